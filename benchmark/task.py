@@ -143,3 +143,14 @@ def in_label_space(mapping: LabelMapping, frame: Frame) -> Frame:
         return dataclasses.replace(frame, labels=mapping.labels(frame.labels, frame.where("labels")))
     assert frame.scores is not None
     return dataclasses.replace(frame, scores=mapping.scores(frame.scores, frame.where("scores")))
+
+
+def truth_task(task: Task) -> Task | None:
+    """The ground truth in the unit's label space; None where there is none, or where it does not map to that."""
+    if not task.scene.ground_truth or task.backbone == GROUND_TRUTH:
+        return None
+    try:
+        mapping = task.scene.label_space(GROUND_TRUTH).mapping_to(task.mapping.target)
+    except ConfigError:
+        return None
+    return dataclasses.replace(task, backbone=GROUND_TRUTH, mapping=mapping)

@@ -24,10 +24,8 @@ import numpy as np
 
 import semstab
 from semstab.core.files import write_json
-from semstab.engine.sizing import SHARE
-from semstab.engine.tiling.partition import tiled
-from semstab.engine.tiling.sights import Sights
-from semstab.engine.work.memory import GB, Kind, Load, filled_of, voxels_of
+from semstab.engine.memory import GB, MemoryModel, filled_share, process_bytes, voxels_in
+from semstab.model.voxels import VoxelTable
 
 HERE = Path(__file__).resolve().parent
 sys.path.insert(0, str(HERE.parent / "tests"))
@@ -72,39 +70,41 @@ def taken(found: dict[str, float]) -> tuple[float, str]:
     return (found["all"] - found["digest"]) * GB, stage
 
 
-def largest_part(out: Path, kind: Kind, memory_gb: float, observed: float) -> tuple[float, float]:
-    """Bytes and voxels of the largest part of a run in tiles, as estimated; `observed` is how often a voxel is seen."""
-    (file,) = (out / "sights").iterdir()
-    sights = Sights.load(file)
-    assert sights is not None
-    parts = tiled(sights, kind.bytes, SHARE * memory_gb * GB).parts
-    return max((kind.bytes(part.voxels, observed * part.voxels), part.voxels) for part in parts)
+def largest_tile(out: Path, model: MemoryModel, observed: float) -> tuple[float, int]:
+    """Bytes, as estimated, and voxels of the largest tile of a run; `observed` is how often a voxel is seen."""
+    voxels = max(map(len, VoxelTable.iter_tiles(next((out / "voxels").iterdir()))))
+    return model.map_bytes(voxels, observed * voxels), voxels
 
 
 def measured(scene: Path, out: Path, backend: str, K: int, kind: str, most_gb: float) -> Iterator[dict[str, Any]]:
     """At once, then in tiles."""
     soft, (width, height) = kind == "scores", SIZE[kind]
     first = flight.frame(0, width, height, K)
-    seen = {"touched": voxels_of(first, VOXEL_SIZE, K), "filled": filled_of(first, VOXEL_SIZE, K)}
-    of = Kind(backend, K, soft=soft, sampled=backend == "numba", **seen)
-    load = Load(first, FRAMES[kind], K, soft, None)
-    if of.bytes(most := FRAMES[kind] * MOST_VOXELS[kind], most) > most_gb * GB:
-        print(f"{backend:>8} {K:4} {kind:>7} left out: {of.bytes(most, most) / GB:.2g} GB")
+    seen = voxels_in(first, VOXEL_SIZE, K)
+    of = MemoryModel(backend, K, soft, sampled=backend == "numba", touched=len(seen), filled=filled_share(seen))
+    if of.map_bytes(most := FRAMES[kind] * MOST_VOXELS[kind], most) > most_gb * GB:
+        print(f"{backend:>8} {K:4} {kind:>7} left out: {of.map_bytes(most, most) / GB:.2g} GB")
         return
     found, stage = taken(stages(scene, out, backend, VOXEL_SIZE, "--set", "memory_gb=1000", "--tile-size", "off"))
     (summary,) = semstab.load_result(out).runs
     voxels, looks = summary.table.voxels, summary.table.observations
     own = {"backend": backend, "K": K, "kind": kind, "voxels": voxels}
-    whole = of.bytes(voxels, looks)
-    yield {**own, "run": "whole", "bytes": found, "estimate": whole + load.beside(whole), "stage": stage}
+    whole = of.map_bytes(voxels, looks)
+    yield {
+        **own,
+        "run": "whole",
+        "bytes": found,
+        "estimate": whole + process_bytes(first, K, None, soft=soft),
+        "stage": stage,
+    }
     limit, out = whole / 3 / GB, out.with_name(f"{backend}-tiles")
     found, stage = taken(stages(scene, out, backend, VOXEL_SIZE, "--set", f"memory_gb={limit}"))
-    part, voxels = largest_part(out, of, limit, looks / voxels)
+    tile, voxels = largest_tile(out, of, looks / voxels)
     yield {
         **own,
         "run": "tiles",
         "bytes": found,
-        "estimate": part + load.beside(part, in_tiles=True),
+        "estimate": tile + process_bytes(first, K, None, soft=soft, in_tiles=True),
         "stage": stage,
     }
 

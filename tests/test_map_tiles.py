@@ -8,7 +8,6 @@ import dataclasses
 import json
 import re
 import shutil
-from collections import Counter
 from collections.abc import Generator
 from unittest import mock
 
@@ -16,10 +15,13 @@ import numpy as np
 import pytest
 import tiny_scene
 from compare_summaries import differences
+from hypothesis import given
+from hypothesis import settings as hypothesis_settings
+from hypothesis import strategies as st
 from posed_config import configure
 from posed_writer import write_posed
 from pyarrow import dataset, parquet
-from test_recording import read
+from scipy.spatial.transform import Rotation
 
 import semstab
 from semstab import backends
@@ -27,20 +29,16 @@ from semstab.comparison import pairing
 from semstab.comparison.comparing import find
 from semstab.comparison.gate_measures import calibrated
 from semstab.core.json_form import to_json
-from semstab.engine import InProcess
+from semstab.engine import InProcess, LocalProcesses
+from semstab.engine.memory import Sizing
 from semstab.engine.observer import Observer
-from semstab.engine.tiling import stretches
-from semstab.engine.tiling.partition import tiled
-from semstab.engine.tiling.sights import Sights, look_at
-from semstab.engine.units import make_plan
+from semstab.engine.tiles import tiles_met
 from semstab.errors import ConfigError, DataError, OutgrownError
 from semstab.exports import export, raster
 from semstab.exports.relabel import Belief, relabel
 from semstab.model.frames import Frame, Intrinsics
 from semstab.model.parquet import Tile
 from semstab.model.voxels import Extent, VoxelTable
-from semstab.recording.observer import Recording
-from semstab.recording.target import Target
 from semstab.statistics.cluster_sums import ClusterSums
 from semstab.testing import random_frames
 from semstab.testing.builders import EXACT, SUMS, sight_line
@@ -114,34 +112,17 @@ def test_a_backend_that_looks_pixels_up_cannot_be_restricted() -> None:
 # --- Runs -------------------------------------------------------------------------------------------------------------
 
 
-class Several(InProcess):
-    """In this process, but as if four tasks were done at once: so that there are several parts."""
-
-    width = 4
+class Counting(InProcess):
+    """In this process; remembers the tiles that were finished, and is interrupted after some."""
 
     def __init__(self, stop_after: int = 1000) -> None:
-        self.left, self.done = stop_after, []
+        self.left, self.done, self.errors = stop_after, [], []
 
-    def run(self, jobs, observers) -> Generator:
-        for job, outcomes in super().run(jobs, observers):
-            self.done += [outcome.portion for outcome in outcomes]
-            yield job, outcomes
-            self.left -= 1
-            if not self.left:
-                raise KeyboardInterrupt
-
-
-class Told(InProcess):
-    """In this process; remembers the portions, and which of them outgrew the memory."""
-
-    def __init__(self, stop_after: int = 1000) -> None:
-        self.left, self.done, self.causes = stop_after, [], []
-
-    def run(self, jobs, observers) -> Generator:
-        for job, outcomes in super().run(jobs, observers):
-            self.done += [(outcome.portion, outcome.outgrown) for outcome in outcomes]
-            self.causes += [outcome.cause for outcome in outcomes if outcome.cause is not None]
-            yield job, outcomes
+    def run(self, next_job, observers) -> Generator:
+        for outcome in super().run(next_job, observers):
+            self.done.append(outcome.tile)
+            self.errors += [outcome.error] if outcome.error is not None else []
+            yield outcome
             self.left -= 1
             if not self.left:
                 raise KeyboardInterrupt
@@ -184,21 +165,18 @@ def both(wall, tmp_path_factory):
     return run_both(wall, tmp_path_factory.mktemp("runs"), **SETTINGS)
 
 
-def run_both(root, folder, **settings):
-    executor = Several()
-    semstab.engine.run(configure(root, **settings), out=folder / "whole")
-    with mock.patch.object(stretches, "LEAST", 8):
-        semstab.engine.run(configure(root, **settings, tile_size=8), out=folder / "tiles", executor=executor)
+def run_both(root, folder, **options):
+    executor = Counting()
+    semstab.engine.run(configure(root, **options), out=folder / "whole")
+    semstab.engine.run(configure(root, **options, tile_size=8), out=folder / "tiles", executor=executor)
     assert len(executor.done) > 4
-    frames = [name for name in executor.done if name.startswith("frames_")]
-    assert len(frames) > 1
     return folder / "whole", folder / "tiles"
 
 
 def assert_same_run(whole, tiles) -> None:
     """Every column of every voxel to the last bit, every number of the summary to 1e-12, the series but for times."""
     assert len(list((tiles / "voxels").glob("*/tile=*.parquet"))) > 4
-    assert not (tiles / "parts").exists()
+    assert not (tiles / "tiles").exists()
     found = differences(summary_of(whole), summary_of(tiles), tolerance=1e-12)
     assert [line for line in found if "_file" not in line.split(":")[0]] == []
     one, other = (semstab.load(folder).table() for folder in (tiles, whole))
@@ -384,115 +362,72 @@ def assert_same_comparison(whole, tiles) -> None:
     assert columns[0] == columns[1]
 
 
-def test_what_was_finished_before_an_interruption_is_kept(wall, tmp_path) -> None:
-    """Parts that are whole are not computed again; a damaged one is."""
-    config, out = configure(wall, backends=["numba"], check=None, tile_size=8), tmp_path / "run"
-    first, second = Several(stop_after=3), Several()
+def test_tiles_that_were_finished_before_an_interruption_are_taken_over(wall, both, tmp_path) -> None:
+    """A damaged one is computed again; and once the unit is whole, it is kept as any other."""
+    config, out = configure(wall, **SETTINGS, tile_size=8), tmp_path / "run"
+    first, second = Counting(stop_after=3), Counting()
     with pytest.raises(KeyboardInterrupt):
         semstab.engine.run(config, out=out, executor=first)
-    (damaged,) = out.glob(f"parts/*/{first.done[0]}.npz")
+    (damaged,) = out.glob(f"tiles/*/{first.done[1]}.npz")
     damaged.write_bytes(damaged.read_bytes()[:-20])
-    result = semstab.engine.run(config, out=out, executor=second)
-    assert set(first.done) & set(second.done) == {first.done[0]}
-    whole = semstab.engine.run(configure(wall, backends=["numba"], check=None), out=tmp_path / "whole")
-    assert_same_bits(result.records[0].table(), whole.records[0].table())
-    again = semstab.engine.run(config, out=out)
-    assert again.manifest["units"]["kept"] == 1
-
-
-@pytest.fixture
-def few_said(monkeypatch):
-    """The index says that there are a twentieth of the voxels; of the process's memory, maps alone count."""
-
-    def fewer(*arguments) -> Sights:
-        found = look_at(*arguments)
-        return dataclasses.replace(found, voxels=found.voxels / 20, observations=found.observations / 20)
-
-    monkeypatch.setattr("semstab.engine.sizing.look_at", fewer)
-    monkeypatch.setattr("semstab.engine.work.memory.resident_bytes", lambda: 0)
-
-
-def test_parts_that_outgrow_the_memory_are_cut_in_two_and_nothing_finished_is_lost(
-    wall, both, few_said, tmp_path
-) -> None:
-    """Also where the run is interrupted between the halves; and once one fits, it tells how the others are cut."""
-    config, out = configure(wall, **SETTINGS, tile_size=8, memory_gb=12e-6), tmp_path / "tiles"
-    first, second = Told(stop_after=7), Told()
-    with pytest.raises(KeyboardInterrupt):
-        semstab.engine.run(config, out=out, executor=first)
-    kept = {path.stem for path in out.glob("parts/*/*.npz")}
     semstab.engine.run(config, out=out, executor=second)
-    assert kept.isdisjoint(name for name, _ in second.done)
-    assert [outgrown for name, outgrown in first.done if name.startswith("tiles")] == [True, True, True, False, False]
-    assert len(first.causes) == 3
-    assert not any(cause.__traceback__ for cause in first.causes), "frames of a traceback keep the map in memory"
-    assert not any(outgrown for _, outgrown in second.done)
+    assert set(first.done) & set(second.done) == {first.done[1]}
     assert_same_run(both[0], out)
+    assert semstab.engine.run(config, out=out).manifest["units"]["kept"] == 1
 
 
-def test_a_tile_that_outgrows_the_memory_is_told_in_one_line(wall, few_said, tmp_path) -> None:
-    config = configure(wall, **SETTINGS, tile_size=8, memory_gb=3e-6)
-    with pytest.raises(
-        ConfigError, match=r"million voxels.*or set a smaller --tile-size: part tiles8_\S+ is a single tile$"
-    ):
-        semstab.engine.run(config, out=tmp_path / "tiles")
+def test_a_run_in_tiles_by_several_processes_leaves_what_one_process_leaves(wall, both, tmp_path) -> None:
+    config = configure(wall, **SETTINGS, tile_size=8)
+    semstab.engine.run(config, out=tmp_path / "tiles", executor=LocalProcesses(2))
+    assert differences(summary_of(both[1]), summary_of(tmp_path / "tiles"), tolerance=0) == []
+    assert_same_run(both[0], tmp_path / "tiles")
 
 
 class Progress(Observer):
-    """The frames that went into maps, and what was remarked."""
+    """The frames that went into maps."""
 
-    def __init__(self) -> None:
-        self.frames, self.lines = 0, []
+    frames = 0
 
     def advanced(self, frames, what) -> None:
         self.frames += frames
 
-    def remarked(self, line) -> None:
-        self.lines.append(line)
+
+def test_a_map_that_will_not_fit_is_fused_in_tiles_and_a_line_says_so(wall, both, tmp_path, caplog) -> None:
+    progress, executor = Progress(), Counting()
+    config = configure(wall, **SETTINGS, memory_gb=30e-6)
+    with mock.patch("semstab.engine.memory.resident_bytes", return_value=0):  # the estimates of maps count alone
+        semstab.engine.run(config, out=tmp_path / "tiles", observers=[progress], executor=executor)
+    assert len(executor.done) > 2
+    assert re.search(
+        r"wall, a: about .* million voxels of 0.25 m would take .* GB, 3e-05 GB are there: fused in tiles", caplog.text
+    )
+    assert progress.frames == 30
+    assert_same_bits(semstab.load(tmp_path / "tiles").table(), semstab.load(both[0]).table())
 
 
-def test_a_map_that_outgrows_the_memory_is_begun_again_in_tiles(wall, both, few_said, tmp_path) -> None:
-    """And goes on so after an interruption, without a further try at once."""
-    config, out = configure(wall, **SETTINGS, memory_gb=30e-6), tmp_path / "run"
-    first, second, progress = Told(stop_after=4), Told(), Progress()
-    with pytest.raises(KeyboardInterrupt):
-        semstab.engine.run(config, out=out, executor=first)
-    assert first.done[:2] == [(None, True), ("frames_0-30", False)]
-    semstab.engine.run(config, out=out, executor=second, observers=[progress])
-    assert all(name is not None and not outgrown for name, outgrown in second.done)
-    (line,) = progress.lines
-    assert re.fullmatch(r"wall, a: about .* 3e-05 GB are there, which it outgrew: begun again in 3 parts, .*", line)
-    assert_same_bits(semstab.load(out).table(), semstab.load(both[0]).table())
-    found = differences(summary_of(both[0]), summary_of(out), tolerance=1e-12)
-    assert [line for line in found if "_file" not in line.split(":")[0]] == []
-    again = Progress()
-    semstab.engine.run(config, out=tmp_path / "anew", observers=[again])
-    assert again.frames == 30
-
-
-def test_the_recording_of_a_map_that_is_begun_again_has_each_frame_once(wall, few_said, tmp_path) -> None:
-    out, file = tmp_path / "run", tmp_path / "recording.rrd"
-    observer = Recording(Target(file), run=out)
-    semstab.engine.run(configure(wall, **SETTINGS, memory_gb=30e-6), out=out, observers=[observer])
-    recorded = read(file)
-    frames = {entity: Counter(row["frame"] for row in rows if "frame" in row) for entity, rows in recorded.items()}
-    assert set(frames["/wall/map/a/numba/00"]) == {29}
-    for entity in ("depth", "camera/a/labels", "series/map_vss/a/numba", "series/fuse_ms/a/numba", "series/wait_ms/a"):
-        assert frames[f"/wall/{entity}"] == Counter(range(30))
-    drift = {row["frame"]: row["Scalars:scalars"] for row in recorded["/wall/series/drift/a/numba"][1:]}
-    assert drift == {int(row["frame"]): [float(row["drift"])] for row in series_of(out) if row["drift"]}
-    assert {path.name for path in tmp_path.iterdir()} == {"run", "recording.rrd"}
-
-
-def test_tiles_that_are_forbidden_are_not_begun_either(wall, few_said, tmp_path) -> None:
-    config = configure(wall, **SETTINGS, memory_gb=30e-6, tile_size="off")
-    with pytest.raises(OutgrownError, match=r"after 20 of 30 frames the map has .* is left of memory_gb"):
+@pytest.mark.parametrize(
+    ("settings", "line"),
+    [({"tile_size": "off"}, r"use tiles \(--tile-size 256\)"), ({"tile_size": 8}, "use a smaller --tile-size than 8")],
+)
+def test_a_map_that_outgrows_the_memory_is_given_up_in_one_line(settings, line, wall, tmp_path) -> None:
+    config = configure(wall, **SETTINGS, memory_gb=3e-6, **settings)
+    with (
+        mock.patch("semstab.engine.memory.resident_bytes", return_value=0),
+        mock.patch("semstab.engine.execution.planned_sizes", forced_sizes),
+        pytest.raises(OutgrownError, match=rf"after \d+ of \d+ frames the map has .* is left of memory_gb; {line}"),
+    ):
         semstab.engine.run(config, out=tmp_path / "run")
+
+
+def forced_sizes(config, missing, width) -> Sizing:
+    """As if every map were expected to fit."""
+    sizes = {each.identity: config.tile_size for each in missing} if isinstance(config.tile_size, int) else {}
+    return Sizing(tile_sizes=sizes)
 
 
 def test_parts_of_other_tiles_are_not_taken_for_those_of_these(wall, both, tmp_path) -> None:
     """A part is named by its corners in tiles, which are others where tiles are larger."""
-    for size, executor in ((8, Several(stop_after=4)), (16, Several())):
+    for size, executor in ((8, Counting(stop_after=4)), (16, Counting())):
         config = configure(wall, **SETTINGS, tile_size=size)
         with contextlib.suppress(KeyboardInterrupt):
             semstab.engine.run(config, out=tmp_path / "tiles", executor=executor)
@@ -545,38 +480,44 @@ def test_what_cannot_be_tiled_is_refused_in_one_line(settings, message, wall) ->
         semstab.engine.run(configure(wall, **{"backends": ["numba"], "check": None, **settings}))
 
 
-# --- What frames see --------------------------------------------------------------------------------------------------
+# --- Which frames see which tiles -------------------------------------------------------------------------------------
 
 
-def test_no_frame_sees_a_tile_that_the_index_lacks(soft_wall) -> None:
-    """Nor are there more: what depth shows is what is fused where every pixel has a label."""
-    config = configure(soft_wall, backends=["numba"], voxel_size=0.1)
-    (task,) = make_plan(config).tasks
-    sights = look_at(task, 0.1, cell=8)
-    tiles = sights.in_tiles(16)
-    for index in task.indices:
-        backend = backends.create("numba", voxel_size=0.1, num_classes=3)
-        backend.integrate(semstab.task.read(task, index))
-        seen = np.unique(backend.table().index[:, :2] // 16, axis=0)
-        np.testing.assert_array_equal(tiles.cell[tiles.frame == index], seen)
+@hypothesis_settings(max_examples=40, deadline=None)
+@given(st.integers(0, 10**6), st.sampled_from([8, 32, 128]), st.floats(0.1, 0.7))
+def test_no_pixel_falls_into_a_tile_that_its_frustum_does_not_meet(seed, size, voxel_size) -> None:
+    """Of cameras that look anywhere, at depth in any range."""
+    rng = np.random.default_rng(seed)
+    T_wc = np.eye(4)
+    T_wc[:3, :3], T_wc[:3, 3] = Rotation.random(rng=seed).as_matrix(), rng.normal(0, 30, 3)
+    low, high = np.sort(rng.uniform(0.1, 60, 2))
+    depth = rng.uniform(low, high, (12, 16)).astype(np.float32)
+    depth[rng.random(depth.shape) < 0.3] = 0
+    frame = Frame(3, depth, Intrinsics(14, 15, 7.2, 6.1), T_wc, labels=np.zeros(depth.shape, np.uint8))
+    met = set(map(tuple, tiles_met(frame, voxel_size, size).tolist()))
+    backend = backends.create("numpy", voxel_size=voxel_size, num_classes=2)
+    backend.integrate(frame)
+    assert {tuple(own) for own in (backend.table().index[:, :2] // size).tolist()} <= met
 
 
-def test_parts_are_rectangles_within_the_budget_that_share_nothing() -> None:
-    """A strip of tiles that frames pass one after the other: few frames are decoded for two parts."""
-    x, y = (axis.ravel() for axis in np.meshgrid(np.arange(-8, 8), np.arange(4), indexing="ij"))
-    place = np.stack([x, y], axis=1).astype(np.int32)
-    rows = [(t, *tile) for t in range(100) for tile in place.tolist() if abs(tile[0] + 8 - t * 0.16) < 1]
-    frame, *cell = np.array(rows, np.int32).T
-    sights = Sights(64, frame, np.stack(cell, axis=1), place, np.full(64, 100.0), np.full(64, 500.0), 100)
-    tiling = tiled(sights, lambda voxels, observations: voxels, 1600, 64)
-    assert [part.voxels for part in tiling.parts] == [1600] * 4
-    covered = np.zeros((16, 4), int)
-    for part in tiling.parts:
-        (x0, y0), (x1, y1) = np.array([part.extent.low, part.extent.high]) // 64
-        covered[x0 + 8 : x1 + 8, y0:y1] += 1
-    assert (covered == 1).all()
-    assert tiling.decodes < 1.6 * 100
-    assert tiled(sights, lambda voxels, observations: voxels, 1600).size == 128  # four parts a budget, at most
+def test_a_frustum_meets_few_tiles_that_no_pixel_falls_into() -> None:
+    """Straight down from 60 voxels above, onto ground 40 by 30 voxels wide; not the box around an oblique view."""
+    down = np.array([[1.0, 0, 0, 4], [0, -1, 0, 4], [0, 0, -1, 60], [0, 0, 0, 1]])
+    depth, labels = np.full((30, 40), 60.0, np.float32), np.zeros((30, 40), np.uint8)
+    frame = Frame(0, depth, Intrinsics(60, 60, 20, 15), down, labels=labels)
+    assert len(tiles_met(frame, 1.0, 8)) <= 7 * 6
+    turned = down.copy()
+    turned[:3, :3] = Rotation.from_euler("zx", [45, 60], degrees=True).as_matrix() @ down[:3, :3]
+    far = dataclasses.replace(frame, T_wc=turned, depth=depth + np.linspace(0, 400, 30, dtype=np.float32)[:, None])
+    met = tiles_met(far, 1.0, 8)
+    assert len(met) < 0.6 * np.prod(np.ptp(met, axis=0) + 1)
+
+
+def test_depth_that_meets_too_many_tiles_is_told_with_its_file() -> None:
+    depth = np.full((4, 4), 1e6, np.float32)
+    frame = Frame(0, depth, Intrinsics(2, 2, 2, 2), np.eye(4), labels=np.zeros((4, 4), np.uint8))
+    with pytest.raises(DataError, match=r"frame 0, depth: up to 1e\+06 m deep, it sees .* tiles of 0.8 m"):
+        tiles_met(frame, 0.1, 8)
 
 
 def test_other_programs_read_the_tiles_as_one_table(both) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import tracemalloc
 
 import numpy as np
@@ -15,12 +16,8 @@ from semstab.backends.shared import observations
 from semstab.backends.shared.observations import Change
 from semstab.config import Config
 from semstab.core.process import available_bytes
-from semstab.engine import InProcess
-from semstab.engine.folder import Folder
-from semstab.engine.sizing import Survey, sized
-from semstab.engine.tiling.sights import look_at
+from semstab.engine import memory
 from semstab.engine.units import Plan, make_plan
-from semstab.engine.work import memory
 from semstab.errors import ConfigError
 from semstab.model.frames import Frame, Intrinsics
 
@@ -38,16 +35,28 @@ def planned(root, **settings) -> tuple[Plan, Config]:
 
 
 def test_the_estimate_holds_for_a_flight_and_saturates_over_one_place(tmp_path) -> None:
-    """From a sample of one in eight voxels; frames that see nothing new add observations only."""
+    """From a few pairs of frames; frames that see nothing new add observations only."""
     root = tiny_scene.write(tmp_path / "wall", backbones=("a",), frames=60)
     plan, config = planned(root, voxel_size=0.05, pixel_stride=1)
     table = semstab.engine.run(config).runs[0].table
-    sights = look_at(plan.tasks[0], 0.05)
-    assert sights.voxels.sum() == pytest.approx(table.voxels, rel=0.3)
-    assert sights.observations.sum() == pytest.approx(table.observations, rel=0.3)
+    size = memory.map_size(plan.tasks[0], plan.units[0].config, 3)
+    assert size.voxels == pytest.approx(table.voxels, rel=0.3)
+    assert size.observations == pytest.approx(table.observations, rel=0.3)
+    still = dataclasses.replace(plan.tasks[0], indices=[0] * 60)
+    assert memory.map_size(still, plan.units[0].config, 3).voxels == pytest.approx(48)
 
 
-def test_what_does_not_fit_is_refused_before_a_frame_is_fused(root, tmp_path) -> None:
+@pytest.mark.parametrize("share", [0.02, 0.2, 0.7])
+def test_the_size_of_a_map_follows_from_how_many_sampled_voxels_are_distinct(share) -> None:
+    """Frames that see a share of a place at random."""
+    rng, places = np.random.default_rng(0), 10_000
+    each = round(share * places)
+    seen = [rng.choice(places, each, replace=False) for _ in range(8)]
+    distinct = len(np.unique(np.concatenate(seen)))
+    assert memory._drawn_from(distinct, each, 8) == pytest.approx(places, rel=0.15)
+
+
+def test_a_unit_that_will_not_fit_is_refused_before_a_frame_is_fused(root, tmp_path) -> None:
     _, config = planned(root, memory_gb=1e-6, tile_size="off")
     said = r"wall, a: about .* million voxels of 0.25 m would take .* GB, and 1e-06 GB is memory_gb; use larger voxels"
     with pytest.raises(ConfigError, match=said + r".*pixel_stride.*\(numpy\).*off forbids to fuse it in tiles"):
@@ -55,29 +64,31 @@ def test_what_does_not_fit_is_refused_before_a_frame_is_fused(root, tmp_path) ->
     assert not (tmp_path / "run" / "voxels").exists()
 
 
-def survey(config, tmp_path) -> Survey:
-    """By threads of this process."""
-    folder = Folder(tmp_path / "run", config)
-    folder.close()
-    return Survey(InProcess(), folder, "start")
-
-
-def test_what_does_not_fit_is_fused_in_tiles(root, tmp_path) -> None:
-    """The limit is what is free, where none is set; a quarter of it where what comes beside takes it all."""
+def test_a_unit_that_will_not_fit_is_fused_in_tiles(root, monkeypatch) -> None:
+    """The limit is the free memory, where none is set; a quarter of it where code and frames take it all."""
     plan, config = planned(root)
-    assert not sized(config, plan.units, survey(config, tmp_path)).tilings
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(memory, "available_bytes", lambda: 1000)
-        sizing = sized(config, plan.units, survey(config, tmp_path))
-    assert sizing.tilings.keys() == {each.identity for each in plan.units}
-    assert "2.5e-07 GB are there: fused in" in sizing.remarks[0]
+    assert not memory.planned_sizes(config, plan.units, 1).tile_sizes
+    monkeypatch.setattr(memory, "available_bytes", lambda: 1000)
+    sizing = memory.planned_sizes(config, plan.units, 1)
+    assert sizing.tile_sizes.keys() == {each.identity for each in plan.units}
+    assert "2.5e-07 GB are there: fused in tiles of" in sizing.lines[0]
 
 
-def test_no_further_frame_is_read_where_there_is_ample_room(root, tmp_path, monkeypatch) -> None:
+def test_tiles_are_as_large_as_the_memory_allows_and_as_many_as_processes_need() -> None:
+    model = memory.MemoryModel("numba", 7)
+    size = memory.MapSize(voxels=1e8, observations=3e8, by_column=2.0)
+    edges = [size.tile_edge(model, budget, 1) for budget in (1e8, 4e8, 16e8)]
+    assert edges[1] == 2 * edges[0]
+    assert edges[2] == 4 * edges[0]
+    assert model.map_bytes(2 * edges[0] ** 2, 6 * edges[0] ** 2) < 1e8
+    assert memory.MapSize(1e6, 3e6, 2.0).tile_edge(model, 1e12, 8) ** 2 * 2 * 2 * 8 <= 1e6
+
+
+def test_one_frame_is_enough_where_there_is_ample_room(root, monkeypatch) -> None:
     plan, config = planned(root)
-    monkeypatch.setattr("semstab.engine.sizing.look_at", lambda *_: pytest.fail("frames were read"))
-    sizing = sized(config, plan.units, survey(config, tmp_path))
-    assert not sizing.tilings
+    monkeypatch.setattr(memory, "map_size", lambda *_: pytest.fail("frames were read"))
+    sizing = memory.planned_sizes(config, plan.units, 1)
+    assert not sizing.tile_sizes
     assert not sizing.refused
 
 
@@ -119,7 +130,7 @@ def test_blocks_of_which_frames_see_little_take_as_much_as_full_ones() -> None:
     backend = create("open3d", voxel_size=0.2, num_classes=7)
     seen = backend.integrate(frame).map_voxels
     held = sum(backend.grid.attribute(column).numpy().nbytes for column in backend.attributes)
-    full, filled = 1 / 4, memory.filled_of(frame, 0.2, 7)
+    full, filled = 1 / 4, memory.filled_share(memory.voxels_in(frame, 0.2, 7))
     assert filled < full / 3
     assert held / 1.5 < expected_bytes("open3d", seen, seen, 7, soft=True, filled=filled) < 1.5 * held
     assert held / 1.5 > expected_bytes("open3d", seen, seen, 7, soft=True, filled=full)

@@ -18,9 +18,8 @@ from test_recording import read
 
 import semstab
 from semstab.config import BACKENDS
-from semstab.engine import LocalProcesses, load_result
+from semstab.engine import LocalProcesses, load_result, streams
 from semstab.engine.units import make_plan
-from semstab.engine.work import image_space
 from semstab.metrics import compare, compensated_flicker
 from semstab.recording.observer import Recording
 from semstab.recording.target import Target
@@ -181,10 +180,10 @@ def test_a_backend_of_ones_own_that_breaks_leaves_its_trace(root, tmp_path, monk
 
 def test_large_frames_are_sampled_for_what_is_measured_in_the_image(root, monkeypatch) -> None:
     """Each pixel of the sample is looked up in the whole frame before: fusion need not wait for all of them."""
-    monkeypatch.setattr(image_space, "SIDE", 4)  # of frames of 8x6: every second pixel
+    monkeypatch.setattr(streams, "SIDE", 4)  # of frames of 8x6: every second pixel
     (task, *_) = make_plan(load_config(overrides=settings(root))).tasks
     frames = [read_frame(task, index) for index in task.indices]
-    meter = image_space.ImageSpaceMeter()
+    meter = streams.ImageSpaceMeter()
     for frame in frames:
         meter.add(frame, None)
     pairs = [compensated_flicker(a, b.every(2)).flicker_percent for a, b in itertools.pairwise(frames)]

@@ -20,9 +20,9 @@ from semstab.core.json_form import to_json
 from semstab.datasets.files.scene import FileScene
 from semstab.engine import load_result, run_study
 from semstab.engine.folder import Folder
+from semstab.engine.passes import run_job
 from semstab.engine.units import make_plan
-from semstab.engine.work.jobs import Job, Request, split
-from semstab.engine.work.passes import run_job
+from semstab.engine.work import Start, Work, jobs_of
 from semstab.errors import ConfigError, DataError
 from semstab.metrics import SelfConsistency, VideoConsistency, compare, compensated_flicker, flicker_percent, summarise
 from semstab.model.records import Variation
@@ -122,14 +122,14 @@ def test_maps_that_exceed_the_memory_bound_are_put_off_and_the_numbers_are_the_s
 
     monkeypatch.setattr(FileScene, "frame", counted)
     grown = itertools.count(step=1_000_000)
-    monkeypatch.setattr("semstab.engine.work.passes.resident_bytes", lambda: next(grown))
+    monkeypatch.setattr("semstab.engine.passes.resident_bytes", lambda: next(grown))
     run_study(configure(root, memory_gb=0.0005), tmp_path / "tight")
     assert len(decoded) > 25
     assert summary(tmp_path / "tight") == summary(tmp_path / "whole")
 
 
 def test_a_unit_that_would_not_fit_into_memory_fails_before_it_is_fused(root, tmp_path, monkeypatch) -> None:
-    monkeypatch.setattr("semstab.engine.work.memory.resident_bytes", lambda: 0)  # what is estimated counts alone
+    monkeypatch.setattr("semstab.engine.memory.resident_bytes", lambda: 0)  # what is estimated counts alone
     small = {"memory_gb": 0.00003, "tile_size": "off"}
     config = configure(root, backends=["numpy"], sweeps={"pixel_stride": [8]}, **small)
     result = run_study(config, tmp_path / "out")
@@ -442,8 +442,7 @@ def test_a_worker_that_does_not_see_the_folder_sends_the_voxels_back(root, tmp_p
     config = resolve(configure(root, sweeps={}, backends=["numpy"], backbones=["a"]))
     (cell,) = make_plan(config).units
     elsewhere = tmp_path / "elsewhere"
-    job = Job("wall", "a", (Request(cell.identity, cell.config, image_space=True, kept=True),), "start", elsewhere)
-    (outcome,) = run_job(job)
+    (outcome,) = run_job((Work.of(cell, Start("start", elsewhere)),))
     assert not elsewhere.exists()
     folder = Folder(tmp_path / "out", config)
     folder.save(outcome)
@@ -456,31 +455,31 @@ def test_a_worker_that_does_not_see_the_folder_sends_the_voxels_back(root, tmp_p
 
 def test_a_job_that_cannot_even_begin_fails_as_a_whole(root, tmp_path) -> None:
     config = resolve(configure(root, sweeps={"voxel_size": [0.5]}, backends=["numpy"], backbones=["a"]))
-    requests = tuple(Request(c.identity, c.config, image_space=False, kept=False) for c in make_plan(config).units)
-    outcomes = run_job(Job("hall", "a", requests, "start", tmp_path))
+    start = Start("start", tmp_path)
+    works = [dataclasses.replace(Work.of(cell, start), scene="hall") for cell in make_plan(config).units]
+    outcomes = [*run_job(tuple(works))]
     assert [outcome.error for outcome in outcomes] == [outcomes[0].error] * 2
     assert "scene 'hall' is not there" in outcomes[0].error
 
 
+def works(backbone: str, identities: str, kept: str = "") -> list[Work]:
+    start = Start("", Path())
+    return [Work(start, "s", backbone, name, Config(), kept=name in kept) for name in identities]
+
+
+def names(job: tuple[Work, ...]) -> str:
+    return "".join(work.identity for work in job)
+
+
 def test_jobs_are_halved_until_every_worker_has_one() -> None:
-    jobs = [job("s", "123456"), job("t", "78")]
-    assert split(jobs, 2) == jobs
-    assert [names(each) for each in split(jobs, 4)] == ["1", "23", "456", "78"]
-    assert [len(each.requests) for each in split(jobs, 100)] == [1] * 8
-    assert "".join(names(each) for each in split(jobs, 5)) == "12345678"
-    assert split([], 3) == []
+    both = [*works("s", "123456"), *works("t", "78")]
+    assert [names(job) for job in jobs_of(both, 2)] == ["123456", "78"]
+    assert [names(job) for job in jobs_of(both, 4)] == ["1", "23", "456", "78"]
+    assert [len(job) for job in jobs_of(both, 100)] == [1] * 8
+    assert "".join(names(job) for job in jobs_of(both, 5)) == "12345678"
+    assert jobs_of([], 3) == []
 
 
-def test_what_is_watched_stays_in_one_job() -> None:
+def test_watched_works_stay_in_one_job() -> None:
     """Observers see all backends of a frame together."""
-    requests = tuple(Request(name, Config(), kept=name in "15") for name in "123456")
-    parts = split([Job("s", "a", requests, "", Path())], 9)
-    assert [names(part) for part in parts] == ["15", "2", "3", "4", "6"]
-
-
-def job(backbone: str, identities: str) -> Job:
-    return Job("s", backbone, tuple(Request(name, Config()) for name in identities), "", Path())
-
-
-def names(part: Job) -> str:
-    return "".join(request.identity for request in part.requests)
+    assert [names(job) for job in jobs_of(works("a", "123456", kept="15"), 9)] == ["15", "2", "3", "4", "6"]

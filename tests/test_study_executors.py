@@ -17,7 +17,7 @@ from tiny_study import Counting, Interrupting, summary
 from semstab.engine import DaskCluster, LocalProcesses, run_study
 from semstab.engine.observer import Observers
 from semstab.engine.units import make_plan
-from semstab.engine.work.jobs import Job, Request
+from semstab.engine.work import Start, Work
 from semstab.errors import ConfigError, MissingDependencyError
 
 BACKBONES = ("a", "b", "c", "d")
@@ -70,8 +70,8 @@ class Killing(Counting):
         super().__init__()
         self.worker = worker
 
-    def unit_done(self, cell, error) -> None:
-        super().unit_done(cell, error)
+    def unit_finished(self, cell, content, table, error) -> None:
+        super().unit_finished(cell, content, table, error)
         if self.worker is not None:
             process, self.worker = self.worker(), None
             os.kill(process, signal.SIGKILL)
@@ -96,10 +96,8 @@ def test_a_local_process_that_is_killed_costs_no_unit(config, tmp_path, expected
     assert summary(tmp_path / "out") == expected
 
 
-class Deadly:
-    """A unit whose process dies of it."""
-
-    identity, portion, again = "deadly", None, None
+class Deadly(Work):
+    """A work whose process dies of it."""
 
     def __reduce__(self):
         return os._exit, (1,)
@@ -107,9 +105,11 @@ class Deadly:
 
 def test_a_job_that_kills_its_process_fails_and_the_others_finish(root, tmp_path) -> None:
     config = tiny_study.configure(root, sweeps={}, backends=["numpy"])
-    fine = [Job("wall", cell.unit.backbone, (Request.of(cell),), "start", tmp_path) for cell in make_plan(config).units]
-    jobs = [fine[0], Job("wall", "x", (Deadly(),), "start", tmp_path), *fine[1:]]
-    found = {job.backbone: outcome for job, (outcome,) in LocalProcesses(2).run(jobs, Observers([]))}
+    start = Start("start", tmp_path)
+    fine = [Work.of(cell, start) for cell in make_plan(config).units]
+    jobs = iter([(fine[0],), (Deadly(start, "wall", "x", "deadly", config),), *((work,) for work in fine[1:])])
+    outcomes = {each.identity: each for each in LocalProcesses(2).run(lambda: next(jobs, None), Observers([]))}
+    found = {work.backbone: outcomes[work.identity] for work in fine} | {"x": outcomes["deadly"]}
     assert sorted(found) == ["a", "b", "c", "d", "x"]
     assert found["x"].error.startswith("its process was killed, perhaps for want of memory")
     assert [found[name].error for name in BACKBONES] == [None] * 4
@@ -133,16 +133,16 @@ def test_an_interruption_ends_the_processes_and_keeps_what_is_finished(config, t
 def test_worker_processes_end_with_a_parent_that_was_killed(tmp_path) -> None:
     (tmp_path / "parent.py").write_text(
         "import pathlib\n"
+        "from semstab.config import Config\n"
         "from semstab.engine import LocalProcesses\n"
-        "from semstab.engine.work.jobs import Job\n"
         "from semstab.engine.observer import Observers\n"
-        "class Endless:\n"
-        "    identity = 'endless'\n"
+        "from semstab.engine.work import Start, Work\n"
+        "class Endless(Work):\n"
         "    def __reduce__(self):\n"
         "        return exec, ('import pathlib, time; pathlib.Path(\"at work\").touch(); time.sleep(600)',)\n"
         "if __name__ == '__main__':\n"
-        "    job = Job('wall', 'a', (Endless(),), 'start', pathlib.Path('out'))\n"
-        "    list(LocalProcesses(1).run([job], Observers([])))\n"
+        "    jobs = iter([(Endless(Start('start', pathlib.Path('out')), 'wall', 'a', 'endless', Config()),)])\n"
+        "    list(LocalProcesses(1).run(lambda: next(jobs, None), Observers([])))\n"
     )
     with subprocess.Popen([sys.executable, "parent.py"], cwd=tmp_path) as parent:
         wait_until((tmp_path / "at work").exists)
@@ -209,9 +209,10 @@ def test_a_dask_cluster_gives_the_same_numbers_though_a_worker_is_killed(
     assert summary(tmp_path / "out") == expected
     assert result.manifest["units"]["executor"] == "Dask, 2 threads"
 
-    monkeypatch.setattr("semstab.engine.work.executors.CONNECT_SECONDS", 1)  # after which it is given up
+    monkeypatch.setattr("semstab.engine.executors.CONNECT_SECONDS", 1)  # after which it is given up
     executor = DaskCluster(address)
-    finished = executor.run([Job("nowhere", "none", (), "start", tmp_path)] * 9, Observers([]))
+    jobs = iter([(Work(Start("start", tmp_path), "nowhere", "none", "x", config),)] * 9)
+    finished = executor.run(lambda: next(jobs, None), Observers([]))
     next(finished)
     scheduler.kill()
     with pytest.raises(ConfigError, match="the scheduler went away; start it again"):
@@ -221,7 +222,7 @@ def test_a_dask_cluster_gives_the_same_numbers_though_a_worker_is_killed(
 
 def test_a_scheduler_that_does_not_answer_is_named(monkeypatch) -> None:
     pytest.importorskip("distributed", reason="needs the extra 'cluster'")
-    monkeypatch.setattr("semstab.engine.work.executors.CONNECT_SECONDS", 0.5)
+    monkeypatch.setattr("semstab.engine.executors.CONNECT_SECONDS", 0.5)
     with pytest.raises(ConfigError, match=r"tcp://127\.0\.0\.1:9: no Dask scheduler answers"):
         DaskCluster("tcp://127.0.0.1:9")
 

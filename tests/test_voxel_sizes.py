@@ -11,7 +11,7 @@ import pytest
 from striped_floor import K, flight
 
 from semstab import backends
-from semstab.engine.work.sizes import SizeMaps
+from semstab.engine.streams import SizeSample
 from semstab.statistics import krippendorff_alpha
 
 
@@ -22,9 +22,9 @@ def soft(frame, kind, seed=0):
 
 def alphas(frames, voxel_size):
     task = SimpleNamespace(indices=[frame.index for frame in frames], mapping=SimpleNamespace(target=range(K)))
-    maps = SizeMaps(task, SimpleNamespace(voxel_size=voxel_size))
+    maps = SizeSample(task, SimpleNamespace(voxel_size=voxel_size))
     for frame in frames:
-        maps.add(frame.index, frame)
+        maps.add(frame)
     return maps.alphas()
 
 

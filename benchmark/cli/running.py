@@ -264,6 +264,8 @@ def execute(
     if report not in ("on", "off"):
         raise ConfigError(f"--report {report}: write on or off")
     recording = _recording(rerun, out)
+    if executor.elsewhere and any(each.target.live for each in recording):
+        raise ConfigError("--rerun: a viewer follows a run in one process; leave out --jobs and --scheduler")
     observers: list[Observer] = [ProgressBar(Console(stderr=True, quiet=quiet)), *recording]
     gc.freeze()  # modules stay: looking for garbage among them takes half a second of a short run
     try:

@@ -1,4 +1,4 @@
-"""The engine behind runs and studies: scenes x backbones x backends x variations, each unit kept when it is done."""
+"""The engine of runs and studies: scenes x backbones x backends x variations, each unit kept when it is finished."""
 
 from __future__ import annotations
 
@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from semstab.engine.execution import run, run_study
+    from semstab.engine.executors import DaskCluster, Executor, InProcess, LocalProcesses
     from semstab.engine.folder import load_result
     from semstab.engine.observer import Observer
-    from semstab.engine.work.executors import DaskCluster, Executor, InProcess, LocalProcesses
 
 __all__ = [
     "DaskCluster",
@@ -23,10 +23,10 @@ __all__ = [
 ]
 
 _HOMES = {
-    "DaskCluster": "work.executors",
-    "Executor": "work.executors",
-    "InProcess": "work.executors",
-    "LocalProcesses": "work.executors",
+    "DaskCluster": "executors",
+    "Executor": "executors",
+    "InProcess": "executors",
+    "LocalProcesses": "executors",
     "Observer": "observer",
     "load_result": "folder",
     "run": "execution",

@@ -1,32 +1,35 @@
-"""A run or a study: every unit of its plan that is not kept from before, computed, and what they add up to."""
+"""A run or a study computes every unit of its plan that an earlier start did not finish; all of them make a result."""
 
 from __future__ import annotations
 
 import contextlib
 import dataclasses
 import itertools
+import logging
 import tempfile
 import time
+from collections import deque
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from semstab.check import Verdict, advise, quick_look, refuse_unsound, with_voxel_size
 from semstab.config import Config
-from semstab.core.process import Stopwatch, give_back
+from semstab.core.process import give_back
+from semstab.engine.executors import Executor, InProcess
 from semstab.engine.folder import Folder, require_file_names
+from semstab.engine.memory import planned_sizes
 from semstab.engine.observer import Observer, Observers
-from semstab.engine.results import Found, advice_of, manifest, result_of
-from semstab.engine.sizing import Sizing, Survey, sized
-from semstab.engine.tiled_units import InTiles, Waiting
-from semstab.engine.tiling.partition import Tiling
+from semstab.engine.passes import share_open_scenes
+from semstab.engine.results import UnitResults, advice_of, manifest, result_of
+from semstab.engine.tiled_units import TiledUnit
 from semstab.engine.units import Plan, Planned, PlannedUnit, make_plan
-from semstab.engine.work.executors import Executor, InProcess
-from semstab.engine.work.jobs import Outcome
-from semstab.engine.work.passes import lend
+from semstab.engine.work import Job, Outcome, Work, jobs_of
 from semstab.errors import ConfigError, DataError
-from semstab.model.records import Result, UnitContent
+from semstab.model.records import Result
 from semstab.model.results import VoxelAdvice
 from semstab.settings import resolve
+
+logger = logging.getLogger("semstab")
 
 
 def run(
@@ -62,10 +65,10 @@ def run_study(
     observers: Sequence[Observer] = (),
     command: Sequence[str] = (),
 ) -> Result:
-    """Compute what the folder `out` does not hold yet, and say what was found.
+    """Compute the units that the folder `out` does not hold yet, and return the result of all.
 
-    Each unit is kept when it is finished, under a key of its settings and its input: a killed study goes on where it
-    was, a changed setting computes again only what it touches. `command` goes into the manifest.
+    Each unit is kept when it is finished, under a key of its settings and its input: a killed study is resumed by the
+    same command, and a changed setting computes again only the units that it touches. `command` goes into the manifest.
 
     Raises ConfigError or DataError where the plan does not fit together, or a scene's depth and poses contradict each
     other, before anything is computed. A unit that fails later is among the result's failures, and the others finish.
@@ -74,158 +77,145 @@ def run_study(
 
 
 def _execute(
-    config: Config, out: Path, executor: Executor, observers: Sequence[Observer], command: Sequence[str]
+    config: Config, out: Path, executor: Executor, observing: Sequence[Observer], command: Sequence[str]
 ) -> tuple[Result, Mapping[str, BaseException]]:
-    """The result, and what failing units raised in this process, by its message."""
-    started, told = time.perf_counter(), Observers(observers)
+    """The result, and the exceptions of failing units in this process, by message."""
+    started, observers = time.perf_counter(), Observers(observing)
     config = resolve(config)
     config, advice = with_voxel_size(config)
     plan = make_plan(config)
     require_file_names(out, (each.unit for each in plan.units))
     folder = Folder(out, config)
     try:
-        found = _compute(plan, folder, executor, told)
-        found.advice = advice or advice_of(plan, found.contents)
-        result = result_of(plan, folder, found)
-        found.watch.seconds["all"] = time.perf_counter() - started
-        content = manifest(config, found.inputs(plan), found.watch.seconds, command)
-        content |= {"units": found.counts() | {"executor": executor.name}}
-        content |= {"geometry": {scene: verdict.summary() for scene, verdict in found.geometry.items()}}
+        units = _compute(plan, folder, executor, observers)
+        units.advice = advice or advice_of(plan, units.contents)
+        result = result_of(plan, folder, units)
+        units.watch.seconds["all"] = time.perf_counter() - started
+        content = manifest(config, units.inputs(plan), units.watch.seconds, command)
+        content |= {"units": units.counts() | {"executor": executor.name}}
+        content |= {"geometry": {scene: verdict.summary() for scene, verdict in units.geometry.items()}}
         content |= {"depth_from": {name: scene.depth_from for name, scene in plan.scenes.items() if scene.depth_from}}
         result = dataclasses.replace(result, manifest=content)
         folder.save_result(result)
-        told.tell(lambda observer: observer.run_finished(result))
+        observers.tell(lambda observer: observer.run_finished(result))
     finally:
         folder.close()
         executor.close()
-    told.raise_first()
-    return result, found.causes
+    observers.raise_first()
+    return result, units.causes
 
 
-def _compute(plan: Plan, folder: Folder, executor: Executor, told: Observers) -> Found:
-    """Take what is kept, compute the rest."""
-    units, watch = plan.distinct(), Stopwatch()
-    with watch("digest"):
-        contents = {identity: kept for identity, each in units.items() if (kept := folder.kept(each)) is not None}
-    found = Found(contents, kept=len(contents), watch=watch)
-    told.tell(lambda observer: observer.run_started(plan, [units[identity] for identity in contents]))
-    _tell_kept(plan, contents, told)
-    missing = [each for identity, each in units.items() if identity not in contents]
+def _compute(plan: Plan, folder: Folder, executor: Executor, observers: Observers) -> UnitResults:
+    """The units that an earlier start finished, and all others, kept as they finish."""
+    planned, units = plan.distinct(), UnitResults()
+    with units.watch("digest"):
+        units.contents = {
+            key: content for key, each in planned.items() if (content := folder.finished(each)) is not None
+        }
+    units.finished_before, finished = len(units.contents), dict(units.contents)
+    observers.tell(lambda observer: observer.run_started(plan, finished))
+    missing = [each for identity, each in planned.items() if identity not in finished]
     if plan.config.check_geometry:
-        with watch("check"):
-            found.geometry, found.advice = _checked(plan.config, missing, told)
-    with folder.started() as start, lend(start, plan.scenes):
-        survey = Survey(executor, folder, start)
-        with watch("sizing"):
-            sizing = sized(plan.config, missing, survey)
-            give_back()
-        for line in sizing.remarks:
-            told.tell(lambda observer, line=line: observer.remarked(line))  # type: ignore[misc]
-        _refuse(sizing, missing, found, executor, told)
-        fitting = [each for each in missing if each.identity not in sizing.refused]
-        _work_off(plan.config, survey, told, found, fitting, sizing.tilings)
-    return found
+        with units.watch("check"):
+            _check_geometry(plan.config, missing, units, observers)
+    with folder.started(plan.config) as start, share_open_scenes(start.name, plan.scenes):
+        queue, tiled = deque[Job](), dict[str, TiledUnit]()
+        whole = _begin(plan.config, missing, executor, units, observers, tiled, folder, start)
+        queue.extend(jobs_of(whole, executor.width))
+        ended = [outcome for unit in tiled.values() if (outcome := unit.ended()) is not None]
+
+        def next_job() -> Job | None:
+            return queue.popleft() if queue else next(filter(None, (unit.next_job() for unit in tiled.values())), None)
+
+        outcomes = executor.run(next_job, observers)
+        with contextlib.closing(outcomes):
+            for outcome in itertools.chain(ended, outcomes):
+                own: Outcome | None = outcome
+                unit = tiled.get(outcome.identity)
+                if unit is not None and outcome.tile is not None:
+                    own = _take_tile(unit, outcome, units, observers)
+                if own is not None:
+                    _keep(planned[own.identity], own, folder, units, executor, observers, in_tiles=unit is not None)
+    return units
 
 
-def _refuse(sizing: Sizing, missing: Sequence[Planned], found: Found, executor: Executor, told: Observers) -> None:
-    """Those that do not fit fail, and the others go on."""
+def _begin(config, missing, executor, units, observers, tiled, folder, start) -> list[Work]:  # type: ignore[no-untyped-def]
+    """Works of the units that are fused whole; those that do not fit are fused in tiles, or fail."""
+    with units.watch("sizing"):
+        sizing = planned_sizes(config, missing, executor.width)
+        give_back()
+    for line in sizing.lines:
+        logger.warning("%s", line)
+    whole = []
     for each in missing:
         if (error := sizing.refused.get(each.identity)) is not None:
-            found.errors[each.identity] = error
-            found.causes.setdefault(error, ConfigError(error))
-            _tell_done(each, error, executor, told)
+            _keep(
+                each, Outcome(each.identity, error=error, cause=ConfigError(error)), folder, units, executor, observers
+            )
+        elif (size := sizing.tile_sizes.get(each.identity)) is not None:
+            tiled[each.identity] = TiledUnit(each, size, folder, start)
+        else:
+            whole.append(Work.of(each, start))
+    return whole
 
 
-def _work_off(
-    config: Config,
-    survey: Survey,
-    told: Observers,
-    found: Found,
-    missing: Sequence[Planned],
-    tilings: Mapping[str, Tiling],
+def _take_tile(unit: TiledUnit, outcome: Outcome, units: UnitResults, observers: Observers) -> Outcome | None:
+    """Take a tile; the unit's own outcome where it came to its end."""
+    units.add_seconds(outcome)
+    with units.watch("assemble"):
+        own = unit.take(outcome)
+    step = unit.step()
+    observers.tell(lambda observer: observer.advanced(step, unit.name))
+    return own
+
+
+def _keep(
+    each: Planned,
+    outcome: Outcome,
+    folder: Folder,
+    units: UnitResults,
+    executor: Executor,
+    observers: Observers,
+    *,
+    in_tiles: bool = False,
 ) -> None:
-    """What is missing, kept as it finishes."""
-    executor, folder = survey.executor, survey.folder
-    factories = told.elsewhere(folder.path) if executor.elsewhere and missing else ()
-    waiting = Waiting(config, folder.path, survey.start, factories)
-    in_tiles = InTiles(config, survey, waiting, told)
-    units, ended = {each.identity: each for each in missing}, list[Outcome | None]()
-    for each in missing:
-        if isinstance(each, PlannedUnit) and each.identity in tilings:
-            ended.append(in_tiles.begin(each, tilings[each.identity]))
-    waiting.add_whole([each for each in missing if each.identity not in tilings], executor.width)
-    with contextlib.closing(executor.run(waiting, told)) as finished:
-        done = itertools.chain.from_iterable(outcomes for _, outcomes in finished)
-        for outcome in itertools.chain((outcome for outcome in ended if outcome is not None), done):
-            each = units[outcome.identity]
-            for stage, seconds in outcome.seconds.items():
-                found.watch.seconds[stage] += seconds
-            with found.watch("assemble"):
-                own = in_tiles.take(each, outcome)
-            if own is not None and own.identity not in found.errors:
-                _keep(folder, found, each, own)
-                tiled = own.identity in in_tiles
-                if tiled and own.content is not None:
-                    _tell_assembled(each, own.content, told)
-                _tell_done(each, own.error, executor, told, counted=tiled)
-
-
-def _keep(folder: Folder, found: Found, each: Planned, outcome: Outcome) -> None:
-    """A finished unit, or why it failed."""
-    if outcome.content is not None:
-        content = dataclasses.replace(outcome.content, advice=found.advice.get(each.unit.scene))
-        with found.watch("keep"):
+    """Keep a finished unit, or the reason why it failed, and tell the observers."""
+    content = outcome.content
+    if content is not None:
+        content = dataclasses.replace(content, advice=units.advice.get(each.unit.scene))
+        with units.watch("keep"):
             folder.save(dataclasses.replace(outcome, content=content))
             if isinstance(each, PlannedUnit):
                 folder.clear(each, content.files)
-        found.contents[outcome.identity] = content
-        return
-    found.errors[outcome.identity] = outcome.error or ""
-    folder.save_trace(outcome)
-    if outcome.cause is not None:
-        found.causes.setdefault(outcome.error or "", outcome.cause)
+        units.contents[outcome.identity] = content
+    else:
+        error = units.errors[outcome.identity] = outcome.error or ""
+        folder.save_trace(outcome)
+        if outcome.cause is not None:
+            units.causes.setdefault(error, outcome.cause)
+    if not in_tiles:
+        units.add_seconds(outcome)
+        if executor.elsewhere or not isinstance(each, PlannedUnit):
+            what = f"{each.unit.scene} · {each.unit.backbone}"
+            observers.tell(lambda observer: observer.advanced(each.frames, what))
+    observers.tell(lambda observer: observer.unit_finished(each, content, outcome.table, outcome.error))
 
 
-def _tell_kept(plan: Plan, contents: Mapping[str, UnitContent], told: Observers) -> None:
-    watched = [each for each in plan.units if each.kept and each.identity in contents]
-    for task in plan.tasks:
-        group = [each for each in watched if (each.unit.scene, each.unit.backbone) == (task.scene.name, task.backbone)]
-        summaries = [summary for each in group if (summary := contents[each.identity].summary) is not None]
-        if summaries:
-            told.tell(lambda observer, task=task, summaries=summaries: observer.group_kept(task, summaries))  # type: ignore[misc]
+def _check_geometry(config: Config, missing: Sequence[Planned], units: UnitResults, observers: Observers) -> None:
+    """Check the geometry of each scene with units to compute, and judge the voxel size.
 
-
-def _tell_assembled(planned: Planned, content: UnitContent, told: Observers) -> None:
-    summary = content.summary
-    if isinstance(planned, PlannedUnit) and planned.kept and summary is not None:
-        told.tell(lambda observer: observer.unit_assembled(planned.task, summary))
-
-
-def _tell_done(each: Planned, error: str | None, executor: Executor, told: Observers, *, counted: bool = False) -> None:
-    if not counted and (executor.elsewhere or not isinstance(each, PlannedUnit)):
-        what = f"{each.unit.scene} · {each.unit.backbone}"
-        told.tell(lambda observer: observer.advanced(each.frames, what))
-    told.tell(lambda observer: observer.unit_done(each, error))
-
-
-def _checked(
-    config: Config, missing: Sequence[Planned], told: Observers
-) -> tuple[dict[str, Verdict], dict[str, VoxelAdvice]]:
-    """The geometry of each scene with units to compute, and where the voxel size lies.
-
-    What cannot be read is left to the units to report.
-
-    Raises DataError where depth and poses contradict each other.
+    A scene that cannot be read is left to its units to report. Raises DataError where depth and poses contradict each
+    other.
     """
-    found: dict[str, Verdict] = {}
-    advice: dict[str, VoxelAdvice] = {}
     tasks = {each.task.scene.name: each.task for each in reversed(missing) if isinstance(each, PlannedUnit)}
+    verdicts: dict[str, Verdict] = {}
+    advice: VoxelAdvice | None
     for task in reversed(tasks.values()):
         with contextlib.suppress(DataError):
-            found[task.scene.name], sample = quick_look(task.scene, task.indices, config.dataset.options)
-            if (told_of := advise(sample, config)) is not None:
-                advice[task.scene.name] = told_of
-    for scene, verdict in found.items():
+            verdicts[task.scene.name], sample = quick_look(task.scene, task.indices, config.dataset.options)
+            if (advice := advise(sample, config)) is not None:
+                units.advice[task.scene.name] = advice
+    for scene, verdict in verdicts.items():
         refuse_unsound(scene, verdict)
-        told.tell(lambda observer, scene=scene, verdict=verdict: observer.geometry_checked(tasks[scene], verdict))  # type: ignore[misc]
-    return found, advice
+        observers.tell(lambda observer, scene=scene, verdict=verdict: observer.geometry_checked(tasks[scene], verdict))  # type: ignore[misc]
+    units.geometry = verdicts

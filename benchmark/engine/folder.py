@@ -20,10 +20,8 @@ from semstab.config import Config, read_yaml
 from semstab.core.files import TEMPORARY, FolderLock, atomic_path, read_json, remove_leftovers, write_json, write_text
 from semstab.core.json_form import from_json, to_json
 from semstab.datasets.formats.disk import file_digest
-from semstab.engine.tiling.portion import PORTIONS, Finished
-from semstab.engine.tiling.sights import SIGHTS
 from semstab.engine.units import Planned, PlannedUnit
-from semstab.engine.work.jobs import Outcome, shared_marker
+from semstab.engine.work import TILES, Outcome, Start
 from semstab.errors import ConfigError, DataError
 from semstab.model.measures import measures
 from semstab.model.records import (
@@ -32,7 +30,6 @@ from semstab.model.records import (
     INFLUENCE,
     LOOKS,
     OVERVIEW,
-    RECORDING_PARTS,
     TRUTH,
     UNITS,
     VOXELS,
@@ -50,7 +47,7 @@ LAYOUT = "# semstab, folder layout 3"
 
 SETTINGS = "config.yaml"
 FAILURES = "failures.log"
-WRITTEN = (UNITS, VOXELS, TRUTH, EVENTS, LOOKS, FRAMES, INFLUENCE, OVERVIEW, PORTIONS, SIGHTS, "tables", "figures")
+WRITTEN = (UNITS, VOXELS, TRUTH, EVENTS, LOOKS, FRAMES, INFLUENCE, OVERVIEW, TILES, "tables", "figures")
 """Folders into which files are written."""
 
 
@@ -87,13 +84,10 @@ class Folder:
         self._files = {file.stem: file for file in (self.path / UNITS).glob("*.json")}
 
     def close(self) -> None:
-        """Let another process have it; what observers keep of maps in tiles goes with the last of these."""
-        recording = self.path / RECORDING_PARTS
-        if not (self.path / PORTIONS).exists() and not any(recording.glob("*.rrd")):  # those could not be merged
-            shutil.rmtree(recording, ignore_errors=True)
+        """Let another process have it."""
         self._lock.release()
 
-    def kept(self, planned: Planned) -> UnitContent | None:
+    def finished(self, planned: Planned) -> UnitContent | None:
         """What an earlier start left of a unit, if its input is the same and nothing that is wanted is missing.
 
         The input is read to compare it only where there is such a unit at all.
@@ -110,36 +104,18 @@ class Folder:
     def save(self, outcome: Outcome) -> None:
         """Keep a finished unit."""
         assert outcome.content is not None
-        for name, file in outcome.files.items():
-            with atomic_path(self.path / name) as temporary:
-                temporary.write_bytes(file)
+        self.save_files(outcome)
         key = unit_key(outcome.identity, outcome.content.input)
         write_json(self.path / UNITS / f"{key}.json", outcome.content)
-        shutil.rmtree(self.path / PORTIONS / key, ignore_errors=True)
+        shutil.rmtree(self.path / TILES / key, ignore_errors=True)
         with contextlib.suppress(OSError):
-            (self.path / PORTIONS).rmdir()  # where nothing of other units is left
+            (self.path / TILES).rmdir()  # where nothing of other units is left
 
     def save_files(self, outcome: Outcome) -> None:
         """Keep what a worker that does not see the folder sent; the last file says that the others are there."""
         for name, file in outcome.files.items():
             with atomic_path(self.path / name) as temporary:
                 temporary.write_bytes(file)
-
-    def portions(self, key: str) -> set[str]:
-        """Names of what earlier starts left of a unit's portions."""
-        return {path.stem for path in (self.path / PORTIONS / key).glob("*.npz")}
-
-    def begun_in_tiles(self, planned: PlannedUnit) -> bool:
-        """Whether earlier starts left portions of a unit with these settings."""
-        return any((self.path / PORTIONS).glob(f"{planned.identity}*/*.npz"))
-
-    def portion(self, key: str, name: str) -> Finished | None:
-        """What an earlier start left of a portion, if its files are there as they were."""
-        try:
-            found = Finished.load(self.path / PORTIONS / key / f"{name}.npz")
-        except DataError:
-            return None
-        return found if found is not None and self._are_whole(found.about.files) else None
 
     def clear(self, planned: PlannedUnit, keep: Collection[str]) -> None:
         """Remove what was left of a unit's voxels, truth and log, a file or tiles, but for these files."""
@@ -183,21 +159,19 @@ class Folder:
         write_json(self.path / "manifest.json", result.manifest)
 
     @contextlib.contextmanager
-    def started(self) -> Iterator[str]:
-        """A name for this start, by which workers know the folder while the block lasts."""
-        start = uuid.uuid4().hex
+    def started(self, config: Config) -> Iterator[Start]:
+        """A start, by whose name workers know the folder while the block lasts."""
+        memory = None if config.memory_gb is None else config.memory_gb * 1e9
+        start = Start(uuid.uuid4().hex, self.path, config.threads, memory)
         for name in WRITTEN:
             for folder in (self.path / name, *self.path.glob(f"{name}/*/")):
                 remove_leftovers(folder)
-        for recording in (self.path / RECORDING_PARTS).glob("*.rrd"):
-            recording.unlink()
         (self.path / FAILURES).unlink(missing_ok=True)
-        marker = shared_marker(self.path, start)
-        marker.touch()
+        start.marker.touch()
         try:
             yield start
         finally:
-            marker.unlink(missing_ok=True)
+            start.marker.unlink(missing_ok=True)
 
     def _is_whole(self, planned: Planned, content: UnitContent) -> bool:
         """Whether the unit's file has what is wanted of it, and its other files are there as they were."""
@@ -210,9 +184,9 @@ class Folder:
             wanted = self._wanted(planned, content)
         else:
             has, wanted = content.regions is not None, []
-        return has and self._are_whole({name: content.files.get(name) for name in wanted})
+        return has and self.are_whole({name: content.files.get(name) for name in wanted})
 
-    def _are_whole(self, files: Mapping[str, str | None]) -> bool:
+    def are_whole(self, files: Mapping[str, str | None]) -> bool:
         """Whether files are there, with these digests; the first that is not as it was is told."""
         for name, digest in files.items():
             path = self.path / name

@@ -1,7 +1,8 @@
-"""What was found of a plan's units, and the result that they make together."""
+"""The contents of a plan's units, and the result that they make together."""
 
 from __future__ import annotations
 
+import dataclasses
 import importlib.metadata
 import itertools
 import platform
@@ -15,9 +16,9 @@ from semstab.check import Verdict
 from semstab.config import BACKENDS, BASE, Config
 from semstab.core.process import Stopwatch
 from semstab.datasets import GROUND_TRUTH
-from semstab.engine.evaluation import comparison
 from semstab.engine.folder import Folder
 from semstab.engine.units import Plan, PlannedUnit, must_agree
+from semstab.engine.work import Outcome
 from semstab.metrics import compare
 from semstab.metrics.agreement import together
 from semstab.model.events import Events
@@ -26,25 +27,31 @@ from semstab.model.results import Agreement, VoxelAdvice
 from semstab.model.tiles import Tiles, side_by_side
 from semstab.model.voxels import VoxelTable
 from semstab.statistics import BackboneComparison, CellObservations, claimed_together
-from semstab.statistics.model_comparison import Region, Regions
+from semstab.statistics.model_comparison import Region, Regions, compare_regions
 
 
 @dataclass
-class Found:
-    """What is known of the units, by their identity: the content of their files, or why they failed.
+class UnitResults:
+    """The contents of the units by their identity, or why they failed.
 
+    finished_before  how many an earlier start finished
     geometry  of the scenes of which something was computed
     advice    where the voxel size lies in them
-    causes    what was raised in this process, by its message
+    causes    exceptions that were raised in this process, by message
     """
 
-    contents: dict[str, UnitContent]
-    kept: int
+    contents: dict[str, UnitContent] = field(default_factory=dict)
+    finished_before: int = 0
     geometry: dict[str, Verdict] = field(default_factory=dict)
     advice: dict[str, VoxelAdvice] = field(default_factory=dict)
     errors: dict[str, str] = field(default_factory=dict)
     causes: dict[str, BaseException] = field(default_factory=dict)
     watch: Stopwatch = field(default_factory=Stopwatch)
+
+    def add_seconds(self, outcome: Outcome) -> None:
+        """Add the time that a pass took, by stage."""
+        for stage, seconds in outcome.seconds.items():
+            self.watch.seconds[stage] += seconds
 
     def inputs(self, plan: Plan) -> dict[str, str]:
         """The digest of the input of each base unit, and of each source of regions."""
@@ -55,21 +62,22 @@ class Found:
         }
 
     def counts(self) -> dict[str, Any]:
-        """How many units there are, were kept from before, computed and failed."""
+        """Numbers of all units, of those finished by an earlier start, of those computed and of those that failed."""
         failed = len(self.errors)
-        computed = len(self.contents) - self.kept
-        return {"units": len(self.contents) + failed, "kept": self.kept, "computed": computed, "failed": failed}
+        kept = self.finished_before
+        computed = len(self.contents) - kept
+        return {"units": len(self.contents) + failed, "kept": kept, "computed": computed, "failed": failed}
 
 
-def result_of(plan: Plan, folder: Folder, found: Found) -> Result:
+def result_of(plan: Plan, folder: Folder, units: UnitResults) -> Result:
     """The result of all units that there are: how they agree, and how backbones compare."""
-    contents, errors = found.contents, found.errors
+    contents, errors = units.contents, units.errors
     records = tuple(folder.record(each, contents[each.identity]) for each in plan.units if each.identity in contents)
     tables = Tables(most=len({record.unit.backend for record in records}))
-    with found.watch("agreement"):
+    with units.watch("agreement"):
         agreement = (*_samples(plan, contents), *_agreement(plan.config, records, tables))
         compared = tuple(_compared(plan.config, records, tables))
-    with found.watch("comparisons"):
+    with units.watch("comparisons"):
         scenes = tuple(_comparisons(plan.config, records, tables)) if plan.config.statistics else ()
         comparisons = claimed_together(scenes)
     return Result(
@@ -87,7 +95,7 @@ def result_of(plan: Plan, folder: Folder, found: Found) -> Result:
         georeference={name: known for name, scene in plan.scenes.items() if (known := scene.georeference) is not None},
         regions=tuple(_regions(plan, contents)),
         compared=compared,
-        advice=found.advice,
+        advice=units.advice,
     )
 
 
@@ -155,9 +163,25 @@ def _comparisons(config: Config, records: Sequence[Record], tables: Tables) -> I
             looks = {
                 name: CellObservations.load(file) for name, file in kept.items() if file is not None and file.exists()
             }
-            found = comparison(scene, regions, looks if len(looks) == len(there) else None)
-            if found is not None:
-                yield found
+            compared = _compared_maps(scene, regions, looks if len(looks) == len(there) else None)
+            if compared is not None:
+                yield compared
+
+
+def _compared_maps(
+    scene: str, regions: Regions, looks: Mapping[str, CellObservations] | None
+) -> BackboneComparison | None:
+    """The comparison of a scene's maps; None where there are not two or more of them in one label space.
+
+    With the logs of all of them, also under other rules of fusion; with the samples of all, on matched observations.
+    """
+    first = next(iter(regions()))
+    classes = {table.classes for table in first.tables.values()}
+    if len(first.tables) < 2 or len(classes) > 1:
+        return None
+    if first.truth is not None and first.truth.classes not in classes:
+        return _compared_maps(scene, lambda: (dataclasses.replace(own, truth=None) for own in regions()), looks)
+    return compare_regions(regions, looks=looks, scene=scene)
 
 
 def _regions_of(there: Sequence[Record], config: Config, tables: Tables) -> Regions:

@@ -1,327 +1,224 @@
-"""The units of a start that are fused in tiles: some from its beginning, others since they outgrew the memory."""
+"""A unit in tiles: what is still to be computed of it, and how its tiles make the unit."""
 
 from __future__ import annotations
 
-import concurrent.futures as cf
-import itertools
-from collections import deque
-from collections.abc import Callable, Collection, Iterator, Sequence
-from functools import partial
+import dataclasses
+import functools
+import operator
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import TypeVar
 
-from semstab.config import Config
+import numpy as np
+
+from semstab.core.rows import Rows
+from semstab.core.types import Float64
+from semstab.datasets.formats.disk import file_digest
+from semstab.engine.finish import analyse_sample, no_voxels, reduced_of, save_voxels, unit_summary, up_axis
 from semstab.engine.folder import Folder, unit_key
-from semstab.engine.observer import Factory, Observers
-from semstab.engine.sizing import Survey, begun_again
-from semstab.engine.tiling.again import SeenAgain
-from semstab.engine.tiling.partition import Part, Tiling
-from semstab.engine.tiling.portion import PART, STRETCH, Finished
-from semstab.engine.units import Planned, PlannedUnit
-from semstab.engine.work.assembly import Joined, Sampled, assembled, joined
-from semstab.engine.work.jobs import Job, Outcome, Request, failed, split
-from semstab.engine.work.memory import GB
-from semstab.errors import DataError, OutgrownError, SemstabError
-from semstab.model.results import Unit
+from semstab.engine.streams import COLUMNS, ImageSpaceMeter
+from semstab.engine.tiles import OBSERVATIONS, TRUE_OBSERVATIONS, TileResult, joined_series
+from semstab.engine.units import PlannedUnit
+from semstab.engine.work import Job, Outcome, Start, TileTask, Work, failed
+from semstab.errors import SemstabError
+from semstab.metrics.agreement import together
+from semstab.metrics.summary import TableSums
+from semstab.model.parquet import tile_of
+from semstab.model.records import FRAMES, INFLUENCE, LOOKS, TRUTH, VOXELS, UnitContent
+from semstab.model.voxels import VoxelTable
+from semstab.statistics import Analysis, CellObservations, MapSample, ObservationSample
+from semstab.statistics.sample import MOST_VOXELS
 
-# What this process puts together while others do the work.
+GUESS = 4
+"""Tiles that a unit is expected to have, for the progress, until they are known."""
 
-T = TypeVar("T")
-
-
-class Beside:
-    """One call after the other, in a thread beside where others do the work; at once where this process does it."""
-
-    def __init__(self, *, threaded: bool = False) -> None:
-        self._pool = cf.ThreadPoolExecutor(1) if threaded else None
-
-    def submit(self, call: Callable[[], T]) -> cf.Future[T]:
-        """What it will return, or raise."""
-        if self._pool is not None:
-            return self._pool.submit(call)
-        future = cf.Future[T]()
-        try:
-            future.set_result(call())
-        except SemstabError as error:
-            future.set_exception(error)
-        return future
-
-
-# A unit in tiles while its portions are worked off: what is there, what is missing, and the unit once all is there.
-
-MORE = 1.5
-"""A part that is expected to take so many times its share is cut before it is begun; a share leaves that much room."""
+UP_VOXELS = 1 << 20
+"""Of more voxels every n-th tells the up axis."""
 
 
 class TiledUnit:
-    """What an earlier start finished of it is kept, if the unit is still cut in the same way.
+    """A unit while its tiles are computed: first a pass over its frames, which tells which of them see which tile.
 
-    A part that turned out larger than there is memory for it is cut in two, and so are those that would, judged by how
-    many voxels the parts before had, of how many were expected. Where several tasks share the parts, the largest are
-    first, and the last one of each is cut in two as well: none is left with a large one when the others are done.
-    What needs no part, or no second look at one, is put together `beside` those who are at them.
-
-    key  under which its portions are kept
+    The results of an earlier start are taken over where they are as they were.
     """
 
-    def __init__(
-        self, planned: PlannedUnit, tiling: Tiling, folder: Folder, width: int = 1, beside: Beside | None = None
-    ) -> None:
-        self.planned, self._folder, self._tiling = planned, folder, tiling
-        self._beside = beside or Beside()
-        self.key = unit_key(planned.identity, planned.digest)
-        self._there: dict[str, Finished] = {}
-        there = folder.portions(self.key)
-        whole = self._evened(Request.portions(planned, self.key, tiling, width), width, there)
-        requests = [each for request in whole for each in self._as_cut(request, there - {_name(one) for one in whole})]
-        self._requests = {_name(request): request for request in requests}
-        self._second: dict[str, Request] | None = None  # looks at the parts, once all of them are there
-        self._again: dict[str, SeenAgain] = {}
-        for name in self._requests.keys() & there:
-            if (found := folder.portion(self.key, name)) is not None:
-                self._there[name] = found.without_rows()
-        self._failed = False
-        self._sampled: cf.Future[Sampled] | None = None  # what all frames tell, once they are looked at
-        self._joined: cf.Future[Joined] | None = None  # what all portions come to
-        self._waiting = [request for name, request in self._requests.items() if name not in self._there]
-        if width > 1:
-            self._waiting.sort(key=self._turn)
-        folder.clear(planned, {name for each in self._there.values() for name in each.about.files})
-        shares = itertools.pairwise(k * planned.frames // len(self._requests) for k in range(len(self._requests) + 1))
-        self._steps = iter([last - first for first, last in shares])
-        self.kept = sum(next(self._steps) for _ in self._there)
+    def __init__(self, planned: PlannedUnit, size: int, folder: Folder, start: Start) -> None:
+        self.planned, self._folder = planned, folder
+        self._work = Work.of(planned, start)
+        self._frames = TileTask(unit_key(planned.identity, planned.digest), size)
+        self._results: dict[str, TileResult] = {}
+        self._samples: list[MapSample] = []
+        self._bound: int | None = None
+        self._tiles: dict[str, tuple[TileTask, list[int]]] | None = None
+        self._waiting: list[tuple[TileTask, list[int] | None]] = [(self._frames, None)]
+        self._advanced, self._failed = 0, False
+        if self._take_over(self._frames):
+            self._waiting = self._begin_tiles()
 
     @property
     def name(self) -> str:
-        """What the progress calls it."""
-        return f"{self.planned.unit.scene} · {self.planned.unit.backbone}"
+        """Its name in the progress."""
+        unit = self.planned.unit
+        return f"{unit.scene} · {unit.backbone} · {unit.backend}"
 
-    @property
-    def finished(self) -> list[str]:
-        """Names of its portions that are."""
-        return [*self._there]
+    def next_job(self) -> Job | None:
+        """The next tile; None where there is none, until the pass over the frames tells them."""
+        if self._failed or not self._waiting:
+            return None
+        task, frames = self._waiting.pop(0)
+        return (self._work.in_tile(dataclasses.replace(task, bound=self._bound), frames),)
+
+    def take(self, outcome: Outcome) -> Outcome | None:
+        """Take the outcome of a tile; return that of the unit where it came to its end."""
+        if self._failed:
+            return None
+        if outcome.error is not None or outcome.tile is None:
+            self._failed = True
+            return dataclasses.replace(outcome, tile=None)
+        self._folder.save_files(outcome)
+        task = self._frames if self._tiles is None else self._tiles[outcome.tile][0]
+        if not self._take_over(task):
+            self._failed = True
+            return failed([self._work], f"{self.name}: tile {task.name} is not in the folder; start it again")[0]
+        if self._tiles is None:
+            self._waiting = self._begin_tiles()
+        return self.ended()
+
+    def ended(self) -> Outcome | None:
+        """The outcome of the unit once all of its tiles are there."""
+        if self._tiles is None or len(self._results) < 1 + len(self._tiles):
+            return None
+        tiles = {task: self._results[name] for name, (task, _) in self._tiles.items()}
+        sample = MapSample.merged(self._samples) if self._samples else None
+        try:
+            content = assembled(self.planned, self._results[self._frames.name], tiles, sample, self._folder.path)
+        except SemstabError as error:
+            return failed([self._work], error)[0]
+        return Outcome(self.planned.identity, content)
 
     def step(self) -> int:
-        """The frames that the portion which is finished now stands for."""
-        return next(self._steps, 0)
+        """The frames by which the progress advances now: all of the unit's once all tiles are there."""
+        parts = 1 + (GUESS if self._tiles is None else len(self._tiles))
+        reached = self.planned.frames * len(self._results) // parts
+        step, self._advanced = max(0, reached - self._advanced), max(reached, self._advanced)
+        return step
 
-    def next_request(self) -> Request | None:
-        """What is to be begun next; None where there is nothing, until what is finished calls for more."""
-        while self._waiting and not self._failed:
-            request = self._waiting.pop(0)
-            if self._expected(request) <= MORE * self._tiling.budget or not self._cut(request):
-                return request
-        return None
+    def _begin_tiles(self) -> list[tuple[TileTask, list[int] | None]]:
+        """The tiles that are still to be computed; files of the unit that belong to none of them are removed."""
+        frames = self._results[self._frames.name]
+        tasks = [
+            (dataclasses.replace(self._frames, place=place, origin=frames.origin), own)
+            for place, own in frames.tiles().items()
+        ]
+        self._tiles = {task.name: (task, own) for task, own in tasks}
+        waiting = [(task, own) for task, own in tasks if not self._take_over(task)]
+        self._folder.clear(self.planned, {name for result in self._results.values() for name in result.files})
+        return [*waiting]
 
-    def take(self, outcome: Outcome | None) -> Outcome | None:
-        """One more portion, None for nothing new; the unit's own outcome where it failed, or all are there."""
-        name = None if outcome is None else outcome.portion
-        if outcome is not None and name is not None and outcome.error is None:
-            if self._second is not None:
-                raise AssertionError(name)  # no part is looked at twice
-            if (error := self._keep(outcome, name)) is not None:
-                return error
-        elif outcome is not None and name is not None and outcome.outgrown and name in self._requests:
-            if not self._cut(self._requests[name]):
-                more = f", or set a smaller --tile-size: part {name} is a single tile"
-                return self._error(name, OutgrownError(f"{outcome.error}{more}"))
-        elif outcome is not None:
-            self._failed = True
-            return outcome
-        if len(self._there) < len(self._requests):
-            self._look_ahead()
-            return None
-        return self._ended()
+    def _take_over(self, task: TileTask) -> bool:
+        """Take a result from the folder, if its files are there as they were."""
+        result = self._stored(task)
+        if result is None:
+            return False
+        self._results[task.name] = result
+        if (name := f"{task.folder}/{task.name}.sample") in result.files:
+            self._samples.append(MapSample.load(self._folder.path / name))
+            if sum(len(sample.table) for sample in self._samples) > 2 * MOST_VOXELS:
+                self._samples = [MapSample.merged(self._samples)]
+                self._bound = self._samples[0].bound()
+        return True
 
-    def _keep(self, outcome: Outcome, name: str) -> Outcome | None:
-        """A finished portion; why the unit failed, where it cannot be kept."""
-        self._folder.save_files(outcome)
-        found = self._folder.portion(self.key, name)
-        if found is None:
-            return self._error(name, f"part {name} is not in the folder; start it again")
-        self._there[name] = found.without_rows()
-        return None
-
-    def _ended(self) -> Outcome | None:
-        """The unit's own outcome, once all parts have been looked at again, which is asked for first."""
-        finished = {name: self._there[name] for name in self._requests}  # sums do not hang on who was first
-        try:
-            self._look_ahead()
-            assert self._sampled is not None
-            sampled = self._sampled.result()
-            if self._second is None:
-                self._waiting, self._second = [], {}
-                together = partial(joined, self.planned, finished, self._loaded, self._folder.path, sampled)
-                self._joined = self._beside.submit(together)
-            if len(self._again) < len(self._second):
-                return None
-            assert self._joined is not None
-            own = self._joined.result()
-            content = assembled(self.planned, finished, own, self._folder.path, sampled)
-            return Outcome(self.planned.identity, content)
-        except SemstabError as error:
-            return failed([*self._requests.values()][:1], error)[0]
-
-    def _loaded(self, name: str) -> Finished:
-        """A portion with what it has of each frame. Raises DataError where it is gone meanwhile."""
-        if (found := self._folder.portion(self.key, name)) is None:
-            raise DataError(f"{self.name}: part {name} is no longer in the folder as it was; start it again")
-        return found
-
-    def _look_ahead(self) -> None:
-        """Prepare what all frames tell, once they are looked at, while others fuse the parts."""
-        frames = [name for name, request in self._requests.items() if _kind(request) == STRETCH]
-        if self._sampled is None and self._there.keys() >= set(frames):
-            stretches = [self._there[name] for name in frames]
-            self._sampled = self._beside.submit(partial(Sampled.of, stretches, self._folder.path))
-
-    def _evened(self, requests: list[Request], width: int, there: Collection[str]) -> list[Request]:
-        """With the smallest parts cut in two, one for each of several tasks: the same ones whenever it is started."""
-        parts = sorted((each for each in requests if _kind(each) == PART), key=self._expected)
-        last = {_name(each) for each in parts[:width]} - {*there} if 1 < width < len(parts) else set[str]()
-        return [half for each in requests for half in (self._halves(each) if _name(each) in last else ()) or (each,)]
-
-    def _turn(self, request: Request) -> tuple[bool, bool, float]:
-        """Stretches first, as what they tell is put together meanwhile; then parts, the largest first."""
-        return _kind(request) != STRETCH, _kind(request) != PART, -self._expected(request)
-
-    def _as_cut(self, request: Request, names: Collection[str]) -> list[Request]:
-        """A part as an earlier start cut it, where something of that is there."""
-        part = _part(request)
-        if not names or part is None:
-            return [request]
-        halves = [each for half in self._tiling.halves(part) for each in self._as_cut(request.of_part(half), names)]
-        return halves if any(_name(half) in names for half in halves) else [request]
-
-    def _cut(self, request: Request) -> bool:
-        """Put a part's halves in its place, to be begun next; not where it is a single tile."""
-        halves = self._halves(request)
-        if halves:
-            parts = ((each,) if each is not request else halves for each in self._requests.values())
-            self._requests = {_name(each): each for some in parts for each in some}
-            self._waiting[:0] = halves
-        return bool(halves)
-
-    def _halves(self, request: Request) -> list[Request]:
-        """Of a part; none of a single tile, or of what is no part."""
-        part = _part(request)
-        return [] if part is None else [request.of_part(half) for half in self._tiling.halves(part)]
-
-    def _expected(self, request: Request) -> float:
-        """Bytes that it takes, by what is known by now; 0 of what is no part."""
-        if (part := _part(request)) is None:
-            return 0.0
-        done = [(_part(self._requests[name]), found.about.voxels) for name, found in self._there.items()]
-        known = [(each.voxels, came) for each, came in done if each is not None]
-        planned, came = sum(one for one, _ in known), sum(one for _, one in known)
-        return self._tiling.bytes(part) * max(1.0, came / max(planned, 1))
-
-    def _error(self, portion: str, error: str | OutgrownError) -> Outcome:
-        self._failed = True
-        return failed([self._requests[portion]], error)[0]
+    def _stored(self, task: TileTask) -> TileResult | None:
+        """A result in the folder, if its files are there as they were."""
+        result = TileResult.load(self._folder.path / task.folder / f"{task.name}.npz")
+        return result if result is not None and self._folder.are_whole(result.files) else None
 
 
-def _name(request: Request) -> str:
-    assert request.portion is not None
-    return request.portion.name
+def assembled(
+    planned: PlannedUnit,
+    frames: TileResult,
+    results: Mapping[TileTask, TileResult],
+    sample: MapSample | None,
+    folder: Path,
+) -> UnitContent:
+    """The content of a unit, from the results of its frames and tiles. Raises DataError where no pixel was valid."""
+    tasks, tiles = [*results], [*results.values()]
+    task, config, unit = planned.task, planned.config, planned.unit
+    sums = functools.reduce(operator.add, (TableSums.read(tile.sums) for tile in tiles)) if tiles else None
+    if sums is None or not sums.total[2]:
+        raise no_voxels(task, config)
+    rows = joined_series(frames.series, [tile.series for tile in tiles])
+    files = {name: digest for each in (frames, *tiles) for name, digest in each.files.items()}
+    analysis = None
+    if sample is not None:  # sums in the order of the tiles, not in that of their ends
+        observations = _observations(tasks[0], folder)
+        analysis = analyse_sample(task, config, dataclasses.replace(sample, summary=sums), observations)
+    files = {name: digest for name, digest in files.items() if not name.startswith(tasks[0].folder)}
+    seen = folder / tasks[0].folder / f"{tasks[0].size}_{OBSERVATIONS}"
+    if planned.kept:
+        files |= _saved(folder, f"{FRAMES}/{unit.slug}.csv", rows.save_csv)
+        if seen.exists():
+            files |= _saved(folder, f"{LOOKS}/{unit.slug}.parquet", CellObservations.load(seen).save)
+        if analysis is not None:
+            files |= _saved(folder, f"{INFLUENCE}/{unit.slug}.parquet", analysis.sums.save)
+    if planned.kept and analysis is not None and config.statistics:
+        for each in tasks:
+            files |= _with_columns(each, unit.slug, analysis, folder)
+    reduced = [tile.reduced for tile in tiles if len(tile.reduced)]
+    summary = unit_summary(
+        task,
+        rows,
+        sums.summary(config.voxel_size, task.mapping.target.classes, config.strata),
+        None if analysis is None else analysis.summary,
+        reduced_of(np.sum(reduced, axis=0)) if reduced else None,
+        frames.sizes,
+    )
+    checked = [tile.checked for tile in tiles if tile.checked is not None]
+    agreement = together(checked) if checked and len(checked) == len(tiles) else None
+    content = UnitContent(planned.digest, summary, files=files, checked=agreement)
+    if not planned.image_space:
+        return content
+    meter = ImageSpaceMeter(Rows(len(COLUMNS), frames.image))
+    voxels = [folder / name for name in files if name.startswith(f"{VOXELS}/")]
+    centers = _centers(voxels, config.voxel_size, -(-int(sums.total[2]) // UP_VOXELS))
+    return dataclasses.replace(
+        content,
+        image_space=meter.result(summary.flicker_percent),
+        quality=frames.quality,
+        up=up_axis(task.scene, centers, frames.poses),
+    )
 
 
-def _kind(request: Request) -> str:
-    assert request.portion is not None
-    return request.portion.kind
+def _observations(task: TileTask, folder: Path) -> ObservationSample | None:
+    """The sample of observations of all frames, against that of the ground truth where there is one."""
+    files = [folder / task.folder / f"{task.size}_{name}" for name in (OBSERVATIONS, TRUE_OBSERVATIONS)]
+    own, true = (CellObservations.load(file).sample() if file.exists() else None for file in files)
+    return own if own is None or true is None else own.against(true)
 
 
-def _part(request: Request) -> Part | None:
-    return None if request.portion is None else request.portion.part
+def _with_columns(task: TileTask, slug: str, analysis: Analysis, folder: Path) -> dict[str, str]:
+    """Write the voxels of a tile once more, with the columns of the statistics; the digest of the file."""
+    assert task.place is not None
+    waiting = folder / task.folder / VOXELS / f"tile={task.place[0]}_{task.place[1]}.parquet"
+    if not waiting.exists():
+        return {}
+    table, truth = VoxelTable.load(waiting), None
+    for path in (folder / TRUTH / slug, folder / task.folder / TRUTH):
+        if (path / waiting.name).exists():
+            truth = VoxelTable.load(path / waiting.name)
+    columns, tile = analysis.columns(table, truth), tile_of(waiting)
+    return _saved(
+        folder, f"{VOXELS}/{slug}/{waiting.name}", functools.partial(save_voxels, table, columns=columns, tile=tile)
+    )
 
 
-# The jobs of a start as they come up: whole units, and portions of those in tiles.
+def _saved(folder: Path, name: str, save: Callable[[Path], None]) -> Mapping[str, str]:
+    """The digest of a file that is written, by its path in the folder."""
+    save(folder / name)
+    return {name: file_digest(folder / name).hex()}
 
 
-class Waiting(Iterator[Job]):
-    """What is still to be begun; where there is nothing, there may be again once what is at work has finished."""
-
-    def __init__(self, config: Config, folder: Path, start: str, observers: Sequence[Factory]) -> None:
-        self._config, self._folder, self._start, self._observers = config, folder, start, tuple(observers)
-        self._whole = deque[Job]()
-        self._tiled: list[TiledUnit] = []
-        self._shown = set[tuple[str, str, str | None]]()
-
-    def add_whole(self, units: Sequence[Planned], width: int) -> None:
-        """Units that are fused at once, for so many tasks.
-
-        By the sequence that they read; scene by scene, for what a scene's backbones share stays at hand.
-        """
-        sequences: dict[tuple[str, str], list[Request]] = {}
-        for each in units:
-            sequences.setdefault((each.unit.scene, each.unit.backbone), []).append(Request.of(each))
-        jobs = [self._job(*sequence, tuple(requests), self._observers) for sequence, requests in sequences.items()]
-        self._whole.extend(split(jobs, width))
-
-    def add_tiled(self, tiled: TiledUnit) -> None:
-        """A unit in tiles."""
-        self._tiled.append(tiled)
-
-    def __next__(self) -> Job:
-        if self._whole:
-            return self._whole.popleft()
-        for each in self._tiled:
-            if (request := each.next_request()) is not None:
-                unit = each.planned.unit
-                return self._job(unit.scene, unit.backbone, (request,), self._watching(unit, request))
-        raise StopIteration
-
-    def _watching(self, unit: Unit, request: Request) -> tuple[Factory, ...]:
-        """Who is shown a portion: a job each, so that no two maps are in memory at once; frames are shown in one."""
-        frames = (unit.scene, unit.backbone, None if request.stretch is None else request.stretch.name)
-        seen = request.part is not None or (request.shown and frames not in self._shown)
-        self._shown.add(frames)
-        return self._observers if seen else ()
-
-    def _job(self, scene: str, backbone: str, requests: tuple[Request, ...], observers: tuple[Factory, ...]) -> Job:
-        memory = None if self._config.memory_gb is None else self._config.memory_gb * GB
-        return Job(scene, backbone, requests, self._start, self._folder, self._config.threads, memory, observers)
-
-
-class InTiles:
-    """Puts them together, and begins them again where they turn out too large."""
-
-    def __init__(self, config: Config, survey: Survey, waiting: Waiting, told: Observers) -> None:
-        self._config, self._survey, self._waiting, self._told = config, survey, waiting, told
-        self._units: dict[str, TiledUnit] = {}
-        self._beside = Beside(threaded=survey.executor.elsewhere)
-
-    def __contains__(self, identity: str) -> bool:
-        return identity in self._units
-
-    def begin(self, planned: PlannedUnit, tiling: Tiling) -> Outcome | None:
-        """A unit; its own outcome where it has failed already."""
-        tiled = TiledUnit(planned, tiling, self._survey.folder, self._survey.executor.width, self._beside)
-        self._units[planned.identity] = tiled
-        if planned.kept:
-            self._told.tell(lambda observer: observer.unit_in_tiles(planned.unit, tiled.key, tiled.finished))
-        self._waiting.add_tiled(tiled)
-        return tiled.take(None)
-
-    def take(self, planned: Planned, outcome: Outcome) -> Outcome | None:
-        """What became of a unit, or of a portion of one; the unit's own outcome, where it has come to its end."""
-        tiled = self._units.get(planned.identity)
-        if tiled is None:
-            again = isinstance(planned, PlannedUnit) and outcome.outgrown
-            return self._begin_again(planned, outcome) if again else outcome  # type: ignore[arg-type]
-        if outcome.portion is None:
-            return outcome
-        if outcome.error is None:
-            self._told.tell(lambda observer: observer.advanced(tiled.step(), tiled.name))
-        return tiled.take(outcome)
-
-    def _begin_again(self, planned: PlannedUnit, outcome: Outcome) -> Outcome | None:
-        sizing = begun_again(self._config, planned, self._survey)
-        for line in sizing.remarks:
-            self._told.tell(lambda observer, line=line: observer.remarked(line))  # type: ignore[misc]
-        tiling = sizing.tilings.get(planned.identity)
-        if tiling is None:
-            return outcome
-        if planned.kept:
-            self._told.tell(lambda observer: observer.unit_begun_again(planned.unit))
-        return self.begin(planned, tiling)
+def _centers(files: Sequence[Path], voxel_size: float, step: int) -> Float64:
+    """(n, 3) of every n-th voxel, metres, in the order of a whole table."""
+    parts = [VoxelTable.columns(file, ("ix", "iy", "iz")) for file in files]
+    index = np.concatenate([np.stack([*part.values()], axis=1)[::step] for part in parts])
+    return (index[np.lexsort(index.T[::-1])] + 0.5) * voxel_size

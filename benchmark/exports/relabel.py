@@ -17,7 +17,6 @@ from semstab.core.files import write_json
 from semstab.core.prefetch import prefetch
 from semstab.core.types import Float64, Int64, Mask, UInt8, UInt16
 from semstab.datasets.geometry.lenses import Labels
-from semstab.engine.evaluation import truth_task
 from semstab.engine.folder import SETTINGS, load_result
 from semstab.engine.units import make_plan
 from semstab.errors import ConfigError, DataError
@@ -35,7 +34,7 @@ from semstab.predict.folder import PredictionFolder
 from semstab.settings import load_config
 from semstab.statistics import psa
 from semstab.statistics.commit import Commit
-from semstab.task import Task, read
+from semstab.task import Task, read, truth_task
 
 # The class that the map has where a frame looks: one a pixel, where the voxel can be believed.
 

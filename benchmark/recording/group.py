@@ -20,7 +20,6 @@ from semstab.recording import camera, series
 from semstab.recording.background import Background
 from semstab.recording.camera import Overlay, coarse_stride, sampling, stride_of
 from semstab.recording.changes import log_difference
-from semstab.recording.drift_parts import Picture
 from semstab.recording.entities import Clock, path
 from semstab.recording.flips import FlipLog, FrameDrift, Suspect, Tracker
 from semstab.recording.layout import drawn, is_pointwise
@@ -158,11 +157,6 @@ class GroupLog:
         stride = stride_of(frame.shape)
         labels = np.ascontiguousarray(frame.predicted[::stride, ::stride])
         self._log_picture(stream, frame.shape, "labels", labels, stride)
-
-    def log_drift(self, stream: rr.RecordingStream, found: Picture) -> None:
-        """Log what parts of a map in tiles say of a frame's drift."""
-        self._flips.see(found.view)
-        self._log_picture(stream, found.shape, "drift", found.levels, found.stride)
 
     def _log_picture(
         self, stream: rr.RecordingStream, shape: tuple[int, int], name: str, picture: Any, stride: int

@@ -14,7 +14,8 @@ from typing import TYPE_CHECKING, Any
 
 from semstab.core.files import write_text
 from semstab.engine.observer import Observer
-from semstab.model.records import Failure, Result
+from semstab.engine.units import PlannedUnit
+from semstab.model.records import Failure, Result, UnitContent
 from semstab.model.results import slug
 from semstab.report import figures
 from semstab.report.averages import describe
@@ -26,7 +27,7 @@ from semstab.report.tables import tables, write_tables
 from semstab.report.tables.table import ARROWS, Table, relations, sections
 
 if TYPE_CHECKING:
-    from semstab.engine.units import Plan, PlannedRegions, PlannedUnit
+    from semstab.engine.units import Plan
 
 
 # The parts of a page that needs no other file: its style, tables and figures.
@@ -149,7 +150,7 @@ class Reporting(Observer):
         self._folder = Path(folder)
         self._svg = False
 
-    def run_started(self, plan: Plan, kept: Sequence[PlannedUnit | PlannedRegions]) -> None:
+    def run_started(self, plan: Plan, finished: Mapping[str, UnitContent]) -> None:
         """Which formats figures are written in."""
         self._svg = plan.config.svg
 

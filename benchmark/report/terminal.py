@@ -14,10 +14,10 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from semstab.check import Verdict
 from semstab.config import BASE
 from semstab.engine.observer import Observer
-from semstab.engine.units import Plan, Planned
+from semstab.engine.units import Plan
 from semstab.metrics import macro_mean
 from semstab.model.measures import measures
-from semstab.model.records import Failure, Record, Result
+from semstab.model.records import Failure, Record, Result, UnitContent
 from semstab.model.results import Agreement, UnitSummary
 from semstab.model.statistics import Estimate
 from semstab.report.narrative import warnings
@@ -329,15 +329,15 @@ class ProgressBar(Observer):
         self.notes: list[str] = []
         self._said = time.monotonic()
 
-    def run_started(self, plan: Plan, kept: Sequence[Planned]) -> None:
+    def run_started(self, plan: Plan, finished: Mapping[str, UnitContent]) -> None:
         """Show the bar: the frames of every unit that is to be computed are its total."""
         units = plan.distinct()
-        if kept:
-            self.bar.console.print(f"kept from before: {len(kept)} of {len(units)} units", style="dim")
+        if finished:
+            self.bar.console.print(f"kept from before: {len(finished)} of {len(units)} units", style="dim")
         for scene in plan.scenes.values():
             if scene.depth_from is not None:
                 self.notes.append(f"{scene.name}: depth from {scene.depth_from}")
-        missing = units.keys() - {each.identity for each in kept}
+        missing = units.keys() - finished.keys()
         self.bar.update(self.work, total=sum(units[identity].frames for identity in missing))
         if self.bar.console.is_interactive:
             self.bar.start()
@@ -346,10 +346,6 @@ class ProgressBar(Observer):
         """Remember, until the run is through, what could not be told."""
         if verdict.state == "unclear":
             self.notes.append(f"{task.scene.name}: {verdict.text}")
-
-    def remarked(self, line: str) -> None:
-        """Say it at once."""
-        self.bar.console.print(line, style="dim", soft_wrap=True, markup=False)
 
     def advanced(self, frames: int, what: str) -> None:
         """So many frames further."""

@@ -79,6 +79,19 @@ class MapSample:
             truth = None if truth is None else truth.rows(shared_rows(table, truth)[1])
         return cls(table, events, truth, functools.reduce(operator.add, (part.summary for part in parts)))
 
+    def bound(self, *, most: int = MOST_VOXELS) -> int | None:
+        """The highest hash of a voxel, where there are as many as a sample has; None where there is room for others."""
+        return int(streams(self.table, slice(None), 0).max()) if len(self.table) >= most else None
+
+    def below(self, bound: int | None) -> MapSample:
+        """The part of it that a sample with that highest hash can take in."""
+        rows = slice(None) if bound is None else np.flatnonzero(streams(self.table, slice(None), 0) <= bound)
+        if isinstance(rows, slice) or len(rows) == len(self.table):
+            return self
+        table, events = self.table.rows(rows), None if self.events is None else self.events.rows(rows)
+        truth = None if self.truth is None else self.truth.rows(shared_rows(table, self.truth)[1])
+        return MapSample(table, events, truth, self.summary)
+
     def save(self, path: Path) -> None:
         """Write one file, atomically."""
         write_arrays(path, to_arrays(self), packed=False)

@@ -96,7 +96,7 @@ def main(count: int, seed: int) -> None:
             for k in range(3 * count):
                 who, out = ("scheduler", "first", "command")[k % 3], base / f"run{k}"
                 running, started = command(scene, out), time.monotonic()
-                while k % 2 and running.poll() is None and not any(out.glob("parts/*/*.npz")):
+                while k % 2 and running.poll() is None and not any(out.glob("tiles/*/*.npz")):
                     time.sleep(0.01)  # every second time once something is finished
                 time.sleep(rng.random() * seconds * (0.1 if k % 2 else 1))
                 moment = time.monotonic() - started
@@ -104,7 +104,7 @@ def main(count: int, seed: int) -> None:
                 os.kill(victim.pid, signal.SIGKILL)
                 victim.wait()
                 code, said = ended(running)
-                kept = len(list(out.glob("parts/*/*.npz")))
+                kept = len(list(out.glob("tiles/*/*.npz")))
                 good = {"scheduler": (0, 2), "first": (0,), "command": (0, -signal.SIGKILL)}[who]
                 if code not in good or len(said) > 1:
                     wrong.append(f"{who} {k}: killed at {moment:.2f} s, ended with {code}: {said}")

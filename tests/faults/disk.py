@@ -24,7 +24,8 @@ from typing import Any
 
 import kills
 
-from semstab.engine.tiling.portion import PORTIONS, Finished
+from semstab.engine.tiles import TileResult
+from semstab.engine.work import TILES
 
 PAGE = 4096
 MARK = "SEMSTAB_OWN_MOUNTS"
@@ -58,10 +59,10 @@ def limits(path: Path, count: int) -> Iterator[str]:
 
 
 def finished(out: Path) -> dict[Path, int]:
-    """What is finished of a run or study, by when it was written: units, and the files that parts leave."""
-    portions = [Finished.load(path) for path in out.glob(f"{PORTIONS}/*/*.npz")]
-    names = [name for portion in portions if portion is not None for name in portion.about.files]
-    files = [out / name for name in names if not name.startswith(f"{PORTIONS}/")]  # the rest goes with the last part
+    """The finished files of a run or study, by when they were written: of units, and of tiles."""
+    results = [TileResult.load(path) for path in out.glob(f"{TILES}/*/*.npz")]
+    names = [name for result in results if result is not None for name in result.files]
+    files = [out / name for name in names if not name.startswith(f"{TILES}/")]  # the rest goes with the last tile
     return {path: path.stat().st_mtime_ns for path in (*out.glob("units/*.json"), *files)}
 
 

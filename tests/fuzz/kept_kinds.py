@@ -1,4 +1,4 @@
-"""What is kept for a later start or a later command: tiles, portions, casts, predictions, comparisons, recordings."""
+"""What is kept for a later start or a later command: tiles, their results, casts, predictions, comparisons, recordings."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ from semstab.comparison.writing import compare, load_comparison
 from semstab.conformance import case_folder, compared
 from semstab.datasets import open_dataset
 from semstab.datasets.files.surfaces import Casts, View
-from semstab.engine.tiling.portion import About, Finished
-from semstab.engine.tiling.sights import Sights, look_at
+from semstab.engine.series import NUMBERS
+from semstab.engine.tiles import TileResult
 from semstab.engine.units import make_plan
 from semstab.errors import DataError
 from semstab.model.frames import Intrinsics
@@ -46,11 +46,9 @@ def of_kept(folder: Path) -> Iterator[Kind]:
     tile = min(tiled.glob("voxels/*/*.parquet"))
     yield Kind("tile of a map", (tile,), lambda file: VoxelTable.load(file.parent))
     task = make_plan(config).tasks[0]
-    look_at(task, 0.25).save(folder / "sights.npz")
-    yield Kind("sights", (folder / "sights.npz",), Sights.load)
-    portion = folder / "frames.npz"
-    Finished(About("frames", {"a.csv": "0"}), np.zeros((3, 18)), {"strata": np.zeros(4)}).save(portion)
-    yield Kind("portion of a unit", (portion,), Finished.load)
+    result = folder / "8_frames.npz"
+    TileResult({"a.csv": "0"}, np.zeros((3, len(NUMBERS))), sums={"strata": np.zeros(4)}).save(result)
+    yield Kind("result of a tile", (result,), TileResult.load)
     view = View(Intrinsics(12, 12, 7.5, 5.5), np.eye(4), (12, 16))
     casts = Casts(folder / "casts", b"surface")
     casts.put(view, np.ones((12, 16), np.float32))

@@ -21,7 +21,7 @@ from semstab.core.files import parse_json
 from semstab.datasets import open_dataset
 from semstab.datasets.files.surfaces import Surface, open_las
 from semstab.datasets.formats.disk import natural
-from semstab.engine.tiling.sights import Sights
+from semstab.engine.tiles import TileResult
 from semstab.errors import ConfigError, DataError, one_line
 from semstab.exports.ply import Header
 from semstab.model.georeference import wkt
@@ -210,11 +210,11 @@ def test_json_nested_too_deeply_is_refused_wherever_it_stands(tmp_path) -> None:
         wkt('{"a":' * 50_000, "crs")
 
 
-def test_sights_whose_header_ends_early_are_made_again(tmp_path) -> None:
+def test_a_tile_whose_header_ends_early_is_computed_again(tmp_path) -> None:
     body = npy_bytes(np.zeros(3)).replace(b"'shape': (3,)", b"'shape': (((")
-    with zipfile.ZipFile(tmp_path / "sights.npz", "w") as archive:
-        archive.writestr("size.npy", body)
-    assert Sights.load(tmp_path / "sights.npz") is None
+    with zipfile.ZipFile(tmp_path / "tile.npz", "w") as archive:
+        archive.writestr("series.npy", body)
+    assert TileResult.load(tmp_path / "tile.npz") is None
 
 
 @pytest.mark.parametrize("content", [b"\xff\xfe\0x", b"", b"\n\n"])

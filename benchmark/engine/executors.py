@@ -1,4 +1,4 @@
-"""Where jobs are done: in this process, in local processes, or on a Dask cluster; one interface."""
+"""Executors run jobs: in this process, in local processes, or on a Dask cluster; one interface."""
 
 from __future__ import annotations
 
@@ -7,11 +7,10 @@ import contextlib
 import dataclasses
 import importlib
 import importlib.metadata
-import itertools
 import multiprocessing
 import os
 import time
-from collections.abc import Callable, Generator, Iterable, Iterator
+from collections.abc import Callable, Generator
 from concurrent.futures.process import BrokenProcessPool
 from multiprocessing.connection import Connection
 from typing import Any, Protocol
@@ -19,8 +18,8 @@ from typing import Any, Protocol
 from semstab.core.prefetch import default_threads
 from semstab.core.process import available_bytes, follow_parent, settle
 from semstab.engine.observer import Observers
-from semstab.engine.work.jobs import Job, Outcome, failed
-from semstab.engine.work.passes import run_job
+from semstab.engine.passes import run_job
+from semstab.engine.work import Job, Outcome, failed
 from semstab.errors import ConfigError, MissingDependencyError
 
 CONNECT_SECONDS = 10
@@ -32,7 +31,8 @@ AWAY = OSError, RuntimeError, AttributeError
 
 LOST = "the scheduler went away; start it again, and the same command goes on from what is kept"
 
-Finished = tuple[Job, tuple[Outcome, ...]]
+NextJob = Callable[[], Job | None]
+"""Gives the next job; None where there is none, until outcomes that were yielded call for more."""
 
 
 class Executor(Protocol):
@@ -41,21 +41,16 @@ class Executor(Protocol):
     name       for the manifest
     width      how many jobs it runs at once
     elsewhere  whether other processes do the work, so that observers here do not see it
-    remote     whether they may be on other machines, so that threads of this process are no help to them
     """
 
     name: str
     width: int
     elsewhere: bool
-    remote: bool
 
-    def run(self, jobs: Iterable[Job], observers: Observers) -> Generator[Finished, None, None]:
-        """Yield each job with its outcomes as it finishes, in any order. Closing the iterator stops the rest.
+    def run(self, next_job: NextJob, observers: Observers) -> Generator[Outcome, None, None]:
+        """Yield outcomes as works finish, in any order. Closing the iterator stops the rest.
 
-        Jobs are taken when there is somebody to do them. Where there is none, `jobs` is asked again once those that
-        were yielded have been looked at: they may call for more.
-
-        `observers` are told of the work that is done in this very process.
+        A job is asked for when there is somebody to do it. `observers` see the work that is done in this very process.
         """
         ...
 
@@ -70,13 +65,11 @@ class InProcess:
     name = "in this process"
     width = 1
     elsewhere = False
-    remote = False
 
-    def run(self, jobs: Iterable[Job], observers: Observers) -> Generator[Finished, None, None]:
-        """In order."""
-        waiting = iter(jobs)
-        while (job := next(waiting, None)) is not None:
-            yield job, run_job(job, observers)
+    def run(self, next_job: NextJob, observers: Observers) -> Generator[Outcome, None, None]:
+        """Run them in order."""
+        while (job := next_job()) is not None:
+            yield from run_job(job, observers)
 
     def close(self) -> None:
         """Nothing is left behind."""
@@ -86,7 +79,6 @@ class LocalProcesses:
     """That many processes on this machine, which share its cores and its free memory."""
 
     elsewhere = True
-    remote = False
 
     def __init__(self, jobs: int) -> None:
         if jobs < 1:
@@ -94,44 +86,49 @@ class LocalProcesses:
         self.width = jobs
         self.name = f"{jobs} local processes"
 
-    def run(self, jobs: Iterable[Job], observers: Observers) -> Generator[Finished, None, None]:
-        """As they finish.
+    def run(self, next_job: NextJob, observers: Observers) -> Generator[Outcome, None, None]:
+        """Yield outcomes as jobs finish.
 
         Where a process dies, nobody knows of which job: those that were at work are tried again, then once more one by
         one. The job whose process dies then fails, and the others finish.
         """
-        waiting, left = map(self._with_a_share(available_bytes() / 2), iter(jobs)), list[Job]()
+        begun, share = list[Job](), available_bytes() / 2
+
+        def shared() -> Job | None:
+            job = next_job()
+            return None if job is None else self._with_a_share(job, share)
+
         while True:
             for _ in range(2):
                 with contextlib.suppress(BrokenProcessPool):
-                    yield from self._run(left, waiting, self.width)
+                    yield from self._run(begun, shared, self.width)
                     return
-            while left:
+            while begun:
                 try:
-                    yield from self._run(left, iter(()), 1)
+                    yield from self._run(begun, lambda: None, 1)
                 except BrokenProcessPool:
-                    job = left.pop(0)
                     text = "its process was killed, perhaps for want of memory; try fewer jobs, or larger voxels"
-                    yield job, tuple(failed(job.requests, text, outgrown=True))
+                    yield from failed(begun.pop(0), text)
 
-    def _run(self, left: list[Job], waiting: Iterator[Job], width: int) -> Generator[Finished, None, None]:
-        """Run the jobs that are left, then those that wait, in order; left are those that were begun and not finished.
+    def _run(self, begun: list[Job], next_job: NextJob, width: int) -> Generator[Outcome, None, None]:
+        """Run the jobs that were begun before, then the next ones; begun stay those that are not finished.
 
-        Each is begun before what is finished is looked at: nobody waits for that.
+        Each is submitted before outcomes are yielded: no process waits for whoever takes them.
         """
-        again, futures = [*left], dict[cf.Future[tuple[Outcome, ...]], Job]()
+        futures = dict[cf.Future[tuple[Outcome, ...]], Job]()
+        waiting = [*begun]
 
         def taken() -> Job | None:
-            if again:
-                return again.pop(0)
-            if (job := next(waiting, None)) is not None:
-                left.append(job)
+            if waiting:
+                return waiting.pop(0)
+            if (job := next_job()) is not None:
+                begun.append(job)
             return job
 
-        def begin(job: Job | None) -> None:
-            while job is not None:
-                futures[pool.submit(run_job, job)] = job
-                job = taken() if len(futures) < width else None
+        def submit(job: Job | None = None) -> None:
+            while job is not None or (len(futures) < width and (job := taken()) is not None):
+                futures[pool.submit(_run_all, job)] = job
+                job = None
 
         if (first := taken()) is None:
             return
@@ -141,15 +138,15 @@ class LocalProcesses:
         pool = cf.ProcessPoolExecutor(width, context, initializer=_start_worker, initargs=(listening, share))
         try:
             _check_start(pool)
-            begin(first)
+            submit(first)
             while futures:
                 done, _ = cf.wait(futures, return_when=cf.FIRST_COMPLETED)
                 for future in done:
                     outcomes, job = future.result(), futures.pop(future)
-                    begin(taken())
-                    left[:] = [each for each in left if each is not job]
-                    yield job, outcomes
-                    begin(taken() if len(futures) < width else None)
+                    submit()  # raises where the processes died meanwhile: then this job is run once more
+                    begun[:] = [each for each in begun if each is not job]
+                    yield from outcomes
+                    submit()
             pool.shutdown()
         finally:
             alive.close()  # ends processes that are still at work: after an interruption, or where one of them died
@@ -158,13 +155,17 @@ class LocalProcesses:
     def close(self) -> None:
         """Processes end with what they were started for."""
 
-    def _with_a_share(self, free: float) -> Callable[[Job], Job]:
-        def shared(job: Job) -> Job:
-            memory = free if job.memory_bytes is None else job.memory_bytes
-            threads = max(1, (job.threads or default_threads()) // self.width)
-            return dataclasses.replace(job, threads=threads, memory_bytes=memory / self.width, width=self.width)
+    def _with_a_share(self, job: Job, free: float) -> Job:
+        """The job with its share of threads and memory."""
+        start = job[0].start
+        memory = free if start.memory_bytes is None else start.memory_bytes
+        threads = max(1, (start.threads or default_threads()) // self.width)
+        own = dataclasses.replace(start, threads=threads, memory_bytes=memory / self.width, width=self.width)
+        return tuple(dataclasses.replace(work, start=own) for work in job)
 
-        return shared
+
+def _run_all(job: Job) -> tuple[Outcome, ...]:
+    return tuple(run_job(job))
 
 
 def _check_start(pool: cf.ProcessPoolExecutor) -> None:
@@ -201,7 +202,6 @@ class DaskCluster:
     """
 
     elsewhere = True
-    remote = True
 
     def __init__(self, scheduler: str) -> None:
         try:
@@ -214,23 +214,24 @@ class DaskCluster:
         self.width = self._threads() or 1
         self.name = f"Dask, {self.width} threads"
 
-    def run(self, jobs: Iterable[Job], observers: Observers) -> Generator[Finished, None, None]:
-        """As they finish. The scheduler gives the job of a worker that died to another one.
+    def run(self, next_job: NextJob, observers: Observers) -> Generator[Outcome, None, None]:
+        """Yield outcomes as jobs finish. The scheduler gives the job of a worker that died to another one.
 
         There are never more at the scheduler than its workers have threads, so that whoever is free has the next one;
-        and that is sent before what is finished is looked at, so that nobody waits for it.
+        and that is sent before outcomes are yielded, so that nobody waits for it.
         Raises ConfigError where the scheduler went away and jobs are left.
         """
-        waiting, futures = iter(jobs), dict[Any, Job]()
+        futures = dict[Any, Job]()
         finished = _distributed().as_completed(loop=self._client.loop)
 
         def send(job: Job | None = None) -> None:
-            free = self._threads() - len(futures) - (job is not None)
-            for each in [*([] if job is None else [job]), *itertools.islice(waiting, max(0, free))]:
-                futures[future := self._client.submit(_run_settled, each, pure=False)] = each
+            free = self._threads() - len(futures)
+            while job is not None or (free > 0 and (job := next_job()) is not None):
+                futures[future := self._client.submit(_run_settled, job, pure=False)] = job
                 finished.add(future)
+                job, free = None, free - 1
 
-        if (first := next(waiting, None)) is None:
+        if (first := next_job()) is None:
             return
         self._require_same_version()
         send(first)
@@ -240,9 +241,9 @@ class DaskCluster:
                 outcomes = _outcomes(future, job)
                 future.release()
                 send()
-                yield job, outcomes
+                yield from outcomes
                 send()
-            if next(waiting, None) is not None:
+            if next_job() is not None:
                 raise ConfigError(LOST)
         finally:
             if futures:
@@ -286,7 +287,8 @@ def _run_settled(job: Job) -> tuple[Outcome, ...]:
     settle()
     with contextlib.suppress(ValueError):  # called outside of a worker
         _use_threads(_distributed().get_worker().state.nthreads)
-    return run_job(dataclasses.replace(job, threads=job.threads or 0))
+    start = dataclasses.replace(job[0].start, threads=job[0].start.threads or 0)
+    return _run_all(tuple(dataclasses.replace(work, start=start) for work in job))
 
 
 def _distributed() -> Any:
@@ -298,11 +300,11 @@ def _distributed() -> Any:
 
 def _outcomes(future: Any, job: Job) -> tuple[Outcome, ...]:
     if future.cancelled():
-        return tuple(failed(job.requests, LOST))
+        return tuple(failed(job, LOST))
     try:
         outcomes: tuple[Outcome, ...] = future.result()
     except Exception as error:  # noqa: BLE001 - whatever happened to it on the cluster
-        return tuple(failed(job.requests, error))
+        return tuple(failed(job, error))
     return outcomes
 
 

@@ -1,0 +1,355 @@
+"""The end of a work: its map is measured, judged by the statistics, and written."""
+
+from __future__ import annotations
+
+import dataclasses
+import tempfile
+from collections.abc import Callable, Mapping
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from semstab.backends.numpy_reference import ONE_IN, NumpySample, in_sample
+from semstab.config import Config
+from semstab.core.files import atomic_path
+from semstab.core.process import Stopwatch, give_back
+from semstab.core.types import Float64
+from semstab.datasets import Scene
+from semstab.datasets.formats.disk import file_digest
+from semstab.engine.series import Series
+from semstab.engine.streams import LiveMap, Stream
+from semstab.engine.tiles import OBSERVATIONS, TRUE_OBSERVATIONS, TileResult
+from semstab.engine.up_axis import estimate_up
+from semstab.engine.work import Outcome, Start
+from semstab.errors import DataError
+from semstab.metrics import compare, summarise
+from semstab.metrics.agreement import rows_of
+from semstab.metrics.summary import TableSums
+from semstab.model.events import Events
+from semstab.model.frames import LeftOut
+from semstab.model.measures import dominant, mean, measures, vss
+from semstab.model.parquet import Tile
+from semstab.model.records import EVENTS, FRAMES, INFLUENCE, LOOKS, OVERVIEW, TRUTH, VOXELS, FrameQuality, UnitContent
+from semstab.model.results import (
+    RECURRENT,
+    STAGES,
+    Agreement,
+    FrameDrift,
+    ReducedScores,
+    SizeAlpha,
+    TableSummary,
+    UnitSummary,
+    slug,
+)
+from semstab.model.statistics import MapStatistics
+from semstab.model.voxels import VoxelTable
+from semstab.statistics import Analysis, MapSample, ObservationSample, analyse
+from semstab.statistics.agreement import alpha_columns, alpha_of, ratio_of
+from semstab.task import Task, read
+
+WORST = 3
+"""So many frames are named that moved the map most."""
+
+SMALL = 1 << 30
+"""A process with fewer bytes keeps freed memory for the next table."""
+
+Savers = dict[str, Callable[[Path], None]]
+"""A function that writes each file of a unit, by the file's path in the folder."""
+
+
+def finish(live: LiveMap, stream: Stream, watch: Stopwatch) -> Outcome:
+    """Measure a finished map and write its files. Raises DataError where no pixel was valid."""
+    task, config, work = live.task, live.work.config, live.work
+    with watch("table"):
+        table = live.table()
+        if not len(table):
+            raise no_voxels(task, config)
+        events = live.backend.events() if live.backend is not None and (config.statistics or config.events) else None
+        events = None if events is None else dataclasses.replace(events, classes=table.classes)
+        live.backend = None  # the statistics have its memory
+        give_back(least=SMALL)
+    with watch("voxel sizes"):
+        sizes = () if live.sizes is None else live.sizes.alphas()
+        give_back(least=SMALL)
+    with watch("statistics"):
+        truth = _truth_table(live)
+        analysis = analyse_map(live, table, events, truth) if work.judged else None
+        give_back(least=SMALL)
+    with watch("measure"):
+        summary = unit_summary(
+            task,
+            live.rows,
+            summarise(table, config.strata) if analysis is None else analysis.table,
+            None if analysis is None else analysis.summary,
+            None if live.hard is None else reduced_of(reduced_sums(live.hard.table())),
+            sizes,
+        )
+    with watch("write"):
+        files, returned = written(work.start, _savers(live, stream, table, events, truth, analysis))
+    with watch("reference"):
+        checked = None if live.reference is None else _checked(live, table, live.reference)
+    content = UnitContent(task.digest, summary, files=files, checked=checked)
+    if work.image_space and stream.image_space is not None:
+        content = dataclasses.replace(
+            content,
+            image_space=stream.image_space.result(summary.flicker_percent),
+            up=up_axis(task.scene, table, stream.poses),
+            quality=_quality(stream),
+        )
+    return Outcome(work.identity, content, files=returned, table=table if work.watched else None)
+
+
+def finish_tile(live: LiveMap, stream: Stream, watch: Stopwatch) -> Outcome:
+    """Write the result of a tile, or of the pass over all frames: sums, rows of the series, and voxels."""
+    work, config, tile = live.work, live.work.config, live.work.tile
+    assert tile is not None
+    sums, table, events, truth, sample = dict[str, Any](), None, None, None, None
+    if work.fuses:
+        with watch("table"):
+            table = live.table()
+            log = live.backend.events() if live.backend is not None and (config.statistics or config.events) else None
+            events = None if log is None else dataclasses.replace(log, classes=table.classes)
+            truth, live.backend = _truth_table(live), None
+            give_back(least=SMALL)
+        with watch("statistics"):
+            log = events if config.statistics else None
+            if work.judged:
+                sample = MapSample.draw(table, log, truth, edges=config.strata).below(tile.bound)
+            sums = (TableSums.of(table, config.strata) if sample is None else sample.summary).arrays()
+    with watch("reference"):
+        checked = None if table is None or live.reference is None else _checked(live, table, live.reference)
+    with watch("write"):
+        files, returned = written(work.start, _tile_savers(live, stream, table, events, truth, sample))
+        result = TileResult(
+            files,
+            live.rows.numbers,
+            voxels=0 if table is None else len(table),
+            sums=sums,
+            reduced=np.zeros(0) if live.hard is None else reduced_sums(live.hard.table()),
+            checked=checked,
+            sizes=() if live.sizes is None else live.sizes.alphas(),
+            quality=_quality(stream),
+            image=np.zeros((0, 0)) if stream.image_space is None else stream.image_space.rows.table(),
+            poses=stream.poses,
+            **({} if live.tiles is None else live.tiles.result()),
+        )
+        _, own = written(work.start, {f"{tile.folder}/{tile.name}.npz": result.save})
+    return Outcome(work.identity, tile=tile.name, files=returned | own)
+
+
+def _truth_table(live: LiveMap) -> VoxelTable | None:
+    if live.truth is None:
+        return None
+    return dataclasses.replace(live.truth.table(), classes=live.task.mapping.target.classes)
+
+
+def analyse_map(live: LiveMap, table: VoxelTable, events: Events | None, truth: VoxelTable | None) -> Analysis:
+    """The statistics of a map that is fused whole."""
+    observations = None if live.sampler is None else live.sampler.sample()
+    if observations is not None and live.truth_sampler is not None:
+        observations = observations.against(live.truth_sampler.sample())
+    config = live.work.config
+    sample = MapSample.draw(table, events if config.statistics else None, truth, edges=config.strata)
+    return analyse_sample(live.task, config, sample, observations)
+
+
+def analyse_sample(task: Task, config: Config, sample: MapSample, observations: ObservationSample | None) -> Analysis:
+    """The statistics of a map; its true labels are right, and bound how far geometry lets labels agree."""
+    name, critical = task.backbone, config.critical_classes
+    return analyse(sample, observations, name=name, edges=config.strata, critical=critical)
+
+
+def _quality(stream: Stream) -> FrameQuality | None:
+    """The quality of the labels of single frames, where it is asked for."""
+    if stream.quality is None:
+        return None
+    made = stream.task.scene.filtering(stream.task.backbone)
+    return stream.quality.result(made.model, made.filters, made.milliseconds)
+
+
+def no_voxels(task: Task, config: Config) -> DataError:
+    """The error of an empty map: it says what is missing in the first frame."""
+    frame = read(task, task.indices[0], config.pixel_stride)
+    depth = np.mean(np.isfinite(frame.depth) & (frame.depth > 0))
+    labelled = np.mean(frame.predicted != frame.ignore_id)
+    return DataError(
+        f"{task.scene.name}, {task.backbone}: no pixel of {len(task.indices)} frames is valid (first frame: depth in"
+        f" {depth:.0%} of the pixels, a label in {labelled:.0%}); check depth_scale, the ignore id and the taxonomy"
+    )
+
+
+def _checked(live: LiveMap, table: VoxelTable, reference: NumpySample) -> Agreement:
+    """How far the map agrees with the reference on the voxels of the sample."""
+    expected = dataclasses.replace(reference.table(), classes=table.classes)
+    drawn = rows_of(table, in_sample(table.index.T))
+    units = (live.unit, dataclasses.replace(live.unit, backend="numpy"))
+    return dataclasses.replace(compare(drawn, expected, units, tolerance=live.work.config.tolerance), one_in=ONE_IN)
+
+
+def unit_summary(
+    task: Task,
+    rows: Series,
+    table: TableSummary,
+    statistics: MapStatistics | None,
+    reduced: ReducedScores | None,
+    sizes: tuple[SizeAlpha, ...],
+) -> UnitSummary:
+    """The report on a unit, from its map, its time series and the statistics of the map."""
+    return UnitSummary(
+        unit=task.units[0],
+        taxonomy=task.mapping.target.name,
+        frames=len(task.indices),
+        table=table,
+        flicker_percent=mean(rows.column("flicker_percent")),
+        fuse_ms_per_frame=mean(1e3 * rows.column("seconds")),
+        stages_ms={stage: mean(1e3 * rows.column(f"{stage}_seconds")) for stage in STAGES},
+        left_out=int(rows.column("left_out").sum()),
+        frames_left_out=task.left_out,
+        frames_empty=int(np.count_nonzero(rows.column("points") == 0)),
+        scores_left_out=_scores_left_out(rows),
+        statistics=statistics,
+        reduced=reduced,
+        worst_frames=tuple(_worst(rows)),
+        sizes=sizes,
+    )
+
+
+def _scores_left_out(rows: Series) -> LeftOut | None:
+    """Over all frames that were cut to their largest scores; None where none was."""
+    left_out, most = rows.column("scores_left_out"), rows.column("most_scores_left_out")
+    return None if np.isnan(left_out).all() else LeftOut(mean(left_out), float(np.nanmax(most)))
+
+
+def reduced_sums(table: VoxelTable) -> Float64:
+    """The sums over voxels from which `reduced_of` follows."""
+    values, recurrent = vss(table), table.op >= RECURRENT
+    means = [values.sum(), len(values), values[recurrent].sum(), np.count_nonzero(recurrent)]
+    alpha = (alpha_columns(table.rows(some)).sum(axis=0) for some in table.evidence.chunks())
+    return np.concatenate([means, sum(alpha, np.zeros(3 + table.K))])
+
+
+def reduced_of(sums: Float64) -> ReducedScores:
+    """Soft scores reduced to labels, from the sums of their map."""
+    return ReducedScores(float(ratio_of(sums[:2])), float(ratio_of(sums[2:4])), float(alpha_of(sums[4:])))
+
+
+def _worst(rows: Series) -> list[FrameDrift]:
+    """The frames that moved the map most, of those that met as many known voxels as half of the frames do."""
+    known, drift = rows.column("voxels") - rows.column("new_voxels"), rows.drift
+    met = np.flatnonzero(known >= max(1, np.median(known) if len(known) else 0))
+    worst = met[np.argsort(-drift[met], kind="stable")][:WORST]
+    frames = rows.column("frame")
+    return [FrameDrift(int(frames[k]), float(drift[k]), int(known[k])) for k in worst]
+
+
+def up_axis(scene: Scene, points: VoxelTable | Float64, poses: Float64) -> tuple[float, float, float] | None:
+    """The scene's up axis, given or estimated; None where neither works."""
+    try:
+        up = estimate_up(points, poses) if scene.up is None else scene.up
+    except DataError:
+        return None
+    x, y, z = (float(value) for value in up)
+    return x, y, z
+
+
+# --- Files ------------------------------------------------------------------------------------------------------------
+
+
+def _savers(
+    live: LiveMap,
+    stream: Stream,
+    table: VoxelTable,
+    events: Events | None,
+    truth: VoxelTable | None,
+    analysis: Analysis | None,
+) -> Savers:
+    """The files of a unit that is fused whole, beside its summary."""
+    config, unit, savers = live.work.config, live.unit, _overview_saver(live, stream)
+    if not live.work.kept:
+        return savers
+    columns = analysis.columns(table, truth) if config.statistics and analysis is not None else {}
+    savers[f"{VOXELS}/{unit.slug}.parquet"] = partial(save_voxels, table, columns=columns)
+    if analysis is not None:
+        savers[f"{INFLUENCE}/{unit.slug}.parquet"] = analysis.sums.save
+    savers[f"{FRAMES}/{unit.slug}.csv"] = live.rows.save_csv
+    if live.sampler is not None:
+        savers[f"{LOOKS}/{unit.slug}.parquet"] = live.sampler.looks(table.classes).save
+    if events is not None and config.events:
+        savers[f"{EVENTS}/{unit.slug}.parquet"] = events.save
+    if truth is not None and live.work.image_space:
+        savers[f"{TRUTH}/{unit.slug}.parquet"] = truth.save
+    return savers
+
+
+def _overview_saver(live: LiveMap, stream: Stream) -> Savers:
+    if not (live.work.image_space and stream.overview):
+        return {}
+    name = slug(live.unit.scene, live.unit.backbone)
+    return {f"{OVERVIEW}/{name}.npz": partial(_save_arrays, stream.overview)}
+
+
+def _tile_savers(
+    live: LiveMap,
+    stream: Stream,
+    table: VoxelTable | None,
+    events: Events | None,
+    truth: VoxelTable | None,
+    sample: MapSample | None,
+) -> Savers:
+    """The files of a tile; voxels to which statistics add columns wait until the whole map is there."""
+    work, config, tile, slug_of_unit = live.work, live.work.config, live.work.tile, live.unit.slug
+    assert tile is not None
+    if table is None or tile.place is None:
+        savers, classes = _overview_saver(live, stream), live.task.mapping.target.classes
+        for sampler, name in ((live.sampler, OBSERVATIONS), (live.truth_sampler, TRUE_OBSERVATIONS)):
+            if sampler is not None:
+                savers[f"{tile.folder}/{tile.size}_{name}"] = sampler.looks(classes).save
+        return savers
+    own, savers = Tile(*tile.place, tile.size, tile.key), Savers()
+    if not len(table):
+        return savers
+    if sample is not None:
+        savers[f"{tile.folder}/{tile.name}.sample"] = sample.save
+    if work.kept:
+        folder = f"{tile.folder}/{VOXELS}" if config.statistics and work.judged else f"{VOXELS}/{slug_of_unit}"
+        savers[f"{folder}/{own.name}"] = partial(save_voxels, table, tile=own)
+        if events is not None and config.events:
+            savers[f"{EVENTS}/{slug_of_unit}/{own.name}"] = partial(events.save, tile=own)
+    if work.kept and truth is not None and len(truth):
+        folder = f"{TRUTH}/{slug_of_unit}" if work.image_space else f"{tile.folder}/{TRUTH}"
+        savers[f"{folder}/{own.name}"] = partial(truth.save, tile=own)
+    return savers
+
+
+def written(start: Start, savers: Savers) -> tuple[dict[str, str], dict[str, bytes]]:
+    """Write files into the folder where it is shared; their digests, and their bytes where it is not."""
+    digests, returned = {}, {}
+    shared = start.marker.exists()
+    with tempfile.TemporaryDirectory() as elsewhere:
+        for name, save in savers.items():
+            path = (start.folder if shared else Path(elsewhere)) / name
+            save(path)
+            digests[name] = file_digest(path).hex()
+            if not shared:
+                returned[name] = path.read_bytes()
+    return digests, returned
+
+
+def save_voxels(
+    table: VoxelTable,
+    path: Path,
+    columns: Mapping[str, npt.NDArray[Any]] | None = None,
+    tile: Tile | None = None,
+) -> None:
+    """Write a voxel table together with its measures, and further columns (n,) by name."""
+    own = {measure.key: measure.of for measure in measures()}
+    table.save(path, columns, {**own, "label": dominant}, tile)
+
+
+def _save_arrays(arrays: Mapping[str, Any], path: Path) -> None:
+    named: dict[str, Any] = dict(arrays)
+    with atomic_path(path) as temporary:
+        np.savez_compressed(temporary, **named)

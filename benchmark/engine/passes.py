@@ -1,0 +1,266 @@
+"""One pass over a sequence: each frame is decoded once, and goes into the maps of all works that want it."""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+import itertools
+import json
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from semstab.core.prefetch import prefetch
+from semstab.core.process import Stopwatch, available_bytes, resident_bytes
+from semstab.datasets import GROUND_TRUTH, Dataset, Scene, open_dataset
+from semstab.engine.finish import finish, finish_tile
+from semstab.engine.memory import MemoryBudget
+from semstab.engine.observer import Observers
+from semstab.engine.streams import Decoded, LiveMap, Stream, in_order, live_maps, streams_of
+from semstab.engine.work import Job, Outcome, Work, failed
+from semstab.errors import DataError
+from semstab.metrics import macro_mean, matched_region_flicker
+from semstab.model.frames import Frame
+from semstab.model.records import RegionFlicker, UnitContent
+from semstab.pixels.preparation import leave_out, perturb
+from semstab.pixels.warp import correspond
+from semstab.task import frame_indices
+
+
+def run_job(job: Job, observers: Observers | None = None) -> Iterator[Outcome]:
+    """Compute works that read one sequence. One that fails does not keep the others from finishing.
+
+    Observers see it where it is done in their process.
+    """
+    left = {(work.identity, work.tile): work for work in job}
+    try:
+        scene = _scene(job[0])
+        for key, work in [*left.items()]:
+            if work.regions:
+                yield _measured_regions(scene, work)
+                del left[key]
+        while left:
+            fusion = Fusion(scene, [*left.values()], observers or Observers())
+            yield from fuse_sequence(fusion)
+            left = {(work.identity, work.tile): work for work in fusion.put_off}
+    except Exception as error:  # noqa: BLE001 - whatever happens to a job is reported, and the other jobs continue
+        yield from failed(left.values(), error)
+
+
+def fuse_sequence(fusion: Fusion) -> Iterator[Outcome]:
+    """Fuse the frames of a sequence into all maps that want them; then measure and write each map."""
+    fusion.start()
+    with contextlib.closing(fusion.decoded_frames()) as frames:
+        for index, fetched in zip(fusion.order, frames, strict=True):
+            for stream in (stream for stream in fusion.streams if index in stream.frames):
+                with fusion.failing(stream.maps):
+                    frame, reports = stream.prepare(fetched), {}
+                    for live in (live for live in stream.maps if index in live.frames):
+                        with fusion.failing([live]):
+                            reports[live] = live.integrate(frame, fusion.watch)
+                            live.sample(frame, fusion.watch)
+                    rows = stream.measure(frame, reports)
+                    stream.notify(frame, rows)
+            if not fusion.keep_within_memory():
+                break  # no map is left
+    for stream, live in fusion.finished():
+        with fusion.failing([live]):
+            end = finish if live.work.tile is None else finish_tile
+            yield replace(end(live, stream, fusion.watch), seconds=fusion.lap())
+    yield from fusion.failures()
+
+
+class Fusion:
+    """The maps of a pass, and the bookkeeping around it: failures, memory, time by stage.
+
+    Where maps take more than the memory bound, works are put off to another pass.
+    """
+
+    def __init__(self, scene: Scene, works: Sequence[Work], observers: Observers) -> None:
+        self.watch, self.put_off = Stopwatch(), list[Work]()
+        self._scene, self._observers, self._start = scene, observers, works[0].start
+        self._failed: list[Outcome] = []
+        maps = [*live_maps(works, scene, self._failing_works)]
+        self.streams = streams_of(maps, self.watch, observers)
+        self.order = in_order(self.streams)
+        self._memory_before = resident_bytes()
+        self._budget = MemoryBudget(works[0].config.memory_gb, self._start.width)
+        bound = self._start.memory_bytes
+        self._bound = available_bytes() / 2 if bound is None else bound
+
+    def start(self) -> None:
+        """Show observers the maps that they watch."""
+        for stream in self.streams:
+            if watched := stream.watched:
+                backends = {live.unit: live.backend for live in watched if live.backend is not None}
+                task, config = stream.task, watched[0].work.config
+                self._observers.tell(lambda observer: observer.group_started(task, config, backends))  # noqa: B023
+
+    def decoded_frames(self) -> Iterator[Any]:
+        """Frames in order, decoded ahead by threads."""
+        fetched = prefetch(self._decode, self.order, threads=self._start.threads, size=lambda each: each.nbytes)
+        with contextlib.closing(fetched):
+            for each in fetched:
+                self.watch.seconds["read"] += each.waited
+                yield each
+
+    def _decode(self, index: int) -> Decoded:
+        """Decode a frame in a worker thread; an error fails the units that need the frame, not those that do not."""
+        scene, wanting = self._scene, [stream for stream in self.streams if index in stream.frames]
+        backbone = wanting[0].task.backbone
+        try:
+            color = self._observers.want_color or any(stream.shown == index for stream in self.streams)
+            frame = scene.frame(index, backbone, color=color)
+            truth = _ground_truth(scene, index) if any(stream.truth_task is not None for stream in wanting) else None
+            model = None
+            name = (
+                scene.filtering(backbone).model if any(stream.quality is not None for stream in wanting) else backbone
+            )
+            if name != backbone:  # without filters
+                model = scene.frame(index, name, color=False)
+            return Decoded(index, frame, truth, model)
+        except Exception as error:  # noqa: BLE001 - raised again by `Stream.prepare`
+            return Decoded(index, error=error)
+
+    @contextlib.contextmanager
+    def failing(self, maps: Sequence[LiveMap]) -> Iterator[None]:
+        """An error that is raised in the block becomes the outcome of these maps, which are given up."""
+        lost = list(maps)
+        try:
+            yield
+        except Exception as error:  # noqa: BLE001 - a failing unit is reported, and the others continue
+            self._failed += failed([live.work for live in lost], error)
+            self._give_up(lost)
+
+    @contextlib.contextmanager
+    def _failing_works(self, works: Sequence[Work]) -> Iterator[None]:
+        try:
+            yield
+        except Exception as error:  # noqa: BLE001 - as above
+            self._failed += failed(works, error)
+
+    def _give_up(self, lost: Sequence[LiveMap]) -> None:
+        for stream in self.streams:
+            stream.maps = [live for live in stream.maps if live not in lost]
+
+    def lap(self) -> dict[str, float]:
+        """The seconds of each stage since the last outcome."""
+        seconds = dict(self.watch.seconds)
+        self.watch.seconds.clear()
+        return seconds
+
+    def failures(self) -> list[Outcome]:
+        """The outcomes of the works that failed."""
+        found, self._failed = self._failed, []
+        return found
+
+    def finished(self) -> Iterator[tuple[Stream, LiveMap]]:
+        """Each map that came to its end; it is let go of before the next one."""
+        for stream in self.streams:
+            while stream.maps:
+                live = stream.maps.pop(0)
+                yield stream, live
+                live.release()
+
+    def keep_within_memory(self) -> bool:
+        """Put maps off, or give up one that outgrows the memory; whether there is still one to fuse."""
+        maps = [live for stream in self.streams for live in stream.maps]
+        if len(maps) > 1 and resident_bytes() - self._memory_before > self._bound:
+            later = sorted(maps, key=lambda live: not live.work.watched)[max(1, len(maps) // 2) :]
+            later = [live for live in later if not live.work.watched]
+            self.put_off += [live.work for live in later]
+            self._give_up(later)
+            maps = [live for live in maps if live not in later]
+        growing = [live for live in maps if live.rows and live.backend is not None]
+        largest = self._budget.lacking(growing) if growing else None
+        if largest is not None:
+            with self.failing([largest]):
+                raise self._budget.outgrown(largest)
+        return any(stream.maps for stream in self.streams)
+
+
+# --- Open scenes ------------------------------------------------------------------------------------------------------
+
+_shared: dict[str, Mapping[str, Scene]] = {}
+
+
+@contextlib.contextmanager
+def share_open_scenes(start: str, scenes: Mapping[str, Scene]) -> Iterator[None]:
+    """Let works of that start that are done in this process read open scenes while the block lasts."""
+    _shared[start] = scenes
+    try:
+        yield
+    finally:
+        del _shared[start]
+
+
+def _scene(work: Work) -> Scene:
+    if work.start.name in _shared:
+        return _shared[work.start.name][work.scene]
+    dataset = work.config.dataset
+    return _dataset(work.start.name, dataset.name, json.dumps(dataset.options)).scene(work.scene)
+
+
+@functools.lru_cache(maxsize=1)
+def _dataset(_start: str, name: str, options: str) -> Dataset:
+    """The dataset, opened once for a start: its scenes share what they read or render."""
+    return open_dataset(name, json.loads(options))
+
+
+def _ground_truth(scene: Scene, index: int) -> Frame | None:
+    """A frame with its ground truth; None where the frame has none."""
+    try:
+        return scene.frame(index, GROUND_TRUTH, color=False)
+    except DataError:
+        return None
+
+
+# --- Flicker of label sources that hold regions without classes, as Segment Anything's proposals do; none is fused ----
+
+
+def _measured_regions(scene: Scene, work: Work) -> Outcome:
+    """The outcome of a unit of regions: the means over its pairs of sampled frames."""
+    try:
+        rows = [_compared(*pair) for pair in itertools.pairwise(_region_frames(scene, work))]
+        flicker, compensated, share = zip(*rows, strict=True) if rows else ((), (), ())
+        means = macro_mean(flicker), macro_mean(compensated), macro_mean(share)
+        digest = scene.digest(frame_indices(scene, work.config, [work.backbone]), work.backbone)
+    except Exception as error:  # noqa: BLE001 - a failing unit is reported, and the others continue
+        return failed([work], error)[0]
+    return Outcome(work.identity, UnitContent(digest, regions=RegionFlicker(work.scene, work.backbone, *means)))
+
+
+def _region_frames(scene: Scene, work: Work) -> Iterator[Frame]:
+    """The sampled frames with the regions' own ids."""
+    config = work.config
+
+    def decode(index: int) -> Frame:
+        frame = scene.frame(index, work.backbone, color=False)
+        if frame.labels is None:
+            raise DataError(f"{frame.where('scores')}: regions are label maps of ids, not scores")
+        frame = leave_out(frame, masks=config.exclude.masks)
+        if config.perturbation is not None:
+            frame = perturb(frame, config.perturbation, work.scene)
+        return frame.every(config.pixel_stride)
+
+    indices = frame_indices(scene, config, [work.backbone])
+    fetched = prefetch(decode, indices, threads=work.start.threads, size=lambda frame: frame.nbytes)
+    with contextlib.closing(fetched):
+        for each in fetched:
+            yield each.item
+
+
+def _compared(previous: Frame, current: Frame) -> tuple[float, float, float]:
+    """Flicker, compensated flicker (percent), and the co-visible share of two successive frames."""
+    before, now = previous.predicted, current.predicted
+    flicker = math.nan
+    if previous.shape == current.shape:
+        flicker = matched_region_flicker(before, now, previous.valid & current.valid).flicker_percent
+    seen = correspond(current, previous)
+    both = current.valid & seen.bring(previous.valid, fill=False)
+    compensated = matched_region_flicker(seen.bring(before), now, both).flicker_percent
+    valid = np.count_nonzero(current.valid)
+    return flicker, compensated, np.count_nonzero(both) / valid if valid else math.nan

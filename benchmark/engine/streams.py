@@ -1,0 +1,422 @@
+"""Live maps, and the frames that they share: preparation, flicker, ground truth and stability in image coordinates."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from semstab.backends import FusionBackend, create, takes_option
+from semstab.backends.numpy_reference import NumpySample
+from semstab.check.reprojection import evenly
+from semstab.config import Config
+from semstab.core.prefetch import Fetched
+from semstab.core.process import Stopwatch
+from semstab.core.rows import Rows
+from semstab.core.types import Float64
+from semstab.engine.observer import Observers
+from semstab.engine.series import FrameRow, Series
+from semstab.engine.tiles import FrameTiles
+from semstab.engine.work import Work
+from semstab.errors import DataError
+from semstab.metrics import FrameJudge, SelfConsistency, VideoConsistency, compensated_flicker, flicker_percent
+from semstab.model.frames import Frame
+from semstab.model.measures import mean
+from semstab.model.records import ImageSpace
+from semstab.model.results import FrameReport, SizeAlpha, Unit
+from semstab.model.voxels import VoxelTable
+from semstab.statistics import Sampler
+from semstab.statistics.agreement import alpha_columns, alpha_of
+from semstab.task import Task, prepare, tasks_of, truth_task
+
+WARM_UP_STRIDE = 8
+"""A backend is warmed up with every n-th pixel of each axis of the first frame."""
+
+POSE = 9
+"""Numbers of a row of poses: down, forward and centre of a camera."""
+
+POSES = 1 << 16
+"""Of more cameras every n-th counts for the up axis."""
+
+OVERVIEW_WIDTH = 1280
+"""Pixels of the frame that is kept for figures."""
+
+
+@dataclass(eq=False)
+class LiveMap:
+    """A work whose frames are being fused, and what goes with its map.
+
+    backend    None where nothing is fused
+    truth      takes the ground truth of the same frames
+    sampler, truth_sampler  take the sample of observations that statistics need
+    reference  follows a sample of its voxels, where it is checked so
+    sizes      some frames, to be fused at other voxel sizes
+    hard       of soft scores, a map of each pixel's likeliest class
+    frames     indices of those that go into it
+    tiles      which tiles each frame meets, where nothing is fused
+    """
+
+    work: Work
+    task: Task
+    backend: FusionBackend | None
+    truth: FusionBackend | None = None
+    sampler: Sampler | None = None
+    truth_sampler: Sampler | None = None
+    reference: NumpySample | None = None
+    sizes: SizeSample | None = None
+    hard: FusionBackend | None = None
+    rows: Series = field(default_factory=Series)
+    observations: int = 0
+    soft: bool = False
+    frames: range | frozenset[int] = range(0)
+    tiles: FrameTiles | None = None
+
+    @classmethod
+    def of(cls, work: Work, task: Task) -> LiveMap:
+        """An empty map for a work."""
+        task = dataclasses.replace(task, left_out=work.left_out)
+        config, K, backend = work.config, len(task.mapping.target), None
+        has_truth = config.statistics and truth_task(task) is not None
+        live = cls(work, task, backend, frames=_as_set(task.indices))
+        if work.fuses:
+            live.backend = new_map(config, K, work)
+            live.truth = _without_log(config, K, work) if has_truth else None
+        elif work.tile is not None:
+            live.tiles = FrameTiles(config.voxel_size, work.tile.size)
+        if work.judged and work.measures_images:
+            live.sampler = Sampler(config.voxel_size, K)
+            live.truth_sampler = Sampler(config.voxel_size, K) if has_truth else None
+        if work.sampled and work.fuses:
+            live.reference = NumpySample(config.voxel_size, K, work.within)
+        if work.image_space and work.judged and work.measures_images and not config.frame_quality:
+            live.sizes = SizeSample(task, config)  # filters share the sizes of what they are put over
+        return live
+
+    @property
+    def unit(self) -> Unit:
+        """Its scene, backbone and backend."""
+        return self.task.units[0]
+
+    def integrate(self, prepared: Prepared, watch: Stopwatch) -> FrameReport:
+        """Fuse a frame, and its ground truth, into the maps."""
+        frame, K = prepared.frame, len(self.task.mapping.target)
+        if self.backend is None:
+            return FrameReport(frame.index, points=0, voxels=0, new_voxels=0, drift_sum=0.0, seconds=0.0, map_voxels=0)
+        if not self.rows:
+            _warm_up(self.work.config, K, frame)
+        with watch(f"fuse {self.unit.backend}"):
+            report = self.backend.integrate(frame)
+        if self.reference is not None:
+            with watch("reference"):
+                self.reference.integrate(frame)
+        if frame.scores is not None and self.work.image_space:
+            with watch("reduced scores"):
+                self.hard = self.hard or _without_log(self.work.config, K, self.work)
+                self.hard.integrate(dataclasses.replace(frame, labels=frame.predicted, scores=None))
+        if self.truth is not None and prepared.truth is not None:
+            self.truth.integrate(prepared.truth)
+        self.observations += report.voxels
+        self.soft = self.soft or frame.scores is not None
+        return report
+
+    def sample(self, prepared: Prepared, watch: Stopwatch) -> None:
+        """Keep a sample of what the frame observes."""
+        with watch("sample"):
+            if self.sampler is not None:
+                self.sampler.add(prepared.frame)
+            if self.truth_sampler is not None and prepared.truth is not None:
+                self.truth_sampler.add(prepared.truth)
+        if self.sizes is not None:
+            with watch("voxel sizes"):
+                self.sizes.add(prepared.frame)
+        if self.tiles is not None:
+            self.tiles.add(prepared.frame)
+
+    def release(self) -> None:
+        """Let go of all that takes memory: the work is finished."""
+        self.backend = self.truth = self.hard = self.reference = None
+        self.sampler = self.truth_sampler = self.sizes = None
+
+    def table(self) -> VoxelTable:
+        """The voxels of its map."""
+        assert self.backend is not None
+        return dataclasses.replace(self.backend.table(), classes=self.task.mapping.target.classes)
+
+
+def new_map(config: Config, num_classes: int, work: Work | None = None) -> FusionBackend:
+    """An empty map; it keeps the history where that is to be written, or statistics are computed from it."""
+    (backend,) = config.backends
+    wanted = (config.events or config.statistics) and takes_option(backend.name, "history")
+    options = ({"history": True} if wanted else {}) | backend.options
+    within = None if work is None else work.within
+    return create(backend.name, voxel_size=config.voxel_size, num_classes=num_classes, within=within, **options)
+
+
+def _without_log(config: Config, num_classes: int, work: Work) -> FusionBackend:
+    return new_map(config.model_copy(update={"statistics": False, "events": False}), num_classes, work)
+
+
+_warm: set[tuple[str, str, int, bool]] = set()
+
+
+def _warm_up(config: Config, num_classes: int, frame: Frame) -> None:
+    """Let a backend load what it compiles, once a process: else the first frame would cost more than the others."""
+    (backend,) = config.backends
+    kind = (backend.name, json.dumps(backend.options), num_classes, frame.scores is None)
+    if kind not in _warm:
+        new_map(config, num_classes).integrate(frame.every(WARM_UP_STRIDE))
+        _warm.add(kind)
+
+
+# --- Frames -----------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class Decoded:
+    """A frame as its scene has it; or the error that came instead.
+
+    truth  its ground truth, where that is wanted; model  the model's frame before filters, where that is wanted
+    """
+
+    index: int
+    frame: Frame | None = None
+    truth: Frame | None = None
+    model: Frame | None = None
+    error: Exception | None = None
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes that it keeps in memory."""
+        return sum(frame.nbytes for frame in (self.frame, self.truth, self.model) if frame is not None)
+
+
+@dataclass(frozen=True, eq=False)
+class Prepared:
+    """A frame as maps fuse it: labels in the run's label space, without moving objects; and its ground truth."""
+
+    fetched: Fetched[Decoded]
+    frame: Frame
+    truth: Frame | None
+
+
+class Stream:
+    """Maps that fuse frames prepared alike: of one taxonomy, noise, pixel stride and selection of frames."""
+
+    def __init__(self, maps: Sequence[LiveMap], watch: Stopwatch, observers: Observers) -> None:
+        self.maps, self._watch, self._observers = list(maps), watch, observers
+        self.watched = [live for live in maps if live.work.watched]
+        self.task = dataclasses.replace(maps[0].task, backends=tuple(live.unit.backend for live in self.watched))
+        self.pixel_stride = maps[0].work.config.pixel_stride
+        self.frames = maps[0].frames if len(maps) == 1 else _as_set({index for live in maps for index in live.frames})
+        self._sequential = any(live.work.measures_images for live in maps)
+        self._previous: Frame | None = None
+        base = any(live.work.image_space and live.work.measures_images for live in maps)
+        self.image_space = ImageSpaceMeter() if base else None
+        quality = base and maps[0].work.config.frame_quality
+        self.quality = FrameJudge(len(self.task.mapping.target)) if quality else None
+        self.truth_task = truth_task(self.task) if base or maps[0].work.config.statistics else None
+        self._poses = Rows(POSE) if base and self.task.scene.up is None else None
+        self.shown = self.task.indices[len(self.task.indices) // 2] if base else None
+        self.overview: dict[str, Any] = {}
+
+    @property
+    def poses(self) -> Float64:
+        """(F, 3, 3) down, forward and centre of cameras in the world; of none where up need not be estimated."""
+        return np.zeros((0, 3, 3)) if self._poses is None else some_poses(self._poses)
+
+    def prepare(self, fetched: Fetched[Decoded]) -> Prepared:
+        """The frame as the stream's maps fuse it, with its colour only where an observer wants it."""
+        decoded = fetched.item
+        if decoded.error is not None:
+            raise decoded.error
+        assert decoded.frame is not None
+        frame, truth = prepare(self.task, decoded.frame, self.pixel_stride), None
+        if self.truth_task is not None and decoded.truth is not None:
+            truth = prepare(self.truth_task, decoded.truth, self.pixel_stride)
+        if decoded.index == self.shown:
+            self.overview = _overview(self.task, decoded.frame)
+            frame = frame if self._observers.want_color else dataclasses.replace(frame, color=None)
+        return Prepared(fetched, frame, truth)
+
+    def measure(self, now: Prepared, reports: Mapping[LiveMap, FrameReport]) -> dict[LiveMap, FrameRow]:
+        """Flicker and stability in image coordinates, beside the reports of the maps: a row of each series."""
+        frame, decoded, flicker = now.frame, now.fetched.item, math.nan
+        with self._watch("flicker") as lap:
+            if self._sequential and self._previous is not None and self._previous.shape == frame.shape:
+                flicker = flicker_percent(self._previous, frame)
+        if self.image_space is not None:
+            with self._watch("image space"):
+                self.image_space.add(frame, now.truth)
+        if self.quality is not None:
+            with self._watch("frame quality"):
+                model = frame if decoded.model is None else prepare(self.task, decoded.model, self.pixel_stride)
+                self.quality.add(frame, model, now.truth)
+        if self._poses is not None:
+            self._poses.append(frame.T_wc[:3, 1:].ravel())
+        self._previous = frame if self._sequential else None
+        cut = frame.scores_left_out
+        seconds = now.fetched.seconds, now.fetched.waited, lap.seconds
+        of_frame: dict[str, Any] = {
+            "left_out": frame.left_out_pixels,
+            "scores_left_out": math.nan if cut is None else cut.mean,
+            "most_scores_left_out": math.nan if cut is None else cut.most,
+        }
+        return {live: FrameRow(own, frame.timestamp, flicker, *seconds, **of_frame) for live, own in reports.items()}
+
+    def notify(self, now: Prepared, rows: Mapping[LiveMap, FrameRow]) -> None:
+        """Show the frame to observers, and append each row to the series of its map."""
+        lap = None
+        if watched := {live.unit: row for live, row in rows.items() if live.work.watched}:
+            with self._watch("observe") as lap:
+                self._observers.tell(lambda observer: observer.frame_fused(self.task, now.frame, watched))
+        for live, row in rows.items():
+            logged = lap is not None and live.work.watched
+            seconds = lap.seconds / len(watched) if logged and lap is not None else math.nan
+            live.rows.append(dataclasses.replace(row, logging_seconds=seconds))
+            if live.work.tile is None:
+                unit = live.unit
+                what = f"{unit.scene} · {unit.backbone} · {unit.backend}"
+                self._observers.tell(lambda observer, what=what: observer.advanced(1, what))  # type: ignore[misc]
+
+
+def streams_of(maps: Iterable[LiveMap], watch: Stopwatch, observers: Observers) -> list[Stream]:
+    """The maps by what they share of each frame; tiles share frames though each fuses those that see it."""
+    groups: dict[Any, list[LiveMap]] = {}
+    for live in maps:
+        config = live.work.config
+        same = (config.taxonomy, config.exclude, config.perturbation, config.pixel_stride, config.top_k)
+        frames = None if live.work.within is not None else live.frames
+        groups.setdefault((*same, frames), []).append(live)
+    return [Stream(group, watch, observers) for group in groups.values()]
+
+
+def in_order(streams: Iterable[Stream]) -> Sequence[int]:
+    """The frames of all of them."""
+    first, *others = {stream.frames for stream in streams} or {range(0)}
+    return first if isinstance(first, range) and not others else sorted({*first}.union(*others))
+
+
+def some_poses(rows: Rows) -> Float64:
+    """(F, 3, 3) of each row, or of every n-th where there are more than are needed to tell the up axis."""
+    return rows.table(step=max(1, -(-len(rows) // POSES))).reshape(-1, 3, 3)
+
+
+def live_maps(works: Iterable[Work], scene: Any, failing: Callable[[Sequence[Work]], Any]) -> Iterator[LiveMap]:
+    """Empty maps for works; none for one that fails."""
+    for work in works:
+        with failing([work]):
+            (task,) = tasks_of(scene, work.config)
+            yield LiveMap.of(work, task)
+
+
+def _as_set(frames: Iterable[int]) -> range | frozenset[int]:
+    return frames if isinstance(frames, range) else frozenset(frames)
+
+
+def _overview(task: Task, decoded: Frame) -> dict[str, Any]:
+    """Arrays of a frame that figures show, no wider than OVERVIEW_WIDTH."""
+    frame = prepare(task, decoded, -(-decoded.shape[1] // OVERVIEW_WIDTH))
+    palette = np.array(task.mapping.target.colors, dtype=np.uint8)
+    arrays: dict[str, Any] = {"frame": frame.index, "labels": frame.predicted, "palette": palette}
+    return arrays if frame.color is None else arrays | {"color": frame.color}
+
+
+# --- Stability in image coordinates -----------------------------------------------------------------------------------
+
+CLIPS = (8, 16)
+"""Frames a clip, as VSPW reports."""
+
+COLUMNS = ("compensated_flicker_percent", "compensated_share", "vc8", "vc16", "self_vc8", "self_vc16")
+"""Numbers of a frame and those before it, by the name of their mean over all frames."""
+
+SIDE = 640
+"""Pixels of the longer side from which on every n-th pixel of each axis is measured, so that fusion does not wait."""
+
+
+class ImageSpaceMeter:
+    """Takes the sampled frames of a unit in order; only the last one stays in memory. rows has COLUMNS of each."""
+
+    def __init__(self, rows: Rows | None = None) -> None:
+        self.rows = Rows(len(COLUMNS)) if rows is None else rows
+        self._previous: Frame | None = None
+        self._by_truth = [VideoConsistency(n) for n in CLIPS]
+        self._by_itself = [SelfConsistency(n) for n in CLIPS]
+
+    def add(self, frame: Frame, truth: Frame | None) -> None:
+        """Add the next frame, with its ground truth in the same label space where there is any."""
+        step = -(-max(frame.shape) // SIDE)
+        sample, true = frame.every(step), None if truth is None else truth.every(step)
+        flicker, share = math.nan, math.nan
+        if self._previous is not None:  # each pixel of the sample is looked up in the whole frame before
+            pair = compensated_flicker(self._previous, sample)
+            flicker, share = pair.flicker_percent, pair.share
+        by_itself = [each.add(sample.predicted, sample.valid) for each in self._by_itself]
+        by_truth = [
+            each.skip() if true is None else each.add(sample.predicted, sample.valid & true.valid, true.predicted)
+            for each in self._by_truth
+        ]
+        self.rows.append((flicker, share, *by_truth, *by_itself))
+        self._previous = frame
+
+    def result(self, flicker_percent: float) -> ImageSpace:
+        """Means over the frames so far, beside the flicker of the unit's summary."""
+        return ImageSpace(flicker_percent, **{name: mean(self.rows.column(k)) for k, name in enumerate(COLUMNS)})
+
+
+# --- A few frames at other voxel sizes --------------------------------------------------------------------------------
+
+FACTORS = (0.5, 1.0, 2.0)
+
+SIZE_FRAMES, SIZE_PIXELS = 16, 2**16
+"""At most so many frames, evenly spaced, are fused once more at each voxel size, and about so many pixels of each."""
+
+
+class SizeSample:
+    """Some pixels of some of a task's frames, from which alpha follows at half, once and twice the voxel size."""
+
+    def __init__(self, task: Task, config: Config) -> None:
+        self._indices = frozenset(task.indices[k] for k in evenly(len(task.indices), SIZE_FRAMES))
+        self._K, self._voxel_size = len(task.mapping.target), config.voxel_size
+        self._frames: list[Frame] = []
+
+    def add(self, frame: Frame) -> None:
+        """Keep some pixels of the frame, if it is one of them."""
+        if frame.index in self._indices:
+            H, W = frame.shape
+            some = frame.every(max(1, round(math.sqrt(H * W / SIZE_PIXELS))))
+            images = {name: getattr(some, name) for name in ("depth", "labels", "scores")}
+            own = {name: None if image is None else image.copy() for name, image in images.items()}  # not the whole one
+            self._frames.append(dataclasses.replace(some, color=None, mask=None, left_out=None, **own))
+
+    def alphas(self) -> tuple[SizeAlpha, ...]:
+        """Krippendorff's alpha at each voxel size; none where the scene is larger than a map of the smallest."""
+        soft = any(frame.scores is not None for frame in self._frames)
+        frames = [_one_hot(frame, self._K) if soft and frame.scores is None else frame for frame in self._frames]
+        try:
+            return tuple(self._at(factor * self._voxel_size, frames) for factor in FACTORS) if frames else ()
+        except DataError:
+            return ()
+
+    def _at(self, voxel_size: float, frames: Sequence[Frame]) -> SizeAlpha:
+        backend = create("numba", voxel_size=voxel_size, num_classes=self._K)
+        for frame in frames:
+            backend.integrate(frame)
+        return SizeAlpha(voxel_size, len(self._indices), alpha_of_table(backend.table()))
+
+
+def alpha_of_table(table: VoxelTable) -> float:
+    """Krippendorff's alpha of a map."""
+    sums = (alpha_columns(table.rows(some)).sum(axis=0) for some in table.evidence.chunks())
+    return float(alpha_of(sum(sums, np.zeros(3 + table.K))))
+
+
+def _one_hot(frame: Frame, K: int) -> Frame:
+    assert frame.labels is not None
+    labels = np.where(frame.valid, frame.labels, 0)
+    scores = np.eye(K, dtype=np.float32)[labels]
+    return dataclasses.replace(frame, labels=None, scores=scores, depth=np.where(frame.valid, frame.depth, 0))

@@ -1,0 +1,194 @@
+"""A map in tiles: which frames see which tile, the result of each, and a time series of all of them."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from semstab.core.files import parse_json, read_arrays, write_arrays
+from semstab.core.json_form import from_json, to_json
+from semstab.core.rows import Rows
+from semstab.core.types import Float64, Int32
+from semstab.engine.series import NUMBERS, Series
+from semstab.errors import DataError
+from semstab.model.frames import Frame
+from semstab.model.records import FrameQuality
+from semstab.model.results import Agreement, SizeAlpha
+
+OBSERVATIONS, TRUE_OBSERVATIONS = "observations.parquet", "true_observations.parquet"
+"""Files of the sample of observations of all frames, and of their ground truth."""
+
+MOST_TILES = 1 << 16
+"""Tiles that one frame may meet."""
+
+MARGIN = 1.0
+"""Voxels by which a frustum is widened: a pixel at its side may be rounded into the next voxel."""
+
+
+class FrameTiles:
+    """Notes which tiles the frustum of each frame meets, from its pose and the range of its depth."""
+
+    def __init__(self, voxel_size: float, size: int) -> None:
+        self._voxel_size, self._size = voxel_size, size
+        self._origin: tuple[int, int, int] | None = None
+        self._seen: list[Int32] = []
+
+    def add(self, frame: Frame) -> None:
+        """The next frame. Raises DataError where it meets more tiles than a map can have."""
+        if self._origin is None:
+            x, y, z = np.floor(frame.T_wc[:3, 3] / self._voxel_size).astype(int).tolist()
+            self._origin = x, y, z
+        tiles = tiles_met(frame, self._voxel_size, self._size)
+        self._seen.append(np.column_stack([np.full(len(tiles), frame.index, np.int32), tiles]))
+
+    def result(self) -> dict[str, Any]:
+        """The fields of a `TileResult`."""
+        return {"origin": self._origin, "seen": np.concatenate([np.zeros((0, 3), np.int32), *self._seen])}
+
+
+def tiles_met(frame: Frame, voxel_size: float, size: int) -> Int32:
+    """(n, 2) the tiles of that edge in voxels that the frustum between the least and the largest depth meets.
+
+    A tile is left out where a line separates it from the corners of the frustum, seen from above. None is left out that
+    a pixel falls into. Raises DataError where there are too many.
+    """
+    depth = frame.depth[(frame.depth > 0) & np.isfinite(frame.depth)]
+    if not depth.size:
+        return np.zeros((0, 2), np.int32)
+    (H, W), camera = frame.shape, frame.intrinsics
+    u, v, d = np.meshgrid([0, W - 1], [0, H - 1], [depth.min(), depth.max()])
+    x, y = (u - camera.cx) / camera.fx * d, (v - camera.cy) / camera.fy * d
+    rays = np.stack([x, y, d], axis=-1, dtype=np.float64).reshape(-1, 3)
+    corners = ((rays @ frame.T_wc[:3, :3].T + frame.T_wc[:3, 3]) / voxel_size)[:, :2]
+    low, high = (np.floor((edge + side) / size) for edge, side in _ranges(corners))
+    if (count := float(np.prod(high - low + 1))) > MOST_TILES:
+        raise DataError(
+            f"{frame.where('depth')}: up to {depth.max():g} m deep, it sees {count:.0f} tiles of"
+            f" {size * voxel_size:g} m; mask such depth, or use a larger --tile-size"
+        )
+    columns, rows = (np.arange(a, b + 1) for a, b in zip(low, high, strict=True))
+    tiles = np.stack(np.meshgrid(columns, rows, indexing="ij"), axis=-1).reshape(-1, 2)
+    a, b = np.triu_indices(len(corners), 1)
+    normal = (corners[a] - corners[b])[:, ::-1] * [1, -1]  # of each line through two corners: the hull's are among them
+    reach = size / 2 * np.abs(normal).sum(axis=1) + MARGIN * np.linalg.norm(normal, axis=1)
+    centre, along = (tiles + 0.5) * size @ normal.T, corners @ normal.T
+    apart = (centre + reach < along.min(axis=0)) | (centre - reach > along.max(axis=0))
+    return tiles[~apart.any(axis=1)].astype(np.int32)
+
+
+def _ranges(corners: Float64) -> tuple[tuple[Float64, float], tuple[Float64, float]]:
+    return (corners.min(axis=0), -MARGIN), (corners.max(axis=0), MARGIN)
+
+
+@dataclass(frozen=True, eq=False)
+class TileResult:
+    """The result of one tile, or of the pass over all frames, kept until the whole unit is there.
+
+    files    digests of its files, by their path in the folder
+    series   (F, C) NUMBERS of each frame
+    sums     of its voxels, by name, as `TableSums` has them
+    reduced  sums of the map of labels that soft scores were reduced to; empty where there are none
+    checked  how far it agrees with the reference on a sample of its voxels
+    image    (F, C) stability of each frame in image coordinates, poses (F, 3, 3) of the cameras: of all frames
+    origin   voxel of the first camera, seen (m, 3) a frame and a tile that it meets, ascending by frame
+    """
+
+    files: Mapping[str, str]
+    series: Float64
+    voxels: int = 0
+    sums: Mapping[str, Float64] = field(default_factory=dict)
+    reduced: Float64 = field(default_factory=lambda: np.zeros(0))
+    checked: Agreement | None = None
+    sizes: tuple[SizeAlpha, ...] = ()
+    quality: FrameQuality | None = None
+    image: Float64 = field(default_factory=lambda: np.zeros((0, 0)))
+    poses: Float64 = field(default_factory=lambda: np.zeros((0, 3, 3)))
+    origin: tuple[int, int, int] | None = None
+    seen: Int32 = field(default_factory=lambda: np.zeros((0, 3), np.int32))
+
+    def save(self, path: Path) -> None:
+        """Write it, atomically."""
+        about = to_json(TileMeta(self.files, self.voxels, self.checked, self.sizes, self.quality, self.origin))
+        arrays: dict[str, Any] = {name: getattr(self, name) for name in ARRAYS}
+        arrays |= {f"sums {name}": value for name, value in self.sums.items()}
+        write_arrays(path, {"about": np.frombuffer(json.dumps(about).encode(), np.uint8), **arrays})
+
+    @classmethod
+    def load(cls, path: Path) -> TileResult | None:
+        """Read the file that `save` wrote; None where there is none, or it is damaged or of another version."""
+        arrays = read_arrays(path)
+        if arrays is None or not {"about", *ARRAYS} <= arrays.keys() or arrays["series"].shape[1:] != (len(NUMBERS),):
+            return None
+        try:
+            about = from_json(TileMeta, parse_json(arrays["about"].tobytes()), path)
+        except (DataError, ValueError):
+            return None
+        sums = {name[5:]: array for name, array in arrays.items() if name.startswith("sums ")}
+        own: dict[str, Any] = {name: arrays[name] for name in ARRAYS}
+        return cls(**own, **vars(about), sums=sums)
+
+    def tiles(self) -> dict[tuple[int, int], list[int]]:
+        """The frames that meet each tile, in order, by its place."""
+        found: dict[tuple[int, int], list[int]] = {}
+        for index, x, y in self.seen.tolist():
+            found.setdefault((x, y), []).append(index)
+        return dict(sorted(found.items()))
+
+
+@dataclass(frozen=True)
+class TileMeta:
+    """The fields of a result that are no arrays."""
+
+    files: Mapping[str, str]
+    voxels: int
+    checked: Agreement | None
+    sizes: tuple[SizeAlpha, ...]
+    quality: FrameQuality | None
+    origin: tuple[int, int, int] | None
+
+
+ARRAYS = ("series", "reduced", "image", "poses", "seen")
+"""The fields that are arrays, beside the sums."""
+
+# --- The time series of a unit in tiles -------------------------------------------------------------------------------
+
+SUMS = ("points", "voxels", "new_voxels", "drift_sum", "seconds")
+
+SECONDS = ("association_seconds", "update_seconds")
+"""Not known of a frame that no tile fused."""
+
+MEANS = ("map_vss", "map_entropy", "map_recurrent")
+
+
+def joined_series(frames: Float64, tiles: Sequence[Float64]) -> Series:
+    """The time series of a unit, from the rows of NUMBERS of its frames, and those of each tile of its map."""
+    column, rows = {name: k for k, name in enumerate(NUMBERS)}, frames.copy()
+    frame = rows[:, column["frame"]]
+    totals = {name: np.zeros(len(rows)) for name in MEANS}
+    voxels = np.zeros(len(rows))
+    for tile in tiles:
+        own = tile[:, column["frame"]]
+        at = np.searchsorted(frame, own)
+        for name in (*SUMS, *SECONDS):
+            before = rows[at, column[name]]
+            rows[at, column[name]] = (np.nan_to_num(before) if name in SECONDS else before) + tile[:, column[name]]
+        so_far = tile[:, column["map_voxels"]]
+        voxels += _latest(frame, own, so_far)
+        for name in MEANS:
+            totals[name] += _latest(frame, own, np.where(so_far > 0, so_far * tile[:, column[name]], 0.0))
+    rows[:, column["map_voxels"]] = voxels
+    for name in MEANS:
+        rows[:, column[name]] = totals[name] / np.where(voxels > 0, voxels, math.nan)
+    return Series(Rows(len(NUMBERS), rows))
+
+
+def _latest(frame: Float64, own: Float64, values: Float64) -> Float64:
+    """(F,) the value of the last of its own frames at each frame, 0 before them."""
+    latest: Float64 = np.concatenate([np.zeros(1), values])[np.searchsorted(own, frame, side="right")]
+    return latest

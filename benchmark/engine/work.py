@@ -1,0 +1,216 @@
+"""What is sent to a worker, and what comes back: small enough for another machine."""
+
+from __future__ import annotations
+
+import traceback
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+from semstab.config import Config, FrameSelection, as_range
+from semstab.core.files import TEMPORARY
+from semstab.engine.units import Planned, PlannedUnit
+from semstab.errors import OUT_OF_MEMORY, OutgrownError, SemstabError, one_line
+from semstab.model.records import UnitContent
+from semstab.model.voxels import Extent, VoxelTable
+
+TILES = "tiles"
+"""Folder of the results of single tiles, unit by unit, until the unit is whole."""
+
+FRAMES = "frames"
+"""Name of the pass over the frames of a unit in tiles that fuses nothing."""
+
+
+@dataclass(frozen=True)
+class Start:
+    """What all works of one start of a run share.
+
+    name          by which a worker opens the dataset once, and knows the folder
+    folder        of the run or study
+    threads       that decode frames ahead; 0: each when it is wanted, None: as many as the machine has for it
+    memory_bytes  that maps of a pass may take before some are put off to another pass; None: half of what is free
+    width         processes that share the machine's memory
+    """
+
+    name: str
+    folder: Path
+    threads: int | None = None
+    memory_bytes: float | None = None
+    width: int = 1
+
+    @property
+    def marker(self) -> Path:
+        """The file by which a worker knows that it sees the folder itself, not one of the same name elsewhere."""
+        return self.folder / f"{TEMPORARY}{self.name}"
+
+
+@dataclass(frozen=True)
+class TileTask:
+    """One tile of the map of a unit; without a place, the pass over all frames that fuses nothing.
+
+    key     of the unit, under which results are kept
+    size    voxels along the edge of a tile
+    place   (x, y) of the tile: ix // size, iy // size
+    origin  voxel of the first camera, where it is known
+    bound   highest hash in the sample of the tiles before, where that is full: no voxel above it will be in the map's
+    """
+
+    key: str
+    size: int
+    place: tuple[int, int] | None = None
+    origin: tuple[int, int, int] | None = None
+    bound: int | None = field(default=None, compare=False)
+
+    @property
+    def name(self) -> str:
+        """Of its result."""
+        return f"{self.size}_{FRAMES}" if self.place is None else f"{self.size}_{self.place[0]}_{self.place[1]}"
+
+    @property
+    def folder(self) -> str:
+        """Of the results of the unit, in the folder of the run."""
+        return f"{TILES}/{self.key}"
+
+    @property
+    def extent(self) -> Extent | None:
+        """The voxels of the tile."""
+        if self.place is None:
+            return None
+        low = (self.place[0] * self.size, self.place[1] * self.size)
+        return Extent(low, (low[0] + self.size, low[1] + self.size), self.origin)
+
+
+@dataclass(frozen=True)
+class Work:
+    """A unit to compute, or a tile of one, and what is wanted of it; see `semstab.engine.units.PlannedUnit`.
+
+    config    with its frames one by one: those of its sequence that all label sources of the plan have
+    left_out  how many selected frames lack a file or a pose
+    regions   whether it is the flicker of regions without classes, and nothing is fused
+    tile      of a unit in tiles; None for all of a unit
+    """
+
+    start: Start
+    scene: str
+    backbone: str
+    identity: str
+    config: Config
+    image_space: bool = False
+    kept: bool = False
+    judged: bool = True
+    sampled: bool = False
+    left_out: int = 0
+    regions: bool = False
+    tile: TileTask | None = None
+
+    @classmethod
+    def of(cls, planned: Planned, start: Start) -> Work:
+        """The whole of a planned unit."""
+        unit = planned.unit
+        if not isinstance(planned, PlannedUnit):
+            return cls(start, unit.scene, unit.backbone, planned.identity, planned.config, regions=True)
+        config = planned.config.model_copy(update={"frames": FrameSelection.of(planned.task.indices)})
+        wanted = (planned.image_space, planned.kept, planned.judged, planned.sampled)
+        return cls(start, unit.scene, unit.backbone, planned.identity, config, *wanted, planned.task.left_out)
+
+    def in_tile(self, tile: TileTask, frames: Sequence[int] | None = None) -> Work:
+        """The same of one tile and these frames alone."""
+        if frames is None:
+            return replace(self, tile=tile)
+        config = self.config.model_copy(update={"frames": FrameSelection.of(as_range(frames))})
+        return replace(self, config=config, tile=tile)
+
+    @property
+    def fuses(self) -> bool:
+        """Whether there is a map."""
+        return self.tile is None or self.tile.place is not None
+
+    @property
+    def watched(self) -> bool:
+        """Whether observers see its frames and its map: it is kept, and fused whole."""
+        return self.kept and self.tile is None
+
+    @property
+    def measures_images(self) -> bool:
+        """Whether it takes the frames in sequence, to measure them in image coordinates."""
+        return self.tile is None or self.tile.place is None
+
+    @property
+    def within(self) -> Extent | None:
+        """The voxels that its map is restricted to."""
+        return None if self.tile is None else self.tile.extent
+
+
+Job = tuple[Work, ...]
+"""Works that read the same sequence, in one pass over its frames if the memory allows."""
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What became of a work: what its file holds, or the one line that says why there is none.
+
+    tile     name of the tile that was computed, or could not be
+    files    further files by their path in the folder, where the worker does not see that folder
+    cause    the exception, where the work failed in this very process; trace where it was raised
+    table    the voxels of a unit that observers watch, where it was fused in this process
+    seconds  that its pass took, by stage; of the last outcome of a pass only
+    """
+
+    identity: str
+    content: UnitContent | None = None
+    tile: str | None = None
+    error: str | None = None
+    files: Mapping[str, bytes] = field(default_factory=dict)
+    cause: BaseException | None = field(default=None, compare=False)
+    trace: str = ""
+    table: VoxelTable | None = field(default=None, compare=False)
+    seconds: Mapping[str, float] = field(default_factory=dict)
+
+    def __getstate__(self) -> dict[str, object]:
+        """Without the exception, which may not travel, and the voxels, which are in the folder."""
+        return {**self.__dict__, "cause": None, "table": None}
+
+
+def failed(works: Iterable[Work], error: str | Exception) -> list[Outcome]:
+    """The outcomes of works that could not be computed."""
+    if isinstance(error, str):
+        return [Outcome(work.identity, tile=work.tile and work.tile.name, error=error) for work in works]
+    trace = "" if isinstance(error, SemstabError) else "".join(traceback.format_exception(error))
+    if isinstance(error, (OutgrownError, MemoryError)):
+        error = error.with_traceback(None)  # its frames would keep the map in memory
+    line = message(error)
+    return [
+        Outcome(work.identity, tile=work.tile and work.tile.name, error=line, cause=error, trace=trace)
+        for work in works
+    ]
+
+
+def message(error: Exception) -> str:
+    """One line; an error that is not semstab's own says its type."""
+    if isinstance(error, MemoryError):
+        return OUT_OF_MEMORY
+    return str(error) if isinstance(error, SemstabError) else f"{type(error).__name__}: {one_line(error)}"
+
+
+def jobs_of(works: Iterable[Work], width: int) -> list[Job]:
+    """Works by the sequence that they read, in as many jobs as can run at once: the largest ones are halved.
+
+    Works that observers watch stay together: they are shown a frame once it went into all of these maps.
+    """
+    sequences: dict[tuple[str, str], list[Work]] = {}
+    for work in works:
+        sequences.setdefault((work.scene, work.backbone), []).append(work)
+    jobs: list[Job] = [tuple(sequence) for sequence in sequences.values()]
+    while len(jobs) < width:
+        divisible = [k for k, job in enumerate(jobs) if all(_halves(job))]
+        if not divisible:
+            break
+        k = max(divisible, key=lambda k: len(jobs[k]))
+        jobs[k : k + 1] = _halves(jobs[k])
+    return jobs
+
+
+def _halves(job: Job) -> tuple[Job, Job]:
+    ordered = sorted(job, key=lambda work: not work.watched)
+    half = max(sum(work.watched for work in job), len(job) // 2)
+    return tuple(ordered[:half]), tuple(ordered[half:])
