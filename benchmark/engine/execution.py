@@ -23,7 +23,7 @@ from semstab.engine.passes import share_open_scenes
 from semstab.engine.results import UnitResults, advice_of, manifest, result_of
 from semstab.engine.tiled_units import TiledUnit
 from semstab.engine.units import Plan, Planned, PlannedUnit, make_plan
-from semstab.engine.work import Job, Outcome, Work, jobs_of
+from semstab.engine.work import Job, Outcome, Start, Work, jobs_of
 from semstab.errors import ConfigError, DataError
 from semstab.model.records import Result
 from semstab.model.results import VoxelAdvice
@@ -119,9 +119,8 @@ def _compute(plan: Plan, folder: Folder, executor: Executor, observers: Observer
         with units.watch("check"):
             _check_geometry(plan.config, missing, units, observers)
     with folder.started(plan.config) as start, share_open_scenes(start.name, plan.scenes):
-        queue, tiled = deque[Job](), dict[str, TiledUnit]()
-        whole = _begin(plan.config, missing, executor, units, observers, tiled, folder, start)
-        queue.extend(jobs_of(whole, executor.width))
+        whole, tiled = _begin(plan.config, missing, folder, units, executor, observers, start)
+        queue = deque(jobs_of(whole, executor.width))
         ended = [outcome for unit in tiled.values() if (outcome := unit.ended()) is not None]
 
         def next_job() -> Job | None:
@@ -139,24 +138,32 @@ def _compute(plan: Plan, folder: Folder, executor: Executor, observers: Observer
     return units
 
 
-def _begin(config, missing, executor, units, observers, tiled, folder, start) -> list[Work]:  # type: ignore[no-untyped-def]
-    """Works of the units that are fused whole; those that do not fit are fused in tiles, or fail."""
+def _begin(
+    config: Config,
+    missing: Sequence[Planned],
+    folder: Folder,
+    units: UnitResults,
+    executor: Executor,
+    observers: Observers,
+    start: Start,
+) -> tuple[list[Work], dict[str, TiledUnit]]:
+    """Works of the units that are fused whole, and the units in tiles; those that cannot be fused fail."""
     with units.watch("sizing"):
         sizing = planned_sizes(config, missing, executor.width)
         give_back()
     for line in sizing.lines:
         logger.warning("%s", line)
-    whole = []
+    whole, tiled = list[Work](), dict[str, TiledUnit]()
     for each in missing:
         if (error := sizing.refused.get(each.identity)) is not None:
             _keep(
                 each, Outcome(each.identity, error=error, cause=ConfigError(error)), folder, units, executor, observers
             )
-        elif (size := sizing.tile_sizes.get(each.identity)) is not None:
+        elif isinstance(each, PlannedUnit) and (size := sizing.tile_sizes.get(each.identity)) is not None:
             tiled[each.identity] = TiledUnit(each, size, folder, start)
         else:
             whole.append(Work.of(each, start))
-    return whole
+    return whole, tiled
 
 
 def _take_tile(unit: TiledUnit, outcome: Outcome, units: UnitResults, observers: Observers) -> Outcome | None:

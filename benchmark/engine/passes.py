@@ -7,13 +7,12 @@ import functools
 import itertools
 import json
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Generator, Iterator, Mapping, Sequence
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 
-from semstab.core.prefetch import prefetch
+from semstab.core.prefetch import Fetched, prefetch
 from semstab.core.process import Stopwatch, available_bytes, resident_bytes
 from semstab.datasets import GROUND_TRUTH, Dataset, Scene, open_dataset
 from semstab.engine.finish import finish, finish_tile
@@ -99,7 +98,7 @@ class Fusion:
                 task, config = stream.task, watched[0].work.config
                 self._observers.tell(lambda observer: observer.group_started(task, config, backends))  # noqa: B023
 
-    def decoded_frames(self) -> Iterator[Any]:
+    def decoded_frames(self) -> Generator[Fetched[Decoded], None, None]:
         """Frames in order, decoded ahead by threads."""
         fetched = prefetch(self._decode, self.order, threads=self._start.threads, size=lambda each: each.nbytes)
         with contextlib.closing(fetched):

@@ -390,7 +390,9 @@ class SizeSample:
             H, W = frame.shape
             some = frame.every(max(1, round(math.sqrt(H * W / SIZE_PIXELS))))
             images = {name: getattr(some, name) for name in ("depth", "labels", "scores")}
-            own = {name: None if image is None else image.copy() for name, image in images.items()}  # not the whole one
+            own: dict[str, Any] = {
+                name: None if image is None else image.copy() for name, image in images.items()
+            }  # not the whole one
             self._frames.append(dataclasses.replace(some, color=None, mask=None, left_out=None, **own))
 
     def alphas(self) -> tuple[SizeAlpha, ...]:

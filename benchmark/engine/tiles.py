@@ -79,7 +79,8 @@ def tiles_met(frame: Frame, voxel_size: float, size: int) -> Int32:
     reach = size / 2 * np.abs(normal).sum(axis=1) + MARGIN * np.linalg.norm(normal, axis=1)
     centre, along = (tiles + 0.5) * size @ normal.T, corners @ normal.T
     apart = (centre + reach < along.min(axis=0)) | (centre - reach > along.max(axis=0))
-    return tiles[~apart.any(axis=1)].astype(np.int32)
+    met: Int32 = tiles[~apart.any(axis=1)].astype(np.int32)
+    return met
 
 
 def _ranges(corners: Float64) -> tuple[tuple[Float64, float], tuple[Float64, float]]:

@@ -136,6 +136,11 @@ class Work:
         return self.tile is None or self.tile.place is None
 
     @property
+    def tile_name(self) -> str | None:
+        """The name of its tile; None of a whole unit."""
+        return None if self.tile is None else self.tile.name
+
+    @property
     def within(self) -> Extent | None:
         """The voxels that its map is restricted to."""
         return None if self.tile is None else self.tile.extent
@@ -174,15 +179,12 @@ class Outcome:
 def failed(works: Iterable[Work], error: str | Exception) -> list[Outcome]:
     """The outcomes of works that could not be computed."""
     if isinstance(error, str):
-        return [Outcome(work.identity, tile=work.tile and work.tile.name, error=error) for work in works]
+        return [Outcome(work.identity, tile=work.tile_name, error=error) for work in works]
     trace = "" if isinstance(error, SemstabError) else "".join(traceback.format_exception(error))
     if isinstance(error, (OutgrownError, MemoryError)):
         error = error.with_traceback(None)  # its frames would keep the map in memory
     line = message(error)
-    return [
-        Outcome(work.identity, tile=work.tile and work.tile.name, error=line, cause=error, trace=trace)
-        for work in works
-    ]
+    return [Outcome(work.identity, tile=work.tile_name, error=line, cause=error, trace=trace) for work in works]
 
 
 def message(error: Exception) -> str:
