@@ -24,7 +24,7 @@ from semstab.engine.series import FrameRow, Series
 from semstab.engine.tiles import FrameTiles
 from semstab.engine.work import Work
 from semstab.errors import DataError
-from semstab.metrics import FrameJudge, SelfConsistency, VideoConsistency, compensated_flicker, flicker_percent
+from semstab.metrics import FrameQualityMeter, SelfConsistency, VideoConsistency, compensated_flicker, flicker_percent
 from semstab.model.frames import Frame
 from semstab.model.measures import mean
 from semstab.model.records import ImageSpace
@@ -218,7 +218,7 @@ class Stream:
         base = any(live.work.image_space and live.work.measures_images for live in maps)
         self.image_space = ImageSpaceMeter() if base else None
         quality = base and maps[0].work.config.frame_quality
-        self.quality = FrameJudge(len(self.task.mapping.target)) if quality else None
+        self.quality = FrameQualityMeter(len(self.task.mapping.target)) if quality else None
         self.truth_task = truth_task(self.task) if base or maps[0].work.config.statistics else None
         self._poses = Rows(POSE) if base and self.task.scene.up is None else None
         self.shown = self.task.indices[len(self.task.indices) // 2] if base else None

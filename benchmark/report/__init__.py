@@ -14,7 +14,6 @@ from typing import TYPE_CHECKING, Any
 
 from semstab.core.files import write_text
 from semstab.engine.observer import Observer
-from semstab.engine.units import PlannedUnit
 from semstab.model.records import Failure, Result, UnitContent
 from semstab.model.results import slug
 from semstab.report import figures

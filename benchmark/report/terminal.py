@@ -108,18 +108,18 @@ def _verdict(run: UnitSummary) -> Iterator[str]:
     """The level, the number that it rests on, and what that number means."""
     found = run.statistics
     assert found is not None
-    level, alpha = found.verdict.level.upper(), found.judged.alpha_between
+    level, alpha = found.verdict.level.upper(), found.headline.alpha_between
     if found.verdict.level == "no verdict":
         yield from textwrap.wrap(found.verdict.line, WIDTH, initial_indent="  ", subsequent_indent="    ")
         return
     share = ""
-    if found.reach is not None and not math.isnan(found.reach.reached.value):
-        share = f", {_percent(found.reach.reached.value)} of its ceiling {found.reach.ceiling.value:.2f}"
+    if found.ceiling_share is not None and not math.isnan(found.ceiling_share.share.value):
+        share = f", {_percent(found.ceiling_share.share.value)} of its ceiling {found.ceiling_share.ceiling.value:.2f}"
     yield f"  {level}    alpha {alpha.value:.2f}{_interval(alpha)}{share}"
     yield f"  act on labels from {_percent(RELIABLE)} of the ceiling on, with care from {_percent(TENTATIVE)}"
-    psa = found.judged.psa.value
+    psa = found.headline.psa.value
     yield f"  two frames see the same class at {_percent(psa)} of the locations"
-    wrong = found.judged.wrong_of_stable
+    wrong = found.headline.wrong_of_stable
     if not math.isnan(wrong.value):
         yield f"  {_percent(wrong.value)}{_interval(wrong, 100)} of the stable locations are wrong"
     yield ""
@@ -192,7 +192,7 @@ def _cells(record: Record) -> list[str]:
     run, found = record.summary, record.summary.statistics
     level, alpha, agree = "-", "", math.nan
     if found is not None:
-        level, agree, between = found.verdict.level, 100 * found.judged.psa.value, found.judged.alpha_between
+        level, agree, between = found.verdict.level, 100 * found.headline.psa.value, found.headline.alpha_between
         ends = "" if math.isnan(between.low) else f" ({_short(between.low)} to {_short(between.high)})"
         alpha = f"{_number(between.value, 2)}{ends}"
     vss, sbd = (run.table.recurrent[m] for m in measures()[:2])

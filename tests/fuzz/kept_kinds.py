@@ -1,4 +1,4 @@
-"""Files for a later start or a later command: tiles, their results, casts, predictions, comparisons, recordings."""
+"""Files for a later start or a later command: tiles, casts, predictions, comparisons, recordings."""
 
 from __future__ import annotations
 
