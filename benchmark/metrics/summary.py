@@ -63,10 +63,9 @@ class TableSums:
         for some in stretches(len(table)):
             rows = Voxels(table.op[some], table.evidence.take(some).measured(), table.drift_sum[some])
             values = [measure.of(rows) for measure in measures()]
-            many = np.ones(len(rows.op)) if table.copies is None else table.copies[some]
-            sums[1] += _by_group(values, rows.op, dominant(rows), table.K, many)
-            by_op += _by_group(values, rows.op, groups_of(rows.op, finest), by_op.shape[1], many)
-            observations += float((many * rows.op).sum())
+            sums[1] += _by_group(values, rows.op, dominant(rows), table.K)
+            by_op += _by_group(values, rows.op, groups_of(rows.op, finest), by_op.shape[1])
+            observations += float(rows.op.sum(dtype=np.int64))
         for own, bounds in ((sums[0], edges), (sums[2], [RECURRENT - 1]), (sums[3], steps)):
             np.add.at(own.T, np.searchsorted(bounds, [*finest, np.iinfo(np.int32).max]), by_op.T)
         total = [table.pixels.sum(), observations, by_op[0].sum()]
@@ -117,12 +116,12 @@ def _steps(edges: Sequence[int]) -> list[int]:
     return [edges[-1], *(step for step in STEPS if step > edges[-1])]
 
 
-def _by_group(values: Sequence[Float64], op: Int32, group: Int64, groups: int, voxels: Float64) -> Float64:
-    """(1 + 3 M, groups) of values (n,) of M measures, of so many voxels (n,): voxels, then of each measure its sum, how
-    often it is defined, and how often OP is high enough for it."""
+def _by_group(values: Sequence[Float64], op: Int32, group: Int64, groups: int) -> Float64:
+    """(1 + 3 M, groups) of values (n,) of M measures: voxels, then of each measure its sum, how often it is defined,
+    and how often OP is high enough for it."""
     levels = sorted({1, *(measure.lowest_op for measure in measures())})
     enough = [np.where(op >= level, 1.0, np.nan) for level in levels]
-    sums, defined = by_group(group, [*values, *enough], groups, voxels)
+    sums, defined = by_group(group, [*values, *enough], groups)
     often = dict(zip(levels, defined.T[len(values) :], strict=True))
     rows = [often[1]]
     for measure, total, known in zip(measures(), sums.T, defined.T, strict=False):

@@ -121,21 +121,17 @@ def by_group(
     group: npt.NDArray[Any],
     values: Sequence[npt.NDArray[Any]] | Float64,
     groups: int,
-    voxels: Float64 | None = None,
 ) -> tuple[Float64, Float64]:
-    """(groups, C) sums of C values (n,) by group (n,), and how often they are defined; -1 is no group.
-
-    Each row counts as so many voxels (n,), as one where that is not given.
-    """
+    """(groups, C) sums of C values (n,) by group (n,), and how often they are defined; -1 is no group."""
     from semstab.model.kernels import add_by_group
 
     wide = -(-len(values) // TOGETHER) * TOGETHER
     sums, defined = np.zeros((2, wide, groups))
-    of, many = group.astype(np.int32, copy=False), np.zeros(0) if voxels is None else voxels
+    of = group.astype(np.int32, copy=False)
     for first in range(0, wide, TOGETHER):
         own = [np.ascontiguousarray(column, dtype=np.float64) for column in values[first : first + TOGETHER]]
         some = slice(first, first + TOGETHER)
-        add_by_group(of, *own, *(TOGETHER - len(own)) * own[:1], many, max(BLOCK, groups), sums[some], defined[some])
+        add_by_group(of, *own, *(TOGETHER - len(own)) * own[:1], max(BLOCK, groups), sums[some], defined[some])
     return tuple(np.ascontiguousarray(found[: len(values)].T) for found in (sums, defined))  # type: ignore[return-value]
 
 

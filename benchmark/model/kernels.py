@@ -119,24 +119,21 @@ def copy_rows(first: Any, label: Any, weight: Any, starts: Any, to_label: Any, t
 
 
 @serial
-def add_by_group(
-    group: Any, one: Any, two: Any, three: Any, four: Any, voxels: Any, block: int, sums: Any, defined: Any
-) -> None:
+def add_by_group(group: Any, one: Any, two: Any, three: Any, four: Any, block: int, sums: Any, defined: Any) -> None:
     """Add four columns (n,), of what is not NaN, to the sums (4, G) of each group (n,), and count it; -1 is no group.
 
-    A row counts as so many voxels (n,), as one where that is empty; rounding adds up within a block of rows only.
+    Rounding adds up within a block of rows only.
     """
     part, count = np.zeros((sums.shape[1], 4)), np.zeros((sums.shape[1], 4))
-    weighted = voxels.shape[0] > 0
     for first in range(0, group.shape[0], block):
         for i in range(first, min(first + block, group.shape[0])):
-            g, many = group[i], voxels[i] if weighted else 1.0
+            g = group[i]
             if g < 0:
                 continue
             for c, value in enumerate((one[i], two[i], three[i], four[i])):
                 known = value == value  # noqa: PLR0124 - NaN is not
-                part[g, c] += many * value if known else 0.0
-                count[g, c] += many if known else 0.0
+                part[g, c] += value if known else 0.0
+                count[g, c] += 1.0 if known else 0.0
         for g in range(sums.shape[1]):
             for c in range(4):
                 sums[c, g] += part[g, c]

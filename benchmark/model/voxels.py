@@ -146,7 +146,6 @@ class VoxelTable:
     frame_entropy_sum  (n,) float64 sum over frames of the entropy of s_bar, bits
     voxel_size         r, metres
     classes            the K class names, where they are known
-    copies             (n,) how many voxels each row stands for, where they are not one each: see `statistics.kinds`
 
     Raises DataError where columns disagree in length or rows are not sorted and distinct.
     """
@@ -164,7 +163,6 @@ class VoxelTable:
     frame_entropy_sum: Float64
     voxel_size: float
     classes: tuple[str, ...] = ()
-    copies: Float64 | None = None
 
     def __post_init__(self) -> None:
         freeze(self, OF_VOXELS, self.ix)
@@ -197,13 +195,7 @@ class VoxelTable:
     def rows(self, rows: Any) -> VoxelTable:
         """The table of some of its voxels: a slice, their numbers ascending, or a mask (n,)."""
         columns: dict[str, Any] = {name: getattr(self, name)[rows] for name in OF_VOXELS if name != "evidence"}
-        copies = None if self.copies is None else self.copies[rows]
-        return replace(self, **columns, evidence=self.evidence.take(rows), copies=copies)
-
-    @property
-    def voxels(self) -> Float64:
-        """(n,) how many voxels each row stands for."""
-        return np.ones(len(self)) if self.copies is None else self.copies
+        return replace(self, **columns, evidence=self.evidence.take(rows))
 
     def measured(self) -> VoxelTable:
         """The same with what measures are functions of, which is then computed once: see `Evidence.measured`."""

@@ -213,6 +213,7 @@ def cluster_sums_of(
     about = (places, true_label, likely)
     whole = sums_of_table(table, *about) if events is None else sums_of_log(events, *about)
     whole = with_frameless_sums(whole, table, places, true_label, sbd_excess)
+    whole = whole.coarsened(whole.edge, whole.step)  # one row for each cube and group of frames, in order
     return whole if sample is None else with_sample(whole, sample, logged=events is not None)
 
 
