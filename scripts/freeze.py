@@ -49,7 +49,7 @@ RENAMED_COLUMNS: dict[str, str | None] = {}
 """Columns of Parquet and CSV, and files, likewise."""
 
 BY_DESIGN = re.compile(
-    r"paired\.(blocks|block_size)|rankings\[\d+\]\.ranks\[\d+\]\.(best|low|high)"  # resamples of the one interval engine
+    r"paired\.(blocks|block_size)|rankings\[\d+\]\.ranks\[\d+\]\.(best|low|high)"  # resamples of the one engine
     r"|(geometry\.\w+|standardised\.values\.\w+\.\w+)\.(low|high|block_size|degrees)"  # intervals of the one engine
 )
 """Numbers that changed with the redesign, as docs/validity.md tells."""
