@@ -50,7 +50,7 @@ from semstab.model.voxels import Extent, VoxelTable
 
 @dataclass(frozen=True, eq=False)
 class _Seen:
-    """A frame's observations, kept: rows of the map, pixels, and their entries as in `Observed`, without empty ones."""
+    """A frame's observations in the log: rows of the map, pixels, and entries as in `Observed`, without empty ones."""
 
     frame: int
     row: Int32
@@ -156,7 +156,7 @@ class NumbaHash:
         self._used = np.zeros(PARTITIONS, dtype=np.int64)
         self._ranges = np.zeros((PARTITIONS, 4), dtype=np.int64)  # two free stretches of nodes: start, end, start, end
         self.changes = Changes.room(*np.zeros((2, 0), dtype=np.int64))
-        """What the last frame did to each voxel."""
+        """The change of each voxel by the last frame."""
         _load_compiled()
 
     @staticmethod
@@ -261,7 +261,7 @@ class NumbaHash:
         return index_of_keys(self._records["key"][rows], self.origin)
 
     def events(self) -> Events | None:
-        """Every observation in order of integration within a voxel, where `history` is kept; else None."""
+        """Every observation in order of integration within a voxel, where there is a `history`; else None."""
         if self._history is None:
             return None
         order = self._order()

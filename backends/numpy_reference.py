@@ -36,7 +36,7 @@ ODD = np.array([-0x61C8864680B583EB, -0x3D4D51C2D82B14B1, 0x165667B19E3779F9])
 
 @dataclass(frozen=True, eq=False)
 class _Seen:
-    """What a frame says of voxels by their rows (n,): mean evidence, of which most is 0, and pixels (n,)."""
+    """The evidence of a frame for voxels, by their rows (n,): mean evidence, of which most is 0, and pixels (n,)."""
 
     rows: Int32
     frame: int
@@ -138,7 +138,7 @@ class NumpySample(NumpyReference):
 
 
 def in_sample(index: npt.NDArray[np.integer]) -> Mask:
-    """Whether the voxels of that index (3, n) are in the sample."""
+    """Which voxels of that index (3, n) are in the sample."""
     mixed = np.zeros(index.shape[1], np.int64)
     for axis, odd in zip(index, ODD, strict=True):
         mixed += axis * odd

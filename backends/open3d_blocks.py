@@ -1,6 +1,6 @@
 """Backend `open3d`: semantic attributes on the hashed voxel blocks of `open3d.t.geometry.VoxelBlockGrid`.
 
-Pixels become one observation a voxel, in compiled code, before the hash is touched: a frame costs one look-up a voxel.
+Pixels become one observation a voxel, in compiled code, before the hash is touched: a frame costs one look-up a block.
 Hash and attributes live on the device. On a CPU the touched voxels are updated in place; a CUDA device hands their rows
 to the host and takes them back, because Open3D tensors have no logarithm.
 """
@@ -18,7 +18,7 @@ from open3d.t.geometry import VoxelBlockGrid
 from semstab.backends import FusionBackend
 from semstab.backends.shared.aggregator import Aggregator
 from semstab.backends.shared.association import check_depth, check_frame, check_settings
-from semstab.backends.shared.columns import update_rows
+from semstab.backends.shared.columns import blocks_of, update_rows
 from semstab.backends.shared.observations import Change, MapTotal, Observed, ObservedScores
 from semstab.core.types import Int64
 from semstab.errors import ConfigError
@@ -135,10 +135,11 @@ class Open3DBlocks(FusionBackend):
             device=self.device,
         )
 
-    def _make_room(self, blocks: int) -> None:
-        """Grow where so many new blocks do not fit, by a copy into a new grid: Open3D's own rehash takes longer."""
+    def _make_room(self, keys: Any) -> None:
+        """Grow where the blocks (n, 3) do not fit, by a copy into a new grid: Open3D's own rehash takes longer."""
         old = self.grid.hashmap()
-        needed = old.size() + blocks
+        _, present = old.find(keys)
+        needed = old.size() + int(np.count_nonzero(~present.cpu().numpy()))
         if needed <= old.capacity():
             return
         grid = self._new_grid(needed + needed // 2)
@@ -148,22 +149,14 @@ class Open3DBlocks(FusionBackend):
 
     def _activate(self, index: Int64) -> Int64:
         """Rows of voxels (n, 3), at least one, in the attributes, their blocks activated; new ones start at 0."""
-        r = self.block_resolution
-        block = index // r
-        x, y, z = (index - block * r).T
-        keys = self._tensor(block.astype(np.int32))
-        buffer, present = self.grid.hashmap().find(keys)
-        new = block[~present.cpu().numpy()]
-        if len(new):
-            low, high = new.min(axis=0), new.max(axis=0)
-            _, first = np.unique(np.ravel_multi_index(tuple((new - low).T), high - low + 1), return_index=True)
-            distinct = new[first]
-            self._make_room(len(distinct))
-            hashmap = self.grid.hashmap()
-            hashmap.activate(self._tensor(distinct.astype(np.int32)))
-            buffer, _ = hashmap.find(keys)
-        rows: Int64 = buffer.cpu().numpy().astype(np.int64) * r**3 + ((z * r + y) * r + x)
-        return rows
+        blocks, block, place = blocks_of(index, self.block_resolution)
+        keys = self._tensor(blocks)
+        self._make_room(keys)
+        hashmap = self.grid.hashmap()
+        hashmap.activate(keys)  # gives indices of new blocks only
+        buffer, _ = hashmap.find(keys)
+        buffers: Int64 = buffer.cpu().numpy().astype(np.int64)
+        return buffers[block] * self.block_resolution**3 + place
 
     def _index_of(self, rows: Int64) -> Int64:
         """Voxel indices (n, 3) of rows: the inverse of `_activate`."""

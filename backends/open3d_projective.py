@@ -1,7 +1,7 @@
 """Backend `open3d-projective`: voxels look up their pixel, as Open3D's own integration does, instead of pixels theirs.
 
 Each voxel near the surface is projected into the image, and where its centre lies within a band of the depth there, its
-pixel is its one observation of the frame. What a voxel is told is no mean over pixels then, a pixel may speak for many
+pixel is its one observation of the frame. An observation is no mean over pixels then, a pixel may speak for many
 voxels, and voxels before and behind the surface take part: the map disagrees with those of the other backends by
 design, and is compared with them, not checked against them.
 """
@@ -88,7 +88,7 @@ class Projector(Aggregator):
         step = max(1, CHUNK // len(self._local))
         parts = [self._in_band(frame, blocks[start : start + step]) for start in range(0, len(blocks), step)]
         self._index = np.concatenate([index for index, _ in parts] or [self._index[:0]])
-        return self._told(frame, np.concatenate([pixel for _, pixel in parts] or [np.zeros(0, dtype=np.int64)]))
+        return self._observed(frame, np.concatenate([pixel for _, pixel in parts] or [np.zeros(0, dtype=np.int64)]))
 
     def index_of(self, key: Int64) -> Int64:
         """Voxel indices (n, 3) of the last frame's keys."""
@@ -129,8 +129,8 @@ class Projector(Aggregator):
         block, local = (at[near] for at in seen)
         return blocks[block] * self.block_resolution + self._local[local], pixel[near]
 
-    def _told(self, frame: Frame, pixel: Int64) -> Observed:
-        """What the pixels (n,) say, each to its voxel."""
+    def _observed(self, frame: Frame, pixel: Int64) -> Observed:
+        """The evidence of the pixels (n,), each for its voxel."""
         n = len(pixel)
         labels, weights = self._evidence(frame, pixel)
         start = np.arange(n + 1, dtype=np.int64) * (len(labels) // max(n, 1))

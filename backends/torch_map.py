@@ -234,7 +234,7 @@ class TorchMaps:
 
 
 def _where(view: DepthView, kind: str, name: str) -> str:
-    """What an error calls the labels, scores or logits of a backbone."""
+    """The name of a backbone's labels, scores or logits in an error."""
     return view.camera.where(kind) + (f" of '{name}'" if name else "")
 
 

@@ -44,7 +44,7 @@ class Association:
 
 @dataclass(frozen=True, eq=False)
 class ViewEvidence:
-    """What one backbone says of the n voxels of a view: s_bar = sums / (scale * pixels).
+    """The evidence of one backbone for the n voxels of a view: s_bar = sums / (scale * pixels).
 
     sums    (K, n) integer
     pixels  (n,) int64 pixels that count; 0 in voxels that the backbone does not see

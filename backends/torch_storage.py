@@ -1,4 +1,4 @@
-"""What a map of the torch backend keeps on its device: a hash from voxel keys to rows, and columns of these rows.
+"""The storage of a map of the torch backend on its device: a hash from voxel keys to rows, and columns of these rows.
 
 Voxel indices are packed into a key with 21 bits an axis, as they count from the map's origin.
 """
@@ -223,7 +223,7 @@ class Storage:
             self.hash = grown
 
 
-# What the torch backend fuses: a view (depth, camera and pose) and what backbones say of its pixels, as tensors.
+# The input of the torch backend: a view (depth, camera and pose) and predictions for its pixels, as tensors.
 
 INTEGERS = (torch.uint8, torch.uint16, torch.int8, torch.int16, torch.int32, torch.int64)
 
@@ -233,7 +233,7 @@ Image = torch.Tensor | npt.NDArray[Any]
 
 @dataclass(frozen=True, eq=False)
 class TensorPrediction:
-    """What a backbone says of each pixel of a view: one of the three. A batch dimension of 1 is left away.
+    """The prediction of a backbone for each pixel of a view: one of the three. A batch dimension of 1 is left away.
 
     labels  (H, W) integer class ids. Ignored are 255 in uint8 and 65535 in uint16; in other types every negative id,
             and 255 (65535 where there are more classes than that)
@@ -334,7 +334,7 @@ class Scores:
 
 
 def evidence_of(prediction: TensorPrediction, view: DepthView, num_classes: int, where: str) -> Labels | Scores:
-    """What a backbone says of the view's pixels, on the view's device; `where` is what an error calls it.
+    """The prediction of a backbone for the view's pixels, on the view's device; `where` is its name in errors.
 
     Raises DataError where the image does not fit the depth image, or is of a wrong type.
     """
@@ -354,7 +354,7 @@ def evidence_of(prediction: TensorPrediction, view: DepthView, num_classes: int,
 
 
 def evidence_of_frame(frame: Frame, device: torch.device) -> Labels | Scores:
-    """What a frame's labels or scores say of its pixels."""
+    """The labels or scores of a frame, as a prediction for its pixels."""
     if frame.labels is not None:
         return Labels(on_device(frame.labels, device).reshape(-1), frame.ignore_id)
     assert frame.scores is not None

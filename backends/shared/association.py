@@ -27,19 +27,19 @@ if TYPE_CHECKING:
 INDEX_LIMIT = 2**31
 """Voxel indices are int32."""
 
-LOOKED_AT = 2**12
-"""Pixels of a depth map, about, that are looked at for its unit; of one as large some must be finite."""
+CHECKED = 2**12
+"""Pixels of a depth map, about, that the check of its unit reads; of one as large some must be finite."""
 
 FAR, DISTINCT = 100.0, 8
 """Depth whose values are all whole numbers, so many different ones, and mostly above FAR metres, is in millimetres."""
 
 FEW = 1 << 15
-"""Pixels that are looked at together, about: what is computed of them stays in a core's cache."""
+"""Pixels that are back-projected together, about: the results stay in a core's cache."""
 
 
 @dataclass(frozen=True, eq=False)
 class Observations:
-    """What one frame says of n voxels, sorted by index.
+    """The observations of n voxels by one frame, sorted by index.
 
     index   (n, 3) int64 voxel index
     s_bar   (n, K) float64 mean evidence of the frame's pixels in the voxel
@@ -78,9 +78,9 @@ def check_frame(frame: Frame, num_classes: int) -> None:
 def check_depth(frame: Frame) -> None:
     """Raise DataError where the frame's depth is finite nowhere, or cannot be metres."""
     depth = frame.depth
-    step = max(1, int(np.sqrt(depth.size / LOOKED_AT)))
+    step = max(1, int(np.sqrt(depth.size / CHECKED)))
     some = depth[::step, ::step]
-    if depth.size >= LOOKED_AT and not np.isfinite(some).any() and not np.isfinite(depth).any():
+    if depth.size >= CHECKED and not np.isfinite(some).any() and not np.isfinite(depth).any():
         raise DataError(f"{frame.where('depth')}: depth is finite nowhere (NaN or inf); leave this frame out")
     if _whole_millimetres(some[np.isfinite(some) & (some > 0)]):
         raise DataError(
@@ -90,7 +90,7 @@ def check_depth(frame: Frame) -> None:
 
 
 def _whole_millimetres(depth: Float32) -> bool:
-    """Whether valid depths (n,) are whole numbers, as no measurement in metres is, and too large to be near."""
+    """Valid depths (n,) are whole numbers, as no measurement in metres is, and too large to be near."""
     if depth.size < DISTINCT or np.median(depth) < FAR or not np.array_equal(depth, np.floor(depth)):
         return False
     return len(np.unique(depth)) >= DISTINCT

@@ -34,7 +34,7 @@ def _series() -> list[float]:
 
 
 def _table() -> tuple[list[float], list[float]]:
-    """What m is multiplied by in each step, about 1 over its middle, and what that takes from the logarithm."""
+    """The factor of m in each step, about 1 over its middle, and what that takes from the logarithm."""
     edges = np.array([LOWEST + (i << (MANTISSA_BITS - STEP_BITS)) for i in range(STEPS + 1)]).view(np.float64)
     inverse = np.where((edges[:-1] < 1) & (edges[1:] > 1), 1.0, 2.0 / (edges[:-1] + edges[1:]))
     return inverse.tolist(), (-np.log2(inverse.astype(np.longdouble))).astype(np.float64).tolist()
@@ -45,7 +45,7 @@ INVERSE, LOGARITHM = _table()
 
 def plogp_of(context: Any, builder: Any, p: Any) -> Any:
     """The vector of p log2 p of 0 <= p <= 2, 0 for 0, to a few units in the last place of the logarithm (with fused
-    multiply-add, as machines have; else to 2^-52 beside them).
+    multiply-add, as machines have; else to 2^-52).
 
     p = 2^e m, m from `LOWEST` to twice that; m c = 1 + r with c by m's step, and log p = e - log c + log(1 + r).
     """
@@ -87,7 +87,7 @@ def _looked_up(context: Any, builder: Any, step: Any, table: list[float]) -> Any
     return values
 
 
-# What an observation changes in a voxel's dense evidence, eight classes at a time.
+# The update of a voxel's dense evidence by an observation, eight classes at a time.
 
 HALVES, ZEROS = ir.Constant(DOUBLES, [0.5] * LANES), ir.Constant(DOUBLES, [0.0] * LANES)
 RESULT = types.Tuple([types.float64] * 5 + [types.intp])

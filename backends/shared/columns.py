@@ -8,11 +8,11 @@ import numba as nb
 import numpy as np
 
 from semstab.backends.shared.beliefs import js_term, plogp
-from semstab.backends.shared.keys import PARTITIONS
+from semstab.backends.shared.keys import PARTITIONS, mix
 from semstab.backends.shared.observations import Change, Observed
 from semstab.backends.shared.pixel_keys import AHEAD, touch
-from semstab.core.compiled import parallel
-from semstab.core.types import Int64
+from semstab.core.compiled import parallel, serial
+from semstab.core.types import Int32, Int64
 from semstab.model.results import RECURRENT
 
 
@@ -86,3 +86,38 @@ def _update_rows(
             recurrent += 1 if T + 1 == RECURRENT else 0
         sums[chunk, 0], sums[chunk, 1], sums[chunk, 2] = vss, entropy, drifted
         sums[chunk, 3], sums[chunk, 4] = new, recurrent
+
+
+# Which blocks of voxels the voxels of a frame lie in.
+
+
+def blocks_of(index: Int64, resolution: int) -> tuple[Int32, Int64, Int32]:
+    """The distinct blocks (m, 3) of voxels (n, 3), the row of each voxel's block, and its place in it, x fastest."""
+    size = 1 << max(4, (2 * len(index)).bit_length())
+    blocks, block = np.empty((len(index), 3), dtype=np.int32), np.empty(len(index), dtype=np.int64)
+    place, slots = np.empty(len(index), dtype=np.int32), np.full(size, -1, dtype=np.int32)
+    n = _number(index, resolution, blocks, block, place, slots)
+    return blocks[:n], block, place
+
+
+@serial
+def _number(index, r, blocks, block, place, slots):
+    """Number the blocks in order of appearance; returns how many there are."""
+    mask = slots.shape[0] - 1
+    n = 0
+    for v in range(index.shape[0]):
+        x, y, z = index[v, 0], index[v, 1], index[v, 2]
+        a, b, c = x // r, y // r, z // r
+        place[v] = ((z - c * r) * r + (y - b * r)) * r + (x - a * r)
+        at = np.int64(mix((a * 73856093) ^ (b * 19349663) ^ (c * 83492791)) & np.uint64(mask))
+        while slots[at] >= 0:
+            e = slots[at]
+            if blocks[e, 0] == a and blocks[e, 1] == b and blocks[e, 2] == c:
+                break
+            at = (at + 1) & mask
+        if slots[at] < 0:
+            slots[at] = n
+            blocks[n, 0], blocks[n, 1], blocks[n, 2] = a, b, c
+            n += 1
+        block[v] = slots[at]
+    return n

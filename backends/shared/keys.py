@@ -35,7 +35,7 @@ def columns_of_keys(keys: Int64, order: npt.NDArray[np.integer], origin: npt.Arr
 
 
 def out_of_reach(frame: Frame, origin: npt.ArrayLike, voxel_size: float) -> DataError:
-    """What to raise where a frame has points too far from the origin, or too far for 32-bit indices altogether."""
+    """The error for a frame that has points too far from the origin, or too far for 32-bit indices altogether."""
     points = back_project(frame)
     voxel_index(points, voxel_size, frame)
     low, high = (edge.round(1).tolist() for edge in (points.min(axis=1), points.max(axis=1)))

@@ -122,7 +122,7 @@ PIECE = 1 << 20
 
 @dataclass(frozen=True)
 class Change:
-    """What one frame did to a map, summed over the voxels that it touched.
+    """The change of a map by one frame, summed over the voxels that it touched.
 
     points     pixels that it counted
     voxels     voxels that it touched

@@ -84,7 +84,7 @@ def keys_fused(depth, labels, ignore, ray_a, ray_b, ray_c, a0, b0, c0, ta, tb, t
 
 @serial
 def keys_of_row(depth, labels, ray_x, ray_y, T, size, ox, oy, oz, ignore, rays, margin, out):
-    """What `exact_keys_of_row` returns, with the same keys in less time; `frame_terms` makes rays and margin."""
+    """The keys and result of `exact_keys_of_row` in less time; `frame_terms` makes rays and margin."""
     a0 = (T[0, 1] * ray_y + T[0, 2]) / size
     b0 = (T[1, 1] * ray_y + T[1, 2]) / size
     c0 = (T[2, 1] * ray_y + T[2, 2]) / size
@@ -110,7 +110,7 @@ def keep_columns(keys, columns):
 
 
 def columns_of(within, origin):
-    """What `keep_columns` takes, of an extent or None: (4,), as packed keys count, or (0,) where all are kept."""
+    """The columns for `keep_columns` of an extent or None: (4,), as packed keys count, or (0,) for all."""
     if within is None:
         return np.zeros(0, dtype=np.int64)
     (x0, y0), (x1, y1) = within.low, within.high

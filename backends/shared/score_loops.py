@@ -301,8 +301,8 @@ def scatter_rows(key, count, room, stride, entries, offset, out_key, out_pixels,
 
 
 @parallel
-def merge_rows(edges, key, pixels, row, again, first, sums, K, found):
-    """Add up the entries of each voxel in place: in its first one, and in the sums of that; how many are `found`.
+def merge_rows(edges, key, pixels, row, again, first, sums, K, voxels):
+    """Add up the entries of each voxel in place: in its first one, and in its sums; their number goes into `voxels`.
 
     again, first  work space: the sums of an entry of a voxel that has one already, and those of its first one
     """
@@ -336,4 +336,4 @@ def merge_rows(edges, key, pixels, row, again, first, sums, K, found):
             to, added = sums[first[i] : first[i] + K], sums[again[i] : again[i] + K]
             for k in range(K):
                 to[k] += added[k]
-        found[p] = n - low
+        voxels[p] = n - low

@@ -79,7 +79,7 @@ class VideoConsistency:
 
     Of the pixels whose ground truth is the same in all n frames of a clip, the share whose prediction is the same in
     all of them, right or wrong; `value` is the mean over all clips of n consecutive frames, the last one included.
-    Frames are added one by one and none is kept. Clips do not reach across a change of the image size.
+    Frames are added one by one, and none stays in memory. Clips do not reach across a change of the image size.
 
     n  frames a clip, at least 2; VSPW reports 8 and 16
     """
@@ -138,7 +138,7 @@ class SelfConsistency:
 
 
 class _Run:
-    """For how many frames, up to n, each pixel has counted and kept its label."""
+    """For how many frames, up to n, each pixel has counted and had its label."""
 
     def __init__(self, n: int) -> None:
         if not 2 <= n <= np.iinfo(np.int16).max:

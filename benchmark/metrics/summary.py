@@ -22,7 +22,7 @@ STRATA = (1, 2, 5)
 """Upper edges of the paper's strata: OP=1, OP=2, 3<=OP<=5, OP>5."""
 
 STEPS = tuple(m * 10**e for e in range(6) for m in (1, 2, 5))
-"""Upper edges of OP by which the last stratum is told apart."""
+"""Upper edges of OP that divide the last stratum."""
 
 CROWDED, PARTS = 0.5, 3
 """A last stratum that holds more than this share of the voxels is split into so many about equal parts."""

@@ -1,1 +1,1 @@
-"""What is done to the pixels of a frame: what moves is left out, noise is added, one frame is warped into another."""
+"""Changes of a frame's pixels: dynamic objects are left out, noise is added, one frame is warped into another."""

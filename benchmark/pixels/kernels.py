@@ -139,12 +139,12 @@ def cut(scores, k, kept, shift, unit, infinite, shares):
                 shares[chunk, 2] = max(shares[chunk, 2], share)
 
 
-# Compiled loops behind video consistency: for how long each pixel has kept its label.
+# Compiled loops behind video consistency: for how long each pixel has had its label.
 
 
 @serial
 def lengthen(labels: Any, before: Any, valid: Any, most: int, length: Any) -> None:
-    """For how many frames, `most` at most, each pixel has counted and kept its label; all arrays are (n,)."""
+    """For how many frames, `most` at most, each pixel has counted and had its label; all arrays are (n,)."""
     for i in range(len(length)):
         kept = np.int32(length[i]) if labels[i] == before[i] else np.int32(0)
         length[i] = min(kept + np.int32(1), np.int32(most)) if valid[i] else np.int32(0)

@@ -45,7 +45,7 @@ def correspond(frame: Frame, other: Frame, *, depth_tolerance: float = DEPTH_TOL
 
     A pixel with valid depth is back-projected, moved into the other camera and projected; there the nearest pixel's
     depth must be valid and differ from the point's distance z along the optical axis by at most depth_tolerance * z,
-    else the point is occluded; of infinity, that is not looked at. Labels do not matter. The frames may differ in size
+    else the point is occluded; infinity switches this test off. Labels do not matter. The frames may differ in size
     and intrinsics.
 
     Raises ConfigError where the tolerance is not above 0 and below 1, and not infinity.
@@ -72,8 +72,8 @@ def warp(
 
     Labels, scores, colours: the nearest pixel's value, never a mixture. See `correspond`.
     """
-    found = correspond(target, source, depth_tolerance=depth_tolerance)
-    return found.bring(values, fill), found.visible
+    seen = correspond(target, source, depth_tolerance=depth_tolerance)
+    return seen.bring(values, fill), seen.visible
 
 
 def motion(frame: Frame, other: Frame) -> Float64:
@@ -88,7 +88,7 @@ def by_rows(matrix: Float64) -> tuple[tuple[float, ...], ...]:
     return tuple(tuple(row) for row in matrix.tolist())
 
 
-# What was believed of one view's pixels, carried into the next view by depth and pose.
+# Beliefs of one view's pixels, carried into the next view by depth and pose.
 
 
 def carry(belief: Float32, source: Frame, target: Frame, *, depth_tolerance: float = DEPTH_TOLERANCE) -> Float32:

@@ -6,9 +6,9 @@
         def create(self, voxel_size, num_classes):
             return MyBackend(voxel_size, num_classes)
 
-`evidence`, `geometry` and `contract` are scenes so small that the answer stands beside them, worked out by hand; they
-are also the shortest way to learn the definitions. `properties` are those of random sequences, and agreement with the
-reference. `builders` make the frames and compare the maps.
+`properties` and `contract` hold scenes so small that the answer is worked out by hand in their docstrings; they are
+also the shortest way to learn the definitions. Further tests check random sequences, and agreement with the reference.
+`builders` make the frames and compare the maps.
 
 Put `pytest.register_assert_rewrite("semstab.testing")` into conftest.py, and failures show the values.
 """
@@ -56,7 +56,7 @@ __all__ = [
 
 
 class BackendConformance(EvidenceTests, GeometryTests, ContractTests, PropertyTests):
-    """What every fusion backend must do. A subclass defines `create`; the rest is inherited.
+    """The contract of every fusion backend. A subclass defines `create`; the rest is inherited.
 
     tolerance    largest difference of a sum (evidence, drift, ...) from its exact value; 1e-9 for float64
     voxel_share  part of the voxels that may differ from the reference on random frames, because other arithmetic puts

@@ -1,4 +1,4 @@
-"""What the tests are built from: frames whose map is known by hand, random ones, and how two maps are compared."""
+"""Building blocks of the tests: frames whose map is known by hand, random ones, and how two maps are compared."""
 
 from __future__ import annotations
 
@@ -156,7 +156,7 @@ def _rows(table: VoxelTable) -> dict[Voxel, Float64]:
     return dict(zip(voxels(table), np.concatenate(columns, axis=1), strict=True))
 
 
-# What the groups of tests have in common: a backend to test, and how to fuse with it.
+# Common to all groups of tests: a backend to test, and how to fuse with it.
 
 
 class BackendTests:

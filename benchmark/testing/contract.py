@@ -1,4 +1,4 @@
-"""What holds beside the numbers: tables and reports, maps and inputs kept apart, and errors that leave no trace."""
+"""Rules beyond the numbers: tables and reports, maps and inputs that share nothing, errors that leave no trace."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ from semstab.testing.builders import (
 
 
 class ContractTests(BackendTests):
-    """What callers rely on, whatever they pass in."""
+    """Guarantees to callers, whatever they pass in."""
 
     # --- Tables -------------------------------------------------------------------------------------------------------
 
@@ -74,7 +74,7 @@ class ContractTests(BackendTests):
         assert_same_map(backend.table(), before, 0)
 
     def test_a_table_is_a_snapshot(self) -> None:
-        """Integrating goes on without changing a table taken earlier."""
+        """Further frames do not change a table taken earlier."""
         backend = self.create(1.0, 3)
         backend.integrate(sight_line(0, [(0.5, 0)]))
         table = backend.table()
@@ -83,7 +83,7 @@ class ContractTests(BackendTests):
         assert table.evidence[0] == self.near([1, 0, 0])
 
     def test_two_maps_share_nothing(self) -> None:
-        """What one map sees, another does not."""
+        """Frames of one map do not show in another."""
         a, b = self.create(1.0, 3), self.create(1.0, 3)
         a.integrate(sight_line(0, [(0.5, 0)]))
         assert len(b.table()) == 0
@@ -214,5 +214,5 @@ class ContractTests(BackendTests):
             "map_recurrent": after.op >= RECURRENT,
         }
         for name, values in means.items():
-            kept = getattr(report, name)
-            assert math.isnan(kept) or kept == self.near(values.mean()), name
+            reported = getattr(report, name)
+            assert math.isnan(reported) or reported == self.near(values.mean()), name

@@ -1,4 +1,4 @@
-"""What counts, and how much: scenes so small that the measures stand beside them, worked out by hand."""
+"""Evidence and its weight: scenes so small that the measures in their docstrings are worked out by hand."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ from semstab.testing.builders import (
 
 
 class EvidenceTests(BackendTests):
-    """What one voxel learns from the pixels and frames that fall into it."""
+    """The evidence of one voxel from the pixels and frames that fall into it."""
 
     # --- Evidence -----------------------------------------------------------------------------------------------------
 
@@ -248,7 +248,7 @@ class GeometryTests(BackendTests):
 
 
 class PropertyTests(BackendTests):
-    """What no order, shift, name or repetition may change."""
+    """Properties that no order, shift, name or repetition may change."""
 
     @checks
     @given(SEQUENCES, st.integers(1, 4))
