@@ -114,8 +114,8 @@ def test_without_asking_there_is_what_the_map_alone_tells(tmp_path) -> None:
 class Interrupting(Observer):
     """Ctrl-C when the second backbone is to be fused."""
 
-    def frame_fused(self, unit, frame, row) -> None:
-        if unit.backbone == "b":
+    def frame_fused(self, task, frame, rows) -> None:
+        if task.backbone == "b":
             raise KeyboardInterrupt
 
 

@@ -8,7 +8,6 @@ import dataclasses
 import json
 import re
 import shutil
-from collections import Counter
 from collections.abc import Generator
 from unittest import mock
 
@@ -19,7 +18,6 @@ from compare_summaries import differences
 from posed_config import configure
 from posed_writer import write_posed
 from pyarrow import dataset, parquet
-from test_recording import read
 
 import semstab
 from semstab import backends
@@ -39,8 +37,6 @@ from semstab.exports.relabel import Belief, relabel
 from semstab.model.frames import Frame, Intrinsics
 from semstab.model.parquet import Tile
 from semstab.model.voxels import Extent, VoxelTable
-from semstab.recording.observer import Recording
-from semstab.recording.target import Target
 from semstab.statistics.sampling import InfluenceSums
 from semstab.testing import random_frames
 from semstab.testing.builders import EXACT, SUMS, sight_line
@@ -439,19 +435,16 @@ def test_a_tile_that_outgrows_the_memory_is_told_in_one_line(wall, few_said, tmp
 
 
 class Progress(Observer):
-    """The frames that went into maps, and what was remarked."""
+    """The frames that went into maps."""
 
     def __init__(self) -> None:
-        self.frames, self.lines = 0, []
+        self.frames = 0
 
     def advanced(self, frames, what) -> None:
         self.frames += frames
 
-    def remarked(self, line) -> None:
-        self.lines.append(line)
 
-
-def test_a_map_that_outgrows_the_memory_is_begun_again_in_tiles(wall, both, few_said, tmp_path) -> None:
+def test_a_map_that_outgrows_the_memory_is_begun_again_in_tiles(wall, both, few_said, tmp_path, caplog) -> None:
     """And goes on so after an interruption, without a further try at once."""
     config, out = configure(wall, **SETTINGS, memory_gb=30e-6), tmp_path / "run"
     first, second, progress = Told(stop_after=4), Told(), Progress()
@@ -460,7 +453,7 @@ def test_a_map_that_outgrows_the_memory_is_begun_again_in_tiles(wall, both, few_
     assert first.done[:2] == [(None, True), ("frames_0-30", False)]
     semstab.engine.run(config, out=out, executor=second, observers=[progress])
     assert all(name is not None and not outgrown for name, outgrown in second.done)
-    (line,) = progress.lines
+    (line,) = caplog.messages
     assert re.fullmatch(r"wall, a: about .* 3e-05 GB are there, which it outgrew: begun again in 3 parts, .*", line)
     assert_same_bits(semstab.load(out).table(), semstab.load(both[0]).table())
     found = differences(summary_of(both[0]), summary_of(out), tolerance=1e-12)
@@ -468,20 +461,6 @@ def test_a_map_that_outgrows_the_memory_is_begun_again_in_tiles(wall, both, few_
     again = Progress()
     semstab.engine.run(config, out=tmp_path / "anew", observers=[again])
     assert again.frames == 30
-
-
-def test_the_recording_of_a_map_that_is_begun_again_has_each_frame_once(wall, few_said, tmp_path) -> None:
-    out, file = tmp_path / "run", tmp_path / "recording.rrd"
-    observer = Recording(Target(file), run=out)
-    semstab.engine.run(configure(wall, **SETTINGS, memory_gb=30e-6), out=out, observers=[observer])
-    recorded = read(file)
-    frames = {entity: Counter(row["frame"] for row in rows if "frame" in row) for entity, rows in recorded.items()}
-    assert set(frames["/wall/map/a/numba/00"]) == {29}
-    for entity in ("depth", "camera/a/labels", "series/map_vss/a/numba", "series/fuse_ms/a/numba", "series/wait_ms/a"):
-        assert frames[f"/wall/{entity}"] == Counter(range(30))
-    drift = {row["frame"]: row["Scalars:scalars"] for row in recorded["/wall/series/drift/a/numba"][1:]}
-    assert drift == {int(row["frame"]): [float(row["drift"])] for row in series_of(out) if row["drift"]}
-    assert {path.name for path in tmp_path.iterdir()} == {"run", "recording.rrd"}
 
 
 def test_tiles_that_are_forbidden_are_not_begun_either(wall, few_said, tmp_path) -> None:

@@ -41,17 +41,15 @@ class Watching(Observer):
     def __init__(self) -> None:
         self.seen: list[str] = []
 
-    def run_started(self, plan, kept) -> None:
+    def run_started(self, plan, finished) -> None:
         self.seen.append(f"start {len(plan.tasks)}")
+        self.seen += [f"kept {each.unit.backbone}" for each in plan.units if each.identity in finished]
 
-    def frame_fused(self, unit, frame, row) -> None:
-        self.seen.append(f"{unit.slug} {row.report.frame}")
+    def frame_fused(self, task, frame, rows) -> None:
+        self.seen += [f"{unit.slug} {row.report.frame}" for unit, row in rows.items()]
 
-    def unit_finished(self, unit, table, summary) -> None:
-        self.seen.append(f"{unit.slug} done {len(table)}")
-
-    def group_kept(self, task, summaries) -> None:
-        self.seen.append(f"kept {task.backbone}")
+    def unit_finished(self, planned, content, table, error) -> None:
+        self.seen.append(f"{planned.unit.slug} {'failed' if table is None else f'done {len(table)}'}")
 
     def run_finished(self, result) -> None:
         self.seen.append("finished")
@@ -63,8 +61,8 @@ class Interrupting(Observer):
     def __init__(self, slug: str) -> None:
         self.slug = slug
 
-    def frame_fused(self, unit, frame, row) -> None:
-        if unit.slug == self.slug and row.report.frame == 1:
+    def frame_fused(self, task, frame, rows) -> None:
+        if self.slug in {unit.slug for unit in rows} and frame.index == 1:
             raise KeyboardInterrupt
 
 
@@ -232,7 +230,7 @@ def test_a_damaged_unit_file_is_computed_again_and_told(root, tmp_path, caplog) 
 
 def test_an_observer_that_fails_costs_nothing_else_and_is_told_at_the_end(root, tmp_path) -> None:
     class Failing(Observer):
-        def frame_fused(self, unit, frame, row) -> None:
+        def frame_fused(self, task, frame, rows) -> None:
             raise OSError(28, "No space left on device", "recording.rrd")
 
     watching, out = Watching(), tmp_path / "run"
@@ -330,7 +328,7 @@ def test_a_damaged_image_stops_the_run_at_its_frame(root) -> None:
     watching = Watching()
     with pytest.raises(DataError, match=r"depth/0002\.png: not a PNG image"):
         semstab.engine.run(configure(root, backbones=["a"], threads=4), observers=[watching])
-    assert watching.seen == ["start 1", "wall__a__numpy 0", "wall__a__numpy 1", "finished"]
+    assert watching.seen == ["start 1", "wall__a__numpy 0", "wall__a__numpy 1", "wall__a__numpy failed", "finished"]
 
 
 def test_the_time_of_a_frame_is_told_by_stage(root, tmp_path) -> None:
@@ -354,7 +352,7 @@ def test_colour_is_decoded_only_for_observers_that_want_it(root) -> None:
     seen = []
 
     class Painting(Observer):
-        def frame_fused(self, unit, frame, row) -> None:
+        def frame_fused(self, task, frame, rows) -> None:
             seen.append(frame.color is not None)
 
     semstab.engine.run(configure(root, backbones=["a"]), observers=[Painting()])

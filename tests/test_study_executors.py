@@ -70,8 +70,8 @@ class Killing(Counting):
         super().__init__()
         self.worker = worker
 
-    def unit_done(self, cell, error) -> None:
-        super().unit_done(cell, error)
+    def unit_finished(self, cell, content, table, error) -> None:
+        super().unit_finished(cell, content, table, error)
         if self.worker is not None:
             process, self.worker = self.worker(), None
             os.kill(process, signal.SIGKILL)

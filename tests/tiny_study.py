@@ -62,10 +62,10 @@ class Counting(Observer):
         self.computed: list[str] = []
         self.failed: list[str] = []
 
-    def run_started(self, plan, kept) -> None:
-        self.units, self.kept = len(plan.distinct()), len(kept)
+    def run_started(self, plan, finished) -> None:
+        self.units, self.kept = len(plan.distinct()), len(finished)
 
-    def unit_done(self, cell, error) -> None:
+    def unit_finished(self, cell, content, table, error) -> None:
         value = cell.variation.value
         what = f"{cell.unit.slug} {cell.variation.sweep} {value if value is None else f'{value:g}'}"
         (self.computed if error is None else self.failed).append(what)
@@ -78,7 +78,7 @@ class Interrupting(Counting):
         super().__init__()
         self.after = after
 
-    def unit_done(self, cell, error) -> None:
-        super().unit_done(cell, error)
+    def unit_finished(self, cell, content, table, error) -> None:
+        super().unit_finished(cell, content, table, error)
         if len(self.computed) == self.after:
             raise KeyboardInterrupt

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import itertools
+import logging
 import tempfile
 import time
 from collections.abc import Mapping, Sequence
@@ -24,9 +25,11 @@ from semstab.engine.work.executors import Executor, InProcess
 from semstab.engine.work.jobs import Outcome
 from semstab.engine.work.passes import lend
 from semstab.errors import ConfigError, DataError
-from semstab.model.records import Result, UnitContent
+from semstab.model.records import Result
 from semstab.model.results import VoxelAdvice
 from semstab.settings import resolve
+
+logger = logging.getLogger("semstab")
 
 
 def run(
@@ -108,8 +111,8 @@ def _compute(plan: Plan, folder: Folder, executor: Executor, told: Observers) ->
     with watch("digest"):
         contents = {identity: kept for identity, each in units.items() if (kept := folder.kept(each)) is not None}
     found = Found(contents, kept=len(contents), watch=watch)
-    told.tell(lambda observer: observer.run_started(plan, [units[identity] for identity in contents]))
-    _tell_kept(plan, contents, told)
+    finished = dict(contents)
+    told.tell(lambda observer: observer.run_started(plan, finished))
     missing = [each for identity, each in units.items() if identity not in contents]
     if plan.config.check_geometry:
         with watch("check"):
@@ -120,7 +123,7 @@ def _compute(plan: Plan, folder: Folder, executor: Executor, told: Observers) ->
             sizing = sized(plan.config, missing, survey)
             give_back()
         for line in sizing.remarks:
-            told.tell(lambda observer, line=line: observer.remarked(line))  # type: ignore[misc]
+            logger.warning("%s", line)
         _refuse(sizing, missing, found, executor, told)
         fitting = [each for each in missing if each.identity not in sizing.refused]
         _work_off(plan.config, survey, told, found, fitting, sizing.tilings)
@@ -133,7 +136,7 @@ def _refuse(sizing: Sizing, missing: Sequence[Planned], found: Found, executor: 
         if (error := sizing.refused.get(each.identity)) is not None:
             found.errors[each.identity] = error
             found.causes.setdefault(error, ConfigError(error))
-            _tell_done(each, error, executor, told)
+            _tell_done(each, Outcome(each.identity, error=error), executor, told)
 
 
 def _work_off(
@@ -146,8 +149,7 @@ def _work_off(
 ) -> None:
     """What is missing, kept as it finishes."""
     executor, folder = survey.executor, survey.folder
-    factories = told.elsewhere(folder.path) if executor.elsewhere and missing else ()
-    waiting = Waiting(config, folder.path, survey.start, factories)
+    waiting = Waiting(config, folder.path, survey.start)
     in_tiles = InTiles(config, survey, waiting, told)
     units, ended = {each.identity: each for each in missing}, list[Outcome | None]()
     for each in missing:
@@ -165,9 +167,7 @@ def _work_off(
             if own is not None and own.identity not in found.errors:
                 _keep(folder, found, each, own)
                 tiled = own.identity in in_tiles
-                if tiled and own.content is not None:
-                    _tell_assembled(each, own.content, told)
-                _tell_done(each, own.error, executor, told, counted=tiled)
+                _tell_done(each, own, executor, told, counted=tiled)
 
 
 def _keep(folder: Folder, found: Found, each: Planned, outcome: Outcome) -> None:
@@ -186,26 +186,11 @@ def _keep(folder: Folder, found: Found, each: Planned, outcome: Outcome) -> None
         found.causes.setdefault(outcome.error or "", outcome.cause)
 
 
-def _tell_kept(plan: Plan, contents: Mapping[str, UnitContent], told: Observers) -> None:
-    watched = [each for each in plan.units if each.kept and each.identity in contents]
-    for task in plan.tasks:
-        group = [each for each in watched if (each.unit.scene, each.unit.backbone) == (task.scene.name, task.backbone)]
-        summaries = [summary for each in group if (summary := contents[each.identity].summary) is not None]
-        if summaries:
-            told.tell(lambda observer, task=task, summaries=summaries: observer.group_kept(task, summaries))  # type: ignore[misc]
-
-
-def _tell_assembled(planned: Planned, content: UnitContent, told: Observers) -> None:
-    summary = content.summary
-    if isinstance(planned, PlannedUnit) and planned.kept and summary is not None:
-        told.tell(lambda observer: observer.unit_assembled(planned.task, summary))
-
-
-def _tell_done(each: Planned, error: str | None, executor: Executor, told: Observers, *, counted: bool = False) -> None:
+def _tell_done(each: Planned, own: Outcome, executor: Executor, told: Observers, *, counted: bool = False) -> None:
     if not counted and (executor.elsewhere or not isinstance(each, PlannedUnit)):
         what = f"{each.unit.scene} · {each.unit.backbone}"
         told.tell(lambda observer: observer.advanced(each.frames, what))
-    told.tell(lambda observer: observer.unit_done(each, error))
+    told.tell(lambda observer: observer.unit_finished(each, own.content, own.table, own.error))
 
 
 def _checked(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import concurrent.futures as cf
 import itertools
+import logging
 from collections import deque
 from collections.abc import Callable, Collection, Iterator, Sequence
 from functools import partial
@@ -12,7 +13,7 @@ from typing import TypeVar
 
 from semstab.config import Config
 from semstab.engine.folder import Folder, unit_key
-from semstab.engine.observer import Factory, Observers
+from semstab.engine.observer import Observers
 from semstab.engine.sizing import Survey, begun_again
 from semstab.engine.tiling.again import SeenAgain
 from semstab.engine.tiling.partition import Part, Tiling
@@ -23,7 +24,6 @@ from semstab.engine.work.jobs import Job, Outcome, Request, failed, split
 from semstab.engine.work.memory import GB
 from semstab.engine.work.passes import look_again
 from semstab.errors import DataError, OutgrownError, SemstabError
-from semstab.model.results import Unit
 from semstab.statistics.sums import Whole
 
 # What this process puts together while others do the work.
@@ -253,11 +253,10 @@ def _part(request: Request) -> Part | None:
 class Waiting(Iterator[Job]):
     """What is still to be begun; where there is nothing, there may be again once what is at work has finished."""
 
-    def __init__(self, config: Config, folder: Path, start: str, observers: Sequence[Factory]) -> None:
-        self._config, self._folder, self._start, self._observers = config, folder, start, tuple(observers)
+    def __init__(self, config: Config, folder: Path, start: str) -> None:
+        self._config, self._folder, self._start = config, folder, start
         self._whole = deque[Job]()
         self._tiled: list[TiledUnit] = []
-        self._shown = set[tuple[str, str, str | None]]()
 
     def add_whole(self, units: Sequence[Planned], width: int) -> None:
         """Units that are fused at once, for so many tasks.
@@ -267,7 +266,7 @@ class Waiting(Iterator[Job]):
         sequences: dict[tuple[str, str], list[Request]] = {}
         for each in units:
             sequences.setdefault((each.unit.scene, each.unit.backbone), []).append(Request.of(each))
-        jobs = [self._job(*sequence, tuple(requests), self._observers) for sequence, requests in sequences.items()]
+        jobs = [self._job(*sequence, tuple(requests)) for sequence, requests in sequences.items()]
         self._whole.extend(split(jobs, width))
 
     def add_tiled(self, tiled: TiledUnit) -> None:
@@ -280,19 +279,12 @@ class Waiting(Iterator[Job]):
         for each in self._tiled:
             if (request := each.next_request()) is not None:
                 unit = each.planned.unit
-                return self._job(unit.scene, unit.backbone, (request,), self._watching(unit, request))
+                return self._job(unit.scene, unit.backbone, (request,))
         raise StopIteration
 
-    def _watching(self, unit: Unit, request: Request) -> tuple[Factory, ...]:
-        """Who is shown a portion: a job each, so that no two maps are in memory at once; frames are shown in one."""
-        frames = (unit.scene, unit.backbone, None if request.stretch is None else request.stretch.name)
-        seen = request.part is not None or (request.shown and frames not in self._shown)
-        self._shown.add(frames)
-        return self._observers if seen else ()
-
-    def _job(self, scene: str, backbone: str, requests: tuple[Request, ...], observers: tuple[Factory, ...]) -> Job:
+    def _job(self, scene: str, backbone: str, requests: tuple[Request, ...]) -> Job:
         memory = None if self._config.memory_gb is None else self._config.memory_gb * GB
-        return Job(scene, backbone, requests, self._start, self._folder, self._config.threads, memory, observers)
+        return Job(scene, backbone, requests, self._start, self._folder, self._config.threads, memory)
 
 
 class InTiles:
@@ -310,8 +302,6 @@ class InTiles:
         """A unit; its own outcome where it has failed already."""
         tiled = TiledUnit(planned, tiling, self._survey.folder, self._survey.executor.width, self._beside)
         self._units[planned.identity] = tiled
-        if planned.kept:
-            self._told.tell(lambda observer: observer.unit_in_tiles(planned.unit, tiled.key, tiled.finished))
         self._waiting.add_tiled(tiled)
         return tiled.take(None)
 
@@ -330,10 +320,8 @@ class InTiles:
     def _begin_again(self, planned: PlannedUnit, outcome: Outcome) -> Outcome | None:
         sizing = begun_again(self._config, planned, self._survey)
         for line in sizing.remarks:
-            self._told.tell(lambda observer, line=line: observer.remarked(line))  # type: ignore[misc]
+            logging.getLogger("semstab").warning("%s", line)
         tiling = sizing.tilings.get(planned.identity)
         if tiling is None:
             return outcome
-        if planned.kept:
-            self._told.tell(lambda observer: observer.unit_begun_again(planned.unit))
         return self.begin(planned, tiling)

@@ -15,7 +15,8 @@ from typing import TYPE_CHECKING, Any
 
 from semstab.core.files import write_text
 from semstab.engine.observer import Observer
-from semstab.model.records import Failure, Result
+from semstab.engine.units import PlannedUnit
+from semstab.model.records import Failure, Result, UnitContent
 from semstab.model.results import slug
 from semstab.report import figures
 from semstab.report.averages import describe
@@ -27,14 +28,9 @@ from semstab.report.tables import tables, write_tables
 from semstab.report.tables.table import ARROWS, Table, relations, sections
 
 if TYPE_CHECKING:
-    import numpy.typing as npt
-
-    from semstab.config import Config
-    from semstab.engine.units import Plan, PlannedRegions, PlannedUnit
-    from semstab.model.results import Unit, UnitSummary
+    from semstab.engine.units import Plan, Planned
     from semstab.model.voxels import VoxelTable
     from semstab.report.figures import DrawingProcess
-    from semstab.task import Task
 
 
 # The parts of a page that needs no other file: its style, tables and figures.
@@ -164,20 +160,17 @@ class Reporting(Observer):
         self._beside: DrawingProcess | None = None
         self._views = figures.Views()
         self._watched = ""
-        self._up: npt.ArrayLike | None = None
 
-    def run_started(self, plan: Plan, kept: Sequence[PlannedUnit | PlannedRegions]) -> None:
+    def run_started(self, plan: Plan, finished: Mapping[str, UnitContent]) -> None:
         """Figures show the units of the first backend; of the statistics they show more than the map says."""
         self._watched = "" if plan.config.statistics else plan.config.backends[0].name
 
-    def group_started(self, task: Task, config: Config) -> None:
-        """Where up is in the scene that is fused now."""
-        self._up = task.scene.up
-
-    def unit_finished(self, unit: Unit, table: VoxelTable, summary: UnitSummary) -> None:
+    def unit_finished(
+        self, planned: Planned, content: UnitContent | None, table: VoxelTable | None, error: str | None
+    ) -> None:
         """Take from the map what figures show of it."""
-        if unit.backend == self._watched:
-            self._views.see(unit, table, self._up)
+        if table is not None and isinstance(planned, PlannedUnit) and planned.unit.backend == self._watched:
+            self._views.see(planned.unit, table, planned.task.scene.up)
 
     def advanced(self, frames: int, what: str) -> None:
         """What takes a while is worth a second process for its figures."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 
 from rich.box import SIMPLE_HEAD
 from rich.console import Console
@@ -15,10 +15,10 @@ from rich.table import Table
 from semstab.check import Verdict
 from semstab.config import BACKENDS, BASE
 from semstab.engine.observer import Observer
-from semstab.engine.units import Plan, Planned
+from semstab.engine.units import Plan
 from semstab.metrics import macro_mean, pool, split_last
 from semstab.model.measures import VSS, measures
-from semstab.model.records import Failure, Record, Result
+from semstab.model.records import Failure, Record, Result, UnitContent
 from semstab.model.results import STAGES, Agreement, Means, UnitSummary
 from semstab.report.averages import Sweep, describe, levels, over_all, over_recurrent, pooled
 from semstab.report.narrative import HARDLY_ANY, remarks
@@ -344,15 +344,15 @@ class ProgressBar(Observer):
         self.notes: list[str] = []
         self._said = time.monotonic()
 
-    def run_started(self, plan: Plan, kept: Sequence[Planned]) -> None:
+    def run_started(self, plan: Plan, finished: Mapping[str, UnitContent]) -> None:
         """Show the bar: the frames of every unit that is to be computed are its total."""
         units = plan.distinct()
-        if kept:
-            self.bar.console.print(f"kept from before: {len(kept)} of {len(units)} units", style="dim")
+        if finished:
+            self.bar.console.print(f"kept from before: {len(finished)} of {len(units)} units", style="dim")
         for scene in plan.scenes.values():
             if scene.depth_from is not None:
                 self.notes.append(f"{scene.name}: depth from {scene.depth_from}")
-        missing = units.keys() - {each.identity for each in kept}
+        missing = units.keys() - finished.keys()
         self.bar.update(self.work, total=sum(units[identity].frames for identity in missing))
         if self.bar.console.is_interactive:
             self.bar.start()
@@ -361,10 +361,6 @@ class ProgressBar(Observer):
         """Remember, until the run is through, what could not be told."""
         if verdict.state == "unclear":
             self.notes.append(f"{task.scene.name}: {verdict.text}")
-
-    def remarked(self, line: str) -> None:
-        """Say it at once."""
-        self.bar.console.print(line, style="dim", soft_wrap=True, markup=False)
 
     def advanced(self, frames: int, what: str) -> None:
         """So many frames further."""

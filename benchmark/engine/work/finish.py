@@ -21,7 +21,6 @@ from semstab.core.types import Float64, Int64
 from semstab.datasets import Scene
 from semstab.datasets.formats.disk import file_digest
 from semstab.engine.evaluation import analyse_map
-from semstab.engine.observer import Observers
 from semstab.engine.series import Series
 from semstab.engine.tiling.portion import About, Finished, Portion
 from semstab.engine.work.image_space import COLUMNS
@@ -68,10 +67,9 @@ Savers = dict[str, Callable[[Path], None]]
 """What writes each file of a unit, by its path in the folder."""
 
 
-def finish(job: Job, stream: Stream, one: UnitMap, observers: Observers, watch: Stopwatch) -> Outcome:
+def finish(job: Job, stream: Stream, one: UnitMap, watch: Stopwatch) -> Outcome:
     """Measure a finished map and write its files. Raises DataError where no pixel was valid."""
-    task, config, unit = one.task, one.request.config, one.task.units[0]
-    kept = one.request.kept
+    task, config = one.task, one.request.config
     with watch("table"):
         table = _table(one.backend, task)
         _require_voxels(task, config, table)
@@ -81,9 +79,6 @@ def finish(job: Job, stream: Stream, one: UnitMap, observers: Observers, watch: 
     with watch("voxel sizes"):
         sizes = () if one.sizes is None else one.sizes.alphas()
         give_back(least=SMALL)
-    if kept:
-        with watch("observe"):
-            observers.tell(lambda observer: observer.unit_fused(unit, table))
     with watch("statistics"):
         truth = None if one.truth is None else _table(one.truth, task)
         events = one.backend.events() if config.statistics else None
@@ -100,10 +95,7 @@ def finish(job: Job, stream: Stream, one: UnitMap, observers: Observers, watch: 
         image_space = stream.image_space.result(summary.flicker_percent)
         content = dataclasses.replace(content, image_space=image_space, up=_up(task.scene, table, stream.poses))
         content = dataclasses.replace(content, quality=_quality(stream))
-    if kept:
-        with watch("observe"):
-            observers.tell(lambda observer: observer.unit_finished(unit, table, summary))
-    return Outcome(one.request.identity, content, files=returned)
+    return Outcome(one.request.identity, content, files=returned, table=table if one.request.kept else None)
 
 
 def _quality(stream: Stream) -> FrameQuality | None:

@@ -10,7 +10,6 @@ from pathlib import Path
 from semstab.check.reprojection import evenly
 from semstab.config import Config, FrameSelection, as_range
 from semstab.core.files import TEMPORARY
-from semstab.engine.observer import Factory
 from semstab.engine.tiling.again import Again, SeenAgain
 from semstab.engine.tiling.partition import Part, Tiling
 from semstab.engine.tiling.portion import SIZES, Portion
@@ -21,7 +20,7 @@ from semstab.engine.work.image_space import CLIPS
 from semstab.engine.work.sizes import FRAMES
 from semstab.errors import OUT_OF_MEMORY, OutgrownError, SemstabError, one_line
 from semstab.model.records import UnitContent
-from semstab.model.voxels import Extent
+from semstab.model.voxels import Extent, VoxelTable
 
 
 @dataclass(frozen=True)
@@ -146,7 +145,6 @@ class Job:
     folder        of the run or study
     threads       that decode frames ahead; 0: each when it is wanted, None: as many as the machine has for it
     memory_bytes  that maps may take before some are put off to another pass over the frames; None: half of what is free
-    observers     made where the job is done, and told of what is fused there
     width         how many jobs share the machine's memory
     """
 
@@ -157,7 +155,6 @@ class Job:
     folder: Path
     threads: int | None = None
     memory_bytes: float | None = None
-    observers: tuple[Factory, ...] = ()
     width: int = 1
 
 
@@ -171,6 +168,7 @@ class Outcome:
     cause    the exception, where the unit failed in this very process
     trace    where it was raised, if it is not semstab's own
     seconds  that its pass took, by stage; of the first outcome of a pass only
+    table    its voxels, where observers see them
     again    what a second look found; None where the voxels are not to be seen from there
     """
 
@@ -184,10 +182,11 @@ class Outcome:
     trace: str = ""
     seconds: Mapping[str, float] = field(default_factory=dict)
     again: SeenAgain | None = None
+    table: VoxelTable | None = None
 
     def __getstate__(self) -> dict[str, object]:
         """Without the exception, which may not travel."""
-        return {**self.__dict__, "cause": None}
+        return {**self.__dict__, "cause": None, "table": None}
 
 
 def failed(requests: Iterable[Request], error: str | Exception, *, outgrown: bool = False) -> list[Outcome]:

@@ -9,7 +9,7 @@ import itertools
 import json
 import logging
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -24,13 +24,13 @@ from semstab.core.process import Stopwatch, available_bytes, resident_bytes
 from semstab.datasets import GROUND_TRUTH, Dataset, Scene, open_dataset
 from semstab.datasets.formats.disk import file_digest
 from semstab.engine.evaluation import truth_task
-from semstab.engine.observer import Observer, Observers
+from semstab.engine.observer import Observers
 from semstab.engine.series import FrameRow
 from semstab.engine.tiling.again import Again, SeenAgain
 from semstab.engine.tiling.portion import PORTIONS
 from semstab.engine.tiling.sights import seen_by
 from semstab.engine.work.finish import Savers, finish, finish_portion, further_columns, save_voxels, written
-from semstab.engine.work.jobs import Job, Outcome, Request, failed, message, shared_marker
+from semstab.engine.work.jobs import Job, Outcome, Request, failed, shared_marker
 from semstab.engine.work.memory import Room
 from semstab.engine.work.sizes import SizeMaps
 from semstab.engine.work.stream import Decoded, NoMap, Prepared, Stream, UnitMap, in_order, streams_of
@@ -161,10 +161,9 @@ WARM_UP_STRIDE = 8
 def run_job(job: Job, observers: Observers | None = None) -> tuple[Outcome, ...]:
     """Compute the units of a job. One that fails does not keep the others from finishing.
 
-    `observers` see it where it is done in their process; elsewhere the job brings its own.
+    `observers` see it where it is done in their process.
     """
-    made = [make() for make in job.observers]
-    told = observers or Observers(made)
+    told = observers or Observers()
     outcomes: list[Outcome] = []
     requests = job.requests
     try:
@@ -180,11 +179,6 @@ def run_job(job: Job, observers: Observers | None = None) -> tuple[Outcome, ...]
             requests = tuple(fused.put_off)
     except Exception as error:  # noqa: BLE001 - whatever happens to a job is reported, and the other jobs go on
         outcomes += failed(requests, error)
-    finally:
-        for observer in made:
-            observer.close()
-    for problem in told.errors if made else ():
-        logger.warning("%s, %s: not recorded (%s)", job.scene, job.backbone, message(problem))
     return tuple(outcomes)
 
 
@@ -233,18 +227,11 @@ class Pass:
         """Fuse and measure; the outcome of every unit that was not put off."""
         order = in_order(self._streams)
         decode = prefetch(self._decode, order, threads=self.job.threads, size=lambda decoded: decoded.nbytes)
-        watched = [one for stream in self._streams for one in stream.maps if one.request.kept or one.request.shown]
+        watched = [one for stream in self._streams for one in stream.maps if one.request.kept]
         if watched:
             task = dataclasses.replace(watched[0].task, backends=tuple(one.task.backends[0] for one in watched))
-            self.observers.tell(lambda observer: observer.group_started(task, watched[0].request.config))
-        for one in (one for one in watched if one.request.kept):
-            self.observers.tell(lambda observer, one=one: observer.unit_started(one.task.units[0], one.backend))  # type: ignore[misc]
-        for one in self._parts():
-            self.observers.tell(
-                lambda observer, one=one: observer.part_started(  # type: ignore[misc]
-                    one.task, one.request.config, one.request.part, one.backend
-                )
-            )
+            config, backends = watched[0].request.config, {one.task.units[0]: one.backend for one in watched}
+            self.observers.tell(lambda observer: observer.group_started(task, config, backends))
         with contextlib.closing(decode) as frames:
             for index, fetched in zip(order, frames, strict=True):
                 self._watch.seconds["read"] += fetched.waited
@@ -306,26 +293,22 @@ class Pass:
         with self._failing([one.request for one in stream.maps]):
             now = stream.next_frame(fetched.item, self._watch, color=self.observers.want_color)
             if now.frame.index in stream.ahead:
-                self._tell_shown(stream, lambda observer, one: observer.frame_ahead(one.task, now.frame))
                 return
+            rows = {}
             for one in stream.maps:
                 with self._failing([one.request]):
                     row = self._integrate(one, now, fetched)
-                    one.rows.append(self._told(one, now.frame, row))
+                    self._tell_advanced(one)
+                    one.rows.append(row)
+                    rows[one.task.units[0]] = row
                     one.observations += row.report.voxels
                     one.soft = one.soft or now.frame.scores is not None
             if watched:
-                self.observers.tell(lambda observer: observer.frame_finished(stream.task, now.frame))
-            for _ in (one for one in stream.maps if one.request.part is not None):
-                self.observers.tell(lambda observer: observer.part_fused(now.frame))
-            self._tell_shown(stream, lambda observer, one: observer.frame_seen(one.task, now.frame))
+                with self._watch("observe"):
+                    seen = {one.task.units[0]: rows[one.task.units[0]] for one in watched if one.task.units[0] in rows}
+                    self.observers.tell(lambda observer: observer.frame_fused(stream.task, now.frame, seen))
         lost = {outcome.identity for outcome in self._outcomes}
         stream.maps = [one for one in stream.maps if one.request.identity not in lost]
-
-    def _tell_shown(self, stream: Stream, what: Callable[[Observer, UnitMap], None]) -> None:
-        """Tell the observers something of each map whose frames they are shown without it."""
-        for one in (one for one in stream.maps if one.request.shown):
-            self.observers.tell(lambda observer, one=one: what(observer, one))  # type: ignore[misc]
 
     def _integrate(self, one: UnitMap, now: Prepared, fetched: Fetched[Decoded]) -> FrameRow:
         frame = now.frame
@@ -358,34 +341,23 @@ class Pass:
             most_scores_left_out=math.nan if cut is None else cut.most,
         )  # fmt: skip
 
-    def _told(self, one: UnitMap, frame: Frame, row: FrameRow) -> FrameRow:
-        """The row, once the observers have seen it."""
+    def _tell_advanced(self, one: UnitMap) -> None:
         unit = one.task.units[0]
         what = f"{unit.scene} · {unit.backbone} · {unit.backend}"
         if one.request.portion is None:
             self.observers.tell(lambda observer: observer.advanced(1, what))
-        if not one.request.kept:
-            return row
-        with self._watch("observe") as lap:
-            self.observers.tell(lambda observer: observer.frame_fused(unit, frame, row))
-        return dataclasses.replace(row, logging_seconds=lap.seconds)
 
     def _finish(self, stream: Stream) -> None:
         """Measure the finished maps of a stream, and let go of each."""
-        watched = any(one.request.kept for one in stream.maps)
         while stream.maps:
             one = stream.maps.pop(0)
             with self._failing([one.request]):
                 self._outcomes.append(self._ended(stream, one))
-        if watched:
-            self.observers.tell(lambda observer: observer.group_finished(stream.task))
 
     def _ended(self, stream: Stream, one: UnitMap) -> Outcome:
         if one.request.portion is not None:
-            if one.request.part is not None:
-                self.observers.tell(lambda observer: observer.part_finished())
             return finish_portion(self.job, stream, one, self._watch)
-        return finish(self.job, stream, one, self.observers, self._watch)
+        return finish(self.job, stream, one, self._watch)
 
     def _make_room(self) -> None:
         """Put maps off to the next pass where they take more than the memory bound: half, but none that is watched."""
