@@ -19,8 +19,8 @@ from semstab.engine import load_result, run_study
 from semstab.errors import ConfigError
 from semstab.model.measures import VSS, Measure, measures, register, registered
 from semstab.model.voxels import VoxelTable
-from semstab.recording.observer import Recording
-from semstab.recording.voxel_maps import defaults, looks
+from semstab.recording import Recording, color_modes
+from semstab.recording.voxel_maps import defaults
 from semstab.report.averages import describe, levels
 from semstab.report.figures.distributions import draw_ecdf, draw_persistence, draw_sweep, histograms, informative
 from semstab.report.figures.judgement import statistics_figures
@@ -135,7 +135,7 @@ def test_figures_show_it(study) -> None:
 
 
 def test_the_recording_colours_by_it(run) -> None:
-    look = looks()["rival"]
+    look = color_modes()["rival"]
     assert look.title == "Rival (0 to 0.4 and more parts; black: OP < 3)"
     (archetype,) = defaults("rival")
     assert archetype.value_range.as_arrow_array().to_pylist() == [[0.0, 0.4]]  # type: ignore[union-attr]

@@ -328,7 +328,7 @@ def test_a_damaged_image_stops_the_run_at_its_frame(root) -> None:
     watching = Watching()
     with pytest.raises(DataError, match=r"depth/0002\.png: not a PNG image"):
         semstab.engine.run(configure(root, backbones=["a"], threads=4), observers=[watching])
-    assert watching.seen == ["start 1", "wall__a__numpy 0", "wall__a__numpy 1", "finished"]
+    assert watching.seen == ["start 1", "wall__a__numpy 0", "wall__a__numpy 1", "wall__a__numpy failed", "finished"]
 
 
 def test_the_time_of_a_frame_is_told_by_stage(root, tmp_path) -> None:

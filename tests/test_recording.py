@@ -9,6 +9,7 @@ import math
 import subprocess
 import sys
 import time
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -29,16 +30,23 @@ from semstab.errors import ConfigError
 from semstab.model.frames import Frame, Intrinsics
 from semstab.model.labels import LabelSpace
 from semstab.model.measures import SBD_MAX, measures
-from semstab.model.records import Record, Result, Variation
+from semstab.model.records import Record, Result, UnitContent, Variation
 from semstab.model.results import Unit, UnitSummary
 from semstab.model.voxels import VoxelTable
-from semstab.recording import background, flips, scenes, voxel_maps
-from semstab.recording.entities import LINE, Clock, Legend
-from semstab.recording.eye import Scenery, direction, fit
-from semstab.recording.observer import Recording
-from semstab.recording.series import OF_THE_BACKBONE, SERIES
-from semstab.recording.target import Target
-from semstab.recording.voxel_maps import looks
+from semstab.recording import (
+    SERIES,
+    Recording,
+    Target,
+    color_modes,
+    drift,
+    group,
+    lacks_pictures,
+    record_finished,
+    timeline,
+    voxel_maps,
+)
+from semstab.recording.layout import LINE, Legend, SceneBounds, direction, fit
+from semstab.recording.timeline import OF_THE_BACKBONE, Clock
 from semstab.task import Task
 
 NANOSECONDS = 1_000_000_000
@@ -91,7 +99,7 @@ def series(rows: dict[str, list[dict[str, Any]]], path: str) -> dict[int, float]
 
 
 def grid(rows: dict[str, list[dict[str, Any]]], path: str) -> dict[str, Any]:
-    """What a map shows at last, voxels sorted: indices, and each of `looks` by the name of its view."""
+    """What a map shows at last, voxels sorted: indices, and each of `color_modes` by the name of its view."""
     chunks = []
     for at in sorted(at for at in rows if at.startswith(f"{path}/")):
         shown: dict[str, Any] = {}
@@ -104,7 +112,7 @@ def grid(rows: dict[str, list[dict[str, Any]]], path: str) -> dict[str, Any]:
     index = [tuple(cell) for shown in chunks for cell in shown["VoxelGridMap:voxel_indices"]]
     order = sorted(range(len(index)), key=index.__getitem__)
     assert len(set(index)) == len(index)
-    components = {name: f"{name}:values" for name, look in looks().items() if look.range}
+    components = {name: f"{name}:values" for name, mode in color_modes().items() if mode.range}
     components |= {"class": "VoxelGridMap:colors", "category": "category:colors"}
     found: dict[str, Any] = {"voxel_indices": [index[i] for i in order]}
     for name, component in components.items():
@@ -211,19 +219,21 @@ def test_the_largest_sbd_has_the_last_colour() -> None:
 
 
 def test_the_blueprint_shows_every_series_and_every_backbone(run) -> None:
-    maps = {f"{backbone}: {title}" for backbone in "ab" for title in (look.title for look in looks().values())}
+    maps = {f"{backbone}: {title}" for backbone in "ab" for title in (mode.title for mode in color_modes().values())}
     pictures = {f"{backbone}: {what}" for backbone in "ab" for what in ("labels", "drift of this frame")}
     for views in read_blueprints(run / "recording.rrd"):
         names = {row["ViewBlueprint:display_name"][0] for row in views if "ViewBlueprint:display_name" in row}
         legends = {"Classes", "Drift of a frame at each pixel"}
-        assert names >= {*SERIES.values(), *maps, *pictures, *legends, "Notes", "Depth", "Frames to blame"}
+        assert names >= {*SERIES.values(), *maps, *pictures, *legends, "Notes", "Depth", "Top contributing frames"}
 
 
-def test_every_map_has_an_eye_that_looks_down_on_it(run) -> None:
+def test_every_map_is_seen_from_above(run) -> None:
     blueprints = read_blueprints(run / "recording.rrd")  # one when the run starts, one when there is a map to look at
     eyes = [row for rows in blueprints for row in rows if "EyeControls3D:look_target" in row]
     assert len(blueprints) == 2
-    assert len(eyes) == 2 * len(looks())  # of two backbones, each a view for the class, the measures, the category
+    assert len(eyes) == 2 * len(
+        color_modes()
+    )  # of two backbones, each a view for the class, the measures, the category
     table = semstab.VoxelTable.load(run / "voxels" / "wall__a__numpy.parquet")
     for eye in eyes:
         assert eye["EyeControls3D:position"][0][1] < table.centers[:, 1].min()  # from above: up is -y
@@ -239,7 +249,7 @@ def test_each_view_of_a_map_shows_its_measure(run) -> None:
             for row in rows
             if "ViewBlueprint:display_name" in row
         }
-        for name, shown in looks().items():
+        for name, shown in color_modes().items():
             for chunk in chunks:
                 at = f"{views[f'a: {shown.title}']}/ViewContents/overrides{chunk}/visualizers/"
                 instructions = [row for row in rows if row["rerun.entity"].startswith(at)]
@@ -260,7 +270,7 @@ def test_each_view_of_a_map_shows_its_measure(run) -> None:
 
 
 def test_the_layout_knows_every_chunk_of_a_map_that_outgrows_it(tmp_path, monkeypatch) -> None:
-    monkeypatch.setattr(scenes, "FIRST_CHUNKS", 1)
+    monkeypatch.setattr(group, "FIRST_CHUNKS", 1)
     monkeypatch.setattr(voxel_maps, "MAX_VOXELS", 1000)
     path = tmp_path / "outgrown.rrd"
     _, table = record(path, [frame(i, i % 3, (0.25 * i + 0.01, 0.01, 2.01)) for i in range(6)])
@@ -271,8 +281,8 @@ def test_the_layout_knows_every_chunk_of_a_map_that_outgrows_it(tmp_path, monkey
              and "/map/" in row["rerun.entity"]})
         for rows in read_blueprints(path)
     ]  # fmt: skip
-    assert min(known) == len(looks()) - 1
-    assert max(known) == (len(looks()) - 1) * voxel_maps.CHUNKS
+    assert min(known) == len(color_modes()) - 1
+    assert max(known) == (len(color_modes()) - 1) * voxel_maps.CHUNKS
     assert len(grid(read(path), r"/floor\ 1/map/net\/x/numpy")["voxel_indices"]) == len(table)
 
 
@@ -283,9 +293,9 @@ def test_a_map_and_its_cameras_fill_the_view(up, aspect) -> None:
     points = rng.normal(size=(4000, 3)) * (20, 2, 50) + (300, -40, 7)
     cameras = np.tile(np.eye(4), (5, 1, 1))
     cameras[:, :3, 3] = (300, -60, 7) + rng.normal(size=(5, 3)) * 10
-    scenery = Scenery(points, cameras, up)
-    target, distance = fit(scenery, aspect)
-    toward, upright = direction(scenery)
+    bounds = SceneBounds(points, cameras, up)
+    target, distance = fit(bounds, aspect)
+    toward, upright = direction(bounds)
     right = np.cross(upright, toward)
     right /= np.linalg.norm(right)
     seen = np.concatenate([points, cameras[:, :3, 3]]) - (target + distance * toward)
@@ -322,14 +332,14 @@ def test_a_start_that_finds_everything_kept_leaves_the_recording_alone(run) -> N
             assert entities
             assert all(series(again, at) == series(first, at) for at in entities)
     was, now = (grid(rows, "/wall/map/a/numpy") for rows in (first, again))
-    assert {*looks()} < {*was}
+    assert {*color_modes()} < {*was}
     assert [repr(was[key]) for key in was] == [repr(now[key]) for key in was]
 
 
 def test_a_resumed_run_says_what_it_does_not_show(tmp_path) -> None:
     class Interrupting(Observer):
-        def frame_fused(self, unit: Unit, frame: Frame, row: FrameRow) -> None:
-            if unit.backbone == "b":
+        def frame_fused(self, task, frame, rows) -> None:
+            if task.backbone == "b":
                 raise KeyboardInterrupt
 
     config = config_of(tiny_scene.write(tmp_path / "data" / "wall"))
@@ -347,7 +357,7 @@ def test_a_resumed_run_says_what_it_does_not_show(tmp_path) -> None:
     semstab.engine.run(config, out=path.parent, observers=[Recording(path, run=path.parent)])
     verify(path)
     rows = read(path)
-    kept, fused_now = notes(rows)
+    kept, fused_now = sorted(notes(rows))
     assert kept.startswith("a, numpy: 60 voxels")
     assert fused_now.startswith("b, numpy: 60 voxels")
     for backbone in "ab":
@@ -356,23 +366,26 @@ def test_a_resumed_run_says_what_it_does_not_show(tmp_path) -> None:
         np.testing.assert_array_equal(grid(rows, f"/wall/map/{backbone}/numpy")["op"], table.op)
     assert "/wall/camera/b/labels" in rows
     assert not [row for row in rows["/wall/camera/a/labels"] if "SegmentationImage:buffer" in row]
+    assert lacks_pictures(path.parent, path)
+    record_finished(path.parent, path)
+    assert not lacks_pictures(path.parent, path)
 
 
 @pytest.mark.parametrize(("fused_by", "own"), [("numba", 0), ("numpy", 2)])
 def test_a_map_of_the_run_is_followed_where_that_is_possible(tmp_path, monkeypatch, fused_by, own) -> None:
     """Else each backbone is fused a second time. The recorded drift is the same."""
     made = []
-    monkeypatch.setattr(flips, "NumbaHash", lambda *settings, within: made.append(settings) or NumbaHash(*settings))
+    monkeypatch.setattr(drift, "NumbaHash", lambda *settings: made.append(settings) or NumbaHash(*settings))
     config = config_of(tiny_scene.write(tmp_path / "wall"), fused_by)
     semstab.run(config, observers=[Recording(tmp_path / "x.rrd")])
     assert len(made) == own
-    drift = [
+    pictures = [
         row["SegmentationImage:buffer"]
         for row in read(tmp_path / "x.rrd")["/wall/camera/a/drift"]
         if "SegmentationImage:buffer" in row
     ]
-    assert len(drift) == 3
-    assert drift[0] != drift[1]
+    assert len(pictures) == 3
+    assert pictures[0] != pictures[1]
 
 
 def test_a_path_that_cannot_be_written_is_named(run, tmp_path) -> None:
@@ -428,22 +441,24 @@ def summary_of(table: VoxelTable) -> UnitSummary:
     return UnitSummary(UNIT, "abc", 3, metrics.summarise(table), math.nan, 1.0)
 
 
+def planned(indices: Sequence[int] = (0,)) -> PlannedUnit:
+    task = Task(Scene(), "net/x", indices, CLASSES.mapping_to(CLASSES), ("numpy",))
+    return PlannedUnit(Variation(), Config(voxel_size=0.25), task, "key", image_space=True, kept=True)
+
+
 def record(path: Path | Target, frames: list[Frame], *, finish: bool = True) -> tuple[Recording, VoxelTable]:
     """Drive a recording as the pipeline does."""
     watching = Recording(path)
-    task = Task(Scene(), "net/x", [f.index for f in frames], CLASSES.mapping_to(CLASSES), ("numpy",))
-    config = Config(voxel_size=0.25)
-    unit = PlannedUnit(Variation(), config, task, "key", image_space=True, kept=True)
-    watching.run_started(Plan(config, {}, (unit,), ()), [])
+    unit = planned([f.index for f in frames])
+    task, config = unit.task, unit.config
+    watching.run_started(Plan(config, {}, (unit,), ()), {})
     backend = backends.create("numpy", voxel_size=0.25, num_classes=3)
+    watching.group_started(task, config, {UNIT: backend})
     for each in frames:
-        watching.frame_fused(UNIT, each, FrameRow(backend.integrate(each), each.timestamp, math.nan))
-        watching.frame_finished(task, each)
+        watching.frame_fused(task, each, {UNIT: FrameRow(backend.integrate(each), each.timestamp, math.nan)})
     table = backend.table()
     if finish:
-        watching.unit_fused(UNIT, table)
-        watching.unit_finished(UNIT, table, summary_of(table))
-        watching.group_finished(task)
+        watching.unit_finished(unit, UnitContent("", summary_of(table)), table, None)
         watching.run_finished(Result("run", "numpy", (Record("key", Variation(), summary_of(table)),)))
     return watching, table
 
@@ -478,10 +493,9 @@ def test_what_goes_wrong_beside_the_loop_is_said_and_the_file_is_closed(tmp_path
     def fail(*_: object) -> str:
         raise RuntimeError("no room")
 
-    monkeypatch.setattr(voxel_maps.MapLog, "finish", fail)
-    watching.unit_fused(UNIT, table)
+    monkeypatch.setattr(voxel_maps.VoxelLogger, "finish", fail)
     with pytest.raises(RuntimeError, match="no room"):
-        watching.unit_finished(UNIT, table, summary_of(table))
+        watching.unit_finished(planned(), UnitContent("", summary_of(table)), table, None)
     watching.close()
     verify(path)
     assert set(series(read(path), r"/floor\ 1/series/map_vss/net\/x/numpy")) == {0, 1}
@@ -490,15 +504,15 @@ def test_what_goes_wrong_beside_the_loop_is_said_and_the_file_is_closed(tmp_path
 def test_jobs_run_in_order_and_few_are_pending() -> None:
     done: list[int] = []
     stream = rr.RecordingStream("test")
-    beside = background.Background(stream, Clock())
+    thread = timeline.Background(stream, Clock())
     for number in range(20):
-        beside.submit(number, None, functools.partial(done.append, number))
-        assert number - len(done) <= background.LOOK_BEHIND
-    beside.drain()
+        thread.submit(number, None, functools.partial(done.append, number))
+        assert number - len(done) <= timeline.MOST_PENDING
+    thread.drain()
     assert done == list(range(20))
-    beside.submit(20, None, functools.partial(done.remove, 99))
+    thread.submit(20, None, functools.partial(done.remove, 99))
     with pytest.raises(ValueError, match="not in list"):
-        beside.close()
+        thread.close()
     stream.disconnect()
 
 

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import contextlib
 import io
 import itertools
 import re
 import signal
 import subprocess
 import sys
-from collections.abc import Generator
 from pathlib import Path
 from typing import Any
 
@@ -24,23 +22,14 @@ from test_recording import config_of, grid, notes, read, read_blueprints, series
 import semstab
 from semstab import backends, metrics
 from semstab.backends.numba_hash import NumbaHash
-from semstab.core.files import write_arrays
-from semstab.engine import InProcess
-from semstab.engine.tiling import stretches
 from semstab.engine.units import make_plan
-from semstab.engine.work.passes import run_job
 from semstab.metrics import compensated_flicker
 from semstab.model.frames import Frame, Intrinsics
 from semstab.model.labels import GLOW, LabelSpace
 from semstab.model.measures import SBD_MAX
-from semstab.model.records import RECORDING_PARTS
-from semstab.model.results import Unit
-from semstab.recording import camera, flips, voxel_maps
-from semstab.recording.drift_parts import DriftParts
-from semstab.recording.entities import Clock
-from semstab.recording.flips import FlipLog, Tracker
-from semstab.recording.observer import Recording
-from semstab.recording.voxel_maps import looks
+from semstab.recording import Recording, camera, color_modes, drift, lacks_pictures, record_finished, voxel_maps
+from semstab.recording.drift import ContributionLog, Tracker, View
+from semstab.recording.timeline import Clock
 from semstab.settings import load_config
 from semstab.task import read as read_frame
 
@@ -83,9 +72,9 @@ def test_the_drift_picture_is_the_drift_of_the_pixels_voxel(compared) -> None:
     rows = [row for row in read(out / "recording.rrd")["/wall/camera/a/drift"] if "SegmentationImage:buffer" in row]
     reference = backends.create("numpy", voxel_size=0.25, num_classes=3)
     for frame, row in zip(frames_of(config), rows, strict=True):
-        before = {tuple(index): drift for index, drift in zip(*state(reference.table()), strict=True)}
+        before = {tuple(index): bits for index, bits in zip(*state(reference.table()), strict=True)}
         reference.integrate(frame)
-        after = {tuple(index): drift for index, drift in zip(*state(reference.table()), strict=True)}
+        after = {tuple(index): bits for index, bits in zip(*state(reference.table()), strict=True)}
         shown = image(row, "SegmentationImage")
         v, u = np.mgrid[: frame.shape[0], : frame.shape[1]]
         K, T = frame.intrinsics, frame.T_wc
@@ -102,27 +91,27 @@ def state(table: semstab.VoxelTable) -> tuple[list[list[int]], list[float]]:
     return table.index.tolist(), table.drift_sum.tolist()
 
 
-def level(drift: float | None) -> int:
+def level(bits: float | None) -> int:
     """By the definition of the levels: the k-th begins at SBD_MAX (k / LEVELS)^2."""
-    if drift is None:
-        return camera.FIRST_SEEN
-    if drift < 1e-9:
-        return camera.NO_DRIFT
-    level = int(camera.LEVELS * (drift / SBD_MAX) ** 0.5 + 1e-9)
-    return camera.NO_DRIFT + 1 + min(level, camera.LEVELS - 1)
+    if bits is None:
+        return drift.FIRST_SEEN
+    if bits < 1e-9:
+        return drift.NO_DRIFT
+    level = int(drift.LEVELS * (bits / SBD_MAX) ** 0.5 + 1e-9)
+    return drift.NO_DRIFT + 1 + min(level, drift.LEVELS - 1)
 
 
 def test_no_class_wears_a_colour_of_drift(compared) -> None:
     """The legend is drawn in the colours of the pictures; red ones give way to a class that glows."""
     given = LabelSpace("many", tuple(f"c{k}" for k in range(150)))
-    assert camera.ramp(given)[0].tolist() == list(GLOW[0])  # no class is given such a colour
-    assert min(np.linalg.norm(camera.ramp(given) - c, axis=1).min() for c in given.colors) >= camera.NEAR
+    assert drift.ramp(given)[0].tolist() == list(GLOW[0])  # no class is given such a colour
+    assert min(np.linalg.norm(drift.ramp(given) - c, axis=1).min() for c in given.colors) >= drift.NEAR
     fire = (230, 30, 0)
     for colors in ([(0, 0, 255), (128, 128, 128)], [fire, (0, 220, 240)], [fire, (0, 220, 240), (200, 0, 190)]):
         classes = LabelSpace("glowing", tuple("abc"[: len(colors)]), colors=tuple(colors))
-        shown = camera.ramp(classes)
-        assert shown.shape == (camera.LEVELS, 3)
-        assert min(np.linalg.norm(shown - color, axis=1).min() for color in colors) >= camera.NEAR
+        shown = drift.ramp(classes)
+        assert shown.shape == (drift.LEVELS, 3)
+        assert min(np.linalg.norm(shown - color, axis=1).min() for color in colors) >= drift.NEAR
     rows = read(compared[1] / "recording.rrd")
     pictures, legend = (
         [row for row in rows[f"/wall/{at}"] if "AnnotationContext:context" in row]
@@ -131,8 +120,8 @@ def test_no_class_wears_a_colour_of_drift(compared) -> None:
     assert pictures[0]["AnnotationContext:context"] == legend[0]["AnnotationContext:context"]
     (levels,) = rows["/wall/drift_legend/levels"]
     shown = image(levels, "SegmentationImage").reshape(-1).tolist()
-    assert shown[0] == camera.FIRST_SEEN
-    assert shown[2:] == [camera.NO_DRIFT + 1 + level for level in range(camera.LEVELS)]
+    assert shown[0] == drift.FIRST_SEEN
+    assert shown[2:] == [drift.NO_DRIFT + 1 + level for level in range(drift.LEVELS)]
 
 
 def test_labels_camera_and_colour_are_those_of_the_frames(compared) -> None:
@@ -278,15 +267,15 @@ def test_what_numba_says_of_a_frame_is_what_happened(evidence) -> None:
         new = {tuple(i): (d, k) for i, d, k in described(reference.table())}
         changes = fused.changes
         assert len(changes.row) == len(new)
-        for voxel, drift, before, after in zip(
+        for voxel, bits, before, after in zip(
             fused.index_of(changes.row).tolist(), changes.drift, changes.before, changes.after, strict=True
         ):
             assert after == new[tuple(voxel)][1]
             if tuple(voxel) in old:
                 assert before == old[tuple(voxel)][1]
-                assert drift == pytest.approx(new[tuple(voxel)][0] - old[tuple(voxel)][0], abs=1e-6)
+                assert bits == pytest.approx(new[tuple(voxel)][0] - old[tuple(voxel)][0], abs=1e-6)
             else:
-                assert np.isnan(drift)
+                assert np.isnan(bits)
                 assert before == after
 
 
@@ -299,8 +288,7 @@ def test_the_voxel_behind_every_pixel_is_found_whatever_becomes_of_the_map() -> 
     labels = np.random.default_rng(1).integers(0, 4, (9, 12))
     labels[0, :3] = 255
     view = frame(0, labels)
-    tracker.follow(view)
-    caused, changes, table = tracker.drift_of(view), tracker.map.changes, tracker.map.table()
+    caused, changes, table = tracker.follow(view), tracker.map.changes, tracker.map.table()
     tracker.follow(frame(1, np.zeros((9, 12))))
     found = caused.voxels_at(1)
     np.testing.assert_array_equal(found == -1, ~view.valid)
@@ -310,9 +298,9 @@ def test_the_voxel_behind_every_pixel_is_found_whatever_becomes_of_the_map() -> 
     assert {tuple(i): n for i, n in zip(index, counted, strict=True)} == {
         tuple(i): n for i, n in zip(table.index.tolist(), table.pixels.tolist(), strict=True)
     }
-    drift, seen = caused.at(1)
+    bits, seen = caused.at(1)
     np.testing.assert_array_equal(seen, view.valid)
-    assert np.isnan(drift[seen]).all()
+    assert np.isnan(bits[seen]).all()
 
 
 def alternating(count: int) -> list[Frame]:
@@ -325,25 +313,25 @@ def alternating(count: int) -> list[Frame]:
     return views
 
 
-def tracked(views: list[Frame]) -> tuple[Tracker, FlipLog]:
-    tracker, log = Tracker(1.0, 3), FlipLog()
+def tracked(views: list[Frame]) -> tuple[Tracker, ContributionLog]:
+    tracker, log = Tracker(1.0, 3), ContributionLog()
     for view in views:
         tracker.follow(view)
         log.update(tracker, view)
     return tracker, log
 
 
-def test_the_voxel_that_flickers_is_the_first_suspect_with_the_frames_to_blame(tmp_path) -> None:
+def test_the_voxel_that_flickers_comes_first_with_its_top_contributing_frames(tmp_path) -> None:
     tracker, log = tracked(alternating(6))
-    suspects = list(log.suspects(tracker))
+    voxels = list(log.top_voxels(tracker))
     table = tracker.map.table()
-    worst = suspects[0]
+    worst = voxels[0]
     np.testing.assert_allclose(worst.center, table.centers[table.drift_sum.argmax()])
     assert worst.bits == pytest.approx(table.drift_sum.max(), rel=1e-6)
-    assert [s.bits for s in suspects] == sorted((s.bits for s in suspects), reverse=True)
+    assert [v.bits for v in voxels] == sorted((v.bits for v in voxels), reverse=True)
     stream = rr.RecordingStream("test")
     stream.save(tmp_path / "flips.rrd")
-    log.log(stream, "s", "net", suspects, CLASSES, np.zeros(3), Clock())
+    log.log(stream, "s", "net", voxels, CLASSES, np.zeros(3), Clock())
     stream.flush()
     stream.disconnect()
     verify(tmp_path / "flips.rrd")
@@ -374,7 +362,7 @@ def test_the_voxel_that_flickers_is_the_first_suspect_with_the_frames_to_blame(t
 
 def test_a_number_is_drawn_where_it_lies_inside_the_image() -> None:
     T_wc = np.array([[1.0, 0, 0, 5], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
-    seen_by = flips.Camera(np.array([[100.0, 0, 50], [0, 100, 40], [0, 0, 1]]), T_wc, (80, 100))
+    seen_by = View(None, Intrinsics(100.0, 100.0, 50.0, 40.0), T_wc, (80, 100))
     pixels, inside = seen_by.project(np.array([[5.0, 0, 2], [5.2, 0.1, 2], [5.0, 0, -2], [5.98, 0, 2], [8, 0, 2]]))
     assert inside.tolist() == [True, True, False, False, False]  # behind, at the edge, outside
     np.testing.assert_allclose(pixels[:2], [[50.5, 40.5], [60.5, 45.5]])
@@ -382,11 +370,11 @@ def test_a_number_is_drawn_where_it_lies_inside_the_image() -> None:
 
 def test_the_log_of_flips_is_bounded_and_keeps_those_of_the_worst(monkeypatch) -> None:
     tracker, log = tracked(alternating(12))
-    monkeypatch.setattr(flips, "MAX_MOVES", 12)
+    monkeypatch.setattr(drift, "MAX_MOVES", 12)
     tracker_bounded, bounded = tracked(alternating(12))
     kept = sum(len(part) for part in bounded.moves)
     assert kept <= 12
-    first, second = (next(each.suspects(t)) for each, t in ((log, tracker), (bounded, tracker_bounded)))
+    first, second = (next(each.top_voxels(t)) for each, t in ((log, tracker), (bounded, tracker_bounded)))
     np.testing.assert_array_equal(first.center, second.center)
 
 
@@ -394,7 +382,7 @@ def test_what_a_growing_map_logs_is_bounded(monkeypatch, tmp_path) -> None:
     monkeypatch.setattr(voxel_maps, "BUDGET", 600)
     monkeypatch.setattr(voxel_maps, "MAX_VOXELS", 2000)
     fused = NumbaHash(voxel_size=0.25, num_classes=3)
-    growing = voxel_maps.MapLog("/map", CLASSES, np.zeros(3, dtype=np.int64), frames=20)
+    growing = voxel_maps.VoxelLogger("/map", CLASSES, np.zeros(3, dtype=np.int64), frames=20)
     stream = rr.RecordingStream("test")
     stream.save(tmp_path / "grown.rrd")
     rng = np.random.default_rng(0)
@@ -418,7 +406,7 @@ def test_what_a_growing_map_logs_is_bounded(monkeypatch, tmp_path) -> None:
 
 def test_a_chunk_that_got_no_new_voxels_is_logged_without_its_places(tmp_path) -> None:
     fused = NumbaHash(voxel_size=0.25, num_classes=3)
-    growing = voxel_maps.MapLog("/map", CLASSES, np.zeros(3, dtype=np.int64), frames=4)
+    growing = voxel_maps.VoxelLogger("/map", CLASSES, np.zeros(3, dtype=np.int64), frames=4)
     stream = rr.RecordingStream("test")
     stream.save(tmp_path / "grown.rrd")
     for index in range(4):
@@ -439,7 +427,7 @@ def test_a_chunk_that_got_no_new_voxels_is_logged_without_its_places(tmp_path) -
 def test_what_is_not_drawn_yet_comes_before_what_changed(tmp_path) -> None:
     """A large map that is seen all over, and grows at its end."""
     fused = NumbaHash(voxel_size=0.25, num_classes=3)
-    growing = voxel_maps.MapLog("/map", CLASSES, np.zeros(3, dtype=np.int64), frames=100)
+    growing = voxel_maps.VoxelLogger("/map", CLASSES, np.zeros(3, dtype=np.int64), frames=100)
     stream = rr.RecordingStream("test")
     stream.save(tmp_path / "grown.rrd")
     growing.allowed = 1e6
@@ -472,7 +460,7 @@ def test_500_frames_of_4k_stay_below_the_size_that_is_stated() -> None:
     _, jpeg = cv2.imencode(".jpg", noise, [cv2.IMWRITE_JPEG_QUALITY, camera.JPEG_QUALITY])
     color = max(500 * jpeg.size, camera.COLOR_BYTES)
     labels, drift, depth = W * H, (W // 2) * (H // 2), 2 * (W // 2) * (H // 2)
-    voxels = (voxel_maps.BUDGET + voxel_maps.MAX_VOXELS) * (3 * 4 + 4 * len(looks()))
+    voxels = (voxel_maps.BUDGET + voxel_maps.MAX_VOXELS) * (3 * 4 + 4 * len(color_modes()))
     assert 500 * (labels + drift + depth) + color + voxels < 0.7e9
 
 
@@ -486,7 +474,7 @@ from semstab.engine import Observer
 from semstab.settings import load_config
 from semstab.recording import Recording
 class Killing(Observer):
-    def unit_finished(self, unit, table, summary):
+    def unit_finished(self, *_):
         time.sleep(1)
         os.kill(os.getpid(), signal.SIGKILL)
 config = load_config(overrides={{"dataset": {{"name": "posed_folder", "options": {{"root": {str(root)!r}}}}},
@@ -505,121 +493,59 @@ semstab.engine.run(config, observers=[Recording({str(path)!r}), Killing()])
     assert set(series(read(whole), "/wall/series/map_vss/a/numba")) == {0, 1, 2}
 
 
-class Elsewhere(InProcess):
-    """In this process, but as if jobs were done in others: each records a part, which are merged."""
-
-    elsewhere = True
-
-    def run(self, jobs: Any, observers: Any) -> Generator:
-        for job in jobs:
-            yield job, run_job(job)
-
-
-class Interrupted(InProcess):
-    """In this process, until so many jobs are done."""
-
-    def __init__(self, jobs: int) -> None:
-        self.left = jobs
-
-    def run(self, jobs: Any, observers: Any) -> Generator:
-        for done in super().run(jobs, observers):
-            yield done
-            self.left -= 1
-            if not self.left:
-                raise KeyboardInterrupt
-
-
 @pytest.fixture(scope="module")
-def module_patch():
-    with pytest.MonkeyPatch.context() as patch:
-        yield patch
-
-
-@pytest.fixture(scope="module")
-def tiles(compared, module_patch):
-    """The same run in tiles: recorded in this process, in parts that are merged, and after an interruption."""
-    module_patch.setattr(stretches, "LEAST", 1)
-    module_patch.setattr(stretches, "MOST", 2)
+def again(compared):
+    """Recordings made from run folders: of a whole map, of one in tiles, of one without its dataset."""
     config, out = compared
-    config = config.model_copy(update={"backends": config.backends[:1], "tile_size": 8})
-    for name, executor in (("one", InProcess()), ("merged", Elsewhere()), ("resumed", InProcess())):
-        at = out.parent / name
-        if name == "resumed":
-            with pytest.raises(KeyboardInterrupt), contextlib.closing(Recording(at / "recording.rrd", run=at)) as first:
-                semstab.engine.run(config, out=at, executor=Interrupted(4), observers=[first])
-            assert len(list(at.glob("parts/*/tiles*.npz"))) > 0
-        recording = Recording(at / "recording.rrd", run=at)
-        semstab.engine.run(config, out=at, executor=executor, observers=[recording])
-        assert len(list((at / "voxels").glob("*/*.parquet"))) > 1
-        assert not (at / RECORDING_PARTS).exists()
-    return [out.parent / name for name in ("one", "merged", "resumed")]
+    tiled = out.parent / "tiled"
+    options = {"backends": config.backends[:1], "tile_size": 8}
+    recording = Recording(tiled / "recording.rrd", run=tiled)
+    semstab.engine.run(config.model_copy(update=options), out=tiled, observers=[recording])
+    assert len(list((tiled / "voxels").glob("*/*.parquet"))) > 1
+    assert lacks_pictures(tiled, tiled / "recording.rrd")
+    verify(tiled / "recording.rrd")
+    record_finished(tiled, tiled / "recording.rrd")
+    record_finished(out, out / "again.rrd")
+    data = Path(config.dataset.options["root"])
+    data.rename(data.with_name("away"))
+    record_finished(out, out / "without.rrd")
+    data.with_name("away").rename(data)
+    return out / "again.rrd", tiled / "recording.rrd", out / "without.rrd"
 
 
-def test_parts_of_a_map_together_show_the_drift_of_the_whole_map(compared, tiles) -> None:
-    entity = "/wall/camera/a/drift"
-
-    def drawn(folder: Path) -> dict[int, bytes]:
-        rows = read(folder / "recording.rrd")[entity]
-        rows = [row for row in rows if "SegmentationImage:buffer" in row]
-        return {row["frame"]: image(row, "SegmentationImage").tobytes() for row in rows}
-
-    expected = drawn(compared[1])
-    assert len(expected) == tiny_scene.FRAMES
-    assert all(drawn(folder) == expected for folder in tiles)
+def test_a_recording_made_from_the_folder_is_that_of_the_run(compared, again) -> None:
+    """Each entity has the same rows, but for the layout of the map in time."""
+    once, replayed = (by_entity(path) for path in (compared[1] / "recording.rrd", again[0]))
+    assert once.keys() == replayed.keys()
+    assert [at for at in once if "/series/" not in at and at != "/__properties" and once[at] != replayed[at]] == []
+    for at in (at for at in once if "/series/" in at):
+        assert series(read(again[0]), at) == series(read(compared[1] / "recording.rrd"), at)
+    assert not lacks_pictures(compared[1], compared[1] / "recording.rrd")
 
 
-def test_a_frame_is_compared_with_the_one_before_it_where_another_job_looks_at_that(compared, tiles) -> None:
-    entity = "/wall/series/compensated_flicker/a"
-    (expected, *others) = (series(read(folder / "recording.rrd"), entity) for folder in (compared[1], *tiles))
-    assert len(expected) == tiny_scene.FRAMES - 1
-    assert others == [expected] * 3
+def test_a_map_in_tiles_has_the_pictures_and_flips_of_the_whole_map(compared, again) -> None:
+    once, tiled = (by_entity(path) for path in (compared[1] / "recording.rrd", again[1]))
+    pictures = [at for at in once if any(part in at for part in ("/camera", "flips", "/depth", "/trajectory"))]
+    assert len([at for at in pictures if "flips" in at]) == drift.SHOWN + 3
+    assert [at for at in pictures if once[at] != tiled[at]] == []
+    flicker = [
+        series(read(path), "/wall/series/compensated_flicker/a") for path in (compared[1] / "recording.rrd", again[1])
+    ]
+    assert flicker[0] == flicker[1]
+    maps = [grid(read(path), "/wall/map/a/numba") for path in (compared[1] / "recording.rrd", again[1])]
+    assert repr(maps[0]) == repr(maps[1])  # NaN where a voxel was seen once
 
 
-def test_an_interrupted_run_in_tiles_is_recorded_as_one_in_one_go(tiles) -> None:
-    """Each entity has the same frames."""
-    once, _, resumed = (read(folder / "recording.rrd") for folder in tiles)
-    assert resumed.keys() == once.keys()
-    for entity, rows in once.items():
-        assert frames_in(resumed[entity]) == frames_in(rows), entity
+def test_without_its_dataset_a_run_is_recorded_without_pictures(compared, again) -> None:
+    whole, without = (read(path) for path in (compared[1] / "recording.rrd", again[2]))
+    entity = "/wall/series/map_vss/a/numba"
+    assert series(without, entity) == series(whole, entity)
+    assert grid(without, "/wall/map/a/numba")["op"] == grid(whole, "/wall/map/a/numba")["op"]
+    assert lacks_pictures(compared[1], again[2])
 
 
-def frames_in(rows: list[dict[str, Any]]) -> list[int]:
-    return sorted(row["frame"] for row in rows if "frame" in row)
-
-
-def test_the_voxels_that_drifted_most_are_those_of_the_whole_map(compared, tiles) -> None:
-    def flips_of(folder: Path) -> dict[str, list[dict[str, Any]]]:
-        entities = read(folder / "recording.rrd")
-        assert entities["/wall/flips_at/a"][0]["Points3D:labels"] == [f"{k + 1}" for k in range(flips.SHOWN)]
-        return {
-            entity: sorted((without_ids(row) for row in rows), key=lambda row: row.get("frame", -1))
-            for entity, rows in entities.items()
-            if "flips" in entity
-        }
-
-    expected = flips_of(compared[1])
-    assert len(expected) == flips.SHOWN + 3
-    assert all(flips_of(folder) == expected for folder in tiles)
-
-
-def without_ids(row: dict[str, Any]) -> dict[str, Any]:
-    return {name: value for name, value in row.items() if "RowId" not in name}
-
-
-def test_voxels_that_drifted_most_are_not_named_where_a_part_has_not_told_of_its_own(tmp_path) -> None:
-    tracker, log = tracked(alternating(6))
-    unit = Unit("s", "net", "numba")
-    for k, name in enumerate(("first", "second")):
-        found = flips.to_arrays(list(log.suspects(tracker))[k : k + 3]) | {"voxels": 10}
-        write_arrays(tmp_path / "flips" / unit.slug / f"{name}.npz", found)
-    told = DriftParts(tmp_path).suspects(unit, 20)
-    assert [suspect.number for suspect in told] == [1, 2, 3]
-    assert [suspect.bits for suspect in told] == sorted((suspect.bits for suspect in told), reverse=True)
-    assert DriftParts(tmp_path).suspects(unit, 21) is None
-    assert DriftParts(None).suspects(unit, 21) is None
-
-
-def test_a_merged_recording_has_one_layout_and_its_maps_are_looked_at(tiles) -> None:
-    """Of two, the viewer would show the one that comes last in the file, in which they lie in no order."""
-    (layout,) = read_blueprints(tiles[1] / "recording.rrd")
-    assert any("EyeControls3D:position" in row for row in layout)
+def by_entity(path: Path) -> dict[str, list[str]]:
+    return {
+        entity: sorted(repr({name: value for name, value in row.items() if "RowId" not in name}) for row in rows)
+        for entity, rows in read(path).items()
+    }

@@ -10,24 +10,20 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 
 import psutil
 import pytest
 import rerun as rr
 import tiny_scene
-from rerun.error_utils import RerunWarning
-from rerun.experimental import ViewerClient
-from test_recording import UNIT, config_of, frame, read, record, series, verify
+from test_recording import config_of, read, series, verify
 from typer.testing import CliRunner
 
 import semstab
 from semstab import cli
 from semstab.errors import ConfigError
-from semstab.recording import target
-from semstab.recording.observer import Recording
-from semstab.recording.target import Target
+from semstab.recording import Recording, Target, target
 
 
 def test_what_rerun_may_say() -> None:
@@ -161,44 +157,3 @@ def test_a_run_is_streamed_to_a_viewer_and_into_its_file(tmp_path) -> None:
     expected = series(read(tmp_path / "own.rrd"), "/wall/series/map_vss/a/numba")
     assert len(expected) == 3
     assert saved.stat().st_size > 10_000
-
-
-def test_a_viewer_gets_a_recording_without_the_map_that_was_given_up(tmp_path, monkeypatch) -> None:
-    """In place of the one that it has."""
-    port, saved, closed = unused_port(), tmp_path / "received.rrd", []
-    monkeypatch.setattr(ViewerClient, "close", lambda _, store_ids: closed.extend(store_ids))
-    file = Target(tmp_path / "own.rrd", f"rerun+http://127.0.0.1:{port}/proxy")
-    with viewer_at(port, saved):
-        again_without_its_map(file)
-        time.sleep(1)
-    (own,) = rr.chunk.RrdReader(file.file).recordings()
-    with pytest.warns(RerunWarning, match="no footer"):
-        received = rr.chunk.RrdReader(saved)
-    shown = {
-        store.recording_id: {chunk.entity_path for chunk in received.stream(store=store)}
-        for store in received.recordings()
-    }
-    assert shown.pop(own.recording_id) == read(file.file).keys()
-    ((before, given_up),) = shown.items()
-    assert r"/floor\ 1/map/net\/x/numpy/00" in given_up
-    assert closed == [f"Recording:semstab:{before}"]
-
-
-def test_who_is_served_stays_connected_when_a_map_is_given_up(tmp_path, monkeypatch) -> None:
-    port = unused_port()
-    monkeypatch.setattr(target, "DEFAULT_URL", f"rerun+http://127.0.0.1:{port}/proxy")
-    with socket.socket() as viewer:  # for as long as it is there its port is taken
-        again_without_its_map(Target(tmp_path / "own.rrd", "serve"), lambda: viewer.connect(("127.0.0.1", port)))
-
-
-def again_without_its_map(file: Target, after: Callable[[], None] = lambda: None) -> None:
-    """Three frames are recorded, and their map is given up."""
-    watching, _ = record(file, [frame(k, k, (0.01, 0.01, 2.01)) for k in range(3)], finish=False)
-    after()
-    watching.unit_begun_again(UNIT)
-    assert listens(int(file.viewer_url.split(":")[-1].split("/")[0]))
-    watching.close()
-    verify(file.file)
-    recorded = read(file.file)
-    assert [row["frame"] for row in recorded[r"/floor\ 1/depth"]] == [0, 1, 2]
-    assert not [entity for entity in recorded if entity.startswith(r"/floor\ 1/map")]

@@ -41,7 +41,7 @@ from semstab.errors import ConfigError
 if TYPE_CHECKING:
     from semstab.config import Config
     from semstab.engine import Executor, Observer
-    from semstab.recording.observer import Recording
+    from semstab.recording import Recording
 
 
 DISAGREE = 3
@@ -222,25 +222,20 @@ def show(
 
 
 def view(run: Annotated[Path, typer.Argument(metavar="RUN", help="Run folder, or an .rrd file.")]) -> None:
-    """Open a run's recording in the rerun viewer."""
+    """Open a run's recording in the rerun viewer; where units lack pictures, it is made again from the run folder."""
     import subprocess
 
-    from semstab.recording.target import viewer_command
+    from semstab.recording import lacks_pictures, record_finished, viewer_command
 
-    recording = run / "recording.rrd" if run.is_dir() else run
-    if not recording.is_file():
-        raise ConfigError(_why_no_recording(run))
-    raise typer.Exit(subprocess.run([*viewer_command(), str(recording)], check=False).returncode)
-
-
-def _why_no_recording(run: Path) -> str:
-    """What is there instead, and how to get one."""
     if not run.exists():
-        return f"{run}: there is no such run or file; name the folder that --out gave, or one of runs/"
-    if run.is_dir() and not (run / "summary.json").exists():
-        return f"{run}: holds no finished run; name the folder that --out gave, or one of runs/"
-    shown = f"open {run / 'report.html'}, or " if (run / "report.html").exists() else ""
-    return f"{run}: was not recorded (a study is only where it is asked for); {shown}start it again with --rerun FILE"
+        raise ConfigError(f"{run}: there is no such run or file; name the folder that --out gave, or one of runs/")
+    recording, finished = run / "recording.rrd" if run.is_dir() else run, (run / "summary.json").is_file()
+    if not finished and not recording.is_file():
+        raise ConfigError(f"{run}: holds no finished run; name the folder that --out gave, or one of runs/")
+    if finished and lacks_pictures(run, recording):
+        say(f"making {recording}")
+        record_finished(run, recording)
+    raise typer.Exit(subprocess.run([*viewer_command(), str(recording)], check=False).returncode)
 
 
 def execute(
@@ -296,8 +291,7 @@ def execute(
 def _recording(rerun: str | None, out: Path) -> list[Recording]:
     if rerun == "off":
         return []
-    from semstab.recording.observer import Recording
-    from semstab.recording.target import Target
+    from semstab.recording import Recording, Target
 
     return [Recording(Target.parse(rerun, out / "recording.rrd"), run=out)]
 

@@ -1,4 +1,4 @@
-"""The rerun recording of a run, written while it goes on. Only this package imports rerun.
+"""The rerun recording of a run, written while it is fused. Only this package imports rerun.
 
 Entities, all below the scene's name:
 
@@ -10,7 +10,7 @@ map/BACKBONE/BACKEND/CHUNK              VoxelGridMap, coloured by class; compone
                                         and KEY:values of each measure, which the views map to its own
 series/NAME/BACKBONE/BACKEND            Scalars: a series of `SERIES`
 flips/BACKBONE/voxel_N                  StateChange: the dominant class of the voxels that drifted most
-flips_report/BACKBONE, flips_at/...     TextDocument: the frames that moved them; Points3D: where those voxels are
+flips_report/BACKBONE, flips_at/...     TextDocument: the top contributing frames; Points3D: where those voxels are
 camera/BACKBONE/flips                   Points2D: those voxels in the frame, where their numbers lie inside its image
 difference/BACKBONE/A and B/PART        VoxelGridMap: voxels where two backends differ
 difference_report/BACKBONE/A and B      TextDocument: how many they are
@@ -21,12 +21,12 @@ log                                     TextLog: each unit's final numbers
 and in the recording of a comparison
 
 change/RUN/agreement, .../truth         VoxelGridMap: what each voxel that changed lost or gained
-change/RUN/.../same, .../places         Points3D: the other voxels; the places that got worse, with their numbers
+change/RUN/.../same, .../locations      Points3D: the other voxels; the locations that got worse, with their numbers
 """
 
-from semstab.recording.observer import Recording
-from semstab.recording.series import SERIES
-from semstab.recording.target import Target
-from semstab.recording.voxel_maps import looks
+from semstab.recording.observer import Recording, lacks_pictures, record_finished
+from semstab.recording.target import Target, viewer_command
+from semstab.recording.timeline import SERIES
+from semstab.recording.voxel_maps import color_modes
 
-__all__ = ["SERIES", "Recording", "Target", "looks"]
+__all__ = ["SERIES", "Recording", "Target", "color_modes", "lacks_pictures", "record_finished", "viewer_command"]

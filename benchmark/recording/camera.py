@@ -7,9 +7,7 @@ from __future__ import annotations
 
 import functools
 import io
-import itertools
 import math
-from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -17,23 +15,17 @@ import numpy as np
 import numpy.typing as npt
 import rerun as rr
 
-from semstab.core.rows import Rows
-from semstab.core.types import Float32, Float64, Mask, UInt8
+from semstab.core.types import Float64, UInt8
 from semstab.datasets import Scene
 from semstab.model.frames import Frame, Intrinsics
-from semstab.model.labels import GLOW, IGNORE_8BIT, IGNORE_16BIT, Color, LabelSpace, between
-from semstab.model.measures import SBD_MAX
-from semstab.recording.background import Background
-from semstab.recording.entities import path
+from semstab.model.labels import IGNORE_8BIT, IGNORE_16BIT, LabelSpace
+from semstab.recording.timeline import Background, path
 
 IMAGE_SIDE = 640
 """Pixels a side, of pictures that are made here."""
 
 SAMPLING = 2
 """In large pictures drift and motion-compensated flicker are looked up for every second pixel of each axis."""
-
-POSES = 1 << 14
-"""About as many of the cameras, at most, make a track."""
 
 JPEG_QUALITY = 80
 COLOR_BYTES = 400_000_000
@@ -89,62 +81,35 @@ class CameraLog:
 
     def __init__(self, scene: Scene, translation: npt.NDArray[np.floating[Any]], frames: int) -> None:
         self.scene = scene
-        self._poses = Rows(16)
+        self._poses: list[Float64] = []
         self.unread: str | None = None
         """Why a colour image is missing, where one is."""
         self._translation = translation
         self._share = COLOR_BYTES // max(frames, 1)
-        self._logged = bytearray()  # for each frame up to the last one, whether it was
+        self._logged: set[int] = set()
         self._overlay = Overlay()
         self._intrinsics: tuple[Intrinsics, tuple[int, int]] | None = None
         self._depth_unit: float | None = None
 
     @property
     def poses(self) -> Float64:
-        """(n, 4, 4) so far, relative to the map's origin: of very many every n-th, and the last one."""
-        n, step = len(self._poses), 1 + len(self._poses) // POSES
-        return self._poses.table((n - 1) % step, step).reshape(-1, 4, 4)
+        """(n, 4, 4) so far, relative to the map's origin."""
+        return np.array(self._poses).reshape(-1, 4, 4)
 
-    def log(self, stream: rr.RecordingStream, frame: Frame, background: Background, *, track: bool = True) -> None:
+    def log(self, stream: rr.RecordingStream, frame: Frame, background: Background) -> None:
         """Log the frame's pose, camera, colour and depth, where that has not happened yet, and the track up to it."""
-        if not self._is_new(frame.index):
+        if frame.index in self._logged:
             return
-        self._log_camera(stream, frame, self._follow(frame.T_wc))
-        if track:
-            self.log_track(stream)
-        background.submit(frame.index, frame.timestamp, functools.partial(self._log_images, stream, frame))
-
-    def follow(self, indices: Sequence[int]) -> Iterator[int]:
-        """Read the poses of frames that are not logged here, one by one, unless they are known."""
-        for index in indices if not self._poses else ():
-            self._follow(self.scene.T_wc(index))
-            yield index
-
-    def take(self, indices: Iterable[int]) -> None:
-        """These frames are in the recording already."""
-        for index in sorted(indices):
-            self._follow(self.scene.T_wc(index))
-            self._is_new(index)
-
-    def log_track(self, stream: rr.RecordingStream) -> None:
-        """Log where it has been so far, unless the frames are so many that this one is left out."""
+        self._logged.add(frame.index)
+        pose = frame.T_wc.copy()
+        pose[:3, 3] -= self._translation
+        self._poses.append(pose)
+        self._log_camera(stream, frame, pose)
         n = len(self._poses)
         if n % (n // 100 + 1) == 0:  # long ones not with every frame: their size would grow with its square
-            track = self.poses[:, :3, 3]
-            stream.log(path(self.scene.name, "trajectory"), rr.LineStrips3D([track], colors=(255, 255, 255)))
-
-    def _is_new(self, index: int) -> bool:
-        """Whether a frame is not logged yet; from now on it is."""
-        self._logged.extend(bytes(max(0, index + 1 - len(self._logged))))
-        new, self._logged[index] = not self._logged[index], True
-        return new
-
-    def _follow(self, T_wc: Float64) -> Float64:
-        """The next pose, relative to the map's origin."""
-        pose = T_wc.copy()
-        pose[:3, 3] -= self._translation
-        self._poses.append(pose.ravel())
-        return pose
+            track = rr.LineStrips3D([self.poses[:, :3, 3]], colors=(255, 255, 255))
+            stream.log(path(self.scene.name, "trajectory"), track)
+        background.submit(frame.index, frame.timestamp, functools.partial(self._log_images, stream, frame))
 
     def _log_images(self, stream: rr.RecordingStream, frame: Frame) -> None:
         stream.log(path(self.scene.name, "depth"), self._depth(frame, 2 * stride_of(frame.shape)))
@@ -232,70 +197,3 @@ def _decoded(data: bytes, reduction: int) -> UInt8 | None:
     except cv2.error:
         return None
     return None if image is None else np.asarray(image, dtype=np.uint8)
-
-
-# How the drift that a frame caused is shown: in levels, in colours that no class wears, with a legend.
-
-NO_VOXEL, FIRST_SEEN, NO_DRIFT = 0, 1, 2
-LEVELS = 24
-LEVEL_EDGES = SBD_MAX * (np.arange(LEVELS + 1) / LEVELS) ** 2
-"""Bits at which one level of drift ends and the next begins: finer where drift is small; the last one is open."""
-
-RAMPS: tuple[tuple[Color, ...], ...] = (
-    GLOW,
-    ((0, 100, 120), (0, 160, 190), (0, 220, 240), (130, 245, 255), (215, 255, 255)),
-    ((120, 0, 110), (200, 0, 190), (255, 60, 220), (255, 150, 235), (255, 220, 250)),
-    ((30, 100, 0), (70, 170, 0), (130, 235, 30), (190, 255, 110), (230, 255, 200)),
-)
-"""What drifts lights up like a glowing body; where a taxonomy of the user's has such a colour, in another hue."""
-
-NEAR = 40.0
-"""Distance in RGB from which on two colours are told apart."""
-
-LEGEND = (-1.0, LEVELS + 3.0), (0.0, 2.8)
-"""What is seen of the legend, across and down, in squares of a level."""
-
-
-def ramp(classes: LabelSpace) -> Float64:
-    """Colours (LEVELS, 3) of the levels: the first of RAMPS that no class's colour is near, else the farthest."""
-    ramps = [between(colors, LEVELS) for colors in RAMPS]
-    worn = np.array(classes.colors, dtype=np.float64)
-    distance = [float(np.linalg.norm(r[:, None] - worn, axis=2).min()) for r in ramps]
-    clear = [number for number, least in enumerate(distance) if least >= NEAR]
-    return ramps[clear[0] if clear else int(np.argmax(distance))]
-
-
-def levels_of(drift: Float32, seen: Mask) -> UInt8:
-    """Picture of drift in bits (H, W), NaN where a voxel is seen for the first time; `seen` where there is a voxel."""
-    level = np.searchsorted(LEVEL_EDGES[1:-1], drift, side="right") + NO_DRIFT + 1
-    level[drift == 0] = NO_DRIFT
-    level[np.isnan(drift)] = FIRST_SEEN
-    level[~seen] = NO_VOXEL
-    return level.astype(np.uint8)
-
-
-def context(classes: LabelSpace) -> rr.AnnotationContext:
-    """Names and colours of the levels; over the colour image only what drifts is seen, and dimly what is new."""
-    names = [f"{low:.4f} to {high:.4f} bits" for low, high in itertools.pairwise(LEVEL_EDGES)]
-    names[-1] = f"{LEVEL_EDGES[-2]:.4f} bits and more"
-    glow = ramp(classes).astype(int)
-    infos: list[tuple[int, str, tuple[int, ...]]] = [
-        (NO_VOXEL, "no voxel", (0, 0, 0, 200)),
-        (FIRST_SEEN, "first seen", (40, 60, 110, 170)),
-        (NO_DRIFT, "no drift", (0, 0, 0, 150)),
-    ]
-    infos += [(NO_DRIFT + 1 + k, name, (*glow[k].tolist(), 255)) for k, name in enumerate(names)]
-    return rr.AnnotationContext([rr.AnnotationInfo(*info) for info in infos])
-
-
-def log_legend(stream: rr.RecordingStream, entity: str, classes: LabelSpace) -> None:
-    """The levels side by side in their colours, and what they mean where that is round."""
-    stream.log(entity, context(classes), static=True)
-    shown = np.array([[FIRST_SEEN, NO_VOXEL, *range(NO_DRIFT + 1, NO_DRIFT + 1 + LEVELS)]], dtype=np.uint8)
-    stream.log(f"{entity}/levels", rr.SegmentationImage(shown), static=True)
-    ticks = [0.01, 0.05, 0.1, 0.2]
-    at = [2 + LEVELS * (bits / SBD_MAX) ** 0.5 for bits in ticks]
-    labels = ["first seen", *(f"{bits:g}" for bits in ticks), f"{SBD_MAX:.2f} bits"]
-    points = np.array([(x, 1.2) for x in (0.5, *at, LEVELS + 1.0)])
-    names = rr.Points2D(points, colors=(255, 255, 255), labels=labels, radii=0.0, show_labels=True)
-    stream.log(f"{entity}/names", names, static=True)

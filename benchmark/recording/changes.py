@@ -1,4 +1,4 @@
-"""What changed between two maps, in the viewer: each voxel by how much, the places that got worse by number."""
+"""What changed between two maps, in the viewer: each voxel by how much, the locations that got worse by number."""
 
 from __future__ import annotations
 
@@ -11,13 +11,11 @@ import numpy.typing as npt
 import rerun as rr
 import rerun.blueprint as rrb
 
-from semstab.core.types import Int64, UInt8
-from semstab.metrics import vss
-from semstab.metrics.agreement import shared_rows
+from semstab.core.types import UInt8
 from semstab.model.voxels import VoxelTable
-from semstab.recording.entities import path
-from semstab.recording.eye import BACKGROUND, Scenery, eye
+from semstab.recording.layout import BACKGROUND, SceneBounds, camera_pose
 from semstab.recording.target import Target
+from semstab.recording.timeline import path
 from semstab.recording.voxel_maps import packed, thinned
 
 WORSE, SAME, BETTER, WHITE = (213, 94, 0), (150, 150, 150), (86, 180, 233), (255, 255, 255)
@@ -27,8 +25,8 @@ LEAST = 0.05
 ASPECT = 1.2
 
 Change = tuple[str, VoxelTable, npt.NDArray[Any], npt.NDArray[Any] | None, Sequence[tuple[str, str, tuple[float, ...]]]]
-"""A title, the voxels, what each gained (n,), -1 to 1, in agreement and where truth tells; and places: in which of the
-two they lost, their names and centres."""
+"""A title, the voxels, the gain of each (n,), -1 to 1, in agreement and where truth tells; and locations: in which of
+the two they lost, their names and centres."""
 
 
 def record_changes(
@@ -37,16 +35,19 @@ def record_changes(
     up: Mapping[str, tuple[float, float, float]],
     sentences: Sequence[str],
 ) -> None:
-    """Write a recording with a tab for each scene and run, and what was found beside it."""
+    """Write a recording with a tab for each scene and run, and the sentences beside it."""
     file.unlink(missing_ok=True)
     stream = Target(file).open()
     stream.log(
-        "/found", rr.TextDocument("\n".join(f"- {text}" for text in sentences), media_type="text/markdown"), static=True
+        "/results",
+        rr.TextDocument("\n".join(f"- {text}" for text in sentences), media_type="text/markdown"),
+        static=True,
     )
     tabs = [_logged(stream, *names, change, up.get(names[0])) for names, change in changes.items()]
-    found = rrb.TextDocumentView(origin="/found", name="What was found")
+    results = rrb.TextDocumentView(origin="/results", name="Results")
     layout = rrb.Blueprint(
-        rrb.Horizontal(rrb.Tabs(*tabs) if len(tabs) > 1 else tabs[0], found, column_shares=[3, 1]), collapse_panels=True
+        rrb.Horizontal(rrb.Tabs(*tabs) if len(tabs) > 1 else tabs[0], results, column_shares=[3, 1]),
+        collapse_panels=True,
     )
     stream.send_blueprint(layout, make_default=True, make_active=True)
     stream.flush()
@@ -56,7 +57,7 @@ def record_changes(
 def _logged(
     stream: rr.RecordingStream, scene: str, run: str, change: Change, up: tuple[float, float, float] | None
 ) -> rrb.Container:
-    title, table, agreement, right, places = change
+    title, table, agreement, right, locations = change
     origin = np.round(table.index.mean(axis=0)).astype(np.int64) if len(table) else np.zeros(3, np.int64)
     index = table.index.astype(np.int64) - origin
     factor, rows = thinned(index)
@@ -64,7 +65,7 @@ def _logged(
     if right is not None:
         views["truth"] = ("Right and wrong", right)
     points = ((index[rows] + 0.5) * table.voxel_size).astype(np.float64)
-    where = Scenery(points, np.zeros((0, 4, 4)), None if up is None else np.array(up))
+    where = SceneBounds(points, np.zeros((0, 4, 4)), None if up is None else np.array(up))
     shown = []
     for name, (what, values) in views.items():
         entity = path(scene, "change", run, name)
@@ -74,13 +75,13 @@ def _logged(
         stream.log(entity, rr.VoxelGridMap(cells, [table.voxel_size * factor] * 3, colors=colors), static=True)
         rest = rr.Points3D(points[~changed], colors=SAME, radii=rr.Radius.ui_points(1.0))  # they do not hide the others
         stream.log(f"{entity}/same", rest, static=True)
-        own = [place for place in places if place[0] == name]
+        own = [each for each in locations if each[0] == name]
         if own:
             at = np.array([centre for *_, centre in own]) - origin * table.voxel_size
             labels = rr.Points3D(
                 at, labels=[label for _, label, _ in own], colors=WHITE, radii=rr.Radius.ui_points(4.0)
             )
-            stream.log(f"{entity}/places", labels, static=True)
+            stream.log(f"{entity}/locations", labels, static=True)
         shown.append(
             rrb.Spatial3DView(
                 origin=path(scene),
@@ -88,7 +89,7 @@ def _logged(
                 name=f"{what}: orange worse, blue better, grey points as before",
                 background=BACKGROUND,
                 line_grid=False,
-                eye_controls=eye(where, ASPECT),
+                eye_controls=camera_pose(where, ASPECT),
             )
         )
     return rrb.Vertical(*shown, name=title)
@@ -100,53 +101,3 @@ def _shades(values: npt.NDArray[Any]) -> UInt8:
     end = np.where((values < 0)[:, None], WORSE, BETTER)
     shades: UInt8 = np.round(share * end + (1 - share) * np.array(SAME)).astype(np.uint8)
     return shades
-
-
-# Voxels where the maps of two backends differ.
-
-ONLY_FIRST, ONLY_SECOND = (230, 159, 0), (86, 180, 233)
-VSS_RANGE = (0.0, 0.5)
-
-DIFFERENCE = {"only_first": "in the first only", "only_second": "in the second only", "changed": "|VSS difference|"}
-"""The parts of a difference, and what they are called."""
-
-
-def log_difference(
-    stream: rr.RecordingStream,
-    entity: str,
-    tables: Mapping[str, VoxelTable],
-    origin: Int64,
-    tolerance: float,
-) -> str:
-    """Log the voxels that one of two maps has only, and those whose VSS differs by more than the tolerance.
-
-    tables  the two maps by the names of their backends
-
-    Returns how many there are, in words. They are of the final maps, so they are logged for all times.
-    """
-    first, second = tables.values()
-    in_first, in_second = shared_rows(first, second)
-    change = np.abs(vss(first)[in_first] - vss(second)[in_second])
-    differs = change > tolerance
-    parts = {
-        "only_first": np.delete(first.index, in_first, axis=0),
-        "only_second": np.delete(second.index, in_second, axis=0),
-        "changed": first.index[in_first[differs]],
-    }
-    looks: dict[str, dict[str, Any]] = {
-        "only_first": {"colors": ONLY_FIRST},
-        "only_second": {"colors": ONLY_SECOND},
-        "changed": {"colormap": rr.components.Colormap.Inferno, "value_range": VSS_RANGE},
-    }
-    for part in DIFFERENCE:
-        index = parts[part] - origin
-        factor, rows = thinned(index)
-        values: dict[str, Any] = {"values": change[differs][rows].astype(np.float32)} if part == "changed" else {}
-        cells = (index[rows] // factor).astype(np.int32)
-        size = [first.voxel_size * factor] * 3
-        stream.log(f"{entity}/{part}", rr.VoxelGridMap(cells, size, **values, **looks[part]), static=True)
-    one, other = tables
-    return (
-        f"{len(parts['only_first']):,} voxels in {one} only, {len(parts['only_second']):,} in {other} only; of"
-        f" {len(in_first):,} in both VSS differs in {int(differs.sum()):,}, by {change.max(initial=0.0):.2g} at most"
-    )

@@ -41,10 +41,6 @@ class Target:
 
     file: Path
     viewer: str | None = None
-    name: str | None = None
-    """Of a recording of which the file is a part; it has none where it is whole."""
-    final: Path | None = None
-    """The whole recording, of which the file is a part."""
 
     @classmethod
     def parse(cls, text: str | None, default: Path) -> Target:
@@ -70,7 +66,7 @@ class Target:
 
     def open(self) -> rr.RecordingStream:
         """A stream into it. Raises ConfigError where the file cannot be written, or the viewer is not there."""
-        stream = rr.RecordingStream(APPLICATION, recording_id=self.name)
+        stream = rr.RecordingStream(APPLICATION)
         try:
             self.file.parent.mkdir(parents=True, exist_ok=True)
             # In place, not renamed when it is whole: a viewer can follow the run, and a killed run leaves a recording.
@@ -89,14 +85,6 @@ class Target:
     def viewer_url(self) -> str | None:
         """Where the viewer listens, or what serves it does; None where there is none."""
         return DEFAULT_URL if self.viewer in ("spawn", "serve") else self.viewer
-
-    def drop(self, recording: str | None) -> None:
-        """Take a recording out of the viewer. Who is served cannot be told to, and keeps it beside others."""
-        from rerun.experimental import ViewerClient
-
-        if self.viewer_url is not None and self.viewer != "serve":
-            with contextlib.suppress(OSError):  # what listens there need not be a viewer
-                ViewerClient(self.viewer_url).close(store_ids=[f"Recording:{APPLICATION}:{recording}"])
 
     def _viewer(self) -> rr.GrpcSink | rr.GrpcServerSink:
         if self.viewer == "serve":

@@ -8,7 +8,7 @@ those that got no new voxels without their indices.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -20,7 +20,8 @@ from rerun.blueprint.encodings import ComponentSourceKind, VisualizerComponentMa
 
 from semstab.backends import GrowingMap
 from semstab.core.types import Float32, Float64, Int32, Int64, UInt32
-from semstab.metrics import CATEGORY_COLORS
+from semstab.metrics import CATEGORY_COLORS, vss
+from semstab.metrics.agreement import shared_rows
 from semstab.metrics.summary import categorise
 from semstab.model.labels import LabelSpace
 from semstab.model.measures import ENTROPY, SBD, VSS, Measure, mean_drift, measures
@@ -31,7 +32,7 @@ from semstab.recording.kernels import read_off
 
 
 @dataclass(frozen=True)
-class Look:
+class ColorMode:
     """What a map is coloured by; ranges are fixed, so that a colour means the same in every recording.
 
     tab    its name where there is little room; `title` is that of its views
@@ -44,7 +45,7 @@ class Look:
     range: tuple[float, float] | None = None
 
     @classmethod
-    def of(cls, measure: Measure) -> Look:
+    def of(cls, measure: Measure) -> ColorMode:
         """Of a measure: 'SBD (0 to 0.31 bits; black: seen once)'."""
         low, high = measure.range
         ends = f"{low:.2g}{' and less' if low > 0 else ''} to {high:.2g}{' and more' if high < measure.largest else ''}"
@@ -55,14 +56,14 @@ class Look:
         return cls(measure.title, title, colors.Viridis if measure.better == "higher" else colors.Plasma, measure.range)
 
 
-def looks() -> dict[str, Look]:
+def color_modes() -> dict[str, ColorMode]:
     """What the maps can be coloured by."""
     category = f"category (blue stable, orange uncertain, yellow drifting, grey OP < {RECURRENT})"
     return {
-        "class": Look("Class", "dominant class"),
-        **{measure.key: Look.of(measure) for measure in measures()},
-        "op": Look("OP", "OP (1 to 10 and more)", rr.components.Colormap.Viridis, (1.0, 10.0)),
-        "category": Look("Category", category),
+        "class": ColorMode("Class", "dominant class"),
+        **{measure.key: ColorMode.of(measure) for measure in measures()},
+        "op": ColorMode("OP", "OP (1 to 10 and more)", rr.components.Colormap.Viridis, (1.0, 10.0)),
+        "category": ColorMode("Category", category),
     }
 
 
@@ -76,7 +77,7 @@ class Columns:
 
 
 MAX_VOXELS = 2_000_000
-"""Drawn of one map; at its end a larger one is thinned."""
+"""VoxelBatch of one map; at its end a larger one is thinned."""
 
 CHUNKS = 32
 BUDGET = 2_000_000
@@ -112,7 +113,7 @@ def packed(colors: npt.ArrayLike) -> UInt32:
 
 
 @dataclass(frozen=True, eq=False)
-class Drawn:
+class VoxelBatch:
     """n voxels as they are drawn.
 
     index   (n, 3) int32 relative to the map's origin: small, so that the viewer's float32 keeps them exact
@@ -135,13 +136,13 @@ class Drawn:
         evidence: Float64,
         op: Int32,
         drift_sum: Float64,
-    ) -> Drawn:
+    ) -> VoxelBatch:
         """From the voxels' columns, as `VoxelTable` has them."""
         n, K = evidence.shape
-        label, vss, bits = np.empty(n, dtype=np.uint16), np.empty(n), np.empty(n)
-        read_off(evidence, label, vss, bits)
+        label, stability, bits = np.empty(n, dtype=np.uint16), np.empty(n), np.empty(n)
+        read_off(evidence, label, stability, bits)
         sbd = mean_drift(drift_sum, op)
-        read = {VSS: vss, SBD: sbd, ENTROPY: bits / math.log2(K)}  # in one pass over the evidence
+        read = {VSS: stability, SBD: sbd, ENTROPY: bits / math.log2(K)}  # in one pass over the evidence
         voxels = Columns(op, evidence, drift_sum)
         values: dict[str, npt.NDArray[Any]] = {m.key: read[m] if m in read else m.of(voxels) for m in measures()}
         values["op"] = op
@@ -186,8 +187,8 @@ def visualizer(name: str) -> rr.blueprint.Visualizer:
 
 def defaults(name: str) -> list[rr.VoxelGridMap]:
     """How a view colours the values of a measure."""
-    look = looks()[name]
-    return [] if look.range is None else [rr.VoxelGridMap.from_fields(colormap=look.colormap, value_range=look.range)]
+    mode = color_modes()[name]
+    return [] if mode.range is None else [rr.VoxelGridMap.from_fields(colormap=mode.colormap, value_range=mode.range)]
 
 
 def thinned(index: Int64) -> tuple[int, Int64]:
@@ -202,29 +203,26 @@ def thinned(index: Int64) -> tuple[int, Int64]:
 
 
 def thinned_map(path: Path, origin: Int64) -> tuple[int, VoxelTable]:
-    """A map from its file, or few enough voxels of one in tiles: the factor, and one voxel of each block of factor^3.
+    """Return a map from its file, or few enough voxels of one in tiles: the factor, and a voxel of each factor^3 block.
 
-    Tiles are read one after the other: what is not drawn is not kept. Blocks are aligned with the origin.
+    Tiles are read one after the other. Blocks are aligned with the origin.
     """
     if path.is_file():
         return 1, VoxelTable.load(path)
     factor, parts = 1, list[VoxelTable]()
     for tile in VoxelTable.iter_tiles(path):
-        parts.append(_of_blocks(tile, origin, factor))
-        while sum(map(len, parts)) > MAX_VOXELS:
-            factor *= 2
-            parts = [_of_blocks(part, origin, factor) for part in parts]
+        parts.append(tile)
+        while factor > 1 or sum(map(len, parts)) > MAX_VOXELS:
+            joined = VoxelTable.joined(parts)
+            factor *= 1 if sum(map(len, parts)) <= MAX_VOXELS else 2
+            _, first = np.unique((joined.index - origin) // factor, axis=0, return_index=True)
+            parts = [joined.rows(np.sort(first))]
+            if len(first) <= MAX_VOXELS:
+                break
     return factor, VoxelTable.joined(parts)
 
 
-def _of_blocks(table: VoxelTable, origin: Int64, factor: int) -> VoxelTable:
-    if factor == 1:
-        return table
-    _, first = np.unique((table.index - origin) // factor, axis=0, return_index=True)
-    return table.rows(np.sort(first))
-
-
-class MapLog:
+class VoxelLogger:
     """Logs what changes in a map, within the budget: of `frames` frames each one may log its share, and what is saved.
 
     Where there is more to log, chunks come first in which the most voxels are new or were observed again since they
@@ -269,11 +267,11 @@ class MapLog:
         for c, part in enumerate(np.split(rows, self._edges[1:-1])):
             if len(part):
                 at = np.s_[part[0] : part[-1] + 1] if factor == 1 else part  # what is not thinned is not copied
-                drawn = Drawn.of(
+                batch = VoxelBatch.of(
                     (index[at] // factor).astype(np.int32), table.voxel_size * factor, self._classes,
                     table.evidence[at], table.op[at], table.drift_sum[at],
                 )  # fmt: skip
-                stream.log(chunk(self.entity, c), *drawn.components(whole=True))
+                stream.log(chunk(self.entity, c), *batch.components(whole=True))
                 self._note(c, len(part))
             elif self._drawn[c]:
                 stream.log(chunk(self.entity, c), rr.Clear(recursive=False))
@@ -291,8 +289,8 @@ class MapLog:
 
         def job() -> None:
             at = (index - self._origin).astype(np.int32)
-            drawn = Drawn.of(at, fused.voxel_size, self._classes, evidence, op, drift_sum)
-            stream.log(chunk(self.entity, c), *drawn.components(whole=whole))
+            batch = VoxelBatch.of(at, fused.voxel_size, self._classes, evidence, op, drift_sum)
+            stream.log(chunk(self.entity, c), *batch.components(whole=whole))
 
         return job
 
@@ -301,30 +299,77 @@ class MapLog:
         self._changed[c], self._drawn[c] = 0, size
 
 
-# What the statistics say of a finished map, as the viewer shows it beside the map.
+# Voxels where the maps of two backends differ.
 
-AXES = (
-    ("angle", "degrees between the views"),
-    ("time", "frames apart"),
-    ("baseline", "metres between the cameras"),
-    ("range", "ratio of the ranges"),
-)
+ONLY_FIRST, ONLY_SECOND = (230, 159, 0), (86, 180, 233)
+VSS_RANGE = (0.0, 0.5)
 
-
-def looks_report(found: MapStatistics) -> str:
-    """The verdict, and agreement by how far apart two looks at a place are, in Markdown."""
-    return "\n".join([found.verdict.line, "", *_correlogram(found)])
+DIFFERENCE = {"only_first": "in the first only", "only_second": "in the second only", "changed": "|VSS difference|"}
+"""The parts of a difference, and what they are called."""
 
 
-def _correlogram(found: MapStatistics) -> Iterator[str]:
-    if found.correlogram is None:
-        return
-    yield "Alpha between frames, by how far apart two looks at a place are:"
-    for axis, unit in AXES:
-        bins: Sequence[LagBin] = getattr(found.correlogram, axis)
+def log_difference(
+    stream: rr.RecordingStream,
+    entity: str,
+    tables: Mapping[str, VoxelTable],
+    origin: Int64,
+    tolerance: float,
+) -> str:
+    """Log the voxels that one of two maps has only, and those whose VSS differs by more than the tolerance.
+
+    tables  the two maps by the names of their backends
+
+    Returns how many there are, in words. They are of the final maps, so they are logged for all times.
+    """
+    first, second = tables.values()
+    in_first, in_second = shared_rows(first, second)
+    change = np.abs(vss(first)[in_first] - vss(second)[in_second])
+    differs = change > tolerance
+    parts = {
+        "only_first": np.delete(first.index, in_first, axis=0),
+        "only_second": np.delete(second.index, in_second, axis=0),
+        "changed": first.index[in_first[differs]],
+    }
+    styles: dict[str, dict[str, Any]] = {
+        "only_first": {"colors": ONLY_FIRST},
+        "only_second": {"colors": ONLY_SECOND},
+        "changed": {"colormap": rr.components.Colormap.Inferno, "value_range": VSS_RANGE},
+    }
+    for part in DIFFERENCE:
+        index = parts[part] - origin
+        factor, rows = thinned(index)
+        values: dict[str, Any] = {"values": change[differs][rows].astype(np.float32)} if part == "changed" else {}
+        cells = (index[rows] // factor).astype(np.int32)
+        size = [first.voxel_size * factor] * 3
+        stream.log(f"{entity}/{part}", rr.VoxelGridMap(cells, size, **values, **styles[part]), static=True)
+    one, other = tables
+    return (
+        f"{len(parts['only_first']):,} voxels in {one} only, {len(parts['only_second']):,} in {other} only; of"
+        f" {len(in_first):,} in both VSS differs in {int(differs.sum()):,}, by {change.max(initial=0.0):.2g} at most"
+    )
+
+
+# Agreement between frames, shown below the map.
+
+AXES = {
+    "angle": "degrees between the views",
+    "time": "frames apart",
+    "baseline": "metres between the cameras",
+    "range": "ratio of the ranges",
+}
+
+
+def agreement_report(statistics: MapStatistics) -> str:
+    """Return the verdict, and agreement by the distance between two observations of a location, in Markdown."""
+    lines = [statistics.verdict.line, ""]
+    if statistics.correlogram is not None:
+        lines.append("Alpha between frames, by how far apart two observations of a location are:")
+    for axis, unit in AXES.items() if statistics.correlogram is not None else ():
+        bins: tuple[LagBin, ...] = getattr(statistics.correlogram, axis)
         if bins:
-            yield from ("", f"| {unit} | alpha | 95% | for | ceiling |", "|---|---|---|---|---|")
-            for row in bins:
-                alpha = row.alpha
-                band = f"{alpha.low:.2f} to {alpha.high:.2f} | {alpha.question}{'' if alpha.decided else ', undecided'}"
-                yield f"| {row.mean:.3g} | {alpha.value:.2f} | {band} | {row.ceiling:.2f} |"
+            lines += ["", f"| {unit} | alpha | 95% | for | ceiling |", "|---|---|---|---|---|"]
+        for row in bins:
+            a = row.alpha
+            band = f"{a.low:.2f} to {a.high:.2f} | {a.question}{'' if a.decided else ', undecided'}"
+            lines.append(f"| {row.mean:.3g} | {a.value:.2f} | {band} | {row.ceiling:.2f} |")
+    return "\n".join(lines)

@@ -29,10 +29,9 @@ from semstab.model.labels import LabelSpace
 from semstab.model.voxels import VoxelTable
 from semstab.predict.filters import parse
 from semstab.predict.predictor import Kept
-from semstab.recording.entities import Clock
-from semstab.recording.observer import Recording
-from semstab.recording.series import send_rows
+from semstab.recording import Recording
 from semstab.recording.target import is_whole
+from semstab.recording.timeline import Clock, send_rows
 from semstab.settings import load_config, resolve
 
 

@@ -1,0 +1,197 @@
+"""Entity paths, the clock of the timelines, the background thread, and the time series."""
+
+from __future__ import annotations
+
+import csv
+from collections import deque
+from collections.abc import Callable, Mapping
+from concurrent.futures import Future, ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import rerun as rr
+
+from semstab.engine.units import Plan
+from semstab.errors import DataError, one_line
+from semstab.model.measures import ENTROPY, VSS
+from semstab.model.results import RECURRENT, Unit
+from semstab.task import Task
+
+FIRST_DATE, LAST_DATE = 1e8, 9e9
+"""Seconds; timestamps from the first on count from 1970 and are shown as dates, smaller ones as durations. Beyond the
+last one they are no seconds, and more nanoseconds than 64 bits hold: frames are shown by their number alone."""
+
+
+def path(*parts: str) -> str:
+    """An entity's path; what a part may not hold is escaped."""
+    return "/" + rr.new_entity_path(list(parts)).lstrip("/")
+
+
+class Clock:
+    """Sets a stream's time: the frame's number, and its timestamp where there is one."""
+
+    def __init__(self) -> None:
+        self._dated: bool | None = None  # a timeline has one type: the first timestamp decides
+
+    def set(self, stream: rr.RecordingStream, frame: int, timestamp: float | None = None) -> None:
+        """What is logged from now on belongs to that frame."""
+        stream.reset_time()
+        stream.set_time("frame", sequence=frame)
+        if timestamp is None or not abs(timestamp) <= LAST_DATE:
+            return
+        if self._dated is None:
+            self._dated = timestamp >= FIRST_DATE
+        if self._dated:
+            stream.set_time("time", timestamp=timestamp)
+        else:
+            stream.set_time("time", duration=timestamp)
+
+    def columns(self, frames: list[int], timestamps: list[float | None]) -> list[rr.TimeColumn]:
+        """The times of a whole series; without timestamps where one is missing."""
+        columns = [rr.TimeColumn("frame", sequence=frames)]
+        known = [stamp for stamp in timestamps if stamp is not None and abs(stamp) <= LAST_DATE]
+        if not known or len(known) < len(frames):
+            return columns
+        if self._dated is None:
+            self._dated = known[0] >= FIRST_DATE
+        stamps = rr.TimeColumn("time", timestamp=known) if self._dated else rr.TimeColumn("time", duration=known)
+        return [*columns, stamps]
+
+
+MOST_PENDING = 4
+"""Jobs that may be waiting; they hold their frames."""
+
+
+class Background:
+    """Does jobs one after the other, each at the time of its frame."""
+
+    def __init__(self, stream: rr.RecordingStream, clock: Clock) -> None:
+        self._stream = stream
+        self._clock = clock
+        self._thread = ThreadPoolExecutor(1, thread_name_prefix="semstab-recording")
+        self._pending: deque[Future[None]] = deque()
+
+    def submit(self, frame: int, timestamp: float | None, job: Callable[[], None]) -> None:
+        """Leave a job to the thread, and wait while too many are pending; raises what an earlier job raised."""
+        self._wait(MOST_PENDING)
+        self._pending.append(self._thread.submit(self._do, frame, timestamp, job))
+
+    def drain(self) -> None:
+        """Wait until all jobs are done; raises what one of them raised."""
+        self._wait(0)
+
+    def close(self) -> None:
+        """Do what is pending, and end the thread."""
+        self._thread.shutdown()
+        self.drain()
+
+    def _do(self, frame: int, timestamp: float | None, job: Callable[[], None]) -> None:
+        self._clock.set(self._stream, frame, timestamp)  # a stream has a time for each thread
+        job()
+
+    def _wait(self, pending: int) -> None:
+        while len(self._pending) > pending:
+            self._pending.popleft().result()
+
+
+# Time series: the columns of RUN/frames/*.csv, and two that follow from them.
+
+SERIES = {
+    "drift": "Mean drift of updates (bits)",
+    "flicker_percent": "Flicker (%)",
+    "compensated_flicker": "Flicker, motion-compensated (%)",
+    "map_vss": f"Mean {VSS.word} so far (0 to {VSS.largest:g})",
+    "map_entropy": f"Mean {ENTROPY.word} so far (0 to {ENTROPY.largest:g})",
+    "map_recurrent": f"Share OP >= {RECURRENT} so far (0 to 1)",
+    "new_voxels": "New voxels",
+    "updated_voxels": "Updated voxels",
+    "fuse_ms": "Fusion (ms)",
+    "association_ms": "Fusion: association (ms)",
+    "update_ms": "Fusion: update (ms)",
+    "decode_ms": "Decoding, in a worker (ms)",
+    "wait_ms": "Waiting for a frame (ms)",
+}
+"""Time series by name, and the titles of their plots. All but updated_voxels (voxels - new_voxels) and
+compensated_flicker are columns of the CSV."""
+
+OF_THE_BACKBONE = ("flicker_percent", "compensated_flicker", "decode_ms", "wait_ms")
+"""Series that are the same for all backends."""
+
+# Okabe and Ito's colours without black: distinct with any colour vision, and on the viewer's dark ground.
+LINE_COLORS = (
+    (230, 159, 0), (86, 180, 233), (0, 158, 115), (240, 228, 66), (204, 121, 167), (213, 94, 0), (0, 114, 178),
+)  # fmt: skip
+
+
+def values(cells: Mapping[str, Any]) -> dict[str, float]:
+    """The series' values in a row of the CSV, without what is undefined."""
+    row = {name: float(cells[name]) for name in SERIES if cells.get(name) not in (None, "")}
+    return row | {"updated_voxels": float(cells["voxels"]) - float(cells["new_voxels"])}
+
+
+def entity(name: str, unit: Unit) -> str:
+    """The entity of a series."""
+    backend = () if name in OF_THE_BACKBONE else (unit.backend,)
+    return path(unit.scene, "series", name, unit.backbone, *backend)
+
+
+def columns(unit: Unit, task: Task) -> list[str]:
+    """The unit's series: what belongs to the backbone goes with its first backend."""
+    return [name for name in SERIES if name not in OF_THE_BACKBONE or unit.backend == task.backends[0]]
+
+
+def log_row(stream: rr.RecordingStream, unit: Unit, task: Task, row: Mapping[str, float]) -> None:
+    """Log one frame's values at the stream's time."""
+    for name in columns(unit, task):
+        if name in row:
+            stream.log(entity(name, unit), rr.Scalars(row[name]))
+
+
+def frames_of(file: Path) -> list[int]:
+    """Return the numbers of the frames in a CSV of time series. Raises DataError where it is damaged."""
+    return [int(row["frame"]) for row in _rows(file)]
+
+
+def send_rows(stream: rr.RecordingStream, unit: Unit, task: Task, file: Path, clock: Clock) -> list[dict[str, float]]:
+    """Log a whole time series from its CSV; return the values of each frame. Raises DataError where it is damaged."""
+    rows = _rows(file)
+    try:
+        frames = np.array([int(row["frame"]) for row in rows], np.int64)
+        stamps = [float(row["timestamp"]) if row["timestamp"] else None for row in rows]
+        cells = [values(row) for row in rows]
+    except (LookupError, TypeError, ArithmeticError, ValueError) as error:
+        raise _damaged(file, error) from error
+    for name in columns(unit, task):
+        at = [k for k, row in enumerate(cells) if name in row]
+        if at:
+            times = clock.columns(frames[at].tolist(), [stamps[k] for k in at])
+            scalars = np.array([cells[k][name] for k in at])
+            stream.send_columns(entity(name, unit), times, rr.Scalars.columns(scalars=scalars))
+    return cells
+
+
+def _rows(file: Path) -> list[dict[str, str]]:
+    try:
+        with file.open(encoding="utf-8", newline="") as lines:
+            return list(csv.DictReader(lines))
+    except (OSError, ValueError, csv.Error) as error:
+        raise _damaged(file, error) from error
+
+
+def _damaged(file: Path, error: Exception) -> DataError:
+    return DataError(f"{file}: not a time series of a run ({one_line(error)}); delete the run folder's units/")
+
+
+def log_styles(stream: rr.RecordingStream, plan: Plan) -> None:
+    """Names, colours and widths of all lines."""
+    units = list(dict.fromkeys((unit.backbone, unit.backend) for task in plan.tasks for unit in task.units))
+    for task in plan.tasks:
+        for unit in task.units:
+            color = LINE_COLORS[units.index((unit.backbone, unit.backend)) % len(LINE_COLORS)]
+            # Where backends agree their lines coincide; the viewer draws them by name, so each one is thinner.
+            width = 2.0 + 2.5 * sum(backend > unit.backend for backend in task.backends)
+            for name in columns(unit, task):
+                label = unit.backbone if name in OF_THE_BACKBONE else f"{unit.backbone}, {unit.backend}"
+                line = rr.SeriesLines(colors=color, names=label, widths=width)
+                stream.log(entity(name, unit), line, static=True)
