@@ -30,9 +30,6 @@ the ground truth of the same frames; logs of observations; time series; and the 
 SCENE__BACKBONE.npz with the arrays frame (its index), labels (H, W) rows 0..K-1 or the ignore id, palette (K, 3) and,
 where the dataset has it, color (H, W, 3). Beside them sums by frame and cube of space, `InfluenceSums`."""
 
-RECORDING_PARTS = "recording"
-"""Folder of a recording that several processes write, until it is one file."""
-
 REGIONS = "region_maps"
 """Not a sweep: the label sources that hold regions without classes."""
 

@@ -35,6 +35,11 @@ def warnings(result: Result) -> Iterator[str]:
                 f"{_name(run, result)}: {run.frames_empty} of {run.frames} frames hold no pixel with both depth and a"
                 " label: semstab-bench check"
             )
+        if (cut := run.scores_left_out) is not None:
+            yield (
+                f"{_name(run, result)}: top_k leaves out {cut.mean:.2%} of a pixel's scores on average,"
+                f" {cut.most:.2%} at most; no belief changes by more than that"
+            )
     once = sum(_seen_once(run) for run in runs) / max(1, sum(run.table.voxels for run in runs))
     if once >= MOSTLY_ONCE:
         yield (
@@ -47,11 +52,6 @@ def warnings(result: Result) -> Iterator[str]:
     for run in runs:
         if (drowned := _one_class(run)) is not None:
             yield f"{_name(run, result)}: {drowned}"
-        if (cut := run.scores_left_out) is not None:
-            yield (
-                f"{_name(run, result)}: top_k leaves out {cut.mean:.2%} of a pixel's scores on average,"
-                f" {cut.most:.2%} at most; no belief changes by more than that"
-            )
 
 
 def _seen_once(run: UnitSummary) -> int:

@@ -35,7 +35,7 @@ RARE = 100
 MOST_CLASSES = {1: 5, 2: 3}
 """How many of the least stable classes are listed by the number of models; 1 of more models."""
 
-MOST_WARNINGS = 2
+MOST_WARNINGS = 3
 STAGE_NAMES = {"read": "reading", "reference": "check", "voxel sizes": "other voxel sizes", "write": "writing"}
 
 
