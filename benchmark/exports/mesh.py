@@ -67,7 +67,7 @@ def write(chosen: Chosen, path: Path) -> int:
             )
         )
     with atomic_path(path) as temporary:
-        temporary.write_bytes(trimesh.exchange.gltf.export_glb(scene))
+        temporary.write_bytes(trimesh.exchange.gltf.export_glb(scene))  # type: ignore[no-untyped-call]
     return voxels
 
 
