@@ -95,11 +95,12 @@ def _head(name: str, result: Result, runs: Sequence[UnitSummary]) -> str:
 
 
 def _geometry(result: Result) -> str:
-    states: Mapping[str, Mapping[str, object]] = result.manifest.get("geometry", {})
+    scenes = result.manifest.get("geometry")
+    states = [state for state in scenes.values() if isinstance(state, Mapping)] if isinstance(scenes, Mapping) else []
     if not states:
         return ""
-    errors = [float(error) for found in states.values() if isinstance(error := found.get("error"), float)]
-    if all(found.get("state") == "sound" for found in states.values()):
+    errors = [float(error) for state in states if isinstance(error := state.get("error"), float)]
+    if all(state.get("state") == "sound" for state in states):
         return f"geometry ok ({100 * max(errors):.2g} %)" if errors else "geometry ok"
     return "geometry unclear: semstab-bench check"
 

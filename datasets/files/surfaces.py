@@ -295,7 +295,8 @@ def _require_whole_chunks(path: Path, header: Any) -> None:
     """Raise ValueError where the chunks of a LAZ file are too large to decode at once, or hold too few points."""
     import lazrs
 
-    laz = lazrs.LazVlr(header.vlrs[header.vlrs.index("LasZipVlr")].record_data)
+    record = header.vlrs[header.vlrs.index("LasZipVlr")].record_data
+    laz = lazrs.LazVlr(record)
     if laz.item_size() != header.point_format.size:
         raise ValueError(f"its points have {header.point_format.size} bytes, and {laz.item_size()} where compressed")
     with path.open("rb") as file:
@@ -309,6 +310,25 @@ def _require_whole_chunks(path: Path, header: Any) -> None:
         raise ValueError(f"its chunks hold fewer points than the {header.point_count:,} that its header names")
     if first + sum(length for _, length in chunks) > path.stat().st_size:
         raise ValueError("its chunks are longer than it; it is cut short")
+    if layers := _layers_of(record):  # lazrs aborts the process where it cannot have the memory that a layer claims
+        with path.open("rb") as file:
+            for _, length in chunks:
+                file.seek(first + laz.item_size() + 4)
+                claimed = sum(struct.unpack(f"<{layers}I", file.read(4 * layers)))
+                if laz.item_size() + 4 + 4 * layers + claimed != length:
+                    raise ValueError(f"a chunk at byte {first} has layers that do not fit into it")
+                first += length
+
+
+LAZ_LAYERS = {10: 9, 11: 1, 12: 2, 13: 1}
+"""Layers of LAZ's items that are compressed in layers (LAS 1.4); item 14, extra bytes, has one a byte."""
+
+
+def _layers_of(record: bytes) -> int:
+    """The layers of a chunk, by the items of the LASzip record; 0 where it is compressed point by point."""
+    (items,) = struct.unpack_from("<H", record, 32)
+    kinds = [struct.unpack_from("<HH", record, 34 + 6 * item) for item in range(items)]
+    return sum(length if kind == 14 else LAZ_LAYERS.get(kind, 0) for kind, length in kinds)
 
 
 # Rays cast at triangles with embree: the depth of each pixel of a camera.
