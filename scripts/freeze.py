@@ -1,472 +1,611 @@
-"""Keep the outputs of an earlier revision for fixed runs, and compare those of the working tree with them.
+"""Keep the outputs of a revision for fixed cases, and compare the outputs of a working tree with them.
 
-    python scripts/freeze.py keep /tmp/freeze --revision 07664a4      # once
-    python scripts/freeze.py compare /tmp/freeze [--case city]    # after each step; 1 if anything differs
+    python scripts/freeze.py keep --revision 07664a4 --into DIR [--case NAME ...] [--quick]
+    python scripts/freeze.py compare DIR [--source CHECKOUT] [--case NAME ...] [--quick]
 
-Everything goes through the command line, so that nothing inside needs to stay. Voxel tables and series are compared bit
-by bit, summaries and tables to 1e-12. Names that changed are in `RENAMED`, commands that changed in `WORDS`.
+Every case runs through the command line in processes of its own, so nothing of the product's inside is used. `compare`
+prints a line for each case and exits with 1 if anything differs. SEMSTAB_DATA is the folder of the real scenes.
 """
 
 from __future__ import annotations
 
 import argparse
+import configparser
 import csv
+import hashlib
+import io
 import json
 import math
 import os
 import re
+import shlex
 import shutil
 import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterator
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-
-HERE = Path(__file__).resolve().parents[1]
-DATA = Path(os.environ.get("SEMSTAB_DATA", HERE.parent / "shared/data"))
-TOP = ("backends", "backbones", "datasets", "configs", "conformance")
-TOLERANCE = 1e-12
-MOST_SHOWN = 10
+import yaml
 
 RENAMED: dict[str, str | None] = {
-    "judged": "headline",
-    "reach": "ceiling_share",
-    "reached": "share",
-    "ceiling_share.classes.matters": "counts_for_verdict",
-    "beyond_coin": "excess_over_chance",
-    "settling": "drift_below_null",
-    "each_place": "voxel_weighted",
-    "ceiling_share.classes.places": "locations",
+    "statistics.judged": "headline",
+    "statistics.reach": "ceiling_share",
+    "reach.reached": "share",
+    "classes.places": "locations",
+    "classes.matters": "counts_for_verdict",
+    "classes.reached": "share",
+    "statistics.beyond_coin": "excess_over_chance",
+    "beyond_coin.settling": "drift_below_null",
+    "agreement.each_place": "voxel_weighted",
 }
-"""Keys of JSON, or ends of their paths, by their names at the kept revision; None: gone by design."""
+"""Key, column, file, header or word of the kept revision -> its name now; None: gone by design (say why in a comment).
 
-OF_STATISTICS = ("sbd_null", "sbd_excess", "trend")
-"""Columns of voxels that statistics compute: compared to 1e-12."""
-
-RENAMED_COLUMNS: dict[str, str | None] = {}
-"""Columns of Parquet and CSV, and files, likewise."""
-
-BY_DESIGN = re.compile(
-    r"paired\.(blocks|block_size)|rankings\[\d+\]\.ranks\[\d+\]\.(best|low|high)"  # resamples of the one engine
-    r"|(disagreement|geometry|model|standardised)[._](low|high)|^range$|best_percent"
-    r"|(geometry\.\w+|standardised\.values\.\w+\.\w+)\.(low|high|block_size|degrees)"  # intervals of the one engine
-)
-"""Numbers that changed with the redesign, as docs/validity.md tells."""
-
-ROUNDED = ("influence", "looks")
-"""Folders of sums that later commands read: compared to 1e-12, not bit by bit."""
+`parent.key` goes before `key`; the parent of a column is the stem of its file, or the folder if that is in FOLDERS. A
+folder is `name/` on both sides. X_low, X_high and X_3 follow X.
+"""
 
 WORDS: dict[str, str] = {}
-"""Commands and options by their names at the kept revision."""
+"""Commands and options of the kept revision -> those of the working tree."""
+
+HERE = Path(__file__).resolve().parents[1]
+TOLERANCE = 1e-12
+SHOWN = 10
+SECONDS = 900  # after which a command is given up
 
 IGNORED = re.compile(
-    r"^(key|unit|image)$|seconds|_ms|(^|_)ms$|time|memory|rss|bytes|version|date|path|folder|file|digest|identity|command|manifest|python"
-    r"|machine|host|cpu|threads|platform|packages|schema|source|inputs?$|where$|columns$|text|sentence|advice|remarks?"
-    r"|reason|line|title|caption|said|story|about|calibrated_on|created"
+    r"schema|key|command|seconds|milliseconds|.*_ms|.*_ms_per_frame|seconds_.*|.*_seconds|fps|.*memory.*|peak_.*|version|semstab|date|created"
+    r"|root|path|source|.*_file|digest|identity|inputs|sha256|model_hash"
+    r"|line|title|caption|advice|undecided|remarks|reason|about|text|calibrated_on"
 )
-"""Keys whose values are times, places, versions, or sentences for people."""
+"""Keys and columns of times, memory, versions, dates, paths, hashes and sentences for people."""
 
-QUIET = ("--rerun", "off", "--report", "off", "--quiet")
-CITY = (
-    "--set", "dataset.options.width=96", "--set", "dataset.options.height=64", "--set", "dataset.options.frames=12",
-    "--scene", "scene0", "--voxel-size", "0.4",
-)  # fmt: skip
+SKIPPED = re.compile(
+    r"(.*/)?((units|parts|sights|figures)/.*|manifest\.json|.*\.(md|tex|html|svg|rrd|zip|xml|log)|exit_codes)"
+)
+"""Files for people, of pictures, and of units under a hash."""
+
+EXACT = ("voxels", "truth", "looks", "frames")
+"""Folders whose tables are compared bit by bit."""
+
+HASH = re.compile(r"[0-9a-f]{24,64}")
+"""Values that are digests, whatever their key."""
+
+FOLDERS = (*EXACT, "influence", "columns")
+"""Folders with a file for each unit, whose names are not of tables."""
+
+SAMPLED_FOLDERS = ("looks", "influence")
+SAMPLED_COLUMNS = re.compile(
+    r"(drift|trend)_[pq]|trend|stable|stable_wrong|flip_rate|frames_since_flip|sbd_(null|excess)"
+)
+"""What a sampled case does not compare: draws of observations, and what statistics add to voxels of the sample."""
+
+
+# --- Cases ------------------------------------------------------------------------------------------------------------
+
+MACROS = {
+    "quiet": "--rerun off --report off --quiet",
+    "drawn": "--rerun off --report on --quiet",
+    "small": "--scene scene0 --option width=96 --option height=64 --option frames=60 --frames 0:20 --voxel-size 0.4",
+    "clusters": "--predict colour-clusters --backbone colour-clusters",
+    "shelf": "--data {data}/apc_shelf",
+}
 
 
 @dataclass(frozen=True)
 class Case:
-    """Commands in a folder of their own: words with {data}, {inputs}; whatever they write there is compared."""
+    """Commands, in the words of the kept revision, in a folder of their own; what they leave there is compared."""
 
     name: str
-    commands: tuple[tuple[str, ...], ...]
-    exact: bool = True
+    commands: Sequence[str]
+    quick: bool = False
+    sampled: bool = False  # more than 500,000 voxels: statistics within two standard errors
+    same: tuple[str, str] | None = None  # two runs of the case whose voxel tables are equal
 
 
-def run(name: str, *words: str) -> Case:
-    """A run without pictures."""
-    return Case(name, (("run", *words, "--out", "run", *QUIET),))
+def cases() -> list[Case]:
+    """All cases, long ones first."""
+    two = [
+        f"run {{shelf}} -m {name} --voxel-size 0.02 --statistics --out of_{name} {{quiet}}" for name in ("gt", "fcn")
+    ]
+    city = "run {small} -m sim-flicker --statistics --check none"
+    return [
+        Case("shelf_statistics", ["run {shelf} -m fcn -m gt --statistics --events --out r {drawn}"], quick=True),
+        Case("study", ["study {inputs}/study.yaml --option root={inputs}/walls --out r --rerun off --quiet"]),
+        Case("brighton", ["run --data {data}/brighton {clusters} --voxel-size 0.5 --statistics --out r {drawn}"]),
+        Case("compare", [*two, "compare of_gt of_fcn --out c --quiet", "compare of_fcn of_gt --out d --quiet",
+                         "export of_fcn --to more.parquet --beside d/columns/apc_shelf__fcn__gt.parquet --quiet"]),
+        Case("city_statistics", ["run {small} -m sim-flicker -m sim-soft -m gt --statistics --events --out r {drawn}"]),
+        Case("city_large", ["run -s scene0 -m sim-flicker --voxel-size 0.12 --check none --statistics --out r {quiet}"],
+             sampled=True),
+        Case("city_sparse", ["run -s scene3 -m sim-flicker --check none --statistics --out r {quiet}"], sampled=True),
+        Case("tiles", [f"{city} --out whole {{quiet}}", f"{city} --tile-size 64 --out tiled {{quiet}}"], quick=True,
+             same=("whole", "tiled")),
+        *(Case(f"city_{name}", [f"run {{small}} -m sim-flicker -m gt -b {name} --statistics --events --check none "
+                                "--out r {quiet}"], quick=True)
+          for name in ("numpy", "numba", "open3d", "open3d-projective")),
+        Case("city_checked", ["run {small} -m sim-flicker -b open3d -b numba --check numpy --out r {drawn}"]),
+        Case("hololens", ["run --data {data}/hololens {clusters} --frames ::3 --statistics --out r {quiet}"]),
+        Case("shelf", ["run {shelf} --out r {quiet}"], quick=True),
+        *(Case(f"shelf_gt_{size}", [f"run {{shelf}} -m gt --voxel-size {size} --out r {{quiet}}"])
+          for size in ("0.01", "0.02", "0.04", "0.08")),
+        *(Case(f"scores_{K}", [f"run --data {{inputs}}/scores{K} --voxel-size 0.1 --statistics --out r {{quiet}}",
+                               f"run --data {{inputs}}/scores{K} --voxel-size 0.1 --top-k 3 --out top {{quiet}}"])
+          for K in (7, 150)),
+        Case("gate", [*two, *(f"gate of_fcn --against of_gt --rule 'alpha drop < 0.02' --rule 'vss > 0.5' --rule "
+                              f"'class *: recall > 0.6' --frames {frames} --out {frames}.json --quiet"
+                              for frames in ("random", "fixed")),
+                      "gate of_gt --against of_gt --rule 'vss > 0.1' --save-baseline base.zip --quiet",
+                      "gate of_fcn --against base.zip --rule 'vss drop < 0.02' --out kept.json --quiet"]),
+        Case("calibrate", [*two[1:], "commit of_fcn --out acted.yaml --precision 0.5 --confidence 0.8 --quiet",
+                           "export of_fcn --to acted.csv --commit acted.yaml --quiet",
+                           "relabel of_fcn --out acted --commit acted.yaml --quiet"]),
+        Case("relabel", [*two[1:], "relabel of_fcn --out fused --min-op 2 --min-psa 0.5 --quiet",
+                         "relabel of_fcn --out others --leave-own-out --quiet"]),
+        Case("export", ["run --data {data}/brighton {clusters} --voxel-size 1 --statistics --out r {quiet}",
+                        "export r --to m.ply --to m.las --to m.laz --to m.tif --to m.glb --to m.parquet --to m.csv -q",
+                        "export r --to few.csv --min-op 3 --measure vss --measure psa --quiet",
+                        "export r --to coarse.tif --cell 4 --measure entropy --quiet",
+                        "export r --onto m.las --to onto.las --radius 2 --quiet"]),
+        Case("filters", ["remedies {shelf} -m fcn --filter ema-warped:0.6 --filter vote:3 --voxel-size 0.02 "
+                         "--frames ::2 --out r --report off --quiet"]),
+        Case("predict", ["predict --backbone colour-clusters {shelf} --frames ::5 --scores --out p --quiet"]),
+        Case("convert", ["convert {shelf} --frames ::5 --out c --quiet",
+                         "convert --dataset tum --config {inputs}/tum.yaml --data {inputs}/tum --out t --quiet"]),
+        Case("check", ["check {shelf} --json c.json --quiet"]),
+        Case("regions", ["study {inputs}/regions.yaml --option root={inputs}/wall --out r --rerun off --quiet"]),
+        *(Case(name, [f"run --dataset {name} --config {{inputs}}/{name}.yaml --data {{inputs}}/{name} --voxel-size 0.1 "
+                      "--statistics --out r {quiet}"]) for name in ("odm", "colmap", "tum")),
+    ]  # fmt: skip
 
 
-def cases() -> tuple[Case, ...]:
-    """All of them."""
-    shelf, wall = ("--data", "{data}/apc_shelf"), ("--data", "{inputs}/wall")
-    clusters = ("--predict", "colour-clusters", "--backbone", "colour-clusters")
-    fine = ("--voxel-size", "0.02", "--statistics")
-    two = tuple(("run", *shelf, "-m", name, *fine, "--out", name, *QUIET) for name in ("gt", "fcn"))
-    backends = ("numpy", "numba", "open3d", "open3d-projective", "torch")
-    suffixes = ("ply", "las", "tif", "glb", "parquet", "csv")
-    return (
-        *(run(f"city_{name}", *CITY, "-b", name, "--check", "none") for name in backends),
-        run("city_checked", *CITY, "-b", "open3d", "-b", "numba"),
-        run("city_statistics", *CITY, "-m", "sim-flicker", "-m", "gt", "--statistics", "--events"),
-        run("scores_7", "--data", "{inputs}/scores7", "--voxel-size", "0.1", "--statistics"),
-        run("scores_150", "--data", "{inputs}/scores150", "--voxel-size", "0.1"),
-        Case("study", (("study", "{inputs}/study.yaml", "--out", "run", *QUIET[:4]),)),
-        Case("regions", (("study", "{inputs}/regions.yaml", "--out", "run", *QUIET[:4]),)),
-        *(run(form, "--config", f"{{inputs}}/{form}.yaml") for form in ("odm", "colmap", "tum")),
-        run("shelf", *shelf, "--statistics"),
-        *(run(f"shelf_gt_{r}", *shelf, "-m", "gt", "--voxel-size", r) for r in ("0.01", "0.02", "0.04", "0.08")),
-        Case("tables", (("run", *shelf, "--statistics", "--out", "run", "--rerun", "off", "--quiet"),)),
-        run("hololens", "--data", "{data}/hololens", *clusters, "--frames", "::3"),
-        run("brighton", "--data", "{data}/brighton", *clusters, "--voxel-size", "0.5", "--statistics"),
-        Case("compare", (*two, ("compare", "gt", "fcn", "--out", "compared", "--quiet"))),
-        Case("gate", (*two, (
-            "gate", "fcn", "--against", "gt", "--rule", "alpha drop < 0.02", "--rule", "vss > 0.5", "--rule",
-            "class *: recall > 0.6", "--out", "gate.json", "--quiet",
-        ))),
-        Case("calibrate", (*two[1:], ("commit", "fcn", "--out", "commit.yaml", "--quiet"))),
-        Case("exports", (
-            ("run", "--data", "{data}/brighton", *clusters, "--voxel-size", "1", "--out", "run", *QUIET),
-            ("export", "run", *(word for s in suffixes for word in ("--to", f"map.{s}")), "--quiet"),
-            ("export", "run", "--to", "some.csv", "--min-op", "3", "--measure", "vss", "--quiet"),
-        )),
-        Case("relabel", (*two[1:], ("relabel", "fcn", "--out", "labels", "--min-op", "2", "--quiet"))),
-        Case("convert", (("convert", *shelf, "--frames", "::5", "--out", "converted", "--quiet"),)),
-        run("tiles", *CITY, "-m", "sim-flicker", "--tile-size", "32", "--statistics"),
-        run("wall", *wall, "-m", "a", "-m", "b", "--statistics", "--events", "--voxel-size", "0.2"),
-    )  # fmt: skip
+WRITER = """
+import pathlib, sys
+import cv2, numpy as np, yaml
+import dataset_writers, tiny_study, wall_study
+
+out = pathlib.Path(sys.argv[1])
+def settings(name, content):
+    (out / f"{name}.yaml").write_text(yaml.safe_dump(content))
+
+for name, kind in (("odm", "odm"), ("colmap", "colmap, text"), ("tum", "tum")):
+    form = dataset_writers.FORMATS[kind]
+    frames = dataset_writers.source(form.scale)
+    folder = out / name / "room"
+    folder.mkdir(parents=True)
+    dataset_writers.write_labels(folder, form.write(folder, frames), frames)
+    options = {key: value() if callable(value) else value for key, value in form.options.items()}
+    settings(name, {"dataset": {"name": name, "options": {"classes": dataset_writers.CLASSES, **options}}})
+
+for name, step in wall_study.STEPS.items():
+    wall_study.write_wall(out / "walls" / name, step)
+posed = {"dataset": {"name": "posed_folder"}}
+sweeps = {"voxel_size": [0.0625, 0.125], "depth_noise": {"values": [0, 0.01], "repeats": 2}}
+settings("study", {**posed, "name": "walls", "backbones": ["nervous"], "voxel_size": 0.0625, "sweeps": sweeps,
+                   "statistics": True, "backends": ["numpy", {"name": "numba", "scenes": ["often"]}]})
+
+tiny_study.write(out / "wall", backbones=("a",), frames=4)
+(out / "wall/labels/regions").mkdir()
+for i in range(4):
+    ids = np.where(np.arange(8) + i < 5, 200 + 2 * i, 300 - i).astype(np.uint16)
+    cv2.imwrite(str(out / f"wall/labels/regions/{i:04d}.png"), np.tile(ids, (6, 1)))
+settings("regions", {**posed, "voxel_size": 0.25, "region_maps": ["regions"], "backends": ["numpy"]})
+"""
+"""Run beside the tests of the kept revision: scenes in the formats of several programs, and settings of studies."""
+
+
+def write_scores(folder: Path, K: int) -> None:
+    """A posed folder with soft scores of K classes, drawn by a seed."""
+    import cv2
+
+    rng, height, width = np.random.default_rng(K), 32, 48
+    for part in ("depth", "pose", "scores/net"):
+        (folder / part).mkdir(parents=True)
+    np.savetxt(folder / "intrinsics.txt", [[40, 0, 24], [0, 40, 16], [0, 0, 1]])
+    classes = ", ".join(f"class {k}" for k in range(K))
+    (folder / "scene.yaml").write_text(f"up_axis: -y\nclasses: [{classes}]\n")
+    blocks = rng.dirichlet(np.full(K, 0.05), (height // 8, width // 8)).repeat(8, 0).repeat(8, 1)
+    for i in range(8):
+        pose = np.eye(4)
+        pose[:3, 3] = 0.05 * i + 0.003, 0.02 * i + 0.004, 0.005
+        np.savetxt(folder / f"pose/{i:03d}.txt", pose)
+        depth = 1500 + 300 * np.sin(np.arange(width) / 9 + i / 8) + np.zeros((height, 1))
+        cv2.imwrite(str(folder / f"depth/{i:03d}.png"), depth.astype(np.uint16))
+        scores = (0.6 * blocks + 0.4 * rng.dirichlet(np.full(K, 0.05), (height, width))).astype(np.float32)
+        np.savez_compressed(folder / f"scores/net/{i:03d}.npz", scores=scores.transpose(2, 0, 1))
 
 
 # --- Running ----------------------------------------------------------------------------------------------------------
 
 
-def import_tree(root: Path, folder: Path) -> Path:
-    """A folder from which `import semstab` takes the code of a checkout."""
-    package = folder / "semstab"
-    package.mkdir(parents=True)
-    for child in [*(root / "benchmark").iterdir(), *(root / name for name in TOP)]:
-        if child.name != "__pycache__":
-            (package / child.name).symlink_to(child)
-    return folder
+def link_tree(root: Path, tree: Path) -> Path:
+    """A folder from which `import semstab` takes the code of a checkout, by its setup.cfg."""
+    setup = configparser.ConfigParser()
+    setup.read(root / "setup.cfg")
+    lines = setup["options"]["package_dir"].split()  # name = folder
+    folders = {name: root / folder for name, folder in zip(lines[::3], lines[2::3], strict=True)}
+    (tree / "semstab").mkdir(parents=True)
+    children = {path.name: path for path in folders.pop("semstab").iterdir() if path.name != "__pycache__"}
+    for name, path in (children | {name.removeprefix("semstab."): path for name, path in folders.items()}).items():
+        (tree / "semstab" / name).symlink_to(path)
+    return tree
 
 
-def run_case(case: Case, tree: Path, out: Path, inputs: Path, words: dict[str, str]) -> str:
-    """Run its commands in a new folder; an error's last lines, empty where all went well."""
+def run_case(case: Case, tree: Path, out: Path, places: Mapping[str, str], words: Mapping[str, str]) -> str:
+    """Run its commands in a new folder; what went wrong, else nothing."""
     shutil.rmtree(out, ignore_errors=True)
     out.mkdir(parents=True)
-    environment = os.environ | {"PYTHONPATH": str(tree), "SEMSTAB_DATA": str(DATA), "COLUMNS": "100"}
+    environment = os.environ | {"PYTHONPATH": str(tree), "SEMSTAB_CACHE": str(tree / "cache")}
+    codes = []
     for command in case.commands:
-        made = [words.get(word, word).format(data=DATA, inputs=inputs) for word in command]
-        done = subprocess.run(
-            [sys.executable, "-m", "semstab", *made],
-            cwd=out,
-            env=environment,
-            capture_output=True,
-            text=True,
-            check=False,
-        )
+        parts = shlex.split(_filled(command, MACROS))
+        line = ["-m", "semstab", *(_filled(words.get(part, part), places) for part in parts)]
+        try:
+            done = subprocess.run(
+                [sys.executable, *line],
+                cwd=out,
+                env=environment,
+                capture_output=True,
+                text=True,
+                timeout=SECONDS,
+                check=False,
+            )
+        except subprocess.TimeoutExpired:
+            return f"{shlex.join(line)}: not done after {SECONDS} s"
+        codes.append(str(done.returncode))
         if done.returncode not in (0, 3, 4):
-            return f"{' '.join(made)}: exit code {done.returncode}\n{(done.stdout + done.stderr)[-1500:]}"
-        with (out / "exit_codes.json").open("a") as codes:
-            codes.write(f"{done.returncode}\n")
+            return f"{shlex.join(line)}: exit code {done.returncode}\n{(done.stdout + done.stderr).strip()[-1200:]}"
+    (out / "exit_codes").write_text(" ".join(codes))
     return ""
 
 
+def _filled(text: str, values: Mapping[str, str]) -> str:
+    for name, value in values.items():
+        text = text.replace("{" + name + "}", value)
+    return text
+
+
 def write_inputs(root: Path, tree: Path, inputs: Path) -> None:
-    """Scenes that the tests' writers make, by the code of the kept revision."""
+    """Scenes that both sides read, by the code and the tests of the kept revision."""
     shutil.rmtree(inputs, ignore_errors=True)
     inputs.mkdir(parents=True)
-    code = f"""
-import json, sys; sys.path.insert(0, {str(root / "tests")!r})
-from pathlib import Path
-import cv2, numpy as np
-import tiny_study
-from dataset_writers import CLASSES, FORMATS, camera_option, source, write_labels
-out = Path({str(inputs)!r})
-for name, form in (("odm", "odm"), ("colmap", "colmap, text"), ("tum", "tum")):
-    frames = source(FORMATS[form].scale)
-    folder = out / name / "room"; folder.mkdir(parents=True)
-    names = FORMATS[form].write(folder, frames)
-    write_labels(folder, names, frames)
-    options = {{"root": str(out / name), "classes": CLASSES}}
-    options |= {{"intrinsics": camera_option()}} if name == "tum" else {{}}
-    config = {{"dataset": {{"name": name, "options": options}}, "voxel_size": 0.1}}
-    (out / f"{{name}}.yaml").write_text(json.dumps(config, default=list))
-tiny_study.write(out / "wall", backbones=("a", "b"), frames=4)
-(out / "wall/labels/regions").mkdir()
-columns = np.arange(8)
-for i in range(4):
-    ids = np.where(columns + i < 5, 200 + 2 * i, 300 - i).astype(np.uint16)
-    cv2.imwrite(str(out / f"wall/labels/regions/{{i:04d}}.png"), np.tile(ids, (6, 1)))
-for K in (7, 150):
-    rng, folder = np.random.default_rng(K), out / f"scores{{K}}"
-    for part in ("depth", "pose", "scores/net"): (folder / part).mkdir(parents=True)
-    np.savetxt(folder / "intrinsics.txt", [[40, 0, 24], [0, 40, 16], [0, 0, 1]])
-    base = rng.dirichlet(np.full(K, 0.1), (4, 6)).repeat(8, 0).repeat(8, 1)
-    for i in range(8):
-        T = np.eye(4); T[:3, 3] = 0.05 * i + 0.003, 0.02 * i + 0.004, 0.005
-        np.savetxt(folder / f"pose/{{i:03d}}.txt", T)
-        depth = 1500 + 300 * np.sin(np.arange(48) / 9 + i / 8)[None, :] + np.zeros((32, 1))
-        cv2.imwrite(str(folder / f"depth/{{i:03d}}.png"), depth.astype(np.uint16))
-        scores = base + 0.5 * rng.dirichlet(np.full(K, 0.1), (32, 48))
-        np.savez_compressed(folder / f"scores/net/{{i:03d}}.npz", scores=scores.transpose(2, 0, 1).astype(np.float32))
-    (folder / "scene.yaml").write_text("up_axis: -y\\nclasses: [" + ", ".join(f"c{{k}}" for k in range(K)) + "]\\n")
-"""
-    environment = os.environ | {"PYTHONPATH": str(tree)}
-    subprocess.run([sys.executable, "-c", code], env=environment, check=True)
-    wall = f"dataset: {{name: posed_folder, options: {{root: {inputs / 'wall'}}}}}\nvoxel_size: 0.2\n"
-    (inputs / "study.yaml").write_text(
-        wall + "backbones: [a, b]\nstatistics: true\nsweeps: {voxel_size: [0.1, 0.4], pixel_stride: [1, 2]}\n"
-    )
-    (inputs / "regions.yaml").write_text(wall + "backbones: [a]\nregion_maps: [regions]\nbackends: [{name: numpy}]\n")
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join([str(tree), str(root / "tests")])}
+    subprocess.run([sys.executable, "-c", WRITER, inputs], env=environment, check=True)
+    for K in (7, 150):
+        write_scores(inputs / f"scores{K}", K)
+    (inputs / "done").touch()
 
 
 # --- Comparing --------------------------------------------------------------------------------------------------------
 
 
-def differences(old: Path, new: Path) -> Iterator[str]:
-    """What the new folder of a case does not have as the old one has it."""
-    for file in sorted(path for path in old.rglob("*") if path.is_file()):
-        where = file.relative_to(old)
-        if any(part in ("units", ".semstab", "recording.rrd") for part in where.parts):
-            continue
-        compare = READERS.get(file.suffix)
-        if compare is None or file.name in ("manifest.json", "config.yaml"):
-            continue
-        name = RENAMED_COLUMNS.get(file.name, file.name)
-        if name is None:
-            continue
-        other = new / where.with_name(name)
-        if not other.is_file():
-            yield f"{where}: missing"
-        else:
-            yield from (f"{where}: {line}" for line in compare(file, other))
+@dataclass
+class Comparison:
+    """What differs between the two folders of a case, what is new, and the verdicts."""
 
+    sampled: bool
+    differences: list[str] = field(default_factory=list)
+    new: Counter[str] = field(default_factory=Counter)
+    verdicts: dict[str, None] = field(default_factory=dict)
+    unchecked: int = 0  # what a sampled case has without an interval
+    files: int = 0
 
-def _close(a: Any, b: Any) -> bool:
-    if isinstance(a, bool) or isinstance(b, bool) or not isinstance(a, int | float) or not isinstance(b, int | float):
-        return bool(a == b)
-    return (math.isnan(a) and math.isnan(b)) or abs(a - b) <= TOLERANCE * max(1.0, abs(a), abs(b))
+    def differ(self, where: str, old: Any, new: Any) -> None:
+        """One value that is not what it was."""
+        self.differences.append(f"{where}: {str(old)[:90]} is now {str(new)[:90]}")
 
+    def names(self, a: Mapping[str, Any], b: Mapping[str, Any], parent: str, what: str) -> dict[str, str]:
+        """Keys of `a` that are compared, with their names in `b`."""
+        found = {key: name for key in a if (name := renamed(key, parent)) is not None}
+        self.new[what] += len(b.keys() - set(found.values()))
+        return {key: name for key, name in found.items() if not IGNORED.fullmatch(key)}
 
-def of_json(old: Path, new: Path) -> Iterator[str]:
-    """Values by their keys."""
-    if old.name == "exit_codes.json":
-        yield from [] if old.read_text() == new.read_text() else ["exit codes differ"]
-        return
-    yield from _nodes(json.loads(old.read_text()), json.loads(new.read_text()), "")
+    def values(self, a: Any, b: Any, where: str, parent: str = "", loose: bool = False) -> None:
+        """Values of JSON by their keys; `loose`: made from a sample."""
+        if isinstance(a, dict) and isinstance(b, dict):
+            if loose and {"value", "low", "high"} <= a.keys():
+                self.interval(a, b, where)
+                return
+            names = self.names(a, b, parent, "keys")
+            if isinstance(verdict := a.get("verdict"), dict) and "level" in verdict:
+                now = (b.get(names["verdict"]) or {}).get(renamed("level", "verdict") or "")
+                change = "" if now == verdict["level"] else f" (now {now})"
+                self.verdicts[f"{a.get('name', '')} {verdict['level']}{change}"] = None
+            for key, name in names.items():
+                if name not in b:
+                    self.differ(f"{where}.{name}", a[key], "missing")
+                else:
+                    drawn = loose or (self.sampled and key == "statistics")
+                    self.values(a[key], b[name], f"{where}.{name}", key, drawn)
+        elif isinstance(a, list) and isinstance(b, list):
+            if len(a) != len(b):
+                self.differ(where, f"{len(a)} entries", f"{len(b)} entries")
+            for i, (old, new) in enumerate(zip(a, b, strict=False)):
+                self.values(old, new, f"{where}[{i}]", parent, loose)
+        elif loose and not isinstance(a, str):
+            self.unchecked += 1
+        elif not same(a, b, TOLERANCE, parent):
+            self.differ(where, a, b)
 
+    def interval(self, a: Mapping[str, Any], b: Mapping[str, Any], where: str) -> None:
+        """An estimate and its bounds, within two standard errors of the kept one."""
+        keys = {key: renamed(key) or key for key in ("value", "low", "high")}
+        if None in (bounds := [a["low"], a["high"]]):
+            self.unchecked += 1
+            return
+        error = (bounds[1] - bounds[0]) / (2 * 1.96)
+        for key, name in keys.items():
+            if b.get(name) is None or abs(a[key] - b[name]) > max(2 * error, TOLERANCE):
+                self.differ(f"{where}.{name} (standard error {error:.3g})", a[key], b.get(name))
 
-def _nodes(a: Any, b: Any, where: str) -> Iterator[str]:
-    if isinstance(a, dict) and isinstance(b, dict):
-        for key, value in a.items():
-            ends = re.sub(r"\[\d+\]", "", f"{where}.{key}").split(".")
-            name = RENAMED.get(".".join(ends[-3:]), RENAMED.get(key, key))
-            if name is None or IGNORED.search(key):
+    def columns(self, a: Mapping[str, Any], b: Mapping[str, Any], where: str, tolerance: float) -> None:
+        """Columns by name, arrays or lists of text; tolerance 0: bit by bit."""
+        folder, stem = Path(where).parent.name, Path(where).stem
+        for key, name in self.names(a, b, folder if folder in FOLDERS else stem, "columns").items():
+            if self.sampled and SAMPLED_COLUMNS.fullmatch(key):
+                self.unchecked += 1
                 continue
-            if name not in b:
-                yield f"{where}.{name}: missing (was {str(value)[:60]})"
+            x, y = (np.asarray(each) for each in (a[key], b.get(name, [])))
+            if name not in b or x.shape != y.shape or (x.dtype != y.dtype and x.dtype.kind in "fiub"):
+                self.differ(
+                    f"{where}: {name}", f"{x.dtype} {x.shape}", f"{y.dtype} {y.shape}" if name in b else "missing"
+                )
+                continue
+            x, y = x.ravel(), y.ravel()
+            if x.dtype.kind not in "fiub":
+                wrong = np.array([not same(p, q, tolerance) for p, q in zip(x.tolist(), y.tolist(), strict=True)], bool)
+            elif tolerance and x.dtype.kind == "f":
+                wrong = ~np.isclose(x, y, rtol=tolerance, atol=tolerance, equal_nan=True)
+            elif x.dtype.kind == "f":
+                wrong = ((x != y) | (np.signbit(x) != np.signbit(y))) & ~(np.isnan(x) & np.isnan(y))
             else:
-                yield from _nodes(value, b[name], f"{where}.{name}")
-    elif isinstance(a, list) and isinstance(b, list):
-        if len(a) != len(b):
-            yield f"{where}: {len(a)} entries, now {len(b)}"
-        for i, (x, y) in enumerate(zip(a, b, strict=False)):
-            yield from _nodes(x, y, f"{where}[{i}]")
-    elif not _close(a, b) and not (isinstance(a, str) and " " in a) and not BY_DESIGN.search(where):
-        yield f"{where}: {str(a)[:80]} is now {str(b)[:80]}"
+                wrong = x != y
+            if wrong.any():
+                first = int(np.argmax(wrong))
+                self.differ(f"{where}: {name}[{first}], one of {wrong.sum()} of {wrong.size}", x[first], y[first])
+
+    def file(self, old: Path, new: Path, where: str) -> None:
+        """One file, or the tiles of one table, by its kind."""
+        self.files += 1
+        path = Path(where)
+        if path.suffix in (".json", ".yaml"):
+            load: Callable[[str], Any] = json.loads if path.suffix == ".json" else yaml.safe_load
+            self.values(load(old.read_text()), load(new.read_text()), where, path.stem)
+        elif decode := DECODERS.get(path.suffix):
+            tolerance = 0.0 if path.parent.name in EXACT else TOLERANCE
+            self.columns(decode(old), decode(new), where, tolerance)
+        elif old.read_bytes() != new.read_bytes():
+            self.differ(where, f"{old.stat().st_size} bytes", f"{new.stat().st_size} other bytes")
+
+    def folders(self, old: Path, new: Path) -> None:
+        """All that the commands of a case left."""
+        ours, theirs = listing(old), listing(new)
+        codes = [(folder / "exit_codes").read_text() for folder in (old, new)]
+        if codes[0] != codes[1]:
+            self.differ("exit codes", *codes)
+        names = {where: name for where in ours if (name := renamed_file(where)) is not None}
+        self.new["files"] += len(theirs.keys() - set(names.values()))
+        for where, name in names.items():
+            if self.sampled and ours[where].parent.name in SAMPLED_FOLDERS:
+                self.unchecked += 1
+            elif name not in theirs:
+                self.differ(where, "a file", "missing")
+            else:
+                try:
+                    self.file(ours[where], theirs[name], where)
+                except Exception as error:  # noqa: BLE001  a file that cannot be read is a difference
+                    self.differ(where, "readable", repr(error))
 
 
-def of_yaml(old: Path, new: Path) -> Iterator[str]:
-    """The same of YAML."""
-    import yaml
-
-    yield from _nodes(yaml.safe_load(old.read_text()), yaml.safe_load(new.read_text()), "")
-
-
-def of_parquet(old: Path, new: Path) -> Iterator[str]:
-    """Columns bit by bit."""
-    import pyarrow.parquet as pq
-
-    a, b = pq.read_table(old), pq.read_table(new)
-    if old.parent.name in ROUNDED:
-        axes = [(name, "ascending") for name in ("ix", "iy", "iz", "frame") if name in a.column_names]
-        a, b = (table.sort_by(axes) if axes else table for table in (a, b))
-    if a.num_rows != b.num_rows:
-        yield f"{a.num_rows} rows, now {b.num_rows}"
-        return
-    for key in a.column_names:
-        name = RENAMED_COLUMNS.get(key, key)
-        if name is None:
-            continue
-        if name not in b.column_names:
-            yield f"column {name}: missing"
-        elif not _same(
-            a[key].combine_chunks(),
-            b[name].combine_chunks(),
-            rounded=old.parent.name in ROUNDED or key in OF_STATISTICS,
-        ):
-            yield f"column {name}: differs"
+def listing(folder: Path) -> dict[str, Path]:
+    """Files to be compared by their names; the tiles of a voxel table are one table, as one file is."""
+    found: dict[str, Path] = {}
+    for path in sorted(each for each in folder.rglob("*") if each.is_file()):
+        tiled = path.name.startswith("tile=")
+        where = path.relative_to(folder).as_posix()
+        name = f"{Path(where).parent.as_posix()}.parquet" if tiled else where
+        if not SKIPPED.fullmatch(name):
+            found[name] = path.parent if tiled else path
+    return found
 
 
-def _same(a: Any, b: Any, *, rounded: bool) -> bool:
-    if a.equals(b):
+def renamed(name: str, parent: str = "") -> str | None:
+    """What a name of the kept revision is now; X_low, X_high and X_3 follow X."""
+    for key in (f"{parent}.{name}", name):
+        if key in RENAMED:
+            return RENAMED[key]
+    match = re.fullmatch(r"(.+)_(low|high|\d+)", name)
+    if match is None or (stem := renamed(match[1], parent)) == match[1]:
+        return name
+    return stem and f"{stem}_{match[2]}"
+
+
+def renamed_file(where: str) -> str | None:
+    """The same of a file, folder by folder; its suffix stays."""
+    *folders, file = where.split("/")
+    stem, dot, suffix = file.partition(".")
+    parts = [RENAMED.get(f"{folder}/", f"{folder}/") for folder in folders]
+    parts.append(RENAMED[file] if file in RENAMED else (name := renamed(stem)) and f"{name}{dot}{suffix}")
+    return None if None in parts else "".join(map(str, parts))
+
+
+def same(a: Any, b: Any, tolerance: float, parent: str = "") -> bool:
+    """Numbers to a tolerance, also where they are written as text; words through the names that changed."""
+    if isinstance(a, bool | None) or isinstance(b, bool | None):
+        return a is b
+    if a == b or (isinstance(a, str) and renamed(a, parent) in (b, None)):
         return True
+    if isinstance(a, str) and isinstance(b, str):
+        if a.startswith("/") and b.startswith("/"):
+            return Path(a).name == Path(b).name
+        if HASH.fullmatch(a) and HASH.fullmatch(b):
+            return True
     try:
-        x, y = (np.asarray(column.to_numpy(zero_copy_only=False)) for column in (a, b))
-        if rounded and x.dtype.kind == "f":
-            scale = TOLERANCE * (1 + np.nan_to_num(np.abs(x)).max(initial=0))
-            return bool(np.allclose(x, y, rtol=TOLERANCE, atol=scale, equal_nan=True))
-        return bool(np.array_equal(x, y, equal_nan=x.dtype.kind == "f"))
-    except (TypeError, ValueError):
-        return bool(a.to_pylist() == b.to_pylist())
-
-
-def of_csv(old: Path, new: Path) -> Iterator[str]:
-    """Cells; those of series to the last bit, as text."""
-    rows = [list(csv.DictReader(path.open(newline=""))) for path in (old, new)]
-    if len(rows[0]) != len(rows[1]):
-        yield f"{len(rows[0])} rows, now {len(rows[1])}"
-        return
-    for n, (a, b) in enumerate(zip(*rows, strict=True)):
-        for key, value in a.items():
-            name = RENAMED_COLUMNS.get(key, key)
-            if name is None or IGNORED.search(key):
-                continue
-            if name not in b:
-                yield f"column {name}: missing"
-                return
-            if (
-                value != b[name]
-                and not BY_DESIGN.search(key)
-                and not ("tiles" in old.parts and _close_text(value, b[name]))
-            ):
-                yield f"row {n}, {name}: {value} is now {b[name]}"
-                return
-
-
-def _close_text(a: str, b: str) -> bool:
-    """Of tiles, whose sums are added in another order."""
-    try:
-        return _close(float(a), float(b))
+        x, y = float(a), float(b)
     except ValueError:
         return False
+    return (math.isnan(x) and math.isnan(y)) or x == y or abs(x - y) <= tolerance * max(1.0, abs(x), abs(y))
 
 
-def of_image(old: Path, new: Path) -> Iterator[str]:
+# --- Formats: each file as columns ------------------------------------------------------------------------------------
+
+
+def of_parquet(path: Path) -> dict[str, Any]:
+    """Columns; lists of numbers laid end to end. Rows are put in the order of voxels and frames."""
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    parts = sorted(path.iterdir()) if path.is_dir() else [path]
+    table = pa.concat_tables([pq.read_table(part, partitioning=None) for part in parts])
+    if order := [name for name in ("ix", "iy", "iz", "frame", "part") if name in table.column_names]:
+        table = table.sort_by([(name, "ascending") for name in order])
+    columns = {name: table[name].combine_chunks() for name in table.column_names}
+    flat = {name: c.flatten() if pa.types.is_fixed_size_list(c.type) else c for name, c in columns.items()}
+    return {name: column.to_numpy(zero_copy_only=False) for name, column in flat.items()}
+
+
+def of_csv(path: Path) -> dict[str, Any]:
+    """Columns of text."""
+    rows = list(csv.reader(io.StringIO(path.read_text())))
+    return {name: [row[i] for row in rows[1:]] for i, name in enumerate(rows[0])} if rows else {}
+
+
+def of_ply(path: Path) -> dict[str, Any]:
+    """Properties of the points of a binary file, and the bytes that follow them."""
+    kinds = {"double": "f8", "float": "f4", "uchar": "u1", "ushort": "u2", "short": "i2", "int": "i4", "uint": "u4"}
+    header, _, body = path.read_bytes().partition(b"end_header\n")
+    lines = [line.split() for line in header.decode().splitlines()]
+    kind = np.dtype([(line[2], f"<{kinds[line[1]]}") for line in lines if line[0] == "property" and line[1] != "list"])
+    points = np.frombuffer(body, kind, next(int(line[2]) for line in lines if line[:2] == ["element", "vertex"]))
+    return {name: points[name] for name in kind.names or ()} | {"faces": [body[points.nbytes :].hex()]}
+
+
+def of_las(path: Path) -> dict[str, Any]:
+    """Dimensions, and what coordinates are counted in."""
+    import laspy
+
+    cloud = laspy.read(path)
+    header = cloud.header
+    placed = {"scales": header.scales, "offsets": header.offsets, "crs": [str(header.parse_crs())]}
+    return {name: np.asarray(cloud[name]) for name in cloud.point_format.dimension_names} | placed
+
+
+def of_raster(path: Path) -> dict[str, Any]:
+    """Bands by what they are called, and where they lie."""
+    import rasterio
+
+    with rasterio.open(path) as raster:
+        bands = {name or f"band {i}": raster.read(i + 1) for i, name in enumerate(raster.descriptions)}
+        return bands | {"transform": list(raster.transform), "crs": [str(raster.crs)]}
+
+
+def of_mesh(path: Path) -> dict[str, Any]:
+    """Corners with their colours, in an order of their own, and the number of triangles."""
+    import trimesh
+
+    mesh: Any = trimesh.load(path, force="mesh", process=False)
+    colors = np.asarray(getattr(mesh.visual, "vertex_colors", np.zeros((len(mesh.vertices), 0))))
+    corners = np.hstack([np.asarray(mesh.vertices, float), colors])
+    return {"corners": corners[np.lexsort(corners.T)], "triangles": np.array([len(mesh.faces)])}
+
+
+def of_image(path: Path) -> dict[str, Any]:
     """Pixels."""
     import cv2
 
-    a, b = (cv2.imread(str(path), cv2.IMREAD_UNCHANGED) for path in (old, new))
-    if a is None or b is None or not np.array_equal(a, b):
-        yield "pixels differ"
+    return {"pixels": cv2.imread(str(path), cv2.IMREAD_UNCHANGED)}
 
 
-def of_raster(old: Path, new: Path) -> Iterator[str]:
-    """Bands and where they lie."""
-    import rasterio
-
-    with rasterio.open(old) as a, rasterio.open(new) as b:
-        if a.transform != b.transform or a.crs != b.crs or not np.array_equal(a.read(), b.read(), equal_nan=True):
-            yield "raster differs"
-
-
-def of_las(old: Path, new: Path) -> Iterator[str]:
-    """Points by dimension."""
-    import laspy
-
-    a, b = laspy.read(old), laspy.read(new)
-    for name in a.point_format.dimension_names:
-        other = RENAMED_COLUMNS.get(name, name)
-        x, y = np.asarray(a[name]), np.asarray(b[other or name])
-        if other is not None and not np.array_equal(x, y, equal_nan=x.dtype.kind == "f"):
-            yield f"dimension {name} differs"
-
-
-def of_mesh(old: Path, new: Path) -> Iterator[str]:
-    """Corners of triangles and their colours, in whatever order."""
-    import trimesh
-
-    found = []
-    for path in (old, new):
-        mesh = trimesh.load(path, force="mesh", process=False)
-        corners = np.asarray(mesh.triangles).reshape(len(mesh.faces), -1).round(4)
-        found.append(corners[np.lexsort(corners.T)])
-    if found[0].shape != found[1].shape or not np.allclose(found[0], found[1], atol=2e-4):
-        yield f"mesh differs: {found[0].shape} and {found[1].shape}"
-
-
-def of_bytes(old: Path, new: Path) -> Iterator[str]:
-    """Bytes."""
-    if old.read_bytes() != new.read_bytes():
-        yield "bytes differ"
-
-
-READERS: dict[str, Callable[[Path, Path], Iterator[str]]] = {
-    ".json": of_json, ".yaml": of_yaml, ".parquet": of_parquet, ".csv": of_csv, ".png": of_image, ".tif": of_raster,
-    ".las": of_las, ".glb": of_mesh, ".ply": of_bytes, ".npy": of_bytes,
+DECODERS: dict[str, Callable[[Path], Mapping[str, Any]]] = {
+    ".parquet": of_parquet, ".csv": of_csv, ".ply": of_ply, ".las": of_las, ".laz": of_las, ".tif": of_raster,
+    ".glb": of_mesh, ".png": of_image, ".npz": lambda path: dict(np.load(path)),
 }  # fmt: skip
-
-
-def verdicts(folder: Path) -> Iterator[str]:
-    """What the statistics call each unit."""
-    for file in sorted(folder.rglob("summary.json")):
-        for row in json.loads(file.read_text()).get("runs", []):
-            verdict = ((row.get("statistics") or {}).get("verdict") or {}).get("level")
-            if verdict:
-                yield f"{row.get('backbone')} {verdict}"
 
 
 # --- The command ------------------------------------------------------------------------------------------------------
 
 
+def compare_case(case: Case, kept: Path, out: Path) -> tuple[bool, str]:
+    """Whether nothing differs, and the line of the case with what does."""
+    found = Comparison(case.sampled)
+    found.folders(kept, out)
+    if case.same:
+        first, second = (listing(out / run) for run in case.same)
+        tables = [
+            name for name in first if name.startswith(tuple(RENAMED.get(f, f) or f for f in ("voxels/", "truth/")))
+        ]
+        for name in tables:
+            found.columns(of_parquet(first[name]), of_parquet(second[name]), f"{' and '.join(case.same)}: {name}", 0.0)
+        if not tables:
+            found.differ(" and ".join(case.same), "voxel tables", "missing")
+    text = f", {found.files} files"
+    text += "".join(f", {count} new {what}" for what, count in found.new.items() if count)
+    text += f", {found.unchecked} of the sample not compared" if found.unchecked else ""
+    text += f"\n        verdicts: {', '.join(found.verdicts)}" if found.verdicts else ""
+    shown = found.differences[:SHOWN]
+    if more := len(found.differences) - len(shown):
+        shown.append(f"and {more} more" if more > 0 else "")
+    return not found.differences, text + "".join(f"\n    {line}" for line in shown)
+
+
 def main() -> int:
     """Keep or compare."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("what", choices=("keep", "compare"))
-    parser.add_argument("folder", type=Path, help="where the outputs of the earlier revision lie")
-    parser.add_argument("--revision", default="07664a4")
-    parser.add_argument("--source", type=Path, default=HERE, help="the checkout that is compared")
-    parser.add_argument("--case", action="append", help="only cases whose names begin so")
-    parser.add_argument("--jobs", type=int, default=2)
+    actions = parser.add_subparsers(dest="action", required=True)
+    keeping, comparing = actions.add_parser("keep"), actions.add_parser("compare")
+    keeping.add_argument("--revision", default="07664a4")
+    keeping.add_argument("--into", dest="folder", type=Path, required=True)
+    comparing.add_argument("folder", type=Path, help="where an earlier `keep` left its outputs")
+    for action in (keeping, comparing):
+        action.add_argument("--source", type=Path, default=HERE, help="the checkout; by default the script's own")
+        action.add_argument("--case", action="append", help="cases whose names begin so; repeatable")
+        action.add_argument("--quick", action="store_true", help="the city, the shelf, statistics and tiles alone")
+        action.add_argument("--jobs", type=int, default=2)
     given = parser.parse_args()
-    folder = given.folder.resolve()
-    inputs = folder / "inputs"
-    chosen = [case for case in cases() if not given.case or case.name.startswith(tuple(given.case))]
-    with tempfile.TemporaryDirectory() as name:
-        root, words = given.source.resolve(), WORDS
-        if given.what == "keep":
-            root, words = Path(name) / "earlier", {}
-            subprocess.run(
-                ["git", "-C", str(HERE), "worktree", "add", "--detach", str(root), given.revision], check=True
-            )
-        tree = import_tree(root, Path(name) / "tree")
-        try:
-            if given.what == "keep":
-                write_inputs(root, tree, inputs)
-            return _all(given.what, chosen, tree, folder, words, given.jobs)
-        finally:
-            if given.what == "keep":
-                subprocess.run(["git", "-C", str(HERE), "worktree", "remove", "--force", str(root)], check=True)
+    keeps, source, folder = given.action == "keep", given.source.resolve(), given.folder.resolve()
+    wanted = tuple(given.case or [""])
+    chosen = [case for case in cases() if case.name.startswith(wanted) and (case.quick or not given.quick)]
+    data = folder / "data"  # where the real scenes were when outputs were kept: worktrees have none beside them
+    if keeps:
+        folder.mkdir(parents=True, exist_ok=True)
+        data.unlink(missing_ok=True)
+        data.symlink_to(Path(os.environ.get("SEMSTAB_DATA", source.parent / "shared/data")).resolve())
+    places = {"data": os.environ.get("SEMSTAB_DATA", str(data.resolve())), "inputs": str(folder / "inputs")}
+    label = "kept" if keeps else f"now/{source.name}-{hashlib.sha256(str(source).encode()).hexdigest()[:8]}"
 
+    def one(case: Case) -> tuple[bool, str]:
+        began, out, kept = time.monotonic(), folder / label / case.name, folder / "kept" / case.name
+        if not keeps and not (kept / "exit_codes").exists():
+            return False, "was not kept"
+        if error := run_case(case, tree, out, places, {} if keeps else WORDS):
+            return False, error
+        good, text = (True, "") if keeps else compare_case(case, kept, out)
+        if good and not keeps:
+            shutil.rmtree(out)
+        return good, f"{time.monotonic() - began:5.1f} s{text}"
 
-def _all(what: str, chosen: list[Case], tree: Path, folder: Path, words: dict[str, str], jobs: int) -> int:
-    def one(case: Case) -> tuple[Case, str, list[str], float]:
-        began, out = time.monotonic(), folder / ("kept" if what == "keep" else "now") / case.name
-        error = run_case(case, tree, out, folder / "inputs", words)
-        found = [] if error or what == "keep" else list(differences(folder / "kept" / case.name, out))
-        return case, error, found, time.monotonic() - began
-
-    bad = 0
-    with ThreadPoolExecutor(jobs) as pool:
-        for case, error, found, seconds in pool.map(one, chosen):
-            out = folder / ("kept" if what == "keep" else "now") / case.name
-            said = "; ".join(dict.fromkeys(verdicts(out)))
-            state = "FAILED" if error else ("DIFFERS" if found else "ok")
-            print(f"{case.name:20} {state:8} {seconds:5.1f} s  {said}", flush=True)
-            for line in error.splitlines()[-12:] if error else found[:MOST_SHOWN]:
-                print(f"    {line}")
-            if len(found) > MOST_SHOWN:
-                print(f"    and {len(found) - MOST_SHOWN} more")
-            bad += bool(error or found)
-    print(f"{len(chosen)} cases, {bad} differ" if bad else f"{len(chosen)} cases: all as before")
-    return int(bad > 0)
+    began, bad = time.monotonic(), 0
+    with tempfile.TemporaryDirectory() as name, ThreadPoolExecutor(given.jobs) as pool:
+        root = Path(name) / "revision" if keeps else source
+        if keeps:
+            root.mkdir()
+            archive = ["git", "-C", str(source), "archive", given.revision]
+            content = subprocess.run(archive, capture_output=True, check=True).stdout
+            subprocess.run(["tar", "-x", "-C", str(root)], input=content, check=True)
+        tree = link_tree(root, Path(name) / "tree")
+        if keeps and not (folder / "inputs/done").exists():
+            write_inputs(root, tree, folder / "inputs")
+        for case, (good, text) in zip(chosen, pool.map(one, chosen), strict=True):
+            bad += not good
+            print(f"{'ok     ' if good else 'DIFFERS'} {case.name:22} {text}", flush=True)
+    print(f"{len(chosen)} cases, {bad} not as they were; {time.monotonic() - began:.0f} s")
+    return int(bad > 0 or not chosen)
 
 
 if __name__ == "__main__":
