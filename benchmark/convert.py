@@ -53,7 +53,7 @@ SCHEMA = 1
 
 CONVERSION_FILE = "conversion.json"
 SCORES_SUFFIX = "-scores"
-"""What posed_folder adds to the name of a folder of scores."""
+"""The suffix that posed_folder adds to the name of a folder of scores."""
 
 MAX_UINT16 = 65535
 LONGEST_NAME = 200
@@ -68,7 +68,7 @@ class DepthFormat:
 
     @property
     def suffix(self) -> str:
-        """Of its files."""
+        """Suffix of its files."""
         return ".npy" if self.scale is None else ".png"
 
     def __str__(self) -> str:
@@ -167,16 +167,16 @@ class SceneFolder:
         return {file.stem for file in (self.path / "depth").glob("[!.]*")}
 
     def has_geometry(self, name: str) -> bool:
-        """Whether depth, pose, colour and mask of a frame are there: depth is written last."""
+        """Return whether depth, pose, colour and mask of a frame are there: depth is written last."""
         assert self.form is not None
         return self._depth_path(name, self.form).exists()
 
     def has_labels(self, name: str, backbone: str) -> bool:
-        """Whether a frame's labels or scores are there."""
+        """Return whether a frame's labels or scores are there."""
         return any(self._label_path(name, backbone, soft).exists() for soft in (False, True))
 
     def is_soft(self, backbone: str) -> bool:
-        """Whether the backbone's scores were written, not labels."""
+        """Return whether the backbone's scores were written, not labels."""
         labels, scores = (self._label_path("", backbone, soft).parent for soft in (False, True))
         return scores.is_dir() and not labels.is_dir()
 
@@ -213,7 +213,7 @@ class SceneFolder:
             np.savez_compressed(temporary, scores=frame.scores.transpose(2, 0, 1))
 
     def write_classes(self, backbone: str, space: LabelSpace) -> None:
-        """Write the classes of a backbone beside its maps."""
+        """Write the classes of a backbone next to its maps."""
         folder = self._label_path("", backbone, self.is_soft(backbone)).parent
         space.save(folder / LABEL_SPACE_FILE)
 

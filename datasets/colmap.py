@@ -36,7 +36,7 @@ MODEL_FOLDERS = ("sparse", "sparse/0", ".")
 
 
 class ColmapOptions(FileOptions):
-    """What the format says, and may be said otherwise."""
+    """Options with the defaults of the format."""
 
     pose_convention: PoseConvention = "world_to_camera"
     pixel_centre: PixelCentre = 0.5
@@ -65,7 +65,7 @@ class Colmap(FileDataset[ColmapOptions]):
         super().__init__(options)
 
     def is_scene(self, folder: Path) -> bool:
-        """Whether there is a sparse model."""
+        """Return whether there is a sparse model."""
         return self._model(folder) is not None
 
     def frames(self, folder: Path) -> list[FrameSource]:
@@ -130,7 +130,7 @@ class ModelImage:
 
 
 def has_model(folder: Path) -> bool:
-    """Whether a folder holds a sparse model."""
+    """Return whether a folder holds a sparse model."""
     return any((folder / f"cameras{suffix}").is_file() for suffix in (".bin", ".txt"))
 
 

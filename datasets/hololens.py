@@ -18,7 +18,7 @@ from semstab.errors import DataError
 
 
 class HoloLensOptions(FileOptions):
-    """What the format says, and may be said otherwise."""
+    """Options with the defaults of the format."""
 
     depth_scale: DepthScale = 1000
 
@@ -30,7 +30,7 @@ class HoloLens(FileDataset[HoloLensOptions]):
     looks_like = "images/, depth/, poses.txt and K.txt"
 
     def is_scene(self, folder: Path) -> bool:
-        """Whether poses.txt and K.txt are there."""
+        """Return whether poses.txt and K.txt are there."""
         return (folder / "poses.txt").is_file() and (folder / "K.txt").is_file()
 
     def frames(self, folder: Path) -> Iterable[FrameSource]:

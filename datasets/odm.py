@@ -51,7 +51,7 @@ Kind = Literal["mesh", "dsm", "mve", "openmvs", "files"]
 
 @dataclass(frozen=True)
 class Project:
-    """The parts of a project: its folder, that of OpenSfM in it, and the file of its poses."""
+    """The parts of a project: its folder, the folder of OpenSfM in it, and the file of its poses."""
 
     folder: Path
     opensfm: Path
@@ -59,7 +59,7 @@ class Project:
 
     @property
     def undistorted(self) -> bool:
-        """Whether the poses are of undistorted images."""
+        """Return whether the poses are of undistorted images."""
         return self.poses == self.opensfm / UNDISTORTED
 
 
@@ -144,7 +144,7 @@ PLACES: dict[Kind, str] = {
 
 
 def find_depth(project: Project, kind: Kind, template: str) -> Path | None:
-    """Return the file or folder of a source of depth, None where the project lacks it; `template` is that of files."""
+    """Return the file or folder of a source of depth, None where the project lacks it; `template` names depth files."""
     if kind == "mesh":
         return next((path for pattern in MESHES for path in sorted(project.folder.glob(pattern))), None)
     if kind == "mve":
@@ -162,12 +162,12 @@ def _dmap_files(project: Project) -> list[Path]:
 
 def _depth_maps(project: Project) -> dict[str, Path]:
     """Depth maps of OpenMVS by the name of the frame that each says it is of."""
-    found = {}
+    maps = {}
     for path in _dmap_files(project):
         with open_file(path) as file:
             image = dmap_header(path, file.read(HEADER_BYTES)).image
-        found[bare_name(Path(image.replace("\\", "/")).name)] = path
-    return found
+        maps[bare_name(Path(image.replace("\\", "/")).name)] = path
+    return maps
 
 
 def depth_files(project: Project, kind: Kind | None, names: Mapping[str, str], template: Template) -> dict[str, Path]:
@@ -183,7 +183,7 @@ def depth_files(project: Project, kind: Kind | None, names: Mapping[str, str], t
 
 
 class OdmOptions(FileOptions):
-    """What the project says, and may be said otherwise."""
+    """Options with the defaults of the project."""
 
     depth_from: Kind | None = Field(
         None,
@@ -221,7 +221,7 @@ class Odm(FileDataset[OdmOptions]):
         super().__init__(options)
 
     def find_scenes(self, root: Path) -> Iterator[ScenePlace]:
-        """The projects, and the submodels of each beside it."""
+        """The projects, and the submodels of each after it."""
         for place in super().find_scenes(root):
             yield place
             parts = place.folder / "submodels"
@@ -231,7 +231,7 @@ class Odm(FileDataset[OdmOptions]):
                     yield ScenePlace(f"{place.name}-submodels-{name}", parts / name, below)
 
     def is_scene(self, folder: Path) -> bool:
-        """Whether there is a reconstruction."""
+        """Return whether there is a reconstruction."""
         return find_project(folder) is not None
 
     def settled(self, folder: Path) -> OdmOptions:
@@ -245,8 +245,8 @@ class Odm(FileDataset[OdmOptions]):
         project = self._project(folder)
         kinds = [options.depth_from] if options.depth_from else list(KINDS)
         for kind in kinds:
-            if (found := find_depth(project, kind, options.depth)) is not None:
-                surface = found if kind in ("mesh", "dsm") else None
+            if (source := find_depth(project, kind, options.depth)) is not None:
+                surface = source if kind in ("mesh", "dsm") else None
                 along = options.depth_kind or ("ray" if kind == "mve" else "planar")
                 return options.model_copy(update={"surface": surface, "depth_from": kind, "depth_kind": along})
         raise DataError(
@@ -262,7 +262,7 @@ class Odm(FileDataset[OdmOptions]):
         return scene
 
     def georeference(self, folder: Path, options: FileOptions) -> Georeference | None:
-        """What the options say, else the project's coords.txt and proj.txt, else OpenSfM's reference."""
+        """The reference of the options, else the project's coords.txt and proj.txt, else OpenSfM's reference."""
         if options.crs is not None:
             return super().georeference(folder, options)
         project = self._project(folder)

@@ -55,17 +55,17 @@ def read_reconstruction(path: Path, wanted: int | None = None) -> list[Shot]:
 
     Raises DataError for a damaged file, several reconstructions where none is wanted, or an unknown camera model.
     """
-    found = _reconstructions(path)
-    if len(found) > 1 and wanted is None:
-        names = "; ".join(f"{k}: {_told(one)}" for k, one in enumerate(found[:5]))
-        more = f"; {len(found) - 5} more" if len(found) > 5 else ""
+    reconstructions = _reconstructions(path)
+    if len(reconstructions) > 1 and wanted is None:
+        names = "; ".join(f"{k}: {_summary(one)}" for k, one in enumerate(reconstructions[:5]))
+        more = f"; {len(reconstructions) - 5} more" if len(reconstructions) > 5 else ""
         raise DataError(
-            f"{path}: {len(found)} reconstructions, which share no coordinates ({names}{more}); choose one"
+            f"{path}: {len(reconstructions)} reconstructions, which share no coordinates ({names}{more}); choose one"
             " with reconstruction: NUMBER"
         )
-    if not 0 <= (wanted or 0) < len(found):
-        raise DataError(f"{path}: there is no reconstruction {wanted}; it has {len(found)}, counted from 0")
-    cameras, shots = (_part(found[wanted or 0], key, path) for key in ("cameras", "shots"))
+    if not 0 <= (wanted or 0) < len(reconstructions):
+        raise DataError(f"{path}: there is no reconstruction {wanted}; it has {len(reconstructions)}, counted from 0")
+    cameras, shots = (_part(reconstructions[wanted or 0], key, path) for key in ("cameras", "shots"))
     lenses = {name: _lens(values, f"{path}: camera {name[:60]!r}") for name, values in cameras.items()}
     read = [_shot(name, values, lenses, f"{path}: shot {name[:80]!r}") for name, values in shots.items()]
     if not read:
@@ -91,7 +91,7 @@ def _part(content: Mapping[str, Any], key: str, path: Path) -> Mapping[str, Mapp
     return part
 
 
-def _told(content: Mapping[str, Any]) -> str:
+def _summary(content: Mapping[str, Any]) -> str:
     shots = content.get("shots")
     names = list(shots) if isinstance(shots, dict) else []
     return f"{len(names)} shots" + (f" from {names[0][:40]}" if names else "")

@@ -30,7 +30,7 @@ MASKS = "mask/{name}"
 
 
 class PosedOptions(FileOptions):
-    """What goes before scene.yaml; what neither says is as `FileSettings` has it, masks are in mask/."""
+    """Options that replace scene.yaml; the rest has the defaults of `FileSettings`, and masks are in mask/."""
 
     scores_layout: ScoresLayout = None
     depth_kind: DepthKind = None
@@ -49,7 +49,7 @@ class PosedFolder(FileDataset[PosedOptions]):
     settings_file = SETTINGS_FILE
 
     def is_scene(self, folder: Path) -> bool:
-        """Whether depth/ is there, or with a surface pose/."""
+        """Return whether depth/ is there, or with a surface pose/."""
         return (folder / ("depth" if self.options.surface is None else "pose")).is_dir()
 
     def frames(self, folder: Path) -> Iterator[FrameSource]:
@@ -70,21 +70,22 @@ class PosedFolder(FileDataset[PosedOptions]):
 
     def settled(self, folder: Path) -> FileOptions:
         """scene.yaml, where there is one, with the options on top. Raises ConfigError with the file and the setting."""
-        said = _said(folder / SETTINGS_FILE)
+        settings = _scene_settings(folder / SETTINGS_FILE)
         options = {key: getattr(self.options, key) for key in FileSettings.model_fields}
         given = {key: value for key, value in options.items() if value not in (None, (), {})}
         if "taxonomy" in given or "classes" in given:  # one of the two is enough to replace either
             given = {"taxonomy": None, "classes": None} | given
-        return self.options.model_copy(update=dict(said) | given)
+        return self.options.model_copy(update=dict(settings) | given)
 
 
-def _said(path: Path) -> FileSettings:
-    """What scene.yaml says; taxonomy files in it are relative to its folder."""
+def _scene_settings(path: Path) -> FileSettings:
+    """The settings of scene.yaml; taxonomy files in it are relative to its folder."""
     content = read_yaml(path) if path.is_file() else {}
-    said = validated(FileSettings, {"masks": MASKS} | content, f"{path}: ")
-    own = {key: _beside(path, value) for key, value in said.taxonomies.items()}
-    return said.model_copy(update={"taxonomy": said.taxonomy and _beside(path, said.taxonomy), "taxonomies": own})
+    settings = validated(FileSettings, {"masks": MASKS} | content, f"{path}: ")
+    taxonomies = {key: _resolved(path, value) for key, value in settings.taxonomies.items()}
+    taxonomy = settings.taxonomy and _resolved(path, settings.taxonomy)
+    return settings.model_copy(update={"taxonomy": taxonomy, "taxonomies": taxonomies})
 
 
-def _beside(path: Path, taxonomy: str) -> str:
+def _resolved(path: Path, taxonomy: str) -> str:
     return str(path.parent / taxonomy) if Path(taxonomy).suffix in (".yaml", ".yml") else taxonomy

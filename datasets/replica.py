@@ -45,7 +45,7 @@ EXPORTS = (NICE_SLAM, SEMANTIC_NERF)
 
 
 class ReplicaOptions(FileOptions):
-    """What the formats say, and may be said otherwise; the depth scale is 6553.5 or 1000, by export."""
+    """Options with the defaults of the formats; the depth scale is 6553.5 or 1000, by export."""
 
     up_axis: UpAxis = "z"
     intrinsics: FourIntrinsics = None
@@ -60,7 +60,7 @@ class Replica(FileDataset[ReplicaOptions]):
     looks_like = "results/ and traj.txt (NICE-SLAM's export), or depth/ and traj_w_c.txt (Semantic-NeRF's)"
 
     def is_scene(self, folder: Path) -> bool:
-        """Whether the trajectory of one of the exports is there."""
+        """Return whether the trajectory of one of the exports is there."""
         return self._export(folder) is not None
 
     def frames(self, folder: Path) -> Iterable[FrameSource]:

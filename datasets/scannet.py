@@ -35,7 +35,7 @@ Which = Literal["depth", "color"]
 
 
 class ScanNetOptions(FileOptions):
-    """What the format says, and may be said otherwise."""
+    """Options with the defaults of the format."""
 
     depth_scale: DepthScale = 1000
     up_axis: UpAxis = "z"
@@ -57,7 +57,7 @@ class ScanNet(FileDataset[ScanNetOptions]):
     looks_like = "depth/, pose/ and intrinsic/intrinsic_depth.txt"
 
     def is_scene(self, folder: Path) -> bool:
-        """Whether depth/, pose/ and the intrinsics of the depth are there; with a surface, the latter two."""
+        """Return whether depth/, pose/ and the intrinsics of the depth are there; with a surface, the latter two."""
         there = self.has_depth(folder / "depth") and (folder / "pose").is_dir()
         return there and _matrix_file(folder, self.options.intrinsics).is_file()
 

@@ -1,4 +1,4 @@
-"""What every dataset yields: scenes of one class, which say what they have and by default lack the rest."""
+"""Scenes and datasets: a scene names what it has, and by default lacks the rest."""
 
 from __future__ import annotations
 
@@ -105,7 +105,7 @@ class Scene(ABC):
         return None
 
     def tracked(self, index: int) -> bool:
-        """Whether the frame has a pose, which tracking may have lost. Reads no image."""
+        """Return whether the frame has a pose, which tracking may have lost. Reads no image."""
         return True
 
     def missing(self, index: int, sources: Sequence[str] = (), *, color: bool = False) -> list[str]:
@@ -123,7 +123,7 @@ class Scene(ABC):
         return None
 
     def filtering(self, backbone: str) -> Filtering:
-        """What was done to a label source before it is read."""
+        """The filters of a label source."""
         return Filtering(backbone)
 
     def geometry(self, index: int, *, color: bool = False) -> Frame:
@@ -163,7 +163,7 @@ class Scene(ABC):
         return color
 
     def image_name(self, index: int) -> str:
-        """What the frame's files are called, without suffix."""
+        """The name of the frame's files, without suffix."""
         return f"{index:06d}"
 
     def predicted(self, index: int, *, labels: Labels | None = None, scores: Scores | None = None) -> Frame:
@@ -247,7 +247,7 @@ def select_frames(
 ) -> Selected:
     """The selected frames of a sequence, to be read with the labels of these sources (or its colour) and no others.
 
-    What is left out is said in a warning. Reads no image. Raises ConfigError for a frame or a range of time that the
+    A warning names the frames that are left out. Reads no image. Raises ConfigError for a frame or a time that the
     scene does not have, DataError where selected frames lack files and the scene does not leave such frames out.
     """
     times = scene.timestamps

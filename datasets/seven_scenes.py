@@ -22,7 +22,7 @@ USUAL = (585.0, 585.0, 320.0, 240.0)
 
 
 class SevenScenesOptions(FileOptions):
-    """What the format says, and may be said otherwise; the camera is 585 585 320 240 unless a file says."""
+    """Options with the defaults of the format; the camera is 585 585 320 240 unless a file says."""
 
     depth_scale: DepthScale = 1000
     invalid_depth: InvalidDepth = (65535,)
@@ -42,7 +42,7 @@ class SevenScenes(FileDataset[SevenScenesOptions]):
     looks_like = "files frame-NNNNNN.depth.png and frame-NNNNNN.pose.txt"
 
     def is_scene(self, folder: Path) -> bool:
-        """Whether the first frame's pose is there, or that of any frame."""
+        """Return whether the first frame's pose or of any frame is there."""
         return (folder / "frame-000000.pose.txt").is_file() or any(folder.glob("frame-*.pose.txt"))
 
     def frames(self, folder: Path) -> Iterable[FrameSource]:
@@ -54,7 +54,7 @@ class SevenScenes(FileDataset[SevenScenesOptions]):
         return frames_of(folder, depth, camera, pose="{name}.pose.txt", color="{name}.color", label_camera=label_camera)
 
     def _camera(self, folder: Path) -> Camera:
-        """Of the depth: as the options say, else as a file beside the frames or above them does, as 3DMatch has it."""
+        """The camera of the depth: of the options, else of a file with the frames or above them, as 3DMatch has it."""
         files = (place / INTRINSICS_FILE for place in (folder, folder.parent))
         file = next((path for path in files if path.is_file()), None)
         if file is None or self.options.intrinsics is not None:

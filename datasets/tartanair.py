@@ -21,7 +21,7 @@ USUAL = (320.0, 320.0, 320.0, 240.0)
 
 
 class TartanAirOptions(FileOptions):
-    """What the format says, and may be said otherwise; the intrinsics are 320 320 320 240."""
+    """Options with the defaults of the format; the intrinsics are 320 320 320 240."""
 
     camera: Literal["left", "right"] = Field("left", description="camera of the stereo pair")
     max_depth: MaxDepth = 1000
@@ -42,7 +42,7 @@ class TartanAir(FileDataset[TartanAirOptions]):
         super().__init__(options.model_copy(update={"ground_truth": truth}))
 
     def is_scene(self, folder: Path) -> bool:
-        """Whether the camera's poses and depth are there; with a surface, the poses."""
+        """Return whether the camera's poses and depth are there; with a surface, the poses."""
         side = self.options.camera
         return (folder / f"pose_{side}.txt").is_file() and self.has_depth(folder / f"depth_{side}")
 

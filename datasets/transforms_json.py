@@ -29,7 +29,7 @@ PINHOLES = (None, "PINHOLE", "SIMPLE_PINHOLE", "OPENCV", "perspective")
 
 
 class TransformsOptions(FileOptions):
-    """What the format says, and may be said otherwise; the depth scale is the file's own, else 1000."""
+    """Options with the defaults of the format; the depth scale is the file's own, else 1000."""
 
     camera_axes: CameraAxes = "opengl"
     pixel_centre: PixelCentre = 0.5
@@ -50,7 +50,7 @@ class TransformsJson(FileDataset[TransformsOptions]):
     looks_like = "transforms.json"
 
     def is_scene(self, folder: Path) -> bool:
-        """Whether the file of the cameras is there."""
+        """Return whether the file of the cameras is there."""
         return inside(self.options.root, folder, self.options.transforms, "option transforms").is_file()
 
     def frames(self, folder: Path) -> list[FrameSource]:

@@ -41,7 +41,7 @@ USUAL = (525.0, 525.0, 319.5, 239.5)
 
 
 class TumOptions(FileOptions):
-    """What the format says, and may be said otherwise."""
+    """Options with the defaults of the format."""
 
     depth_scale: DepthScale = 5000
     up_axis: UpAxis = "z"
@@ -64,7 +64,7 @@ class Tum(FileDataset[TumOptions]):
     looks_like = "depth.txt, groundtruth.txt and rgb.txt"
 
     def is_scene(self, folder: Path) -> bool:
-        """Whether depth.txt is there, or with a surface rgb.txt."""
+        """Return whether depth.txt is there, or with a surface rgb.txt."""
         return (folder / self._list(folder)).is_file()
 
     def frames(self, folder: Path) -> list[FrameSource]:
@@ -79,12 +79,12 @@ class Tum(FileDataset[TumOptions]):
         _require_ascending(trajectory, numbers[:, 0])
         times, depths = self._listed(folder, self._list(folder))
         colors = self._colors(folder, times)
-        kept = np.array([color is not None for color in colors]) if colors else np.ones(len(times), dtype=np.bool_)
-        if not kept.any():
+        paired = np.array([color is not None for color in colors]) if colors else np.ones(len(times), dtype=np.bool_)
+        if not paired.any():
             limit = self.options.max_difference
             raise DataError(f"{folder}: no depth image is within {limit:g} s of a colour image; set max_difference")
-        if not kept.all():
-            logger.warning("%s: %d depth images have no colour image; left out", folder, np.count_nonzero(~kept))
+        if not paired.all():
+            logger.warning("%s: %d depth images have no colour image; left out", folder, np.count_nonzero(~paired))
         poses = at_times(
             times=numbers[:, 0],
             poses=from_quaternions(numbers[:, 1:4], numbers[:, 4:], trajectory),
@@ -103,7 +103,7 @@ class Tum(FileDataset[TumOptions]):
                 color=colors[k] if colors else None,
                 timestamp=float(times[k]),
             )
-            for k in np.flatnonzero(kept)
+            for k in np.flatnonzero(paired)
         ]
 
     def _list(self, folder: Path) -> str:

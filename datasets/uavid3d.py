@@ -34,7 +34,7 @@ from semstab.errors import ConfigError
 from semstab.model.frames import Intrinsics
 
 TAXONOMY = "uavid8"
-"""Of the label maps, unless the options say otherwise: the colours of UAVid's ground truth."""
+"""Taxonomy of the label maps, unless the options say otherwise: the colours of UAVid's ground truth."""
 
 PoseFormat = Literal["colmap", "transforms", "matrix"]
 
@@ -43,7 +43,7 @@ FORMATS: Mapping[PoseFormat, dict[str, Any]] = {
     "transforms": {"pose_convention": "camera_to_world", "camera_axes": "opengl", "pixel_centre": 0.5},
     "matrix": {"pose_convention": "camera_to_world", "camera_axes": "opencv", "pixel_centre": 0.0},
 }
-"""What each format of poses means, unless the options say otherwise."""
+"""Conventions of each format of poses, unless the options say otherwise."""
 
 
 class Uavid3dOptions(FileOptions):
@@ -91,7 +91,7 @@ class Uavid3d(FileDataset[Uavid3dOptions]):
         super().__init__(options.model_copy(update=means))
 
     def is_scene(self, folder: Path) -> bool:
-        """Whether the poses are there, in the format that the options say."""
+        """Return whether the poses are there, in the format that the options say."""
         if self.options.pose_format == "colmap":
             return has_model(self._inside(folder, self.options.model))
         if self.options.pose_format == "transforms":

@@ -1,1 +1,1 @@
-"""What readers of files share: their base class, scene and options, and where label maps are looked for."""
+"""Base class, scene and options of datasets in files, and their label maps."""

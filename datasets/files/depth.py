@@ -28,7 +28,7 @@ from semstab.model.frames import Intrinsics
 MVEI = b"\x89MVE_IMAGE\n"
 MVEI_HEADER = struct.Struct("<4i")
 MVEI_FLOAT = 9
-"""Of a sample: 32-bit float."""
+"""Type of a sample: 32-bit float."""
 
 DMAP_HEADER = struct.Struct("<2sBb4I2f")
 """Magic, what it holds, exponent; width and height of the image, then of the depth; least and largest depth."""
@@ -37,7 +37,7 @@ DMAP_CAMERA = 21 * 8
 HEADER_BYTES = 2**18
 """In which all that `dmap_header` reads lies: a name and the numbers of some thousand neighbours at most."""
 SAMPLES: Mapping[bytes, np.dtype[Any]] = {b"DR": np.dtype("<f4"), b"D2": np.dtype("<f2")}
-"""Of a depth map, by its magic: of today's files halves, that 2 ** exponent makes metres."""
+"""Type of a sample by magic; newer files hold halves, which times 2 ** exponent are metres."""
 
 
 def read_mvei(path: Path, scale: float | None = None, read: Read = read_bytes) -> Float32:
@@ -57,7 +57,7 @@ def read_mvei(path: Path, scale: float | None = None, read: Read = read_bytes) -
 
 @dataclass(frozen=True)
 class DmapHeader:
-    """What a .dmap says of its depth: shape (H, W), samples of `dtype` from byte `start`, times 2 ** exponent.
+    """The header of a .dmap: shape (H, W), samples of `dtype` from byte `start`, times 2 ** exponent.
 
     image  the name of the file that it is of
     """
@@ -145,7 +145,7 @@ Camera = Callable[[Shape], Intrinsics]
 """The intrinsics of a frame's depth image, of shape (H, W)."""
 
 FORMATS = {".bin": read_depth_map, ".mvei": read_mvei, ".dmap": read_dmap}
-"""What reads depth by the file's suffix; `read_depth` reads the rest."""
+"""Functions that read depth, by the suffix of the file; `read_depth` reads the rest."""
 
 
 class StoredDepth:
@@ -159,12 +159,12 @@ class StoredDepth:
         return frame.depth
 
     def scale(self, frame: FrameSource) -> float:
-        """What is said, else what its kind of file means."""
+        """The scale of the options, else the usual one of its kind of file."""
         usual = MILLIMETRES if frame.depth.suffix.lower() == ".png" else 1.0
         return self._options.depth_scale or frame.depth_scale or usual
 
     def depth(self, frame: FrameSource, read: Read, camera: Camera, T_wc: Callable[[], Float64]) -> Depth:
-        """What the file holds, without what marks pixels that have none."""
+        """Depth of the file; pixels with a value that means 'no depth' become 0."""
         scale = self._options.depth_scale or frame.depth_scale
         depth = FORMATS.get(frame.depth.suffix.lower(), read_depth)(frame.depth, scale, read)
         if np.isnan(depth[0, 0]) and np.isnan(depth).all():  # one frame that saw nothing ends no run; it is counted
@@ -200,7 +200,7 @@ class CastDepth:
         return
 
     def depth(self, frame: FrameSource, read: Read, camera: Camera, T_wc: Callable[[], Float64]) -> Depth:
-        """What the camera sees of it."""
+        """Depth of the surface in the view of the camera."""
         shape = shape_of(frame, self._options)
         depth = self._surface.depth(View(camera(shape), T_wc(), shape))
         if not self._seen and not depth.any():
@@ -216,7 +216,7 @@ class CastDepth:
 
 
 def shape_of(frame: FrameSource, options: FileOptions) -> Shape:
-    """(H, W) of what is cast for a frame: the size that its camera is for, else that of its depth file or colour image.
+    """(H, W) of the cast depth of a frame: the size of its camera, else of its depth file or colour image.
 
     Raises DataError where none is known.
     """

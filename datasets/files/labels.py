@@ -91,7 +91,7 @@ def find_sources(
     Raises ConfigError for a template that cannot be used, or a labels_root that is not there, DataError for a folder
     that cannot be listed.
     """
-    found: dict[str, LabelSource] = {}
+    sources: dict[str, LabelSource] = {}
     base = place.folder if options.labels_root is None else options.labels_root
     if not os.path.isdir(base):  # noqa: PTH112  Path.is_dir raises where the name is too long
         raise ConfigError(f"{base}: there is no such folder; mend labels_root")
@@ -99,34 +99,34 @@ def find_sources(
         for backbone, template in _templates(kind, options, place, base).items():
             source = _source(kind, base, template, frames, folders)
             name = f"{backbone}-scores" if kind == "scores" and not isinstance(options.scores, dict) else backbone
-            if name in found:
+            if name in sources:
                 raise ConfigError(f"{place.folder}: two label sources are called '{name}'; rename one")
             if source.first is not None:
-                found[name] = source
+                sources[name] = source
             elif frames:
                 logger.warning("%s: no file of any frame, such as %s; left out", name, source.missing(frames[0])[0])
-    if not found and (options.labels or options.scores or options.labels_root):
+    if not sources and (options.labels or options.scores or options.labels_root):
         logger.warning(
             "%s: no label maps in %s fit the options labels and scores; looked for %s",
             place.name, base, ", ".join(label_paths(options, place, frames)),
         )  # fmt: skip
-    if options.ground_truth and GROUND_TRUTH not in found:
+    if options.ground_truth and GROUND_TRUTH not in sources:
         truth = Template("ground_truth", options.ground_truth, ("scene", "name"), ("name",))
         source = _source("labels", place.folder, truth.filled(scene=place.below_root), frames, folders)
-        found |= {GROUND_TRUTH: source} if source.first is not None else {}
-    return found
+        sources |= {GROUND_TRUTH: source} if source.first is not None else {}
+    return sources
 
 
 def label_paths(options: FileOptions, place: ScenePlace, frames: Sequence[FrameSource]) -> list[str]:
     """Where label maps and scores are looked for: the paths of the first frame, with BACKBONE for any name."""
-    base, found = options.labels_root or place.folder, []
+    base, paths = options.labels_root or place.folder, []
     for kind in KINDS:
-        said = _said(kind, options)
-        for template in said.values() if isinstance(said, dict) else [said] if said else []:
+        templates = _stated(kind, options)
+        for template in templates.values() if isinstance(templates, dict) else [templates] if templates else []:
             name = template.replace("{scene}", place.below_root).replace("{backbone}", "BACKBONE")
             path = base / name.replace("{name}", frames[0].name if frames else "NAME")
-            found.append(str(path if path.suffix.lower() in SUFFIXES[kind] else f"{path}{SUFFIXES[kind][0]}"))
-    return found
+            paths.append(str(path if path.suffix.lower() in SUFFIXES[kind] else f"{path}{SUFFIXES[kind][0]}"))
+    return paths
 
 
 def find_regions(
@@ -138,13 +138,13 @@ def find_regions(
     """
     base = place.folder if options.labels_root is None else options.labels_root
     template = Template("regions", REGIONS, ("backbone", "name"), ("backbone", "name"))
-    found = {
+    regions = {
         backbone: _source("labels", base, filled, frames, folders)
         for backbone, filled in matching_folders(base, template, "backbone", scene=place.below_root).items()
     }
-    if both := next((name for name in found if name in sources), None):
+    if both := next((name for name in regions if name in sources), None):
         raise DataError(f"{base / 'regions' / both}: labels/{both} is called '{both}' too; rename one")
-    return {backbone: source for backbone, source in found.items() if source.first is not None}
+    return {backbone: source for backbone, source in regions.items() if source.first is not None}
 
 
 def find_masks(options: FileOptions, place: ScenePlace, folders: Folders) -> LabelSource | None:
@@ -155,11 +155,11 @@ def find_masks(options: FileOptions, place: ScenePlace, folders: Folders) -> Lab
     return LabelSource("masks", place.folder, template, folders)
 
 
-def _said(kind: Kind, options: FileOptions) -> str | dict[str, str] | None:
+def _stated(kind: Kind, options: FileOptions) -> str | dict[str, str] | None:
     """The template of every backbone, or one of each by its name; None where there are none of that kind."""
-    said = options.labels if kind == "labels" else options.scores
-    if said is not None:
-        return said
+    stated = options.labels if kind == "labels" else options.scores
+    if stated is not None:
+        return stated
     if options.labels_root is not None:
         return SEPARATE if kind == "labels" else None
     return DEFAULTS[kind]
@@ -167,13 +167,13 @@ def _said(kind: Kind, options: FileOptions) -> str | dict[str, str] | None:
 
 def _templates(kind: Kind, options: FileOptions, place: ScenePlace, base: Path) -> dict[str, str]:
     """By backbone, a template in which only {name} is left."""
-    said = _said(kind, options)
-    if isinstance(said, dict):
-        templates = {key: Template(f"{kind}.{key}", text, ("scene", "name"), ("name",)) for key, text in said.items()}
+    stated = _stated(kind, options)
+    if isinstance(stated, dict):
+        templates = {key: Template(f"{kind}.{key}", text, ("scene", "name"), ("name",)) for key, text in stated.items()}
         return {key: template.filled(scene=place.below_root) for key, template in templates.items()}
-    if said is None:
+    if stated is None:
         return {}
-    template = Template(kind, said, ("scene", "backbone", "name"), ("backbone", "name"))
+    template = Template(kind, stated, ("scene", "backbone", "name"), ("backbone", "name"))
     return matching_folders(base, template, "backbone", scene=place.below_root)
 
 
@@ -185,7 +185,7 @@ def _source(kind: Kind, base: Path, template: str, frames: Sequence[FrameSource]
 
 
 def label_space(options: FileOptions, folder: Path, name: str, source: LabelSource) -> LabelSpace | None:
-    """That of option taxonomies, else of a label_space.yaml beside its maps, else that of the scene in `folder`.
+    """The classes of option taxonomies, else of a label_space.yaml next to its maps, else of the scene in `folder`.
 
     None where nothing says it. Raises ConfigError for one that cannot be used.
     """
@@ -194,8 +194,8 @@ def label_space(options: FileOptions, folder: Path, name: str, source: LabelSour
     assert source.first is not None
     frame, file = source.first
     for parent in Path(file).parents[: 1 + frame.count("/")]:  # a frame's name may be a path: cam0/0001
-        if (beside := parent / LABEL_SPACE_FILE).is_file():
-            return LabelSpace.load(beside)
+        if (classes := parent / LABEL_SPACE_FILE).is_file():
+            return LabelSpace.load(classes)
     try:
         if options.classes is not None:
             return LabelSpace(name="classes of the scene", classes=options.classes)
@@ -214,7 +214,7 @@ NO_ID = IGNORE_16BIT - 1
 
 
 class LabelMaps:
-    """What was predicted of the frames of a scene: which sources there are, their classes, and the maps themselves.
+    """The predictions for the frames of a scene: the label sources, their classes, and the maps themselves.
 
     class_ids  by label source a table from the ids of its files to those of its taxonomy, where they differ
     folders    what lies where maps may be
@@ -276,10 +276,10 @@ class LabelMaps:
         space = self.space(backbone)
         if space is None:
             assert source.first is not None
-            beside = Path(source.first[1]).parent
+            folder = Path(source.first[1]).parent
             raise DataError(
                 f"{where}: the classes of '{backbone}' are not known; set classes: [name, ...] in id order, taxonomy:"
-                f" NAME, or taxonomies: {{{backbone}: NAME}}, or put a {LABEL_SPACE_FILE} into {beside}"
+                f" NAME, or taxonomies: {{{backbone}: NAME}}, or put a {LABEL_SPACE_FILE} into {folder}"
             )
         return space
 

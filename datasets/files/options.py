@@ -142,7 +142,7 @@ SurfaceCell = Annotated[
 
 
 class FileOptions(FileSettings):
-    """What can be said of any dataset of files: where they are, and how they are read."""
+    """Options of any dataset of files: where they are, and how they are read."""
 
     root: Path = Field(description="a scene's folder, or the folder above scenes")
     incomplete: Literal["error", "skip"] = Field(
@@ -221,8 +221,8 @@ def matching_folders(base: Path, template: Template, placeholder: str, **values:
     before, _, after = parts[k].partition(hole)
     pattern = re.compile(f"{re.escape(before)}(?P<value>.+){re.escape(after.replace(hole, ''))}", re.DOTALL)
     matches = (pattern.fullmatch(name) for name in subfolders(base.joinpath(*parts[:k])))
-    found = sorted((match["value"] for match in matches if match), key=natural)
-    return {value: "/".join(parts).replace(hole, value) for value in found}
+    names = sorted((match["value"] for match in matches if match), key=natural)
+    return {value: "/".join(parts).replace(hole, value) for value in names}
 
 
 def inside(root: Path, folder: Path, relative: str, where: str) -> Path:
@@ -255,7 +255,7 @@ def _require_path(relative: str, where: str) -> None:
 
 
 class Folders:
-    """What lies in folders, each listed when it is first asked for: names as bytes in order, a fifth of a set's memory.
+    """The contents of folders, each listed once: names as bytes in order, a fifth of a set's memory.
 
     Several threads may ask.
     """
@@ -264,7 +264,7 @@ class Folders:
         self._names: dict[str, npt.NDArray[np.bytes_]] = {}
 
     def has(self, path: Path) -> bool:
-        """Whether there is a file or folder of that path."""
+        """Return whether there is a file or folder of that path."""
         return self._has(*os.path.split(path))
 
     def one_of(self, path: Path, suffixes: Collection[str]) -> Path | None:
@@ -380,7 +380,7 @@ class FrameTable(Sequence[FrameSource]):
 
     @property
     def distorted(self) -> bool:
-        """Whether label maps of some frames are those of distorted photographs."""
+        """Return whether label maps of some frames are those of distorted photographs."""
         return any(row[FIELDS.index("label_lens")] is not None for row in self._rows)
 
     def _made(self, k: int) -> FrameSource:

@@ -32,7 +32,7 @@ class FileDataset(Dataset, Generic[Options]):
 
     Raises DataError where there is no scene.
 
-    looks_like         what a scene's folder holds, as errors say it
+    looks_like         the contents of a scene's folder, for error messages
     labels_like_depth  whether label maps that are made for it have the depth's pixels, not those of the images
     settings_file      name of a file in a scene's folder that says what no option says, which `settled` reads
     """
@@ -91,7 +91,7 @@ class FileDataset(Dataset, Generic[Options]):
         return {name: folder / f"{before}{name}{after}" for name in naturally({*there, *instead})}
 
     def has_depth(self, folder: Path) -> bool:
-        """Whether a folder of depth images is there, or needs not be, as a surface gives the depth."""
+        """Return whether a folder of depth images is there, or needs not be, as a surface gives the depth."""
         return self.options.surface is not None or folder.is_dir()
 
     def class_ids(self) -> Mapping[str, UInt16]:
@@ -100,7 +100,7 @@ class FileDataset(Dataset, Generic[Options]):
 
     @abstractmethod
     def is_scene(self, folder: Path) -> bool:
-        """Whether a folder is a scene of this format."""
+        """Return whether a folder is a scene of this format."""
 
     @abstractmethod
     def frames(self, folder: Path) -> Iterable[FrameSource]:
@@ -117,10 +117,10 @@ def find_scenes(root: Path, is_scene: Callable[[Path], bool], looks_like: str) -
     if is_scene(root):
         name = root.resolve().name or "scene"
         return [ScenePlace(name, root, name)]
-    found = [path.relative_to(root).parts for path in _below(root, is_scene, DEEPEST)]
-    if not found:
+    relative = [path.relative_to(root).parts for path in _below(root, is_scene, DEEPEST)]
+    if not relative:
         raise DataError(f"{root}: no scene here, nor {DEEPEST} folders deep; one holds {looks_like}")
-    places = [ScenePlace("-".join(parts), root.joinpath(*parts), "/".join(parts)) for parts in found]
+    places = [ScenePlace("-".join(parts), root.joinpath(*parts), "/".join(parts)) for parts in relative]
     names = [place.name for place in places]
     if repeated := sorted({name for name in names if names.count(name) > 1}):
         raise DataError(f"{root}: two scenes would be called '{repeated[0]}'; rename one, or set root deeper")
@@ -187,7 +187,7 @@ def frames_of(
 
 
 def _surface(options: FileOptions, georeference: Georeference | None) -> Surface | None:
-    """What depth is cast from, where the options say so. Raises ConfigError for heights over another axis than z."""
+    """The surface of the options. Raises ConfigError for heights over another axis than z."""
     if options.surface is None:
         return None
     if options.surface.suffix.lower() in SEEN_FROM_ABOVE and options.up_axis not in (None, "z"):

@@ -40,7 +40,7 @@ BATCH = 4096
 """Frames whose files are in memory by name at once, for their digests."""
 
 DEPTH, LABELS, MASK = "depth", "labels of ", "mask"
-"""What a frame's files are."""
+"""Kinds of a frame's files."""
 
 
 class FileScene(Scene):
@@ -92,7 +92,7 @@ class FileScene(Scene):
         return self._frames.times
 
     def tracked(self, index: int) -> bool:
-        """Whether the frame has a pose: one that is not finite says that tracking was lost. Its file is read once."""
+        """Return whether the frame has a pose; one that is not finite means that tracking was lost. Read once."""
         source, known = self._frame(index), self._tracked[index]
         if known is None:
             known = self._tracked[index] = bool(np.isfinite(self._stored_pose(source)).all())
@@ -117,7 +117,7 @@ class FileScene(Scene):
 
     @property
     def depth_scale(self) -> float | None:
-        """Units of its stored depth in a metre: what is said, else what its kind of file means."""
+        """Units of its stored depth in a metre: the option, else the usual scale of its kind of file."""
         return self._depth.scale(self._frames[0])
 
     def label_space(self, backbone: str) -> LabelSpace:
@@ -188,7 +188,7 @@ class FileScene(Scene):
         return undistorted(read_color(path), source.color_lens, self.intrinsics(index, shape), shape, str(path))
 
     def image(self, index: int) -> UInt8:
-        """What models predict on: the colour image, or the distorted photograph where label maps belong to that."""
+        """The image that models predict on: in colour, or the distorted photograph where label maps belong to it."""
         source = self._frame(index)
         if source.label_lens is None:
             return super().image(index)
@@ -200,7 +200,7 @@ class FileScene(Scene):
         return read_color(source.photograph)
 
     def image_name(self, index: int) -> str:
-        """What path templates call the frame."""
+        """The frame's name in path templates."""
         return self._frame(index).name
 
     def intrinsics(self, index: int, shape: tuple[int, ...]) -> Intrinsics:
@@ -294,13 +294,13 @@ class FileScene(Scene):
         )
 
     def _mask(self, index: int, path: Path, shape: tuple[int, ...]) -> Mask:
-        """What is masked in a frame, at the depth's pixels; what the mask does not see is not."""
+        """The masked pixels of a frame, at the depth's pixels; outside of the mask's view nothing is masked."""
         mask = self._maps.mask(path, self._reader(index, MASK))
         masked: Mask = self._stored(index, mask, shape, path, "the mask is") == 1
         return masked
 
     def _stored(self, index: int, values: Pixels, shape: tuple[int, ...], path: Path, what: str) -> Pixels:
-        """What a file holds, at the depth's pixels; where it must have them, `Frame` says that it has not."""
+        """The content of a file at the depth's pixels; where it must have them, `Frame` raises an error."""
         as_they_are = self.labels_like_depth and self._frame(index).label_lens is None
         return values if as_they_are else self._fitted(index, values, shape, str(path), what)
 

@@ -28,13 +28,13 @@ from semstab.model.georeference import INSTALL, Georeference
 # Heights on a grid over x and y: of a raster file, and of the points of a cloud.
 
 MOST_CELLS = 5_000_000
-"""Of a grid: twice as many triangles take about a gigabyte."""
+"""Largest grid: twice as many triangles take about a gigabyte."""
 
 HEIGHT_QUANTILE = 0.8
-"""Of a cell's points: near its top, as a camera above sees it, but not the single point that is noise."""
+"""Quantile of the heights in a cell: near its top, as a camera above sees it, but not a single point of noise."""
 
 SPACINGS = 2.0
-"""Mean distances between points that a cell is wide where nothing is said: nearly every cell then has a point."""
+"""Mean distances between points that a cell is wide by default: nearly every cell then has a point."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,7 +54,7 @@ class Heights:
 
 
 def read_heights(path: Path, cell: float | None, georeference: Georeference | None) -> Heights:
-    """The first band of a GeoTIFF, in the scene's coordinates, averaged to cells of `cell` metres where that is said.
+    """The first band of a GeoTIFF, in the scene's coordinates, averaged to cells of `cell` metres where that is given.
 
     A larger one than `MOST_CELLS` becomes coarser. Raises DataError for a rotated raster, ConfigError where it lies in
     another projection than the scene.
@@ -116,7 +116,7 @@ DAMAGE = (
     ValueError, TypeError, LookupError, AttributeError, OSError, EOFError, AssertionError, NotImplementedError,
     struct.error, RuntimeError, OverflowError, NameError, MemoryError,
 )  # fmt: skip
-"""What reading a damaged file may raise in libraries."""
+"""Errors that libraries raise for damaged files."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -136,21 +136,21 @@ class Triangles:
 def read_triangles(path: Path, cell: float | None, georeference: Georeference | None) -> Triangles:
     """The surface in a file: GeoTIFF is a height raster, LAS, LAZ and PLY without faces a cloud, all else a mesh.
 
-    Rasters and clouds become a grid over x and y, with cells of `cell` metres where that is said. GeoTIFF, LAS and LAZ
+    Rasters and clouds become a grid over x and y, with cells of `cell` metres where that is given. GeoTIFF, LAS and LAZ
     lie in the projection of the georeference, and the rest in the scene's coordinates.
     Raises DataError for a file that holds no surface, MissingDependencyError where its library is not installed.
     """
     try:
-        found = READERS.get(path.suffix.lower(), _mesh)(path, cell, georeference)
+        triangles = READERS.get(path.suffix.lower(), _mesh)(path, cell, georeference)
     except (DataError, ConfigError):
         raise
     except ImportError as error:
         raise MissingDependencyError(f"{path}: cannot be read ({one_line(error)}); {INSTALL}") from error
     except DAMAGE as error:
         raise DataError(f"{path}: cannot be read as a surface ({one_line(error)})") from error
-    if not len(found.faces):
-        raise DataError(f"{path}: holds no triangle that can be seen ({found.what})")
-    return found
+    if not len(triangles.faces):
+        raise DataError(f"{path}: holds no triangle that can be seen ({triangles.what})")
+    return triangles
 
 
 def _raster(path: Path, cell: float | None, georeference: Georeference | None) -> Triangles:
@@ -337,7 +337,7 @@ def _layers_of(record: bytes) -> int:
 # Open3D 1.23 s; and embree lets other threads work meanwhile, which Open3D's binding does not.
 
 RAYS_AT_ONCE = 2**18
-"""What bounds the memory of a large image."""
+"""Bounds the memory of a large image."""
 
 FAR = 1e30
 """Beyond it is what embree says of a ray that hits nothing."""
@@ -386,7 +386,7 @@ class Caster:
         return depth
 
 
-# Cast depth that is kept in files, so that a second run reads it.
+# Cast depth is stored in files, so that a second run reads it.
 
 logger = logging.getLogger("semstab")
 
@@ -402,7 +402,7 @@ def usual_folder() -> Path:
 
 
 class Casts:
-    """The casts at one surface in a folder; None keeps nothing. What cannot be written is not kept, which is said once.
+    """The casts at one surface in a folder; None stores nothing. A failure to write is one warning.
 
     surface  what the surface is, bytes that are equal where it is
     """
@@ -470,7 +470,7 @@ PROBE = (9, 16)
 
 
 class Surface:
-    """Opened by its file's digest; its triangles are read when a cast is asked for that is not kept.
+    """Opened by its file's digest; its triangles are read when a cast is asked for that is not stored.
 
     Threads may ask at once. Raises DataError where the file cannot be read.
     """

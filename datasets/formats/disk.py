@@ -63,7 +63,7 @@ def file_digest(path: Path) -> bytes:
 
 def natural(name: str) -> tuple[list[str | int], str]:
     """Sort key with numbers by value: frame2 before frame10."""
-    # a number has as many digits as Python turns into one; names of more are told apart by the whole
+    # a number has as many digits as Python turns into one; the whole name tells longer ones apart
     return [int(part[:4000]) if part.isdecimal() else part for part in re.split(r"(\d+)", name)], name
 
 
@@ -96,7 +96,7 @@ def files_by_stem(folder: Path, suffixes: Container[str]) -> dict[str, str]:
 
 
 def _entries(folder: Path) -> Iterator[os.DirEntry[str]]:
-    """What is in a folder, but for hidden entries; nothing where there is no folder."""
+    """The entries of a folder, but for hidden entries; nothing where there is no folder."""
     try:
         with os.scandir(folder) as entries:
             yield from (entry for entry in entries if not entry.name.startswith("."))
@@ -109,7 +109,7 @@ def _entries(folder: Path) -> Iterator[os.DirEntry[str]]:
 # npy and npz bytes to an array of plain numbers: the whole one, or one DataError with the file; nothing is run.
 
 MAX_ARRAY_BYTES = 2**29
-"""Of an image as an array; scores, of many classes, may be larger."""
+"""Largest array of an image; scores, of many classes, may be larger."""
 MAX_SCORE_BYTES = 2**32
 
 NPY_DTYPE = re.compile(rb"""['"]descr['"]\s*:\s*['"]([<>|=]?(?:b1|[iu][1248]|f[248]))['"]""")

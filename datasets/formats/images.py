@@ -36,11 +36,11 @@ MASK_SUFFIXES = (".png",)
 MILLIMETRES = 1000.0
 NO_CLASS = IGNORE_16BIT
 PIXELS_AT_ONCE = 2**20
-"""Of a label map of colours: the lookup takes many times the memory of the image."""
+"""Pixels of a label map of colours at a time: the lookup takes many times the memory of the image."""
 
 MAX_PIXELS = 2**28
 MAX_IMAGE_BYTES = 2**29
-"""Of a decoded image: RGB of 178 megapixels."""
+"""Largest decoded image: RGB of 178 megapixels."""
 
 Size = tuple[int, int]
 Read = Callable[[Path], bytes]
@@ -93,7 +93,7 @@ def read_labels(path: Path, space: LabelSpace | None = None, read: Read = read_b
 def read_scores(
     path: Path, layout: Literal["KHW", "HWK"], size: Size, read: Read = read_bytes
 ) -> npt.NDArray[np.floating[Any]]:
-    """Soft scores (H, W, K) float16, float32 or float64, C-contiguous; `layout` is that of the file.
+    """Soft scores (H, W, K) float16, float32 or float64, C-contiguous; `layout` is the file's.
 
     `size` is (H, W) of the depth, to recognise the other layout. Raises DataError where the file has another
     type or layout, or is damaged.
@@ -103,9 +103,9 @@ def read_scores(
         raise DataError(
             f"{path}: scores must be float16 or float32 with three axes, got {scores.dtype} of shape {scores.shape}"
         )
-    found = {"KHW": scores.shape[1:], "HWK": scores.shape[:2]}
+    sizes = {"KHW": scores.shape[1:], "HWK": scores.shape[:2]}
     other = "HWK" if layout == "KHW" else "KHW"
-    if found[layout] != size and found[other] == size:
+    if sizes[layout] != size and sizes[other] == size:
         raise DataError(f"{path}: scores of shape {scores.shape} are not {layout}; set scores_layout: {other}")
     return np.ascontiguousarray(scores.transpose(1, 2, 0) if layout == "KHW" else scores)
 
@@ -181,12 +181,12 @@ def _labels_by_color(path: Path, rgb: UInt8, space: LabelSpace) -> Labels:
     ids = np.empty((H, W), dtype=np.uint8 if max(space.ids) < IGNORE_8BIT else np.uint16)
     rows, count, first = max(1, PIXELS_AT_ONCE // W), 0, (0, 0)
     for top in range(0, H, rows):
-        found = table[_packed(rgb[top : top + rows])]
-        if (unknown := found == NO_CLASS).any():
+        part = table[_packed(rgb[top : top + rows])]
+        if (unknown := part == NO_CLASS).any():
             y, x = np.argwhere(unknown)[0]
             first = first if count else (top + int(y), int(x))
             count += int(np.count_nonzero(unknown))
-        ids[top : top + rows] = found
+        ids[top : top + rows] = part
     if count:
         raise DataError(
             f"{path}: colour {tuple(rgb[first].tolist())} at pixel ({first[1]}, {first[0]}) ({count} pixels) is no"
@@ -371,7 +371,7 @@ def _decode_exr(path: Path, data: bytes) -> npt.NDArray[Any]:
 
 @functools.cache
 def reads_exr() -> bool:
-    """Whether the installed OpenCV was built with EXR."""
+    """Return whether the installed OpenCV was built with EXR."""
     return re.search(r"OpenEXR:\s+(?!NO)\S", _opencv().getBuildInformation()) is not None
 
 

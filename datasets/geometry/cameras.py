@@ -121,17 +121,17 @@ def at_times(
 ) -> Poses:
     """(m, 4, 4) at `wanted` seconds of a trajectory (n, 4, 4) at ascending `times`: the nearest, or between the two.
 
-    NaN where no pose is within `max_gap` seconds, and beside a pose that is NaN. Between two poses the position is
+    NaN where no pose is within `max_gap` seconds, or the nearest pose is NaN. Between two poses the position is
     linear and the rotation spherically linear (slerp); before the first and after the last one they hold.
     """
-    kept = np.isfinite(poses).all(axis=(1, 2))
-    times, poses = times[kept], poses[kept]
+    known = np.isfinite(poses).all(axis=(1, 2))
+    times, poses = times[known], poses[known]
     if not len(times):
         return np.full((len(wanted), 4, 4), np.nan)
     at = nearest(wanted, times)
-    found = poses[at] if method == "nearest" or len(times) == 1 else _between(times, poses, wanted)
-    found[np.abs(times[at] - wanted) > max_gap] = np.nan
-    return found
+    T = poses[at] if method == "nearest" or len(times) == 1 else _between(times, poses, wanted)
+    T[np.abs(times[at] - wanted) > max_gap] = np.nan
+    return T
 
 
 def nearest(times: Float64, others: Float64) -> npt.NDArray[np.intp]:

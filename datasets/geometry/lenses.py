@@ -42,7 +42,7 @@ def fit(values: Pixels, K: Intrinsics, K_depth: Intrinsics, shape: tuple[int, in
 def fit_labels(labels: Labels, K: Intrinsics, K_depth: Intrinsics, shape: tuple[int, int]) -> Labels:
     """The label map as a camera with K_depth and an image (H, W) sees it: of each pixel the nearest label.
 
-    K is that of the label map. Both images share centre and axes. What K does not see is ignored.
+    K belongs to the label map. Both images share centre and axes. Pixels that K does not see are ignored.
     """
     return _nearest(labels, K, K_depth, shape, ignore_id(labels))
 
@@ -82,7 +82,7 @@ def _positions(K: Intrinsics, K_depth: Intrinsics, shape: tuple[int, int]) -> tu
 
 
 def _within(positions: npt.NDArray[Any], length: int) -> Mask:
-    """Whether positions lie on the area of the pixels 0 to length - 1."""
+    """Return whether positions lie on the area of the pixels 0 to length - 1."""
     return (positions >= -0.5 - TIE) & (positions < length - 0.5 + TIE)
 
 
@@ -148,7 +148,7 @@ CHANNELS = 4
 """That are interpolated at a time: OpenCV 5 ends the process with a hundred."""
 
 SAMPLES = 2000
-"""Of the radius, at which it is seen whether the distortion folds the image over."""
+"""Samples of the radius that show whether the distortion folds the image over."""
 
 
 @dataclass(frozen=True)
@@ -179,15 +179,15 @@ def undistorted(
     require_same_view(values.shape, (size[1], size[0]), where, f"{what} {{}} but its camera {{}}")
     x, y = _source_pixels(lens, (values.shape[0], values.shape[1]), K, shape)
     remap: Any = cv2.remap
-    found: Any
+    image: Any
     if values.ndim == 2:
-        found = remap(values, x, y, cv2.INTER_NEAREST, borderValue=int(ignore_id(values)))
+        image = remap(values, x, y, cv2.INTER_NEAREST, borderValue=int(ignore_id(values)))
     else:
         wide = values if values.dtype == np.uint8 else values.astype(np.float32, copy=False)
         parts = [wide[..., k : k + CHANNELS] for k in range(0, values.shape[2], CHANNELS)]
         mixed = [remap(np.ascontiguousarray(part), x, y, cv2.INTER_LINEAR, borderValue=0) for part in parts]
-        found = np.concatenate([part.reshape(*shape, -1) for part in mixed], axis=2).astype(values.dtype, copy=False)
-    return found  # type: ignore[no-any-return]
+        image = np.concatenate([part.reshape(*shape, -1) for part in mixed], axis=2).astype(values.dtype, copy=False)
+    return image  # type: ignore[no-any-return]
 
 
 @functools.lru_cache(maxsize=2)
