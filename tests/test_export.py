@@ -23,9 +23,9 @@ from records import voxels as voxels_by_hand
 
 import semstab
 from semstab.errors import ConfigError, DataError, MissingDependencyError
-from semstab.exports import export, mesh
-from semstab.exports.las import codes
-from semstab.exports.raster import seen_from_above
+from semstab.exports import export, maps
+from semstab.exports.clouds import codes
+from semstab.exports.maps import seen_from_above
 from semstab.exports.voxels import Column, Voxels
 from semstab.metrics import categories, dominant, vss
 
@@ -206,7 +206,7 @@ def test_voxels_that_span_too_much_are_refused(tmp_path):
     far = voxels_by_hand((2, 1, [1, 0, 0]))
     far = as_voxels(dataclasses.replace(far, ix=np.array([0, 2**22]), iy=np.array([0, 2**22])))
     fails(ConfigError, "choose larger ones with --cell", seen_from_above, far)
-    fails(ConfigError, "too much for a mesh", mesh.write, Alone(far), tmp_path / "far.glb")
+    fails(ConfigError, "too much for a mesh", maps.write_mesh, Alone(far), tmp_path / "far.glb")
 
 
 class Alone:

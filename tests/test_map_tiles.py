@@ -34,7 +34,7 @@ from semstab.engine.tiling.partition import tiled
 from semstab.engine.tiling.sights import Sights, look_at
 from semstab.engine.units import make_plan
 from semstab.errors import ConfigError, DataError, OutgrownError
-from semstab.exports import export, raster
+from semstab.exports import export, maps
 from semstab.exports.relabel import Belief, relabel
 from semstab.model.frames import Frame, Intrinsics
 from semstab.model.parquet import Tile
@@ -293,7 +293,7 @@ def test_rasters_and_meshes_of_tiles_are_those_of_the_whole_map(both, tmp_path, 
     rasterio, trimesh = pytest.importorskip("rasterio"), pytest.importorskip("trimesh")
     rasters, meshes = [], []
     for folder, window in zip(both, (1024, 4), strict=True):
-        monkeypatch.setattr(raster, "WINDOW", window)
+        monkeypatch.setattr(maps, "WINDOW", window)
         files = [tmp_path / f"{folder.name}{suffix}" for suffix in (".tif", ".glb")]
         export(folder, files, min_op=2)
         for file in (files[0], files[0].with_suffix(".class.tif")):

@@ -10,7 +10,7 @@ from pathlib import Path
 from semstab.config import nearest
 from semstab.engine.folder import load_result
 from semstab.errors import ConfigError
-from semstab.exports import las, mesh, ply, raster
+from semstab.exports import clouds, maps
 from semstab.exports import voxels as tabular
 from semstab.exports.join import MEASURES as ONTO_MEASURES
 from semstab.exports.join import classify
@@ -40,11 +40,11 @@ class Settings:
 Writer = Callable[[Chosen, Path, Settings], int]
 
 WRITERS: Mapping[str, Writer] = {
-    ".ply": lambda chosen, path, settings: ply.write(chosen, path, sum(len(part.table) for part in chosen)),
-    ".las": lambda chosen, path, settings: las.write(chosen, path, settings.asprs),
-    ".laz": lambda chosen, path, settings: las.write(chosen, path, settings.asprs),
-    ".tif": lambda chosen, path, settings: raster.write(chosen, path, settings.cell),
-    ".glb": lambda chosen, path, settings: mesh.write(chosen, path),
+    ".ply": lambda chosen, path, settings: clouds.write_ply(chosen, path, sum(len(part.table) for part in chosen)),
+    ".las": lambda chosen, path, settings: clouds.write_las(chosen, path, settings.asprs),
+    ".laz": lambda chosen, path, settings: clouds.write_las(chosen, path, settings.asprs),
+    ".tif": lambda chosen, path, settings: maps.write_raster(chosen, path, settings.cell),
+    ".glb": lambda chosen, path, settings: maps.write_mesh(chosen, path),
     ".parquet": lambda chosen, path, settings: tabular.write_parquet(chosen, path),
     ".csv": lambda chosen, path, settings: tabular.write_csv(chosen, path),
 }
@@ -106,7 +106,7 @@ def export(
     return [_written(chosen(USUAL.get(file.suffix.lower())), file, settings) for file in files]
 
 
-USUAL = {".tif": raster.MEASURES}
+USUAL = {".tif": maps.RASTER_MEASURES}
 """The columns of some formats, where none is chosen."""
 
 
@@ -126,6 +126,6 @@ def _classified(chosen: Chosen, cloud: Path, file: Path, radius: float | None, s
 
 
 def _remarks(voxels: Voxels, kind: str, settings: Settings) -> Iterator[str]:
-    if kind in (".las", ".laz") and (names := list(las.without_code(voxels, settings.asprs))):
+    if kind in (".las", ".laz") and (names := list(clouds.without_code(voxels, settings.asprs))):
         listed = ", ".join(names[:3]) + (", ..." if len(names) > 3 else "")
         yield f"without ASPRS code (--asprs): {listed}; their classification is 1, dimension 'class' tells them apart"

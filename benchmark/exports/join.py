@@ -18,7 +18,7 @@ from semstab.core.files import atomic_path
 from semstab.core.types import Float64, Int64
 from semstab.datasets.formats.las_files import opened, points_at_once
 from semstab.errors import ConfigError, DataError
-from semstab.exports import las, ply
+from semstab.exports import clouds
 from semstab.exports.voxels import Chosen, Column, Voxels
 from semstab.metrics.agreement import voxel_keys
 from semstab.model.tiles import AT_HAND, Place
@@ -200,7 +200,7 @@ class _Finder:
 
 def as_taken(column: Column) -> npt.NDArray[Any]:
     """A column in the type that files have it in."""
-    return ply.as_stored(column.values)
+    return clouds.as_stored(column.values)
 
 
 def _beside(cloud: Path, finder: _Finder) -> DataError:
@@ -220,7 +220,7 @@ def _beside(cloud: Path, finder: _Finder) -> DataError:
 
 
 def _classify_las(voxels: Voxels, cloud: Path, out: Path, find: Finder, asprs: Path | None) -> None:
-    module = las.with_lazrs(cloud)
+    module = clouds.with_lazrs(cloud)
     with opened(cloud) as reader:
         _require_same_crs(voxels, reader.header, cloud)
         header = _extended(reader.header, voxels)
@@ -233,14 +233,10 @@ def _classify_las(voxels: Voxels, cloud: Path, out: Path, find: Finder, asprs: P
 
 
 def _extended(header: laspy.LasHeader, voxels: Voxels) -> laspy.LasHeader:
-    """The cloud's header with the dimensions that its points take."""
+    """Return the cloud's header with the dimensions of the voxels."""
     extended = copy.deepcopy(header)
     extended.vlrs = type(header.vlrs)(_without_copc(header.vlrs))
-    las.declare(extended, BEFORE, np.uint8, "what was there before")
-    las.declare(extended, "class", voxels.classified.dtype, "1 to K; 0 unclassified")
-    for name, column in voxels.columns.items():
-        las.declare_column(extended, name, column)
-    las.describe(extended, voxels)
+    clouds.declare(extended, voxels, **{BEFORE: (np.uint8, "what was there before")})
     return extended
 
 
@@ -258,9 +254,9 @@ def _classified_points(
     taken.copy_fields_from(points)
     if BEFORE not in points.point_format.dimension_names:
         taken[BEFORE] = points.classification
-    codes = las.codes(voxels, asprs)
-    if header.point_format.id < las.FIRST_OF_1_4:
-        codes[codes > OLD_CODES] = las.UNCLASSIFIED
+    codes = clouds.codes(voxels, asprs)
+    if header.point_format.id < clouds.FIRST_OF_1_4:
+        codes[codes > OLD_CODES] = clouds.UNCLASSIFIED
     taken.classification = codes[found.label]
     taken["class"] = found.label
     for name, values in found.columns.items():
@@ -286,12 +282,12 @@ def _require_same_crs(voxels: Voxels, header: laspy.LasHeader, cloud: Path) -> N
 
 def _classify_ply(voxels: Voxels, cloud: Path, out: Path, find: Finder) -> None:
     with cloud.open("rb") as source, out.open("wb") as target:
-        header = ply.Header.read(source, cloud)
+        header = clouds.Header.read(source, cloud)
         own = {name: header.dtype[name].newbyteorder("<") for name in header.dtype.names or ()}
         kinds = {"class": voxels.classified.dtype, **{k: as_taken(own).dtype for k, own in voxels.columns.items()}}
         dtype = np.dtype([*(own | kinds).items()])
-        comments = dict.fromkeys((*header.comments, *ply.legend(voxels)))
-        target.write(ply.Header(dtype, header.count, 0, tuple(comments)).text())
+        comments = dict.fromkeys((*header.comments, *clouds.legend(voxels)))
+        target.write(clouds.Header(dtype, header.count, 0, tuple(comments)).text())
         for points in _ply_chunks(source, header, cloud):
             found = find(np.stack([points[axis].astype(np.float64) for axis in "xyz"], axis=1))
             chunk = np.empty(len(points), dtype)
@@ -303,7 +299,7 @@ def _classify_ply(voxels: Voxels, cloud: Path, out: Path, find: Finder) -> None:
             target.write(chunk.tobytes())
 
 
-def _ply_chunks(source: Any, header: ply.Header, cloud: Path) -> Iterator[npt.NDArray[np.void]]:
+def _ply_chunks(source: Any, header: clouds.Header, cloud: Path) -> Iterator[npt.NDArray[np.void]]:
     for first in range(0, header.count, CHUNK):
         wanted = min(CHUNK, header.count - first)
         points = np.fromfile(source, header.dtype, wanted)

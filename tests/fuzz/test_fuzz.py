@@ -24,7 +24,7 @@ from semstab.datasets.formats.disk import natural
 from semstab.datasets.formats.las_files import opened
 from semstab.engine.tiling.sights import Sights
 from semstab.errors import ConfigError, DataError, one_line
-from semstab.exports.ply import Header
+from semstab.exports.clouds import Header
 from semstab.model.georeference import wkt
 from semstab.model.voxels import VoxelTable
 from semstab.report.figures.maps import Overview
