@@ -329,11 +329,11 @@ def test_a_cloud_takes_from_tiles_what_it_takes_from_the_whole_map(both, tmp_pat
     assert "100.0%" not in written[0][1]
 
 
-@pytest.mark.parametrize("leave_own_out", [False, True])
-def test_labels_from_tiles_are_those_from_the_whole_map(leave_own_out, both, tmp_path) -> None:
+@pytest.mark.parametrize("leave_one_out", [False, True])
+def test_labels_from_tiles_are_those_from_the_whole_map(leave_one_out, both, tmp_path) -> None:
     found = []
     for folder in both:
-        report = relabel(folder, tmp_path / folder.name, belief=Belief(min_op=2, leave_own_out=leave_own_out))
+        report = relabel(folder, tmp_path / folder.name, belief=Belief(min_op=2, leave_one_out=leave_one_out))
         files = sorted((tmp_path / folder.name / "labels" / "a-fused").glob("*.png"))
         found.append(([file.read_bytes() for file in files], dataclasses.replace(report, folder="")))
     assert found[0] == found[1]

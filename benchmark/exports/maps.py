@@ -66,12 +66,11 @@ def write_raster(chosen: Chosen, path: Path, cell: int = 1) -> int:
     kind = np.uint8 if len(legend) <= 2**8 else np.uint16
     palette = {0: (0, 0, 0, 0)} | {k: (*map(int, color), 255) for k, color in enumerate(some.colors, start=1)}
     one: dict[str, Any] = {"count": 1, "dtype": kind, "nodata": 0}
-    beside = path.with_suffix(f".class{path.suffix}")
     with (
         atomic_path(path) as temporary,
-        atomic_path(beside) as temporary_beside,
+        atomic_path(path.with_suffix(f".class{path.suffix}")) as temporary_classes,
         rasterio.open(temporary, "w", **many, **shape) as file,
-        rasterio.open(temporary_beside, "w", **one, **shape) as classes,
+        rasterio.open(temporary_classes, "w", **one, **shape) as classes,
     ):
         for window in whole.parts():
             there = [chosen[place] for place, own in seen.items() if own.meets(window)]
@@ -280,7 +279,7 @@ def write_mesh(chosen: Chosen, path: Path) -> int:
             )
         )
     with atomic_path(path) as temporary:
-        temporary.write_bytes(trimesh.exchange.gltf.export_glb(scene))
+        temporary.write_bytes(scene.export(file_type="glb"))
     return voxels
 
 
