@@ -23,9 +23,9 @@ from records import voxels as voxels_by_hand
 
 import semstab
 from semstab.errors import ConfigError, DataError, MissingDependencyError
-from semstab.exports import export, mesh
-from semstab.exports.las import codes
-from semstab.exports.raster import seen_from_above
+from semstab.exports import export, maps
+from semstab.exports.clouds import codes
+from semstab.exports.maps import seen_from_above
 from semstab.exports.voxels import Column, Voxels
 from semstab.metrics import categories, dominant, vss
 
@@ -206,7 +206,7 @@ def test_voxels_that_span_too_much_are_refused(tmp_path):
     far = voxels_by_hand((2, 1, [1, 0, 0]))
     far = as_voxels(dataclasses.replace(far, ix=np.array([0, 2**22]), iy=np.array([0, 2**22])))
     fails(ConfigError, "choose larger ones with --cell", seen_from_above, far)
-    fails(ConfigError, "too much for a mesh", mesh.write, Alone(far), tmp_path / "far.glb")
+    fails(ConfigError, "too much for a mesh", maps.write_mesh, Alone(far), tmp_path / "far.glb")
 
 
 class Alone:
@@ -252,7 +252,7 @@ def las_cloud(path, points, point_format=7, crs=CRS):
 @pytest.mark.parametrize("point_format", [3, 7])
 def test_a_las_cloud_is_classified_and_keeps_its_fields(fused, table, points, point_format):
     cloud = las_cloud(fused / f"cloud{point_format}.laz", points, point_format)
-    (done,) = export(fused / "run", fused / "onto.laz", backbone="a", onto=cloud, radius=0.3)
+    (done,) = export(fused / "run", fused / "onto.laz", backbone="a", classify=cloud, radius=0.3)
     before, after = laspy.read(cloud), laspy.read(fused / "onto.laz")
     for name in (*before.point_format.dimension_names,):
         assert (after["classification_before" if name == "classification" else name] == before[name]).all(), name
@@ -263,7 +263,7 @@ def test_a_las_cloud_is_classified_and_keeps_its_fields(fused, table, points, po
     np.testing.assert_allclose(after.vss, [*vss(table), vss(table)[-1], 0], rtol=1e-6)
     assert [vlr.user_id for vlr in after.evlrs or ()] == ["surveyor"] * (point_format > 5)
     assert done.content == f"{len(points)} points, {(len(points) - 1) / len(points):.1%} of them classified"
-    export(fused / "run", fused / "none.laz", backbone="a", onto=fused / "onto.laz", radius=0)
+    export(fused / "run", fused / "none.laz", backbone="a", classify=fused / "onto.laz", radius=0)
     again = laspy.read(fused / "none.laz")
     assert again["class"].tolist() == [*expected, 0, 0]
     assert (again["classification_before"] == 2).all()
@@ -290,7 +290,7 @@ def test_a_ply_cloud_is_classified_in_chunks(fused, table, points, monkeypatch):
     monkeypatch.setattr(join, "CHUNK", 7)
     for order in "<>":
         cloud = ply_cloud(fused / "cloud.ply", points, order)
-        export(fused / "run", fused / "onto.ply", backbone="a", onto=cloud, measures=["vss"], radius=0.3)
+        export(fused / "run", fused / "onto.ply", backbone="a", classify=cloud, measures=["vss"], radius=0.3)
         after = o3d.t.io.read_point_cloud(str(fused / "onto.ply"))
         np.testing.assert_array_equal(after.point.positions.numpy(), points)
         assert (after.point["gray"].numpy().ravel() == np.arange(len(points))).all()
@@ -301,12 +301,12 @@ def test_a_ply_cloud_is_classified_in_chunks(fused, table, points, monkeypatch):
 
 def test_clouds_that_cannot_be_classified(fused, points):
     def classify(cloud, to="never.laz"):
-        export(fused / "run", fused / to, backbone="a", onto=cloud)
+        export(fused / "run", fused / to, backbone="a", classify=cloud)
 
     there = las_cloud(fused / "there.laz", points[-1:] + 1000)
     fails(DataError, "no point lies in the map: it spans .* m, the map .*; mend the cloud", classify, there)
     beside = fused / "nowhere", fused / "never.laz"
-    fails(DataError, "give the run's dataset a georeference", export, *beside, backbone="a", onto=there)
+    fails(DataError, "give the run's dataset a georeference", export, *beside, backbone="a", classify=there)
     elsewhere = las_cloud(fused / "elsewhere.laz", points, crs="EPSG:32616")
     fails(DataError, "is in EPSG:32616, the run in EPSG:32615; reproject", classify, elsewhere)
     fails(ConfigError, "stays what it is; write .*never.las", classify, las_cloud(fused / "c.las", points), "never.ply")
@@ -333,6 +333,13 @@ def test_clouds_that_cannot_be_classified(fused, points):
         short.write_bytes(text)
         fails(DataError, message, classify, short, "never.ply")
     assert not list(fused.glob("never*"))
+
+
+def test_an_option_by_its_old_name_is_taken_with_a_warning(fused, points):
+    cloud = ply_cloud(fused / "cloud.ply", points)
+    done = bench("export", fused / "run", "--to", "old.ply", "-m", "a", "--onto", cloud, cwd=fused)
+    assert "--onto is now called --classify" in done.stderr
+    assert f"{len(points)} points" in done.stdout
 
 
 def test_the_command(fused):

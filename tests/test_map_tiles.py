@@ -34,7 +34,7 @@ from semstab.engine.memory import Sizing
 from semstab.engine.observer import Observer
 from semstab.engine.tiles import tiles_met
 from semstab.errors import ConfigError, DataError, OutgrownError
-from semstab.exports import export, raster
+from semstab.exports import export, maps
 from semstab.exports.relabel import Belief, relabel
 from semstab.model.frames import Frame, Intrinsics
 from semstab.model.parquet import Tile
@@ -271,7 +271,7 @@ def test_rasters_and_meshes_of_tiles_are_those_of_the_whole_map(both, tmp_path, 
     rasterio, trimesh = pytest.importorskip("rasterio"), pytest.importorskip("trimesh")
     rasters, meshes = [], []
     for folder, window in zip(both, (1024, 4), strict=True):
-        monkeypatch.setattr(raster, "WINDOW", window)
+        monkeypatch.setattr(maps, "WINDOW", window)
         files = [tmp_path / f"{folder.name}{suffix}" for suffix in (".tif", ".glb")]
         export(folder, files, min_op=2)
         for file in (files[0], files[0].with_suffix(".class.tif")):
@@ -307,11 +307,11 @@ def test_a_cloud_takes_from_tiles_what_it_takes_from_the_whole_map(both, tmp_pat
     assert "100.0%" not in written[0][1]
 
 
-@pytest.mark.parametrize("leave_own_out", [False, True])
-def test_labels_from_tiles_are_those_from_the_whole_map(leave_own_out, both, tmp_path) -> None:
+@pytest.mark.parametrize("leave_one_out", [False, True])
+def test_labels_from_tiles_are_those_from_the_whole_map(leave_one_out, both, tmp_path) -> None:
     found = []
     for folder in both:
-        report = relabel(folder, tmp_path / folder.name, belief=Belief(min_op=2, leave_own_out=leave_own_out))
+        report = relabel(folder, tmp_path / folder.name, belief=Belief(min_op=2, leave_one_out=leave_one_out))
         files = sorted((tmp_path / folder.name / "labels" / "a-fused").glob("*.png"))
         found.append(([file.read_bytes() for file in files], dataclasses.replace(report, folder="")))
     assert found[0] == found[1]

@@ -52,8 +52,8 @@ def voxels_of(folder):
     return np.stack([np.floor(x / R + i) + 100 * np.floor(y / R) for i in range(4)]).astype(int)
 
 
-@pytest.mark.parametrize("leave_own_out", [False, True])
-def test_each_pixel_gets_what_the_frames_said_of_its_voxel(fused, leave_own_out):
+@pytest.mark.parametrize("leave_one_out", [False, True])
+def test_each_pixel_gets_what_the_frames_said_of_its_voxel(fused, leave_one_out):
     own, voxel = maps(fused / "scene/labels/a"), voxels_of(fused)
     seen = np.ones(own.shape, bool)
     seen[1, 0] = False
@@ -62,12 +62,12 @@ def test_each_pixel_gets_what_the_frames_said_of_its_voxel(fused, leave_own_out)
         votes = np.zeros(K)
         for other in range(4):
             said = own[other][seen[other] & (voxel[other] == voxel[t, v, u])]
-            if len(said) and not (leave_own_out and other == t):
+            if len(said) and not (leave_one_out and other == t):
                 votes += np.bincount(said, minlength=K) / len(said)
         if votes.any():
             expected[t, v, u] = votes.argmax()
-    name = f"oracle-{leave_own_out}"
-    report = relabel(fused / "run", fused / "out", name=name, belief=Belief(leave_own_out=leave_own_out))
+    name = f"oracle-{leave_one_out}"
+    report = relabel(fused / "run", fused / "out", name=name, belief=Belief(leave_one_out=leave_one_out))
     found = maps(fused / "out/labels" / name)
     np.testing.assert_array_equal(found, expected)
     truth, has = maps(fused / "scene/labels/gt"), found != 255
@@ -76,7 +76,7 @@ def test_each_pixel_gets_what_the_frames_said_of_its_voxel(fused, leave_own_out)
     assert report.changed == np.count_nonzero(has & (found != own)) > 0
     assert report.unseen == tiny_scene.WIDTH
     assert report.unstable == np.count_nonzero(seen & ~has)
-    assert (report.unstable > 0) == leave_own_out
+    assert (report.unstable > 0) == leave_one_out
     assert report.correctness.after.accuracy == np.mean(found[has] == truth[has])
     assert report.correctness.before.accuracy == np.mean(own[has] == truth[has])
     assert report.correctness.all_before.accuracy == np.mean(own == truth)
@@ -101,7 +101,7 @@ def test_without_its_own_vote_a_frame_sees_the_map_of_the_others(soft):
         rest = table_of([*frames[:i], *frames[i + 1 :]])
         rest = dataclasses.replace(rest, evidence=np.round(rest.evidence, 9))  # ties are no matter of rounding
         others = labels(rest, Belief(min_op=2, min_psa=0.3)).of(frame)
-        without = labels(whole, Belief(min_op=2, min_psa=0.3, leave_own_out=True)).of(frame)
+        without = labels(whole, Belief(min_op=2, min_psa=0.3, leave_one_out=True)).of(frame)
         np.testing.assert_array_equal(np.maximum(without, UNSEEN), np.maximum(others, UNSEEN))
         assert len(np.unique(without)) > 2
 

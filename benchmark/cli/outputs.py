@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from semstab.cli.options import Quiet
+from semstab.cli.options import Quiet, renamed
 
 if TYPE_CHECKING:
     from semstab.core.registry import Registry
@@ -38,19 +38,21 @@ def export(
     commit: CommitFile = None,
     cell: Annotated[int, typer.Option(min=1, help="Edge of a cell of .tif, in voxels.")] = 1,
     asprs: Annotated[Path | None, typer.Option(metavar="FILE", help="YAML 'CLASS: CODE' for .las and .laz.")] = None,
-    onto: Annotated[
+    classify: Annotated[
         Path | None, typer.Option(metavar="CLOUD", help="Classify this .las, .laz or .ply cloud, and write it.")
     ] = None,
     radius: Annotated[
         float | None, typer.Option(min=0, help="Metres from a point to the voxel that it may take; a voxel's edge.")
     ] = None,
-    beside: Annotated[
+    join: Annotated[
         Path | None,
         typer.Option(metavar="FILE", help="Parquet with more columns of the voxels: OUT/columns of compare."),
     ] = None,
     quiet: Quiet = False,
+    onto: Annotated[Path | None, typer.Option("--onto", hidden=True)] = None,
+    beside: Annotated[Path | None, typer.Option("--beside", hidden=True)] = None,
 ) -> None:
-    """The fused map as a point cloud, raster, mesh or table, with how far to trust each place."""
+    """The fused map as a point cloud, raster, mesh or table, with how far to trust each location."""
     from rich.console import Console
 
     from semstab.exports import export as write
@@ -58,11 +60,12 @@ def export(
     unit = {"scene": scene, "backbone": backbone, "backend": backend}
     written = write(
         run, to, **unit, measures=measure, min_op=min_op, classes=classes or (),
-        commit=commit, cell=cell, asprs=asprs, onto=onto, radius=radius, beside=beside,
+        commit=commit, cell=cell, asprs=asprs, radius=radius,
+        classify=renamed(onto, "--onto", classify, "--classify"), join=renamed(beside, "--beside", join, "--join"),
     )  # fmt: skip
     console = Console(quiet=quiet)
     for file in written:
-        for line in (f"{file.path}: {file.content}", *(f"  {remark}" for remark in file.remarks)):
+        for line in (f"{file.path}: {file.content}", *(f"  {note}" for note in file.notes)):
             console.print(line, soft_wrap=True, markup=False, highlight=False)
 
 
@@ -79,13 +82,14 @@ def relabel(
         list[str] | None, typer.Option(help="Keep pixels of voxels of this category alone; repeatable.")
     ] = None,
     commit: CommitFile = None,
-    leave_own_out: Annotated[
-        bool, typer.Option("--leave-own-out", help="What the other frames say, without the frame's own vote.")
+    leave_one_out: Annotated[
+        bool, typer.Option("--leave-one-out", help="Label each frame by the other frames, without its own vote.")
     ] = False,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace maps of other settings.")] = False,
     quiet: Quiet = False,
+    leave_own_out: Annotated[bool, typer.Option("--leave-own-out", hidden=True)] = False,
 ) -> None:
-    """The fused classes back in every frame: label maps of a new source, unstable places ignored."""
+    """The fused classes back in every frame: label maps of a new source, unstable voxels ignored."""
     from rich.console import Console
 
     from semstab.convert import frame_bar
@@ -94,7 +98,8 @@ def relabel(
     from semstab.statistics.commit import Commit
 
     thresholds = None if commit is None else Commit.load(commit)
-    belief = Belief(min_op, min_psa, tuple(category or ()), leave_own_out, thresholds)
+    leave_one_out = renamed(leave_own_out, "--leave-own-out", leave_one_out, "--leave-one-out")
+    belief = Belief(min_op, min_psa, tuple(category or ()), leave_one_out, thresholds)
     with frame_bar(Console(stderr=True, quiet=quiet)) as bar:
         report = write(
             run, out, belief=belief, scene=scene, backbone=backbone, backend=backend, name=name, overwrite=overwrite,

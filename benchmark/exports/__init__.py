@@ -1,4 +1,4 @@
-"""What a finished run found, for other programs: point clouds, rasters, meshes and tables, in global coordinates."""
+"""A finished run for other programs: point clouds, rasters, meshes and tables, in global coordinates."""
 
 from __future__ import annotations
 
@@ -10,10 +10,9 @@ from pathlib import Path
 from semstab.config import nearest
 from semstab.engine.folder import load_result
 from semstab.errors import ConfigError
-from semstab.exports import las, mesh, ply, raster
+from semstab.exports import clouds, maps
+from semstab.exports import join as joining
 from semstab.exports import voxels as tabular
-from semstab.exports.join import MEASURES as ONTO_MEASURES
-from semstab.exports.join import classify
 from semstab.exports.voxels import Chosen, Voxels, crs_name
 from semstab.statistics.commit import Commit
 
@@ -22,16 +21,16 @@ __all__ = ["SUFFIXES", "Exported", "export"]
 
 @dataclass(frozen=True)
 class Exported:
-    """A file that was written: what it holds, in a line, and what its reader has to know."""
+    """A file that was written, its content in a line, and notes for its reader."""
 
     path: Path
     content: str
-    remarks: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
 class Settings:
-    """What some formats take: a raster's cell in voxels, a table of ASPRS codes."""
+    """Settings of some formats: a raster's cell in voxels, a table of ASPRS codes."""
 
     cell: int = 1
     asprs: Path | None = None
@@ -40,15 +39,15 @@ class Settings:
 Writer = Callable[[Chosen, Path, Settings], int]
 
 WRITERS: Mapping[str, Writer] = {
-    ".ply": lambda chosen, path, settings: ply.write(chosen, path, sum(len(part.table) for part in chosen)),
-    ".las": lambda chosen, path, settings: las.write(chosen, path, settings.asprs),
-    ".laz": lambda chosen, path, settings: las.write(chosen, path, settings.asprs),
-    ".tif": lambda chosen, path, settings: raster.write(chosen, path, settings.cell),
-    ".glb": lambda chosen, path, settings: mesh.write(chosen, path),
+    ".ply": lambda chosen, path, settings: clouds.write_ply(chosen, path, sum(len(part.table) for part in chosen)),
+    ".las": lambda chosen, path, settings: clouds.write_las(chosen, path, settings.asprs),
+    ".laz": lambda chosen, path, settings: clouds.write_las(chosen, path, settings.asprs),
+    ".tif": lambda chosen, path, settings: maps.write_raster(chosen, path, settings.cell),
+    ".glb": lambda chosen, path, settings: maps.write_mesh(chosen, path),
     ".parquet": lambda chosen, path, settings: tabular.write_parquet(chosen, path),
     ".csv": lambda chosen, path, settings: tabular.write_csv(chosen, path),
 }
-"""By suffix; each takes a map tile by tile and says how many voxels it wrote."""
+"""By suffix; each takes a map tile by tile and returns the number of voxels."""
 
 SUFFIXES = tuple(WRITERS)
 
@@ -66,8 +65,10 @@ def export(
     commit: str | Path | None = None,
     cell: int = 1,
     asprs: str | Path | None = None,
-    onto: str | Path | None = None,
+    classify: str | Path | None = None,
     radius: float | None = None,
+    join: str | Path | None = None,
+    onto: str | Path | None = None,
     beside: str | Path | None = None,
 ) -> list[Exported]:
     """Write a unit of the run in a folder to files, in the format that each one's suffix names (`SUFFIXES`).
@@ -78,9 +79,10 @@ def export(
     commit    file of thresholds: only voxels whose label has the evidence that they ask for (`Commit`)
     cell      edge of a raster's cell, in voxels
     asprs     YAML file CLASS: CODE for LAS; else the table that ships for the taxonomy
-    onto      a cloud: what is written is this cloud, classified; a point outside of all voxels takes the nearest one
-              within `radius` metres, a voxel's edge where not given
-    beside    a Parquet file with further columns of the same voxels, such as `compare` writes
+    classify  a cloud: write this cloud, classified; a point outside of all voxels takes the nearest one within
+              `radius` metres, a voxel's edge where not given
+    join      a Parquet file with further columns of the same voxels, such as `compare` writes
+    onto, beside  names of `classify` and `join` in the version before
 
     Raises ConfigError, DataError, MissingDependencyError, each with the file.
     """
@@ -92,40 +94,37 @@ def export(
     record = result.record(scene=scene, backbone=backbone, backend=backend)
     thresholds = None if commit is None else Commit.load(commit)
     settings = Settings(cell, None if asprs is None else Path(asprs))
-    further = None if beside is None else Path(beside)
+    classify, join = classify or onto, join or beside
 
     @functools.cache
     def chosen(usual: tuple[str, ...] | None) -> Chosen:
         return Chosen(
             result, record, columns=measures or usual, min_op=min_op, classes=classes, commit=thresholds,
-            beside=further,
+            join=None if join is None else Path(join),
         )  # fmt: skip
 
-    if onto is not None:
-        return [_classified(chosen(ONTO_MEASURES), Path(onto), file, radius, settings) for file in files]
-    return [_written(chosen(USUAL.get(file.suffix.lower())), file, settings) for file in files]
-
-
-USUAL = {".tif": raster.MEASURES}
-"""The columns of some formats, where none is chosen."""
+    if classify is not None:
+        return [_classified(chosen(joining.MEASURES), Path(classify), file, radius, settings) for file in files]
+    usual = {".tif": maps.RASTER_MEASURES}
+    return [_written(chosen(usual.get(file.suffix.lower())), file, settings) for file in files]
 
 
 def _written(chosen: Chosen, file: Path, settings: Settings) -> Exported:
     voxels, some = WRITERS[file.suffix.lower()](chosen, file, settings), chosen.first
     where = "coordinates of the scene, which has no georeference"
     where = where if some.georeference is None else crs_name(some.georeference)
-    return Exported(file, f"{voxels:,} voxels, {where}", tuple(_remarks(some, file.suffix.lower(), settings)))
+    return Exported(file, f"{voxels:,} voxels, {where}", tuple(_notes(some, file.suffix.lower(), settings)))
 
 
 def _classified(chosen: Chosen, cloud: Path, file: Path, radius: float | None, settings: Settings) -> Exported:
     some = chosen.first
-    tally = classify(chosen, cloud, file, some.table.voxel_size if radius is None else radius, settings.asprs)
+    tally = joining.classify(chosen, cloud, file, some.table.voxel_size if radius is None else radius, settings.asprs)
     share = tally.classified / tally.points
     content = f"{tally.points:,} points, {share:.1%} of them classified"
-    return Exported(file, content, tuple(_remarks(some, file.suffix.lower(), settings)))
+    return Exported(file, content, tuple(_notes(some, file.suffix.lower(), settings)))
 
 
-def _remarks(voxels: Voxels, kind: str, settings: Settings) -> Iterator[str]:
-    if kind in (".las", ".laz") and (names := list(las.without_code(voxels, settings.asprs))):
+def _notes(voxels: Voxels, kind: str, settings: Settings) -> Iterator[str]:
+    if kind in (".las", ".laz") and (names := clouds.without_code(voxels, settings.asprs)):
         listed = ", ".join(names[:3]) + (", ..." if len(names) > 3 else "")
         yield f"without ASPRS code (--asprs): {listed}; their classification is 1, dimension 'class' tells them apart"

@@ -1,4 +1,4 @@
-"""A given cloud, classified: each point takes what is known of its voxel; the cloud is never whole in memory."""
+"""Classify a given cloud: each point takes the class and columns of its voxel; the cloud is read in chunks."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ from semstab.core.files import atomic_path
 from semstab.core.types import Float64, Int64
 from semstab.datasets.files.surfaces import open_las, points_at_once
 from semstab.errors import ConfigError, DataError
-from semstab.exports import las, ply
-from semstab.exports.voxels import Chosen, Column, Voxels
+from semstab.exports import clouds
+from semstab.exports.voxels import Chosen, Voxels
 from semstab.metrics.agreement import voxel_keys
 from semstab.model.tiles import AT_HAND, Place
 from semstab.model.voxels import VoxelTable
@@ -36,7 +36,7 @@ NONE = -1
 
 
 class VoxelLookup:
-    """Finds voxels of a table by coordinates, those of the scene and an offset; a radius of 0 takes no neighbours."""
+    """Finds voxels of a table by coordinates, the scene's plus an offset; a radius of 0 takes no neighbours."""
 
     def __init__(self, table: VoxelTable, offset: npt.ArrayLike = (0.0, 0.0, 0.0), radius: float = 0.0) -> None:
         self.table, self._offset, self._radius = table, np.asarray(offset, dtype=np.float64), radius
@@ -51,11 +51,11 @@ class VoxelLookup:
         return self._low * r + self._offset - self._radius, (self._high + 1) * r + self._offset + self._radius
 
     def rows(self, points: Float64) -> Int64:
-        """(n,) the voxel of each point (n, 3), a row of the table, or NONE."""
+        """Return (n,) the voxel of each point (n, 3), a row of the table, or NONE."""
         return self.nearest(points)[0]
 
     def nearest(self, points: Float64) -> tuple[Int64, Float64]:
-        """The same, with the distance of its centre, 0 for the voxel that a point lies in."""
+        """Return the voxels, and the distance of their centres, 0 for the voxel that a point lies in."""
         points = points - self._offset
         index = np.floor(points / self.table.voxel_size).astype(np.int64)
         inside = np.flatnonzero(((index >= self._low) & (index <= self._high)).all(axis=1))
@@ -70,12 +70,12 @@ class VoxelLookup:
         return rows, apart
 
     def _around(self, points: Float64) -> tuple[Int64, Float64]:
-        """(n,) the voxel whose centre is nearest to each point of the scene, within the radius, and how near."""
+        """Return (n,) the voxel whose centre is nearest to each point, within the radius, and its distance."""
         low, high = (edge - self._offset for edge in self.bounds)
         near = np.flatnonzero(((points >= low) & (points <= high)).all(axis=1))
         rows, apart = np.full(len(points), NONE), np.full(len(points), np.inf)
-        apart[near], found = self._tree.query(points[near], distance_upper_bound=self._radius, workers=-1)
-        rows[near] = np.where(found < len(self.table), found, NONE)
+        apart[near], nearest = self._tree.query(points[near], distance_upper_bound=self._radius, workers=-1)
+        rows[near] = np.where(nearest < len(self.table), nearest, NONE)
         return rows, apart
 
     @cached_property
@@ -89,10 +89,10 @@ CHUNK = 1_000_000
 """Points at a time."""
 
 MEASURES = ("vss", "op", "category")
-"""What a point takes beside its class where nothing is chosen."""
+"""Columns of a point where none is chosen."""
 
 BEFORE = "classification_before"
-"""The extra dimension that keeps what a LAS cloud was classified as."""
+"""The extra dimension with the classification that a LAS cloud had."""
 
 OLD_CODES = 31
 """The largest code that the point formats before LAS 1.4 have room for."""
@@ -100,7 +100,7 @@ OLD_CODES = 31
 
 @dataclass
 class Tally:
-    """How many points there were, how many of them have a voxel, and where they lie."""
+    """The number of points, the number with a voxel, and their bounds."""
 
     points: int = 0
     classified: int = 0
@@ -108,7 +108,7 @@ class Tally:
     high: Float64 = field(default_factory=lambda: np.full(3, -np.inf))
 
     def add(self, points: Float64, classified: int) -> None:
-        """A chunk of points (n, 3), of which so many have a voxel."""
+        """Count a chunk of points (n, 3), of which `classified` have a voxel."""
         self.points += len(points)
         self.classified += classified
         self.low = np.minimum(self.low, points.min(axis=0, initial=np.inf))
@@ -117,7 +117,7 @@ class Tally:
 
 @dataclass(frozen=True, eq=False)
 class Taken:
-    """What points take of their voxels, (n,) each: the class from 1 on, and the columns; 0 where they have none."""
+    """The classes of points, from 1 on, and their columns, (n,) each; 0 without a voxel."""
 
     label: npt.NDArray[Any]
     columns: Mapping[str, npt.NDArray[Any]]
@@ -130,9 +130,9 @@ Writer = Callable[[Voxels, Path, Path, Finder], None]
 def classify(chosen: Chosen, cloud: Path, out: Path, radius: float, asprs: Path | None = None) -> Tally:
     """Write the cloud with all its fields, and class, classification (LAS) and the voxels' columns.
 
-    A point belongs to the voxel that it lies in, else to the nearest whose centre is within `radius` metres; else all
-    it takes is 0, class 0 'unclassified'. Classes count from 1.
-    Raises ConfigError for files of different or unknown kinds, DataError for a damaged cloud, or one beside the map.
+    A point belongs to the voxel that it lies in, else to the nearest whose centre is within `radius` metres; else it
+    has class 0 'unclassified' and zeros. Classes count from 1.
+    Raises ConfigError for files of different or unknown kinds, DataError for a damaged cloud, or one outside the map.
     """
     of_las = partial(_classify_las, asprs=asprs)
     kinds: dict[str, Writer] = {".las": of_las, ".laz": of_las, ".ply": _classify_ply}
@@ -147,41 +147,43 @@ def classify(chosen: Chosen, cloud: Path, out: Path, radius: float, asprs: Path 
     with atomic_path(out) as temporary:
         write(chosen.first, cloud, temporary, finder)
         if not finder.tally.classified:
-            raise _beside(cloud, finder)
+            raise _outside(cloud, finder)
     return finder.tally
 
 
 class _Finder:
-    """Finds what points take, tile by tile; the last few tiles are at hand."""
+    """Finds the voxels of points, tile by tile; the latest tiles stay in memory."""
 
     def __init__(self, chosen: Chosen, radius: float) -> None:
         self.chosen, self.tally, self._radius = chosen, Tally(), radius
         self._lookups = AtHand(self.lookup, lambda lookup: len(lookup.table), AT_HAND)
 
     def lookup(self, place: Place) -> VoxelLookup:
-        """Of a tile that has voxels."""
+        """Return the lookup of a tile with voxels."""
         voxels = self.chosen[place]
         return VoxelLookup(voxels.table, voxels.offset, self._radius)
 
     def __call__(self, points: Float64) -> Taken:
         some, apart = self.chosen.first, np.full(len(points), np.inf)
         label = np.zeros(len(points), some.classified.dtype)
-        columns = {name: np.zeros(len(points), as_taken(own).dtype) for name, own in some.columns.items()}
+        columns = {
+            name: np.zeros(len(points), clouds.as_stored(own.values).dtype) for name, own in some.columns.items()
+        }
         for place, rows in self._near(points - some.offset):
             voxels = self.chosen[place]
             if not len(voxels.table):
                 continue
-            found, distance = self._lookups[place].nearest(points[rows])
+            nearest, distance = self._lookups[place].nearest(points[rows])
             nearer = distance < apart[rows]
-            to, of = rows[nearer], found[nearer]
+            to, of = rows[nearer], nearest[nearer]
             apart[to], label[to] = distance[nearer], voxels.classified[of]
             for name, own in columns.items():
-                own[to] = as_taken(voxels.columns[name])[of]
+                own[to] = clouds.as_stored(voxels.columns[name].values)[of]
         self.tally.add(points, int(np.isfinite(apart).sum()))
         return Taken(label, columns)
 
     def _near(self, points: Float64) -> Iterator[tuple[Place, Int64]]:
-        """The tiles that may hold the nearest voxels of points (n, 3) of the scene, with the rows (m,) of these."""
+        """Yield the tiles that may hold the nearest voxels of points (n, 3), with the points' rows (m,)."""
         size, r = self.chosen.size, self.chosen.first.table.voxel_size
         if size is None:
             yield (0, 0), np.arange(len(points))
@@ -191,20 +193,15 @@ class _Finder:
             np.column_stack([np.floor((points[:, :2] + shift) / (size * r)).astype(np.int64), np.arange(len(points))])
             for shift in itertools.product(steps, steps)
         ]
-        found = np.unique(np.concatenate(pairs), axis=0)
-        places, first = np.unique(found[:, :2], axis=0, return_index=True)
-        for (x, y), rows in zip(places.tolist(), np.split(found[:, 2], first[1:]), strict=True):
+        tiles = np.unique(np.concatenate(pairs), axis=0)
+        places, first = np.unique(tiles[:, :2], axis=0, return_index=True)
+        for (x, y), rows in zip(places.tolist(), np.split(tiles[:, 2], first[1:]), strict=True):
             if (x, y) in self.chosen:
                 yield (x, y), rows
 
 
-def as_taken(column: Column) -> npt.NDArray[Any]:
-    """A column in the type that files have it in."""
-    return ply.as_stored(column.values)
-
-
-def _beside(cloud: Path, finder: _Finder) -> DataError:
-    """What to raise where no point of a cloud has a voxel."""
+def _outside(cloud: Path, finder: _Finder) -> DataError:
+    """Return the error of a cloud without a point in the map."""
     boxes = [finder.lookup(place).bounds for place in finder.chosen.places()]
     map_box = np.min([low for low, _ in boxes], axis=0), np.max([high for _, high in boxes], axis=0)
     there, here = (
@@ -220,7 +217,7 @@ def _beside(cloud: Path, finder: _Finder) -> DataError:
 
 
 def _classify_las(voxels: Voxels, cloud: Path, out: Path, find: Finder, asprs: Path | None) -> None:
-    module = las.with_lazrs(cloud)
+    module = clouds.with_lazrs(cloud)
     with open_las(cloud) as reader:
         _require_same_crs(voxels, reader.header, cloud)
         header = _extended(reader.header, voxels)
@@ -233,34 +230,30 @@ def _classify_las(voxels: Voxels, cloud: Path, out: Path, find: Finder, asprs: P
 
 
 def _extended(header: laspy.LasHeader, voxels: Voxels) -> laspy.LasHeader:
-    """The cloud's header with the dimensions that its points take."""
+    """Return the cloud's header with the dimensions of the voxels."""
     extended = copy.deepcopy(header)
     extended.vlrs = type(header.vlrs)(_without_copc(header.vlrs))
-    las.declare(extended, BEFORE, np.uint8, "what was there before")
-    las.declare(extended, "class", voxels.classified.dtype, "1 to K; 0 unclassified")
-    for name, column in voxels.columns.items():
-        las.declare_column(extended, name, column)
-    las.describe(extended, voxels)
+    clouds.declare(extended, voxels, **{BEFORE: (np.uint8, "what was there before")})
     return extended
 
 
 def _without_copc(records: Iterable[laspy.VLR]) -> list[laspy.VLR]:
-    """The records but those that say in which order a COPC file has its points: it is written as plain LAZ."""
+    """Drop the records of the order of points in a COPC file: it is written as plain LAZ."""
     return [record for record in records if record.user_id != "copc"]
 
 
 def _classified_points(
     points: laspy.ScaleAwarePointRecord, header: laspy.LasHeader, voxels: Voxels, find: Finder, asprs: Path | None
 ) -> laspy.ScaleAwarePointRecord:
-    """A chunk with what its points take."""
+    """Return a chunk with the classes and columns of its points."""
     found = find(np.stack([points.x, points.y, points.z], axis=1))
     taken = type(points).zeros(len(points), header=header)
     taken.copy_fields_from(points)
     if BEFORE not in points.point_format.dimension_names:
         taken[BEFORE] = points.classification
-    codes = las.codes(voxels, asprs)
-    if header.point_format.id < las.FIRST_OF_1_4:
-        codes[codes > OLD_CODES] = las.UNCLASSIFIED
+    codes = clouds.codes(voxels, asprs)
+    if header.point_format.id < clouds.FIRST_OF_1_4:
+        codes[codes > OLD_CODES] = clouds.UNCLASSIFIED
     taken.classification = codes[found.label]
     taken["class"] = found.label
     for name, values in found.columns.items():
@@ -286,12 +279,15 @@ def _require_same_crs(voxels: Voxels, header: laspy.LasHeader, cloud: Path) -> N
 
 def _classify_ply(voxels: Voxels, cloud: Path, out: Path, find: Finder) -> None:
     with cloud.open("rb") as source, out.open("wb") as target:
-        header = ply.Header.read(source, cloud)
+        header = clouds.Header.read(source, cloud)
         own = {name: header.dtype[name].newbyteorder("<") for name in header.dtype.names or ()}
-        kinds = {"class": voxels.classified.dtype, **{k: as_taken(own).dtype for k, own in voxels.columns.items()}}
+        kinds = {
+            "class": voxels.classified.dtype,
+            **{k: clouds.as_stored(own.values).dtype for k, own in voxels.columns.items()},
+        }
         dtype = np.dtype([*(own | kinds).items()])
-        comments = dict.fromkeys((*header.comments, *ply.legend(voxels)))
-        target.write(ply.Header(dtype, header.count, 0, tuple(comments)).text())
+        comments = dict.fromkeys((*header.comments, *clouds.legend(voxels)))
+        target.write(clouds.Header(dtype, header.count, 0, tuple(comments)).text())
         for points in _ply_chunks(source, header, cloud):
             found = find(np.stack([points[axis].astype(np.float64) for axis in "xyz"], axis=1))
             chunk = np.empty(len(points), dtype)
@@ -303,7 +299,7 @@ def _classify_ply(voxels: Voxels, cloud: Path, out: Path, find: Finder) -> None:
             target.write(chunk.tobytes())
 
 
-def _ply_chunks(source: Any, header: ply.Header, cloud: Path) -> Iterator[npt.NDArray[np.void]]:
+def _ply_chunks(source: Any, header: clouds.Header, cloud: Path) -> Iterator[npt.NDArray[np.void]]:
     for first in range(0, header.count, CHUNK):
         wanted = min(CHUNK, header.count - first)
         points = np.fromfile(source, header.dtype, wanted)

@@ -1,7 +1,8 @@
-"""Fused labels back into the frames: label maps of a new source, such as pseudo-labels to train with."""
+"""Project the fused labels back into the frames: label maps of a new source, such as pseudo-labels to train with."""
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -16,7 +17,6 @@ from semstab.core.at_hand import AtHand
 from semstab.core.files import write_json
 from semstab.core.prefetch import prefetch
 from semstab.core.types import Float64, Int64, Mask, UInt8, UInt16
-from semstab.datasets.geometry.lenses import Labels
 from semstab.engine.folder import SETTINGS, load_result
 from semstab.engine.units import make_plan
 from semstab.errors import ConfigError, DataError
@@ -36,24 +36,24 @@ from semstab.statistics import psa
 from semstab.statistics.commit import Commit
 from semstab.task import Task, read, truth_task
 
-# The class that the map has where a frame looks: one a pixel, where the voxel can be believed.
+# The class of the map at each pixel of a frame, where its voxel meets the criteria.
 
 UNSEEN, UNSTABLE = -1, -2
-"""Instead of a class: no depth or no voxel there; a voxel that is not believed."""
+"""Instead of a class: no depth or no voxel there; a voxel that fails the criteria."""
 
 DECIMALS = 9
-"""Of evidence from which a vote was taken: what rounding left decides no tie."""
+"""Of evidence without a frame's own vote: a rounding error decides no tie."""
 
 
 @dataclass(frozen=True)
 class Belief:
-    """Which voxels are believed.
+    """The criteria that a voxel must meet.
 
     min_op         seen by so many frames
     min_psa        their pairs of frames agree so often; a voxel seen once has no pair
     categories     of these categories, of any where none is named
-    leave_own_out  without the frame's own vote, and seen by another frame. Drift is that of all votes: it depends on
-                   their order
+    leave_one_out  without the frame's own vote, and seen by another frame. Drift stays that of all votes: it depends
+                   on their order
     commit         whose label has the evidence that these thresholds ask for
 
     Raises ConfigError for a category that there is not, and values out of range.
@@ -62,7 +62,7 @@ class Belief:
     min_op: int = 1
     min_psa: float = 0.0
     categories: tuple[str, ...] = ()
-    leave_own_out: bool = False
+    leave_one_out: bool = False
     commit: Commit | None = None
 
     def __post_init__(self) -> None:
@@ -73,7 +73,7 @@ class Belief:
                 raise ConfigError(f"no category '{name}'; {nearest(name, CATEGORIES)}")
 
     def of(self, table: VoxelTable) -> Mask:
-        """(n,) whether each voxel is."""
+        """(n,) whether each voxel meets them."""
         believed = table.op >= max(self.min_op, 1)
         if self.min_psa > 0:
             believed &= np.nan_to_num(psa(table), nan=-1.0) >= self.min_psa
@@ -85,13 +85,13 @@ class Belief:
         return believed
 
     def settings(self) -> dict[str, object]:
-        """As JSON has it."""
+        """Return the criteria for JSON."""
         own = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
         return own | {"commit": None if self.commit is None else self.commit.model_dump(by_alias=True)}
 
 
 class FusedLabels:
-    """A map, to be asked for the classes that a frame sees; of its tiles those are at hand that frames saw last."""
+    """Looks up the classes of a map that a frame sees; the latest tiles stay in memory."""
 
     def __init__(self, tiles: Tiles[VoxelTable], belief: Belief, num_classes: int) -> None:
         self._tiles, self._belief, self._K = tiles, belief, num_classes
@@ -108,7 +108,7 @@ class FusedLabels:
         points = back_project(everywhere).T
         found, fused = np.full(len(points), UNSEEN), np.full(frame.shape, UNSEEN)
         own = (
-            observe(frame.every(pixel_stride), self._tiles.voxel_size, self._K) if self._belief.leave_own_out else None
+            observe(frame.every(pixel_stride), self._tiles.voxel_size, self._K) if self._belief.leave_one_out else None
         )
         for place, pixels in self._tiles.holding(points):
             found[pixels] = self._labels(self._lookups[place], points[pixels], own)
@@ -116,7 +116,7 @@ class FusedLabels:
         return fused
 
     def _labels(self, lookup: VoxelLookup, points: Float64, own: Observations | None) -> Int64:
-        """(n,) what points see of a tile."""
+        """Return the classes (n,) of points in a tile."""
         found = lookup.rows(points)
         met = found != NONE
         rows, inverse = np.unique(found[met], return_inverse=True)
@@ -129,7 +129,7 @@ class FusedLabels:
 
 
 def _without(own: Observations, lookup: VoxelLookup, seen: VoxelTable, rows: Int64) -> VoxelTable:
-    """The voxels of a tile that a frame sees, those rows of it, without the frame's own vote."""
+    """Return the voxels of a tile that a frame sees, `rows` of it, without the frame's own vote."""
     centers = np.add(own.index, 0.5, dtype=np.float64) * seen.voxel_size
     found = lookup.rows(centers)
     here = found != NONE
@@ -142,19 +142,19 @@ def _without(own: Observations, lookup: VoxelLookup, seen: VoxelTable, rows: Int
 
 
 def labels_of(fused: Int64, ids: Sequence[int]) -> UInt8 | UInt16:
-    """The label map of fused rows: the ids of the classes, or the ignore id of its type."""
+    """Return the label map of fused rows: the ids of the classes, or the ignore id."""
     at = np.where(fused < 0, len(ids), fused)
     if max(ids) < IGNORE_8BIT:
         return np.array([*ids, IGNORE_8BIT], np.uint8)[at]
     return np.array([*ids, IGNORE_16BIT], np.uint16)[at]
 
 
-# What relabelling did: pixels confirmed, changed and dropped, and whether it helped where there is ground truth.
+# The effect of relabelling: pixels confirmed, changed and dropped, and accuracy where there is ground truth.
 
 
 @dataclass(frozen=True)
 class Accuracy:
-    """Of pixels with ground truth: how many, the share that is right, and the mean intersection over union."""
+    """The accuracy and mean IoU of a number of pixels with ground truth."""
 
     pixels: int
     accuracy: float
@@ -162,7 +162,7 @@ class Accuracy:
 
     @classmethod
     def of(cls, confusion: Int64) -> Accuracy:
-        """From (K, K) pixels by true and given class; a class counts for the mean where either has it."""
+        """Make it from pixels (K, K) by true and given class; a class counts for the mean where either has it."""
         right, n = confusion.diagonal(), int(confusion.sum())
         union = confusion.sum(axis=0) + confusion.sum(axis=1) - right
         there = union > 0
@@ -186,11 +186,11 @@ class Correctness:
 
 @dataclass(frozen=True)
 class Relabelled:
-    """What became of the pixels of a label source; its maps are in `folder`.
+    """Numbers of pixels of a relabelled source, whose maps are in `folder`.
 
     confirmed  have the class that they had      changed   have another one
     filled     had none                          unseen    had one, and have no depth or no voxel
-    unstable   had one, and their voxel is not believed
+    unstable   had one, and their voxel fails the criteria
     """
 
     scene: str
@@ -204,11 +204,11 @@ class Relabelled:
     filled: int
     unseen: int
     unstable: int
-    leave_own_out: bool = False
+    leave_one_out: bool = False
     correctness: Correctness | None = None
 
     def lines(self) -> Iterator[str]:
-        """What to tell."""
+        """Yield the report, a line each."""
         yield f"{self.scene}, {self.name}: {self.frames} frames in {self.folder}"
         counts = [
             (self.confirmed, "confirmed"),
@@ -218,7 +218,7 @@ class Relabelled:
             (self.unstable, "dropped as unstable"),
         ]
         yield f"  of {self.pixels:,} pixels " + ", ".join(f"{n / self.pixels:.1%} {what}" for n, what in counts)
-        if not self.leave_own_out:
+        if not self.leave_one_out:
             yield "  the stability of these maps says nothing: a voxel has one class in all of them"
         if self.correctness is not None:
             c = self.correctness
@@ -231,7 +231,7 @@ class Relabelled:
 
 
 class Tally:
-    """Pixels, counted frame by frame."""
+    """Counts of pixels, frame by frame."""
 
     def __init__(self, K: int) -> None:
         self._K = K
@@ -239,10 +239,10 @@ class Tally:
         self._confusion = {name: np.zeros((K, K), np.int64) for name in ("all_before", "before", "after", "all_after")}
 
     def add(self, own: Frame, fused: Int64, truth: Frame | None) -> None:
-        """A frame as it was, its fused rows (H, W), and its ground truth in the same classes."""
+        """Count a frame as it was, its fused rows (H, W), and its ground truth in the same classes."""
         before = np.where(own.predicted == own.ignore_id, UNSEEN, own.predicted.astype(np.int64))
         had, has = before >= 0, fused >= 0
-        found = {
+        masks = {
             "pixels": np.ones(fused.shape, np.bool_),
             "confirmed": had & has & (before == fused),
             "changed": had & has & (before != fused),
@@ -250,25 +250,26 @@ class Tally:
             "unseen": had & (fused == UNSEEN),
             "unstable": had & (fused == UNSTABLE),
         }
-        for name, where in found.items():
-            self.counts[name] += int(np.count_nonzero(where))
-        if truth is not None and truth.shape == fused.shape:
-            right = truth.predicted.astype(np.int64)
-            known = truth.predicted != truth.ignore_id
-            self._count("all_before", right, before, known & had)
-            self._count("before", right, before, known & had & has)
-            self._count("after", right, fused, known & had & has)
-            self._count("all_after", right, fused, known & has)
+        for name, mask in masks.items():
+            self.counts[name] += int(np.count_nonzero(mask))
+        if truth is None or truth.shape != fused.shape:
+            return
+        true, known = truth.predicted.astype(np.int64), truth.predicted != truth.ignore_id
+        compared = {
+            "all_before": (before, known & had),
+            "before": (before, known & had & has),
+            "after": (fused, known & had & has),
+            "all_after": (fused, known & has),
+        }
+        for name, (given, mask) in compared.items():
+            pairs = true[mask] * self._K + given[mask]
+            self._confusion[name] += np.bincount(pairs, minlength=self._K**2).reshape(self._K, self._K)
 
     def correctness(self) -> Correctness | None:
-        """None where no pixel had ground truth."""
+        """Return the accuracies, None where no pixel had ground truth."""
         if not self._confusion["all_before"].any():
             return None
         return Correctness(**{name: Accuracy.of(confusion) for name, confusion in self._confusion.items()})
-
-    def _count(self, name: str, right: Int64, given: Int64, where: Mask) -> None:
-        pairs = right[where] * self._K + given[where]
-        self._confusion[name] += np.bincount(pairs, minlength=self._K**2).reshape(self._K, self._K)
 
 
 __all__ = ["Belief", "Relabelled", "relabel"]
@@ -289,11 +290,11 @@ def relabel(
     overwrite: bool = False,
     progress: Progress = lambda what, done, total: None,
 ) -> Relabelled:
-    """Look up the fused class of every pixel of every frame of a unit, and write the maps to OUT/labels/NAME.
+    """Write the fused class of every pixel of every frame of a unit to OUT/labels/NAME.
 
     scene, backbone, backend  which unit; may be left out where there is one, and for the base backend
-    name  of the new source, BACKBONE-fused where not given; its classes stand beside its maps
-    belief  which voxels count; the pixels of others are ignored, as are those without depth
+    name  of the new source, BACKBONE-fused where not given; its classes are in its folder
+    belief  the criteria of a voxel; other pixels are ignored, as are those without depth
 
     Raises ConfigError, and DataError where the data is no longer what was fused, or its label maps cannot have the
     depth's pixels.
@@ -312,38 +313,36 @@ def relabel(
     tally, truth = Tally(len(space)), truth_task(task)
     fused = FusedLabels(Tiles.open(record.voxels_file, VoxelTable), chosen, len(space))
 
-    def work(index: int) -> _Work:
+    def read_and_fuse(index: int) -> tuple[Frame, Int64, Frame | None]:
         frame = read(task, index)
-        return _Work(frame, fused.of(frame, pixel_stride), None if truth is None else _known(truth, index))
+        known = None
+        if truth is not None:
+            with contextlib.suppress(DataError):  # a frame without ground truth
+                known = read(truth, index)
+        return frame, fused.of(frame, pixel_stride), known
 
-    for done, fetched in enumerate(prefetch(work, task.indices), start=1):
-        each = fetched.item
-        maps = labels_of(each.fused, space.ids)
-        if done == 1:
-            _require_same_pixels(task, each.frame.index, maps)
-        folder.write(task.scene.image_name(each.frame.index), record.key, maps, 0.0)
-        tally.add(each.frame, each.fused, each.truth)
+    for done, fetched in enumerate(prefetch(read_and_fuse, task.indices), start=1):
+        frame, rows, known = fetched.item
+        maps = labels_of(rows, space.ids)
+        if done == 1 and not np.array_equal(task.scene.predicted(frame.index, labels=maps).predicted, maps):
+            raise DataError(
+                f"{task.scene.name}: its label maps have the pixels of the image, not those of the depth; convert it"
+                " (semstab-bench convert), and run and relabel the posed folder"
+            )
+        folder.write(task.scene.image_name(frame.index), record.key, maps, 0.0)
+        tally.add(frame, rows, known)
         progress(f"{task.scene.name} · {name}", done, len(task.indices))
     folder.save()
     report = Relabelled(
         task.scene.name, task.backbone, name, str(folder.path), len(task.indices), **tally.counts,
-        leave_own_out=chosen.leave_own_out, correctness=tally.correctness(),
+        leave_one_out=chosen.leave_one_out, correctness=tally.correctness(),
     )  # fmt: skip
     write_json(folder.path / REPORT, {**dataclasses.asdict(report), "belief": chosen.settings()})
     return report
 
 
-@dataclass(frozen=True, eq=False)
-class _Work:
-    """A frame as it was fused, its fused rows (H, W), and its ground truth."""
-
-    frame: Frame
-    fused: Int64
-    truth: Frame | None
-
-
 def _task(run: Path, record: Record, fused: Mapping[str, str]) -> tuple[Task, int]:
-    """The unit as it was fused, from inputs of these digests, and its pixel stride.
+    """Return the unit as it was fused, from inputs of these digests, and its pixel stride.
 
     Raises DataError where its data has changed since.
     """
@@ -353,20 +352,3 @@ def _task(run: Path, record: Record, fused: Mapping[str, str]) -> tuple[Task, in
     if task is None or task.digest != fused.get(f"{scene}/{backbone}"):
         raise DataError(f"{run}: the data of {scene}, {backbone} is not what was fused; run it again")
     return task, plan.config.pixel_stride
-
-
-def _known(truth: Task, index: int) -> Frame | None:
-    """A frame with its ground truth, where it has any."""
-    try:
-        return read(truth, index)
-    except DataError:
-        return None
-
-
-def _require_same_pixels(task: Task, index: int, maps: Labels) -> None:
-    """Raise DataError where a label map of the depth's pixels would be read as one of the image's."""
-    if not np.array_equal(task.scene.predicted(index, labels=maps).predicted, maps):
-        raise DataError(
-            f"{task.scene.name}: its label maps have the pixels of the image, not those of the depth; convert it"
-            " (semstab-bench convert), and run and relabel the posed folder"
-        )

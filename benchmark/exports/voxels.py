@@ -1,4 +1,4 @@
-"""The voxels of a finished unit that are to leave it: which of them, what is said of each, where they lie on Earth."""
+"""The voxels of a finished unit for export: their selection, columns and coordinates; Parquet and CSV."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
-from functools import cached_property, partial
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -44,7 +44,7 @@ INDEX = ("ix", "iy", "iz")
 
 @dataclass(frozen=True, eq=False)
 class Column:
-    """A number of each voxel (n,), its unit, and what it is in a few words."""
+    """A number of each voxel (n,), its unit, and a short description."""
 
     values: npt.NDArray[Any]
     unit: str = ""
@@ -56,7 +56,7 @@ class Voxels:
     """The voxels of a map that are exported, in the order of its table.
 
     table        their rows
-    columns      what is said of each, by name
+    columns      numbers of each, by name
     classes      K names
     colors       (K, 3) RGB
     taxonomy     whose classes they are
@@ -79,7 +79,7 @@ class Voxels:
 
     @property
     def offset(self) -> Float64:
-        """(3,) what leads from the scene's coordinates to those of the file."""
+        """(3,) the file's coordinates less the scene's."""
         return np.zeros(3) if self.georeference is None else np.array(self.georeference.offset)
 
     @property
@@ -89,11 +89,11 @@ class Voxels:
 
 
 class Chosen:
-    """The voxels of a unit that are to leave it, by the tile that holds them; the last few tiles are at hand.
+    """The voxels of a unit that are exported, tile by tile; the latest tiles stay in memory.
 
     Those with OP >= min_op and one of these dominant classes, all where none is named; with thresholds (commit), of
     those the ones whose label has enough evidence. `columns` names measures, op, category, psa, columns of the unit's
-    Parquet file, or of one `beside` it, which has some of the same voxels; where not given, see `usual`.
+    Parquet file, or of a file to `join`, which has some of the same voxels; where not given, see `usual`.
     Raises ConfigError for a name that is not there, and where no voxel is left.
 
     size  edge of a tile in voxels, None for the one tile of a map in a single file
@@ -107,13 +107,14 @@ class Chosen:
         columns: Sequence[str] | None = None,
         min_op: int = 1,
         classes: Sequence[str] = (),
-        beside: Path | None = None,
+        join: Path | None = None,
         commit: Commit | None = None,
     ) -> None:
         if record.voxels_file is None:
             raise ConfigError(f"{record.unit.slug}: its voxels were not kept; run it with a folder")
-        self._record, self._limits = record, (min_op, classes, commit)
-        self._load = partial(_chosen, result, record, columns, min_op, classes, commit, beside)
+        self._result, self._record = result, record
+        self._columns, self._join = columns, join
+        self._min_op, self._classes, self._commit = min_op, classes, commit
         tiles = {file: parquet.tile_of(file) if record.in_tiles else None for file in files_of(record.voxels_file)}
         self._files = {(0, 0) if tile is None else (tile.x, tile.y): file for file, tile in tiles.items()}
         self.size = next(None if tile is None else tile.size for tile in tiles.values())
@@ -124,37 +125,61 @@ class Chosen:
         return place in self._files
 
     def __getitem__(self, place: Place) -> Voxels:
-        """Those of a tile, which may be none."""
+        """Return the voxels of a tile, which may be none."""
         return self._at_hand[place]
 
     def __iter__(self) -> Iterator[Voxels]:
-        """Tile by tile, but for those without any."""
+        """Yield the voxels tile by tile, without empty tiles."""
         return (self[place] for place in self.places())
 
     def places(self) -> Iterator[Place]:
-        """The tiles that have some."""
+        """Yield the tiles that have voxels. Raises ConfigError where none has."""
         left = False
         for place in self._files:
             if len(self[place].table):
                 left = True
                 yield place
         if not left:
-            raise _none_left(self._record, *self._limits, self._highest)
+            limits = f"OP >= {self._min_op}" + (f" and class {' or '.join(self._classes)}" if self._classes else "")
+            limits += " and the evidence that --commit asks for" if self._commit is not None else ""
+            raise ConfigError(f"{self._record.voxels_file}: no voxel with {limits}; OP goes up to {self._highest}")
 
     @cached_property
     def first(self) -> Voxels:
-        """Some of them, for what all have in common."""
+        """The voxels of one tile, for the properties that all share."""
         return next(iter(self))
 
     def _read(self, place: Place) -> Voxels:
-        file = self._files[place]
+        """Read a tile and choose its voxels."""
+        file, record = self._files[place], self._record
+        assert record.voxels_file is not None
         table = VoxelTable.load(file)
         self._highest = max(self._highest, int(table.op.max(initial=0)))
-        return self._load(table, file)
+        names = table.classes or tuple(str(k) for k in range(table.K))
+        keep = table.op >= self._min_op
+        if self._classes:
+            keep &= np.isin(dominant(table), rows_named(self._classes, names, str(record.voxels_file)))
+        if self._commit is not None:
+            keep &= self._commit.decide(table) >= 0
+        further = {} if self._join is None else joined_columns(table, self._join)
+        columns = {
+            name: further.get(name) or _column(name, table, file) for name in self._columns or (*usual(), *further)
+        }
+        scene, backbone = record.unit.scene, record.unit.backbone
+        georeference = self._result.georeference.get(scene)
+        return Voxels(
+            rows_of(table, keep),
+            {name: replace(column, values=column.values[keep]) for name, column in columns.items()},
+            names,
+            _colors(record.voxels_file.parents[1] / OVERVIEW / f"{slug(scene, backbone)}.npz", table.K),
+            record.summary.taxonomy,
+            self._result.up.get(scene) if georeference is None else (0.0, 0.0, 1.0),
+            georeference,
+        )
 
 
 def together(parts: Sequence[Voxels]) -> Voxels:
-    """Voxels of several tiles as those of one."""
+    """Return the voxels of several tiles as one."""
     if len(parts) == 1:
         return parts[0]
     order = np.lexsort(np.concatenate([part.table.index for part in parts]).T[::-1])
@@ -165,51 +190,8 @@ def together(parts: Sequence[Voxels]) -> Voxels:
     return replace(parts[0], table=VoxelTable.joined([part.table for part in parts]), columns=columns)
 
 
-def _none_left(record: Record, min_op: int, classes: Sequence[str], commit: Commit | None, highest: int) -> ConfigError:
-    limits = f"OP >= {min_op}" + (f" and class {' or '.join(classes)}" if classes else "")
-    limits += " and the evidence that --commit asks for" if commit is not None else ""
-    return ConfigError(f"{record.voxels_file}: no voxel with {limits}; OP goes up to {highest}")
-
-
-def _chosen(
-    result: Result,
-    record: Record,
-    columns: Sequence[str] | None,
-    min_op: int,
-    classes: Sequence[str],
-    commit: Commit | None,
-    beside: Path | None,
-    table: VoxelTable,
-    file: Path,
-) -> Voxels:
-    """Of a table, which is in a file."""
-    assert record.voxels_file is not None
-    names = table.classes or tuple(str(k) for k in range(table.K))
-    keep = table.op >= min_op
-    if classes:
-        keep &= np.isin(dominant(table), rows_named(classes, names, str(record.voxels_file)))
-    if commit is not None:
-        keep &= commit.decide(table) >= 0
-    further = {} if beside is None else columns_beside(table, beside)
-    chosen = {
-        name: further[name] if name in further else _column(name, table, file)
-        for name in columns or (*usual(), *further)
-    }
-    scene, backbone = record.unit.scene, record.unit.backbone
-    georeference = result.georeference.get(scene)
-    return Voxels(
-        rows_of(table, keep),
-        {name: Column(column.values[keep], column.unit, column.about) for name, column in chosen.items()},
-        names,
-        _colors(record.voxels_file.parents[1] / OVERVIEW / f"{slug(scene, backbone)}.npz", table.K),
-        record.summary.taxonomy,
-        result.up.get(scene) if georeference is None else (0.0, 0.0, 1.0),
-        georeference,
-    )
-
-
-def columns_beside(table: VoxelTable, file: Path) -> dict[str, Column]:
-    """The columns of a file with rows of these voxels, as `compare` writes it; 0, or NaN, where it has no row.
+def joined_columns(table: VoxelTable, file: Path) -> dict[str, Column]:
+    """Return the columns of a file with rows of these voxels, as `compare` writes it; 0, or NaN, without a row.
 
     Raises DataError where it is no such file, or has voxels of another size.
     """
@@ -233,14 +215,14 @@ def columns_beside(table: VoxelTable, file: Path) -> dict[str, Column]:
 
 
 def crs_name(georeference: Georeference) -> str:
-    """What a reference system is called, with its number where there is one: 'WGS 84 / UTM zone 15N (EPSG:32615)'."""
+    """Return the name of a reference system, with its number where it has one: 'WGS 84 / UTM zone 15N (EPSG:32615)'."""
     name = re.search(r'"([^"]*)"', georeference.crs)
     number = re.search(r'ID\["EPSG",\s*(\d+)\]\s*\]\s*$', georeference.crs)
     return f"{name[1] if name else 'a projection'}{f' (EPSG:{number[1]})' if number else ''}"
 
 
 def usual() -> tuple[str, ...]:
-    """The columns that go along where none is chosen: the measures, OP, category."""
+    """Return the columns where none is chosen: the measures, OP, category."""
     return (*(measure.key for measure in measures()), "op", "category")
 
 
@@ -254,7 +236,7 @@ def rows_named(wanted: Sequence[str], names: Sequence[str], where: str) -> list[
 
 
 def _column(name: str, table: VoxelTable, file: Path) -> Column:
-    """A number of each voxel by its name."""
+    """Return a column by its name: a measure, or one that the run wrote into its Parquet file."""
     known = {measure.key: measure for measure in measures()}
     if name in known:
         return Column(known[name].of(table), known[name].unit, known[name].title)
@@ -264,20 +246,15 @@ def _column(name: str, table: VoxelTable, file: Path) -> Column:
         return Column(categories(table), "", "0 low 1 drift 2 uncert 3 stable")
     if name == "psa":
         return Column(psa(table), "", "pairwise semantic agreement")
-    return _kept_column(name, file, known)
-
-
-def _kept_column(name: str, file: Path, known: Iterable[str]) -> Column:
-    """A column that the run wrote beside those that every map has."""
-    kept = parquet.names_in(file)
-    if name not in kept:
-        there = sorted({*known, "op", "category", "psa", *kept} - {"ix", "iy", "iz", "label"})
+    in_file = parquet.names_in(file)
+    if name not in in_file:
+        there = sorted({*known, "op", "category", "psa", *in_file} - {*INDEX, "label"})
         raise ConfigError(f"{file}: the run has no column '{name}'; {nearest(name, there)}")
     return Column(VoxelTable.columns(file, [name])[name])
 
 
 def _colors(overview: Path, K: int) -> UInt8:
-    """Of the classes, as the run's figures show them; of the palette where it kept none."""
+    """Return the colours of the classes in the run's figures, or the palette where it has no overview."""
     try:
         palette = Overview.load(overview).palette
     except DataError:
@@ -303,30 +280,26 @@ def write_csv(parts: Iterable[Voxels], path: Path) -> int:
 
 
 def _written(parts: Iterable[Voxels], path: Path, opened: Callable[[Path, pa.Schema], Any]) -> int:
-    """How many voxels went into the file that a writer of Arrow opens."""
+    """Write parts with a writer of Arrow; return the number of voxels."""
     voxels, writer = 0, None
     with atomic_path(path) as temporary, ExitStack() as open_files:
         for part in parts:
-            table = arrow(part).replace_schema_metadata(_about(part))
+            about = {
+                "voxel_size": part.table.voxel_size,
+                "crs": None if part.georeference is None else part.georeference.crs,
+                "taxonomy": part.taxonomy,
+                "classes": list(part.classes),
+                "units": {name: column.unit for name, column in part.columns.items() if column.unit},
+            }
+            table = arrow(part).replace_schema_metadata({"semstab": json.dumps(about)})
             writer = writer or open_files.enter_context(opened(temporary, table.schema))
             writer.write_table(table)
             voxels += len(part.table)
     return voxels
 
 
-def _about(voxels: Voxels) -> dict[str, str]:
-    about = {
-        "voxel_size": voxels.table.voxel_size,
-        "crs": None if voxels.georeference is None else voxels.georeference.crs,
-        "taxonomy": voxels.taxonomy,
-        "classes": list(voxels.classes),
-        "units": {name: column.unit for name, column in voxels.columns.items() if column.unit},
-    }
-    return {"semstab": json.dumps(about)}
-
-
 def arrow(voxels: Voxels) -> pa.Table:
-    """x, y, z in metres, class and category by their names, and the other columns."""
+    """Return x, y, z in metres, class and category by their names, and the other columns."""
     import pyarrow as pa
 
     x, y, z = voxels.points.T

@@ -23,7 +23,7 @@ from semstab.datasets.files.surfaces import Surface, open_las
 from semstab.datasets.formats.disk import natural
 from semstab.engine.tiles import TileResult
 from semstab.errors import ConfigError, DataError, one_line
-from semstab.exports.ply import Header
+from semstab.exports.clouds import Header
 from semstab.model.georeference import wkt
 from semstab.model.voxels import VoxelTable
 from semstab.report.figures.maps import Overview
