@@ -45,9 +45,9 @@ def main() -> None:
     for name in base:
         alone = every - needed(set(base) - {name})
         rows.append((sum(map(megabytes, alone)), megabytes(name), len(alone), name))
-    print(f"{sum(map(megabytes, every)):.0f} MB in {len(every)} packages\n   own  saved  packages")  # noqa: T201
+    print(f"{sum(map(megabytes, every)):.0f} MB in {len(every)} packages\n   own  saved  packages")
     for saved, own, packages, name in sorted(rows, reverse=True):
-        print(f"{own:6.1f} {saved:6.1f} {packages:9}  {name}")  # noqa: T201
+        print(f"{own:6.1f} {saved:6.1f} {packages:9}  {name}")
 
 
 if __name__ == "__main__":
