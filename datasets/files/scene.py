@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import hashlib
 import json
 from collections.abc import Iterator, Mapping, Sequence
@@ -13,7 +12,6 @@ from typing import Any
 import numpy as np
 
 from semstab.core.prefetch import prefetch
-from semstab.core.rows import Memory, Scratch, room_for
 from semstab.core.types import Float32, Float64, Mask, UInt8, UInt16
 from semstab.datasets.files.depth import CastDepth, DepthSource, StoredDepth, shape_of
 from semstab.datasets.files.frame_source import FrameSource, FrameTable
@@ -36,25 +34,21 @@ BYTES = 32
 
 
 class Digests:
-    """32 bytes for each file of a frame, of a long sequence in a file; several threads may keep them."""
+    """32 bytes for each file of a frame; several threads may set them."""
 
     def __init__(self, frames: int) -> None:
         self._frames = frames
-        self._kept: dict[str, Memory | Scratch] = {}
+        self._bytes: dict[str, UInt8] = {}
 
     def keep(self, index: int, what: str, digest: bytes) -> None:
-        """That of what file of a frame it is; not where the disk is full: the frame's file is read again then."""
-        if what not in self._kept:
-            self._kept.setdefault(what, room_for(BYTES * self._frames))
-        with contextlib.suppress(OSError):
-            self._kept[what].write(np.frombuffer(digest, np.uint8), BYTES * index)
+        """Set the digest of a frame's file of that kind."""
+        digests = self._bytes.setdefault(what, np.zeros((self._frames, BYTES), np.uint8))
+        digests[index] = np.frombuffer(digest, np.uint8)
 
     def of(self, index: int, what: str) -> bytes | None:
-        """That of a frame's file; None where it was not read."""
-        if what not in self._kept:
-            return None
-        digest = self._kept[what].read(np.uint8, BYTES, BYTES * index).tobytes()
-        return digest if any(digest) else None
+        """Return the digest of a frame's file; None where it was not read."""
+        digests = self._bytes.get(what)
+        return None if digests is None or not digests[index].any() else digests[index].tobytes()
 
 
 PLACES = {
