@@ -37,11 +37,13 @@ faults: setup-dev
 	$(BIN)/python tests/faults/kills.py 100
 	$(BIN)/python tests/faults/disk.py 12
 
+BUDGETS := --report
 lint: setup-dev
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 	$(BIN)/lint-imports
+	$(BIN)/python scripts/budgets.py $(BUDGETS)
 
 format: setup-dev
 	$(BIN)/ruff check --fix .
