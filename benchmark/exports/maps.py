@@ -257,7 +257,7 @@ def write_mesh(chosen: Chosen, path: Path) -> int:
         "voxel_size": some.table.voxel_size,
         "classes": list(some.classes),
     }
-    scene = trimesh.Scene(metadata=extras)
+    scene: Any = trimesh.Scene(metadata=extras)
     voxels, size, to_gltf = 0, 0, some.table.voxel_size * _to_gltf(some.up).T
     for place in corners:
         part = chosen[place]
