@@ -13,7 +13,7 @@ from model_folders import tiny
 from pictures import blobs
 
 from semstab.backbones import create
-from semstab.backbones.sam_proposals import SamOptions, SamProposer
+from semstab.backbones.sam import SamOptions, SamProposer
 from semstab.errors import ConfigError, DataError
 
 WIDE = [blobs(shift=k) for k in range(2)]
@@ -205,8 +205,8 @@ def test_later_kinds_of_sam_propose(kind):
 
 
 def test_a_sam_of_another_kind(tmp_path, monkeypatch):
-    from semstab.backbones import sam_proposals
+    from semstab.backbones import sam
 
-    monkeypatch.setattr(sam_proposals, "KINDS", {})
+    monkeypatch.setattr(sam, "KINDS", {})
     with pytest.raises(DataError, match="a 'sam' model; name one of sam, sam_hq, sam2"):
         SamProposer(SamOptions(model=str(tiny("sam"))))
