@@ -27,8 +27,10 @@ class Flight:
     frames   of the flight
     looks    frames that see a place, on average; all of them where it is as many as frames
     quality  of frames: 'alike', 'bad' (one in ten is much worse), 'uneven' (each its own), 'lasting' (AR(1) with 0.8),
-             'view' (the farther from the middle of the frame, the worse), 'direction' (each place is hard from a
-             direction of its own, which neighbours have in common)
+             'regimes' (good and bad stretches of 8 frames on average), 'heavy' (Student's t with 2 degrees of freedom),
+             'objects' (a square of 5 voxels errs as a whole, for 3 frames on average), 'view' (the farther from the
+             middle of the frame, the worse), 'direction' (each location is hard from a direction of its own, which
+             neighbours have in common)
     city     whether the floor is one of boxes with walls, in three dimensions
     coin     whether labels are drawn at random instead
     K        classes
@@ -67,6 +69,10 @@ def qualities(flight: Flight, rng: np.random.Generator) -> np.ndarray:
         for t in range(1, flight.frames):
             steps[t] = 0.8 * steps[t - 1] + 0.6 * steps[t]
         return 0.5 * steps
+    if flight.quality == "regimes":
+        return np.where(np.cumsum(rng.random(flight.frames) < 1 / 8) % 2 == rng.integers(2), 1.0, 0.0)
+    if flight.quality == "heavy":
+        return 0.35 * rng.standard_t(2, flight.frames)
     return np.zeros(flight.frames)
 
 
@@ -129,11 +135,22 @@ def fly(flight: Flight, over: World, rng: np.random.Generator, ease: float | Non
         harder = harder + 3 * np.abs(off) - 0.7
     if flight.quality == "direction":
         harder = harder + np.cos(2 * np.pi * off - over.turned[voxel])
-    wrong = rng.random(len(voxel)) < (0.5 if flight.coin else 0.6 * norm.cdf(harder / ROUGH))
+    chance = 0.5 if flight.coin else 0.6 * norm.cdf(harder / ROUGH)
+    wrong = (_by_object(over, F, rng)[voxel, frame] if flight.quality == "objects" else rng.random(len(voxel))) < chance
     other = 1 if flight.K == 2 else 1 + rng.integers(flight.K - 1, size=len(voxel))
     labels = np.full((n, F), -1)
     labels[voxel, frame] = np.where(wrong, (over.truth[voxel] + other) % flight.K, over.truth[voxel])
     return labels
+
+
+def _by_object(over: World, frames: int, rng: np.random.Generator) -> np.ndarray:
+    """Uniform numbers (n, F) that are one for a square of 5 x 5 voxels, and stay so for 3 frames on average."""
+    _, of = np.unique(over.index[:, :2] // 5, axis=0, return_inverse=True)
+    drawn = rng.random((of.max() + 1, frames))
+    for t in range(1, frames):
+        stays = rng.random(len(drawn)) < 2 / 3
+        drawn[stays, t] = drawn[stays, t - 1]
+    return drawn[of.ravel()]
 
 
 def log_of(labels: np.ndarray, over: World, flight: Flight, voxel_size: float = 0.125) -> Events:

@@ -71,15 +71,21 @@ class Interval(Estimate):
 UNKNOWN = Interval(math.nan, math.nan, math.nan)
 
 Level = Literal[
-    "stable", "partly stable", "usable", "unstable", "undecided", "too coarse", "misleading", "no verdict",
+    "stable", "usable", "unstable", "undecided", "too coarse", "misleading", "no verdict",
 ]  # fmt: skip
 
 
 @dataclass(frozen=True)
 class StabilityVerdict:
-    """What the evidence says of a backbone on a scene: a level, see ADVICE, and the line that gives the reason."""
+    """A backbone on a scene.
+
+    level        see ADVICE
+    probability  that the level is right, for the same scene flown again; NaN where it follows from no threshold
+    line         the reasons
+    """
 
     level: Level
+    probability: float
     line: str
 
 
@@ -139,8 +145,9 @@ class FrameAgreement:
 class ClassCeilingShare:
     """`CeilingShare` of one class against all others.
 
-    locations           the evidence for it in the whole map's voxels with OP >= 2, in voxels
-    counts_for_verdict  whether the verdict depends on it
+    locations           voxels with OP >= 2 of which it is the dominant class
+    counts_for_verdict  whether it has enough of them to be judged
+    unstable            the probability that its share of the ceiling is below 2/3; NaN where that is not known
     """
 
     name: str
@@ -149,6 +156,7 @@ class ClassCeilingShare:
     alpha: float
     ceiling: float
     share: Interval
+    unstable: float
 
 
 @dataclass(frozen=True)
@@ -204,10 +212,10 @@ class CeilingShare:
     classes: tuple[ClassCeilingShare, ...]
 
     @property
-    def worst(self) -> ClassCeilingShare | None:
-        """The class that matters whose frames agree least; one of which nothing is known first."""
-        matter = [row for row in self.classes if row.counts_for_verdict]
-        return min(matter, key=lambda row: (not math.isnan(row.share.value), row.share.value), default=None)
+    def judged_classes(self) -> tuple[ClassCeilingShare, ...]:
+        """The classes that count, those most probably unstable first."""
+        known = [row for row in self.classes if row.counts_for_verdict and not math.isnan(row.unstable)]
+        return tuple(sorted(known, key=lambda row: (-row.unstable, row.share.value)))
 
 
 @dataclass(frozen=True)

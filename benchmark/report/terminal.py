@@ -19,7 +19,7 @@ from semstab.metrics import macro_mean
 from semstab.model.measures import measures
 from semstab.model.records import Failure, Record, Result, UnitContent
 from semstab.model.results import Agreement, UnitSummary
-from semstab.model.statistics import Estimate
+from semstab.model.statistics import Estimate, StabilityVerdict
 from semstab.report.narrative import warnings
 from semstab.report.remedies import advice, remedies
 from semstab.report.tables import tables
@@ -116,7 +116,7 @@ def _verdict(run: UnitSummary) -> Iterator[str]:
     share = ""
     if found.ceiling_share is not None and not math.isnan(found.ceiling_share.share.value):
         share = f", {_percent(found.ceiling_share.share.value)} of its ceiling {found.ceiling_share.ceiling.value:.2f}"
-    yield f"  {level}    alpha {alpha.value:.2f}{_interval(alpha)}{share}"
+    yield f"  {level}{_probability(found.verdict)}    alpha {alpha.value:.2f}{_interval(alpha)}{share}"
     yield f"  act on labels from {_percent(RELIABLE)} of the ceiling on, with care from {_percent(TENTATIVE)}"
     psa = found.headline.psa.value
     yield f"  two frames see the same class at {_percent(psa)} of the locations"
@@ -124,6 +124,10 @@ def _verdict(run: UnitSummary) -> Iterator[str]:
     if not math.isnan(wrong.value):
         yield f"  {_percent(wrong.value)}{_interval(wrong, 100)} of the stable locations are wrong"
     yield ""
+
+
+def _probability(verdict: StabilityVerdict) -> str:
+    return "" if math.isnan(verdict.probability) else f" {_percent(verdict.probability)}"
 
 
 def _flicker(record: Record) -> Iterator[str]:
@@ -159,7 +163,7 @@ def _metres(size: float) -> str:
 
 COLUMNS = ("model", "verdict", "alpha (95 % CI)", "agree", "flicker", "VSS", "SBD", "mIoU")
 UNITS = ("", "", "", "%", "%", "OP>=3", "bits", "%")
-WIDTHS = (13, -14, -19, 6, 8, 6, 7, 5)
+WIDTHS = (13, -14, -18, 7, 8, 6, 7, 5)
 """Of the columns of several models; text stands left, below 0."""
 
 
@@ -193,7 +197,8 @@ def _cells(record: Record) -> list[str]:
     run, found = record.summary, record.summary.statistics
     level, alpha, agree = "-", "", math.nan
     if found is not None:
-        level, agree, between = found.verdict.level, 100 * found.headline.psa.value, found.headline.alpha_between
+        level = f"{found.verdict.level}{_probability(found.verdict)}"
+        agree, between = 100 * found.headline.psa.value, found.headline.alpha_between
         ends = "" if math.isnan(between.low) else f" ({_short(between.low)} to {_short(between.high)})"
         alpha = f"{_number(between.value, 2)}{ends}"
     vss, sbd = (run.table.recurrent[m] for m in measures()[:2])

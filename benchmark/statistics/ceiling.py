@@ -26,11 +26,12 @@ from semstab.model.voxels import VoxelTable
 from semstab.statistics.accumulate import Cubes, CubeSums, cluster_sums_of
 from semstab.statistics.agreement import psa, ratio_of
 from semstab.statistics.cluster_sums import ClusterSums, value
-from semstab.statistics.intervals import EstimateSpec, confidence_intervals, question_of, spec_of
+from semstab.statistics.intervals import EstimateSpec, confidence_intervals, probability_above, question_of, spec_of
 from semstab.statistics.observations import ObservationSample
+from semstab.statistics.verdict import TENTATIVE
 
 SUPPORT = 100.0
-"""Places from which on a class matters to the verdict, where no critical classes are named."""
+"""Voxels of its own from which on a class is judged, where no critical classes are named."""
 
 
 def ceiling_share(
@@ -48,10 +49,14 @@ def ceiling_share(
     critical  names of the classes that matter; where none is given, those with `least` places or more
     """
     sums = cluster_sums_of(table, sample=sample.shared()) if sums is None else sums
-    repeated = table.op >= 2
-    places = (table.evidence[repeated] / table.op[repeated, None]).sum(axis=0)
+    places = locations_by_class(table)
     found = confidence_intervals(ceiling_specs(sums, table.K))
     return ceiling_share_from(sample.by, places, sums, found, critical=critical, least=least)
+
+
+def locations_by_class(table: VoxelTable) -> Float64:
+    """Return (K,) voxels with OP >= 2 by their dominant class."""
+    return np.bincount(dominant(table)[table.op >= 2], minlength=table.K).astype(np.float64)
 
 
 def ceiling_specs(sums: ClusterSums, K: int) -> Iterator[EstimateSpec]:
@@ -98,6 +103,7 @@ def ceiling_share_from(
                 value(sums.seen, "alpha_between", k),
                 value(sums.limit, "alpha_between", k),
                 of_classes[k],
+                1 - probability_above(of_classes[k], TENTATIVE, "plain"),
             )
             for k, name in enumerate(names)
         ),

@@ -34,7 +34,7 @@ from semstab.model.statistics import (
 from semstab.model.voxels import VoxelTable
 from semstab.statistics.accumulate import Cubes, CubeSums, cluster_sums_of
 from semstab.statistics.agreement import class_agreement_of, class_sums, ratio_of
-from semstab.statistics.ceiling import ceiling_share_from, ceiling_specs, losses
+from semstab.statistics.ceiling import ceiling_share_from, ceiling_specs, locations_by_class, losses
 from semstab.statistics.cluster_sums import ClusterSums
 from semstab.statistics.correctness import (
     Predictions,
@@ -193,7 +193,7 @@ def analyse(
     means, whole = dict(zip(MEANS, found, strict=True)), sample.summary.summary(table.voxel_size, table.classes, edges)
     reach = None
     if observations is not None:
-        reach = ceiling_share_from(observations.by, of_places["kappa"][2:], influence, reached, critical=critical)
+        reach = ceiling_share_from(observations.by, locations_by_class(table), influence, reached, critical=critical)
     headline, count = HeadlineStatistics(*judged), len(places.cell)
     repeats = whole.means.voxels[SBD.key]
     repeated = Repeated(repeats, repeats / whole.voxels if whole.voxels else math.nan)

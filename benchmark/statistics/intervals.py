@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import itertools
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -26,33 +25,25 @@ from semstab.statistics.cluster_sums import (
     sums_for,
     value,
 )
-from semstab.statistics.variance import TINY, Influences, TwoWay, apart, influences, two_way
+from semstab.statistics.variance import (
+    TINY,
+    Influences,
+    Spread,
+    influences,
+    spread_of,
+    spread_of_flights,
+    spread_of_frames,
+)
 
 LEVEL = 0.95
 """Of intervals, where no other is asked for."""
 
-LEAST_FRAMES = 30
-"""Of fewer frames nothing is said about the next flight: a kind of bad frame, one in ten, is missed by one flight of 20
-frames in eight, by one of 30 in 24."""
+LEAST_FRAMES = 8
+"""From fewer frames nothing is claimed about a flight."""
 
-LASTING = 6.0
-"""For each degree of freedom of a number of the next flight so many frames are asked for, whatever they look like: that
-quality lasts so long, or that there is a kind of bad frame which did not occur, does not show in a short flight."""
+TOO_FEW = "too few frames to tell how frames differ: take {least} or more"
 
-LEAST_DEGREES = 3.0
-"""Where it is more likely than not that fewer places err independently of each other, nothing is said: errors reach as
-far as the scene. Where fewer frames do, nothing of the next flight: their quality lasts as long as this one."""
-
-LEAST_OF_PLACES = 1.0
-"""The same with fewer degrees of freedom, the doubt about reaches in them."""
-
-AS_FAR = "errors reach as far as the scene: fly more of it"
-AS_LONG = "the quality of frames lasts about as long as the flight: fly longer"
-TOO_FEW = "too few frames to tell of the next flight: fly {least} or more"
-TOGETHER = 64
-"""Numbers that are worked on together: of thousands of classes not all influences are there at once."""
-
-NO_PLACES = "nothing was seen twice in two places: fly with more overlap"
+NO_PLACES = "no two locations were seen twice: more overlap between frames is needed"
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,29 +64,17 @@ class EstimateSpec:
         return self.question if told else THIS_MAP
 
 
-def confidence_intervals(asked: Iterable[EstimateSpec]) -> list[Interval]:
-    """Numbers with their intervals; those of one map together, as most of the work is the same for all of them."""
-    found: list[Interval] = []
-    asked = iter(asked)
-    while some := list(itertools.islice(asked, TOGETHER)):
-        known = [own.grid for own in some if own.grid is not None]
-        spread = iter(two_way(known, [own.answered for own in some if own.grid is not None]))
-        found += [_nowhere(own.value) if own.grid is None else _answer(own, own.grid, next(spread)) for own in some]
-    return found
+def confidence_intervals(specs: Iterable[EstimateSpec]) -> list[Interval]:
+    """Return the numbers with their confidence intervals."""
+    return [
+        Interval(spec.value, math.nan, math.nan, undecided=NO_PLACES) if spec.grid is None else _answer(spec, spec.grid)
+        for spec in specs
+    ]
 
 
 def grouped_intervals(*groups: Iterable[EstimateSpec]) -> list[list[Interval]]:
-    """The same for groups of numbers of one map."""
-    counts = [0] * len(groups)
-
-    def all_of_them() -> Iterator[EstimateSpec]:
-        for k, group in enumerate(groups):
-            for own in group:
-                counts[k] += 1
-                yield own
-
-    found = iter(confidence_intervals(all_of_them()))
-    return [list(itertools.islice(found, count)) for count in counts]
+    """Return the confidence intervals of groups of numbers."""
+    return [confidence_intervals(group) for group in groups]
 
 
 def estimate(
@@ -141,17 +120,17 @@ def difference(
         return no_difference(estimate(a, key, k, question, level))
     one, other = grid_of(a, key, k), grid_of(b, key, k)
     if one is None or other is None:
-        return _nowhere(found)
+        return Interval(found, math.nan, math.nan, undecided=NO_PLACES)
     question = question if a.step else THIS_MAP
     paired = np.array_equal(np.unique(a.frame), np.unique(b.frame)) if same_frames is None else same_frames
     between = one.minus(other)
-    spread = two_way([between], [question])[0] if paired else apart(one, other, question)
+    spread = spread_of(between, question) if paired else spread_of_flights(one, other, between, question)
     half = spread.half(level)
     low, high = found - half, found + half
-    if spread.total <= TINY:
+    if spread.variance <= TINY:
         ends = confidence_intervals(spec_of(sums, key, k, question, level) for sums in (a, b))
         low, high = ends[0].low - ends[1].high, ends[0].high - ends[1].low
-    return dataclasses.replace(_interval(found, low, high, between, spread, question), p_value=_p_value(found, spread))
+    return dataclasses.replace(_interval(found, low, high, between, spread, question), p_value=spread.p_value(found))
 
 
 def identical(a: ClusterSums, b: ClusterSums, key: str, k: int | None = None) -> bool:
@@ -222,7 +201,7 @@ def spec_of_observations(
 
 
 def question_of(sums: ClusterSums) -> Question:
-    """What verdicts on a map answer: for the next flight, if there are enough frames to tell."""
+    """Return what verdicts on a map are about: the same scene flown again, if frames tell of that."""
     return NEXT_FLIGHT if sums.frames * sums.step >= LEAST_FRAMES else THIS_MAP
 
 
@@ -232,21 +211,16 @@ def headline_specs(sums: ClusterSums) -> Iterator[EstimateSpec]:
     return (spec_of(sums, field.name, question=question) for field in dataclasses.fields(HeadlineStatistics))
 
 
-def _nowhere(found: float) -> Interval:
-    return Interval(found, math.nan, math.nan, undecided=NO_PLACES)
-
-
-def _answer(asked: EstimateSpec, grid: Influences, spread: TwoWay) -> Interval:
-    found, question, level = asked.value, asked.answered, asked.level
-    if question == NEXT_FLIGHT:  # with no more degrees of freedom than a quality that lasts may leave
-        spread = dataclasses.replace(spread, most=max(len(grid.frames) * grid.step / LASTING, LEAST_DEGREES))
-    if math.isnan(found) or not spread.degrees > 0:
+def _answer(spec: EstimateSpec, grid: Influences) -> Interval:
+    found, question, level = spec.value, spec.answered, spec.level
+    spread = spread_of(grid, question)
+    if math.isnan(found):
         low, high = math.nan, math.nan
-    elif asked.scale == "share":
-        low, high = _share_ends(found, spread, grid.units(question), level)
+    elif spec.scale == "share":
+        low, high = _share_ends(found, spread, len(grid.places), level)
     else:
-        low, high = _ends(found, spread, grid.unseen(question, level), asked.scale, level)
-    return _interval(found, max(low, asked.bounds[0]), min(high, asked.bounds[1]), grid, spread, question)
+        low, high = _ends(found, spread, grid.unseen(level), spec.scale, level)
+    return _interval(found, max(low, spec.bounds[0]), min(high, spec.bounds[1]), grid, spread, question)
 
 
 def grid_of(sums: ClusterSums, key: str, k: int | None = None) -> Influences | None:
@@ -259,27 +233,45 @@ def grid_of(sums: ClusterSums, key: str, k: int | None = None) -> Influences | N
     return influences(rows.where, columns, number.of, halves)
 
 
+def probability_above(found: Interval, threshold: float, scale: Scale) -> float:
+    """Return how probable a number is above a threshold, from its interval at 95 %; NaN where nothing is claimed."""
+    from scipy import special
+
+    low, high = found.low, found.high
+    if scale == "agreement":  # by the end that no bound cuts off, on the scale of log(1 - x)
+        value, error = -math.log(max(1 - found.value, TINY)), -math.log(max(1 - found.value, TINY))
+        error -= -math.log(max(1 - low, TINY))
+        above = -math.log(max(1 - threshold, TINY))
+    else:
+        value, error, above = found.value, max(found.value - low, high - found.value), threshold
+    if math.isnan(value) or math.isnan(error):
+        return math.nan
+    degrees = found.degrees if found.degrees > 0 else math.inf
+    error /= float(special.stdtrit(degrees, (1 + LEVEL) / 2))
+    return float(special.stdtr(degrees, (value - above) / error)) if error > TINY else float(value >= above)
+
+
 # --- Ends -------------------------------------------------------------------------------------------------------------
 
 
-def _share_ends(p: float, spread: TwoWay, units: int, level: float) -> tuple[float, float]:
+def _share_ends(p: float, spread: Spread, units: int, level: float) -> tuple[float, float]:
     """Of a share, or of a mean of numbers from 0 to 1, by the looks that it is worth (Korn and Graubard 1998)."""
     from scipy import special
 
     p = min(max(p, 0.0), 1.0)
     looks: float = units
-    if spread.total > TINY and 0 < p < 1:
+    if spread.variance > TINY and 0 < p < 1:
         quantile = special.stdtrit([max(units - 1, 1), spread.degrees], (1 + level) / 2)
-        looks = p * (1 - p) / spread.total * (quantile[0] / quantile[1]) ** 2
+        looks = p * (1 - p) / spread.variance * (quantile[0] / quantile[1]) ** 2
     tail, hits = (1 - level) / 2, looks * p
     low = special.betaincinv(hits, looks - hits + 1, tail) if hits > 0 else 0.0
     high = special.betaincinv(hits + 1, looks - hits, 1 - tail) if hits < looks else 1.0
     return float(low), float(high)
 
 
-def _ends(found: float, spread: TwoWay, unseen: float, scale: Scale, level: float) -> tuple[float, float]:
+def _ends(found: float, spread: Spread, unseen: float, scale: Scale, level: float) -> tuple[float, float]:
     """By Student's t, for agreement on the scale log(1 - found), so that no end passes 1; or what may be unseen."""
-    if spread.total <= TINY:
+    if spread.variance <= TINY:
         return found - unseen, found if scale == "agreement" else found + unseen
     half = spread.half(level)
     if scale == "plain" or 1 - found <= TINY:
@@ -288,25 +280,9 @@ def _ends(found: float, spread: TwoWay, unseen: float, scale: Scale, level: floa
     return 1 - (1 - found) * math.exp(ratio), 1 - (1 - found) * math.exp(-ratio)
 
 
-def _p_value(found: float, spread: TwoWay) -> float:
-    """That a number of that spread is 0, two-sided, by Student's t."""
-    from scipy import special
-
-    if spread.total <= TINY:
-        return math.nan
-    return float(2 * special.stdtr(spread.degrees, -abs(found) / math.sqrt(spread.total)))
-
-
-def _interval(found: float, low: float, high: float, grid: Influences, spread: TwoWay, question: Question) -> Interval:
+def _interval(found: float, low: float, high: float, grid: Influences, spread: Spread, question: Question) -> Interval:
     frames = len(grid.frames) * grid.step
-    places = spread.places
-    few = places.with_fewer(LEAST_DEGREES) > 0.5 or not places.degrees >= LEAST_OF_PLACES
-    far = spread.total > TINY and few
-    reasons = [AS_FAR] if far else []
-    if question == NEXT_FLIGHT and frames < LEAST_FRAMES:
-        reasons.append(TOO_FEW.format(least=LEAST_FRAMES))
-    elif not far and spread.frames.with_more_alike(len(grid.frames) / LEAST_DEGREES) > 0.5:
-        reasons.append(AS_LONG)
+    few = question != THIS_MAP and frames < LEAST_FRAMES
     return Interval(
         found,
         low,
@@ -314,9 +290,8 @@ def _interval(found: float, low: float, high: float, grid: Influences, spread: T
         question=question,
         frames=frames,
         places=len(grid.places),
-        block_size=places.block * grid.edge,
         degrees=spread.degrees,
-        undecided="; ".join(reasons),
+        undecided=TOO_FEW.format(least=LEAST_FRAMES) if few else "",
     )
 
 
@@ -377,30 +352,22 @@ def standard_error(found: Interval, level: float = LEVEL) -> float:
 
 # Intervals of what has no sums by frame and cube: a series over frames, and how much of a map another one covers.
 
-LASTS = "what frames are like lasts as long as the flight: fly more"
-
 
 def mean_over_frames(frame: npt.NDArray[np.integer], values: Float64, level: float = LEVEL) -> Interval:
-    """The mean of values (F,), NaN where undefined, of frames (F,) by their index, for the next flight.
-
-    Frames that are near each other may be alike: how far that goes is found as for places, on a line.
-    """
+    """Return the mean of values (F,), NaN where undefined, of frames (F,) by their index, for another flight."""
     there = ~np.isnan(values)
     if there.sum() < 2:
         return UNKNOWN
     frame, values = np.asarray(frame)[there], values[there]
-    step = 1
-    while len(groups := np.unique(frame // step)) > MOST_GROUPS:
-        step *= 2
-    at = np.searchsorted(groups, frame // step)
-    columns = np.stack([np.bincount(at, weights=values), np.bincount(at)], axis=1).astype(np.float64)
-    cell = np.stack([groups, np.zeros_like(groups), np.zeros_like(groups)], axis=1)
-    found = interval_of_cubes(cell, step, columns, ratio_of, "plain", level=level)
-    reasons = [LASTS] if found.undecided else []
-    reasons += [TOO_FEW.format(least=LEAST_FRAMES)] if len(values) < LEAST_FRAMES else []
-    return dataclasses.replace(
-        found, question=NEXT_FLIGHT, frames=len(values), places=0, block_size=math.nan, undecided="; ".join(reasons)
-    )
+    groups = np.array_split(np.argsort(frame, kind="stable"), min(len(frame), MOST_GROUPS))
+    effect, size = np.array([values[own].mean() for own in groups]), np.array([len(own) for own in groups])
+    spread = spread_of_frames(effect, size / size.sum(), np.array([frame[own].mean() for own in groups]))
+    found, half = float(values.mean()), spread.half(level)
+    few = TOO_FEW.format(least=LEAST_FRAMES) if len(values) < LEAST_FRAMES else ""
+    return Interval(
+        found, found - half, found + half, NEXT_FLIGHT, len(values), degrees=spread.degrees, undecided=few,
+        p_value=spread.p_value(found),
+    )  # fmt: skip
 
 
 def difference_over_frames(a: Mapping[int, float], b: Mapping[int, float], level: float = LEVEL) -> Interval:

@@ -16,9 +16,8 @@ from semstab.model.events import Events
 from semstab.model.evidence import row_chunks
 from semstab.model.measures import mean, sbd
 from semstab.model.voxels import VoxelTable
-from semstab.statistics.correlation import cluster_grids
 from semstab.statistics.drift import VoxelDrift, streams, trend_columns, varying
-from semstab.statistics.variance import Residuals, longest_correlation
+from semstab.statistics.variance import longest_effect
 
 CERTAIN, MOST_SPANS = 0.95, 128
 """How certain it must be that errors last no longer, and by how many spans of time that is looked at."""
@@ -188,8 +187,7 @@ def _lasting(departures: Float64, frame: Int64, frames: int) -> float:
     starts = np.arange(0, frames, span)
     sums: Float64 = np.add.reduceat(series, starts)
     sizes: Float64 = np.add.reduceat(size, starts)
-    (cells,) = cluster_grids([np.arange(len(starts))[:, None]])
-    return span * longest_correlation(Residuals(cells, sums, sizes), CERTAIN)
+    return span * longest_effect(sums / sizes, sizes, np.arange(len(starts), dtype=np.float64), CERTAIN)
 
 
 def _total(values: Float64) -> float:

@@ -1,244 +1,148 @@
-"""The influences of places and frames on a number, and the variance that they make together."""
+"""The variance of a number over new frames and new locations, by a model of random effects.
+
+The influences x_gf of what frame f observed at location g on a number are a sum over n_gf observations of a location's
+effect, a frame's effect and noise:
+
+    x_gf = n_gf (l_g + q_f) + e_gf,    var e_gf = s^2 n_gf
+
+Effects of frames are alike by rho^d, d frames apart; those of locations by exp(-d / reach). The same scene flown again
+has the same l and new q and e; other scenes have all three anew. How large effects are and how far they reach is not
+decided: the variance is a mean over a grid of both, weighted by the restricted likelihood (Harville 1977, Journal of
+the American Statistical Association 72).
+"""
 
 from __future__ import annotations
 
-import functools
 import math
 from collections.abc import Sequence
-from contextlib import AbstractContextManager
 from dataclasses import dataclass
 
 import numpy as np
-from threadpoolctl import ThreadpoolController
 
 from semstab.core.types import Float64, Int64
-from semstab.model.statistics import THIS_MAP, Question
+from semstab.model.statistics import NEXT_FLIGHT, THIS_MAP, Question
 from semstab.statistics.cluster_sums import ClusterIndex, Statistic
-from semstab.statistics.correlation import GROWTH, REACHES, ClusterGrid, CorrelationModel, cluster_grids
 
-# The variance of a sum over places, or over frames, that err alike where they are near each other.
-#
-# How far errors reach is found by likelihood, and what is found is a weight of each reach, not one of them. Under each,
-# pairs within four times the reach count, by a kernel that is the mean of all shifted grids of blocks; and what the
-# kernel misses, where blocks are few or errors reach far, is put back.
+LASTING = (0.0, 0.5, 0.8, 0.9)
+"""Correlations rho of the effects of successive frames."""
 
-DOUBT = 4.0
-"""By how much the log likelihood must be better for a share of a cell's variance that it has for itself: a weak
-correlation that reaches far is seldom real, and leaves hardly anything to say."""
+REACHES = (0.0, 0.08, 0.2, 0.4)
+"""How far effects of locations reach, as a share of the scene's extent."""
 
-FAR = 0.5
-"""Of places, a reach counts with this power of its length besides: one that is found too short does more harm."""
+PRIOR = (8.0, 4.0, 2.0, 1.0)
+"""Weights of these before the data: an effect that lasts as long as the flight cannot be told from none."""
 
-UNLIKELY = 1e-3
-"""A reach of a smaller weight does not count."""
+SIZES = 25
+"""Variances of an effect that are tried, evenly spaced in their logarithm."""
+
+SMALLEST, UNLIKELY = 1e-4, 0.01
+"""The smallest of them, as a share of the variance that was seen; the largest would show so little with this
+probability."""
+
+MOST_LOCATIONS = 64
+"""Locations of a model at most: neighbouring cubes are taken together."""
+
+TINY = 1e-12
+"""A variance below is none."""
 
 ROUNDING = 1e-13
 """Influences below are rounding's."""
 
 
-@dataclass(frozen=True, eq=False)
-class Residuals:
-    """Influences (n,) of cells on a sum, which are centred, and how much is in each cell (n,)."""
-
-    cells: ClusterGrid
-    influence: Float64
-    size: Float64
-
-    @property
-    def told(self) -> bool:
-        """Whether there is anything to tell of."""
-        return len(self.cells) > 1 and bool(np.abs(self.influence).max() >= ROUNDING)
-
-
-@dataclass(frozen=True, eq=False)
-class Parts:
-    """The variance of a sum as it is under each of the reaches (m,): weights, degrees of freedom, blocks, in cells.
-
-    alike  how much larger than that of independent cells
-    """
-
-    weight: Float64
-    variance: Float64
-    degrees: Float64
-    block: Float64
-    alike: Float64
-
-    def times(self, factor: Float64) -> Parts:
-        """With variances so many times as large."""
-        return Parts(self.weight, self.variance * factor, self.degrees, self.block, self.alike)
-
-
-NONE = Parts(*(np.zeros(0) for _ in range(5)))
-
-
-@dataclass(frozen=True, eq=False)
-class VarianceEstimate:
-    """The variance of a sum, the degrees of freedom of that number, and the likeliest block, in cells.
-
-    parts  what it is the mean of
-    """
+@dataclass(frozen=True)
+class Spread:
+    """The variance of a number, and the degrees of freedom of the t distribution of its error."""
 
     variance: float
     degrees: float
-    block: float
-    parts: Parts = NONE
 
-    @classmethod
-    def mean(cls, parts: Parts) -> VarianceEstimate:
-        """The mean of the variances; degrees say how well its logarithm is known, with the doubt about the reach.
+    def half(self, level: float) -> float:
+        """Return half the width of the confidence interval; NaN where nothing is known."""
+        from scipy import special
 
-        The variance of the logarithm of an estimate of d degrees is about 2 / d; to it is added how far the logarithms
-        of the parts lie apart (as in a mean over models: Hoeting et al. 1999, Statistical Science 14).
+        if not self.degrees > 0:
+            return math.nan
+        return float(special.stdtrit(self.degrees, (1 + level) / 2)) * math.sqrt(self.variance)
+
+    def p_value(self, value: float) -> float:
+        """Return the two-sided p-value of a number that is 0 without an effect; NaN without a variance."""
+        from scipy import special
+
+        if not self.variance > TINY:
+            return math.nan
+        return float(2 * special.stdtr(self.degrees, -abs(value) / math.sqrt(self.variance)))
+
+
+EXACT, UNKNOWN_SPREAD = Spread(0.0, math.inf), Spread(math.nan, 0.0)
+
+
+@dataclass(frozen=True, eq=False)
+class Variances:
+    """Variances (m,) that are possible, and how likely each is (m,)."""
+
+    weight: Float64
+    variance: Float64
+
+    def plus(self, other: Variances) -> Variances:
+        """Return those of a sum of independent errors."""
+        weight = np.outer(self.weight, other.weight).ravel()
+        return Variances(weight, np.add.outer(self.variance, other.variance).ravel())
+
+    def spread(self) -> Spread:
+        """Return the t distribution that a mean over normal ones of these variances comes to.
+
+        Degrees follow from how well the logarithm of the variance is known: of d degrees its variance is about
+        2 / (d - 1), and its mean is log(d / 2) - psi(d / 2) above that of the t distribution's scale.
         """
-        if not len(parts.weight):
-            return cls(math.nan, 0.0, 1.0)
-        block = float(parts.block[parts.weight.argmax()])
-        found = float(parts.weight @ parts.variance)
-        if not found > 0:
-            return cls(0.0, math.inf, block, parts)
-        logs = np.log(np.maximum(parts.variance, 1e-3 * found))
-        doubt = 2 / parts.degrees + (logs - parts.weight @ logs) ** 2
-        return cls(found, 2 / float(parts.weight @ doubt), block, parts)
+        from scipy import special
 
-    def with_fewer(self, degrees: float) -> float:
-        """The weight of the parts that have fewer degrees of freedom."""
-        return float(self.parts.weight[self.parts.degrees < degrees].sum())
-
-    def with_more_alike(self, times: float) -> float:
-        """The weight of the parts whose variance is more than so many times that of independent cells."""
-        return float(self.parts.weight[self.parts.alike > times].sum())
+        logs = np.log(self.variance)
+        mean = float(self.weight @ logs)
+        doubt = float(self.weight @ (logs - mean) ** 2)
+        degrees = 2 / doubt + 1 if doubt > 0 else math.inf
+        shift = special.psi(degrees / 2) - math.log(degrees / 2) if degrees < 1e6 else 0.0
+        return Spread(math.exp(mean + float(shift)), degrees)
 
 
-def variance_estimates(errors: Sequence[Residuals], *, modelled: bool = False) -> list[VarianceEstimate]:
-    """Of the sums over cells of several errors.
+NOTHING = Variances(np.ones(1), np.zeros(1))
 
-    modelled  as the correlation has it, instead of by a kernel: where there are too few blocks for one
+
+def variances(
+    effect: Float64, weight: Float64, noise: Float64, distance: Float64, ranges: Sequence[float]
+) -> Variances:
+    """Return what the variance of sum(weight * effect) may be if the effects (n,) are drawn anew.
+
+    noise     (n, n) covariance of the errors of `effect`
+    distance  (n, n) between the effects, whose correlation is exp(-distance / range); range 0: independent
     """
-    found = [
-        VarianceEstimate(0.0, len(own.cells) - 1.0, 1.0) if len(own.cells) > 1 else VarianceEstimate.mean(NONE)
-        for own in errors
-    ]
-    for arrangement in {id(own.cells.of): own.cells.of for own in errors}.values():
-        some = [k for k, own in enumerate(errors) if own.told and own.cells.of is arrangement]
-        if some:
-            together = _Together(arrangement, [errors[k] for k in some])
-            parts = together.modelled() if modelled else together.by_kernel()
-            for k, own in zip(some, parts, strict=True):
-                found[k] = VarianceEstimate.mean(own)
-    return found
+    from scipy import special
 
+    n = len(effect)
+    if n < 2 or not effect.var() > 0:
+        return NOTHING
+    contrasts = np.linalg.svd(np.eye(n) - 1 / n)[0][:, : n - 1]
+    error = contrasts.T @ noise @ contrasts + 1e-9 * effect.var() * np.eye(n - 1)
+    whiten = np.linalg.inv(np.linalg.cholesky(error)) @ contrasts.T
+    seen, largest = whiten @ effect, (n - 1) / special.chdtri(n - 1, 1 - UNLIKELY)
+    sizes = effect.var() * n / (n - 1) * np.geomspace(SMALLEST, largest, SIZES)
+    logs, found = [], []
+    for reach, prior in zip(ranges, PRIOR, strict=True):
+        alike = np.exp(-distance / reach) if reach > 0 else np.eye(n)
+        own, vectors = np.linalg.eigh(whiten @ alike @ whiten.T)
+        total = 1 + np.outer(sizes, np.maximum(own, 0.0))
+        logs.append(math.log(prior) - 0.5 * (np.log(total) + (vectors.T @ seen) ** 2 / total).sum(axis=1))
+        found.append(sizes * (weight @ alike @ weight))
+    log = np.concatenate(logs)
+    likely = np.exp(log - log.max())
+    return Variances(likely / likely.sum(), np.concatenate(found))
 
-def longest_correlation(errors: Residuals, level: float) -> float:
-    """The reach, in cells, that errors exceed with no more than the weight 1 - level; 0 where they do not reach."""
-    if not errors.told:
-        return 0.0
-    arrangement = errors.cells.of
-    with one_thread():
-        weight, reach = _Together(arrangement, [errors]).weight[:, 0], arrangement.reach[arrangement.number]
-    some = np.flatnonzero(weight)  # alternatives are in the order of their reaches
-    at = int(np.searchsorted(np.cumsum(weight[some]), level))
-    return float(reach[some[min(at, len(some) - 1)]])
-
-
-class _Together:
-    """Errors (N,) of cells of one arrangement; matrices have zeros where cells are not theirs.
-
-    weight   (A, N) of each alternative
-    scatter  (A, N) the variance of a cell of size 1 under it
-    """
-
-    def __init__(self, arrangement: CorrelationModel, errors: Sequence[Residuals]) -> None:
-        self._of = arrangement
-        self._count = np.array([len(own.cells) for own in errors])
-        shape = len(errors), len(arrangement.at)
-        self._influence, self._size = np.zeros(shape), np.zeros(shape)
-        for k, own in enumerate(errors):
-            self._influence[k, : len(own.cells)] = own.influence[own.cells.order]
-            self._size[k, : len(own.cells)] = own.size[own.cells.order]
-        self._scale = self._size**GROWTH
-        self.weight, self.scatter = self._likely()
-
-    def _likely(self) -> tuple[Float64, Float64]:
-        """How likely each alternative is (REML)."""
-        of, there = self._of, self._size > 0
-        seen = np.divide(self._influence, self._scale, out=np.zeros_like(self._scale), where=there)
-        mean = np.divide(self._size, self._scale, out=np.zeros_like(self._scale), where=there)
-        white = of.whitened(np.concatenate([seen, mean])).reshape(len(of.number), 2, *there.shape) * there
-        a, b = white[:, 0], white[:, 1]
-        within = (b * b).sum(axis=2)
-        left = (a * a).sum(axis=2) - (a * b).sum(axis=2) ** 2 / within
-        reach = of.reach[of.number]
-        far = np.maximum([of.far(count) for count in self._count], REACHES[0])
-        some = (left > 0) & (reach[:, None] <= far)
-        log = of.logarithms(self._count) + np.log(within) + (self._count - 1) * np.log(np.where(some, left, 1.0))
-        before = np.where(of.alone > 0, -DOUBT, 0.0)
-        if of.at.shape[1] > 1:
-            before += FAR * np.log(np.maximum(reach, REACHES[0]))
-        likely = np.where(some, before[:, None] - 0.5 * log, -math.inf)
-        weight = np.exp(likely - np.maximum(likely.max(axis=0), -1e300))
-        weight[weight < UNLIKELY * weight.sum(axis=0)] = 0.0
-        return weight / np.maximum(weight.sum(axis=0), 1.0), left / (self._count - 1)
-
-    def by_kernel(self) -> list[Parts]:
-        """What the variances are under each reach that is not unlikely, by its kernel."""
-        block = self._of.blocks[self._of.number]
-        plain = np.zeros_like(self.weight)
-        for edge in set(block[self.weight.any(axis=1)].tolist()):
-            plain[block == edge] = ((self._influence @ self._of.kernel(edge)) * self._influence).sum(axis=1)
-        return [self._by_kernel(k, plain[:, k]) for k in range(len(self._count))]
-
-    def _by_kernel(self, k: int, plain: Float64) -> Parts:
-        of, some, size = self._of, np.flatnonzero((self.weight[:, k] > 0) & (plain > 0)), self._size[k]
-        total, expected, square = of.moments(of.number[some], size[: self._count[k]]).at(of.alone[some])
-        there = expected > 0
-        some, total, expected, square = some[there], total[there], expected[there], square[there]
-        weight, degrees = self.weight[some, k], np.minimum(expected**2 / square, carriers(self._influence[k]))
-        variance = plain[some] * total / expected
-        return Parts(weight / weight.sum(), variance, degrees, of.blocks[of.number[some]], np.ones(len(some)))
-
-    def modelled(self) -> list[Parts]:
-        """The same as the correlations have it."""
-        of, alone = self._of, (self._scale**2).sum(axis=1)
-        alike = ((of.correlations @ self._scale.T) * self._scale.T).sum(axis=1)[of.number]
-        share = of.alone[:, None]
-        total = (1 - share) * alike + share * alone
-        most = [min(count - 1.0, carriers(own)) for count, own in zip(self._count, self._influence, strict=True)]
-        parts = []
-        for k, degrees in enumerate(most):
-            some = np.flatnonzero(self.weight[:, k])
-            variance, block = self.scatter[some, k] * total[some, k], of.blocks[of.number[some]]
-            parts.append(
-                Parts(self.weight[some, k], variance, np.full(len(some), degrees), block, total[some, k] / alone[k])
-            )
-        return parts
-
-
-@functools.cache
-def _blas() -> ThreadpoolController:
-    return ThreadpoolController()
-
-
-def one_thread() -> AbstractContextManager[object]:
-    """Matrices are so small that a second thread only waits, the longer the busier the machine is."""
-    limited: AbstractContextManager[object] = _blas().limit(limits=1, user_api="blas")
-    return limited
-
-
-def carriers(influence: Float64) -> float:
-    """How many cells carry the variance, less one: all of them where influences are normal, 2 where one is all."""
-    fourth = float((influence**4).sum())
-    return 3 * float((influence**2).sum()) ** 2 / fourth - 1 if fourth > 0 else math.inf
-
-
-TINY = 1e-12
-"""A variance below is none."""
 
 # --- Influences -------------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, eq=False)
 class Influences:
-    """Influences of places and frames on a number.
+    """Influences of locations and frames on a number.
 
     places   (G, 3) cubes in which something counts, frames (F,) groups
     block    (G,) influence of each cube; they sum to 0
@@ -257,16 +161,12 @@ class Influences:
     step: int
     one_off: float
 
-    def units(self, question: Question) -> int:
-        """How many independent looks there can be."""
-        return len(self.places) if question == THIS_MAP else min(len(self.places), len(self.frames) * self.step)
-
-    def unseen(self, question: Question, level: float) -> float:
-        """What so many looks without a single error may have missed."""
-        return self.one_off * float(1 - ((1 - level) / 2) ** (1 / self.units(question)))
+    def unseen(self, level: float) -> float:
+        """Return what so many locations without a single error may have missed."""
+        return self.one_off * float(1 - ((1 - level) / 2) ** (1 / len(self.places)))
 
     def minus(self, other: Influences) -> Influences:
-        """The influences on the difference of two numbers."""
+        """Return the influences on the difference of two numbers."""
         places, rows = np.unique(np.concatenate([self.places, other.places]), axis=0, return_inverse=True)
         frames, columns = np.unique(np.concatenate([self.frames, other.frames]), return_inverse=True)
         block, everything = np.zeros(len(places)), np.zeros(len(places))
@@ -285,9 +185,10 @@ class Influences:
 def influences(
     where: ClusterIndex, columns: Float64, of: Statistic, halves: Float64 | None = None
 ) -> Influences | None:
-    """The influences of sums (m, C) by cube and group of frames.
+    """Return the influences of sums (m, C) by cube and group of frames; None where all is in one cube.
 
-    halves (m, 2): of places that two frames saw, what of the first two sums both are held for, instead of half each.
+    halves (m, 2): at locations that two frames saw, how much of the first two sums both are held for, instead of half
+    each.
     """
     total = columns.sum(axis=0)
     gradient = gradient_of(of, total)
@@ -312,93 +213,123 @@ def influences(
     )
 
 
-# --- Variance ---------------------------------------------------------------------------------------------------------
+# --- The model of a number --------------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True)
-class TwoWay:
-    """The variance that comes from places, and what frames add to it.
+@dataclass(frozen=True, eq=False)
+class Effects:
+    """What a number's influences come from: variances over new frames, over new locations, and of the noise."""
 
-    most  degrees of freedom that it has at most
-    """
+    frames: Variances
+    locations: Variances
+    noise: float
 
-    places: VarianceEstimate
-    frames: VarianceEstimate
-    most: float = math.inf
-
-    @property
-    def total(self) -> float:
-        """Of both."""
-        return self.places.variance + self.frames.variance
-
-    @property
-    def degrees(self) -> float:
-        """Of the sum (Satterthwaite 1946)."""
-        parts = (self.places, self.frames)
-        spread = sum(part.variance**2 / part.degrees for part in parts if part.variance > 0)
-        return min(max(self.total**2 / spread, 1.0) if spread else self.places.degrees, self.most)
-
-    def half(self, level: float) -> float:
-        """Half the width of the interval."""
-        from scipy import special
-
-        if not self.degrees > 0:
-            return math.nan
-        return float(special.stdtrit(self.degrees, (1 + level) / 2)) * math.sqrt(self.total)
-
-
-NO_FRAMES = VarianceEstimate(0.0, math.inf, 1.0)
-
-
-def two_way(grids: Sequence[Influences], questions: Sequence[Question]) -> list[TwoWay]:
-    """V_frame + V_block - V_cell (Cameron, Gelbach, Miller 2011): pairs that share a frame or a block count once."""
-    cells = cluster_grids([grid.places for grid in grids])
-    errors = [Residuals(at, grid.block, grid.all) for at, grid in zip(cells, grids, strict=True)]
-    with one_thread():
-        found = [TwoWay(own, NO_FRAMES) for own in variance_estimates(errors)]
-        of_flight = [k for k, grid in enumerate(grids) if questions[k] != THIS_MAP and len(grid.frames) > 1]
-        beyond = _beyond_places([(grids[k], cells[k], found[k].places) for k in of_flight])
-    for k, frames in zip(of_flight, beyond, strict=True):
-        found[k] = TwoWay(found[k].places, frames)
-    return found
+    @classmethod
+    def of(cls, grid: Influences) -> Effects:
+        """Fit the model to influences."""
+        cell, size = grid.cell, grid.size
+        by_location, by_frame = size.sum(axis=1), size.sum(axis=0)
+        some = by_location > 0
+        cell, size, by_location = cell[some], size[some], by_location[some]
+        if grid.step == 0 or len(by_frame) < 2 or len(by_location) < 2:
+            return cls(NOTHING, _of_locations(grid, 0.0), 0.0)
+        normal = np.diag(by_frame) - size.T @ (size / by_location[:, None])
+        right = cell.sum(axis=0) - size.T @ (cell.sum(axis=1) / by_location)
+        frame = np.linalg.pinv(normal, rcond=1e-9, hermitian=True) @ right
+        location = (cell.sum(axis=1) - size @ frame) / by_location
+        residual = cell - size * np.add.outer(location, frame)
+        cells = np.count_nonzero(size)
+        left = max(cells - len(location) - len(frame) + 1, 1)
+        unit = float((residual**2 / np.where(size > 0, size, 1.0)).sum()) / left
+        mean = by_location @ location / by_location.sum()
+        scatter = by_location @ (location - mean) ** 2 / by_location.sum() - unit * len(location) / by_location.sum()
+        shrink = unit / max(scatter, 1e-3 * unit / float(np.median(by_location)), TINY**2)
+        ridge = size / (by_location + shrink)[:, None]  # locations as random effects: what frames differ in is kept
+        normal = np.diag(by_frame * (1 + TINY)) - size.T @ ridge
+        frame = np.linalg.solve(normal, cell.sum(axis=0) - ridge.T @ cell.sum(axis=1))
+        return cls(
+            _of_frames(frame, by_frame, unit * np.linalg.inv(normal), grid.frames.astype(np.float64)),
+            _of_locations(grid, unit),
+            float((residual**2).sum()) * cells / left,
+        )
 
 
-def _beyond_places(grids: Sequence[tuple[Influences, ClusterGrid, VarianceEstimate]]) -> list[VarianceEstimate]:
-    """What frames add: the influences that one frame, and those near it, have in places far from each other."""
-    errors = []
-    for cells, (grid, _, _) in zip(cluster_grids([grid.frames[:, None] for grid, _, _ in grids]), grids, strict=True):
-        influence, size = grid.cell.sum(axis=0), grid.size.sum(axis=0)
-        influence = influence - size / size.sum() * influence.sum()  # of a sample they do not sum to 0
-        errors.append(Residuals(cells, influence, size))
-    found = variance_estimates(errors, modelled=True)
-    return [
-        _less_of_places(own, frames, grid, places, by_place) if frames.variance > 0 else NO_FRAMES
-        for own, frames, (grid, places, by_place) in zip(errors, found, grids, strict=True)
-    ]
+def _of_frames(effect: Float64, weight: Float64, noise: Float64, at: Float64) -> Variances:
+    """Return the variances over new frames; `at` (F,) is when they were taken, ascending."""
+    step = float(np.median(np.diff(at)))  # effects last for so many frames that were fused
+    ranges = [-step / math.log(rho) if rho > 0 else 0.0 for rho in LASTING]
+    return variances(effect, weight, noise, np.abs(np.subtract.outer(at, at)), ranges)
 
 
-def _less_of_places(
-    errors: Residuals, frames: VarianceEstimate, grid: Influences, places: ClusterGrid, by_place: VarianceEstimate
-) -> VarianceEstimate:
-    """The variance that comes from frames less what is within places that err alike."""
-    order, influence = errors.cells.order, errors.influence[errors.cells.order]
-    cell = grid.cell[np.ix_(places.order, order)]
-    together = cell.T @ places.kernel(by_place.parts.block, by_place.parts.weight) @ cell
-    blocks, of = np.unique(frames.parts.block, return_inverse=True)
-    kernels = [errors.cells.of.kernel(block)[: len(order), : len(order)] for block in blocks.tolist()]
-    plain = np.array([influence @ kernel @ influence for kernel in kernels])
-    inside = np.array([(kernel * together).sum() for kernel in kernels])
-    beyond = np.where(plain > 0, np.maximum(1 - inside / np.where(plain > 0, plain, 1.0), 0.0), 0.0)
-    return VarianceEstimate.mean(frames.parts.times(beyond[of]))
+def _of_locations(grid: Influences, unit: float) -> Variances:
+    """Return the variances over new locations, where the noise of an observation has that variance."""
+    of = _neighbours(grid.places.astype(np.float64), MOST_LOCATIONS)
+    weight, effect = np.bincount(of, weights=grid.all), np.bincount(of, weights=grid.block)
+    at = np.stack([np.bincount(of, weights=grid.all * axis) / weight for axis in grid.places.T], axis=1)
+    apart = np.linalg.norm(at[:, None] - at[None], axis=2)
+    centre = weight @ at / weight.sum()
+    extent = 2 * math.sqrt(float(weight @ ((at - centre) ** 2).sum(axis=1)) / float(weight.sum()))
+    return variances(effect / weight, weight, np.diag(unit / weight), apart, [own * extent for own in REACHES])
 
 
-def apart(one: Influences, other: Influences, question: Question) -> TwoWay:
-    """Of two flights over the same places: each adds the variance of its own frames."""
-    both, first, second = two_way([one.minus(other), one, other], [THIS_MAP, question, question])
+def _neighbours(points: Float64, most: int) -> Int64:
+    """Return (G,) to which of at most so many groups of neighbours points (G, 3) belong: halves of halves."""
+    groups = [np.arange(len(points))]
+    while 2 * len(groups) <= most and len(groups) < len(points):
+        halves = []
+        for group in groups:
+            along = int(np.ptp(points[group], axis=0).argmax())
+            order = group[np.argsort(points[group, along], kind="stable")]
+            halves += [half for half in np.array_split(order, 2) if len(half)]
+        groups = halves
+    of = np.empty(len(points), np.int64)
+    for number, group in enumerate(groups):
+        of[group] = number
+    return of
+
+
+def spread_of(grid: Influences, question: Question) -> Spread:
+    """Return the spread of a number: for these frames, this scene flown again, or other scenes."""
+    largest = float(np.abs(grid.block).max(initial=np.abs(grid.cell).max(initial=0.0)))
+    if largest < ROUNDING:
+        return EXACT
+    effects = Effects.of(grid)
+    noise = Variances(np.ones(1), np.array([effects.noise]))
     if question == THIS_MAP:
-        return both
-    joined = TwoWay(first.frames, second.frames)
-    return TwoWay(both.places, VarianceEstimate(joined.total, joined.degrees, first.frames.block))
+        parts = effects.locations.plus(noise)
+    elif question == NEXT_FLIGHT:
+        parts = effects.frames.plus(noise)
+    else:
+        parts = effects.frames.plus(effects.locations).plus(noise)
+    return parts.spread() if (parts.variance > 0).all() else EXACT
+
+
+def spread_of_flights(one: Influences, other: Influences, between: Influences, question: Question) -> Spread:
+    """Return the spread of the difference of two flights over the same locations, each with frames of its own."""
+    if question == THIS_MAP:
+        return spread_of(between, question)
+    effects = [Effects.of(one), Effects.of(other)]
+    noise = sum(own.noise for own in effects)
+    parts = effects[0].frames.plus(effects[1].frames).plus(Variances(np.ones(1), np.array([noise])))
+    if question != NEXT_FLIGHT:
+        parts = parts.plus(Effects.of(between).locations)
+    return parts.spread() if (parts.variance > 0).all() else EXACT
+
+
+def longest_effect(effect: Float64, weight: Float64, at: Float64, level: float) -> float:
+    """Return for how many frames effects (F,) of frames at times (F,) last at most, with that probability."""
+    likely = _of_frames(effect, weight, np.zeros((len(effect),) * 2), at).weight
+    if len(likely) < 2:
+        return 0.0
+    by_range = likely.reshape(len(LASTING), -1).sum(axis=1)
+    rho = LASTING[min(int(np.searchsorted(np.cumsum(by_range), level)), len(LASTING) - 1)]
+    return -float(np.median(np.diff(at))) / math.log(rho) if rho > 0 else 0.0
+
+
+def spread_of_frames(effect: Float64, weight: Float64, at: Float64) -> Spread:
+    """Return the spread of sum(weight * effect) of a series (F,) over frames taken at times (F,), ascending."""
+    parts = _of_frames(effect, weight, np.zeros((len(effect),) * 2), at)
+    return parts.spread() if (parts.variance > 0).all() else EXACT
 
 
 # --- Gradients --------------------------------------------------------------------------------------------------------

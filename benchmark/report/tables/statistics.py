@@ -75,7 +75,8 @@ def class_agreement(result: Result) -> list[Table]:
         Column("alpha_between", "found", 3, "higher", over="Alpha between frames"),
         Column("ceiling", "ceiling", 3, over="Alpha between frames"),
         Column("reached_percent", "reached (%)", 0, "higher", over="Alpha between frames"),
-        Column("matters", "Matters"),
+        Column("counts_for_verdict", "Judged"),
+        Column("unstable_percent", "Unstable (%)", 0, "lower"),
         *map(Column.of, (KAPPA, ALPHA)),
     )
     cells = [row[1:] for group in groups for row in group.rows]
@@ -85,8 +86,9 @@ def class_agreement(result: Result) -> list[Table]:
     )
     caption = (
         f"{SEEN_TWICE} Each class against all others; observations are the evidence for it, in frames, of all scenes."
-        " Alpha between frames, its ceiling, and the share of it that is reached: in sampled voxels. Matters: the"
-        f" verdict depends on it. Classes that no frame saw there are left out. Macro means: each scene counts once."
+        " Alpha between frames, its ceiling, and the share of it that is reached: in sampled voxels. Judged: it has"
+        " enough locations; unstable: the probability that its share of the ceiling is below 67 %. Classes that no"
+        " frame saw there are left out. Macro means: each scene counts once."
         f" {INTERVALS}"
     )
     title = "Agreement of the frames, by class"
@@ -168,9 +170,8 @@ def verdicts(result: Result) -> list[Table]:
     columns = (
         SCENE,
         Column("verdict", "Verdict"),
-        Column("reached_percent", "Reached (%)", 0, "higher"),
-        Column("worst_class", "Worst class"),
-        Column("worst_percent", "reached (%)", 0, "higher"),
+        Column("probability_percent", "Probability (%)", 0),
+        Column("reached_percent", "% of ceiling", 0, "higher"),
         Column("wrong_of_stable_percent", "Of the stable, wrong (%)", 0, "lower"),
         REPEATED,
         Column("repeated_percent", "of the map (%)", 0),
@@ -178,9 +179,10 @@ def verdicts(result: Result) -> list[Table]:
     )
     groups = tuple(Group(name, tuple(_verdict_row(*row) for row in rows)) for name, rows in judged.items())
     caption = (
-        f"{SEEN_TWICE} Reached: alpha between frames, in percent of its ceiling. Decided by the intervals: stable where"
-        " it is at least 80 and no class that matters below 67, usable from 67, unstable below;"
-        " misleading where more than 5% of the stable places are wrong, which only ground truth tells."
+        f"{SEEN_TWICE} % of ceiling: alpha between frames over its ceiling. The verdict is the most probable level for"
+        " the same scene flown again: stable where that is at least 80, usable from 67, unstable below; undecided where"
+        " no level has 60 %; misleading where more than 5% of the stable locations are wrong, which only ground truth"
+        " tells."
         f" {INTERVALS}"
     )
     return [Table("verdicts", "Verdicts", caption, columns, groups)]
@@ -281,6 +283,7 @@ def _class_rows(judged: Sequence[MapStatistics]) -> tuple[Row, ...]:
             macro_mean([row.ceiling for row in reached.get(name, [])]),
             _one_or_mean([row.share.percent for row in reached.get(name, [])]),
             "yes" if any(row.counts_for_verdict for row in reached.get(name, [])) else "",
+            macro_mean([100 * row.unstable for row in reached.get(name, [])]),
             macro_mean([row.kappa for row in rows]),
             macro_mean([row.alpha for row in rows]),
         )
@@ -295,13 +298,12 @@ def _one_or_mean(values: Sequence[Estimate]) -> float | Estimate:
 
 
 def _verdict_row(record: Record, found: MapStatistics) -> Row:
-    right, worst = found.correctness, None if found.ceiling_share is None else found.ceiling_share.worst
+    right = found.correctness
     return (
         record.unit.scene,
         found.verdict.level,
+        100 * found.verdict.probability,
         UNDEFINED if found.ceiling_share is None else found.ceiling_share.share.percent,
-        "" if worst is None else worst.name,
-        UNDEFINED if worst is None else worst.share.percent,
         UNDEFINED if right is None else right.quadrants.wrong_of_stable.percent,
         found.repeated.voxels,
         100 * found.repeated.share,
