@@ -20,10 +20,19 @@ from semstab.statistics import fusion_rules
 from semstab.statistics.accumulate import Cubes, CubeSums, Mean
 from semstab.statistics.agreement import alpha_of, between_of, decompose, disagreement, kappa_of, psa, ratio_of
 from semstab.statistics.correctness import Truth, rule_means_of, rule_sums
-from semstab.statistics.drift import TESTABLE, Flips, VoxelDrift, benjamini_hochberg, flips, rounded_up, trend_columns
+from semstab.statistics.drift import (
+    TESTABLE,
+    Flips,
+    OrderTest,
+    VoxelDrift,
+    benjamini_hochberg,
+    flips,
+    order_test,
+    rounded_up,
+    trend_columns,
+)
 from semstab.statistics.intervals import EstimateSpec
 from semstab.statistics.sample import MapSample
-from semstab.statistics.scene_drift import OrderTest, order_test
 
 Columns = dict[str, npt.NDArray[Any]]
 
