@@ -21,12 +21,13 @@ from semstab.statistics.cluster_sums import (
     Scale,
     Statistic,
     aligned,
+    distinct_rows,
     functional,
     parts_of,
     sums_for,
     value,
 )
-from semstab.statistics.variance import TINY, Influences, TwoWay, apart, influences, two_way
+from semstab.statistics.variance import TINY, Influences, TwoWay, influences, two_way, unpaired_variance
 
 LEVEL = 0.95
 """Of intervals, where no other is asked for."""
@@ -40,11 +41,11 @@ LASTING = 6.0
 quality lasts so long, or that there is a kind of bad frame which did not occur, does not show in a short flight."""
 
 LEAST_DEGREES = 3.0
-"""Where it is more likely than not that fewer places err independently of each other, nothing is said: errors reach as
-far as the scene. Where fewer frames do, nothing of the next flight: their quality lasts as long as this one."""
+"""Where it is more likely than not that fewer locations err independently of each other, nothing is claimed: errors
+reach as far as the scene. Where fewer frames do, nothing for a new flight: their quality lasts as long as this one."""
 
-LEAST_OF_PLACES = 1.0
-"""The same with fewer degrees of freedom, the doubt about reaches in them."""
+LEAST_OF_SPACE = 1.0
+"""The same with fewer degrees of freedom, the doubt about correlation lengths in them."""
 
 AS_FAR = "errors reach as far as the scene: fly more of it"
 AS_LONG = "the quality of frames lasts about as long as the flight: fly longer"
@@ -52,7 +53,7 @@ TOO_FEW = "too few frames to tell of the next flight: fly {least} or more"
 TOGETHER = 64
 """Numbers that are worked on together: of thousands of classes not all influences are there at once."""
 
-NO_PLACES = "nothing was seen twice in two places: fly with more overlap"
+ONE_CUBE = "nothing was seen twice in two places: fly with more overlap"
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,34 +69,36 @@ class EstimateSpec:
 
     @property
     def answered(self) -> Question:
-        """Of a single group of frames nothing is said about the next flight."""
-        told = self.grid is not None and self.grid.step and len(self.grid.frames) > 1
-        return self.question if told else THIS_MAP
+        """The question that is answered: a single group of frames tells nothing of a new flight."""
+        several = self.grid is not None and self.grid.step and len(self.grid.frames) > 1
+        return self.question if several else THIS_MAP
 
 
-def confidence_intervals(asked: Iterable[EstimateSpec]) -> list[Interval]:
-    """Numbers with their intervals; those of one map together, as most of the work is the same for all of them."""
-    found: list[Interval] = []
-    asked = iter(asked)
-    while some := list(itertools.islice(asked, TOGETHER)):
-        known = [own.grid for own in some if own.grid is not None]
-        spread = iter(two_way(known, [own.answered for own in some if own.grid is not None]))
-        found += [_nowhere(own.value) if own.grid is None else _answer(own, own.grid, next(spread)) for own in some]
-    return found
+def confidence_intervals(specs: Iterable[EstimateSpec]) -> list[Interval]:
+    """Return the intervals of numbers of one map; together, as most of the work is the same for all of them."""
+    intervals: list[Interval] = []
+    specs = iter(specs)
+    while some := list(itertools.islice(specs, TOGETHER)):
+        known = [(own.grid, own.answered) for own in some if own.grid is not None]
+        variances = iter(two_way([grid for grid, _ in known], [question for _, question in known]))
+        intervals += [
+            _undefined(own.value) if own.grid is None else _interval_of(own, own.grid, next(variances)) for own in some
+        ]
+    return intervals
 
 
 def grouped_intervals(*groups: Iterable[EstimateSpec]) -> list[list[Interval]]:
-    """The same for groups of numbers of one map."""
-    counts = [0] * len(groups)
+    """Return the intervals of groups of numbers of one map."""
+    group_of: list[int] = []
 
-    def all_of_them() -> Iterator[EstimateSpec]:
+    def specs() -> Iterator[EstimateSpec]:
         for k, group in enumerate(groups):
             for own in group:
-                counts[k] += 1
+                group_of.append(k)
                 yield own
 
-    found = iter(confidence_intervals(all_of_them()))
-    return [list(itertools.islice(found, count)) for count in counts]
+    intervals = confidence_intervals(specs())
+    return [[own for own, of in zip(intervals, group_of, strict=True) if of == k] for k in range(len(groups))]
 
 
 def estimate(
@@ -112,7 +115,7 @@ def estimate(
 def spec_of(
     sums: ClusterSums, key: str, k: int | None = None, question: Question = NEXT_FLIGHT, level: float = LEVEL
 ) -> EstimateSpec:
-    """For `answers`, see `estimate`."""
+    """Return what `confidence_intervals` takes, see `estimate`."""
     number = functional(key, k)
     bounds = number.low, number.high
     return EstimateSpec(value(sums, key, k), grid_of(sums, key, k), question, number.scale, bounds, level)
@@ -136,38 +139,39 @@ def difference(
     sums there is no difference anywhere: exactly 0, without a p-value.
     """
     a, b = aligned(a, b)
-    found = value(a, key, k) - value(b, key, k)
-    if identical(a, b, key, k) and not math.isnan(found):
+    change = value(a, key, k) - value(b, key, k)
+    if _identical(a, b, key, k) and not math.isnan(change):
         return no_difference(estimate(a, key, k, question, level))
     one, other = grid_of(a, key, k), grid_of(b, key, k)
     if one is None or other is None:
-        return _nowhere(found)
+        return _undefined(change)
     question = question if a.step else THIS_MAP
     paired = np.array_equal(np.unique(a.frame), np.unique(b.frame)) if same_frames is None else same_frames
     between = one.minus(other)
-    spread = two_way([between], [question])[0] if paired else apart(one, other, question)
+    spread = two_way([between], [question])[0] if paired else unpaired_variance(one, other, question)
     half = spread.half(level)
-    low, high = found - half, found + half
+    low, high = change - half, change + half
     if spread.total <= TINY:
         ends = confidence_intervals(spec_of(sums, key, k, question, level) for sums in (a, b))
         low, high = ends[0].low - ends[1].high, ends[0].high - ends[1].low
-    return dataclasses.replace(_interval(found, low, high, between, spread, question), p_value=_p_value(found, spread))
+    return dataclasses.replace(
+        _interval(change, low, high, between, spread, question), p_value=_p_value(change, spread)
+    )
 
 
-def identical(a: ClusterSums, b: ClusterSums, key: str, k: int | None = None) -> bool:
+def _identical(a: ClusterSums, b: ClusterSums, key: str, k: int | None = None) -> bool:
     """Whether a number is of the very same sums in two maps, so that it has no difference, anywhere."""
-    found = []
-    for part in aligned(a, b):
-        columns = sums_for(part, key, k)
-        rows = parts_of(part, functional(key, k))[:1]
-        where = columns.any(axis=1) & bool(rows)
-        found.append([columns[where], *(own[where] for each in rows for own in (each.cell, each.frame))])
-    return all(np.array_equal(one, other, equal_nan=True) for one, other in zip(*found, strict=True))
+    rows = []
+    for sums in (a, b):
+        columns, parts = sums_for(sums, key, k), parts_of(sums, functional(key, k))[:1]
+        there = columns.any(axis=1) & bool(parts)
+        rows.append([columns[there], *(own[there] for part in parts for own in (part.cell, part.frame))])
+    return all(np.array_equal(one, other, equal_nan=True) for one, other in zip(*rows, strict=True))
 
 
-def no_difference(found: Interval) -> Interval:
-    """A difference that there is nowhere, of places and frames as found."""
-    return dataclasses.replace(found, value=0.0, low=0.0, high=0.0, degrees=math.inf, undecided="", p_value=math.nan)
+def no_difference(like: Interval) -> Interval:
+    """Return a difference of exactly 0, of as many locations and frames as another interval."""
+    return dataclasses.replace(like, value=0.0, low=0.0, high=0.0, degrees=math.inf, undecided="", p_value=math.nan)
 
 
 def interval_of_cubes(
@@ -196,7 +200,7 @@ def spec_of_cubes(
     bounds: tuple[float, float] = (-math.inf, math.inf),
     level: float = LEVEL,
 ) -> EstimateSpec:
-    """For `answers`, see `of_places`."""
+    """Return what `confidence_intervals` takes, see `interval_of_cubes`."""
     grid = influences(where, columns, statistic)
     return EstimateSpec(float(statistic(columns.sum(axis=0))), grid, THIS_MAP, scale, bounds, level)
 
@@ -211,7 +215,7 @@ def spec_of_observations(
     statistic: Statistic,
     level: float = LEVEL,
 ) -> EstimateSpec:
-    """For `answers`: an agreement of sums (m, C) of cubes and groups of frames, see `influences`.
+    """Return the spec of an agreement of sums (m, C) of cubes and groups of frames, see `influences`.
 
     Its interval is for the next flight where frames tell of it, else for this map.
     """
@@ -227,26 +231,26 @@ def question_of(sums: ClusterSums) -> Question:
 
 
 def headline_specs(sums: ClusterSums) -> Iterator[EstimateSpec]:
-    """For `answers`: the numbers that a verdict on a map rests on, in the order of `HeadlineStatistics`."""
+    """Yield the numbers that a verdict on a map rests on, in the order of `HeadlineStatistics`."""
     question = question_of(sums)
     return (spec_of(sums, field.name, question=question) for field in dataclasses.fields(HeadlineStatistics))
 
 
-def _nowhere(found: float) -> Interval:
-    return Interval(found, math.nan, math.nan, undecided=NO_PLACES)
+def _undefined(value: float) -> Interval:
+    return Interval(value, math.nan, math.nan, undecided=ONE_CUBE)
 
 
-def _answer(asked: EstimateSpec, grid: Influences, spread: TwoWay) -> Interval:
-    found, question, level = asked.value, asked.answered, asked.level
+def _interval_of(spec: EstimateSpec, grid: Influences, spread: TwoWay) -> Interval:
+    value, question, level = spec.value, spec.answered, spec.level
     if question == NEXT_FLIGHT:  # with no more degrees of freedom than a quality that lasts may leave
         spread = dataclasses.replace(spread, most=max(len(grid.frames) * grid.step / LASTING, LEAST_DEGREES))
-    if math.isnan(found) or not spread.degrees > 0:
+    if math.isnan(value) or not spread.degrees > 0:
         low, high = math.nan, math.nan
-    elif asked.scale == "share":
-        low, high = _share_ends(found, spread, grid.units(question), level)
+    elif spec.scale == "share":
+        low, high = _share_ends(value, spread, grid.units(question), level)
     else:
-        low, high = _ends(found, spread, grid.unseen(question, level), asked.scale, level)
-    return _interval(found, max(low, asked.bounds[0]), min(high, asked.bounds[1]), grid, spread, question)
+        low, high = _ends(value, spread, grid.unseen(question, level), spec.scale, level)
+    return _interval(value, max(low, spec.bounds[0]), min(high, spec.bounds[1]), grid, spread, question)
 
 
 def grid_of(sums: ClusterSums, key: str, k: int | None = None) -> Influences | None:
@@ -256,7 +260,7 @@ def grid_of(sums: ClusterSums, key: str, k: int | None = None) -> Influences | N
         return None
     rows = parts_of(sums, number)[0]
     halves = rows.of(("twice_agreeing", "twice")) * (0.5 if key == "psa" else 1.0) if number.pairs else None
-    return influences(rows.where, columns, number.of, halves)
+    return influences(rows.index, columns, number.of, halves)
 
 
 # --- Ends -------------------------------------------------------------------------------------------------------------
@@ -299,22 +303,25 @@ def _p_value(found: float, spread: TwoWay) -> float:
 
 def _interval(found: float, low: float, high: float, grid: Influences, spread: TwoWay, question: Question) -> Interval:
     frames = len(grid.frames) * grid.step
-    places = spread.places
-    few = places.with_fewer(LEAST_DEGREES) > 0.5 or not places.degrees >= LEAST_OF_PLACES
+    space = spread.space
+    fewer = float(space.parts.weight[space.parts.degrees < LEAST_DEGREES].sum())
+    few = fewer > 0.5 or not space.degrees >= LEAST_OF_SPACE
     far = spread.total > TINY and few
     reasons = [AS_FAR] if far else []
     if question == NEXT_FLIGHT and frames < LEAST_FRAMES:
         reasons.append(TOO_FEW.format(least=LEAST_FRAMES))
-    elif not far and spread.frames.with_more_alike(len(grid.frames) / LEAST_DEGREES) > 0.5:
-        reasons.append(AS_LONG)
+    elif not far:
+        parts = spread.frames.parts
+        if parts.weight[parts.inflation > len(grid.frames) / LEAST_DEGREES].sum() > 0.5:
+            reasons.append(AS_LONG)
     return Interval(
         found,
         low,
         high,
         question=question,
         frames=frames,
-        places=len(grid.places),
-        block_size=places.block * grid.edge,
+        places=len(grid.cubes),
+        block_size=space.block * grid.edge,
         degrees=spread.degrees,
         undecided="; ".join(reasons),
     )
@@ -413,17 +420,17 @@ def difference_over_frames(a: Mapping[int, float], b: Mapping[int, float], level
 
 
 def coverage(new: ClusterSums, base: ClusterSums, level: float = LEVEL) -> Interval:
-    """How many voxels with OP >= 2 a map has for each one of another, less 1, paired on cubes, for this map."""
+    """Return how many voxels with OP >= 2 a map has for each one of another, less 1, paired on cubes, for this map."""
     edge = max(new.edge, base.edge)
     parts = [sums.coarsened(edge, 0) for sums in (new, base)]
-    cell, row = np.unique(np.concatenate([part.cell for part in parts]), axis=0, return_inverse=True)
-    of = np.split(row.ravel(), [len(parts[0].cell)])
+    cell, row = distinct_rows(np.concatenate([part.cell for part in parts]))
+    of = np.split(row, [len(parts[0].cell)])
     after, before = (
         np.bincount(at, weights=part["voxels"][:, 0], minlength=len(cell)) for at, part in zip(of, parts, strict=True)
     )
     columns = np.stack([after - before, after + before, before], axis=1)
-    found = interval_of_cubes(cell, edge, columns, lambda s: ratio_of(s[..., [0, 2]]), "plain", level=level)
-    return no_difference(found) if np.allclose(after, before, rtol=1e-9) else found
+    change = interval_of_cubes(cell, edge, columns, lambda s: ratio_of(s[..., [0, 2]]), "plain", level=level)
+    return no_difference(change) if np.allclose(after, before, rtol=1e-9) else change
 
 
 def same_flight(a: ClusterSums, b: ClusterSums) -> bool:

@@ -115,7 +115,9 @@ def place_sums(table: VoxelTable, columns: Columns, places: Cubes) -> CubeSums:
     observations, agreeing, own, own_of_one = (
         sums.pop(name)[:, :1] for name in ("observations", "agreeing", "own", "own of an observation")
     )
-    by_observation, by_voxel = places.sums_by_class(table)
+    weight = table.evidence.weight
+    each = np.repeat(T, np.diff(table.evidence.starts))
+    by_observation, by_voxel = places.sums_by_class(table.evidence, weight, weight / each)
     further = {
         **{name: [sums[name][:, :1], observations] for name in ("within", "between")},
         "coin": [sums.pop("of two"), sums.pop("of more")],
@@ -155,9 +157,9 @@ class FlippingSums:
         share = CubeSums(places.cell, places.edge, places.means({"": unsteady}))
         return cls(share, int(np.count_nonzero(table.op >= ENOUGH)), _together(table, unsteady))
 
-    def asked(self) -> Iterator[EstimateSpec]:
-        """For `answers`: the share of the places that are not stable."""
-        return self.share.asked({"": Mean("")})
+    def specs(self) -> Iterator[EstimateSpec]:
+        """Yield the share of the locations that are not stable, for `confidence_intervals`."""
+        return self.share.specs({"": Mean("")})
 
     def flipping(self, share: Interval, classes: Sequence[str] = ()) -> Flipping:
         """That share, as it was answered, and the two classes that stand together most often there."""
