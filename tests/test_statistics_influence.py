@@ -11,17 +11,10 @@ from semstab.metrics.agreement import rows_of
 from semstab.model.measures import dominant, entropy, sbd, vss
 from semstab.statistics.accumulate import cluster_sums_of
 from semstab.statistics.agreement import class_agreement, krippendorff_alpha, psa
-from semstab.statistics.cluster_sums import ClusterSums, aligned, merged_sums, value
+from semstab.statistics.cluster_sums import ClusterSums, aligned, value
 from semstab.statistics.correctness import correctness
 from semstab.statistics.drift import expected_sbd
-from semstab.statistics.intervals import (
-    coverage,
-    difference,
-    difference_over_frames,
-    identical,
-    mean_over_frames,
-    same_flight,
-)
+from semstab.statistics.intervals import coverage, difference, difference_over_frames, mean_over_frames, same_flight
 from semstab.statistics.stability import stability_posterior
 
 
@@ -70,16 +63,13 @@ def test_the_sums_give_every_number_back(soft_evidence):
     assert value(sums, "iou", 1) == pytest.approx((right & true_one).sum() / (true_one | said_one).sum())
 
 
-def test_parts_of_a_map_add_up_and_a_file_holds_them(tmp_path):
+def test_sums_become_coarser_and_a_file_holds_them(tmp_path):
     table, log, truth = flight(side=16)
     whole = cluster_sums_of(table, log, truth)
     coarse = whole.coarsened(4 * whole.edge, 2)
     assert (coarse.edge, coarse.step, coarse.frames) == (4 * whole.edge, 2, 5)
     assert coarse.cells < whole.cells
     assert value(coarse, "alpha") == pytest.approx(value(whole, "alpha"))
-    parts = [flight(side=16, seed=seed) for seed in (0, 1)]
-    together = merged_sums(*(cluster_sums_of(*part) for part in parts))
-    assert together["observations"].sum() == sum(p[0].op[p[0].op >= 2].sum() for p in parts)
     whole.save(tmp_path / "sums.parquet")
     again = ClusterSums.load(tmp_path / "sums.parquet")
     assert np.array_equal(again.columns, whole.columns)
@@ -117,8 +107,7 @@ def test_a_series_over_frames_and_how_much_of_a_map_is_covered():
     assert same_flight(whole, whole)
     assert not same_flight(whole, part)
     other = cluster_sums_of(table, log, 1 - truth)
-    assert identical(whole, other, "alpha")
-    assert not identical(whole, other, "accuracy")
+    assert difference(whole, other, "accuracy").high > 0
     nothing = difference(whole, other, "alpha")
     assert (nothing.value, nothing.low, nothing.high, nothing.decided) == (0.0, 0.0, 0.0, True)
     series = dict(enumerate(values))
@@ -139,4 +128,3 @@ def test_at_most_so_many_cubes_and_groups_of_frames():
     sums = cluster_sums_of(log.table(), log)
     assert (sums.cells, sums.edge) == (256, 0.5)
     assert (sums.frames, sums.step) == (38, 4)
-    assert merged_sums(sums, sums).cells == sums.cells

@@ -21,7 +21,7 @@ from semstab.errors import ConfigError, DataError, OutgrownError
 from semstab.model.evidence import STRETCH
 from semstab.model.frames import Frame
 from semstab.pixels.preparation import perturb
-from semstab.statistics.ranks import distinct_rows
+from semstab.statistics.cluster_sums import distinct_rows
 from semstab.task import Task, read
 
 if TYPE_CHECKING:

@@ -29,14 +29,22 @@ from semstab.statistics.ceiling import ceiling, ceiling_share, losses, rendered
 from semstab.statistics.correctness import Truth, correctness, join_truth, quadrants, reliability, stable_wrong
 from semstab.statistics.correlogram import correlogram
 from semstab.statistics.description import Analysis, analyse, describe
-from semstab.statistics.drift import Flips, VoxelDrift, benjamini_hochberg, expected_sbd, flips, voxel_drift
+from semstab.statistics.drift import (
+    Flips,
+    SceneDrift,
+    VoxelDrift,
+    benjamini_hochberg,
+    expected_sbd,
+    flips,
+    scene_drift,
+    voxel_drift,
+)
 from semstab.statistics.fusion_rules import RULES, Fused, fuse
 from semstab.statistics.model_comparison import compare_backbones, coverage, paired
 from semstab.statistics.observations import CellObservations, ObservationSample, Views
 from semstab.statistics.paired_differences import claimed_together, standardised
 from semstab.statistics.sample import MOST_VOXELS, MapSample
 from semstab.statistics.sampler import Sampler
-from semstab.statistics.scene_drift import SceneDrift, scene_drift
 from semstab.statistics.verdict import verdict
 
 __all__ = [

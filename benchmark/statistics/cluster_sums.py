@@ -1,6 +1,6 @@
-"""What each frame contributed to each cube of space: sums from which values, intervals and differences follow.
+"""Sums by frame and cube of space, from which statistics, their intervals and differences follow.
 
-They add up over parts of a map, and are a small file: comparisons and gates need no voxels.
+They add up over clusters, and are a small file: comparisons and gates need no voxels.
 """
 
 from __future__ import annotations
@@ -9,7 +9,7 @@ import dataclasses
 import functools
 import json
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from types import MappingProxyType
@@ -23,11 +23,9 @@ from semstab.core.files import atomic_path, parse_json
 from semstab.core.json_form import from_json
 from semstab.core.types import Float64, Int32, Int64, Mask
 from semstab.errors import DataError, one_line
-from semstab.metrics.agreement import voxel_keys
 from semstab.statistics.agreement import ONE_HOT, alpha_of, between_of, class_of, ratio_of
-from semstab.statistics.ranks import distinct_rows, numbered
 
-# What the columns of influence sums are, and what was right in them.
+# --- Columns ----------------------------------------------------------------------------------------------------------
 
 MOST_CLASSES = 64
 """Sums by class are kept up to so many classes."""
@@ -41,7 +39,7 @@ PLAIN = (
 DRIFT = ("sbd_excess", "sbd_known")
 WITH_TRUTH = ("known", "right", "looks", "looks_right", "stable", "stable_wrong")
 BY_TRUE_CLASS = ("class_known", "class_right", "class_predicted")
-OF_PLACES = (*DRIFT, "judged", "gap")
+WITHOUT_FRAMES = (*DRIFT, "judged", "gap")
 """Sums that belong to no frame: they stand in rows whose frame is -1."""
 
 
@@ -57,8 +55,8 @@ def layout(K: int, *, truth: bool) -> Mapping[str, slice]:
         widths += [(name, K) for name in BY_TRUE_CLASS] if by_class else []
         widths += [("judged", 1), ("gap", BINS)]
     ends = np.cumsum([width for _, width in widths])
-    found = {name: slice(int(end) - width, int(end)) for (name, width), end in zip(widths, ends, strict=True)}
-    return MappingProxyType(found)
+    slices = {name: slice(int(end) - width, int(end)) for (name, width), end in zip(widths, ends, strict=True)}
+    return MappingProxyType(slices)
 
 
 def width(K: int, *, truth: bool) -> int:
@@ -96,18 +94,18 @@ def ece_of(sums: Float64) -> Float64:
     return error
 
 
-# Which cube of space, and which group of frames, each row of some sums is of.
+# --- Clusters ---------------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, eq=False)
 class ClusterIndex:
-    """Of rows (m,), some of which belong to no frame.
+    """The cube of space and the group of frames of rows (m,), some of which belong to no frame.
 
-    places  (G, 3) the cubes, sorted, of an edge in metres; row (m,) which of them
+    cubes   (G, 3) sorted, of an edge in metres; row (m,) which of them each row is in
     frames  (F,) the groups of `step` frames, sorted; known (r,) the rows that belong to one, column (r,) which of them
     """
 
-    places: Int64
+    cubes: Int64
     row: Int64
     frames: Int64
     known: Int64
@@ -119,25 +117,37 @@ class ClusterIndex:
     def of(
         cls, cell: npt.NDArray[np.integer], frame: npt.NDArray[np.integer] | None, edge: float, step: int = 0
     ) -> ClusterIndex:
-        """By cube (m, 3) and group of frames (m,), -1 where that is not known; without frames all are of one."""
-        places, row = distinct_rows(cell)
+        """Index rows by cube (m, 3) and group of frames (m,), -1 where unknown; without frames all are of one."""
+        cubes, row = distinct_rows(cell)
         if frame is None:
-            return cls(places, row, np.array([-1]), np.arange(len(row)), np.zeros(len(row), np.int64), edge, 0)
+            return cls(cubes, row, np.array([-1]), np.arange(len(row)), np.zeros(len(row), np.int64), edge, 0)
         known = np.flatnonzero((frame >= 0) | (step == 0))
-        frames, column = numbered(frame[known].astype(np.int64))
-        return cls(places, row, frames, known, column, edge, step)
+        frames, column = np.unique(frame[known].astype(np.int64), return_inverse=True)
+        return cls(cubes, row, frames, known, column, edge, step)
 
-    def by_place(self, values: Float64) -> Float64:
-        """(G,) the sums of values (m,)."""
-        sums: Float64 = np.bincount(self.row, weights=values, minlength=len(self.places)).astype(np.float64)
-        return sums
+    def by_cube(self, values: Float64) -> Float64:
+        """Return the sums (G,) of values (m,)."""
+        return np.bincount(self.row, weights=values, minlength=len(self.cubes))
 
     def by_both(self, values: Float64) -> Float64:
-        """(G, F) the sums of values (m,)."""
-        shape = len(self.places), len(self.frames)
+        """Return the sums (G, F) of values (m,)."""
+        shape = len(self.cubes), len(self.frames)
         cell = self.row[self.known] * shape[1] + self.column
-        sums = np.bincount(cell, weights=values[self.known], minlength=shape[0] * shape[1])
-        return np.asarray(sums.reshape(shape), np.float64)
+        return np.bincount(cell, weights=values[self.known], minlength=shape[0] * shape[1]).reshape(shape)
+
+
+def distinct_rows(rows: npt.NDArray[np.integer]) -> tuple[Int64, Int64]:
+    """Return each row of whole numbers (n, C) once, ascending, and which of them each is: np.unique by one number."""
+    low = rows.min(axis=0, initial=0).astype(np.int64)
+    size = [int(n) for n in rows.max(axis=0, initial=0) - low + 1]
+    if math.prod(size) >= 2**63:
+        distinct, of = np.unique(rows, axis=0, return_inverse=True)
+        return distinct.astype(np.int64), of.ravel()
+    key = np.zeros(len(rows), np.int64)
+    for column, least, many in zip(rows.T, low, size, strict=True):
+        key = key * many + (column - least)
+    _, first, of = np.unique(key, return_index=True, return_inverse=True)
+    return rows[first].astype(np.int64), of
 
 
 Statistic = Callable[[Float64], Float64]
@@ -151,15 +161,8 @@ MOST_SUMS = 2**24
 """Numbers in the sums, at most: of thousands of classes fewer groups of frames are kept apart."""
 
 
-EDGES, MOST_STEP = (2.0**-30, 2.0**62), 2**30
-"""Metres that the edge of a cube may have, and how many frames may be in a group."""
-
-LARGEST_SUM = 1e18
-"""No map has so many observations."""
-
-
 def most_groups(K: int) -> int:
-    """Of frames that are kept apart with K classes."""
+    """Return how many groups of frames are kept apart with K classes."""
     return max(1, min(MOST_GROUPS, MOST_SUMS // (MOST_CELLS * K)))
 
 
@@ -169,7 +172,7 @@ class ClusterSums:
 
     cell     (m, 3) int32 which cube: floor(voxel centre / edge), so that the cubes of all maps of a scene are the same
     frame    (m,) int32 which group: frame index // step; -1 where the frames are not known, for want of a log, and for
-             sums that belong to none (`OF_PLACES`)
+             sums that belong to none (`WITHOUT_FRAMES`)
     columns  (m, C) float64, see `layout`. A place counts 1 / T for each of its T frames in `voxels`, 1 in
              `observations`; its pairwise agreement is shared out among them in `psa` and `agreeing`
     edge     metres, a power of 2
@@ -200,19 +203,19 @@ class ClusterSums:
         return np.concatenate([self[name] for name in names], axis=1)
 
     @functools.cached_property
-    def where(self) -> ClusterIndex:
-        """Which cube and which group of frames each row is of."""
+    def index(self) -> ClusterIndex:
+        """The cube and the group of frames of each row."""
         return ClusterIndex.of(self.cell, self.frame, self.edge, self.step)
 
     @property
     def frames(self) -> int:
-        """How many groups of frames there are; 0 where they are not known."""
-        return len(self.where.frames) if self.step else 0
+        """Return how many groups of frames there are; 0 where they are not known."""
+        return len(self.index.frames) if self.step else 0
 
     @property
     def cells(self) -> int:
-        """How many cubes hold a voxel that was seen twice."""
-        return len(self.where.places)
+        """Return how many cubes hold a voxel that was seen twice."""
+        return len(self.index.cubes)
 
     def coarsened(self, edge: float, step: int) -> ClusterSums:
         """With larger cubes, or groups of frames; step 0 forgets the frames."""
@@ -223,6 +226,10 @@ class ClusterSums:
         rows, of = distinct_rows(key)
         columns = np.zeros((len(rows), self.columns.shape[1]))
         np.add.at(columns, of, self.columns)
+        parts = {
+            name: None if part is None else part.coarsened(edge, step)
+            for name, part in (("seen", self.seen), ("limit", self.limit))
+        }
         return dataclasses.replace(
             self,
             cell=rows[:, :3].astype(np.int32),
@@ -230,24 +237,13 @@ class ClusterSums:
             columns=columns,
             edge=edge,
             step=step if known else 0,
-            seen=None if self.seen is None else self.seen.coarsened(edge, step),
-            limit=None if self.limit is None else self.limit.coarsened(edge, step),
+            **parts,
         )
 
     def without_truth(self) -> ClusterSums:
         """Without what is right and wrong."""
         columns = self.columns[:, : width(self.K, truth=False)]
         return dataclasses.replace(self, columns=columns, truth=False)
-
-    def bounded(self) -> ClusterSums:
-        """With at most MOST_CELLS cubes and `most_groups`."""
-        edge, step = self.edge, self.step
-        while len(np.unique(_joined(self.cell, edge / self.edge), axis=0)) > MOST_CELLS:
-            edge *= 2
-        known = self.frame[self.frame >= 0]
-        while step and len(np.unique(_joined(known, step // self.step))) > most_groups(self.K):
-            step *= 2
-        return self if (edge, step) == (self.edge, self.step) else self.coarsened(edge, step)
 
     def save(self, path: str | Path) -> None:
         """Write Parquet, atomically."""
@@ -289,18 +285,16 @@ class ClusterSums:
             columns = np.stack([*map(arrow.values_of, content.columns[len(KEYS) :])], axis=1)
             if columns.shape[1] != width(about["K"], truth=about["truth"]):
                 raise DataError(f"{columns.shape[1]} columns of sums for {about['K']} classes")
-            if np.any(np.abs(columns) > LARGEST_SUM):
-                raise DataError("a sum is larger than a map can have it")
-            found: list[ClusterSums | None] = []
+            parts: list[ClusterSums | None] = []
             for number in range(3):
                 own = part == number
-                cell, frame = np.stack([key[own] for key in keys[:3]], axis=1), keys[3][own]
                 some = about | ({"truth": False} if number else {})
                 sums = columns[own, : width(about["K"], truth=some["truth"])].astype(np.float64)
+                cell, frame = np.stack([key[own] for key in keys[:3]], axis=1), keys[3][own]
                 made = cls(cell.astype(np.int32), frame.astype(np.int32), sums, **some)
-                found.append(made if own.any() or not number else None)
-            whole, seen, limit = found
-            if seen is not None and (limit is None or not _same_rows(seen, limit)):
+                parts.append(made if own.any() or not number else None)
+            whole, seen, limit = parts
+            if seen is not None and (limit is None or not np.array_equal(seen.frame, limit.frame)):
                 raise DataError("what was seen of the sample and its limit are of other rows")
         except (OSError, LookupError, TypeError, ValueError, OverflowError, pa.ArrowException) as error:
             raise DataError(f"{path}: not a file of influence sums ({one_line(error)})") from error
@@ -326,10 +320,10 @@ class SumsMeta:
     def __post_init__(self) -> None:
         if not (0 < self.voxel_size < math.inf and self.K > 0 and len(self.classes) in (0, self.K)):
             raise DataError(f"{self.K} classes, {len(self.classes)} names, voxels of {self.voxel_size:g} m")
-        if not (EDGES[0] <= self.edge <= EDGES[1] and math.frexp(self.edge)[0] == 0.5):
-            raise DataError(f"cubes of {self.edge:g} m, which is no power of 2 from {EDGES[0]:g} to {EDGES[1]:g}")
-        if not (0 <= self.step <= MOST_STEP and self.step & (self.step - 1) == 0):
-            raise DataError(f"groups of {self.step} frames, which is no power of 2 up to {MOST_STEP}")
+        if not (0 < self.edge < math.inf and math.frexp(self.edge)[0] == 0.5):
+            raise DataError(f"cubes of {self.edge:g} m, which is no power of 2")
+        if self.step < 0 or self.step & (self.step - 1):
+            raise DataError(f"groups of {self.step} frames, which is no power of 2")
 
 
 def _joined(index: Int32, times: float) -> Int64:
@@ -343,40 +337,6 @@ def _key(values: npt.NDArray[Any], name: str) -> npt.NDArray[Any]:
     if values.dtype.kind not in "iu" or not np.array_equal(values, values.astype(np.int32)):
         raise DataError(f"a number of column '{name}' is out of range")
     return values
-
-
-def _same_rows(one: ClusterSums, other: ClusterSums) -> bool:
-    return np.array_equal(one.cell, other.cell) and np.array_equal(one.frame, other.frame)
-
-
-def merged_sums(*parts: ClusterSums) -> ClusterSums:
-    """The sums of a map from those of its parts. Raises DataError where they differ in classes or voxel size."""
-    parts = aligned(*parts)
-    together = dataclasses.replace(
-        parts[0],
-        cell=np.concatenate([part.cell for part in parts]),
-        frame=np.concatenate([part.frame for part in parts]),
-        columns=np.concatenate([part.columns for part in parts]),
-        seen=_merged([part.seen for part in parts]),
-        limit=_merged([part.limit for part in parts]),
-    )
-    return _known(together.coarsened(together.edge, together.step).bounded())
-
-
-def _known(sums: ClusterSums) -> ClusterSums:
-    """Where one part does not tell what frames have to do with a class, all of them do not."""
-    by_class = [own for name, own in layout(sums.K, truth=sums.truth).items() if name in ("class_own", "class_apart")]
-    if not any(np.isnan(sums.columns[:, own]).any() for own in by_class):
-        return sums
-    columns = sums.columns.copy()
-    for own in by_class:
-        columns[sums["voxels"][:, 0] != 0, own] = np.nan
-    return dataclasses.replace(sums, columns=columns)
-
-
-def _merged(parts: Sequence[ClusterSums | None]) -> ClusterSums | None:
-    there = [part for part in parts if part is not None]
-    return merged_sums(*there) if len(there) == len(parts) else None
 
 
 def aligned(*parts: ClusterSums) -> tuple[ClusterSums, ...]:
@@ -481,7 +441,7 @@ BY_CLASS: Mapping[str, Functional] = {
 
 def of_space_alone(key: str, k: int | None = None) -> bool:
     """Whether a number says nothing of frames, so that its intervals are for this map."""
-    return set(functional(key, k).names) <= set(OF_PLACES)
+    return set(functional(key, k).names) <= set(WITHOUT_FRAMES)
 
 
 def functional(key: str, k: int | None = None) -> Functional:
@@ -514,31 +474,23 @@ def value(sums: ClusterSums, key: str, k: int | None = None) -> float:
     return float(functional(key, k).of(columns.sum(axis=0))) if columns.size else math.nan
 
 
-# Cubes of space: how large they are, which of them hold voxels, and which one each voxel is in.
-
-FEW_RUNS = 1 << 12
-"""Voxels that follow each other in a map are mostly in one cube: there is room for so many runs at first."""
-
-
 def cubes_of(
     index: tuple[Int32, Int32, Int32], voxel_size: float, edge: float | None = None, some: Mask | None = None
 ) -> tuple[Int32, Int32, float]:
-    """The cubes (G, 3) that hold voxels of index columns (n,), which of them each is in (n,), and their edge.
+    """Return the cubes (G, 3) that hold voxels of index columns (n,), which of them each is in (n,), and their edge.
 
     A cube is floor(voxel centre / edge). Only `some` (n,) of the voxels count, the others are in -1. The edge, unless
     it is given, is the smallest power of 2 metres, no smaller than a voxel, that leaves at most MOST_CELLS cubes.
     """
-    from semstab.statistics.loops import rows as loops
-
-    some = np.ones(len(index[0]), np.bool_) if some is None else some
-    if edge is None:
-        smallest = 2.0 ** math.ceil(math.log2(voxel_size) - 1e-9)
-        edge = float(smallest * 2.0 ** loops.occupied(*index, some, voxel_size / smallest, MOST_CELLS))
-    cells, of, scale = np.empty((FEW_RUNS, 3), np.int64), np.empty(len(some), np.int32), voxel_size / edge
-    if (count := loops.runs(*index, some, scale, cells, of)) > len(cells):
-        cells = np.empty((count, 3), np.int64)
-        loops.runs(*index, some, scale, cells, of)
-    (key,) = voxel_keys(cells[:count])
-    _, first, number = np.unique(key, return_index=True, return_inverse=True)
-    loops.renumber(of, number)
-    return cells[first].astype(np.int32), of, edge
+    rows = np.arange(len(index[0])) if some is None else np.flatnonzero(some)
+    doubled = edge is None
+    edge = 2.0 ** math.ceil(math.log2(voxel_size) - 1e-9) if edge is None else edge
+    scale = voxel_size / edge
+    cell = np.stack([np.floor((axis[rows] + 0.5) * scale) for axis in index], axis=1).astype(np.int64)
+    cubes, number = distinct_rows(cell)
+    while doubled and len(cubes) > MOST_CELLS:
+        cubes, joined = distinct_rows(cubes // 2)
+        number, edge = joined[number], 2 * edge
+    of = np.full(len(index[0]), -1, np.int32)
+    of[rows] = number
+    return cubes.astype(np.int32), of, edge

@@ -21,7 +21,6 @@ from semstab.statistics.agreement import between_of
 from semstab.statistics.cluster_sums import MOST_GROUPS, cubes_of
 from semstab.statistics.intervals import EstimateSpec, confidence_intervals, spec_of_observations
 from semstab.statistics.observations import ObservationSample
-from semstab.statistics.ranks import numbered
 
 STANDARD = (5.0, 15.0)
 """Degrees between the viewing directions at which alpha is stated: a baseline of a tenth to a quarter of the range."""
@@ -94,7 +93,7 @@ class _Cells:
         while len(frames := np.unique(seen.frame // step)) > most:
             step *= 2
         group = np.searchsorted(frames, seen.frame // step)
-        there, of = numbered(cube_of[seen.voxel].astype(np.int64) * len(frames) + group)
+        there, of = np.unique(cube_of[seen.voxel].astype(np.int64) * len(frames) + group, return_inverse=True)
         cube, group = np.divmod(there, max(len(frames), 1))
         return cls(at, cube, frames[group], of, edge, step)
 

@@ -50,7 +50,7 @@ from semstab.statistics.correctness import (
 )
 from semstab.statistics.correlogram import correlogram
 from semstab.statistics.drift import expected_sbd, voxel_drift
-from semstab.statistics.intervals import grouped_intervals, headline_specs
+from semstab.statistics.intervals import confidence_intervals, grouped_intervals, headline_specs
 from semstab.statistics.observations import ObservationSample
 from semstab.statistics.sample import MapSample
 from semstab.statistics.sections import (
@@ -176,7 +176,7 @@ def analyse(
         None if truth is None else truth.label,
         sample=None if observations is None else observations.shared(),
         sbd_excess=columns["sbd_excess"],
-        places=places,
+        cubes=places,
         stable=stable,
     )
     flipping = FlippingSums.of(table, stable, places)
@@ -184,11 +184,11 @@ def analyse(
     if truth is not None:
         drawn["true_label"] = truth.label
     found, judged, (unsteady,), reached, of_flips = grouped_intervals(
-        of_places.asked(MEANS),
+        of_places.specs(MEANS),
         headline_specs(influence),
-        flipping.asked(),
+        flipping.specs(),
         () if observations is None else ceiling_specs(influence, table.K),
-        () if log is None else log.places.asked(OF_FLIPS),
+        () if log is None else log.places.specs(OF_FLIPS),
     )
     means, whole = dict(zip(MEANS, found, strict=True)), sample.summary.summary(table.voxel_size, table.classes, edges)
     reach = None
@@ -248,7 +248,7 @@ def _drift(
     tests, rates, sampled = None, None, places["psa"][1]
     if log is not None:
         one_way, by_chance, all_of_it = log.trend
-        since, excess = log.places.estimates(OF_CHANGES).values()
+        since, excess = confidence_intervals(log.places.specs(OF_CHANGES))
         tests = DriftTests(
             sbd_p=log.test.p_value,
             trend=float(one_way / all_of_it) if all_of_it else math.nan,

@@ -1,24 +1,27 @@
-"""Is there drift in the order of a place's observations, or only their disagreement in whatever order it came?
+"""Is there drift in the order of observations, or only their disagreement in whatever order they came?
 
 SBD is never 0 where observations disagree, and falls with OP whatever the model does: later observations move a mean
-less. So it is compared with what a random order of the very same observations gives.
+less. So it is compared with what a random order of the very same observations gives: for each voxel, and for the scene
+as a whole, whose frames stay together in stretches of time, as frames that follow each other err alike.
 """
 
 from __future__ import annotations
 
 import itertools
-from dataclasses import dataclass, replace
+import math
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from semstab.core.types import Float64, Int32, Int64, Mask, UInt16, UInt64
+from semstab.core.types import Float64, Int64, Mask, UInt16, UInt64
 from semstab.errors import ConfigError
 from semstab.model.events import Events
-from semstab.model.measures import Quantity, sbd
+from semstab.model.evidence import row_chunks
+from semstab.model.measures import Quantity, mean, sbd
 from semstab.model.voxels import VoxelTable
 from semstab.statistics.agreement import ONE_HOT
-from semstab.statistics.ranks import numbered, ranked
+from semstab.statistics.variance import longest_effect
 
 FLIP_RATE = Quantity(key="flip_rate", title="Flip rate", better="lower", needs="events")
 
@@ -93,7 +96,7 @@ def expected_sbd(table: VoxelTable) -> Float64:
     entries = np.flatnonzero(np.repeat(known, np.diff(evidence.starts)))
     of = np.repeat(np.arange(len(table)), np.diff(evidence.starts))[entries]
     times = np.rint(evidence.weight[entries]).astype(np.int64)
-    pairs, which = numbered(times * (LONGEST_TABLE + 1) + T[of])
+    pairs, which = np.unique(times * (LONGEST_TABLE + 1) + T[of], return_inverse=True)
     part, drifts = np.zeros(len(pairs)), one_hot_drifts(int(T.max(initial=2, where=known)))
     in_chunks(expected_one_hot, *np.divmod(pairs, LONGEST_TABLE + 1), _log_factorials(LONGEST_TABLE + 1), drifts, part)
     total = np.bincount(of, weights=part[which], minlength=len(table))
@@ -119,106 +122,50 @@ def voxel_drift(
     """
     if not (draws >= 1 and most >= 1 and enough >= 1):
         raise ConfigError(f"draws = {draws}, most = {most}, enough = {enough}: use 1 or more")
-    orders, exact = _Orders.of(table, events, seed), expected_sbd(table)
-    vary, T = orders.vary, orders.T
-    seen, null, p = orders.measure(~np.isnan(exact[vary]), draws, most, enough)
+    from semstab.core.compiled import in_chunks
+    from semstab.statistics.loops import orders as loops
+
+    exact, vary = expected_sbd(table), varying(table)
+    first, T, *log = _log_of(events, vary)
+    own, base = streams(table, vary, seed), _random_bits(seed)
+    seen, null = np.zeros(len(T)), np.zeros(len(T))
+    enumerated, trend_tail, drift_tails = (np.full((len(T), tails), np.nan) for tails in (3, 1, 2))
+    in_chunks(loops.seen_trends, first, T, *log[:2], seen)
+    rank = np.argsort(T, kind="stable")
+    bounds = np.searchsorted(T, np.arange(2, loops.ENUMERATED + 2), sorter=rank)
+    for steps, (begin, end) in enumerate(itertools.pairwise(bounds), 2):
+        order = np.ascontiguousarray(np.array(list(itertools.permutations(range(steps)))).T)
+        age = np.argsort(order, axis=0) - 0.5 * (steps - 1)
+        in_chunks(loops.test_all_orders, rank[begin:end], first, steps, *log, order, age, null, enumerated)
+    rest = rank[bounds[-1] :]
+    in_chunks(loops.mean_drifts, rest[np.isnan(exact[vary][rest])], first, T, *log, own, draws, null)
+    shared = first, T, *log, own, base, seen
+    in_chunks(loops.test_orders, rest, *shared, loops.LANES, most, enough, trend_tail)
+    some = rest[lowest(own[rest], sample)]
+    some = some[np.argsort(T[some], kind="stable")]
+    in_chunks(loops.test_orders, some, *shared, loops.LANES // 2, most, enough, drift_tails)
     with np.errstate(invalid="ignore", divide="ignore"):
-        trend = np.where(T > 2, seen / (T * (T * T - 1.0) / 12 * orders.variation[vary]), np.nan)
-    p_value = np.minimum(1.0, 2 * p[:, :2].min(axis=1))
-    some = orders.sampled(sample)
-    p_value[some] = orders.test(some, most, enough)
+        trend = np.where(T > 2, seen / (T * (T * T - 1.0) / 12 * variation(table)[vary]), np.nan)
     expected = np.where(table.op >= 2, 0.0, np.nan)
     expected[vary] = null / (T - 1)
-    expected = np.where(np.isnan(exact), expected, exact)
     return VoxelDrift(
-        null=expected,
-        p_value=_spread_out(p_value, vary),
+        null=np.where(np.isnan(exact), expected, exact),
+        p_value=_spread_out(np.minimum(1.0, 2 * np.fmin(enumerated[:, :2], drift_tails).min(axis=1)), vary),
         trend=_spread_out(trend, vary),
-        trend_p=_spread_out(np.where(T > 2, p[:, 2], np.nan), vary),
+        trend_p=_spread_out(np.fmin(enumerated[:, 2], trend_tail[:, 0]), vary),
         table=table,
     )
 
 
-@dataclass(frozen=True, eq=False)
-class _Orders:
-    """The observations of the voxels whose observations differ, in other orders.
+def _log_of(events: Events, voxels: Any) -> tuple[Int64, Int64, tuple[Int64, UInt16, Float64], int, int]:
+    """The first rows (n,) and the OP (n,) of some voxels, the entries of the log, K, and the most entries of one."""
+    entries = events.evidence.entries
+    first, last = events.starts[voxels], events.ends[voxels]
+    return first, last - first, entries, events.K, int((entries[0][last] - entries[0][first]).max(initial=0))
 
-    vary, variation  (N,) which of all voxels they are, and how far the observations of each are from their mean
-    first, T  (n,) their first rows of the log and OP
-    log       starts, label and weight of all observations
-    streams   (n,) of each voxel's random stream, which depends on its place only
-    seed      of the orders that voxels of the same OP go through
-    """
 
-    vary: Mask
-    variation: Float64
-    first: Int64
-    T: Int64
-    log: tuple[Int64, UInt16, Float64]
-    K: int
-    streams: UInt64
-    seed: np.uint64
-
-    @classmethod
-    def of(cls, table: VoxelTable, events: Events, seed: int) -> _Orders:
-        spread = variation(table)
-        vary = spread > ONE_HOT * table.op
-        T = table.op[vary].astype(np.int64)
-        own = streams(table, vary, seed)
-        base = np.random.default_rng(seed).integers(2**64, dtype=np.uint64)
-        return cls(vary, spread, events.starts[vary], T, events.evidence.entries, table.K, own, base)
-
-    def part(self, which: Int64) -> _Orders:
-        """The voxels of these numbers."""
-        return replace(self, first=self.first[which], T=self.T[which], streams=self.streams[which])
-
-    def sampled(self, count: int) -> Int64:
-        """Numbers of so many voxels with many orders, by chance."""
-        from semstab.statistics.loops.orders import ENUMERATED
-
-        many = np.flatnonzero(self.T > ENUMERATED)
-        return many[lowest(self.streams[many], count)]
-
-    def measure(self, known: Mask, draws: int, most: int, enough: int) -> tuple[Float64, Float64, Float64]:
-        """The trends seen and the null of the sums of drifts (n,) unless known (n,), and p-values (n, 3)."""
-        from semstab.core.compiled import in_chunks
-        from semstab.statistics.loops import orders
-
-        n = len(self.T)
-        found = np.zeros(n), np.zeros(n), np.full((n, 3), np.nan)
-        rank, *shared = self._shared()
-        log, K, entries = shared[2:5]
-        bounds = np.searchsorted(self.T, np.arange(2, orders.ENUMERATED + 2), sorter=rank)
-        for T, (begin, end) in enumerate(itertools.pairwise(bounds), 2):
-            order = np.array(list(itertools.permutations(range(T)))).T
-            age = np.argsort(order, axis=0) - 0.5 * (T - 1)
-            own = np.ascontiguousarray(order), np.ascontiguousarray(age)
-            in_chunks(orders.measure_all_orders, rank[begin:end], self.first, T, log, K, entries, *own, *found)
-        if bounds[-1] < n:
-            in_chunks(orders.measure_voxels, rank[bounds[-1] :], *shared, known, draws, most, enough, *found)
-        return found
-
-    def test(self, which: Int64, most: int, enough: int) -> Float64:
-        """P-values (r,) of the drifts of the voxels of these numbers."""
-        from semstab.core.compiled import in_chunks
-        from semstab.statistics.loops import orders
-
-        p, part = np.zeros(len(which)), self.part(which)
-        in_chunks(orders.test_drifts, *part._shared(), most, enough, p)
-        return p
-
-    def _shared(self) -> tuple[Any, ...]:
-        entries = self.log[0][self.first + self.T] - self.log[0][self.first]
-        return (
-            ranked(self.T),
-            self.first,
-            self.T,
-            self.log,
-            self.K,
-            int(entries.max(initial=0)),
-            self.streams,
-            self.seed,
-        )
+def _random_bits(seed: int) -> np.uint64:
+    return np.random.default_rng(seed).integers(2**64, dtype=np.uint64)
 
 
 def lowest(numbers: UInt64, count: int) -> Int64:
@@ -238,28 +185,22 @@ def trend_columns(table: VoxelTable, drift: VoxelDrift) -> tuple[Int64, Float64]
 
 
 def flips(events: Events) -> Flips:
-    """How often, and how long ago, the predicted class (argmax of s_bar, the lowest on ties) changed."""
-    return flips_of(events, *changes(events))
-
-
-def changes(events: Events) -> tuple[Float64, Float64, Int32]:
-    """Of `flips` what does not hang on frames: rate and null (n,), and how many looks (n,) follow the last change."""
-    from semstab.core import compiled
-    from semstab.statistics.loops import rows as log_kernels
-
-    (rate, null), since = np.empty((2, len(events.starts))), np.empty(len(events.starts), np.int32)
-    log, rows = events.evidence, (events.starts, events.ends)
-    compiled.in_chunks(log_kernels.count_flips, *rows, log.entries, log.K, rate, null, since)
-    return rate, null, since
-
-
-def flips_of(events: Events, rate: Float64, null: Float64, since: Int32) -> Flips:
-    """Those of a log, from its `changes`."""
-    from semstab.statistics.loops import rows as log_kernels
-
-    frames = np.empty(len(rate))
-    log_kernels.count_frames(events.ends, events.frame, since, frames)
-    return Flips(rate, null, frames)
+    """Return how often, and how long ago, the predicted class (argmax of s_bar, the lowest on ties) changed."""
+    starts, label, weight = events.evidence.entries
+    n, T = len(events.starts), events.ends - events.starts
+    of = np.repeat(np.arange(len(events)), np.diff(starts))
+    top = np.maximum.reduceat(weight, starts[:-1]) if len(of) else weight
+    leads = np.flatnonzero(weight == top[of])
+    voted = label[leads[np.flatnonzero(np.diff(of[leads], prepend=-1))]].astype(np.int64)
+    changed = np.flatnonzero((np.diff(voted, prepend=-1) != 0) & (np.diff(events.voxel, prepend=-1) == 0))
+    changes = np.bincount(events.voxel[changed], minlength=n)
+    key, votes = np.unique(events.voxel * events.K + voted, return_counts=True)
+    same = np.bincount(key // events.K, weights=votes * (votes - 1) / 2, minlength=n)
+    since = np.full(n, np.nan)
+    since[events.voxel[changed]] = (events.frame[events.ends - 1][events.voxel] - events.frame)[changed]
+    with np.errstate(invalid="ignore", divide="ignore"):
+        pairs = T * (T - 1) / 2
+        return Flips(np.where(T > 1, changes / (T - 1), np.nan), np.where(T > 1, (pairs - same) / pairs, np.nan), since)
 
 
 def variation(table: VoxelTable) -> Float64:
@@ -281,7 +222,7 @@ def streams(table: VoxelTable, rows: Any, seed: int) -> UInt64:
 
     index = np.stack([table.ix[rows], table.iy[rows], table.iz[rows]], axis=1)
     drawn = np.empty(len(index), np.uint64)
-    orders.draw_streams(index, np.random.default_rng(seed).integers(2**64, dtype=np.uint64), drawn)
+    orders.draw_streams(index, _random_bits(seed), drawn)
     return drawn
 
 
@@ -319,12 +260,140 @@ def benjamini_hochberg(p: Float64) -> Float64:
     """
     adjusted, tested = np.full(p.shape, np.nan), ~np.isnan(p)
     value, of, count = np.unique(p[tested], return_inverse=True, return_counts=True)
-    adjusted[tested] = _raised(value, count)[of]
+    by_rank = value * count.sum() / np.cumsum(count)
+    adjusted[tested] = np.minimum(np.minimum.accumulate(by_rank[::-1])[::-1], 1.0)[of]
     return adjusted
 
 
-def _raised(value: Float64, count: Int64) -> Float64:
-    """Adjusted p-values of those (v,) that there are, ascending, and how often each is there."""
-    by_rank = value * count.sum() / np.cumsum(count)
-    lowest: Float64 = np.minimum.accumulate(by_rank[::-1])[::-1]
-    return np.minimum(lowest, 1.0)
+# --- The scene --------------------------------------------------------------------------------------------------------
+
+CERTAIN, MOST_SPANS = 0.95, 128
+"""How certain it must be that errors last no longer, and by how many spans of time that is looked at."""
+
+SAMPLE, ORDERS = 30_000, 499
+"""About so many observations are put into so many orders."""
+
+MOST_STRETCHES, LEAST_STRETCHES, LEAST_SPAN = 12, 6, 4
+"""Stretches of time, at most and at least, and in how many of them a voxel must be seen to be put to the test."""
+
+
+@dataclass(frozen=True)
+class SceneDrift:
+    """The order of observations over all voxels, tested by putting stretches of time into random orders.
+
+    sbd, null    means over the voxels with OP >= 2, bits
+    p_value      of a mean SBD this far from what random orders of the stretches give, either way; NaN where errors last
+                 so long that there are fewer than LEAST_STRETCHES, or no place was seen in LEAST_SPAN of them
+    trend        share of all disagreement, over voxels with OP >= 3, that goes one way in time; null: in random order
+    trend_p      of a trend this large
+    stretches    of time that were put in other orders
+    voxels       whose observations tell, a random sample
+    """
+
+    sbd: float
+    null: float
+    p_value: float
+    trend: float
+    trend_null: float
+    trend_p: float
+    stretches: int
+    voxels: int
+
+
+@dataclass(frozen=True)
+class OrderTest:
+    """The parts of `SceneDrift` that follow from a sample of the voxels."""
+
+    p_value: float
+    trend_p: float
+    stretches: int
+    voxels: int
+
+
+def scene_drift(
+    table: VoxelTable, events: Events, drift: VoxelDrift, *, seed: int = 0, frame_orders: int = ORDERS
+) -> SceneDrift:
+    """Test whether stretches of time are exchangeable, in `frame_orders` random orders.
+
+    What neighbouring voxels have in common in a frame stays in common, and so does what frames of one stretch have.
+    `drift` is what `voxel_drift` says of the same map.
+    """
+    test = order_test(table, events, seed=seed, frame_orders=frame_orders)
+    one_way, by_chance, disagreement = trend_columns(table, drift)[1].sum(axis=0)
+    return SceneDrift(
+        sbd=mean(sbd(table)),
+        null=mean(drift.null),
+        p_value=test.p_value,
+        trend=one_way / disagreement if disagreement else math.nan,
+        trend_null=by_chance / disagreement if disagreement else math.nan,
+        trend_p=test.trend_p,
+        stretches=test.stretches,
+        voxels=test.voxels,
+    )
+
+
+def order_test(table: VoxelTable, events: Events, *, seed: int = 0, frame_orders: int = ORDERS) -> OrderTest:
+    """Put the stretches of time of a sample of a map's observations, about SAMPLE of them, into random orders."""
+    from semstab.core.compiled import CHUNKS, in_chunks
+    from semstab.statistics.loops import orders as loops
+
+    rows = np.flatnonzero(varying(table))
+    order = np.argsort(streams(table, rows, seed))
+    drawn = np.sort(rows[order[: np.searchsorted(np.cumsum(table.op[rows][order]), SAMPLE) + 1]])
+    table, events = table.rows(drawn), events.rows(drawn)
+    frames, rank = np.unique(events.frame, return_inverse=True)
+    stretches = min(
+        MOST_STRETCHES, int(len(frames) / (1 + 2 * _lasting(_departures(table, events), rank, len(frames))))
+    )
+    stretch = rank * stretches // max(len(frames), 1)
+    changes = np.diff(stretch, prepend=-1) != 0
+    changes[events.starts] = True
+    span = np.bincount(events.voxel, weights=changes, minlength=len(table))
+    some = (span >= LEAST_SPAN) & (stretches >= LEAST_STRETCHES)
+    if not some.any():
+        return OrderTest(math.nan, math.nan, stretches, 0)
+    first, T, *log = _log_of(events, some)
+    stretch = stretch[np.repeat(some, table.op)]
+    as_seen = np.tile(np.arange(stretches), (frame_orders, 1))
+    orders = np.ascontiguousarray(np.random.default_rng(seed).permuted(as_seen, axis=1).T)
+    cuts = np.arange(CHUNKS + 1) * len(T) // CHUNKS
+    edges, sums = np.stack([cuts, np.append(0, np.cumsum(T))[cuts]], axis=1), np.zeros((CHUNKS, frame_orders, 2))
+    in_chunks(loops.permute_stretches, edges, first, T, *log, stretch, orders, sums)
+    drifts, trends = sums.sum(axis=0).T
+    trend = np.zeros(len(T))
+    in_chunks(loops.seen_trends, first, T, *log[:2], trend)
+    total_trend = float((trend / np.maximum(T * (T * T - 1.0) / 12, 1))[T > 2].sum())
+    total_drift = float(sbd(table)[some].sum())
+    p_value = min(1.0, 2 * min(_tail(-drifts, -total_drift), _tail(drifts, total_drift)))
+    return OrderTest(p_value, _tail(trends, total_trend) if total_trend > 0 else math.nan, stretches, len(T))
+
+
+def _departures(table: VoxelTable, events: Events) -> Float64:
+    """(m,) how much less an observation agrees with its voxel's mean than the voxel's observations do on average."""
+    agrees, of = np.zeros(len(events)), events.voxel
+    for some in row_chunks(len(events), table.K):
+        at = of[some]
+        agrees[some] = (events.evidence[some] * table.evidence[at]).sum(axis=1) / table.op[at]
+    mean_of = np.bincount(of, weights=agrees) / np.maximum(np.bincount(of), 1)
+    departures: Float64 = mean_of[of] - agrees
+    return departures
+
+
+def _lasting(departures: Float64, frame: Int64, frames: int) -> float:
+    """For how many frames what departs in one may last in the next ones: the longest reach not excluded at 95 %."""
+    if frames < 2:
+        return 0.0
+    size = np.bincount(frame, minlength=frames).astype(np.float64)
+    series: Float64 = np.bincount(frame, weights=departures, minlength=frames).astype(np.float64)
+    series = series - size / size.sum() * series.sum()
+    span = -(-frames // MOST_SPANS)  # frames that are looked at as one, where there are many
+    starts = np.arange(0, frames, span)
+    sums: Float64 = np.add.reduceat(series, starts)
+    sizes: Float64 = np.add.reduceat(size, starts)
+    return span * longest_effect(sums / sizes, sizes, np.arange(len(starts), dtype=np.float64), CERTAIN)
+
+
+def _tail(values: Float64, seen: float) -> float:
+    """P-value of a value as high as the one seen, of which `values` are random draws."""
+    slack = 1e-9 * (1 + abs(seen))
+    return float((np.count_nonzero(values >= seen - slack) + 1) / (len(values) + 1))

@@ -13,7 +13,6 @@ from semstab.model.events import Events
 from semstab.model.evidence import Evidence
 from semstab.model.information import Concentration
 from semstab.statistics.agreement import ONE_HOT
-from semstab.statistics.ranks import ranked
 
 RULES = ("averaging", "majority", "product", "geometric")
 """The paper's mean of evidence; the share of frames that vote for a class; Bayes' product of the frames' evidence under
@@ -90,41 +89,31 @@ def fuse_all(
     evidence: Evidence | None = None,
     rows: Int64 | None = None,
 ) -> list[Fused]:
-    """What `fuse` makes of a log by each of some rules, in one pass.
+    """Fuse the observations of every voxel by each of some rules, in one pass, as `fuse` does.
 
     evidence  of its voxels (n, K), where that is known: it has an entry for each class that a voxel ever saw
     rows      (n,) which voxels of the log these are, where they are not all
     """
-    from semstab.core import compiled
-    from semstab.statistics.loops import rules as loops
+    from semstab.core.compiled import in_chunks
+    from semstab.statistics.loops.orders import fuse_by_rules
 
     K, log = events.evidence.K, events.evidence.entries
-    first, label = classes_seen(events) if evidence is None else (evidence.starts, evidence.label)
+    first, label = _classes_seen(events) if evidence is None else (evidence.starts, evidence.label)
     starts, ends = (bounds if rows is None else bounds[rows] for bounds in (events.starts, events.ends))
     belief, *sums = (np.zeros((len(rules), size)) for size in (len(label), *3 * [len(starts)]))
-    op, count = ends - starts, np.diff(first)
-    most, numbers = int(count.max(initial=0)), np.array([RULES.index(rule) for rule in rules])
-    seen, how = (first, label, most), (numbers, min(FLOOR, 1 / K) if floor is None else floor)
-    rank = ranked(op * (most + 1) + count)
-    compiled.in_chunks(loops.fuse_by_rules, rank, starts, ends, log, K, *seen, *how, belief, *sums)
+    how = np.array([RULES.index(rule) for rule in rules]), min(FLOOR, 1 / K) if floor is None else floor
+    in_chunks(fuse_by_rules, starts, ends, log, K, first, label, *how, belief, *sums)
     return [
-        Fused(Belief.with_bits(first, label, own, K, rest, bits), op.astype(np.int32), drift_sum)
+        Fused(Belief.with_bits(first, label, own, K, rest, bits), (ends - starts).astype(np.int32), drift_sum)
         for own, rest, drift_sum, bits in zip(belief, *sums, strict=True)
     ]
 
 
-def classes_seen(events: Events) -> tuple[Int64, UInt16]:
+def _classes_seen(events: Events) -> tuple[Int64, UInt16]:
     """The classes that each voxel of a log ever saw, ascending: bounds (n + 1,) and labels (m,)."""
-    from semstab.core import compiled
-    from semstab.statistics.loops import rules as loops
-
-    bounds, log = (events.starts, events.ends), events.evidence.entries
-    count = np.zeros(len(events.starts) + 1, np.int64)
-    compiled.in_chunks(loops.count_classes, *bounds, log, events.evidence.K, count)
-    first: Int64 = np.cumsum(count)
-    label = np.zeros(first[-1], np.uint16)
-    compiled.in_chunks(loops.list_classes, *bounds, log, events.evidence.K, first, label)
-    return first, label
+    evidence, K = events.evidence, events.K
+    key = np.unique(np.repeat(events.voxel, np.diff(evidence.starts)).astype(np.int64) * K + evidence.label)
+    return np.searchsorted(key // K, np.arange(len(events.ix) + 1)), (key % K).astype(np.uint16)
 
 
 def labels(evidence: Float64 | Evidence) -> Int64:

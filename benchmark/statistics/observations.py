@@ -25,7 +25,6 @@ from semstab.model.events import Events
 from semstab.model.evidence import Evidence
 from semstab.model.voxels import index_columns
 from semstab.statistics.observation_keys import CELLS, DIGITS, Voxel, alike, cells_of, keys_of
-from semstab.statistics.ranks import ranked
 
 # Keys of cells, a quarter as wide as a voxel: three voxel indices of BITS each, then three digits of 2 bits.
 
@@ -202,7 +201,7 @@ class CellObservations:
             place = np.unique(self.key >> DIGITS, return_inverse=True)[1] * views + self.view
         entries: tuple[npt.NDArray[Any], ...] = self.key, self.view, self.label, self.weight
         key, view, label, weight = (np.empty_like(column) for column in entries)
-        gather(ranked(place), *entries, key, view, label, weight)
+        gather(np.argsort(place, kind="stable"), *entries, key, view, label, weight)
         return key, view, label, weight
 
     def _log(

@@ -21,7 +21,6 @@ from semstab.model.frames import Frame
 from semstab.model.labels import fixed
 from semstab.statistics.observation_keys import SPAN, Voxel
 from semstab.statistics.observations import VIEW, CellObservations, ObservationSample, Views
-from semstab.statistics.ranks import numbered
 
 BUDGET = 1 << 19
 """Entries (cell, frame, class) that are kept at most."""
@@ -161,7 +160,7 @@ class Sampler:
             some = piece[pixels.drawn[of[piece]] < self._share]  # less than before, if the pieces before were too many
             s = frame.scores[np.divmod(pixels.pixel[some], frame.shape[1])].astype(np.float64)
             s /= s.sum(axis=1, keepdims=True)
-            own, number = numbered(of[some])
+            own, number = np.unique(of[some], return_inverse=True)
             sums = np.zeros((len(own), self.K))
             add_rows(s, number, sums)
             row, label = np.nonzero(sums)

@@ -20,10 +20,19 @@ from semstab.statistics import fusion_rules
 from semstab.statistics.accumulate import Cubes, CubeSums, Mean
 from semstab.statistics.agreement import alpha_of, between_of, decompose, disagreement, kappa_of, psa, ratio_of
 from semstab.statistics.correctness import Truth, rule_means_of, rule_sums
-from semstab.statistics.drift import TESTABLE, Flips, VoxelDrift, benjamini_hochberg, flips, rounded_up, trend_columns
+from semstab.statistics.drift import (
+    TESTABLE,
+    Flips,
+    OrderTest,
+    VoxelDrift,
+    benjamini_hochberg,
+    flips,
+    order_test,
+    rounded_up,
+    trend_columns,
+)
 from semstab.statistics.intervals import EstimateSpec
 from semstab.statistics.sample import MapSample
-from semstab.statistics.scene_drift import OrderTest, order_test
 
 Columns = dict[str, npt.NDArray[Any]]
 
@@ -106,7 +115,9 @@ def place_sums(table: VoxelTable, columns: Columns, places: Cubes) -> CubeSums:
     observations, agreeing, own, own_of_one = (
         sums.pop(name)[:, :1] for name in ("observations", "agreeing", "own", "own of an observation")
     )
-    by_observation, by_voxel = places.sums_by_class(table)
+    weight = table.evidence.weight
+    each = np.repeat(T, np.diff(table.evidence.starts))
+    by_observation, by_voxel = places.sums_by_class(table.evidence, weight, weight / each)
     further = {
         **{name: [sums[name][:, :1], observations] for name in ("within", "between")},
         "coin": [sums.pop("of two"), sums.pop("of more")],
@@ -146,9 +157,9 @@ class FlippingSums:
         share = CubeSums(places.cell, places.edge, places.means({"": unsteady}))
         return cls(share, int(np.count_nonzero(table.op >= ENOUGH)), _together(table, unsteady))
 
-    def asked(self) -> Iterator[EstimateSpec]:
-        """For `answers`: the share of the places that are not stable."""
-        return self.share.asked({"": Mean("")})
+    def specs(self) -> Iterator[EstimateSpec]:
+        """Yield the share of the locations that are not stable, for `confidence_intervals`."""
+        return self.share.specs({"": Mean("")})
 
     def flipping(self, share: Interval, classes: Sequence[str] = ()) -> Flipping:
         """That share, as it was answered, and the two classes that stand together most often there."""

@@ -14,7 +14,6 @@ from semstab.core.types import Float64, Int64
 from semstab.model.measures import vss
 from semstab.model.voxels import VoxelTable
 from semstab.statistics.agreement import STABLE
-from semstab.statistics.ranks import numbered
 
 LIKELY = 0.5
 """A place is called stable from this probability on."""
@@ -72,6 +71,6 @@ def _votes(table: VoxelTable) -> tuple[Int64, Int64, Int64]:
     again = table.op >= 2
     T = table.op[again].astype(np.int64)
     longest = int(T.max(initial=0)) + 1
-    pairs, of = numbered(np.rint(vss(table)[again] * T).astype(np.int64) + T * longest)
+    pairs, of = np.unique(np.rint(vss(table)[again] * T).astype(np.int64) + T * longest, return_inverse=True)
     seen, most = np.divmod(pairs, longest)
     return seen, most, of

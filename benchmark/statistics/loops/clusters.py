@@ -76,7 +76,7 @@ def _label_without(total, x, look, A):
 
 
 @serial
-def _add_truth(sums, base, x, first, T, frames, truth, likely, total, active, A, label, without, mean, column, K):
+def _add_truth(sums, base, x, first, T, group, truth, likely, total, active, A, label, without, mean, column, K):
     """What is right of a voxel: of the fused label by leaving a frame out, of each look by itself.
 
     mean (A,) is room.
@@ -93,9 +93,9 @@ def _add_truth(sums, base, x, first, T, frames, truth, likely, total, active, A,
         for t in range(T):
             without[t] = _label_without(total, x, t * A, A)
             mean[without[t]] += part
-    share, (group, frame) = part, frames
+    share = part
     for t in range(T):
-        r = base + group[frame[first + t]]
+        r = base + group[first + t]
         own = right * share
         if not alike and true >= 0:
             own = (right + (T - 1) * (mean[true] - (without[t] == true))) * share
@@ -135,22 +135,21 @@ def _agreement(total, squares, T, A, certain, surprise, apart):
 
 @serial
 def add_influences(
-    chunk, order, bounds, rows, longest, log, K, frames, truth, likely, by_class, with_truth, groups, sums
+    chunk, order, bounds, rows, longest, log, K, group, truth, likely, by_class, with_truth, groups, sums
 ):
     """Add the observations of voxels, of which each has two or more, to `sums` (cells * groups, C).
 
     order (r,) has the voxels by cell, bounds (cells + 1,) where each cell's begin; rows (starts (n,) and ends) bound a
-    voxel's rows of the log, `longest` at most; frames: see `FrameGroups`. truth (n,) is its true class or -1, likely
-    (n,) how likely it is stable. The pairwise agreement P of a location is shared out as P + 2 (T - 1) / (T - 2)
-    (a_t - P), a_t being frame t's mean agreement with the others: what is left of a frame is then its own quality, free
-    of that of the frames it was held against, and the shares add up to T P.
+    voxel's rows of the log, `longest` at most; group (m,) is that of each row's frame. truth (n,) is its true class
+    or -1, likely (n,) how likely it is stable. The pairwise agreement P of a location is shared out as
+    P + 2 (T - 1) / (T - 2) (a_t - P), a_t being frame t's mean agreement with the others: what is left of a frame is
+    then its own quality, free of that of the frames it was compared with, and the shares add up to T P.
     """
     starts, ends = rows
     x, number, active = np.empty(longest * K), np.full(K, -1), np.empty(K, np.int64)
     total, squares, own, without = np.empty(K), np.empty(K), np.empty(longest), np.empty(longest, np.int64)
     mean, surprise, apart, certain = np.empty(K), np.empty(K), np.empty(K), np.log(K)
     first_truth = ENTROPY + 1 + (3 * K if by_class else K) + DRIFT
-    group, frame = frames
     for cell in range(chunk, bounds.shape[0] - 1, CHUNKS):
         for at in range(bounds[cell], bounds[cell + 1]):
             i = order[at]
@@ -160,7 +159,7 @@ def add_influences(
             spread = 2.0 * (T - 1.0) / (T - 2.0) if T > 2 else 0.0
             part, of_others = 1.0 / T, 1.0 / (T - 1.0)
             for t in range(T):
-                r = cell * groups + group[frame[first + t]]
+                r = cell * groups + group[first + t]
                 with_others = surprised = 0.0
                 for j in range(A):
                     k, s = active[j], x[t * A + j]
@@ -187,6 +186,6 @@ def add_influences(
                     sums[r, VSS] += x[t * A + label] * part
             if with_truth and truth[i] >= 0:
                 _add_truth(
-                    sums, cell * groups, x, first, T, frames, truth[i], steady, total, active, A, label, without,
+                    sums, cell * groups, x, first, T, group, truth[i], steady, total, active, A, label, without,
                     mean, first_truth, K if by_class else 0,
                 )  # fmt: skip

@@ -1,18 +1,16 @@
-"""Compiled loops over the observations of voxels, in the orders in which they could have come.
+"""Compiled loops over the observations of voxels: in the orders in which they could have come, and by fusion rules.
 
-Many orders go side by side, one in each lane, so that logarithms are vector instructions. Voxels of the same OP go
-through the same random orders, each beginning with its observations in an order of its own, which depends on its place
-and the seed only: the same seed gives the same numbers for any number of threads, and for any parts of a map.
+Voxels of the same OP go through the same random orders, each beginning with its observations in an order of its own,
+which depends on its location and the seed only: the same seed gives the same numbers for any number of threads.
 """
 
 from __future__ import annotations
 
 import numpy as np
 
-from semstab.backends.shared.beliefs import js_term
+from semstab.backends.shared.beliefs import js_term, plogp
 from semstab.backends.shared.keys import mix
 from semstab.core.compiled import CHUNKS, compiled, serial
-from semstab.statistics.loops.logarithm import EIGHT, add_step
 
 ENUMERATED = 5
 """Up to this OP all T! orders are gone through; 5! = 120."""
@@ -21,54 +19,44 @@ ROUNDING = 1e-9
 """Sums of the same terms in another order differ by less."""
 
 LANES = 128
-"""Orders that go side by side, at most."""
+"""Orders that are drawn together."""
 
 GOLDEN = np.uint64(0x9E3779B97F4A7C15)
 """What the states of splitmix64 are apart."""
 
 TURNS = 8
-"""A random order begins at so many places, as far apart as can be, and goes round: what comes first differs."""
-
-
-# --- Orders, side by side ---------------------------------------------------------------------------------------------
+"""A random order begins at so many observations, as far apart as can be, and goes round: what comes first differs."""
 
 
 @serial
-def drifts(x, A, T, order, lanes, work, drift):
-    """The sum of drifts, bits, in each of `lanes` orders, to drift (LANES,).
+def _drifts(x, A, T, order, lanes, drift):
+    """The sum of drifts, bits, of observations x (A, T) in each of `lanes` orders (T, lanes), to drift (lanes,).
 
-    x (A, T) are the observations, order (T, LANES) the number of the observation that comes at each step; work space is
-    (2 A, LANES). A step's drift is H(m) - (H(p) + H(q)) / 2 with the mean m of the beliefs p and q before and after:
-    each belief but the first and last is one after, then one before.
+    A step's drift is H(m) - (H(p) + H(q)) / 2 with the mean m of the beliefs p and q before and after: each belief but
+    the first and last is one after, then one before.
     """
-    wide = -(-lanes // EIGHT) * EIGHT
-    work[:A, :wide] = 0.0
-    drift[:wide] = 0.0
-    for t in range(T):
-        soon = t % (LANES // wide)
-        if soon == 0:  # well before they are read: what was stored as numbers is not at hand as a vector
-            for a in range(A):
-                for step in range(min(LANES // wide, T - t)):
-                    for lane in range(lanes):
-                        work[A + a, step * wide + lane] = x[a, order[t + step, lane]]
-        whole = 0.5 if t == 0 or t == T - 1 else 1.0
-        mixed = 1.0 if t > 0 else 0.0
-        before, after = 1.0 / max(t, 1), 1.0 / (t + 1)
+    for lane in range(lanes):
+        total = 0.0
         for a in range(A):
-            more = (A + a) * LANES + soon * wide
-            for lane in range(0, lanes, EIGHT):
-                add_step(drift, lane, work, a * LANES + lane, work, more + lane, before, after, mixed, whole)
+            sum_before = 0.0
+            for t in range(T):
+                sum_after = sum_before + x[a, order[t, lane]]
+                q = sum_after / (t + 1)
+                total += plogp(q) * (0.5 if t == 0 or t == T - 1 else 1.0)
+                if t > 0:
+                    total -= plogp(0.5 * (sum_before / t + q))
+                sum_before = sum_after
+        drift[lane] = total
 
 
 @compiled(fastmath={"reassoc", "contract"})
-def trends(x, A, T, age, lanes, work, trend):
+def _trends(x, A, T, age, lanes, moment, trend):
     """|| sum_t (t - mean t) s_t ||^2 in each of `lanes` orders, to trend (LANES,).
 
-    age (T, LANES) is t - mean t of each observation; work space is (1, LANES). As these add up to 0, what most
+    age (T, LANES) is t - mean t of each observation; moment (LANES,) is work space. As ages add up to 0, what most
     observations have of a class, all or nothing, can be left out of each.
     """
     trend[:lanes] = 0.0
-    moment = work[0]
     for a in range(A):
         moment[:lanes] = 0.0
         others = 0
@@ -85,7 +73,7 @@ def trends(x, A, T, age, lanes, work, trend):
 
 
 @serial
-def dense(log, first, T, number, at, x):
+def _dense(log, first, T, number, at, x):
     """A voxel's T observations as columns `at` (T,) of x (A, T); returns A, how many classes it ever saw.
 
     log is (starts, label, weight) of all observations; number is work space (K,), all -1.
@@ -106,16 +94,27 @@ def dense(log, first, T, number, at, x):
 
 
 @serial
-def room(T, entries, K):
-    """Work space for voxels of OP up to T (n,) and so many entries: x, work, number, order, age, value."""
+def seen_trends(chunk, first, T, log, K, trend):
+    """|| sum_t (t - mean t) s_t ||^2 of each voxel's observations as they came, to trend (n,)."""
+    starts, label, weight = log
+    moment = np.zeros(K)
+    for i in range(chunk, T.shape[0], CHUNKS):
+        for t in range(T[i]):
+            for e in range(starts[first[i] + t], starts[first[i] + t + 1]):
+                moment[label[e]] += (t - 0.5 * (T[i] - 1)) * weight[e]
+        for e in range(starts[first[i]], starts[first[i] + T[i]]):
+            trend[i] += moment[label[e]] ** 2
+            moment[label[e]] = 0.0
+
+
+@serial
+def _work_space(T, entries, K):
+    """Work space for voxels of OP up to T (n,) and so many entries: x, number, order, age, moment, value, at."""
     longest, classes = 1, max(1, min(K, entries))
     for i in range(T.shape[0]):
         longest = max(longest, T[i])
-    x, work, number = np.empty((classes, longest)), np.zeros((2 * classes, LANES)), np.full(K, -1)
-    return x, work, number, np.empty((longest, LANES), np.int64), np.empty((longest, LANES)), np.empty(LANES)
-
-
-# --- Random and all orders --------------------------------------------------------------------------------------------
+    order, age, at = np.empty((longest, LANES), np.int64), np.empty((longest, LANES)), np.arange(longest)
+    return np.empty((classes, longest)), np.full(K, -1), order, age, np.empty(LANES), np.empty(LANES), at
 
 
 @serial
@@ -129,74 +128,73 @@ def draw_streams(index, seed, streams):
 
 
 @serial
-def _below(state, n):
-    """A random integer in [0, n) from the stream (splitmix64) whose state (1,) it moves on."""
-    state[0] += GOLDEN
-    return np.int64(((mix(state[0]) >> np.uint64(32)) * np.uint64(n)) >> np.uint64(32))
-
-
-@serial
 def _shuffle(order, T, state):
-    """A random order of T observations, to order (T,)."""
+    """A random order of T observations, to order (T,), from the stream (splitmix64) whose state (1,) it advances."""
     for t in range(T):
-        other = _below(state, t + 1)
+        state[0] += GOLDEN
+        other = np.int64(((mix(state[0]) >> np.uint64(32)) * np.uint64(t + 1)) >> np.uint64(32))
         order[t] = order[other]
         order[other] = t
 
 
 @serial
-def _draw_orders(order, age, T, seed, other):
+def _draw_orders(order, age, T, seed):
     """Random orders (T, LANES), and t - mean t of each observation in random orders: the inverse of one is one."""
     for t in range(T):
         for lane in range(LANES):
             drawn = mix(seed + np.uint64(t * LANES + lane) * GOLDEN) >> np.uint64(32)
-            other[lane] = np.int64((drawn * np.uint64(t + 1)) >> np.uint64(32))
-        for lane in range(LANES):
-            order[t, lane] = order[other[lane], lane]
-            order[other[lane], lane] = t
-    for t in range(T):
-        for lane in range(LANES):
-            age[t, lane] = order[t, lane] - 0.5 * (T - 1)
-
-
-# --- Orders of one voxel ----------------------------------------------------------------------------------------------
+            other = np.int64((drawn * np.uint64(t + 1)) >> np.uint64(32))
+            order[t, lane] = order[other, lane]
+            order[other, lane] = t
+    age[:T] = order[:T] - 0.5 * (T - 1)
 
 
 @serial
-def _shares(value, lanes, slack):
-    """The shares of the values of all orders that are as low as the first, which came, and as high."""
-    low = high = 0
-    for lane in range(lanes):
-        low += value[lane] <= value[0] + slack
-        high += value[lane] >= value[0] - slack
-    return low / lanes, high / lanes
-
-
-@serial
-def measure_all_orders(chunk, voxels, first, T, log, K, entries, order, age, trend, null, p):
-    """As `measure_voxels`, of voxels of these numbers (r,), all of OP T <= ENUMERATED, from all of their orders.
+def test_all_orders(chunk, voxels, first, T, log, K, entries, order, age, null, p):
+    """Voxels of these numbers (r,), all of OP T <= ENUMERATED, in all of their orders.
 
     order (T, T!) is the number of the observation that comes at each step, in the first order as they came; age
-    (T, T!) is t - mean t of each observation.
+    (T, T!) is t - mean t of each observation. null (n,) takes the mean sum of drifts; p (n, 3) the shares of the orders
+    whose sum of drifts is as low, and as high, and whose trend is as high.
     """
-    classes, lanes = max(1, min(K, entries)), order.shape[1]
-    x, work, number = np.empty((classes, T)), np.zeros((2 * classes, LANES)), np.full(K, -1)
-    at, value = np.arange(T), np.empty(LANES)
-    for j in range(chunk * voxels.shape[0] // CHUNKS, (chunk + 1) * voxels.shape[0] // CHUNKS):
+    lanes, at, number = order.shape[1], np.arange(T), np.full(K, -1)
+    x, moment, value = np.empty((max(1, min(K, entries)), T)), np.empty(LANES), np.empty(LANES)
+    for j in range(chunk, voxels.shape[0], CHUNKS):
         i = voxels[j]
-        A = dense(log, first[i], T, number, at, x)
-        drifts(x, A, T, order, lanes, work, value)
+        A = _dense(log, first[i], T, number, at, x)
+        _drifts(x, A, T, order, lanes, value)
         null[i] = value[:lanes].mean()
-        p[i, 0], p[i, 1] = _shares(value, lanes, ROUNDING)
+        p[i, 0] = (value[:lanes] <= value[0] + ROUNDING).mean()
+        p[i, 1] = (value[:lanes] >= value[0] - ROUNDING).mean()
         if T > 2:
-            trends(x, A, T, age, lanes, work, value)
-            trend[i] = value[0]
-            p[i, 2] = _shares(value, lanes, ROUNDING * (1.0 + value[0]))[1]
+            _trends(x, A, T, age, lanes, moment, value)
+            p[i, 2] = (value[:lanes] >= value[0] - ROUNDING * (1.0 + value[0])).mean()
+
+
+@serial
+def mean_drifts(chunk, voxels, first, T, log, K, entries, seeds, draws, null):
+    """The mean sum of drifts of `draws` random orders, TURNS of which are turns of one, to null (n,)."""
+    x, number, turned, _, _, value, at = _work_space(T, entries, K)
+    own = np.empty(1, np.uint64)
+    for j in range(chunk, voxels.shape[0], CHUNKS):
+        i = voxels[j]
+        steps, total = T[i], 0.0
+        for t in range(steps):
+            for turn in range(TURNS):
+                turned[t, turn] = (t + turn * steps // TURNS) % steps
+        own[0] = seeds[i]
+        for drawn in range(0, draws, TURNS):
+            _shuffle(at, steps, own)
+            A = _dense(log, first[i], steps, number, at, x)
+            lanes = min(TURNS, draws - drawn)
+            _drifts(x, A, steps, turned, lanes, value)
+            total += value[:lanes].sum()
+        null[i] = total / draws
 
 
 @serial
 def _groups(chunk, rank, T):
-    """The voxels of a chunk, those of the same OP together; rank (n,) sorts all by OP."""
+    """The voxels of a chunk, those of the same OP together; rank (r,) sorts all by OP."""
     first, last = chunk * rank.shape[0] // CHUNKS, (chunk + 1) * rank.shape[0] // CHUNKS
     groups = []
     for i in range(first + 1, last + 1):
@@ -207,197 +205,82 @@ def _groups(chunk, rank, T):
 
 
 @serial
-def _own_order(at, T, seed, state):
-    """The order in which a voxel's observations go through the orders that all voxels of this OP go through."""
-    state[0] = seed
-    _shuffle(at, T, state)
+def test_orders(chunk, rank, first, T, log, K, entries, seeds, seed, seen, together, most, enough, tails):
+    """P-values of voxels from up to `most` random orders, drawn `together` at a time, at most LANES.
 
-
-@serial
-def _trend(x, A, T, at):
-    """|| sum_t (t - mean t) s_t ||^2 of the observations in columns `at`."""
-    trend = 0.0
-    for a in range(A):
-        moment = 0.0
-        for t in range(T):
-            moment += (t - 0.5 * (T - 1)) * x[a, at[t]]
-        trend += moment * moment
-    return trend
-
-
-@serial
-def _tail(hits, tried, value, least, lanes, enough):
-    """The p-value, NaN until there are `enough` hits, and the hits, values >= least, after `lanes` more orders.
-
-    Enough of them settle it: as the share of the orders until then (Besag and Clifford 1991, Biometrika 78).
+    rank (r,) are the voxels that are tested, sorted by OP; first, T (n,) are their rows of the log, seeds (n,) their
+    random streams, and `entries` is the most that one has. tails (n, 1) takes the share of the orders whose trend is as
+    high as that seen (n,); tails (n, 2) the shares whose sum of drifts is as high, and as low, and `seen` is not read.
+    A tail is settled by `enough` orders: as the share of the orders until then (Besag and Clifford 1991, Biometrika
+    78). `tails` must be NaN before.
     """
-    more = 0
-    for lane in range(lanes):
-        more += value[lane] >= least
-    if hits + more < enough:
-        return np.nan, hits + more
-    lane = -1
-    while hits < enough:
-        lane += 1
-        hits += value[lane] >= least
-    return enough / (tried + lane + 1), hits
-
-
-@serial
-def _mean_drift(x, A, log, first, T, number, at, own, turned, draws, work, value):
-    """The mean sum of drifts over turns of the order in which x has the observations, and of further random ones."""
-    total = 0.0
-    for drawn in range(0, draws, TURNS):
-        if drawn:
-            _shuffle(at, T, own)
-            dense(log, first, T, number, at, x)
-        lanes = min(TURNS, draws - drawn)
-        drifts(x, A, T, turned, lanes, work, value)
-        for lane in range(lanes):
-            total += value[lane]
-    return total / draws
-
-
-@serial
-def measure_voxels(chunk, rank, first, T, log, K, entries, seeds, seed, known, draws, most, enough, trend, null, p):
-    """What each voxel's order gives, and what orders of its observations give.
-
-    rank (n,) sorts the voxels by OP; first, T (n,) are their rows of the log, seeds (n,) their random streams, and
-    `entries` is the most that one has. null (n,) takes the mean sum of drifts of `draws` random orders, TURNS of which
-    are turns of one, unless it is `known` (n,), and p[:, 2] of (n, 3) comes from random orders until `enough` of them
-    have a trend as high, or from the `most` that there are. trend (n,) takes what was seen.
-    """
-    x, work, number, order, age, value = room(T, entries, K)
-    at, own, other = np.empty(x.shape[1], np.int64), np.empty(1, np.uint64), np.empty(LANES, np.int64)
-    turned = np.empty((x.shape[1], TURNS), np.int64)
+    x, number, order, age, moment, value, at = _work_space(T, entries, K)
+    own, sides, least = np.empty(1, np.uint64), tails.shape[1], np.empty(2)
     for voxels in _groups(chunk, rank, T):
-        steps = T[voxels[0]]
-        base, left, tried = mix(seed ^ np.uint64(steps)), voxels.shape[0], 0
-        hits = np.zeros(left, np.int64)
-        for t in range(steps):
-            for turn in range(TURNS):
-                turned[t, turn] = (t + turn * steps // TURNS) % steps
+        steps, tried, left = T[voxels[0]], 0, voxels.shape[0]
+        base, hits, drift = mix(seed ^ np.uint64(steps)), np.zeros((left, sides), np.int64), np.empty(left)
+        unsettled = np.arange(left)
         while left:
-            lanes = min(LANES, most - tried)
-            _draw_orders(order, age, steps, mix(base + np.uint64(tried)), other)
-            open_ = 0
-            for j in range(left):
+            lanes, remaining = min(together, most - tried), 0
+            _draw_orders(order, age, steps, mix(base + np.uint64(tried)))
+            for j in unsettled[:left]:
                 i = voxels[j]
-                _own_order(at, steps, seeds[i], own)
-                A = dense(log, first[i], steps, number, at, x)
-                if tried == 0:
-                    trend[i] = _trend(x, A, steps, at)
-                trends(x, A, steps, age, lanes, work, value)
-                least = trend[i] - ROUNDING * (1.0 + trend[i])
-                p[i, 2], hits[j] = _tail(hits[j], tried, value, least, lanes, enough)
-                if np.isnan(p[i, 2]):
-                    p[i, 2] = (hits[j] + 1) / (tried + lanes + 1)
-                    voxels[open_], hits[open_] = i, hits[j]
-                    open_ += 1
-                if tried == 0 and not known[i]:
-                    null[i] = _mean_drift(x, A, log, first[i], steps, number, at, own, turned, draws, work, value)
-            left, tried = open_ if tried + lanes < most else 0, tried + lanes
+                own[0] = seeds[i]
+                _shuffle(at, steps, own)
+                A = _dense(log, first[i], steps, number, at, x)
+                if sides == 1:
+                    _trends(x, A, steps, age, lanes, moment, value)
+                    least[0] = seen[i] - ROUNDING * (1.0 + seen[i])
+                else:
+                    if tried == 0:
+                        _drifts(x, A, steps, at.reshape(-1, 1), 1, value)
+                        drift[j] = value[0]
+                    _drifts(x, A, steps, order, lanes, value)
+                    least[0], least[1] = drift[j] - ROUNDING, -drift[j] - ROUNDING
+                for side in range(sides):
+                    lane, sign = 0, 1.0 - 2.0 * side
+                    while lane < lanes and hits[j, side] < enough:
+                        hits[j, side] += sign * value[lane] >= least[side]
+                        lane += 1
+                    if np.isnan(tails[i, side]) and hits[j, side] == enough:
+                        tails[i, side] = enough / (tried + lane)
+                    elif np.isnan(tails[i, side]) and tried + lanes == most:
+                        tails[i, side] = (hits[j, side] + 1) / (most + 1)
+                if np.isnan(tails[i]).any():
+                    unsettled[remaining] = j
+                    remaining += 1
+            left, tried = remaining, tried + lanes
 
 
 @serial
-def test_drifts(chunk, rank, first, T, log, K, entries, seeds, seed, most, enough, p):
-    """P-values (n,) of the sum of drifts of voxels, either way, from up to `most` random orders; see `measure_voxels`.
-
-    Each tail is settled by `enough` orders, and the smaller one counts twice.
-    """
-    x, work, number, order, age, value = room(T, entries, K)
-    at, own, other = np.empty(x.shape[1], np.int64), np.empty(1, np.uint64), np.empty(LANES, np.int64)
-    for voxels in _groups(chunk, rank, T):
-        steps = T[voxels[0]]
-        base, left, tried = mix(seed ^ np.uint64(steps)), voxels.shape[0], 0
-        hits, tails, seen = np.zeros((left, 2), np.int64), np.full((left, 2), np.nan), np.empty(left)
-        number_of = np.arange(left)
-        while left:
-            lanes = min(LANES // 2, most - tried)
-            _draw_orders(order, age, steps, mix(base + np.uint64(tried)), other)
-            open_ = 0
-            for j in number_of[:left]:
-                i = voxels[j]
-                _own_order(at, steps, seeds[i], own)
-                A = dense(log, first[i], steps, number, at, x)
-                if tried == 0:
-                    drifts(x, A, steps, at.reshape(-1, 1), 1, work, value)
-                    seen[j] = value[0]
-                drifts(x, A, steps, order, lanes, work, value)
-                for side in range(2):
-                    if side:
-                        value[:lanes] = -value[:lanes]
-                    if np.isnan(tails[j, side]):
-                        least = (-seen[j] if side else seen[j]) - ROUNDING
-                        tails[j, side], hits[j, side] = _tail(hits[j, side], tried, value, least, lanes, enough)
-                        if np.isnan(tails[j, side]) and tried + lanes >= most:
-                            tails[j, side] = (hits[j, side] + 1) / (most + 1)
-                p[i] = min(1.0, 2.0 * tails[j].min())
-                if np.isnan(tails[j]).any():
-                    number_of[open_] = j
-                    open_ += 1
-            left, tried = open_, tried + lanes
-
-
-# Compiled loop over the orders of stretches of time, the same for all voxels of a scene.
-
-
-@serial
-def _in_order(rank, T, stretches, order, age, bounds, made, begins, came):
-    """The observations of a voxel in each order of the stretches (S, lanes), which rank (T,) puts them into.
-
-    bounds (S + 1,), made (T,), begins (S, LANES) and came (LANES,) are work space.
-    """
-    bounds[:] = 0
-    for t in range(T):
-        bounds[rank[t] + 1] += 1
-    for s in range(bounds.shape[0] - 1):
-        bounds[s + 1] += bounds[s]
-    for t in range(T):
-        made[bounds[rank[t]]] = t
-        bounds[rank[t]] += 1  # now where the next stretch begins
-    came[:] = 0
-    for turn in range(stretches.shape[0]):
-        for lane in range(stretches.shape[1]):
-            s = stretches[turn, lane]
-            begins[s, lane] = came[lane]
-            came[lane] += bounds[s] - (bounds[s - 1] if s else 0)
-    for s in range(stretches.shape[0]):
-        first = bounds[s - 1] if s else 0
-        for j in range(first, bounds[s]):
-            for lane in range(stretches.shape[1]):
-                t = begins[s, lane] + (j - first)
-                age[made[j], lane] = t - 0.5 * (T - 1)
-                order[t, lane] = made[j]
-
-
-@serial
-def permute_stretches(chunk, edges, first, T, log, K, entries, rank, orders, sums):
+def permute_stretches(chunk, edges, first, T, log, K, entries, stretch, orders, sums):
     """Statistics of the scene with its stretches of time in other orders, the same for all voxels.
 
-    edges (CHUNKS + 1, 2) bounds each chunk's voxels and their observations; rank (m,) is the stretch of each
-    observation of the voxels, one voxel after the other, orders (S, R) the stretches in each order; `entries` is the
-    most that a voxel has. sums (CHUNKS, R, 2) takes, over voxels: the drift a step; the trend divided by
-    sum_t (t - mean t)^2, over those with T > 2.
+    edges (CHUNKS + 1, 2) bounds each chunk's voxels and their observations; stretch (m,) is that of each observation of
+    the voxels, one voxel after the other, orders (S, R) the stretches in each order; `entries` is the most that a voxel
+    has. sums (CHUNKS, R, 2) takes, over voxels: the drift a step; the trend divided by sum_t (t - mean t)^2, over those
+    with T > 2.
     """
-    x, work, number, order, age, value = room(T, entries, K)
-    natural, made = np.arange(x.shape[1]), np.empty(x.shape[1], np.int64)
-    bounds, at = np.empty(orders.shape[0] + 1, np.int64), edges[chunk, 1]
-    begins, came = np.empty((orders.shape[0], LANES), np.int64), np.empty(LANES, np.int64)
+    x, number, order, age, moment, value, natural = _work_space(T, entries, K)
+    at = edges[chunk, 1]
     for i in range(edges[chunk, 0], edges[chunk + 1, 0]):
-        A = dense(log, first[i], T[i], number, natural, x)
+        A, steps = _dense(log, first[i], T[i], number, natural, x), T[i]
+        by_time = np.argsort(stretch[at : at + steps], kind="mergesort")
+        bounds = np.searchsorted(stretch[at : at + steps][by_time], np.arange(orders.shape[0] + 1))
         for r in range(0, orders.shape[1], LANES):
             lanes = min(LANES, orders.shape[1] - r)
-            own = rank[at : at + T[i]]
-            _in_order(own, T[i], orders[:, r : r + lanes], order, age, bounds, made, begins, came)
-            drifts(x, A, T[i], order, lanes, work, value)
             for lane in range(lanes):
-                sums[chunk, r + lane, 0] += value[lane] / (T[i] - 1)
-            if T[i] > 2:
-                trends(x, A, T[i], age, lanes, work, value)
-                for lane in range(lanes):
-                    sums[chunk, r + lane, 1] += value[lane] / (T[i] * (T[i] * T[i] - 1) / 12)
-        at += T[i]
+                t = 0
+                for s in orders[:, r + lane]:
+                    for j in by_time[bounds[s] : bounds[s + 1]]:
+                        order[t, lane], age[j, lane] = j, t - 0.5 * (steps - 1)
+                        t += 1
+            _drifts(x, A, steps, order, lanes, value)
+            sums[chunk, r : r + lanes, 0] += value[:lanes] / (steps - 1)
+            if steps > 2:
+                _trends(x, A, steps, age, lanes, moment, value)
+                sums[chunk, r : r + lanes, 1] += value[:lanes] / (steps * (steps * steps - 1) / 12)
+        at += steps
 
 
 # Compiled loops over one-hot observations, whose drift depends on counts only.
@@ -407,21 +290,16 @@ LONGEST_TABLE = 256
 
 
 @serial
-def one_hot_drift(c, t):
-    """D_JS of the beliefs after t and t + 1 one-hot observations, bits: the new class was seen c times among the t.
-
-    The other classes' shares all shrink by the factor t / (t + 1), so only how many they are in all matters.
-    """
-    return js_term(c / t, (c + 1) / (t + 1)) + (t - c) * js_term(1 / t, 1 / (t + 1))
-
-
-@serial
 def one_hot_drifts(longest):
-    """Table (longest, longest) of `one_hot_drift` at [c, t]."""
+    """D_JS of the beliefs after t and t + 1 one-hot observations, bits, at [c, t] of a table (longest, longest).
+
+    The new class was seen c times among the t. The other classes' shares all shrink by the factor t / (t + 1), so only
+    how many they are in all matters.
+    """
     drifts = np.zeros((longest, longest))
     for t in range(1, longest):
         for c in range(t + 1):
-            drifts[c, t] = one_hot_drift(c, t)
+            drifts[c, t] = js_term(c / t, (c + 1) / (t + 1)) + (t - c) * js_term(1 / t, 1 / (t + 1))
     return drifts
 
 
@@ -442,3 +320,68 @@ def expected_one_hot(chunk, n, T, log_factorial, drifts, out):
                 log_p += log_factorial[rest] - log_factorial[t - c] - log_factorial[rest - t + c]
                 total += np.exp(log_p) * drifts[c, t]
         out[i] = n[i] / T[i] * total
+
+
+# Compiled loop that fuses the observations of voxels by several rules.
+
+AVERAGING, MAJORITY, PRODUCT, GEOMETRIC = range(4)
+
+
+@serial
+def _observe(log, row, rule, floor, number, total):
+    """Add an observation to the sums total (A,) of evidence, of votes, or of log2(max(s, floor) / floor)."""
+    starts, label, weight = log
+    best = starts[row]
+    for e in range(starts[row], starts[row + 1]):
+        best = e if weight[e] > weight[best] else best
+        if rule == AVERAGING:
+            total[number[label[e]]] += weight[e]
+        elif rule >= PRODUCT and weight[e] > floor:
+            total[number[label[e]]] += np.log2(weight[e] / floor)
+    if rule == MAJORITY:
+        total[number[label[best]]] += 1.0
+
+
+@serial
+def _pooled(total, scale, others, after):
+    """The belief after (A + 1,) that is proportional to 2^(scale * total); the last one is that of `others` classes."""
+    norm, top, A = 0.0, total.max(), total.shape[0] - 1
+    for a in range(A + 1):
+        after[a] = np.exp2((total[a] - top) * scale)
+        norm += after[a] * (others if a == A else 1.0)
+    after /= norm
+
+
+@serial
+def fuse_by_rules(chunk, starts, ends, log, K, first, classes, rules, floor, belief, rest, drift_sum, bits):
+    """Fuse each voxel's observations by each of the rules (R,).
+
+    starts, ends (n,) bound their rows of the log, classes[first[i] : first[i + 1]] are the classes that a voxel saw.
+    belief (R, m) takes the beliefs in these after the last observation, rest (R, n) that in each of the others, which
+    are all alike, drift_sum (R, n) the sum of the Jensen-Shannon divergences of successive beliefs, bits (R, n) the
+    entropy of the last one, in bits both.
+    """
+    number = np.empty(K, np.int64)
+    for i in range(chunk, starts.shape[0], CHUNKS):
+        A = first[i + 1] - first[i]
+        for a in range(A):
+            number[classes[first[i] + a]] = a
+        total, before, after = np.empty(A + 1), np.zeros(A + 1), np.empty(A + 1)
+        for r in range(rules.shape[0]):
+            total[:], logs_before, drift = 0.0, 0.0, 0.0
+            for t in range(ends[i] - starts[i]):
+                _observe(log, starts[i] + t, rules[r], floor, number, total)
+                if rules[r] >= PRODUCT:
+                    _pooled(total, 1.0 if rules[r] == PRODUCT else 1.0 / (t + 1), K - A, after)
+                else:
+                    after[:] = total * (1.0 / (t + 1))
+                logs = mixed = 0.0
+                for a in range(A + 1):
+                    many = K - A if a == A else 1.0
+                    logs += many * plogp(after[a])
+                    mixed += many * plogp(0.5 * (before[a] + after[a]))
+                if t > 0:
+                    drift += min(max(0.5 * (logs_before + logs) - mixed, 0.0), 1.0)
+                before[:], logs_before = after, logs
+            belief[r, first[i] : first[i + 1]], rest[r, i] = before[:A], before[A]
+            drift_sum[r, i], bits[r, i] = drift, max(-logs_before, 0.0)
