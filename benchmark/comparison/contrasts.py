@@ -9,7 +9,7 @@ from collections.abc import Iterable, Iterator, Sequence
 import numpy as np
 
 from semstab.comparison.opening import Entry, Flicker
-from semstab.comparison.pairing import Common
+from semstab.comparison.pairing import Common, joint_class
 from semstab.comparison.tables import (
     BY_CLASS,
     COVERAGE,
@@ -246,13 +246,3 @@ def _of_places(common: Common, names: Sequence[str], number: int) -> Iterator[Co
 def class_of_places(common: Common) -> Int64:
     """The class (n,) of each common place: the true one, or what all runs together say; -1 where it is not known."""
     return common.label if common.label is not None else joint_class(common.tables)
-
-
-def joint_class(tables: Iterable[VoxelTable]) -> Int64:
-    """The dominant class (n,) of the same voxels in several maps, each counting alike."""
-    first, *others = tables
-    beliefs = first.evidence[:] / first.op[:, None]
-    for other in others:
-        beliefs = beliefs + other.evidence[:] / other.op[:, None]
-    label: Int64 = beliefs.round(9).argmax(axis=1)
-    return label
