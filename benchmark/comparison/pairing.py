@@ -10,7 +10,7 @@ from functools import partial
 
 import numpy as np
 
-from semstab.comparison.opening import Entry
+from semstab.comparison.runs import Entry
 from semstab.core.types import Int64, Mask
 from semstab.metrics.agreement import observations, rows_of, shared_rows
 from semstab.model.contrast import Basis, CommonLooks, MapCoverage
