@@ -16,7 +16,7 @@ import argparse
 import numpy as np
 from flights import Flight, World, fly, log_of, table_of, world
 
-from semstab.comparison.opening import open_contender
+from semstab.comparison.runs import open_contender
 from semstab.metrics.agreement import rows_of
 from semstab.model.measures import dominant
 from semstab.model.voxels import VoxelTable

@@ -17,10 +17,10 @@ from posed_writer import write_posed
 from rich.console import Console
 
 import semstab
-from semstab.comparison.contrasts import corrected, over_scenes
-from semstab.comparison.narrative import print_comparison
-from semstab.comparison.opening import open_contenders
+from semstab.comparison.differences import corrected, over_scenes
 from semstab.comparison.pairing import pair
+from semstab.comparison.runs import open_contenders
+from semstab.comparison.tables import print_comparison
 from semstab.comparison.writing import load_comparison, markdown
 from semstab.errors import ConfigError, DataError
 from semstab.model.contrast import Against, Contrast, RunComparison

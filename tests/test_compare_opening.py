@@ -18,8 +18,7 @@ from posed_config import configure
 from posed_scene import fails
 
 import semstab
-from semstab.comparison.baseline import LARGEST
-from semstab.comparison.opening import open_contender, open_contenders, save_summary, shared_scenes
+from semstab.comparison.runs import LARGEST, open_contender, open_contenders, save_summary, shared_scenes
 from semstab.errors import ConfigError, DataError
 from semstab.statistics.cluster_sums import value
 

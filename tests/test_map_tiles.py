@@ -26,8 +26,8 @@ from scipy.spatial.transform import Rotation
 import semstab
 from semstab import backends
 from semstab.comparison import pairing
-from semstab.comparison.comparing import find
-from semstab.comparison.gate_measures import calibrated
+from semstab.comparison.differences import find
+from semstab.comparison.gate import calibrated
 from semstab.core.json_form import to_json
 from semstab.engine import InProcess, LocalProcesses
 from semstab.engine.memory import Sizing

@@ -15,10 +15,9 @@ import typer
 from typer.core import TyperCommand, TyperGroup
 
 from semstab import __version__
-from semstab.cli.comparing import commit, compare, conform, gate
 from semstab.cli.data import check, convert, predict
+from semstab.cli.finished import commit, compare, conform, export, gate, list_, relabel
 from semstab.cli.options import say
-from semstab.cli.outputs import export, list_, relabel
 from semstab.cli.running import remedies, run, show, study, view
 from semstab.core.process import settle
 from semstab.errors import OUT_OF_MEMORY, SemstabError, one_line

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
 
-from semstab.comparison.opening import Entry
+from semstab.comparison.runs import Entry
 from semstab.core.types import Int64, Mask
 from semstab.metrics.agreement import observations, rows_of, shared_rows
 from semstab.model.contrast import Basis, CommonLooks, MapCoverage
@@ -146,6 +146,16 @@ def in_share(table: VoxelTable, share: float) -> Mask:
         return np.ones(len(table), np.bool_)
     drawn: Mask = streams(table, slice(None), 0) >> np.uint64(11) < np.uint64(share * 2**53)
     return drawn
+
+
+def joint_class(tables: Iterable[VoxelTable]) -> Int64:
+    """The dominant class (n,) of the same voxels in several maps, each counting alike."""
+    first, *others = tables
+    beliefs = first.evidence[:] / first.op[:, None]
+    for other in others:
+        beliefs = beliefs + other.evidence[:] / other.op[:, None]
+    label: Int64 = beliefs.round(9).argmax(axis=1)
+    return label
 
 
 # --- What is in common ------------------------------------------------------------------------------------------------

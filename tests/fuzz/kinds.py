@@ -25,10 +25,10 @@ from rich.console import Console
 import semstab
 from semstab.backbones.sam import read_rules
 from semstab.backbones.segearth_ov import read_prompts
-from semstab.comparison.contrasts import contrasts
+from semstab.comparison.differences import contrasts
 from semstab.comparison.gate import gate_config, parse
-from semstab.comparison.opening import open_contender, open_contenders, save_summary, shared_scenes
 from semstab.comparison.pairing import pair
+from semstab.comparison.runs import open_contender, open_contenders, save_summary, shared_scenes
 from semstab.convert import convert
 from semstab.core.files import read_json
 from semstab.core.json_form import from_json

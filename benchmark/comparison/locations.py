@@ -14,8 +14,7 @@ from typing import Any, Literal
 import numpy as np
 import numpy.typing as npt
 
-from semstab.comparison.contrasts import joint_class
-from semstab.comparison.pairing import Common, in_share
+from semstab.comparison.pairing import Common, in_share, joint_class
 from semstab.core.types import Float64, Int32, Int64, Mask
 from semstab.metrics.agreement import shared_rows, voxel_keys
 from semstab.model.contrast import Blame, Place
