@@ -38,7 +38,6 @@ from semstab.statistics.cluster_sums import ClusterSums, of_space_alone, sums_fo
 from semstab.statistics.commit import Commit, calibrate
 from semstab.statistics.correctness import ACCURACY, ECE, MIOU, Truth, join_truth
 from semstab.statistics.intervals import (
-    LEAST_DEGREES,
     LEAST_FRAMES,
     TOO_FEW,
     coverage,
@@ -272,11 +271,6 @@ Frames = Literal["random", "fixed"]
 LEAST = 8
 """Of fewer frames nothing is concluded: a frame in three may be of a kind that none of them shows."""
 
-DOUBT = 0.1
-"""Where errors or the quality of frames may reach as far as the data, each end is missed so much less often: what holds
-even then is concluded."""
-
-AS_LONG = "what frames are like lasts about as long as the flight: fly longer"
 NOTHING = "it has no value: nothing that it is of was seen twice"
 UNKNOWN_FRAMES = "its frames are not known: run it with --statistics"
 SCORES = "labels beside scores, which spread their evidence: run both as labels"
@@ -335,12 +329,6 @@ def comparable(new: ClusterSums, base: ClusterSums) -> tuple[ClusterSums, Cluste
     return new.without_truth(), base.without_truth()
 
 
-def doubtful(found: Interval) -> bool:
-    """Whether nothing may be concluded only because errors, or the quality of frames, may reach as far as the data."""
-    final = ("frames are too few", NOTHING, UNKNOWN_FRAMES, SCORES)
-    return bool(found.undecided) and not any(reason in found.undecided for reason in final)
-
-
 def negative(found: Interval) -> Interval:
     """Of the opposite number."""
     return dataclasses.replace(found, value=0.0 - found.value, low=0.0 - found.high, high=0.0 - found.low)
@@ -350,8 +338,6 @@ def of_frames(found: Interval, frames: int) -> Interval:
     """With this gate's own least number of frames: a rule is judged for frames like these."""
     few = TOO_FEW.format(least=LEAST_FRAMES)
     reasons = [reason for reason in found.undecided.split("; ") if reason and reason != few]
-    if not reasons and found.question == NEXT_FLIGHT and found.degrees < LEAST_DEGREES:
-        reasons.append(AS_LONG)
     if math.isnan(found.value):
         reasons.append(NOTHING)
     if frames < LEAST:
@@ -576,14 +562,7 @@ def _judged(rule: Rule, own: Contender, base: Contender | None, scenes: Sequence
         for scene in ([rule.scene] if rule.scene else scenes)
     ]
 
-    def at(level: float) -> Interval:
-        chosen = dataclasses.replace(ways, level=level)
-        return mean_of([_found(rule, new, old, chosen) for new, old in pairs], 1 - 2 * level)
-
-    found = at(ways.level)
-    if doubtful(found):
-        strict = dataclasses.replace(at(ways.level * DOUBT), undecided="")
-        found = found if verdict(rule, strict) == "undecided" else strict
+    found = mean_of([_found(rule, new, old, ways) for new, old in pairs], 1 - 2 * ways.level)
     return Judgement(
         rule,
         verdict(rule, found),

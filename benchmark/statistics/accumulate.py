@@ -92,7 +92,8 @@ class Cubes:
         some = np.flatnonzero(of >= 0)
         key, shape = of[some] * evidence.K + evidence.label[some], (self.count, evidence.K)
         size = self.count * evidence.K
-        return [np.bincount(key, weights=own[some], minlength=size).reshape(shape) for own in weights]
+        sums = (np.bincount(key, weights=own[some], minlength=size).astype(np.float64) for own in weights)
+        return [own.reshape(shape) for own in sums]
 
     def estimate(
         self,
@@ -325,7 +326,8 @@ def _sums_of_table(table: VoxelTable, cubes: Cubes, true_label: Int64 | None, li
         known = np.where(one_hot_where(table, cubes.at >= 0), 1.0, np.nan)
         by_class |= {"class_own": known * shares, "class_apart": known * apart}
     if true_label is not None:
-        plain, further = _sums_with_truth(table, cubes, true_label, likely * recurrent)
+        likely = recurrent if likely is None else likely * recurrent
+        plain, further = _sums_with_truth(table, cubes, true_label, likely)
         values, by_class = values | plain, by_class | further
     sums, own = np.zeros((cubes.count, width(K, truth=truth))), layout(K, truth=truth)
     for name, column in zip(values, by_group(cubes.at, [*values.values()], cubes.count)[0].T, strict=True):

@@ -127,13 +127,14 @@ class ClusterIndex:
 
     def by_cube(self, values: Float64) -> Float64:
         """Return the sums (G,) of values (m,)."""
-        return np.bincount(self.row, weights=values, minlength=len(self.cubes))
+        return np.bincount(self.row, weights=values, minlength=len(self.cubes)).astype(np.float64, copy=False)
 
     def by_both(self, values: Float64) -> Float64:
         """Return the sums (G, F) of values (m,)."""
         shape = len(self.cubes), len(self.frames)
         cell = self.row[self.known] * shape[1] + self.column
-        return np.bincount(cell, weights=values[self.known], minlength=shape[0] * shape[1]).reshape(shape)
+        sums: Float64 = np.bincount(cell, weights=values[self.known], minlength=shape[0] * shape[1]).astype(np.float64)
+        return sums.reshape(shape)
 
 
 def distinct_rows(rows: npt.NDArray[np.integer]) -> tuple[Int64, Int64]:
@@ -226,10 +227,6 @@ class ClusterSums:
         rows, of = distinct_rows(key)
         columns = np.zeros((len(rows), self.columns.shape[1]))
         np.add.at(columns, of, self.columns)
-        parts = {
-            name: None if part is None else part.coarsened(edge, step)
-            for name, part in (("seen", self.seen), ("limit", self.limit))
-        }
         return dataclasses.replace(
             self,
             cell=rows[:, :3].astype(np.int32),
@@ -237,7 +234,8 @@ class ClusterSums:
             columns=columns,
             edge=edge,
             step=step if known else 0,
-            **parts,
+            seen=self.seen and self.seen.coarsened(edge, step),
+            limit=self.limit and self.limit.coarsened(edge, step),
         )
 
     def without_truth(self) -> ClusterSums:

@@ -168,7 +168,7 @@ def interval_of_cubes(
 
 
 def spec_of_cubes(
-    where: ClusterIndex,
+    index: ClusterIndex,
     columns: Float64,
     statistic: Statistic,
     scale: Scale,
@@ -176,7 +176,7 @@ def spec_of_cubes(
     level: float = LEVEL,
 ) -> EstimateSpec:
     """For `answers`, see `of_places`."""
-    grid = influences(where, columns, statistic)
+    grid = influences(index, columns, statistic)
     return EstimateSpec(float(statistic(columns.sum(axis=0))), grid, THIS_MAP, scale, bounds, level)
 
 
@@ -230,7 +230,7 @@ def grid_of(sums: ClusterSums, key: str, k: int | None = None) -> Influences | N
         return None
     rows = parts_of(sums, number)[0]
     halves = rows.of(("twice_agreeing", "twice")) * (0.5 if key == "psa" else 1.0) if number.pairs else None
-    return influences(rows.where, columns, number.of, halves)
+    return influences(rows.index, columns, number.of, halves)
 
 
 def probability_above(found: Interval, threshold: float, scale: Scale) -> float:

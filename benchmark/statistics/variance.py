@@ -183,7 +183,7 @@ class Influences:
 
 
 def influences(
-    where: ClusterIndex, columns: Float64, of: Statistic, halves: Float64 | None = None
+    index: ClusterIndex, columns: Float64, of: Statistic, halves: Float64 | None = None
 ) -> Influences | None:
     """Return the influences of sums (m, C) by cube and group of frames; None where all is in one cube.
 
@@ -192,23 +192,23 @@ def influences(
     """
     total = columns.sum(axis=0)
     gradient = gradient_of(of, total)
-    everything = np.abs(where.by_place(columns[:, 1]))
+    everything = np.abs(index.by_cube(columns[:, 1]))
     some = everything > TINY * everything.sum()
     if some.sum() < 2 or everything.sum() < TINY or not np.isfinite(gradient).all():
         return None  # of 150 classes hardly any voxel may count as stable: 1e-112 of all of them
     own: Float64 = columns @ gradient
     shared = own if halves is None else own + gradient[0] * (halves[:, 0] - total[0] / total[1] * halves[:, 1])
-    by_frame, size = where.by_both(shared), where.by_both(np.abs(columns[:, 1]))
+    by_frame, size = index.by_both(shared), index.by_both(np.abs(columns[:, 1]))
     seen = size.sum(axis=0) > 0
     return Influences(
-        where.places[some],
-        where.frames[seen],
-        where.by_place(own)[some],
+        index.cubes[some],
+        index.frames[seen],
+        index.by_cube(own)[some],
         by_frame[np.ix_(some, seen)],
         size[np.ix_(some, seen)],
         everything[some],
-        where.edge,
-        where.step,
+        index.edge,
+        index.step,
         one_off=abs(float(gradient[0] * total[1])),
     )
 
@@ -228,7 +228,8 @@ class Effects:
     def of(cls, grid: Influences) -> Effects:
         """Fit the model to influences."""
         cell, size = grid.cell, grid.size
-        by_location, by_frame = size.sum(axis=1), size.sum(axis=0)
+        by_location: Float64 = size.sum(axis=1)
+        by_frame: Float64 = size.sum(axis=0)
         some = by_location > 0
         cell, size, by_location = cell[some], size[some], by_location[some]
         if grid.step == 0 or len(by_frame) < 2 or len(by_location) < 2:
@@ -242,13 +243,14 @@ class Effects:
         left = max(cells - len(location) - len(frame) + 1, 1)
         unit = float((residual**2 / np.where(size > 0, size, 1.0)).sum()) / left
         mean = by_location @ location / by_location.sum()
-        scatter = by_location @ (location - mean) ** 2 / by_location.sum() - unit * len(location) / by_location.sum()
+        total = float(by_location.sum())
+        scatter = float(by_location @ (location - mean) ** 2) / total - unit * len(location) / total
         shrink = unit / max(scatter, 1e-3 * unit / float(np.median(by_location)), TINY**2)
         ridge = size / (by_location + shrink)[:, None]  # locations as random effects: what frames differ in is kept
-        normal = np.diag(by_frame * (1 + TINY)) - size.T @ ridge
+        normal = np.diag(by_frame * (1 + 1e-9)) - size.T @ ridge
         frame = np.linalg.solve(normal, cell.sum(axis=0) - ridge.T @ cell.sum(axis=1))
         return cls(
-            _of_frames(frame, by_frame, unit * np.linalg.inv(normal), grid.frames.astype(np.float64)),
+            _of_frames(frame, by_frame, (unit * np.linalg.inv(normal)).astype(np.float64), grid.frames.astype(np.float64)),
             _of_locations(grid, unit),
             float((residual**2).sum()) * cells / left,
         )
@@ -264,7 +266,8 @@ def _of_frames(effect: Float64, weight: Float64, noise: Float64, at: Float64) ->
 def _of_locations(grid: Influences, unit: float) -> Variances:
     """Return the variances over new locations, where the noise of an observation has that variance."""
     of = _neighbours(grid.places.astype(np.float64), MOST_LOCATIONS)
-    weight, effect = np.bincount(of, weights=grid.all), np.bincount(of, weights=grid.block)
+    weight: Float64 = np.bincount(of, weights=grid.all).astype(np.float64)
+    effect = np.bincount(of, weights=grid.block)
     at = np.stack([np.bincount(of, weights=grid.all * axis) / weight for axis in grid.places.T], axis=1)
     apart = np.linalg.norm(at[:, None] - at[None], axis=2)
     centre = weight @ at / weight.sum()
@@ -309,7 +312,7 @@ def spread_of_flights(one: Influences, other: Influences, between: Influences, q
     if question == THIS_MAP:
         return spread_of(between, question)
     effects = [Effects.of(one), Effects.of(other)]
-    noise = sum(own.noise for own in effects)
+    noise = effects[0].noise + effects[1].noise
     parts = effects[0].frames.plus(effects[1].frames).plus(Variances(np.ones(1), np.array([noise])))
     if question != NEXT_FLIGHT:
         parts = parts.plus(Effects.of(between).locations)
