@@ -1,12 +1,13 @@
 """How often do intervals hold what they are about?
 
-    python simulations/intervals.py this-map [--trials 300] [--seed 0]
-    python simulations/intervals.py next-flight [--trials 300] [--seed 0]
+    python simulations/intervals.py these-frames [--trials 300] [--seed 0]
+    python simulations/intervals.py this-scene [--trials 300] [--seed 0]
+    python simulations/intervals.py other-scenes [--trials 300] [--seed 0]
     python simulations/intervals.py differences [--trials 300] [--seed 0]
     python simulations/intervals.py correlogram [--trials 300] [--seed 0]
 
-Prints a table in Markdown. What an interval is about is the number that very many such scenes and flights have
-together: that of the sums of all trials.
+Prints a table in Markdown. The target of an interval is the number that very many flights have together: over the same
+scene for 'this scene', over all scenes for the others.
 """
 
 from __future__ import annotations
@@ -14,12 +15,12 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 from flights import Flight, fly, sample_of, sums_of, world
 
-from semstab.model.statistics import NEXT_FLIGHT, THIS_MAP, Interval, Question
+from semstab.model.statistics import OTHER_SCENES, THESE_FRAMES, THIS_SCENE, Interval, Scope
 from semstab.statistics.cluster_sums import FUNCTIONALS
 from semstab.statistics.correlogram import correlogram
 from semstab.statistics.intervals import difference, estimate
@@ -28,111 +29,133 @@ from semstab.statistics.observations import Views
 KEYS = ("alpha", "psa", "accuracy")
 
 
+FLIGHTS = 8
+"""Flights over each scene, of which the first has the interval and all together the target of scope 'this scene'."""
+
+
 @dataclasses.dataclass(frozen=True)
 class Row:
-    """What became of the trials of one condition: the value aimed at, and for each trial its interval."""
+    """What became of the trials of one condition: for each its value, interval and target, and the spread of values."""
 
     name: str
     key: str
-    target: float
+    spread: float
+    targets: np.ndarray
     intervals: tuple[Interval, ...]
 
-    def covered(self, which: Callable[[Interval], bool] = lambda _: True) -> float:
-        """The share of the intervals that hold the target, among those for which `which` holds."""
-        held = [i.low <= self.target <= i.high for i in self.intervals if which(i)]
-        return float(np.mean(held)) if held else float("nan")
+    def covered(self) -> float:
+        """Return the share of the intervals that hold their target."""
+        return float(np.mean([i.low <= t <= i.high for i, t in zip(self.intervals, self.targets, strict=True)]))
 
     def cells(self) -> list[str]:
-        """As the table has them."""
-        values = np.array([i.value for i in self.intervals])
+        """Return the row of the table."""
         half = np.median([(i.high - i.low) / 2 for i in self.intervals])
-        decided = np.array([i.decided for i in self.intervals])
-        held = np.array([i.low <= self.target <= i.high for i in self.intervals])
-        above = np.array([i.low > self.target for i in self.intervals])
-        claimed = self.covered(lambda interval: interval.decided)
+        decided = np.mean([i.decided for i in self.intervals])
+        error = math.sqrt(0.0475 / len(self.intervals))
         return [
-            self.name, self.key, f"{self.target:.3f}", f"{values.std():.3f}", f"{half:.3f}",
-            _share(held.mean(), len(held)), f"{decided.mean():.2f}", _share(claimed, int(decided.sum())),
-            f"{np.mean(decided & ~held):.3f}", f"{np.mean(decided & above):.3f}",
+            self.name, self.key, f"{self.targets.mean():.3f}", f"{self.spread:.4f}", f"{half:.3f}",
+            f"{half / 1.96 / self.spread:.2f}", f"{self.covered():.3f} ± {error:.3f}", f"{decided:.2f}",
         ]  # fmt: skip
 
 
-def _share(share: float, of: int) -> str:
-    """With its standard error, no smaller than that of a share of 5 %."""
-    return f"{share:.3f} ± {np.sqrt(max(share * (1 - share), 0.0475) / of):.3f}" if of else ""
-
-
-HEAD = ["condition", "of", "target", "sd", "half width", "held", "claimed", "held of claimed", "wrong", "low end above"]
+HEAD = ["condition", "of", "target", "sd", "half width", "half width / 1.96 sd", "held", "claimed"]
 
 
 def trials(
-    flight: Flight, count: int, seed: int, question: Question, keys: Sequence[str] = KEYS, name: str = ""
+    flight: Flight, count: int, seed: int, scope: Scope, keys: Sequence[str] = KEYS, name: str = ""
 ) -> list[Row]:
-    """Scene after scene, each flown over once."""
-    found: dict[str, list[Interval]] = {key: [] for key in keys}
-    totals: dict[str, np.ndarray | float] = dict.fromkeys(keys, 0.0)
+    """Simulate scene after scene: 'this scene' has a target of its own in each, the others one of all."""
+    flights = FLIGHTS if scope == THIS_SCENE else 1
+    intervals: dict[str, list[Interval]] = {key: [] for key in keys}
+    values: dict[str, list[list[float]]] = {key: [] for key in keys}
+    totals: dict[str, list[np.ndarray]] = {key: [] for key in keys}
     for trial in range(count):
         rng = np.random.default_rng([seed, trial])
         over = world(flight, rng)
-        sums = sums_of(fly(flight, over, rng), over, flight)
+        flown = [sums_of(fly(flight, over, rng), over, flight) for _ in range(flights)]
         for key in keys:
-            found[key].append(estimate(sums, key, question=question))
-            totals[key] = totals[key] + sums.of(FUNCTIONALS[key].names).sum(axis=0)
-    targets = {key: float(FUNCTIONALS[key].of(np.asarray(totals[key]))) for key in keys}
-    return [Row(name, key, targets[key], tuple(found[key])) for key in keys]
+            columns = [sums.of(FUNCTIONALS[key].names).sum(axis=0) for sums in flown]
+            intervals[key].append(estimate(flown[0], key, scope=scope))
+            values[key].append([float(FUNCTIONALS[key].of(own)) for own in columns])
+            totals[key].append(sum(columns))
+    rows = []
+    for key in keys:
+        of, scenes = FUNCTIONALS[key].of, np.array(totals[key])
+        one = np.array(values[key])
+        if scope == THIS_SCENE:
+            targets, spread = of(scenes), math.sqrt(one.var(axis=1, ddof=1).mean())
+        else:
+            targets, spread = np.full(count, float(of(scenes.sum(axis=0)))), float(one.std(ddof=1))
+        rows.append(Row(name, key, spread, targets, tuple(intervals[key])))
+    return rows
 
 
-# --- This map ---------------------------------------------------------------------------------------------------------
+# --- These frames -----------------------------------------------------------------------------------------------------
 
 
-def this_map(count: int, seed: int) -> Iterator[Row]:
+def these_frames(count: int, seed: int) -> Iterator[Row]:
     """Floors of 2,000 to 50,000 voxels and a city, errors reaching half a voxel to twenty, all sorts of alpha."""
     for side in (45, 100, 224):
         for reach in (0.5, 2.0, 5.0, 10.0, 20.0):
             flight = Flight(side=side, reach=reach)
-            yield from trials(flight, count, seed, THIS_MAP, ("alpha",), f"floor {side} x {side}, reach {reach:g}")
+            yield from trials(flight, count, seed, THESE_FRAMES, ("alpha",), f"floor {side} x {side}, reach {reach:g}")
     for reach in (0.5, 2.0, 5.0):
         yield from trials(
-            Flight(80, reach, city=True), count, seed, THIS_MAP, ("alpha",), f"city 80 x 80, reach {reach:g}"
+            Flight(80, reach, city=True), count, seed, THESE_FRAMES, ("alpha",), f"city 80 x 80, reach {reach:g}"
         )
-    yield from trials(Flight(100, 2.0, coin=True), count, seed, THIS_MAP, KEYS, "floor 100 x 100, a coin")
+    yield from trials(Flight(100, 2.0, coin=True), count, seed, THESE_FRAMES, KEYS, "floor 100 x 100, a coin")
     for soft, K in ((True, 2), (False, 5)):
         name = "floor 100 x 100, reach 2, " + ("scores" if soft else f"{K} classes")
-        yield from trials(Flight(100, 2.0, K=K, soft=soft), count, seed, THIS_MAP, ("alpha_between", "accuracy"), name)
+        flight, keys = Flight(100, 2.0, K=K, soft=soft), ("alpha_between", "accuracy")
+        yield from trials(flight, count, seed, THESE_FRAMES, keys, name)
     for ease in (2.0, 2.5, 3.0):
         yield from trials(
-            Flight(100, 2.0, ease), count, seed, THIS_MAP, KEYS, f"floor 100 x 100, reach 2, ease {ease:g}"
+            Flight(100, 2.0, ease), count, seed, THESE_FRAMES, KEYS, f"floor 100 x 100, reach 2, ease {ease:g}"
         )
 
 
-# --- The next flight --------------------------------------------------------------------------------------------------
+# --- This scene, and other scenes -------------------------------------------------------------------------------------
 
 
-def next_flight(count: int, seed: int) -> Iterator[Row]:
-    """All frames see all, or each a strip; frames of six kinds; and other scenes, classes, scores, shares of errors."""
-    for frames in (20, 30, 40, 60, 100):
-        for quality in ("alike", "bad", "uneven", "lasting"):
-            yield from _of_frames(Flight(45, 2.0, 1.0, frames, 5, quality), count, seed)
-    for frames in (30, 60):
-        for quality in ("alike", "bad", "uneven", "lasting"):
-            yield from _of_frames(Flight(45, 2.0, 1.0, frames, frames, quality), count, seed)
-        for quality in ("view", "direction"):
-            yield from _of_frames(Flight(45, 2.0, 1.0, frames, 5, quality), count, seed)
-    for quality in ("bad", "lasting", "direction"):
-        yield from _of_frames(Flight(60, 2.0, 1.0, 40, 5, quality, city=True), count, seed, "city 60 x 60")
-        yield from _of_frames(Flight(45, 2.0, 1.0, 40, 5, quality, K=5), count, seed, "five classes")
-        yield from _of_frames(Flight(45, 2.0, 1.0, 40, 5, quality, soft=True), count, seed, "scores", "alpha_between")
-        yield from _of_frames(Flight(45, 2.0, 2.2, 40, 5, quality), count, seed, "few errors")
-        yield from _of_frames(Flight(45, 2.0, 1.0, 40, 5, quality), count, seed, "", "psa")
-    yield from _of_frames(Flight(45, 2.0, 1.0, 40, 5, coin=True), count, seed, "a coin")
-    for quality in ("bad", "lasting"):
-        yield from _of_frames(Flight(224, 4.0, 1.0, 40, 5, quality), count, seed, "floor 224 x 224, reach 4")
+QUALITIES = ("alike", "bad", "uneven", "lasting", "regimes", "heavy", "objects", "view", "direction")
 
 
-def _of_frames(flight: Flight, count: int, seed: int, where: str = "", key: str = "alpha") -> Iterator[Row]:
+def this_scene(count: int, seed: int) -> Iterator[Row]:
+    """Simulate the same scene flown again: frames of nine kinds, of which all see all or each sees a strip."""
+    yield from _flown(count, seed, THIS_SCENE)
+
+
+def other_scenes(count: int, seed: int) -> Iterator[Row]:
+    """Simulate other scenes, also with errors that reach up to a fifth of the scene."""
+    yield from _flown(count, seed, OTHER_SCENES)
+    for reach in (0.5, 5.0, 10.0):
+        for quality in ("alike", "bad", "lasting", "objects"):
+            yield from _of_frames(Flight(45, reach, 1.0, 40, 5, quality), count, seed, OTHER_SCENES, f"reach {reach:g}")
+
+
+def _flown(count: int, seed: int, scope: Scope) -> Iterator[Row]:
+    for frames in (20, 40, 80, 150):
+        for quality in QUALITIES:
+            yield from _of_frames(Flight(45, 2.0, 1.0, frames, 5, quality), count, seed, scope)
+    for frames in (20, 60):
+        for quality in ("alike", "bad", "lasting", "regimes", "objects"):
+            yield from _of_frames(Flight(32, 2.0, 1.0, frames, frames, quality), count, seed, scope)
+    for quality in ("bad", "lasting", "objects"):
+        yield from _of_frames(Flight(60, 2.0, 1.0, 40, 5, quality, city=True), count, seed, scope, "city 60 x 60")
+        yield from _of_frames(Flight(45, 2.0, 1.0, 40, 5, quality, K=5), count, seed, scope, "five classes")
+        yield from _of_frames(
+            Flight(45, 2.0, 1.0, 40, 5, quality, soft=True), count, seed, scope, "scores", "alpha_between"
+        )
+        yield from _of_frames(Flight(45, 2.0, 2.2, 40, 5, quality), count, seed, scope, "few errors")
+        yield from _of_frames(Flight(45, 2.0, 1.0, 40, 5, quality), count, seed, scope, "", "psa")
+
+
+def _of_frames(
+    flight: Flight, count: int, seed: int, scope: Scope, where: str = "", key: str = "alpha"
+) -> Iterator[Row]:
     seen = "all see all" if flight.looks == flight.frames else "strips"
     name = ", ".join(filter(None, (f"{flight.frames} frames", flight.quality, seen, where)))
-    yield from trials(flight, count, seed, NEXT_FLIGHT, (key,), name)
+    yield from trials(flight, count, seed, scope, (key,), name)
 
 
 # --- Differences ------------------------------------------------------------------------------------------------------
@@ -143,12 +166,12 @@ def differences(count: int, seed: int) -> Iterator[Row]:
     for side, looks in ((32, 60), (45, 5)):
         for quality in ("alike", "bad", "uneven", "lasting"):
             yield from _pairs(Flight(side, 1.5, 1.0, 60, looks, quality), count, seed)
-    yield from _pairs(Flight(32, 1.5, 1.0, 15, 5, "alike"), count, seed, THIS_MAP, "this map")
+    yield from _pairs(Flight(32, 1.5, 1.0, 15, 5, "alike"), count, seed, THESE_FRAMES, "these frames")
     yield from _pairs(Flight(45, 1.5, 1.0, 40, 5, "uneven", K=5), count, seed, where="five classes")
     yield from _pairs(Flight(45, 1.5, 1.0, 40, 5, "uneven", soft=True), count, seed, where="scores")
 
 
-def _pairs(flight: Flight, count: int, seed: int, question: Question = NEXT_FLIGHT, where: str = "") -> Iterator[Row]:
+def _pairs(flight: Flight, count: int, seed: int, scope: Scope = THIS_SCENE, where: str = "") -> Iterator[Row]:
     key = "alpha_between" if flight.soft else "alpha"
     found: dict[str, list[Interval]] = {"same frames": [], "two flights": []}
     for trial in range(count):
@@ -156,12 +179,13 @@ def _pairs(flight: Flight, count: int, seed: int, question: Question = NEXT_FLIG
         over = world(flight, rng)
         other = dataclasses.replace(over, hard=world(flight, rng).hard)
         pair = [sums_of(fly(flight, scene, rng), scene, flight) for scene in (over, other)]
-        found["same frames"].append(difference(*pair, key, question=question, same_frames=True))
-        found["two flights"].append(difference(*pair, key, question=question, same_frames=False))
+        found["same frames"].append(difference(*pair, key, scope=scope, same_frames=True))
+        found["two flights"].append(difference(*pair, key, scope=scope, same_frames=False))
     seen = "all see all" if flight.looks == flight.frames else "strips"
     for flights, intervals in found.items():
         parts = (f"{flight.side} x {flight.side}, {flight.frames} frames", flight.quality, seen, where, flights)
-        yield Row(", ".join(filter(None, parts)), f"{key} a - b", 0.0, tuple(intervals))
+        spread = float(np.std([interval.value for interval in intervals]))
+        yield Row(", ".join(filter(None, parts)), f"{key} a - b", spread, np.zeros(count), tuple(intervals))
 
 
 # --- Correlogram ------------------------------------------------------------------------------------------------------
@@ -185,13 +209,22 @@ def correlograms(count: int, seed: int) -> Iterator[Row]:
             for own, lag in zip(found.values(), bins, strict=False):
                 own.append(lag.alpha)
         for apart, own in found.items():
-            target = float(np.mean([alpha.value for alpha in own]))
-            yield Row(f"40 frames, {quality}, strips, {apart} apart", "alpha_between", target, tuple(own))
+            values = np.array([alpha.value for alpha in own])
+            targets = np.full(count, values.mean())
+            yield Row(
+                f"40 frames, {quality}, strips, {apart} apart", "alpha_between", values.std(), targets, tuple(own)
+            )
 
 
 # --- Table ------------------------------------------------------------------------------------------------------------
 
-STUDIES = {"this-map": this_map, "next-flight": next_flight, "differences": differences, "correlogram": correlograms}
+STUDIES = {
+    "these-frames": these_frames,
+    "this-scene": this_scene,
+    "other-scenes": other_scenes,
+    "differences": differences,
+    "correlogram": correlograms,
+}
 
 
 def main() -> None:

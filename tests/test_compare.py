@@ -186,7 +186,7 @@ def test_a_terminal_of_80_columns_and_markdown_hold_it(fault):
     text = StringIO()
     print_comparison(fault, Console(file=text, width=80))
     assert max(map(len, text.getvalue().splitlines())) <= 80
-    for word in ("new is less", "Alpha between", "door", "window", "frames"):
+    for word in ("Over all classes", "Alpha between", "door", "window", "frames"):
         assert word in text.getvalue()
     page = markdown(fault)
     assert page.startswith("## new against old\n")

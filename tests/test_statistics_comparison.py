@@ -14,7 +14,7 @@ from semstab.errors import ConfigError, DataError
 from semstab.metrics import vss
 from semstab.metrics.agreement import shared_rows
 from semstab.model.measures import VSS
-from semstab.model.statistics import NEXT_FLIGHT, THIS_MAP
+from semstab.model.statistics import THESE_FRAMES, THIS_SCENE
 from semstab.statistics import claimed_together, compare_backbones, coverage, paired, psa, standardised
 from semstab.statistics.agreement import PSA
 from semstab.statistics.paired_differences import EDGES, common_weights, holm, stratum_counts
@@ -222,9 +222,9 @@ def test_what_describes_says_what_its_interval_answers():
     rng = np.random.default_rng(6)
     logs = {name: log_of(rng.integers(0, 2, size=(256, 30)), K=2, index=grid(16)) for name in "ab"}
     result = paired({name: log.table() for name, log in logs.items()}, logs=logs)
-    answers = {row.measure: row.question for row in result.differences}
-    assert answers["psa"] == answers["alpha"] == answers["entropy"] == NEXT_FLIGHT
-    assert answers["sbd"] == answers["vss"] == THIS_MAP
+    answers = {row.measure: row.scope for row in result.differences}
+    assert answers["psa"] == answers["alpha"] == answers["entropy"] == THIS_SCENE
+    assert answers["sbd"] == answers["vss"] == THESE_FRAMES
     assert all(row.difference.low < 0 < row.difference.high for row in result.differences)
 
 

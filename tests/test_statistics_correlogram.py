@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from simulated_events import grid, log_of
 
-from semstab.model.statistics import NEXT_FLIGHT, THIS_MAP
+from semstab.model.statistics import THESE_FRAMES, THIS_SCENE
 from semstab.recording.voxel_maps import agreement_report
 from semstab.report.figures.statistics import draw_correlogram
 from semstab.statistics import ObservationSample, Views, correlogram, describe, krippendorff_alpha
@@ -98,17 +98,17 @@ def test_frames_of_one_look_have_no_correlogram_and_all_outputs_take_it():
     assert report.count("| ceiling |") == 4
 
 
-def test_bands_are_for_the_next_flight_where_a_bin_has_the_frames_for_it():
+def test_bands_are_for_another_flight_where_a_bin_has_the_frames_for_it():
     """Frames of uneven quality widen them; errors of places alone leave them as they are."""
     rng = np.random.default_rng(5)
-    frames, few = 64, slice(0, 12)
+    frames, few = 64, slice(0, 6)
     wrong = rng.random((SIDE**2, frames))
     centres = flown(0.2, frames)
     alike, uneven = (np.where(wrong < share, 1, 0) for share in (0.2, rng.choice([0.05, 0.35], size=frames)))
     widths = []
     for labels in (alike, uneven):
         band = correlogram(sample_of(labels, centres, K=2)).time[0].alpha
-        assert (band.question, band.undecided) == (NEXT_FLIGHT, "")
+        assert (band.scope, band.undecided) == (THIS_SCENE, "")
         widths.append(band.high - band.low)
-        assert correlogram(sample_of(labels[:, few], centres[few], K=2)).time[0].alpha.question == THIS_MAP
+        assert correlogram(sample_of(labels[:, few], centres[few], K=2)).time[0].alpha.scope == THESE_FRAMES
     assert widths[1] > 1.5 * widths[0]

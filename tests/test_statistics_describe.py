@@ -17,7 +17,7 @@ from semstab.errors import ConfigError, DataError
 from semstab.metrics import sbd
 from semstab.model.contrast import BackboneComparison
 from semstab.model.statistics import (
-    NEXT_FLIGHT,
+    THIS_SCENE,
     UNKNOWN,
     CeilingShare,
     ClassCeilingShare,
@@ -36,6 +36,8 @@ from semstab.statistics import (
     verdict,
 )
 from semstab.statistics.agreement import PSA
+from semstab.statistics.intervals import probability_above
+from semstab.statistics.verdict import TENTATIVE, level_probabilities
 
 SIDE, F = 24, 8
 
@@ -173,7 +175,7 @@ def test_one_backbone_cannot_be_compared():
 
 
 def between(low, high):
-    return Interval((low + high) / 2, low, high, question=NEXT_FLIGHT, frames=60)
+    return Interval((low + high) / 2, low, high, scope=THIS_SCENE, frames=60)
 
 
 def judged(low, high, wrong=UNKNOWN, voxels=5000, blocks=40, ceiling=None, classes=()):
@@ -189,58 +191,62 @@ def judged(low, high, wrong=UNKNOWN, voxels=5000, blocks=40, ceiling=None, class
 
 
 def of_class(name, low, high, *, matters=True):
-    return ClassCeilingShare(name, 200.0, matters, 0.5, 0.9, between(low, high))
+    share = between(low, high)
+    return ClassCeilingShare(name, 200.0, matters, 0.5, 0.9, share, 1 - probability_above(share, TENTATIVE, "plain"))
 
 
 @pytest.mark.parametrize(
     ("low", "high", "level"),
     [
-        (0.81, 0.9, "stable"), (0.79, 0.9, "usable"), (0.67, 0.7, "usable"), (0.6, 0.9, "undecided"),
-        (0.3, 0.66, "unstable"), (math.nan, math.nan, "no verdict"),
+        (0.81, 0.9, "stable"), (0.79, 0.9, "stable"), (0.67, 0.7, "usable"), (0.6, 0.9, "usable"),
+        (0.6, 0.98, "undecided"), (0.3, 0.66, "unstable"), (math.nan, math.nan, "no verdict"),
     ],
 )  # fmt: skip
-def test_the_interval_decides_the_level(low, high, level):
+def test_the_most_probable_level_is_the_verdict(low, high, level):
     assert judged(low, high).level == level
 
 
 def test_agreement_below_zero_is_no_share_of_anything():
     line = judged(-0.2, -0.1, ceiling=0.9, classes=(of_class("tree", -0.2, -0.1),)).line
     assert "alpha between frames -0.15, no better than chance, is -15%" in line
-    assert "worst class tree no better than chance, -15%" in line
+    assert "probably unstable: tree (100%)" in line
     assert "chance" not in judged(0.1, 0.2, ceiling=0.9).line
 
 
 def test_what_is_stably_wrong_is_not_called_stable():
     assert judged(0.9, 0.95, Interval(0.2, 0.1, 0.3)).level == "misleading"
     assert judged(0.9, 0.95, Interval(0.06, 0.04, 0.1)).level == "stable"
-    assert "20% of the stable places are wrong (10% to 30%)" in judged(0.9, 0.95, Interval(0.2, 0.1, 0.3)).line
+    assert "20% of the stable locations are wrong (10% to 30%)" in judged(0.9, 0.95, Interval(0.2, 0.1, 0.3)).line
 
 
 def test_there_is_no_verdict_from_few_places():
     assert judged(0.9, 0.95, voxels=99).level == judged(0.9, 0.95, blocks=15).level == "no verdict"
-    assert "fly with more overlap" in judged(0.9, 0.95, voxels=99).line
+    assert "more overlap between frames" in judged(0.9, 0.95, voxels=99).line
     assert "one class" in judged(math.nan, math.nan).line
 
 
 def test_the_line_says_what_to_do_and_why():
     assert judged(0.5, 0.6).line == (
-        "net: unstable, do not act on its labels: two frames agree on 55% of the places (50% to 60%),"
-        " alpha between frames 0.55 (0.50 to 0.60), its ceiling not known; 5000 places seen twice or more, 50% of"
-        " the map; intervals are for the next flight, from 60 frames"
+        "net: unstable (100%), do not act on its labels: two frames agree at 55% of the locations (50% to 60%),"
+        " alpha between frames 0.55 (0.50 to 0.60), its ceiling not known; 5000 locations seen twice or more, 50% of"
+        " the map; for this scene flown again, from 60 frames"
     )
 
 
-def test_errors_that_reach_as_far_as_the_scene_leave_it_undecided_and_few_frames_are_said():
+def test_few_frames_and_a_missing_log_are_named():
     events = backbone(0.1, 3)
-    few = describe(events.table(), events).verdict.line
-    assert "intervals are for these 8 frames: fly 30 or more to tell of the next flight" in few
-    assert "these frames: keep a log" in describe(events.table()).verdict.line
-    alike = Interval(0.9, 0.85, 0.95, undecided="errors reach as far as the scene: fly more of it")
-    found = verdict(
-        "net", headline=HeadlineStatistics(*[alike] * 5, UNKNOWN), ceiling=None, voxels=5000, share=0.5, blocks=40
-    )
-    assert found.level == "undecided"
-    assert "fly more of it" in found.line
+    assert "for this scene flown again, from 8 frames" in describe(events.table(), events).verdict.line
+    assert "for these frames alone (no log)" in describe(events.table()).verdict.line
+
+
+def test_probabilities_of_the_levels_sum_to_one_and_follow_the_interval():
+    for low, high in ((0.5, 0.6), (0.7, 0.9), (0.81, 0.9)):
+        for scale in ("agreement", "plain"):
+            levels = level_probabilities(between(low, high), scale)
+            assert sum(levels.values()) == pytest.approx(1)
+            assert min(levels.values()) >= 0
+    half = level_probabilities(between(0.7, 0.9), "plain")
+    assert half["stable"] == pytest.approx(0.5)
 
 
 def test_agreement_is_judged_against_its_ceiling_and_the_line_says_which():
@@ -251,16 +257,12 @@ def test_agreement_is_judged_against_its_ceiling_and_the_line_says_which():
     assert judged(0.1, 0.2, ceiling=0.4).level == "unstable"
 
 
-def test_the_worst_class_that_matters_is_named_and_keeps_a_map_from_being_stable():
-    good, bad = of_class("road", 0.9, 1.0), of_class("person", 0.1, 0.7)
-    found = judged(0.9, 1.0, ceiling=0.9, classes=(good, bad))
-    assert found.level == "partly stable"
-    assert "worst class person 40% (10% to 70%)" in found.line
-    rare = of_class("person", 0.1, 0.7, matters=False)
-    found = judged(0.9, 1.0, ceiling=0.9, classes=(good, rare))
-    assert (found.level, "worst class road" in found.line) == ("stable", True)
-    unknown = of_class("person", math.nan, math.nan)
-    assert judged(0.9, 1.0, ceiling=0.9, classes=(good, unknown)).level == "partly stable"
+def test_classes_that_are_probably_unstable_are_named_the_most_probable_first():
+    good, bad, worse = of_class("road", 0.9, 1.0), of_class("person", 0.3, 0.6), of_class("tree", -0.1, 0.1)
+    rare, unknown = of_class("car", 0.1, 0.2, matters=False), of_class("sign", math.nan, math.nan)
+    found = judged(0.9, 1.0, ceiling=0.9, classes=(good, bad, worse, rare, unknown))
+    assert found.level == "stable"
+    assert "probably unstable: tree (100%), person (100%)" in found.line
 
 
 def test_voxels_seen_once_change_no_verdict():

@@ -97,7 +97,7 @@ def test_a_series_over_frames_and_how_much_of_a_map_is_covered():
     found = mean_over_frames(np.arange(1, 80), values := rng.normal(3.0, 1.0, 79))
     assert (found.value, found.frames, found.undecided) == (pytest.approx(values.mean()), 79, "")
     assert 0.9 < (found.high - found.low) / (2 * 1.99 * values.std() / np.sqrt(79)) < 1.6
-    assert "too few frames" in mean_over_frames(np.arange(12), np.append(values[:11], np.nan)).undecided
+    assert "too few frames" in mean_over_frames(np.arange(8), np.append(values[:7], np.nan)).undecided
     table, log, truth = flight(side=16)
     kept = table.index[:, 0] < 12
     whole = cluster_sums_of(table, log, truth)

@@ -1,4 +1,4 @@
-"""By how much runs differ: each measure with its interval, the question that this answers, and its p-value."""
+"""By how much runs differ: each measure with its interval, the scope that this answers, and its p-value."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ from semstab.metrics import macro_mean
 from semstab.model.contrast import Against, Compared, Contrast, RunComparison, SceneComparison
 from semstab.model.measures import Measure, Quantity, mean
 from semstab.model.results import slug
-from semstab.model.statistics import NEXT_FLIGHT, THIS_MAP, UNKNOWN, Interval, Question
+from semstab.model.statistics import THESE_FRAMES, THIS_SCENE, UNKNOWN, Interval, Scope
 from semstab.model.voxels import VoxelTable
 from semstab.statistics.accumulate import Cubes
 from semstab.statistics.agreement import ALPHA_BETWEEN, ratio_of
@@ -46,7 +46,7 @@ from semstab.statistics.intervals import (
     mean_of,
     mean_over_frames,
     no_difference,
-    question_of,
+    scope_of,
     standard_error,
     unpaired,
 )
@@ -152,17 +152,17 @@ def _row(
 
 
 def _difference(base: ClusterSums, other: ClusterSums, key: str, k: int | None, common: Common) -> Interval:
-    question, number = _question(key, k, base, other), functional(key, k)
+    scope, number = _scope(key, k, base, other), functional(key, k)
     if common.basis == "flights":
-        return unpaired(estimate(other, key, k, question), estimate(base, key, k, question))
-    found = difference(other, base, key, k, question, same_frames=common.same_frames)
+        return unpaired(estimate(other, key, k, scope), estimate(base, key, k, scope))
+    found = difference(other, base, key, k, scope, same_frames=common.same_frames)
     most = number.high - number.low
     return dataclasses.replace(found, low=max(found.low, -most), high=min(found.high, most))
 
 
-def _question(key: str, k: int | None, *sums: ClusterSums) -> Question:
-    all_tell = {question_of(own) for own in sums} == {NEXT_FLIGHT} and not of_space_alone(key, k)
-    return NEXT_FLIGHT if all_tell else THIS_MAP
+def _scope(key: str, k: int | None, *sums: ClusterSums) -> Scope:
+    all_tell = {scope_of(own) for own in sums} == {THIS_SCENE} and not of_space_alone(key, k)
+    return THIS_SCENE if all_tell else THESE_FRAMES
 
 
 def _same_ceiling(base: Entry, other: Entry) -> bool:

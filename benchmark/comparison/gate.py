@@ -30,7 +30,7 @@ from semstab.config import nearest, read_yaml, validated
 from semstab.errors import ConfigError, DataError
 from semstab.model.measures import ENTROPY, Quantity
 from semstab.model.records import Record
-from semstab.model.statistics import NEXT_FLIGHT, THIS_MAP, Interval, Question
+from semstab.model.statistics import THESE_FRAMES, THIS_SCENE, Interval, Scope
 from semstab.model.tiles import Tiles, side_by_side
 from semstab.model.voxels import VoxelTable
 from semstab.statistics.agreement import ALPHA, ALPHA_BETWEEN, PSA
@@ -306,7 +306,7 @@ def change(
         found = coverage(new, base, both)
     else:
         paired = frames == "fixed" or same_flight(new, base)
-        found = difference(new, base, key, k, _question(key, k, frames), same_frames=paired, level=both)
+        found = difference(new, base, key, k, _scope(key, k, frames), same_frames=paired, level=both)
     return of_frames(found, _frames(new, base))
 
 
@@ -315,11 +315,11 @@ def rule_value(
 ) -> Interval:
     """The number itself, each end of its interval missed with probability `level`."""
     key = measure.key
-    return of_frames(estimate(new, key, k, _question(key, k, frames), 1 - 2 * level), _frames(new))
+    return of_frames(estimate(new, key, k, _scope(key, k, frames), 1 - 2 * level), _frames(new))
 
 
-def _question(key: str, k: int | None, frames: Frames) -> Question:
-    return THIS_MAP if frames == "fixed" or of_space_alone(key, k) else NEXT_FLIGHT
+def _scope(key: str, k: int | None, frames: Frames) -> Scope:
+    return THESE_FRAMES if frames == "fixed" or of_space_alone(key, k) else THIS_SCENE
 
 
 def comparable(new: ClusterSums, base: ClusterSums) -> tuple[ClusterSums, ClusterSums]:
@@ -357,7 +357,7 @@ class GateConfig(BaseModel):
 
     level   the probability with which a rule may fail that holds, or pass that does not
     frames  'random': rules are judged for other frames like these, and other places; 'fixed': for other places in these
-            very frames, which says nothing of the next flight
+            very frames, which says nothing of this scene flown again
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
@@ -409,11 +409,11 @@ class Judgement:
     @property
     def about(self) -> str:
         """What was random: for which other data the ends are."""
-        if self.found.question != NEXT_FLIGHT:
+        if self.found.scope != THIS_SCENE:
             return "other places like these, in these very frames"
         if self.found.frames < LEAST_FRAMES:
             return f"other places and frames like these {self.found.frames}"
-        return "the next flight"
+        return "this scene"
 
     @property
     def reason(self) -> str:

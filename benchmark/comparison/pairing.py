@@ -197,7 +197,7 @@ def _by_voxels(regions: Regions) -> Common:
     tables = tuple(VoxelTable.joined(own) for own in zip(*parts, strict=True))
     label = join_truth(tables[0], VoxelTable.joined(truths)).label if truths else None
     sums = tuple(_sums(table, None, label) for table in tables)
-    remark = "the runs made other looks, of other frames: they are paired on voxels alone, for this map"
+    remark = "the runs made other looks, of other frames: they are paired on voxels alone, for these frames"
     sampled = () if share == 1 else (SAMPLED.format(millions=common / 1e6, n=round(1 / share)),)
     return Common("voxels", (remark, *sampled), sums, False, tables, (), label, same_frames=False)
 

@@ -11,7 +11,7 @@ from rich.console import Console
 from semstab.comparison.locations import MOST
 from semstab.model.contrast import Against, Basis, Blame, Contrast, Place, RunComparison, SceneComparison
 from semstab.model.measures import ENTROPY, VSS, Quantity, measures
-from semstab.model.statistics import NEXT_FLIGHT, THIS_MAP, Estimate, Interval
+from semstab.model.statistics import THESE_FRAMES, THIS_SCENE, Estimate, Interval
 from semstab.report.tables.correctness import coverage_table, ignored_table
 from semstab.report.tables.table import Column, Group, Row, Table, to_terminal
 from semstab.report.terminal import WIDTH
@@ -69,9 +69,9 @@ IN_CLASSES = (VERDICT, ALPHA_BETWEEN, PSA, RECALL, IOU)
 """What the table of classes has beside each other."""
 
 ANSWERS = (
-    f"In brackets: intervals at 95%. They answer for the next flight where {LEAST_FRAMES} frames or more tell of it,"
-    " else for this map: other places like these in these very frames. p (Holm): that there is no difference, corrected"
-    " for all that is compared in the scene, or over all scenes."
+    f"In brackets: intervals at 95%, for this scene flown again where there are {LEAST_FRAMES} frames or more, else for"
+    " these frames: other locations in these very frames. p (Holm): that there is no difference, corrected for all that"
+    " is compared in the scene, or over all scenes."
 )
 
 
@@ -94,11 +94,11 @@ def heading(found: RunComparison, scope: str, own: Against) -> str:
     return f"{scope}: {own.other} less {found.base}"
 
 
-def question(row: Contrast) -> str:
+def scope(row: Contrast) -> str:
     """What a difference answers, or why it claims nothing, in a word or two."""
     if row.difference.undecided:
         return "undecided"
-    return {THIS_MAP: "this map", NEXT_FLIGHT: "next flight"}[row.difference.question]
+    return {THESE_FRAMES: "these frames", THIS_SCENE: "this scene"}[row.difference.scope]
 
 
 # --- Parts ------------------------------------------------------------------------------------------------------------
@@ -127,7 +127,7 @@ def _differences(found: RunComparison) -> Table:
 def _rows(own: Against, shown: Sequence[Quantity]) -> tuple[Row, ...]:
     keys = {quantity.key: quantity for quantity in shown}
     return tuple(
-        (_titled(keys[row.measure]), row.base, row.other, row.difference, row.p_holm, question(row), row.change)
+        (_titled(keys[row.measure]), row.base, row.other, row.difference, row.p_holm, scope(row), row.change)
         for row in own.contrasts
         if row.measure in keys
     )
@@ -234,7 +234,7 @@ def everything(found: RunComparison) -> Table:
         Column("base", "Base", 6),
         Column("other", "The run", 6),
         Column("difference", "Difference", 6, signed=True),
-        Column("question", "Question"),
+        Column("holds_for", "Holds for"),
         Column("p", "p", 6),
         Column("p_holm", "p (Holm)", 6),
         Column("change", "Change"),
@@ -249,7 +249,7 @@ def _all_rows(own: Against) -> Iterator[Row]:
         found: Interval = row.difference
         yield (
             own.other, row.of, row.measure, row.base, row.other, Estimate(found.value, found.low, found.high),
-            found.question, found.p_value, row.p_holm, row.change, found.undecided,
+            found.scope, found.p_value, row.p_holm, row.change, found.undecided,
         )  # fmt: skip
 
 
@@ -303,7 +303,7 @@ def _steadiness(found: RunComparison, own: Against) -> str:
         return f"{own.other} is as steady as {found.base}: {numbers}, the same in every place."
     interval = f"{row.difference.value:+z.3f} ({row.difference.low:+z.3f} to {row.difference.high:+z.3f})"
     p = "" if math.isnan(row.p_holm) else f", p {row.p_holm:.2g}"
-    whose = "the next flight" if row.difference.question == NEXT_FLIGHT else "these frames"
+    whose = "this scene" if row.difference.scope == THIS_SCENE else "these frames"
     said = {"better": "is steadier than", "worse": "is less steady than"}
     if row.change:
         return f"{own.other} {said[row.change]} {found.base}: {numbers}, {interval}{p}, for {whose}."

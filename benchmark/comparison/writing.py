@@ -54,8 +54,8 @@ def _forest(found: RunComparison) -> Iterator[Figure]:
     yield Figure(
         "comparison",
         "Differences",
-        f"Each run less {found.base}, with intervals at 95%: for the next flight where {LEAST_FRAMES} frames tell"
-        " of it, else for this map. An interval that holds 0 decides nothing.",
+        f"Each run less {found.base}, with intervals at 95%: for this scene flown again where there are {LEAST_FRAMES}"
+        " frames, else for these frames. An interval that holds 0 decides nothing.",
         f"One panel a measure with the difference of each run from {found.base} and its interval, beside 0.",
         lambda: draw_intervals(panels, dict.fromkeys(panels, (0.0,))),
     )

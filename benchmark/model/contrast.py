@@ -52,7 +52,7 @@ class PairedDifference:
 
     p_value  that there is none, of the primary measure; p_holm corrects it for all pairs, and all scenes of a study, of
              which something may be claimed (Holm 1979). The other measures describe: they have intervals and no test
-    question   what interval and p-value answer, see `Interval`
+    scope   what interval and p-value answer, see `Interval`
     undecided  why nothing may be claimed; empty where something may
     """
 
@@ -62,7 +62,7 @@ class PairedDifference:
     difference: Estimate
     p_value: float
     p_holm: float
-    question: str = ""
+    scope: str = ""
     undecided: str = ""
 
 
@@ -100,7 +100,6 @@ class Paired:
     primary: str
     voxels: int
     blocks: int
-    block_size: float
     values: Mapping[str, ByBackbone]
     differences: tuple[PairedDifference, ...]
     rankings: tuple[Ranking, ...]
@@ -194,7 +193,7 @@ class Contrast:
 
     measure     its key
     of          the class whose places it is of; empty: all
-    difference  the run's less the base's, with its interval, the question that this answers, and the p-value that there
+    difference  the run's less the base's, with its interval, the scope that this answers, and the p-value that there
                 is none
     p_holm      that p-value corrected for all that stand in one list with it (Holm 1979)
     change      what is said of it: 'better', 'worse', or nothing

@@ -36,28 +36,28 @@ class Estimate:
 
 UNDEFINED = Estimate(math.nan, math.nan, math.nan)
 
-Question = Literal["this map", "the next flight"]
-THIS_MAP: Question = "this map"
-NEXT_FLIGHT: Question = "the next flight"
+Scope = Literal["these frames", "this scene", "other scenes"]
+THESE_FRAMES: Scope = "these frames"
+THIS_SCENE: Scope = "this scene"
+OTHER_SCENES: Scope = "other scenes"
 
 
 @dataclass(frozen=True)
 class Interval(Estimate):
-    """A value with its interval, and what that answers.
+    """A value with its confidence interval.
 
-    question    'this map': other places like these, in these very frames; 'the next flight': other frames, too
-    frames      that were sampled, about; 0 where they are not known
-    places      cubes of space that hold something that counts
-    block_size  edge of the blocks in which errors may depend on each other, metres
-    degrees     of freedom of the standard error
-    undecided   why nothing may be claimed, and what to fly; empty where something may
-    p_value     of a difference: that there is none
+    scope      what varies. 'this scene': the frames, when the same scene is flown again; 'other scenes': frames and
+               locations; 'these frames': locations like these in these very frames
+    frames     that were fused, about; 0 where they are not known
+    locations  cubes of space that hold something that counts
+    degrees    of freedom of the standard error
+    undecided  why nothing may be claimed, and what to do; empty where something may
+    p_value    of a difference: that there is none
     """
 
-    question: Question = THIS_MAP
+    scope: Scope = THESE_FRAMES
     frames: int = 0
-    places: int = 0
-    block_size: float = math.nan
+    locations: int = 0
     degrees: float = math.nan
     undecided: str = ""
     p_value: float = math.nan
@@ -95,17 +95,6 @@ class Repeated:
 
     voxels: int
     share: float
-
-
-@dataclass(frozen=True)
-class BlockCut:
-    """How many cubes of space hold voxels with OP >= 2, and the edge of the blocks in which alpha's errors may depend.
-
-    size in metres: four times as far as errors were found to reach.
-    """
-
-    count: int
-    size: float
 
 
 @dataclass(frozen=True)
@@ -220,9 +209,9 @@ class CeilingShare:
 
 @dataclass(frozen=True)
 class HeadlineStatistics:
-    """The numbers that a verdict rests on, with intervals for the next flight: other frames and places like these.
+    """The numbers that a verdict rests on, with intervals for the same scene flown again.
 
-    Where frames are not known, or too few to tell, the intervals are for this map, as their `question` says. vss is at
+    Where frames are not known, or too few to tell, the intervals are for these frames, as their `scope` says. vss is at
     OP >= 3; the last two are undefined without ground truth.
     """
 
@@ -238,7 +227,7 @@ class HeadlineStatistics:
 class Flipping:
     """Places about which frames do not agree: with OP >= 2, and two frames agree with a probability below 0.8.
 
-    share    of these places, each counting by how likely it is one, for this map
+    share    of these places, each counting by how likely it is one, for these frames
     seen     the part of them that four frames or more saw: of fewer looks it cannot be told whether errors come again
              at the same places
     a, b     the two classes between which most of them flip, with the part of all flips that is between these
@@ -435,7 +424,7 @@ class MapStatistics:
     voxels: int
     observations: int
     repeated: Repeated
-    blocks: BlockCut
+    blocks: int
     verdict: StabilityVerdict
     agreement: FrameAgreement
     flipping: Flipping | None

@@ -370,6 +370,6 @@ def agreement_report(statistics: MapStatistics) -> str:
             lines += ["", f"| {unit} | alpha | 95% | for | ceiling |", "|---|---|---|---|---|"]
         for row in bins:
             a = row.alpha
-            band = f"{a.low:.2f} to {a.high:.2f} | {a.question}{'' if a.decided else ', undecided'}"
+            band = f"{a.low:.2f} to {a.high:.2f} | {a.scope}{'' if a.decided else ', undecided'}"
             lines.append(f"| {row.mean:.3g} | {a.value:.2f} | {band} | {row.ceiling:.2f} |")
     return "\n".join(lines)

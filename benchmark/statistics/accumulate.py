@@ -37,7 +37,7 @@ from semstab.statistics.cluster_sums import (
 from semstab.statistics.intervals import EstimateSpec, confidence_intervals, spec_of_cubes
 from semstab.statistics.stability import stability_posterior
 
-# Cubes of space over any set of voxels, and intervals for this map of any statistic of their sums.
+# Cubes of space over any set of voxels, and intervals for these frames of any statistic of their sums.
 
 
 @dataclass(frozen=True, eq=False)

@@ -26,7 +26,7 @@ from semstab.model.voxels import VoxelTable
 from semstab.statistics.accumulate import Cubes, CubeSums, cluster_sums_of
 from semstab.statistics.agreement import psa, ratio_of
 from semstab.statistics.cluster_sums import ClusterSums, value
-from semstab.statistics.intervals import EstimateSpec, confidence_intervals, probability_above, question_of, spec_of
+from semstab.statistics.intervals import EstimateSpec, confidence_intervals, probability_above, scope_of, spec_of
 from semstab.statistics.observations import ObservationSample
 from semstab.statistics.verdict import TENTATIVE
 
@@ -64,11 +64,11 @@ def ceiling_specs(sums: ClusterSums, K: int) -> Iterator[EstimateSpec]:
     each."""
     assert sums.seen is not None
     assert sums.limit is not None
-    question = question_of(sums)
-    yield spec_of(sums.seen, "alpha_between", question=question)
-    yield spec_of(sums.limit, "alpha_between", question=question)
+    scope = scope_of(sums)
+    yield spec_of(sums.seen, "alpha_between", scope=scope)
+    yield spec_of(sums.limit, "alpha_between", scope=scope)
     for k in (None, *range(K)):
-        yield spec_of(sums, "reached", k, question)
+        yield spec_of(sums, "reached", k, scope)
 
 
 def ceiling_share_from(

@@ -283,6 +283,8 @@ class ClusterSums:
             columns = np.stack([*map(arrow.values_of, content.columns[len(KEYS) :])], axis=1)
             if columns.shape[1] != width(about["K"], truth=about["truth"]):
                 raise DataError(f"{columns.shape[1]} columns of sums for {about['K']} classes")
+            if np.any(np.abs(columns) > LARGEST**2):
+                raise DataError("a sum is larger than a map can have it")
             parts: list[ClusterSums | None] = []
             for number in range(3):
                 own = part == number
@@ -304,6 +306,10 @@ KEYS = ("part", "ix", "iy", "iz", "frame")
 """The columns of the file before the sums; part 0 is the map, 1 what was seen of the sample, 2 its limit."""
 
 
+LARGEST = 2.0**30
+"""Of edges in metres and groups of frames; its square of sums: larger numbers are damage."""
+
+
 @dataclass(frozen=True)
 class SumsMeta:
     """What the file says of its sums; see `InfluenceSums`."""
@@ -318,10 +324,10 @@ class SumsMeta:
     def __post_init__(self) -> None:
         if not (0 < self.voxel_size < math.inf and self.K > 0 and len(self.classes) in (0, self.K)):
             raise DataError(f"{self.K} classes, {len(self.classes)} names, voxels of {self.voxel_size:g} m")
-        if not (0 < self.edge < math.inf and math.frexp(self.edge)[0] == 0.5):
-            raise DataError(f"cubes of {self.edge:g} m, which is no power of 2")
-        if self.step < 0 or self.step & (self.step - 1):
-            raise DataError(f"groups of {self.step} frames, which is no power of 2")
+        if not (0 < self.edge <= LARGEST and math.frexp(self.edge)[0] == 0.5):
+            raise DataError(f"cubes of {self.edge:g} m, which is no power of 2 of that size")
+        if not 0 <= self.step <= LARGEST or self.step & (self.step - 1):
+            raise DataError(f"groups of {self.step} frames, which is no power of 2 of that size")
 
 
 def _joined(index: Int32, times: float) -> Int64:
@@ -438,7 +444,7 @@ BY_CLASS: Mapping[str, Functional] = {
 
 
 def of_space_alone(key: str, k: int | None = None) -> bool:
-    """Whether a number says nothing of frames, so that its intervals are for this map."""
+    """Whether a number says nothing of frames, so that its intervals are for these frames."""
     return set(functional(key, k).names) <= set(WITHOUT_FRAMES)
 
 

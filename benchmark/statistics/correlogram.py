@@ -113,8 +113,8 @@ def correlogram(sample: ObservationSample) -> Correlogram:
     """Alpha between frames in bins of the distance of two looks, over the pairs of looks at sampled voxels.
 
     Of a voxel's looks those that are 1, 2, 4, 8, ... looks apart are paired, so that the cost is linear. Chance is that
-    of the pairs in the bin. Bands are at 95 %, for the next flight where the frames of a bin tell of it, else for this
-    map.
+    of the pairs in the bin. Bands are at 95 %, for this scene flown again where the frames of a bin tell of it, else
+    for these frames.
     """
     seen, limit = _of_seen_classes(*sample.shared())
     looks, still = _Looks.of(seen.evidence), _Looks.of(limit.evidence)

@@ -16,7 +16,6 @@ from semstab.model.information import by_group
 from semstab.model.measures import SBD
 from semstab.model.results import TableSummary
 from semstab.model.statistics import (
-    BlockCut,
     ClassAgreement,
     CorrectnessStatistics,
     DriftStatistics,
@@ -157,7 +156,7 @@ def analyse(
     edges     upper bounds of the strata of OP
     critical  the classes that the verdict depends on; where none is named, all with enough locations
 
-    Intervals are at 95 %, for this map, but those of `judged` and `reach`; undefined numbers are NaN, and a section
+    Intervals are at 95 %, for these frames, but those of `judged` and `reach`; undefined numbers are NaN, and a section
     that cannot be computed is None.
     """
     table, events = sample.table.measured(), sample.events
@@ -207,7 +206,7 @@ def analyse(
         voxels=whole.voxels,
         observations=whole.observations,
         repeated=repeated,
-        blocks=BlockCut(count, headline.alpha.block_size),
+        blocks=count,
         verdict=verdict(
             name or "backbone",
             headline=headline,

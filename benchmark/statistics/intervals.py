@@ -1,4 +1,4 @@
-"""Intervals for this map and for the next flight, and differences between maps, from sums by frame and cube."""
+"""Confidence intervals of numbers of a map and of differences between maps, from sums by frame and cube."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from semstab.core.types import Float64
-from semstab.model.statistics import NEXT_FLIGHT, THIS_MAP, UNKNOWN, HeadlineStatistics, Interval, Question
+from semstab.model.statistics import THESE_FRAMES, THIS_SCENE, UNKNOWN, HeadlineStatistics, Interval, Scope
 from semstab.statistics.agreement import ratio_of
 from semstab.statistics.cluster_sums import (
     MOST_GROUPS,
@@ -52,16 +52,16 @@ class EstimateSpec:
 
     value: float
     grid: Influences | None
-    question: Question
+    scope: Scope
     scale: Scale
     bounds: tuple[float, float]
     level: float = LEVEL
 
     @property
-    def answered(self) -> Question:
-        """Of a single group of frames nothing is said about the next flight."""
+    def answered(self) -> Scope:
+        """The scope of the interval: one group of frames does not tell how frames differ."""
         told = self.grid is not None and self.grid.step and len(self.grid.frames) > 1
-        return self.question if told else THIS_MAP
+        return self.scope if told else THESE_FRAMES
 
 
 def confidence_intervals(specs: Iterable[EstimateSpec]) -> list[Interval]:
@@ -78,23 +78,22 @@ def grouped_intervals(*groups: Iterable[EstimateSpec]) -> list[list[Interval]]:
 
 
 def estimate(
-    sums: ClusterSums, key: str, k: int | None = None, question: Question = NEXT_FLIGHT, level: float = LEVEL
+    sums: ClusterSums, key: str, k: int | None = None, scope: Scope = THIS_SCENE, level: float = LEVEL
 ) -> Interval:
-    """A number of a map with its interval; see `FUNCTIONALS` for its key, k is a class.
+    """Return a number of a map with its interval; see `FUNCTIONALS` for its key, k is a class.
 
-    'this map': what other places like these would give in these very frames. 'the next flight': what other frames like
-    these would give, too; where the frames are not known the interval is for this map, and says so.
+    The scope is that of `Interval`; where frames are not known it is 'these frames'.
     """
-    return confidence_intervals([spec_of(sums, key, k, question, level)])[0]
+    return confidence_intervals([spec_of(sums, key, k, scope, level)])[0]
 
 
 def spec_of(
-    sums: ClusterSums, key: str, k: int | None = None, question: Question = NEXT_FLIGHT, level: float = LEVEL
+    sums: ClusterSums, key: str, k: int | None = None, scope: Scope = THIS_SCENE, level: float = LEVEL
 ) -> EstimateSpec:
     """For `answers`, see `estimate`."""
     number = functional(key, k)
     bounds = number.low, number.high
-    return EstimateSpec(value(sums, key, k), grid_of(sums, key, k), question, number.scale, bounds, level)
+    return EstimateSpec(value(sums, key, k), grid_of(sums, key, k), scope, number.scale, bounds, level)
 
 
 def difference(
@@ -102,7 +101,7 @@ def difference(
     b: ClusterSums,
     key: str,
     k: int | None = None,
-    question: Question = NEXT_FLIGHT,
+    scope: Scope = THIS_SCENE,
     *,
     same_frames: bool | None = None,
     level: float = LEVEL,
@@ -117,20 +116,20 @@ def difference(
     a, b = aligned(a, b)
     found = value(a, key, k) - value(b, key, k)
     if identical(a, b, key, k) and not math.isnan(found):
-        return no_difference(estimate(a, key, k, question, level))
+        return no_difference(estimate(a, key, k, scope, level))
     one, other = grid_of(a, key, k), grid_of(b, key, k)
     if one is None or other is None:
         return Interval(found, math.nan, math.nan, undecided=NO_PLACES)
-    question = question if a.step else THIS_MAP
+    scope = scope if a.step else THESE_FRAMES
     paired = np.array_equal(np.unique(a.frame), np.unique(b.frame)) if same_frames is None else same_frames
     between = one.minus(other)
-    spread = spread_of(between, question) if paired else spread_of_flights(one, other, between, question)
+    spread = spread_of(between, scope) if paired else spread_of_flights(one, other, between, scope)
     half = spread.half(level)
     low, high = found - half, found + half
     if spread.variance <= TINY:
-        ends = confidence_intervals(spec_of(sums, key, k, question, level) for sums in (a, b))
+        ends = confidence_intervals(spec_of(sums, key, k, scope, level) for sums in (a, b))
         low, high = ends[0].low - ends[1].high, ends[0].high - ends[1].low
-    return dataclasses.replace(_interval(found, low, high, between, spread, question), p_value=spread.p_value(found))
+    return dataclasses.replace(_interval(found, low, high, between, spread, scope), p_value=spread.p_value(found))
 
 
 def identical(a: ClusterSums, b: ClusterSums, key: str, k: int | None = None) -> bool:
@@ -158,7 +157,7 @@ def interval_of_cubes(
     bounds: tuple[float, float] = (-math.inf, math.inf),
     level: float = LEVEL,
 ) -> Interval:
-    """The statistic of sums (m, C) of cubes (m, 3) of an edge in metres, with its interval for this map.
+    """The statistic of sums (m, C) of cubes (m, 3) of an edge in metres, with its interval for these frames.
 
     The second column counts what the first is a sum of.
     """
@@ -177,7 +176,7 @@ def spec_of_cubes(
 ) -> EstimateSpec:
     """For `answers`, see `of_places`."""
     grid = influences(index, columns, statistic)
-    return EstimateSpec(float(statistic(columns.sum(axis=0))), grid, THIS_MAP, scale, bounds, level)
+    return EstimateSpec(float(statistic(columns.sum(axis=0))), grid, THESE_FRAMES, scale, bounds, level)
 
 
 def spec_of_observations(
@@ -192,35 +191,35 @@ def spec_of_observations(
 ) -> EstimateSpec:
     """For `answers`: an agreement of sums (m, C) of cubes and groups of frames, see `influences`.
 
-    Its interval is for the next flight where frames tell of it, else for this map.
+    Its interval is for this scene flown again where frames tell of it, else for these frames.
     """
     found = float(statistic(columns.sum(axis=0)))
     grid = influences(ClusterIndex.of(cell, frame, edge, step), columns, statistic, halves)
     told = grid is not None and len(grid.frames) * step >= LEAST_FRAMES
-    return EstimateSpec(found, grid, NEXT_FLIGHT if told else THIS_MAP, "agreement", (-1.0, 1.0), level)
+    return EstimateSpec(found, grid, THIS_SCENE if told else THESE_FRAMES, "agreement", (-1.0, 1.0), level)
 
 
-def question_of(sums: ClusterSums) -> Question:
+def scope_of(sums: ClusterSums) -> Scope:
     """Return what verdicts on a map are about: the same scene flown again, if frames tell of that."""
-    return NEXT_FLIGHT if sums.frames * sums.step >= LEAST_FRAMES else THIS_MAP
+    return THIS_SCENE if sums.frames * sums.step >= LEAST_FRAMES else THESE_FRAMES
 
 
 def headline_specs(sums: ClusterSums) -> Iterator[EstimateSpec]:
     """For `answers`: the numbers that a verdict on a map rests on, in the order of `HeadlineStatistics`."""
-    question = question_of(sums)
-    return (spec_of(sums, field.name, question=question) for field in dataclasses.fields(HeadlineStatistics))
+    scope = scope_of(sums)
+    return (spec_of(sums, field.name, scope=scope) for field in dataclasses.fields(HeadlineStatistics))
 
 
 def _answer(spec: EstimateSpec, grid: Influences) -> Interval:
-    found, question, level = spec.value, spec.answered, spec.level
-    spread = spread_of(grid, question)
+    found, scope, level = spec.value, spec.answered, spec.level
+    spread = spread_of(grid, scope)
     if math.isnan(found):
         low, high = math.nan, math.nan
     elif spec.scale == "share":
         low, high = _share_ends(found, spread, len(grid.places), level)
     else:
         low, high = _ends(found, spread, grid.unseen(level), spec.scale, level)
-    return _interval(found, max(low, spec.bounds[0]), min(high, spec.bounds[1]), grid, spread, question)
+    return _interval(found, max(low, spec.bounds[0]), min(high, spec.bounds[1]), grid, spread, scope)
 
 
 def grid_of(sums: ClusterSums, key: str, k: int | None = None) -> Influences | None:
@@ -280,16 +279,16 @@ def _ends(found: float, spread: Spread, unseen: float, scale: Scale, level: floa
     return 1 - (1 - found) * math.exp(ratio), 1 - (1 - found) * math.exp(-ratio)
 
 
-def _interval(found: float, low: float, high: float, grid: Influences, spread: Spread, question: Question) -> Interval:
+def _interval(found: float, low: float, high: float, grid: Influences, spread: Spread, scope: Scope) -> Interval:
     frames = len(grid.frames) * grid.step
-    few = question != THIS_MAP and frames < LEAST_FRAMES
+    few = scope != THESE_FRAMES and frames < LEAST_FRAMES
     return Interval(
         found,
         low,
         high,
-        question=question,
+        scope=scope,
         frames=frames,
-        places=len(grid.places),
+        locations=len(grid.places),
         degrees=spread.degrees,
         undecided=TOO_FEW.format(least=LEAST_FRAMES) if few else "",
     )
@@ -326,15 +325,14 @@ def _combined(
     total = sum(variances)
     degrees = max(total**2 / spread, 1.0) if spread > 0 else math.inf
     p = float(2 * special.stdtr(degrees, -abs(value) / math.sqrt(total))) if total > 0 else math.nan
-    questions = {own.question for own in parts}
+    scopes = {own.scope for own in parts}
     return Interval(
         value,
         low,
         high,
-        question=NEXT_FLIGHT if questions == {NEXT_FLIGHT} else THIS_MAP,
+        scope=THIS_SCENE if scopes == {THIS_SCENE} else THESE_FRAMES,
         frames=min(own.frames for own in parts),
-        places=sum(own.places for own in parts),
-        block_size=max(own.block_size for own in parts),
+        locations=sum(own.locations for own in parts),
         degrees=degrees,
         undecided="; ".join(dict.fromkeys(own.undecided for own in parts if own.undecided)),
         p_value=p,
@@ -365,22 +363,22 @@ def mean_over_frames(frame: npt.NDArray[np.integer], values: Float64, level: flo
     found, half = float(values.mean()), spread.half(level)
     few = TOO_FEW.format(least=LEAST_FRAMES) if len(values) < LEAST_FRAMES else ""
     return Interval(
-        found, found - half, found + half, NEXT_FLIGHT, len(values), degrees=spread.degrees, undecided=few,
+        found, found - half, found + half, THIS_SCENE, len(values), degrees=spread.degrees, undecided=few,
         p_value=spread.p_value(found),
     )  # fmt: skip
 
 
 def difference_over_frames(a: Mapping[int, float], b: Mapping[int, float], level: float = LEVEL) -> Interval:
-    """The mean of a series by frame less that of another one, paired on the frames of both, for the next flight."""
+    """Return the mean difference of two series by frame, paired on the frames of both, for another flight."""
     frames = sorted(a.keys() & b.keys())
     differences = np.array([a[frame] - b[frame] for frame in frames])
     if not differences.any():
-        return no_difference(Interval(0.0, 0.0, 0.0, NEXT_FLIGHT, frames=len(frames)))
+        return no_difference(Interval(0.0, 0.0, 0.0, THIS_SCENE, frames=len(frames)))
     return mean_over_frames(np.array(frames), differences, level)
 
 
 def coverage(new: ClusterSums, base: ClusterSums, level: float = LEVEL) -> Interval:
-    """How many voxels with OP >= 2 a map has for each one of another, less 1, paired on cubes, for this map."""
+    """How many voxels with OP >= 2 a map has for each one of another, less 1, paired on cubes, for these frames."""
     edge = max(new.edge, base.edge)
     parts = [sums.coarsened(edge, 0) for sums in (new, base)]
     cell, row = np.unique(np.concatenate([part.cell for part in parts]), axis=0, return_inverse=True)

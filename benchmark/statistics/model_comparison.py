@@ -106,10 +106,10 @@ def paired(
     """Compare backbones voxel by voxel where all of them observed at least twice.
 
     truth is the map of the ground truth labels; without it there is no accuracy. Only the primary measure is tested,
-    alpha or alpha between frames, for the next flight where the logs of the tables are given, else for this map; the
-    other differences describe. Ranks come from resamples of the cubes of space, the same ones for every measure.
-    `whole` are the same tables before observations were reduced to a class, where they were: alpha between frames is
-    that of these.
+    alpha or alpha between frames, for this scene flown again where the logs of the tables are given, else for these
+    frames; the other differences describe. Ranks come from resamples of the cubes of space, the same ones for every
+    measure. `whole` are the same tables before observations were reduced to a class, where they were: alpha between
+    frames is that of these.
     """
     rows = repeated_rows(tables)
     columns, statistics = _columns(tables, rows, truth, whole or tables)
@@ -120,7 +120,7 @@ def paired(
         values[measure.key] = {
             name: UNDEFINED if common is None else common.value(measure, name, own[name], statistic) for name in tables
         }
-    count, edge = (0, math.nan) if common is None else (common.cubes.count, common.cubes.edge)
+    count = 0 if common is None else common.cubes.count
     drawn = np.zeros((1, 0))
     if count:
         drawn = np.random.default_rng(seed).multinomial(count, np.full(count, 1 / count), size=REPLICATES).astype(float)
@@ -130,7 +130,7 @@ def paired(
                 for name, own in columns[measure].items()}  # fmt: skip
         rankings.append(_ranking(measure, statistic, sums, drawn))
     paired_rows = differences(primary, columns, statistics, common)
-    return Paired(primary.key, len(rows[0]), count, edge, values, paired_rows, tuple(rankings))
+    return Paired(primary.key, len(rows[0]), count, values, paired_rows, tuple(rankings))
 
 
 def _columns(

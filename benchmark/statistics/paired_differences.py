@@ -1,6 +1,6 @@
 """Values of backbones on the places that all saw twice, and their differences, with intervals and what these answer.
 
-What the sums by frame and cube of space know is said for the next flight; the rest, as SBD, for this map.
+What the sums by frame and cube of space know is said for this scene flown again; the rest, as SBD, for these frames.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from semstab.statistics.accumulate import Cubes, CubeSums, cluster_sums_of
 from semstab.statistics.agreement import ALPHA, ALPHA_BETWEEN, PSA, psa, ratio_of
 from semstab.statistics.cluster_sums import ClusterSums, Statistic
 from semstab.statistics.correctness import ACCURACY, join_truth
-from semstab.statistics.intervals import difference, estimate, question_of
+from semstab.statistics.intervals import difference, estimate, scope_of
 
 Rows = Int64
 
@@ -77,20 +77,20 @@ class OnCommonLocations:
         """Of one backbone; columns (n, C) are those that the statistic is of."""
         if measure in self.known:
             sums = self.sums[name]
-            return estimate(sums, measure.key, question=question_of(sums)).ends
+            return estimate(sums, measure.key, scope=scope_of(sums)).ends
         bounds = (-1.0, 1.0) if measure in (ALPHA, ALPHA_BETWEEN) else (0.0, 1.0)
         return self.cubes.estimate(columns, statistic, bounds, "agreement" if bounds[0] else None).ends
 
     def difference(self, measure: Quantity, a: str, b: str, columns: Mapping[str, Float64], of: Statistic) -> Interval:
         """Of backbone a less backbone b."""
         if measure in self.known:
-            return difference(self.sums[a], self.sums[b], measure.key, question=question_of(self.sums[a]))
+            return difference(self.sums[a], self.sums[b], measure.key, scope=scope_of(self.sums[a]))
         C = columns[a].shape[1]
         both = np.concatenate([columns[a], columns[b]], axis=1)
         return self.cubes.estimate(both, lambda sums: of(sums[..., :C]) - of(sums[..., C:]), (-2.0, 2.0), "plain")
 
     def tested(self, primary: Quantity, a: str, b: str) -> Interval:
-        """The difference of the primary measure, for the next flight."""
+        """The difference of the primary measure, for this scene flown again."""
         return difference(self.sums[a], self.sums[b], primary.key)
 
 
@@ -116,7 +116,7 @@ def differences(
 
 def _row(measure: Quantity, a: str, b: str, found: Interval, *, tested: bool) -> PairedDifference:
     p = found.p_value if tested else float("nan")
-    return PairedDifference(measure.key, a, b, found.ends, p, float("nan"), found.question, found.undecided)
+    return PairedDifference(measure.key, a, b, found.ends, p, float("nan"), found.scope, found.undecided)
 
 
 # --- What is claimed --------------------------------------------------------------------------------------------------

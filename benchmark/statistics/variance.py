@@ -20,7 +20,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from semstab.core.types import Float64, Int64
-from semstab.model.statistics import NEXT_FLIGHT, THIS_MAP, Question
+from semstab.model.statistics import THESE_FRAMES, THIS_SCENE, Scope
 from semstab.statistics.cluster_sums import ClusterIndex, Statistic
 
 LASTING = (0.0, 0.5, 0.8, 0.9)
@@ -239,18 +239,19 @@ class Effects:
         frame = np.linalg.pinv(normal, rcond=1e-9, hermitian=True) @ right
         location = (cell.sum(axis=1) - size @ frame) / by_location
         residual = cell - size * np.add.outer(location, frame)
-        cells = np.count_nonzero(size)
-        left = max(cells - len(location) - len(frame) + 1, 1)
+        cells = int(np.count_nonzero(size))
+        left = max(cells - len(by_location) - len(by_frame) + 1, 1)
         unit = float((residual**2 / np.where(size > 0, size, 1.0)).sum()) / left
         mean = by_location @ location / by_location.sum()
         total = float(by_location.sum())
         scatter = float(by_location @ (location - mean) ** 2) / total - unit * len(location) / total
-        shrink = unit / max(scatter, 1e-3 * unit / float(np.median(by_location)), TINY**2)
+        shrink = unit / max(scatter, 1e-3 * unit / float(np.median(by_location)), TINY * TINY)
         ridge = size / (by_location + shrink)[:, None]  # locations as random effects: what frames differ in is kept
         normal = np.diag(by_frame * (1 + 1e-9)) - size.T @ ridge
         frame = np.linalg.solve(normal, cell.sum(axis=0) - ridge.T @ cell.sum(axis=1))
+        noise: Float64 = unit * np.linalg.inv(normal).astype(np.float64)
         return cls(
-            _of_frames(frame, by_frame, (unit * np.linalg.inv(normal)).astype(np.float64), grid.frames.astype(np.float64)),
+            _of_frames(frame, by_frame, noise, grid.frames.astype(np.float64)),
             _of_locations(grid, unit),
             float((residual**2).sum()) * cells / left,
         )
@@ -291,30 +292,30 @@ def _neighbours(points: Float64, most: int) -> Int64:
     return of
 
 
-def spread_of(grid: Influences, question: Question) -> Spread:
+def spread_of(grid: Influences, scope: Scope) -> Spread:
     """Return the spread of a number: for these frames, this scene flown again, or other scenes."""
     largest = float(np.abs(grid.block).max(initial=np.abs(grid.cell).max(initial=0.0)))
     if largest < ROUNDING:
         return EXACT
     effects = Effects.of(grid)
     noise = Variances(np.ones(1), np.array([effects.noise]))
-    if question == THIS_MAP:
+    if scope == THESE_FRAMES:
         parts = effects.locations.plus(noise)
-    elif question == NEXT_FLIGHT:
+    elif scope == THIS_SCENE:
         parts = effects.frames.plus(noise)
     else:
         parts = effects.frames.plus(effects.locations).plus(noise)
     return parts.spread() if (parts.variance > 0).all() else EXACT
 
 
-def spread_of_flights(one: Influences, other: Influences, between: Influences, question: Question) -> Spread:
+def spread_of_flights(one: Influences, other: Influences, between: Influences, scope: Scope) -> Spread:
     """Return the spread of the difference of two flights over the same locations, each with frames of its own."""
-    if question == THIS_MAP:
-        return spread_of(between, question)
+    if scope == THESE_FRAMES:
+        return spread_of(between, scope)
     effects = [Effects.of(one), Effects.of(other)]
     noise = effects[0].noise + effects[1].noise
     parts = effects[0].frames.plus(effects[1].frames).plus(Variances(np.ones(1), np.array([noise])))
-    if question != NEXT_FLIGHT:
+    if scope != THIS_SCENE:
         parts = parts.plus(Effects.of(between).locations)
     return parts.spread() if (parts.variance > 0).all() else EXACT
 

@@ -6,7 +6,7 @@ import math
 from collections.abc import Mapping
 
 from semstab.model.statistics import (
-    NEXT_FLIGHT,
+    THIS_SCENE,
     CeilingShare,
     Flipping,
     HeadlineStatistics,
@@ -124,7 +124,7 @@ def _level(
 
 def _for(basis: Interval) -> str:
     """Return what the interval is about."""
-    if basis.question == NEXT_FLIGHT:
+    if basis.scope == THIS_SCENE:
         return f"for this scene flown again, from {basis.frames} frames"
     reason = f"{basis.frames} frames; {LEAST_FRAMES} or more tell of another flight" if basis.frames else "no log"
     return f"for these frames alone ({reason})"

@@ -54,7 +54,7 @@ def _agreement(judged: Judged) -> Iterator[Figure]:
             "temporal_agreement",
             "Agreement of the frames, with intervals",
             "Pairwise agreement (PSA) and Krippendorff's alpha of the voxels seen twice or more, with intervals at"
-            " 95% for this map. Dotted: alpha from which conclusions are tentative (0.667),"
+            " 95% for these frames. Dotted: alpha from which conclusions are tentative (0.667),"
             " and from which data are reliable (0.8).",
             "Two panels with one interval a scene and backbone: pairwise agreement and Krippendorff's alpha.",
             lambda: draw_intervals(
@@ -77,9 +77,9 @@ def _correlograms(judged: Judged) -> Iterator[Figure]:
             slug("correlogram", scene),
             f"Agreement by distance of the looks: {scene}",
             "Alpha between frames of pairs of looks at a place, by how far apart they are in time, angle, range and"
-            f" baseline, with bands at 95%: for the next flight if {LEAST_FRAMES} frames of a bin tell of it, else"
-            " (open points) for this map. Dashed: the same of labels that do not depend on the view; the gap is the"
-            " model's. Bins with few pairs are left out.",
+            f" baseline, with bands at 95%: for this scene flown again if {LEAST_FRAMES} frames of a bin tell of it,"
+            " else (open points) for these frames. Dashed: the same of labels that do not depend on the view; the gap"
+            " is the model's. Bins with few pairs are left out.",
             f"Four panels of {scene}, one curve a backbone with its band and a dashed ceiling: agreement against frames"
             " apart, degrees between the views, ratio of the ranges, and metres between the cameras.",
             partial(draw_correlogram, backbones),

@@ -11,7 +11,7 @@ import numpy as np
 
 from semstab.core.types import Float64
 from semstab.model.measures import VSS, sbd
-from semstab.model.statistics import NEXT_FLIGHT, Correlogram, Estimate, LagBin, Reliability
+from semstab.model.statistics import THIS_SCENE, Correlogram, Estimate, LagBin, Reliability
 from semstab.model.voxels import VoxelTable
 from semstab.report.averages import ENOUGH, Level, Pooled, Sweep, over_all
 from semstab.report.figures.distributions import (
@@ -223,7 +223,7 @@ AXES = (
 def draw_correlogram(backbones: Mapping[str, Correlogram]) -> Figure:
     """Alpha between frames with its band, and its ceiling; one panel for each way of being apart.
 
-    Points are open where the band is for this map alone.
+    Points are open where the band is for these frames alone.
     """
     from matplotlib.lines import Line2D
     from matplotlib.ticker import NullFormatter
@@ -255,7 +255,7 @@ def _draw_bins(axes: Axes, bins: Sequence[LagBin], shade: str) -> None:
     axes.plot(x, [row.ceiling for row in bins], color=shade, linestyle="--", linewidth=0.9)
     axes.plot(x, [row.alpha.value for row in bins], color=shade)
     for row in bins:
-        face = shade if row.alpha.question == NEXT_FLIGHT else "white"
+        face = shade if row.alpha.scope == THIS_SCENE else "white"
         axes.plot(row.mean, row.alpha.value, color=shade, marker="o", markersize=3.5, markerfacecolor=face)
     axes.fill_between(
         x, [row.alpha.low for row in bins], [row.alpha.high for row in bins], color=shade, alpha=0.15, linewidth=0

@@ -233,7 +233,7 @@ def _difference_rows(found: BackboneComparison) -> tuple[Row, ...]:
     words = {quantity.key: quantity.word for quantity in compared(truth=True)}
     rows = sorted(found.paired.differences, key=lambda row: row.measure != found.paired.primary)
     return tuple(
-        (row.a, row.b, words[row.measure], row.difference, row.p_holm, row.undecided or row.question) for row in rows
+        (row.a, row.b, words[row.measure], row.difference, row.p_holm, row.undecided or row.scope) for row in rows
     )
 
 
@@ -352,8 +352,8 @@ def correlogram(result: Result) -> list[Table]:
         "Alpha between frames of pairs of looks at a place, by how far apart they are: models and flights compare at a"
         " stated angle between the directions of view, not over whatever pairs a flight has. Nearest, farthest: the"
         " first and the last bin with enough pairs in time (frames), angle, ratio of the ranges, and distance of the"
-        " cameras. In sampled voxels; intervals at 95%, for the next flight"
-        f" if {LEAST_FRAMES} frames of a bin tell of it, else for this map."
+        " cameras. In sampled voxels; intervals at 95%, for this scene flown again"
+        f" if {LEAST_FRAMES} frames of a bin tell of it, else for these frames."
     )
     return by_scene(result, "correlogram", "Agreement by distance of the looks", caption, columns, numbers)
 

@@ -20,7 +20,7 @@ from semstab.statistics.verdict import ADVICE
 SCENE = Column("scene", "Scene")
 REPEATED = Column("repeated_voxels", "Voxels", 0)
 INTERVALS = (
-    "In brackets: intervals at 95% for this map; those of verdicts for the next flight"
+    "In brackets: intervals at 95% for these frames; those of verdicts for this scene flown again"
     f" if {LEAST_FRAMES} frames tell of it."
 )
 SEEN_TWICE = "Over the voxels seen twice or more."
