@@ -1,81 +1,84 @@
-"""How often is a verdict wrong, ceiling, classes and all?
+"""How often is a verdict right that states its probability?
 
-    python simulations/verdicts.py [--trials 200] [--seed 0]
+    python simulations/verdicts.py [--trials 60] [--seed 0]
 
-Scenes with voxels at borders that hold two classes, as a sampler sees them. Models reach a little less of their ceiling
-than a level of the verdict asks for: how many flights are said to be of that level, or of a better one?
+Scenes with voxels at borders that hold two classes, as a sampler sees them, and models whose share of the ceiling lies
+near the thresholds of the verdict. A verdict is right where the share that eight flights over the same scene reach
+together is in its level. Prints two tables in Markdown: right verdicts by stated probability, and the mean probability
+of the right level by the length of the flight.
 """
 
 from __future__ import annotations
 
 import argparse
-from collections import Counter
+import math
+from collections import defaultdict
+from collections.abc import Iterator
 
 import numpy as np
 from flights import Flight, fly, sample_of, table_of, world
 
-from semstab.model.statistics import HeadlineStatistics
+from semstab.model.statistics import HeadlineStatistics, Level, StabilityVerdict
 from semstab.statistics.accumulate import cluster_sums_of
 from semstab.statistics.ceiling import ceiling_share
-from semstab.statistics.cluster_sums import FUNCTIONALS, sums_for, value
+from semstab.statistics.cluster_sums import FUNCTIONALS, sums_for
 from semstab.statistics.intervals import confidence_intervals, headline_specs
-from semstab.statistics.verdict import verdict
+from semstab.statistics.verdict import RELIABLE, TENTATIVE, level_probabilities, verdict
 
-BETTER = {"stable": ("stable", "partly stable"), "usable": ("stable", "partly stable", "usable")}
-"""At each level, what says as much or more."""
-
-CASES = {
-    "stable": (
-        Flight(45, 2.0, 1.26, 40, 5, "alike"),
-        Flight(45, 2.0, 1.68, 40, 5, "bad"),
-        Flight(45, 2.0, 1.40, 40, 5, "lasting"),
-        Flight(45, 2.0, 1.65, 40, 5, "direction"),
-        Flight(60, 2.0, 1.30, 60, 5, "lasting", city=True),
-        Flight(45, 2.0, 1.20, 40, 5, "uneven", K=4),
-        Flight(45, 2.0, 1.26, 12, 5, "alike"),
-    ),
-    "usable": (
-        Flight(45, 2.0, 0.92, 40, 5, "lasting"),
-        Flight(32, 1.5, 0.76, 12, 5, "alike"),
-    ),
-}
-"""Flights that reach a little less than each level asks for; what they reach stands in the table."""
+FLIGHTS = 8
+FRAMES = (10, 20, 40, 80, 160)
+EASES = {"alike": (0.8, 1.0, 1.3), "bad": (1.2, 1.5, 1.8), "lasting": (0.9, 1.2, 1.5), "objects": (0.9, 1.1, 1.4),
+         "regimes": (1.3, 1.6, 1.9), "direction": (1.2, 1.5, 1.8)}  # fmt: skip
+"""Models near the thresholds, by how their frames differ."""
 
 
-def levels(flight: Flight, count: int, seed: int) -> tuple[float, Counter[str]]:
-    """The share of its ceiling that very many flights reach together, and the verdicts on each."""
-    found: Counter[str] = Counter()
-    total: np.ndarray | float = 0.0
+def true_level(share: float) -> Level:
+    """Return the level of a share of the ceiling that is known."""
+    return "stable" if share >= RELIABLE else "usable" if share >= TENTATIVE else "unstable"
+
+
+def verdicts(flight: Flight, count: int, seed: int) -> Iterator[tuple[StabilityVerdict, Level, float]]:
+    """Yield the verdict on a flight over scene after scene, the right level, and the probability that it was given."""
     for trial in range(count):
         rng = np.random.default_rng([seed, trial])
-        over = world(flight, rng)
-        sample = sample_of(fly(flight, over, rng), over, flight, rng)
-        table = table_of(sample.seen)
-        sums = cluster_sums_of(table, sample=sample.shared())
-        reach = ceiling_share(sample, table, sums)
-        assert np.isclose(reach.share.value, value(sums, "reached"))
-        judged = HeadlineStatistics(*confidence_intervals(headline_specs(sums)))
-        said = verdict("net", headline=judged, ceiling=reach, voxels=len(table), share=1.0, blocks=sums.cells)
-        found[said.level] += 1
-        total = total + sums_for(sums, "reached").sum(axis=0)
-    return float(FUNCTIONALS["reached"].of(np.asarray(total))), found
+        over, total = world(flight, rng), []
+        for _ in range(FLIGHTS):
+            sample = sample_of(fly(flight, over, rng), over, flight, rng)
+            sums = cluster_sums_of(table_of(sample.seen), sample=sample.shared())
+            total.append(sums_for(sums, "reached").sum(axis=0))
+            if len(total) == 1:
+                table = table_of(sample.seen)
+                share = ceiling_share(sample, table, sums)
+                headline = HeadlineStatistics(*confidence_intervals(headline_specs(sums)))
+                said = verdict("net", headline=headline, ceiling=share, voxels=len(table), share=1.0, blocks=sums.cells)
+        level = true_level(float(FUNCTIONALS["reached"].of(sum(total))))
+        yield said, level, level_probabilities(share.share, "plain")[level]
 
 
 def main() -> None:
-    """Print the table."""
+    """Print the tables."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--trials", type=int, default=200)
+    parser.add_argument("--trials", type=int, default=60)
     parser.add_argument("--seed", type=int, default=0)
     arguments = parser.parse_args()
-    print("| flights | reached | level | wrongly of that level | verdicts |\n| --- | --- | --- | --- | --- |")
-    for level, flights in CASES.items():
-        for flight in flights:
-            reached, found = levels(flight, arguments.trials, arguments.seed)
-            wrong = sum(found[name] for name in BETTER[level]) / arguments.trials
-            scene = f"{'city' if flight.city else 'floor'} {flight.side} x {flight.side}, {flight.K} classes"
-            said = ", ".join(f"{name} {times / arguments.trials:.2f}" for name, times in found.most_common())
-            name = f"{scene}, {flight.frames} frames, {flight.quality}"
-            print(f"| {name} | {reached:.3f} | {level} | {wrong:.3f} | {said} |", flush=True)
+    right: dict[int, list[bool]] = defaultdict(list)
+    given: dict[int, list[float]] = defaultdict(list)
+    undecided: dict[int, list[bool]] = defaultdict(list)
+    for quality, eases in EASES.items():
+        for ease in eases:
+            for frames in FRAMES:
+                flight = Flight(45, 2.0, ease, frames, 5, quality)
+                for said, level, probability in verdicts(flight, arguments.trials, arguments.seed):
+                    given[frames].append(probability)
+                    undecided[frames].append(said.level == "undecided")
+                    if not math.isnan(said.probability) and said.level != "undecided":
+                        right[min(int(10 * said.probability), 9)].append(said.level == level)
+    print("| stated probability | verdicts | right |\n| --- | ---: | ---: |")
+    for tenth, own in sorted(right.items()):
+        print(f"| {tenth / 10:.1f} to {(tenth + 1) / 10:.1f} | {len(own)} | {np.mean(own):.3f} |")
+    print("\n| frames | mean probability of the right level | undecided |\n| ---: | ---: | ---: |")
+    for frames in FRAMES:
+        print(f"| {frames} | {np.mean(given[frames]):.3f} | {np.mean(undecided[frames]):.3f} |")
 
 
 if __name__ == "__main__":
