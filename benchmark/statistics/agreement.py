@@ -13,8 +13,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from semstab.core.types import Float64, Mask
+from semstab.core.types import Float64, Int64, Mask
 from semstab.model.events import Events
+from semstab.model.evidence import Evidence
 from semstab.model.measures import Quantity, entropy
 from semstab.model.statistics import ClassAgreement
 from semstab.model.voxels import VoxelTable
@@ -183,20 +184,37 @@ def class_agreement(table: VoxelTable, events: Events | None = None) -> tuple[Cl
 
 
 def class_sums(table: VoxelTable, events: Events | None = None) -> Float64:
-    """(7, K) what `class_agreement_of` is a function of: sums over the voxels with OP >= 2."""
-    from semstab.statistics.loops.rows import add_class_sums
+    """Return (7, K) what `class_agreement_of` is a function of: sums over the voxels with OP >= 2.
 
-    again, one_hot, sums = table.op >= 2, table.self_sum == table.op, np.zeros((7, table.K))
+    Evidence, that / OP, disagreement, that * OP, and squares of single observations; then voxels and observations.
+    """
+    K, again, T = table.K, table.op >= 2, table.op.astype(np.float64)
+    one_hot, known = table.self_sum == table.op, True
     if events is None:
-        one_hot, told = np.ones(len(table), np.bool_), one_hot_where(table, again)
-        log, rows = table.evidence.entries, (none := np.zeros(len(table), np.int64), none)
-    else:
-        log, rows, told = events.evidence.entries, (events.starts, events.ends), True
-    add_class_sums(table.evidence.entries, table.op, one_hot, *rows, log, sums[:5])
-    if not told:
-        sums[2:5, sums[0] > 0] = np.nan
-    sums[5], sums[6] = np.count_nonzero(again), table.op.sum(where=again, dtype=np.float64)
-    return sums
+        one_hot, known = np.ones(len(table), np.bool_), one_hot_where(table, again)
+    pairs = np.where(again, T * np.maximum(T - 1, 1), 1.0)
+
+    def by_class(evidence: Evidence, voxel: Int64, values: Float64, where: Mask) -> Float64:
+        some = np.flatnonzero((where & again)[voxel])
+        label, of, own = evidence.label[some], voxel[some], values[some]
+        apart = 2.0 * own / pairs[of]
+        return np.stack([np.bincount(label, weights=each, minlength=K) for each in (own, apart, T[of] * apart)])
+
+    own, voxel = table.evidence.weight, np.repeat(np.arange(len(table)), np.diff(table.evidence.starts))
+    every, squares = np.ones(len(table), np.bool_), np.where(one_hot[voxel], own, 0.0)
+    total = by_class(table.evidence, voxel, own, every)[0]
+    shares = by_class(table.evidence, voxel, own / T[voxel], every)[0]
+    _, apart, weighted = by_class(table.evidence, voxel, (T[voxel] - 1.0) * own - own * own + squares, every)
+    of_squares = by_class(table.evidence, voxel, squares, every)[0]
+    if events is not None:  # evidence that is not one-hot: the log has the squares of its observations
+        log = events.evidence
+        further = by_class(log, np.repeat(events.voxel, np.diff(log.starts)), log.weight**2, ~one_hot)
+        of_squares, apart, weighted = of_squares + further[0], apart + further[1], weighted + further[2]
+    if not known:
+        for unknown in (apart, weighted, of_squares):
+            unknown[total > 0] = np.nan
+    counts = np.full((2, K), [[np.count_nonzero(again)], [table.op.sum(where=again, dtype=np.float64)]], np.float64)
+    return np.concatenate([np.stack([total, shares, apart, weighted, of_squares]), counts])
 
 
 def class_agreement_of(sums: Float64, classes: Sequence[str] = ()) -> tuple[ClassAgreement, ...]:

@@ -39,13 +39,12 @@ from semstab.statistics.cluster_sums import ClusterSums
 from semstab.statistics.correctness import (
     Predictions,
     Truth,
+    by_stratum,
     join_truth,
-    judged_strata,
-    judged_where,
+    judged_sums,
     quadrant_sums,
     quadrants_of,
     reliability_of,
-    strata_of,
     wrong_of_steady,
 )
 from semstab.statistics.correlogram import correlogram
@@ -280,8 +279,8 @@ def _correctness(
     right = places.means({"right": np.where(truth.known, judged.right, np.nan)})
     return CorrectnessStatistics(
         accuracy=CubeSums(places.cell, places.edge, right).estimate("right", ratio_of),
-        strata=strata_of(judged_strata(judged, table.op, truth.known, edges), edges),
-        reliability=reliability_of(judged_where(judged, truth.known & (table.op >= 2))),
+        strata=by_stratum(judged, table.op, truth.known, edges),
+        reliability=reliability_of(judged_sums(judged, truth.known & (table.op >= 2))),
         quadrants=quadrants_of(quadrant_sums(table, truth, stable, places.edge)),
     )
 
