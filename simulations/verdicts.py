@@ -16,10 +16,9 @@ from flights import Flight, fly, sample_of, table_of, world
 
 from semstab.model.statistics import HeadlineStatistics
 from semstab.statistics.accumulate import cluster_sums_of
-from semstab.statistics.ceiling import ceiling_share
 from semstab.statistics.cluster_sums import FUNCTIONALS, sums_for, value
 from semstab.statistics.intervals import confidence_intervals, headline_specs
-from semstab.statistics.verdict import verdict
+from semstab.statistics.verdict import ceiling_share, verdict
 
 BETTER = {"stable": ("stable", "partly stable"), "usable": ("stable", "partly stable", "usable")}
 """At each level, what says as much or more."""

@@ -13,8 +13,8 @@ from semstab.errors import DataError
 from semstab.model.information import normalise
 from semstab.statistics import correctness, join_truth, quadrants, reliability, stable_wrong
 from semstab.statistics.accumulate import Cubes
+from semstab.statistics.agreement import stability_posterior
 from semstab.statistics.correctness import Predictions, by_stratum
-from semstab.statistics.stability import stability_posterior
 
 
 def random_beliefs(n=400, K=4, seed=0):

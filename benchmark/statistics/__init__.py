@@ -25,7 +25,6 @@ from semstab.statistics.agreement import (
     krippendorff_alpha,
     psa,
 )
-from semstab.statistics.ceiling import ceiling, ceiling_share, losses, rendered
 from semstab.statistics.correctness import Truth, correctness, join_truth, quadrants, reliability, stable_wrong
 from semstab.statistics.correlogram import correlogram
 from semstab.statistics.description import Analysis, analyse, describe
@@ -45,7 +44,7 @@ from semstab.statistics.observations import CellObservations, ObservationSample,
 from semstab.statistics.paired_differences import claimed_together, standardised
 from semstab.statistics.sample import MOST_VOXELS, MapSample
 from semstab.statistics.sampler import Sampler
-from semstab.statistics.verdict import verdict
+from semstab.statistics.verdict import ceiling, ceiling_share, losses, rendered, verdict
 
 __all__ = [
     "MOST_VOXELS",

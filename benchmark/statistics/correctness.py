@@ -19,8 +19,7 @@ from semstab.model.results import RECURRENT
 from semstab.model.statistics import UNKNOWN, Correctness, Quadrants, Reliability, RuleMeans
 from semstab.model.voxels import VoxelTable
 from semstab.statistics.accumulate import Cubes, CubeSums
-from semstab.statistics.agreement import STABLE, ratio_of
-from semstab.statistics.stability import LIKELY, stability_posterior
+from semstab.statistics.agreement import LIKELY, STABLE, ratio_of, stability_posterior
 
 ACCURACY = Quantity(key="accuracy", title="Accuracy", better="higher", needs="truth")
 MIOU = Quantity(key="miou", title="mIoU", better="higher", needs="truth")

@@ -33,8 +33,7 @@ from semstab.model.statistics import (
 )
 from semstab.model.voxels import VoxelTable
 from semstab.statistics.accumulate import Cubes, CubeSums, cluster_sums_of
-from semstab.statistics.agreement import class_agreement_of, class_sums, ratio_of
-from semstab.statistics.ceiling import ceiling_share_from, ceiling_specs, losses
+from semstab.statistics.agreement import class_agreement_of, class_sums, ratio_of, shares_of, stability_posterior
 from semstab.statistics.cluster_sums import ClusterSums
 from semstab.statistics.correctness import (
     Predictions,
@@ -64,8 +63,7 @@ from semstab.statistics.sections import (
     row_columns,
     rule_outcomes,
 )
-from semstab.statistics.stability import shares_of, stability_posterior
-from semstab.statistics.verdict import verdict
+from semstab.statistics.verdict import ceiling_share_from, ceiling_specs, losses, verdict
 
 SCHEMA = 1
 
