@@ -32,8 +32,8 @@ from semstab.report.tables import tables
 from semstab.report.tables.table import to_json as table_content
 from semstab.report.terminal import print_summary
 from semstab.statistics import CellObservations, Estimate, MapSample, ObservationSample, Reliability, analyse, describe
+from semstab.statistics.agreement import stability_posterior
 from semstab.statistics.correctness import ACCURACY
-from semstab.statistics.stability import stability_posterior
 
 BACKBONES = ("a", "b", "gt")
 

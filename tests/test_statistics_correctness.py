@@ -13,8 +13,8 @@ from semstab.errors import DataError
 from semstab.model.information import normalise
 from semstab.statistics import correctness, join_truth, quadrants, reliability, stable_wrong
 from semstab.statistics.accumulate import Cubes
-from semstab.statistics.correctness import by_stratum
-from semstab.statistics.stability import stability_posterior
+from semstab.statistics.agreement import stability_posterior
+from semstab.statistics.correctness import Predictions, by_stratum
 
 
 def random_beliefs(n=400, K=4, seed=0):
@@ -91,7 +91,10 @@ def test_every_voxel_is_in_one_bin():
 def test_strata_hold_the_voxels_of_their_op():
     table = log_of([[0, -1, -1], [1, 1, -1], [2, 2, 2], [0, 0, 1]]).table()
     truth = join_truth(table, log_of([[0], [0], [2], [1]]).table())
-    rows = {row.name: (row.voxels, row.accuracy) for row in by_stratum(table, truth, (1, 2, 5))}
+    rows = {
+        row.name: (row.voxels, row.accuracy)
+        for row in by_stratum(Predictions.of(table.evidence, truth.label), table.op, truth.known, (1, 2, 5))
+    }
     assert rows["all"] == (4, 0.5)
     assert rows["OP=1"] == (1, 1.0)
     assert rows["OP=2"] == (1, 0.0)
@@ -171,5 +174,5 @@ def test_the_belief_is_the_normalised_evidence():
     events = log_of_evidence([[[0.2, 0.8], [0.6, 0.4], [0.7, 0.3]]])
     table = events.table()
     truth = join_truth(table, log_of_evidence([[[0.0, 1.0]]]).table())
-    (everything, *_) = by_stratum(table, truth, (1, 2, 5))
+    (everything, *_) = by_stratum(Predictions.of(table.evidence, truth.label), table.op, truth.known, (1, 2, 5))
     assert everything.brier == pytest.approx(2 * normalise(table.evidence)[0, 0] ** 2)

@@ -14,8 +14,7 @@ from semstab import backends
 from semstab.errors import DataError
 from semstab.model.contrast import CommonLooks
 from semstab.statistics import CellObservations, compare_backbones, psa
-from semstab.statistics.common_observations import common_observations, psa_bounds
-from semstab.statistics.paired_differences import stratum_counts, thin_share
+from semstab.statistics.paired_differences import common_observations, psa_bounds, stratum_counts, thin_share
 
 SIZE = 0.2
 

@@ -10,12 +10,11 @@ from semstab.errors import DataError
 from semstab.metrics.agreement import rows_of
 from semstab.model.measures import dominant, entropy, sbd, vss
 from semstab.statistics.accumulate import cluster_sums_of
-from semstab.statistics.agreement import class_agreement, krippendorff_alpha, psa
+from semstab.statistics.agreement import class_agreement, krippendorff_alpha, psa, stability_posterior
 from semstab.statistics.cluster_sums import ClusterSums, aligned, value
 from semstab.statistics.correctness import correctness
 from semstab.statistics.drift import expected_sbd
 from semstab.statistics.intervals import coverage, difference, difference_over_frames, mean_over_frames, same_flight
-from semstab.statistics.stability import stability_posterior
 
 
 def flight(side=12, F=9, K=3, soft_evidence=False, seed=0):

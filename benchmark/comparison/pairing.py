@@ -21,11 +21,11 @@ from semstab.model.tiles import Tiles, side_by_side
 from semstab.model.voxels import VoxelTable
 from semstab.statistics.accumulate import cluster_sums_of
 from semstab.statistics.cluster_sums import ClusterSums
-from semstab.statistics.common_observations import compared_observations
 from semstab.statistics.correctness import join_truth
 from semstab.statistics.drift import expected_sbd, streams
 from semstab.statistics.model_comparison import Region, Regions, coverage_of, held, repeated_rows, truth_at
 from semstab.statistics.observations import CellObservations
+from semstab.statistics.paired_differences import compared_observations
 
 NEAR = 1e-3
 """Metres within which cameras of the same frame lie."""

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import reduce
 from typing import Any
 
 import numpy as np
@@ -133,9 +132,3 @@ def by_group(
         some = slice(first, first + TOGETHER)
         add_by_group(of, *own, *(TOGETHER - len(own)) * own[:1], max(BLOCK, groups), sums[some], defined[some])
     return tuple(np.ascontiguousarray(found[: len(values)].T) for found in (sums, defined))  # type: ignore[return-value]
-
-
-def blockwise(sums: Callable[[slice], Float64], rows: int, groups: int) -> Float64:
-    """Sums by group of so many rows, block by block: rounding adds up within a block only."""
-    step = max(BLOCK, groups)
-    return reduce(np.add, (sums(slice(first, min(first + step, rows))) for first in range(0, max(rows, 1), step)))

@@ -18,7 +18,7 @@ from semstab.model.measures import dominant, entropy, vss
 from semstab.model.results import RECURRENT
 from semstab.model.statistics import Interval
 from semstab.model.voxels import VoxelTable
-from semstab.statistics.agreement import one_hot_where, psa, ratio_of
+from semstab.statistics.agreement import one_hot_where, psa, ratio_of, stability_posterior
 from semstab.statistics.cluster_sums import (
     BINS,
     DRIFT,
@@ -35,7 +35,6 @@ from semstab.statistics.cluster_sums import (
     width,
 )
 from semstab.statistics.intervals import EstimateSpec, confidence_intervals, spec_of_cubes
-from semstab.statistics.stability import stability_posterior
 
 # Cubes of space over any set of voxels, and intervals for these frames of any statistic of their sums.
 

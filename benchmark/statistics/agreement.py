@@ -13,9 +13,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from semstab.core.types import Float64, Mask
+from semstab.core.types import Float64, Int64, Mask
 from semstab.model.events import Events
-from semstab.model.measures import Quantity, entropy
+from semstab.model.evidence import Evidence
+from semstab.model.measures import Quantity, entropy, vss
 from semstab.model.statistics import ClassAgreement
 from semstab.model.voxels import VoxelTable
 
@@ -183,20 +184,37 @@ def class_agreement(table: VoxelTable, events: Events | None = None) -> tuple[Cl
 
 
 def class_sums(table: VoxelTable, events: Events | None = None) -> Float64:
-    """(7, K) what `class_agreement_of` is a function of: sums over the voxels with OP >= 2."""
-    from semstab.statistics.loops.rows import add_class_sums
+    """Return (7, K) what `class_agreement_of` is a function of: sums over the voxels with OP >= 2.
 
-    again, one_hot, sums = table.op >= 2, table.self_sum == table.op, np.zeros((7, table.K))
+    Evidence, that / OP, disagreement, that * OP, and squares of single observations; then voxels and observations.
+    """
+    K, again, T = table.K, table.op >= 2, table.op.astype(np.float64)
+    one_hot, known = table.self_sum == table.op, True
     if events is None:
-        one_hot, told = np.ones(len(table), np.bool_), one_hot_where(table, again)
-        log, rows = table.evidence.entries, (none := np.zeros(len(table), np.int64), none)
-    else:
-        log, rows, told = events.evidence.entries, (events.starts, events.ends), True
-    add_class_sums(table.evidence.entries, table.op, one_hot, *rows, log, sums[:5])
-    if not told:
-        sums[2:5, sums[0] > 0] = np.nan
-    sums[5], sums[6] = np.count_nonzero(again), table.op.sum(where=again, dtype=np.float64)
-    return sums
+        one_hot, known = np.ones(len(table), np.bool_), one_hot_where(table, again)
+    pairs = np.where(again, T * np.maximum(T - 1, 1), 1.0)
+
+    def by_class(evidence: Evidence, voxel: Int64, values: Float64, where: Mask) -> Float64:
+        some = np.flatnonzero((where & again)[voxel])
+        label, of, own = evidence.label[some], voxel[some], values[some]
+        apart = 2.0 * own / pairs[of]
+        return np.stack([np.bincount(label, weights=each, minlength=K) for each in (own, apart, T[of] * apart)])
+
+    own, voxel = table.evidence.weight, np.repeat(np.arange(len(table)), np.diff(table.evidence.starts))
+    every, squares = np.ones(len(table), np.bool_), np.where(one_hot[voxel], own, 0.0)
+    total = by_class(table.evidence, voxel, own, every)[0]
+    shares = by_class(table.evidence, voxel, own / T[voxel], every)[0]
+    _, apart, weighted = by_class(table.evidence, voxel, (T[voxel] - 1.0) * own - own * own + squares, every)
+    of_squares = by_class(table.evidence, voxel, squares, every)[0]
+    if events is not None:  # evidence that is not one-hot: the log has the squares of its observations
+        log = events.evidence
+        further = by_class(log, np.repeat(events.voxel, np.diff(log.starts)), log.weight**2, ~one_hot)
+        of_squares, apart, weighted = of_squares + further[0], apart + further[1], weighted + further[2]
+    if not known:
+        for unknown in (apart, weighted, of_squares):
+            unknown[total > 0] = np.nan
+    counts = np.full((2, K), [[np.count_nonzero(again)], [table.op.sum(where=again, dtype=np.float64)]], np.float64)
+    return np.concatenate([np.stack([total, shares, apart, weighted, of_squares]), counts])
 
 
 def class_agreement_of(sums: Float64, classes: Sequence[str] = ()) -> tuple[ClassAgreement, ...]:
@@ -250,3 +268,69 @@ def decompose(table: VoxelTable) -> Uncertainty:
     total = entropy(table)
     within = table.frame_entropy_sum / table.op / math.log2(table.K)
     return Uncertainty(np.minimum(within, total), np.maximum(total - within, 0.0), total)
+
+
+# Is a location stable? A probability, because a few frames that agree say less than many.
+#
+# Frames agree or not by chance: of locations that all err in one frame of ten, those that three frames saw look perfect
+# more often than those that thirty saw. So a location borrows from what all locations of its map are like.
+
+LIKELY = 0.5
+"""A place is called stable from this probability on."""
+
+STEPS, ROUNDS = 80, 200
+"""Shares of the dominant class that a place may have, between 1/2 and 1, and rounds to find how many have which."""
+
+
+def stable_share(agreement: float = STABLE) -> float:
+    """The share p of the dominant class from which two frames agree with that probability: p^2 + (1 - p)^2."""
+    return (1 + math.sqrt(2 * agreement - 1)) / 2
+
+
+def shares_of(table: VoxelTable) -> Float64:
+    """Return how many of a map's locations (STEPS,) have which share of the dominant class."""
+    seen, most, of = _votes(table)
+    count, likelihood, share = np.bincount(of), _likelihood(seen, most), np.full(STEPS, 1 / STEPS)
+    if not len(seen):
+        return share
+    for _ in range(ROUNDS):  # how often each share is so, a posteriori
+        share = share * ((count / (likelihood @ share)) @ likelihood) / count.sum()
+    return share
+
+
+def stability_posterior(table: VoxelTable, shares: Float64 | None = None, *, stable: float = STABLE) -> Float64:
+    """(n,) the probability that a location is stable, given its frames and all locations; NaN where OP < 2.
+
+    Of T frames m vote for the dominant class, which happens with the probability b(m; T, p) + b(T - m; T, p) where its
+    share is p. How many locations have which p is estimated from all of them without any form of its distribution
+    (Kiefer and Wolfowitz 1956, Annals of Mathematical Statistics 27; by the EM algorithm), then Bayes' theorem is
+    applied. `shares` are those of the whole map, where the table has but some of its locations.
+    """
+    seen, most, of = _votes(table)
+    posterior = _likelihood(seen, most) * (shares_of(table) if shares is None else shares)
+    posterior /= posterior.sum(axis=1, keepdims=True)
+    likely = np.full(len(table), np.nan)
+    likely[table.op >= 2] = posterior[:, stable_share(stable) <= STEPS_OF_P].sum(axis=1)[of]
+    return likely
+
+
+STEPS_OF_P = 0.5 + 0.5 * (np.arange(STEPS) + 0.5) / STEPS
+
+
+def _likelihood(seen: Int64, most: Int64) -> Float64:
+    """(v, STEPS) of votes given each share, up to a factor of each row."""
+    m, rest, p, q = most[:, None], (seen - most)[:, None], np.log(STEPS_OF_P), np.log1p(-STEPS_OF_P)
+    own, folded = m * p + rest * q, rest * p + m * q
+    best = np.maximum(own, folded).max(axis=1, keepdims=True)
+    likelihood: Float64 = np.exp(own - best) + np.exp(folded - best)
+    return likelihood
+
+
+def _votes(table: VoxelTable) -> tuple[Int64, Int64, Int64]:
+    """Frames that saw a location and votes for its class, each pair once (v,); which pair each with OP >= 2 has."""
+    again = table.op >= 2
+    T = table.op[again].astype(np.int64)
+    longest = int(T.max(initial=0)) + 1
+    pairs, of = np.unique(np.rint(vss(table)[again] * T).astype(np.int64) + T * longest, return_inverse=True)
+    seen, most = np.divmod(pairs, longest)
+    return seen, most, of

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -13,15 +14,13 @@ from semstab.metrics import strata
 from semstab.metrics.agreement import require_same_grid, same_voxels, shared_rows
 from semstab.metrics.summary import groups_of
 from semstab.model.evidence import Evidence
-from semstab.model.information import blockwise, by_group
+from semstab.model.information import by_group
 from semstab.model.measures import Beliefs, MeasureMeans, Quantity, Voxels, dominant, measures
 from semstab.model.results import RECURRENT
 from semstab.model.statistics import UNKNOWN, Correctness, Quadrants, Reliability, RuleMeans
 from semstab.model.voxels import VoxelTable
 from semstab.statistics.accumulate import Cubes, CubeSums
-from semstab.statistics.agreement import STABLE, ratio_of
-from semstab.statistics.fusion_rules import Fused
-from semstab.statistics.stability import LIKELY, stability_posterior
+from semstab.statistics.agreement import LIKELY, STABLE, ratio_of, stability_posterior
 
 ACCURACY = Quantity(key="accuracy", title="Accuracy", better="higher", needs="truth")
 MIOU = Quantity(key="miou", title="mIoU", better="higher", needs="truth")
@@ -52,11 +51,9 @@ def join_truth(table: VoxelTable, truth: VoxelTable) -> Truth:
 
     Raises DataError where the maps differ in K or voxel size.
     """
-    from semstab.statistics.loops.rows import majorities
-
     require_same_grid(table, truth)
-    label = np.empty(len(truth), np.int64)
-    majorities(truth.evidence.entries, PURE, label)
+    found = truth.evidence.concentration
+    label = np.where(found.largest > PURE, found.label.astype(np.int64), -1)
     if not same_voxels(table, truth):
         (rows, true_rows), true = shared_rows(table, truth), label
         label = np.full(len(table), -1)
@@ -83,12 +80,15 @@ class Predictions:
     @classmethod
     def of(cls, evidence: Float64 | Evidence, label: Int64) -> Predictions:
         """Beliefs as evidence (n, K), up to a factor; what is said where the label is -1 means nothing."""
-        from semstab.statistics.loops.rows import square_errors
-
-        kept = Evidence.of(evidence)
-        found, error, rest = kept.concentration, np.empty(len(kept)), kept.unseen
-        square_errors(kept.entries, np.zeros(0) if rest is None else rest, kept.K, label, error)
-        return cls(label, found.label.astype(np.int64), found.largest, error, kept.K)
+        evidence = Evidence.of(evidence)
+        count, spread = np.diff(evidence.starts), evidence.concentration
+        of, rest = np.repeat(np.arange(len(evidence)), count), evidence.unseen
+        rest = np.zeros(len(evidence)) if rest is None else rest
+        total = np.bincount(of, weights=evidence.weight, minlength=len(evidence)) + (evidence.K - count) * rest
+        hit, own = evidence.label == label[of], rest.copy()
+        own[of[hit]] = evidence.weight[hit]
+        error = spread.squares / total**2 - 2 * own / total + 1
+        return cls(label, spread.label.astype(np.int64), spread.largest, error, evidence.K)
 
     @property
     def right(self) -> Mask:
@@ -98,40 +98,36 @@ class Predictions:
 
 
 def correctness(belief: Float64 | Evidence, label: Int64, name: str = "all") -> Correctness:
-    """Of beliefs (n, K) and true classes (n,)."""
-    return _correctness(Predictions.of(belief, label), name)
+    """Return accuracy and calibration of beliefs (n, K) whose true classes are (n,)."""
+    return correctness_of(judged_sums(Predictions.of(belief, label), label >= 0), name)
 
 
-def _correctness(judged: Predictions, name: str = "all") -> Correctness:
-    return correctness_of(judged_sums(judged), name)
-
-
-def judged_sums(judged: Predictions) -> Float64:
-    """(3 + 3 BINS + 3 K,) what all that is said of them is a function of.
+def judged_sums(judged: Predictions, where: Mask) -> Float64:
+    """Return (3 + 3 BINS + 3 K,) what `correctness_of` is a function of, over the voxels for which `where` (n,) holds.
 
     Voxels, right ones and errors; by bin of confidence voxels, confidence and right ones; by class right, true and
     predicted ones.
     """
-    return judged_where(judged, np.ones(len(judged.label), np.bool_))
-
-
-def judged_where(judged: Predictions, where: Mask) -> Float64:
-    """`judged_sums` of those for which `where` (n,) holds."""
     sums: Float64 = _judged_by_group(judged, where - np.int64(1), 1)[0]
     return sums
 
 
 def _judged_by_group(judged: Predictions, group: Int64, groups: int) -> Float64:
     """(G, ...) `judged_sums` of each group; -1 is none."""
-    from semstab.statistics.loops.rows import add_judged
+    some, K = np.flatnonzero(group >= 0), judged.K
+    of, label, predicted, confidence = (own[some] for own in (group, judged.label, judged.predicted, judged.confidence))
+    right = judged.right[some].astype(np.float64)
+    bins = np.clip(np.ceil(confidence * BINS - 1e-9).astype(np.int64) - 1, 0, BINS - 1)
 
-    def of(some: slice) -> Float64:
-        sums = np.zeros((groups, 3 + 3 * BINS + 3 * judged.K))
-        own = (judged.label, judged.predicted, judged.confidence, judged.error)
-        add_judged(group[some], *(values[some] for values in own), BINS, sums)
-        return sums
+    def sums(width: int, within: Any, weights: Any = None) -> Float64:
+        found = np.bincount(of * width + within, weights=weights, minlength=groups * width)
+        return found.astype(np.float64).reshape(groups, width)
 
-    return blockwise(of, len(group), groups * judged.K)
+    return np.hstack([
+        sums(1, 0), sums(1, 0, right), sums(1, 0, judged.error[some]),
+        sums(BINS, bins), sums(BINS, bins, confidence), sums(BINS, bins, right),
+        sums(K, label, right), sums(K, label), sums(K, predicted),
+    ])  # fmt: skip
 
 
 def correctness_of(sums: Float64, name: str = "all") -> Correctness:
@@ -157,11 +153,6 @@ def reliability_of(sums: Float64) -> tuple[Reliability, ...]:
     )
 
 
-def rule_means(fused: Fused, where: Mask, truth: Truth | None) -> RuleMeans:
-    """Means over the voxels of a map, fused by some rule, for which `where` (n,) holds."""
-    return rule_means_of(rule_sums(fused, where, truth))
-
-
 def rule_sums(fused: Beliefs, where: Mask, truth: Truth | None = None) -> Float64:
     """(3 M,) of each measure its sum, how often it is defined and how often OP is high enough; then `judged_sums`.
 
@@ -174,7 +165,7 @@ def rule_sums(fused: Beliefs, where: Mask, truth: Truth | None = None) -> Float6
     rows = np.stack([total[0], defined[0], often], axis=1).ravel()
     if truth is None:
         return rows
-    return np.concatenate([rows, judged_where(Predictions.of(evidence, truth.label), truth.known & where)])
+    return np.concatenate([rows, judged_sums(Predictions.of(evidence, truth.label), truth.known & where)])
 
 
 def rule_means_of(sums: Float64) -> RuleMeans:
@@ -188,31 +179,15 @@ def rule_means_of(sums: Float64) -> RuleMeans:
 
 
 def reliability(belief: Float64 | Evidence, label: Int64) -> tuple[Reliability, ...]:
-    """The bins of the reliability diagram (Guo et al. 2017, ICML) of beliefs (n, K) and true classes (n,)."""
-    return reliability_of(judged_sums(Predictions.of(belief, label)))
+    """Return the bins of the reliability diagram (Guo et al. 2017, ICML) of beliefs (n, K) and true classes (n,)."""
+    return reliability_of(judged_sums(Predictions.of(belief, label), label >= 0))
 
 
-def by_stratum(table: VoxelTable, truth: Truth, edges: Sequence[int]) -> tuple[Correctness, ...]:
-    """Correctness of all voxels with a true class, then of each stratum of OP."""
-    return strata_of(stratum_sums(table, truth, edges), edges)
-
-
-def stratum_sums(table: VoxelTable, truth: Truth, edges: Sequence[int]) -> Float64:
-    """(1 + S, ...) `judged_sums` of all voxels with a true class, then of each stratum of OP."""
-    return judged_strata(Predictions.of(table.evidence, truth.label), table.op, truth.known, edges)
-
-
-def judged_strata(judged: Predictions, op: Int32, known: Mask, edges: Sequence[int]) -> Float64:
-    """The same of what is judged already, by OP (n,) and where a true class is known (n,)."""
-    group = np.where(known, groups_of(op, edges), -1)
-    sums = _judged_by_group(judged, group, len(edges) + 1)
-    return np.concatenate([sums.sum(axis=0, keepdims=True), sums])
-
-
-def strata_of(sums: Float64, edges: Sequence[int]) -> tuple[Correctness, ...]:
-    """What is said of them, from `stratum_sums`."""
+def by_stratum(judged: Predictions, op: Int32, known: Mask, edges: Sequence[int]) -> tuple[Correctness, ...]:
+    """Return the correctness of all voxels whose true class is known (n,), then of each stratum of OP (n,)."""
+    sums = _judged_by_group(judged, np.where(known, groups_of(op, edges), -1), len(edges) + 1)
     names = ["all", *(name for name, _, _ in strata(edges))]
-    return tuple(correctness_of(own, name) for own, name in zip(sums, names, strict=True))
+    return tuple(correctness_of(own, name) for own, name in zip([sums.sum(axis=0), *sums], names, strict=True))
 
 
 def quadrants(table: VoxelTable, truth: Truth, places: Cubes, *, stable: float = STABLE) -> Quadrants:

@@ -32,19 +32,18 @@ from semstab.model.statistics import (
 )
 from semstab.model.voxels import VoxelTable
 from semstab.statistics.accumulate import Cubes, CubeSums, cluster_sums_of
-from semstab.statistics.agreement import class_agreement_of, class_sums, ratio_of
+from semstab.statistics.agreement import class_agreement_of, class_sums, ratio_of, shares_of, stability_posterior
 from semstab.statistics.ceiling import ceiling_share_from, ceiling_specs, locations_by_class, losses
 from semstab.statistics.cluster_sums import ClusterSums
 from semstab.statistics.correctness import (
     Predictions,
     Truth,
+    by_stratum,
     join_truth,
-    judged_strata,
-    judged_where,
+    judged_sums,
     quadrant_sums,
     quadrants_of,
     reliability_of,
-    strata_of,
     wrong_of_steady,
 )
 from semstab.statistics.correlogram import correlogram
@@ -64,7 +63,6 @@ from semstab.statistics.sections import (
     row_columns,
     rule_outcomes,
 )
-from semstab.statistics.stability import shares_of, stability_posterior
 from semstab.statistics.verdict import verdict
 
 SCHEMA = 1
@@ -279,8 +277,8 @@ def _correctness(
     right = places.means({"right": np.where(truth.known, judged.right, np.nan)})
     return CorrectnessStatistics(
         accuracy=CubeSums(places.cell, places.edge, right).estimate("right", ratio_of),
-        strata=strata_of(judged_strata(judged, table.op, truth.known, edges), edges),
-        reliability=reliability_of(judged_where(judged, truth.known & (table.op >= 2))),
+        strata=by_stratum(judged, table.op, truth.known, edges),
+        reliability=reliability_of(judged_sums(judged, truth.known & (table.op >= 2))),
         quadrants=quadrants_of(quadrant_sums(table, truth, stable, places.edge)),
     )
 

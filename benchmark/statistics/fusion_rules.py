@@ -117,10 +117,15 @@ def _classes_seen(events: Events) -> tuple[Int64, UInt16]:
 
 
 def labels(evidence: Float64 | Evidence) -> Int64:
-    """Class (n,) of the largest belief of evidence (n, K), the lowest of those that tie: rounding decides none."""
-    from semstab.statistics.loops.rows import label_near
-
-    kept = Evidence.of(evidence)
-    rest, found = kept.unseen, np.empty(len(kept), np.int64)
-    label_near(kept.entries, np.zeros(0) if rest is None else rest, kept.K, ONE_HOT, found)
-    return found
+    """Return the class (n,) of the largest belief of evidence (n, K), the lowest of those that tie but for rounding."""
+    evidence = Evidence.of(evidence)
+    starts, label, weight = evidence.entries
+    count = np.diff(starts)
+    of, others = np.repeat(np.arange(len(evidence)), count), evidence.K - count
+    rest = np.zeros(len(evidence)) if evidence.unseen is None else evidence.unseen
+    total = np.bincount(of, weights=weight, minlength=len(evidence)) + others * rest
+    least = np.maximum(np.maximum.reduceat(weight, starts[:-1]), np.where(others > 0, rest, 0.0)) - ONE_HOT * total
+    lowest = np.minimum.reduceat(np.where(weight >= least[of], label, evidence.K).astype(np.int64), starts[:-1])
+    # the lowest class without an entry: labels ascend, so that each entry at its own place has all lower ones before it
+    gap = np.bincount(of[label == np.arange(len(label)) - starts[of]], minlength=len(evidence))
+    return np.where((others > 0) & (rest >= least), np.minimum(lowest, gap), lowest)

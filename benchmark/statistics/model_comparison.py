@@ -21,14 +21,16 @@ from semstab.statistics import fusion_rules
 from semstab.statistics.accumulate import CubeSums
 from semstab.statistics.agreement import ALPHA, ALPHA_BETWEEN, PSA, alpha_columns, alpha_of, between_of, ratio_of
 from semstab.statistics.cluster_sums import Statistic
-from semstab.statistics.common_observations import SharedObservations, compared_observations, decided
 from semstab.statistics.correctness import ACCURACY, ECE, MIOU, join_truth, rule_means_of, rule_sums
 from semstab.statistics.observations import CellObservations
 from semstab.statistics.paired_differences import (
     EDGES,
     OnCommonLocations,
+    SharedObservations,
     Tables,
     common_weights,
+    compared_observations,
+    decided,
     differences,
     standardised_of,
     stratum_counts,

@@ -7,25 +7,28 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from semstab.core.types import Float64, Int64
-from semstab.errors import ConfigError
+from semstab.errors import ConfigError, DataError
 from semstab.metrics.agreement import observations, require_same_grid, rows_of
-from semstab.model.contrast import BackboneComparison, PairedDifference
+from semstab.model.contrast import BackboneComparison, CommonLooks, Ignored, PairedDifference
 from semstab.model.events import Events
+from semstab.model.evidence import Evidence
 from semstab.model.information import by_group
-from semstab.model.measures import ENTROPY, Quantity, measures
+from semstab.model.measures import ENTROPY, Quantity, mean, measures
 from semstab.model.statistics import UNDEFINED, UNKNOWN, Estimate, Interval
 from semstab.model.voxels import VoxelTable
 from semstab.statistics.accumulate import Cubes, CubeSums, cluster_sums_of
-from semstab.statistics.agreement import ALPHA, ALPHA_BETWEEN, PSA, psa, ratio_of
+from semstab.statistics.agreement import ALPHA, ALPHA_BETWEEN, PSA, alpha_between, psa, ratio_of
 from semstab.statistics.cluster_sums import ClusterSums, Statistic
 from semstab.statistics.correctness import ACCURACY, join_truth
 from semstab.statistics.intervals import difference, estimate, scope_of
+from semstab.statistics.observations import CellObservations, Views
 
 Rows = Int64
 
@@ -242,3 +245,150 @@ def _stratum(table: VoxelTable, edges: Sequence[int]) -> Int64:
     if list(edges) != sorted(set(edges)) or not edges or edges[0] < 2:
         raise ConfigError(f"edges = {list(edges)}: upper bounds of OP must ascend from 2 or more")
     return np.where(table.op >= 2, np.searchsorted(edges, table.op) + 1, 0)
+
+
+# Several maps on the very looks that all of them made, and what their order owes to the looks that some left out.
+
+
+@dataclass(frozen=True, eq=False)
+class CommonObservations:
+    """Maps of one scene, observed alike.
+
+    logs      of each map: the looks at cells that all made, each with as many pixels as the map with fewest has there
+    ignoring  of each map: the looks that any made, with one class more, the last, for what the map did not label
+    missing   share of the pixels of these that the map did not label
+    """
+
+    logs: tuple[Events, ...]
+    ignoring: tuple[Events, ...]
+    missing: tuple[float, ...]
+
+
+def common_observations(maps: Sequence[CellObservations]) -> CommonObservations:
+    """What samples of the same frames have in common. Raises DataError where they differ in K or voxel size."""
+    if len({(looks.K, looks.voxel_size) for looks in maps}) > 1:
+        raise DataError("samples of other classes or voxel sizes cannot be compared; fuse both alike")
+    maps = _of_the_same_voxels(maps)
+    look, first = _numbered(maps)
+    pixels = np.stack([np.bincount(own, looks.weight, len(first)) for own, looks in zip(look, maps, strict=True)])
+    least, most = pixels.min(axis=0), pixels.max(axis=0)
+    places = CellObservations.joined(maps).only(first)
+    logs, ignoring = [], []
+    for looks, own, seen in zip(maps, look, pixels, strict=True):
+        shared = dataclasses.replace(looks, weight=looks.weight * (least / np.where(seen > 0, seen, 1.0))[own])
+        logs.append(shared.only(least[own] > 0).observations())
+        ignoring.append(_filled(looks, places, most - seen).observations())
+    total = most.sum()
+    missing = tuple(float(1 - seen.sum() / total) if total else math.nan for seen in pixels)
+    return CommonObservations(tuple(logs), tuple(ignoring), missing)
+
+
+def _of_the_same_voxels(maps: Sequence[CellObservations]) -> list[CellObservations]:
+    """The voxels that are in all samples by their hash, with the frames of all numbered alike."""
+    share = min(looks.share for looks in maps)
+    views = Views.joined([looks.views for looks in maps])
+    views = views.take(np.sort(np.unique(views.frame, return_index=True)[1]))
+    same = []
+    for looks in maps:
+        kept = looks.only(looks.drawn < share)
+        rank = views.rank(looks.views.frame)
+        same.append(dataclasses.replace(kept, view=rank[kept.view].astype(np.int32), views=views, share=share))
+    return same
+
+
+def _numbered(maps: Sequence[CellObservations]) -> tuple[list[Int64], Int64]:
+    """The number of each entry's look, the same in all maps, and one entry of each look among those of all maps."""
+    F = max((len(looks.views) for looks in maps), default=1)
+    all_of_them = CellObservations.joined(maps)
+    _, cell = np.unique(all_of_them.key, return_inverse=True)
+    _, first, look = np.unique(cell * F + all_of_them.view, return_index=True, return_inverse=True)
+    return np.split(look, np.cumsum([len(looks) for looks in maps])[:-1]), first
+
+
+def _filled(looks: CellObservations, places: CellObservations, ignored: Float64) -> CellObservations:
+    """A map's entries, and those of a further class that has the pixels `ignored` of each of the places."""
+    further = dataclasses.replace(places, label=np.full(len(places), looks.K, np.uint16), weight=ignored).only(
+        ignored > 0
+    )
+    return dataclasses.replace(CellObservations.joined([looks, further]), K=looks.K + 1, classes=())
+
+
+def decided(log: Events) -> Events:
+    """Each look reduced to its largest class, the lowest on ties: what labels and scores have in common."""
+    label = log.evidence.rowwise(lambda s: s.round(9).argmax(axis=1))  # sums in another order are equal still
+    one_hot = Evidence(np.arange(len(log) + 1), label.astype(np.uint16), np.ones(len(log)), log.K)
+    return dataclasses.replace(log, evidence=one_hot)
+
+
+def psa_bounds(log: Events) -> tuple[float, float]:
+    """The least and the largest that the mean PSA can be, whatever the looks at the last class would have said.
+
+    Manski (1990, American Economic Review 80): pairs of looks of which one is missing agree never, or always.
+    """
+    starts = log.starts
+    T = np.diff(np.append(starts, len(log))).astype(np.float64)
+    again = T >= 2
+    if not again.any():
+        return math.nan, math.nan
+    said = log.evidence[:, :-1]
+    known = said.sum(axis=1)
+
+    def pairs(values: Float64) -> Float64:
+        total = np.add.reduceat(values, starts, axis=0)
+        own = np.add.reduceat((values**2).sum(axis=1), starts)
+        products: Float64 = ((total**2).sum(axis=1) - own)[again] / (T * (T - 1))[again]
+        return products
+
+    low = pairs(said)
+    high = low + 1 - pairs(known[:, None])
+    return float(low.mean()), float(high.mean())
+
+
+# What the order of backbones owes to the looks that some of them left out.
+
+
+@dataclass(frozen=True, eq=False)
+class SharedObservations:
+    """The logs of backbones on common looks, the same before any was reduced, what is compared first, what is said."""
+
+    logs: Mapping[str, Events]
+    whole: Mapping[str, Events]
+    primary: Quantity
+    found: CommonLooks
+
+
+def compared_observations(looks: Mapping[str, CellObservations]) -> SharedObservations:
+    """The looks that all backbones made; where labels are compared with scores, each as its largest class.
+
+    Two frames that both give a class 0.6 agree by 0.52 in expectation, and entirely by alpha between frames; labels
+    know no such looks. So that neither gains, both are compared by what they decide.
+    """
+    names = list(looks)
+    both = common_observations([looks[name] for name in names])
+    mixed = len({own.soft for own in looks.values()}) > 1
+    reduce = decided if mixed else (lambda log: log)
+    logs = dict(zip(names, map(reduce, both.logs), strict=True))
+    ignoring = dict(zip(names, map(reduce, both.ignoring), strict=True))
+    value = {name: alpha_between(log.table()) for name, log in logs.items()}
+    ignored = tuple(
+        Ignored(name, missing, *psa_bounds(ignoring[name]), alpha_between(ignoring[name].table()))
+        for name, missing in zip(names, both.missing, strict=True)
+    )
+    order = tuple(sorted(names, key=lambda name: -value[name]))
+    first = next(iter(logs.values()))
+    bounds = {row.backbone: (row.psa_low, row.psa_high) for row in ignored}
+    by_psa = sorted(names, key=lambda name: -mean(psa(logs[name].table())))
+    return SharedObservations(
+        logs,
+        dict(zip(names, both.logs, strict=True)),
+        ALPHA if mixed else ALPHA_BETWEEN,
+        CommonLooks(
+            voxels=len(first.ix),
+            observations=len(first),
+            decided=mixed,
+            ignored=ignored,
+            order=order,
+            order_ignored=tuple(row.backbone for row in sorted(ignored, key=lambda row: -row.alpha)),
+            bounded=all(bounds[better][0] >= bounds[worse][1] for better, worse in itertools.pairwise(by_psa)),
+        ),
+    )

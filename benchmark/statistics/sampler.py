@@ -19,8 +19,7 @@ from semstab.core.rows import Rows
 from semstab.core.types import Float64, Int32, Int64, UInt16, UInt32
 from semstab.model.frames import Frame
 from semstab.model.labels import fixed
-from semstab.statistics.observation_keys import SPAN, Voxel
-from semstab.statistics.observations import VIEW, CellObservations, ObservationSample, Views
+from semstab.statistics.observations import SPAN, VIEW, CellObservations, ObservationSample, Views, Voxel
 
 BUDGET = 1 << 19
 """Entries (cell, frame, class) that are kept at most."""

@@ -175,10 +175,12 @@ class FlippingSums:
 
 def _together(table: VoxelTable, unsteady: Float64) -> Float64:
     """(K, K) of voxels that are unsteady with that probability (n,), NaN for those that do not count."""
-    from semstab.statistics.loops.rows import add_pairs
-
-    pairs = np.zeros((table.K, table.K))
-    add_pairs(table.evidence.entries, table.op, unsteady, pairs)
+    starts, label, weight = table.evidence.entries
+    of = np.repeat(np.arange(len(table)), np.diff(starts))
+    share, counts, pairs = weight / table.op[of], np.nan_to_num(unsteady)[of], np.zeros((table.K, table.K))
+    for ahead in range(1, int(np.diff(starts).max(initial=1))):
+        first = np.flatnonzero(of[ahead:] == of[:-ahead])
+        np.add.at(pairs, (label[first], label[first + ahead]), counts[first] * share[first] * share[first + ahead])
     return pairs
 
 

@@ -30,7 +30,7 @@ from semstab.report.figures.statistics import DriftByOP
 from semstab.report.figures.style import COLORS, COLUMN, FAINT, INK, LETTERS, PAGE, canvas, mark_panel
 from semstab.report.figures.topdown import EMPTY, MOST, OUTLIERS, FromAbove, best_view, level_axes, top_down, topmost
 from semstab.statistics import decompose, expected_sbd
-from semstab.statistics.stability import LIKELY
+from semstab.statistics.agreement import LIKELY
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -8,7 +8,7 @@ import numpy as np
 
 from semstab.backends.shared.pixel_keys import in_voxels
 from semstab.core.compiled import serial
-from semstab.statistics.observation_keys import CELLS, DIGITS, SHIFTS, SPAN, WITHIN
+from semstab.statistics.observations import CELLS, DIGITS, SHIFTS, SPAN, WITHIN
 
 FIRST, SECOND, THIRD = SHIFTS
 HIGH, MIDDLE, LOW = WITHIN
