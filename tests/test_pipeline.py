@@ -101,7 +101,7 @@ def test_the_run_folder_holds_what_the_design_promises(root, tmp_path) -> None:
     result = semstab.engine.run(configure(root, events=True), out=out, command=["semstab-bench", "--x"])
     summary = json.loads((out / "summary.json").read_text())
     assert summary == json.loads(json.dumps(summary))
-    assert summary["schema"] == 2
+    assert summary["schema"] == 3
     first = summary["runs"][0]
     for key in (
         "scene", "backbone", "backend", "K", "voxel_size", "frames", "points", "observations", "voxels", "mean_op",

@@ -22,6 +22,7 @@ from semstab.core.json_form import from_json, to_json
 from semstab.datasets import GROUND_TRUTH
 from semstab.engine.folder import load_result
 from semstab.errors import ConfigError, DataError, one_line
+from semstab.model import earlier
 from semstab.model.georeference import Georeference
 from semstab.model.records import ImageSpace, Record, Result
 from semstab.model.results import Unit, UnitSummary
@@ -29,7 +30,7 @@ from semstab.statistics.cluster_sums import ClusterSums
 
 # A small summary: what a later comparison needs but voxels, in one file that a repository can keep.
 
-SCHEMA, KIND = 1, "semstab small summary"
+SCHEMA, KIND = 2, "semstab small summary"
 CONTENT = "summary.json"
 LARGEST = 100_000_000
 """Bytes of a file that is looked into, and of all that is packed in it."""
@@ -126,6 +127,8 @@ def load_baseline(path: str | Path) -> Baseline:
             if sum(member.file_size for member in archive.infolist()) > LARGEST:
                 raise DataError(f"{path}: unpacks to more than {LARGEST // 10**6} MB; write the summary again")
             text = parse_json(archive.read(CONTENT))
+            if isinstance(text, dict) and text.get("schema") == SCHEMA - 1:
+                text = earlier.translated(text, path) | {"schema": SCHEMA}
             if not isinstance(text, dict) or (text.get("kind"), text.get("schema")) != (KIND, SCHEMA):
                 raise DataError("of another kind or version")
             content = from_json(_Content, text, path)

@@ -23,6 +23,7 @@ from semstab.datasets.formats.disk import file_digest
 from semstab.engine.units import Planned, PlannedUnit
 from semstab.engine.work import TILES, Outcome, Start
 from semstab.errors import ConfigError, DataError
+from semstab.model import earlier
 from semstab.model.measures import measures
 from semstab.model.records import (
     EVENTS,
@@ -42,8 +43,11 @@ from semstab.model.results import SCHEMA, Unit, slug
 
 logger = logging.getLogger("semstab")
 
-LAYOUT = "# semstab, folder layout 3"
+LAYOUT = "# semstab, folder layout 4"
 """First line of config.yaml: a folder that begins otherwise is of another version."""
+
+EARLIER_LAYOUT = "# semstab, folder layout 3"
+"""Of version 0.3, whose results are read for one version."""
 
 SETTINGS = "config.yaml"
 FAILURES = "failures.log"
@@ -222,9 +226,11 @@ def load_result(folder: str | Path) -> Result:
     """What a finished run or study found, from its folder. Raises DataError where it is not there or damaged."""
     folder = Path(folder)
     path = folder / "summary.json"
-    if _is_earlier(folder):
+    if _is_earlier(folder, (LAYOUT, EARLIER_LAYOUT)):
         raise DataError(f"{folder}: holds results of an earlier version of semstab; run it again, into another folder")
     content = read_json(path)
+    if isinstance(content, dict) and content.get("schema") == earlier.SCHEMA:
+        content = earlier.translated(content, path) | {"schema": SCHEMA}
     if not isinstance(content, dict) or content.get("schema") != SCHEMA:
         raise DataError(f"{path}: not a summary of this version of semstab; run it again, into another folder")
     result = from_json(Result, {**content, "records": content.get("runs")}, path)
@@ -296,9 +302,9 @@ def _claimed(path: Path) -> dict[str, Any] | None:
     return None
 
 
-def _is_earlier(folder: Path) -> bool:
+def _is_earlier(folder: Path, layouts: Collection[str] = (LAYOUT,)) -> bool:
     settings = folder / SETTINGS
-    return (folder / "study.yaml").exists() or (settings.exists() and _first_line(settings) != LAYOUT)
+    return (folder / "study.yaml").exists() or (settings.exists() and _first_line(settings) not in layouts)
 
 
 def _first_line(path: Path) -> str:

@@ -13,7 +13,7 @@ from semstab.model.frames import LeftOut
 from semstab.model.measures import Measure, MeasureMeans
 from semstab.model.statistics import MapStatistics
 
-SCHEMA = 2
+SCHEMA = 3
 """Version of summary.json."""
 
 STAGES = ("decode", "wait", "flicker", "association", "update", "logging")
