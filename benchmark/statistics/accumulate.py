@@ -210,7 +210,7 @@ def cluster_sums_of(
     if events is None:
         whole = _sums_of_table(table, cubes, true_label, likely)
     else:
-        whole = _sums_of_log(events, cubes, true_label, likely)
+        whole = _sums_of_log(events, cubes, dominant(table), true_label, likely)
     whole = _with_frameless_sums(whole, table, cubes, true_label, sbd_excess)
     whole = whole.coarsened(whole.edge, whole.step)  # one row for each cube and group of frames, in order
     if sample is None:
@@ -220,9 +220,13 @@ def cluster_sums_of(
 
 
 def _sums_of_log(
-    events: Events, cubes: Cubes, true_label: Int64 | None = None, likely: Float64 | None = None
+    events: Events,
+    cubes: Cubes,
+    fused: Int64 | None = None,
+    true_label: Int64 | None = None,
+    likely: Float64 | None = None,
 ) -> ClusterSums:
-    """The sums by cube and group of frames of the locations of a log, by the compiled pass."""
+    """The sums by cube and group of frames of the locations of a log, whose dominant classes are `fused`."""
     from semstab.core.compiled import in_chunks
     from semstab.statistics.loops.clusters import add_influences
 
@@ -235,11 +239,12 @@ def _sums_of_log(
     bounds = np.concatenate([[0], np.cumsum(np.bincount(cubes.at[again], minlength=cubes.count))])
     sums = np.zeros((cubes.count * len(groups), width(K, truth=truth)))
     longest = int((events.ends - events.starts).max(initial=0))
+    own = np.zeros(0, np.int64) if fused is None else fused
     label = np.zeros(0, np.int64) if true_label is None else true_label
     stable = np.zeros(0) if likely is None else likely
     in_chunks(
-        add_influences, order, bounds, (events.starts, events.ends), longest, events.evidence.entries, K, group, label,
-        stable, K <= MOST_CLASSES, truth, len(groups), sums,
+        add_influences, order, bounds, (events.starts, events.ends), longest, events.evidence.entries, K, group, own,
+        label, stable, K <= MOST_CLASSES, truth, len(groups), sums,
     )  # fmt: skip
     rows = np.flatnonzero(sums[:, layout(K, truth=False)["observations"].start])
     cell, frame = np.divmod(rows, max(len(groups), 1))

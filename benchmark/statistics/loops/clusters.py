@@ -55,9 +55,12 @@ def _looks(log, first, T, number, active, x, total, squares, own):
 
 
 @serial
-def _label(total, A):
-    """Which class is the dominant one, the lowest of equals."""
+def _label(total, active, A, fused):
+    """Which class is the dominant one: the map's, whose sums are rounded in another order, else the lowest of equals."""
     best, top = 0, total[0]
+    for j in range(A):
+        if active[j] == fused:
+            return j
     for j in range(1, A):
         more = total[j] > top
         best, top = (j if more else best), (total[j] if more else top)
@@ -135,13 +138,13 @@ def _agreement(total, squares, T, A, certain, surprise, apart):
 
 @serial
 def add_influences(
-    chunk, order, bounds, rows, longest, log, K, group, truth, likely, by_class, with_truth, groups, sums
+    chunk, order, bounds, rows, longest, log, K, group, fused, truth, likely, by_class, with_truth, groups, sums
 ):
     """Add the observations of voxels, of which each has two or more, to `sums` (cells * groups, C).
 
     order (r,) has the voxels by cell, bounds (cells + 1,) where each cell's begin; rows (starts (n,) and ends) bound a
-    voxel's rows of the log, `longest` at most; group (m,) is that of each row's frame. truth (n,) is its true class
-    or -1, likely (n,) how likely it is stable. The pairwise agreement P of a location is shared out as
+    voxel's rows of the log, `longest` at most; group (m,) is that of each row's frame. fused (n,) is its dominant class
+    in the map, (0,) where that is not known, truth (n,) its true class or -1, likely (n,) how likely it is stable. The pairwise agreement P of a location is shared out as
     P + 2 (T - 1) / (T - 2) (a_t - P), a_t being frame t's mean agreement with the others: what is left of a frame is
     then its own quality, free of that of the frames it was compared with, and the shares add up to T P.
     """
@@ -155,7 +158,10 @@ def add_influences(
             i = order[at]
             first, T, steady = starts[i], ends[i] - starts[i], likely[i] if likely.shape[0] else 0.0
             A = _looks(log, first, T, number, active, x, total, squares, own)
-            agreed, label = _agreement(total, squares, T, A, certain, surprise, apart), _label(total, A)
+            agreed, label = (
+                _agreement(total, squares, T, A, certain, surprise, apart),
+                _label(total, active, A, fused[i] if fused.shape[0] else -1),
+            )
             spread = 2.0 * (T - 1.0) / (T - 2.0) if T > 2 else 0.0
             part, of_others = 1.0 / T, 1.0 / (T - 1.0)
             for t in range(T):
