@@ -115,13 +115,18 @@ class Sampler:
 
         A part of the view that came before may have lowered the share.
         """
-        from semstab.statistics.loops.observations import append, keep
-
-        drawn = entries[-1]
+        cell, label, weight, drawn = entries
         while self._entries + np.count_nonzero(drawn < self._share) > self.budget:
             self._share //= 2
-            self._entries = keep(self._share, self._entries, *self._columns)
-        self._entries = append(self._share, self._entries, len(self._views) - 1, *entries, *self._columns)
+            rows = np.flatnonzero(self._columns[-1][: self._entries] < self._share)
+            for column in self._columns:
+                column[: len(rows)] = column[rows]
+            self._entries = len(rows)
+        some = np.flatnonzero(drawn < self._share)
+        end, view = self._entries + len(some), np.full(len(drawn), len(self._views) - 1)
+        for column, own in zip(self._columns, (cell, view, label, weight, drawn), strict=True):
+            column[self._entries : end] = own[some]
+        self._entries = end
 
     def sample(self) -> ObservationSample:
         """What is there so far, as observations of the sampled voxels."""

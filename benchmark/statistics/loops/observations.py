@@ -8,7 +8,7 @@ import numpy as np
 
 from semstab.backends.shared.pixel_keys import in_voxels
 from semstab.core.compiled import serial
-from semstab.statistics.observations import CELLS, DIGITS, SHIFTS, SPAN, WITHIN
+from semstab.statistics.observations import CELLS, DIGITS, SHIFTS, WITHIN
 
 FIRST, SECOND, THIRD = SHIFTS
 HIGH, MIDDLE, LOW = WITHIN
@@ -147,61 +147,7 @@ def add_rows(rows, of, sums):
             sums[of[i], k] += rows[i, k]
 
 
-@serial
-def keep(share, entries, key, view, label, weight, drawn):
-    """Move the entries whose hash is below `share` to the front, without a branch; returns how many they are."""
-    n = 0
-    for i in range(entries):
-        key[n], view[n], label[n], weight[n], drawn[n] = key[i], view[i], label[i], weight[i], drawn[i]
-        n += drawn[n] < share
-    return n
-
-
-@serial
-def append(share, entries, seen, cell, said, more, hashed, key, view, label, weight, drawn):
-    """Put entries of a view whose hash is below `share` behind so many others; returns how many there are then."""
-    n = entries
-    for i in range(len(cell)):
-        if hashed[i] < share:
-            key[n], view[n], label[n], weight[n], drawn[n] = cell[i], seen, said[i], more[i], hashed[i]
-            n += 1
-    return n
-
-
 # Compiled passes over entries in order of voxel and frame: what cells show, and what each look at a voxel says.
-
-
-@serial
-def voxel_of(key):
-    """The three voxel indices of a key, from where keys begin."""
-    return key >> FIRST, (key >> SECOND) & (SPAN - 1), (key >> THIRD) & (SPAN - 1)
-
-
-@serial
-def extent(key, low, high):
-    """Set low and high (3,) to the least and largest voxel index of each axis in keys (n,), 0 where there are none."""
-    low[:], high[:] = SPAN - 1 if len(key) else 0, 0
-    for i in range(len(key)):
-        x, y, z = voxel_of(key[i])
-        low[0], low[1], low[2] = min(low[0], x), min(low[1], y), min(low[2], z)
-        high[0], high[1], high[2] = max(high[0], x), max(high[1], y), max(high[2], z)
-
-
-@serial
-def places(key, view, low, size, views, place):
-    """A number (n,) for the voxel and frame of each entry, ascending with x, y, z and frame, of voxels in a box."""
-    for i in range(len(key)):
-        x, y, z = voxel_of(key[i])
-        voxel = ((x - low[0]) * size[1] + (y - low[1])) * size[2] + (z - low[2])
-        place[i] = voxel * views + view[i]
-
-
-@serial
-def gather(order, key, view, label, weight, own_key, own_view, own_label, own_weight):
-    """Entries (n,) in that order, into columns of their own."""
-    for i in range(len(order)):
-        k = order[i]
-        own_key[i], own_view[i], own_label[i], own_weight[i] = key[k], view[k], label[k], weight[k]
 
 
 @serial
