@@ -85,7 +85,7 @@ class Cubes:
         both = by_group(self.at, [*values.values()], self.count)
         return {name: np.stack(own, axis=1) for name, *own in zip(values, both[0].T, both[1].T, strict=True)}
 
-    def sums_by_class(self, evidence: Evidence, *weights: Float64) -> list[Float64]:
+    def sums_by_class(self, evidence: Evidence, *weights: Float64) -> list[Any]:
         """Return (G, K) for weights (m,) of the entries of the voxels' evidence: their sums by cube and class."""
         of = np.repeat(self.at, np.diff(evidence.starts)).astype(np.int64)
         some = np.flatnonzero(of >= 0)
@@ -323,7 +323,7 @@ def _sums_of_table(table: VoxelTable, cubes: Cubes, true_label: Int64 | None, li
     if K <= MOST_CLASSES:
         known = np.where(one_hot_where(table, cubes.at >= 0), 1.0, np.nan)
         by_class |= {"class_own": known * shares, "class_apart": known * apart}
-    if true_label is not None:
+    if true_label is not None and likely is not None:
         plain, further = _sums_with_truth(table, cubes, true_label, likely * recurrent)
         values, by_class = values | plain, by_class | further
     sums, own = np.zeros((cubes.count, width(K, truth=truth))), layout(K, truth=truth)

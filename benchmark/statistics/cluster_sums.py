@@ -127,13 +127,15 @@ class ClusterIndex:
 
     def by_cube(self, values: Float64) -> Float64:
         """Return the sums (G,) of values (m,)."""
-        return np.bincount(self.row, weights=values, minlength=len(self.cubes))
+        sums: Any = np.bincount(self.row, weights=values, minlength=len(self.cubes))
+        return np.asarray(sums, np.float64)
 
     def by_both(self, values: Float64) -> Float64:
         """Return the sums (G, F) of values (m,)."""
         shape = len(self.cubes), len(self.frames)
         cell = self.row[self.known] * shape[1] + self.column
-        return np.bincount(cell, weights=values[self.known], minlength=shape[0] * shape[1]).reshape(shape)
+        sums: Any = np.bincount(cell, weights=values[self.known], minlength=shape[0] * shape[1])
+        return np.asarray(sums.reshape(shape), np.float64)
 
 
 def distinct_rows(rows: npt.NDArray[np.integer]) -> tuple[Int64, Int64]:
@@ -226,10 +228,6 @@ class ClusterSums:
         rows, of = distinct_rows(key)
         columns = np.zeros((len(rows), self.columns.shape[1]))
         np.add.at(columns, of, self.columns)
-        parts = {
-            name: None if part is None else part.coarsened(edge, step)
-            for name, part in (("seen", self.seen), ("limit", self.limit))
-        }
         return dataclasses.replace(
             self,
             cell=rows[:, :3].astype(np.int32),
@@ -237,7 +235,8 @@ class ClusterSums:
             columns=columns,
             edge=edge,
             step=step if known else 0,
-            **parts,
+            seen=None if self.seen is None else self.seen.coarsened(edge, step),
+            limit=None if self.limit is None else self.limit.coarsened(edge, step),
         )
 
     def without_truth(self) -> ClusterSums:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -114,12 +115,13 @@ def judged_sums(judged: Predictions, where: Mask) -> Float64:
 def _judged_by_group(judged: Predictions, group: Int64, groups: int) -> Float64:
     """(G, ...) `judged_sums` of each group; -1 is none."""
     some, K = np.flatnonzero(group >= 0), judged.K
-    of, label, predicted, confidence = (own[some] for own in (group, judged.label, judged.predicted, judged.confidence))
+    of, label, predicted, confidence = group[some], judged.label[some], judged.predicted[some], judged.confidence[some]
     right = judged.right[some].astype(np.float64)
     bins = np.clip(np.ceil(confidence * BINS - 1e-9).astype(np.int64) - 1, 0, BINS - 1)
 
     def sums(width: int, within: Int64 | int, weights: Float64 | None = None) -> Float64:
-        return np.bincount(of * width + within, weights=weights, minlength=groups * width).reshape(groups, width)
+        total: Any = np.bincount(of * width + within, weights=weights, minlength=groups * width)
+        return np.asarray(total.reshape(groups, width), np.float64)
 
     return np.hstack([
         sums(1, 0), sums(1, 0, right), sums(1, 0, judged.error[some]),

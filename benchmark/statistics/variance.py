@@ -13,7 +13,7 @@ import functools
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -82,7 +82,7 @@ class CorrelationModel:
         self.number = np.repeat(np.arange(len(self.length)), np.where(self.length > 0, len(OWN_SHARES), 1))
         self.own = np.concatenate([[0.0], np.tile(OWN_SHARES, len(self.length) - 1)])
         self._kernels: dict[float, Float64] = {}
-        self._moments: dict[tuple[int, bytes], list[float]] = {}
+        self._moments: dict[tuple[int, bytes], list[Any]] = {}
 
     def __len__(self) -> int:
         return len(self._distance)
@@ -150,7 +150,7 @@ class CorrelationModel:
         twice, once = np.stack([other**2, 2 * other * share, share**2]), np.stack([other, share])
         return (once * known[:2]).sum(axis=0), (once * known[2:4]).sum(axis=0), (twice * known[4:]).sum(axis=0)
 
-    def _coefficients(self, numbers: Sequence[int], size: Float64) -> Iterator[list[float]]:
+    def _coefficients(self, numbers: Sequence[int], size: Float64) -> Iterator[list[Any]]:
         """Yield the polynomials in the share of `moments` for each correlation, coefficient by coefficient."""
         n, scale, share, block = len(size), size**GROWTH, size / size.sum(), 0.0
         for number in numbers:
@@ -197,7 +197,7 @@ def _grids_of(keys: tuple[tuple[int, bytes], ...]) -> dict[tuple[int, bytes], Cl
         if nest is None:
             nests.append(nest := [])
         nest.append(key)
-    grids = {}
+    grids: dict[tuple[int, bytes], ClusterGrid] = {}
     for nest in nests:
         place: dict[tuple[int, ...], int] = {}
         for key in reversed(nest):
@@ -573,7 +573,7 @@ def gradient_of(statistic: Statistic, total: Float64) -> Float64:
     some = np.flatnonzero(total)
     for at in np.array_split(some, len(some) * len(total) // AT_ONCE + 1):
         scale = np.maximum(np.abs(total[at]), TINY)
-        along = np.zeros((len(at), len(total)), np.complex128)
+        along: Any = np.zeros((len(at), len(total)), np.complex128)
         along[np.arange(len(at)), at] = STEP * 1j * scale
         with np.errstate(all="ignore"):  # complex numbers warn of NaN where real ones do not
             value = statistic(total + along)
