@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
@@ -19,7 +19,8 @@ from semstab.core.rows import Rows
 from semstab.core.types import Float64, Int32, Int64, UInt16, UInt32
 from semstab.model.frames import Frame
 from semstab.model.labels import fixed
-from semstab.statistics.observations import SPAN, VIEW, CellObservations, ObservationSample, Views, Voxel
+from semstab.statistics.loops import SPAN
+from semstab.statistics.observations import VIEW, CellObservations, ObservationSample, Views, Voxel
 
 BUDGET = 1 << 19
 """Entries (cell, frame, class) that are kept at most."""
@@ -179,17 +180,3 @@ def _pieces(of: Int64, most: int) -> list[Int64]:
     first = np.flatnonzero(np.diff(of[order], prepend=-1))
     cuts = np.searchsorted(first, np.arange(most, len(of), most))
     return np.split(order, np.unique(first[np.minimum(cuts, len(first) - 1)]))
-
-
-def merged_observations(stretches: Sequence[CellObservations], budget: int = BUDGET) -> CellObservations:
-    """What one sampler would have of the stretches of a sequence, in order: voxels go by their hash alone."""
-    share = min(looks.share for looks in stretches)
-    while sum(np.count_nonzero(looks.drawn < share) for looks in stretches) > budget:
-        share //= 2
-    kept = [looks.only(looks.drawn < share) for looks in stretches]
-    before = np.cumsum([0, *(len(looks.views) for looks in stretches)], dtype=np.int32)
-    joined = CellObservations.joined(
-        [dataclasses.replace(own, view=own.view + first) for own, first in zip(kept, before, strict=False)]
-    )
-    views = Views.joined([looks.views for looks in stretches])
-    return dataclasses.replace(joined, views=views, share=share, soft=any(looks.soft for looks in stretches))

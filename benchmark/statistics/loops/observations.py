@@ -6,7 +6,7 @@ import numpy as np
 
 from semstab.backends.shared.pixel_keys import in_voxels
 from semstab.core.compiled import serial
-from semstab.statistics.observations import CELLS, DIGITS, SHIFTS, WITHIN
+from semstab.statistics.loops import CELLS, DIGITS, SHIFTS, WITHIN
 
 FIRST, SECOND, THIRD = SHIFTS
 HIGH, MIDDLE, LOW = WITHIN
