@@ -25,8 +25,6 @@ from semstab.model.evidence import Evidence
 from semstab.model.voxels import index_columns
 from semstab.statistics.loops import CELLS, DIGITS, SHIFTS, SPAN, WITHIN
 
-# Keys of cells, a quarter as wide as a voxel: three voxel indices of BITS each, then three digits of 2 bits.
-
 Voxel = tuple[int, int, int]
 
 
@@ -70,8 +68,6 @@ def _near(voxel: Int64) -> Int64:
         raise DataError(f"the maps span more than {SPAN} voxels; leave out far depth, or use larger voxels")
     return voxel
 
-
-# Keys of cells, a quarter as wide as a voxel: three voxel indices of BITS each, then three digits of 2 bits.
 
 # Where the frames of a sample of observations were taken.
 

@@ -125,7 +125,8 @@ class Sampler:
             self._entries = len(rows)
         some = np.flatnonzero(drawn < self._share)
         end, view = self._entries + len(some), np.full(len(drawn), len(self._views) - 1)
-        for column, own in zip(self._columns, (cell, view, label, weight, drawn), strict=True):
+        taken: tuple[npt.NDArray[Any], ...] = cell, view, label, weight, drawn
+        for column, own in zip(self._columns, taken, strict=True):
             column[self._entries : end] = own[some]
         self._entries = end
 

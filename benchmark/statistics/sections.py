@@ -21,7 +21,6 @@ from semstab.statistics.agreement import alpha_of, between_of, decompose, disagr
 from semstab.statistics.correctness import Truth, rule_means_of, rule_sums
 from semstab.statistics.drift import (
     TESTABLE,
-    Flips,
     OrderTest,
     VoxelDrift,
     benjamini_hochberg,
@@ -204,7 +203,7 @@ def log_sums(
     """The columns and sums that need a log; none without one."""
     if sample.events is None or drift is None:
         return {}, None
-    changes: Flips = flips(sample.events)
+    changes = flips(sample.events)
     tell, trend = trend_columns(table, drift)
     trends = places.rows(tell).sums(trend)
     means = {
