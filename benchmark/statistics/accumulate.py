@@ -100,7 +100,7 @@ class Cubes:
         bounds: tuple[float, float] = (0.0, 1.0),
         scale: Scale | None = None,
     ) -> Interval:
-        """The statistic of the sums of the voxels' columns (n, C), the second of which counts, with its interval; see `Mean`."""
+        """Return the statistic of sums of columns (n, C), the second of which counts, with its interval; see `Mean`."""
         return CubeSums(self.cell, self.edge, {"": self.sums(columns)}).estimate("", statistic, bounds, scale)
 
 
