@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import json
 import math
 import os
 from pathlib import Path
@@ -274,7 +273,5 @@ def test_views_are_found_by_the_index_of_their_frame_whatever_their_order():
     views = Views(np.array([7, 2, 5]), np.arange(9.0).reshape(3, 3), np.array([0.5, math.nan, 1.0]))
     assert views.rank(np.array([5, 7, 7, 2])).tolist() == [2, 0, 0, 1]
     np.testing.assert_array_equal(Views.of(views.rows().tolist()).rows(), views.rows())
-    long = Views.of(np.tile(views.rows(), (2000, 1)))
-    np.testing.assert_array_equal(Views.of(json.loads(long.text())).rows(), long.rows())
     with pytest.raises(ValueError, match="without an index"):
         Views.of([[math.nan, 0, 0, 0, 0]])

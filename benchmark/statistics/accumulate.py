@@ -85,7 +85,7 @@ class Cubes:
         both = by_group(self.at, [*values.values()], self.count)
         return {name: np.stack(own, axis=1) for name, *own in zip(values, both[0].T, both[1].T, strict=True)}
 
-    def sums_by_class(self, evidence: Evidence, *weights: Float64) -> list[Float64]:
+    def sums_by_class(self, evidence: Evidence, *weights: Float64) -> list[Any]:
         """Return (G, K) for weights (m,) of the entries of the voxels' evidence: their sums by cube and class."""
         of = np.repeat(self.at, np.diff(evidence.starts)).astype(np.int64)
         some = np.flatnonzero(of >= 0)
@@ -101,10 +101,7 @@ class Cubes:
         bounds: tuple[float, float] = (0.0, 1.0),
         scale: Scale | None = None,
     ) -> Interval:
-        """The statistic of the sums of the voxels' columns (n, C), the second of which counts, with its interval.
-
-        Where no scale is given, what goes from 0 to 1 is a share.
-        """
+        """Return the statistic of sums of columns (n, C), the second of which counts, with its interval; see `Mean`."""
         return CubeSums(self.cell, self.edge, {"": self.sums(columns)}).estimate("", statistic, bounds, scale)
 
 

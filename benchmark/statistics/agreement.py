@@ -153,15 +153,6 @@ def between_of(sums: Float64) -> Float64:
     return beyond
 
 
-def class_columns(events: Events) -> Float64:
-    """(n, K, 4): what the alphas of the classes are functions of by their sum over voxels, as `class_of` takes them."""
-    starts = events.starts
-    T = np.diff(np.append(starts, len(events))).astype(np.float64)[:, None]
-    e, squares = (np.add.reduceat(values, starts, axis=0) for values in (events.evidence, events.evidence**2))
-    disagreement = 2 * (T * squares - e**2) / np.maximum(T - 1, 1)
-    return np.where(T[..., None] >= 2, np.stack([disagreement, T + 0 * e, squares, e], axis=-1), 0.0)
-
-
 def class_of(sums: Float64) -> Float64:
     """Alpha between frames (...,) of a class against all others, from sums (..., 4).
 

@@ -115,7 +115,7 @@ def judged_sums(judged: Predictions, where: Mask) -> Float64:
 def _judged_by_group(judged: Predictions, group: Int64, groups: int) -> Float64:
     """(G, ...) `judged_sums` of each group; -1 is none."""
     some, K = np.flatnonzero(group >= 0), judged.K
-    of, label, predicted, confidence = (own[some] for own in (group, judged.label, judged.predicted, judged.confidence))
+    of, label, predicted, confidence = group[some], judged.label[some], judged.predicted[some], judged.confidence[some]
     right = judged.right[some].astype(np.float64)
     bins = np.clip(np.ceil(confidence * BINS - 1e-9).astype(np.int64) - 1, 0, BINS - 1)
 

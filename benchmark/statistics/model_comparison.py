@@ -301,8 +301,8 @@ def _by_rule(regions: Regions, *, mixed: bool) -> RuleComparison:
             truth = None if region.truth is None else join_truth(table, region.truth)
             where = np.zeros(len(table), np.bool_)
             where[own] = True
-            for rule, found in sums.items():
-                found[name] = found.get(name, 0.0) + rule_sums(fusion_rules.fuse(log, rule), where, truth)
+            for rule, fused in zip(sums, fusion_rules.fuse_all(log, fusion_rules.RULES), strict=True):
+                sums[rule][name] = sums[rule].get(name, 0.0) + rule_sums(fused, where, truth)
     values = {rule: {name: rule_means_of(own) for name, own in found.items()} for rule, found in sums.items()}
     orders = {
         quantity.key: {rule: _order(quantity, take, found) for rule, found in values.items()}

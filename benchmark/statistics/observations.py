@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -24,22 +23,7 @@ from semstab.metrics.agreement import shared_observations
 from semstab.model.events import Events
 from semstab.model.evidence import Evidence
 from semstab.model.voxels import index_columns
-
-# Keys of cells, a quarter as wide as a voxel: three voxel indices of BITS each, then three digits of 2 bits.
-
-CELLS = 4
-"""Cells along a voxel's edge."""
-
-DIGITS = 6
-"""Bits of a key that say which cell of its voxel it is."""
-
-BITS = 19
-"""Bits of a voxel's index along an axis, from the voxel on at which keys begin."""
-
-SPAN = 1 << BITS
-SHIFTS = DIGITS + 2 * BITS, DIGITS + BITS, DIGITS
-WITHIN = 4, 2, 0
-"""Where in a key the three voxel indices begin, and the three digits."""
+from semstab.statistics.loops import CELLS, DIGITS, SHIFTS, SPAN, WITHIN
 
 Voxel = tuple[int, int, int]
 
@@ -85,15 +69,10 @@ def _near(voxel: Int64) -> Int64:
     return voxel
 
 
-# Keys of cells, a quarter as wide as a voxel: three voxel indices of BITS each, then three digits of 2 bits.
-
 # Where the frames of a sample of observations were taken.
 
 VIEW = 5
 """Numbers of a view: frame, centre, time stamp."""
-
-AT_ONCE = 4096
-"""Views that are made text together."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -123,11 +102,6 @@ class Views:
     def rows(self) -> Float64:
         """(V, 5) what `of` takes."""
         return np.concatenate([self.frame[:, None], self.centre, self.timestamp[:, None]], axis=1)
-
-    def text(self) -> str:
-        """Its rows as JSON, made some at a time: as Python's numbers all of them would take ten times the memory."""
-        rows = self.rows()
-        return f"[{', '.join(json.dumps(rows[k : k + AT_ONCE].tolist())[1:-1] for k in range(0, len(rows), AT_ONCE))}]"
 
     def take(self, rows: Int64) -> Views:
         """Some of them."""
@@ -249,19 +223,8 @@ class CellObservations:
 
     def _in_order(self) -> Entries:
         """Keys, views, labels and weights by voxel and frame, entries of one as they come."""
-        from semstab.statistics.loops.observations import extent, gather, places
-
-        low, high, place = np.empty(3, np.int64), np.empty(3, np.int64), np.empty(len(self), np.int64)
-        extent(self.key, low, high)
-        size, views = high - low + 1, len(self.views)
-        if math.prod(size.tolist()) * views < 2**63:
-            places(self.key, self.view, low, size, views, place)
-        else:
-            place = np.unique(self.key >> DIGITS, return_inverse=True)[1] * views + self.view
-        entries: tuple[npt.NDArray[Any], ...] = self.key, self.view, self.label, self.weight
-        key, view, label, weight = (np.empty_like(column) for column in entries)
-        gather(np.argsort(place, kind="stable"), *entries, key, view, label, weight)
-        return key, view, label, weight
+        order = np.lexsort((self.view, self.key >> DIGITS))
+        return self.key[order], self.view[order], self.label[order], self.weight[order]
 
     def _log(
         self,
@@ -299,7 +262,7 @@ class CellObservations:
         columns |= {name: getattr(self, name) for name in COLUMNS[1:]}
         about = {name: getattr(self, name) for name in ("voxel_size", "K", "share", "soft", "classes")}
         content = pa.table({name: arrays.column(values) for name, values in columns.items()})
-        text = f'{json.dumps({"schema": SCHEMA, "kind": "Looks", **about})[:-1]}, "views": {self.views.text()}}}'
+        text = json.dumps({"schema": SCHEMA, "kind": "Looks", **about, "views": self.views.rows().tolist()})
         with atomic_path(path) as temporary, pq.ParquetWriter(temporary, content.schema, compression="zstd") as file:
             file.write_table(content)
             file.add_key_value_metadata({"semstab": text})  # a schema's own is written twice, and copied more often

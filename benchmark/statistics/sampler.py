@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
@@ -19,7 +19,8 @@ from semstab.core.rows import Rows
 from semstab.core.types import Float64, Int32, Int64, UInt16, UInt32
 from semstab.model.frames import Frame
 from semstab.model.labels import fixed
-from semstab.statistics.observations import SPAN, VIEW, CellObservations, ObservationSample, Views, Voxel
+from semstab.statistics.loops import SPAN
+from semstab.statistics.observations import VIEW, CellObservations, ObservationSample, Views, Voxel
 
 BUDGET = 1 << 19
 """Entries (cell, frame, class) that are kept at most."""
@@ -115,13 +116,19 @@ class Sampler:
 
         A part of the view that came before may have lowered the share.
         """
-        from semstab.statistics.loops.observations import append, keep
-
-        drawn = entries[-1]
+        cell, label, weight, drawn = entries
         while self._entries + np.count_nonzero(drawn < self._share) > self.budget:
             self._share //= 2
-            self._entries = keep(self._share, self._entries, *self._columns)
-        self._entries = append(self._share, self._entries, len(self._views) - 1, *entries, *self._columns)
+            rows = np.flatnonzero(self._columns[-1][: self._entries] < self._share)
+            for column in self._columns:
+                column[: len(rows)] = column[rows]
+            self._entries = len(rows)
+        some = np.flatnonzero(drawn < self._share)
+        end, view = self._entries + len(some), np.full(len(drawn), len(self._views) - 1)
+        taken: tuple[npt.NDArray[Any], ...] = cell, view, label, weight, drawn
+        for column, own in zip(self._columns, taken, strict=True):
+            column[self._entries : end] = own[some]
+        self._entries = end
 
     def sample(self) -> ObservationSample:
         """What is there so far, as observations of the sampled voxels."""
@@ -174,17 +181,3 @@ def _pieces(of: Int64, most: int) -> list[Int64]:
     first = np.flatnonzero(np.diff(of[order], prepend=-1))
     cuts = np.searchsorted(first, np.arange(most, len(of), most))
     return np.split(order, np.unique(first[np.minimum(cuts, len(first) - 1)]))
-
-
-def merged_observations(stretches: Sequence[CellObservations], budget: int = BUDGET) -> CellObservations:
-    """What one sampler would have of the stretches of a sequence, in order: voxels go by their hash alone."""
-    share = min(looks.share for looks in stretches)
-    while sum(np.count_nonzero(looks.drawn < share) for looks in stretches) > budget:
-        share //= 2
-    kept = [looks.only(looks.drawn < share) for looks in stretches]
-    before = np.cumsum([0, *(len(looks.views) for looks in stretches)], dtype=np.int32)
-    joined = CellObservations.joined(
-        [dataclasses.replace(own, view=own.view + first) for own, first in zip(kept, before, strict=False)]
-    )
-    views = Views.joined([looks.views for looks in stretches])
-    return dataclasses.replace(joined, views=views, share=share, soft=any(looks.soft for looks in stretches))

@@ -10,9 +10,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from semstab.core.types import Float64, Int64
+from semstab.core.types import Float64
 from semstab.model.events import Events
-from semstab.model.evidence import stretches
 from semstab.model.measures import Beliefs, sbd, vss
 from semstab.model.statistics import Flipping, Interval, RuleOutcome
 from semstab.model.voxels import VoxelTable
@@ -22,7 +21,6 @@ from semstab.statistics.agreement import alpha_of, between_of, decompose, disagr
 from semstab.statistics.correctness import Truth, rule_means_of, rule_sums
 from semstab.statistics.drift import (
     TESTABLE,
-    Flips,
     OrderTest,
     VoxelDrift,
     benjamini_hochberg,
@@ -205,7 +203,7 @@ def log_sums(
     """The columns and sums that need a log; none without one."""
     if sample.events is None or drift is None:
         return {}, None
-    changes: Flips = flips(sample.events)
+    changes = flips(sample.events)
     tell, trend = trend_columns(table, drift)
     trends = places.rows(tell).sums(trend)
     means = {
@@ -242,32 +240,19 @@ def log_sums(
 
 # --- Other rules of fusion
 
-TOGETHER = 1 << 16
-"""Voxels whose beliefs under all rules are in memory at once."""
-
 
 def rule_outcomes(table: VoxelTable, events: Events, truth: Truth | None) -> tuple[RuleOutcome, ...]:
     """Return the means over the voxels with OP >= 2 under each rule of fusion."""
-    again = np.flatnonzero(table.op >= 2)
-    parts = [_rule_sums(table, events, truth, again[some]) for some in stretches(len(again), TOGETHER)]
-    total = np.sum(parts, axis=0)
-    return tuple(
-        RuleOutcome(rule, rule_means_of(own[2:]), float(ratio_of(own[:2])))
-        for rule, own in zip(fusion_rules.RULES, total, strict=True)
-    )
-
-
-def _rule_sums(table: VoxelTable, events: Events, truth: Truth | None, rows: Int64) -> Float64:
-    """(R, 2 + C) for each rule how many voxels it relabels, of how many, and `rule_sums`."""
+    rows = np.flatnonzero(table.op >= 2)
     _, *others = fusion_rules.RULES  # the first one is the map's own
     some, own = table.rows(rows), None if truth is None else Truth(truth.known[rows], truth.label[rows])
     fused: list[Beliefs] = [some, *fusion_rules.fuse_all(events, others, evidence=some.evidence, rows=rows)]
-    usual, *labels = (fusion_rules.labels(belief.evidence) for belief in fused)
-    relabelled = [0, *(np.count_nonzero(label != usual) for label in labels)]
-    every = np.ones(len(rows), np.bool_)
-    return np.stack(
-        [
-            np.concatenate([[count, len(rows)], rule_sums(belief, every, own)])
-            for count, belief in zip(relabelled, fused, strict=True)
-        ]
+    labels, every = [fusion_rules.labels(belief.evidence) for belief in fused], np.ones(len(rows), np.bool_)
+    return tuple(
+        RuleOutcome(
+            rule,
+            rule_means_of(rule_sums(belief, every, own)),
+            np.count_nonzero(label != labels[0]) / len(rows) if len(rows) else math.nan,
+        )
+        for rule, belief, label in zip(fusion_rules.RULES, fused, labels, strict=True)
     )
