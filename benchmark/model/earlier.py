@@ -21,7 +21,7 @@ KEYS: Mapping[str, str] = {
 SCOPES: Mapping[str, str] = {"this map": "these frames", "the next flight": "other scenes"}
 
 
-def translated(content: Mapping[str, Any], path: Path) -> dict[str, Any]:
+def translated(content: Mapping[str, Any], path: str | Path) -> dict[str, Any]:
     """Return the content of a summary.json of schema 2 under the names of today, with a warning that names the file."""
     logger.warning("%s: written by version 0.3; its names are translated. Run it again before the next version", path)
     return {key: _value(value) for key, value in content.items()}

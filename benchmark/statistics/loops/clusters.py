@@ -56,7 +56,7 @@ def _looks(log, first, T, number, active, x, total, squares, own):
 
 @serial
 def _label(total, active, A, fused):
-    """Which class is the dominant one: the map's, whose sums are rounded in another order, else the lowest of equals."""
+    """Which class is the dominant one: that of the map, whose sums are rounded otherwise, or the lowest of equals."""
     best, top = 0, total[0]
     for j in range(A):
         if active[j] == fused:
@@ -144,9 +144,10 @@ def add_influences(
 
     order (r,) has the voxels by cell, bounds (cells + 1,) where each cell's begin; rows (starts (n,) and ends) bound a
     voxel's rows of the log, `longest` at most; group (m,) is that of each row's frame. fused (n,) is its dominant class
-    in the map, (0,) where that is not known, truth (n,) its true class or -1, likely (n,) how likely it is stable. The pairwise agreement P of a location is shared out as
-    P + 2 (T - 1) / (T - 2) (a_t - P), a_t being frame t's mean agreement with the others: what is left of a frame is
-    then its own quality, free of that of the frames it was compared with, and the shares add up to T P.
+    in the map, (0,) where that is not known; truth (n,) is its true class or -1, likely (n,) how likely it is stable.
+    The pairwise agreement P of a location is shared out as P + 2 (T - 1) / (T - 2) (a_t - P), a_t being frame t's mean
+    agreement with the others: what is left of a frame is then its own quality, free of that of the frames it was
+    compared with, and the shares add up to T P.
     """
     starts, ends = rows
     x, number, active = np.empty(longest * K), np.full(K, -1), np.empty(K, np.int64)
