@@ -30,6 +30,7 @@ from semstab.statistics.variance import (
     Influences,
     Spread,
     influences,
+    one_thread,
     spread_of,
     spread_of_flights,
     spread_of_frames,
@@ -66,10 +67,11 @@ class EstimateSpec:
 
 def confidence_intervals(specs: Iterable[EstimateSpec]) -> list[Interval]:
     """Return the numbers with their confidence intervals."""
-    return [
-        Interval(spec.value, math.nan, math.nan, undecided=NO_PLACES) if spec.grid is None else _answer(spec, spec.grid)
-        for spec in specs
-    ]
+    with one_thread():
+        return [
+            Interval(own.value, math.nan, math.nan, undecided=NO_PLACES) if own.grid is None else _answer(own, own.grid)
+            for own in specs
+        ]
 
 
 def grouped_intervals(*groups: Iterable[EstimateSpec]) -> list[list[Interval]]:
@@ -123,7 +125,8 @@ def difference(
     scope = scope if a.step else THESE_FRAMES
     paired = np.array_equal(np.unique(a.frame), np.unique(b.frame)) if same_frames is None else same_frames
     between = one.minus(other)
-    spread = spread_of(between, scope) if paired else spread_of_flights(one, other, between, scope)
+    with one_thread():
+        spread = spread_of(between, scope) if paired else spread_of_flights(one, other, between, scope)
     half = spread.half(level)
     low, high = found - half, found + half
     if spread.variance <= TINY:

@@ -13,11 +13,14 @@ the American Statistical Association 72).
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Sequence
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 
 import numpy as np
+from threadpoolctl import ThreadpoolController
 
 from semstab.core.types import Float64, Int64
 from semstab.model.statistics import THESE_FRAMES, THIS_SCENE, Scope
@@ -218,43 +221,55 @@ def influences(
 
 @dataclass(frozen=True, eq=False)
 class Effects:
-    """What a number's influences come from: variances over new frames, over new locations, and of the noise."""
+    """The model of a number's influences.
 
-    frames: Variances
-    locations: Variances
+    noise  the variance that comes from it, unit: of a single observation
+    frame  (F,) effects of the frames, error (F, F) the covariance of their errors; None where frames are not known
+    """
+
+    grid: Influences
     noise: float
+    unit: float
+    frame: Float64 | None
+    error: Float64 | None
 
     @classmethod
     def of(cls, grid: Influences) -> Effects:
         """Fit the model to influences."""
-        cell, size = grid.cell, grid.size
-        by_location: Float64 = size.sum(axis=1)
-        by_frame: Float64 = size.sum(axis=0)
-        some = by_location > 0
-        cell, size, by_location = cell[some], size[some], by_location[some]
+        some = grid.size.sum(axis=1) > 0
+        cell, size = grid.cell[some], grid.size[some]
+        by_location, by_frame = size.sum(axis=1), size.sum(axis=0)
         if grid.step == 0 or len(by_frame) < 2 or len(by_location) < 2:
-            return cls(NOTHING, _of_locations(grid, 0.0), 0.0)
+            return cls(grid, 0.0, 0.0, None, None)
         normal = np.diag(by_frame) - size.T @ (size / by_location[:, None])
         right = cell.sum(axis=0) - size.T @ (cell.sum(axis=1) / by_location)
         frame = np.linalg.pinv(normal, rcond=1e-9, hermitian=True) @ right
         location = (cell.sum(axis=1) - size @ frame) / by_location
         residual = cell - size * np.add.outer(location, frame)
-        cells = int(np.count_nonzero(size))
+        cells, total = int(np.count_nonzero(size)), float(by_location.sum())
         left = max(cells - len(by_location) - len(by_frame) + 1, 1)
         unit = float((residual**2 / np.where(size > 0, size, 1.0)).sum()) / left
-        mean = by_location @ location / by_location.sum()
-        total = float(by_location.sum())
-        scatter = float(by_location @ (location - mean) ** 2) / total - unit * len(location) / total
+        mean = by_location @ location / total
+        scatter = float(by_location @ (location - mean) ** 2) / total - unit * len(by_location) / total
         shrink = unit / max(scatter, 1e-3 * unit / float(np.median(by_location)), TINY * TINY)
-        ridge = size / (by_location + shrink)[:, None]  # locations as random effects: what frames differ in is kept
+        ridge = size / (by_location + shrink)[:, None]  # locations as random effects: what frames differ in stays
         normal = np.diag(by_frame * (1 + 1e-9)) - size.T @ ridge
         frame = np.linalg.solve(normal, cell.sum(axis=0) - ridge.T @ cell.sum(axis=1))
-        noise: Float64 = unit * np.linalg.inv(normal).astype(np.float64)
-        return cls(
-            _of_frames(frame, by_frame, noise, grid.frames.astype(np.float64)),
-            _of_locations(grid, unit),
-            float((residual**2).sum()) * cells / left,
-        )
+        error: Float64 = unit * np.linalg.inv(normal).astype(np.float64)
+        return cls(grid, float((residual**2).sum()) * cells / left, unit, frame, error)
+
+    @functools.cached_property
+    def frames(self) -> Variances:
+        """The variances over new frames."""
+        if self.frame is None or self.error is None:
+            return NOTHING
+        weight = self.grid.size.sum(axis=0)
+        return _of_frames(self.frame, weight, self.error, self.grid.frames.astype(np.float64))
+
+    @functools.cached_property
+    def locations(self) -> Variances:
+        """The variances over new locations."""
+        return _of_locations(self.grid, self.unit)
 
 
 def _of_frames(effect: Float64, weight: Float64, noise: Float64, at: Float64) -> Variances:
@@ -290,6 +305,17 @@ def _neighbours(points: Float64, most: int) -> Int64:
     for number, group in enumerate(groups):
         of[group] = number
     return of
+
+
+@functools.cache
+def _blas() -> ThreadpoolController:
+    return ThreadpoolController()
+
+
+def one_thread() -> AbstractContextManager[object]:
+    """Return a context in which BLAS has one thread: matrices are so small that a second one only waits."""
+    limited: AbstractContextManager[object] = _blas().limit(limits=1, user_api="blas")
+    return limited
 
 
 def spread_of(grid: Influences, scope: Scope) -> Spread:
