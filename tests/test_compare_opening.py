@@ -74,7 +74,7 @@ def test_what_cannot_be_opened_is_one_line(run, named, line):
 def test_an_earlier_layout_is_said(run, tmp_path):
     shutil.copytree(run, tmp_path / "old")
     settings = tmp_path / "old/config.yaml"
-    settings.write_text(settings.read_text().replace("layout 3", "layout 2"))
+    settings.write_text(settings.read_text().replace("layout 4", "layout 2"))
     fails(
         DataError,
         re.escape("holds results of an earlier version of semstab; run it again"),

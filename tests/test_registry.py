@@ -64,7 +64,7 @@ def test_an_import_that_fails_inside_is_a_missing_dependency(monkeypatch, error)
 
 def test_the_list_says_what_is_not_ready(monkeypatch, capsys):
     from semstab import backbones
-    from semstab.cli.outputs import list_
+    from semstab.cli.finished import list_
 
     original = registry.importlib.import_module
 

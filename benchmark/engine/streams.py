@@ -107,8 +107,11 @@ class LiveMap:
         frame, K = prepared.frame, len(self.task.mapping.target)
         if self.backend is None:
             return FrameReport(frame.index, points=0, voxels=0, new_voxels=0, drift_sum=0.0, seconds=0.0, map_voxels=0)
-        if not self.rows:
-            _warm_up(self.work.config, K, frame)
+        config = self.work.config
+        kind = (self.unit.backend, json.dumps(config.backends[0].options), K, frame.scores is None)
+        if kind not in _warm:  # let it load what it compiles, once a process: else the first frame costs more
+            _warm.add(kind)
+            new_map(config, K).integrate(frame.every(WARM_UP_STRIDE))
         with watch(f"fuse {self.unit.backend}"):
             report = self.backend.integrate(frame)
         if self.reference is not None:
@@ -162,15 +165,6 @@ def _without_log(config: Config, num_classes: int, work: Work) -> FusionBackend:
 
 
 _warm: set[tuple[str, str, int, bool]] = set()
-
-
-def _warm_up(config: Config, num_classes: int, frame: Frame) -> None:
-    """Let a backend load what it compiles, once a process: else the first frame would cost more than the others."""
-    (backend,) = config.backends
-    kind = (backend.name, json.dumps(backend.options), num_classes, frame.scores is None)
-    if kind not in _warm:
-        new_map(config, num_classes).integrate(frame.every(WARM_UP_STRIDE))
-        _warm.add(kind)
 
 
 # --- Frames -----------------------------------------------------------------------------------------------------------

@@ -163,7 +163,7 @@ def _metres(size: float) -> str:
 
 COLUMNS = ("model", "verdict", "alpha (95 % CI)", "agree", "flicker", "VSS", "SBD", "mIoU")
 UNITS = ("", "", "", "%", "%", "OP>=3", "bits", "%")
-WIDTHS = (13, -14, -18, 7, 8, 6, 7, 5)
+WIDTHS = (12, -14, -20, 6, 8, 6, 7, 5)
 """Of the columns of several models; text stands left, below 0."""
 
 

@@ -292,7 +292,7 @@ def _interval(found: float, low: float, high: float, grid: Influences, spread: S
         scope=scope,
         frames=frames,
         locations=len(grid.places),
-        degrees=spread.degrees,
+        degrees=spread.degrees if math.isfinite(spread.degrees) else math.nan,
         undecided=TOO_FEW.format(least=LEAST_FRAMES) if few else "",
     )
 
