@@ -16,7 +16,7 @@ import argparse
 import numpy as np
 from flights import Flight, World, fly, log_of, table_of, world
 
-from semstab.comparison.runs import open_contender
+from semstab.comparison.runs import open_run
 from semstab.metrics.agreement import rows_of
 from semstab.model.measures import dominant
 from semstab.model.voxels import VoxelTable
@@ -70,7 +70,7 @@ def simulated(flight: Flight, trials: int, seed: int, precision: float) -> list[
 def halves(run: str, precision: float) -> list[list[str]]:
     """Calibrated on either side of the median along each axis, counted on the other."""
     rows = []
-    for name, entry in open_contender(run).scenes.items():
+    for name, entry in open_run(run).scenes.items():
         record = entry.with_voxels("this")
         table = record.table()
         truth = join_truth(table, VoxelTable.load(record.truth_file))

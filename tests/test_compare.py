@@ -19,7 +19,7 @@ from rich.console import Console
 import semstab
 from semstab.comparison.differences import corrected, over_scenes
 from semstab.comparison.pairing import pair
-from semstab.comparison.runs import open_contenders
+from semstab.comparison.runs import open_runs
 from semstab.comparison.tables import print_comparison
 from semstab.comparison.writing import load_comparison, markdown
 from semstab.errors import ConfigError, DataError
@@ -150,7 +150,7 @@ def test_of_other_voxel_sizes_only_what_does_not_depend_on_them_is_compared(runs
 
 
 def test_of_other_frames_of_reference_nothing_is_paired(runs):
-    entries = [each.scenes["wall"] for each in open_contenders([runs / "old", f"{runs}/new:net"])]
+    entries = [each.scenes["wall"] for each in open_runs([runs / "old", f"{runs}/new:net"])]
     here = Georeference("PROJCRS", (0.0, 0.0, 0.0))
     moved = dataclasses.replace(here, offset=(100.0, 0.0, 0.0))
     for pairs in ((here, moved), (None, here)):

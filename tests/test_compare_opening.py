@@ -18,7 +18,7 @@ from posed_config import configure
 from posed_scene import fails
 
 import semstab
-from semstab.comparison.runs import LARGEST, open_contender, open_contenders, save_summary, shared_scenes
+from semstab.comparison.runs import LARGEST, open_run, open_runs, save_summary, shared_scenes
 from semstab.errors import ConfigError, DataError
 from semstab.statistics.cluster_sums import value
 
@@ -33,7 +33,7 @@ def run(tmp_path_factory):
 
 
 def test_a_label_source_is_selected_behind_a_colon(run):
-    found = open_contender(f"{run}:b")
+    found = open_run(f"{run}:b")
     assert (found.backbone, list(found.scenes), found.source) == ("b", ["wall"], run)
     entry = found.scenes["wall"]
     assert entry.classes == entry.with_voxels("").table().classes
@@ -44,17 +44,17 @@ def test_a_label_source_is_selected_behind_a_colon(run):
 
 def test_names_are_the_shortest_that_tell_apart(run, tmp_path):
     shutil.copytree(run, tmp_path / "new")
-    names = [each.name for each in open_contenders([f"{run}:a", f"{run}:b"])]
+    names = [each.name for each in open_runs([f"{run}:a", f"{run}:b"])]
     assert names == ["a", "b"]
-    assert [each.name for each in open_contenders([f"{run}:a", f"{tmp_path}/new:a"])] == ["run", "new"]
-    three = open_contenders([f"{run}:a", f"{tmp_path}/new:a", f"{run}:b"])
+    assert [each.name for each in open_runs([f"{run}:a", f"{tmp_path}/new:a"])] == ["run", "new"]
+    three = open_runs([f"{run}:a", f"{tmp_path}/new:a", f"{run}:b"])
     assert [each.name for each in three] == ["run:a", "new:a", "run:b"]
-    assert [each.name for each in open_contenders([f"{run}:a", f"{run}:a"])] == ["a", "a (2)"]
+    assert [each.name for each in open_runs([f"{run}:a", f"{run}:a"])] == ["a", "a (2)"]
 
 
 def test_a_path_with_a_colon_is_a_path(run, tmp_path):
     shutil.copytree(run, tmp_path / "a:b")
-    assert open_contender(f"{tmp_path}/a:b:a").source == tmp_path / "a:b"
+    assert open_run(f"{tmp_path}/a:b:a").source == tmp_path / "a:b"
 
 
 @pytest.mark.parametrize(
@@ -68,7 +68,7 @@ def test_a_path_with_a_colon_is_a_path(run, tmp_path):
     ],
 )
 def test_what_cannot_be_opened_is_one_line(run, named, line):
-    fails((ConfigError, DataError), re.escape(line.format(run=run)), open_contender, named.format(run=run))
+    fails((ConfigError, DataError), re.escape(line.format(run=run)), open_run, named.format(run=run))
 
 
 def test_an_earlier_layout_is_said(run, tmp_path):
@@ -78,13 +78,13 @@ def test_an_earlier_layout_is_said(run, tmp_path):
     fails(
         DataError,
         re.escape("holds results of an earlier version of semstab; run it again"),
-        open_contender,
+        open_run,
         f"{tmp_path}/old:a",
     )
 
 
 def test_runs_of_other_scenes_and_classes_are_refused(run):
-    one = open_contender(f"{run}:a")
+    one = open_run(f"{run}:a")
     other = dataclasses.replace(one, scenes={"street": one.scenes["wall"]})
     fails(DataError, re.escape("have no scene in common (wall; street)"), shared_scenes, [one, other])
     entry = dataclasses.replace(one.scenes["wall"])
@@ -98,9 +98,9 @@ def test_runs_of_other_scenes_and_classes_are_refused(run):
 
 
 def test_a_small_summary_holds_all_but_voxels(run, tmp_path):
-    one, file = open_contender(f"{run}:a"), tmp_path / "kept.semstab"
+    one, file = open_run(f"{run}:a"), tmp_path / "kept.semstab"
     save_summary(one, file)
-    kept = open_contender(file)
+    kept = open_run(file)
     assert (kept.backbone, list(kept.scenes)) == ("a", ["wall"])
     own, back = one.scenes["wall"], kept.scenes["wall"]
     assert (back.summary.statistics.agreement, back.image_space) == (own.summary.statistics.agreement, own.image_space)
@@ -115,12 +115,12 @@ def test_a_small_summary_holds_all_but_voxels(run, tmp_path):
 
 
 def test_a_small_summary_becomes_coarser_until_it_fits(run, tmp_path):
-    one, file = open_contender(f"{run}:a"), tmp_path / "kept.semstab"
+    one, file = open_run(f"{run}:a"), tmp_path / "kept.semstab"
     save_summary(one, file)
     most = file.stat().st_size - 500
     save_summary(one, file, most)
     assert file.stat().st_size <= most
-    coarse, fine = open_contender(file).scenes["wall"].sums, one.scenes["wall"].sums
+    coarse, fine = open_run(file).scenes["wall"].sums, one.scenes["wall"].sums
     assert coarse.edge > fine.edge
     assert value(coarse, "alpha") == pytest.approx(value(fine, "alpha"))
     fails(DataError, re.escape("keep fewer scenes"), save_summary, one, file, 100)
@@ -128,18 +128,18 @@ def test_a_small_summary_becomes_coarser_until_it_fits(run, tmp_path):
 
 def test_a_damaged_small_summary_is_one_line(run, tmp_path):
     file = tmp_path / "kept.semstab"
-    save_summary(open_contender(f"{run}:a"), file)
+    save_summary(open_run(f"{run}:a"), file)
     whole = file.read_bytes()
     for data in (whole[: len(whole) // 2], b"", whole[:200] + b"\0" * 200 + whole[400:]):
         file.write_bytes(data)
-        fails(DataError, re.escape(str(file)), open_contender, file)
+        fails(DataError, re.escape(str(file)), open_run, file)
     with zipfile.ZipFile(file, "w") as archive:
         archive.writestr("summary.json", json.dumps({"kind": "else"}))
-    fails(DataError, re.escape("of another kind or version"), open_contender, file)
+    fails(DataError, re.escape("of another kind or version"), open_run, file)
     with zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as archive:
         archive.writestr("summary.json", b" " * (LARGEST + 1))
     assert file.stat().st_size < 200_000
-    fails(DataError, re.escape(f"{file}: unpacks to more than 100 MB"), open_contender, file)
+    fails(DataError, re.escape(f"{file}: unpacks to more than 100 MB"), open_run, file)
 
 
 @pytest.mark.parametrize(
@@ -158,7 +158,7 @@ def test_a_damaged_small_summary_is_one_line(run, tmp_path):
 )
 def test_numbers_that_no_map_has_are_refused_before_they_overflow(run, tmp_path, field, number, line):
     file = tmp_path / "kept.semstab"
-    save_summary(open_contender(f"{run}:a"), file)
+    save_summary(open_run(f"{run}:a"), file)
     with zipfile.ZipFile(file) as archive:
         content, sums = json.loads(archive.read("summary.json")), pq.read_table(io.BytesIO(archive.read("0.parquet")))
     about = json.loads(sums.schema.metadata[b"semstab"])
@@ -173,7 +173,7 @@ def test_numbers_that_no_map_has_are_refused_before_they_overflow(run, tmp_path,
     with zipfile.ZipFile(file, "w") as archive:
         archive.writestr("summary.json", json.dumps(content))
         archive.write(tmp_path / "sums.parquet", "0.parquet")
-    fails(DataError, line, open_contender, file)
+    fails(DataError, line, open_run, file)
 
 
 def test_flicker_out_of_range_in_a_runs_series_is_refused(run, tmp_path):
@@ -184,11 +184,11 @@ def test_flicker_out_of_range_in_a_runs_series_is_refused(run, tmp_path):
     values = rows[2].split(",")
     values[at] = "1e308"
     series.write_text("\n".join([*rows[:2], ",".join(values), *rows[3:]]))
-    fails(DataError, "out of range", lambda: open_contender(f"{tmp_path}/run:a").scenes["wall"].flicker)
+    fails(DataError, "out of range", lambda: open_run(f"{tmp_path}/run:a").scenes["wall"].flicker)
 
 
 def test_cubes_and_groups_as_large_as_they_may_be(run):
-    sums = open_contender(f"{run}:a").scenes["wall"].sums
+    sums = open_run(f"{run}:a").scenes["wall"].sums
     assert sums.cells > 8
     wide = sums.coarsened(2.0**62, 2**30 if sums.step else 0)
     assert wide.cells <= 8

@@ -89,7 +89,7 @@ def gate(
     from semstab.comparison import gate_report
     from semstab.comparison.gate import gate as judge
     from semstab.comparison.gate import gate_config
-    from semstab.comparison.runs import open_contender, save_summary
+    from semstab.comparison.runs import open_run, save_summary
 
     gate_report.require_formats(out or ())
     console = Console(quiet=quiet)
@@ -102,7 +102,7 @@ def gate(
         if result.failed:
             raise typer.Exit(FAILED)
     if save_baseline is not None:
-        save_summary(open_contender(new), save_baseline)
+        save_summary(open_run(new), save_baseline)
         console.print(f"{save_baseline}: a baseline of {save_baseline.stat().st_size:,} bytes", markup=False)
 
 

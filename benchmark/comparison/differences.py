@@ -12,7 +12,7 @@ import numpy as np
 
 from semstab.comparison.locations import Changes, worse_places
 from semstab.comparison.pairing import Common, joint_class, pair
-from semstab.comparison.runs import Contender, Entry, Flicker, open_contenders, shared_scenes
+from semstab.comparison.runs import Entry, Flicker, RunHandle, open_runs, shared_scenes
 from semstab.comparison.tables import (
     BY_CLASS,
     COVERAGE,
@@ -279,31 +279,31 @@ class Found:
 def find(runs: Sequence[str | Path], progress: Progress = lambda what: None) -> Found:
     """Compare runs with the first one; `progress` is told what is done.
 
-    Raises ConfigError for fewer than two, and what `open_contenders`, `shared_scenes` and `pair` raise.
+    Raises ConfigError for fewer than two, and what `open_runs`, `shared_scenes` and `pair` raise.
     """
     if len(runs) < 2:
         raise ConfigError("there is nothing to compare it with; name two runs or more, the one to compare with first")
-    contenders = open_contenders(runs)
+    handles = open_runs(runs)
     scenes: list[SceneComparison] = []
     changes: dict[tuple[str, str], Changes] = {}
-    for scene in shared_scenes(contenders):
+    for scene in shared_scenes(handles):
         progress(scene)
-        found, own = _scene(scene, contenders)
+        found, own = _scene(scene, handles)
         scenes.append(found)
         changes |= {(scene, name): each for name, each in own.items()}
     result = RunComparison(
         schema=SCHEMA,
-        base=contenders[0].name,
-        runs=tuple(Compared(each.name, each.source, each.backbone) for each in contenders),
+        base=handles[0].name,
+        runs=tuple(Compared(each.name, each.source, each.backbone) for each in handles),
         overall=_over_all(scenes),
         scenes=tuple(scenes),
     )
-    ups = {scene: up for each in reversed(contenders) for scene, own in each.scenes.items() if (up := own.up)}
+    ups = {scene: up for each in reversed(handles) for scene, own in each.scenes.items() if (up := own.up)}
     return Found(result, changes, ups)
 
 
-def _scene(scene: str, contenders: Sequence[Contender]) -> tuple[SceneComparison, dict[str, Changes]]:
-    entries, names = [each.scenes[scene] for each in contenders], [each.name for each in contenders]
+def _scene(scene: str, runs: Sequence[RunHandle]) -> tuple[SceneComparison, dict[str, Changes]]:
+    entries, names = [each.scenes[scene] for each in runs], [each.name for each in runs]
     common = pair(entries, names)
     numbers = range(1, len(entries))
     everything = corrected([contrasts(common, entries[0], entries[n], n) for n in numbers])

@@ -14,7 +14,7 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
 from semstab.comparison.pairing import in_share, share_of
-from semstab.comparison.runs import Contender, Entry, open_contender, shared_scenes
+from semstab.comparison.runs import Entry, RunHandle, open_run, shared_scenes
 from semstab.comparison.tables import (
     COVERAGE,
     FLICKER,
@@ -131,9 +131,9 @@ def listed() -> Sequence[str]:
 def calibrated(run: str | Path, *, precision: float = 0.95, confidence: float = 0.95) -> Commit:
     """Thresholds from all scenes of a run with ground truth; 'FOLDER:BACKBONE' selects one of several label sources.
 
-    Raises ConfigError and DataError as `open_contender`, and for a scene whose ground truth was not fused.
+    Raises ConfigError and DataError as `open_run`, and for a scene whose ground truth was not fused.
     """
-    own = open_contender(run)
+    own = open_run(run)
     maps, sampled = [], 1.0
     for scene, entry in own.scenes.items():
         record = entry.with_voxels("a calibration")
@@ -477,8 +477,8 @@ def gate(new: str | Path, against: str | Path | None, config: GateConfig) -> Gat
     Raises ConfigError and DataError, each with the rule or the folder, and what to do.
     """
     parsed = [parse(text) for text in config.rules]
-    own = open_contender(new)
-    base = None if against is None else open_contender(against)
+    own = open_run(new)
+    base = None if against is None else open_run(against)
     scenes = tuple(own.scenes) if base is None else shared_scenes([base, own])
     judged: list[Judgement] = []
     for given in parsed:
@@ -501,11 +501,11 @@ class _Ways:
     frames: Frames
 
 
-def _named(run: Contender) -> str:
+def _named(run: RunHandle) -> str:
     return f"{run.backbone} ({run.source})"
 
 
-def _remarks(own: Contender, base: Contender | None, scenes: Sequence[str]) -> list[str]:
+def _remarks(own: RunHandle, base: RunHandle | None, scenes: Sequence[str]) -> list[str]:
     left = [scene for scene in own.scenes if scene not in scenes]
     missing = [scene for scene in (base.scenes if base else ()) if scene not in scenes]
     said = [f"not in the baseline, and not compared: {', '.join(left)}"] if left else []
@@ -515,7 +515,7 @@ def _remarks(own: Contender, base: Contender | None, scenes: Sequence[str]) -> l
 # --- Before anything is judged ----------------------------------------------------------------------------------------
 
 
-def _check(rule: Rule, own: Contender, base: Contender | None, scenes: Sequence[str]) -> None:
+def _check(rule: Rule, own: RunHandle, base: RunHandle | None, scenes: Sequence[str]) -> None:
     if rule.change is not None and base is None:
         raise ConfigError(f"rule '{rule.text}': a {rule.change} is from a baseline; give --against RUN")
     if rule.scene is not None and rule.scene not in scenes:
@@ -555,7 +555,7 @@ def _k(rule: Rule, entry: Entry) -> int | None:
 # --- Rules ------------------------------------------------------------------------------------------------------------
 
 
-def _judged(rule: Rule, own: Contender, base: Contender | None, scenes: Sequence[str], ways: _Ways) -> Judgement:
+def _judged(rule: Rule, own: RunHandle, base: RunHandle | None, scenes: Sequence[str], ways: _Ways) -> Judgement:
     """Over the mean of the scenes, which err by themselves, or in the one that the rule names."""
     pairs = [
         (own.scenes[scene], None if base is None else base.scenes[scene])

@@ -1,4 +1,7 @@
-"""What is compared: run folders, a label source of them, and small summaries; opened, selected, held side by side."""
+"""Runs that are compared: run folders, a label source of them, and small summaries; opened, named, matched by scene.
+
+A small summary holds what a later comparison needs but voxels, in one file that a repository can keep.
+"""
 
 from __future__ import annotations
 
@@ -24,8 +27,8 @@ from semstab.engine.folder import load_result
 from semstab.errors import ConfigError, DataError, one_line
 from semstab.model import earlier
 from semstab.model.georeference import Georeference
-from semstab.model.records import ImageSpace, Record, Result
-from semstab.model.results import Unit, UnitSummary
+from semstab.model.records import ImageSpace, Record
+from semstab.model.results import UnitSummary
 from semstab.statistics.cluster_sums import ClusterSums
 
 # A small summary: what a later comparison needs but voxels, in one file that a repository can keep.
@@ -187,8 +190,8 @@ Flicker = Mapping[int, float]
 class Entry:
     """A unit that is compared: a label source on a scene.
 
-    where   the folder or the file that it is of
-    record  what its folder has of it; None of a small summary, which holds no voxels
+    where   the folder or the file that it comes from
+    record  what its folder holds of it; None of a small summary, which holds no voxels
     up      the scene's up axis, where it is known
     seed    of a simulated scene
     """
@@ -203,14 +206,9 @@ class Entry:
     read_sums: Callable[[], ClusterSums]
     read_flicker: Callable[[], Flicker]
 
-    @property
-    def unit(self) -> Unit:
-        """Its scene, label source and backend."""
-        return self.summary.unit
-
     @functools.cached_property
     def sums(self) -> ClusterSums:
-        """Its sums by frame and cube of space. Raises DataError where the run kept none."""
+        """Its sums by frame and cube of space. Raises DataError where the run has none."""
         return self.read_sums()
 
     @functools.cached_property
@@ -223,18 +221,20 @@ class Entry:
         """Names of the classes, in order."""
         return self.sums.classes
 
-    def with_voxels(self, what: str) -> Record:
-        """The record with its voxels. Raises DataError, which names what needs them, where there are none."""
+    def with_voxels(self, purpose: str) -> Record:
+        """Return the record with its voxels. Raises DataError, which names what needs them, where there are none."""
         if self.record is None:
-            raise DataError(f"{self.where}: is a small summary, without the voxels that {what} needs; give the folder")
+            raise DataError(
+                f"{self.where}: is a small summary, without the voxels that {purpose} needs; give the folder"
+            )
         return self.record
 
 
 @dataclass(frozen=True, eq=False)
-class Contender:
+class RunHandle:
     """A label source with all scenes that it was fused in.
 
-    name    as it is called beside others: by its backbone, its folder, or both
+    name    distinct among the runs that are compared: its backbone, its folder, or both
     source  the folder, or the file of a small summary
     """
 
@@ -244,104 +244,106 @@ class Contender:
     scenes: Mapping[str, Entry]
 
 
-def open_contenders(named: Sequence[str | Path]) -> tuple[Contender, ...]:
-    """Folders of runs or studies, 'FOLDER:BACKBONE', and files of small summaries, under names that tell them apart.
+def open_runs(named: Sequence[str | Path]) -> tuple[RunHandle, ...]:
+    """Open folders of runs or studies, 'FOLDER:BACKBONE', and small summaries, under the shortest distinct names.
 
-    Raises ConfigError or DataError as `open_contender` does.
+    Raises ConfigError or DataError as `open_run` does.
     """
-    found = [open_contender(each) for each in named]
-    return tuple(replace(each, name=name) for each, name in zip(found, _names(found), strict=True))
+    runs = [open_run(each) for each in named]
+    folders, backbones = [run.source.resolve().name for run in runs], [run.backbone for run in runs]
+    both = [f"{folder}:{backbone}" for folder, backbone in zip(folders, backbones, strict=True)]
+    names = [f"{run.source}:{run.backbone}" for run in runs]
+    names = next((short for short in (backbones, folders, both) if len({*short}) == len({*names})), names)
+    times = [names[: i + 1].count(name) for i, name in enumerate(names)]
+    names = [name if nth == 1 else f"{name} ({nth})" for name, nth in zip(names, times, strict=True)]
+    return tuple(replace(run, name=name) for run, name in zip(runs, names, strict=True))
 
 
-def open_contender(named: str | Path) -> Contender:
-    """A run's only label source, or the one that 'FOLDER:BACKBONE' selects, at the run's base settings and backend.
+def open_run(named: str | Path) -> RunHandle:
+    """Open a run's only label source, or the one that 'FOLDER:BACKBONE' selects, at the base settings and backend.
 
     Raises ConfigError where there is no such folder or label source, or several; DataError where it is damaged.
     """
-    path, backbone = _selected(str(named))
+    text = str(named)
+    start, _, wanted = text.rpartition(":")
+    if Path(text).exists() or not start:
+        start, wanted = text, ""
+    path = Path(start)
+    if not path.exists():
+        raise ConfigError(f"{path}: there is no such folder; give the folder of a run, or FOLDER:BACKBONE")
     if path.is_file():
-        return _of_baseline(path, load_baseline(path), backbone)
+        backbone, scenes = load_summary(path)
+        _chosen(path, [backbone], wanted)
+        return RunHandle(backbone, path, backbone, scenes)
     result = load_result(path)
-    backbone = _backbone(path, result.backbones, backbone)
-    records = {record.unit.scene: record for record in result.select(backbone=backbone)}
-    return Contender(backbone, path, backbone, {scene: _entry(path, result, own) for scene, own in records.items()})
+    backbone = _chosen(path, result.backbones, wanted)
+    seed = result.manifest.get("seed")
+    scenes = {
+        record.unit.scene: Entry(
+            path, record.summary, record.image_space, result.georeference.get(record.unit.scene),
+            result.up.get(record.unit.scene), seed if isinstance(seed, int) else None, record,
+            functools.partial(_sums, path, record), functools.partial(_flicker, record.series),
+        )
+        for record in result.select(backbone=backbone)
+    }  # fmt: skip
+    return RunHandle(backbone, path, backbone, scenes)
 
 
-def shared_scenes(contenders: Sequence[Contender]) -> tuple[str, ...]:
-    """The scenes that all have, in the order of the first one.
+def shared_scenes(runs: Sequence[RunHandle]) -> tuple[str, ...]:
+    """Return the scenes that all runs have, in the order of the first one.
 
     Raises DataError where there is none, where one was simulated with other seeds, or its classes differ.
     """
-    first, *others = contenders
+    first, *others = runs
     scenes = tuple(scene for scene in first.scenes if all(scene in other.scenes for other in others))
     if not scenes:
         other = next((each for each in others if not first.scenes.keys() & each.scenes.keys()), others[-1])
+        listed = [", ".join([*run.scenes][:3]) + (", ..." if len(run.scenes) > 3 else "") for run in (first, other)]
         raise DataError(
-            f"{first.source} and {other.source} have no scene in common ({_listed(first.scenes)}; "
-            f"{_listed(other.scenes)}); run both on the same scenes"
+            f"{first.source} and {other.source} have no scene in common ({listed[0] or 'none'}; {listed[1] or 'none'});"
+            " run both on the same scenes"
         )
     for scene in scenes:
         for other in others:
-            _require_same_scene(first.scenes[scene], other.scenes[scene])
-            _require_same_classes(first.scenes[scene], other.scenes[scene])
+            _require_same_scene(scene, first.scenes[scene], other.scenes[scene])
     return scenes
 
 
-def save_summary(contender: Contender, path: str | Path, most: int = 1_000_000) -> None:
-    """Write all that a later comparison needs but voxels into one file of at most so many bytes."""
-    kept = {
-        scene: Kept(own.summary, own.image_space, own.georeference, own.up, own.seed, dict(own.flicker))
-        for scene, own in contender.scenes.items()
-    }
-    sums = {scene: own.sums for scene, own in contender.scenes.items()}
-    save_baseline(Baseline(contender.backbone, kept, sums), path, most)
+def _require_same_scene(scene: str, one: Entry, other: Entry) -> None:
+    where = f"{one.where} and {other.where}"
+    if one.seed != other.seed:
+        raise DataError(
+            f"{where}: {scene} was simulated with the seeds {one.seed} and {other.seed}, which make other scenes;"
+            " run both with one --seed"
+        )
+    if one.classes != other.classes:
+        a, b = ((*entry.classes, "no more") for entry in (one, other))
+        k = next(k for k, pair in enumerate(zip(a, b, strict=False)) if pair[0] != pair[1])
+        raise DataError(
+            f"{where}: the classes of {scene} differ ({len(one.classes)} and {len(other.classes)}; class {k} is {a[k]}"
+            f" and {b[k]}); run both with one --taxonomy"
+        )
 
 
-# --- Parts ------------------------------------------------------------------------------------------------------------
-
-
-def _selected(text: str) -> tuple[Path, str | None]:
-    """The path, and what stands behind its last colon where it is not itself there."""
-    path, colon, backbone = text.rpartition(":")
-    if Path(text).exists() or not colon:
-        path, backbone = text, ""
-    if not Path(path).exists():
-        raise ConfigError(f"{path}: there is no such folder; give the folder of a run, or FOLDER:BACKBONE")
-    return Path(path), backbone or None
-
-
-def _backbone(path: Path, there: Sequence[str], wanted: str | None) -> str:
-    if wanted is not None:
+def _chosen(path: Path, there: Sequence[str], wanted: str) -> str:
+    """Return the wanted backbone, or the only one."""
+    if wanted:
         if wanted not in there:
             raise ConfigError(f"{path}: no backbone '{wanted}'; {nearest(wanted, there)}")
         return wanted
     own = [name for name in there if name != GROUND_TRUTH] or list(there)
-    if len(own) != 1:
+    if not own:
+        raise ConfigError(f"{path}: holds no finished unit")
+    if len(own) > 1:
         listed = ", ".join(own[:4]) + (", ..." if len(own) > 4 else "")
-        what = f"holds several label sources ({listed}); name one: {path}:{own[0]}" if own else "holds no finished unit"
-        raise ConfigError(f"{path}: {what}")
+        raise ConfigError(f"{path}: holds several label sources ({listed}); name one: {path}:{own[0]}")
     return own[0]
-
-
-def _entry(folder: Path, result: Result, record: Record) -> Entry:
-    scene = record.unit.scene
-    return Entry(
-        folder,
-        record.summary,
-        record.image_space,
-        result.georeference.get(scene),
-        result.up.get(scene),
-        _seed(result),
-        record,
-        lambda: _sums(folder, record),
-        lambda: _flicker(record.series),
-    )
 
 
 def _sums(folder: Path, record: Record) -> ClusterSums:
     file = record.influence_file
     if file is None or not file.is_file():
-        raise DataError(f"{folder}: kept no sums by frame and place of {record.unit.slug}; run it again")
+        raise DataError(f"{folder}: has no sums by frame and cube of {record.unit.slug}; run it again")
     try:
         return ClusterSums.load(file)
     except DataError as error:
@@ -354,65 +356,123 @@ def _flicker(file: Path | None) -> Flicker:
     try:
         with file.open(encoding="utf-8", newline="") as lines:
             rows = [(row["frame"], row["flicker_percent"]) for row in csv.DictReader(lines)]
-        found = {int(frame): float(percent) for frame, percent in rows if percent}
-        found = {frame: percent for frame, percent in found.items() if math.isfinite(percent)}
-        if not valid_flicker(found, found.values()):
+        flicker = {int(frame): float(percent) for frame, percent in rows if percent}
+        flicker = {frame: percent for frame, percent in flicker.items() if math.isfinite(percent)}
+        if not _valid(flicker, flicker.values()):
             raise ValueError("a percentage of flicker, or a frame's index, is out of range")
     except (OSError, ValueError, KeyError, TypeError, csv.Error) as error:
         raise DataError(f"{file}: cannot be read ({one_line(error)}); run it again") from error
-    return found
+    return flicker
 
 
-def _of_baseline(path: Path, found: Baseline, backbone: str | None) -> Contender:
-    backbone = _backbone(path, [found.backbone], backbone)
-    scenes = {
-        scene: Entry(
-            path, own.summary, own.image_space, own.georeference, own.up, own.seed, None,
-            functools.partial(found.sums.__getitem__, scene), functools.partial(dict, own.flicker),
+def _valid(frames: Iterable[int], percents: Iterable[float]) -> bool:
+    return all(0 <= frame < 2**31 for frame in frames) and all(0 <= percent <= 100 for percent in percents)
+
+
+# --- Small summaries --------------------------------------------------------------------------------------------------
+
+SCHEMA, KIND = 1, "semstab small summary"
+CONTENT = "summary.json"
+LARGEST = 100_000_000
+"""Bytes of a file that is opened, and of its content unpacked."""
+
+MANY_GROUPS = 32
+"""Groups of frames down to which these are joined, before cubes are."""
+
+
+@dataclass(frozen=True)
+class _Scene:
+    name: str
+    summary: UnitSummary
+    image_space: ImageSpace
+    georeference: Georeference | None
+    up: tuple[float, float, float] | None
+    seed: int | None
+    frames: tuple[int, ...]
+    flicker: tuple[float, ...]
+
+    def __post_init__(self) -> None:
+        if len(self.frames) != len(self.flicker) or not _valid(self.frames, self.flicker):
+            raise DataError("percentages of flicker, or the frames they are of, are out of range")
+
+
+@dataclass(frozen=True)
+class _Content:
+    backbone: str
+    scenes: tuple[_Scene, ...] = field(default=())
+
+
+def save_summary(run: RunHandle, path: str | Path, most: int = 1_000_000) -> None:
+    """Write all that a later comparison needs but voxels into one file.
+
+    Its cubes of space and groups of frames are as fine as `most` bytes allow. Raises DataError where even the coarsest
+    take more.
+    """
+    scenes = tuple(
+        _Scene(
+            name, own.summary, own.image_space, own.georeference, own.up, own.seed, (*own.flicker,),
+            (*own.flicker.values(),),
         )
-        for scene, own in found.scenes.items()
-    }  # fmt: skip
-    return Contender(backbone, path, backbone, scenes)
+        for name, own in run.scenes.items()
+    )  # fmt: skip
+    content = json.dumps({"kind": KIND, "schema": SCHEMA, **to_json(_Content(run.backbone, scenes))})
+    sums = [own.sums for own in run.scenes.values()]
+    while len(data := _archive(content, sums)) > most:
+        coarser = [_coarser(own) for own in sums]
+        if all(np.array_equal(a.cell, b.cell) and a.step == b.step for a, b in zip(coarser, sums, strict=True)):
+            raise DataError(f"{path}: a summary of {len(sums)} scenes takes {len(data)} bytes; keep fewer scenes")
+        sums = coarser
+    with atomic_path(path) as temporary:
+        temporary.write_bytes(data)
 
 
-def _seed(result: Result) -> int | None:
-    seed = result.manifest.get("seed")
-    return seed if isinstance(seed, int) else None
+def load_summary(path: str | Path) -> tuple[str, dict[str, Entry]]:
+    """Return the backbone and the scenes that `save_summary` wrote. Raises DataError for anything else."""
+    path = Path(path)
+    try:
+        with zipfile.ZipFile(io.BytesIO(read_limited(path, LARGEST))) as archive:
+            if sum(member.file_size for member in archive.infolist()) > LARGEST:
+                raise DataError(f"{path}: unpacks to more than {LARGEST // 10**6} MB; write the summary again")
+            text = parse_json(archive.read(CONTENT))
+            if not isinstance(text, dict) or (text.get("kind"), text.get("schema")) != (KIND, SCHEMA):
+                raise DataError("of another kind or version")
+            content = from_json(_Content, text, path)
+            files = [archive.read(f"{i}.parquet") for i in range(len(content.scenes))]
+    except (OSError, zipfile.BadZipFile, zlib.error, LookupError, ValueError, RuntimeError, EOFError) as error:
+        if isinstance(error, DataError) and str(path) in str(error):
+            raise
+        raise DataError(f"{path}: neither a run's folder nor a small summary ({one_line(error)})") from error
+    scenes = {}
+    with tempfile.TemporaryDirectory() as folder:
+        part = Path(folder) / "sums.parquet"
+        for own, data in zip(content.scenes, files, strict=True):
+            part.write_bytes(data)
+            try:
+                sums = ClusterSums.load(part)
+            except DataError as error:
+                raise DataError(f"{path}: the sums of {own.name} are damaged; write the summary again") from error
+            flicker = dict(zip(own.frames, own.flicker, strict=True))
+            scenes[own.name] = Entry(
+                path, own.summary, own.image_space, own.georeference, own.up, own.seed, None,
+                lambda sums=sums: sums, lambda flicker=flicker: flicker,
+            )  # fmt: skip
+    return content.backbone, scenes
 
 
-def _require_same_scene(one: Entry, other: Entry) -> None:
-    if one.seed != other.seed:
-        raise DataError(
-            f"{one.where} and {other.where}: {one.unit.scene} was simulated with the seeds {one.seed} and {other.seed},"
-            " which make other scenes; run both with one --seed"
-        )
+def _archive(content: str, sums: list[ClusterSums]) -> bytes:
+    """Return the file, byte for byte the same for the same content."""
+    data = io.BytesIO()
+    with zipfile.ZipFile(data, "w", zipfile.ZIP_DEFLATED) as archive, tempfile.TemporaryDirectory() as folder:
+        archive.writestr(zipfile.ZipInfo(CONTENT), content, zipfile.ZIP_DEFLATED)
+        for i, own in enumerate(sums):
+            part = Path(folder) / "sums.parquet"
+            own.save(part)
+            archive.writestr(zipfile.ZipInfo(f"{i}.parquet"), part.read_bytes())
+    return data.getvalue()
 
 
-def _require_same_classes(one: Entry, other: Entry) -> None:
-    if one.classes != other.classes:
-        k = next(
-            k for k, pair in enumerate(zip((*one.classes, ""), (*other.classes, ""), strict=False)) if len({*pair}) > 1
-        )
-        names = [(*own.classes, "no more")[k] for own in (one, other)]
-        raise DataError(
-            f"{one.where} and {other.where}: the classes of {one.unit.scene} differ ({len(one.classes)} and"
-            f" {len(other.classes)}; class {k} is {names[0]} and {names[1]}); run both with one --taxonomy"
-        )
-
-
-def _names(found: Sequence[Contender]) -> list[str]:
-    """The shortest names that are distinct; what is given twice is numbered."""
-    folders, backbones = ([each.source.resolve().name for each in found], [each.backbone for each in found])
-    both = [f"{folder}:{backbone}" for folder, backbone in zip(folders, backbones, strict=True)]
-    whole = [f"{each.source}:{each.backbone}" for each in found]
-    for names in (backbones, folders, both):
-        if len(set(names)) == len(set(whole)):
-            whole = names
-            break
-    times = [whole[: i + 1].count(name) for i, name in enumerate(whole)]
-    return [name if nth == 1 else f"{name} ({nth})" for name, nth in zip(whole, times, strict=True)]
-
-
-def _listed(names: Mapping[str, Entry]) -> str:
-    some = ", ".join(list(names)[:3])
-    return some + (", ..." if len(names) > 3 else "") if some else "none"
+def _coarser(sums: ClusterSums) -> ClusterSums:
+    """Join two groups of frames each where there are many, else cubes."""
+    if sums.step and sums.frames > MANY_GROUPS:
+        return sums.coarsened(sums.edge, 2 * sums.step)
+    return sums.coarsened(2 * sums.edge, sums.step)

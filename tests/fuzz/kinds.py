@@ -28,7 +28,7 @@ from semstab.backbones.segearth_ov import read_prompts
 from semstab.comparison.differences import contrasts
 from semstab.comparison.gate import gate_config, parse
 from semstab.comparison.pairing import pair
-from semstab.comparison.runs import open_contender, open_contenders, save_summary, shared_scenes
+from semstab.comparison.runs import open_run, open_runs, save_summary, shared_scenes
 from semstab.convert import convert
 from semstab.core.files import read_json
 from semstab.core.json_form import from_json
@@ -236,7 +236,7 @@ def of_results(folder: Path) -> Iterator[Kind]:
         if found := sorted(run.glob(pattern)):
             yield Kind(f"run {pattern}", (found[0],), read)
     small = folder / "small.semstab"
-    save_summary(open_contender(f"{run}:a"), small)
+    save_summary(open_run(f"{run}:a"), small)
     yield Kind("small summary", (small,), lambda file: compared(file, f"{run}:b"))
     conversion = folder / "converted/wall/conversion.json"
     yield Kind("conversion.json", (conversion,), lambda _: list(convert(config, folder / "converted")))
@@ -260,10 +260,10 @@ def read_result(folder: Path) -> None:
 
 
 def compared(*named: Path | str) -> None:
-    contenders = open_contenders(named)
-    for scene in shared_scenes(contenders):
-        entries = [each.scenes[scene] for each in contenders]
-        contrasts(pair(entries, [each.name for each in contenders]), *entries, 1)
+    runs = open_runs(named)
+    for scene in shared_scenes(runs):
+        entries = [each.scenes[scene] for each in runs]
+        contrasts(pair(entries, [each.name for each in runs]), *entries, 1)
 
 
 def predict(folder: Path) -> None:
