@@ -42,6 +42,7 @@ RENAMED: dict[str, str | None] = {
     "statistics.beyond_coin": "excess_over_chance",
     "beyond_coin.settling": "drift_below_null",
     "agreement.each_place": "voxel_weighted",
+    "judged.accuracy": None,  # two voxels of a study whose classes tie: now by the map's own class, as correctness is
 }
 """Key, column, file, header or word of the kept revision -> its name now; None: gone by design (say why in a comment).
 
