@@ -115,7 +115,7 @@ def _level(
     level = max(probabilities, key=lambda name: probabilities[name])
     if math.isnan(probabilities[level]):
         return "no verdict", math.nan
-    if headline.wrong_of_stable.low > DANGEROUS:
+    if headline.wrong_of_stable.low > DANGEROUS and level != "unstable":
         return "misleading", math.nan
     if ceiling is not None and not ceiling.ceiling.value >= LEAST_CEILING and level != "unstable":
         return "too coarse", math.nan
