@@ -367,7 +367,9 @@ class Comparison:
                     f"{where}: {name}", f"{x.dtype} {x.shape}", f"{y.dtype} {y.shape}" if name in b else "missing"
                 )
                 continue
-            x, y, own = x.ravel(), y.ravel(), TOLERANCE if SUMMED.fullmatch(key) or SERIES.fullmatch(key) else tolerance
+            x, y, own = x.ravel(), y.ravel(), tolerance
+            if SUMMED.fullmatch(key) or (SERIES.fullmatch(key) and where.startswith("tiled/")):
+                own = TOLERANCE
             if x.dtype.kind not in "fiub":
                 wrong = np.array([not same(p, q, tolerance) for p, q in zip(x.tolist(), y.tolist(), strict=True)], bool)
             elif own and x.dtype.kind == "f":
