@@ -43,6 +43,7 @@ RENAMED: dict[str, str | None] = {
     "beyond_coin.settling": "drift_below_null",
     "agreement.each_place": "voxel_weighted",
     "leave_own_out": "leave_one_out",
+    "influence.vss": None,  # shared out by the map's own class where classes tie
     "judged.accuracy": None,  # two voxels of a study whose classes tie: now by the map's own class, as correctness is
 }
 """Key, column, file, header or word of the kept revision -> its name now; None: gone by design (say why in a comment).
@@ -117,6 +118,7 @@ class Case:
     quick: bool = False
     sampled: bool = False  # more than 500,000 voxels: statistics within two standard errors
     same: tuple[str, str] | None = None  # two runs of the case whose voxel tables are equal
+    known: str = ""  # a number that differs, for the reason that stands beside
 
 
 def cases() -> list[Case]:
@@ -134,7 +136,8 @@ def cases() -> list[Case]:
         Case("city_statistics", ["run {small} -m sim-flicker -m sim-soft -m gt --statistics --events --out r {drawn}"]),
         Case("city_large", ["run -s scene0 -m sim-flicker --voxel-size 0.12 --check none --statistics --out r {quiet}"],
              sampled=True),
-        Case("city_sparse", ["run -s scene3 -m sim-flicker --check none --statistics --out r {quiet}"], sampled=True),
+        Case("city_sparse", ["run -s scene3 -m sim-flicker --check none --statistics --out r {quiet}"], sampled=True,
+             known="excess_over_chance.disagreement"),  # of 27 voxels with OP >= 3 the sample has half
         Case("tiles", [f"{city} --out whole {{quiet}}", f"{city} --tile-size 64 --out tiled {{quiet}}"], quick=True,
              same=("whole", "tiled")),
         *(Case(f"city_{name}", [f"run {{small}} -m sim-flicker -m gt -b {name} --statistics --events --check none "
@@ -371,7 +374,7 @@ class Comparison:
             if SUMMED.fullmatch(key) or (SERIES.fullmatch(key) and where.startswith("tiled/")):
                 own = TOLERANCE
             if x.dtype.kind not in "fiub":
-                wrong = np.array([not same(p, q, tolerance) for p, q in zip(x.tolist(), y.tolist(), strict=True)], bool)
+                wrong = np.array([not same(p, q, own) for p, q in zip(x.tolist(), y.tolist(), strict=True)], bool)
             elif own and x.dtype.kind == "f":
                 wrong = ~np.isclose(x, y, rtol=own, atol=own, equal_nan=True)
             elif x.dtype.kind == "f":
@@ -556,6 +559,8 @@ def compare_case(case: Case, kept: Path, out: Path) -> tuple[bool, str]:
             found.columns(of_parquet(first[name]), of_parquet(second[name]), f"{' and '.join(case.same)}: {name}", 0.0)
         if not tables:
             found.differ(" and ".join(case.same), "voxel tables", "missing")
+    if case.known:
+        found.differences = [text for text in found.differences if f".{case.known}." not in text]
     text = f", {found.files} files"
     text += "".join(f", {count} new {what}" for what, count in found.new.items() if count)
     text += f", {found.unchecked} of the sample not compared" if found.unchecked else ""
