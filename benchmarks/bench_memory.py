@@ -58,8 +58,8 @@ def stages(scene: Path, out: Path, backend: str, voxel_size: float, *options: st
     """Peak of each stage of a run, GB."""
     watched = out.with_suffix(".json")
     command = [sys.executable, str(HERE / "staged.py"), str(watched), "run", "--data", str(scene), "--out", str(out),
-               "--voxel-size", str(voxel_size), "--backend", backend, "--trust-geometry", "--report", "off", "--quiet",
-               "--rerun", "off", *options]  # fmt: skip
+               "--voxel-size", str(voxel_size), "--backend", backend, "--no-geometry-check", "--report", "off",
+               "--quiet", "--rerun", "off", *options]  # fmt: skip
     subprocess.run(command, check=True)
     return {name: stage["peak_gb"] for name, stage in json.loads(watched.read_text()).items()}
 

@@ -92,7 +92,7 @@ def measure(scene: Path, out: Path, workers: int, memory_gb: float, *, cold: boo
 def run(scene: Path, out: Path, address: str, *options: str) -> resource.struct_rusage:
     """What the command takes itself."""
     command = [sys.executable, "-m", "semstab", "run", "--data", str(scene), "--out", str(out), "--voxel-size", "0.2",
-               "--trust-geometry", "--report", "off", "--rerun", "off", "--quiet", "--scheduler", address,
+               "--no-geometry-check", "--report", "off", "--rerun", "off", "--quiet", "--scheduler", address,
                *options]  # fmt: skip
     process = subprocess.Popen(command, env=os.environ | ONE_THREAD)
     _, status, usage = os.wait4(process.pid, 0)

@@ -314,7 +314,7 @@ def test_frames_without_ground_truth_are_read_with_the_backbone():
 
 def test_unsound_data_are_refused_in_one_line():
     with pytest.raises(
-        DataError, match=r"^room: depth reprojects with .* --trust-geometry fuses it as it is$"
+        DataError, match=r"^room: depth reprojects with .* --no-geometry-check fuses it as it is$"
     ) as caught:
         require_sound(Room(told_pose=np.linalg.inv), ALL)
     assert "\n" not in str(caught.value)

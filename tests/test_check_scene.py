@@ -366,7 +366,7 @@ def test_a_run_refuses_unsound_data_unless_told_otherwise(tmp_path):
     refused = bench("run", *arguments, tmp_path / "other")
     assert refused.exit_code == 2
     assert len(refused.stderr.strip().splitlines()) == 1
-    assert bench("run", *arguments, tmp_path / "other", "--trust-geometry").exit_code == 0
+    assert bench("run", *arguments, tmp_path / "other", "--no-geometry-check").exit_code == 0
 
 
 def test_a_study_refuses_unsound_data_unless_told_otherwise(tmp_path):
@@ -379,7 +379,7 @@ def test_a_study_refuses_unsound_data_unless_told_otherwise(tmp_path):
     assert "pose_convention: world_to_camera" in refused.stderr
     assert len(refused.stderr.strip().splitlines()) == 1
     assert not list((tmp_path / "study/units").glob("*.json"))
-    assert bench("study", file, "--out", tmp_path / "study", "-q", "--trust-geometry").exit_code == 0
+    assert bench("study", file, "--out", tmp_path / "study", "-q", "--no-geometry-check").exit_code == 0
     assert json.loads((tmp_path / "study/manifest.json").read_text())["geometry"] == {}
 
 

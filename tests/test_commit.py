@@ -102,16 +102,17 @@ def test_export_and_relabel_take_the_file(tmp_path):
         return done.output
 
     file = tmp_path / "commit.yaml"
-    text = cli("commit", tmp_path / "run", "--precision", 0.5, "--confidence", 0.6, "--out", file)
+    text = cli("calibrate", tmp_path / "run", "--precision", 0.5, "--confidence", 0.6, "--out", file)
     thresholds = semstab.Commit.load(file)
     assert f"{thresholds.left:.1%} of the voxels are left" in text
     table = semstab.load(tmp_path / "run").table()
     decided = thresholds.decide(table) >= 0
     assert 0 < decided.sum() < len(table)
-    text = cli("export", tmp_path / "run", "--to", tmp_path / "map.csv", "--commit", file)
+    text = cli("export", tmp_path / "run", "--to", tmp_path / "map.csv", "--thresholds", file)
     assert f"{decided.sum()} voxels" in text
-    cli("relabel", tmp_path / "run", "--out", tmp_path / "wall", "--commit", file)
+    cli("relabel", tmp_path / "run", "--out", tmp_path / "wall", "--thresholds", file)
     assert re.search(r'"op"|"belief"|"margin"', (tmp_path / "wall/labels/a-fused/relabelled.json").read_text())
     assert vss(table).max() <= 1
     done = CliRunner().invoke(app, ["commit", str(tmp_path / "run") + ":b", "--out", str(file)])
+    assert "commit is now called calibrate" in done.stderr  # the name of version 0.3
     assert done.exit_code == 2

@@ -272,7 +272,7 @@ def refuse_unsound(scene: str, verdict: Verdict) -> None:
     """Raise DataError where the verdict on that scene is that depth and poses contradict each other."""
     if verdict.state == "unsound":
         raise DataError(
-            f"{scene}: {verdict.text}; `semstab-bench check` tells more, --trust-geometry fuses it as it is"
+            f"{scene}: {verdict.text}; `semstab-bench check` tells more, --no-geometry-check fuses it as it is"
         )
 
 

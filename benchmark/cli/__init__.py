@@ -16,7 +16,7 @@ from typer.core import TyperCommand, TyperGroup
 
 from semstab import __version__
 from semstab.cli.data import check, convert, predict
-from semstab.cli.finished import commit, compare, conform, export, gate, list_, relabel
+from semstab.cli.finished import calibrate, compare, conform, export, gate, list_, relabel
 from semstab.cli.options import say
 from semstab.cli.running import remedies, run, show, study, view
 from semstab.core.process import settle
@@ -73,6 +73,22 @@ class Command(TyperCommand):
         return _without_kind(super().get_params(ctx))
 
 
+EARLIER = {
+    "commit": "calibrate", "--commit": "--thresholds", "--onto": "--classify", "--beside": "--join",
+    "--leave-own-out": "--leave-one-out", "--trust-geometry": "--no-geometry-check",
+}  # fmt: skip
+"""Names of version 0.3, which work for one version."""
+
+
+def _of_today(word: str, position: int) -> str:
+    """Return a word of the command line under its name of today, and warn; a command is the first word."""
+    name, equals, value = word.partition("=")
+    if name not in EARLIER or (not name.startswith("-") and position > 0):
+        return word
+    say(f"warning: {name} is now called {EARLIER[name]}; the next version will not know the old name")
+    return EARLIER[name] + equals + value
+
+
 class Group(TyperGroup):
     """Runs `run` where no command is named, shows its options in the help, and reports every error in one line."""
 
@@ -81,11 +97,11 @@ class Group(TyperGroup):
         return _without_kind(super().get_params(ctx))
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        """Put `run` in front of bare options."""
+        """Put `run` in front of bare options, and today's names in place of earlier ones."""
         own = {"--help", "-h", "--version", "--install-completion", "--show-completion"}
         if not args or (args[0].startswith("-") and args[0] not in own):
             args = ["run", *args]
-        return super().parse_args(ctx, args)
+        return super().parse_args(ctx, [_of_today(word, k) for k, word in enumerate(args)])
 
     def format_help(self, ctx: Any, formatter: Any) -> None:
         """The group's own help, with the options of `run` in it."""
@@ -147,7 +163,7 @@ def root(
 
 for command, name in (
     (run, "run"), (study, "study"), (predict, "predict"), (check, "check"), (convert, "convert"), (compare, "compare"),
-    (remedies, "remedies"), (gate, "gate"), (commit, "commit"), (export, "export"), (relabel, "relabel"),
+    (remedies, "remedies"), (gate, "gate"), (calibrate, "calibrate"), (export, "export"), (relabel, "relabel"),
     (conform, "conform"), (show, "show"), (view, "view"), (list_, "list"),
 ):  # fmt: skip
     app.command(name, cls=Command)(command)

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from semstab.cli.options import Quiet, renamed, say
+from semstab.cli.options import Quiet, say
 
 if TYPE_CHECKING:
     from semstab.core.registry import Registry
@@ -47,7 +47,7 @@ def compare(
         console.print(f"folder: {out}; report: {out / 'report.html'}", soft_wrap=True, markup=False, highlight=False)
 
 
-# The commands gate and commit: may a new model ship, and which of its labels may be acted on?
+# The commands gate and calibrate: quality gates, and thresholds from which labels may be acted on.
 
 FAILED = 4
 
@@ -106,7 +106,7 @@ def gate(
         console.print(f"{save_baseline}: a baseline of {save_baseline.stat().st_size:,} bytes", markup=False)
 
 
-def commit(
+def calibrate(
     run: Annotated[str, typer.Argument(metavar="RUN", help="Folder of a run with ground truth, or FOLDER:BACKBONE.")],
     out: Annotated[Path, typer.Option("--out", "-o", metavar="FILE", help="YAML file to write.")],
     precision: Annotated[float, typer.Option(help="How often a label that is acted on shall be right.")] = 0.95,
@@ -157,7 +157,8 @@ Run = Annotated[Path, typer.Argument(metavar="RUN", help="Folder of a finished r
 Scene = Annotated[str | None, typer.Option("--scene", "-s", help="Scene; needed where the run has several.")]
 Backbone = Annotated[str | None, typer.Option("--backbone", "-m", help="Label source; needed where there are several.")]
 CommitFile = Annotated[
-    Path | None, typer.Option("--commit", metavar="FILE", help="Only labels that `semstab-bench commit` vouches for.")
+    Path | None,
+    typer.Option("--thresholds", metavar="FILE", help="Only labels above the thresholds of `semstab-bench calibrate`."),
 ]
 Backend = Annotated[str | None, typer.Option("--backend", "-b", help="Whose map; the run's first backend by default.")]
 
@@ -189,8 +190,6 @@ def export(
         typer.Option(metavar="FILE", help="Parquet with more columns of the voxels: OUT/columns of compare."),
     ] = None,
     quiet: Quiet = False,
-    onto: Annotated[Path | None, typer.Option("--onto", hidden=True)] = None,
-    beside: Annotated[Path | None, typer.Option("--beside", hidden=True)] = None,
 ) -> None:
     """The fused map as a point cloud, raster, mesh or table, with how far to trust each location."""
     from rich.console import Console
@@ -201,7 +200,7 @@ def export(
     written = write(
         run, to, **unit, measures=measure, min_op=min_op, classes=classes or (),
         commit=commit, cell=cell, asprs=asprs, radius=radius,
-        classify=renamed(onto, "--onto", classify, "--classify"), join=renamed(beside, "--beside", join, "--join"),
+        classify=classify, join=join,
     )  # fmt: skip
     console = Console(quiet=quiet)
     for file in written:
@@ -227,7 +226,6 @@ def relabel(
     ] = False,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace maps of other settings.")] = False,
     quiet: Quiet = False,
-    leave_own_out: Annotated[bool, typer.Option("--leave-own-out", hidden=True)] = False,
 ) -> None:
     """The fused classes back in every frame: label maps of a new source, unstable voxels ignored."""
     from rich.console import Console
@@ -238,7 +236,6 @@ def relabel(
     from semstab.statistics.commit import Commit
 
     thresholds = None if commit is None else Commit.load(commit)
-    leave_one_out = renamed(leave_own_out, "--leave-own-out", leave_one_out, "--leave-one-out")
     belief = Belief(min_op, min_psa, tuple(category or ()), leave_one_out, thresholds)
     with frame_bar(Console(stderr=True, quiet=quiet)) as bar:
         report = write(

@@ -147,7 +147,7 @@ Frames = Annotated[
     str | None, typer.Option(metavar="START:STOP:STRIDE", help="Frames, as a Python slice.", show_default="all")
 ]
 TrustGeometry = Annotated[
-    bool, typer.Option("--trust-geometry", help="Fuse also where depth and poses contradict each other.")
+    bool, typer.Option("--no-geometry-check", help="Fuse also where depth and poses contradict each other.")
 ]
 Rerun = Annotated[
     str | None,
@@ -259,11 +259,3 @@ def slice_of(text: str) -> dict[str, int]:
 def say(text: str) -> None:
     """A line beside the results: on standard error."""
     typer.echo(told(text), err=True)
-
-
-def renamed(old: Any, old_name: str, new: Any, new_name: str) -> Any:
-    """Return the value of an option that was renamed, and warn where it is given by its old name."""
-    if not old:
-        return new
-    say(f"warning: {old_name} is now called {new_name}; the next version will not know the old name")
-    return old

@@ -141,7 +141,7 @@ class Chosen:
                 yield place
         if not left:
             limits = f"OP >= {self._min_op}" + (f" and class {' or '.join(self._classes)}" if self._classes else "")
-            limits += " and the evidence that --commit asks for" if self._commit is not None else ""
+            limits += " and the evidence that --thresholds asks for" if self._commit is not None else ""
             raise ConfigError(f"{self._record.voxels_file}: no voxel with {limits}; OP goes up to {self._highest}")
 
     @cached_property
