@@ -52,7 +52,10 @@ RENAMED: dict[str, str | None] = {
 folder is `name/` on both sides. X_low, X_high and X_3 follow X.
 """
 
-WORDS: dict[str, str] = {"commit": "calibrate", "--commit": "--thresholds", "--onto": "--classify", "--beside": "--join"}
+WORDS: dict[str, str] = {
+    "commit": "calibrate", "--commit": "--thresholds", "--onto": "--classify", "--beside": "--join",
+    "--leave-own-out": "--leave-one-out",
+}  # fmt: skip
 """Commands and options of the kept revision -> those of the working tree."""
 
 HERE = Path(__file__).resolve().parents[1]
