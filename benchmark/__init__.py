@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from semstab.settings import load_config, load_study
     from semstab.statistics.commit import Commit
 
-__version__ = "0.3.0"
+__version__ = "0.4.0"
 
 __all__ = [
     "Belief",
