@@ -21,13 +21,13 @@ if TYPE_CHECKING:
     from semstab.model.voxels import VoxelTable
     from semstab.report.loaded import load
     from semstab.settings import load_config, load_study
-    from semstab.statistics.commit import Commit
+    from semstab.statistics.acceptance import AcceptanceThresholds
 
 __version__ = "0.4.0"
 
 __all__ = [
+    "AcceptanceThresholds",
     "Belief",
-    "Commit",
     "Config",
     "ConfigError",
     "DataError",
@@ -59,7 +59,7 @@ __all__ = [
 
 _HOMES = {
     "Belief": "exports.relabel",
-    "Commit": "statistics.commit",
+    "AcceptanceThresholds": "statistics.acceptance",
     "Config": "config",
     "ConfigError": "errors",
     "DataError": "errors",

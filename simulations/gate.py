@@ -1,6 +1,6 @@
 """How often does a gate err, and how much does it take to be decided?
 
-    python simulations/gate.py [--trials 200] [--seed 0] [--only TEXT] [--frames random|fixed]
+    python simulations/gate.py [--trials 200] [--seed 0] [--only TEXT] [--scope "these frames"]
 
 Two models on the same frames of the same scene; scenes, frames and errors are drawn anew for each trial. Prints a table
 in Markdown of the rule 'alpha drop < margin' at the 5 % level: without a difference, which must not fail, and with a
@@ -16,14 +16,15 @@ from collections.abc import Iterator
 import numpy as np
 from flights import Flight, World, fly, sums_of, world
 
-from semstab.comparison.gate import Frames, change, negative, parse, verdict
+from semstab.comparison.gate import bounded, parse, verdict
+from semstab.core.types import THESE_FRAMES, THIS_SCENE, Scope
 from semstab.model.statistics import Interval
 from semstab.statistics.cluster_sums import FUNCTIONALS, ClusterSums
 
 EASES = (1.0, 1.0, 0.8)
 """How easy a scene is to the baseline and to two new models: as easy, harder."""
 
-ALPHA = parse("alpha drop < 0.02").measure
+RULE = parse("alpha drop < 0.02")
 LEVEL = 0.05
 
 
@@ -49,7 +50,7 @@ def models(flight: Flight, same: bool, rng: np.random.Generator) -> list[Cluster
     return found
 
 
-def rates(flight: Flight, same: bool, trials: int, seed: int, frames: Frames = "random") -> list[float]:
+def rates(flight: Flight, same: bool, trials: int, seed: int, scope: Scope = THIS_SCENE) -> list[float]:
     """The margin, then shares of trials: without a difference failed, passed; with it passed, failed, undecided."""
     found: list[list[Interval]] = []
     totals = np.zeros((len(EASES), 3 + 2))
@@ -57,11 +58,11 @@ def rates(flight: Flight, same: bool, trials: int, seed: int, frames: Frames = "
         rng = np.random.default_rng([seed, trial])
         base, *new = own = models(flight, same, rng)
         totals += [each.of(FUNCTIONALS["alpha"].names).sum(axis=0) for each in own]
-        found.append([change(each, base, ALPHA, None, LEVEL, frames) for each in new])
+        found.append([bounded(RULE, each, base, level=LEVEL, scope=scope) for each in new])
     alphas = FUNCTIONALS["alpha"].of(totals)
     margin = float(alphas[0] - alphas[2])
-    rule = dataclasses.replace(parse("alpha drop < 0.02"), limit=margin)
-    said = [[verdict(rule, negative(each)) for each in column] for column in zip(*found, strict=True)]
+    rule = dataclasses.replace(RULE, limit=margin)
+    said = [[verdict(rule, each) for each in column] for column in zip(*found, strict=True)]
     asked = [(0, "fails"), (0, "passes"), (1, "passes"), (1, "fails"), (1, "undecided")]
     return [margin, *(float(np.mean([each == what for each in said[which]])) for which, what in asked)]
 
@@ -77,13 +78,13 @@ def main() -> None:
     parser.add_argument("--trials", type=int, default=200)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--only", default="")
-    parser.add_argument("--frames", choices=["random", "fixed"], default="random")
+    parser.add_argument("--scope", choices=[THESE_FRAMES, THIS_SCENE], default=THIS_SCENE)
     arguments = parser.parse_args()
     print("|", " | ".join(HEAD), "|")
     print("|", " | ".join("---" for _ in HEAD), "|")
     for name, flight, same in conditions():
         if arguments.only in name:
-            row = rates(flight, same, arguments.trials, arguments.seed, arguments.frames)
+            row = rates(flight, same, arguments.trials, arguments.seed, arguments.scope)
             print("|", " | ".join([name, *(f"{x:.3f}" for x in row)]), "|", flush=True)
 
 

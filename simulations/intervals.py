@@ -20,7 +20,8 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 from flights import Flight, fly, sample_of, sums_of, world
 
-from semstab.model.statistics import OTHER_SCENES, THESE_FRAMES, THIS_SCENE, Interval, Scope
+from semstab.core.types import OTHER_SCENES, THESE_FRAMES, THIS_SCENE, Scope
+from semstab.model.statistics import Interval
 from semstab.statistics.cluster_sums import FUNCTIONALS
 from semstab.statistics.correlogram import correlogram
 from semstab.statistics.intervals import difference, estimate

@@ -134,20 +134,18 @@ def test_a_planted_fault_fails_itself_passes_and_three_frames_are_undecided():
 
     def outcome(new, old, rule=rule):
         k = None if rule.class_name is None else 1
-        found = judging.change(new, old, rule.measure, k, 0.05)
-        return judging.verdict(rule, found if rule.change == "rise" else judging.negative(found))
+        return judging.verdict(rule, judging.bounded(rule, new, old, k=k))
 
     assert outcome(sums(faulty, truth), base) == "fails"
     assert outcome(base, base) == "passes"
     assert outcome(base, base.without_truth()) == "passes"
     assert outcome(sums(faulty, truth), base, parse("class b: alpha drop < 0.02")) == "fails"
     assert outcome(sums(faulty, truth), base, parse("look accuracy drop < 0.02")) == "fails"
-    one = rule.measure, None, 0.05
-    fixed = judging.change(sums(faulty, truth), base, *one, "fixed")
-    loose = judging.change(sums(faulty, truth), base, *one)
+    fixed = judging.bounded(rule, sums(faulty, truth), base, scope="these frames")
+    loose = judging.bounded(rule, sums(faulty, truth), base)
     assert fixed.high - fixed.low < loose.high - loose.low
     assert outcome(sums(faulty[:, :3], truth), sums(labels[:, :3], truth)) == "undecided"
-    assert outcome(sums(labels[:, :3], truth), sums(labels[:, :3], truth)) == "undecided"
+    assert outcome(sums(labels[:, :3], truth), sums(labels[:, :3], truth)) == "passes"  # the very same
 
 
 def test_a_rule_of_each_class_shares_the_level(run):
@@ -162,10 +160,8 @@ def test_a_rule_of_each_class_shares_the_level(run):
 def test_a_class_that_is_nowhere_has_no_value():
     labels, truth = models()
     log = log_of(labels, K=3, index=grid(16))
-    found = judging.rule_value(
-        cluster_sums_of(log.table(), log, truth), parse("class c: recall > 0.5").measure, 2, 0.05
-    )
-    assert "nothing that it is of was seen" in found.undecided
+    found = judging.bounded(parse("class c: recall > 0.5"), cluster_sums_of(log.table(), log, truth), k=2)
+    assert math.isnan(found.value)
     assert judging.verdict(parse("class c: recall > 0.5"), found) == "undecided"
 
 
@@ -173,7 +169,7 @@ def test_ends_are_one_sided_and_of_the_sums_differences():
     (labels, truth), (other, _) = models(), models(seed=1)
     new, base = sums(labels, truth), sums(other, truth)
     for key in ("alpha", "look_accuracy"):
-        found = judging.change(new, base, parse(f"{key.replace('_', ' ')} drop < 1").measure, None, 0.05)
+        found = judging.bounded(parse(f"{key.replace('_', ' ')} rise < 1"), new, base)
         both = difference(new, base, key, same_frames=True, level=0.9)
         assert (found.value, found.low, found.high) == (both.value, both.low, both.high)
         assert found.value == pytest.approx(value(new, key) - value(base, key))
@@ -231,6 +227,9 @@ def test_the_command_says_what_came_of_each_rule(run, tmp_path):
         (["--rule", "alpha drop < 0.02"], "a drop is from a baseline; give --against RUN"),
         (["--rule", "class q: alpha > 0.1"], "no class 'q'"),
         (["--rule", "scene q: alpha > 0.1"], "no scene 'q'; known: wall"),
+        (["--rule", "flicker < 99", "--scope", "other-scenes"], "flicker is known by frame alone"),
+        (["--rule", "alpha > 0.1", "--scope", "some"], "scope"),
+        (["--rule", "class door: recall > 0.1"], "has no recall of wall; run it with --statistics"),
         (["--rule", "accuracy > 0.1"], "has no accuracy of wall; run it with --statistics"),
         (["--rule", "sbd excess < 0.1", "--out", "x.txt"], "format '.txt' is not known"),
         (["--rule", "alpha > 0.1", "--undecided", "maybe"], "undecided"),

@@ -26,8 +26,8 @@ from scipy.spatial.transform import Rotation
 import semstab
 from semstab import backends
 from semstab.comparison import pairing
+from semstab.comparison.calibration import calibrate_run
 from semstab.comparison.differences import find
-from semstab.comparison.gate import calibrated
 from semstab.core.json_form import to_json
 from semstab.engine import InProcess, LocalProcesses
 from semstab.engine.memory import Sizing
@@ -342,7 +342,7 @@ def test_evidence_is_calibrated_on_tiles_as_on_the_whole_map(judged, monkeypatch
     """Also on the sample that stands for a large map."""
     for most in (pairing.MOST, 100):
         monkeypatch.setattr(pairing, "MOST", most)
-        one, other = (calibrated(folder, precision=0.6) for folder in judged)
+        one, other = (calibrate_run(folder, precision=0.6) for folder in judged)
         assert one == other
         assert ("1 in 4 of the places" in one.calibrated_on) == (most == 100)
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from simulated_events import grid, log_of
 
-from semstab.model.statistics import THESE_FRAMES, THIS_SCENE
+from semstab.core.types import THESE_FRAMES, THIS_SCENE
 from semstab.recording.voxel_maps import agreement_report
 from semstab.report.figures.statistics import draw_correlogram
 from semstab.statistics import ObservationSample, Views, correlogram, describe, krippendorff_alpha

@@ -13,11 +13,11 @@ from simulated_events import grid, log_of
 
 from semstab.core.files import read_json, write_json
 from semstab.core.json_form import from_json, to_json
+from semstab.core.types import THIS_SCENE
 from semstab.errors import ConfigError, DataError
 from semstab.metrics import sbd
 from semstab.model.contrast import BackboneComparison
 from semstab.model.statistics import (
-    THIS_SCENE,
     UNKNOWN,
     CeilingShare,
     ClassCeilingShare,

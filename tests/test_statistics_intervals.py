@@ -12,7 +12,8 @@ from intervals import trials
 from scipy import stats
 from simulated_events import grid, log_of
 
-from semstab.model.statistics import OTHER_SCENES, THESE_FRAMES, THIS_SCENE, Interval
+from semstab.core.types import OTHER_SCENES, THESE_FRAMES, THIS_SCENE
+from semstab.model.statistics import Interval
 from semstab.statistics.accumulate import Cubes, cluster_sums_of
 from semstab.statistics.agreement import ratio_of
 from semstab.statistics.cluster_sums import value

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from semstab.cli.options import Quiet, say
+from semstab.cli.options import Quiet, ScopeOption, say
 
 if TYPE_CHECKING:
     from semstab.core.registry import Registry
@@ -23,6 +23,7 @@ def compare(
     out: Annotated[
         Path | None, typer.Option("--out", "-o", help="Folder for report.html, tables, figures, JSON, Markdown.")
     ] = None,
+    scope: ScopeOption = None,
     markdown: Annotated[
         bool, typer.Option("--markdown", metavar="", help="Print Markdown, for a pull request.")
     ] = False,
@@ -34,9 +35,12 @@ def compare(
     from semstab.comparison.tables import print_comparison
     from semstab.comparison.writing import compare
     from semstab.comparison.writing import markdown as as_markdown
+    from semstab.core.types import THIS_SCENE
 
     with Console(stderr=True, quiet=quiet).status("opening") as status:
-        found = compare(runs, out, progress=lambda scene: status.update(f"comparing {scene}"))
+        found = compare(
+            runs, out, scope=scope or THIS_SCENE, progress=lambda scene: status.update(f"comparing {scene}")
+        )
     console = Console(quiet=quiet)
     if markdown:
         console.print(as_markdown(found), soft_wrap=True, markup=False, highlight=False)
@@ -62,7 +66,7 @@ def gate(
         typer.Option("--rule", "-r", metavar="RULE", help="E.g. 'alpha drop < 0.02', 'class car: recall > 0.6'."),
     ] = None,
     config: Annotated[
-        Path | None, typer.Option("--config", "-c", help="YAML file: rules, level, undecided, frames.")
+        Path | None, typer.Option("--config", "-c", help="YAML file: rules, level, undecided, scope.")
     ] = None,
     level: Annotated[
         float | None, typer.Option(help="How often a rule may err on each side.", show_default="0.05")
@@ -70,10 +74,7 @@ def gate(
     undecided: Annotated[
         str | None, typer.Option(metavar="pass|fail", help="What becomes of rules that stay open.", show_default="pass")
     ] = None,
-    frames: Annotated[
-        str | None,
-        typer.Option(metavar="random|fixed", help="For frames like these, or these alone.", show_default="random"),
-    ] = None,
+    scope: ScopeOption = None,
     out: Annotated[
         list[Path] | None,
         typer.Option("--out", "-o", metavar="FILE", help=".xml (JUnit), .md (pull request), .json; repeatable."),
@@ -94,7 +95,7 @@ def gate(
     gate_report.require_formats(out or ())
     console = Console(quiet=quiet)
     if save_baseline is None or rule or config:
-        result = judge(new, against, gate_config(config, rule or (), level, undecided, frames))
+        result = judge(new, against, gate_config(config, rule or (), level, undecided, scope))
         for file in out or ():
             gate_report.write(result, file)
         for line in gate_report.lines(result, console.width):
@@ -116,9 +117,9 @@ def calibrate(
     """For each class the least evidence at which its labels are right often enough to be acted on."""
     from rich.console import Console
 
-    from semstab.comparison.gate import calibrated, lines
+    from semstab.comparison.calibration import calibrate_run, lines
 
-    found = calibrated(run, precision=precision, confidence=confidence)
+    found = calibrate_run(run, precision=precision, confidence=confidence)
     found.save(out)
     for line in lines(found):
         Console(quiet=quiet).print(line, markup=False, highlight=False, soft_wrap=True)
@@ -233,9 +234,9 @@ def relabel(
     from semstab.convert import frame_bar
     from semstab.exports.relabel import Belief
     from semstab.exports.relabel import relabel as write
-    from semstab.statistics.commit import Commit
+    from semstab.statistics.acceptance import AcceptanceThresholds
 
-    thresholds = None if commit is None else Commit.load(commit)
+    thresholds = None if commit is None else AcceptanceThresholds.load(commit)
     belief = Belief(min_op, min_psa, tuple(category or ()), leave_one_out, thresholds)
     with frame_bar(Console(stderr=True, quiet=quiet)) as bar:
         report = write(

@@ -171,6 +171,15 @@ TileSize = Annotated[
     ),
 ]
 Verbose = Annotated[bool, typer.Option("--verbose", "-v", help="Also print every table.")]
+ScopeOption = Annotated[
+    str | None,
+    typer.Option(
+        "--scope",
+        metavar="these-frames|this-scene|other-scenes",
+        help="What intervals are for: these very frames, this scene flown again, or other scenes like it.",
+        show_default="this-scene",
+    ),
+]
 Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Print nothing but errors.")]
 
 

@@ -27,6 +27,7 @@ from semstab.cli.options import (
     Rerun,
     Scenes,
     Scheduler,
+    ScopeOption,
     TileSize,
     TrustGeometry,
     Verbose,
@@ -113,6 +114,7 @@ def run(
         bool | None,
         typer.Option("--statistics", help="Also test drift, judge by ground truth, compare backbones; takes longer."),
     ] = None,
+    scope: ScopeOption = None,
     out: Annotated[Path | None, typer.Option("--out", "-o", help="Run folder.", show_default="runs/TIME")] = None,
     rerun: Rerun = None,
     report: Report = "on",
@@ -137,6 +139,7 @@ def run(
         "check": check,
         "events": events,
         "statistics": statistics,
+        "scope": scope,
         "check_geometry": False if trust_geometry else None,
         "tile_size": tile_size if tile_size is None or not tile_size.isdigit() else int(tile_size),
     }

@@ -26,18 +26,19 @@ from semstab.comparison.tables import (
     RECALL,
     quantities,
 )
-from semstab.core.types import Int64
+from semstab.core.types import THESE_FRAMES, THIS_SCENE, Int64, Scope
 from semstab.errors import ConfigError
 from semstab.metrics import macro_mean
 from semstab.model.contrast import Against, Compared, Contrast, RunComparison, SceneComparison
 from semstab.model.measures import Measure, Quantity, mean
 from semstab.model.results import slug
-from semstab.model.statistics import THESE_FRAMES, THIS_SCENE, UNKNOWN, Interval, Scope
+from semstab.model.statistics import UNKNOWN, Interval
 from semstab.model.voxels import VoxelTable
 from semstab.statistics.accumulate import Cubes
 from semstab.statistics.agreement import ALPHA_BETWEEN, ratio_of
 from semstab.statistics.cluster_sums import ClusterSums, functional, of_space_alone, value
 from semstab.statistics.correctness import ACCURACY, MIOU
+from semstab.statistics.intervals import LEVEL as INTERVAL_LEVEL
 from semstab.statistics.intervals import (
     coverage,
     difference,
@@ -123,7 +124,8 @@ def _rows(common: Common, base: Entry, other: Entry, number: int) -> Iterator[Co
     if _comparable(REACHED, common) and _same_ceiling(base, other):
         yield from _row(REACHED, before, after, common)
     if common.basis != "flights" and not common.sizes_differ:
-        yield _coverage(before, after)
+        change = sums_difference(COVERAGE.key, after, before)
+        yield Contrast(COVERAGE.key, "", 1.0, 1 + change.value, change, math.nan, "")
     if base.flicker and (base.flicker.keys() == other.flicker.keys() or common.same_frames is False):
         yield _flicker(base.flicker, other.flicker, paired=common.same_frames is not False)
     done = {quantity.key for quantity in (*HEADLINES, *IN_SUMS)}
@@ -152,17 +154,45 @@ def _row(
 
 
 def _difference(base: ClusterSums, other: ClusterSums, key: str, k: int | None, common: Common) -> Interval:
-    scope, number = _scope(key, k, base, other), functional(key, k)
-    if common.basis == "flights":
-        return unpaired(estimate(other, key, k, scope), estimate(base, key, k, scope))
-    found = difference(other, base, key, k, scope, same_frames=common.same_frames)
-    most = number.high - number.low
+    scope = THESE_FRAMES if THESE_FRAMES in map(scope_of, (base, other)) else common.scope
+    apart = common.basis == "flights"
+    return sums_difference(key, other, base, k, scope=scope, same_frames=common.same_frames, apart=apart)
+
+
+def sums_difference(
+    key: str,
+    new: ClusterSums,
+    base: ClusterSums,
+    k: int | None = None,
+    *,
+    scope: Scope = THIS_SCENE,
+    same_frames: bool | None = None,
+    apart: bool = False,
+    level: float = INTERVAL_LEVEL,
+) -> Interval:
+    """Return a number of one run's sums less another's, or its coverage of the other's voxels, with its interval.
+
+    same_frames  False for another flight; where it is not given the sums tell
+    apart        the runs have nothing in common: each errs by itself
+    level        of the interval
+    """
+    if new.truth != base.truth:
+        new, base = new.without_truth(), base.without_truth()
+    if key == COVERAGE.key:
+        return _with_p_value(coverage(new, base, level), level)
+    scope, number = THESE_FRAMES if of_space_alone(key, k) else scope, functional(key, k)
+    if apart:
+        return unpaired(estimate(new, key, k, scope, level), estimate(base, key, k, scope, level), level)
+    found, most = difference(new, base, key, k, scope, same_frames=same_frames, level=level), number.high - number.low
     return dataclasses.replace(found, low=max(found.low, -most), high=min(found.high, most))
 
 
-def _scope(key: str, k: int | None, *sums: ClusterSums) -> Scope:
-    all_tell = {scope_of(own) for own in sums} == {THIS_SCENE} and not of_space_alone(key, k)
-    return THIS_SCENE if all_tell else THESE_FRAMES
+def flicker_difference(new: Flicker, base: Flicker, *, paired: bool = True, level: float = INTERVAL_LEVEL) -> Interval:
+    """Return the mean flicker of one run less another's, by frame where both have the same ones."""
+    if paired and len(new.keys() & base.keys()) > 1:
+        return _with_p_value(difference_over_frames(new, base, level), level)
+    each = [mean_over_frames(np.array([*own]), np.array([*own.values()]), level) for own in (new, base)]
+    return unpaired(each[0], each[1], level)
 
 
 def _same_ceiling(base: Entry, other: Entry) -> bool:
@@ -174,21 +204,12 @@ def _same_ceiling(base: Entry, other: Entry) -> bool:
     )
 
 
-def _coverage(base: ClusterSums, other: ClusterSums) -> Contrast:
-    change = _with_p_value(coverage(other, base))
-    return Contrast(COVERAGE.key, "", 1.0, 1 + change.value, change, math.nan, "")
-
-
 def _flicker(base: Flicker, other: Flicker, *, paired: bool) -> Contrast:
-    frames = sorted(base.keys() & other.keys()) if paired else []
-    if len(frames) > 1:
-        before, after = ([own[frame] for frame in frames] for own in (base, other))
-        found = _with_p_value(difference_over_frames(other, base))
-    else:
-        before, after = ([*own.values()] for own in (base, other))
-        each = [mean_over_frames(np.array([*own]), np.array([*own.values()])) for own in (base, other)]
-        found = unpaired(each[1], each[0])
-    return Contrast(FLICKER.key, "", mean(np.array(before)), mean(np.array(after)), found, math.nan, "")
+    frames = base.keys() & other.keys() if paired else set()
+    before, after = (
+        mean(np.array([own[frame] for frame in (frames if len(frames) > 1 else own)])) for own in (base, other)
+    )
+    return Contrast(FLICKER.key, "", before, after, flicker_difference(other, base, paired=paired), math.nan, "")
 
 
 def _of_voxels(measure: Measure, base: VoxelTable, other: VoxelTable, edge: float) -> Contrast:
@@ -204,11 +225,11 @@ def _of_voxels(measure: Measure, base: VoxelTable, other: VoxelTable, edge: floa
     return Contrast(measure.key, "", mean(before), mean(after), found, math.nan, "")
 
 
-def _with_p_value(found: Interval) -> Interval:
-    """That the number is 0, by its interval."""
+def _with_p_value(found: Interval, level: float = INTERVAL_LEVEL) -> Interval:
+    """Return the interval with the p-value that the number is 0."""
     from scipy import special
 
-    error = standard_error(found)
+    error = standard_error(found, level)
     if not error > 0:
         return found
     degrees = found.degrees if found.degrees > 0 else math.inf
@@ -276,8 +297,8 @@ class Found:
     up: Mapping[str, Up]
 
 
-def find(runs: Sequence[str | Path], progress: Progress = lambda what: None) -> Found:
-    """Compare runs with the first one; `progress` is told what is done.
+def find(runs: Sequence[str | Path], progress: Progress = lambda what: None, scope: Scope = THIS_SCENE) -> Found:
+    """Compare runs with the first one for a scope; `progress` is told what is done.
 
     Raises ConfigError for fewer than two, and what `open_runs`, `shared_scenes` and `pair` raise.
     """
@@ -288,7 +309,7 @@ def find(runs: Sequence[str | Path], progress: Progress = lambda what: None) -> 
     changes: dict[tuple[str, str], Changes] = {}
     for scene in shared_scenes(handles):
         progress(scene)
-        found, own = _scene(scene, handles)
+        found, own = _scene(scene, handles, scope)
         scenes.append(found)
         changes |= {(scene, name): each for name, each in own.items()}
     result = RunComparison(
@@ -302,9 +323,9 @@ def find(runs: Sequence[str | Path], progress: Progress = lambda what: None) -> 
     return Found(result, changes, ups)
 
 
-def _scene(scene: str, runs: Sequence[RunHandle]) -> tuple[SceneComparison, dict[str, Changes]]:
+def _scene(scene: str, runs: Sequence[RunHandle], scope: Scope) -> tuple[SceneComparison, dict[str, Changes]]:
     entries, names = [each.scenes[scene] for each in runs], [each.name for each in runs]
-    common = pair(entries, names)
+    common = pair(entries, names, scope)
     numbers = range(1, len(entries))
     everything = corrected([contrasts(common, entries[0], entries[n], n) for n in numbers])
     classes = corrected([by_class(common, entries[0], entries[n], n) for n in numbers])

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -13,7 +13,7 @@ from typing import Literal
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
-from semstab.comparison.pairing import in_share, share_of
+from semstab.comparison.differences import flicker_difference, sums_difference
 from semstab.comparison.runs import Entry, RunHandle, open_run, shared_scenes
 from semstab.comparison.tables import (
     COVERAGE,
@@ -27,27 +27,15 @@ from semstab.comparison.tables import (
     SBD_EXCESS,
 )
 from semstab.config import nearest, read_yaml, validated
+from semstab.config.settings import ScopeSetting
+from semstab.core.types import OTHER_SCENES, THESE_FRAMES, THIS_SCENE, Scope
 from semstab.errors import ConfigError, DataError
 from semstab.model.measures import ENTROPY, Quantity
-from semstab.model.records import Record
-from semstab.model.statistics import THESE_FRAMES, THIS_SCENE, Interval, Scope
-from semstab.model.tiles import Tiles, side_by_side
-from semstab.model.voxels import VoxelTable
+from semstab.model.statistics import Interval
 from semstab.statistics.agreement import ALPHA, ALPHA_BETWEEN, PSA
 from semstab.statistics.cluster_sums import ClusterSums, of_space_alone, sums_for, value
-from semstab.statistics.commit import Commit, calibrate
-from semstab.statistics.correctness import ACCURACY, ECE, MIOU, Truth, join_truth
-from semstab.statistics.intervals import (
-    LEAST_FRAMES,
-    TOO_FEW,
-    coverage,
-    difference,
-    difference_over_frames,
-    estimate,
-    mean_of,
-    mean_over_frames,
-    same_flight,
-)
+from semstab.statistics.correctness import ACCURACY, ECE, MIOU
+from semstab.statistics.intervals import estimate, mean_of, mean_over_frames
 
 # What a rule may be about: the numbers that follow from the sums of a run, and what to run for those it lacks.
 
@@ -101,6 +89,9 @@ MEASURES = (
 )
 """In the order in which they are listed."""
 
+NOTHING = "nothing that it is of was seen twice"
+SCORES = "one run has labels and the other scores, which spread their evidence; run both as labels"
+
 OF_EVIDENCE = (PSA, ALPHA, ALPHA_BETWEEN, REACHED, RECURRENT_VSS, ENTROPY, SBD_EXCESS, ECE)
 """What depends on whether a model gives labels or scores."""
 
@@ -123,65 +114,6 @@ def measure_named(name: str, where: str) -> GateMeasure:
 def listed() -> Sequence[str]:
     """The names of all measures."""
     return [measure.name for measure in MEASURES]
-
-
-# From a run with ground truth to the evidence from which on its labels may be acted on.
-
-
-def calibrated(run: str | Path, *, precision: float = 0.95, confidence: float = 0.95) -> Commit:
-    """Thresholds from all scenes of a run with ground truth; 'FOLDER:BACKBONE' selects one of several label sources.
-
-    Raises ConfigError and DataError as `open_run`, and for a scene whose ground truth was not fused.
-    """
-    own = open_run(run)
-    maps, sampled = [], 1.0
-    for scene, entry in own.scenes.items():
-        record = entry.with_voxels("a calibration")
-        if record.truth_file is None:
-            raise ConfigError(
-                f"{own.source}: ground truth of {scene} was not fused; run it with --statistics, on a scene that has it"
-            )
-        maps.append(_judged_gate_measures(record, record.truth_file))
-        sampled = min(sampled, share_of(record.summary.table.voxels))
-    first = maps[0][0]
-    for table, _ in maps[1:]:
-        if (table.classes, table.voxel_size) != (first.classes, first.voxel_size):
-            raise DataError(f"{own.source}: its scenes differ in classes or voxel size; calibrate on one at a time")
-    on = f"{own.backbone} on {', '.join(own.scenes)}"
-    on += f", 1 in {round(1 / sampled)} of the places of a large map" if sampled < 1 else ""
-    return calibrate(maps, precision=precision, confidence=confidence, on=on)
-
-
-def _judged_gate_measures(record: Record, truth_file: Path) -> tuple[VoxelTable, Truth]:
-    """A map with its true classes; of a very large one a sample, by a hash of the place."""
-    share, parts = share_of(record.summary.table.voxels), []
-    files = [file for file in (record.voxels_file, truth_file) if file is not None]
-    for table, truth in side_by_side([Tiles.open(file, VoxelTable) for file in files]):
-        some = table.rows(in_share(table, share))
-        parts.append((some, join_truth(some, truth).label))
-    order = np.lexsort(np.concatenate([table.index for table, _ in parts]).T[::-1])
-    label = np.concatenate([own for _, own in parts])[order]
-    return VoxelTable.joined([table for table, _ in parts]), Truth(label >= 0, label)
-
-
-def lines(commit: Commit) -> Iterator[str]:
-    """For the terminal."""
-    yield (
-        f"labels that are right with a probability of {commit.precision:g} or more, class by class at a confidence of"
-        f" {commit.confidence:g}; calibrated on {commit.calibrated_on}"
-    )
-    width = min(max(map(len, commit.classes), default=0), 20)
-    for name, own in commit.classes.items():
-        right = f"{own.by:<6} >= {own.at_least:<5.3g} right in {own.precision:.3f}, at least {own.low:.3f}"
-        if not own.voxels:
-            yield f"  {name[:width]:<{width}}  never: no label of it has a known truth"
-        elif own.never:
-            yield f"  {name[:width]:<{width}}  never; best {right} ({own.voxels:,} voxels)"
-        else:
-            yield f"  {name[:width]:<{width}}  {right}: {own.left:.0%} left"
-    yield f"{commit.left:.1%} of the voxels are left"
-    if any(own.never for own in commit.classes.values()):
-        yield "more places, in other scenes, show more: errors near each other count as few"
 
 
 # The rules of a gate, as text: 'alpha drop < 0.02', 'class human: recall > 0.6'.
@@ -266,15 +198,6 @@ def _check_rule(rule: Rule) -> None:
 # One rule on one scene, or over all: what the data show of it, and what follows.
 
 Verdict = Literal["passes", "fails", "undecided"]
-Frames = Literal["random", "fixed"]
-
-LEAST = 8
-"""Of fewer frames nothing is concluded: a frame in three may be of a kind that none of them shows."""
-
-NOTHING = "it has no value: nothing that it is of was seen twice"
-UNKNOWN_FRAMES = "its frames are not known: run it with --statistics"
-SCORES = "labels beside scores, which spread their evidence: run both as labels"
-FEW = "{frames} frames are too few: fly {least} or more"
 
 
 def verdict(rule: Rule, found: Interval) -> Verdict:
@@ -291,62 +214,27 @@ def verdict(rule: Rule, found: Interval) -> Verdict:
     return "fails" if low > (min(limit, 0.0) if rule.bounds_a_loss else limit) else "undecided"
 
 
-def change(
+def bounded(
+    rule: Rule,
     new: ClusterSums,
-    base: ClusterSums,
-    measure: GateMeasure,
-    k: int | None,
-    level: float,
-    frames: Frames = "random",
+    base: ClusterSums | None = None,
+    *,
+    k: int | None = None,
+    level: float = 0.05,
+    scope: Scope = THIS_SCENE,
 ) -> Interval:
-    """New less base, each end of its interval missed with probability `level`."""
-    key, both = measure.key, 1 - 2 * level
-    new, base = comparable(new, base)
-    if key == "coverage":
-        found = coverage(new, base, both)
-    else:
-        paired = frames == "fixed" or same_flight(new, base)
-        found = difference(new, base, key, k, _scope(key, k, frames), same_frames=paired, level=both)
-    return of_frames(found, _frames(new, base))
-
-
-def rule_value(
-    new: ClusterSums, measure: GateMeasure, k: int | None, level: float, frames: Frames = "random"
-) -> Interval:
-    """The number itself, each end of its interval missed with probability `level`."""
-    key = measure.key
-    return of_frames(estimate(new, key, k, _scope(key, k, frames), 1 - 2 * level), _frames(new))
-
-
-def _scope(key: str, k: int | None, frames: Frames) -> Scope:
-    return THESE_FRAMES if frames == "fixed" or of_space_alone(key, k) else THIS_SCENE
-
-
-def comparable(new: ClusterSums, base: ClusterSums) -> tuple[ClusterSums, ClusterSums]:
-    """Both without what only one of them knows of the ground truth."""
-    if new.truth == base.truth:
-        return new, base
-    return new.without_truth(), base.without_truth()
+    """Return what a rule bounds, from sums: a value, a drop or a rise; each end is missed with probability `level`."""
+    key, both = rule.measure.key, 1 - 2 * level
+    if base is None or rule.change is None:
+        return estimate(new, key, k, THESE_FRAMES if of_space_alone(key, k) else scope, both)
+    same_frames = True if scope == THESE_FRAMES else None
+    found = sums_difference(key, new, base, k, scope=scope, same_frames=same_frames, level=both)
+    return found if rule.change == "rise" else negative(found)
 
 
 def negative(found: Interval) -> Interval:
-    """Of the opposite number."""
+    """Return the interval of the opposite number."""
     return dataclasses.replace(found, value=0.0 - found.value, low=0.0 - found.high, high=0.0 - found.low)
-
-
-def of_frames(found: Interval, frames: int) -> Interval:
-    """With this gate's own least number of frames: a rule is judged for frames like these."""
-    few = TOO_FEW.format(least=LEAST_FRAMES)
-    reasons = [reason for reason in found.undecided.split("; ") if reason and reason != few]
-    if math.isnan(found.value):
-        reasons.append(NOTHING)
-    if frames < LEAST:
-        reasons.append(FEW.format(frames=frames, least=LEAST) if frames else UNKNOWN_FRAMES)
-    return dataclasses.replace(found, frames=frames, undecided="; ".join(reasons))
-
-
-def _frames(*sums: ClusterSums) -> int:
-    return min(own.frames * own.step for own in sums)
 
 
 # The settings of a gate: its rules, the level, what is to become of what is undecided.
@@ -356,8 +244,7 @@ class GateConfig(BaseModel):
     """What stands in gate.yaml.
 
     level   the probability with which a rule may fail that holds, or pass that does not
-    frames  'random': rules are judged for other frames like these, and other places; 'fixed': for other places in these
-            very frames, which says nothing of this scene flown again
+    scope   for which data rules are judged: 'this scene' flown again, 'these frames', or 'other scenes' like these
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
@@ -365,7 +252,7 @@ class GateConfig(BaseModel):
     rules: tuple[str, ...] = ()
     level: float = Field(0.05, ge=1e-4, le=0.25)
     undecided: Literal["pass", "fail"] = "pass"
-    frames: Frames = "random"
+    scope: ScopeSetting = THIS_SCENE
 
 
 def gate_config(
@@ -373,13 +260,13 @@ def gate_config(
     rules: Sequence[str] = (),
     level: float | None = None,
     undecided: str | None = None,
-    frames: str | None = None,
+    scope: str | None = None,
 ) -> GateConfig:
     """From a YAML file, and what is given beside it, which counts more; rules are added to the file's.
 
     Raises ConfigError, which names the file and the setting.
     """
-    given = {"level": level, "undecided": undecided, "frames": frames}
+    given = {"level": level, "undecided": undecided, "scope": scope}
     options = {name: value for name, value in given.items() if value is not None}
     config = GateConfig() if file is None else validated(GateConfig, read_yaml(file), f"{file}: ")
     config = validated(GateConfig, {**config.model_dump(), **options, "rules": (*config.rules, *rules)}, "gate: ")
@@ -408,12 +295,8 @@ class Judgement:
 
     @property
     def about(self) -> str:
-        """What was random: for which other data the ends are."""
-        if self.found.scope != THIS_SCENE:
-            return "other places like these, in these very frames"
-        if self.found.frames < LEAST_FRAMES:
-            return f"other places and frames like these {self.found.frames}"
-        return "this scene"
+        """The scope of the interval: what varies."""
+        return self.found.scope
 
     @property
     def reason(self) -> str:
@@ -465,10 +348,15 @@ class GateResult:
     @property
     def failed(self) -> bool:
         """Whether a rule fails, or is undecided where that fails."""
-        return self.count("fails") > 0 or (self.undecided == "fail" and self.count("undecided") > 0)
+        return self.outcome == "fails"
 
-
-__all__ = ["GateConfig", "GateResult", "gate", "gate_config"]
+    @property
+    def outcome(self) -> Verdict:
+        """Of all rules together."""
+        undecided = self.count("undecided") > 0
+        if self.count("fails") or (undecided and self.undecided == "fail"):
+            return "fails"
+        return "undecided" if undecided else "passes"
 
 
 def gate(new: str | Path, against: str | Path | None, config: GateConfig) -> GateResult:
@@ -481,24 +369,21 @@ def gate(new: str | Path, against: str | Path | None, config: GateConfig) -> Gat
     base = None if against is None else open_run(against)
     scenes = tuple(own.scenes) if base is None else shared_scenes([base, own])
     judged: list[Judgement] = []
+    remarks = list(_remarks(own, base, scenes))
     for given in parsed:
         rules = given.of_each(own.scenes[scenes[0]].classes)
         for rule in rules:
             _check(rule, own, base, scenes)
-        ways = _Ways(config.level / len(rules), config.frames)
-        judged += [_judged(rule, own, base, scenes, ways) for rule in rules]
+        if given.class_name == ALL:
+            rules, absent = _with_a_value(rules, own, base, scenes)
+            remarks += [f"{given.text}: seen nowhere twice, and left out: {', '.join(absent)}"] if absent else []
+        for rule in rules:
+            _require_values(rule, own, base, scenes)
+        judged += [_judged(rule, own, base, scenes, config.level / len(rules), config.scope) for rule in rules]
     return GateResult(
         _named(own), "" if base is None else _named(base), scenes, config.level, config.undecided, tuple(judged),
-        tuple(_remarks(own, base, scenes)),
+        tuple(remarks),
     )  # fmt: skip
-
-
-@dataclasses.dataclass(frozen=True)
-class _Ways:
-    """How a rule is judged: with what error on either side, for which frames."""
-
-    level: float
-    frames: Frames
 
 
 def _named(run: RunHandle) -> str:
@@ -552,24 +437,50 @@ def _k(rule: Rule, entry: Entry) -> int | None:
     return None if rule.class_name is None else entry.classes.index(rule.class_name)
 
 
-# --- Rules ------------------------------------------------------------------------------------------------------------
+def _pairs(
+    rule: Rule, own: RunHandle, base: RunHandle | None, scenes: Sequence[str]
+) -> list[tuple[Entry, Entry | None]]:
+    """The runs on each scene that a rule is about; of a rule on a value the new one alone."""
+    named = [rule.scene] if rule.scene else scenes
+    return [(own.scenes[scene], base.scenes[scene] if base and rule.change else None) for scene in named]
 
 
-def _judged(rule: Rule, own: RunHandle, base: RunHandle | None, scenes: Sequence[str], ways: _Ways) -> Judgement:
-    """Over the mean of the scenes, which err by themselves, or in the one that the rule names."""
-    pairs = [
-        (own.scenes[scene], None if base is None else base.scenes[scene])
-        for scene in ([rule.scene] if rule.scene else scenes)
+def _with_a_value(
+    rules: Sequence[Rule], own: RunHandle, base: RunHandle | None, scenes: Sequence[str]
+) -> tuple[tuple[Rule, ...], list[str]]:
+    """The rules of classes that some run has a value of, and the names of the other classes."""
+    there = [
+        any(not math.isnan(_value(rule, entry)) for pair in _pairs(rule, own, base, scenes) for entry in pair if entry)
+        for rule in rules
     ]
+    kept = tuple(rule for rule, has in zip(rules, there, strict=True) if has)
+    return kept or tuple(rules), [str(rule.class_name) for rule, has in zip(rules, there, strict=True) if not has]
 
-    found = mean_of([_found(rule, new, old, ways) for new, old in pairs], 1 - 2 * ways.level)
-    return Judgement(
-        rule,
-        verdict(rule, found),
-        found,
-        float(np.mean([_value(rule, new) for new, _ in pairs])),
-        float(np.mean([math.nan if old is None or not rule.change else _value(rule, old) for _, old in pairs])),
-    )
+
+def _require_values(rule: Rule, own: RunHandle, base: RunHandle | None, scenes: Sequence[str]) -> None:
+    """Raise ConfigError for a rule that cannot be evaluated, with what it takes."""
+    for new, old in _pairs(rule, own, base, scenes):
+        for entry in (new, old):
+            if entry is None or rule.measure.quantity is COVERAGE:
+                continue
+            where = f"rule '{rule.text}': {entry.where}"
+            if math.isnan(_value(rule, entry)):
+                whose = f" of {rule.class_name}" if rule.class_name else ""
+                raise ConfigError(f"{where} has no {rule.measure.name}{whose}: {NOTHING}; {rule.measure.lacking}")
+        if old is None:
+            continue
+        if rule.measure.quantity in OF_EVIDENCE and (new.summary.reduced is None) != (old.summary.reduced is None):
+            raise ConfigError(f"rule '{rule.text}': {SCORES}")
+
+
+def _judged(
+    rule: Rule, own: RunHandle, base: RunHandle | None, scenes: Sequence[str], level: float, scope: Scope
+) -> Judgement:
+    """Over the mean of the scenes, which err by themselves, or in the one that the rule names."""
+    pairs = _pairs(rule, own, base, scenes)
+    found = mean_of([_found(rule, new, old, level, scope) for new, old in pairs], 1 - 2 * level)
+    values = [[math.nan if entry is None else _value(rule, entry) for entry in pair] for pair in pairs]
+    return Judgement(rule, verdict(rule, found), found, *(float(mean) for mean in np.mean(values, axis=0)))
 
 
 def _value(rule: Rule, entry: Entry) -> float:
@@ -580,33 +491,13 @@ def _value(rule: Rule, entry: Entry) -> float:
     return value(entry.sums, rule.measure.key, _k(rule, entry))
 
 
-def _found(rule: Rule, new: Entry, base: Entry | None, ways: _Ways) -> Interval:
+def _found(rule: Rule, new: Entry, base: Entry | None, level: float, scope: Scope) -> Interval:
     """What a rule bounds, in one scene."""
-    if rule.change is None:
-        return _own(rule, new, ways)
-    assert base is not None
-    if rule.measure.quantity is FLICKER:
-        found = _flicker(new, base, ways.level)
-    else:
-        found = change(new.sums, base.sums, rule.measure, _k(rule, new), ways.level, ways.frames)
-    if rule.measure.quantity in OF_EVIDENCE and (new.summary.reduced is None) != (base.summary.reduced is None):
-        found = dataclasses.replace(found, undecided=SCORES)
-    return found if rule.change == "rise" else negative(found)
-
-
-def _own(rule: Rule, entry: Entry, ways: _Ways) -> Interval:
     if rule.measure.quantity is not FLICKER:
-        return rule_value(entry.sums, rule.measure, _k(rule, entry), ways.level, ways.frames)
-    frames, percent = np.array(list(entry.flicker)), np.array(list(entry.flicker.values()))
-    return of_frames(mean_over_frames(frames, percent, 1 - 2 * ways.level), len(frames))
-
-
-def _flicker(new: Entry, base: Entry, level: float) -> Interval:
-    """Paired by frame, where both have the same ones; else each by itself."""
-    shared = sorted(new.flicker.keys() & base.flicker.keys())
-    if len(shared) < 2:
-        raise DataError(
-            f"{new.where} and {base.where}: no frames in common to compare flicker on; run both on the same"
-        )
-    found = difference_over_frames(new.flicker, base.flicker, 1 - 2 * level)
-    return of_frames(found, len(shared))
+        return bounded(rule, new.sums, None if base is None else base.sums, k=_k(rule, new), level=level, scope=scope)
+    if scope == OTHER_SCENES:
+        raise ConfigError(f"rule '{rule.text}': flicker is known by frame alone; judge it with --scope this-scene")
+    if base is None:
+        return mean_over_frames(np.array([*new.flicker]), np.array([*new.flicker.values()]), 1 - 2 * level)
+    found = flicker_difference(new.flicker, base.flicker, level=1 - 2 * level)
+    return found if rule.change == "rise" else negative(found)

@@ -16,16 +16,15 @@ from semstab.errors import ConfigError
 
 SCHEMA = 1
 INDENT = 10
+OUTCOMES: Mapping[Verdict, str] = {"passes": "passes", "fails": "fails", "undecided": "is undecided"}
 SIGNS: Mapping[Verdict, str] = {"passes": "✅", "fails": "❌", "undecided": "❔"}
 
 
 def headline(result: GateResult) -> str:
-    """'2 rules pass, 1 fails: the gate fails'."""
+    """'1 fails, 2 pass: the gate fails'; a gate with rules that the data leave open is undecided, never passed."""
     counts = [(n, verdict) for verdict in ("fails", "undecided", "passes") if (n := result.count(verdict))]
     said = ", ".join(f"{n} {_plural(verdict, n)}" for n, verdict in counts)
-    treated = f" (which {result.undecided}es)" if result.undecided == "pass" else " (which fails)"
-    said = said.replace("undecided", f"undecided{treated}")
-    return f"{said}: the gate {'fails' if result.failed else 'passes'}"
+    return f"{said}: the gate {OUTCOMES[result.outcome]}"
 
 
 def _plural(verdict: str, n: int) -> str:
@@ -70,7 +69,7 @@ def markdown(result: GateResult) -> str:
         for each in result.judgements
     ]
     text = [
-        f"### {SIGNS['fails' if result.failed else 'passes']} semstab gate: {headline(result)}",
+        f"### {SIGNS[result.outcome]} semstab gate: {headline(result)}",
         "",
         f"{_code(result.new)}{against}, {_cell(_scenes(result))}; {_ends(result)}.",
         *(f"\n{_cell(remark)}" for remark in result.remarks),
@@ -103,7 +102,7 @@ def as_json(result: GateResult) -> str:
         for each in result.judgements
     ]  # fmt: skip
     content = {
-        "schema": SCHEMA, "gate": "fails" if result.failed else "passes", "new": result.new,
+        "schema": SCHEMA, "gate": result.outcome, "new": result.new,
         "against": result.against or None, "scenes": result.scenes, "level": result.level,
         "undecided": result.undecided, "remarks": result.remarks, "rules": [to_json(row) for row in rows],
     }  # fmt: skip

@@ -11,7 +11,7 @@ from functools import partial
 import numpy as np
 
 from semstab.comparison.runs import Entry
-from semstab.core.types import Int64, Mask
+from semstab.core.types import THIS_SCENE, Int64, Mask, Scope
 from semstab.metrics.agreement import observations, rows_of, shared_rows
 from semstab.model.contrast import Basis, CommonLooks, MapCoverage
 from semstab.model.events import Events
@@ -64,6 +64,7 @@ class Common:
     regions where there are voxels: the whole maps if they were made of the same frames and are all of labels or all of
             scores, else `tables`, place by place, with the ground truth
     shown   the part of them that figures show beside those that changed
+    scope   of the intervals, where frames tell
     sizes_differ, frames_differ  whether voxels do, and the frames of runs that are paired on looks
     same_frames  whether frames are paired; None where the sums tell
     """
@@ -82,6 +83,7 @@ class Common:
     sizes_differ: bool = False
     frames_differ: bool = False
     shown: float = 1.0
+    scope: Scope = THIS_SCENE
 
     def among(self, where: Mask) -> tuple[ClusterSums, ...]:
         """The sums of some of the common places (n,)."""
@@ -91,12 +93,12 @@ class Common:
         )
 
 
-def pair(entries: Sequence[Entry], names: Sequence[str]) -> Common:
+def pair(entries: Sequence[Entry], names: Sequence[str], scope: Scope = THIS_SCENE) -> Common:
     """The most that all runs of a scene have in common. Raises DataError where a file of a run cannot be read."""
     found = _paired(entries, names)
     mixed = len({entry.summary.reduced is None for entry in entries}) > 1
     told = (LOOKS_DECIDED if found.basis == "looks" else NOT_DECIDED,) if mixed else ()
-    return replace(found, mixed=mixed, remarks=(*found.remarks, *told))
+    return replace(found, scope=scope, mixed=mixed, remarks=(*found.remarks, *told))
 
 
 def _paired(entries: Sequence[Entry], names: Sequence[str]) -> Common:

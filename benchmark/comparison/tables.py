@@ -11,7 +11,7 @@ from rich.console import Console
 from semstab.comparison.locations import MOST
 from semstab.model.contrast import Against, Basis, Blame, Contrast, Place, RunComparison, SceneComparison
 from semstab.model.measures import ENTROPY, VSS, Quantity, measures
-from semstab.model.statistics import THESE_FRAMES, THIS_SCENE, Estimate, Interval
+from semstab.model.statistics import Estimate, Interval
 from semstab.report.tables.correctness import coverage_table, ignored_table
 from semstab.report.tables.table import Column, Group, Row, Table, to_terminal
 from semstab.report.terminal import WIDTH
@@ -98,7 +98,7 @@ def scope(row: Contrast) -> str:
     """What a difference answers, or why it claims nothing, in a word or two."""
     if row.difference.undecided:
         return "undecided"
-    return {THESE_FRAMES: "these frames", THIS_SCENE: "this scene"}[row.difference.scope]
+    return row.difference.scope
 
 
 # --- Parts ------------------------------------------------------------------------------------------------------------
@@ -303,14 +303,13 @@ def _steadiness(found: RunComparison, own: Against) -> str:
         return f"{own.other} is as steady as {found.base}: {numbers}, the same in every place."
     interval = f"{row.difference.value:+z.3f} ({row.difference.low:+z.3f} to {row.difference.high:+z.3f})"
     p = "" if math.isnan(row.p_holm) else f", p {row.p_holm:.2g}"
-    whose = "this scene" if row.difference.scope == THIS_SCENE else "these frames"
     said = {"better": "is steadier than", "worse": "is less steady than"}
     if row.change:
-        return f"{own.other} {said[row.change]} {found.base}: {numbers}, {interval}{p}, for {whose}."
+        return f"{own.other} {said[row.change]} {found.base}: {numbers}, {interval}{p}, for {row.difference.scope}."
     why = f"; undecided: {row.difference.undecided}" if row.difference.undecided else ""
     return (
         f"Over all classes no difference in steadiness between {own.other} and {found.base} is shown: {numbers},"
-        f" {interval}{p}, for {whose}{why}."
+        f" {interval}{p}, for {row.difference.scope}{why}."
     )
 
 

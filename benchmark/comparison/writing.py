@@ -10,8 +10,10 @@ from typing import TYPE_CHECKING, Any
 from semstab.comparison.differences import Found, Progress, find
 from semstab.comparison.locations import Changes
 from semstab.comparison.tables import ALL_SCENES, HEADLINES, IN_CLASSES, IOU, by_key, heading, scopes, sentences, tables
+from semstab.config.settings import ScopeOption, validated
 from semstab.core.files import keep_only, read_json, write_json, write_text
 from semstab.core.json_form import from_json
+from semstab.core.types import THIS_SCENE
 from semstab.errors import ConfigError
 from semstab.model import parquet
 from semstab.model.contrast import Against, RunComparison
@@ -118,18 +120,23 @@ KIND = "Changes"
 
 
 def compare(
-    runs: Sequence[str | Path], out: str | Path | None = None, *, progress: Progress = lambda what: None
+    runs: Sequence[str | Path],
+    out: str | Path | None = None,
+    *,
+    scope: str = THIS_SCENE,
+    progress: Progress = lambda what: None,
 ) -> RunComparison:
     """What differs between runs and the first of them, by scene and over all scenes: by how much, how surely, where.
 
     runs  folders of runs or studies, 'FOLDER:BACKBONE' where there are several label sources, or small summaries
+    scope 'this scene' flown again, 'these frames' or 'other scenes': what intervals and p-values are for
     out   a folder for tables, figures, report.html, comparison.json and .md, columns of voxels, and a recording
 
     Raises ConfigError and DataError, in one line, for what cannot be opened, or has no scene or no classes in common.
     """
     if out is not None:
         _require_own(Path(out))
-    found = find(runs, progress)
+    found = find(runs, progress, validated(ScopeOption, {"scope": scope}, "compare: ").scope)
     if out is not None:
         write(found, out)
     return found.result

@@ -17,6 +17,7 @@ from semstab.config.settings import (
     Lengths,
     Noise,
     Part,
+    ScopeSetting,
     Settings,
     Sweeps,
     as_range,
@@ -25,6 +26,7 @@ from semstab.config.settings import (
     read_yaml,
     validated,
 )
+from semstab.core.types import THIS_SCENE
 from semstab.errors import ConfigError
 
 __all__ = [
@@ -164,6 +166,9 @@ class Config(Settings):
     critical_classes: list[str] = Field(
         default_factory=list,
         description="classes that the verdict depends on; all that have enough places where none is named",
+    )
+    scope: ScopeSetting = Field(
+        THIS_SCENE, description="of the verdict and its intervals: 'this scene' flown again, or 'other scenes' like it"
     )
     threads: int | None = Field(
         None, ge=1, exclude=True, description="threads that decode frames ahead; changes no number, so it is not kept"

@@ -12,9 +12,10 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self, TypeVar
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, field_validator, model_validator
 
 from semstab.core.files import MAX_YAML_BYTES, parse_yaml, read_limited
+from semstab.core.types import THIS_SCENE, Scope
 from semstab.errors import ConfigError, one_line
 
 Model = TypeVar("Model", bound=BaseModel)
@@ -49,6 +50,18 @@ def merge(base: Mapping[str, Any], over: Mapping[str, Any]) -> dict[str, Any]:
         both = isinstance(value, Mapping) and isinstance(merged.get(key), Mapping)
         merged[key] = merge(merged[key], value) if both else value
     return merged
+
+
+ScopeSetting = Annotated[
+    Scope, BeforeValidator(lambda given: given.replace("-", " ") if isinstance(given, str) else given)
+]
+"""'this scene', or 'this-scene'."""
+
+
+class ScopeOption(BaseModel):
+    """The option --scope of a command."""
+
+    scope: ScopeSetting = THIS_SCENE
 
 
 def validated(model: type[Model], content: Any, where: str = "") -> Model:

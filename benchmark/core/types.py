@@ -1,6 +1,8 @@
-"""The array types that signatures name."""
+"""The types that signatures name."""
 
 from __future__ import annotations
+
+from typing import Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -14,3 +16,10 @@ UInt32 = npt.NDArray[np.uint32]
 UInt16 = npt.NDArray[np.uint16]
 UInt8 = npt.NDArray[np.uint8]
 Mask = npt.NDArray[np.bool_]
+
+Scope = Literal["these frames", "this scene", "other scenes"]
+"""What varies in an interval: locations, frames of the same scene flown again, or both."""
+
+THESE_FRAMES: Scope = "these frames"
+THIS_SCENE: Scope = "this scene"
+OTHER_SCENES: Scope = "other scenes"

@@ -158,8 +158,10 @@ def analyse_map(live: LiveMap, table: VoxelTable, events: Events | None, truth: 
 
 def analyse_sample(task: Task, config: Config, sample: MapSample, observations: ObservationSample | None) -> Analysis:
     """The statistics of a map; its true labels are right, and bound how far geometry lets labels agree."""
-    name, critical = task.backbone, config.critical_classes
-    return analyse(sample, observations, name=name, edges=config.strata, critical=critical)
+    return analyse(
+        sample, observations, name=task.backbone, edges=config.strata, critical=config.critical_classes,
+        scope=config.scope,
+    )  # fmt: skip
 
 
 def _quality(stream: Stream) -> FrameQuality | None:

@@ -14,7 +14,7 @@ from semstab.exports import clouds, maps
 from semstab.exports import join as joining
 from semstab.exports import voxels as tabular
 from semstab.exports.voxels import Chosen, Voxels, crs_name
-from semstab.statistics.commit import Commit
+from semstab.statistics.acceptance import AcceptanceThresholds
 
 __all__ = ["SUFFIXES", "Exported", "export"]
 
@@ -76,7 +76,7 @@ def export(
     scene, backbone, backend  which unit; may be left out where there is one, and for the base backend
     measures  columns that go along: measures, op, category, psa, or what the run's Parquet file has
     min_op, classes  only voxels seen that often, of these dominant classes
-    commit    file of thresholds: only voxels whose label has the evidence that they ask for (`Commit`)
+    commit    file of thresholds: only voxels whose label has the evidence that they ask for (`AcceptanceThresholds`)
     cell      edge of a raster's cell, in voxels
     asprs     YAML file CLASS: CODE for LAS; else the table that ships for the taxonomy
     classify  a cloud: write this cloud, classified; a point outside of all voxels takes the nearest one within
@@ -92,7 +92,7 @@ def export(
             raise ConfigError(f"{file}: format '{file.suffix}' is not known; {nearest(file.suffix, SUFFIXES)}")
     result = load_result(run)
     record = result.record(scene=scene, backbone=backbone, backend=backend)
-    thresholds = None if commit is None else Commit.load(commit)
+    thresholds = None if commit is None else AcceptanceThresholds.load(commit)
     settings = Settings(cell, None if asprs is None else Path(asprs))
     classify, join = classify or onto, join or beside
 

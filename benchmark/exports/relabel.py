@@ -33,7 +33,7 @@ from semstab.model.voxels import VoxelTable
 from semstab.predict.folder import PredictionFolder
 from semstab.settings import load_config
 from semstab.statistics import psa
-from semstab.statistics.commit import Commit
+from semstab.statistics.acceptance import AcceptanceThresholds
 from semstab.task import Task, read, truth_task
 
 # The class of the map at each pixel of a frame, where its voxel meets the criteria.
@@ -63,7 +63,7 @@ class Belief:
     min_psa: float = 0.0
     categories: tuple[str, ...] = ()
     leave_one_out: bool = False
-    commit: Commit | None = None
+    commit: AcceptanceThresholds | None = None
 
     def __post_init__(self) -> None:
         if not 0 <= self.min_psa <= 1:

@@ -33,7 +33,7 @@ from semstab.model.tiles import AT_HAND, Place
 from semstab.model.voxels import VoxelTable
 from semstab.report.figures.maps import Overview
 from semstab.statistics import psa
-from semstab.statistics.commit import Commit
+from semstab.statistics.acceptance import AcceptanceThresholds
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -108,7 +108,7 @@ class Chosen:
         min_op: int = 1,
         classes: Sequence[str] = (),
         join: Path | None = None,
-        commit: Commit | None = None,
+        commit: AcceptanceThresholds | None = None,
     ) -> None:
         if record.voxels_file is None:
             raise ConfigError(f"{record.unit.slug}: its voxels were not kept; run it with a folder")

@@ -10,6 +10,7 @@ from dataclasses import dataclass, field
 from typing import Literal
 
 from semstab.core.json_form import INLINE
+from semstab.core.types import THESE_FRAMES, Scope
 from semstab.model.measures import Measure, MeasureMeans
 
 # --- Parts ------------------------------------------------------------------------------------------------------------
@@ -35,11 +36,6 @@ class Estimate:
 
 
 UNDEFINED = Estimate(math.nan, math.nan, math.nan)
-
-Scope = Literal["these frames", "this scene", "other scenes"]
-THESE_FRAMES: Scope = "these frames"
-THIS_SCENE: Scope = "this scene"
-OTHER_SCENES: Scope = "other scenes"
 
 
 @dataclass(frozen=True)

@@ -261,7 +261,8 @@ def _sums_of_log(
 def _with_frames(whole: ClusterSums, seen: ClusterSums) -> ClusterSums:
     """The sums of a whole map, with the share that each frame has in a cube as in a sample of its voxels.
 
-    What the sample does not account for stands in rows of its own, whose frame is -1.
+    What the sample does not account for stands in rows of its own, whose frame is -1. Agreement by class, which a table
+    of evidence that is not one-hot cannot tell, comes from the sample.
     """
     cells, row = distinct_rows(np.concatenate([whole.cell, seen.cell]))
     mine, theirs = np.split(row, [len(whole.cell)])
@@ -273,6 +274,7 @@ def _with_frames(whole: ClusterSums, seen: ClusterSums) -> ClusterSums:
     left = np.zeros((len(cells), whole.columns.shape[1]))
     np.add.at(left, mine, whole.columns)
     np.subtract.at(left, theirs, by_frame)
+    left[np.isnan(left)] = 0.0  # sums by class that a table cannot tell: the sample alone has them
     return replace(
         whole,
         cell=np.concatenate([seen.cell, cells]).astype(np.int32),

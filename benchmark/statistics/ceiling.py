@@ -15,7 +15,7 @@ import numpy.typing as npt
 
 from semstab.backends import FusionBackend
 from semstab.backends.shared.association import back_project, voxel_index
-from semstab.core.types import Float64, Int64
+from semstab.core.types import THIS_SCENE, Float64, Int64, Scope
 from semstab.errors import DataError
 from semstab.metrics import dominant
 from semstab.metrics.agreement import shared_rows, voxel_keys
@@ -59,12 +59,12 @@ def locations_by_class(table: VoxelTable) -> Float64:
     return np.bincount(dominant(table)[table.op >= 2], minlength=table.K).astype(np.float64)
 
 
-def ceiling_specs(sums: ClusterSums, K: int) -> Iterator[EstimateSpec]:
+def ceiling_specs(sums: ClusterSums, K: int, wanted: Scope = THIS_SCENE) -> Iterator[EstimateSpec]:
     """For `answers`: alpha in the sample, its ceiling, and what share of it is reached, by K classes together and by
     each."""
     assert sums.seen is not None
     assert sums.limit is not None
-    scope = scope_of(sums)
+    scope = scope_of(sums, wanted)
     yield spec_of(sums.seen, "alpha_between", scope=scope)
     yield spec_of(sums.limit, "alpha_between", scope=scope)
     for k in (None, *range(K)):

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from semstab.core.types import Float64
+from semstab.core.types import THIS_SCENE, Float64, Scope
 from semstab.metrics.agreement import shared_rows
 from semstab.metrics.summary import STRATA, groups_of
 from semstab.model.events import Events
@@ -145,6 +145,7 @@ def analyse(
     seed: int = 0,
     edges: Sequence[int] = STRATA,
     critical: Sequence[str] = (),
+    scope: Scope = THIS_SCENE,
 ) -> Analysis:
     """Return all statistics of one map; the same seed gives the same numbers.
 
@@ -153,8 +154,9 @@ def analyse(
     name      of the backbone, for the verdict
     edges     upper bounds of the strata of OP
     critical  the classes that the verdict depends on; where none is named, all with enough locations
+    scope     of the headline and the share of the ceiling, where frames tell of it
 
-    Intervals are at 95 %, for these frames, but those of `judged` and `reach`; undefined numbers are NaN, and a section
+    Intervals are at 95 %, those of all other numbers for these frames; undefined numbers are NaN, and a section
     that cannot be computed is None.
     """
     table, events = sample.table.measured(), sample.events
@@ -182,9 +184,9 @@ def analyse(
         drawn["true_label"] = truth.label
     found, judged, (unsteady,), reached, of_flips = grouped_intervals(
         of_places.specs(MEANS),
-        headline_specs(influence),
+        headline_specs(influence, scope),
         flipping.specs(),
-        () if observations is None else ceiling_specs(influence, table.K),
+        () if observations is None else ceiling_specs(influence, table.K, scope),
         () if log is None else log.places.specs(OF_FLIPS),
     )
     means, whole = dict(zip(MEANS, found, strict=True)), sample.summary.summary(table.voxel_size, table.classes, edges)

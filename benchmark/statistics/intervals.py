@@ -10,8 +10,8 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from semstab.core.types import Float64
-from semstab.model.statistics import THESE_FRAMES, THIS_SCENE, UNKNOWN, HeadlineStatistics, Interval, Scope
+from semstab.core.types import THESE_FRAMES, THIS_SCENE, Float64, Scope
+from semstab.model.statistics import UNKNOWN, HeadlineStatistics, Interval
 from semstab.statistics.agreement import ratio_of
 from semstab.statistics.cluster_sums import (
     MOST_GROUPS,
@@ -123,7 +123,7 @@ def difference(
     if one is None or other is None:
         return Interval(found, math.nan, math.nan, undecided=NO_PLACES)
     scope = scope if a.step else THESE_FRAMES
-    paired = np.array_equal(np.unique(a.frame), np.unique(b.frame)) if same_frames is None else same_frames
+    paired = (not a.step or same_flight(a, b)) if same_frames is None else same_frames
     between = one.minus(other)
     with one_thread():
         spread = spread_of(between, scope) if paired else spread_of_flights(one, other, between, scope)
@@ -202,14 +202,14 @@ def spec_of_observations(
     return EstimateSpec(found, grid, THIS_SCENE if told else THESE_FRAMES, "agreement", (-1.0, 1.0), level)
 
 
-def scope_of(sums: ClusterSums) -> Scope:
-    """Return what verdicts on a map are about: the same scene flown again, if frames tell of that."""
-    return THIS_SCENE if sums.frames * sums.step >= LEAST_FRAMES else THESE_FRAMES
+def scope_of(sums: ClusterSums, wanted: Scope = THIS_SCENE) -> Scope:
+    """Return what verdicts on a map are about: what is wanted if frames tell of it, else these frames."""
+    return wanted if sums.frames * sums.step >= LEAST_FRAMES else THESE_FRAMES
 
 
-def headline_specs(sums: ClusterSums) -> Iterator[EstimateSpec]:
+def headline_specs(sums: ClusterSums, wanted: Scope = THIS_SCENE) -> Iterator[EstimateSpec]:
     """For `answers`: the numbers that a verdict on a map rests on, in the order of `HeadlineStatistics`."""
-    scope = scope_of(sums)
+    scope = scope_of(sums, wanted)
     return (spec_of(sums, field.name, scope=scope) for field in dataclasses.fields(HeadlineStatistics))
 
 
@@ -333,7 +333,7 @@ def _combined(
         value,
         low,
         high,
-        scope=THIS_SCENE if scopes == {THIS_SCENE} else THESE_FRAMES,
+        scope=scopes.pop() if len(scopes) == 1 else THESE_FRAMES,
         frames=min(own.frames for own in parts),
         locations=sum(own.locations for own in parts),
         degrees=degrees,

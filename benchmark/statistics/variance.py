@@ -22,8 +22,7 @@ from dataclasses import dataclass
 import numpy as np
 from threadpoolctl import ThreadpoolController
 
-from semstab.core.types import Float64, Int64
-from semstab.model.statistics import THESE_FRAMES, THIS_SCENE, Scope
+from semstab.core.types import THESE_FRAMES, THIS_SCENE, Float64, Int64, Scope
 from semstab.statistics.cluster_sums import ClusterIndex, Statistic
 
 LASTING = (0.0, 0.5, 0.8, 0.9)

@@ -5,15 +5,8 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 
-from semstab.model.statistics import (
-    THIS_SCENE,
-    CeilingShare,
-    Flipping,
-    HeadlineStatistics,
-    Interval,
-    Level,
-    StabilityVerdict,
-)
+from semstab.core.types import THIS_SCENE
+from semstab.model.statistics import CeilingShare, Flipping, HeadlineStatistics, Interval, Level, StabilityVerdict
 from semstab.statistics.cluster_sums import Scale
 from semstab.statistics.intervals import LEAST_FRAMES, probability_above
 

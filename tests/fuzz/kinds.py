@@ -58,8 +58,8 @@ from semstab.report.figures.maps import Overview
 from semstab.report.tables import tables
 from semstab.report.terminal import print_summary
 from semstab.settings import load_config, load_study
+from semstab.statistics.acceptance import AcceptanceThresholds
 from semstab.statistics.cluster_sums import ClusterSums
-from semstab.statistics.commit import Commit
 from semstab.statistics.observations import CellObservations
 
 SHAPE = (12, 16)
@@ -159,7 +159,7 @@ def of_settings(folder: Path) -> Iterator[Kind]:
     contents["gate.yaml"] = ({"rules": rules, "level": 0.05, "undecided": "pass"}, read_gate)
     wall = {"by": "op", "at_least": 3, "precision": 0.97, "low": 0.95, "voxels": 200, "left": 0.7}
     commit = {"schema": 1, "precision": 0.95, "confidence": 0.95, "voxel_size": 0.25, "left": 0.6}
-    contents["commit.yaml"] = (commit | {"classes": {"wall": wall, "door": {"never": True}}}, Commit.load)
+    contents["commit.yaml"] = (commit | {"classes": {"wall": wall, "door": {"never": True}}}, AcceptanceThresholds.load)
     for name, (content, read) in contents.items():
         (folder / name).write_text(yaml.safe_dump(content))
         yield Kind(name, (folder / name,), read)

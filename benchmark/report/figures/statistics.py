@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from semstab.core.types import Float64
+from semstab.core.types import THIS_SCENE, Float64
 from semstab.model.measures import VSS, sbd
-from semstab.model.statistics import THIS_SCENE, Correlogram, Estimate, LagBin, Reliability
+from semstab.model.statistics import Correlogram, Estimate, LagBin, Reliability
 from semstab.model.voxels import VoxelTable
 from semstab.report.averages import ENOUGH, Level, Pooled, Sweep, over_all
 from semstab.report.figures.distributions import (

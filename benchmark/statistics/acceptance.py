@@ -63,7 +63,7 @@ class Threshold(BaseModel):
     left: float = 0.0
 
 
-class Commit(BaseModel):
+class AcceptanceThresholds(BaseModel):
     """Which labels of a map may be acted on, as a YAML file keeps it.
 
     precision, confidence  labels of a class that are acted on are right with at least this probability; that a class'
@@ -82,7 +82,7 @@ class Commit(BaseModel):
     classes: dict[str, Threshold]
 
     @classmethod
-    def load(cls, path: str | Path) -> Commit:
+    def load(cls, path: str | Path) -> AcceptanceThresholds:
         """Read what `save` wrote. Raises ConfigError, which names the file and the setting."""
         found = validated(cls, read_yaml(path), f"{path}: ")
         if found.schema_ != SCHEMA:
@@ -127,7 +127,7 @@ class Commit(BaseModel):
 
 def calibrate(
     maps: Sequence[tuple[VoxelTable, Truth]], *, precision: float = 0.95, confidence: float = 0.95, on: str = ""
-) -> Commit:
+) -> AcceptanceThresholds:
     """For each class the evidence, of OP, belief and margin, that leaves most labels, each right with that precision.
 
     maps  of scenes with the same classes and voxel size, with the true class of their voxels; they err by themselves
@@ -152,7 +152,7 @@ def calibrate(
         own = {by: value[rows] for by, value in values.items()}
         sample = _Labels(index[rows], true[rows] == k, own, size)
         found[name] = sample.least(precision, 1 - confidence)
-    every = Commit(
+    every = AcceptanceThresholds(
         schema=SCHEMA, precision=precision, confidence=confidence, voxel_size=size, calibrated_on=on, classes=found
     )
     decided = [every.decide(table) for table in tables]

@@ -17,7 +17,7 @@ from semstab.cli import app
 from semstab.errors import ConfigError, DataError
 from semstab.model.measures import dominant, vss
 from semstab.model.voxels import VoxelTable
-from semstab.statistics.commit import Commit, calibrate
+from semstab.statistics.acceptance import AcceptanceThresholds, calibrate
 from semstab.statistics.correctness import Truth
 
 CLASSES = ("road", "car", "tree")
@@ -72,7 +72,7 @@ def test_labels_that_err_together_count_as_few():
 
 def test_a_file_keeps_it(commit, tmp_path):
     commit.save(file := tmp_path / "commit.yaml")
-    again = semstab.Commit.load(file)
+    again = semstab.AcceptanceThresholds.load(file)
     assert again == commit
     text = file.read_text()
     for bad, line in (
@@ -81,7 +81,7 @@ def test_a_file_keeps_it(commit, tmp_path):
         (text.replace("schema: 1", "schema: 9"), "calibrate again"),
     ):
         file.write_text(bad)
-        fails(ConfigError, f"commit.yaml: .*{line}", Commit.load, file)
+        fails(ConfigError, f"commit.yaml: .*{line}", AcceptanceThresholds.load, file)
 
 
 def test_another_kind_of_map_is_refused(commit):
@@ -103,7 +103,7 @@ def test_export_and_relabel_take_the_file(tmp_path):
 
     file = tmp_path / "commit.yaml"
     text = cli("calibrate", tmp_path / "run", "--precision", 0.5, "--confidence", 0.6, "--out", file)
-    thresholds = semstab.Commit.load(file)
+    thresholds = semstab.AcceptanceThresholds.load(file)
     assert f"{thresholds.left:.1%} of the voxels are left" in text
     table = semstab.load(tmp_path / "run").table()
     decided = thresholds.decide(table) >= 0

@@ -20,7 +20,7 @@ from semstab.comparison.runs import open_run
 from semstab.metrics.agreement import rows_of
 from semstab.model.measures import dominant
 from semstab.model.voxels import VoxelTable
-from semstab.statistics.commit import EVIDENCE, Commit, calibrate
+from semstab.statistics.acceptance import EVIDENCE, AcceptanceThresholds, calibrate
 from semstab.statistics.correctness import Truth, join_truth
 
 CLASSES = ("a", "b")
@@ -88,7 +88,7 @@ def _part(table: VoxelTable, truth: Truth, where: np.ndarray) -> tuple[VoxelTabl
     return rows_of(table, np.flatnonzero(where)), Truth(truth.known[where], truth.label[where])
 
 
-def _held(commit: Commit, held: tuple[VoxelTable, Truth]) -> list[str]:
+def _held(commit: AcceptanceThresholds, held: tuple[VoxelTable, Truth]) -> list[str]:
     table, truth = held
     decided = commit.decide(table)
     counted = (decided >= 0) & truth.known

@@ -1,0 +1,73 @@
+"""Acceptance thresholds from a run with ground truth, and what they say in the terminal."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+
+from semstab.comparison.pairing import in_share, share_of
+from semstab.comparison.runs import open_run
+from semstab.errors import ConfigError, DataError
+from semstab.model.records import Record
+from semstab.model.tiles import Tiles, side_by_side
+from semstab.model.voxels import VoxelTable
+from semstab.statistics.acceptance import AcceptanceThresholds, calibrate
+from semstab.statistics.correctness import Truth, join_truth
+
+
+def calibrate_run(run: str | Path, *, precision: float = 0.95, confidence: float = 0.95) -> AcceptanceThresholds:
+    """Thresholds from all scenes of a run with ground truth; 'FOLDER:BACKBONE' selects one of several label sources.
+
+    Raises ConfigError and DataError as `open_run`, and for a scene whose ground truth was not fused.
+    """
+    own = open_run(run)
+    maps, sampled = [], 1.0
+    for scene, entry in own.scenes.items():
+        record = entry.with_voxels("a calibration")
+        if record.truth_file is None:
+            raise ConfigError(
+                f"{own.source}: ground truth of {scene} was not fused; run it with --statistics, on a scene that has it"
+            )
+        maps.append(_with_truth(record, record.truth_file))
+        sampled = min(sampled, share_of(record.summary.table.voxels))
+    first = maps[0][0]
+    for table, _ in maps[1:]:
+        if (table.classes, table.voxel_size) != (first.classes, first.voxel_size):
+            raise DataError(f"{own.source}: its scenes differ in classes or voxel size; calibrate on one at a time")
+    on = f"{own.backbone} on {', '.join(own.scenes)}"
+    on += f", 1 in {round(1 / sampled)} of the places of a large map" if sampled < 1 else ""
+    return calibrate(maps, precision=precision, confidence=confidence, on=on)
+
+
+def _with_truth(record: Record, truth_file: Path) -> tuple[VoxelTable, Truth]:
+    """A map with its true classes; of a very large one a sample, by a hash of the place."""
+    share, parts = share_of(record.summary.table.voxels), []
+    files = [file for file in (record.voxels_file, truth_file) if file is not None]
+    for table, truth in side_by_side([Tiles.open(file, VoxelTable) for file in files]):
+        some = table.rows(in_share(table, share))
+        parts.append((some, join_truth(some, truth).label))
+    order = np.lexsort(np.concatenate([table.index for table, _ in parts]).T[::-1])
+    label = np.concatenate([own for _, own in parts])[order]
+    return VoxelTable.joined([table for table, _ in parts]), Truth(label >= 0, label)
+
+
+def lines(found: AcceptanceThresholds) -> Iterator[str]:
+    """For the terminal."""
+    yield (
+        f"labels that are right with a probability of {found.precision:g} or more, class by class at a confidence of"
+        f" {found.confidence:g}; calibrated on {found.calibrated_on}"
+    )
+    width = min(max(map(len, found.classes), default=0), 20)
+    for name, own in found.classes.items():
+        right = f"{own.by:<6} >= {own.at_least:<5.3g} right in {own.precision:.3f}, at least {own.low:.3f}"
+        if not own.voxels:
+            yield f"  {name[:width]:<{width}}  never: no label of it has a known truth"
+        elif own.never:
+            yield f"  {name[:width]:<{width}}  never; best {right} ({own.voxels:,} voxels)"
+        else:
+            yield f"  {name[:width]:<{width}}  {right}: {own.left:.0%} left"
+    yield f"{found.left:.1%} of the voxels are left"
+    if any(own.never for own in found.classes.values()):
+        yield "more places, in other scenes, show more: errors near each other count as few"
