@@ -1,4 +1,4 @@
-"""Runs side by side: nothing where nothing changed; a planted fault with its place, class and frames."""
+"""Runs side by side: nothing where nothing changed; a planted fault with its area, class and frames."""
 
 from __future__ import annotations
 
@@ -82,16 +82,16 @@ def test_a_run_and_itself_do_not_differ_anywhere(runs):
 
 def test_a_planted_fault_is_found_with_its_class_its_place_and_its_frames(fault):
     (own,) = fault.scenes[0].against
-    assert fault.scenes[0].basis == "looks"
+    assert fault.scenes[0].basis == "observations"
     found = rows(own)
     assert found["alpha_between"].difference.value < -0.05
     assert found["accuracy"].other < found["accuracy"].base
     assert found["coverage"].difference.value == 0
     assert rows(own, "door")["alpha_between"].difference.value < rows(own, "wall")["alpha_between"].difference.value
-    assert own.places
-    assert {(place.of, place.instead) for place in own.places} == {("door", "window")}
-    assert {blame.frame for place in own.places for blame in place.frames} <= set(FAULTY)
-    assert {FAULTY[0], FAULTY[1]} <= {blame.frame for blame in own.blamed} <= set(FAULTY)
+    assert own.areas
+    assert {(area.of, area.confused_with) for area in own.areas} == {("door", "window")}
+    assert {each.frame for area in own.areas for each in area.frames} <= set(FAULTY)
+    assert {FAULTY[0], FAULTY[1]} <= {each.frame for each in own.top_frames} <= set(FAULTY)
     assert own.worse > 10 * own.better
 
 
@@ -112,7 +112,7 @@ def test_what_is_written_comes_back_and_every_file_is_there(runs, fault):
     folder = runs / "compared"
     again = load_comparison(folder)
     assert [row.measure for row in again.overall[0].contrasts] == [row.measure for row in fault.overall[0].contrasts]
-    assert again.scenes[0].against[0].places == fault.scenes[0].against[0].places
+    assert again.scenes[0].against[0].areas == fault.scenes[0].against[0].areas
     for name in ("comparison.md", "report.html", "recording.rrd", "tables/comparison.csv", "figures/comparison.png",
                  "figures/comparison_classes.png", "figures/comparison_map__wall__new.png"):  # fmt: skip
         assert (folder / name).stat().st_size > 0
@@ -130,12 +130,12 @@ def test_the_columns_go_along_in_an_export(runs, fault, tmp_path):
     columns = pq.read_table(runs / "compared" / own.columns)
     assert columns.num_rows == own.compared
     assert (columns["change"].to_numpy() <= -0.2).sum() == own.worse
-    listed = [place.number for place in own.places if place.what == "agreement"]
-    assert set(listed) <= set(columns["place"].to_numpy().tolist())
+    listed = [area.number for area in own.areas if area.what == "agreement"]
+    assert set(listed) <= set(columns["area"].to_numpy().tolist())
     file = runs / "compared" / own.columns
-    semstab.export(runs / "old", tmp_path / "map.parquet", measures=["change", "place"], beside=file)
+    semstab.export(runs / "old", tmp_path / "map.parquet", measures=["change", "area"], beside=file)
     exported = pq.read_table(tmp_path / "map.parquet")
-    assert (exported["place"].to_numpy() > 0).sum() == (columns["place"].to_numpy() > 0).sum()
+    assert (exported["area"].to_numpy() > 0).sum() == (columns["area"].to_numpy() > 0).sum()
     assert exported["change"].null_count == exported.num_rows - own.compared
     with pytest.raises(DataError, match=r"voxels of 0\.125 m"):
         semstab.export(runs / "coarse", tmp_path / "map.csv", measures=["change"], beside=file)
@@ -145,8 +145,8 @@ def test_of_other_voxel_sizes_only_what_does_not_depend_on_them_is_compared(runs
     (scene,) = semstab.compare([runs / "old", runs / "coarse"]).scenes
     assert scene.basis == "cubes"
     assert set(rows(scene.against[0])) == {"reached", "flicker_percent", "accuracy", "miou"}
-    assert not scene.against[0].places
-    assert "voxels of 0.125 m and 0.25 m" in scene.remarks[0]
+    assert not scene.against[0].areas
+    assert "voxels of 0.125 m and 0.25 m" in scene.notes[0]
 
 
 def test_of_other_frames_of_reference_nothing_is_paired(runs):
@@ -157,7 +157,7 @@ def test_of_other_frames_of_reference_nothing_is_paired(runs):
         placed = [dataclasses.replace(entry, georeference=own) for entry, own in zip(entries, pairs, strict=True)]
         found = pair(placed, ["old", "new"])
         assert found.basis == "flights"
-        assert "nothing can be paired" in found.remarks[0]
+        assert "nothing can be paired" in found.notes[0]
 
 
 def contrast(value: float, error: float, measure: str = "psa") -> Contrast:

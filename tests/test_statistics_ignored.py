@@ -12,7 +12,7 @@ from striped_floor import K, flight, sampler_of
 
 from semstab import backends
 from semstab.errors import DataError
-from semstab.model.contrast import CommonLooks
+from semstab.model.contrast import ComparedObservations
 from semstab.statistics import CellObservations, compare_backbones, psa
 from semstab.statistics.paired_differences import common_observations, psa_bounds, stratum_counts, thin_share
 
@@ -59,13 +59,13 @@ def test_the_order_is_said_to_depend_on_errors_that_were_left_out():
     silent = without(frames, lambda f: wrong[f.index] & (np.kron(rng.random((6, 8)), np.ones((10, 10))) < 0.6))
     better = list(flight(8, flicker=0.22, patch=10, seed=2))
     found = compared(silent=silent, better=better)
-    looks = found.looks
+    looks = found.observations
     missing = {row.backbone: row for row in looks.ignored}
     assert looks.order[0] == "silent"
     assert looks.depends
     assert missing["silent"].missing == pytest.approx(0.6 * np.mean(list(wrong.values())), abs=0.03)
     assert missing["better"].missing == 0
-    whole = compared(a=frames, b=frames).looks.ignored[0]
+    whole = compared(a=frames, b=frames).observations.ignored[0]
     assert whole.psa_low == whole.psa_high
     assert missing["silent"].psa_low < whole.psa_low < missing["silent"].psa_high
     assert missing["silent"].alpha < missing["better"].alpha
@@ -73,9 +73,9 @@ def test_the_order_is_said_to_depend_on_errors_that_were_left_out():
 
 def test_maps_that_left_nothing_out_have_an_order_that_depends_on_nothing():
     found = compared(steady=list(flight(6, flicker=0.1, patch=10)), nervous=list(flight(6, flicker=0.4, patch=10)))
-    assert found.looks.order == ("steady", "nervous")
-    assert not found.looks.depends
-    assert not found.looks.decided
+    assert found.observations.order == ("steady", "nervous")
+    assert not found.observations.depends
+    assert not found.observations.decided
     assert found.paired.primary == "alpha_between"
 
 
@@ -83,7 +83,7 @@ def test_labels_and_scores_are_compared_by_what_they_decide():
     frames = list(flight(6, flicker=0.2, patch=10))
     unsure = [dataclasses.replace(f, labels=None, scores=0.2 + 0.4 * np.eye(K)[f.labels]) for f in frames]
     found = compared(labels=frames, scores=unsure)
-    assert found.looks.decided
+    assert found.observations.decided
     assert found.paired.primary == "alpha"
     (row,) = (row for row in found.paired.differences if row.measure == "alpha")
     assert row.difference.value == pytest.approx(0, abs=1e-12)
@@ -167,8 +167,8 @@ def test_looks_stay_as_they_were_when_more_frames_come():
 def test_nothing_in_common_leaves_everything_undefined():
     apart = [dataclasses.replace(f, index=f.index + 10) for f in flight(4)]
     found = compared(a=list(flight(4)), b=apart)
-    assert isinstance(found.looks, CommonLooks)
-    assert (found.looks.voxels, found.paired.voxels) == (0, 0)
+    assert isinstance(found.observations, ComparedObservations)
+    assert (found.observations.voxels, found.paired.voxels) == (0, 0)
     assert psa(compared(a=list(flight(2)), b=list(flight(2))) and log_of_evidence(np.eye(3)[None]).table()).shape == (
         1,
     )

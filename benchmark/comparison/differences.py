@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from semstab.comparison.locations import Changes, worse_places
+from semstab.comparison.locations import Changes, worse_areas
 from semstab.comparison.pairing import Common, joint_class, pair
 from semstab.comparison.runs import Entry, Flicker, RunHandle, open_runs, shared_scenes
 from semstab.comparison.tables import (
@@ -70,14 +70,14 @@ def contrasts(common: Common, base: Entry, other: Entry, number: int) -> tuple[C
 
 
 def by_class(common: Common, base: Entry, other: Entry, number: int) -> tuple[Contrast, ...]:
-    """The same of each class: against all others, or of the places that are of the class.
+    """The same of each class: against all others, or of the locations of the class.
 
     These are by the ground truth, or else by what all runs together say, so that none of them chooses its own.
     """
     names = base.classes or tuple(str(k) for k in range(base.sums.K))
-    own = list(_of_places(common, names, number)) if common.tables else []
+    own = list(_of_locations(common, names, number)) if common.tables else []
     rows = [*_against_all(common, base, other, names, number), *own]
-    order = {quantity.key: place for place, quantity in enumerate(BY_CLASS)}
+    order = {quantity.key: rank for rank, quantity in enumerate(BY_CLASS)}
     return tuple(sorted(rows, key=lambda row: (names.index(row.of), order[row.measure])))
 
 
@@ -140,7 +140,7 @@ def _comparable(quantity: Quantity, common: Common) -> bool:
         return False
     if not common.mixed:
         return True
-    return quantity not in FORGIVING if common.basis == "looks" else quantity in DECIDED
+    return quantity not in FORGIVING if common.basis == "observations" else quantity in DECIDED
 
 
 def _row(
@@ -218,9 +218,9 @@ def _of_voxels(measure: Measure, base: VoxelTable, other: VoxelTable, edge: floa
     known = ~np.isnan(before) & ~np.isnan(after)
     if not known.any():
         return Contrast(measure.key, "", math.nan, math.nan, UNKNOWN, math.nan, "")
-    places, columns = Cubes.of(base, edge, where=known), np.stack([after - before, known], axis=1)
+    cubes, columns = Cubes.of(base, edge, where=known), np.stack([after - before, known], axis=1)
     before, after = before[known], after[known]
-    change = places.estimate(columns, ratio_of, (-measure.largest, measure.largest), "plain")
+    change = cubes.estimate(columns, ratio_of, (-measure.largest, measure.largest), "plain")
     found = no_difference(change) if np.array_equal(before, after) else _with_p_value(change)
     return Contrast(measure.key, "", mean(before), mean(after), found, math.nan, "")
 
@@ -257,8 +257,8 @@ def _enough(sums: ClusterSums, k: int) -> bool:
     return bool(sums["evidence"][:, k].sum() >= LEAST_VOXELS * seen)
 
 
-def _of_places(common: Common, names: Sequence[str], number: int) -> Iterator[Contrast]:
-    labels = class_of_places(common)
+def _of_locations(common: Common, names: Sequence[str], number: int) -> Iterator[Contrast]:
+    labels = class_of_locations(common)
     wanted = [each for each in BY_CLASS if each not in ONE_AGAINST_ALL and _comparable(each, common)]
     for k, name in enumerate(names):
         where = labels == k
@@ -269,14 +269,14 @@ def _of_places(common: Common, names: Sequence[str], number: int) -> Iterator[Co
             yield from _row(quantity, sums[0], sums[number], common, of=name)
 
 
-def class_of_places(common: Common) -> Int64:
-    """The class (n,) of each common place: the true one, or what all runs together say; -1 where it is not known."""
+def class_of_locations(common: Common) -> Int64:
+    """The class (n,) of each common location: the true one, or what all runs together say; -1 where it is not known."""
     return common.label if common.label is not None else joint_class(common.tables)
 
 
 # Runs beside the first one, scene by scene and over all scenes.
 
-SCHEMA = 1
+SCHEMA = 2
 COLUMNS = "columns"
 """Folder of the files SCENE__BASE__RUN.parquet: what changed in each voxel."""
 
@@ -285,7 +285,7 @@ Progress = Callable[[str], None]
 
 
 @dataclass(frozen=True, eq=False)
-class Found:
+class ComparisonData:
     """What was found, and what figures and files show of it.
 
     changes  in each voxel, by scene and run, where voxels could be paired
@@ -297,7 +297,9 @@ class Found:
     up: Mapping[str, Up]
 
 
-def find(runs: Sequence[str | Path], progress: Progress = lambda what: None, scope: Scope = THIS_SCENE) -> Found:
+def find(
+    runs: Sequence[str | Path], progress: Progress = lambda what: None, scope: Scope = THIS_SCENE
+) -> ComparisonData:
     """Compare runs with the first one for a scope; `progress` is told what is done.
 
     Raises ConfigError for fewer than two, and what `open_runs`, `shared_scenes` and `pair` raise.
@@ -320,7 +322,7 @@ def find(runs: Sequence[str | Path], progress: Progress = lambda what: None, sco
         scenes=tuple(scenes),
     )
     ups = {scene: up for each in reversed(handles) for scene, own in each.scenes.items() if (up := own.up)}
-    return Found(result, changes, ups)
+    return ComparisonData(result, changes, ups)
 
 
 def _scene(scene: str, runs: Sequence[RunHandle], scope: Scope) -> tuple[SceneComparison, dict[str, Changes]]:
@@ -333,15 +335,15 @@ def _scene(scene: str, runs: Sequence[RunHandle], scope: Scope) -> tuple[SceneCo
     for n, own, of_classes in zip(numbers, everything, classes, strict=True):
         found = Against(names[n], own, of_classes)
         if common.regions is not None:
-            worse = worse_places(common, n)
+            worse = worse_areas(common, n)
             changes[names[n]] = worse.changes
             found = dataclasses.replace(
                 found,
                 compared=worse.changes.compared,
                 worse=worse.changes.worse,
                 better=worse.changes.better,
-                places=worse.places,
-                blamed=worse.blamed,
+                areas=worse.areas,
+                top_frames=worse.top_frames,
                 columns=Path(COLUMNS) / f"{slug(scene, names[0], names[n])}.parquet",
             )
         against.append(found)
@@ -352,7 +354,9 @@ def _found(scene: str, common: Common, against: tuple[Against, ...]) -> SceneCom
     frames = min((sums.frames * sums.step for sums in common.sums), default=0)
     voxels = len(common.tables[0]) if common.tables else 0
     voxels = int((common.tables[0].op >= 2).sum()) if voxels else 0
-    return SceneComparison(scene, common.basis, common.remarks, voxels, frames, common.coverage, common.looks, against)
+    return SceneComparison(
+        scene, common.basis, common.notes, voxels, frames, common.coverage, common.observations, against
+    )
 
 
 def _over_all(scenes: Sequence[SceneComparison]) -> tuple[Against, ...]:

@@ -330,7 +330,7 @@ class GateResult:
     """Everything that a gate found.
 
     new, against  what was judged, and the baseline, empty where there is none
-    remarks       what a reader has to know beside
+    notes       what a reader has to know beside
     """
 
     new: str
@@ -339,7 +339,7 @@ class GateResult:
     level: float
     undecided: str
     judgements: tuple[Judgement, ...]
-    remarks: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()
 
     def count(self, verdict: Verdict) -> int:
         """How many rules came out so."""
@@ -369,20 +369,20 @@ def gate(new: str | Path, against: str | Path | None, config: GateConfig) -> Gat
     base = None if against is None else open_run(against)
     scenes = tuple(own.scenes) if base is None else shared_scenes([base, own])
     judged: list[Judgement] = []
-    remarks = list(_remarks(own, base, scenes))
+    notes = list(_notes(own, base, scenes))
     for given in parsed:
         rules = given.of_each(own.scenes[scenes[0]].classes)
         for rule in rules:
             _check(rule, own, base, scenes)
         if given.class_name == ALL:
             rules, absent = _with_a_value(rules, own, base, scenes)
-            remarks += [f"{given.text}: seen nowhere twice, and left out: {', '.join(absent)}"] if absent else []
+            notes += [f"{given.text}: seen nowhere twice, and left out: {', '.join(absent)}"] if absent else []
         for rule in rules:
             _require_values(rule, own, base, scenes)
         judged += [_judged(rule, own, base, scenes, config.level / len(rules), config.scope) for rule in rules]
     return GateResult(
         _named(own), "" if base is None else _named(base), scenes, config.level, config.undecided, tuple(judged),
-        tuple(remarks),
+        tuple(notes),
     )  # fmt: skip
 
 
@@ -390,7 +390,7 @@ def _named(run: RunHandle) -> str:
     return f"{run.backbone} ({run.source})"
 
 
-def _remarks(own: RunHandle, base: RunHandle | None, scenes: Sequence[str]) -> list[str]:
+def _notes(own: RunHandle, base: RunHandle | None, scenes: Sequence[str]) -> list[str]:
     left = [scene for scene in own.scenes if scene not in scenes]
     missing = [scene for scene in (base.scenes if base else ()) if scene not in scenes]
     said = [f"not in the baseline, and not compared: {', '.join(left)}"] if left else []

@@ -35,8 +35,8 @@ def lines(result: GateResult, width: int = 80) -> Iterator[str]:
     """For the terminal."""
     yield from _wrapped(f"gate: {result.new}" + (f" against {result.against}" if result.against else ""), width, 2)
     yield from _wrapped(f"  {_scenes(result)}; {_ends(result)}", width, 2)
-    for remark in result.remarks:
-        yield from _wrapped(f"  {remark}", width, 2)
+    for note in result.notes:
+        yield from _wrapped(f"  {note}", width, 2)
     for each in result.judgements:
         yield from _wrapped(f"{each.verdict.upper():<9} {each.rule.text}", width, INDENT)
         yield from _wrapped(f"{'':{INDENT}}{each.values}", width, INDENT)
@@ -72,7 +72,7 @@ def markdown(result: GateResult) -> str:
         f"### {SIGNS[result.outcome]} semstab gate: {headline(result)}",
         "",
         f"{_code(result.new)}{against}, {_cell(_scenes(result))}; {_ends(result)}.",
-        *(f"\n{_cell(remark)}" for remark in result.remarks),
+        *(f"\n{_cell(note)}" for note in result.notes),
         "",
         "| | rule | found | why (for which data) |",
         "|---|---|---|---|",
@@ -104,7 +104,7 @@ def as_json(result: GateResult) -> str:
     content = {
         "schema": SCHEMA, "gate": result.outcome, "new": result.new,
         "against": result.against or None, "scenes": result.scenes, "level": result.level,
-        "undecided": result.undecided, "remarks": result.remarks, "rules": [to_json(row) for row in rows],
+        "undecided": result.undecided, "notes": result.notes, "rules": [to_json(row) for row in rows],
     }  # fmt: skip
     return json.dumps(to_json(content), indent=2) + "\n"
 

@@ -1,7 +1,7 @@
-"""Which places got worse: neighbouring voxels whose frames agree less, or that are wrong now; and which frames did it.
+"""Which areas got worse: neighbouring voxels whose frames agree less, or that are wrong now; and which frames did it.
 
-Chance makes places worse and better alike where nothing changed. So beside each place stands how many others improved
-by as much: its rivals.
+Chance makes areas worse and better alike where nothing changed. So beside each area stands how many others improved
+by as much: its `improved_alike`.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ import numpy.typing as npt
 from semstab.comparison.pairing import Common, in_share, joint_class
 from semstab.core.types import Float64, Int32, Int64, Mask
 from semstab.metrics.agreement import shared_rows, voxel_keys
-from semstab.model.contrast import Blame, Place
+from semstab.model.contrast import Area, FrameShare
 from semstab.model.events import Events
 from semstab.model.measures import dominant
 from semstab.model.voxels import VoxelTable
@@ -25,16 +25,16 @@ from semstab.statistics.agreement import disagreement
 from semstab.statistics.correctness import join_truth
 
 WORSE = 0.2
-"""A voxel got worse where so much of its agreement is lost: of ten looks, one turned to another class."""
+"""A voxel got worse where so much of its agreement is lost: of ten observations, one turned to another class."""
 
 LEAST = 4
-"""Neighbouring voxels that make a place."""
+"""Neighbouring voxels that make an area."""
 
 MOST = 20
 """Places that are told of, the largest loss first."""
 
 SHARE, MOST_FRAMES = 0.9, 8
-"""The frames that account for this share of a place's loss are blamed, so many at most."""
+"""The frames that account for this share of an area's loss, so many at most."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,7 +56,7 @@ class Changed:
 
     @classmethod
     def of(cls, base: VoxelTable, other: VoxelTable, truth: VoxelTable | None) -> Changed:
-        """Of two maps, or of what both have in one place."""
+        """Of two maps, or of what both have in one area."""
         rows = shared_rows(base, other)
         again = (base.op[rows[0]] >= 2) & (other.op[rows[1]] >= 2)
         base, other = (table.rows(own[again]) for table, own in zip((base, other), rows, strict=True))
@@ -70,7 +70,7 @@ class Changed:
 
     @property
     def matters(self) -> Mask:
-        """(n,) which may be part of a place, or of its rivals."""
+        """(n,) which may be part of an area, or of its `improved_alike`."""
         much: Mask = np.abs(self.change) >= WORSE
         return much if self.right is None else much | (self.right != 0)
 
@@ -81,7 +81,7 @@ class Changed:
 
     @classmethod
     def joined(cls, parts: Sequence[Changed]) -> Changed:
-        """Of several places."""
+        """Of several areas."""
         order = np.lexsort(np.concatenate([part.table.index for part in parts]).T[::-1])
 
         def column(name: str) -> Any:
@@ -97,7 +97,7 @@ class Changes:
     """What changed between two maps; of a large one `shown` are those that matter, and some of the others.
 
     compared, worse, better  how many voxels both saw twice or more, and how many changed by WORSE
-    place, wrong_place       (m,) number of the place that got worse, or is wrong now, of each of `shown`; 0 in none
+    area, wrong_area       (m,) number of the area that got worse, or is wrong now, of each of `shown`; 0 in none
     parts                    all voxels with their changes, by name as a file has them, some after the others
     """
 
@@ -105,22 +105,22 @@ class Changes:
     compared: int
     worse: int
     better: int
-    place: Int64
-    wrong_place: Int64 | None
+    area: Int64
+    wrong_area: Int64 | None
     parts: Callable[[], Iterator[dict[str, npt.NDArray[Any]]]]
 
 
 @dataclass(frozen=True, eq=False)
 class Worse:
-    """The places that got worse, the frames to blame for all of them, and what changed in each voxel."""
+    """The areas that got worse, the frames that contribute most, and what changed in each voxel."""
 
-    places: tuple[Place, ...]
-    blamed: tuple[Blame, ...]
+    areas: tuple[Area, ...]
+    top_frames: tuple[FrameShare, ...]
     changes: Changes
 
 
-def worse_places(common: Common, number: int) -> Worse:
-    """Of a run against the base; the frames to blame are known where the looks were kept."""
+def worse_areas(common: Common, number: int) -> Worse:
+    """Of a run against the base; the top contributing frames are known where the observations were kept."""
     compared = worse = better = 0
     kept, shown = list[Changed](), list[Changed]()
     for own in _changed(common, number):
@@ -131,32 +131,32 @@ def worse_places(common: Common, number: int) -> Worse:
         shown.append(own.rows(own.matters | in_share(own.table, common.shown)))
     found, seen = Changed.joined(kept), Changed.joined(shown)
     index = found.table.index
-    place, rivals = _clusters(index, found.label, -found.change, WORSE)
-    looks = _looks(common, number, index)
+    area, improved_alike = _clusters(index, found.label, -found.change, WORSE)
+    observations = _observations(common, number, index)
     names = found.table.classes or tuple(str(k) for k in range(found.table.K))
     size = found.table.voxel_size
-    listed = _places("agreement", place, rivals, -found.change, index, size, found.label, names, looks)
-    wrong_place = None
+    listed = _areas("agreement", area, improved_alike, -found.change, index, size, found.label, names, observations)
+    wrong_area = None
     if found.true is not None and found.right is not None:
         loss = -found.right.astype(float)
-        wrong_place, wrong_rivals = _clusters(index, found.true, loss, 1.0)
-        listed += _places("truth", wrong_place, wrong_rivals, loss, index, size, found.true, names, looks)
+        wrong_area, wrong_rivals = _clusters(index, found.true, loss, 1.0)
+        listed += _areas("truth", wrong_area, wrong_rivals, loss, index, size, found.true, names, observations)
 
     def numbers(table: VoxelTable) -> tuple[Int64, Int64 | None]:
-        """The places of some voxels (n,), which hold those that matter among them."""
+        """The areas of some voxels (n,), which hold those that matter among them."""
         own, theirs = voxel_keys(table.index, index)
         at = np.minimum(np.searchsorted(own, theirs), max(len(own) - 1, 0))
         there = own[at] == theirs if len(own) else np.zeros(len(theirs), np.bool_)
-        wrong = None if wrong_place is None else _put(len(own), at[there], wrong_place[there])
-        return _put(len(own), at[there], place[there]), wrong
+        wrong = None if wrong_area is None else _put(len(own), at[there], wrong_area[there])
+        return _put(len(own), at[there], area[there]), wrong
 
     def parts() -> Iterator[dict[str, npt.NDArray[Any]]]:
         for own in _changed(common, number):
             yield _columns(own, *numbers(own.table))
 
     changes = Changes(seen, compared, worse, better, *numbers(seen.table), parts)
-    blamed = () if looks is None else _blamed(looks.among(place > 0, found.label))
-    return Worse(tuple(listed), blamed, changes)
+    top_frames = () if observations is None else _top_frames(observations.among(area > 0, found.label))
+    return Worse(tuple(listed), top_frames, changes)
 
 
 def _changed(common: Common, number: int) -> Iterator[Changed]:
@@ -172,17 +172,17 @@ def _put(n: int, at: Int64, values: Int64) -> Int64:
     return found
 
 
-def _columns(own: Changed, place: Int64, wrong_place: Int64 | None) -> dict[str, npt.NDArray[Any]]:
+def _columns(own: Changed, area: Int64, wrong_area: Int64 | None) -> dict[str, npt.NDArray[Any]]:
     table = own.table
     found: dict[str, npt.NDArray[Any]] = {
         "ix": table.ix,
         "iy": table.iy,
         "iz": table.iz,
         "change": own.change,
-        "place": place.astype(np.int32),
+        "area": area.astype(np.int32),
     }
-    if own.right is not None and wrong_place is not None:
-        found |= {"right_change": own.right.astype(np.int8), "wrong_place": wrong_place.astype(np.int32)}
+    if own.right is not None and wrong_area is not None:
+        found |= {"right_change": own.right.astype(np.int8), "wrong_area": wrong_area.astype(np.int32)}
     return found
 
 
@@ -190,14 +190,14 @@ def _columns(own: Changed, place: Int64, wrong_place: Int64 | None) -> dict[str,
 
 
 def _clusters(index: Int32, label: Int64, loss: Float64, least: float) -> tuple[Int64, Int64]:
-    """The number (n,) of each voxel's place, the largest loss first, 0 in none; and the rivals of each place (m,)."""
-    place, mass = _connected(index, label, loss, loss >= least)
+    """The number (n,) of each voxel's area, the largest loss first, 0 in none; and how many improved alike (m,)."""
+    area, mass = _connected(index, label, loss, loss >= least)
     _, others = _connected(index, label, -loss, loss <= -least)
-    return place, np.array([np.count_nonzero(others >= own - 1e-9) for own in mass], dtype=np.int64)
+    return area, np.array([np.count_nonzero(others >= own - 1e-9) for own in mass], dtype=np.int64)
 
 
 def _connected(index: Int32, label: Int64, loss: Float64, where: Mask) -> tuple[Int64, Float64]:
-    """The places that voxels of one class make which touch each other, and the loss that each sums up to."""
+    """The areas that voxels of one class make which touch each other, and the loss that each sums up to."""
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
 
@@ -232,36 +232,36 @@ def _touching(index: Int32, label: Int64) -> tuple[Int64, Int64]:
     return np.concatenate(first), np.concatenate(second)
 
 
-def _places(
+def _areas(
     what: Literal["agreement", "truth"],
     number: Int64,
-    rivals: Int64,
+    improved_alike: Int64,
     loss: Float64,
     index: Int32,
     voxel_size: float,
     label: Int64,
     names: Sequence[str],
-    looks: Looks | None,
-) -> list[Place]:
+    observations: Observations | None,
+) -> list[Area]:
     listed = []
-    for k in range(1, min(len(rivals), MOST) + 1):
+    for k in range(1, min(len(improved_alike), MOST) + 1):
         where = number == k
         cells = (index[where] + 0.5) * voxel_size
         x, y, z = cells.mean(axis=0).tolist()
-        seen = None if looks is None else looks.among(where, label)
+        seen = None if observations is None else observations.among(where, label)
         of = int(label[where][0])
         listed.append(
-            Place(
+            Area(
                 k,
                 what,
                 names[of],
-                "" if seen is None else seen.instead(of, names),
+                "" if seen is None else seen.confused_with(of, names),
                 len(cells),
                 float(loss[where].mean()),
                 (x, y, z),
                 float(np.linalg.norm(np.ptp(cells, axis=0) + voxel_size)),
-                int(rivals[k - 1]),
-                () if seen is None else _blamed(seen),
+                int(improved_alike[k - 1]),
+                () if seen is None else _top_frames(seen),
             )
         )
     return listed
@@ -271,11 +271,11 @@ def _places(
 
 
 @dataclass(frozen=True, eq=False)
-class Looks:
-    """The looks of both maps at voxels: (m,) each.
+class Observations:
+    """The observations of both maps at voxels: (m,) each.
 
-    voxel  row of the voxel; frame of the look
-    base, other  (m, K) what they say; of the base its mean at the voxel where it did not look
+    voxel  row of the voxel; frame of the observation
+    base, other  (m, K) what they say; of the base its mean at the voxel where it saw nothing
     """
 
     voxel: Int64
@@ -284,7 +284,7 @@ class Looks:
     other: Float64
 
     def among(self, where: Mask, label: Int64) -> Seen:
-        """Those at some of the voxels (n,), whose classes (n,) are what the looks should say."""
+        """Those at some of the voxels (n,), whose classes (n,) are what the observations should say."""
         rows = where[self.voxel]
         k = label[self.voxel[rows]][:, None]
         base, other = self.base[rows], self.other[rows]
@@ -294,20 +294,20 @@ class Looks:
 
 @dataclass(frozen=True, eq=False)
 class Seen:
-    """Looks at a place: frame (m,), what each lost of the place's class (m,), and what it says (m, K)."""
+    """Observations of an area: frame (m,), what each lost of the area's class (m,), and what it says (m, K)."""
 
     frame: Int64
     lost: Float64
     says: Float64
 
-    def instead(self, of: int, names: Sequence[str]) -> str:
-        """The class that stands where the place's own is missing."""
+    def confused_with(self, of: int, names: Sequence[str]) -> str:
+        """The class that stands where the area's own is missing."""
         said = np.maximum(self.lost, 0) @ self.says if len(self.lost) else np.zeros(len(names))
         said[of] = 0
         return names[int(said.argmax())] if said.max(initial=0) > 0 else ""
 
 
-def _blamed(seen: Seen) -> tuple[Blame, ...]:
+def _top_frames(seen: Seen) -> tuple[FrameShare, ...]:
     """The frames that lost most, as far as they account for it."""
     frames, of = np.unique(seen.frame, return_inverse=True)
     lost = np.maximum(np.bincount(of, weights=seen.lost, minlength=len(frames)), 0.0)
@@ -316,20 +316,22 @@ def _blamed(seen: Seen) -> tuple[Blame, ...]:
     order = np.argsort(-lost, kind="stable")
     share = lost[order] / lost.sum()
     enough = min(int(np.searchsorted(np.cumsum(share), SHARE - 1e-9)) + 1, MOST_FRAMES)
-    return tuple(Blame(int(frames[k]), float(part)) for k, part in zip(order[:enough], share[:enough], strict=True))
+    return tuple(
+        FrameShare(int(frames[k]), float(part)) for k, part in zip(order[:enough], share[:enough], strict=True)
+    )
 
 
-def _looks(common: Common, number: int, index: Int32) -> Looks | None:
-    """The common looks at the voxels (n, 3), in one order; None where they were not kept."""
+def _observations(common: Common, number: int, index: Int32) -> Observations | None:
+    """The common observations at the voxels (n, 3), in one order; None where they were not kept."""
     if not common.logs:
         return None
     base, other = (_rows_of(common.logs[k], index) for k in (0, number))
     there = base[0] >= 0
-    return Looks(base[0][there], base[1][there], base[2][there], other[2][there])
+    return Observations(base[0][there], base[1][there], base[2][there], other[2][there])
 
 
 def _rows_of(log: Events, index: Int32) -> tuple[Int64, Int64, Float64]:
-    """Of each look the row of its voxel, -1 where that is not among them, its frame, and what it says."""
+    """Of each observation the row of its voxel, -1 where that is not among them, its frame, and what it says."""
     own, wanted = voxel_keys(np.stack([log.ix, log.iy, log.iz], axis=1), index)
     at = np.minimum(np.searchsorted(wanted, own), max(len(wanted) - 1, 0))
     row = np.where(wanted[at] == own, at, -1) if len(wanted) else np.full(len(own), -1)

@@ -1,4 +1,4 @@
-"""What runs have in common on a scene: looks, voxels, cubes of space, or nothing; and what that leaves out."""
+"""What runs have in common on a scene: observations, voxels, cubes of space, or nothing; and what that leaves out."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ import numpy as np
 from semstab.comparison.runs import Entry
 from semstab.core.types import THIS_SCENE, Int64, Mask, Scope
 from semstab.metrics.agreement import observations, rows_of, shared_rows
-from semstab.model.contrast import Basis, CommonLooks, MapCoverage
+from semstab.model.contrast import Basis, ComparedObservations, MapCoverage
 from semstab.model.events import Events
 from semstab.model.measures import sbd
 from semstab.model.records import Record
@@ -33,7 +33,7 @@ NEAR = 1e-3
 MOST = 1 << 22
 """Voxels that are in memory at a time: of more common ones a sample is compared, and shown."""
 
-SAMPLED = "of {millions:.3g} million common voxels 1 in {n} is compared, by a hash of its place"
+SAMPLED = "of {millions:.3g} million common voxels 1 in {n} is compared, by a hash of its location"
 SHOWN = "figures and the recording show the voxels that changed, and 1 in {n} of the others"
 
 FEW = 0.1
@@ -42,41 +42,43 @@ FEW = 0.1
 BY_CUBES = (
     "compared are sums in the same cubes of space, each map with all its voxels; what needs them voxel by voxel is"
 )
-BY_CUBES += " left out: the places that got worse"
+BY_CUBES += " left out: the locations that got worse"
 OTHER_SIZES = f"voxels of {{sizes}}: {BY_CUBES}, and what depends on their size (alpha, PSA, VSS, SBD, coverage, ECE)"
 
 
-LOOKS_DECIDED = "labels stand beside scores: each look is reduced to its largest class; the share of the ceiling and"
-LOOKS_DECIDED += " alpha between frames, which forgive what a score leaves open, are left out"
-NOT_DECIDED = "labels stand beside scores, and common looks are not known: of agreement nothing can be compared"
+OBSERVATIONS_DECIDED = (
+    "labels stand beside scores: each observation is reduced to its largest class; the share of the ceiling and"
+)
+OBSERVATIONS_DECIDED += " alpha between frames, which forgive what a score leaves open, are left out"
+NOT_DECIDED = "labels stand beside scores, and common observations are not known: of agreement nothing can be compared"
 
 
 @dataclass(frozen=True, eq=False)
 class Common:
     """Runs on a scene, as far as they can be held against each other.
 
-    sums    of each run, of the common places; for `cubes` and `flights` of its whole map
+    sums    of each run, of the common locations; for `cubes` and `flights` of its whole map
     mixed   whether labels stand beside scores
-    tables  of the common places; none for `cubes` and `flights`
-    logs    of these tables, where looks are in common
+    tables  of the common locations; none for `cubes` and `flights`
+    logs    of these tables, where observations are in common
     label   (n,) the true class of each of their voxels, -1 where it is not known; None without ground truth
-    looks   what the common looks are
+    observations   what the common observations are
     regions where there are voxels: the whole maps if they were made of the same frames and are all of labels or all of
-            scores, else `tables`, place by place, with the ground truth
+            scores, else `tables`, location by location, with the ground truth
     shown   the part of them that figures show beside those that changed
     scope   of the intervals, where frames tell
-    sizes_differ, frames_differ  whether voxels do, and the frames of runs that are paired on looks
+    sizes_differ, frames_differ  whether voxels do, and the frames of runs that are paired on observations
     same_frames  whether frames are paired; None where the sums tell
     """
 
     basis: Basis
-    remarks: tuple[str, ...]
+    notes: tuple[str, ...]
     sums: tuple[ClusterSums, ...]
     mixed: bool = False
     tables: tuple[VoxelTable, ...] = ()
     logs: tuple[Events, ...] = ()
     label: Int64 | None = None
-    looks: CommonLooks | None = None
+    observations: ComparedObservations | None = None
     regions: Regions | None = None
     coverage: tuple[MapCoverage, ...] = ()
     same_frames: bool | None = None
@@ -86,7 +88,7 @@ class Common:
     scope: Scope = THIS_SCENE
 
     def among(self, where: Mask) -> tuple[ClusterSums, ...]:
-        """The sums of some of the common places (n,)."""
+        """The sums of some of the common locations (n,)."""
         return tuple(
             _sums(rows_of(table, where), _some(log, where), None if self.label is None else self.label[where])
             for table, log in zip(self.tables, self.logs or (None,) * len(self.tables), strict=True)
@@ -97,28 +99,28 @@ def pair(entries: Sequence[Entry], names: Sequence[str], scope: Scope = THIS_SCE
     """The most that all runs of a scene have in common. Raises DataError where a file of a run cannot be read."""
     found = _paired(entries, names)
     mixed = len({entry.summary.reduced is None for entry in entries}) > 1
-    told = (LOOKS_DECIDED if found.basis == "looks" else NOT_DECIDED,) if mixed else ()
-    return replace(found, scope=scope, mixed=mixed, remarks=(*found.remarks, *told))
+    told = (OBSERVATIONS_DECIDED if found.basis == "observations" else NOT_DECIDED,) if mixed else ()
+    return replace(found, scope=scope, mixed=mixed, notes=(*found.notes, *told))
 
 
 def _paired(entries: Sequence[Entry], names: Sequence[str]) -> Common:
-    if remark := _other_frame_of_reference(entries):
-        return _apart(entries, remark)
+    if note := _other_frame_of_reference(entries):
+        return _apart(entries, note)
     if len(sizes := {entry.summary.table.voxel_size for entry in entries}) > 1:
-        remark = OTHER_SIZES.format(sizes=" and ".join(f"{size:g} m" for size in sorted(sizes)))
-        return replace(_of_whole_maps("cubes", remark, entries), sizes_differ=True)
-    if remark := _no_voxels(entries):
-        return _of_whole_maps("cubes", remark, entries)
+        note = OTHER_SIZES.format(sizes=" and ".join(f"{size:g} m" for size in sorted(sizes)))
+        return replace(_of_whole_maps("cubes", note, entries), sizes_differ=True)
+    if note := _no_voxels(entries):
+        return _of_whole_maps("cubes", note, entries)
     records = [entry.with_voxels("a comparison by voxels") for entry in entries]
     maps = [Tiles.open(file, VoxelTable) for record in records if (file := record.voxels_file) is not None]
     regions = partial(_regions, names, maps, _truth(records))
     covered = coverage_of(names, [held(region.tables) for region in regions()])
     if not any(row.common_share for row in covered):
-        return _apart(entries, "the maps have no voxel in common: other places, or other frames of reference")
-    found = _by_looks(names, records, regions) or _by_voxels(regions)
+        return _apart(entries, "the maps have no voxel in common: other locations, or other frames of reference")
+    found = _by_observations(names, records, regions) or _by_voxels(regions)
     shown = share_of(min(row.voxels for row in covered))
-    remarks = (*found.remarks, *_remarks(covered), *((SHOWN.format(n=round(1 / shown)),) if shown < 1 else ()))
-    return replace(found, remarks=remarks, regions=found.regions or regions, coverage=covered, shown=shown)
+    notes = (*found.notes, *_notes(covered), *((SHOWN.format(n=round(1 / shown)),) if shown < 1 else ()))
+    return replace(found, notes=notes, regions=found.regions or regions, coverage=covered, shown=shown)
 
 
 def _truth(records: Sequence[Record]) -> Tiles[VoxelTable] | None:
@@ -163,11 +165,11 @@ def joint_class(tables: Iterable[VoxelTable]) -> Int64:
 # --- What is in common ------------------------------------------------------------------------------------------------
 
 
-def _by_looks(names: Sequence[str], records: Sequence[Record], regions: Regions) -> Common | None:
-    """The looks that all made; None where the looks of one were not kept, or are of other frames."""
-    looks = [_looks_of(record) for record in records]
-    there = [own for own in looks if own is not None]
-    if len(there) < len(looks) or not _same_frames(there):
+def _by_observations(names: Sequence[str], records: Sequence[Record], regions: Regions) -> Common | None:
+    """The observations that all made; None where the observations of one were not kept, or are of other frames."""
+    observations = [_observations_of(record) for record in records]
+    there = [own for own in observations if own is not None]
+    if len(there) < len(observations) or not _same_frames(there):
         return None
     shared = compared_observations(dict(zip(names, there, strict=True)))
     tables = tuple(log.table() for log in shared.logs.values())
@@ -177,11 +179,20 @@ def _by_looks(names: Sequence[str], records: Sequence[Record], regions: Regions)
     label = None if truth is None else join_truth(tables[0], truth).label
     logs = tuple(shared.logs.values())
     sums = tuple(_sums(table, log, label) for table, log in zip(tables, logs, strict=True))
-    remarks = _fewer_frames(there)
-    apart = Region(dict(zip(names, tables, strict=True)), None, truth) if remarks or shared.found.decided else None
-    of_looks = None if apart is None else lambda: [apart]
+    notes = _fewer_frames(there)
+    apart = Region(dict(zip(names, tables, strict=True)), None, truth) if notes or shared.found.decided else None
+    of_observations = None if apart is None else lambda: [apart]
     return Common(
-        "looks", remarks, sums, False, tables, logs, label, shared.found, of_looks, frames_differ=bool(remarks)
+        "observations",
+        notes,
+        sums,
+        False,
+        tables,
+        logs,
+        label,
+        shared.found,
+        of_observations,
+        frames_differ=bool(notes),
     )
 
 
@@ -199,25 +210,25 @@ def _by_voxels(regions: Regions) -> Common:
     tables = tuple(VoxelTable.joined(own) for own in zip(*parts, strict=True))
     label = join_truth(tables[0], VoxelTable.joined(truths)).label if truths else None
     sums = tuple(_sums(table, None, label) for table in tables)
-    remark = "the runs made other looks, of other frames: they are paired on voxels alone, for these frames"
+    note = "the runs made other observations, of other frames: they are paired on voxels alone, for these frames"
     sampled = () if share == 1 else (SAMPLED.format(millions=common / 1e6, n=round(1 / share)),)
-    return Common("voxels", (remark, *sampled), sums, False, tables, (), label, same_frames=False)
+    return Common("voxels", (note, *sampled), sums, False, tables, (), label, same_frames=False)
 
 
 def _apart(entries: Sequence[Entry], reason: str) -> Common:
-    remark = f"{reason}: nothing can be paired; each map's own numbers stand beside each other"
-    return replace(_of_whole_maps("flights", remark, entries), same_frames=False)
+    note = f"{reason}: nothing can be paired; each map's own numbers stand beside each other"
+    return replace(_of_whole_maps("flights", note, entries), same_frames=False)
 
 
-def _of_whole_maps(basis: Basis, remark: str, entries: Sequence[Entry]) -> Common:
+def _of_whole_maps(basis: Basis, note: str, entries: Sequence[Entry]) -> Common:
     """The sums of the runs' folders; of right and wrong only where all have them."""
     sums = tuple(entry.sums for entry in entries)
     without = [entry.where for entry in entries if not entry.sums.truth]
     if 0 < len(without) < len(entries):
         sums = tuple(own.without_truth() for own in sums)
         untold = f"{without[0]} holds no ground truth (run it with --statistics): nothing about right and wrong"
-        return Common(basis, (remark, untold), sums)
-    return Common(basis, (remark,), sums)
+        return Common(basis, (note, untold), sums)
+    return Common(basis, (note,), sums)
 
 
 def _sums(table: VoxelTable, log: Events | None, label: Int64 | None) -> ClusterSums:
@@ -228,14 +239,14 @@ def _some(log: Events | None, where: Mask) -> Events | None:
     return None if log is None else observations(log, np.flatnonzero(where[log.voxel]))
 
 
-def _looks_of(record: Record) -> CellObservations | None:
+def _observations_of(record: Record) -> CellObservations | None:
     file = record.looks_file
     return CellObservations.load(file) if file is not None and file.is_file() else None
 
 
-def _same_frames(looks: Sequence[CellObservations]) -> bool:
-    """Whether frames of one index were taken from one place, and most of the shorter flight's are in the others."""
-    first, *others = (own.views for own in looks)
+def _same_frames(observations: Sequence[CellObservations]) -> bool:
+    """Whether frames of one index were taken from one location, and most of the shorter flight's are in the others."""
+    first, *others = (own.views for own in observations)
     for other in others:
         _, one, same = np.intersect1d(first.frame, other.frame, return_indices=True)
         if 2 * len(one) < min(len(first), len(other)):
@@ -245,9 +256,9 @@ def _same_frames(looks: Sequence[CellObservations]) -> bool:
     return True
 
 
-def _fewer_frames(looks: Sequence[CellObservations]) -> tuple[str, ...]:
+def _fewer_frames(observations: Sequence[CellObservations]) -> tuple[str, ...]:
     """Where not all of a run's frames are in the others."""
-    frames = [own.views.frame for own in looks]
+    frames = [own.views.frame for own in observations]
     both = len(functools.reduce(np.intersect1d, frames))
     listed = " and ".join(str(len(own)) for own in frames)
     if both == max(map(len, frames)):
@@ -262,7 +273,7 @@ def _fewer_frames(looks: Sequence[CellObservations]) -> tuple[str, ...]:
 
 
 def _other_frame_of_reference(entries: Sequence[Entry]) -> str:
-    """Why coordinates are not those of the same places; empty where they are."""
+    """Why coordinates are not those of the same locations; empty where they are."""
     first, *others = (entry.georeference for entry in entries)
     for entry, own in zip(entries[1:], others, strict=True):
         if (own is None) != (first is None):
@@ -284,7 +295,7 @@ def _no_voxels(entries: Sequence[Entry]) -> str:
     return ""
 
 
-def _remarks(covered: Sequence[MapCoverage]) -> list[str]:
+def _notes(covered: Sequence[MapCoverage]) -> list[str]:
     """Where a map has hardly anything in common with the others."""
     return [
         f"only {row.common_share:.1%} of the voxels of {row.backbone} are in all maps: are the frames of reference the"

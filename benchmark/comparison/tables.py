@@ -9,9 +9,9 @@ from collections.abc import Iterator, Mapping, Sequence
 from rich.console import Console
 
 from semstab.comparison.locations import MOST
-from semstab.model.contrast import Against, Basis, Blame, Contrast, Place, RunComparison, SceneComparison
+from semstab.model.contrast import Against, Area, Basis, Contrast, FrameShare, RunComparison, SceneComparison
 from semstab.model.measures import ENTROPY, VSS, Quantity, measures
-from semstab.model.statistics import Estimate, Interval
+from semstab.model.statistics import Interval
 from semstab.report.tables.correctness import coverage_table, ignored_table
 from semstab.report.tables.table import Column, Group, Row, Table, to_terminal
 from semstab.report.terminal import WIDTH
@@ -56,10 +56,10 @@ def by_key(chosen: Sequence[Quantity]) -> Mapping[str, Quantity]:
 
 
 IN_SUMS = (ALPHA_BETWEEN, ALPHA, PSA, RECURRENT_VSS, SBD_EXCESS, ENTROPY, ACCURACY, MIOU, ECE, MISLEADING)
-"""Of these the sums by frame and place tell all."""
+"""Of these the sums by frame and location tell all."""
 
 ONE_AGAINST_ALL = (VERDICT, ALPHA_BETWEEN, ALPHA, RECALL, PRECISION, IOU)
-"""By class: of that class against all others; the rest is of the places of that class."""
+"""By class: of that class against all others; the rest is of the locations of that class."""
 
 
 ALL_SCENES = "all scenes"
@@ -75,23 +75,29 @@ ANSWERS = (
 )
 
 
-def tables(found: RunComparison) -> list[Table]:
+def tables(comparison: RunComparison) -> list[Table]:
     """All that there is something for."""
-    made = [_differences(found), _by_class(found), _places(found), _frames(found), *_what_was_compared(found)]
-    return [table for table in made if any(group.rows for group in table.groups)] + [everything(found)]
+    made = [
+        _differences(comparison),
+        _by_class(comparison),
+        _areas(comparison),
+        _frames(comparison),
+        *_what_was_compared(comparison),
+    ]
+    return [table for table in made if any(group.rows for group in table.groups)] + [everything(comparison)]
 
 
-def scopes(found: RunComparison) -> Iterator[tuple[str, Against]]:
+def scopes(comparison: RunComparison) -> Iterator[tuple[str, Against]]:
     """Each run against the base: over all scenes where there are several, then scene by scene."""
-    if len(found.scenes) > 1:
-        yield from ((ALL_SCENES, own) for own in found.overall)
-    for scene in found.scenes:
+    if len(comparison.scenes) > 1:
+        yield from ((ALL_SCENES, own) for own in comparison.overall)
+    for scene in comparison.scenes:
         yield from ((scene.scene, own) for own in scene.against)
 
 
-def heading(found: RunComparison, scope: str, own: Against) -> str:
+def heading(comparison: RunComparison, scope: str, own: Against) -> str:
     """What stands above a run's differences."""
-    return f"{scope}: {own.other} less {found.base}"
+    return f"{scope}: {own.other} less {comparison.base}"
 
 
 def scope(row: Contrast) -> str:
@@ -104,20 +110,21 @@ def scope(row: Contrast) -> str:
 # --- Parts ------------------------------------------------------------------------------------------------------------
 
 
-def _differences(found: RunComparison) -> Table:
+def _differences(comparison: RunComparison) -> Table:
     columns = (
         Column("measure", "Measure"),
-        Column("base", found.base, 4),
+        Column("base", comparison.base, 4),
         Column("other", "The run", 4),
         Column("difference", "Difference", 4, signed=True),
         Column("p_holm", "p (Holm)", 4),
         Column("answers", "Answers for"),
         Column("change", "Change"),
     )
-    groups = tuple(Group(heading(found, scope, own), _rows(own, HEADLINES)) for scope, own in scopes(found))
-    macro = " Over all scenes each scene counts once." if len(found.scenes) > 1 else ""
+    groups = tuple(Group(heading(comparison, scope, own), _rows(own, HEADLINES)) for scope, own in scopes(comparison))
+    macro = " Over all scenes each scene counts once." if len(comparison.scenes) > 1 else ""
     caption = (
-        "On the places that all runs saw; the share of the ceiling and coverage are of each run's whole map, flicker of"
+        "On the locations that all runs saw; the share of the ceiling and coverage are of each run's whole map, flicker"
+        " of"
         " its images; coverage is the number of voxels seen twice or more, for each one of the base. Undecided: too few"
         f" frames, or errors reach as far as the scene. {ANSWERS}{macro}"
     )
@@ -138,14 +145,14 @@ def _titled(quantity: Quantity) -> str:
     return f"{quantity.title}{unit}"
 
 
-def _by_class(found: RunComparison) -> Table:
-    there = {row.measure for _, own in scopes(found) for row in own.by_class}
+def _by_class(comparison: RunComparison) -> Table:
+    there = {row.measure for _, own in scopes(comparison) for row in own.by_class}
     shown = [quantity for quantity in IN_CLASSES if quantity.key in there]
     columns = (Column("class", "Class"), *(Column(q.key, q.title, 3, q.better, signed=True) for q in shown))
     worse = Column("worse", "Worse"), Column("better", "Better")
-    groups = tuple(Group(heading(found, scope, own), _class_rows(own, shown)) for scope, own in scopes(found))
+    groups = tuple(Group(heading(comparison, scope, own), _class_rows(own, shown)) for scope, own in scopes(comparison))
     caption = (
-        "Differences of each class: agreement of the class against all others, PSA of the places that are of it (by the"
+        "Differences of each class: agreement of the class against all others, PSA of its locations (by the"
         " ground truth, else by what all runs together say), recall and IoU. Worse, better: what differs where the"
         f" p-values are corrected for all measures and classes. {ANSWERS}"
     )
@@ -166,66 +173,69 @@ def _class_rows(own: Against, shown: Sequence[Quantity]) -> tuple[Row, ...]:
     return tuple(rows)
 
 
-def _places(found: RunComparison) -> Table:
+def _areas(comparison: RunComparison) -> Table:
     columns = (
-        Column("number", "Place", 0),
+        Column("number", "Area", 0),
         Column("what", "Lost"),
         Column("class", "Class"),
-        Column("instead", "Instead"),
+        Column("confused_with", "Confused with"),
         Column("voxels", "Voxels", 0),
         Column("loss", "Loss", 2),
         Column("x", "x", 2, over="Centre (m)"),
         Column("y", "y", 2, over="Centre (m)"),
         Column("z", "z", 2, over="Centre (m)"),
         Column("size", "Size (m)", 2),
-        Column("rivals", "Rivals", 0),
-        Column("frames", "Frames to blame"),
+        Column("improved_alike", "Improved alike", 0),
+        Column("frames", "Top contributing frames"),
     )
     groups = tuple(
-        Group(heading(found, scene.scene, own), tuple(_place_row(place) for place in own.places))
-        for scene in found.scenes
+        Group(heading(comparison, scene.scene, own), tuple(_area_row(area) for area in own.areas))
+        for scene in comparison.scenes
         for own in scene.against
     )
     caption = (
         "Neighbouring voxels of one class that got worse. Agreement: a fifth or more of the agreement between frames is"
-        " lost; truth: right in the base, and wrong now. Loss: its mean. Instead: what the blamed looks say. Rivals:"
-        " places that got better by as much; where nothing changed there are as many of them. Frames to blame: those"
-        " whose looks turned away from the class, with their share."
+        " lost; truth: right in the base, and wrong now. Loss: its mean. Confused with: what these frames say. Improved"
+        " alike:"
+        " areas that got better by as much; where nothing changed there are as many. Top contributing frames: those"
+        " whose observations turned away from the class, with their share."
     )
-    return Table("comparison_places", "Places that got worse", caption, columns, groups, "scope")
+    return Table("comparison_areas", "Areas that got worse", caption, columns, groups, "scope")
 
 
-def _place_row(place: Place) -> Row:
+def _area_row(area: Area) -> Row:
     return (
-        place.number, place.what, place.of, place.instead, place.voxels, place.loss, *place.centre, place.size,
-        place.rivals, blamed(place.frames),
+        area.number, area.what, area.of, area.confused_with, area.voxels, area.loss, *area.centre, area.size,
+        area.improved_alike, top_frames(area.frames),
     )  # fmt: skip
 
 
-def blamed(frames: Sequence[Blame]) -> str:
+def top_frames(frames: Sequence[FrameShare]) -> str:
     """'13 (30%), 4 (26%)'."""
     listed = ", ".join(f"{own.frame} ({own.share:.0%})" for own in frames[:NAMED_FRAMES])
     return listed + (", ..." if len(frames) > NAMED_FRAMES else "")
 
 
-def _frames(found: RunComparison) -> Table:
+def _frames(comparison: RunComparison) -> Table:
     columns = (Column("frame", "Frame"), Column("share_percent", "Share of what was lost (%)", 1))
     groups = tuple(
-        Group(heading(found, scene.scene, own), tuple((str(each.frame), 100 * each.share) for each in own.blamed))
-        for scene in found.scenes
+        Group(
+            heading(comparison, scene.scene, own), tuple((str(each.frame), 100 * each.share) for each in own.top_frames)
+        )
+        for scene in comparison.scenes
         for own in scene.against
     )
-    caption = "Of all places whose frames agree less, together."
-    return Table("comparison_frames", "Frames to blame", caption, columns, groups, "scope")
+    caption = "Of all areas whose frames agree less, together."
+    return Table("comparison_frames", "Top contributing frames", caption, columns, groups, "scope")
 
 
-def _what_was_compared(found: RunComparison) -> list[Table]:
-    covered = coverage_table({scene.scene: scene.coverage for scene in found.scenes if scene.coverage})
-    looks = {scene.scene: scene.looks for scene in found.scenes if scene.looks is not None}
-    return [covered, ignored_table(looks)]
+def _what_was_compared(comparison: RunComparison) -> list[Table]:
+    covered = coverage_table({scene.scene: scene.coverage for scene in comparison.scenes if scene.coverage})
+    observations = {scene.scene: scene.observations for scene in comparison.scenes if scene.observations is not None}
+    return [covered, ignored_table(observations)]
 
 
-def everything(found: RunComparison) -> Table:
+def everything(comparison: RunComparison) -> Table:
     """All contrasts, one a row."""
     columns = (
         Column("run", "Run"),
@@ -240,40 +250,40 @@ def everything(found: RunComparison) -> Table:
         Column("change", "Change"),
         Column("undecided", "Undecided"),
     )
-    groups = tuple(Group(scope, tuple(_all_rows(own))) for scope, own in scopes(found))
+    groups = tuple(Group(scope, tuple(_all_rows(own))) for scope, own in scopes(comparison))
     return Table("comparison_all", "All that was compared", ANSWERS, columns, groups, "scope")
 
 
 def _all_rows(own: Against) -> Iterator[Row]:
     for row in (*own.contrasts, *own.by_class):
-        found: Interval = row.difference
+        change: Interval = row.difference
         yield (
-            own.other, row.of, row.measure, row.base, row.other, Estimate(found.value, found.low, found.high),
-            found.scope, found.p_value, row.p_holm, row.change, found.undecided,
+            own.other, row.of, row.measure, row.base, row.other, change.ends, change.scope, change.p_value,
+            row.p_holm, row.change, change.undecided,
         )  # fmt: skip
 
 
-# What a comparison found, in sentences: on the terminal, in Markdown and above the report.
+# What a comparison comparison, in sentences: on the terminal, in Markdown and above the report.
 
 MOST_CLASSES = 4
 """Classes that are told of in a sentence."""
 
 BASES: dict[Basis, str] = {
-    "looks": "paired on the looks (a place in a frame) that all runs made, each with the same weight",
+    "observations": "paired on the observations (a voxel in a frame) that all runs made, each with the same weight",
     "voxels": "paired on the voxels that all runs saw twice or more",
     "cubes": "paired on cubes of space",
     "flights": "not paired",
 }
 
 
-def sentences(found: RunComparison) -> list[str]:
+def sentences(comparison: RunComparison) -> list[str]:
     """One run after the other, then what could not be compared."""
-    told = [sentence for own in found.overall for sentence in _of_run(found, own)]
-    return [*told, *(sentence for scene in found.scenes for sentence in _what(scene))]
+    told = [sentence for own in comparison.overall for sentence in _of_run(comparison, own)]
+    return [*told, *(sentence for scene in comparison.scenes for sentence in _what(scene))]
 
 
-def _of_run(found: RunComparison, own: Against) -> Iterator[str]:
-    yield _steadiness(found, own)
+def _of_run(comparison: RunComparison, own: Against) -> Iterator[str]:
+    yield _stability(comparison, own)
     if changes := _changes(own.contrasts, by_key(HEADLINES)):
         yield f"{own.other}: {changes}."
     classes = {
@@ -283,32 +293,34 @@ def _of_run(found: RunComparison, own: Against) -> Iterator[str]:
     if listed := [f"{name} {text}" for name, text in told.items() if text]:
         more = f"; and {len(listed) - MOST_CLASSES} more classes" if len(listed) > MOST_CLASSES else ""
         yield f"{own.other} by class: {'. '.join(listed[:MOST_CLASSES])}{more}."
-    for scene in found.scenes:
+    for scene in comparison.scenes:
         mine = next(each for each in scene.against if each.other == own.other)
         for what in ("agreement", "truth"):
-            if places := [place for place in mine.places if place.what == what]:
-                yield f"{own.other} in {scene.scene}: {_of_places(places)}."
+            if areas := [area for area in mine.areas if area.what == what]:
+                yield f"{own.other} in {scene.scene}: {_of_areas(areas)}."
 
 
-def _steadiness(found: RunComparison, own: Against) -> str:
+def _stability(comparison: RunComparison, own: Against) -> str:
     """What the share of the ceiling says, on which verdicts rest, or the first measure that is known."""
     rows = {row.measure: row for row in own.contrasts}
     quantity = next((each for each in HEADLINES if each.key in rows), VERDICT)
     row = rows.get(quantity.key)
     if row is None:
-        return f"{own.other} and {found.base} have nothing that can be compared."
-    where = f" over {len(found.scenes)} scenes" if len(found.scenes) > 1 else ""
+        return f"{own.other} and {comparison.base} have nothing that can be compared."
+    where = f" over {len(comparison.scenes)} scenes" if len(comparison.scenes) > 1 else ""
     numbers = f"{quantity.word} {row.base:.3f} and {row.other:.3f}{where}"
     if row.difference.value == row.difference.low == row.difference.high == 0:
-        return f"{own.other} is as steady as {found.base}: {numbers}, the same in every place."
+        return f"{own.other} is as stable as {comparison.base}: {numbers}, the same everywhere."
     interval = f"{row.difference.value:+z.3f} ({row.difference.low:+z.3f} to {row.difference.high:+z.3f})"
     p = "" if math.isnan(row.p_holm) else f", p {row.p_holm:.2g}"
-    said = {"better": "is steadier than", "worse": "is less steady than"}
+    said = {"better": "is more stable than", "worse": "is less stable than"}
     if row.change:
-        return f"{own.other} {said[row.change]} {found.base}: {numbers}, {interval}{p}, for {row.difference.scope}."
+        return (
+            f"{own.other} {said[row.change]} {comparison.base}: {numbers}, {interval}{p}, for {row.difference.scope}."
+        )
     why = f"; undecided: {row.difference.undecided}" if row.difference.undecided else ""
     return (
-        f"Over all classes no difference in steadiness between {own.other} and {found.base} is shown: {numbers},"
+        f"Over all classes no difference in stability between {own.other} and {comparison.base} is shown: {numbers},"
         f" {interval}{p}, for {row.difference.scope}{why}."
     )
 
@@ -322,24 +334,24 @@ def _changes(rows: Sequence[Contrast], known: Mapping[str, Quantity]) -> str:
     return "; ".join(f"{change} in {', '.join(names)}" for change, names in listed.items() if names)
 
 
-def _of_places(places: Sequence[Place]) -> str:
-    first = places[0]
+def _of_areas(areas: Sequence[Area]) -> str:
+    first = areas[0]
     lost = "whose frames agree less" if first.what == "agreement" else "that are wrong now"
-    count = f"{MOST} or more places" if len(places) == MOST else f"{len(places)} place{'s' if len(places) > 1 else ''}"
-    rivals = f"{first.rivals or 'none'} improved by as much as the largest"
-    instead = f", {first.instead} instead" if first.instead else ""
+    count = f"{MOST} or more areas" if len(areas) == MOST else f"{len(areas)} area{'s' if len(areas) > 1 else ''}"
+    alike = f"{first.improved_alike or 'none'} improved by as much as the largest"
+    confused_with = f", confused with {first.confused_with}" if first.confused_with else ""
     x, y, z = first.centre
-    frames = f"; to blame are the frames {blamed(first.frames)}" if first.frames else ""
+    frames = f"; the top contributing frames are {top_frames(first.frames)}" if first.frames else ""
     return (
-        f"{count} {lost} ({rivals}); the largest is {first.voxels} voxels of"
-        f" {first.of}{instead}, at ({x:.2f}, {y:.2f}, {z:.2f}) m{frames}"
+        f"{count} {lost} ({alike}); the largest is {first.voxels} voxels of"
+        f" {first.of}{confused_with}, at ({x:.2f}, {y:.2f}, {z:.2f}) m{frames}"
     )
 
 
 def _what(scene: SceneComparison) -> Iterator[str]:
-    if scene.basis in ("looks", "voxels"):
+    if scene.basis in ("observations", "voxels"):
         yield f"{scene.scene}: {scene.voxels:,} voxels, {BASES[scene.basis]}."
-    yield from (f"{scene.scene}: {remark}." for remark in scene.remarks)
+    yield from (f"{scene.scene}: {note}." for note in scene.notes)
 
 
 # --- In a terminal of 80 columns --------------------------------------------------------------------------------------
@@ -347,16 +359,16 @@ def _what(scene: SceneComparison) -> Iterator[str]:
 SHOWN = {
     "comparison": ("measure", "base", "other", "difference", "change"),
     "comparison_classes": ("class", "worse", "better", VERDICT.key, "alpha_between"),
-    "comparison_places": ("what", "class", "instead", "voxels", "loss", "x", "y", "z"),
+    "comparison_areas": ("what", "class", "confused_with", "voxels", "loss", "x", "y", "z"),
 }
 """The columns of each table that fit; files have all of them."""
 
 
-def print_comparison(found: RunComparison, console: Console) -> None:
+def print_comparison(comparison: RunComparison, console: Console) -> None:
     """The answer in sentences, then the differences, the classes and the locations that got worse."""
-    for sentence in sentences(found):
+    for sentence in sentences(comparison):
         console.print(sentence, highlight=False, markup=False)
-    for table in tables(found):
+    for table in tables(comparison):
         if table.name in SHOWN:
             text = to_terminal(dataclasses.replace(table.only(*SHOWN[table.name]), caption=""), WIDTH)
             console.print(f"\n{text}", highlight=False, markup=False, soft_wrap=True)

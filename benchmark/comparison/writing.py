@@ -7,7 +7,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from semstab.comparison.differences import Found, Progress, find
+from semstab.comparison.differences import ComparisonData, Progress, find
 from semstab.comparison.locations import Changes
 from semstab.comparison.tables import ALL_SCENES, HEADLINES, IN_CLASSES, IOU, by_key, heading, scopes, sentences, tables
 from semstab.config.settings import ScopeOption, validated
@@ -42,30 +42,31 @@ MOST_NUMBERS = 9
 """Places that have their number in a map."""
 
 
-def figures(found: Found) -> list[Figure]:
+def figures(comparison: ComparisonData) -> list[Figure]:
     """All that there is something for."""
-    return [*_forest(found.result), *_forest_by_class(found.result), *_maps(found)]
+    return [*_forest(comparison.result), *_forest_by_class(comparison.result), *_maps(comparison)]
 
 
-def _forest(found: RunComparison) -> Iterator[Figure]:
+def _forest(comparison: RunComparison) -> Iterator[Figure]:
     shown, panels = by_key(HEADLINES), Panels()
-    for scope, own in scopes(found):
+    for scope, own in scopes(comparison):
         for row in own.contrasts:
             if row.measure in shown:
                 panels.setdefault(shown[row.measure].title, {}).setdefault(scope, {})[own.other] = row.difference
     yield Figure(
         "comparison",
         "Differences",
-        f"Each run less {found.base}, with intervals at 95%: for this scene flown again where there are {LEAST_FRAMES}"
+        f"Each run less {comparison.base}, with intervals at 95%: for this scene flown again where there are"
+        f" {LEAST_FRAMES}"
         " frames, else for these frames. An interval that holds 0 decides nothing.",
-        f"One panel a measure with the difference of each run from {found.base} and its interval, beside 0.",
+        f"One panel a measure with the difference of each run from {comparison.base} and its interval, beside 0.",
         lambda: draw_intervals(panels, dict.fromkeys(panels, (0.0,))),
     )
 
 
-def _forest_by_class(found: RunComparison) -> Iterator[Figure]:
+def _forest_by_class(comparison: RunComparison) -> Iterator[Figure]:
     """Over all scenes where there are several."""
-    overall = found.overall
+    overall = comparison.overall
     panels = Panels()
     for quantity in (quantity for quantity in IN_CLASSES if quantity is not PSA):
         for own in overall:
@@ -74,29 +75,29 @@ def _forest_by_class(found: RunComparison) -> Iterator[Figure]:
                     classes = panels.setdefault(quantity.title, {})
                     classes.setdefault(row.of or "all classes", {})[own.other] = row.difference
     if any(own.by_class for own in overall):
-        where = f", macro means over {ALL_SCENES}" if len(found.scenes) > 1 else ""
+        where = f", macro means over {ALL_SCENES}" if len(comparison.scenes) > 1 else ""
         yield Figure(
             "comparison_classes",
             "Differences by class",
-            f"Each run less {found.base}{where}, with intervals at 95%. Agreement is that of the class against all"
-            " others; of all classes recall is accuracy, and IoU its mean. Classes with few places are left out.",
-            f"One panel a measure with the difference of each run from {found.base} in each class, beside 0.",
+            f"Each run less {comparison.base}{where}, with intervals at 95%. Agreement is that of the class against all"
+            " others; of all classes recall is accuracy, and IoU its mean. Classes with few locations are left out.",
+            f"One panel a measure with the difference of each run from {comparison.base} in each class, beside 0.",
             lambda: draw_intervals(panels, dict.fromkeys(panels, (0.0,))),
         )
 
 
-def _maps(found: Found) -> Iterator[Figure]:
-    for scene in found.result.scenes:
+def _maps(comparison: ComparisonData) -> Iterator[Figure]:
+    for scene in comparison.result.scenes:
         for own in scene.against:
-            if (scene.scene, own.other) in found.changes and scene.scene in found.up:
+            if (scene.scene, own.other) in comparison.changes and scene.scene in comparison.up:
                 yield Figure(
                     slug("comparison_map", scene.scene, own.other),
-                    f"Where it changed: {scene.scene}, {own.other} less {found.result.base}",
+                    f"Where it changed: {scene.scene}, {own.other} less {comparison.result.base}",
                     "The largest change in each column of voxels that both saw twice or more: agreement between frames,"
-                    " and where ground truth is known what is wrong now or right now. Numbers are those of the places"
+                    " and where ground truth is known what is wrong now or right now. Numbers are those of the areas"
                     " that got worse.",
                     f"Maps of {scene.scene} from above: orange where {own.other} is worse, blue where it is better.",
-                    partial(_draw, found.changes[scene.scene, own.other], found.up[scene.scene], own),
+                    partial(_draw, comparison.changes[scene.scene, own.other], comparison.up[scene.scene], own),
                     unit=slug(scene.scene, own.other),
                 )
 
@@ -110,8 +111,8 @@ def _draw(changes: Changes, up: tuple[float, float, float], own: Against) -> Can
 
 
 def _numbers(own: Against, what: str) -> tuple[list[int], list[tuple[float, float, float]]]:
-    shown = [place for place in own.places if place.what == what][:MOST_NUMBERS]
-    return [place.number for place in shown], [place.centre for place in shown]
+    shown = [area for area in own.areas if area.what == what][:MOST_NUMBERS]
+    return [area.number for area in shown], [area.centre for area in shown]
 
 
 CONTENT, PAGE, REPORT, RECORDING = "comparison.json", "comparison.md", "report.html", "recording.rrd"
@@ -136,10 +137,10 @@ def compare(
     """
     if out is not None:
         _require_own(Path(out))
-    found = find(runs, progress, validated(ScopeOption, {"scope": scope}, "compare: ").scope)
+    comparison = find(runs, progress, validated(ScopeOption, {"scope": scope}, "compare: ").scope)
     if out is not None:
-        write(found, out)
-    return found.result
+        write(comparison, out)
+    return comparison.result
 
 
 def load_comparison(folder: str | Path) -> RunComparison:
@@ -148,39 +149,44 @@ def load_comparison(folder: str | Path) -> RunComparison:
     return from_json(RunComparison, read_json(path), path)
 
 
-def write(found: Found, out: str | Path) -> None:
+def write(comparison: ComparisonData, out: str | Path) -> None:
     """Write the folder; of an earlier comparison nothing is left in it."""
-    folder, made, drawn = Path(out), tables(found.result), figures(found)
+    folder, made, drawn = Path(out), tables(comparison.result), figures(comparison)
     _require_own(folder)
-    write_json(folder / CONTENT, found.result)
-    write_text(folder / PAGE, markdown(found.result, made))
+    write_json(folder / CONTENT, comparison.result)
+    write_text(folder / PAGE, markdown(comparison.result, made))
     save_tables(made, folder)
     keep_only([path for figure in drawn for path in figure.save(folder / "figures")], folder / "figures")
-    _write_columns(found, folder)
-    write_text(folder / REPORT, page(found.result, made, drawn, folder))
-    if found.changes:
+    _write_columns(comparison, folder)
+    write_text(folder / REPORT, page(comparison.result, made, drawn, folder))
+    if comparison.changes:
         from semstab.recording.changes import record_changes
 
-        record_changes(folder / RECORDING, dict(_recorded(found)), found.up, sentences(found.result))
+        record_changes(folder / RECORDING, dict(_recorded(comparison)), comparison.up, sentences(comparison.result))
 
 
-def markdown(found: RunComparison, made: Sequence[Table] | None = None) -> str:
-    """The comparison for a pull request: what was found, then the tables."""
-    shown = [table for table in (made or tables(found)) if table.name != "comparison_all"]
-    names = ", ".join(each.name for each in found.runs[1:])
-    head = [f"## {names} against {found.base}", "", *(f"- {relations(text)}" for text in sentences(found)), ""]
+def markdown(comparison: RunComparison, made: Sequence[Table] | None = None) -> str:
+    """The comparison for a pull request: what was comparison, then the tables."""
+    shown = [table for table in (made or tables(comparison)) if table.name != "comparison_all"]
+    names = ", ".join(each.name for each in comparison.runs[1:])
+    head = [
+        f"## {names} against {comparison.base}",
+        "",
+        *(f"- {relations(text)}" for text in sentences(comparison)),
+        "",
+    ]
     return "\n".join([*head, *map(to_markdown, shown)])
 
 
-def page(found: RunComparison, made: Sequence[Table], drawn: Sequence[Figure], folder: Path) -> str:
+def page(comparison: RunComparison, made: Sequence[Table], drawn: Sequence[Figure], folder: Path) -> str:
     """report.html."""
     shown = [table for table in made if table.name != "comparison_all"]
     return filled(
         "comparison.html.j2",
-        title=f"{', '.join(each.name for each in found.runs[1:])} against {found.base}",
-        runs=found.runs,
-        scenes=[scene.scene for scene in found.scenes],
-        reading=[relations(text) for text in sentences(found)],
+        title=f"{', '.join(each.name for each in comparison.runs[1:])} against {comparison.base}",
+        runs=comparison.runs,
+        scenes=[scene.scene for scene in comparison.scenes],
+        reading=[relations(text) for text in sentences(comparison)],
         topics=list(_topics(shown, drawn, folder)),
     )
 
@@ -190,7 +196,7 @@ def page(found: RunComparison, made: Sequence[Table], drawn: Sequence[Figure], f
 TOPICS = (
     ("differences", "What differs", ("comparison",)),
     ("classes", "By class", ("comparison_classes",)),
-    ("where", "Where", ("comparison_places", "comparison_frames", "comparison_map")),
+    ("where", "Where", ("comparison_areas", "comparison_frames", "comparison_map")),
     ("compared", "What was compared", ("comparison_coverage", "comparison_ignored")),
 )
 
@@ -203,12 +209,12 @@ def _topics(made: Sequence[Table], drawn: Sequence[Figure], folder: Path) -> Ite
             yield {"id": key, "title": title, "blocks": list(blocks(own, shown, folder))}
 
 
-def _write_columns(found: Found, folder: Path) -> None:
+def _write_columns(comparison: ComparisonData, folder: Path) -> None:
     written = []
-    for scene in found.result.scenes:
+    for scene in comparison.result.scenes:
         for own in scene.against:
             if own.columns is not None:
-                changes = found.changes[scene.scene, own.other]
+                changes = comparison.changes[scene.scene, own.other]
                 written.append(folder / own.columns)
                 table = changes.shown.table
                 parquet.write(written[-1], changes.parts(), KIND, table.voxel_size, table.classes)
@@ -216,13 +222,13 @@ def _write_columns(found: Found, folder: Path) -> None:
         keep_only(written, written[0].parent)
 
 
-def _recorded(found: Found) -> Iterator[tuple[tuple[str, str], tuple[Any, ...]]]:
-    for scene in found.result.scenes:
+def _recorded(comparison: ComparisonData) -> Iterator[tuple[tuple[str, str], tuple[Any, ...]]]:
+    for scene in comparison.result.scenes:
         for own in scene.against:
-            if (changes := found.changes.get((scene.scene, own.other))) is not None:
-                places = [(place.what, f"{place.number} {place.of}", place.centre) for place in own.places]
-                title, shown = heading(found.result, scene.scene, own), changes.shown
-                yield (scene.scene, own.other), (title, shown.table, shown.change, shown.right, places)
+            if (changes := comparison.changes.get((scene.scene, own.other))) is not None:
+                areas = [(area.what, f"{area.number} {area.of}", area.centre) for area in own.areas]
+                title, shown = heading(comparison.result, scene.scene, own), changes.shown
+                yield (scene.scene, own.other), (title, shown.table, shown.change, shown.right, areas)
 
 
 def _require_own(folder: Path) -> None:

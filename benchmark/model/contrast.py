@@ -68,7 +68,7 @@ class PairedDifference:
 
 @dataclass(frozen=True)
 class Rank:
-    """A backbone's place, 1 being the best, with the range that holds 95 % of the resamples.
+    """A backbone's rank, 1 being the best, with the range that holds 95 % of the resamples.
 
     best is the share of the resamples in which it is first.
     """
@@ -111,11 +111,11 @@ class Paired:
 
 @dataclass(frozen=True)
 class Ignored:
-    """What a backbone left out of the looks that any backbone labelled, and what that may be worth.
+    """What a backbone left out of the observations that any backbone labelled, and what that may be worth.
 
     missing            share of their pixels
-    psa_low, psa_high  bounds of its mean PSA, whatever the missing looks would have said (Manski 1990)
-    alpha              between frames, where to leave a place out is a class of its own
+    psa_low, psa_high  bounds of its mean PSA, whatever the missing observations would have said (Manski 1990)
+    alpha              between frames, where to leave a location out is a class of its own
     """
 
     backbone: str
@@ -126,13 +126,13 @@ class Ignored:
 
 
 @dataclass(frozen=True)
-class CommonLooks:
-    """What was compared: the looks (cell of a voxel, frame) that all backbones labelled, each with the same weight.
+class ComparedObservations:
+    """What was compared: the cells of voxels that all backbones labelled in a frame, each with the same weight.
 
     voxels, observations  sampled ones that they are of
-    decided               whether each look was reduced to its largest class: labels were compared with scores
-    order                 of the backbones by the primary measure on these looks, the best first
-    order_ignored         the same where to leave a place out is a class of its own
+    decided               whether each observation was reduced to its largest class: labels were compared with scores
+    order                 of the backbones by the primary measure on these observations, the best first
+    order_ignored         the same where to leave a location out is a class of its own
     bounded               whether the bounds of PSA keep its order of the backbones, whatever was left out
     """
 
@@ -176,15 +176,15 @@ class BackboneComparison:
     coverage: tuple[MapCoverage, ...]
     standardised: Standardised
     paired: Paired
-    looks: CommonLooks | None
+    observations: ComparedObservations | None
     fusion_rules: RuleComparison | None
 
 
 # What differs between runs; in JSON as the fields say. Undefined numbers are NaN.
 
-Basis = Literal["looks", "voxels", "cubes", "flights"]
-"""What was paired: looks (a place in a frame) that all made; voxels that all saw twice or more; cubes of space, each
-map with all its voxels; nothing, each flight by itself."""
+Basis = Literal["observations", "voxels", "cubes", "flights"]
+"""What was paired: observations (a voxel in a frame) that all made; voxels that all saw twice or more; cubes of space,
+each map with all its voxels; nothing, each flight by itself."""
 
 
 @dataclass(frozen=True)
@@ -192,7 +192,7 @@ class Contrast:
     """A measure in a run, beside that in the base.
 
     measure     its key
-    of          the class whose places it is of; empty: all
+    of          the class whose locations it is of; empty: all
     difference  the run's less the base's, with its interval, the scope that this answers, and the p-value that there
                 is none
     p_holm      that p-value corrected for all that stand in one list with it (Holm 1979)
@@ -209,7 +209,7 @@ class Contrast:
 
 
 @dataclass(frozen=True)
-class Blame:
+class FrameShare:
     """A frame, and its share of what was lost."""
 
     frame: int
@@ -217,31 +217,31 @@ class Blame:
 
 
 @dataclass(frozen=True)
-class Place:
+class Area:
     """Neighbouring voxels of a class that got worse.
 
-    number   from 1 on, the largest loss first; in the column `place`
+    number   from 1 on, the largest loss first; in the column `area`
     what     'agreement': frames agree less; 'truth': right before, wrong now
     of       the class that both runs together give these voxels, or the true one
-    instead  the class that the blamed looks give
+    confused_with  the class that the top contributing frames give
     voxels   how many
     loss     mean over them: of agreement between frames, or 1
     centre   metres, as the run has coordinates
     size     metres from end to end
-    rivals   places that improved by as much or more, in all: what chance gives where nothing got worse
-    frames   to blame, the worst first; empty where the looks were not kept
+    improved_alike   areas that improved by as much or more, in all: what chance gives where nothing got worse
+    frames   the top contributing ones, the worst first; empty where the observations were not kept
     """
 
     number: int
     what: Literal["agreement", "truth"]
     of: str
-    instead: str
+    confused_with: str
     voxels: int
     loss: float
     centre: tuple[float, float, float]
     size: float
-    rivals: int
-    frames: tuple[Blame, ...]
+    improved_alike: int
+    frames: tuple[FrameShare, ...]
 
 
 @dataclass(frozen=True)
@@ -250,8 +250,8 @@ class Against:
 
     compared  voxels whose change is known
     worse, better  voxels whose frames agree less, or more, by a fifth or more
-    blamed    frames, of all places together
-    columns   file of each voxel's change and place, relative to the folder
+    top_frames  the top contributing frames of all areas together
+    columns   file of each voxel's change and area, relative to the folder
     """
 
     other: str
@@ -260,8 +260,8 @@ class Against:
     compared: int = 0
     worse: int = 0
     better: int = 0
-    places: tuple[Place, ...] = ()
-    blamed: tuple[Blame, ...] = ()
+    areas: tuple[Area, ...] = ()
+    top_frames: tuple[FrameShare, ...] = ()
     columns: Path | None = None
 
 
@@ -269,18 +269,18 @@ class Against:
 class SceneComparison:
     """The runs on one scene.
 
-    remarks   what cannot be compared here, and why
+    notes   what cannot be compared here, and why
     voxels    that all saw twice or more; 0 where they are not known
     frames    that they come from, about
     """
 
     scene: str
     basis: Basis
-    remarks: tuple[str, ...]
+    notes: tuple[str, ...]
     voxels: int
     frames: int
     coverage: tuple[MapCoverage, ...]
-    looks: CommonLooks | None
+    observations: ComparedObservations | None
     against: tuple[Against, ...]
 
 

@@ -36,6 +36,8 @@ def _value(value: Any) -> Any:
     if "scope" in named and "low" in named:  # an interval
         named["scope"] = SCOPES.get(named["scope"], named["scope"])
         named["locations"] = named.pop("places", 0)
+    if {"paired", "looks"} <= named.keys():  # a comparison of backbones
+        named["observations"] = named.pop("looks")
     if "counts_for_verdict" in named:  # a class
         named |= {"locations": named.pop("places", 0), "unstable": None}
     if isinstance(named.get("blocks"), Mapping):  # statistics

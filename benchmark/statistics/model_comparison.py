@@ -251,7 +251,7 @@ def compare_regions(
         coverage=coverage_of(names, held_there),
         standardised=Standardised(EDGES, tuple(weights.tolist()), thin_share(observed, weights), everywhere),
         paired=_paired(regions, shared, seed),
-        looks=None if shared is None else shared.found,
+        observations=None if shared is None else shared.found,
         fusion_rules=None if first.events is None else _by_rule(regions, mixed=mixed),
     )
 

@@ -16,7 +16,7 @@ import numpy as np
 from semstab.core.types import Float64, Int64
 from semstab.errors import ConfigError, DataError
 from semstab.metrics.agreement import observations, require_same_grid, rows_of
-from semstab.model.contrast import BackboneComparison, CommonLooks, Ignored, PairedDifference
+from semstab.model.contrast import BackboneComparison, ComparedObservations, Ignored, PairedDifference
 from semstab.model.events import Events
 from semstab.model.evidence import Evidence
 from semstab.model.information import by_group
@@ -354,7 +354,7 @@ class SharedObservations:
     logs: Mapping[str, Events]
     whole: Mapping[str, Events]
     primary: Quantity
-    found: CommonLooks
+    found: ComparedObservations
 
 
 def compared_observations(looks: Mapping[str, CellObservations]) -> SharedObservations:
@@ -382,7 +382,7 @@ def compared_observations(looks: Mapping[str, CellObservations]) -> SharedObserv
         logs,
         dict(zip(names, both.logs, strict=True)),
         ALPHA if mixed else ALPHA_BETWEEN,
-        CommonLooks(
+        ComparedObservations(
             voxels=len(first.ix),
             observations=len(first),
             decided=mixed,

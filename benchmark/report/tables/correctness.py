@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 
 from semstab.metrics import macro_mean
-from semstab.model.contrast import BackboneComparison, CommonLooks, MapCoverage
+from semstab.model.contrast import BackboneComparison, ComparedObservations, MapCoverage
 from semstab.model.measures import VSS, Quantity, measures
 from semstab.model.records import Result
 from semstab.model.statistics import (
@@ -206,7 +206,7 @@ def comparison(result: Result) -> list[Table]:
     if not result.comparisons:
         return []
     covered = coverage_table({found.scene: found.coverage for found in result.comparisons})
-    looks = {found.scene: found.looks for found in result.comparisons if found.looks is not None}
+    looks = {found.scene: found.observations for found in result.comparisons if found.observations is not None}
     return [_differences(result), _ranking(result), covered, *([ignored_table(looks)] if looks else [])]
 
 
@@ -223,7 +223,7 @@ def _differences(result: Result) -> Table:
         f"{_COMMON} Only the first measure is tested, its p corrected by Holm's method for all pairs of all scenes of"
         f" which something may be claimed; the others describe. {INTERVALS}"
     )
-    if any(found.looks is not None and found.looks.decided for found in result.comparisons):
+    if any(found.observations is not None and found.observations.decided for found in result.comparisons):
         caption += " Labels stand beside scores: each observation is reduced to its largest class."
     groups = tuple(Group(found.scene, _difference_rows(found)) for found in result.comparisons)
     return Table("comparison", "Differences on the same places", caption, columns, groups, "scene")
@@ -275,7 +275,7 @@ def _ranking_rows(found: BackboneComparison) -> tuple[Row, ...]:
     )
 
 
-def ignored_table(looks: Mapping[str, CommonLooks]) -> Table:
+def ignored_table(looks: Mapping[str, ComparedObservations]) -> Table:
     """What each backbone left out, by scene."""
     columns = (
         Column("backbone", "Backbone"),
@@ -294,7 +294,7 @@ def ignored_table(looks: Mapping[str, CommonLooks]) -> Table:
     return Table("comparison_ignored", "What was left out", caption, columns, groups, "scene")
 
 
-def _ignored_rows(found: CommonLooks) -> tuple[Row, ...]:
+def _ignored_rows(found: ComparedObservations) -> tuple[Row, ...]:
     depends = "yes" if found.depends else "no"
     return tuple(
         (row.backbone, 100 * row.missing, row.psa_low, row.psa_high, row.alpha, depends) for row in found.ignored
