@@ -44,7 +44,7 @@ def verdicts(flight: Flight, count: int, seed: int) -> Iterator[tuple[StabilityV
         over, total = world(flight, rng), []
         for _ in range(FLIGHTS):
             sample = sample_of(fly(flight, over, rng), over, flight, rng)
-            sums = cluster_sums_of(table_of(sample.seen), sample=sample.shared())
+            sums = cluster_sums_of(table_of(sample.seen), sample=sample)
             total.append(sums_for(sums, "reached").sum(axis=0))
             if len(total) == 1:
                 table = table_of(sample.seen)

@@ -121,7 +121,7 @@ def _rows(common: Common, base: Entry, other: Entry, number: int) -> Iterator[Co
     for quantity in IN_SUMS:
         if _comparable(quantity, common):
             yield from _row(quantity, common.sums[0], common.sums[number], common)
-    if _comparable(REACHED, common) and _same_ceiling(base, other):
+    if _comparable(REACHED, common):
         yield from _row(REACHED, before, after, common)
     if common.basis != "flights" and not common.sizes_differ:
         change = sums_difference(COVERAGE.key, after, before)
@@ -195,15 +195,6 @@ def flicker_difference(new: Flicker, base: Flicker, *, paired: bool = True, leve
     return unpaired(each[0], each[1], level)
 
 
-def _same_ceiling(base: Entry, other: Entry) -> bool:
-    """Whether both judge against the same labels: those of the truth, or their own in finer cells."""
-    found = [entry.summary.statistics for entry in (base, other)]
-    return (
-        len({own.ceiling_share.by if own is not None and own.ceiling_share is not None else "" for own in found} - {""})
-        == 1
-    )
-
-
 def _flicker(base: Flicker, other: Flicker, *, paired: bool) -> Contrast:
     frames = base.keys() & other.keys() if paired else set()
     before, after = (
@@ -244,7 +235,7 @@ def _against_all(common: Common, base: Entry, other: Entry, names: Sequence[str]
         before, after = common.sums[0], common.sums[number]
         if quantity is REACHED:
             before, after = base.sums.without_truth(), other.sums.without_truth()
-        if not _comparable(quantity, common) or (quantity is REACHED and not _same_ceiling(base, other)):
+        if not _comparable(quantity, common):
             continue
         for k, name in enumerate(names):
             if _enough(before, k):

@@ -21,7 +21,7 @@ from semstab.datasets import Scene
 from semstab.datasets.formats.disk import file_digest
 from semstab.engine.series import Series
 from semstab.engine.streams import LiveMap, Stream
-from semstab.engine.tiles import OBSERVATIONS, TRUE_OBSERVATIONS, TileResult
+from semstab.engine.tiles import OBSERVATIONS, TileResult
 from semstab.engine.up_axis import estimate_up
 from semstab.engine.work import Outcome, Start
 from semstab.errors import DataError
@@ -149,8 +149,6 @@ def _truth_table(live: LiveMap) -> VoxelTable | None:
 def analyse_map(live: LiveMap, table: VoxelTable, events: Events | None, truth: VoxelTable | None) -> Analysis:
     """The statistics of a map that is fused whole."""
     observations = None if live.sampler is None else live.sampler.sample()
-    if observations is not None and live.truth_sampler is not None:
-        observations = observations.against(live.truth_sampler.sample())
     config = live.work.config
     sample = MapSample.draw(table, events if config.statistics else None, truth, edges=config.strata)
     return analyse_sample(live.task, config, sample, observations)
@@ -306,9 +304,8 @@ def _tile_savers(
     assert tile is not None
     if table is None or tile.place is None:
         savers, classes = _overview_saver(live, stream), live.task.mapping.target.classes
-        for sampler, name in ((live.sampler, OBSERVATIONS), (live.truth_sampler, TRUE_OBSERVATIONS)):
-            if sampler is not None:
-                savers[f"{tile.folder}/{tile.size}_{name}"] = sampler.looks(classes).save
+        if live.sampler is not None:
+            savers[f"{tile.folder}/{tile.size}_{OBSERVATIONS}"] = live.sampler.looks(classes).save
         return savers
     own, savers = Tile(*tile.place, tile.size, tile.key), Savers()
     if not len(table):

@@ -53,7 +53,7 @@ class LiveMap:
 
     backend    None where nothing is fused
     truth      takes the ground truth of the same frames
-    sampler, truth_sampler  take the sample of observations that statistics need
+    sampler  takes the sample of observations that statistics need
     reference  follows a sample of its voxels, where it is checked so
     sizes      some frames, to be fused at other voxel sizes
     hard       of soft scores, a map of each pixel's likeliest class
@@ -66,7 +66,6 @@ class LiveMap:
     backend: FusionBackend | None
     truth: FusionBackend | None = None
     sampler: Sampler | None = None
-    truth_sampler: Sampler | None = None
     reference: NumpySample | None = None
     sizes: SizeSample | None = None
     hard: FusionBackend | None = None
@@ -90,7 +89,6 @@ class LiveMap:
             live.tiles = FrameTiles(config.voxel_size, work.tile.size)
         if work.judged and work.measures_images:
             live.sampler = Sampler(config.voxel_size, K)
-            live.truth_sampler = Sampler(config.voxel_size, K) if has_truth else None
         if work.sampled and work.fuses:
             live.reference = NumpySample(config.voxel_size, K, work.within)
         if work.image_space and work.judged and work.measures_images and not config.frame_quality:
@@ -132,8 +130,6 @@ class LiveMap:
         with watch("sample"):
             if self.sampler is not None:
                 self.sampler.add(prepared.frame)
-            if self.truth_sampler is not None and prepared.truth is not None:
-                self.truth_sampler.add(prepared.truth)
         if self.sizes is not None:
             with watch("voxel sizes"):
                 self.sizes.add(prepared.frame)
@@ -143,7 +139,7 @@ class LiveMap:
     def release(self) -> None:
         """Let go of all that takes memory: the work is finished."""
         self.backend = self.truth = self.hard = self.reference = None
-        self.sampler = self.truth_sampler = self.sizes = None
+        self.sampler = self.sizes = None
 
     def table(self) -> VoxelTable:
         """The voxels of its map."""

@@ -16,7 +16,7 @@ from semstab.datasets.formats.disk import file_digest
 from semstab.engine.finish import analyse_sample, no_voxels, reduced_of, save_voxels, unit_summary, up_axis
 from semstab.engine.folder import Folder, unit_key
 from semstab.engine.streams import COLUMNS, ImageSpaceMeter
-from semstab.engine.tiles import OBSERVATIONS, TRUE_OBSERVATIONS, TileResult, joined_series
+from semstab.engine.tiles import OBSERVATIONS, TileResult, joined_series
 from semstab.engine.units import PlannedUnit
 from semstab.engine.work import Job, Outcome, Start, TileTask, Work, failed
 from semstab.errors import SemstabError
@@ -189,10 +189,9 @@ def assembled(
 
 
 def _observations(task: TileTask, folder: Path) -> ObservationSample | None:
-    """The sample of observations of all frames, against that of the ground truth where there is one."""
-    files = [folder / task.folder / f"{task.size}_{name}" for name in (OBSERVATIONS, TRUE_OBSERVATIONS)]
-    own, true = (CellObservations.load(file).sample() if file.exists() else None for file in files)
-    return own if own is None or true is None else own.against(true)
+    """The sample of observations of all frames."""
+    file = folder / task.folder / f"{task.size}_{OBSERVATIONS}"
+    return CellObservations.load(file).sample() if file.exists() else None
 
 
 def _with_columns(task: TileTask, slug: str, analysis: Analysis, folder: Path) -> dict[str, str]:

@@ -31,7 +31,7 @@ from semstab.model.records import REGIONS, Variation
 from semstab.model.results import Unit
 from semstab.task import Task, applies, frame_indices, selected, tasks_of
 
-FORMAT = 8
+FORMAT = 9
 """Part of every key: raise it with any change of the numbers that a unit's settings and input lead to."""
 
 IN_KEYS = ("voxel_size", "pixel_stride", "top_k", "exclude", "perturbation", "strata", "statistics", "critical_classes",

@@ -149,7 +149,6 @@ class LagBin:
     """Pairs of looks at a place that are `low` to `high` apart, `mean` in the mean.
 
     alpha    between frames, of these pairs and beyond their own chance
-    ceiling  the same of labels that do not depend on the view
     """
 
     low: float
@@ -157,7 +156,6 @@ class LagBin:
     mean: float
     pairs: int
     alpha: Interval
-    ceiling: float
 
 
 @dataclass(frozen=True)
@@ -180,16 +178,14 @@ class Correlogram:
 
 @dataclass(frozen=True)
 class CeilingShare:
-    """Alpha between frames beside its ceiling, that of labels which do not depend on the view, in sampled voxels.
+    """Alpha between frames beside its ceiling, which seeing other parts of a voxel sets, in sampled voxels.
 
     Intervals are as those of `HeadlineStatistics`.
 
-    by       whose labels those are
     voxels   sampled ones with OP >= 2
-    share    alpha / ceiling: what is left to the model, whatever the size of the voxels
+    share    alpha / ceiling: what it would be had frames seen the same cells, whatever the size of the voxels
     """
 
-    by: str
     voxels: int
     alpha: Interval
     ceiling: Interval

@@ -367,9 +367,9 @@ def agreement_report(statistics: MapStatistics) -> str:
     for axis, unit in AXES.items() if statistics.correlogram is not None else ():
         bins: tuple[LagBin, ...] = getattr(statistics.correlogram, axis)
         if bins:
-            lines += ["", f"| {unit} | alpha | 95% | for | ceiling |", "|---|---|---|---|---|"]
+            lines += ["", f"| {unit} | alpha | 95% | for |", "|---|---|---|---|"]
         for row in bins:
             a = row.alpha
             band = f"{a.low:.2f} to {a.high:.2f} | {a.scope}{'' if a.decided else ', undecided'}"
-            lines.append(f"| {row.mean:.3g} | {a.value:.2f} | {band} | {row.ceiling:.2f} |")
+            lines.append(f"| {row.mean:.3g} | {a.value:.2f} | {band} |")
     return "\n".join(lines)

@@ -35,6 +35,7 @@ from semstab.statistics.cluster_sums import (
     width,
 )
 from semstab.statistics.intervals import EstimateSpec, confidence_intervals, spec_of_cubes
+from semstab.statistics.observations import ObservationSample
 
 # Cubes of space over any set of voxels, and intervals for these frames of any statistic of their sums.
 
@@ -184,7 +185,7 @@ def cluster_sums_of(
     events: Events | None = None,
     true_label: Int64 | None = None,
     *,
-    sample: tuple[Events, Events] | None = None,
+    sample: ObservationSample | None = None,
     sbd_excess: Float64 | None = None,
     edge: float | None = None,
     cubes: Cubes | None = None,
@@ -195,8 +196,7 @@ def cluster_sums_of(
     events      its log; without it, but with a sample, frames are known of the sampled voxels only; without either a
                 location counts as a whole, and the frames are not known
     true_label  (n,) the true class of each voxel, -1 where it is not known
-    sample      the same observations of sampled voxels, as they were and as they would be with labels that do not
-                depend on the view
+    sample      what was seen of sampled voxels
     sbd_excess  (n,) SBD of each voxel less that in random order, NaN where that is not known
     edge        of the cubes in metres, a power of 2, where several maps are to have the same; else the smallest that
                 leaves at most MOST_CELLS
@@ -212,8 +212,28 @@ def cluster_sums_of(
     whole = whole.coarsened(whole.edge, whole.step)  # one row for each cube and group of frames, in order
     if sample is None:
         return whole
-    seen, limit = (replace(_sums_of_log(log, Cubes.of_log(log, whole.edge)), classes=whole.classes) for log in sample)
-    return replace(_with_frames(whole, seen) if events is None else whole, seen=seen, limit=limit)
+    some = Cubes.of_log(sample.seen, whole.edge)
+    seen = replace(_sums_of_log(sample.seen, some), classes=whole.classes)
+    whole = _with_frames(whole, seen) if events is None else whole
+    return replace(whole, seen=seen, same_cells=_of_same_cells(seen, sample, some))
+
+
+def _of_same_cells(seen: ClusterSums, sample: ObservationSample, cubes: Cubes) -> ClusterSums:
+    """The sums of a sample had frames seen the same cells of its voxels: pairs of them agree by that much more."""
+    from scipy.sparse import csr_array
+
+    log = sample.seen
+    at = cubes.at[log.voxel].astype(np.int64)
+    again = np.flatnonzero(at >= 0)
+    row = distinct_rows(np.stack([at, log.frame // max(seen.step, 1)], axis=1)[again])[1]
+    ones = np.ones(len(row))
+    counts = csr_array((ones, (row, log.voxel[again])), shape=(len(seen.cell), len(log)))
+    shift = csr_array((sample.shift, (sample.voxel, sample.label)), shape=(len(log), log.K))
+    apart, columns, own = (counts @ shift).toarray(), seen.columns.copy(), layout(seen.K, truth=False)
+    columns[:, own["agreeing"].start] -= apart.sum(axis=1) / 2
+    if "class_apart" in own:
+        columns[:, own["class_apart"]] += apart
+    return replace(seen, columns=columns)
 
 
 def _sums_of_log(

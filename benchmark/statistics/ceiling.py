@@ -1,7 +1,8 @@
-"""Agreement beside its ceiling: what two frames would agree on had their labels not depended on the view.
+"""Agreement beside its ceiling: what it would be had frames seen the same cells of each voxel.
 
-Voxels hold more than one thing, and frames see different parts of them: that sets a ceiling to agreement, which falls
-as voxels grow. The share of it that a model reaches does not.
+Voxels hold more than one thing, and frames see other parts of them: that sets a ceiling to agreement, which falls as
+voxels grow. Two frames share a cell of a voxel less often than two pixels of a frame do. What that costs follows from
+the pairs of frames that did see the same cell, so that errors of the labels lower neither the share nor the ceiling.
 """
 
 from __future__ import annotations
@@ -42,16 +43,16 @@ def ceiling_share(
     critical: Sequence[str] = (),
     least: float = SUPPORT,
 ) -> CeilingShare:
-    """Alpha between frames in the sampled voxels beside that of the sample's limit, of all classes and of each.
+    """Alpha between frames in the sampled voxels beside what it would be of the same cells, of all classes and of each.
 
     table     the whole map: how many places a class has
     sums      of the map with that sample, where they are there already
     critical  names of the classes that matter; where none is given, those with `least` places or more
     """
-    sums = cluster_sums_of(table, sample=sample.shared()) if sums is None else sums
+    sums = cluster_sums_of(table, sample=sample) if sums is None else sums
     places = locations_by_class(table)
     found = confidence_intervals(ceiling_specs(sums, table.K))
-    return ceiling_share_from(sample.by, places, sums, found, critical=critical, least=least)
+    return ceiling_share_from(places, sums, found, critical=critical, least=least)
 
 
 def locations_by_class(table: VoxelTable) -> Float64:
@@ -63,16 +64,14 @@ def ceiling_specs(sums: ClusterSums, K: int, wanted: Scope = THIS_SCENE) -> Iter
     """For `answers`: alpha in the sample, its ceiling, and what share of it is reached, by K classes together and by
     each."""
     assert sums.seen is not None
-    assert sums.limit is not None
     scope = scope_of(sums, wanted)
     yield spec_of(sums.seen, "alpha_between", scope=scope)
-    yield spec_of(sums.limit, "alpha_between", scope=scope)
+    yield spec_of(sums, "ceiling", scope=scope)
     for k in (None, *range(K)):
         yield spec_of(sums, "reached", k, scope)
 
 
 def ceiling_share_from(
-    by: str,
     places: Float64,
     sums: ClusterSums,
     found: Sequence[Interval],
@@ -80,17 +79,15 @@ def ceiling_share_from(
     critical: Sequence[str] = (),
     least: float = SUPPORT,
 ) -> CeilingShare:
-    """The same from the sums of a map with a sample, whose limit has labels `by` whom; places (K,) of each class.
+    """The same from the sums of a map with a sample; places (K,) of each class.
 
     found  the answers to `ceiling_specs`
     """
     assert sums.seen is not None
-    assert sums.limit is not None
     names = sums.classes or tuple(str(k) for k in range(len(places)))
     named = set(critical) & set(names)
     alpha, ceiling, reached, *of_classes = found
     return CeilingShare(
-        by=by,
         voxels=round(float(sums.seen["voxels"].sum())),
         alpha=alpha,
         ceiling=ceiling,
@@ -101,9 +98,9 @@ def ceiling_share_from(
                 float(places[k]),
                 name in named if named else bool(places[k] >= least),
                 value(sums.seen, "alpha_between", k),
-                value(sums.limit, "alpha_between", k),
+                value(sums, "ceiling", k),
                 of_classes[k],
-                1 - probability_above(of_classes[k], TENTATIVE, "plain"),
+                1 - probability_above(of_classes[k], TENTATIVE, "agreement"),
             )
             for k, name in enumerate(names)
         ),

@@ -154,7 +154,7 @@ def distinct_rows(rows: npt.NDArray[np.integer]) -> tuple[Int64, Int64]:
 Statistic = Callable[[Float64], Float64]
 Scale = Literal["share", "agreement", "plain"]
 
-SCHEMA = 2
+SCHEMA = 3
 MOST_CELLS, MOST_GROUPS = 256, 64
 """Cubes of space and groups of frames that are kept apart, at most."""
 
@@ -179,8 +179,8 @@ class ClusterSums:
     edge     metres, a power of 2
     step     frames of a group, a power of 2; 0 where they are not known
     truth    whether ground truth is in it
-    seen     the same of the sampled voxels alone, where there is an `ObservationSample`; limit of what
-             they would be had their labels not depended on the view, in the same rows
+    seen     the same of the sampled voxels alone, where there is an `ObservationSample`; same_cells of what they would
+             be had frames seen the same cells of each voxel, in the same rows
     """
 
     cell: Int32
@@ -193,7 +193,7 @@ class ClusterSums:
     classes: tuple[str, ...] = ()
     truth: bool = False
     seen: ClusterSums | None = None
-    limit: ClusterSums | None = None
+    same_cells: ClusterSums | None = None
 
     def __getitem__(self, name: str) -> Float64:
         """Sums (m, 1), or (m, K) by class, of that name."""
@@ -235,7 +235,7 @@ class ClusterSums:
             edge=edge,
             step=step if known else 0,
             seen=self.seen and self.seen.coarsened(edge, step),
-            limit=self.limit and self.limit.coarsened(edge, step),
+            same_cells=self.same_cells and self.same_cells.coarsened(edge, step),
         )
 
     def without_truth(self) -> ClusterSums:
@@ -248,7 +248,7 @@ class ClusterSums:
         import pyarrow as pa
         import pyarrow.parquet as pq
 
-        parts = [part for part in (self, self.seen, self.limit) if part is not None]
+        parts = [part for part in (self, self.seen, self.same_cells) if part is not None]
         about = {name: getattr(self, name) for name in ("edge", "step", "voxel_size", "K", "classes", "truth")}
         lengths = [len(part.frame) for part in parts]
         cell, frame = np.concatenate([part.cell for part in parts]), np.concatenate([part.frame for part in parts])
@@ -293,17 +293,17 @@ class ClusterSums:
                 cell, frame = np.stack([key[own] for key in keys[:3]], axis=1), keys[3][own]
                 made = cls(cell.astype(np.int32), frame.astype(np.int32), sums, **some)
                 parts.append(made if own.any() or not number else None)
-            whole, seen, limit = parts
-            if seen is not None and (limit is None or not np.array_equal(seen.frame, limit.frame)):
-                raise DataError("what was seen of the sample and its limit are of other rows")
+            whole, seen, same_cells = parts
+            if seen is not None and (same_cells is None or not np.array_equal(seen.frame, same_cells.frame)):
+                raise DataError("the sums of the sample, and of its cells, are of other rows")
         except (OSError, LookupError, TypeError, ValueError, OverflowError, pa.ArrowException) as error:
             raise DataError(f"{path}: not a file of influence sums ({one_line(error)})") from error
         assert whole is not None
-        return dataclasses.replace(whole, seen=seen, limit=limit)
+        return dataclasses.replace(whole, seen=seen, same_cells=same_cells)
 
 
 KEYS = ("part", "ix", "iy", "iz", "frame")
-"""The columns of the file before the sums; part 0 is the map, 1 what was seen of the sample, 2 its limit."""
+"""The columns of the file before the sums; part 0 is the map, 1 what was seen of the sample, 2 of the same cells."""
 
 
 LARGEST = 2.0**30
@@ -358,6 +358,9 @@ def aligned(*parts: ClusterSums) -> tuple[ClusterSums, ...]:
 # --- What follows from the sums ---------------------------------------------------------------------------------------
 
 
+Part = Literal["map", "seen", "same_cells"]
+
+
 @dataclass(frozen=True)
 class Functional:
     """A number that is a smooth function of sums over a map.
@@ -366,7 +369,7 @@ class Functional:
     of         the number (...,) from these sums (..., C)
     low, high  its range
     scale      of its interval: a 'share' or mean of numbers from 0 to 1, an 'agreement', at most 1, or 'plain'
-    sampled    it is of the sample's sums beside those of its limit
+    parts      the sums that it is of, side by side: the map's own, or the sample's
     pairs      the first sum is of pairwise agreement, which of a place that two frames saw neither has for itself alone
 
     The second sum counts what the first is a sum of.
@@ -378,7 +381,7 @@ class Functional:
     high: float = 1.0
     scale: Scale = "share"
     pairs: bool = False
-    sampled: bool = False
+    parts: tuple[Part, ...] = ("map",)
 
 
 def class_alpha_of(sums: Float64) -> Float64:
@@ -396,15 +399,15 @@ def class_between_of(sums: Float64) -> Float64:
     return class_of(np.stack([apart - 2 * (total - squares), n, squares, total], axis=-1))
 
 
-def ceiling_share_of(of: Statistic) -> Statistic:
-    """The share of its ceiling that a number reaches; NaN where that is no better than chance."""
+def ratio_to(of: Statistic) -> Statistic:
+    """A number over that of further sums, side by side; NaN where that is no better than chance."""
 
     def ratio(sums: Float64) -> Float64:
-        seen, limit = np.split(sums, 2, axis=-1)
-        ceiling = of(limit)
+        one, other = np.split(sums, 2, axis=-1)
+        below = of(other)
         with np.errstate(invalid="ignore"):  # of complex sums, by which slopes are found
-            share: Float64 = of(seen) / np.where(ceiling.real > 0, ceiling, np.nan)
-        return share
+            quotient: Float64 = of(one) / np.where(below.real > 0, below, np.nan)
+        return quotient
 
     return ratio
 
@@ -416,7 +419,8 @@ FUNCTIONALS: Mapping[str, Functional] = {
     "psa": Functional(("psa", "voxels"), ratio_of, pairs=True),
     "alpha": Functional(ALPHA_SUMS, alpha_of, -1.0, 1.0, "agreement", pairs=True),
     "alpha_between": Functional(ALPHA_SUMS, between_of, -1.0, 1.0, "agreement", pairs=True),
-    "reached": Functional(ALPHA_SUMS, ceiling_share_of(between_of), -math.inf, math.inf, "plain", sampled=True),
+    "reached": Functional(ALPHA_SUMS, between_of, -1.0, 1.0, "agreement", pairs=True, parts=("same_cells",)),
+    "ceiling": Functional(ALPHA_SUMS, ratio_to(between_of), 0.0, 1.0, "plain", parts=("seen", "same_cells")),
     "vss": Functional(("vss", "recurrent"), ratio_of),
     "entropy": Functional(("entropy", "voxels"), ratio_of),
     "accuracy": Functional(("right", "known"), ratio_of),
@@ -426,15 +430,16 @@ FUNCTIONALS: Mapping[str, Functional] = {
     "miou": Functional(("known", "known", "class_right", "class_known", "class_predicted"), miou_of, scale="plain"),
     "ece": Functional(("judged", "judged", "gap"), ece_of, scale="plain"),
 }
-"""By key: PSA, both alphas, the share of its ceiling that alpha between frames reaches, and entropy at OP >= 2, VSS at
-OP >= 3, SBD less that in random order where that is known; with ground truth the accuracy of the fused labels at
-OP >= 2 and of single looks, the wrong among the stable places at OP >= 3, mean intersection over union and expected
-calibration error at OP >= 2."""
+"""By key: PSA, both alphas, the share of its ceiling that alpha between frames reaches and that ceiling, and entropy at
+OP >= 2, VSS at OP >= 3, SBD less that in random order where that is known; with ground truth the accuracy of the fused
+labels at OP >= 2 and of single looks, the wrong among the stable places at OP >= 3, mean intersection over union and
+expected calibration error at OP >= 2."""
 
 BY_CLASS: Mapping[str, Functional] = {
     "alpha": Functional(CLASS_SUMS, class_alpha_of, -1.0, 1.0, "agreement"),
     "alpha_between": Functional(CLASS_SUMS, class_between_of, -1.0, 1.0, "agreement"),
-    "reached": Functional(CLASS_SUMS, ceiling_share_of(class_between_of), -math.inf, math.inf, "plain", sampled=True),
+    "reached": Functional(CLASS_SUMS, class_between_of, -1.0, 1.0, "agreement", parts=("same_cells",)),
+    "ceiling": Functional(CLASS_SUMS, ratio_to(class_between_of), 0.0, 1.0, "plain", parts=("seen", "same_cells")),
     "accuracy": Functional(("class_right", "class_known"), ratio_of),
     "precision": Functional(("class_right", "class_predicted"), ratio_of),
     "iou": Functional(("class_right", "known", "class_known", "class_predicted"), iou_of),
@@ -454,8 +459,8 @@ def functional(key: str, k: int | None = None) -> Functional:
 
 
 def parts_of(sums: ClusterSums, number: Functional) -> tuple[ClusterSums, ...]:
-    """The sums that a number is of: the map's, or those of the sample and its limit; none where they are not there."""
-    parts = (sums.seen, sums.limit) if number.sampled else (sums,)
+    """The sums that a number is of: the map's, or the sample's; none where they are not there."""
+    parts = [sums if name == "map" else sums.seen if name == "seen" else sums.same_cells for name in number.parts]
     there = tuple(part for part in parts if part is not None)
     known = all(set(number.names) <= set(layout(part.K, truth=part.truth)) for part in there)
     return there if known and len(there) == len(parts) else ()

@@ -51,8 +51,8 @@ def correlogram(sample: ObservationSample) -> Correlogram:
     of the pairs in the bin. Bands are at 95 %, for this scene flown again where the frames of a bin tell of it, else
     for these frames.
     """
-    seen, limit = sample.shared()
-    labels = np.unique(np.concatenate([seen.evidence.label, limit.evidence.label]))  # of the others nothing changes
+    seen = sample.seen
+    labels = np.unique(seen.evidence.label)  # of the others nothing changes
     cubes, of, edge = _cubes(seen)
     step, most = 1, min(MOST_GROUPS, max(1, MOST_SUMS // (max(len(cubes), 1) * (3 + len(labels)))))
     while len(frames := np.unique(seen.frame // step)) > most:
@@ -60,14 +60,13 @@ def correlogram(sample: ObservationSample) -> Correlogram:
     group = np.searchsorted(frames, seen.frame // step)
     there, cluster = np.unique(of[seen.voxel].astype(np.int64) * len(frames) + group, return_inverse=True)
     cube, group = np.divmod(there, max(len(frames), 1))
-    sums, still = _BinSums(seen.evidence.only(labels), len(there)), _BinSums(limit.evidence.only(labels), 1)
+    sums = _BinSums(seen.evidence.only(labels), len(there))
     pairs, distance = np.zeros((2, len(BINS) + 1))
     for first, second, apart in _pairs(sample, seen):
         bins = _bins(apart)
         pairs += np.bincount(bins.ravel(), minlength=len(pairs))
         distance += np.bincount(bins.ravel(), weights=apart.ravel(), minlength=len(pairs))
         sums.add(bins, first, second, cluster)
-        still.add(bins, first, second, np.zeros_like(cluster))
     rows, specs = [], []
     for k in np.flatnonzero(pairs[:-1] >= LEAST_PAIRS):
         some = np.flatnonzero(sums.total[k, :, 1])
@@ -77,12 +76,12 @@ def correlogram(sample: ObservationSample) -> Correlogram:
         halves = own[:, :2]  # of its agreement with the other one, neither observation has half for itself alone
         where = cubes[cube[some]], frames[group[some]], edge, step
         specs.append(spec_of_observations(*where, own, halves, between_of))
-        rows.append((k, float(distance[k] / pairs[k]), int(pairs[k]), float(between_of(still.total[k, 0]))))
+        rows.append((k, float(distance[k] / pairs[k]), int(pairs[k])))
     of_axis: dict[str, tuple[LagBin, ...]] = dict.fromkeys(AXES, ())
-    for (k, lag, count, ceiling), alpha in zip(rows, confidence_intervals(specs), strict=True):
+    for (k, lag, count), alpha in zip(rows, confidence_intervals(specs), strict=True):
         axis, low, high = BINS[k]
-        of_axis[axis] += (LagBin(low, high, lag, count, alpha, ceiling),)
-    (standard,) = of_axis.pop("standard") or (LagBin(*STANDARD, math.nan, 0, UNKNOWN, math.nan),)
+        of_axis[axis] += (LagBin(low, high, lag, count, alpha),)
+    (standard,) = of_axis.pop("standard") or (LagBin(*STANDARD, math.nan, 0, UNKNOWN),)
     return Correlogram(**of_axis, standard=standard)
 
 

@@ -173,7 +173,7 @@ def analyse(
         table,
         events,
         None if truth is None else truth.label,
-        sample=None if observations is None else observations.shared(),
+        sample=None if observations is None else observations,
         sbd_excess=columns["sbd_excess"],
         cubes=places,
         stable=stable,
@@ -192,7 +192,7 @@ def analyse(
     means, whole = dict(zip(MEANS, found, strict=True)), sample.summary.summary(table.voxel_size, table.classes, edges)
     reach = None
     if observations is not None:
-        reach = ceiling_share_from(observations.by, locations_by_class(table), influence, reached, critical=critical)
+        reach = ceiling_share_from(locations_by_class(table), influence, reached, critical=critical)
     headline, count = HeadlineStatistics(*judged), len(places.cell)
     repeats = whole.means.voxels[SBD.key]
     repeated = Repeated(repeats, repeats / whole.voxels if whole.voxels else math.nan)

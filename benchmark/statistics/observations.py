@@ -19,7 +19,6 @@ from semstab.core import arrays
 from semstab.core.files import atomic_path, parse_json
 from semstab.core.types import Float64, Int32, Int64, Mask, UInt16, UInt32
 from semstab.errors import DataError, one_line
-from semstab.metrics.agreement import shared_observations
 from semstab.model.events import Events
 from semstab.model.evidence import Evidence
 from semstab.model.voxels import index_columns
@@ -120,36 +119,26 @@ COLUMNS = "key", "view", "label", "weight", "drawn"
 """Of entries."""
 
 SCHEMA = 2
-OWN, TRUTH = "its own labels in finer cells", "the ground truth"
-
 Entries = tuple[Int64, Int32, UInt16, Float64]
 
 
 @dataclass(frozen=True, eq=False)
 class ObservationSample:
-    """What was seen of the sampled voxels, and what would have been had their labels not depended on the view.
+    """What was seen of the sampled voxels, and what part of the disagreement comes from seeing other parts of them.
 
     seen   observations (s_bar of a voxel in a frame), of the cells that LEAST_FRAMES or more saw
-    limit  the same rows, each cell having the dominant label of all frames in each of them
+    voxel, label, shift  (m,) how much further apart two frames are about a class in a voxel, by its row of `seen`,
+           where they see of its cells what a frame sees of itself
     views  of all frames, in order of integration
     soft   whether the evidence is scores
-    by     whose labels the limit has: the map's own in finer cells, or those of the ground truth
     """
 
     seen: Events
-    limit: Events
+    voxel: Int32
+    label: UInt16
+    shift: Float64
     views: Views
     soft: bool
-    by: str = OWN
-
-    def shared(self) -> tuple[Events, Events]:
-        """The observations that both logs have."""
-        seen, limit = shared_observations(self.seen, self.limit)
-        return seen, limit
-
-    def against(self, truth: ObservationSample) -> ObservationSample:
-        """The same with the ground truth's labels as the limit, of a sample of the same frames."""
-        return dataclasses.replace(self, limit=truth.seen, by=TRUTH)
 
 
 @dataclass(frozen=True, eq=False)
@@ -186,14 +175,15 @@ class CellObservations:
         return cells_of(self.key, self.low)
 
     def sample(self) -> ObservationSample:
-        """Observations of the voxels, and those of labels that do not depend on the view."""
-        from semstab.statistics.loops.observations import settle
+        """Observations of the voxels, and what comes from seeing other parts of them."""
+        from semstab.statistics.loops.observations import same_cells
 
         key, view, label, weight = self._in_order()
-        kept, shown = np.empty(len(key), np.bool_), np.empty(len(key), np.uint16)
-        settle(key, view, label, weight, CELLS**3, self.K, LEAST_FRAMES, kept, shown)
-        seen, limit = (self._log(key, view, which, weight, kept) for which in (label, shown))
-        return ObservationSample(seen, dataclasses.replace(seen, evidence=limit.evidence), self.views, self.soft)
+        kept, of = np.empty(len(key), np.bool_), np.empty(len(key), np.int32)
+        classes, shift = np.empty(len(key), np.uint16), np.empty(len(key))
+        m = same_cells(key, view, label, weight, CELLS**3, self.K, LEAST_FRAMES, kept, of, classes, shift)
+        seen = self._log(key, view, label, weight, kept)
+        return ObservationSample(seen, of[:m], classes[:m], shift[:m], self.views, self.soft)
 
     def only(self, rows: Any) -> CellObservations:
         """Some of the entries."""

@@ -99,7 +99,7 @@ def verdict(
 
 def _basis(headline: HeadlineStatistics, ceiling: CeilingShare | None) -> tuple[Interval, Scale]:
     """Return the number that decides."""
-    return (headline.alpha_between, "agreement") if ceiling is None else (ceiling.share, "plain")
+    return (headline.alpha_between, "agreement") if ceiling is None else (ceiling.share, "agreement")
 
 
 def _level(
@@ -140,7 +140,7 @@ def _flips(flips: Flipping) -> list[str]:
 def _share_of_ceiling(ceiling: CeilingShare) -> str:
     share = ceiling.share
     chance = ", no better than chance," if share.value < 0 else ""
-    far = f"({share.low:.0%} to {share.high:.0%}) of its ceiling, {ceiling.ceiling.value:.2f} by {ceiling.by}"
+    far = f"({share.low:.0%} to {share.high:.0%}) of its ceiling, {ceiling.ceiling.value:.2f}"
     named = ", ".join(
         f"{row.name} ({row.unstable:.0%})" for row in ceiling.judged_classes[:3] if row.unstable >= PROBABLE
     )

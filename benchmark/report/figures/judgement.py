@@ -78,9 +78,8 @@ def _correlograms(judged: Judged) -> Iterator[Figure]:
             f"Agreement by distance of the looks: {scene}",
             "Alpha between frames of pairs of looks at a place, by how far apart they are in time, angle, range and"
             f" baseline, with bands at 95%: for this scene flown again if {LEAST_FRAMES} frames of a bin tell of it,"
-            " else (open points) for these frames. Dashed: the same of labels that do not depend on the view; the gap"
-            " is the model's. Bins with few pairs are left out.",
-            f"Four panels of {scene}, one curve a backbone with its band and a dashed ceiling: agreement against frames"
+            " else (open points) for these frames. Bins with few pairs are left out.",
+            f"Four panels of {scene}, one curve a backbone with its band: agreement against frames"
             " apart, degrees between the views, ratio of the ranges, and metres between the cameras.",
             partial(draw_correlogram, backbones),
         )

@@ -221,7 +221,7 @@ AXES = (
 
 
 def draw_correlogram(backbones: Mapping[str, Correlogram]) -> Figure:
-    """Alpha between frames with its band, and its ceiling; one panel for each way of being apart.
+    """Alpha between frames with its band; one panel for each way of being apart.
 
     Points are open where the band is for these frames alone.
     """
@@ -245,14 +245,12 @@ def draw_correlogram(backbones: Mapping[str, Correlogram]) -> Figure:
     panels[0].set_ylabel("alpha between frames")
     panels[0].set_ylim(top=1.03)
     handles = [Line2D([], [], color=color(k), marker="o", label=name) for k, name in enumerate(backbones)]
-    ceiling = Line2D([], [], color=INK, linestyle="--", linewidth=0.9, label="ceiling")
-    figure.legend(handles=[*handles, ceiling], loc="outside lower center", ncols=min(len(handles) + 1, 6))
+    figure.legend(handles=handles, loc="outside lower center", ncols=min(len(handles), 6))
     return figure
 
 
 def _draw_bins(axes: Axes, bins: Sequence[LagBin], shade: str) -> None:
     x = [row.mean for row in bins]
-    axes.plot(x, [row.ceiling for row in bins], color=shade, linestyle="--", linewidth=0.9)
     axes.plot(x, [row.alpha.value for row in bins], color=shade)
     for row in bins:
         face = shade if row.alpha.scope == THIS_SCENE else "white"

@@ -338,13 +338,11 @@ def correlogram(result: Result) -> list[Table]:
     stated = f"{low:g} to {high:g} degrees apart"
     columns = (
         Column("standard", "found", 3, "higher", over=stated),
-        Column("standard_ceiling", "ceiling", 3, over=stated),
         Column("standard_pairs", "pairs", 0, over=stated),
         *(Column(f"{axis}_{end}", f"{end}", 3, over=f"By {axis}") for axis in _AXES for end in ("nearest", "farthest")),
     )
     numbers = (
         _of(lambda found: found.standard.alpha),
-        _of(lambda found: found.standard.ceiling),
         _of(lambda found: found.standard.pairs or math.nan),
         *(_of(_end(axis, last)) for axis in _AXES for last in (0, -1)),
     )

@@ -57,8 +57,8 @@ def temporal_agreement(result: Result) -> list[Table]:
     caption = (
         f"{SEEN_TWICE} PSA: share of pairs of frames that agree about a voxel; kappa (Fleiss) and alpha (Krippendorff):"
         " the same beyond chance, 1 perfect, 0 chance; disagreement: the parts of 1 - PSA within a frame and between"
-        " frames; alpha between frames: of the latter alone, beside its ceiling, that of labels which do not depend on"
-        " the view (in sampled voxels); flip rate: share of the steps from one observation to the next"
+        " frames; alpha between frames: of the latter alone, beside its ceiling, which seeing other parts of"
+        " voxels sets (in sampled voxels); flip rate: share of the steps from one observation to the next"
         f" at which the predicted class changes. {INTERVALS}"
     )
     return by_scene(result, "temporal_agreement", "Agreement of the frames", caption, columns, numbers)

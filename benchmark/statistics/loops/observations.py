@@ -149,41 +149,83 @@ def add_rows(rows, of, sums):
 
 
 @serial
-def settle(key, view, label, weight, cells, K, least, kept, shown):
-    """Whether `least` frames or more saw each entry's cell, and the class with the largest sum of shares there.
+def same_cells(key, view, label, weight, cells, K, least, kept, of, classes, shift):
+    """Whether `least` frames or more saw each entry's cell, and how far agreement is off for want of the same cells.
 
-    A frame's classes have shares of its pixels in the cell; the lowest class on ties. All arrays are (n,); a voxel has
-    so many `cells`.
+    Two frames that saw other cells of a voxel may disagree because it holds several things, whatever the labels are
+    worth. Within a frame two pixels lie in the same cell with a probability q0, in two frames with q. From pairs of
+    frames comes D, how far apart they are about a class, and so its means over pixels of the same cell and of others:
+    (q0 - q) (D_same - D_other) is what is to be added to D for frames that see what they see of themselves.
+    Entries are in order of voxel and frame; kept (n,) says which count. `of` numbers voxels that have one, and with
+    classes and shift (n,) takes a row for each voxel and class; returns how many rows there are.
     """
-    seen, pixels, sums = np.zeros(cells, np.int64), np.zeros(cells), np.zeros((cells, K))
-    most, best, which = np.zeros(cells), np.zeros(cells, np.uint16), (1 << DIGITS) - 1
-    start = 0
+    seen, last, which = np.zeros(cells, np.int64), np.full(cells, -1), (1 << DIGITS) - 1
+    w, W, W2 = np.zeros((3, cells))
+    s, S, S2, same = np.zeros((4, K))
+    x, X, X2, XW = np.zeros((4, cells, K))
+    m = start = 0
+    number = -1
     while start < len(key):
         end, voxel = start, key[start] >> DIGITS
         while end < len(key) and key[end] >> DIGITS == voxel:
-            first = end
-            while end < len(key) and key[end] >> DIGITS == voxel and view[end] == view[first]:
-                c = key[end] & which
-                seen[c] += pixels[c] == 0.0
-                pixels[c] += weight[end]
-                end += 1
-            for i in range(first, end):
-                c = key[i] & which
-                sums[c, label[i]] += weight[i] / pixels[c]
-            for i in range(first, end):
-                pixels[key[i] & which] = 0.0
+            c = key[end] & which
+            seen[c] += last[c] != view[end]
+            last[c] = view[end]
+            end += 1
+        T, first = 0, start
+        while first < end:
+            after, total = first, 0.0
+            while after < end and view[after] == view[first]:
+                kept[after] = seen[key[after] & which] >= least
+                total += weight[after] * kept[after]
+                after += 1
+            T += total > 0.0
+            for i in range(first, after):
+                if kept[i]:
+                    c, k, part = key[i] & which, label[i], weight[i] / total
+                    x[c, k] += part
+                    w[c] += part
+                    s[k] += part
+            for i in range(first, after):
+                if kept[i]:
+                    c, k = key[i] & which, label[i]
+                    X[c, k] += x[c, k]
+                    X2[c, k] += x[c, k] ** 2
+                    XW[c, k] += x[c, k] * w[c]
+                    S[k] += x[c, k]
+                    x[c, k] = 0.0
+                    S2[k] += s[k] ** 2
+                    s[k] = 0.0
+            for i in range(first, after):
+                if kept[i]:
+                    c = key[i] & which
+                    W[c] += w[c]
+                    W2[c] += w[c] ** 2
+                    w[c] = 0.0
+            first = after
+        number += T > 0
+        pairs, within, among = T * (T - 1.0), 0.0, 0.0
+        for i in range(start, end):
+            c, k = key[i] & which, label[i]
+            same[k] += 2.0 * (X[c, k] * W[c] - XW[c, k] - X[c, k] ** 2 + X2[c, k])
+            X[c, k] = X2[c, k] = XW[c, k] = 0.0
         for i in range(start, end):
             c = key[i] & which
-            own = sums[c, label[i]]
-            if own > most[c] or (own == most[c] and label[i] < best[c]):
-                most[c], best[c] = own, label[i]
+            within += W2[c]
+            among += W[c] ** 2 - W2[c]
+            W[c] = W2[c] = 0.0
+            seen[c], last[c] = 0, -1
+        some = among > 1e-9 and pairs - among > 1e-9
         for i in range(start, end):
-            c = key[i] & which
-            kept[i], shown[i] = seen[c] >= least, best[c]
-        for i in range(start, end):
-            c = key[i] & which
-            seen[c], most[c], sums[c, label[i]] = 0, 0.0, 0.0
+            k = label[i]
+            if some and S[k] > 0.0:
+                apart = 2.0 * (S[k] * (T - 1.0) - S[k] ** 2 + S2[k])
+                of[m], classes[m] = number, k
+                shift[m] = (within / T - among / pairs) * (same[k] / among - (apart - same[k]) / (pairs - among))
+                m += 1
+            S[k] = S2[k] = same[k] = 0.0
         start = end
+    return m
 
 
 @serial
