@@ -344,7 +344,7 @@ def test_evidence_is_calibrated_on_tiles_as_on_the_whole_map(judged, monkeypatch
         monkeypatch.setattr(pairing, "MOST", most)
         one, other = (calibrate_run(folder, precision=0.6) for folder in judged)
         assert one == other
-        assert ("1 in 4 of the places" in one.calibrated_on) == (most == 100)
+        assert ("1 in 4 of the locations" in one.calibrated_on) == (most == 100)
 
 
 def assert_same_comparison(whole, tiles) -> None:
@@ -357,7 +357,7 @@ def assert_same_comparison(whole, tiles) -> None:
         together = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
         columns.append(sorted(zip(*together.values(), strict=True)))
     (scene,) = said[0]["scenes"]
-    assert scene["against"][0]["places"]
+    assert scene["against"][0]["areas"]
     assert [line for line in differences(*said, tolerance=1e-9) if "source" not in line] == []
     assert columns[0] == columns[1]
 

@@ -182,17 +182,15 @@ def judged(low, high, wrong=UNKNOWN, voxels=5000, blocks=40, ceiling=None, class
     """By alpha between frames as it is, or where there is a ceiling by the share of it that is reached."""
     middle = between(low, high)
     numbers = HeadlineStatistics(*[middle] * 5, wrong_of_stable=wrong)
-    reach = (
-        None
-        if ceiling is None
-        else CeilingShare("the ground truth", 500, middle, between(ceiling, ceiling), middle, classes)
-    )
+    reach = None if ceiling is None else CeilingShare(500, middle, between(ceiling, ceiling), middle, classes)
     return verdict("net", headline=numbers, ceiling=reach, voxels=voxels, share=0.5, blocks=blocks)
 
 
 def of_class(name, low, high, *, matters=True):
     share = between(low, high)
-    return ClassCeilingShare(name, 200.0, matters, 0.5, 0.9, share, 1 - probability_above(share, TENTATIVE, "plain"))
+    return ClassCeilingShare(
+        name, 200.0, matters, 0.5, 0.9, share, 1 - probability_above(share, TENTATIVE, "agreement")
+    )
 
 
 @pytest.mark.parametrize(
@@ -252,7 +250,7 @@ def test_probabilities_of_the_levels_sum_to_one_and_follow_the_interval():
 def test_agreement_is_judged_against_its_ceiling_and_the_line_says_which():
     found = judged(0.82, 0.9, ceiling=0.7)
     assert found.level == "stable"
-    assert "alpha between frames 0.86 is 86% (82% to 90%) of its ceiling, 0.70 by the ground truth" in found.line
+    assert "alpha between frames 0.86 is 86% (82% to 90%) of its ceiling, 0.70" in found.line
     assert judged(0.82, 0.9, ceiling=0.4).level == "too coarse"
     assert judged(0.1, 0.2, ceiling=0.4).level == "unstable"
 

@@ -37,12 +37,12 @@ def calibrate_run(run: str | Path, *, precision: float = 0.95, confidence: float
         if (table.classes, table.voxel_size) != (first.classes, first.voxel_size):
             raise DataError(f"{own.source}: its scenes differ in classes or voxel size; calibrate on one at a time")
     on = f"{own.backbone} on {', '.join(own.scenes)}"
-    on += f", 1 in {round(1 / sampled)} of the places of a large map" if sampled < 1 else ""
+    on += f", 1 in {round(1 / sampled)} of the locations of a large map" if sampled < 1 else ""
     return calibrate(maps, precision=precision, confidence=confidence, on=on)
 
 
 def _with_truth(record: Record, truth_file: Path) -> tuple[VoxelTable, Truth]:
-    """A map with its true classes; of a very large one a sample, by a hash of the place."""
+    """A map with its true classes; of a very large one a sample, by a hash of the location."""
     share, parts = share_of(record.summary.table.voxels), []
     files = [file for file in (record.voxels_file, truth_file) if file is not None]
     for table, truth in side_by_side([Tiles.open(file, VoxelTable) for file in files]):
@@ -70,4 +70,4 @@ def lines(found: AcceptanceThresholds) -> Iterator[str]:
             yield f"  {name[:width]:<{width}}  {right}: {own.left:.0%} left"
     yield f"{found.left:.1%} of the voxels are left"
     if any(own.never for own in found.classes.values()):
-        yield "more places, in other scenes, show more: errors near each other count as few"
+        yield "more locations, in other scenes, show more: errors near each other count as few"
