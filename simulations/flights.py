@@ -189,11 +189,9 @@ def sample_of(labels: np.ndarray, over: World, flight: Flight, rng: np.random.Ge
     """
     some = (labels >= 0).any(axis=1)
     voxel, frame = np.nonzero(labels[some] >= 0)
-    n, truth, mixed = len(voxel), over.truth[some][voxel], over.mixed[some][voxel]
+    n, mixed = len(voxel), over.mixed[some][voxel]
     part = np.where(mixed > 0, np.clip(mixed + 0.3 * rng.standard_normal(n), 0, 1), 0.0)[:, None]
-
-    def log(first: np.ndarray) -> Events:
-        evidence = (1 - part) * np.eye(flight.K)[first] + part * np.eye(flight.K)[(first + 1) % flight.K]
-        return Events(*over.index[some].T, voxel, frame, evidence, np.ones(n), 0.125)
-
-    return ObservationSample(log(labels[some][voxel, frame]), log(truth), (), soft=False)
+    first = labels[some][voxel, frame]
+    evidence = (1 - part) * np.eye(flight.K)[first] + part * np.eye(flight.K)[(first + 1) % flight.K]
+    seen = Events(*over.index[some].T, voxel, frame, evidence, np.ones(n), 0.125)
+    return ObservationSample(seen, *([np.zeros(0, int)] * 3), (), soft=False)  # its cells are not known

@@ -52,7 +52,7 @@ def verdicts(flight: Flight, count: int, seed: int) -> Iterator[tuple[StabilityV
                 headline = HeadlineStatistics(*confidence_intervals(headline_specs(sums)))
                 said = verdict("net", headline=headline, ceiling=share, voxels=len(table), share=1.0, blocks=sums.cells)
         level = true_level(float(FUNCTIONALS["reached"].of(sum(total))))
-        yield said, level, level_probabilities(share.share, "plain")[level]
+        yield said, level, level_probabilities(share.share, "agreement")[level]
 
 
 def main() -> None:

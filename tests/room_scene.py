@@ -76,7 +76,11 @@ def render(T: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 @functools.lru_cache(maxsize=64)
 def _render(pose: bytes) -> tuple[np.ndarray, np.ndarray]:
     T = np.frombuffer(pose).reshape(4, 4)
-    direction, origin = rays() @ T[:3, :3].T, T[:3, 3]
+    return cast(rays() @ T[:3, :3].T, T[:3, 3])
+
+
+def cast(direction: np.ndarray, origin: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Depth (H, W) along rays (H, W, 3) and the number of the box that each meets."""
     with np.errstate(divide="ignore"):
         t = (BOXES[:, :, None, None, :] - origin) / direction  # (box, corner, H, W, 3)
     near, far = t.min(axis=1).max(axis=-1), t.max(axis=1).min(axis=-1)
