@@ -1,71 +1,57 @@
-"""How often does the scene's test of drift reject where there is none?
+"""How often do tests of drift find some where there is none?
 
-    python simulations/drift.py [--runs 200]
+    python simulations/drift.py [--trials 60]
 
-Groups of 12 voxels that are first seen together, in frames whose errors are anew in each or last (autocorrelation 0.8),
-common to a group or to a frame. Share of scenes of which a p-value is told, and with p <= 0.05, of the test by SBD and
-of that by the trend.
+Flights over a floor (flights.py) whose frames are alike or differ, whose errors last, or depend on the view; the model
+does not change. Prints a table in Markdown: the share of flights whose scene is tested at all, in which it is found to
+drift (p <= 0.05) by SBD and by the trend, and the share of the voxels that are named as trending of those tested.
 """
 
 from __future__ import annotations
 
 import argparse
-import sys
-from pathlib import Path
 
 import numpy as np
+from flights import Flight, fly, log_of, world
 
-sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
+from semstab.statistics.drift import TESTABLE, benjamini_hochberg, in_stretches, order_test, rounded_up, voxel_drift
+from semstab.statistics.sections import FALSE_DISCOVERIES
 
-from simulated_events import log_of
-
-from semstab.model.events import Events
-from semstab.statistics import scene_drift, voxel_drift
-
-CASES = ((40, 20, 6), (40, 40, 6), (200, 80, 20), (200, 200, 10))
-"""Frames, in how many of them a group is seen, groups."""
-
-GROUP = 12
+KINDS = ("alike", "bad", "uneven", "heavy", "lasting", "regimes", "objects", "view", "direction")
+FLIGHTS = ((40, 20), (80, 40), (60, 60), (120, 120))
+"""Frames, and how many of them see a voxel."""
 
 
-def scene(rng: np.random.Generator, case: tuple[int, int, int], common: str, lasting: float) -> Events:
-    """The log of a scene without drift."""
-    F, T, groups = case
-    z = np.zeros(F)
-    for f, anew in enumerate(rng.standard_normal(F)):
-        z[f] = anew if f == 0 else lasting * z[f - 1] + np.sqrt(1 - lasting**2) * anew
-    p = 1 / (1 + np.exp(1.5 - z))
-    start = rng.integers(0, F - T + 1, groups)[:, None]
-    seen = (np.arange(F) >= start) & (np.arange(F) < start + T)
-    wrong = rng.random((groups, 1 if common == "group" else GROUP, F)) < p
-    labels = np.where(seen[:, None], wrong, -1)
-    return log_of(np.broadcast_to(labels, (groups, GROUP, F)).reshape(-1, F), K=2)
-
-
-def rejected(case: tuple[int, int, int], common: str, lasting: float, runs: int) -> tuple[float, float, float]:
-    """Share of the scenes that have a p-value, and that are found to drift, by SBD and by the trend."""
-    rng, found = np.random.default_rng(1), []
-    for _ in range(runs):
-        events = scene(rng, case, common, lasting)
-        table = events.table()
-        test = scene_drift(table, events, voxel_drift(table, events, draws=1, most=1), frame_orders=99)
-        found.append((not np.isnan(test.p_value), test.p_value <= 0.05, test.trend_p <= 0.05))
-    told, by_sbd, by_trend = np.mean(found, axis=0)
-    return float(told), float(by_sbd), float(by_trend)
+def trial(flight: Flight, seed: int) -> tuple[bool, bool, bool, int, int]:
+    """Whether the scene is tested, drifts by SBD and by trend; voxels that are tested and that trend."""
+    rng = np.random.default_rng(seed)
+    over = world(flight, rng)
+    log = log_of(fly(flight, over, rng), over, flight)
+    test = order_test(log.table(), log, frame_orders=99)
+    log = in_stretches(log, test.lasting) if test.lasting > 1 else log
+    table = log.table()
+    p = np.where(table.op >= TESTABLE, voxel_drift(table, log, sample=1).trend_p, np.nan)
+    trending = benjamini_hochberg(rounded_up(p)) <= FALSE_DISCOVERIES
+    return (
+        not np.isnan(test.trend_p), test.p_value <= 0.05, test.trend_p <= 0.05,
+        np.count_nonzero(~np.isnan(p)), np.count_nonzero(trending),
+    )  # fmt: skip
 
 
 def main() -> None:
     """Print the table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--runs", type=int, default=200)
-    runs = parser.parse_args().runs
-    print("| frames, seen in | errors | told | by SBD | by trend |\n|---|---|---|---|---|")
-    for case in CASES:
-        for common in ("group", "frame"):
-            for lasting in (0.0, 0.8):
-                told, by_sbd, by_trend = rejected(case, common, lasting, runs)
-                errors = f"of a {common}, {'lasting' if lasting else 'anew'}"
-                print(f"| {case[0]}, {case[1]} | {errors} | {told:.2f} | {by_sbd:.3f} | {by_trend:.3f} |", flush=True)
+    parser.add_argument("--trials", type=int, default=60)
+    trials = parser.parse_args().trials
+    print("| frames | frames, seen in | tested | by SBD | by trend | trending voxels |\n|---|---|---|---|---|---|")
+    for kind in KINDS:
+        for frames, looks in FLIGHTS:
+            flight = Flight(32, 2.0, 1.0, frames, looks, kind)
+            found = np.array([trial(flight, seed) for seed in range(trials)], float)
+            told, by_sbd, by_trend = found[:, :3].mean(axis=0)
+            share = found[:, 4].sum() / max(found[:, 3].sum(), 1)
+            voxels = f"{share:.3f}" if found[:, 3].any() else "none tested"
+            print(f"| {kind} | {frames}, {looks} | {told:.2f} | {by_sbd:.3f} | {by_trend:.3f} | {voxels} |", flush=True)
 
 
 if __name__ == "__main__":

@@ -7,6 +7,7 @@ as a whole, whose frames stay together in stretches of time, as frames that foll
 
 from __future__ import annotations
 
+import dataclasses
 import itertools
 import math
 from dataclasses import dataclass
@@ -17,7 +18,7 @@ import numpy as np
 from semstab.core.types import Float64, Int64, Mask, UInt16, UInt64
 from semstab.errors import ConfigError
 from semstab.model.events import Events
-from semstab.model.evidence import row_chunks
+from semstab.model.evidence import Evidence, row_chunks
 from semstab.model.measures import Quantity, mean, sbd
 from semstab.model.voxels import VoxelTable
 from semstab.statistics.agreement import ONE_HOT
@@ -273,6 +274,12 @@ CERTAIN, MOST_SPANS = 0.95, 128
 SAMPLE, ORDERS = 30_000, 499
 """About so many observations are put into so many orders."""
 
+IN_COMMON = 0.05
+"""Two observations have nothing in common whose departures from their voxel's mean correlate by no more."""
+
+FEW_PAIRS = 0.02
+"""A bin with a smaller share of all pairs says nothing."""
+
 MOST_STRETCHES, LEAST_STRETCHES, LEAST_SPAN = 12, 6, 4
 """Stretches of time, at most and at least, and in how many of them a voxel must be seen to be put to the test."""
 
@@ -302,12 +309,13 @@ class SceneDrift:
 
 @dataclass(frozen=True)
 class OrderTest:
-    """The parts of `SceneDrift` that follow from a sample of the voxels."""
+    """The parts of `SceneDrift` that follow from a sample of the voxels; `lasting`: frames that err alike."""
 
     p_value: float
     trend_p: float
     stretches: int
     voxels: int
+    lasting: int = 1
 
 
 def scene_drift(
@@ -342,16 +350,16 @@ def order_test(table: VoxelTable, events: Events, *, seed: int = 0, frame_orders
     drawn = np.sort(rows[order[: np.searchsorted(np.cumsum(table.op[rows][order]), SAMPLE) + 1]])
     table, events = table.rows(drawn), events.rows(drawn)
     frames, rank = np.unique(events.frame, return_inverse=True)
-    stretches = min(
-        MOST_STRETCHES, int(len(frames) / (1 + 2 * _lasting(_departures(table, events), rank, len(frames))))
-    )
+    common = _lasting(_departures(table, events), rank, len(frames))
+    lasting = max(int(1 + 2 * common), persistence(table, events))
+    stretches = min(MOST_STRETCHES, len(frames) // lasting)
     stretch = rank * stretches // max(len(frames), 1)
     changes = np.diff(stretch, prepend=-1) != 0
     changes[events.starts] = True
     span = np.bincount(events.voxel, weights=changes, minlength=len(table))
     some = (span >= LEAST_SPAN) & (stretches >= LEAST_STRETCHES)
     if not some.any():
-        return OrderTest(math.nan, math.nan, stretches, 0)
+        return OrderTest(math.nan, math.nan, stretches, 0, lasting)
     first, T, *log = _log_of(events, some)
     stretch = stretch[np.repeat(some, table.op)]
     as_seen = np.tile(np.arange(stretches), (frame_orders, 1))
@@ -365,7 +373,57 @@ def order_test(table: VoxelTable, events: Events, *, seed: int = 0, frame_orders
     total_trend = float((trend / np.maximum(T * (T * T - 1.0) / 12, 1))[T > 2].sum())
     total_drift = float(sbd(table)[some].sum())
     p_value = min(1.0, 2 * min(_tail(-drifts, -total_drift), _tail(drifts, total_drift)))
-    return OrderTest(p_value, _tail(trends, total_trend) if total_trend > 0 else math.nan, stretches, len(T))
+    return OrderTest(p_value, _tail(trends, total_trend) if total_trend > 0 else math.nan, stretches, len(T), lasting)
+
+
+def persistence(table: VoxelTable, events: Events) -> int:
+    """Return for how many frames observations of a voxel have more in common than any two of it: 1 if none last.
+
+    By the correlation of departures from the voxel's mean, over pairs that are 1, 2, 4, ... observations apart, in bins
+    of frames. In random order it is -1 / (OP - 1), whatever the voxel's observations are. A belief that moves all along
+    the flight lasts as long as the flight.
+    """
+    from scipy.sparse import csr_array
+
+    rank, of, T = np.unique(events.frame, return_inverse=True)[1], events.voxel, table.op
+    starts, label, weight = events.evidence.entries
+    evidence = csr_array((weight, label.astype(np.int32), starts), shape=(len(events), events.K))
+    squares, agrees = table.evidence.concentration.squares / T**2.0, np.zeros(len(events))
+    for some in row_chunks(len(events), table.K):
+        agrees[some] = (events.evidence[some] * table.evidence[of[some]]).sum(axis=1) / T[of[some]]
+    spread = variation(table) / T
+    common, among = np.zeros((2, 64))
+    apart = 1
+    while len(first := np.flatnonzero(of[apart:] == of[:-apart])):
+        second, voxel = first + apart, of[first]
+        together = evidence[first].multiply(evidence[second]).sum(axis=1) - agrees[first] - agrees[second]
+        bins = np.log2(abs(rank[second] - rank[first])).astype(np.int64)
+        excess = together + squares[voxel] + spread[voxel] / (T[voxel] - 1)
+        common += np.bincount(bins, weights=excess, minlength=64)
+        among += np.bincount(bins, weights=spread[voxel], minlength=64)
+        apart *= 2
+    lasting = np.flatnonzero((common > IN_COMMON * among) & (among > FEW_PAIRS * among.sum()))
+    return 2 ** (int(lasting[-1]) + 2) if len(lasting) else 1
+
+
+def in_stretches(events: Events, frames: int) -> Events:
+    """Return the log of the means over stretches of so many frames: what a voxel's observations there say together."""
+    from scipy.sparse import csr_array
+
+    stretch, K = np.unique(events.frame, return_inverse=True)[1] // frames, events.K
+    key = events.voxel.astype(np.int64) * (int(stretch.max(initial=0)) + 1) + stretch
+    own, at, of, count = np.unique(key, return_index=True, return_inverse=True, return_counts=True)
+    starts, label, weight = events.evidence.entries
+    evidence = csr_array((weight, label.astype(np.int32), starts), shape=(len(events), K))
+    joined = csr_array((1.0 / count[of], (of, np.arange(len(events)))), shape=(len(own), len(events))) @ evidence
+    joined.sort_indices()
+    return dataclasses.replace(
+        events,
+        voxel=events.voxel[at],
+        frame=stretch[at].astype(np.int32),
+        evidence=Evidence(joined.indptr.astype(np.int64), joined.indices.astype(np.uint16), joined.data, K),
+        pixels=np.bincount(of, weights=events.pixels).astype(np.int32),
+    )
 
 
 def _departures(table: VoxelTable, events: Events) -> Float64:

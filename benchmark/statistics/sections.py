@@ -25,9 +25,11 @@ from semstab.statistics.drift import (
     VoxelDrift,
     benjamini_hochberg,
     flips,
+    in_stretches,
     order_test,
     rounded_up,
     trend_columns,
+    voxel_drift,
 )
 from semstab.statistics.intervals import EstimateSpec
 from semstab.statistics.sample import MapSample
@@ -214,22 +216,27 @@ def log_sums(
     }
     sums = places.means(means)
     sums["trend_excess"] = np.stack([trends[:, 0] - trends[:, 1], trends[:, 2]], axis=1)
-    testable = table.op >= TESTABLE
-    drift_q = benjamini_hochberg(np.where(testable, drift.p_value, np.nan))
-    trend_q = benjamini_hochberg(rounded_up(np.where(testable, drift.trend_p, np.nan)))
+    test = order_test(table, sample.events, seed=seed)
+    tested, op = drift, table.op
+    if test.lasting > 1:  # single observations are not exchangeable: the means over stretches may be
+        log_of_means = in_stretches(sample.events, test.lasting)
+        means_of = log_of_means.table()
+        tested, op = voxel_drift(means_of, log_of_means, seed=seed), means_of.op
+    drift_q = benjamini_hochberg(np.where(op >= TESTABLE, tested.p_value, np.nan))
+    trend_q = benjamini_hochberg(rounded_up(np.where(op >= TESTABLE, tested.trend_p, np.nan)))
     log = LogSums(
         CubeSums(places.cell, places.edge, sums),
         trends.sum(axis=0),
-        order_test(table, sample.events, seed=seed),
+        test,
         int(np.count_nonzero(~np.isnan(trend_q))),
         int(np.count_nonzero(drift_q <= FALSE_DISCOVERIES)),
         int(np.count_nonzero(trend_q <= FALSE_DISCOVERIES)),
     )
     columns: Columns = {
         "sbd_null": drift.null,
-        "drift_p": drift.p_value,
+        "drift_p": tested.p_value,
         "trend": drift.trend,
-        "trend_p": drift.trend_p,
+        "trend_p": tested.trend_p,
         "flip_rate": changes.rate,
         "frames_since_flip": changes.since,
         "drift_q": drift_q,

@@ -99,11 +99,11 @@ def drift(result: Result) -> list[Table]:
     """SBD beside what a random order of the same observations gives, and the drift in one direction."""
     columns = (
         Column("voxels", "Voxels", 0),
-        Column("sbd", "as seen", 4, over="SBD (bits)"),
+        Column("sbd", "observed", 4, over="SBD (bits)"),
         Column("sbd_null", "random order", 4, over="SBD (bits)"),
         Column("sbd_excess", "excess", 4, signed=True, over="SBD (bits)"),
         Column("sbd_p", "p", 3, over="SBD (bits)"),
-        Column("trend", "one way", 3, over="Trend"),
+        Column("trend", "R² (time)", 3, over="Trend"),
         Column("trend_null", "random order", 3, over="Trend"),
         Column("trend_p", "p", 3, over="Trend"),
         Column("trending_voxels", "trending", 0, over="Voxels"),
@@ -126,8 +126,9 @@ def drift(result: Result) -> list[Table]:
     seen = SEEN_TWICE if logged else one_class
     tests = (
         " Trend: share of the disagreement that goes one way in time. p: of values this far out, from random orders of"
-        " stretches of time; none where errors may last too long for six of them. Trending: voxels whose own trend is"
-        " significant at a false discovery rate of 5%, of those seen six times or more."
+        " stretches of time; none where errors last, or depend on the view, too long for six of them: no test can tell"
+        " that from a trend. Trending: voxels whose own trend is significant at a false discovery rate of 5%, of those"
+        " seen in six stretches or more."
     )
     caption = (
         f"{seen} Random order: what the same observations give in the mean of all orders; excess: SBD less that."
