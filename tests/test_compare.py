@@ -103,7 +103,7 @@ def test_the_numbers_are_those_of_the_runs_where_all_looks_are_common(runs, faul
     assert found["alpha"].base == pytest.approx(judged.alpha.value, abs=1e-9)
     assert found["accuracy"].base == pytest.approx(judged.accuracy.value, abs=1e-9)
     assert found["reached"].base == pytest.approx(record.statistics.ceiling_share.share.value, abs=1e-9)
-    assert found["flicker_percent"].base == pytest.approx(record.image_space.flicker_percent)
+    assert found["compensated_flicker_percent"].base == pytest.approx(record.image_space.compensated_flicker_percent)
     assert found["wrong_of_stable"].base == pytest.approx(right.quadrants.wrong_of_stable.value, abs=1e-9)
     assert {"sbd_excess", "miou", "ece", "entropy", "sbd", "margin"} <= found.keys()
 
@@ -144,7 +144,7 @@ def test_the_columns_go_along_in_an_export(runs, fault, tmp_path):
 def test_of_other_voxel_sizes_only_what_does_not_depend_on_them_is_compared(runs):
     (scene,) = semstab.compare([runs / "old", runs / "coarse"]).scenes
     assert scene.basis == "cubes"
-    assert set(rows(scene.against[0])) == {"reached", "flicker_percent", "accuracy", "miou"}
+    assert set(rows(scene.against[0])) == {"reached", "compensated_flicker_percent", "accuracy", "miou"}
     assert not scene.against[0].areas
     assert "voxels of 0.125 m and 0.25 m" in scene.notes[0]
 

@@ -39,7 +39,7 @@ def test_a_label_source_is_selected_behind_a_colon(run):
     assert entry.classes == entry.with_voxels("").table().classes
     assert value(entry.sums, "psa") == pytest.approx(entry.summary.statistics.agreement.psa.value)
     assert list(entry.flicker) == [1, 2, 3, 4, 5]
-    assert np.mean(list(entry.flicker.values())) == pytest.approx(entry.summary.flicker_percent)
+    assert np.mean(list(entry.flicker.values())) == pytest.approx(entry.image_space.compensated_flicker_percent)
 
 
 def test_names_are_the_shortest_that_tell_apart(run, tmp_path):
@@ -180,7 +180,7 @@ def test_flicker_out_of_range_in_a_runs_series_is_refused(run, tmp_path):
     shutil.copytree(run, tmp_path / "run")
     series = next((tmp_path / "run/frames").glob("wall__a*.csv"))
     rows = series.read_text().splitlines()
-    at = rows[0].split(",").index("flicker_percent")
+    at = rows[0].split(",").index("compensated_flicker_percent")
     values = rows[2].split(",")
     values[at] = "1e308"
     series.write_text("\n".join([*rows[:2], ",".join(values), *rows[3:]]))

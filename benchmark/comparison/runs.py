@@ -36,7 +36,7 @@ from semstab.statistics.cluster_sums import ClusterSums
 T = TypeVar("T")
 
 Flicker = Mapping[int, float]
-"""Percent of the pixels whose label differs from that of the frame before, by frame index."""
+"""Percent of the pixels whose label differs from that of the frame before, camera motion removed, by frame index."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -208,7 +208,7 @@ def _flicker(file: Path | None) -> Flicker:
         return {}
     try:
         with file.open(encoding="utf-8", newline="") as lines:
-            rows = [(row["frame"], row["flicker_percent"]) for row in csv.DictReader(lines)]
+            rows = [(row["frame"], row.get("compensated_flicker_percent")) for row in csv.DictReader(lines)]
         flicker = {int(frame): float(percent) for frame, percent in rows if percent}
         flicker = {frame: percent for frame, percent in flicker.items() if math.isfinite(percent)}
         if not _valid(flicker, flicker.values()):

@@ -24,7 +24,7 @@ from semstab.statistics.intervals import LEAST_FRAMES
 REACHED = Quantity(key="reached", title="Share of the ceiling", short="of ceiling", better="higher", digits=(3, 4))
 RECURRENT_VSS = Quantity(key="vss", title="VSS at OP>=3", better="higher", digits=VSS.digits)
 SBD_EXCESS = Quantity(key="sbd_excess", title="SBD excess", unit="bits", better="lower", digits=(4, 4))
-FLICKER = Quantity(key="flicker_percent", title="Flicker", unit="%", better="lower", digits=(2, 2))
+FLICKER = Quantity(key="compensated_flicker_percent", title="Flicker", unit="%", better="lower", digits=(2, 2))
 COVERAGE = Quantity(key="coverage", title="Coverage", better="higher")
 MISLEADING = Quantity(
     key="wrong_of_stable", title="Stable and wrong", short="stable, wrong", better="lower", needs="truth"

@@ -17,7 +17,8 @@ from semstab.core.types import Float64
 from semstab.model.results import STAGES, FrameReport
 
 FRAME_COLUMNS = (
-    "frame", "timestamp", "points", "voxels", "new_voxels", "drift", "flicker_percent", "map_voxels", "map_vss",
+    "frame", "timestamp", "points", "voxels", "new_voxels", "drift", "flicker_percent",
+    "compensated_flicker_percent", "map_voxels", "map_vss",
     "map_entropy", "map_recurrent", "fuse_ms",
     "decode_ms", "wait_ms", "association_ms", "update_ms", "left_out",
 )  # fmt: skip
@@ -28,7 +29,8 @@ FRAME_COLUMNS = (
 class FrameRow:
     """One row of a unit's time series: the backend's report, what the frame itself tells, and seconds by stage.
 
-    left_out counts the pixels that were left out of fusion because what they show moves; scores_left_out and
+    compensated_flicker_percent has the camera's motion removed (`ImageSpace`), NaN where that is not measured. left_out
+    counts the pixels that were left out of fusion because what they show moves; scores_left_out and
     most_scores_left_out are the mean and the largest share of a pixel's scores that `top_k` left out. logging_seconds
     is known once the observers have seen the row.
     """
@@ -36,6 +38,7 @@ class FrameRow:
     report: FrameReport
     timestamp: float | None
     flicker_percent: float
+    compensated_flicker_percent: float = math.nan
     decode_seconds: float = math.nan
     wait_seconds: float = math.nan
     flicker_seconds: float = math.nan
@@ -54,6 +57,7 @@ class FrameRow:
         row = vars(self.report) | {
             "timestamp": self.timestamp,
             "flicker_percent": self.flicker_percent,
+            "compensated_flicker_percent": self.compensated_flicker_percent,
             "left_out": self.left_out,
             "drift": self.report.drift,
             "fuse_ms": self.report.seconds * 1e3,
@@ -64,8 +68,8 @@ class FrameRow:
 
 REPORT = ("frame", "points", "voxels", "new_voxels", "drift_sum", "seconds", "map_voxels", "map_vss", "map_entropy",
           "map_recurrent", "association_seconds", "update_seconds")  # fmt: skip
-ROW = ("timestamp", "flicker_percent", "decode_seconds", "wait_seconds", "flicker_seconds", "logging_seconds",
-       "left_out", "scores_left_out", "most_scores_left_out")  # fmt: skip
+ROW = ("timestamp", "flicker_percent", "compensated_flicker_percent", "decode_seconds", "wait_seconds",
+       "flicker_seconds", "logging_seconds", "left_out", "scores_left_out", "most_scores_left_out")  # fmt: skip
 NUMBERS = (*REPORT, *ROW)
 """What a row of numbers holds: fields of the report, then of the row; an undefined one is NaN."""
 

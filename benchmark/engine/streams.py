@@ -235,13 +235,13 @@ class Stream:
 
     def measure(self, now: Prepared, reports: Mapping[LiveMap, FrameReport]) -> dict[LiveMap, FrameRow]:
         """Flicker and stability in image coordinates, beside the reports of the maps: a row of each series."""
-        frame, decoded, flicker = now.frame, now.fetched.item, math.nan
+        frame, decoded, flicker, compensated = now.frame, now.fetched.item, math.nan, math.nan
         with self._watch("flicker") as lap:
             if self._sequential and self._previous is not None and self._previous.shape == frame.shape:
                 flicker = flicker_percent(self._previous, frame)
         if self.image_space is not None:
             with self._watch("image space"):
-                self.image_space.add(frame, now.truth)
+                compensated = self.image_space.add(frame, now.truth)
         if self.quality is not None:
             with self._watch("frame quality"):
                 model = frame if decoded.model is None else prepare(self.task, decoded.model, self.pixel_stride)
@@ -250,7 +250,7 @@ class Stream:
             self._poses.append(frame.T_wc[:3, 1:].ravel())
         self._previous = frame if self._sequential else None
         cut = frame.scores_left_out
-        seconds = now.fetched.seconds, now.fetched.waited, lap.seconds
+        seconds = compensated, now.fetched.seconds, now.fetched.waited, lap.seconds
         of_frame: dict[str, Any] = {
             "left_out": frame.left_out_pixels,
             "scores_left_out": math.nan if cut is None else cut.mean,
@@ -337,8 +337,8 @@ class ImageSpaceMeter:
         self._by_truth = [VideoConsistency(n) for n in CLIPS]
         self._by_itself = [SelfConsistency(n) for n in CLIPS]
 
-    def add(self, frame: Frame, truth: Frame | None) -> None:
-        """Add the next frame, with its ground truth in the same label space where there is any."""
+    def add(self, frame: Frame, truth: Frame | None) -> float:
+        """Add the next frame, with its truth in the same label space where there is any; its compensated flicker."""
         step = -(-max(frame.shape) // SIDE)
         sample, true = frame.every(step), None if truth is None else truth.every(step)
         flicker, share = math.nan, math.nan
@@ -352,6 +352,7 @@ class ImageSpaceMeter:
         ]
         self.rows.append((flicker, share, *by_truth, *by_itself))
         self._previous = frame
+        return flicker
 
     def result(self, flicker_percent: float) -> ImageSpace:
         """Means over the frames so far, beside the flicker of the unit's summary."""

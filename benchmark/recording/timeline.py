@@ -99,8 +99,8 @@ class Background:
 
 SERIES = {
     "drift": "Mean drift of updates (bits)",
-    "flicker_percent": "Flicker (%)",
-    "compensated_flicker": "Flicker, motion-compensated (%)",
+    "flicker_percent": "Pixel flicker (%)",
+    "compensated_flicker": "Flicker (%)",
     "map_vss": f"Mean {VSS.word} so far (0 to {VSS.largest:g})",
     "map_entropy": f"Mean {ENTROPY.word} so far (0 to {ENTROPY.largest:g})",
     "map_recurrent": f"Share OP >= {RECURRENT} so far (0 to 1)",

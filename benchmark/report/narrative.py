@@ -170,11 +170,11 @@ def _flicker(records: Sequence[Record]) -> Iterator[str]:
         plain = macro_mean([row.image_space.flicker_percent for row in rows])
         compensated = macro_mean([row.image_space.compensated_flicker_percent for row in rows])
         if not math.isnan(compensated):
-            parts.append(f"{backbone} {plain:.0f}% ({compensated:.0f}%)")
+            parts.append(f"{backbone} {compensated:.0f}% ({plain:.0f}%)")
     if parts:
         yield (
-            "Share of the pixels whose label changes from one sampled frame to the next, and in brackets what is left"
-            f" of it where the camera's motion is taken out: {', '.join(parts)}."
+            "Flicker, the share of the pixels whose label changes from one sampled frame to the next with the camera's"
+            f" motion removed (in brackets pixel flicker, with it): {', '.join(parts)}."
         )
 
 

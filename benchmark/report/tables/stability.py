@@ -174,8 +174,8 @@ _COLUMNS = (
     Column("recurrent_percent", "OP>=3 (%)", 2),
     *(Column.of(measure, over="All voxels") for measure in _HEADLINES),
     *(Column.of(measure, prefix="recurrent_", over="OP>=3") for measure in _HEADLINES),
-    Column("flicker_percent", "plain (%)", 2, "lower", over="Flicker"),
-    Column("compensated_flicker_percent", "compensated (%)", 2, "lower", over="Flicker"),
+    Column("flicker_percent", "Pixel flicker (%)", 2, "lower"),
+    Column("compensated_flicker_percent", "Flicker (%)", 2, "lower"),
 )
 
 
@@ -186,8 +186,8 @@ def glance(result: Result) -> list[Table]:
         return []
     rows = tuple(_row(name, found) for name, found in by_backbone(records).items())
     caption = (
-        f"{settings(records)} Pooled over the voxels of all scenes; flicker is the macro mean of the scenes,"
-        f" compensated for camera motion in the last column. {SBD_OVER}"
+        f"{settings(records)} Pooled over the voxels of all scenes; flicker is the macro mean of the scenes;"
+        f" pixel flicker has the camera's motion in it. {SBD_OVER}"
     )
     return [Table("glance", "Backbones at a glance", caption, _COLUMNS, (Group("", rows),), by="")]
 
@@ -293,8 +293,8 @@ def _sweep_row(sweep: Sweep, level: Level) -> Row:
 # Stability in image coordinates: flicker, flicker without the camera's motion, video consistency.
 
 _NUMBERS = (
-    Column("flicker_percent", "Flicker (%)", 2, "lower"),
-    Column("compensated_flicker_percent", "compensated (%)", 2, "lower"),
+    Column("flicker_percent", "Pixel flicker (%)", 2, "lower"),
+    Column("compensated_flicker_percent", "Flicker (%)", 2, "lower"),
     Column("compensated_share_percent", "co-visible (%)", 2),
     Column("vc8", "VC8", 4, "higher"),
     Column("vc16", "VC16", 4, "higher"),
@@ -302,7 +302,7 @@ _NUMBERS = (
     Column("self_vc16", "VC16", 4, "higher", over="Without truth"),
 )
 _WHAT = (
-    "Flicker: share of the pixels valid in two consecutive sampled frames whose label changes. Compensated: the same"
+    "Pixel flicker: share of the pixels valid in two consecutive sampled frames whose label changes. Flicker: the same"
     " after the earlier map is warped by depth and pose, occluded pixels left out, so that camera motion does not"
     " count; co-visible is the share of the valid pixels that the warped map reaches. VC8, VC16: video consistency, the"
     " share of the pixels whose ground truth stays the same through a clip of 8 or 16 frames and whose prediction does"
