@@ -8,7 +8,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
-from semstab.config import Config, Exclusion, Part, Perturbation, as_range
+from semstab.config import Config, Exclusion, Part, Perturbation, as_range, nearest
 from semstab.datasets import GROUND_TRUTH, Scene
 from semstab.datasets.scene import Selected, select_frames
 from semstab.errors import ConfigError, DataError
@@ -65,7 +65,7 @@ def tasks_of(scene: Scene, config: Config, beside: Sequence[str] = ()) -> Iterat
         source = scene.label_space(backbone)
         target = source if config.taxonomy is None else LabelSpace.load(config.taxonomy)
         mapping = source.mapping_to(target)
-        _require_classes(config.exclude.classes, mapping, scene.name)
+        _require_classes(config.exclude, mapping, scene.name)
         fused_by = tuple(backend.name for backend in config.fused_by() if applies(backend, scene.name, backbone))
         yield Task(
             scene, backbone, indices, mapping, fused_by, config.perturbation, config.exclude, config.top_k,
@@ -78,13 +78,14 @@ def applies(part: Part, scene: str, backbone: str) -> bool:
     return scene in (part.scenes or [scene]) and backbone in (part.backbones or [backbone])
 
 
-def _require_classes(names: Sequence[str], mapping: LabelMapping, where: str) -> None:
-    for name in names:
-        if not mapping.named([name]):
-            known = [*dict.fromkeys((*mapping.source.classes, *mapping.target.classes))]
-            near = difflib.get_close_matches(name, known, n=1)
-            hint = f"did you mean '{near[0]}'?" if near else f"there is {', '.join(known)}"
-            raise ConfigError(f"{where}: exclude.classes: no class '{name}'; {hint}")
+def _require_classes(exclude: Exclusion, mapping: LabelMapping, where: str) -> None:
+    fused, predicted = mapping.target.classes, [*dict.fromkeys((*mapping.source.classes, *mapping.target.classes))]
+    for setting, names, known in (
+        ("classes", exclude.classes, fused), ("predicted_classes", exclude.predicted_classes, predicted),
+    ):  # fmt: skip
+        for name in names:
+            if name not in known and not (setting == "predicted_classes" and mapping.named([name])):
+                raise ConfigError(f"{where}: exclude.{setting}: no class '{name}'; {nearest(name, known)}")
 
 
 def chosen_frames(scene: Scene, config: Config, sources: Sequence[str] = ()) -> Selected:
@@ -131,7 +132,7 @@ def prepare(task: Task, frame: Frame, pixel_stride: int = 1) -> Frame:
 
 
 def _still(task: Task, frame: Frame) -> Frame:
-    classes = task.mapping.named(task.exclude.classes)
+    classes = task.mapping.named(task.exclude.predicted_classes)
     if frame.labels is not None:
         classes = tuple(task.mapping.source.ids[k] for k in classes)
     return leave_out(frame, classes, masks=task.exclude.masks)

@@ -18,8 +18,10 @@ from semstab.engine.units import make_plan
 from semstab.errors import ConfigError, DataError
 from semstab.model.frames import Frame, Intrinsics
 from semstab.model.labels import LabelSpace
+from semstab.model.measures import dominant
 from semstab.pixels.preparation import leave_out
 from semstab.settings import load_config
+from semstab.statistics import describe
 from semstab.task import read
 
 CAMERA = Intrinsics(4, 4, 2, 2)
@@ -86,7 +88,7 @@ def test_a_mask_of_another_size_or_type_is_refused() -> None:
 def test_a_run_leaves_out_a_class_and_says_how_many_pixels(root, tmp_path) -> None:
     everything = semstab.engine.run(configure(root)).runs[0]
     out = tmp_path / "run"
-    still = semstab.engine.run(configure(root, exclude={"classes": ["Door"]}), out=out).runs[0]
+    still = semstab.engine.run(configure(root, exclude={"predicted_classes": ["Door"]}), out=out).runs[0]
     assert still.left_out > 0
     assert still.table.points + still.left_out == everything.table.points
     classes = {group.name: group.voxels for group in still.table.classes}
@@ -94,6 +96,27 @@ def test_a_run_leaves_out_a_class_and_says_how_many_pixels(root, tmp_path) -> No
     (path,) = (out / "frames").iterdir()
     assert sum(int(row["left_out"]) for row in csv.DictReader(path.read_text().splitlines())) == still.left_out
     assert json.loads((out / "summary.json").read_text())["runs"][0]["left_out"] == still.left_out
+
+
+@pytest.mark.parametrize("tile_size", [None, 16])
+def test_locations_of_a_class_are_left_out_and_errors_elsewhere_stay(root, tmp_path, tile_size) -> None:
+    """Frames that miss the door elsewhere, or see one where there is none, count as before."""
+
+    def of(name, **settings):
+        config = configure(root, statistics=True, tile_size=tile_size, **settings)
+        return semstab.engine.run(config, out=tmp_path / name).runs[0]
+
+    whole, some = of("whole"), of("some", exclude={"classes": ["door"]})
+    tables = [semstab.load(tmp_path / name).table() for name in ("whole", "some")]
+    keep = dominant(tables[0]) != tables[0].classes.index("door")
+    assert 0 < keep.sum() < len(keep)
+    np.testing.assert_array_equal(tables[1].index, tables[0].index[keep])
+    np.testing.assert_array_equal(tables[1].evidence[:], tables[0].evidence[:][keep])
+    assert some.left_out == whole.left_out == 0
+    assert (tables[1].evidence[:][:, tables[1].classes.index("door")] > 0).any()
+    expected = describe(tables[0].rows(keep)).agreement.psa.value
+    assert some.statistics.agreement.psa.value == pytest.approx(expected)
+    assert some.statistics.ceiling_share.voxels < whole.statistics.ceiling_share.voxels
 
 
 def test_the_masks_of_a_posed_folder(root) -> None:

@@ -104,9 +104,16 @@ class Perturbation(Settings):
 
 
 class Exclusion(Settings):
-    """What is left out of fusion because it moves; see `semstab.pixels.preparation`."""
+    """What is left out of maps by the class of a location, or of fusion because it moves (`pixels.preparation`)."""
 
-    classes: tuple[str, ...] = Field((), description="classes, by their name in a backbone's or in the run's taxonomy")
+    classes: tuple[str, ...] = Field(
+        (), description="locations whose fused class is one of these, by its name in the run's taxonomy"
+    )
+    predicted_classes: tuple[str, ...] = Field(
+        (),
+        description="pixels that are predicted as one of these moving things, by a name of the backbone's or of the"
+        " run's taxonomy; it also removes what is predicted so by mistake",
+    )
     masks: bool = Field(True, description="pixels under the masks of the dataset, where it has some")
 
 

@@ -69,6 +69,9 @@ def finish(live: LiveMap, stream: Stream, watch: Stopwatch) -> Outcome:
             raise no_voxels(task, config)
         events = live.backend.events() if live.backend is not None and (config.statistics or config.events) else None
         events = None if events is None else dataclasses.replace(events, classes=table.classes)
+        whole, (table, events) = table, _left(live, table, events)
+        if not len(table):
+            raise no_voxels(task, config)
         live.backend = None  # the statistics have its memory
         give_back(least=SMALL)
     with watch("voxel sizes"):
@@ -84,13 +87,13 @@ def finish(live: LiveMap, stream: Stream, watch: Stopwatch) -> Outcome:
             live.rows,
             summarise(table, config.strata) if analysis is None else analysis.table,
             None if analysis is None else analysis.summary,
-            None if live.hard is None else reduced_of(reduced_sums(live.hard.table())),
+            None if live.hard is None else reduced_of(reduced_sums(_left(live, live.hard.table())[0])),
             sizes,
         )
     with watch("write"):
         files, returned = written(work.start, _savers(live, stream, table, events, truth, analysis))
     with watch("reference"):
-        checked = None if live.reference is None else _checked(live, table, live.reference)
+        checked = None if live.reference is None else _checked(live, whole, live.reference)
     content = UnitContent(task.digest, summary, files=files, checked=checked)
     if work.image_space and stream.image_space is not None:
         content = dataclasses.replace(
@@ -106,12 +109,13 @@ def finish_tile(live: LiveMap, stream: Stream, watch: Stopwatch) -> Outcome:
     """Write the result of a tile, or of the pass over all frames: sums, rows of the series, and voxels."""
     work, config, tile = live.work, live.work.config, live.work.tile
     assert tile is not None
-    sums, table, events, truth, sample = dict[str, Any](), None, None, None, None
+    sums, whole, table, events, truth, sample = dict[str, Any](), None, None, None, None, None
     if work.fuses:
         with watch("table"):
             table = live.table()
             log = live.backend.events() if live.backend is not None and (config.statistics or config.events) else None
             events = None if log is None else dataclasses.replace(log, classes=table.classes)
+            whole, (table, events) = table, _left(live, table, events)
             truth, live.backend = _truth_table(live), None
             give_back(least=SMALL)
         with watch("statistics"):
@@ -120,7 +124,7 @@ def finish_tile(live: LiveMap, stream: Stream, watch: Stopwatch) -> Outcome:
                 sample = MapSample.draw(table, log, truth, edges=config.strata).below(tile.bound)
             sums = (TableSums.of(table, config.strata) if sample is None else sample.summary).arrays()
     with watch("reference"):
-        checked = None if table is None or live.reference is None else _checked(live, table, live.reference)
+        checked = None if whole is None or live.reference is None else _checked(live, whole, live.reference)
     with watch("write"):
         files, returned = written(work.start, _tile_savers(live, stream, table, events, truth, sample))
         result = TileResult(
@@ -128,7 +132,7 @@ def finish_tile(live: LiveMap, stream: Stream, watch: Stopwatch) -> Outcome:
             live.rows.numbers,
             voxels=0 if table is None else len(table),
             sums=sums,
-            reduced=np.zeros(0) if live.hard is None else reduced_sums(live.hard.table()),
+            reduced=np.zeros(0) if live.hard is None else reduced_sums(_left(live, live.hard.table())[0]),
             checked=checked,
             sizes=() if live.sizes is None else live.sizes.alphas(),
             quality=_quality(stream),
@@ -140,6 +144,14 @@ def finish_tile(live: LiveMap, stream: Stream, watch: Stopwatch) -> Outcome:
     return Outcome(work.identity, tile=tile.name, files=returned | own)
 
 
+def _left(live: LiveMap, table: VoxelTable, events: Events | None = None) -> tuple[VoxelTable, Events | None]:
+    """The map and its log without the locations whose fused class is left out."""
+    if not live.left_out:
+        return table, events
+    keep = np.flatnonzero(~np.isin(dominant(table), live.left_out))
+    return table.rows(keep), None if events is None else events.rows(keep)
+
+
 def _truth_table(live: LiveMap) -> VoxelTable | None:
     if live.truth is None:
         return None
@@ -148,7 +160,8 @@ def _truth_table(live: LiveMap) -> VoxelTable | None:
 
 def analyse_map(live: LiveMap, table: VoxelTable, events: Events | None, truth: VoxelTable | None) -> Analysis:
     """The statistics of a map that is fused whole."""
-    observations = None if live.sampler is None else live.sampler.sample()
+    seen = live.sampled_observations()
+    observations = None if seen is None else seen.sample()
     config = live.work.config
     sample = MapSample.draw(table, events if config.statistics else None, truth, edges=config.strata)
     return analyse_sample(live.task, config, sample, observations)
@@ -275,8 +288,8 @@ def _savers(
     if analysis is not None:
         savers[f"{INFLUENCE}/{unit.slug}.parquet"] = analysis.sums.save
     savers[f"{FRAMES}/{unit.slug}.csv"] = live.rows.save_csv
-    if live.sampler is not None:
-        savers[f"{LOOKS}/{unit.slug}.parquet"] = live.sampler.looks(table.classes).save
+    if (seen := live.sampled_observations()) is not None:
+        savers[f"{LOOKS}/{unit.slug}.parquet"] = seen.save
     if events is not None and config.events:
         savers[f"{EVENTS}/{unit.slug}.parquet"] = events.save
     if truth is not None and live.work.image_space:
@@ -303,9 +316,9 @@ def _tile_savers(
     work, config, tile, slug_of_unit = live.work, live.work.config, live.work.tile, live.unit.slug
     assert tile is not None
     if table is None or tile.place is None:
-        savers, classes = _overview_saver(live, stream), live.task.mapping.target.classes
-        if live.sampler is not None:
-            savers[f"{tile.folder}/{tile.size}_{OBSERVATIONS}"] = live.sampler.looks(classes).save
+        savers = _overview_saver(live, stream)
+        if (seen := live.sampled_observations()) is not None:
+            savers[f"{tile.folder}/{tile.size}_{OBSERVATIONS}"] = seen.save
         return savers
     own, savers = Tile(*tile.place, tile.size, tile.key), Savers()
     if not len(table):

@@ -32,6 +32,7 @@ from semstab.model.results import FrameReport, SizeAlpha, Unit
 from semstab.model.voxels import VoxelTable
 from semstab.statistics import Sampler
 from semstab.statistics.agreement import alpha_columns, alpha_of
+from semstab.statistics.observations import CellObservations
 from semstab.task import Task, prepare, tasks_of, truth_task
 
 WARM_UP_STRIDE = 8
@@ -140,6 +141,17 @@ class LiveMap:
         """Let go of all that takes memory: the work is finished."""
         self.backend = self.truth = self.hard = self.reference = None
         self.sampler = self.sizes = None
+
+    @property
+    def left_out(self) -> list[int]:
+        """The classes whose locations are left out of the map."""
+        return [self.task.mapping.target.classes.index(name) for name in self.work.config.exclude.classes]
+
+    def sampled_observations(self) -> CellObservations | None:
+        """What was sampled, without the locations that are left out."""
+        if self.sampler is None:
+            return None
+        return self.sampler.looks(self.task.mapping.target.classes).without(self.left_out)
 
     def table(self) -> VoxelTable:
         """The voxels of its map."""

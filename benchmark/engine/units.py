@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import json
+import logging
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
@@ -30,6 +31,8 @@ from semstab.model.measures import measures
 from semstab.model.records import REGIONS, Variation
 from semstab.model.results import Unit
 from semstab.task import Task, applies, frame_indices, selected, tasks_of
+
+logger = logging.getLogger("semstab")
 
 FORMAT = 9
 """Part of every key: raise it with any change of the numbers that a unit's settings and input lead to."""
@@ -184,6 +187,11 @@ def make_plan(config: Config) -> Plan:
     scenes = {name: dataset.scene(name) for name in names}
     base = tuple(_base_units(config, scenes))
     units = (*base, *_varied_units(config, base, scenes))
+    if config.exclude.predicted_classes:
+        logger.warning(
+            "exclude.predicted_classes: pixels predicted so by mistake are left out too, and are then no error;"
+            " exclude.classes leaves out locations by their fused class"
+        )
     return Plan(config, scenes, units, tuple(_planned_regions(config, scenes)))
 
 

@@ -81,7 +81,10 @@ def _one_class(run: UnitSummary) -> str | None:
     largest = max(run.table.classes, key=lambda row: row.voxels)
     if largest.share < ONE_CLASS:
         return None
-    return f"'{largest.name}' covers {largest.share:.0%} of the map and makes most of its numbers; read them by class"
+    return (
+        f"'{largest.name}' covers {largest.share:.0%} of the map and makes most of its numbers; read them by class, or"
+        f" leave it out: --set exclude.classes=[{largest.name}]"
+    )
 
 
 def mixed(runs: Sequence[UnitSummary]) -> bool:

@@ -21,6 +21,7 @@ from semstab.core.types import Float64, Int32, Int64, Mask, UInt16, UInt32
 from semstab.errors import DataError, one_line
 from semstab.model.events import Events
 from semstab.model.evidence import Evidence
+from semstab.model.measures import dominant
 from semstab.model.voxels import index_columns
 from semstab.statistics.loops import CELLS, DIGITS, SHIFTS, SPAN, WITHIN
 
@@ -184,6 +185,13 @@ class CellObservations:
         m = same_cells(key, view, label, weight, CELLS**3, self.K, LEAST_FRAMES, kept, of, classes, shift)
         seen = self._log(key, view, label, weight, kept)
         return ObservationSample(seen, of[:m], classes[:m], shift[:m], self.views, self.soft)
+
+    def without(self, classes: Sequence[int]) -> CellObservations:
+        """Return the entries of voxels whose fused class is none of these."""
+        if not len(classes) or not len(self):
+            return self
+        _, of = np.unique(self.key >> DIGITS, return_inverse=True)
+        return self.only(~np.isin(dominant(self.observations().table()), classes)[of])
 
     def only(self, rows: Any) -> CellObservations:
         """Some of the entries."""
