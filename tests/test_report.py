@@ -270,7 +270,7 @@ def test_the_shared_taxonomy_decides_the_order():
 def test_flicker_is_read_beside_its_compensated_share():
     image = ImageSpace(65.2, 12.4)
     sentences = read(study(record(voxels((5, 1, SURE)), backbone="net", image_space=image)))
-    assert any(sentence.endswith("the camera's motion is taken out: net 65% (12%).") for sentence in sentences)
+    assert any(sentence.endswith("(in brackets pixel flicker, with it): net 12% (65%).") for sentence in sentences)
 
 
 def test_the_scene_that_looks_steadiest_may_be_the_one_seen_least():
