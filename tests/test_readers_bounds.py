@@ -4,26 +4,15 @@ from __future__ import annotations
 
 import os
 
-import numpy as np
 import pytest
 from dataset_writers import FORMATS, opened, source, write_colmap, write_labels, write_model_text
 from posed_scene import fails, first_frame, write_scene
 from posed_scene import opened as opened_folder
 
 from semstab.config import read_yaml
-from semstab.datasets.formats.images import read_labels
 from semstab.errors import ConfigError, DataError, one_line
 from semstab.model.labels import LabelSpace
 from semstab.predict.folder import PredictionFolder
-
-
-def test_colours_of_a_large_label_map_are_looked_up_in_parts(tmp_path):
-    from PIL import Image
-
-    space = LabelSpace("two", ("a", "b"), colors=((1, 2, 3), (4, 5, 6)))
-    ids = np.random.default_rng(0).integers(0, 2, (700, 2000)).astype(np.uint8)
-    Image.fromarray(np.array(space.colors, np.uint8)[ids]).save(tmp_path / "a.png")
-    np.testing.assert_array_equal(read_labels(tmp_path / "a.png", space), ids)
 
 
 @pytest.mark.parametrize("file", ["intrinsics.txt", "pose/frame1.txt", "depth/frame1.png", "scene.yaml"])

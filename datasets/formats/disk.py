@@ -108,22 +108,14 @@ def _entries(folder: Path) -> Iterator[os.DirEntry[str]]:
 
 # npy and npz bytes to an array of plain numbers: the whole one, or one DataError with the file; nothing is run.
 
-MAX_ARRAY_BYTES = 2**29
-"""Largest array of an image; scores, of many classes, may be larger."""
-MAX_SCORE_BYTES = 2**32
-
 NPY_DTYPE = re.compile(rb"""['"]descr['"]\s*:\s*['"]([<>|=]?(?:b1|[iu][1248]|f[248]))['"]""")
 NPY_ORDER = re.compile(rb"""['"]fortran_order['"]\s*:\s*(True|False)""")
 NPY_SHAPE = re.compile(rb"""['"]shape['"]\s*:\s*\(([\d\s,]{0,200})\)""")
 
 
-def decode_array(path: Path, data: bytes, key: str, limit: int | None = None) -> npt.NDArray[Any]:
+def decode_array(path: Path, data: bytes, key: str) -> npt.NDArray[Any]:
     """The array of an .npy file, or of an .npz file the one called `key` or the only one; read-only."""
-    return (
-        _decode_npz(path, data, key, limit or MAX_ARRAY_BYTES)
-        if path.suffix.lower() == ".npz"
-        else _decode_npy(str(path), data)
-    )
+    return _decode_npz(path, data, key) if path.suffix.lower() == ".npz" else _decode_npy(str(path), data)
 
 
 def _decode_npy(where: str, data: bytes) -> npt.NDArray[Any]:
@@ -149,32 +141,20 @@ def _decode_npy(where: str, data: bytes) -> npt.NDArray[Any]:
     return array.astype(kind.newbyteorder("="), copy=False)
 
 
-def _decode_npz(path: Path, data: bytes, key: str, limit: int) -> npt.NDArray[Any]:
+def _decode_npz(path: Path, data: bytes, key: str) -> npt.NDArray[Any]:
     damage = (zipfile.BadZipFile, zlib.error, struct.error, OSError, EOFError, ValueError, LookupError, RuntimeError)
     try:
         with zipfile.ZipFile(io.BytesIO(data)) as archive:
-            info = _member(path, archive, key, limit)
-            with archive.open(info) as member:
-                content = member.read(info.file_size)  # bounded; the checksum is verified at its end
+            members = {name.removesuffix(".npy"): name for name in archive.namelist()}
+            name = next(iter(members.values())) if len(members) == 1 else members.get(key)
+            if name is None:
+                raise DataError(f"{path}: holds arrays {reprlib.repr(sorted(members))}; name one '{key}'")
+            content = archive.read(name)
     except DataError:
         raise
     except damage as error:
         raise DataError(f"{path}: not a whole .npz archive ({one_line(error)}); {AGAIN}") from error
-    return _decode_npy(f"{path} ({reprlib.repr(info.filename)})", content)
-
-
-def _member(path: Path, archive: zipfile.ZipFile, key: str, limit: int) -> zipfile.ZipInfo:
-    """The member called `key`, or the only one. Raises DataError where there is none that can be read."""
-    members = {info.filename.removesuffix(".npy"): info for info in archive.infolist()}
-    info = next(iter(members.values())) if len(members) == 1 else members.get(key)
-    if info is None:
-        raise DataError(f"{path}: holds arrays {reprlib.repr(sorted(members))}; name one '{key}'")
-    if info.file_size > limit or info.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
-        raise DataError(
-            f"{path}: {reprlib.repr(info.filename)} claims {info.file_size} bytes (at most {limit}), compression"
-            f" {info.compress_type} (stored or deflated are read); save it with numpy"
-        )
-    return info
+    return _decode_npy(f"{path} ({reprlib.repr(name)})", content)
 
 
 # JSON files of datasets: an object with numbers where numbers are expected, or one DataError with the file.
