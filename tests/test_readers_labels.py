@@ -13,7 +13,7 @@ from posed_scene import fails
 from scipy import ndimage
 
 from semstab.datasets.files.labels import ScenePlace, find_sources
-from semstab.datasets.files.options import FileOptions, Folders, FrameSource, FrameTable
+from semstab.datasets.files.options import FileOptions, Folders, FrameSource
 from semstab.datasets.geometry.cameras import Camera
 from semstab.datasets.geometry.lenses import fit_labels, fit_scores
 from semstab.datasets.scannet import read_class_table
@@ -93,8 +93,8 @@ def test_a_name_from_a_file_cannot_lead_out_of_the_folder(tmp_path):
     (tmp_path / "labels/net").mkdir(parents=True)
     for name in ("../../../etc/passwd", "a\nb", "a\0b", "x" * 2000, "\ud800"):
         frames = [FrameSource(name, tmp_path, tmp_path, camera)]
-        for of in (FrameTable, frames, tmp_path), (find_sources, FileOptions(root=tmp_path), place, frames, Folders()):
-            fails(DataError, "leaves|cannot be the path", *of)
+        options = FileOptions(root=tmp_path)
+        fails(DataError, "leaves|cannot be the path", find_sources, options, place, frames, Folders())
 
 
 def test_labels_and_scores_side_by_side(scene):

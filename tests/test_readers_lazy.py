@@ -13,13 +13,10 @@ from dataset_writers import COUNT, FORMATS, numbers, opened, source, write_label
 from posed_scene import fails
 
 from semstab.config import FrameSelection
-from semstab.datasets.files.options import Folders, FrameSource, FrameTable
+from semstab.datasets.files.options import Folders
 from semstab.datasets.formats.disk import natural, naturally
-from semstab.datasets.geometry.cameras import Camera
-from semstab.datasets.geometry.lenses import Lens
 from semstab.datasets.scene import select_frames
 from semstab.errors import DataError
-from semstab.model.frames import Intrinsics
 
 IMAGES = {".png", ".jpg", ".npy", ".tif"}
 
@@ -86,37 +83,6 @@ def test_a_posed_folder_of_ten_thousand_frames_opens_at_once(tmp_path):
     assert select_frames(scene, FrameSelection(stride=100), ["all", "some"]).left_out == 0
     assert time.process_time() - started < 5
     fails(DataError, "9900 missing", select_frames, scene, FrameSelection(), ["some"])
-
-
-@pytest.mark.parametrize("posed", [True, False])
-def test_a_table_of_frames_gives_every_source_back(tmp_path, posed):
-    cameras = [Camera(Intrinsics(k + 1.0, 2, 3, 4), (k + 5, 6)) for k in range(2)]
-    lens = Lens(cameras[0], "brown", (0.1, 0.0, 0.0, 0.0, 0.0))
-    names = ["0", "é 7", "cam0/0001", "b.c", "1"]
-    frames = [
-        FrameSource(
-            name,
-            depth=tmp_path / f"depth/{name if k % 2 else 1.5 * k}.png",
-            pose_file=tmp_path / ("poses.txt" if posed else f"pose/{name}.txt"),
-            camera=cameras[k % 2],
-            pose=np.arange(16.0).reshape(4, 4) + k if posed else None,
-            label_camera=cameras[1] if k else None,
-            label_lens=lens if k > 2 else None,
-            photograph=tmp_path / f"images/IMG_{k}.JPG" if k > 2 else None,
-            aliases=(f"{name}.JPG", f"IMG_{k}") if k else (),
-            color=tmp_path / f"{name}/{name}.jpg" if k != 1 else None,
-            depth_scale=1000.0 if k == 4 else None,
-            timestamp=0.1 * k if posed else None,
-        )
-        for k, name in enumerate(names)
-    ]
-    table = FrameTable(iter(frames), tmp_path)
-    assert [*table.names] == names
-    assert table[-1].name == table[1:][-1].name == "1"
-    assert (None if table.times is None else table.times.tolist()) == ([0.1 * k for k in range(5)] if posed else None)
-    for made, given in zip(table, frames, strict=True):
-        assert np.array_equal(made.pose, given.pose) if posed else made.pose is None
-        assert {**vars(made), "pose": None} == {**vars(given), "pose": None}
 
 
 @pytest.mark.parametrize("names", [["f10", "f09", "f01"], ["f10", "f9", "g1"], ["a1b02", "a1b01", "a0b99"], ["٣", "2"]])

@@ -12,7 +12,7 @@ from typing import Literal
 import numpy as np
 
 from semstab.core.types import UInt8, UInt16
-from semstab.datasets.files.options import FileOptions, Folders, FrameSource, Template, inside_text, matching_folders
+from semstab.datasets.files.options import FileOptions, Folders, FrameSource, Template, inside, matching_folders
 from semstab.datasets.formats.images import (
     LABEL_SUFFIXES,
     MASK_SUFFIXES,
@@ -54,15 +54,15 @@ class LabelSource:
     base: Path
     template: str
     folders: Folders
-    first: tuple[str, str] | None = None
+    first: tuple[str, Path] | None = None
 
-    def file(self, frame: FrameSource) -> str | None:
-        """The file of a frame; as text, for a path takes longer to make than to look up."""
-        where = str(self.base)
-        paths = (inside_text(self.base, self.template.replace("{name}", name), where) for name in frame.called)
-        return next(
-            (file for path in paths if (file := self.folders.file(path, SUFFIXES[self.kind])) is not None), None
-        )
+    def file(self, frame: FrameSource) -> Path | None:
+        """The file of a frame, under its own name or another that it has."""
+        for name in (frame.name, *frame.aliases):
+            path = inside(self.base, self.base, self.template.replace("{name}", name), str(self.base))
+            if (file := self.folders.one_of(path, SUFFIXES[self.kind])) is not None:
+                return file
+        return None
 
     def missing(self, frame: FrameSource) -> list[str]:
         """Nothing, or the path that the file of that frame would have."""
@@ -193,7 +193,7 @@ def label_space(options: FileOptions, folder: Path, name: str, source: LabelSour
         return LabelSpace.load(options.taxonomies[name])
     assert source.first is not None
     frame, file = source.first
-    for parent in Path(file).parents[: 1 + frame.count("/")]:  # a frame's name may be a path: cam0/0001
+    for parent in file.parents[: 1 + frame.count("/")]:  # a frame's name may be a path: cam0/0001
         if (classes := parent / LABEL_SPACE_FILE).is_file():
             return LabelSpace.load(classes)
     try:
@@ -259,7 +259,7 @@ class LabelMaps:
             raise DataError(
                 f"{self._folder}: {listed(lost, str(self._folder))}; choose frames that have them, or add them"
             )
-        return Path(file)
+        return file
 
     def space(self, backbone: str) -> LabelSpace | None:
         """The classes of a label source, None where nothing says them; what says them is read once."""
@@ -276,7 +276,7 @@ class LabelMaps:
         space = self.space(backbone)
         if space is None:
             assert source.first is not None
-            folder = Path(source.first[1]).parent
+            folder = source.first[1].parent
             raise DataError(
                 f"{where}: the classes of '{backbone}' are not known; set classes: [name, ...] in id order, taxonomy:"
                 f" NAME, or taxonomies: {{{backbone}: NAME}}, or put a {LABEL_SPACE_FILE} into {folder}"
@@ -309,8 +309,7 @@ class LabelMaps:
 
     def mask_file(self, frame: FrameSource) -> Path | None:
         """The mask of a frame, where it has one."""
-        file = None if self._masks is None else self._masks.file(frame)
-        return None if file is None else Path(file)
+        return None if self._masks is None else self._masks.file(frame)
 
     def mask(self, path: Path, read: Read) -> UInt8:
         """(H, W): 1 where a mask leaves out. Raises DataError that names it."""

@@ -10,7 +10,7 @@ from typing import Generic, TypeVar
 
 from semstab.core.types import UInt16
 from semstab.datasets.files.labels import ScenePlace
-from semstab.datasets.files.options import FileOptions, Folders, FrameSource, FrameTable
+from semstab.datasets.files.options import FileOptions, Folders, FrameSource, inside
 from semstab.datasets.files.scene import FileScene
 from semstab.datasets.files.surfaces import SEEN_FROM_ABOVE, Surface, usual_folder
 from semstab.datasets.formats.disk import naturally, subfolders
@@ -56,7 +56,9 @@ class FileDataset(Dataset, Generic[Options]):
             raise ConfigError(f"{self.options.root}: scene '{name}' is not there; {nearest(name, self._places)}")
         place = self._places[name]
         options = self.settled(place.folder)
-        frames = FrameTable(self.frames(place.folder), place.folder)
+        frames = tuple(self.frames(place.folder))
+        for frame in frames:
+            inside(place.folder, place.folder, frame.name, str(frame.pose_file))  # files of predictions have its name
         if not frames:
             raise DataError(f"{place.folder}: holds no frame; expected {self.looks_like}")
         georeference = self.georeference(place.folder, options)

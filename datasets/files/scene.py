@@ -15,7 +15,7 @@ from semstab.core.prefetch import prefetch
 from semstab.core.types import Float32, Float64, Mask, UInt8, UInt16
 from semstab.datasets.files.depth import CastDepth, StoredDepth, shape_of
 from semstab.datasets.files.labels import LabelMaps, ScenePlace, label_paths
-from semstab.datasets.files.options import FileOptions, Folders, FrameSource, FrameTable
+from semstab.datasets.files.options import FileOptions, Folders, FrameSource
 from semstab.datasets.files.surfaces import Surface, View
 from semstab.datasets.formats import disk
 from semstab.datasets.formats.disk import read_pose
@@ -33,12 +33,6 @@ PLACES = {
 }  # fmt: skip
 """Options that say where things are, not what the numbers mean; label spaces and tables count by their content."""
 
-AT_ONCE = 64
-"""Files that a thread reads one after the other for their digests."""
-
-BATCH = 4096
-"""Frames whose files are in memory by name at once, for their digests."""
-
 DEPTH, LABELS, MASK = "depth", "labels of ", "mask"
 """Kinds of a frame's files."""
 
@@ -54,12 +48,12 @@ class FileScene(Scene):
     def __init__(
         self,
         place: ScenePlace,
-        frames: FrameTable,
+        frames: Sequence[FrameSource],
         options: FileOptions,
         class_ids: Mapping[str, UInt16] | None = None,
         surface: Surface | None = None,
     ) -> None:
-        if len(set(frames.names)) < len(frames):
+        if len({frame.name for frame in frames}) < len(frames):
             raise DataError(f"{place.folder}: two frames have one name; frames need names of their own")
         self.name = place.name
         self.folder = place.folder
@@ -73,12 +67,12 @@ class FileScene(Scene):
         self.ground_truth = self._maps.ground_truth
         self.regions = self._maps.regions
         self.label_paths = tuple(label_paths(options, place, frames))
-        self._digests: dict[str, UInt8] = {}
-        self._tracked: list[bool | None] = [None] * len(frames)
+        self._digests: dict[tuple[int, str], bytes] = {}
+        self._tracked: dict[int, bool] = {}
         self._depth = StoredDepth(options) if surface is None else CastDepth(surface, options, self._views)
         self.surface = None if surface is None else surface.path
         self.depth_from = None if surface is None else f"rays cast at {surface.path}"
-        self.on_photographs = frames.distorted
+        self.on_photographs = any(frame.label_lens is not None for frame in frames)
 
     def __len__(self) -> int:
         """Number of frames of the sequence, those that lack a file or a pose among them."""
@@ -89,14 +83,15 @@ class FileScene(Scene):
         """(len,) seconds on the dataset's own clock; None where it has none."""
         if self.options.frames_per_second is not None:
             return np.arange(len(self)) / self.options.frames_per_second
-        return self._frames.times
+        times = [frame.timestamp for frame in self._frames]
+        return None if None in times else np.array(times, dtype=np.float64)
 
     def tracked(self, index: int) -> bool:
         """Return whether the frame has a pose; one that is not finite means that tracking was lost. Read once."""
-        source, known = self._frame(index), self._tracked[index]
-        if known is None:
-            known = self._tracked[index] = bool(np.isfinite(self._stored_pose(source)).all())
-        return known
+        source = self._frame(index)
+        if index not in self._tracked:
+            self._tracked[index] = bool(np.isfinite(self._stored_pose(source)).all())
+        return self._tracked[index]
 
     def missing(self, index: int, sources: Sequence[str] = (), *, color: bool = False) -> list[str]:
         """Paths of the files that the frame lacks: depth, pose, the labels of these sources, colour."""
@@ -230,32 +225,25 @@ class FileScene(Scene):
         digest = hashlib.blake2b(digest_size=16)
         digest.update(json.dumps([settings, space.to_dict() if space else None]).encode())
         digest.update(self._maps.table_bytes(backbone))
-        for first in range(0, len(indices), BATCH):
-            some = indices[first : first + BATCH]
-            files = [self._images(index, backbone) for index in some]
-            self._read_digests(
-                [
-                    (index, what, path)
-                    for index, own in zip(some, files, strict=True)
-                    for what, path in own.items()
-                    if self._known_digest(index, what) is None
-                ]
-            )
-            for index, own in zip(some, files, strict=True):
-                source = self._frame(index)
-                digest.update(source.name.encode() + b"\0" + self._geometry_bytes(source))
-                digest.update(self._depth.digest(source) or b"")
-                for what in own:
-                    digest.update(self._known_digest(index, what) or b"")
+        files = [self._images(index, backbone) for index in indices]
+        unread = [k for k, own in enumerate(files) if own.keys() - self._digests.keys()]
+        for fetched in prefetch(lambda k: {key: disk.file_digest(path) for key, path in files[k].items()}, unread):
+            self._digests |= fetched.item
+        for index, own in zip(indices, files, strict=True):
+            source = self._frame(index)
+            digest.update(source.name.encode() + b"\0" + self._geometry_bytes(source))
+            digest.update(self._depth.digest(source) or b"")
+            for key in own:
+                digest.update(self._digests[key])
         return digest.hexdigest()
 
-    def _images(self, index: int, backbone: str) -> dict[str, Path]:
+    def _images(self, index: int, backbone: str) -> dict[tuple[int, str], Path]:
         """The files that a frame is made of, but for its pose: depth where it is stored, labels, a mask."""
         source = self._frame(index)
         depth = source.depth if self._depth.digest(source) is None else None
         labels, mask = self._maps.file(source, backbone), self._maps.mask_file(source)
         files = {DEPTH: depth, LABELS + backbone: labels, MASK: mask}
-        return {what: path for what, path in files.items() if path is not None}
+        return {(index, what): path for what, path in files.items() if path is not None}
 
     def _views(self) -> Iterator[View]:
         """Those of the frames that have a pose."""
@@ -328,27 +316,10 @@ class FileScene(Scene):
 
         def read(path: Path) -> bytes:
             data = disk.read_bytes(path)
-            self._remember_digest(index, what, disk.digest(data))
+            self._digests[index, what] = disk.digest(data)
             return data
 
         return read
-
-    def _remember_digest(self, index: int, what: str, digest: bytes) -> None:
-        digests = self._digests.setdefault(what, np.zeros((len(self), len(digest)), dtype=np.uint8))
-        digests[index] = np.frombuffer(digest, dtype=np.uint8)
-
-    def _read_digests(self, files: Sequence[tuple[int, str, Path]]) -> None:
-        """Read files of frames for their digests, some in each of several threads."""
-        some = [files[first : first + AT_ONCE] for first in range(0, len(files), AT_ONCE)]
-        digests = prefetch(lambda k: [disk.file_digest(path) for _, _, path in some[k]], range(len(some)))
-        for own, fetched in zip(some, digests, strict=True):
-            for (index, what, _), digest in zip(own, fetched.item, strict=True):
-                self._remember_digest(index, what, digest)
-
-    def _known_digest(self, index: int, what: str) -> bytes | None:
-        """The digest of a frame's file; None where it was not read."""
-        digest = self._digests[what][index].tobytes() if what in self._digests else b""
-        return digest if any(digest) else None
 
     def _stored_pose(self, source: FrameSource) -> Poses:
         return read_pose(source.pose_file) if source.pose is None else source.pose
