@@ -80,7 +80,7 @@ def test_a_depth_map_by_hand(tmp_path):
 @pytest.mark.parametrize(
     ("content", "match"),
     [
-        (b"3&2&1&" + bytes(20), "3x2 pixels need 24 bytes, the file has 20"),
+        (b"3&2&1&" + bytes(20), "3x2 pixels need 30 bytes, it has 26"),
         (b"3&2&3&" + bytes(72), r"has 3 channels \(a normal map\?\)"),
         (b"99999&99999&1&" + bytes(24), "claims 99999x99999 pixels"),
         (b"0&2&1&", "claims 0x2 pixels"),

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -13,7 +13,7 @@ import numpy as np
 
 from semstab.core.prefetch import prefetch
 from semstab.core.types import Float32, Float64, Mask, UInt8, UInt16
-from semstab.datasets.files.depth import CastDepth, StoredDepth, shape_of
+from semstab.datasets.files.depth import shape_of, stored_depth, stored_scale
 from semstab.datasets.files.labels import LabelMaps, ScenePlace, label_paths
 from semstab.datasets.files.options import FileOptions, Folders, FrameSource
 from semstab.datasets.files.surfaces import Surface, View
@@ -69,7 +69,8 @@ class FileScene(Scene):
         self.label_paths = tuple(label_paths(options, place, frames))
         self._digests: dict[tuple[int, str], bytes] = {}
         self._tracked: dict[int, bool] = {}
-        self._depth = StoredDepth(options) if surface is None else CastDepth(surface, options, self._views)
+        self._surface = surface
+        self._surface_seen = False
         self.surface = None if surface is None else surface.path
         self.depth_from = None if surface is None else f"rays cast at {surface.path}"
         self.on_photographs = any(frame.label_lens is not None for frame in frames)
@@ -96,7 +97,7 @@ class FileScene(Scene):
     def missing(self, index: int, sources: Sequence[str] = (), *, color: bool = False) -> list[str]:
         """Paths of the files that the frame lacks: depth, pose, the labels of these sources, colour."""
         frame = self._frame(index)
-        files = [self._depth.path(frame), *([frame.pose_file] if frame.pose is None else [])]
+        files = [self._depth_file(frame), *([frame.pose_file] if frame.pose is None else [])]
         lost = [str(path) for path in files if not self._folders.has(path)]
         lost += [path for name in sources for path in self._maps.source(name).missing(frame)]
         if color and self._color_file(frame) is None:
@@ -113,7 +114,7 @@ class FileScene(Scene):
     @property
     def depth_scale(self) -> float | None:
         """Units of its stored depth in a metre: the option, else the usual scale of its kind of file."""
-        return self._depth.scale(self._frames[0])
+        return stored_scale(self._frames[0], self.options) if self._surface is None else None
 
     def label_space(self, backbone: str) -> LabelSpace:
         """The classes of that label source.
@@ -168,8 +169,16 @@ class FileScene(Scene):
 
     def depth(self, index: int) -> Float32:
         """Depth (H, W) float32 in metres along the optical axis; needs no labels. Raises DataError with the file."""
-        source, read = self._frame(index), self._reader(index, DEPTH)
-        return self._depth.depth(source, read, lambda shape: self.intrinsics(index, shape), lambda: self.T_wc(index))
+        if self._surface is None:
+            read = self._reader(index, DEPTH)
+            return stored_depth(self._frame(index), self.options, read, lambda shape: self.intrinsics(index, shape))
+        depth = self._surface.depth(self._view(index))
+        if not self._surface_seen and not depth.any():
+            self._surface.require_seen(self._view(k) for k in range(len(self)) if self.tracked(k))
+        self._surface_seen = True
+        if self.options.max_depth is not None:
+            depth[depth >= self.options.max_depth] = 0
+        return depth
 
     def color(self, index: int) -> UInt8 | None:
         """Colour (H, W, 3) uint8 RGB, None where the frame has none; needs no labels. Raises DataError."""
@@ -232,7 +241,7 @@ class FileScene(Scene):
         for index, own in zip(indices, files, strict=True):
             source = self._frame(index)
             digest.update(source.name.encode() + b"\0" + self._geometry_bytes(source))
-            digest.update(self._depth.digest(source) or b"")
+            digest.update(b"" if self._surface is None else self._surface.digest)
             for key in own:
                 digest.update(self._digests[key])
         return digest.hexdigest()
@@ -240,16 +249,17 @@ class FileScene(Scene):
     def _images(self, index: int, backbone: str) -> dict[tuple[int, str], Path]:
         """The files that a frame is made of, but for its pose: depth where it is stored, labels, a mask."""
         source = self._frame(index)
-        depth = source.depth if self._depth.digest(source) is None else None
+        depth = source.depth if self._surface is None else None
         labels, mask = self._maps.file(source, backbone), self._maps.mask_file(source)
         files = {DEPTH: depth, LABELS + backbone: labels, MASK: mask}
         return {(index, what): path for what, path in files.items() if path is not None}
 
-    def _views(self) -> Iterator[View]:
-        """Those of the frames that have a pose."""
-        for index in filter(self.tracked, range(len(self))):
-            shape = shape_of(self._frame(index), self.options)
-            yield View(self.intrinsics(index, shape), self.T_wc(index), shape)
+    def _view(self, index: int) -> View:
+        shape = shape_of(self._frame(index), self.options)
+        return View(self.intrinsics(index, shape), self.T_wc(index), shape)
+
+    def _depth_file(self, source: FrameSource) -> Path:
+        return source.depth if self._surface is None else self._surface.path
 
     def _framed(
         self,
@@ -266,7 +276,7 @@ class FileScene(Scene):
         image = self._color_file(source)  # named also where it is not read: a recording takes the file as it is
         mask = self._maps.mask_file(source)
         shown = image if source.color_lens is None else None  # a distorted one is not what the depth's camera sees
-        known = {"depth": self._depth.path(source), "pose": source.pose_file, "color": shown, "mask": mask}
+        known = {"depth": self._depth_file(source), "pose": source.pose_file, "color": shown, "mask": mask}
         known |= dict(files or {})
         return Frame(
             index=int(index),
