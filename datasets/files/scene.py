@@ -19,7 +19,7 @@ from semstab.datasets.files.options import FileOptions, Folders, FrameSource
 from semstab.datasets.files.surfaces import Surface, View
 from semstab.datasets.formats import disk
 from semstab.datasets.formats.disk import read_pose
-from semstab.datasets.formats.images import Read, read_color
+from semstab.datasets.formats.images import Read, read_color, read_mask
 from semstab.datasets.geometry.cameras import UP_AXES, Camera, Poses, to_camera_to_world
 from semstab.datasets.geometry.lenses import Labels, Pixels, Scores, at_image, fit, fitted, undistorted
 from semstab.datasets.scene import Scene
@@ -233,7 +233,8 @@ class FileScene(Scene):
         settings = self.options.model_dump(mode="json", exclude=PLACES)
         digest = hashlib.blake2b(digest_size=16)
         digest.update(json.dumps([settings, space.to_dict() if space else None]).encode())
-        digest.update(self._maps.table_bytes(backbone))
+        if (table := self._maps.class_ids.get(backbone)) is not None:
+            digest.update(table.tobytes())
         files = [self._images(index, backbone) for index in indices]
         unread = [k for k, own in enumerate(files) if own.keys() - self._digests.keys()]
         for fetched in prefetch(lambda k: {key: disk.file_digest(path) for key, path in files[k].items()}, unread):
@@ -293,7 +294,7 @@ class FileScene(Scene):
 
     def _mask(self, index: int, path: Path, shape: tuple[int, ...]) -> Mask:
         """The masked pixels of a frame, at the depth's pixels; outside of the mask's view nothing is masked."""
-        mask = self._maps.mask(path, self._reader(index, MASK))
+        mask = read_mask(path, self._reader(index, MASK)).astype(np.uint8)
         masked: Mask = self._stored(index, mask, shape, path, "the mask is") == 1
         return masked
 
