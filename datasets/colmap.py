@@ -76,13 +76,13 @@ class Colmap(FileDataset[ColmapOptions]):
         path, images = read_model(model)
         frames = []
         for image in images:
-            name = image_name(image.name)
-            wanted = inside(options.root, folder, self._depth.filled(image=image.name, name=name), str(path))
+            depth_name = self._depth.filled(image=image.name, name=image.frame)
+            wanted = inside(options.root, folder, depth_name, str(path))
             depth = folders.one_of(wanted, (*DEPTH_SUFFIXES, ".bin")) or wanted
             color = inside(options.root, folder, f"{options.images}/{image.name}", str(path))
             frames.append(
                 FrameSource(
-                    name=name,
+                    name=image.frame,
                     depth=depth,
                     pose=image.T_cw,
                     pose_file=path,
@@ -128,6 +128,11 @@ class ModelImage:
     T_cw: Poses
     camera: Camera
 
+    @property
+    def frame(self) -> str:
+        """The name without its suffix: the frame's name in path templates."""
+        return os.path.splitext(self.name)[0]  # noqa: PTH122  a name, not a path
+
 
 def has_model(folder: Path) -> bool:
     """Return whether a folder holds a sparse model."""
@@ -158,11 +163,6 @@ def read_model(folder: Path) -> tuple[Path, list[ModelImage]]:
             raise DataError(f"{path}: image {name[:80]!r} has camera {camera_id}, which is not in {cameras_path.name}")
         images.append(ModelImage(name, T_cw, _pinhole(cameras[camera_id], f"{cameras_path}: camera {camera_id}")))
     return path, sorted(images, key=lambda image: natural(image.name))
-
-
-def image_name(name: str) -> str:
-    """Return the name of an image in the model without its suffix: the frame's name in path templates."""
-    return os.path.splitext(name)[0]  # noqa: PTH122  a name, not a path
 
 
 def _pinhole(camera: Stated, where: str) -> Camera:

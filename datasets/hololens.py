@@ -11,8 +11,8 @@ from pathlib import Path
 from pydantic import BaseModel
 
 from semstab.datasets.files.options import DepthScale, FileOptions, FrameSource
-from semstab.datasets.files.reader import FileDataset, files_named, frames_of
-from semstab.datasets.formats.disk import read_intrinsics, read_matrices
+from semstab.datasets.files.reader import FileDataset, frames_of
+from semstab.datasets.formats.disk import files_named, read_intrinsics, read_matrices
 from semstab.datasets.geometry.cameras import Camera
 from semstab.errors import DataError
 

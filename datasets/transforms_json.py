@@ -17,7 +17,7 @@ from pydantic import BaseModel, Field
 
 from semstab.datasets.files.options import CameraAxes, FileOptions, Folders, FrameSource, PixelCentre, Template, inside
 from semstab.datasets.files.reader import FileDataset
-from semstab.datasets.formats.disk import matrix, natural, number, read_object
+from semstab.datasets.formats.disk import matrix, natural, number, pixels, read_object
 from semstab.datasets.formats.images import COLOR_SUFFIXES, DEPTH_SUFFIXES, MILLIMETRES
 from semstab.datasets.geometry.cameras import Camera
 from semstab.errors import DataError
@@ -119,7 +119,7 @@ def _camera(values: Mapping[str, Any], where: str) -> Camera:
     fx, fy = fy if fx is None else fx, fx if fy is None else fy
     if fx is None or fy is None:
         raise DataError(f"{where}: 'fl_x' is missing; add it, or camera_angle_x with w and h")
-    size = (_pixels(values, "w", where), _pixels(values, "h", where)) if "w" in values and "h" in values else None
+    size = (pixels(values, "w", where), pixels(values, "h", where)) if "w" in values and "h" in values else None
     cx = size[0] / 2 if size and "cx" not in values else number(values, "cx", where)
     cy = size[1] / 2 if size and "cy" not in values else number(values, "cy", where)
     try:
@@ -134,18 +134,11 @@ def _focal(values: Mapping[str, Any], axis: str, where: str) -> float | None:
         return number(values, f"fl_{axis}", where)
     if values.get(f"camera_angle_{axis}") is None:
         return None
-    side = _pixels(values, "w" if axis == "x" else "h", where)
+    side = pixels(values, "w" if axis == "x" else "h", where)
     angle = number(values, f"camera_angle_{axis}", where)
     if not 0 < angle < math.pi:
         raise DataError(f"{where}: 'camera_angle_{axis}' is {angle:g}; expected radians between 0 and pi")
     return side / (2 * math.tan(angle / 2))
-
-
-def _pixels(values: Mapping[str, Any], key: str, where: str) -> int:
-    value = number(values, key, where)
-    if not 1 <= value <= 2**24:
-        raise DataError(f"{where}: '{key}' is {value:g}; expected a number of pixels")
-    return int(value)
 
 
 def _depth_scale(content: Mapping[str, Any], path: Path) -> float:

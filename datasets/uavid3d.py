@@ -12,7 +12,7 @@ from typing import Any, Literal
 
 from pydantic import BaseModel, Field
 
-from semstab.datasets.colmap import has_model, image_name, read_model
+from semstab.datasets.colmap import has_model, read_model
 from semstab.datasets.files.options import (
     CameraAxes,
     FileOptions,
@@ -25,8 +25,8 @@ from semstab.datasets.files.options import (
     Template,
     inside,
 )
-from semstab.datasets.files.reader import FileDataset, files_named
-from semstab.datasets.formats.disk import read_intrinsics
+from semstab.datasets.files.reader import FileDataset
+from semstab.datasets.formats.disk import files_named, read_intrinsics
 from semstab.datasets.formats.images import COLOR_SUFFIXES, DEPTH_SUFFIXES
 from semstab.datasets.geometry.cameras import Camera, Poses
 from semstab.datasets.transforms_json import read_transforms
@@ -108,9 +108,7 @@ class Uavid3d(FileDataset[Uavid3dOptions]):
     def _of_model(self, folder: Path) -> list[FrameSource]:
         path, images = read_model(self._inside(folder, self.options.model))
         folders = Folders()
-        return [
-            self._frame(folder, image_name(image.name), image.T_cw, path, image.camera, folders) for image in images
-        ]
+        return [self._frame(folder, image.frame, image.T_cw, path, image.camera, folders) for image in images]
 
     def _of_matrices(self, folder: Path) -> list[FrameSource]:
         before, _, after = self._pose.text.partition("{name}")

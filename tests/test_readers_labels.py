@@ -15,7 +15,7 @@ from scipy import ndimage
 from semstab.datasets.files.labels import ScenePlace, find_sources
 from semstab.datasets.files.options import FileOptions, Folders, FrameSource
 from semstab.datasets.geometry.cameras import Camera
-from semstab.datasets.geometry.lenses import fit_labels, fit_scores
+from semstab.datasets.geometry.lenses import fit
 from semstab.datasets.scannet import read_class_table
 from semstab.errors import ConfigError, DataError
 from semstab.model.frames import Intrinsics
@@ -234,7 +234,7 @@ def test_ids_are_those_of_the_nearest_pixel(shape, seed):
     """Against whole numbers: the source pixel that the target pixel's centre falls into, at a tie the later one."""
     labels = np.random.default_rng(seed).integers(0, 200, shape).astype(np.uint8)
     rows, columns = ((2 * np.arange(n) + 1) * size // (2 * n) for n, size in zip((H, W), shape, strict=True))
-    np.testing.assert_array_equal(fit_labels(labels, *sized(shape), (H, W)), labels[np.ix_(rows, columns)])
+    np.testing.assert_array_equal(fit(labels, *sized(shape), (H, W)), labels[np.ix_(rows, columns)])
 
 
 @given(shape=st.tuples(st.integers(1, 60), st.integers(1, 70)), seed=st.integers(0, 99))
@@ -242,7 +242,7 @@ def test_ids_are_those_of_the_nearest_pixel(shape, seed):
 def test_scores_are_linear_between_pixel_centres(shape, seed):
     """Against scipy's interpolation of one class at a time, and OpenCV's resizing."""
     scores = np.random.default_rng(seed).random((*shape, 3)).astype(np.float32)
-    found = fit_scores(scores, *sized(shape), (H, W))
+    found = fit(scores, *sized(shape), (H, W))
     v, u = ((np.arange(n) + 0.5) * size / n - 0.5 for n, size in zip((H, W), shape, strict=True))
     at = np.meshgrid(v, u, indexing="ij")
     expected = [ndimage.map_coordinates(scores[..., k], at, order=1, mode="nearest") for k in range(3)]
@@ -253,7 +253,7 @@ def test_scores_are_linear_between_pixel_centres(shape, seed):
 def test_half_precision_scores_are_mixed_in_single_and_unusable_ones_stay_so():
     scores = np.full((2, 2, 2), 0.5, np.float16)
     scores[0, 0] = np.nan
-    found = fit_scores(scores, *sized((2, 2)), (H, W))
+    found = fit(scores, *sized((2, 2)), (H, W))
     assert found.dtype == np.float32
     assert np.isnan(found[0, 0]).all()
     assert np.isfinite(found[-1, -1]).all()
@@ -286,10 +286,10 @@ def test_labels_of_the_colour_camera_are_looked_up_with_its_intrinsics(tmp_path)
 def test_scores_that_the_colour_camera_does_not_have_are_not_used():
     scores = np.full((4, 4, 2), 0.5)
     narrow, wide = Intrinsics(8, 8, 1.5, 1.5), Intrinsics(8, 8, 5.5, 5.5)
-    found = fit_scores(scores, narrow, wide, (12, 12))
+    found = fit(scores, narrow, wide, (12, 12))
     assert (found.sum(axis=2) > 0).sum() == 16
     assert (found[4:8, 4:8] == 0.5).all()
-    ids = fit_labels(np.zeros((4, 4), np.uint16), narrow, wide, (12, 12))
+    ids = fit(np.zeros((4, 4), np.uint16), narrow, wide, (12, 12))
     assert (ids == 0).sum() == 16
     assert (ids[0] == 65535).all()
 

@@ -14,7 +14,6 @@ from posed_scene import fails
 
 from semstab.config import FrameSelection
 from semstab.datasets.files.options import Folders
-from semstab.datasets.formats.disk import natural, naturally
 from semstab.datasets.scene import select_frames
 from semstab.errors import DataError
 
@@ -83,11 +82,6 @@ def test_a_posed_folder_of_ten_thousand_frames_opens_at_once(tmp_path):
     assert select_frames(scene, FrameSelection(stride=100), ["all", "some"]).left_out == 0
     assert time.process_time() - started < 5
     fails(DataError, "9900 missing", select_frames, scene, FrameSelection(), ["some"])
-
-
-@pytest.mark.parametrize("names", [["f10", "f09", "f01"], ["f10", "f9", "g1"], ["a1b02", "a1b01", "a0b99"], ["٣", "2"]])
-def test_names_are_in_natural_order_whatever_their_shape(names):
-    assert naturally(names) == sorted(names, key=natural)
 
 
 def test_a_name_that_is_listed_in_a_folder_is_found_and_no_other(tmp_path):

@@ -13,7 +13,7 @@ from semstab.datasets.files.labels import ScenePlace
 from semstab.datasets.files.options import FileOptions, Folders, FrameSource, inside
 from semstab.datasets.files.scene import FileScene
 from semstab.datasets.files.surfaces import SEEN_FROM_ABOVE, Surface, usual_folder
-from semstab.datasets.formats.disk import naturally, subfolders
+from semstab.datasets.formats.disk import files_named, natural, subfolders
 from semstab.datasets.formats.images import COLOR_SUFFIXES
 from semstab.datasets.geometry.cameras import Camera, Poses
 from semstab.datasets.scene import Dataset, nearest
@@ -22,7 +22,6 @@ from semstab.model.georeference import Georeference
 
 DEEPEST = 3
 """Levels of folders below root that are searched for scenes."""
-
 
 Options = TypeVar("Options", bound=FileOptions)
 
@@ -62,7 +61,16 @@ class FileDataset(Dataset, Generic[Options]):
         if not frames:
             raise DataError(f"{place.folder}: holds no frame; expected {self.looks_like}")
         georeference = self.georeference(place.folder, options)
-        scene = FileScene(place, frames, options, self.class_ids(), _surface(options, georeference))
+        surface = None
+        if options.surface is not None:
+            if options.surface.suffix.lower() in SEEN_FROM_ABOVE and options.up_axis not in (None, "z"):
+                raise ConfigError(
+                    f"{options.surface}: is a surface over x and y, but up_axis is {options.up_axis}; turn it, or take"
+                    " a mesh"
+                )
+            casts = None if options.casts is False else options.casts or usual_folder()
+            surface = Surface(options.surface, options.surface_cell, georeference, casts)
+        scene = FileScene(place, frames, options, self.class_ids(), surface)
         scene.georeference = georeference
         scene.labels_like_depth = self.labels_like_depth
         scene.settings_file = None if self.settings_file is None else place.folder / self.settings_file
@@ -90,7 +98,7 @@ class FileDataset(Dataset, Generic[Options]):
         there = files_named(folder, before, after)
         if self.options.surface is None:
             return there
-        return {name: folder / f"{before}{name}{after}" for name in naturally({*there, *instead})}
+        return {name: folder / f"{before}{name}{after}" for name in sorted({*there, *instead}, key=natural)}
 
     def has_depth(self, folder: Path) -> bool:
         """Return whether a folder of depth images is there, or needs not be, as a surface gives the depth."""
@@ -119,7 +127,13 @@ def find_scenes(root: Path, is_scene: Callable[[Path], bool], looks_like: str) -
     if is_scene(root):
         name = root.resolve().name or "scene"
         return [ScenePlace(name, root, name)]
-    relative = [path.relative_to(root).parts for path in _below(root, is_scene, DEEPEST)]
+
+    def below(folder: Path, levels: int) -> Iterator[Path]:
+        for name in subfolders(folder) if levels else ():
+            inner = folder / name
+            yield from [inner] if is_scene(inner) else below(inner, levels - 1)
+
+    relative = [path.relative_to(root).parts for path in below(root, DEEPEST)]
     if not relative:
         raise DataError(f"{root}: no scene here, nor {DEEPEST} folders deep; one holds {looks_like}")
     places = [ScenePlace("-".join(parts), root.joinpath(*parts), "/".join(parts)) for parts in relative]
@@ -127,22 +141,6 @@ def find_scenes(root: Path, is_scene: Callable[[Path], bool], looks_like: str) -
     if repeated := sorted({name for name in names if names.count(name) > 1}):
         raise DataError(f"{root}: two scenes would be called '{repeated[0]}'; rename one, or set root deeper")
     return places
-
-
-def files_named(folder: Path, before: str, after: str) -> dict[str, Path]:
-    """The files 'BEFORE name AFTER' of a folder by name, in natural order; none where there is no folder.
-
-    Raises DataError where the folder cannot be listed.
-    """
-    try:
-        entries = os.listdir(folder)  # noqa: PTH208  names, not paths
-    except FileNotFoundError:
-        return {}
-    except OSError as error:
-        raise DataError(f"{folder}: the folder cannot be listed ({error.strerror})") from error
-    fitting = (entry for entry in entries if entry.startswith(before) and entry.endswith(after))
-    names = (entry[len(before) : len(entry) - len(after)] for entry in fitting if not entry.startswith("."))
-    return {name: folder / f"{before}{name}{after}" for name in naturally(names) if name}
 
 
 def images_named(folder: Path, before: str = "", after: str = "") -> list[str]:
@@ -186,23 +184,3 @@ def frames_of(
         )
         for k, (name, path) in enumerate(depth.items())
     )
-
-
-def _surface(options: FileOptions, georeference: Georeference | None) -> Surface | None:
-    """The surface of the options. Raises ConfigError for heights over another axis than z."""
-    if options.surface is None:
-        return None
-    if options.surface.suffix.lower() in SEEN_FROM_ABOVE and options.up_axis not in (None, "z"):
-        raise ConfigError(
-            f"{options.surface}: is a surface over x and y, but up_axis is {options.up_axis}; turn it, or take a mesh"
-        )
-    casts = None if options.casts is False else options.casts or usual_folder()
-    return Surface(options.surface, options.surface_cell, georeference, casts)
-
-
-def _below(folder: Path, is_scene: Callable[[Path], bool], levels: int) -> Iterator[Path]:
-    for name in subfolders(folder) if levels else ():
-        if is_scene(folder / name):
-            yield folder / name
-        else:
-            yield from _below(folder / name, is_scene, levels - 1)

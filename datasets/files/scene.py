@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from semstab.core.prefetch import prefetch
-from semstab.core.types import Float32, Float64, Mask, UInt8, UInt16
+from semstab.core.types import Float32, Float64, UInt8, UInt16
 from semstab.datasets.files.depth import shape_of, stored_depth, stored_scale
 from semstab.datasets.files.labels import LabelMaps, ScenePlace, label_paths
 from semstab.datasets.files.options import FileOptions, Folders, FrameSource
@@ -275,7 +275,10 @@ class FileScene(Scene):
         """The frame with labels or scores that have the depth's pixels."""
         source, timestamps = self._frame(index), self.timestamps
         image = self._color_file(source)  # named also where it is not read: a recording takes the file as it is
-        mask = self._maps.mask_file(source)
+        mask, masked = self._maps.mask_file(source), None
+        if mask is not None:  # outside of the mask's view nothing is masked
+            values = read_mask(mask, self._reader(index, MASK)).astype(np.uint8)
+            masked = self._stored(index, values, depth.shape, mask, "the mask is") == 1
         shown = image if source.color_lens is None else None  # a distorted one is not what the depth's camera sees
         known = {"depth": self._depth_file(source), "pose": source.pose_file, "color": shown, "mask": mask}
         known |= dict(files or {})
@@ -287,21 +290,16 @@ class FileScene(Scene):
             labels=labels,
             scores=scores,
             color=self.color(index) if color else None,
-            mask=None if mask is None else self._mask(index, mask, depth.shape),
+            mask=masked,
             timestamp=None if timestamps is None else float(timestamps[index]),
             files={what: str(path) for what, path in known.items() if path is not None},
         )
 
-    def _mask(self, index: int, path: Path, shape: tuple[int, ...]) -> Mask:
-        """The masked pixels of a frame, at the depth's pixels; outside of the mask's view nothing is masked."""
-        mask = read_mask(path, self._reader(index, MASK)).astype(np.uint8)
-        masked: Mask = self._stored(index, mask, shape, path, "the mask is") == 1
-        return masked
-
     def _stored(self, index: int, values: Pixels, shape: tuple[int, ...], path: Path, what: str) -> Pixels:
         """The content of a file at the depth's pixels; where it must have them, `Frame` raises an error."""
-        as_they_are = self.labels_like_depth and self._frame(index).label_lens is None
-        return values if as_they_are else self._fitted(index, values, shape, str(path), what)
+        if self.labels_like_depth and self._frame(index).label_lens is None:
+            return values
+        return self._fitted(index, values, shape, str(path), what)
 
     def _fitted(
         self, index: int, values: Pixels, shape: tuple[int, ...], where: str, what: str = "the image is"

@@ -12,7 +12,7 @@ import struct
 import zipfile
 import zlib
 from array import array
-from collections.abc import Container, Iterable, Iterator, Mapping
+from collections.abc import Container, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -47,6 +47,11 @@ def read_bytes(path: Path, limit: int = MAX_BYTES) -> bytes:
     return data
 
 
+def read_text(path: Path, limit: int) -> str:
+    """The text of a file; raises what `read_bytes` raises."""
+    return read_bytes(path, limit).decode("utf-8-sig", errors="replace")
+
+
 def digest(data: bytes) -> bytes:
     """A hash of a file's content."""
     return hashlib.new(DIGEST, data).digest()
@@ -67,13 +72,6 @@ def natural(name: str) -> tuple[list[str | int], str]:
     return [int(part[:4000]) if part.isdecimal() else part for part in re.split(r"(\d+)", name)], name
 
 
-def naturally(names: Iterable[str]) -> list[str]:
-    """The names in natural order; of names alike but for their digits, as of a camera, that is the usual order."""
-    listed = sorted(names)
-    alike = len({re.sub("[0-9]", "0", name) for name in listed}) < 2
-    return listed if alike else sorted(listed, key=natural)
-
-
 def subfolders(folder: Path) -> list[str]:
     """Names in natural order. Raises DataError where the folder cannot be listed."""
     return sorted((entry.name for entry in _entries(folder) if entry.is_dir()), key=natural)
@@ -87,12 +85,21 @@ def files_by_stem(folder: Path, suffixes: Container[str]) -> dict[str, str]:
     files: dict[str, str] = {}
     for entry in _entries(folder):
         stem, suffix = os.path.splitext(entry.name)  # noqa: PTH122  of a hundred thousand names
-        if suffix.lower() not in suffixes or not entry.is_file():
-            continue
-        if stem in files:
-            raise DataError(f"{folder / entry.name}: {files[stem]} is the same frame; keep one of the two")
-        files[stem] = entry.name
+        if suffix.lower() in suffixes and entry.is_file():
+            if stem in files:
+                raise DataError(f"{folder / entry.name}: {files[stem]} is the same frame; keep one of the two")
+            files[stem] = entry.name
     return files
+
+
+def files_named(folder: Path, before: str, after: str) -> dict[str, Path]:
+    """The files 'BEFORE name AFTER' of a folder by name, in natural order; none where there is no folder.
+
+    Raises DataError where the folder cannot be listed.
+    """
+    fitting = (entry.name for entry in _entries(folder) if entry.name.startswith(before) and entry.name.endswith(after))
+    names = sorted((name[len(before) : len(name) - len(after)] for name in fitting), key=natural)
+    return {name: folder / f"{before}{name}{after}" for name in names if name}
 
 
 def _entries(folder: Path) -> Iterator[os.DirEntry[str]]:
@@ -164,14 +171,27 @@ MAX_JSON_BYTES = 2**28
 
 def read_object(path: Path) -> dict[str, Any]:
     """The object in a file. Raises DataError where there is none."""
-    data = read_bytes(path, MAX_JSON_BYTES)
-    try:
-        content = parse_json(data)
-    except ValueError as error:
-        raise DataError(f"{path}: not valid JSON ({one_line(error)[:120]})") from error
+    content = read_content(path, MAX_JSON_BYTES)
     if not isinstance(content, dict):
         raise DataError(f"{path}: expected an object with named values, found a {type(content).__name__}")
     return content
+
+
+def read_content(path: Path, limit: int) -> Any:
+    """The content of a JSON file of at most `limit` bytes. Raises DataError where it is none."""
+    data = read_bytes(path, limit)
+    try:
+        return parse_json(data)
+    except ValueError as error:
+        raise DataError(f"{path}: not valid JSON ({one_line(error)[:120]})") from error
+
+
+def pixels(content: Mapping[str, Any], key: str, where: str) -> int:
+    """The side of an image in an object. Raises DataError with `where` (the file) and the key."""
+    value = number(content, key, where)
+    if not 1 <= value <= 2**24:
+        raise DataError(f"{where}: '{key}' is {value:g}; expected a number of pixels")
+    return int(value)
 
 
 def number(content: Mapping[str, Any], key: str, where: str) -> float:
@@ -234,8 +254,7 @@ def read_intrinsics(path: Path) -> Intrinsics:
 
 
 def _numbers(path: Path) -> list[float]:
-    data = read_bytes(path, MAX_TEXT_BYTES)
-    words = data.decode("utf-8-sig", errors="replace").replace(",", " ").split()
+    words = read_text(path, MAX_TEXT_BYTES).replace(",", " ").split()
     try:
         return [float(word) for word in words]
     except ValueError as error:
@@ -252,8 +271,7 @@ def records(path: Path) -> Iterator[tuple[int, str]]:
 
     Raises DataError where the file cannot be read or is larger than any such table.
     """
-    data = read_bytes(path, MAX_TABLE_BYTES)
-    for number, line in enumerate(data.decode("utf-8-sig", errors="replace").split("\n"), start=1):
+    for number, line in enumerate(read_text(path, MAX_TABLE_BYTES).split("\n"), start=1):
         text = line.strip()
         if text and not text.startswith("#"):
             yield number, text

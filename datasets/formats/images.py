@@ -96,7 +96,7 @@ def read_labels(path: Path, space: LabelSpace | None = None, read: Read = read_b
         return samples
     if space is None:
         raise DataError(f"{path}: the labels are colours; set classes or taxonomy, so that each has a class")
-    return _labels_by_color(path, _opaque(path, samples), space)
+    return _labels_by_color(path, samples, space)
 
 
 def read_scores(
@@ -148,11 +148,8 @@ def color_size(path: Path) -> Size:
     """(width, height) of a colour image, from its header. Raises DataError where that is damaged."""
     from PIL import Image
 
-    try:
-        with Image.open(path) as image:
-            return image.size
-    except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
-        raise DataError(f"{path}: not an image ({one_line(error)})") from error
+    with _one_line(path, "colour"), Image.open(path) as image:
+        return image.size
 
 
 # --- labels ---------------------------------------------------------------------------------------------------------
@@ -171,21 +168,17 @@ def _narrow(path: Path, ids: npt.NDArray[Any], space: LabelSpace | None) -> Labe
     return ids.astype(np.uint8) if fits else ids.astype(np.uint16)
 
 
-def _opaque(path: Path, image: UInt8) -> UInt8:
-    """RGB of an RGB or fully opaque RGBA image."""
+def _labels_by_color(path: Path, image: UInt8, space: LabelSpace) -> Labels:
+    """Ids (H, W) of an RGB or fully opaque RGBA image."""
     if image.shape[2] == 4 and (transparent := image[..., 3] < 255).any():
         y, x = np.argwhere(transparent)[0]
         raise DataError(f"{path}: pixel ({x}, {y}) is transparent, so its label colour is not exact; save as RGB")
-    return image[..., :3]
-
-
-def _labels_by_color(path: Path, rgb: UInt8, space: LabelSpace) -> Labels:
-    ids = _ids_by_color(space)[_packed(rgb)]
+    ids = _ids_by_color(space)[_packed(image)]
     if (unknown := ids == NO_CLASS).any():
         y, x = np.argwhere(unknown)[0]
         raise DataError(
-            f"{path}: colour {tuple(rgb[y, x].tolist())} at pixel ({x}, {y}) ({np.count_nonzero(unknown)} pixels) is no"
-            f" class of '{space.name}'; set taxonomy to the one whose colours the image has"
+            f"{path}: colour {tuple(image[y, x, :3].tolist())} at pixel ({x}, {y}) ({np.count_nonzero(unknown)} pixels)"
+            f" is no class of '{space.name}'; set taxonomy to the one whose colours the image has"
         )
     return ids.astype(np.uint8) if max(space.ids) < IGNORE_8BIT else ids
 
@@ -202,7 +195,7 @@ def _ids_by_color(space: LabelSpace) -> UInt16:
 
 
 def _packed(rgb: UInt8) -> UInt32:
-    """RGB (..., 3) as one 24-bit number each."""
+    """RGB, or RGB and more, (..., 3) as one 24-bit number each."""
     r, g, b = (rgb[..., channel].astype(np.uint32) for channel in range(3))
     return (r << np.uint32(16)) | (g << np.uint32(8)) | b
 
@@ -330,9 +323,6 @@ def _decode_exr(path: Path, data: bytes) -> npt.NDArray[Any]:
     if depth.ndim != 2:
         raise DataError(f"{path}: expected one channel, found {depth.shape[2]}; export the depth channel alone")
     return depth
-
-
-# --- OpenCV ---------------------------------------------------------------------------------------------------------
 
 
 @functools.cache

@@ -82,7 +82,12 @@ def to_camera_to_world(T: Poses, convention: str, axes: str, where: str) -> Pose
     if (largest := np.abs(T).max()) > LARGEST_COORDINATE:
         raise DataError(f"{where}: the pose holds {largest:g}, which no camera's has; is the file damaged?")
     if convention == "world_to_camera":
-        T = _inverse(T, where)
+        try:
+            T = np.linalg.inv(T)
+        except np.linalg.LinAlgError as error:
+            raise DataError(
+                f"{where}: the pose cannot be inverted, so it is not rigid; leave this frame out"
+            ) from error
     T = T.copy()
     T[:3, :3] = T[:3, :3] @ CAMERA_AXES[axes]
     return T
@@ -150,13 +155,6 @@ def _between(times: Float64, poses: Poses, wanted: Float64) -> Poses:
     for axis in range(3):
         T[:, axis, 3] = np.interp(at, times, poses[:, axis, 3])
     return T
-
-
-def _inverse(T: Poses, where: str) -> Poses:
-    try:
-        return np.linalg.inv(T).astype(np.float64, copy=False)
-    except np.linalg.LinAlgError as error:
-        raise DataError(f"{where}: the pose cannot be inverted, so it is not rigid; leave this frame out") from error
 
 
 # Depth that was stored as the distance along a pixel's ray, brought to the distance along the optical axis.
