@@ -167,8 +167,8 @@ def test_moving_cars_move_and_buildings_do_not() -> None:
     before, after = traffic.at(1.0, camera), traffic.at(2.0, camera)
     assert set(np.unique(before.classes)) == {6, 7}
     assert not np.array_equal(before.vertices, after.vertices)
-    s0, t0, _ = traffic.cars.plan_places(1.0)
-    s1, t1, _ = traffic.cars.plan_places(2.0)
+    s0, t0, _ = traffic.cars.plan_points(1.0)
+    s1, t1, _ = traffic.cars.plan_points(2.0)
     step = np.hypot(s1 - s0, t1 - t0)
     assert 6 <= np.median(step) <= 13
 
