@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import os
 import struct
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -101,14 +101,12 @@ class Colmap(FileDataset[ColmapOptions]):
 
 # The sparse model, text and binary (colmap.github.io/format.html): the cameras and the images; points are skipped.
 
-MODELS = (
-    "SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE", "FULL_OPENCV", "FOV",
-    "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "THIN_PRISM_FISHEYE", "RAD_TAN_THIN_PRISM_FISHEYE",
-)  # fmt: skip
-"""By model id."""
-PARAMETERS = (3, 4, 4, 5, 8, 8, 12, 5, 4, 5, 12, 16)
-FOCALS = {"SIMPLE_PINHOLE": 1, "PINHOLE": 2, "SIMPLE_RADIAL": 1, "RADIAL": 1, "OPENCV": 2, "FULL_OPENCV": 2}
-"""Focal lengths among the parameters of the models that are a pinhole where their distortion is zero."""
+MODELS: Mapping[str, tuple[int, int]] = {
+    "SIMPLE_PINHOLE": (3, 1), "PINHOLE": (4, 2), "SIMPLE_RADIAL": (4, 1), "RADIAL": (5, 1), "OPENCV": (8, 2),
+    "OPENCV_FISHEYE": (8, 0), "FULL_OPENCV": (12, 2), "FOV": (5, 0), "SIMPLE_RADIAL_FISHEYE": (4, 0),
+    "RADIAL_FISHEYE": (5, 0), "THIN_PRISM_FISHEYE": (12, 0), "RAD_TAN_THIN_PRISM_FISHEYE": (16, 0),
+}  # fmt: skip
+"""Number of parameters, and of focal lengths among them; 0 where it distorts even if all coefficients are zero."""
 
 MAX_SIDE = 2**24
 MAX_NAME = 1000
@@ -169,8 +167,8 @@ def _pinhole(camera: Stated, where: str) -> Camera:
     model, width, height, parameters = camera
     if not (0 < width <= MAX_SIDE and 0 < height <= MAX_SIDE):
         raise DataError(f"{where} has images of {width}x{height} pixels; {AGAIN}")
-    focals = FOCALS.get(model)
-    if focals is None or any(parameters[focals + 2 :]):
+    _, focals = MODELS[model]
+    if not focals or any(parameters[focals + 2 :]):
         raise DataError(
             f"{where} is {model}, which distorts; undistort the images ('colmap image_undistorter')"
             " and use the model that it writes"
@@ -184,11 +182,11 @@ def _pinhole(camera: Stated, where: str) -> Camera:
 
 def _cameras_txt(file: BinaryIO, path: Path) -> Iterator[tuple[int, Stated]]:
     for line, text in _lines(file):
-        if not text or text.startswith("#"):
-            continue
         words = text.split()
+        if not words or text.startswith("#"):
+            continue
         model = words[1] if len(words) > 1 else ""
-        if model not in MODELS or len(words) != 4 + PARAMETERS[MODELS.index(model)]:
+        if model not in MODELS or len(words) != 4 + MODELS[model][0]:
             raise DataError(f"{path}: line {line} is {text[:60]!r}; expected CAMERA_ID MODEL WIDTH HEIGHT PARAMS")
         camera_id, width, height = (_whole(words[k], path, line) for k in (0, 2, 3))
         yield camera_id, (model, width, height, [to_number(word, path, line) for word in words[4:]])
@@ -202,7 +200,8 @@ def _cameras_bin(file: BinaryIO, path: Path) -> Iterator[tuple[int, Stated]]:
             raise DataError(
                 f"{path}: camera {camera_id} has the model {model_id}, which is not known; undistort the images"
             )
-        yield camera_id, (MODELS[model_id], width, height, [*_unpack(file, f"<{PARAMETERS[model_id]}d", path)])
+        model, (parameters, _) = [*MODELS.items()][model_id]
+        yield camera_id, (model, width, height, [*_unpack(file, f"<{parameters}d", path)])
 
 
 def _images_txt(file: BinaryIO, path: Path) -> Iterator[Registered]:

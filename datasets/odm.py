@@ -115,16 +115,14 @@ def find_image(folders: Iterable[Path], shot: str, contents: Folders, where: str
 # --- depth ----------------------------------------------------------------------------------------------------------
 
 
-KINDS: tuple[Kind, ...] = ("mesh", "dsm", "mve", "openmvs", "files")
-"""Sources of depth; the first of them that a project has is taken."""
-
-PLACES: dict[Kind, str] = {
+LOCATIONS: dict[Kind, str] = {
     "mesh": "odm_meshing/odm_mesh.ply, odm_25dmesh.ply, odm_texturing*/*_geo.obj",
     "dsm": DSM,
     "mve": "mve/views/view_NNNN.mve/depth-L0.mvei",
     "openmvs": "opensfm/undistorted/openmvs/depthmaps/*.dmap",
     "files": "depth/NAME.png",
 }
+"""Sources of depth and where they are; the first of them that a project has is taken."""
 
 
 def find_depth(project: Project, kind: Kind, template: str) -> Path | None:
@@ -217,22 +215,22 @@ class Odm(FileDataset[OdmOptions]):
         if options.surface is not None:
             return options.model_copy(update={"depth_kind": options.depth_kind or "planar"})
         project = self._project(folder)
-        kinds = [options.depth_from] if options.depth_from else list(KINDS)
+        kinds = [options.depth_from] if options.depth_from else list(LOCATIONS)
         for kind in kinds:
             if (source := find_depth(project, kind, options.depth)) is not None:
                 surface = source if kind in ("mesh", "dsm") else None
                 along = options.depth_kind or ("ray" if kind == "mve" else "planar")
                 return options.model_copy(update={"surface": surface, "depth_from": kind, "depth_kind": along})
         raise DataError(
-            f"{folder}: has no depth: no {', '.join(kinds)} ({'; '.join(PLACES[kind] for kind in kinds)}); set surface"
-            " to a mesh, cloud or raster"
+            f"{folder}: has no depth: no {', '.join(kinds)} ({'; '.join(LOCATIONS[kind] for kind in kinds)}); set"
+            " surface to a mesh, cloud or raster"
         )
 
     def scene(self, name: str) -> FileScene:
         """Open one; it says where its depth comes from."""
         scene = super().scene(name)
         kind = self.settled(scene.folder).depth_from
-        scene.depth_from = f"{kind}, {scene.depth_from or PLACES[kind]}" if kind is not None else scene.depth_from
+        scene.depth_from = f"{kind}, {scene.depth_from or LOCATIONS[kind]}" if kind is not None else scene.depth_from
         return scene
 
     def georeference(self, folder: Path, options: FileOptions) -> Georeference | None:

@@ -22,7 +22,7 @@ from semstab.datasets.files.options import (
     zero_is_void,
 )
 from semstab.datasets.files.reader import FileDataset, frames_of, images_named
-from semstab.datasets.formats.disk import number, read_matrices, read_object
+from semstab.datasets.formats.disk import number, read_object, read_table
 from semstab.datasets.geometry.cameras import Camera, camera_of
 from semstab.errors import DataError
 
@@ -67,7 +67,7 @@ class Replica(FileDataset[ReplicaOptions]):
         """One a depth image. Raises DataError where there are not as many poses."""
         export = self._export(folder)
         assert export is not None
-        poses = read_matrices(folder / export.trajectory)
+        poses = read_table(folder / export.trajectory, 16, "a flattened 4x4 matrix").reshape(-1, 4, 4)
         where, _, before = export.depth.rpartition("/")
         images, _, frame = export.color.removesuffix("{name}").rpartition("/")
         instead = images_named(folder / images, frame)

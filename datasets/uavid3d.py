@@ -100,40 +100,27 @@ class Uavid3d(FileDataset[Uavid3dOptions]):
 
     def frames(self, folder: Path) -> list[FrameSource]:
         """One a pose. Raises what `read_model` or `read_transforms` raises."""
-        if self.options.pose_format == "transforms":
-            path = self._inside(folder, self.options.transforms)
-            return read_transforms(path, self.options.root, folder, self._depth)
-        return self._of_model(folder) if self.options.pose_format == "colmap" else self._of_matrices(folder)
-
-    def _of_model(self, folder: Path) -> list[FrameSource]:
-        path, images = read_model(self._inside(folder, self.options.model))
-        folders = Folders()
-        return [self._frame(folder, image.frame, image.T_cw, path, image.camera, folders) for image in images]
-
-    def _of_matrices(self, folder: Path) -> list[FrameSource]:
-        before, _, after = self._pose.text.partition("{name}")
-        where, _, before = before.rpartition("/")
-        stated = self.options.intrinsics
-        K = Intrinsics(*stated) if stated else read_intrinsics(self._inside(folder, self.options.intrinsics_file))
-        folders = Folders()
-        return [
-            self._frame(folder, name, None, path, Camera(K), folders)
-            for name, path in files_named(folder / where, before, after).items()
-        ]
-
-    def _frame(
-        self, folder: Path, name: str, pose: Poses | None, pose_file: Path, camera: Camera, folders: Folders
-    ) -> FrameSource:
-        depth = self._inside(folder, self._depth.filled(name=name))
-        color = self._inside(folder, self._images.filled(name=name))
-        return FrameSource(
-            name=name,
-            depth=folders.one_of(depth, (*DEPTH_SUFFIXES, ".bin")) or depth,
-            pose=pose,
-            pose_file=pose_file,
-            camera=camera,
-            color=folders.one_of(color, COLOR_SUFFIXES),
-        )
+        options, folders = self.options, Folders()
+        if options.pose_format == "transforms":
+            path = self._inside(folder, options.transforms)
+            return read_transforms(path, options.root, folder, self._depth)
+        posed: list[tuple[str, Poses | None, Path, Camera]]  # name, pose, file of it, camera
+        if options.pose_format == "colmap":
+            path, images = read_model(self._inside(folder, options.model))
+            posed = [(image.frame, image.T_cw, path, image.camera) for image in images]
+        else:
+            before, _, after = self._pose.text.partition("{name}")
+            where, _, before = before.rpartition("/")
+            file = self._inside(folder, options.intrinsics_file)
+            camera = Camera(Intrinsics(*options.intrinsics) if options.intrinsics else read_intrinsics(file))
+            posed = [(name, None, path, camera) for name, path in files_named(folder / where, before, after).items()]
+        frames = []
+        for name, pose, pose_file, camera in posed:
+            depth = self._inside(folder, self._depth.filled(name=name))
+            color = folders.one_of(self._inside(folder, self._images.filled(name=name)), COLOR_SUFFIXES)
+            depth = folders.one_of(depth, (*DEPTH_SUFFIXES, ".bin")) or depth
+            frames.append(FrameSource(name, depth, pose_file, camera, pose, color=color))
+        return frames
 
     def _inside(self, folder: Path, relative: str) -> Path:
         return inside(self.options.root, folder, relative, "the options of uavid3d")

@@ -14,7 +14,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -37,8 +37,7 @@ SPACINGS = 2.0
 """Mean distances between points that a cell is wide by default: nearly every cell then has a point."""
 
 
-@dataclass(frozen=True, eq=False)
-class Heights:
+class Heights(NamedTuple):
     """z (rows, columns) float64 in metres, NaN where there is none; cell (j, i) is at x0 + dx i, y0 + dy j."""
 
     z: Float64

@@ -293,11 +293,6 @@ def read_table(path: Path, columns: int, what: str) -> Float64:
     return np.frombuffer(values, dtype=np.float64).reshape(-1, columns)
 
 
-def read_matrices(path: Path) -> Float64:
-    """(n, 4, 4) from a flattened matrix a line. Raises what `read_table` raises."""
-    return read_table(path, 16, "a flattened 4x4 matrix").reshape(-1, 4, 4)
-
-
 def to_number(word: str, path: Path, line: int) -> float:
     """One number. Raises DataError that names the line."""
     try:

@@ -282,26 +282,20 @@ def _decode_tiff(path: Path, data: bytes) -> npt.NDArray[Any]:
 
 
 def _checked_tags(path: Path, data: bytes, pixel_bytes: int = 1) -> dict[int, int]:
-    """The tags of a TIFF whose size can be read."""
+    """The first value of each short or long tag of the first image of a TIFF whose size can be read."""
+    tags = {}
     try:
-        tags = _tiff_tags(data)
+        order = {b"II*\0": "<", b"MM\0*": ">"}[data[:4]]
+        (start,) = struct.unpack_from(order + "I", data, 4)
+        (count,) = struct.unpack_from(order + "H", data, start)
+        for entry in range(start + 2, start + 2 + 12 * count, 12):
+            tag, kind, _, value = struct.unpack_from(order + "HHII", data, entry)
+            (short,) = struct.unpack_from(order + "H", data, entry + 8)
+            tags[tag] = short if kind == 3 else value
         width, height = tags[256], tags[257]
     except (struct.error, KeyError) as error:
         raise DataError(f"{path}: not a whole TIFF image; {AGAIN}") from error
     _check_pixels(path, width, height, pixel_bytes)
-    return tags
-
-
-def _tiff_tags(data: bytes) -> dict[int, int]:
-    """The first value of each short or long tag of the first image. Raises struct.error, KeyError where damaged."""
-    order = {b"II*\0": "<", b"MM\0*": ">"}[data[:4]]
-    (start,) = struct.unpack_from(order + "I", data, 4)
-    (count,) = struct.unpack_from(order + "H", data, start)
-    tags = {}
-    for entry in range(start + 2, start + 2 + 12 * count, 12):
-        tag, kind, _, value = struct.unpack_from(order + "HHII", data, entry)
-        (short,) = struct.unpack_from(order + "H", data, entry + 8)
-        tags[tag] = short if kind == 3 else value
     return tags
 
 
