@@ -188,16 +188,6 @@ def test_random_bytes_are_an_array_or_a_data_error(tmp_path, suffix, content):
     survives(written(tmp_path / f"file{suffix}", BEGINNINGS[suffix] + content))
 
 
-@pytest.mark.parametrize("name", [name for name in WHOLE if name != "color.png"])
-@given(data=st.data())
-@FUZZ
-def test_damaged_bytes_are_an_array_or_a_data_error(tmp_path, name, data):
-    content = bytearray(WHOLE[name][0])
-    for _ in range(data.draw(st.integers(1, 4))):
-        content[data.draw(st.integers(0, len(content) - 1))] = data.draw(st.integers(0, 255))
-    survives(written(tmp_path / name, content))
-
-
 @given(
     size=st.tuples(st.integers(0, 9), st.integers(0, 9)),
     bits=st.sampled_from([1, 2, 3, 4, 8, 16]),

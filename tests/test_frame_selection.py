@@ -55,12 +55,6 @@ def test_evenly_spaced_frames_hold_both_ends_at_equal_distances(length, count, s
         assert steps.max() - steps.min() <= 1
 
 
-@given(length=st.integers(0, 100), start=st.integers(0, 120), stride=st.integers(1, 9), count=st.integers(1, 120))
-def test_without_more_it_is_a_slice(length, start, stride, count):
-    selection = FrameSelection(start=start, stride=stride, count=count)
-    assert selection.indices(length) == list(range(length))[start::stride][:count]
-
-
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
@@ -163,11 +157,6 @@ def test_a_damaged_pose_is_no_lost_one(tmp_path):
     write_lines(tmp_path / "pose/2.txt", matrix_text(np.eye(3)))
     with pytest.raises(ValueError, match=r"pose/2\.txt: expected a 4x4 or 3x4 matrix, found 9 numbers"):
         select_frames(opened(FORMATS["scannet"], tmp_path), FrameSelection())
-
-
-def test_scenes_without_times_and_tracking_are_selected_by_number():
-    scene = open_dataset("city", {"frames": 6}).scene("scene0")
-    assert select_frames(scene, FrameSelection(count=3, spacing="even")).indices == [0, 2, 5]
 
 
 def test_the_city_s_frames_can_be_chosen_by_time() -> None:

@@ -83,13 +83,6 @@ def test_names_sort_by_number():
     assert sorted(["f10", "f9", "f09", "g1", "10", "9", "f"], key=natural) == ["9", "10", "f", "f09", "f9", "f10", "g1"]
 
 
-def test_opening_reads_no_image(folder):
-    for path in (path for part in ("depth", "pose", "labels", "scores") for path in (folder / part).rglob("frame*")):
-        path.write_bytes(b"")
-    scene = opened(folder)
-    fails(DataError, r"depth/frame1\.png: the file is empty", scene.frame, 0, "net")
-
-
 def test_a_scene_without_labels_still_has_depth_and_poses(folder):
     (folder / "labels").rename(folder / "other labels")
     (folder / "scores").rename(folder / "other scores")
@@ -110,11 +103,6 @@ def test_an_unknown_backbone_or_frame_is_named(folder):
     fails(ConfigError, message, scene.digest, [0], "net-score")
     for index in (-1, 3):
         fails(ConfigError, f"there is no frame {index}; it has 3", scene.frame, index, "net")
-
-
-def test_two_backbones_of_one_name_are_refused(folder):
-    (folder / "labels/net").rename(folder / "labels/net-scores")
-    fails(ConfigError, "two label sources are called 'net-scores'; rename one", opened, folder)
 
 
 def test_two_files_of_one_frame_are_refused(folder):
@@ -155,13 +143,6 @@ def test_an_incomplete_frame_is_an_error_or_left_out(folder, missing, caplog):
     for backbone in scene.backbones:
         files = [scene.frame(k, backbone).files["depth"] for k in chosen.indices]
         assert files == [f"{folder}/depth/frame1.png", f"{folder}/depth/frame10.png"]
-
-
-def test_many_missing_files_are_counted(folder):
-    for k in range(20):
-        (folder / f"pose/extra{k}.txt").write_text("")
-    message = r"60 missing: .*depth/extra0\.png, .*labels/net/extra0\.png.*\(55 more\)"
-    fails(DataError, message, select_frames, opened(folder), FrameSelection(), ("net", "net-scores"))
 
 
 def test_a_scene_without_a_whole_frame_is_an_error(folder):

@@ -4,20 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from dataset_writers import (
-    CLASSES,
-    COUNT,
-    FORMATS,
-    H,
-    W,
-    assert_same_voxels,
-    city,
-    fused,
-    opened,
-    save,
-    source,
-    write_labels,
-)
+from dataset_writers import CLASSES, COUNT, FORMATS, H, W, assert_same_voxels, opened, save, source, write_labels
 
 from semstab.config import FrameSelection
 from semstab.datasets import open_dataset
@@ -140,14 +127,6 @@ def test_a_frame_that_lacks_a_file_is_an_error_or_left_out(form, written, caplog
     assert select_frames(scene, FrameSelection(), ["net"]).indices == [0, 1, 3]
     assert (len(scene), scene.frame(1, "net").files["depth"]) == (COUNT, depth)
     assert "1 of 4 frames left out" in caplog.text
-
-
-def test_the_scene_in_the_middle_of_the_city_is_worth_reading():
-    """The source has depth at every pixel, several classes, and views that overlap."""
-    frames = city()
-    assert all(frame.valid.all() for frame in frames)
-    assert len(np.unique([frame.labels for frame in frames])) > 4
-    assert (fused(frames).op >= 3).mean() > 0.05
 
 
 @pytest.mark.parametrize("above", [False, True])

@@ -5,7 +5,7 @@ from __future__ import annotations
 import cv2
 import numpy as np
 import pytest
-from dataset_writers import CLASSES, COUNT, FORMATS, H, W, assert_same_voxels, city, opened, save, source, write_labels
+from dataset_writers import CLASSES, COUNT, FORMATS, H, W, assert_same_voxels, opened, save, source, write_labels
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from PIL import Image
@@ -150,31 +150,6 @@ def test_a_labels_root_that_is_wrong_is_said(scene, tmp_path, caplog):
         f"{tmp_path}/BACKBONE/room_00003.png",
         f"{tmp_path}/soft/00003.npy",
     )
-
-
-def test_a_scene_without_labels_has_depth_and_poses(scene):
-    root, _, frames = scene
-    found = opened(FORM, root)
-    assert (found.backbones, found.ground_truth, len(found)) == ((), False, COUNT)
-    np.testing.assert_array_equal(found.depth(1), frames[1].depth)
-    fails(
-        ConfigError,
-        "backbone 'net' is not there; put its label maps into labels/NAME/, or set option labels",
-        found.frame,
-        0,
-        "net",
-    )
-
-
-def test_ground_truth_may_be_sparse(tmp_path):
-    frames = source(1000)
-    names = SCANNET.write(tmp_path, frames)
-    write_labels(tmp_path, names, frames)
-    write_labels(tmp_path, names[:1], frames[:1], "label-filt/{}.png")
-    found = opened(SCANNET, tmp_path, label_camera="depth")
-    assert (found.backbones, found.ground_truth, len(found)) == (("net",), True, COUNT)
-    assert found.frame(0, "gt").labels.shape == (H, W)
-    fails(DataError, r"3 missing: .*label-filt/1\.png.*choose frames that have them, or add them", found.frame, 1, "gt")
 
 
 # --- formats
@@ -399,7 +374,3 @@ def test_another_table_is_refused(tmp_path, text, match):
     path = tmp_path / "t.tsv"
     path.write_text(text)
     fails(DataError, f"t.tsv: .*{match}", read_class_table, path, "nyu40id")
-
-
-def test_the_city_has_the_classes_of_this_file():
-    assert max(frame.labels.max() for frame in city()) < len(CLASSES)

@@ -7,9 +7,8 @@ import os
 import time
 from pathlib import Path
 
-import numpy as np
 import pytest
-from dataset_writers import COUNT, FORMATS, numbers, opened, source, write_labels, write_lines
+from dataset_writers import COUNT, FORMATS, opened, source, write_labels, write_lines
 from posed_scene import fails
 
 from semstab.config import FrameSelection
@@ -45,23 +44,6 @@ def test_opening_and_selecting_read_no_image(tmp_path, name, monkeypatch):
     assert not [path for path in read if is_image(path)]
     fails(DataError, "the file is empty", scene.frame, 0, "net")
     assert is_image(read[-1])
-
-
-def test_ten_thousand_frames_open_at_once(tmp_path):
-    """Less than a second; the bound is for machines that do other work too."""
-    count = 10_000
-    (tmp_path / "depth_left").mkdir()
-    for k in range(count):
-        (tmp_path / f"depth_left/{k:06d}_left_depth.npy").touch()
-    steps = np.linspace(0, 500, count)
-    write_lines(tmp_path / "pose_left.txt", [numbers([x, 0, 0, 0, 0, 0, 1]) for x in steps])
-    started = time.process_time()
-    scene = opened(FORMATS["tartanair"], tmp_path)
-    chosen = select_frames(scene, FrameSelection(count=20, spacing="even")).indices
-    assert time.process_time() - started < 5
-    assert (len(scene), chosen[0], chosen[-1]) == (count, 0, count - 1)
-    assert scene.T_wc(count - 1)[0, 3] == 500
-    fails(DataError, r"009999_left_depth\.npy: the file is empty", scene.depth, count - 1)
 
 
 def test_a_posed_folder_of_ten_thousand_frames_opens_at_once(tmp_path):

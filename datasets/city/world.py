@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import numpy as np
 
@@ -187,6 +188,7 @@ class World:
     traffic: Traffic
 
 
+@lru_cache(maxsize=2)
 def build_world(seed: int, flight: Flight) -> World:
     """The town under a flight; the same for every camera, resolution and number of frames."""
     layout = Layout.random(_rng(seed, flight, 0))
