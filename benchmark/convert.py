@@ -149,12 +149,12 @@ class SceneFolder:
             for folder in self.path.glob("**/"):
                 remove_leftovers(folder)
         self.form = form
-        said = dict(scene_settings) | ({} if form.scale is None else {"depth_scale": form.scale})
+        settings = dict(scene_settings) | ({} if form.scale is None else {"depth_scale": form.scale})
         write_json(
             self.path / CONVERSION_FILE,
             {"schema": SCHEMA, "key": self._key, "depth_scale": form.scale, "settings": self._settings},
         )
-        write_text(self.path / SETTINGS_FILE, yaml.safe_dump(said, sort_keys=False))
+        write_text(self.path / SETTINGS_FILE, yaml.safe_dump(settings, sort_keys=False))
 
     def close(self) -> None:
         """Release the lock of the folder."""
@@ -330,17 +330,17 @@ def convert_scene(scene: Scene, config: Config, path: Path, depth_error: float, 
     if repeated := [name for name in backbones if folders.count(folder_name(name)) > 1]:
         raise ConfigError(f"{scene.name}: {' and '.join(repeated)} would get one folder; choose with --backbone")
     work = _Work(scene, indices, backbones, folder, progress)
-    said: dict[str, Any] = {"pose_convention": "camera_to_world", "camera_axes": "opencv"}
+    settings: dict[str, Any] = {"pose_convention": "camera_to_world", "camera_axes": "opencv"}
     if up := _up_axis(scene):
-        said["up_axis"] = up
+        settings["up_axis"] = up
     if scene.georeference is not None:
-        said |= {"crs": scene.georeference.crs, "offset": list(scene.georeference.offset)}
+        settings |= {"crs": scene.georeference.crs, "offset": list(scene.georeference.offset)}
     with contextlib.closing(folder):
-        folder.begin(folder.form or depth_format(work.probe(), depth_error), said)
+        folder.begin(folder.form or depth_format(work.probe(), depth_error), settings)
         try:
             written = work.write()
         except DepthFormatError:
-            folder.begin(DepthFormat(None), said)
+            folder.begin(DepthFormat(None), settings)
             written = work.write()
     return Converted(
         scene=scene.name,
@@ -448,4 +448,4 @@ def print_converted(converted: Converted, console: Console) -> None:
     for old, new in converted.renamed.items():
         console.print(f"  {old} is called {new} there")
     for lost in converted.lost:
-        console.print(f"  not kept: {lost}")
+        console.print(f"  not converted: {lost}")

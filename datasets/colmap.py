@@ -198,7 +198,7 @@ def _cameras_bin(file: BinaryIO, path: Path) -> Iterator[tuple[int, Stated]]:
         camera_id, model_id, width, height = _unpack(file, "<IiQQ", path)
         if not 0 <= model_id < len(MODELS):
             raise DataError(
-                f"{path}: camera {camera_id} has the model {model_id}, which is not known; undistort the images"
+                f"{path}: camera {camera_id} has the model {model_id}, which is not known; undistort images"
             )
         model, (parameters, _) = [*MODELS.items()][model_id]
         yield camera_id, (model, width, height, [*_unpack(file, f"<{parameters}d", path)])
@@ -208,13 +208,12 @@ def _images_txt(file: BinaryIO, path: Path) -> Iterator[Registered]:
     """Each image has two lines, of which the second, with its points, may be empty."""
     lines = _lines(file)
     for line, text in lines:
-        if not text or text.startswith("#"):
-            continue
         words = text.split(maxsplit=9)
+        if not words or text.startswith("#"):
+            continue
         if len(words) != 10:
-            raise DataError(
-                f"{path}: line {line} is {text[:60]!r}; expected IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME"
-            )
+            form = "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME"
+            raise DataError(f"{path}: line {line} is {text[:60]!r}; expected {form}")
         yield [to_number(word, path, line) for word in words[1:8]], _whole(words[8], path, line), words[9]
         _, points = next(lines, (0, ""))
         if len(points.split()) % 3:

@@ -14,7 +14,7 @@ from pydantic import BaseModel, Field
 
 from semstab.core.files import open_file
 from semstab.datasets.files.depth import HEADER_BYTES, dmap_header
-from semstab.datasets.files.labels import ScenePlace
+from semstab.datasets.files.labels import SceneEntry
 from semstab.datasets.files.options import (
     DepthKind,
     FileOptions,
@@ -192,15 +192,15 @@ class Odm(FileDataset[OdmOptions]):
         self._read: dict[Path, list[Shot]] = {}
         super().__init__(options)
 
-    def find_scenes(self, root: Path) -> Iterator[ScenePlace]:
+    def find_scenes(self, root: Path) -> Iterator[SceneEntry]:
         """The projects, and the submodels of each after it."""
-        for place in super().find_scenes(root):
-            yield place
-            parts = place.folder / "submodels"
+        for entry in super().find_scenes(root):
+            yield entry
+            parts = entry.folder / "submodels"
             for name in subfolders(parts):
                 if self.is_scene(parts / name):
-                    below = f"{place.below_root}/submodels/{name}"
-                    yield ScenePlace(f"{place.name}-submodels-{name}", parts / name, below)
+                    below = f"{entry.below_root}/submodels/{name}"
+                    yield SceneEntry(f"{entry.name}-submodels-{name}", parts / name, below)
 
     def is_scene(self, folder: Path) -> bool:
         """Return whether there is a reconstruction."""

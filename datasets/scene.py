@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import dataclasses
-import difflib
 import logging
 import os
 from abc import ABC, abstractmethod
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -210,12 +209,6 @@ def listed(missing: Sequence[str], folder: str = "") -> str:
     missing = [path.removeprefix(f"{folder}{os.sep}") for path in missing]
     more = f", ... ({len(missing) - MAX_LISTED} more)" if len(missing) > MAX_LISTED else ""
     return f"{len(missing)} missing: {', '.join(missing[:MAX_LISTED])}{more}"
-
-
-def nearest(name: str, known: Iterable[str]) -> str:
-    """The known names, those most like `name` first."""
-    names = list(known)
-    return f"there are {', '.join(difflib.get_close_matches(name, names, n=len(names), cutoff=0))}"
 
 
 # The frames of a scene that a selection picks, without those that lack a file or whose pose was lost.

@@ -62,7 +62,7 @@ class Uavid3dOptions(FileOptions):
     transforms: str = Field("transforms.json", description="file of the cameras")
     pose: str = Field("pose/{name}.txt", description="template of the matrices")
     intrinsics: FourIntrinsics = None
-    intrinsics_file: str = Field("intrinsics.txt", description="3x3 matrix, beside matrices of poses")
+    intrinsics_file: str = Field("intrinsics.txt", description="3x3 matrix, where poses are matrices")
     ground_truth: GroundTruth = "Labels/{name}.png"
     pose_convention: PoseConvention = None
     camera_axes: CameraAxes = None

@@ -155,7 +155,7 @@ def test_a_damaged_pose_is_no_lost_one(tmp_path):
     names = FORMATS["scannet"].write(tmp_path, frames)
     write_labels(tmp_path, names, frames)
     write_lines(tmp_path / "pose/2.txt", matrix_text(np.eye(3)))
-    with pytest.raises(ValueError, match=r"pose/2\.txt: expected a 4x4 or 3x4 matrix, found 9 numbers"):
+    with pytest.raises(ValueError, match=r"pose/2\.txt: expected a 4x4 or 3x4 matrix, got 9 numbers"):
         select_frames(opened(FORMATS["scannet"], tmp_path), FrameSelection())
 
 

@@ -58,7 +58,7 @@ def test_scenes_go_in_natural_order_and_other_folders_do_not_count(tmp_path):
     dataset = open_dataset("posed_folder", {"root": tmp_path})
     assert dataset.scenes == ("a (1)", "scene2", "scene10")
     assert dataset.scene("a (1)").name == "a (1)"
-    message = r"scene 'scene11' is not there; there are scene10, scene2, a \(1\)"
+    message = r"scene 'scene11' is not there; did you mean 'scene10'\?"
     fails(ConfigError, message, dataset.scene, "scene11")
 
 
@@ -97,7 +97,7 @@ def test_a_scene_without_labels_still_has_depth_and_poses(folder):
 
 def test_an_unknown_backbone_or_frame_is_named(folder):
     scene = opened(folder)
-    message = "'net-score' is not there; there are net-scores, net, gt$"
+    message = r"'net-score' is not there; did you mean 'net-scores'\?$"
     fails(ConfigError, message, scene.label_space, "net-score")
     fails(ConfigError, message, scene.frame, 0, "net-score")
     fails(ConfigError, message, scene.digest, [0], "net-score")

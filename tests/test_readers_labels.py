@@ -12,7 +12,7 @@ from PIL import Image
 from posed_scene import fails
 from scipy import ndimage
 
-from semstab.datasets.files.labels import ScenePlace, find_sources
+from semstab.datasets.files.labels import SceneEntry, find_sources
 from semstab.datasets.files.options import FileOptions, Folders, FrameSource
 from semstab.datasets.geometry.cameras import Camera
 from semstab.datasets.geometry.lenses import fit
@@ -89,7 +89,7 @@ def test_a_template_that_cannot_be_is_one_line(scene, option, template, message)
 
 
 def test_a_name_from_a_file_cannot_lead_out_of_the_folder(tmp_path):
-    place, camera = ScenePlace("s", tmp_path, "s"), Camera(Intrinsics(1, 1, 0, 0))
+    place, camera = SceneEntry("s", tmp_path, "s"), Camera(Intrinsics(1, 1, 0, 0))
     (tmp_path / "labels/net").mkdir(parents=True)
     for name in ("../../../etc/passwd", "a\nb", "a\0b", "x" * 2000, "\ud800"):
         frames = [FrameSource(name, tmp_path, tmp_path, camera)]
@@ -112,7 +112,7 @@ def test_labels_and_scores_side_by_side(scene):
     np.testing.assert_array_equal(soft.predicted, hard.labels)
     assert soft.files["scores"].endswith(f"room/scores/net/{names[2]}.npz")
     np.testing.assert_array_equal(found.frame(2, "gt").labels, hard.labels)
-    fails(ConfigError, "backbone 'nets' is not there; there are net, net-scores, gt", found.frame, 0, "nets")
+    fails(ConfigError, "backbone 'nets' is not there; did you mean 'net'", found.frame, 0, "nets")
     named = opened(FORM, root, scores={"soft": "scores/net/{name}"}, labels={"hard": "labels/net/{name}"})
     assert named.backbones == ("hard", "soft")
 
@@ -144,7 +144,7 @@ def test_a_labels_root_that_is_wrong_is_said(scene, tmp_path, caplog):
     )
     assert opened(FORM, root, labels_root=tmp_path).backbones == ()
     assert f"room: no label maps in {tmp_path} fit the options labels and scores" in caplog.text
-    assert f"looked for {tmp_path}/room/BACKBONE/00003.png" in caplog.text
+    assert f"expected {tmp_path}/room/BACKBONE/00003.png" in caplog.text
     said = {"labels_root": tmp_path, "labels": "{backbone}/{scene}_{name}", "scores": {"x": "soft/{name}.npy"}}
     assert opened(FORM, root, **said).label_paths == (
         f"{tmp_path}/BACKBONE/room_00003.png",

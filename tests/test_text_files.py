@@ -54,9 +54,9 @@ def test_a_pose_is_16_or_12_numbers(tmp_path, text):
     ("text", "match"),
     [
         ("", "the file is empty"),
-        ("\n", "found 0 numbers"),
-        ("1 2 3 0 0 0 1", r"found 7 numbers \(position and quaternion\?\)"),
-        ("1 0 0 0 1 0 0 0 1", "found 9 numbers"),
+        ("\n", "got 0 numbers"),
+        ("1 2 3 0 0 0 1", r"got 7 numbers \(position and quaternion\?\)"),
+        ("1 0 0 0 1 0 0 0 1", "got 9 numbers"),
         ("1 0 0 x 0 1 0 0 0 0 1 0", "expected numbers .*'x'"),
         pytest.param("1 " * 40000, "too many for such a file", id="long"),
     ],
@@ -85,7 +85,7 @@ def test_a_pose_that_is_not_rigid_names_its_file(folder, T, convention, match):
 @pytest.mark.parametrize(
     ("text", "match"),
     [
-        ("10 11 3 2", "found 4 numbers"),
+        ("10 11 3 2", "got 4 numbers"),
         ("10 0 0 0 11 0 3 2 1", "is no camera matrix"),
         ("10 0 3 0 nan 2 0 0 1", "is no camera matrix"),
         ("10 1 3 0 11 2 0 0 1", "skew"),

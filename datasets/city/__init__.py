@@ -1,8 +1,8 @@
 """The built-in dataset `city`: a simulated UAV flight over a procedural town, with simulated backbones.
 
 Five towns (scene0 to scene4) with roads, buildings, trees, gardens, cars and people, every face of a uavid8 class.
-Depth is exact: the rays' triangles are found with embree, their planes are cut in float64. What the backbones get
-wrong, and where and when, is set by `CityOptions.backbones`; `SimulatedBackbone` documents the error model.
+Depth is exact: the rays' triangles are found with embree, their planes are cut in float64. Errors of the
+backbones are set by `CityOptions.backbones`; `SimulatedBackbone` documents the error model.
 """
 
 from __future__ import annotations

@@ -11,6 +11,7 @@ from typing import Literal
 
 import numpy as np
 
+from semstab.config import nearest
 from semstab.core.types import UInt16
 from semstab.datasets.files.options import FileOptions, Folders, FrameSource, Template, inside, matching_folders
 from semstab.datasets.formats.images import (
@@ -23,7 +24,7 @@ from semstab.datasets.formats.images import (
     read_scores,
 )
 from semstab.datasets.geometry.lenses import Labels, Scores
-from semstab.datasets.scene import GROUND_TRUTH, listed, nearest
+from semstab.datasets.scene import GROUND_TRUTH, listed
 from semstab.errors import ConfigError, DataError
 from semstab.model.labels import IGNORE_16BIT, LabelSpace, ignore_id
 
@@ -42,7 +43,7 @@ SEPARATE = "{scene}/{backbone}/{name}"
 
 
 @dataclass(frozen=True)
-class ScenePlace:
+class SceneEntry:
     """A scene's name, its folder, and its path below root, which {scene} in templates stands for."""
 
     name: str
@@ -87,7 +88,7 @@ class LabelSource:
 
 
 def find_sources(
-    options: FileOptions, place: ScenePlace, frames: Sequence[FrameSource], folders: Folders
+    options: FileOptions, entry: SceneEntry, frames: Sequence[FrameSource], folders: Folders
 ) -> dict[str, LabelSource]:
     """The label sources of a scene with these frames; `gt` is the ground truth.
 
@@ -97,42 +98,42 @@ def find_sources(
     that cannot be listed.
     """
     sources: dict[str, LabelSource] = {}
-    base = options.labels_root or place.folder
+    base = options.labels_root or entry.folder
     if not os.path.isdir(base):  # noqa: PTH112  Path.is_dir raises where the name is too long
         raise ConfigError(f"{base}: there is no such folder; mend labels_root")
     for kind in KINDS:
         templates: dict[str, str] = {}
         for backbone, template in _stated(kind, options).items():
             if backbone is not None:
-                templates[backbone] = template.filled(scene=place.below_root)
+                templates[backbone] = template.filled(scene=entry.below_root)
                 continue
             suffix = "-scores" if kind == "scores" else ""
-            folders_of = matching_folders(base, template, "backbone", scene=place.below_root)
+            folders_of = matching_folders(base, template, "backbone", scene=entry.below_root)
             templates |= {f"{name}{suffix}": filled for name, filled in folders_of.items()}
         for name, filled in templates.items():
             source = LabelSource.of(kind, base, filled, frames, folders)
             if name in sources:
-                raise ConfigError(f"{place.folder}: two label sources are called '{name}'; rename one")
+                raise ConfigError(f"{entry.folder}: two label sources are called '{name}'; rename one")
             if source.first is not None:
                 sources[name] = source
             elif frames:
                 logger.warning("%s: no file of any frame, such as %s; left out", name, source.missing(frames[0])[0])
     if not sources and (options.labels or options.scores or options.labels_root):
         logger.warning(
-            "%s: no label maps in %s fit the options labels and scores; looked for %s",
-            place.name, base, ", ".join(label_paths(options, place, frames)),
+            "%s: no label maps in %s fit the options labels and scores; expected %s",
+            entry.name, base, ", ".join(label_paths(options, entry, frames)),
         )  # fmt: skip
     if options.ground_truth and GROUND_TRUTH not in sources:
         truth = Template("ground_truth", options.ground_truth, ("scene", "name"), ("name",))
-        source = LabelSource.of("labels", place.folder, truth.filled(scene=place.below_root), frames, folders)
+        source = LabelSource.of("labels", entry.folder, truth.filled(scene=entry.below_root), frames, folders)
         sources |= {GROUND_TRUTH: source} if source.first is not None else {}
     return sources
 
 
-def label_paths(options: FileOptions, place: ScenePlace, frames: Sequence[FrameSource]) -> list[str]:
-    """Where label maps and scores are looked for: the paths of the first frame, with BACKBONE for any name."""
-    values = {"scene": place.below_root, "backbone": "BACKBONE", "name": frames[0].name if frames else "NAME"}
-    base = options.labels_root or place.folder
+def label_paths(options: FileOptions, entry: SceneEntry, frames: Sequence[FrameSource]) -> list[str]:
+    """Paths of label maps and scores that would be read: the paths of the first frame, with BACKBONE for any name."""
+    values = {"scene": entry.below_root, "backbone": "BACKBONE", "name": frames[0].name if frames else "NAME"}
+    base = options.labels_root or entry.folder
     return [
         _with_suffix(base / template.filled(**values), kind)
         for kind in KINDS
@@ -172,16 +173,16 @@ class LabelMaps:
     def __init__(
         self,
         options: FileOptions,
-        place: ScenePlace,
+        entry: SceneEntry,
         frames: Sequence[FrameSource],
         class_ids: Mapping[str, UInt16],
         folders: Folders,
     ) -> None:
-        labels, base = find_sources(options, place, frames, folders), options.labels_root or place.folder
+        labels, base = find_sources(options, entry, frames, folders), options.labels_root or entry.folder
         template = Template("regions", REGIONS, ("backbone", "name"), ("backbone", "name"))
         regions = {
             name: LabelSource.of("labels", base, filled, frames, folders)
-            for name, filled in matching_folders(base, template, "backbone", scene=place.below_root).items()
+            for name, filled in matching_folders(base, template, "backbone", scene=entry.below_root).items()
         }
         if both := next((name for name in regions if name in labels), None):
             raise DataError(f"{base / 'regions' / both}: labels/{both} is called '{both}' too; rename one")
@@ -191,20 +192,22 @@ class LabelMaps:
         self.regions = tuple(regions)
         self.class_ids = class_ids
         self._options = options
-        self._folder = place.folder
+        self._folder = entry.folder
         self._frames = frames
         self._sources = {**labels, **regions}
         self._masks: LabelSource | None = None
         if options.masks is not None:
-            masks = Template("masks", options.masks, ("scene", "name"), ("name",)).filled(scene=place.below_root)
-            self._masks = LabelSource("masks", place.folder, masks, folders)
+            masks = Template("masks", options.masks, ("scene", "name"), ("name",)).filled(scene=entry.below_root)
+            self._masks = LabelSource("masks", entry.folder, masks, folders)
         self._spaces: dict[str, LabelSpace | None] = {}
 
     def source(self, backbone: str) -> LabelSource:
         """The files of a label source. Raises ConfigError where there is none of that name."""
         known = self._sources
         if backbone not in known:
-            hint = nearest(backbone, known) if known else "put its label maps into labels/NAME/, or set option labels"
+            hint = (
+                nearest(backbone, [*known]) if known else "put its label maps into labels/NAME/, or set option labels"
+            )
             raise ConfigError(f"{self._folder}: backbone '{backbone}' is not there; {hint}")
         return known[backbone]
 

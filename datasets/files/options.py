@@ -126,15 +126,6 @@ class FileSettings(Settings):
         return self
 
 
-Surface = Annotated[
-    Path | None,
-    Field(description="mesh, cloud (LAS, LAZ, PLY) or height raster (GeoTIFF) that depth is cast from, not from files"),
-]
-SurfaceCell = Annotated[
-    Positive | None, Field(description="metres of a cell of the grid that a cloud or a raster becomes, seen from above")
-]
-
-
 class FileOptions(FileSettings):
     """Options of any dataset of files: where they are, and how they are read."""
 
@@ -145,8 +136,13 @@ class FileOptions(FileSettings):
     labels_root: Path | None = Field(
         None, description="folder of label maps and scores; the scene's own where not given"
     )
-    surface: Surface = None
-    surface_cell: SurfaceCell = None
+    surface: Path | None = Field(
+        None,
+        description="mesh, cloud (LAS, LAZ, PLY) or height raster (GeoTIFF) that depth is cast from, not from files",
+    )
+    surface_cell: Positive | None = Field(
+        None, description="metres of a cell of the grid that a cloud or a raster becomes, seen from above"
+    )
     casts: Path | Literal[False] | None = Field(
         None, description="folder where cast depth is kept, or false; semstab/casts in the user's cache by default"
     )
@@ -173,33 +169,24 @@ class Template:
     required: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
-        names = PLACEHOLDER.findall(self.text)
-        for name in names:
-            if name not in self.known:
-                raise ConfigError(f"{self._says}: unknown {{{name}}}; known: {_listed(self.known)}")
-        for name in self.required:
-            if name not in names:
-                raise ConfigError(f"{self._says}: needs {{{name}}}")
+        names, where = PLACEHOLDER.findall(self.text), f"{self.option}: {self.text[:200]!r}"
+        known = ", ".join(f"{{{name}}}" for name in self.known)
+        if unknown := next((name for name in names if name not in self.known), None):
+            raise ConfigError(f"{where}: unknown {{{unknown}}}; known: {known}")
+        if lacking := next((name for name in self.required if name not in names), None):
+            raise ConfigError(f"{where}: needs {{{lacking}}}")
         if any(brace in PLACEHOLDER.sub("", self.text) for brace in "{}"):
-            raise ConfigError(f"{self._says}: a brace is not closed; placeholders are {_listed(self.known)}")
+            raise ConfigError(f"{where}: a brace is not closed; placeholders are {known}")
         path = PurePosixPath(self.text)
         if path.is_absolute() or ".." in path.parts or UNSAFE.search(self.text) or not path.parts:
             raise ConfigError(
-                f"{self._says}: leaves its folder; write a path inside it, and set root, or labels_root for labels that"
+                f"{where}: leaves its folder; write a path inside it, and set root, or labels_root for labels that"
                 " stand elsewhere"
             )
 
     def filled(self, **values: str) -> str:
         """The path with the placeholders that are given replaced."""
         return PLACEHOLDER.sub(lambda match: values.get(match[1], match[0]), self.text)
-
-    @property
-    def _says(self) -> str:
-        return f"{self.option}: {self.text[:200]!r}"
-
-
-def _listed(names: Collection[str]) -> str:
-    return ", ".join(f"{{{name}}}" for name in names) or "none"
 
 
 def matching_folders(base: Path, template: Template, placeholder: str, **values: str) -> dict[str, str]:

@@ -14,7 +14,7 @@ import numpy as np
 from semstab.core.prefetch import prefetch
 from semstab.core.types import Float32, Float64, UInt8, UInt16
 from semstab.datasets.files.depth import shape_of, stored_depth, stored_scale
-from semstab.datasets.files.labels import LabelMaps, ScenePlace, label_paths
+from semstab.datasets.files.labels import LabelMaps, SceneEntry, label_paths
 from semstab.datasets.files.options import FileOptions, Folders, FrameSource
 from semstab.datasets.files.surfaces import Surface, View
 from semstab.datasets.formats import disk
@@ -47,26 +47,26 @@ class FileScene(Scene):
 
     def __init__(
         self,
-        place: ScenePlace,
+        entry: SceneEntry,
         frames: Sequence[FrameSource],
         options: FileOptions,
         class_ids: Mapping[str, UInt16] | None = None,
         surface: Surface | None = None,
     ) -> None:
         if len({frame.name for frame in frames}) < len(frames):
-            raise DataError(f"{place.folder}: two frames have one name; frames need names of their own")
-        self.name = place.name
-        self.folder = place.folder
+            raise DataError(f"{entry.folder}: two frames have one name; frames need names of their own")
+        self.name = entry.name
+        self.folder = entry.folder
         self.options = options
         self.skips_incomplete = options.incomplete == "skip"
         self.up = np.array(UP_AXES[options.up_axis], dtype=np.float64) if options.up_axis else None
         self._frames = frames
         self._folders = Folders()
-        self._maps = LabelMaps(options, place, frames, class_ids or {}, self._folders)
+        self._maps = LabelMaps(options, entry, frames, class_ids or {}, self._folders)
         self.backbones = self._maps.backbones
         self.ground_truth = self._maps.ground_truth
         self.regions = self._maps.regions
-        self.label_paths = tuple(label_paths(options, place, frames))
+        self.label_paths = tuple(label_paths(options, entry, frames))
         self._digests: dict[tuple[int, str], bytes] = {}
         self._tracked: dict[int, bool] = {}
         self._surface = surface
@@ -97,7 +97,7 @@ class FileScene(Scene):
     def missing(self, index: int, sources: Sequence[str] = (), *, color: bool = False) -> list[str]:
         """Paths of the files that the frame lacks: depth, pose, the labels of these sources, colour."""
         frame = self._frame(index)
-        files = [self._depth_file(frame), *([frame.pose_file] if frame.pose is None else [])]
+        files = [self.surface or frame.depth, *([frame.pose_file] if frame.pose is None else [])]
         lost = [str(path) for path in files if not self._folders.has(path)]
         lost += [path for name in sources for path in self._maps.source(name).missing(frame)]
         if color and self._color_file(frame) is None:
@@ -238,10 +238,11 @@ class FileScene(Scene):
         files = [self._images(index, backbone) for index in indices]
         unread = [k for k, own in enumerate(files) if own.keys() - self._digests.keys()]
         for fetched in prefetch(lambda k: {key: disk.file_digest(path) for key, path in files[k].items()}, unread):
-            self._digests |= fetched.item
+            self._digests = fetched.item | self._digests
         for index, own in zip(indices, files, strict=True):
             source = self._frame(index)
-            digest.update(source.name.encode() + b"\0" + self._geometry_bytes(source))
+            cameras = (source.camera, source.label_camera, source.depth_scale, source.label_lens)
+            digest.update(source.name.encode() + b"\0" + self._stored_pose(source).tobytes() + repr(cameras).encode())
             digest.update(b"" if self._surface is None else self._surface.digest)
             for key in own:
                 digest.update(self._digests[key])
@@ -258,9 +259,6 @@ class FileScene(Scene):
     def _view(self, index: int) -> View:
         shape = shape_of(self._frame(index), self.options)
         return View(self.intrinsics(index, shape), self.T_wc(index), shape)
-
-    def _depth_file(self, source: FrameSource) -> Path:
-        return source.depth if self._surface is None else self._surface.path
 
     def _framed(
         self,
@@ -280,7 +278,7 @@ class FileScene(Scene):
             values = read_mask(mask, self._reader(index, MASK)).astype(np.uint8)
             masked = self._stored(index, values, depth.shape, mask, "the mask is") == 1
         shown = image if source.color_lens is None else None  # a distorted one is not what the depth's camera sees
-        known = {"depth": self._depth_file(source), "pose": source.pose_file, "color": shown, "mask": mask}
+        known = {"depth": self.surface or source.depth, "pose": source.pose_file, "color": shown, "mask": mask}
         known |= dict(files or {})
         return Frame(
             index=int(index),
@@ -314,11 +312,6 @@ class FileScene(Scene):
             return fitted(values, shape, where, what)
         K = camera.at(values.shape, self.options.pixel_centre or 0.0)
         return fit(values, K, self.intrinsics(index, shape), (shape[0], shape[1]))
-
-    def _geometry_bytes(self, source: FrameSource) -> bytes:
-        """The pose and the cameras of a frame, as bytes that are equal where they are."""
-        cameras = (source.camera, source.label_camera, source.depth_scale, source.label_lens)
-        return self._stored_pose(source).tobytes() + repr(cameras).encode()
 
     def _reader(self, index: int, what: str) -> Read:
         """Give the content of a frame's file; its digest is remembered, so that `digest` need not read it again."""

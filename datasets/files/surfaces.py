@@ -56,16 +56,16 @@ def read_heights(path: Path, cell: float | None, georeference: Georeference | No
     import rasterio
 
     with rasterio.open(path) as file:
-        place = file.transform
-        if place.b or place.d:
+        transform = file.transform
+        if transform.b or transform.d:
             raise DataError(f"{path}: the raster is rotated; bring it to north up (gdalwarp)")
         if georeference is not None and file.crs is not None:
             require_same_projection(path, file.crs.to_wkt(), georeference)
-        factor = max(1.0, (cell or 0) / abs(place.a), math.sqrt(file.width * file.height / MOST_CELLS))
+        factor = max(1.0, (cell or 0) / abs(transform.a), math.sqrt(file.width * file.height / MOST_CELLS))
         rows, columns = (max(1, math.floor(side / factor)) for side in (file.height, file.width))
         z = file.read(1, out_shape=(rows, columns), masked=True, resampling=rasterio.enums.Resampling.average)
-        dx, dy = place.a * file.width / columns, place.e * file.height / rows
-        x, y = place.c + dx / 2, place.f + dy / 2
+        dx, dy = transform.a * file.width / columns, transform.e * file.height / rows
+        x, y = transform.c + dx / 2, transform.f + dy / 2
     east, north, up = (0.0, 0.0, 0.0) if georeference is None else georeference.offset
     return Heights(z.astype(np.float64).filled(np.nan) - up, x - east, y - north, dx, dy)
 
@@ -274,7 +274,7 @@ def _require_whole_las(path: Path) -> None:
         if compressed:
             file.seek(start)
             table = int.from_bytes(file.read(8), "little", signed=True)
-            if table == -1:  # its writer could not seek: the place of the table stands at the end
+            if table == -1:  # its writer could not seek: the position of the table stands at the end
                 file.seek(max(start, size - 8))
                 table = int.from_bytes(file.read(8), "little", signed=True)
             if not start + 8 <= table <= size - 8:
@@ -315,7 +315,7 @@ FAR = 1e30
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """A camera at a place: T_wc (4, 4) camera-to-world, and its image of shape (H, W)."""
+    """A camera: T_wc (4, 4) camera-to-world, and its image of shape (H, W)."""
 
     intrinsics: Intrinsics
     T_wc: Float64
@@ -409,7 +409,7 @@ class Casts:
             with atomic_path(file) as temporary:
                 temporary.write_bytes(zlib.crc32(content).to_bytes(4, "little") + content)
         except OSError as error:
-            logger.warning("%s: cast depth cannot be kept (%s); set casts to a folder", self._folder, error.strerror)
+            logger.warning("%s: cast depth cannot be stored (%s); set casts to a folder", self._folder, error.strerror)
             self._folder = None
 
     def _file(self, view: View) -> Path | None:

@@ -139,11 +139,11 @@ def _decode_npy(where: str, data: bytes) -> npt.NDArray[Any]:
         raise DataError(f"{where}: the .npy header is damaged, or the array does not hold plain numbers; save it anew")
     kind = np.dtype(dtype[1].decode())
     sizes = tuple(int(n) for n in re.findall(rb"\d+", shape[1]))
-    needed, found = math.prod(sizes) * kind.itemsize, len(data) - start
+    needed, there = math.prod(sizes) * kind.itemsize, len(data) - start
     if needed == 0 or len(sizes) > 4:
         raise DataError(f"{where}: an array of shape {sizes} cannot hold an image; {AGAIN}")
-    if found != needed:
-        raise DataError(f"{where}: the array {sizes} of {kind} needs {needed} bytes, the file has {found}; {AGAIN}")
+    if there != needed:
+        raise DataError(f"{where}: the array {sizes} of {kind} needs {needed} bytes, the file has {there}; {AGAIN}")
     array = np.frombuffer(data, kind, offset=start).reshape(sizes, order="F" if order[1] == b"True" else "C")
     return array.astype(kind.newbyteorder("="), copy=False)
 
@@ -173,7 +173,7 @@ def read_object(path: Path) -> dict[str, Any]:
     """The object in a file. Raises DataError where there is none."""
     content = read_content(path, MAX_JSON_BYTES)
     if not isinstance(content, dict):
-        raise DataError(f"{path}: expected an object with named values, found a {type(content).__name__}")
+        raise DataError(f"{path}: expected an object with named values, got a {type(content).__name__}")
     return content
 
 
@@ -232,7 +232,7 @@ def read_pose(path: Path) -> Float64:
         numbers += [0, 0, 0, 1]
     if len(numbers) != 16:
         hint = " (position and quaternion?)" if len(numbers) in (7, 8) else ""
-        raise DataError(f"{path}: expected a 4x4 or 3x4 matrix, found {len(numbers)} numbers{hint}; convert it")
+        raise DataError(f"{path}: expected a 4x4 or 3x4 matrix, got {len(numbers)} numbers{hint}; convert it")
     return np.array(numbers, dtype=np.float64).reshape(4, 4)
 
 
@@ -241,7 +241,7 @@ def read_intrinsics(path: Path) -> Intrinsics:
     numbers = _numbers(path)
     if len(numbers) not in (9, 16):
         raise DataError(
-            f"{path}: expected a 3x3 camera matrix, found {len(numbers)} numbers; write fx 0 cx 0 fy cy 0 0 1"
+            f"{path}: expected a 3x3 camera matrix, got {len(numbers)} numbers; write fx 0 cx 0 fy cy 0 0 1"
         )
     side = 3 if len(numbers) == 9 else 4
     K = np.array(numbers, dtype=np.float64).reshape(side, side)[:3, :3]

@@ -58,7 +58,7 @@ def read_depth(path: Path, scale: float | None = None, read: Read = read_bytes) 
         with _whole_png(path, data) as png:
             if png.kind != "grey" or png.bits != 16:
                 raise DataError(
-                    f"{path}: expected 16-bit grey, found {png.bits}-bit {png.kind} (a picture of the depth?);"
+                    f"{path}: expected 16-bit grey, got {png.bits}-bit {png.kind} (a picture of the depth?);"
                     " export the depth values"
                 )
             depth, scale = png.samples(), scale or MILLIMETRES
@@ -274,10 +274,10 @@ def _decode_tiff(path: Path, data: bytes) -> npt.NDArray[Any]:
     tags = _checked_tags(path, data)
     bits, channels, sample = tags.get(258, 1), tags.get(277, 1), tags.get(339, 1)
     if channels != 1:
-        raise DataError(f"{path}: expected one channel of 32-bit float, found {channels} channels")
+        raise DataError(f"{path}: expected one channel of 32-bit float, got {channels} channels")
     if (sample, bits) not in ((3, 32), (3, 64), (1, 16)):
         kind = {1: "unsigned", 2: "signed", 3: "float"}.get(sample, "other")
-        raise DataError(f"{path}: expected 32-bit float metres, found {bits}-bit {kind}; convert it")
+        raise DataError(f"{path}: expected 32-bit float metres, got {bits}-bit {kind}; convert it")
     return _imdecode(path, data, "IMREAD_UNCHANGED")
 
 
@@ -315,7 +315,7 @@ def _decode_exr(path: Path, data: bytes) -> npt.NDArray[Any]:
     if depth.ndim == 3 and (depth[..., :1] == depth[..., :3]).all():  # Blender writes depth as three equal channels
         depth = depth[..., 0]
     if depth.ndim != 2:
-        raise DataError(f"{path}: expected one channel, found {depth.shape[2]}; export the depth channel alone")
+        raise DataError(f"{path}: expected one channel, got {depth.shape[2]}; export the depth channel alone")
     return depth
 
 
