@@ -258,9 +258,7 @@ def select_frames(
             scene.name, len(lost), len(chosen), ", ".join(map(str, sorted(lost)[:MAX_LISTED])), more,
         )  # fmt: skip
     return Selected(
-        indices=[index for index in complete if index not in lost],
-        incomplete=tuple(missing),
-        lost=tuple(sorted(lost)),
+        indices=[index for index in complete if index not in lost], incomplete=tuple(missing), lost=tuple(sorted(lost))
     )
 
 

@@ -139,10 +139,7 @@ def test_a_frame_reprojects_into_its_neighbour() -> None:
     assert same.mean() > 0.85
 
 
-@pytest.mark.parametrize(
-    ("name", "low", "high"),
-    [("scene0", 1.9, 2.2), ("scene2", 1.1, 1.27)],
-)
+@pytest.mark.parametrize(("name", "low", "high"), [("scene0", 1.9, 2.2), ("scene2", 1.1, 1.27)])
 def test_overlap_and_classes_are_as_in_the_paper(name: str, low: float, high: float) -> None:
     """Mean OP at 0.2 m: about 2 in two scenes, 1.15 to 1.25 in three; every class occurs in every scene."""
     scene = full(name)

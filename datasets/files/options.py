@@ -41,8 +41,7 @@ CameraAxes = Annotated[
 ]
 UpAxis = Annotated[Literal["x", "y", "z", "-x", "-y", "-z"] | None, Field(description="the world's up axis")]
 Crs = Annotated[
-    str | None,
-    Field(description="projected reference system of the world in metres: EPSG:32615, a PROJ string or WKT"),
+    str | None, Field(description="projected reference system of the world in metres: EPSG:32615, a PROJ string or WKT")
 ]
 PixelCentre = Annotated[
     float | None, Field(ge=0, le=1, description="where the intrinsics have the centre of the first pixel: 0 or 0.5")

@@ -118,11 +118,7 @@ def from_quaternions(translations: Poses, quaternions: Poses, path: Path) -> Pos
 
 
 def at_times(
-    times: Float64,
-    poses: Poses,
-    wanted: Float64,
-    max_gap: float,
-    method: Literal["interpolate", "nearest"],
+    times: Float64, poses: Poses, wanted: Float64, max_gap: float, method: Literal["interpolate", "nearest"]
 ) -> Poses:
     """(m, 4, 4) at `wanted` seconds of a trajectory (n, 4, 4) at ascending `times`: the nearest, or between the two.
 
