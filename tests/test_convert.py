@@ -330,14 +330,6 @@ def test_an_oblique_up_direction_and_unknown_classes_are_said_to_be_lost(tmp_pat
     assert opened(tmp_path / "out").frame(1, "net").labels is not None
 
 
-def test_scores_keep_type_and_layout(tmp_path):
-    room = Room(walk(2), soft=True)
-    of_memory(room, tmp_path, backbones=["net"])
-    scores = opened(tmp_path / "out").frame(1, "net-scores").scores
-    assert scores.dtype == np.float32
-    np.testing.assert_array_equal(scores, room.frame(1, "net").scores)
-
-
 def test_a_scene_without_labels_keeps_depth_poses_colour_and_masks(tmp_path):
     root = write(tmp_path / "room", Room(walk(3)))
     for part in ("net", "gt"):

@@ -165,16 +165,6 @@ def test_ground_truth_may_be_sparse(folder):
 # --- digest
 
 
-def test_the_digest_follows_the_content(folder, tmp_path):
-    scene = opened(folder)
-    digest = scene.digest([0, 1], "net")
-    assert digest == opened(write_scene(tmp_path / "elsewhere")).digest([0, 1], "net")
-    assert len({digest, *(scene.digest([0, 1], b) for b in ("net-scores", "gt")), scene.digest([0], "net")}) == 4
-    save_image(folder / "color/frame1.png", np.zeros((H, W, 3), np.uint8))
-    save_image(folder / "labels/net/frame10.png", np.zeros((H, W), np.uint8))
-    assert opened(folder).digest([0, 1], "net") == digest
-
-
 @pytest.mark.parametrize("changed", ["depth/frame2.png", "pose/frame2.txt", "labels/net/frame2.png", "intrinsics.txt"])
 def test_the_digest_sees_a_changed_file(folder, changed):
     digest = opened(folder).digest([0, 1], "net")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import struct
 from pathlib import Path
 
 import pytest
@@ -14,7 +13,6 @@ from posed_scene import fails
 
 from semstab.config import FrameSelection
 from semstab.datasets.colmap import read_model
-from semstab.datasets.files.depth import read_depth_map
 from semstab.datasets.formats.disk import read_table, records
 from semstab.datasets.scannet import read_class_table
 from semstab.datasets.scene import select_frames
@@ -103,19 +101,6 @@ def test_counts_that_do_not_match_are_named(tmp_path, name, file, match):
     fails(DataError, match, opened, FORMATS[name], tmp_path)
 
 
-@pytest.mark.parametrize("name", ["hololens", "replica, NICE-SLAM", "tartanair", "seven_scenes", "scannet"])
-def test_a_pose_with_nan_is_lost_and_no_frame(tmp_path, name, caplog):
-    form = FORMATS[name]
-    write(form, tmp_path)
-    path = next(p for p in text_files(tmp_path) if "pose" in str(p.relative_to(tmp_path)) or "traj" in p.name)
-    lines = path.read_text().splitlines()
-    write_lines(path, [lines[0].replace(lines[0].split()[0], "nan", 1), *lines[1:]])
-    scene = opened(form, tmp_path)
-    assert select_frames(scene, FrameSelection()).indices == [1, 2, 3]
-    assert "1 of 4 selected frames have no pose" in caplog.text
-    fails(DataError, "the pose is not finite", scene.frame, 0, "net")
-
-
 @pytest.mark.parametrize(
     ("text", "match"),
     [
@@ -166,21 +151,6 @@ def test_any_text_is_read_or_refused_in_one_line(tmp_path, content):
     promised(lambda: list(records(tmp_path / "table.txt")))
     promised(lambda: read_transforms(tmp_path / "transforms.json", tmp_path, tmp_path))
     promised(lambda: read_class_table(tmp_path / "t.tsv", "nyu40id"))
-
-
-@given(
-    images=st.binary(max_size=120),
-    cameras=st.binary(max_size=80),
-    count=st.integers(0, 2**64 - 1),
-    depth=st.binary(max_size=60),
-)
-@settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
-def test_any_bytes_are_read_or_refused_in_one_line(tmp_path, images, cameras, count, depth):
-    (tmp_path / "cameras.bin").write_bytes(struct.pack("<Q", count) + cameras)
-    (tmp_path / "images.bin").write_bytes(struct.pack("<Q", count) + images)
-    (tmp_path / "d.bin").write_bytes(b"2&3&1&" + depth)
-    promised(lambda: read_model(tmp_path))
-    promised(lambda: read_depth_map(tmp_path / "d.bin"))
 
 
 # --- as a run

@@ -8,7 +8,6 @@ import pytest
 from dataset_writers import CLASSES, COUNT, FORMATS, H, W, assert_same_voxels, opened, save, source, write_labels
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from PIL import Image
 from posed_scene import fails
 from scipy import ndimage
 
@@ -153,32 +152,6 @@ def test_a_labels_root_that_is_wrong_is_said(scene, tmp_path, caplog):
 
 
 # --- formats
-
-
-def test_every_format_holds_the_same_labels(scene):
-    root, names, frames = scene
-    colors = np.arange(24, dtype=np.uint8).reshape(8, 3) * 10
-    taxonomy = root / "mine.yaml"
-    taxonomy.write_text(
-        "classes:\n" + "".join(f"- {{name: {c}, color: {list(map(int, colors[k]))}}}\n" for k, c in enumerate(CLASSES))
-    )
-    for name, frame in zip(names, frames, strict=True):
-        ids = frame.labels
-        save(root / f"room/labels/grey/{name}.png", ids)
-        save(root / f"room/labels/wide/{name}.png", ids.astype(np.uint16))
-        save(root / f"room/labels/colors/{name}.png", colors[ids])
-        save(root / f"room/labels/numpy/{name}.npy", ids.astype(np.int64))
-        indexed = Image.fromarray(ids).convert("P")
-        indexed.putpalette([7, 7, 7] * 256)
-        for backbone in ("indexed", "zipped"):
-            (root / "room/labels" / backbone).mkdir(exist_ok=True)
-        indexed.save(root / f"room/labels/indexed/{name}.png")
-        np.savez(root / f"room/labels/zipped/{name}.npz", ids)
-    found = opened(FORM, root, classes=None, taxonomy=str(taxonomy))
-    assert len(found.backbones) == 6
-    for backbone in found.backbones:
-        for k, frame in enumerate(frames):
-            np.testing.assert_array_equal(found.frame(k, backbone).labels, frame.labels, err_msg=backbone)
 
 
 # --- another size

@@ -46,9 +46,9 @@ def test_opening_and_selecting_read_no_image(tmp_path, name, monkeypatch):
     assert is_image(read[-1])
 
 
-def test_a_posed_folder_of_ten_thousand_frames_opens_at_once(tmp_path):
+def test_a_posed_folder_of_thousands_of_frames_opens_at_once(tmp_path):
     """Two label sources, of which one has every hundredth frame; what is selected is all that has to be there."""
-    names = [f"{k:06d}" for k in range(10_000)]
+    names = [f"{k:06d}" for k in range(3000)]
     for part in ("depth", "pose", "labels/all", "labels/some"):
         (tmp_path / part).mkdir(parents=True)
     for name in names:
@@ -60,10 +60,10 @@ def test_a_posed_folder_of_ten_thousand_frames_opens_at_once(tmp_path):
     write_lines(tmp_path / "intrinsics.txt", ["9 0 3", "0 9 3", "0 0 1"])
     started = time.process_time()
     scene = opened(FORMATS["posed_folder"], tmp_path)
-    assert select_frames(scene, FrameSelection(), ["all"]).indices == [*range(10_000)]
+    assert select_frames(scene, FrameSelection(), ["all"]).indices == [*range(3000)]
     assert select_frames(scene, FrameSelection(stride=100), ["all", "some"]).left_out == 0
-    assert time.process_time() - started < 5
-    fails(DataError, "9900 missing", select_frames, scene, FrameSelection(), ["some"])
+    assert time.process_time() - started < 2
+    fails(DataError, "2970 missing", select_frames, scene, FrameSelection(), ["some"])
 
 
 def test_a_name_that_is_listed_in_a_folder_is_found_and_no_other(tmp_path):
