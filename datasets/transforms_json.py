@@ -74,7 +74,13 @@ def read_transforms(path: Path, root: Path, folder: Path, depth: Template | None
     wheres = [f"{path}: frame {k}" for k in range(len(entries))]
     images = [_named(entry, ("file_path",), path, root, where) for entry, where in zip(entries, wheres, strict=True)]
     shared = Path(os.path.commonpath([image.parent for image in images if image is not None] or [path.parent]))
-    scale, frames = _depth_scale(content, path), []
+    scale, frames = MILLIMETRES, []  # units in a metre
+    key = next((k for k in ("integer_depth_scale", "depth_unit_scale_factor") if content.get(k) is not None), None)
+    if key is not None:
+        metres = number(content, key, str(path))
+        if metres <= 0 or math.isinf(1 / metres):
+            raise DataError(f"{path}: '{key}' is {metres:g}; expected the metres in a unit of depth")
+        scale = 1 / metres
     for entry, image, where in zip(entries, images, wheres, strict=True):
         if image is None:
             raise DataError(f"{where}: 'file_path' is missing; add it")
@@ -139,14 +145,3 @@ def _focal(values: Mapping[str, Any], axis: str, where: str) -> float | None:
     if not 0 < angle < math.pi:
         raise DataError(f"{where}: 'camera_angle_{axis}' is {angle:g}; expected radians between 0 and pi")
     return side / (2 * math.tan(angle / 2))
-
-
-def _depth_scale(content: Mapping[str, Any], path: Path) -> float:
-    """Units in a metre."""
-    key = next((k for k in ("integer_depth_scale", "depth_unit_scale_factor") if content.get(k) is not None), None)
-    if key is None:
-        return MILLIMETRES
-    metres = number(content, key, str(path))
-    if metres <= 0 or math.isinf(1 / metres):
-        raise DataError(f"{path}: '{key}' is {metres:g}; expected the metres in a unit of depth")
-    return 1 / metres

@@ -68,7 +68,7 @@ class CityScene(Scene):
         self._flight = FLIGHTS[name]
         self.origin = np.array(options.origin, dtype=np.float64)
         self.rendered: dict[int, Rendered] = {}
-        """The frames that are kept, by their index."""
+        """By index; those that fit into memory."""
         self._lock = threading.Lock()
 
     def __len__(self) -> int:

@@ -94,7 +94,7 @@ class Street:
         return self.high - self.low
 
     def strip(self, left: float, right: float, low: float | None = None, high: float | None = None) -> Rectangle:
-        """The part between two offsets from the middle, over the whole length unless said."""
+        """The part between two offsets from the middle, over the whole length by default."""
         low, high = self.low if low is None else low, self.high if high is None else high
         if self.axis == "s":
             return Rectangle(low, high, self.at + left, self.at + right)
@@ -111,7 +111,7 @@ class Street:
         return 0.0 if self.axis == "s" else np.pi / 2
 
     def clear_of_crossings(self, along: Float64, streets: list[Street], distance: float) -> Float64:
-        """Those places along this street that keep a distance from every street that meets it."""
+        """The points along this street at a distance from every street that meets it."""
         for other in streets:
             if other.axis != self.axis and other.low - 1 <= self.at <= other.high + 1:
                 along = along[np.abs(along - other.at) > distance + other.width / 2]

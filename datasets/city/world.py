@@ -66,18 +66,18 @@ def person() -> Shape:
     )
 
 
-def _painted_cars(count: int, rng: np.random.Generator) -> dict[str, Float64]:
-    """Paint, and scales of length, width and height; one in seven is a van."""
+def _painted_cars(count: int, rng: np.random.Generator) -> tuple[Float64, Float64]:
+    """Scales of length, width and height, and paint; one in seven is a van."""
     paint = choose(PAINT, count, rng)
     sizes = rng.uniform([0.86, 0.95, 0.97], [1.08, 1.04, 1.12], size=(count, 3))
     sizes[rng.random(count) < 1 / 7] *= [1.2, 1.1, 1.4]
-    return {"tint": paint, "size": sizes}
+    return sizes, paint
 
 
-def _dressed_people(count: int, rng: np.random.Generator) -> dict[str, Float64]:
-    """Clothes and heights."""
+def _dressed_people(count: int, rng: np.random.Generator) -> tuple[Float64, Float64]:
+    """Scales of the three axes, and clothes."""
     clothes = choose(CLOTHES, count, rng)
-    return {"tint": clothes, "size": np.tile(rng.uniform(0.9, 1.08, size=(count, 1)), (1, 3))}
+    return np.tile(rng.uniform(0.9, 1.08, size=(count, 1)), (1, 3)), clothes
 
 
 def roadside_cars(streets: list[Street], rng: np.random.Generator) -> list[Spot]:
@@ -100,7 +100,7 @@ class Movers:
 
     low, length, at  of their streets; along_s whether it runs along the plan's s axis
     offset           from the street's middle; start and speed along it, towards its high end where positive
-    tint, size       (n, 3) and (n,) or (n, 3): what they look like
+    tint, size       (n, 3) and (n,) or (n, 3): their appearance
     """
 
     low: Float64
@@ -134,8 +134,9 @@ class Traffic:
         """A car every 38 m of lane or so at 6 to 13 m/s, a walker every 70 m of sidewalk or so at 0.9 to 1.7 m/s."""
         cars = _movers(streets, 38.0, lambda width: min(1.75, 0.135 * width), (6.0, 13.0), rng)
         walkers = _movers(streets, 70.0, lambda width: width / 2 + SIDEWALK / 2, (0.9, 1.7), rng)
-        cars = replace(cars, **_painted_cars(len(cars.at), rng))
-        return cls(site, cars, replace(walkers, **_dressed_people(len(walkers.at), rng)))
+        sizes, paint = _painted_cars(len(cars.at), rng)
+        heights, clothes = _dressed_people(len(walkers.at), rng)
+        return cls(site, replace(cars, size=sizes, tint=paint), replace(walkers, size=heights, tint=clothes))
 
     def at(self, seconds: float, camera: Float64) -> Surface:
         """What moves as it stands at a time, as far as it is within SIGHT of the camera at (x, y, z)."""
@@ -264,8 +265,8 @@ def _standing(town: Inventory, site: Site, path: Float64, seed: int, flight: Fli
         bushes(close(town.bushes), site, _rng(seed, flight, 9)),
         hedges(town.hedges, site, _rng(seed, flight, 10)),
         fences(town.fences, site, _rng(seed, flight, 11)),
-        site.stand(car(), STATIC_CAR, cars[:3], ROAD_ABOVE, **_painted_cars(cars.shape[1], _rng(seed, flight, 12))),
-        site.stand(person(), HUMAN, people[:3], ROAD_ABOVE, **_dressed_people(people.shape[1], _rng(seed, flight, 13))),
+        site.stand(car(), STATIC_CAR, cars[:3], ROAD_ABOVE, *_painted_cars(cars.shape[1], _rng(seed, flight, 12))),
+        site.stand(person(), HUMAN, people[:3], ROAD_ABOVE, *_dressed_people(people.shape[1], _rng(seed, flight, 13))),
         site.stand(box(), CLUTTER, bins[:3], 0.02, size=extent * bins[3][:, None], tint=tint),
     ]
 

@@ -13,7 +13,7 @@ from semstab.core.types import UInt16
 from semstab.datasets.files.labels import SceneEntry
 from semstab.datasets.files.options import FileOptions, Folders, FrameSource, inside
 from semstab.datasets.files.scene import FileScene
-from semstab.datasets.files.surfaces import SEEN_FROM_ABOVE, Surface, usual_folder
+from semstab.datasets.files.surfaces import SEEN_FROM_ABOVE, Surface
 from semstab.datasets.formats.disk import files_named, natural, subfolders
 from semstab.datasets.formats.images import COLOR_SUFFIXES
 from semstab.datasets.geometry.cameras import Camera, Poses
@@ -69,7 +69,8 @@ class FileDataset(Dataset, Generic[Options]):
                     f"{options.surface}: is a surface over x and y, but up_axis is {options.up_axis}; turn it, or take"
                     " a mesh"
                 )
-            casts = None if options.casts is False else options.casts or usual_folder()
+            cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+            casts = None if options.casts is False else options.casts or cache / "semstab" / "casts"
             surface = Surface(options.surface, options.surface_cell, georeference, casts)
         scene = FileScene(entry, frames, options, self.class_ids(), surface)
         scene.georeference = georeference

@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 import logging
 import math
-import os
 import struct
 import threading
 import zlib
@@ -359,11 +358,6 @@ class Caster:
 # Cast depth is stored in files, so that a second run reads it.
 
 logger = logging.getLogger("semstab")
-
-
-def usual_folder() -> Path:
-    """The user's cache folder."""
-    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "semstab" / "casts"
 
 
 class Casts:

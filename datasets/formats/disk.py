@@ -228,12 +228,10 @@ def read_pose(path: Path) -> Float64:
     Raises DataError for anything else.
     """
     numbers = _numbers(path)
-    if len(numbers) == 12:
-        numbers += [0, 0, 0, 1]
-    if len(numbers) != 16:
+    if len(numbers) not in (12, 16):
         hint = " (position and quaternion?)" if len(numbers) in (7, 8) else ""
         raise DataError(f"{path}: expected a 4x4 or 3x4 matrix, got {len(numbers)} numbers{hint}; convert it")
-    return np.array(numbers, dtype=np.float64).reshape(4, 4)
+    return np.array([*numbers, 0, 0, 0, 1][:16], dtype=np.float64).reshape(4, 4)
 
 
 def read_intrinsics(path: Path) -> Intrinsics:

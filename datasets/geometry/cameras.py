@@ -83,7 +83,7 @@ def to_camera_to_world(T: Poses, convention: str, axes: str, where: str) -> Pose
         raise DataError(f"{where}: the pose holds {largest:g}, which no camera's has; is the file damaged?")
     if convention == "world_to_camera":
         try:
-            T = np.linalg.inv(T)
+            T = np.linalg.inv(T).astype(np.float64, copy=False)
         except np.linalg.LinAlgError as error:
             raise DataError(
                 f"{where}: the pose cannot be inverted, so it is not rigid; leave this frame out"
