@@ -2,13 +2,39 @@
 
 from __future__ import annotations
 
+import io
+import itertools
+import os
+import re
+import shlex
+import time
+from pathlib import Path
+
 import numpy as np
 import pytest
-from dataset_writers import CLASSES, COUNT, FORMATS, H, W, assert_same_voxels, opened, save, source, write_labels
+from dataset_writers import (
+    CLASSES,
+    COUNT,
+    FORMATS,
+    H,
+    W,
+    assert_same_voxels,
+    opened,
+    save,
+    source,
+    write_labels,
+    write_lines,
+)
+from posed_scene import fails
+from pydantic import ValidationError
 
-from semstab.config import FrameSelection
-from semstab.datasets import open_dataset
+from semstab.config import Config, FrameSelection
+from semstab.core.files import parse_yaml
+from semstab.datasets import REGISTRY, open_dataset, options_model
+from semstab.datasets.files.options import Folders
 from semstab.datasets.scene import select_frames
+from semstab.errors import DataError
+from semstab.model.labels import shipped_taxonomies
 
 
 @pytest.fixture(params=FORMATS)
@@ -141,3 +167,127 @@ def test_the_camera_of_7_scenes_is_that_of_its_file(tmp_path, above):
     np.testing.assert_allclose(found.matrix, frames[0].intrinsics.matrix)
     said = open_dataset("seven_scenes", {"root": folder, "intrinsics": (50, 51, 24, 16)}).scene("seq-01")
     assert said.intrinsics(0, (H, W)).fy == 51
+
+
+# --- opening reads no image
+
+
+IMAGES = {".png", ".jpg", ".npy", ".tif"}
+
+
+def is_image(path: Path) -> bool:
+    return path.suffix in IMAGES or "depth_maps" in path.parts
+
+
+@pytest.mark.parametrize("name", FORMATS)
+def test_opening_and_selecting_read_no_image(tmp_path, name, monkeypatch):
+    form = FORMATS[name]
+    names = form.write(tmp_path, source(form.scale))
+    write_labels(tmp_path, names, source(form.scale))
+    images = [path for path in tmp_path.rglob("*") if path.is_file() and is_image(path)]
+    assert len(images) >= 3 * COUNT
+    for path in images:
+        path.write_bytes(b"")  # whoever reads it fails
+    read = []
+    for module in (io, os):  # who opens a file by either of the two is seen
+        actual = module.open
+        monkeypatch.setattr(
+            module, "open", lambda path, *rest, to=actual, **how: (read.append(Path(path)), to(path, *rest, **how))[1]
+        )
+    scene = opened(form, tmp_path)
+    assert select_frames(scene, FrameSelection()).indices == [*range(COUNT)]
+    assert read
+    assert not [path for path in read if is_image(path)]
+    fails(DataError, "the file is empty", scene.frame, 0, "net")
+    assert is_image(read[-1])
+
+
+def test_a_posed_folder_of_thousands_of_frames_opens_at_once(tmp_path):
+    """Two label sources, of which one has every hundredth frame; what is selected is all that has to be there."""
+    names = [f"{k:06d}" for k in range(3000)]
+    for part in ("depth", "pose", "labels/all", "labels/some"):
+        (tmp_path / part).mkdir(parents=True)
+    for name in names:
+        (tmp_path / f"depth/{name}.png").touch()
+        (tmp_path / f"labels/all/{name}.png").touch()
+        write_lines(tmp_path / f"pose/{name}.txt", ["1 0 0 0", "0 1 0 0", "0 0 1 0"])
+    for name in names[::100]:
+        (tmp_path / f"labels/some/{name}.png").touch()
+    write_lines(tmp_path / "intrinsics.txt", ["9 0 3", "0 9 3", "0 0 1"])
+    started = time.process_time()
+    scene = opened(FORMATS["posed_folder"], tmp_path)
+    assert select_frames(scene, FrameSelection(), ["all"]).indices == [*range(3000)]
+    assert select_frames(scene, FrameSelection(stride=100), ["all", "some"]).left_out == 0
+    assert time.process_time() - started < 2
+    fails(DataError, "2970 missing", select_frames, scene, FrameSelection(), ["some"])
+
+
+def test_a_name_that_is_listed_in_a_folder_is_found_and_no_other(tmp_path):
+    for name in ("b.png", "a", "é.PNG", "b.pngx"):
+        (tmp_path / name).touch()
+    folders = Folders()
+    asked = ("b.png", "a", "é.PNG", "b.pngx", "b", "b.pn", "c", "b.pngxy")
+    assert [folders.has(tmp_path / name) for name in asked] == [True] * 4 + [False] * 4
+    assert folders.one_of(tmp_path / "b", (".jpg", ".png")) == tmp_path / "b.png"
+    assert folders.one_of(tmp_path / "é.PNG", (".png",)) == tmp_path / "é.PNG"
+    assert not folders.has(tmp_path / "nowhere/a")
+
+
+# --- docs/datasets.md
+
+
+TEXT = (Path(__file__).parents[1] / "docs/datasets.md").read_text()
+SECTIONS = {match[1]: match[2] for match in re.finditer(r"^## [^\n]*\(`(\w+)`\)\n(.*?)(?=^## |\Z)", TEXT, re.M | re.S)}
+READERS = {
+    name for name, entry in REGISTRY.builtin.items() if re.fullmatch(r"semstab\.datasets\.\w+:\w+", entry.target)
+}
+
+
+def test_every_reader_has_a_section_with_its_terms():
+    assert set(SECTIONS) == READERS - {"city", "posed_folder", "predicted"}
+    for name, section in SECTIONS.items():
+        assert all(f"- **{word}**" in section for word in ("Get", "Licence", "Read", "Name")), name
+        assert f"--dataset {name}" in section
+
+
+COMMANDS = [
+    (name, command)
+    for name, section in SECTIONS.items()
+    for block in re.findall(r"```bash\n(.*?)```", section, re.S)
+    for command in block.replace("\\\n", " ").strip().splitlines()
+]
+
+
+@pytest.mark.parametrize(("name", "command"), COMMANDS)
+def test_the_sample_commands_set_what_there_is(name, command):
+    words = shlex.split(command)
+    assert words[words.index("--dataset") + 1] == name
+    options, frames = {"root": "."}, {}
+    for setting in (word for before, word in itertools.pairwise(words) if before == "--set"):
+        key, _, value = setting.partition("=")
+        group = options if key.startswith("dataset.options.") else frames
+        group[key.rpartition(".")[2]] = parse_yaml(value, key)
+    try:
+        model = options_model(name).model_validate(options)
+    except ValidationError as error:
+        pytest.fail(str(error))
+    Config.build({"frames": frames})
+    assert getattr(model, "taxonomy", None) in (None, *shipped_taxonomies())
+
+
+def test_the_options_in_tables_are_those_of_every_reader():
+    table = TEXT.split("## Options that every dataset below has")[1].split("## Frames")[0]
+    named = set(
+        re.findall(r"`(\w+)`", "".join(line.split("|")[1] for line in table.splitlines() if line.startswith("|")))
+    )
+    assert len(named) > 8
+    for name in SECTIONS:
+        assert named <= set(options_model(name).model_fields), name
+
+
+def test_the_frames_that_are_shown_are_settings():
+    table = TEXT.split("## Frames")[1].split("## UAVid")[0]
+    shown = re.findall(r"\| `(\{.*?\})` \|", table)
+    assert len(shown) == 4
+    for text in shown:
+        Config.build({"frames": parse_yaml(text, "docs/datasets.md")})
