@@ -30,7 +30,6 @@ from semstab.datasets.formats.disk import AGAIN, natural, to_number
 from semstab.datasets.formats.images import DEPTH_SUFFIXES
 from semstab.datasets.geometry.cameras import Camera, Poses, from_quaternions
 from semstab.errors import DataError
-from semstab.model.frames import Intrinsics
 
 MODEL_FOLDERS = ("sparse", "sparse/0", ".")
 
@@ -173,11 +172,8 @@ def _pinhole(camera: Stated, where: str) -> Camera:
             f"{where} is {model}, which distorts; undistort the images ('colmap image_undistorter')"
             " and use the model that it writes"
         )
-    fx, fy, (cx, cy) = parameters[0], parameters[focals - 1], parameters[focals : focals + 2]
-    try:
-        return Camera(Intrinsics(fx, fy, cx, cy), (width, height))
-    except DataError as error:
-        raise DataError(f"{where}: {error}") from error
+    cx, cy = parameters[focals : focals + 2]
+    return Camera.stated((parameters[0], parameters[focals - 1], cx, cy), (width, height), where)
 
 
 def _cameras_txt(file: BinaryIO, path: Path) -> Iterator[tuple[int, Stated]]:

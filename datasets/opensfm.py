@@ -18,7 +18,6 @@ from semstab.datasets.formats.disk import number, pixels, read_content, read_obj
 from semstab.datasets.geometry.cameras import Camera, Poses
 from semstab.datasets.geometry.lenses import Lens
 from semstab.errors import DataError
-from semstab.model.frames import Intrinsics
 from semstab.model.georeference import Georeference
 
 MAX_BYTES = 2**32
@@ -54,9 +53,7 @@ def read_reconstruction(path: Path, wanted: int | None = None) -> list[Shot]:
     Raises DataError for a damaged file, several reconstructions where none is wanted, or an unknown camera model.
     """
     reconstructions = read_content(path, MAX_BYTES)
-    if not (isinstance(reconstructions, list) and reconstructions) or any(
-        type(one) is not dict for one in reconstructions
-    ):
+    if not isinstance(reconstructions, list) or {type(one) for one in reconstructions} != {dict}:
         raise DataError(f"{path}: expected a list of reconstructions; run the reconstruction again")
     if len(reconstructions) > 1 and wanted is None:
         names = "; ".join(f"{k}: {_summary(one)}" for k, one in enumerate(reconstructions[:5]))
@@ -125,11 +122,8 @@ def _lens(values: Mapping[str, Any], where: str) -> tuple[Camera, Lens | None]:
     model, keys = COEFFICIENTS[kind]
     coefficients = tuple(_or_zero(values, key, where) for key in keys)
     centre = ((width - 1) / 2, (height - 1) / 2)
-    try:
-        pinhole = Camera(Intrinsics((fx + fy) / 2, (fx + fy) / 2, *centre), (width, height))
-        stated = Camera(Intrinsics(fx, fy, centre[0] + cx, centre[1] + cy), (width, height))
-    except DataError as error:
-        raise DataError(f"{where}: {error}") from error
+    pinhole = Camera.stated(((fx + fy) / 2, (fx + fy) / 2, *centre), (width, height), where)
+    stated = Camera.stated((fx, fy, centre[0] + cx, centre[1] + cy), (width, height), where)
     if model == "brown" and not any(coefficients):
         return stated, None
     return pinhole, Lens(stated, "brown" if model == "brown" else "fisheye", coefficients)
@@ -162,7 +156,9 @@ def georeference_of(folder: Path, opensfm: Path, T_cw: Sequence[Poses]) -> Geore
     if not coords.is_file():
         return _topocentric(opensfm)
     east, north, positions = _read_coords(coords)
-    off = _off(centres, positions)
+    off = 0.0  # metres over the ground between the middles of cameras and positions
+    if len(positions):
+        off = float(np.hypot(*(np.median(centres[:, :2], axis=0) - np.median(positions[:, :2], axis=0))))
     if off > FAR and (local := _topocentric(opensfm)) is not None:
         return local
     if off > FAR:
@@ -192,14 +188,6 @@ def _read_coords(path: Path) -> tuple[float, float, Float64]:
     if not np.isfinite([east, north]).all():
         raise DataError(f"{path}: the offset {east:g} {north:g} is not finite; run ODM again")
     return east, north, positions
-
-
-def _off(centres: Float64, positions: Float64) -> float:
-    """Metres between the middles of cameras and positions, over the ground; 0 where there are no positions."""
-    if not len(positions):
-        return 0.0
-    middle = np.median(centres[:, :2], axis=0) - np.median(positions[:, :2], axis=0)
-    return float(np.hypot(*middle))
 
 
 def _topocentric(opensfm: Path) -> Georeference | None:

@@ -21,7 +21,6 @@ from semstab.datasets.formats.disk import matrix, natural, number, pixels, read_
 from semstab.datasets.formats.images import COLOR_SUFFIXES, DEPTH_SUFFIXES, MILLIMETRES
 from semstab.datasets.geometry.cameras import Camera
 from semstab.errors import DataError
-from semstab.model.frames import Intrinsics
 
 DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")
 PINHOLES = (None, "PINHOLE", "SIMPLE_PINHOLE", "OPENCV", "perspective")
@@ -128,10 +127,7 @@ def _camera(values: Mapping[str, Any], where: str) -> Camera:
     size = (pixels(values, "w", where), pixels(values, "h", where)) if "w" in values and "h" in values else None
     cx = size[0] / 2 if size and "cx" not in values else number(values, "cx", where)
     cy = size[1] / 2 if size and "cy" not in values else number(values, "cy", where)
-    try:
-        return Camera(Intrinsics(fx, fy, cx, cy), size)
-    except DataError as error:
-        raise DataError(f"{where}: {error}") from error
+    return Camera.stated((fx, fy, cx, cy), size, where)
 
 
 def _focal(values: Mapping[str, Any], axis: str, where: str) -> float | None:

@@ -111,12 +111,10 @@ class Tum(FileDataset[TumOptions]):
         ]
 
     def _list(self, folder: Path) -> str:
-        """The list of the images that make the frames."""
         cast = self.options.surface is not None and not (folder / "depth.txt").is_file()
         return "rgb.txt" if cast else "depth.txt"
 
     def _listed(self, folder: Path, name: str) -> tuple[Float64, list[Path]]:
-        """Time stamps and paths of a list of images."""
         path = folder / name
         times, paths = [], []
         for line, text in records(path):

@@ -40,7 +40,6 @@ def join(surfaces: Sequence[Surface]) -> Surface:
 
 
 def _joined(parts: Sequence[Surface | Shape]) -> tuple[Float64, Int64, Float64]:
-    """Vertices, faces and colours of all parts."""
     starts = np.cumsum([0, *(len(part.vertices) for part in parts)])
     faces = [part.faces + start for part, start in zip(parts, starts, strict=False)]
     colors = np.concatenate([part.colors for part in parts])

@@ -260,7 +260,6 @@ def _fields(land: Rectangle, town: Inventory, rng: np.random.Generator) -> None:
 
 
 def _crowd(land: Rectangle, count: int, town: Inventory, rng: np.random.Generator) -> None:
-    """People near the sidewalk."""
     for _ in range(count):
         s, t = rng.uniform(land.s0, land.s1), land.t0 - rng.uniform(0.2, 1.6)
         town.people.append(Spot(s, t, rng.uniform(0, 6.28)))

@@ -271,9 +271,8 @@ def _standing(town: Inventory, site: Site, path: Float64, seed: int, flight: Fli
     ]
 
 
-def _near(places: Sequence[tuple[float, ...]], layout: Layout, path: Float64, distance: float) -> list[bool]:
-    """Which plan points are within a distance of the path."""
-    s, t = np.array(places, dtype=np.float64).T
+def _near(points: Sequence[tuple[float, ...]], layout: Layout, path: Float64, distance: float) -> list[bool]:
+    s, t = np.array(points, dtype=np.float64).T
     return [bool(near) for near in _distance(np.stack(layout.to_world(s, t), axis=1), path) < distance]
 
 

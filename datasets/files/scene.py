@@ -270,7 +270,6 @@ class FileScene(Scene):
         color: bool,
         files: Mapping[str, Path] | None = None,
     ) -> Frame:
-        """The frame with labels or scores that have the depth's pixels."""
         source, timestamps = self._frame(index), self.timestamps
         image = self._color_file(source)  # named also where it is not read: a recording takes the file as it is
         mask, masked = self._maps.mask_file(source), None
@@ -327,7 +326,6 @@ class FileScene(Scene):
         return read_pose(source.pose_file) if source.pose is None else source.pose
 
     def _color_file(self, source: FrameSource) -> Path | None:
-        """The colour image of a frame, where there is one."""
         return source.color if source.color is not None and self._folders.has(source.color) else None
 
     def _frame(self, index: int) -> FrameSource:

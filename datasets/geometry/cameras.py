@@ -15,6 +15,7 @@ from semstab.errors import DataError
 from semstab.model.frames import Intrinsics
 
 LARGEST = 1e9
+FxFyCxCy = tuple[float, float, float, float]
 
 
 @dataclass(frozen=True)
@@ -33,6 +34,14 @@ class Camera:
             if not least <= abs(value) <= LARGEST:
                 raise DataError(f"intrinsics: {name} = {value:g} pixels is none of a camera; is the file damaged?")
 
+    @classmethod
+    def stated(cls, numbers: FxFyCxCy, size: tuple[int, int] | None, where: str) -> Camera:
+        """A camera as the file `where` states it. Raises DataError that names it for numbers that no camera has."""
+        try:
+            return cls(Intrinsics(*numbers), size)
+        except DataError as error:
+            raise DataError(f"{where}: {error}") from error
+
     def at(self, shape: tuple[int, ...], centre: float = 0.0) -> Intrinsics:
         """Intrinsics, pixel centres at integers, of an image of the whole field of view and of that shape (H, W, ...).
 
@@ -41,9 +50,6 @@ class Camera:
         stated, size = self.intrinsics, (shape[1], shape[0])
         K = Intrinsics(stated.fx, stated.fy, stated.cx - centre, stated.cy - centre)
         return K if self.size in (None, size) else K.resized(self.size or size, size)
-
-
-FxFyCxCy = tuple[float, float, float, float]
 
 
 def camera_of(stated: FxFyCxCy | None, usual: FxFyCxCy, size: tuple[int, int]) -> Camera:
