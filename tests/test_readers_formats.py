@@ -7,6 +7,7 @@ import itertools
 import os
 import re
 import shlex
+import shutil
 import time
 from pathlib import Path
 
@@ -22,7 +23,7 @@ from dataset_writers import (
     opened,
     save,
     source,
-    write_labels,
+    write_labelled,
     write_lines,
 )
 from posed_scene import fails
@@ -37,20 +38,24 @@ from semstab.errors import DataError
 from semstab.model.labels import shipped_taxonomies
 
 
-@pytest.fixture(params=FORMATS)
+@pytest.fixture(scope="module", params=FORMATS)
 def form(request):
     return FORMATS[request.param]
 
 
-@pytest.fixture
-def written(form, tmp_path):
-    """A root with one scene two folders deep, with labels of 'net' in its folder."""
-    frames = source(form.scale)
-    folder = tmp_path / "room" / "seq 1"
+@pytest.fixture(scope="module")
+def written(form, tmp_path_factory):
+    """A root with one scene two folders deep, with labels of 'net' in its folder; nothing is changed in it."""
+    folder = tmp_path_factory.mktemp("form") / "room" / "seq 1"
     folder.mkdir(parents=True)
-    names = form.write(folder, frames)
-    write_labels(folder, names, frames)
-    return folder, names, frames
+    return folder, *write_labelled(form, folder)
+
+
+@pytest.fixture
+def copied(written, tmp_path):
+    """The same in a folder of its own."""
+    shutil.copytree(written[0].parents[1], tmp_path / "copy")
+    return tmp_path / "copy/room/seq 1", *written[1:]
 
 
 def test_files_give_the_voxels_of_their_source(form, written):
@@ -125,8 +130,8 @@ def test_intrinsics_for_another_size_are_scaled(form, written):
     assert K.cx == pytest.approx((frames[0].intrinsics.cx + 0.5) / 2 - 0.5)
 
 
-def test_the_digest_follows_what_counts(form, written):
-    folder, names, frames = written
+def test_the_digest_follows_what_counts(form, copied):
+    folder, names, frames = copied
     scene = opened(form, folder)
     digest = scene.digest([0, 1], "net")
     for index in (0, 1):
@@ -140,8 +145,8 @@ def test_the_digest_follows_what_counts(form, written):
     assert opened(form, folder).digest([0, 1], "net") != digest
 
 
-def test_a_frame_that_lacks_a_file_is_an_error_or_left_out(form, written, caplog):
-    folder, names, _ = written
+def test_a_frame_that_lacks_a_file_is_an_error_or_left_out(form, copied, caplog):
+    folder, names, _ = copied
     depth = opened(form, folder).frame(1, "net").files["depth"]
     lost = folder / f"labels/net/{names[2]}.png"
     lost.unlink()
@@ -182,8 +187,7 @@ def is_image(path: Path) -> bool:
 @pytest.mark.parametrize("name", FORMATS)
 def test_opening_and_selecting_read_no_image(tmp_path, name, monkeypatch):
     form = FORMATS[name]
-    names = form.write(tmp_path, source(form.scale))
-    write_labels(tmp_path, names, source(form.scale))
+    write_labelled(form, tmp_path)
     images = [path for path in tmp_path.rglob("*") if path.is_file() and is_image(path)]
     assert len(images) >= 3 * COUNT
     for path in images:

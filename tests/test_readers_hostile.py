@@ -6,7 +6,7 @@ import os
 from pathlib import Path
 
 import pytest
-from dataset_writers import CLASSES, COUNT, FORMATS, opened, source, write_labels, write_lines
+from dataset_writers import CLASSES, COUNT, FORMATS, opened, write_labelled, write_lines
 from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 from image_files import raw_png
@@ -29,10 +29,7 @@ from semstab.settings import load_config
 
 def write(form, folder: Path) -> list[str]:
     folder.mkdir(parents=True, exist_ok=True)
-    frames = source(form.scale)
-    names = form.write(folder, frames)
-    write_labels(folder, names, frames)
-    return names
+    return write_labelled(form, folder)[0]
 
 
 @pytest.fixture(params=FORMATS)

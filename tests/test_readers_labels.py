@@ -5,7 +5,19 @@ from __future__ import annotations
 import cv2
 import numpy as np
 import pytest
-from dataset_writers import CLASSES, COUNT, FORMATS, H, W, assert_same_voxels, opened, save, source, write_labels
+from dataset_writers import (
+    CLASSES,
+    COUNT,
+    FORMATS,
+    H,
+    W,
+    assert_same_voxels,
+    opened,
+    save,
+    source,
+    write_labelled,
+    write_labels,
+)
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from posed_scene import fails
@@ -257,9 +269,7 @@ def test_depth_of_another_size_than_the_intrinsics_and_the_labels(scene):
 
 
 def test_void_ids_and_taxonomies_go_by_label_source(tmp_path):
-    frames = source(1000)
-    names = SCANNET.write(tmp_path, frames)
-    write_labels(tmp_path, names, frames)
+    names, frames = write_labelled(SCANNET, tmp_path)
     write_labels(tmp_path, names, frames, "label-filt/{}.png")
     (tmp_path / "gt.yaml").write_text("classes: [nothing, p, q, r, s, t, u, v, w]\n")
     found = opened(SCANNET, tmp_path, label_camera="depth", taxonomies={"gt": str(tmp_path / "gt.yaml")})
