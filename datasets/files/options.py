@@ -40,9 +40,6 @@ CameraAxes = Annotated[
     Field(description="axes of the camera: opencv, opengl, or ned (x forward, y right, z down)"),
 ]
 UpAxis = Annotated[Literal["x", "y", "z", "-x", "-y", "-z"] | None, Field(description="the world's up axis")]
-Crs = Annotated[
-    str | None, Field(description="projected reference system of the world in metres: EPSG:32615, a PROJ string or WKT")
-]
 PixelCentre = Annotated[
     float | None, Field(ge=0, le=1, description="where the intrinsics have the centre of the first pixel: 0 or 0.5")
 ]
@@ -107,7 +104,9 @@ class FileSettings(Settings):
     camera_axes: CameraAxes = "opencv"
     up_axis: UpAxis = None
     metres_per_unit: MetresPerUnit = 1.0
-    crs: Crs = None
+    crs: str | None = Field(
+        None, description="projected reference system of the world in metres: EPSG:32615, a PROJ string or WKT"
+    )
     offset: Offset = None
 
     intrinsics_size: Size = None

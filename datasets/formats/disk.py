@@ -8,9 +8,7 @@ import math
 import os
 import re
 import reprlib
-import struct
 import zipfile
-import zlib
 from array import array
 from collections.abc import Container, Iterator, Mapping
 from pathlib import Path
@@ -149,7 +147,6 @@ def _decode_npy(where: str, data: bytes) -> npt.NDArray[Any]:
 
 
 def _decode_npz(path: Path, data: bytes, key: str) -> npt.NDArray[Any]:
-    damage = (zipfile.BadZipFile, zlib.error, struct.error, OSError, EOFError, ValueError, LookupError, RuntimeError)
     try:
         with zipfile.ZipFile(io.BytesIO(data)) as archive:
             members = {name.removesuffix(".npy"): name for name in archive.namelist()}
@@ -159,7 +156,7 @@ def _decode_npz(path: Path, data: bytes, key: str) -> npt.NDArray[Any]:
             content = archive.read(name)
     except DataError:
         raise
-    except damage as error:
+    except Exception as error:
         raise DataError(f"{path}: not a whole .npz archive ({one_line(error)}); {AGAIN}") from error
     return _decode_npy(f"{path} ({reprlib.repr(name)})", content)
 

@@ -240,12 +240,11 @@ def _whole_png(path: Path, data: bytes) -> Iterator[Png]:
 @contextmanager
 def _one_line(path: Path, what: str) -> Iterator[None]:
     """Turn what Pillow raises for damaged files into DataError."""
-    damage = (OSError, SyntaxError, ValueError, TypeError, LookupError, EOFError, struct.error, ZeroDivisionError)
     try:
         yield
     except DataError:
         raise
-    except damage as error:
+    except Exception as error:
         raise DataError(f"{path}: not a whole {what} image ({one_line(error)}); {AGAIN}") from error
 
 
