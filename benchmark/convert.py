@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -29,7 +28,6 @@ from semstab.core.files import (
     write_png,
     write_text,
 )
-from semstab.core.json_form import from_json
 from semstab.core.prefetch import prefetch
 from semstab.core.types import Float32, Float64, UInt16
 from semstab.datasets import GROUND_TRUTH, Scene, open_dataset
@@ -105,18 +103,6 @@ def depth_format(depths: Sequence[Float32], tolerance: float) -> DepthFormat:
     return DepthFormat(best if errors[best] <= tolerance else None)
 
 
-@dataclass(frozen=True)
-class _Conversion:
-    """The values of conversion.json that a later start needs."""
-
-    key: str
-    depth_scale: float | None
-
-    def __post_init__(self) -> None:
-        if self.depth_scale is not None and not 0 < self.depth_scale < math.inf:
-            raise ValueError(f"depth_scale is {self.depth_scale}")
-
-
 class DepthFormatError(Exception):
     """A depth image that the folder's 16-bit format cannot hold."""
 
@@ -149,12 +135,12 @@ class SceneFolder:
             for folder in self.path.glob("**/"):
                 remove_leftovers(folder)
         self.form = form
-        said = dict(scene_settings) | ({} if form.scale is None else {"depth_scale": form.scale})
+        settings = dict(scene_settings) | ({} if form.scale is None else {"depth_scale": form.scale})
         write_json(
             self.path / CONVERSION_FILE,
             {"schema": SCHEMA, "key": self._key, "depth_scale": form.scale, "settings": self._settings},
         )
-        write_text(self.path / SETTINGS_FILE, yaml.safe_dump(said, sort_keys=False))
+        write_text(self.path / SETTINGS_FILE, yaml.safe_dump(settings, sort_keys=False))
 
     def close(self) -> None:
         """Release the lock of the folder."""
@@ -169,7 +155,7 @@ class SceneFolder:
     def has_geometry(self, name: str) -> bool:
         """Return whether depth, pose, colour and mask of a frame are there: depth is written last."""
         assert self.form is not None
-        return self._depth_path(name, self.form).exists()
+        return (self.path / "depth" / f"{name}{self.form.suffix}").exists()
 
     def has_labels(self, name: str, backbone: str) -> bool:
         """Return whether a frame's labels or scores are there."""
@@ -195,7 +181,7 @@ class SceneFolder:
         if frame.mask is not None:
             write_png(self.path / "mask" / f"{name}.png", np.where(frame.mask, 0, 255).astype(np.uint8))
         write_text(self.path / "pose" / f"{name}.txt", matrix_text(frame.T_wc))
-        path = self._depth_path(name, self.form)
+        path = self.path / "depth" / f"{name}{self.form.suffix}"
         if self.form.scale is None:
             with atomic_path(path) as temporary:
                 np.save(temporary, stored)
@@ -208,21 +194,17 @@ class SceneFolder:
         if frame.scores is None:
             assert frame.labels is not None
             write_png(path, frame.labels)
-            return
-        with atomic_path(path) as temporary:
-            np.savez_compressed(temporary, scores=frame.scores.transpose(2, 0, 1))
+        else:
+            with atomic_path(path) as temporary:
+                np.savez_compressed(temporary, scores=frame.scores.transpose(2, 0, 1))
 
     def write_classes(self, backbone: str, space: LabelSpace) -> None:
         """Write the classes of a backbone next to its maps."""
-        folder = self._label_path("", backbone, self.is_soft(backbone)).parent
-        space.save(folder / LABEL_SPACE_FILE)
+        space.save(self._label_path("", backbone, self.is_soft(backbone)).parent / LABEL_SPACE_FILE)
 
     def read_as(self, backbone: str) -> str:
         """Return the name of the backbone as posed_folder reads it."""
         return f"{_bare(backbone)}{SCORES_SUFFIX}" if self.is_soft(backbone) else folder_name(backbone)
-
-    def _depth_path(self, name: str, form: DepthFormat) -> Path:
-        return self.path / "depth" / f"{name}{form.suffix}"
 
     def _label_path(self, name: str, backbone: str, soft: bool) -> Path:
         if soft:
@@ -249,14 +231,18 @@ class SceneFolder:
                 raise ConfigError(f"{self.path}: is there already and holds no conversion; choose another --out")
             return None
         try:
-            there = from_json(_Conversion, read_json(manifest), manifest)
-        except DataError as error:
+            there = read_json(manifest)
+            key, scale = there["key"], there["depth_scale"]
+            form = DepthFormat(None if scale is None else float(scale))
+            if form.scale is not None and not 0 < form.scale < np.inf:
+                raise ValueError(f"depth_scale is {scale}")
+        except (DataError, LookupError, TypeError, ValueError) as error:
             raise DataError(f"{manifest}: damaged; delete {self.path}, and the scene is converted again") from error
-        if there.key != self._key:
+        if key != self._key:
             raise ConfigError(
                 f"{self.path}: was converted from other data or with other settings; choose another --out"
             )
-        return DepthFormat(there.depth_scale)
+        return form
 
 
 def folder_name(name: str) -> str:
@@ -330,17 +316,17 @@ def convert_scene(scene: Scene, config: Config, path: Path, depth_error: float, 
     if repeated := [name for name in backbones if folders.count(folder_name(name)) > 1]:
         raise ConfigError(f"{scene.name}: {' and '.join(repeated)} would get one folder; choose with --backbone")
     work = _Work(scene, indices, backbones, folder, progress)
-    said: dict[str, Any] = {"pose_convention": "camera_to_world", "camera_axes": "opencv"}
+    settings: dict[str, Any] = {"pose_convention": "camera_to_world", "camera_axes": "opencv"}
     if up := _up_axis(scene):
-        said["up_axis"] = up
+        settings["up_axis"] = up
     if scene.georeference is not None:
-        said |= {"crs": scene.georeference.crs, "offset": list(scene.georeference.offset)}
+        settings |= {"crs": scene.georeference.crs, "offset": list(scene.georeference.offset)}
     with contextlib.closing(folder):
-        folder.begin(folder.form or depth_format(work.probe(), depth_error), said)
+        folder.begin(folder.form or depth_format(work.probe(), depth_error), settings)
         try:
             written = work.write()
         except DepthFormatError:
-            folder.begin(DepthFormat(None), said)
+            folder.begin(DepthFormat(None), settings)
             written = work.write()
     return Converted(
         scene=scene.name,
@@ -448,4 +434,4 @@ def print_converted(converted: Converted, console: Console) -> None:
     for old, new in converted.renamed.items():
         console.print(f"  {old} is called {new} there")
     for lost in converted.lost:
-        console.print(f"  not kept: {lost}")
+        console.print(f"  not converted: {lost}")

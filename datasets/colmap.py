@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import os
 import struct
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -30,7 +30,6 @@ from semstab.datasets.formats.disk import AGAIN, natural, to_number
 from semstab.datasets.formats.images import DEPTH_SUFFIXES
 from semstab.datasets.geometry.cameras import Camera, Poses, from_quaternions
 from semstab.errors import DataError
-from semstab.model.frames import Intrinsics
 
 MODEL_FOLDERS = ("sparse", "sparse/0", ".")
 
@@ -76,13 +75,13 @@ class Colmap(FileDataset[ColmapOptions]):
         path, images = read_model(model)
         frames = []
         for image in images:
-            name = image_name(image.name)
-            wanted = inside(options.root, folder, self._depth.filled(image=image.name, name=name), str(path))
+            depth_name = self._depth.filled(image=image.name, name=image.frame)
+            wanted = inside(options.root, folder, depth_name, str(path))
             depth = folders.one_of(wanted, (*DEPTH_SUFFIXES, ".bin")) or wanted
             color = inside(options.root, folder, f"{options.images}/{image.name}", str(path))
             frames.append(
                 FrameSource(
-                    name=name,
+                    name=image.frame,
                     depth=depth,
                     pose=image.T_cw,
                     pose_file=path,
@@ -101,14 +100,12 @@ class Colmap(FileDataset[ColmapOptions]):
 
 # The sparse model, text and binary (colmap.github.io/format.html): the cameras and the images; points are skipped.
 
-MODELS = (
-    "SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE", "FULL_OPENCV", "FOV",
-    "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "THIN_PRISM_FISHEYE", "RAD_TAN_THIN_PRISM_FISHEYE",
-)  # fmt: skip
-"""By model id."""
-PARAMETERS = (3, 4, 4, 5, 8, 8, 12, 5, 4, 5, 12, 16)
-FOCALS = {"SIMPLE_PINHOLE": 1, "PINHOLE": 2, "SIMPLE_RADIAL": 1, "RADIAL": 1, "OPENCV": 2, "FULL_OPENCV": 2}
-"""Focal lengths among the parameters of the models that are a pinhole where their distortion is zero."""
+MODELS: Mapping[str, tuple[int, int]] = {
+    "SIMPLE_PINHOLE": (3, 1), "PINHOLE": (4, 2), "SIMPLE_RADIAL": (4, 1), "RADIAL": (5, 1), "OPENCV": (8, 2),
+    "OPENCV_FISHEYE": (8, 0), "FULL_OPENCV": (12, 2), "FOV": (5, 0), "SIMPLE_RADIAL_FISHEYE": (4, 0),
+    "RADIAL_FISHEYE": (5, 0), "THIN_PRISM_FISHEYE": (12, 0), "RAD_TAN_THIN_PRISM_FISHEYE": (16, 0),
+}  # fmt: skip
+"""Number of parameters, and of focal lengths among them; 0 where it distorts even if all coefficients are zero."""
 
 MAX_SIDE = 2**24
 MAX_NAME = 1000
@@ -127,6 +124,11 @@ class ModelImage:
     name: str
     T_cw: Poses
     camera: Camera
+
+    @property
+    def frame(self) -> str:
+        """The name without its suffix: the frame's name in path templates."""
+        return os.path.splitext(self.name)[0]  # noqa: PTH122  a name, not a path
 
 
 def has_model(folder: Path) -> bool:
@@ -160,35 +162,27 @@ def read_model(folder: Path) -> tuple[Path, list[ModelImage]]:
     return path, sorted(images, key=lambda image: natural(image.name))
 
 
-def image_name(name: str) -> str:
-    """Return the name of an image in the model without its suffix: the frame's name in path templates."""
-    return os.path.splitext(name)[0]  # noqa: PTH122  a name, not a path
-
-
 def _pinhole(camera: Stated, where: str) -> Camera:
     model, width, height, parameters = camera
     if not (0 < width <= MAX_SIDE and 0 < height <= MAX_SIDE):
         raise DataError(f"{where} has images of {width}x{height} pixels; {AGAIN}")
-    focals = FOCALS.get(model)
-    if focals is None or any(parameters[focals + 2 :]):
+    _, focals = MODELS[model]
+    if not focals or any(parameters[focals + 2 :]):
         raise DataError(
             f"{where} is {model}, which distorts; undistort the images ('colmap image_undistorter')"
             " and use the model that it writes"
         )
-    fx, fy, (cx, cy) = parameters[0], parameters[focals - 1], parameters[focals : focals + 2]
-    try:
-        return Camera(Intrinsics(fx, fy, cx, cy), (width, height))
-    except DataError as error:
-        raise DataError(f"{where}: {error}") from error
+    cx, cy = parameters[focals : focals + 2]
+    return Camera.stated((parameters[0], parameters[focals - 1], cx, cy), (width, height), where)
 
 
 def _cameras_txt(file: BinaryIO, path: Path) -> Iterator[tuple[int, Stated]]:
     for line, text in _lines(file):
-        if not text or text.startswith("#"):
-            continue
         words = text.split()
+        if not words or text.startswith("#"):
+            continue
         model = words[1] if len(words) > 1 else ""
-        if model not in MODELS or len(words) != 4 + PARAMETERS[MODELS.index(model)]:
+        if model not in MODELS or len(words) != 4 + MODELS[model][0]:
             raise DataError(f"{path}: line {line} is {text[:60]!r}; expected CAMERA_ID MODEL WIDTH HEIGHT PARAMS")
         camera_id, width, height = (_whole(words[k], path, line) for k in (0, 2, 3))
         yield camera_id, (model, width, height, [to_number(word, path, line) for word in words[4:]])
@@ -200,22 +194,22 @@ def _cameras_bin(file: BinaryIO, path: Path) -> Iterator[tuple[int, Stated]]:
         camera_id, model_id, width, height = _unpack(file, "<IiQQ", path)
         if not 0 <= model_id < len(MODELS):
             raise DataError(
-                f"{path}: camera {camera_id} has the model {model_id}, which is not known; undistort the images"
+                f"{path}: camera {camera_id} has the model {model_id}, which is not known; undistort images"
             )
-        yield camera_id, (MODELS[model_id], width, height, [*_unpack(file, f"<{PARAMETERS[model_id]}d", path)])
+        model, (parameters, _) = [*MODELS.items()][model_id]
+        yield camera_id, (model, width, height, [*_unpack(file, f"<{parameters}d", path)])
 
 
 def _images_txt(file: BinaryIO, path: Path) -> Iterator[Registered]:
     """Each image has two lines, of which the second, with its points, may be empty."""
     lines = _lines(file)
     for line, text in lines:
-        if not text or text.startswith("#"):
-            continue
         words = text.split(maxsplit=9)
+        if not words or text.startswith("#"):
+            continue
         if len(words) != 10:
-            raise DataError(
-                f"{path}: line {line} is {text[:60]!r}; expected IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME"
-            )
+            form = "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME"
+            raise DataError(f"{path}: line {line} is {text[:60]!r}; expected {form}")
         yield [to_number(word, path, line) for word in words[1:8]], _whole(words[8], path, line), words[9]
         _, points = next(lines, (0, ""))
         if len(points.split()) % 3:

@@ -11,8 +11,8 @@ from pathlib import Path
 from pydantic import BaseModel
 
 from semstab.datasets.files.options import DepthScale, FileOptions, FrameSource
-from semstab.datasets.files.reader import FileDataset, files_named, frames_of
-from semstab.datasets.formats.disk import read_intrinsics, read_matrices
+from semstab.datasets.files.reader import FileDataset, frames_of
+from semstab.datasets.formats.disk import files_named, read_intrinsics, read_table
 from semstab.datasets.geometry.cameras import Camera
 from semstab.errors import DataError
 
@@ -36,7 +36,7 @@ class HoloLens(FileDataset[HoloLensOptions]):
     def frames(self, folder: Path) -> Iterable[FrameSource]:
         """One a line of poses.txt. Raises DataError where there are not as many images."""
         camera = Camera(read_intrinsics(folder / "K.txt"))
-        poses = read_matrices(folder / "poses.txt")
+        poses = read_table(folder / "poses.txt", 16, "a flattened 4x4 matrix").reshape(-1, 4, 4)
         images = files_named(folder / "images", "", ".png")
         if not images:
             raise DataError(f"{folder / 'images'}: there is no PNG image; its name ties a pose to its depth")

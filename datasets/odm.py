@@ -14,7 +14,7 @@ from pydantic import BaseModel, Field
 
 from semstab.core.files import open_file
 from semstab.datasets.files.depth import HEADER_BYTES, dmap_header
-from semstab.datasets.files.labels import ScenePlace
+from semstab.datasets.files.labels import SceneEntry
 from semstab.datasets.files.options import (
     DepthKind,
     FileOptions,
@@ -29,6 +29,7 @@ from semstab.datasets.files.reader import FileDataset
 from semstab.datasets.files.scene import FileScene
 from semstab.datasets.formats.disk import natural, subfolders
 from semstab.datasets.formats.images import COLOR_SUFFIXES, DEPTH_SUFFIXES
+from semstab.datasets.geometry.lenses import Lens
 from semstab.datasets.opensfm import GEOREFERENCING, Shot, georeference_of, read_reconstruction
 from semstab.errors import DataError
 from semstab.model.georeference import Georeference
@@ -44,7 +45,7 @@ MESHES = (
 )  # fmt: skip
 DSM = "odm_dem/dsm.tif"
 MVE = "mve/views/view_{:04d}.mve/depth-L0.mvei"
-DMAPS = "openmvs/depthmaps"
+DMAPS = "undistorted/openmvs/depthmaps"
 
 Kind = Literal["mesh", "dsm", "mve", "openmvs", "files"]
 
@@ -101,46 +102,27 @@ def frame_names(shots: Iterable[str]) -> list[str]:
     return bare if len(set(bare)) == len(names) else names
 
 
-class Images:
-    """The files of a project's images, by the names that ODM and OpenSfM give them; `stated` is where they are else."""
-
-    def __init__(self, project: Project, stated: Path | None) -> None:
-        self._folders = Folders()
-        self._project = project
-        self._photographs = [project.folder / "images", project.opensfm / "images"]
-        own = [project.opensfm / "undistorted/images"] if project.undistorted else self._photographs
-        self._own = own if stated is None else [stated]
-
-    def color(self, shot: str) -> Path | None:
-        """The image that the shot's pose is of."""
-        return self._first(self._own, shot)
-
-    def photograph(self, shot: str) -> Path | None:
-        """The photograph that it was made of."""
-        return self._first(self._photographs, shot)
-
-    def _first(self, places: Iterable[Path], shot: str) -> Path | None:
-        for place in places:
-            for written in written_names(shot):
-                path = inside(place, place, written, str(self._project.poses))
-                if path.suffix.lower() in COLOR_SUFFIXES and self._folders.has(path):
-                    return path
-        return None
+def find_image(folders: Iterable[Path], shot: str, contents: Folders, where: str) -> Path | None:
+    """The image of a shot in the first folder that has one; `where` is the file that names the shot."""
+    for folder in folders:
+        for written in written_names(shot):
+            path = inside(folder, folder, written, where)
+            if path.suffix.lower() in COLOR_SUFFIXES and contents.has(path):
+                return path
+    return None
 
 
 # --- depth ----------------------------------------------------------------------------------------------------------
 
 
-KINDS: tuple[Kind, ...] = ("mesh", "dsm", "mve", "openmvs", "files")
-"""Sources of depth; the first of them that a project has is taken."""
-
-PLACES: dict[Kind, str] = {
+LOCATIONS: dict[Kind, str] = {
     "mesh": "odm_meshing/odm_mesh.ply, odm_25dmesh.ply, odm_texturing*/*_geo.obj",
     "dsm": DSM,
     "mve": "mve/views/view_NNNN.mve/depth-L0.mvei",
     "openmvs": "opensfm/undistorted/openmvs/depthmaps/*.dmap",
     "files": "depth/NAME.png",
 }
+"""Sources of depth and where they are; the first of them that a project has is taken."""
 
 
 def find_depth(project: Project, kind: Kind, template: str) -> Path | None:
@@ -150,24 +132,10 @@ def find_depth(project: Project, kind: Kind, template: str) -> Path | None:
     if kind == "mve":
         return next(iter(sorted(project.folder.glob("mve/views/*/depth-L0.mvei"))), None)
     if kind == "openmvs":
-        return next(iter(_dmap_files(project)), None)
+        return next(iter(sorted((project.opensfm / DMAPS).glob("*.dmap"))), None)
     path = project.folder / DSM if kind == "dsm" else (project.folder / template).parent
     there = path.is_file() if kind == "dsm" else "{" not in str(path) and path.is_dir()
     return path if there else None
-
-
-def _dmap_files(project: Project) -> list[Path]:
-    return sorted((project.opensfm / "undistorted" / DMAPS).glob("*.dmap"))
-
-
-def _depth_maps(project: Project) -> dict[str, Path]:
-    """Depth maps of OpenMVS by the name of the frame that each says it is of."""
-    maps = {}
-    for path in _dmap_files(project):
-        with open_file(path) as file:
-            image = dmap_header(path, file.read(HEADER_BYTES)).image
-        maps[bare_name(Path(image.replace("\\", "/")).name)] = path
-    return maps
 
 
 def depth_files(project: Project, kind: Kind | None, names: Mapping[str, str], template: Template) -> dict[str, Path]:
@@ -175,7 +143,11 @@ def depth_files(project: Project, kind: Kind | None, names: Mapping[str, str], t
     if kind == "mve":
         return {shot: project.folder / MVE.format(k) for k, shot in enumerate(names)}
     if kind == "openmvs":
-        maps, folder = _depth_maps(project), project.opensfm / "undistorted" / DMAPS
+        maps, folder = {}, project.opensfm / DMAPS
+        for path in sorted(folder.glob("*.dmap")):  # each says which image it is of
+            with open_file(path) as file:
+                image = dmap_header(path, file.read(HEADER_BYTES)).image
+            maps[bare_name(Path(image.replace("\\", "/")).name)] = path
         return {shot: maps.get(name, folder / f"{name}.dmap") for shot, name in names.items()}
     folders = Folders()
     wanted = {shot: project.folder / template.filled(name=name) for shot, name in names.items()}
@@ -220,15 +192,15 @@ class Odm(FileDataset[OdmOptions]):
         self._read: dict[Path, list[Shot]] = {}
         super().__init__(options)
 
-    def find_scenes(self, root: Path) -> Iterator[ScenePlace]:
+    def find_scenes(self, root: Path) -> Iterator[SceneEntry]:
         """The projects, and the submodels of each after it."""
-        for place in super().find_scenes(root):
-            yield place
-            parts = place.folder / "submodels"
+        for entry in super().find_scenes(root):
+            yield entry
+            parts = entry.folder / "submodels"
             for name in subfolders(parts):
                 if self.is_scene(parts / name):
-                    below = f"{place.below_root}/submodels/{name}"
-                    yield ScenePlace(f"{place.name}-submodels-{name}", parts / name, below)
+                    below = f"{entry.below_root}/submodels/{name}"
+                    yield SceneEntry(f"{entry.name}-submodels-{name}", parts / name, below)
 
     def is_scene(self, folder: Path) -> bool:
         """Return whether there is a reconstruction."""
@@ -243,22 +215,22 @@ class Odm(FileDataset[OdmOptions]):
         if options.surface is not None:
             return options.model_copy(update={"depth_kind": options.depth_kind or "planar"})
         project = self._project(folder)
-        kinds = [options.depth_from] if options.depth_from else list(KINDS)
+        kinds = [options.depth_from] if options.depth_from else list(LOCATIONS)
         for kind in kinds:
             if (source := find_depth(project, kind, options.depth)) is not None:
                 surface = source if kind in ("mesh", "dsm") else None
                 along = options.depth_kind or ("ray" if kind == "mve" else "planar")
                 return options.model_copy(update={"surface": surface, "depth_from": kind, "depth_kind": along})
         raise DataError(
-            f"{folder}: has no depth: no {', '.join(kinds)} ({'; '.join(PLACES[kind] for kind in kinds)}); set surface"
-            " to a mesh, cloud or raster"
+            f"{folder}: has no depth: no {', '.join(kinds)} ({'; '.join(LOCATIONS[kind] for kind in kinds)}); set"
+            " surface to a mesh, cloud or raster"
         )
 
     def scene(self, name: str) -> FileScene:
         """Open one; it says where its depth comes from."""
         scene = super().scene(name)
         kind = self.settled(scene.folder).depth_from
-        scene.depth_from = f"{kind}, {scene.depth_from or PLACES[kind]}" if kind is not None else scene.depth_from
+        scene.depth_from = f"{kind}, {scene.depth_from or LOCATIONS[kind]}" if kind is not None else scene.depth_from
         return scene
 
     def georeference(self, folder: Path, options: FileOptions) -> Georeference | None:
@@ -272,53 +244,47 @@ class Odm(FileDataset[OdmOptions]):
     def frames(self, folder: Path) -> list[FrameSource]:
         """One a shot, in the natural order of their names. Raises what `read_reconstruction` raises."""
         project = self._project(folder)
-        shots = self._shots(project.poses)
+        shots, contents, where = self._shots(project.poses), Folders(), str(project.poses)
         names = frame_names(shot.name for shot in shots)
-        kind = self.settled(folder).depth_from
-        depth = depth_files(
-            project, kind, {shot.name: name for shot, name in zip(shots, names, strict=True)}, self._depth
-        )
-        originals = self._originals(project)
-        look = Images(project, self.options.images)
-        frames = [
-            self._frame(project, look, shot, name, depth[shot.name], originals.get(name))
-            for shot, name in zip(shots, names, strict=True)
-        ]
+        by_shot = {shot.name: name for shot, name in zip(shots, names, strict=True)}
+        depth = depth_files(project, self.settled(folder).depth_from, by_shot, self._depth)
+        lenses = self._label_lenses(project, dict(zip(names, shots, strict=True)))
+        photographs = [project.folder / "images", project.opensfm / "images"]
+        images = [project.opensfm / "undistorted/images"] if project.undistorted else photographs
+        images = images if self.options.images is None else [self.options.images]
+        frames = []
+        for shot, name in zip(shots, names, strict=True):
+            color = find_image(images, shot.name, contents, where)
+            frames.append(
+                FrameSource(
+                    name=name,
+                    depth=depth[shot.name],
+                    pose=shot.T_cw,
+                    pose_file=project.poses,
+                    camera=shot.camera,
+                    color=color,
+                    color_lens=shot.lens,
+                    label_lens=lenses.get(name),
+                    photograph=find_image(photographs, shot.name, contents, where) if project.undistorted else color,
+                    aliases=written_names(shot.name),
+                )
+            )
         return sorted(frames, key=lambda frame: natural(frame.name))
 
-    def _frame(
-        self, project: Project, look: Images, shot: Shot, name: str, depth: Path, original: Shot | None
-    ) -> FrameSource:
-        color, photograph = look.color(shot.name), look.photograph(shot.name)
-        wanted = self.options.labels_on or ("undistorted" if project.undistorted else "original")
-        lens = shot.lens
-        if wanted == "original" and project.undistorted:
-            if original is None:
-                raise DataError(
-                    f"{project.opensfm / DISTORTED}: does not say how the photograph {name} is distorted, which"
-                    " labels_on: original needs"
-                )
-            lens = original.lens
-        return FrameSource(
-            name=name,
-            depth=depth,
-            pose=shot.T_cw,
-            pose_file=project.poses,
-            camera=shot.camera,
-            color=color,
-            color_lens=shot.lens,
-            label_lens=lens if wanted == "original" else None,
-            photograph=photograph if project.undistorted else color,
-            aliases=written_names(shot.name),
-        )
-
-    def _originals(self, project: Project) -> dict[str, Shot]:
-        """The shots with the cameras of the photographs, by the frames' names, where they are asked for."""
-        path = project.opensfm / DISTORTED
-        if self.options.labels_on != "original" or not project.undistorted or not path.is_file():
+    def _label_lenses(self, project: Project, shots: Mapping[str, Shot]) -> dict[str, Lens | None]:
+        """The lens of the photograph that a frame's label map belongs to, where they belong to photographs."""
+        if (self.options.labels_on or ("undistorted" if project.undistorted else "original")) != "original":
             return {}
-        shots = self._shots(path)
-        return dict(zip(frame_names(shot.name for shot in shots), shots, strict=True))
+        if project.undistorted:
+            path = project.opensfm / DISTORTED
+            originals = self._shots(path) if path.is_file() else []
+            there = dict(zip(frame_names(shot.name for shot in originals), originals, strict=True))
+            if lost := next((name for name in shots if name not in there), None):
+                raise DataError(
+                    f"{path}: does not say how the photograph {lost} is distorted, which labels_on: original needs"
+                )
+            shots = there
+        return {name: shot.lens for name, shot in shots.items()}
 
     def _shots(self, path: Path) -> list[Shot]:
         if path not in self._read:

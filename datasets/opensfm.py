@@ -13,19 +13,16 @@ from typing import Any
 
 import numpy as np
 
-from semstab.core.files import parse_json
 from semstab.core.types import Float64
-from semstab.datasets.formats.disk import number, read_bytes, read_object
+from semstab.datasets.formats.disk import number, pixels, read_content, read_object, read_text
 from semstab.datasets.geometry.cameras import Camera, Poses
 from semstab.datasets.geometry.lenses import Lens
-from semstab.errors import DataError, one_line
-from semstab.model.frames import Intrinsics
+from semstab.errors import DataError
 from semstab.model.georeference import Georeference
 
 MAX_BYTES = 2**32
 """With the points of thousands of photographs."""
 
-MAX_SIDE = 2**24
 COEFFICIENTS: Mapping[str, tuple[str, tuple[str, ...]]] = {
     "perspective": ("brown", ("k1", "k2", "", "", "")),
     "simple_radial": ("brown", ("k1", "", "", "", "")),
@@ -55,7 +52,9 @@ def read_reconstruction(path: Path, wanted: int | None = None) -> list[Shot]:
 
     Raises DataError for a damaged file, several reconstructions where none is wanted, or an unknown camera model.
     """
-    reconstructions = _reconstructions(path)
+    reconstructions = read_content(path, MAX_BYTES)
+    if not isinstance(reconstructions, list) or {type(one) for one in reconstructions} != {dict}:
+        raise DataError(f"{path}: expected a list of reconstructions; run the reconstruction again")
     if len(reconstructions) > 1 and wanted is None:
         names = "; ".join(f"{k}: {_summary(one)}" for k, one in enumerate(reconstructions[:5]))
         more = f"; {len(reconstructions) - 5} more" if len(reconstructions) > 5 else ""
@@ -71,17 +70,6 @@ def read_reconstruction(path: Path, wanted: int | None = None) -> list[Shot]:
     if not read:
         raise DataError(f"{path}: the reconstruction has no shot; reconstruct again")
     return read
-
-
-def _reconstructions(path: Path) -> Sequence[Mapping[str, Any]]:
-    data = read_bytes(path, MAX_BYTES)
-    try:
-        content = parse_json(data)
-    except ValueError as error:
-        raise DataError(f"{path}: not valid JSON ({one_line(error)[:120]})") from error
-    if not isinstance(content, list) or not content or not all(isinstance(one, dict) for one in content):
-        raise DataError(f"{path}: expected a list of reconstructions; run the reconstruction again")
-    return content
 
 
 def _part(content: Mapping[str, Any], key: str, path: Path) -> Mapping[str, Mapping[str, Any]]:
@@ -127,18 +115,15 @@ def _lens(values: Mapping[str, Any], where: str) -> tuple[Camera, Lens | None]:
             f"{where}: the camera model {str(kind)[:40]!r} is not known; there is {', '.join(COEFFICIENTS)}; undistort"
             " the images (opensfm undistort)"
         )
-    width, height = (_side(values, key, where) for key in ("width", "height"))
+    width, height = (pixels(values, key, where) for key in ("width", "height"))
     side = max(width, height)
     fx, fy = (number(values, key if key in values else "focal", where) * side for key in ("focal_x", "focal_y"))
     cx, cy = (_or_zero(values, key, where) * side for key in ("c_x", "c_y"))
     model, keys = COEFFICIENTS[kind]
     coefficients = tuple(_or_zero(values, key, where) for key in keys)
     centre = ((width - 1) / 2, (height - 1) / 2)
-    try:
-        pinhole = Camera(Intrinsics((fx + fy) / 2, (fx + fy) / 2, *centre), (width, height))
-        stated = Camera(Intrinsics(fx, fy, centre[0] + cx, centre[1] + cy), (width, height))
-    except DataError as error:
-        raise DataError(f"{where}: {error}") from error
+    pinhole = Camera.stated(((fx + fy) / 2, (fx + fy) / 2, *centre), (width, height), where)
+    stated = Camera.stated((fx, fy, centre[0] + cx, centre[1] + cy), (width, height), where)
     if model == "brown" and not any(coefficients):
         return stated, None
     return pinhole, Lens(stated, "brown" if model == "brown" else "fisheye", coefficients)
@@ -146,13 +131,6 @@ def _lens(values: Mapping[str, Any], where: str) -> tuple[Camera, Lens | None]:
 
 def _or_zero(values: Mapping[str, Any], key: str, where: str) -> float:
     return number(values, key, where) if key in values else 0.0
-
-
-def _side(values: Mapping[str, Any], key: str, where: str) -> int:
-    value = number(values, key, where)
-    if not 1 <= value <= MAX_SIDE:
-        raise DataError(f"{where}: '{key}' is {value:g}; expected a number of pixels")
-    return int(value)
 
 
 # Where a project of OpenDroneMap or OpenSfM lies on Earth: coords.txt and proj.txt, or reference_lla.json.
@@ -178,7 +156,9 @@ def georeference_of(folder: Path, opensfm: Path, T_cw: Sequence[Poses]) -> Geore
     if not coords.is_file():
         return _topocentric(opensfm)
     east, north, positions = _read_coords(coords)
-    off = _off(centres, positions)
+    off = 0.0  # metres over the ground between the middles of cameras and positions
+    if len(positions):
+        off = float(np.hypot(*(np.median(centres[:, :2], axis=0) - np.median(positions[:, :2], axis=0))))
     if off > FAR and (local := _topocentric(opensfm)) is not None:
         return local
     if off > FAR:
@@ -189,8 +169,8 @@ def georeference_of(folder: Path, opensfm: Path, T_cw: Sequence[Poses]) -> Geore
 def _crs(coords: Path, proj: Path) -> str:
     """proj.txt, else the first line of coords.txt: 'WGS84 UTM 15N' or a PROJ string."""
     if proj.is_file():
-        return _text(proj).strip()
-    words = _text(coords).split("\n")[0].split()
+        return read_text(proj, MAX_TEXT_BYTES).strip()
+    words = read_text(coords, MAX_TEXT_BYTES).split("\n")[0].split()
     if len(words) == 3 and words[:2] == ["WGS84", "UTM"] and words[2][:-1].isdecimal():
         return f"EPSG:{(326 if words[2][-1] == 'N' else 327) * 100 + int(words[2][:-1])}"
     return " ".join(words)
@@ -198,7 +178,7 @@ def _crs(coords: Path, proj: Path) -> str:
 
 def _read_coords(path: Path) -> tuple[float, float, Float64]:
     """Offset to the east and north, and the positions (n, 3) of the photographs relative to it."""
-    lines = [line.split() for line in _text(path).splitlines()[1:] if line.strip()]
+    lines = [line.split() for line in read_text(path, MAX_TEXT_BYTES).splitlines()[1:] if line.strip()]
     try:
         numbers = [[float(word) for word in line] for line in lines]
         east, north = numbers[0]
@@ -208,14 +188,6 @@ def _read_coords(path: Path) -> tuple[float, float, Float64]:
     if not np.isfinite([east, north]).all():
         raise DataError(f"{path}: the offset {east:g} {north:g} is not finite; run ODM again")
     return east, north, positions
-
-
-def _off(centres: Float64, positions: Float64) -> float:
-    """Metres between the middles of cameras and positions, over the ground; 0 where there are no positions."""
-    if not len(positions):
-        return 0.0
-    middle = np.median(centres[:, :2], axis=0) - np.median(positions[:, :2], axis=0)
-    return float(np.hypot(*middle))
 
 
 def _topocentric(opensfm: Path) -> Georeference | None:
@@ -230,7 +202,3 @@ def _topocentric(opensfm: Path) -> Georeference | None:
     latitude, longitude, altitude = (number(content, key, str(path)) for key in ("latitude", "longitude", "altitude"))
     crs = f"+proj=tmerc +lat_0={latitude!r} +lon_0={longitude!r} +k=1 +datum=WGS84 +units=m +no_defs +type=crs"
     return Georeference.of(crs, (0.0, 0.0, altitude), str(path))
-
-
-def _text(path: Path) -> str:
-    return read_bytes(path, MAX_TEXT_BYTES).decode("utf-8-sig", errors="replace")

@@ -21,7 +21,7 @@ from semstab.datasets.files.options import (
     ScoresLayout,
 )
 from semstab.datasets.files.reader import FileDataset
-from semstab.datasets.formats.disk import files_by_stem, naturally, read_intrinsics
+from semstab.datasets.formats.disk import files_by_stem, natural, read_intrinsics
 from semstab.datasets.formats.images import COLOR_SUFFIXES, DEPTH_SUFFIXES
 from semstab.datasets.geometry.cameras import Camera
 
@@ -59,7 +59,7 @@ class PosedFolder(FileDataset[PosedOptions]):
         colors = files_by_stem(folder / "color", COLOR_SUFFIXES)
         camera = Camera(read_intrinsics(folder / "intrinsics.txt"))
         suffix = next((os.path.splitext(file)[1] for file in depth.values()), DEPTH_SUFFIXES[0])  # noqa: PTH122
-        for name in naturally({*depth, *poses}):
+        for name in sorted({*depth, *poses}, key=natural):
             yield FrameSource(
                 name=name,
                 depth=folder / "depth" / depth.get(name, name + suffix),

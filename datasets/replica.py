@@ -22,7 +22,7 @@ from semstab.datasets.files.options import (
     zero_is_void,
 )
 from semstab.datasets.files.reader import FileDataset, frames_of, images_named
-from semstab.datasets.formats.disk import number, read_matrices, read_object
+from semstab.datasets.formats.disk import number, read_object, read_table
 from semstab.datasets.geometry.cameras import Camera, camera_of
 from semstab.errors import DataError
 
@@ -42,6 +42,7 @@ class Export:
 NICE_SLAM = Export("traj.txt", "results/depth", "results/frame{name}", 6553.5, (600, 600, 599.5, 339.5), (1200, 680))
 SEMANTIC_NERF = Export("traj_w_c.txt", "depth/depth_", "rgb/rgb_{name}", 1000, (320, 320, 319.5, 239.5), (640, 480))
 EXPORTS = (NICE_SLAM, SEMANTIC_NERF)
+CAMERA_FILE = "cam_params.json"
 
 
 class ReplicaOptions(FileOptions):
@@ -67,7 +68,7 @@ class Replica(FileDataset[ReplicaOptions]):
         """One a depth image. Raises DataError where there are not as many poses."""
         export = self._export(folder)
         assert export is not None
-        poses = read_matrices(folder / export.trajectory)
+        poses = read_table(folder / export.trajectory, 16, "a flattened 4x4 matrix").reshape(-1, 4, 4)
         where, _, before = export.depth.rpartition("/")
         images, _, frame = export.color.removesuffix("{name}").rpartition("/")
         instead = images_named(folder / images, frame)
@@ -84,20 +85,15 @@ class Replica(FileDataset[ReplicaOptions]):
     def _camera(self, folder: Path, export: Export) -> tuple[Camera, float]:
         """The camera and the depth scale: of the options, of cam_params.json, or the export's usual ones."""
         numbers, size, scale = export.intrinsics, export.size, export.depth_scale
-        path = next((path for path in (folder, folder.parent) if (path / "cam_params.json").is_file()), None)
+        path = next((p for p in (folder / CAMERA_FILE, folder.parent / CAMERA_FILE) if p.is_file()), None)
         if path is not None:
-            numbers, size, scale = _cam_params(path / "cam_params.json")
+            camera: Any = read_object(path).get("camera")
+            if not isinstance(camera, Mapping):
+                raise DataError(f"{path}: there is no 'camera' in it; download it again, or set intrinsics")
+            fx, fy, cx, cy, width, height, scale = (
+                number(camera, key, str(path)) for key in ("fx", "fy", "cx", "cy", "w", "h", "scale")
+            )
+            if not (width >= 1 and height >= 1 and scale > 0):
+                raise DataError(f"{path}: w, h and scale must be positive, got {width:g}, {height:g}, {scale:g}")
+            numbers, size = (fx, fy, cx, cy), (int(width), int(height))
         return camera_of(self.options.intrinsics, numbers, size), scale
-
-
-def _cam_params(path: Path) -> tuple[tuple[float, float, float, float], tuple[int, int], float]:
-    """fx fy cx cy, (width, height) and the depth scale of cam_params.json."""
-    camera: Any = read_object(path).get("camera")
-    if not isinstance(camera, Mapping):
-        raise DataError(f"{path}: there is no 'camera' in it; download it again, or set intrinsics")
-    fx, fy, cx, cy, width, height, scale = (
-        number(camera, key, str(path)) for key in ("fx", "fy", "cx", "cy", "w", "h", "scale")
-    )
-    if not (width >= 1 and height >= 1 and scale > 0):
-        raise DataError(f"{path}: w, h and scale must be positive, got {width:g}, {height:g}, {scale:g}")
-    return (fx, fy, cx, cy), (int(width), int(height)), scale

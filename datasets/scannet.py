@@ -25,8 +25,8 @@ from semstab.datasets.files.options import (
     VoidIds,
     zero_is_void,
 )
-from semstab.datasets.files.reader import FileDataset, files_named, frames_of
-from semstab.datasets.formats.disk import read_bytes, read_intrinsics
+from semstab.datasets.files.reader import FileDataset, frames_of
+from semstab.datasets.formats.disk import MAX_TABLE_BYTES, files_named, read_intrinsics, read_text
 from semstab.datasets.geometry.cameras import Camera
 from semstab.errors import DataError
 from semstab.model.labels import IGNORE_16BIT
@@ -85,7 +85,7 @@ def read_class_table(path: Path, column: str) -> UInt16:
 
     Raises DataError for a file without the columns, or an id that is no whole number.
     """
-    lines = read_bytes(path).decode("utf-8-sig", errors="replace").splitlines()
+    lines = read_text(path, MAX_TABLE_BYTES).splitlines()
     header = lines[0].split("\t") if lines else []
     if "id" not in header or column not in header:
         raise DataError(f"{path}: there are no columns 'id' and '{column}'; set class_column to one it has")

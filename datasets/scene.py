@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import dataclasses
-import difflib
 import logging
 import os
 from abc import ABC, abstractmethod
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -212,12 +211,6 @@ def listed(missing: Sequence[str], folder: str = "") -> str:
     return f"{len(missing)} missing: {', '.join(missing[:MAX_LISTED])}{more}"
 
 
-def nearest(name: str, known: Iterable[str]) -> str:
-    """The known names, those most like `name` first."""
-    names = list(known)
-    return f"there are {', '.join(difflib.get_close_matches(name, names, n=len(names), cutoff=0))}"
-
-
 # The frames of a scene that a selection picks, without those that lack a file or whose pose was lost.
 
 logger = logging.getLogger("semstab")
@@ -265,9 +258,7 @@ def select_frames(
             scene.name, len(lost), len(chosen), ", ".join(map(str, sorted(lost)[:MAX_LISTED])), more,
         )  # fmt: skip
     return Selected(
-        indices=[index for index in complete if index not in lost],
-        incomplete=tuple(missing),
-        lost=tuple(sorted(lost)),
+        indices=[index for index in complete if index not in lost], incomplete=tuple(missing), lost=tuple(sorted(lost))
     )
 
 

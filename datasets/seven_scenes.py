@@ -11,8 +11,8 @@ from pathlib import Path
 from pydantic import BaseModel
 
 from semstab.datasets.files.options import DepthScale, FileOptions, FourIntrinsics, FrameSource, InvalidDepth, Size
-from semstab.datasets.files.reader import FileDataset, files_named, frames_of
-from semstab.datasets.formats.disk import read_intrinsics
+from semstab.datasets.files.reader import FileDataset, frames_of
+from semstab.datasets.formats.disk import files_named, read_intrinsics
 from semstab.datasets.geometry.cameras import Camera, camera_of
 from semstab.model.frames import Intrinsics
 
@@ -48,15 +48,10 @@ class SevenScenes(FileDataset[SevenScenesOptions]):
     def frames(self, folder: Path) -> Iterable[FrameSource]:
         """One a depth image."""
         color = self.options.color_intrinsics
-        camera = self._camera(folder)
+        camera = camera_of(self.options.intrinsics, USUAL, IMAGE_SIZE)
+        files = (parent / INTRINSICS_FILE for parent in (folder, folder.parent))  # 3DMatch has it above the frames
+        if self.options.intrinsics is None and (file := next((path for path in files if path.is_file()), None)):
+            camera = Camera(read_intrinsics(file))
         label_camera = None if color is None else Camera(Intrinsics(*color), self.options.color_size)
         depth = self.depth_files(folder, "", ".depth.png", instead=files_named(folder, "", ".pose.txt"))
         return frames_of(folder, depth, camera, pose="{name}.pose.txt", color="{name}.color", label_camera=label_camera)
-
-    def _camera(self, folder: Path) -> Camera:
-        """The camera of the depth: of the options, else of a file with the frames or above them, as 3DMatch has it."""
-        files = (place / INTRINSICS_FILE for place in (folder, folder.parent))
-        file = next((path for path in files if path.is_file()), None)
-        if file is None or self.options.intrinsics is not None:
-            return camera_of(self.options.intrinsics, USUAL, IMAGE_SIZE)
-        return Camera(read_intrinsics(file))

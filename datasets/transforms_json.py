@@ -17,11 +17,10 @@ from pydantic import BaseModel, Field
 
 from semstab.datasets.files.options import CameraAxes, FileOptions, Folders, FrameSource, PixelCentre, Template, inside
 from semstab.datasets.files.reader import FileDataset
-from semstab.datasets.formats.disk import matrix, natural, number, read_object
+from semstab.datasets.formats.disk import matrix, natural, number, pixels, read_object
 from semstab.datasets.formats.images import COLOR_SUFFIXES, DEPTH_SUFFIXES, MILLIMETRES
 from semstab.datasets.geometry.cameras import Camera
 from semstab.errors import DataError
-from semstab.model.frames import Intrinsics
 
 DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")
 PINHOLES = (None, "PINHOLE", "SIMPLE_PINHOLE", "OPENCV", "perspective")
@@ -74,7 +73,13 @@ def read_transforms(path: Path, root: Path, folder: Path, depth: Template | None
     wheres = [f"{path}: frame {k}" for k in range(len(entries))]
     images = [_named(entry, ("file_path",), path, root, where) for entry, where in zip(entries, wheres, strict=True)]
     shared = Path(os.path.commonpath([image.parent for image in images if image is not None] or [path.parent]))
-    scale, frames = _depth_scale(content, path), []
+    scale, frames = MILLIMETRES, []  # units in a metre
+    key = next((k for k in ("integer_depth_scale", "depth_unit_scale_factor") if content.get(k) is not None), None)
+    if key is not None:
+        metres = number(content, key, str(path))
+        if metres <= 0 or math.isinf(1 / metres):
+            raise DataError(f"{path}: '{key}' is {metres:g}; expected the metres in a unit of depth")
+        scale = 1 / metres
     for entry, image, where in zip(entries, images, wheres, strict=True):
         if image is None:
             raise DataError(f"{where}: 'file_path' is missing; add it")
@@ -119,13 +124,10 @@ def _camera(values: Mapping[str, Any], where: str) -> Camera:
     fx, fy = fy if fx is None else fx, fx if fy is None else fy
     if fx is None or fy is None:
         raise DataError(f"{where}: 'fl_x' is missing; add it, or camera_angle_x with w and h")
-    size = (_pixels(values, "w", where), _pixels(values, "h", where)) if "w" in values and "h" in values else None
+    size = (pixels(values, "w", where), pixels(values, "h", where)) if "w" in values and "h" in values else None
     cx = size[0] / 2 if size and "cx" not in values else number(values, "cx", where)
     cy = size[1] / 2 if size and "cy" not in values else number(values, "cy", where)
-    try:
-        return Camera(Intrinsics(fx, fy, cx, cy), size)
-    except DataError as error:
-        raise DataError(f"{where}: {error}") from error
+    return Camera.stated((fx, fy, cx, cy), size, where)
 
 
 def _focal(values: Mapping[str, Any], axis: str, where: str) -> float | None:
@@ -134,26 +136,8 @@ def _focal(values: Mapping[str, Any], axis: str, where: str) -> float | None:
         return number(values, f"fl_{axis}", where)
     if values.get(f"camera_angle_{axis}") is None:
         return None
-    side = _pixels(values, "w" if axis == "x" else "h", where)
+    side = pixels(values, "w" if axis == "x" else "h", where)
     angle = number(values, f"camera_angle_{axis}", where)
     if not 0 < angle < math.pi:
         raise DataError(f"{where}: 'camera_angle_{axis}' is {angle:g}; expected radians between 0 and pi")
     return side / (2 * math.tan(angle / 2))
-
-
-def _pixels(values: Mapping[str, Any], key: str, where: str) -> int:
-    value = number(values, key, where)
-    if not 1 <= value <= 2**24:
-        raise DataError(f"{where}: '{key}' is {value:g}; expected a number of pixels")
-    return int(value)
-
-
-def _depth_scale(content: Mapping[str, Any], path: Path) -> float:
-    """Units in a metre."""
-    key = next((k for k in ("integer_depth_scale", "depth_unit_scale_factor") if content.get(k) is not None), None)
-    if key is None:
-        return MILLIMETRES
-    metres = number(content, key, str(path))
-    if metres <= 0 or math.isinf(1 / metres):
-        raise DataError(f"{path}: '{key}' is {metres:g}; expected the metres in a unit of depth")
-    return 1 / metres

@@ -78,8 +78,11 @@ class Tum(FileDataset[TumOptions]):
         numbers = read_table(trajectory, 8, "timestamp tx ty tz qx qy qz qw")
         _require_ascending(trajectory, numbers[:, 0])
         times, depths = self._listed(folder, self._list(folder))
-        colors = self._colors(folder, times)
-        paired = np.array([color is not None for color in colors]) if colors else np.ones(len(times), dtype=np.bool_)
+        images, partners = depths, np.arange(len(times))
+        if in_color := (folder / "rgb.txt").is_file():
+            color_times, images = self._listed(folder, "rgb.txt")
+            partners = mutual_nearest(times, color_times, self.options.max_difference)
+        paired = partners >= 0
         if not paired.any():
             limit = self.options.max_difference
             raise DataError(f"{folder}: no depth image is within {limit:g} s of a colour image; set max_difference")
@@ -92,35 +95,26 @@ class Tum(FileDataset[TumOptions]):
             max_gap=self.options.max_difference,
             method=self.options.poses,
         )
-        camera = camera_of(self.options.intrinsics, _calibrated(folder), IMAGE_SIZE)
+        usual = next((numbers for key, numbers in CAMERAS.items() if key in folder.resolve().name), USUAL)
+        camera = camera_of(self.options.intrinsics, usual, IMAGE_SIZE)
         return [
             FrameSource(
-                name=(colors[k] or depths[k]).stem if colors else depths[k].stem,
+                name=images[partners[k]].stem,
                 depth=depths[k],
                 pose=poses[k],
                 pose_file=trajectory,
                 camera=camera,
-                color=colors[k] if colors else None,
+                color=images[partners[k]] if in_color else None,
                 timestamp=float(times[k]),
             )
             for k in np.flatnonzero(paired)
         ]
 
     def _list(self, folder: Path) -> str:
-        """The list of the images that make the frames."""
         cast = self.options.surface is not None and not (folder / "depth.txt").is_file()
         return "rgb.txt" if cast else "depth.txt"
 
-    def _colors(self, folder: Path, times: Float64) -> list[Path | None]:
-        """The colour image of each depth image; none at all where there is no rgb.txt."""
-        if not (folder / "rgb.txt").is_file():
-            return []
-        color_times, colors = self._listed(folder, "rgb.txt")
-        partners = mutual_nearest(times, color_times, self.options.max_difference)
-        return [None if partner < 0 else colors[partner] for partner in partners]
-
     def _listed(self, folder: Path, name: str) -> tuple[Float64, list[Path]]:
-        """Time stamps and paths of a list of images."""
         path = folder / name
         times, paths = [], []
         for line, text in records(path):
@@ -152,8 +146,3 @@ def _require_ascending(path: Path, times: Float64) -> None:
             f"{path}: time stamps must ascend, but record {k + 2} ({times[k + 1]:.6f}) is not after record {k + 1}"
             f" ({times[k]:.6f}); sort the file"
         )
-
-
-def _calibrated(folder: Path) -> tuple[float, float, float, float]:
-    name = folder.resolve().name
-    return next((camera for key, camera in CAMERAS.items() if key in name), USUAL)

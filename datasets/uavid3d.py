@@ -12,7 +12,7 @@ from typing import Any, Literal
 
 from pydantic import BaseModel, Field
 
-from semstab.datasets.colmap import has_model, image_name, read_model
+from semstab.datasets.colmap import has_model, read_model
 from semstab.datasets.files.options import (
     CameraAxes,
     FileOptions,
@@ -25,8 +25,8 @@ from semstab.datasets.files.options import (
     Template,
     inside,
 )
-from semstab.datasets.files.reader import FileDataset, files_named
-from semstab.datasets.formats.disk import read_intrinsics
+from semstab.datasets.files.reader import FileDataset
+from semstab.datasets.formats.disk import files_named, read_intrinsics
 from semstab.datasets.formats.images import COLOR_SUFFIXES, DEPTH_SUFFIXES
 from semstab.datasets.geometry.cameras import Camera, Poses
 from semstab.datasets.transforms_json import read_transforms
@@ -62,7 +62,7 @@ class Uavid3dOptions(FileOptions):
     transforms: str = Field("transforms.json", description="file of the cameras")
     pose: str = Field("pose/{name}.txt", description="template of the matrices")
     intrinsics: FourIntrinsics = None
-    intrinsics_file: str = Field("intrinsics.txt", description="3x3 matrix, beside matrices of poses")
+    intrinsics_file: str = Field("intrinsics.txt", description="3x3 matrix, where poses are matrices")
     ground_truth: GroundTruth = "Labels/{name}.png"
     pose_convention: PoseConvention = None
     camera_axes: CameraAxes = None
@@ -100,42 +100,27 @@ class Uavid3d(FileDataset[Uavid3dOptions]):
 
     def frames(self, folder: Path) -> list[FrameSource]:
         """One a pose. Raises what `read_model` or `read_transforms` raises."""
-        if self.options.pose_format == "transforms":
-            path = self._inside(folder, self.options.transforms)
-            return read_transforms(path, self.options.root, folder, self._depth)
-        return self._of_model(folder) if self.options.pose_format == "colmap" else self._of_matrices(folder)
-
-    def _of_model(self, folder: Path) -> list[FrameSource]:
-        path, images = read_model(self._inside(folder, self.options.model))
-        folders = Folders()
-        return [
-            self._frame(folder, image_name(image.name), image.T_cw, path, image.camera, folders) for image in images
-        ]
-
-    def _of_matrices(self, folder: Path) -> list[FrameSource]:
-        before, _, after = self._pose.text.partition("{name}")
-        where, _, before = before.rpartition("/")
-        stated = self.options.intrinsics
-        K = Intrinsics(*stated) if stated else read_intrinsics(self._inside(folder, self.options.intrinsics_file))
-        folders = Folders()
-        return [
-            self._frame(folder, name, None, path, Camera(K), folders)
-            for name, path in files_named(folder / where, before, after).items()
-        ]
-
-    def _frame(
-        self, folder: Path, name: str, pose: Poses | None, pose_file: Path, camera: Camera, folders: Folders
-    ) -> FrameSource:
-        depth = self._inside(folder, self._depth.filled(name=name))
-        color = self._inside(folder, self._images.filled(name=name))
-        return FrameSource(
-            name=name,
-            depth=folders.one_of(depth, (*DEPTH_SUFFIXES, ".bin")) or depth,
-            pose=pose,
-            pose_file=pose_file,
-            camera=camera,
-            color=folders.one_of(color, COLOR_SUFFIXES),
-        )
+        options, folders = self.options, Folders()
+        if options.pose_format == "transforms":
+            path = self._inside(folder, options.transforms)
+            return read_transforms(path, options.root, folder, self._depth)
+        posed: list[tuple[str, Poses | None, Path, Camera]]  # name, pose, file of it, camera
+        if options.pose_format == "colmap":
+            path, images = read_model(self._inside(folder, options.model))
+            posed = [(image.frame, image.T_cw, path, image.camera) for image in images]
+        else:
+            before, _, after = self._pose.text.partition("{name}")
+            where, _, before = before.rpartition("/")
+            file = self._inside(folder, options.intrinsics_file)
+            camera = Camera(Intrinsics(*options.intrinsics) if options.intrinsics else read_intrinsics(file))
+            posed = [(name, None, path, camera) for name, path in files_named(folder / where, before, after).items()]
+        frames = []
+        for name, pose, pose_file, camera in posed:
+            depth = self._inside(folder, self._depth.filled(name=name))
+            color = folders.one_of(self._inside(folder, self._images.filled(name=name)), COLOR_SUFFIXES)
+            depth = folders.one_of(depth, (*DEPTH_SUFFIXES, ".bin")) or depth
+            frames.append(FrameSource(name, depth, pose_file, camera, pose, color=color))
+        return frames
 
     def _inside(self, folder: Path, relative: str) -> Path:
         return inside(self.options.root, folder, relative, "the options of uavid3d")

@@ -356,3 +356,11 @@ def opened(form: Format, root: Path, **options):
     dataset = open_dataset(form.dataset, {"root": root, "classes": CLASSES} | needed | options)
     (name,) = dataset.scenes
     return dataset.scene(name)
+
+
+def write_labelled(form: Format, folder: Path) -> tuple[list[str], list[Frame]]:
+    """Names and frames of a scene that is written with its label maps."""
+    frames = source(form.scale)
+    names = form.write(folder, frames)
+    write_labels(folder, names, frames)
+    return names, frames

@@ -22,7 +22,7 @@ from typer.testing import CliRunner
 from semstab.backends import create
 from semstab.cli import app
 from semstab.config import Config
-from semstab.convert import DepthFormat, convert, convert_scene, depth_format, matrix_text, quantised
+from semstab.convert import convert, convert_scene, depth_format, matrix_text, quantised
 from semstab.datasets import GROUND_TRUTH, open_dataset
 from semstab.errors import ConfigError, DataError
 from semstab.model.frames import Intrinsics
@@ -279,12 +279,6 @@ def test_a_format_holds_what_it_was_chosen_for(depth, tolerance):
         assert stored.dtype == np.uint16
 
 
-def test_without_valid_depth_any_format_will_do():
-    nothing = np.zeros((2, 2), np.float32)
-    assert depth_format([nothing], 0.0) == DepthFormat(1000.0)
-    assert str(DepthFormat(None)) == "float32 .npy"
-
-
 @given(hnp.arrays(np.float64, (4, 4), elements=st.floats(-1e7, 1e7)))
 def test_matrices_read_back_to_the_same_numbers(matrix):
     numbers = [float(word) for word in matrix_text(matrix).split()]
@@ -334,25 +328,6 @@ def test_an_oblique_up_direction_and_unknown_classes_are_said_to_be_lost(tmp_pat
         "the classes of gt, which are not known; write a label_space.yaml for them",
     )
     assert opened(tmp_path / "out").frame(1, "net").labels is not None
-
-
-def test_scores_keep_type_and_layout(tmp_path):
-    room = Room(walk(2), soft=True)
-    of_memory(room, tmp_path, backbones=["net"])
-    scores = opened(tmp_path / "out").frame(1, "net-scores").scores
-    assert scores.dtype == np.float32
-    np.testing.assert_array_equal(scores, room.frame(1, "net").scores)
-
-
-def test_masks_are_kept(tmp_path):
-    root = tiny_scene.write(tmp_path / "wall")
-    (root / "mask").mkdir()
-    Image.fromarray(np.eye(6, 8, dtype=np.uint8)).save(root / "mask/0001.png")
-    list(convert(configure(root), tmp_path / "out"))
-    source, scene = opened(root), opened(tmp_path / "out/wall")
-    np.testing.assert_array_equal(scene.frame(1, "a").mask, source.frame(1, "a").mask)
-    assert scene.frame(1, "a").mask.sum() == 6 * 8 - 6
-    assert scene.frame(0, "a").mask is None
 
 
 def test_a_scene_without_labels_keeps_depth_poses_colour_and_masks(tmp_path):

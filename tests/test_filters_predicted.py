@@ -192,7 +192,7 @@ def test_a_chain_from_the_command_line(scene):
     [
         (("--backbone", "noisy", "--filter", "threshold"), "it needs scores, and 'noisy' gives labels alone"),
         (("--backbone", "noisy", "--filter", "smooth"), "filter 'smooth' is not known"),
-        (("--predict", "stored,source=nosy", "--filter", "ema"), "backbone 'nosy' is not there; there are noisy"),
+        (("--predict", "stored,source=nosy", "--filter", "ema"), "backbone 'nosy' is not there; did you mean 'noisy'"),
         (("--predict", "stored,filters=[ema]"), "source"),
     ],
 )

@@ -1,4 +1,4 @@
-"""The posed_folder reader: its layout, incomplete frames, its digest, and the real data where it is at hand."""
+"""The posed_folder reader: layout, incomplete frames, digest, poses and intrinsics, and the real data."""
 
 import logging
 import os
@@ -7,12 +7,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
 from PIL import Image
-from posed_scene import H, W, fails, first_frame, opened, pose, save_image, write_scene
+from posed_scene import H, W, fails, first_frame, opened, pose, save_image, say, write_scene
 
 from semstab.config import FrameSelection
 from semstab.datasets import open_dataset
-from semstab.datasets.formats.disk import natural
+from semstab.datasets.formats.disk import natural, read_intrinsics, read_pose
 from semstab.datasets.scene import select_frames
 from semstab.errors import ConfigError, DataError
 
@@ -58,7 +60,7 @@ def test_scenes_go_in_natural_order_and_other_folders_do_not_count(tmp_path):
     dataset = open_dataset("posed_folder", {"root": tmp_path})
     assert dataset.scenes == ("a (1)", "scene2", "scene10")
     assert dataset.scene("a (1)").name == "a (1)"
-    message = r"scene 'scene11' is not there; there are scene10, scene2, a \(1\)"
+    message = r"scene 'scene11' is not there; did you mean 'scene10'\?"
     fails(ConfigError, message, dataset.scene, "scene11")
 
 
@@ -83,13 +85,6 @@ def test_names_sort_by_number():
     assert sorted(["f10", "f9", "f09", "g1", "10", "9", "f"], key=natural) == ["9", "10", "f", "f09", "f9", "f10", "g1"]
 
 
-def test_opening_reads_no_image(folder):
-    for path in (path for part in ("depth", "pose", "labels", "scores") for path in (folder / part).rglob("frame*")):
-        path.write_bytes(b"")
-    scene = opened(folder)
-    fails(DataError, r"depth/frame1\.png: the file is empty", scene.frame, 0, "net")
-
-
 def test_a_scene_without_labels_still_has_depth_and_poses(folder):
     (folder / "labels").rename(folder / "other labels")
     (folder / "scores").rename(folder / "other scores")
@@ -104,17 +99,12 @@ def test_a_scene_without_labels_still_has_depth_and_poses(folder):
 
 def test_an_unknown_backbone_or_frame_is_named(folder):
     scene = opened(folder)
-    message = "'net-score' is not there; there are net-scores, net, gt$"
+    message = r"'net-score' is not there; did you mean 'net-scores'\?$"
     fails(ConfigError, message, scene.label_space, "net-score")
     fails(ConfigError, message, scene.frame, 0, "net-score")
     fails(ConfigError, message, scene.digest, [0], "net-score")
     for index in (-1, 3):
         fails(ConfigError, f"there is no frame {index}; it has 3", scene.frame, index, "net")
-
-
-def test_two_backbones_of_one_name_are_refused(folder):
-    (folder / "labels/net").rename(folder / "labels/net-scores")
-    fails(ConfigError, "two label sources are called 'net-scores'; rename one", opened, folder)
 
 
 def test_two_files_of_one_frame_are_refused(folder):
@@ -157,13 +147,6 @@ def test_an_incomplete_frame_is_an_error_or_left_out(folder, missing, caplog):
         assert files == [f"{folder}/depth/frame1.png", f"{folder}/depth/frame10.png"]
 
 
-def test_many_missing_files_are_counted(folder):
-    for k in range(20):
-        (folder / f"pose/extra{k}.txt").write_text("")
-    message = r"60 missing: .*depth/extra0\.png, .*labels/net/extra0\.png.*\(55 more\)"
-    fails(DataError, message, select_frames, opened(folder), FrameSelection(), ("net", "net-scores"))
-
-
 def test_a_scene_without_a_whole_frame_is_an_error(folder):
     (folder / "pose").rename(folder / "poses")
     scene = opened(folder, incomplete="skip")
@@ -182,16 +165,6 @@ def test_ground_truth_may_be_sparse(folder):
 
 
 # --- digest
-
-
-def test_the_digest_follows_the_content(folder, tmp_path):
-    scene = opened(folder)
-    digest = scene.digest([0, 1], "net")
-    assert digest == opened(write_scene(tmp_path / "elsewhere")).digest([0, 1], "net")
-    assert len({digest, *(scene.digest([0, 1], b) for b in ("net-scores", "gt")), scene.digest([0], "net")}) == 4
-    save_image(folder / "color/frame1.png", np.zeros((H, W, 3), np.uint8))
-    save_image(folder / "labels/net/frame10.png", np.zeros((H, W), np.uint8))
-    assert opened(folder).digest([0, 1], "net") == digest
 
 
 @pytest.mark.parametrize("changed", ["depth/frame2.png", "pose/frame2.txt", "labels/net/frame2.png", "intrinsics.txt"])
@@ -266,3 +239,110 @@ def test_hololens():
     assert 0.002 < np.median(errors) < 0.006
     mirrored = opened(DATA / "hololens", camera_axes="opengl")
     assert np.median(reprojection_errors(mirrored, *pairs[0])) > 3 * errors[0]
+
+
+# --- poses and intrinsics
+
+
+POINT_CV = np.array([0.2, -0.3, 2.0])
+"""A point right of, above and before the camera: OpenCV axes."""
+
+
+@pytest.mark.parametrize(
+    ("axes", "point"), [("opencv", POINT_CV), ("opengl", [0.2, 0.3, -2.0]), ("ned", [2.0, 0.2, -0.3])]
+)
+@pytest.mark.parametrize("convention", ["camera_to_world", "world_to_camera"])
+def test_poses_of_any_convention_see_the_same_point(folder, axes, point, convention):
+    T = pose(5)
+    expected = T[:3, :3] @ point + T[:3, 3]
+    np.savetxt(folder / "pose/frame1.txt", T if convention == "camera_to_world" else np.linalg.inv(T))
+    say(folder, camera_axes=axes, pose_convention=convention)
+    T_wc = first_frame(folder).T_wc
+    np.testing.assert_allclose(T_wc[:3, :3] @ POINT_CV + T_wc[:3, 3], expected, rtol=0, atol=1e-8)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "1 0 0 5\n0 1 0 6\n0 0 1 7\n0 0 0 1\n",
+        "1 0 0 5\n0 1 0 6\n0 0 1 7\n",
+        "1,0,0,5,0,1,0,6,0,0,1,7,0,0,0,1",
+        "\ufeff1.0, 0, 0, 5e0\r\n0\t1 0 6\r\n0 0 1 7\r\n",
+    ],
+)
+def test_a_pose_is_16_or_12_numbers(tmp_path, text):
+    (tmp_path / "p.txt").write_text(text, encoding="utf-8")
+    np.testing.assert_array_equal(
+        read_pose(tmp_path / "p.txt"), [[1, 0, 0, 5], [0, 1, 0, 6], [0, 0, 1, 7], [0, 0, 0, 1]]
+    )
+
+
+@pytest.mark.parametrize(
+    ("text", "match"),
+    [
+        ("", "the file is empty"),
+        ("\n", "got 0 numbers"),
+        ("1 2 3 0 0 0 1", r"got 7 numbers \(position and quaternion\?\)"),
+        ("1 0 0 0 1 0 0 0 1", "got 9 numbers"),
+        ("1 0 0 x 0 1 0 0 0 0 1 0", "expected numbers .*'x'"),
+        pytest.param("1 " * 40000, "too many for such a file", id="long"),
+    ],
+)
+def test_a_pose_of_another_form_is_refused(folder, text, match):
+    (folder / "pose/frame1.txt").write_text(text)
+    fails(DataError, rf"pose/frame1\.txt: .*{match}", first_frame, folder)
+
+
+@pytest.mark.parametrize(
+    ("T", "convention", "match"),
+    [
+        (np.full((4, 4), -np.inf), "camera_to_world", "not finite"),
+        (np.full((4, 4), np.nan), "world_to_camera", "not finite"),
+        (np.zeros((4, 4)), "world_to_camera", "cannot be inverted"),
+        (np.diag([1.0, 1, -1, 1]), "camera_to_world", "mirrors"),
+        (np.diag([2.0, 2, 2, 1]), "world_to_camera", "not orthonormal"),
+        (pose(1).T, "camera_to_world", "transposed"),
+    ],
+)
+def test_a_pose_that_is_not_rigid_names_its_file(folder, T, convention, match):
+    np.savetxt(folder / "pose/frame1.txt", T)
+    fails(DataError, rf"pose/frame1\.txt: .*{match}", first_frame, folder, pose_convention=convention)
+
+
+@pytest.mark.parametrize(
+    ("text", "match"),
+    [
+        ("10 11 3 2", "got 4 numbers"),
+        ("10 0 0 0 11 0 3 2 1", "is no camera matrix"),
+        ("10 0 3 0 nan 2 0 0 1", "is no camera matrix"),
+        ("10 1 3 0 11 2 0 0 1", "skew"),
+        ("-10 0 3 0 11 2 0 0 1", "focal lengths must be positive"),
+        ("ten", "expected numbers"),
+    ],
+)
+def test_intrinsics_that_are_none_are_refused(folder, text, match):
+    (folder / "intrinsics.txt").write_text(text)
+    fails(DataError, rf"intrinsics\.txt: .*{match}", opened, folder)
+
+
+def test_missing_intrinsics_are_named(folder):
+    (folder / "intrinsics.txt").unlink()
+    fails(DataError, r"intrinsics\.txt: cannot be read", opened, folder)
+
+
+NUMBERISH = st.text(alphabet="0123456789.eE+-_, \n\tnaif", max_size=120)
+
+
+@given(content=st.one_of(st.binary(max_size=120), NUMBERISH.map(str.encode)))
+@settings(max_examples=80, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+def test_random_text_is_a_matrix_or_a_data_error(tmp_path, content):
+    path = tmp_path / "matrix.txt"
+    path.write_bytes(content)
+    for read in (read_pose, read_intrinsics):
+        message = path.name
+        try:
+            read(path)
+        except DataError as error:
+            message = str(error)
+        assert path.name in message
+        assert "\n" not in message

@@ -2,6 +2,15 @@
 
 from __future__ import annotations
 
+import io
+import itertools
+import os
+import re
+import shlex
+import shutil
+import time
+from pathlib import Path
+
 import numpy as np
 import pytest
 from dataset_writers import (
@@ -11,33 +20,42 @@ from dataset_writers import (
     H,
     W,
     assert_same_voxels,
-    city,
-    fused,
     opened,
     save,
     source,
-    write_labels,
+    write_labelled,
+    write_lines,
 )
+from posed_scene import fails
+from pydantic import ValidationError
 
-from semstab.config import FrameSelection
-from semstab.datasets import open_dataset
+from semstab.config import Config, FrameSelection
+from semstab.core.files import parse_yaml
+from semstab.datasets import REGISTRY, open_dataset, options_model
+from semstab.datasets.files.options import Folders
 from semstab.datasets.scene import select_frames
+from semstab.errors import DataError
+from semstab.model.labels import shipped_taxonomies
 
 
-@pytest.fixture(params=FORMATS)
+@pytest.fixture(scope="module", params=FORMATS)
 def form(request):
     return FORMATS[request.param]
 
 
-@pytest.fixture
-def written(form, tmp_path):
-    """A root with one scene two folders deep, with labels of 'net' in its folder."""
-    frames = source(form.scale)
-    folder = tmp_path / "room" / "seq 1"
+@pytest.fixture(scope="module")
+def written(form, tmp_path_factory):
+    """A root with one scene two folders deep, with labels of 'net' in its folder; nothing is changed in it."""
+    folder = tmp_path_factory.mktemp("form") / "room" / "seq 1"
     folder.mkdir(parents=True)
-    names = form.write(folder, frames)
-    write_labels(folder, names, frames)
-    return folder, names, frames
+    return folder, *write_labelled(form, folder)
+
+
+@pytest.fixture
+def copied(written, tmp_path):
+    """The same in a folder of its own."""
+    shutil.copytree(written[0].parents[1], tmp_path / "copy")
+    return tmp_path / "copy/room/seq 1", *written[1:]
 
 
 def test_files_give_the_voxels_of_their_source(form, written):
@@ -112,8 +130,8 @@ def test_intrinsics_for_another_size_are_scaled(form, written):
     assert K.cx == pytest.approx((frames[0].intrinsics.cx + 0.5) / 2 - 0.5)
 
 
-def test_the_digest_follows_what_counts(form, written):
-    folder, names, frames = written
+def test_the_digest_follows_what_counts(form, copied):
+    folder, names, frames = copied
     scene = opened(form, folder)
     digest = scene.digest([0, 1], "net")
     for index in (0, 1):
@@ -127,8 +145,8 @@ def test_the_digest_follows_what_counts(form, written):
     assert opened(form, folder).digest([0, 1], "net") != digest
 
 
-def test_a_frame_that_lacks_a_file_is_an_error_or_left_out(form, written, caplog):
-    folder, names, _ = written
+def test_a_frame_that_lacks_a_file_is_an_error_or_left_out(form, copied, caplog):
+    folder, names, _ = copied
     depth = opened(form, folder).frame(1, "net").files["depth"]
     lost = folder / f"labels/net/{names[2]}.png"
     lost.unlink()
@@ -140,14 +158,6 @@ def test_a_frame_that_lacks_a_file_is_an_error_or_left_out(form, written, caplog
     assert select_frames(scene, FrameSelection(), ["net"]).indices == [0, 1, 3]
     assert (len(scene), scene.frame(1, "net").files["depth"]) == (COUNT, depth)
     assert "1 of 4 frames left out" in caplog.text
-
-
-def test_the_scene_in_the_middle_of_the_city_is_worth_reading():
-    """The source has depth at every pixel, several classes, and views that overlap."""
-    frames = city()
-    assert all(frame.valid.all() for frame in frames)
-    assert len(np.unique([frame.labels for frame in frames])) > 4
-    assert (fused(frames).op >= 3).mean() > 0.05
 
 
 @pytest.mark.parametrize("above", [False, True])
@@ -162,3 +172,126 @@ def test_the_camera_of_7_scenes_is_that_of_its_file(tmp_path, above):
     np.testing.assert_allclose(found.matrix, frames[0].intrinsics.matrix)
     said = open_dataset("seven_scenes", {"root": folder, "intrinsics": (50, 51, 24, 16)}).scene("seq-01")
     assert said.intrinsics(0, (H, W)).fy == 51
+
+
+# --- opening reads no image
+
+
+IMAGES = {".png", ".jpg", ".npy", ".tif"}
+
+
+def is_image(path: Path) -> bool:
+    return path.suffix in IMAGES or "depth_maps" in path.parts
+
+
+@pytest.mark.parametrize("name", FORMATS)
+def test_opening_and_selecting_read_no_image(tmp_path, name, monkeypatch):
+    form = FORMATS[name]
+    write_labelled(form, tmp_path)
+    images = [path for path in tmp_path.rglob("*") if path.is_file() and is_image(path)]
+    assert len(images) >= 3 * COUNT
+    for path in images:
+        path.write_bytes(b"")  # whoever reads it fails
+    read = []
+    for module in (io, os):  # who opens a file by either of the two is seen
+        actual = module.open
+        monkeypatch.setattr(
+            module, "open", lambda path, *rest, to=actual, **how: (read.append(Path(path)), to(path, *rest, **how))[1]
+        )
+    scene = opened(form, tmp_path)
+    assert select_frames(scene, FrameSelection()).indices == [*range(COUNT)]
+    assert read
+    assert not [path for path in read if is_image(path)]
+    fails(DataError, "the file is empty", scene.frame, 0, "net")
+    assert is_image(read[-1])
+
+
+def test_a_posed_folder_of_thousands_of_frames_opens_at_once(tmp_path):
+    """Two label sources, of which one has every hundredth frame; what is selected is all that has to be there."""
+    names = [f"{k:06d}" for k in range(3000)]
+    for part in ("depth", "pose", "labels/all", "labels/some"):
+        (tmp_path / part).mkdir(parents=True)
+    for name in names:
+        (tmp_path / f"depth/{name}.png").touch()
+        (tmp_path / f"labels/all/{name}.png").touch()
+        write_lines(tmp_path / f"pose/{name}.txt", ["1 0 0 0", "0 1 0 0", "0 0 1 0"])
+    for name in names[::100]:
+        (tmp_path / f"labels/some/{name}.png").touch()
+    write_lines(tmp_path / "intrinsics.txt", ["9 0 3", "0 9 3", "0 0 1"])
+    started = time.process_time()
+    scene = opened(FORMATS["posed_folder"], tmp_path)
+    assert select_frames(scene, FrameSelection(), ["all"]).indices == [*range(3000)]
+    assert select_frames(scene, FrameSelection(stride=100), ["all", "some"]).left_out == 0
+    assert time.process_time() - started < 2
+    fails(DataError, "2970 missing", select_frames, scene, FrameSelection(), ["some"])
+
+
+def test_a_name_that_is_listed_in_a_folder_is_found_and_no_other(tmp_path):
+    for name in ("b.png", "a", "é.PNG", "b.pngx"):
+        (tmp_path / name).touch()
+    folders = Folders()
+    asked = ("b.png", "a", "é.PNG", "b.pngx", "b", "b.pn", "c", "b.pngxy")
+    assert [folders.has(tmp_path / name) for name in asked] == [True] * 4 + [False] * 4
+    assert folders.one_of(tmp_path / "b", (".jpg", ".png")) == tmp_path / "b.png"
+    assert folders.one_of(tmp_path / "é.PNG", (".png",)) == tmp_path / "é.PNG"
+    assert not folders.has(tmp_path / "nowhere/a")
+
+
+# --- docs/datasets.md
+
+
+TEXT = (Path(__file__).parents[1] / "docs/datasets.md").read_text()
+SECTIONS = {match[1]: match[2] for match in re.finditer(r"^## [^\n]*\(`(\w+)`\)\n(.*?)(?=^## |\Z)", TEXT, re.M | re.S)}
+READERS = {
+    name for name, entry in REGISTRY.builtin.items() if re.fullmatch(r"semstab\.datasets\.\w+:\w+", entry.target)
+}
+
+
+def test_every_reader_has_a_section_with_its_terms():
+    assert set(SECTIONS) == READERS - {"city", "posed_folder", "predicted"}
+    for name, section in SECTIONS.items():
+        assert all(f"- **{word}**" in section for word in ("Get", "Licence", "Read", "Name")), name
+        assert f"--dataset {name}" in section
+
+
+COMMANDS = [
+    (name, command)
+    for name, section in SECTIONS.items()
+    for block in re.findall(r"```bash\n(.*?)```", section, re.S)
+    for command in block.replace("\\\n", " ").strip().splitlines()
+]
+
+
+@pytest.mark.parametrize(("name", "command"), COMMANDS)
+def test_the_sample_commands_set_what_there_is(name, command):
+    words = shlex.split(command)
+    assert words[words.index("--dataset") + 1] == name
+    options, frames = {"root": "."}, {}
+    for setting in (word for before, word in itertools.pairwise(words) if before == "--set"):
+        key, _, value = setting.partition("=")
+        group = options if key.startswith("dataset.options.") else frames
+        group[key.rpartition(".")[2]] = parse_yaml(value, key)
+    try:
+        model = options_model(name).model_validate(options)
+    except ValidationError as error:
+        pytest.fail(str(error))
+    Config.build({"frames": frames})
+    assert getattr(model, "taxonomy", None) in (None, *shipped_taxonomies())
+
+
+def test_the_options_in_tables_are_those_of_every_reader():
+    table = TEXT.split("## Options that every dataset below has")[1].split("## Frames")[0]
+    named = set(
+        re.findall(r"`(\w+)`", "".join(line.split("|")[1] for line in table.splitlines() if line.startswith("|")))
+    )
+    assert len(named) > 8
+    for name in SECTIONS:
+        assert named <= set(options_model(name).model_fields), name
+
+
+def test_the_frames_that_are_shown_are_settings():
+    table = TEXT.split("## Frames")[1].split("## UAVid")[0]
+    shown = re.findall(r"\| `(\{.*?\})` \|", table)
+    assert len(shown) == 4
+    for text in shown:
+        Config.build({"frames": parse_yaml(text, "docs/datasets.md")})

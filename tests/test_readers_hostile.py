@@ -2,40 +2,34 @@
 
 from __future__ import annotations
 
-import io
-import json
-import pickle
-import resource
-import struct
+import os
 from pathlib import Path
 
-import numpy as np
 import pytest
-from dataset_writers import CLASSES, COUNT, FORMATS, opened, source, write_labels, write_lines
+from dataset_writers import CLASSES, COUNT, FORMATS, opened, write_labelled, write_lines
 from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 from image_files import raw_png
-from posed_scene import fails
+from posed_scene import fails, first_frame, write_scene
+from posed_scene import opened as opened_folder
 
-from semstab.config import FrameSelection
+from semstab.config import FrameSelection, read_yaml
 from semstab.datasets.colmap import read_model
-from semstab.datasets.files.depth import read_depth_map
 from semstab.datasets.formats.disk import read_table, records
 from semstab.datasets.scannet import read_class_table
 from semstab.datasets.scene import select_frames
 from semstab.datasets.transforms_json import read_transforms
 from semstab.engine import run
-from semstab.errors import DataError, SemstabError
+from semstab.errors import ConfigError, DataError, SemstabError, one_line
+from semstab.model.labels import LabelSpace
 from semstab.model.voxels import VoxelTable
+from semstab.predict.folder import PredictionFolder
 from semstab.settings import load_config
 
 
 def write(form, folder: Path) -> list[str]:
     folder.mkdir(parents=True, exist_ok=True)
-    frames = source(form.scale)
-    names = form.write(folder, frames)
-    write_labels(folder, names, frames)
-    return names
+    return write_labelled(form, folder)[0]
 
 
 @pytest.fixture(params=FORMATS)
@@ -70,50 +64,6 @@ def read_all(form, folder) -> None:
 # --- images
 
 
-def test_an_image_that_claims_3_6_gigapixels_is_refused_at_once(tmp_path):
-    form, folder = FORMATS["scannet"], tmp_path
-    names = write(form, folder)
-    bomb = raw_png(60_000, 60_000, 8, 0, b"x\x9c\x03\x00\x00\x00\x00\x01")
-    (folder / f"labels/net/{names[1]}.png").write_bytes(bomb)
-    scene = opened(form, folder)
-    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    fails(DataError, rf"labels/net/{names[1]}\.png: claims 60000x60000 pixels", scene.frame, 1, "net")
-    depth = Path(scene.frame(2, "net").files["depth"])
-    depth.write_bytes(raw_png(60_000, 60_000, 16, 0, b""))
-    fails(DataError, "claims 60000x60000 pixels", scene.frame, 2, "net")
-    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 200_000  # kilobytes
-
-
-class Unpickled:
-    """What a hostile file would run."""
-
-    def __reduce__(self):
-        return Path.write_text, (Path("unpickled"), "yes")
-
-
-def pickled_array() -> bytes:
-    """A .npy file of objects, as numpy writes it: loading it runs what is pickled."""
-    out = io.BytesIO()
-    np.lib.format.write_array(out, np.array([Unpickled()], dtype=object), allow_pickle=True)
-    return out.getvalue()
-
-
-def test_pickled_objects_are_not_run(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    form = FORMATS["tartanair"]
-    names = write(form, tmp_path)
-    with pytest.raises((pickle.UnpicklingError, ValueError)):
-        np.load(io.BytesIO(pickled_array()))
-    scene = opened(form, tmp_path)
-    (tmp_path / f"depth_left/{names[0]}_left_depth.npy").write_bytes(pickled_array())
-    fails(DataError, r"_left_depth\.npy: .*does not hold plain numbers", scene.frame, 0, "net")
-    (tmp_path / f"seg_left/{names[1]}_left_seg.npy").write_bytes(pickled_array())
-    fails(DataError, r"_left_seg\.npy: .*does not hold plain numbers", scene.frame, 1, "gt")
-    (tmp_path / f"labels/net/{names[2]}.png").write_bytes(pickled_array())
-    fails(DataError, r"labels/net/.*not a PNG image", scene.frame, 2, "net")
-    assert not (tmp_path / "unpickled").exists()
-
-
 # --- text
 
 
@@ -129,22 +79,6 @@ def test_a_text_file_cut_in_the_middle_is_named(written):
             read_all(form, folder)
         path.write_bytes(whole)
     read_all(form, folder)
-
-
-@given(data=st.data())
-@settings(max_examples=8, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
-def test_a_text_file_with_any_bytes_changed_works_or_says_why(written, data):
-    form, folder, _ = written
-    path = data.draw(st.sampled_from(text_files(folder)), label="file")
-    whole = path.read_bytes()
-    at = data.draw(st.integers(0, len(whole)), label="at")
-    gone = data.draw(st.integers(0, 12), label="gone")
-    new = data.draw(st.one_of(st.binary(max_size=8), st.sampled_from(WORDS)), label="new")
-    try:
-        path.write_bytes(whole[:at] + new + whole[at + gone :])
-        promised(lambda: read_all(form, folder))
-    finally:
-        path.write_bytes(whole)
 
 
 WORDS = [
@@ -166,19 +100,6 @@ def test_counts_that_do_not_match_are_named(tmp_path, name, file, match):
     write(FORMATS[name], tmp_path)
     write_lines(tmp_path / file, (tmp_path / file).read_text().splitlines()[1:])
     fails(DataError, match, opened, FORMATS[name], tmp_path)
-
-
-@pytest.mark.parametrize("name", ["hololens", "replica, NICE-SLAM", "tartanair", "seven_scenes", "scannet"])
-def test_a_pose_with_nan_is_lost_and_no_frame(tmp_path, name, caplog):
-    form = FORMATS[name]
-    write(form, tmp_path)
-    path = next(p for p in text_files(tmp_path) if "pose" in str(p.relative_to(tmp_path)) or "traj" in p.name)
-    lines = path.read_text().splitlines()
-    write_lines(path, [lines[0].replace(lines[0].split()[0], "nan", 1), *lines[1:]])
-    scene = opened(form, tmp_path)
-    assert select_frames(scene, FrameSelection()).indices == [1, 2, 3]
-    assert "1 of 4 selected frames have no pose" in caplog.text
-    fails(DataError, "the pose is not finite", scene.frame, 0, "net")
 
 
 @pytest.mark.parametrize(
@@ -233,43 +154,6 @@ def test_any_text_is_read_or_refused_in_one_line(tmp_path, content):
     promised(lambda: read_class_table(tmp_path / "t.tsv", "nyu40id"))
 
 
-@given(
-    images=st.binary(max_size=120),
-    cameras=st.binary(max_size=80),
-    count=st.integers(0, 2**64 - 1),
-    depth=st.binary(max_size=60),
-)
-@settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
-def test_any_bytes_are_read_or_refused_in_one_line(tmp_path, images, cameras, count, depth):
-    (tmp_path / "cameras.bin").write_bytes(struct.pack("<Q", count) + cameras)
-    (tmp_path / "images.bin").write_bytes(struct.pack("<Q", count) + images)
-    (tmp_path / "d.bin").write_bytes(b"2&3&1&" + depth)
-    promised(lambda: read_model(tmp_path))
-    promised(lambda: read_depth_map(tmp_path / "d.bin"))
-
-
-PATHS = ["", "images/1.png", "../x", "a\nb", "\ud800"]
-JSON = st.recursive(
-    st.none() | st.booleans() | st.integers() | st.floats() | st.sampled_from(PATHS),
-    lambda inner: st.lists(inner, max_size=4) | st.dictionaries(st.sampled_from(["x", "y"]), inner, max_size=2),
-    max_leaves=8,
-)  # fmt: skip
-KEYS = ["fl_x", "fl_y", "cx", "cy", "w", "h", "k1", "camera_model", "camera_angle_x", "integer_depth_scale", "frames"]
-FRAME_KEYS = ["file_path", "depth_file_path", "depth_path", "transform_matrix", "fl_x", "w"]
-
-
-@given(
-    shared=st.dictionaries(st.sampled_from(KEYS), JSON, max_size=4),
-    own=st.dictionaries(st.sampled_from(FRAME_KEYS), JSON, max_size=3),
-)
-@settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
-def test_any_transforms_are_read_or_refused_in_one_line(tmp_path, shared, own):
-    frame = {"file_path": "images/1.png", "depth_path": "d.png", "transform_matrix": np.eye(4).tolist()}
-    content = {"fl_x": 9, "cx": 1, "cy": 1, "frames": [frame | own, frame | {"file_path": "images/2.png"}]} | shared
-    (tmp_path / "transforms.json").write_text(json.dumps(content))
-    promised(lambda: read_transforms(tmp_path / "transforms.json", tmp_path, tmp_path))
-
-
 # --- as a run
 
 
@@ -283,3 +167,68 @@ def test_a_run_reads_a_dataset_and_names_a_damaged_file(tmp_path):
     assert VoxelTable.load(tmp_path / f"out/voxels/{summary.unit.slug}.parquet").op.max() > 1
     (tmp_path / f"data/labels/net/{names[COUNT - 1]}.png").write_bytes(raw_png(60_000, 60_000, 8, 0, b""))
     fails(DataError, "claims 60000x60000 pixels", run, config, out=tmp_path / "again")
+
+
+# --- files that are none, aliases without end, names that lead out
+
+
+@pytest.mark.parametrize("file", ["intrinsics.txt", "pose/frame1.txt", "depth/frame1.png", "scene.yaml"])
+def test_a_pipe_or_a_device_is_no_file(tmp_path, file):
+    folder = write_scene(tmp_path / "scene")
+    (folder / file).unlink()
+    os.mkfifo(folder / file)
+    if file != "scene.yaml" and not file.endswith(".png"):
+        fails(DataError, "it is no regular file", first_frame, folder)
+    (folder / file).unlink()
+    (folder / file).symlink_to("/dev/zero")
+    if file == "intrinsics.txt":
+        fails(DataError, "it is no regular file", first_frame, folder)
+    fails(ConfigError, "it is no regular file", read_yaml, folder / file)
+
+
+BOMB = "a: &a [x, x, x, x, x, x, x, x, x, x]\n" + "".join(
+    f"{new}: &{new} [{', '.join([f'*{old}'] * 10)}]\n" for old, new in zip("abcdefgh", "bcdefghi", strict=True)
+)
+
+
+@pytest.mark.parametrize("content", [BOMB + "classes: *i\n", "classes: &c [*c, *c]\n"])
+def test_aliases_that_stand_for_a_billion_values_are_refused(tmp_path, content):
+    folder = write_scene(tmp_path / "scene")
+    (folder / "labels/net/label_space.yaml").write_text(content)
+    fails(ConfigError, r"label_space\.yaml: its aliases", opened_folder(folder).label_space, "net")
+    (folder / "scene.yaml").write_text(content)
+    fails(ConfigError, r"scene\.yaml: its aliases", opened_folder, folder)
+
+
+def test_aliases_that_save_writing_are_kept(tmp_path):
+    (tmp_path / "c.yaml").write_text("classes: &c [a, b]\nagain: *c\nmore: {<<: {x: 1}}\n")
+    assert read_yaml(tmp_path / "c.yaml") == {"classes": ["a", "b"], "again": ["a", "b"], "more": {"x": 1}}
+
+
+def test_many_classes_are_no_bomb(tmp_path, monkeypatch):
+    monkeypatch.setattr("semstab.core.files.MAX_ALIASED", 10)
+    classes = "".join(f"- {{name: class {k}, id: {k}, color: [1, 2, 3]}}\n" for k in range(100))
+    (tmp_path / "many.yaml").write_text(f"classes:\n{classes}")
+    assert len(LabelSpace.load(tmp_path / "many.yaml")) == 100
+
+
+def test_messages_are_short_whatever_the_file_holds(tmp_path):
+    folder = write_scene(tmp_path / "scene")
+    for file, content in (
+        ("pose/frame1.txt", "x" * 60_000),
+        ("labels/net/label_space.yaml", f"classes: [{{name: {'y' * 60_000}, colour: 1}}]"),
+        ("labels/net/label_space.yaml", f"{'k' * 60_000}: 1\nclasses: [a]"),
+        ("labels/net/label_space.yaml", f"classes: [{{name: a, id: {'z' * 60_000}}}, b]"),
+    ):
+        (folder / file).write_text(content)
+        with pytest.raises((ConfigError, DataError)) as caught:
+            opened_folder(folder).frame(0, "net")
+        assert len(str(caught.value)) < 400 + len(str(folder))
+    assert len(one_line(ValueError("v" * 9999))) < 250
+
+
+def test_predictions_stay_in_their_folder(tmp_path):
+    folder = PredictionFolder(tmp_path / "scene/labels/net", "labels", {}, {}, None)
+    for name in ("../../../evil", "/tmp/evil"):
+        fails(DataError, "leaves", folder.file, name)
+    assert folder.file("cam 0/0001") == tmp_path / "scene/labels/net/cam 0/0001.png"

@@ -50,12 +50,6 @@ def test_the_nearest_pose_and_none_beyond_the_gap():
     assert np.isnan(found[[1, 3]]).all()
 
 
-def test_outside_the_trajectory_its_end_holds():
-    times = np.array([1.0, 2.0])
-    found = at_times(times, turning(times), np.array([0.99, 2.01]), max_gap=0.02, method="interpolate")
-    np.testing.assert_allclose(found, turning(times), atol=1e-12)
-
-
 def test_lost_poses_are_no_neighbours():
     times = np.array([0.0, 1.0, 2.0])
     poses = turning(times)

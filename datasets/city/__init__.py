@@ -1,8 +1,8 @@
 """The built-in dataset `city`: a simulated UAV flight over a procedural town, with simulated backbones.
 
 Five towns (scene0 to scene4) with roads, buildings, trees, gardens, cars and people, every face of a uavid8 class.
-Depth is exact: the rays' triangles are found with embree, their planes are cut in float64. What the backbones get
-wrong, and where and when, is set by `CityOptions.backbones`; `SimulatedBackbone` documents the error model.
+Depth is exact: the rays' triangles are found with embree, their planes are cut in float64. Errors of the
+backbones are set by `CityOptions.backbones`; `SimulatedBackbone` documents the error model.
 """
 
 from __future__ import annotations
@@ -68,7 +68,7 @@ class CityScene(Scene):
         self._flight = FLIGHTS[name]
         self.origin = np.array(options.origin, dtype=np.float64)
         self.rendered: dict[int, Rendered] = {}
-        """The frames that are kept, by their index."""
+        """By index; those that fit into memory."""
         self._lock = threading.Lock()
 
     def __len__(self) -> int:
@@ -143,11 +143,6 @@ class CityScene(Scene):
         """What rays hit of the town, whatever the time."""
         return Caster(self.world.still)
 
-    @cached_property
-    def _ground(self) -> float:
-        """Mean height of the ground under the flight."""
-        return float(self.world.terrain.height(*self._flight.path(np.linspace(0, 1, 50))).mean())
-
     def _share(self, index: int) -> float:
         """How much of the flight lies behind at a frame."""
         return index / max(1, len(self) - 1)
@@ -156,23 +151,20 @@ class CityScene(Scene):
         if not 0 <= index < len(self):
             raise DataError(f"city/{self.name}: there is no frame {index}; the scene has {len(self)} frames, from 0")
         with self._lock:  # the town is built once, by whoever asks first
-            ground = self._ground
+            terrain = self.world.terrain
+        ground = float(terrain.height(*self._flight.path(np.linspace(0, 1, 50))).mean())
         return self._flight.pose(self._share(index), ground, self._options.altitude)
 
     def _render(self, index: int, T: Float64) -> Rendered:
-        """The rendered frame, kept while there is room.
-
-        What does not fit is rendered again: dropping old frames instead would, in passes over all frames, drop each
-        of them just before it is needed.
-        """
+        """The rendered frame, stored while there is room: a pass over all frames would drop old ones too early."""
         with self._lock:
             if index in self.rendered:
                 return self.rendered[index]
             moving = Caster(self.world.traffic.at(self._share(index) * self._flight.seconds, T[:3, 3]))
             size = (self._options.height, self._options.width)
             rendered = render(self.still, moving, T, self.camera, size)
-            kept = sum(other.nbytes for other in self.rendered.values())
-            if kept + rendered.nbytes <= self._options.cache_megabytes * 1_000_000:
+            stored = sum(other.nbytes for other in self.rendered.values())
+            if stored + rendered.nbytes <= self._options.cache_megabytes * 1_000_000:
                 self.rendered[index] = rendered
             return rendered
 

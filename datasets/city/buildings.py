@@ -37,6 +37,8 @@ TILES = np.array([[0.58, 0.28, 0.20], [0.50, 0.25, 0.20], [0.38, 0.27, 0.24], [0
 FLAT = np.array([[0.56, 0.55, 0.54], [0.44, 0.44, 0.46], [0.66, 0.64, 0.60], [0.36, 0.37, 0.36]])
 GLASS = np.array([[0.20, 0.24, 0.29]])
 METAL = np.array([0.74, 0.75, 0.76])
+GABLE = [[0, 1, 5, 4], [2, 3, 4, 5]]
+HIP = [[0, 1, 5], [0, 5, 4], [2, 3, 4], [2, 4, 5], [1, 2, 5], [3, 0, 4]]
 
 
 @dataclass(frozen=True)
@@ -67,19 +69,15 @@ def build(buildings: Sequence[Building], site: Site, rng: np.random.Generator) -
     tiles = np.where((kind == "flat")[:, None], choose(FLAT, len(kind), rng), choose(TILES, len(kind), rng))
     position = site.on(columns[:, 0], columns[:, 1])
     placed = _Placed(position, yaw, columns[:, 3:6], choose(WALLS, len(kind), rng) * tone, tiles * tone)
+    foundation = np.array([0, 0, FOUNDATION])
     return [
-        _walls(placed),
-        *_pitched(placed.pick(np.flatnonzero(kind == "gable")), _gable(), rng),
+        box().place(BUILDING, position - foundation, yaw, placed.size + foundation, placed.walls),
+        *_pitched(placed.pick(np.flatnonzero(kind == "gable")), _roof(1, GABLE), rng),
         _gable_ends(placed.pick(np.flatnonzero(kind == "gable"))),
-        *_pitched(placed.pick(np.flatnonzero(kind == "hip")), _hip(), rng),
+        *_pitched(placed.pick(np.flatnonzero(kind == "hip")), _roof(0.4, HIP), rng),
         *_flat_roofs(placed.pick(np.flatnonzero(kind == "flat")), rng),
         _windows(placed),
     ]
-
-
-def _walls(b: _Placed) -> Surface:
-    position = b.position - [0, 0, FOUNDATION]
-    return box().place(BUILDING, position, b.yaw, b.size + np.array([0, 0, FOUNDATION]), b.walls)
 
 
 def _pitched(b: _Placed, roof: Shape, rng: np.random.Generator) -> list[Surface]:
@@ -111,13 +109,10 @@ def _flat_roofs(b: _Placed, rng: np.random.Generator) -> list[Surface]:
     rim = 0.3
     for side in (-1, 1):
         along = np.stack([b.size[:, 0], zero + rim, zero + 0.55], axis=1)
-        parts.append(
-            box().place(BUILDING, b.local(zero, side * (b.size[:, 1] - rim) / 2, height), b.yaw, along, b.walls)
-        )
         across = np.stack([zero + rim, b.size[:, 1], zero + 0.55], axis=1)
-        parts.append(
-            box().place(BUILDING, b.local(side * (b.size[:, 0] - rim) / 2, zero, height), b.yaw, across, b.walls)
-        )
+        x, y = (side * (b.size[:, axis] - rim) / 2 for axis in (0, 1))
+        parts.append(box().place(BUILDING, b.local(zero, y, height), b.yaw, along, b.walls))
+        parts.append(box().place(BUILDING, b.local(x, zero, height), b.yaw, across, b.walls))
     for _ in range(4):
         x, y = (rng.uniform(-0.38, 0.38, len(zero)) * b.size[:, axis] for axis in (0, 1))
         extent = rng.uniform([0.9, 0.9, 0.6], [2.6, 2.0, 1.7], size=(len(zero), 3))
@@ -147,16 +142,10 @@ def _windows(b: _Placed) -> Surface:
     return pane().place(BUILDING, position, owner.yaw + np.concatenate(turn), size, np.tile(GLASS, (len(position), 1)))
 
 
-def _gable() -> Shape:
-    """Two slopes of unit extent with the ridge along x, and their undersides' edges left open."""
-    vertices = [[-0.5, -0.5, 0], [0.5, -0.5, 0], [0.5, 0.5, 0], [-0.5, 0.5, 0], [-0.5, 0, 1], [0.5, 0, 1]]
-    return shape(vertices, [[0, 1, 5, 4], [2, 3, 4, 5]])
-
-
-def _hip() -> Shape:
-    """Four slopes of unit extent; the ridge is 0.4 long."""
-    vertices = [[-0.5, -0.5, 0], [0.5, -0.5, 0], [0.5, 0.5, 0], [-0.5, 0.5, 0], [-0.2, 0, 1], [0.2, 0, 1]]
-    return shape(vertices, [[0, 1, 5], [0, 5, 4], [2, 3, 4], [2, 4, 5], [1, 2, 5], [3, 0, 4]])
+def _roof(ridge: float, faces: list[list[int]]) -> Shape:
+    """Slopes of unit extent under a ridge of a length along x; their undersides are open."""
+    eaves = [[-0.5, -0.5, 0], [0.5, -0.5, 0], [0.5, 0.5, 0], [-0.5, 0.5, 0]]
+    return shape([*eaves, [-ridge / 2, 0, 1], [ridge / 2, 0, 1]], faces)
 
 
 def _rise(width: Float64) -> Float64:
@@ -221,22 +210,16 @@ def _barriers(
     counts = np.maximum(1, np.ceil(np.hypot(ends[:, 2] - ends[:, 0], ends[:, 3] - ends[:, 1]) / PIECE)).astype(int)
     owner = np.repeat(np.arange(len(ends)), counts)
     number = np.arange(len(owner)) - np.repeat(np.cumsum(counts) - counts, counts)
-    start, stop = (
-        np.stack(site.layout.to_world(*_between(ends[owner], (number + k) / counts[owner])), axis=1) for k in (0, 1)
-    )
+    low, span = ends[owner, :2], ends[owner, 2:] - ends[owner, :2]
+    points = [low + ((number + k) / counts[owner])[:, None] * span for k in (0, 1)]
+    start, stop = (np.stack(site.layout.to_world(*point.T), axis=1) for point in points)
     middle, along = (start + stop) / 2, stop - start
-    size = np.stack(
-        [np.hypot(*along.T) + 0.05, np.full(len(owner), profile[0]), np.full(len(owner), profile[1])], axis=1
-    )
+    size = np.concatenate([np.hypot(*along.T)[:, None] + 0.05, np.tile(profile, (len(owner), 1))], axis=1)
     size[:, 2] *= rng.uniform(0.9, 1.1, len(owner)) * rng.uniform(0.8, 1.2, len(ends))[owner]
     tint = choose(colors, len(ends), rng)[owner] * rng.uniform(0.92, 1.08, size=(len(owner), 1))
     position = site.terrain.on(middle[:, 0], middle[:, 1], -0.15)
     lean = site.terrain.slope(middle[:, 0], middle[:, 1])
     return box().place(class_id, position, np.arctan2(along[:, 1], along[:, 0]), size, tint, lean)
-
-
-def _between(ends: Float64, share: Float64) -> tuple[Float64, Float64]:
-    return ends[:, 0] + share * (ends[:, 2] - ends[:, 0]), ends[:, 1] + share * (ends[:, 3] - ends[:, 1])
 
 
 def _broadleaf(rng: np.random.Generator) -> Shape:

@@ -35,18 +35,15 @@ class Surface:
 
 def join(surfaces: Sequence[Surface]) -> Surface:
     """All surfaces as one, in the given order."""
-    return Surface(*_joined(surfaces), np.concatenate([s.classes for s in surfaces]), _colors(surfaces))
+    vertices, faces, colors = _joined(surfaces)
+    return Surface(vertices, faces, np.concatenate([s.classes for s in surfaces]), colors)
 
 
-def _joined(parts: Sequence[Surface | Shape]) -> tuple[Float64, Int64]:
-    """Vertices and faces of all parts."""
+def _joined(parts: Sequence[Surface | Shape]) -> tuple[Float64, Int64, Float64]:
     starts = np.cumsum([0, *(len(part.vertices) for part in parts)])
     faces = [part.faces + start for part, start in zip(parts, starts, strict=False)]
-    return np.concatenate([part.vertices for part in parts]), np.concatenate(faces)
-
-
-def _colors(parts: Sequence[Surface | Shape]) -> Float64:
-    return np.concatenate([part.colors for part in parts])
+    colors = np.concatenate([part.colors for part in parts])
+    return np.concatenate([part.vertices for part in parts]), np.concatenate(faces), colors
 
 
 def choose(colors: Float64, count: int, rng: np.random.Generator) -> Float64:
@@ -96,7 +93,7 @@ def shape(vertices: npt.ArrayLike, faces: npt.ArrayLike, color: Color | None = N
 
 def combine(*shapes: Shape) -> Shape:
     """Several shapes as one template."""
-    return Shape(*_joined(shapes), _colors(shapes), np.concatenate([s.tinted for s in shapes]))
+    return Shape(*_joined(shapes), np.concatenate([s.tinted for s in shapes]))
 
 
 def box(

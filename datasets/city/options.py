@@ -93,16 +93,14 @@ class SimulatedBackbone(Settings):
 _SMALL_THINGS = {"human": 3.0, "static car": 1.6, "moving car": 1.6, "clutter": 1.4}
 
 BACKBONES = {
-    "sim-steady": SimulatedBackbone(
-        place=0.07, view=0.05, flicker=0.015, border=0.8, cell=2.0, difficulty=_SMALL_THINGS
-    ),
-    "sim-flicker": SimulatedBackbone(
-        place=0.02, view=0.08, flicker=0.11, border=2.0, cell=1.2, difficulty=_SMALL_THINGS
-    ),
-    "sim-soft": SimulatedBackbone(
-        place=0.04, view=0.06, flicker=0.05, border=1.2, cell=1.6, softness=0.4, difficulty=_SMALL_THINGS
-    ),
-}
+    name: SimulatedBackbone(place=place, view=view, flicker=flicker, border=border, cell=cell, softness=softness,
+                            difficulty=_SMALL_THINGS)
+    for name, place, view, flicker, border, cell, softness in (
+        ("sim-steady", 0.07, 0.05, 0.015, 0.8, 2.0, 0.0),
+        ("sim-flicker", 0.02, 0.08, 0.11, 2.0, 1.2, 0.0),
+        ("sim-soft", 0.04, 0.06, 0.05, 1.2, 1.6, 0.4),
+    )
+}  # fmt: skip
 
 
 class CityOptions(Settings):
@@ -207,15 +205,11 @@ def look(heading: float, down: float, roll: float) -> Float64:
     return np.stack([c * right + s * below, c * below - s * right, ahead], axis=1)
 
 
-def _flight(number: int, length: float, axis: float, sway: float, waves: float, swing: float, pitch: float) -> Flight:
-    return Flight(number, length, np.deg2rad(axis), sway, waves, np.deg2rad(swing), np.deg2rad(pitch))
-
-
 FLIGHTS = {
-    "scene0": _flight(0, 235, 12, 9, 1.0, 9, 55),
-    "scene1": _flight(1, 255, -20, 12, 0.8, 7, 55),
-    "scene2": _flight(2, 510, 8, 25, 1.3, 9, 57),
-    "scene3": _flight(3, 520, -12, 30, 1.0, 8, 56),
-    "scene4": _flight(4, 490, 17, 22, 1.5, 9, 57),
-}
+    f"scene{number}": Flight(number, length, np.deg2rad(axis), sway, waves, np.deg2rad(swing), np.deg2rad(pitch))
+    for number, (length, axis, sway, waves, swing, pitch) in enumerate(
+        [(235, 12, 9, 1.0, 9, 55), (255, -20, 12, 0.8, 7, 55), (510, 8, 25, 1.3, 9, 57), (520, -12, 30, 1.0, 8, 56),
+         (490, 17, 22, 1.5, 9, 57)]
+    )
+}  # fmt: skip
 """Scene0 and scene1 see a place in about four of 20 frames, the others in fewer than two."""

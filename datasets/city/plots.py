@@ -81,25 +81,15 @@ class Inventory:
 
 def furnish(plot: Plot, town: Inventory, rng: np.random.Generator) -> None:
     """Put sidewalks around a plot and one of the kinds of use on it."""
-    inside = plot.inside
-    _sidewalks(inside, town)
+    inside, w = plot.inside, SIDEWALK
+    s0, s1, t0, t1 = inside.s0, inside.s1, inside.t0, inside.t1
+    strips = [(s0, s1, t0, t0 + w), (s0, s1, t1 - w, t1), (s0, s0 + w, t0 + w, t1 - w), (s1 - w, s1, t0 + w, t1 - w)]
+    town.patches += [Patch(Rectangle(*strip), SIDEWALK_ABOVE, CLUTTER, KERB) for strip in strips]
     land = inside.within(SIDEWALK)
     uses: tuple[Callable[[Rectangle, Inventory, np.random.Generator], None], ...]
     uses = (_houses, _apartments, _hall, _park, _fields)
     use = uses[int(rng.choice(len(uses), p=[0.52, 0.20, 0.09, 0.11, 0.08]))]
     use(land, town, rng)
-
-
-def _sidewalks(inside: Rectangle, town: Inventory) -> None:
-    s0, s1, t0, t1 = inside.s0, inside.s1, inside.t0, inside.t1
-    w = SIDEWALK
-    for area in (
-        Rectangle(s0, s1, t0, t0 + w),
-        Rectangle(s0, s1, t1 - w, t1),
-        Rectangle(s0, s0 + w, t0 + w, t1 - w),
-        Rectangle(s1 - w, s1, t0 + w, t1 - w),
-    ):
-        town.patches.append(Patch(area, SIDEWALK_ABOVE, CLUTTER, KERB))
 
 
 class _Row(NamedTuple):
@@ -111,6 +101,11 @@ class _Row(NamedTuple):
     inwards: int
     depth: float
 
+    @property
+    def span(self) -> tuple[float, float]:
+        """Where the row begins and ends."""
+        return (self.land.s0, self.land.s1) if self.along_s else (self.land.t0, self.land.t1)
+
     def point(self, along: float, into: float) -> tuple[float, float]:
         """Plan point at a place along the row and a distance behind its front."""
         across = self.front + self.inwards * into
@@ -121,7 +116,7 @@ class _Row(NamedTuple):
         return Rectangle(min(s0, s1), max(s0, s1), min(t0, t1), max(t0, t1))
 
 
-def _rows(land: Rectangle, two_from: float) -> list[_Row]:
+def _rows(land: Rectangle, two_from: float = np.inf) -> list[_Row]:
     """One or, where the land is deep enough, two rows back to back along its longer side."""
     s, t = land.size
     along_s = s >= t
@@ -133,7 +128,7 @@ def _rows(land: Rectangle, two_from: float) -> list[_Row]:
 
 def _houses(land: Rectangle, town: Inventory, rng: np.random.Generator) -> None:
     for row in _rows(land, two_from=34.0):
-        low, high = (land.s0, land.s1) if row.along_s else (land.t0, land.t1)
+        low, high = row.span
         count = max(1, round((high - low) / rng.uniform(16, 21)))
         borders = np.linspace(low, high, count + 1).tolist()
         for a0, a1 in pairwise(borders):
@@ -182,7 +177,7 @@ def _apartments(land: Rectangle, town: Inventory, rng: np.random.Generator) -> N
     town.patches.append(Patch(land.within(-0.2), YARD_ABOVE - 0.02, CLUTTER, PAVING[int(rng.integers(len(PAVING)))]))
     floors = int(rng.integers(3, 5))
     for row in _rows(land, two_from=40.0):
-        low, high = (land.s0, land.s1) if row.along_s else (land.t0, land.t1)
+        low, high = row.span
         count = max(1, round((high - low) / rng.uniform(30, 42)))
         deep = min(rng.uniform(11, 13.5), row.depth - 6)
         for a0, a1 in pairwise(np.linspace(low, high, count + 1).tolist()):
@@ -213,8 +208,8 @@ def _apartments(land: Rectangle, town: Inventory, rng: np.random.Generator) -> N
 def _hall(land: Rectangle, town: Inventory, rng: np.random.Generator) -> None:
     """A wide flat hall and a car park beside it."""
     town.patches.append(Patch(land.within(-0.2), YARD_ABOVE - 0.02, CLUTTER, (0.42, 0.42, 0.43)))
-    row = _rows(land, two_from=1e9)[0]
-    low, high = (land.s0, land.s1) if row.along_s else (land.t0, land.t1)
+    row = _rows(land)[0]
+    low, high = row.span
     split = low + 0.5 * (high - low)
     s, t = row.point((low + split) / 2 + 1, row.depth / 2)
     angle = 0.0 if row.along_s else np.pi / 2
@@ -249,8 +244,8 @@ def _park(land: Rectangle, town: Inventory, rng: np.random.Generator) -> None:
 
 def _fields(land: Rectangle, town: Inventory, rng: np.random.Generator) -> None:
     """Beds of crops in rows, a hedge around them and a shed."""
-    row = _rows(land, two_from=1e9)[0]
-    low, high = (land.s0, land.s1) if row.along_s else (land.t0, land.t1)
+    row = _rows(land)[0]
+    low, high = row.span
     count = max(2, round((high - low) / 11))
     for a0, a1 in pairwise(np.linspace(low + 3, high - 3, count + 1).tolist()):
         crop = CROPS[int(rng.integers(len(CROPS)))]
@@ -265,7 +260,6 @@ def _fields(land: Rectangle, town: Inventory, rng: np.random.Generator) -> None:
 
 
 def _crowd(land: Rectangle, count: int, town: Inventory, rng: np.random.Generator) -> None:
-    """People near the sidewalk."""
     for _ in range(count):
         s, t = rng.uniform(land.s0, land.s1), land.t0 - rng.uniform(0.2, 1.6)
         town.people.append(Spot(s, t, rng.uniform(0, 6.28)))

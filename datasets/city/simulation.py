@@ -141,10 +141,9 @@ def render(still: Caster, moving: Caster, T: Float64, intrinsics: Intrinsics, sh
     depth, incidence = np.zeros((2, H * W), dtype=np.float32)
     classes = np.full(H * W, IGNORE_8BIT, dtype=np.uint8)
     color = np.empty((H * W, 3), dtype=np.uint8)
-    rows = max(1, CHUNK // W)
-    for top in range(0, H, rows):
-        part = slice(top * W, min(top + rows, H) * W)
-        directions = pixel_rays(intrinsics, T, top, min(top + rows, H), W)
+    for rows in _row_chunks(shape):
+        part = slice(rows.start * W, rows.stop * W)
+        directions = pixel_rays(intrinsics, T, rows, W)
         hit = _nearest((still, moving), T[:3, 3], directions)
         depth[part] = np.where(hit.classes == IGNORE_8BIT, 0.0, hit.depth)
         incidence[part], classes[part] = hit.incidence, hit.classes
@@ -152,10 +151,10 @@ def render(still: Caster, moving: Caster, T: Float64, intrinsics: Intrinsics, sh
     return Rendered(depth.reshape(shape), classes.reshape(shape), incidence.reshape(shape), color.reshape(H, W, 3))
 
 
-def pixel_rays(intrinsics: Intrinsics, T: Float64, top: int, bottom: int, width: int) -> Float64:
-    """World directions ((bottom - top) * width, 3) of the rays of rows of pixels; the ray parameter is planar depth."""
+def pixel_rays(intrinsics: Intrinsics, T: Float64, rows: slice, width: int) -> Float64:
+    """World directions (n, 3) of the rays of rows of pixels; the ray parameter is planar depth."""
     x = (np.arange(width) - intrinsics.cx) / intrinsics.fx
-    y = (np.arange(top, bottom) - intrinsics.cy) / intrinsics.fy
+    y = (np.arange(rows.start, rows.stop) - intrinsics.cy) / intrinsics.fy
     rays = y[:, None, None] * T[:3, 1] + x[None, :, None] * T[:3, 0] + T[:3, 2]
     directions: Float64 = rays.reshape(-1, 3)
     return directions
@@ -200,8 +199,7 @@ def _shade(hit: _Hit, casters: tuple[Caster, Caster]) -> UInt8:
     brightness = AMBIENT + SUNLIGHT * light
     fine, coarse = GRAIN[hit.classes].T
     brightness *= 1 + fine * _noise(hit.points, 0.3) + coarse * _noise(hit.points, 2.3)
-    seen = hit.classes != IGNORE_8BIT
-    shaded = np.where(seen[:, None], hit.material * brightness[:, None], SKY)
+    shaded = np.where((hit.classes != IGNORE_8BIT)[:, None], hit.material * brightness[:, None], SKY)
     color: UInt8 = np.clip(shaded * 255, 0, 255).astype(np.uint8)
     return color
 
@@ -248,9 +246,12 @@ class Simulation:
     def __init__(self, model: SimulatedBackbone, seed: int, name: str, scene: str) -> None:
         self.model = model
         self._salts = {kind: salt(seed, name, scene, kind) for kind in ("place", "view", "flicker", "border", "soft")}
-        self._weights = confusion_matrix(model)
+        names, rows = uavid8().classes, CONFUSION | model.confusion
+        weights = np.array([[rows[true].get(wrong, 0.0) for wrong in names] for true in names])
+        self._weights: Float64 = weights / weights.sum(axis=1, keepdims=True)
+        """(8, 8): for a true class in its row, the probability of each wrong class."""
         self._cumulative = np.cumsum(self._weights, axis=1)
-        self._factors = np.array([model.difficulty.get(name, 1.0) for name in uavid8().classes] + [0.0])
+        self._factors = np.array([model.difficulty.get(name, 1.0) for name in names] + [0.0])
 
     def labels(self, view: View) -> Labels:
         """Predicted ids (H, W) uint8; 255 where there is nothing."""
@@ -277,7 +278,9 @@ class Simulation:
         wrong = self._strike(predicted, true, rehash(place, self._salts["place"]), model.place * factor)
         if model.view:
             seen_from, distance = self._seen_from(view, cells)
-            chance = _view_chance(model, view.rendered.incidence[rows], distance) * factor
+            # grows with the angle to the normal, 1 from 60 degrees, and with the distance
+            slant = np.minimum(1.0, 2 * (1 - view.rendered.incidence[rows].astype(np.float64)))
+            chance = model.view * slant * np.minimum(1.0, distance / model.view_distance) * factor
             drawn = hash_integers(self._salts["view"], place.view(np.int64), *seen_from)
             wrong = self._strike(wrong, true, drawn, chance)
         if model.flicker:
@@ -308,14 +311,10 @@ class Simulation:
 
     def _cells(self, view: View, rows: slice) -> tuple[Int64, Int64, Int64]:
         """Cell of each pixel, counted from the cell of the town's origin, so that errors move with the town."""
-        x, y, z = view.positions(rows)
-        a, b, c = np.rint(view.origin / self.model.cell)
         size = self.model.cell
-        return (
-            (np.floor(x / size) - a).astype(np.int64),
-            (np.floor(y / size) - b).astype(np.int64),
-            (np.floor(z / size) - c).astype(np.int64),
-        )
+        first = np.rint(view.origin / size)
+        x, y, z = ((np.floor(x / size) - first[k]).astype(np.int64) for k, x in enumerate(view.positions(rows)))
+        return x, y, z
 
     def _seen_from(self, view: View, cells: tuple[Int64, Int64, Int64]) -> tuple[tuple[Int64, Int64, Int64], Float64]:
         """Quantised azimuth, elevation and distance of the camera as seen from the cell's centre; and that distance."""
@@ -357,22 +356,6 @@ class Simulation:
         nodes = (model.border * (2 * uniform(drawn) - 1)).astype(np.float32)
         size = (round(columns * model.border_scale), round(rows * model.border_scale))
         return np.asarray(cv2.resize(nodes, size, interpolation=cv2.INTER_LINEAR), dtype=np.float32)[:H, :W]
-
-
-def confusion_matrix(model: SimulatedBackbone) -> Float64:
-    """(8, 8): for a true class in its row, the probability of each wrong class."""
-    names = uavid8().classes
-    rows = CONFUSION | model.confusion
-    weights = np.array([[rows[true].get(wrong, 0.0) for wrong in names] for true in names])
-    probabilities: Float64 = weights / weights.sum(axis=1, keepdims=True)
-    return probabilities
-
-
-def _view_chance(model: SimulatedBackbone, incidence: Float32, distance: Float64) -> Float64:
-    """Probability of a view error: grows with the angle to the normal, 1 from 60 degrees, and with the distance."""
-    slant = np.minimum(1.0, 2 * (1 - incidence.astype(np.float64)))
-    chance: Float64 = model.view * slant * np.minimum(1.0, distance / model.view_distance)
-    return chance
 
 
 def _row_chunks(shape: tuple[int, ...]) -> list[slice]:

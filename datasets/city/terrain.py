@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -16,7 +17,6 @@ from semstab.datasets.city.mesh import LOW_VEGETATION, Shape, Surface
 MAIN_WIDTH = 11.0
 SIDE_WIDTH = 8.0
 LARGEST_BLOCK = 105.0
-SMALLEST_BLOCK = 44.0
 
 
 @dataclass(frozen=True)
@@ -94,7 +94,7 @@ class Street:
         return self.high - self.low
 
     def strip(self, left: float, right: float, low: float | None = None, high: float | None = None) -> Rectangle:
-        """The part between two offsets from the middle, over the whole length unless said."""
+        """The part between two offsets from the middle, over the whole length by default."""
         low, high = self.low if low is None else low, self.high if high is None else high
         if self.axis == "s":
             return Rectangle(low, high, self.at + left, self.at + right)
@@ -111,7 +111,7 @@ class Street:
         return 0.0 if self.axis == "s" else np.pi / 2
 
     def clear_of_crossings(self, along: Float64, streets: list[Street], distance: float) -> Float64:
-        """Those places along this street that keep a distance from every street that meets it."""
+        """The points along this street at a distance from every street that meets it."""
         for other in streets:
             if other.axis != self.axis and other.low - 1 <= self.at <= other.high + 1:
                 along = along[np.abs(along - other.at) > distance + other.width / 2]
@@ -141,33 +141,23 @@ def plan_streets(area: Rectangle, rng: np.random.Generator) -> tuple[list[Street
     open_plots = [(Plot(area, (0.0, 0.0, 0.0, 0.0)), 0)]
     while open_plots:
         plot, depth = open_plots.pop()
-        street = _split(plot, depth, rng)
-        if street is None:
+        area, (s, t) = plot.area, plot.area.size
+        if max(s, t) < LARGEST_BLOCK:
             plots.append(plot)
             continue
+        fraction, width = rng.uniform(0.38, 0.62), MAIN_WIDTH if depth < 3 else SIDE_WIDTH
+        s0, s1, t0, t1 = plot.widths
+        if s > t:
+            street = Street("t", area.s0 + fraction * s, area.t0, area.t1, width)
+            halves = [Plot(replace(area, s1=street.at), (s0, width, t0, t1))]
+            halves.append(Plot(replace(area, s0=street.at), (width, s1, t0, t1)))
+        else:
+            street = Street("s", area.t0 + fraction * t, area.s0, area.s1, width)
+            halves = [Plot(replace(area, t1=street.at), (s0, s1, t0, width))]
+            halves.append(Plot(replace(area, t0=street.at), (s0, s1, width, t1)))
         streets.append(street)
-        open_plots += [(half, depth + 1) for half in _halves(plot, street)]
+        open_plots += [(half, depth + 1) for half in halves]
     return streets, plots
-
-
-def _split(plot: Plot, depth: int, rng: np.random.Generator) -> Street | None:
-    s, t = plot.area.size
-    if max(s, t) < LARGEST_BLOCK or max(s, t) < 2 * SMALLEST_BLOCK:
-        return None
-    fraction, width = rng.uniform(0.38, 0.62), MAIN_WIDTH if depth < 3 else SIDE_WIDTH
-    area = plot.area
-    if s > t:
-        return Street("t", area.s0 + fraction * s, area.t0, area.t1, width)
-    return Street("s", area.t0 + fraction * t, area.s0, area.s1, width)
-
-
-def _halves(plot: Plot, street: Street) -> tuple[Plot, Plot]:
-    s0, s1, t0, t1 = plot.widths
-    if street.axis == "t":
-        first = Plot(replace(plot.area, s1=street.at), (s0, street.width, t0, t1))
-        return first, Plot(replace(plot.area, s0=street.at), (street.width, s1, t0, t1))
-    first = Plot(replace(plot.area, t1=street.at), (s0, s1, t0, street.width))
-    return first, Plot(replace(plot.area, t0=street.at), (s0, s1, street.width, t1))
 
 
 SPACING = 4.0
@@ -214,7 +204,10 @@ class Terrain:
 
     def mesh(self, low: Float64, high: Float64, rng: np.random.Generator) -> Surface:
         """Grass over the rectangle from `low` to `high` (x, y), with ever larger triangles up to the horizon."""
-        x, y = (_graded(low[axis], high[axis]) for axis in (0, 1))
+        steps = np.cumsum(SPACING * 1.25 ** np.arange(1, 21))
+        far = steps[steps < HORIZON]
+        fine = [np.arange(low[axis], high[axis] + SPACING, SPACING) for axis in (0, 1)]
+        x, y = (np.concatenate([near[0] - far[::-1], near, near[-1] + far]) for near in fine)
         gx, gy = np.meshgrid(x, y, indexing="ij")
         vertices = self.on(gx.ravel(), gy.ravel())
         faces = grid_faces(len(x), len(y))
@@ -237,17 +230,17 @@ class Site:
         return self.terrain.on(*self.layout.to_world(s, t), above)
 
     def stand(
-        self, template: Shape, class_id: int, places: tuple[Float64, ...], above: float, size: Float64, tint: Float64
+        self, template: Shape, class_id: int, spots: Iterable[Float64], above: float, size: Float64, tint: Float64
     ) -> Surface:
-        """Copies of a shape that follow the ground at `places`: plan coordinates s and t, and the angle in the plan."""
-        s, t, angle = places
+        """Copies of a shape that follow the ground at `spots`: plan coordinates s and t, and the angle in the plan."""
+        s, t, angle = spots
         lean = self.terrain.slope(*self.layout.to_world(s, t))
         return template.place(class_id, self.on(s, t, above), self.layout.heading(s, t, angle), size, tint, lean)
 
     def drape(self, area: Rectangle, above: float, class_id: int, color: npt.ArrayLike) -> Surface:
         """A rectangle of the plan laid over the ground, `above` metres over it, in cells of at most SPACING."""
-        s = np.linspace(area.s0, area.s1, max(2, int(np.ceil((area.s1 - area.s0) / SPACING)) + 1))
-        t = np.linspace(area.t0, area.t1, max(2, int(np.ceil((area.t1 - area.t0) / SPACING)) + 1))
+        sides = ((area.s0, area.s1), (area.t0, area.t1))
+        s, t = (np.linspace(low, high, max(2, int(np.ceil((high - low) / SPACING)) + 1)) for low, high in sides)
         gs, gt = np.meshgrid(s, t, indexing="ij")
         return Surface.of_class(self.on(gs.ravel(), gt.ravel(), above), grid_faces(len(s), len(t)), class_id, color)
 
@@ -258,11 +251,3 @@ def grid_faces(rows: int, columns: int) -> Int64:
     first = np.stack([corner, corner + columns, corner + columns + 1], axis=1)
     second = np.stack([corner, corner + columns + 1, corner + 1], axis=1)
     return np.concatenate([first, second])
-
-
-def _graded(low: float, high: float) -> Float64:
-    """Coordinates SPACING apart from low to high, then ever further apart for another HORIZON metres each way."""
-    fine = np.arange(low, high + SPACING, SPACING)
-    steps = np.cumsum(SPACING * 1.25 ** np.arange(1, 21))
-    coarse = steps[steps < HORIZON]
-    return np.concatenate([fine[0] - coarse[::-1], fine, fine[-1] + coarse])

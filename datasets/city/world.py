@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import numpy as np
 
@@ -24,7 +25,7 @@ from semstab.datasets.city.mesh import (
 )
 from semstab.datasets.city.options import Flight
 from semstab.datasets.city.plots import SIDEWALK, SIDEWALK_ABOVE, Inventory, Spot, columns, furnish
-from semstab.datasets.city.terrain import MAIN_WIDTH, Layout, Plot, Rectangle, Site, Street, Terrain, plan_streets
+from semstab.datasets.city.terrain import MAIN_WIDTH, Layout, Rectangle, Site, Street, Terrain, plan_streets
 
 # Cars and people: those that stay where they are, and those that move with time.
 
@@ -65,17 +66,18 @@ def person() -> Shape:
     )
 
 
-def parked_cars(spots: Sequence[Spot], site: Site, rng: np.random.Generator) -> Surface:
-    """Cars that stand still."""
-    paint = choose(PAINT, len(spots), rng)
-    return site.stand(car(), STATIC_CAR, tuple(columns(spots)[:3]), ROAD_ABOVE, _car_sizes(len(spots), rng), paint)
+def _painted_cars(count: int, rng: np.random.Generator) -> tuple[Float64, Float64]:
+    """Scales of length, width and height, and paint; one in seven is a van."""
+    paint = choose(PAINT, count, rng)
+    sizes = rng.uniform([0.86, 0.95, 0.97], [1.08, 1.04, 1.12], size=(count, 3))
+    sizes[rng.random(count) < 1 / 7] *= [1.2, 1.1, 1.4]
+    return sizes, paint
 
 
-def standing_people(spots: Sequence[Spot], site: Site, rng: np.random.Generator) -> Surface:
-    """People who stand still."""
-    clothes = choose(CLOTHES, len(spots), rng)
-    heights = np.tile(rng.uniform(0.9, 1.08, size=(len(spots), 1)), (1, 3))
-    return site.stand(person(), HUMAN, tuple(columns(spots)[:3]), ROAD_ABOVE, heights, clothes)
+def _dressed_people(count: int, rng: np.random.Generator) -> tuple[Float64, Float64]:
+    """Scales of the three axes, and clothes."""
+    clothes = choose(CLOTHES, count, rng)
+    return np.tile(rng.uniform(0.9, 1.08, size=(count, 1)), (1, 3)), clothes
 
 
 def roadside_cars(streets: list[Street], rng: np.random.Generator) -> list[Spot]:
@@ -98,7 +100,7 @@ class Movers:
 
     low, length, at  of their streets; along_s whether it runs along the plan's s axis
     offset           from the street's middle; start and speed along it, towards its high end where positive
-    tint, size       (n, 3) and (n,) or (n, 3): what they look like
+    tint, size       (n, 3) and (n,) or (n, 3): their appearance
     """
 
     low: Float64
@@ -111,7 +113,7 @@ class Movers:
     tint: Float64
     size: Float64
 
-    def plan_places(self, seconds: float) -> tuple[Float64, Float64, Float64]:
+    def plan_points(self, seconds: float) -> tuple[Float64, Float64, Float64]:
         """Plan coordinates s and t, and heading in the plan, at a time."""
         along = self.low + np.mod(self.start + self.speed * seconds, self.length)
         across = self.at + self.offset
@@ -132,28 +134,21 @@ class Traffic:
         """A car every 38 m of lane or so at 6 to 13 m/s, a walker every 70 m of sidewalk or so at 0.9 to 1.7 m/s."""
         cars = _movers(streets, 38.0, lambda width: min(1.75, 0.135 * width), (6.0, 13.0), rng)
         walkers = _movers(streets, 70.0, lambda width: width / 2 + SIDEWALK / 2, (0.9, 1.7), rng)
-        n, m = len(cars.at), len(walkers.at)
-        cars = replace(cars, tint=choose(PAINT, n, rng), size=_car_sizes(n, rng))
-        clothes, heights = choose(CLOTHES, m, rng), rng.uniform(0.9, 1.08, size=(m, 1))
-        return cls(site, cars, replace(walkers, tint=clothes, size=np.tile(heights, (1, 3))))
+        sizes, paint = _painted_cars(len(cars.at), rng)
+        heights, clothes = _dressed_people(len(walkers.at), rng)
+        return cls(site, replace(cars, size=sizes, tint=paint), replace(walkers, size=heights, tint=clothes))
 
     def at(self, seconds: float, camera: Float64) -> Surface:
         """What moves as it stands at a time, as far as it is within SIGHT of the camera at (x, y, z)."""
-        return join(
-            [
-                self._place(self.cars, car(), MOVING_CAR, ROAD_ABOVE, seconds, camera),
-                self._place(self.walkers, person(), HUMAN, SIDEWALK_ABOVE, seconds, camera),
-            ]
-        )
-
-    def _place(
-        self, movers: Movers, template: Shape, class_id: int, above: float, seconds: float, camera: Float64
-    ) -> Surface:
-        places = movers.plan_places(seconds)
-        x, y = self.site.layout.to_world(*places[:2])
-        near = np.hypot(x - camera[0], y - camera[1]) < SIGHT
-        seen = tuple(place[near] for place in places)
-        return self.site.stand(template, class_id, seen, above, movers.size[near], movers.tint[near])
+        kinds = ((self.cars, car(), MOVING_CAR, ROAD_ABOVE), (self.walkers, person(), HUMAN, SIDEWALK_ABOVE))
+        surfaces = []
+        for movers, template, class_id, above in kinds:
+            s, t, heading = movers.plan_points(seconds)
+            x, y = self.site.layout.to_world(s, t)
+            near = np.hypot(x - camera[0], y - camera[1]) < SIGHT
+            spots = (s[near], t[near], heading[near])
+            surfaces.append(self.site.stand(template, class_id, spots, above, movers.size[near], movers.tint[near]))
+        return join(surfaces)
 
 
 def _movers(
@@ -170,29 +165,12 @@ def _movers(
             count = max(1, round(street.length / spacing))
             starts = (np.arange(count) + rng.uniform(0.15, 0.85, count)) * street.length / count
             speed = -side * rng.uniform(*speeds)
-            lane = (
-                street.low,
-                street.length,
-                street.at,
-                street.axis == "s",
-                _keep_right(street, side) * offset(street.width),
-            )
-            rows += [(*lane, start, speed) for start in starts]
+            along_s = street.axis == "s"
+            across = (side if along_s else -side) * offset(street.width)  # on the right
+            rows += [(street.low, street.length, street.at, along_s, across, start, speed) for start in starts]
     low, length, at, along_s, across, start, speed = np.array(rows, dtype=np.float64).T
     none = np.empty((len(rows), 0))
     return Movers(low, length, at, along_s.astype(bool), across, start, speed, tint=none, size=none)
-
-
-def _keep_right(street: Street, side: float) -> float:
-    """The sign of the offset on which traffic with the direction -side drives on the right."""
-    return side if street.axis == "s" else -side
-
-
-def _car_sizes(count: int, rng: np.random.Generator) -> Float64:
-    """Scales of length, width and height; one in seven is a van."""
-    sizes = rng.uniform([0.86, 0.95, 0.97], [1.08, 1.04, 1.12], size=(count, 3))
-    sizes[rng.random(count) < 1 / 7] *= [1.2, 1.1, 1.4]
-    return sizes
 
 
 REACH = 125.0
@@ -211,14 +189,22 @@ class World:
     traffic: Traffic
 
 
+@lru_cache(maxsize=2)
 def build_world(seed: int, flight: Flight) -> World:
     """The town under a flight; the same for every camera, resolution and number of frames."""
     layout = Layout.random(_rng(seed, flight, 0))
     terrain = Terrain.random(_rng(seed, flight, 1))
     site = Site(layout, terrain)
     path = np.stack(flight.path(np.linspace(0, 1, 60)), axis=1)
-    streets, plots = plan_streets(_plan_area(layout, path), _rng(seed, flight, 2))
-    town = _furnished(plots, layout, path, _rng(seed, flight, 3))
+    c, s = np.cos(layout.yaw), np.sin(layout.yaw)
+    plan = path @ np.array([[c, -s], [s, c]])
+    low, high = plan.min(axis=0) - REACH - 30, plan.max(axis=0) + REACH + 30
+    area = Rectangle(float(low[0]), float(high[0]), float(low[1]), float(high[1]))
+    streets, plots = plan_streets(area, _rng(seed, flight, 2))
+    town, rng = Inventory(), _rng(seed, flight, 3)
+    for plot, near in zip(plots, _near([p.area.centre for p in plots], layout, path, REACH + 70), strict=True):
+        if near:
+            furnish(plot, town, rng)
     town.cars += roadside_cars(streets, _rng(seed, flight, 4))
     town.trees += _street_trees(streets, _rng(seed, flight, 5))
     still = [
@@ -232,23 +218,6 @@ def build_world(seed: int, flight: Flight) -> World:
 def _rng(seed: int, flight: Flight, purpose: int) -> np.random.Generator:
     """A generator for one purpose, so that a change in one part of the town leaves the others as they are."""
     return np.random.default_rng([seed, flight.number, purpose])
-
-
-def _plan_area(layout: Layout, path: Float64) -> Rectangle:
-    """A rectangle of the plan that holds everything within REACH of the path."""
-    margin = REACH + 30
-    c, s = np.cos(layout.yaw), np.sin(layout.yaw)
-    plan = path @ np.array([[c, -s], [s, c]])
-    low, high = plan.min(axis=0) - margin, plan.max(axis=0) + margin
-    return Rectangle(float(low[0]), float(high[0]), float(low[1]), float(high[1]))
-
-
-def _furnished(plots: Sequence[Plot], layout: Layout, path: Float64, rng: np.random.Generator) -> Inventory:
-    town = Inventory()
-    for plot, near in zip(plots, _near([p.area.centre for p in plots], layout, path, REACH + 70), strict=True):
-        if near:
-            furnish(plot, town, rng)
-    return town
 
 
 def _street_trees(streets: Sequence[Street], rng: np.random.Generator) -> list[Spot]:
@@ -277,7 +246,8 @@ def _ground(town: Inventory, streets: Sequence[Street], site: Site, path: Float6
         for low in street.clear_of_crossings(np.arange(street.low + 3, street.high - 6, 7.0), list(streets), 6.0):
             dash = street.strip(-0.08, 0.08, float(low), float(low) + 3.0)
             surfaces.append(site.drape(dash, MARKING_ABOVE + 0.0007 * number, ROAD, MARKING))
-    return [_within(surface, path) for surface in surfaces]
+    near = [_distance(surface.vertices[surface.faces[:, 0], :2], path) < REACH for surface in surfaces]
+    return [Surface(s.vertices, s.faces[k], s.classes[k], s.colors[k]) for s, k in zip(surfaces, near, strict=True)]
 
 
 def _standing(town: Inventory, site: Site, path: Float64, seed: int, flight: Flight) -> list[Surface]:
@@ -285,36 +255,25 @@ def _standing(town: Inventory, site: Site, path: Float64, seed: int, flight: Fli
         near = _near([row[:2] for row in rows], site.layout, path, REACH)
         return [row for row, keep in zip(rows, near, strict=True) if keep]
 
+    cars, people, bins = columns(close(town.cars)), columns(close(town.people)), columns(town.bins)
+    rng = _rng(seed, flight, 14)
+    extent = rng.uniform([0.7, 0.6, 0.9], [1.9, 1.1, 1.5], size=(bins.shape[1], 3))
+    tint = rng.uniform([0.15, 0.22, 0.2], [0.5, 0.45, 0.5], size=(bins.shape[1], 3))
     return [
         *build(town.buildings, site, _rng(seed, flight, 7)),
         *trees(close(town.trees), site, _rng(seed, flight, 8)),
         bushes(close(town.bushes), site, _rng(seed, flight, 9)),
         hedges(town.hedges, site, _rng(seed, flight, 10)),
         fences(town.fences, site, _rng(seed, flight, 11)),
-        parked_cars(close(town.cars), site, _rng(seed, flight, 12)),
-        standing_people(close(town.people), site, _rng(seed, flight, 13)),
-        _bins(town, site, _rng(seed, flight, 14)),
+        site.stand(car(), STATIC_CAR, cars[:3], ROAD_ABOVE, *_painted_cars(cars.shape[1], _rng(seed, flight, 12))),
+        site.stand(person(), HUMAN, people[:3], ROAD_ABOVE, *_dressed_people(people.shape[1], _rng(seed, flight, 13))),
+        site.stand(box(), CLUTTER, bins[:3], 0.02, size=extent * bins[3][:, None], tint=tint),
     ]
 
 
-def _bins(town: Inventory, site: Site, rng: np.random.Generator) -> Surface:
-    """Containers and bins."""
-    *places, size = columns(town.bins)
-    extent = rng.uniform([0.7, 0.6, 0.9], [1.9, 1.1, 1.5], size=(len(size), 3)) * size[:, None]
-    tint = rng.uniform([0.15, 0.22, 0.2], [0.5, 0.45, 0.5], size=(len(size), 3))
-    return site.stand(box(), CLUTTER, tuple(places), 0.02, extent, tint)
-
-
-def _near(places: Sequence[tuple[float, ...]], layout: Layout, path: Float64, distance: float) -> list[bool]:
-    """Which plan points are within a distance of the path."""
-    s, t = np.array(places, dtype=np.float64).T
+def _near(points: Sequence[tuple[float, ...]], layout: Layout, path: Float64, distance: float) -> list[bool]:
+    s, t = np.array(points, dtype=np.float64).T
     return [bool(near) for near in _distance(np.stack(layout.to_world(s, t), axis=1), path) < distance]
-
-
-def _within(surface: Surface, path: Float64) -> Surface:
-    """The faces within REACH of the path; vertices stay."""
-    keep = _distance(surface.vertices[surface.faces[:, 0], :2], path) < REACH
-    return Surface(surface.vertices, surface.faces[keep], surface.classes[keep], surface.colors[keep])
 
 
 def _distance(points: Float64, path: Float64) -> Float64:

@@ -1,29 +1,29 @@
-"""Where a frame's depth comes from: a file of its own, or a surface that its camera looks at."""
+"""Depth maps of a file a frame, of every kind: metres, or one DataError with the file."""
 
 from __future__ import annotations
 
 import math
 import re
 import struct
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from semstab.core.types import Float32, Float64
+from semstab.core.types import Float32
 from semstab.datasets.files.options import FileOptions, FrameSource
-from semstab.datasets.files.surfaces import Surface, View
 from semstab.datasets.formats.disk import AGAIN, read_bytes
 from semstab.datasets.formats.images import MAX_PIXELS, MILLIMETRES, Read, color_size, read_depth
 from semstab.datasets.geometry.cameras import planar
 from semstab.errors import DataError
 from semstab.model.frames import Intrinsics
 
-# Depth maps of multi-view stereo programs, MVE's .mvei and OpenMVS's .dmap: metres, or one DataError with the file.
+# Depth maps of multi-view stereo programs: MVE's .mvei, OpenMVS's .dmap, COLMAP's .bin.
 #
-# Sources: Fuhrmann et al., MVE, GCH 2014 (libs/mve/image_io); openMVS (libs/MVS/Interface.h, HeaderDepthDataRaw).
+# Sources: Fuhrmann et al., MVE, GCH 2014 (libs/mve/image_io); openMVS (libs/MVS/Interface.h, HeaderDepthDataRaw);
+# colmap.github.io/format.html.
 
 MVEI = b"\x89MVE_IMAGE\n"
 MVEI_HEADER = struct.Struct("<4i")
@@ -52,7 +52,7 @@ def read_mvei(path: Path, scale: float | None = None, read: Read = read_bytes) -
     width, height, channels, kind = MVEI_HEADER.unpack_from(data, len(MVEI))
     if (channels, kind) != (1, MVEI_FLOAT):
         raise DataError(f"{path}: {channels} channels of type {kind}; a depth map has one of type {MVEI_FLOAT} (float)")
-    return _metres(path, data, start, (height, width), np.dtype("<f4"), 1 / (scale or 1))
+    return _metres(path, data, start, (height, width), np.dtype("<f4"), scale or 1)
 
 
 @dataclass(frozen=True)
@@ -94,11 +94,26 @@ def read_dmap(path: Path, scale: float | None = None, read: Read = read_bytes) -
     """Depth (H, W) of a .dmap along the optical axis, float32, 0 where there is none; raises as `read_mvei`."""
     data = read(path)
     header = dmap_header(path, data)
-    return _metres(path, data, header.start, header.shape, header.dtype, 2.0**header.exponent / (scale or 1))
+    return _metres(path, data, header.start, header.shape, header.dtype, (scale or 1) / 2.0**header.exponent)
 
 
-def _metres(path: Path, data: bytes, start: int, shape: tuple[int, int], dtype: np.dtype[Any], unit: float) -> Float32:
-    """Samples (H, W) in a unit, as float32 metres. Raises DataError where there are not as many."""
+def read_depth_map(path: Path, scale: float | None = None, read: Read = read_bytes) -> Float32:
+    """Depth (H, W) of COLMAP's .bin, float32: the text 'width&height&channels&', then values, x fastest.
+
+    `scale` is units in a metre. Raises DataError for a normal map, another format, or a truncated file.
+    """
+    data = read(path)
+    header = re.match(rb"(\d{1,9})&(\d{1,9})&(\d{1,9})&", data)
+    if header is None:
+        raise DataError(f"{path}: not a depth map of COLMAP (it begins with {data[:12]!r}); {AGAIN}")
+    width, height, channels = (int(number) for number in header.groups())
+    if channels != 1:
+        raise DataError(f"{path}: has {channels} channels (a normal map?); set depth to the depth maps")
+    return _metres(path, data, header.end(), (height, width), np.dtype("<f4"), scale or 1)
+
+
+def _metres(path: Path, data: bytes, start: int, shape: tuple[int, int], dtype: np.dtype[Any], scale: float) -> Float32:
+    """Samples (H, W) of `scale` units in a metre, as float32 metres. Raises DataError where there are not as many."""
     if not (min(shape) > 0 and math.prod(shape) <= MAX_PIXELS):
         raise DataError(f"{path}: claims {shape[1]}x{shape[0]} pixels; is it damaged?")
     end = start + math.prod(shape) * dtype.itemsize
@@ -108,114 +123,40 @@ def _metres(path: Path, data: bytes, start: int, shape: tuple[int, int], dtype: 
         )
     stored = np.frombuffer(data, dtype, math.prod(shape), start).reshape(shape)
     with np.errstate(all="ignore"):  # beyond float32 becomes inf: invalid, as it should
-        metres: Float32 = np.multiply(stored, unit, dtype=np.float32, casting="same_kind")
+        metres: Float32 = np.divide(stored, scale, dtype=np.float32, casting="same_kind")
     return metres
 
-
-# COLMAP's dense depth maps: the text 'width&height&channels&', then float32 values, x fastest.
-
-HEADER = re.compile(rb"(\d{1,9})&(\d{1,9})&(\d{1,9})&")
-
-
-def read_depth_map(path: Path, scale: float | None = None, read: Read = read_bytes) -> Float32:
-    """Depth (H, W) float32 in metres; `scale` is units per metre, 1 where not given.
-
-    Raises DataError for a normal map, another format, or a file of another size than it says.
-    """
-    data = read(path)
-    header = HEADER.match(data)
-    if header is None:
-        raise DataError(f"{path}: not a depth map of COLMAP (it begins with {data[:12]!r}); {AGAIN}")
-    width, height, channels = (int(number) for number in header.groups())
-    if channels != 1:
-        raise DataError(f"{path}: has {channels} channels (a normal map?); set depth to the depth maps")
-    if not 0 < width * height <= MAX_PIXELS:
-        raise DataError(f"{path}: claims {width}x{height} pixels (at most {MAX_PIXELS} are read); is it damaged?")
-    stored, needed = memoryview(data)[header.end() :], 4 * width * height
-    if len(stored) != needed:
-        raise DataError(f"{path}: {width}x{height} pixels need {needed} bytes, the file has {len(stored)}; {AGAIN}")
-    with np.errstate(all="ignore"):  # beyond float32 becomes inf: invalid, as it should
-        metres: Float32 = np.divide(np.frombuffer(stored, "<f4"), scale or 1, dtype=np.float32)
-    return metres.reshape(height, width)
-
-
-Depth = Float32
-Shape = tuple[int, int]
-Camera = Callable[[Shape], Intrinsics]
-"""The intrinsics of a frame's depth image, of shape (H, W)."""
 
 FORMATS = {".bin": read_depth_map, ".mvei": read_mvei, ".dmap": read_dmap}
 """Functions that read depth, by the suffix of the file; `read_depth` reads the rest."""
 
 
-class StoredDepth:
-    """Depth from a file a frame."""
-
-    def __init__(self, options: FileOptions) -> None:
-        self._options = options
-
-    def path(self, frame: FrameSource) -> Path:
-        """The frame's own file."""
-        return frame.depth
-
-    def scale(self, frame: FrameSource) -> float:
-        """The scale of the options, else the usual one of its kind of file."""
-        usual = MILLIMETRES if frame.depth.suffix.lower() == ".png" else 1.0
-        return self._options.depth_scale or frame.depth_scale or usual
-
-    def depth(self, frame: FrameSource, read: Read, camera: Camera, T_wc: Callable[[], Float64]) -> Depth:
-        """Depth of the file; pixels with a value that means 'no depth' become 0."""
-        scale = self._options.depth_scale or frame.depth_scale
-        depth = FORMATS.get(frame.depth.suffix.lower(), read_depth)(frame.depth, scale, read)
-        if np.isnan(depth[0, 0]) and np.isnan(depth).all():  # one frame that saw nothing ends no run; it is counted
-            depth = np.zeros_like(depth)
-        for value in self._options.invalid_depth:
-            with np.errstate(over="ignore"):
-                depth[depth == np.float32(value) / np.float32(self.scale(frame))] = 0
-        if self._options.max_depth is not None:
-            depth[depth >= self._options.max_depth] = 0
-        shape = (depth.shape[0], depth.shape[1])
-        return planar(depth, camera(shape)) if self._options.depth_kind == "ray" else depth
-
-    def digest(self, frame: FrameSource) -> None:
-        """That of its file, which the scene knows where it has read it."""
-        return
+def stored_scale(frame: FrameSource, options: FileOptions) -> float:
+    """Units of a frame's depth file in a metre: those of the options, else the usual ones of its kind of file."""
+    usual = MILLIMETRES if frame.depth.suffix.lower() == ".png" else 1.0
+    return options.depth_scale or frame.depth_scale or usual
 
 
-class CastDepth:
-    """Depth of rays cast at one surface. `views` of all frames tell what is wrong where one sees nothing."""
+def stored_depth(
+    frame: FrameSource, options: FileOptions, read: Read, camera: Callable[[tuple[int, int]], Intrinsics]
+) -> Float32:
+    """Depth (H, W) of a frame's file in metres along the optical axis; values that mean 'no depth' become 0.
 
-    def __init__(self, surface: Surface, options: FileOptions, views: Callable[[], Iterable[View]]) -> None:
-        self._surface = surface
-        self._options = options
-        self._views = views
-        self._seen = False
-
-    def path(self, frame: FrameSource) -> Path:
-        """The file of the surface."""
-        return self._surface.path
-
-    def scale(self, frame: FrameSource) -> None:
-        """Depth is not stored."""
-        return
-
-    def depth(self, frame: FrameSource, read: Read, camera: Camera, T_wc: Callable[[], Float64]) -> Depth:
-        """Depth of the surface in the view of the camera."""
-        shape = shape_of(frame, self._options)
-        depth = self._surface.depth(View(camera(shape), T_wc(), shape))
-        if not self._seen and not depth.any():
-            self._surface.require_seen(self._views())
-        self._seen = True
-        if self._options.max_depth is not None:
-            depth[depth >= self._options.max_depth] = 0
-        return depth
-
-    def digest(self, frame: FrameSource) -> bytes:
-        """That of the surface."""
-        return self._surface.digest
+    camera  gives the intrinsics of the depth image of a shape
+    """
+    scale = options.depth_scale or frame.depth_scale
+    depth = FORMATS.get(frame.depth.suffix.lower(), read_depth)(frame.depth, scale, read)
+    if np.isnan(depth[0, 0]) and np.isnan(depth).all():  # one frame that saw nothing ends no run; it is counted
+        depth = np.zeros_like(depth)
+    for value in options.invalid_depth:
+        with np.errstate(over="ignore"):
+            depth[depth == np.float32(value) / np.float32(stored_scale(frame, options))] = 0
+    if options.max_depth is not None:
+        depth[depth >= options.max_depth] = 0
+    return planar(depth, camera((depth.shape[0], depth.shape[1]))) if options.depth_kind == "ray" else depth
 
 
-def shape_of(frame: FrameSource, options: FileOptions) -> Shape:
+def shape_of(frame: FrameSource, options: FileOptions) -> tuple[int, int]:
     """(H, W) of the cast depth of a frame: the size of its camera, else of its depth file or colour image.
 
     Raises DataError where none is known.

@@ -4,15 +4,16 @@ from __future__ import annotations
 
 import logging
 import os
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
 import numpy as np
 
-from semstab.core.types import UInt8, UInt16
-from semstab.datasets.files.options import FileOptions, Folders, FrameSource, Template, inside_text, matching_folders
+from semstab.config import nearest
+from semstab.core.types import UInt16
+from semstab.datasets.files.options import FileOptions, Folders, FrameSource, Template, inside, matching_folders
 from semstab.datasets.formats.images import (
     LABEL_SUFFIXES,
     MASK_SUFFIXES,
@@ -20,11 +21,10 @@ from semstab.datasets.formats.images import (
     Read,
     Size,
     read_labels,
-    read_mask,
     read_scores,
 )
 from semstab.datasets.geometry.lenses import Labels, Scores
-from semstab.datasets.scene import GROUND_TRUTH, listed, nearest
+from semstab.datasets.scene import GROUND_TRUTH, listed
 from semstab.errors import ConfigError, DataError
 from semstab.model.labels import IGNORE_16BIT, LabelSpace, ignore_id
 
@@ -43,6 +43,15 @@ SEPARATE = "{scene}/{backbone}/{name}"
 
 
 @dataclass(frozen=True)
+class SceneEntry:
+    """A scene's name, its folder, and its path below root, which {scene} in templates stands for."""
+
+    name: str
+    folder: Path
+    below_root: str
+
+
+@dataclass(frozen=True)
 class LabelSource:
     """One label source of a scene: where a frame's file would be.
 
@@ -54,35 +63,32 @@ class LabelSource:
     base: Path
     template: str
     folders: Folders
-    first: tuple[str, str] | None = None
+    first: tuple[str, Path] | None = None
 
-    def file(self, frame: FrameSource) -> str | None:
-        """The file of a frame; as text, for a path takes longer to make than to look up."""
-        where = str(self.base)
-        paths = (inside_text(self.base, self.template.replace("{name}", name), where) for name in frame.called)
-        return next(
-            (file for path in paths if (file := self.folders.file(path, SUFFIXES[self.kind])) is not None), None
-        )
+    @classmethod
+    def of(cls, kind: Kind, base: Path, template: str, frames: Sequence[FrameSource], folders: Folders) -> LabelSource:
+        """One source, with the first frame that has a file."""
+        source = cls(kind, base, template, folders)
+        there = ((frame.name, file) for frame in frames if (file := source.file(frame)) is not None)
+        return replace(source, first=next(there, None))
+
+    def file(self, frame: FrameSource) -> Path | None:
+        """The file of a frame, under its own name or another that it has."""
+        for name in (frame.name, *frame.aliases):
+            path = inside(self.base, self.base, self.template.replace("{name}", name), str(self.base))
+            if (file := self.folders.one_of(path, SUFFIXES[self.kind])) is not None:
+                return file
+        return None
 
     def missing(self, frame: FrameSource) -> list[str]:
         """Nothing, or the path that the file of that frame would have."""
         if self.file(frame) is not None:
             return []
-        path = self.base / self.template.replace("{name}", frame.name)
-        return [str(path if path.suffix.lower() in SUFFIXES[self.kind] else f"{path}{SUFFIXES[self.kind][0]}")]
-
-
-@dataclass(frozen=True)
-class ScenePlace:
-    """A scene's name, its folder, and its path below root, which {scene} in templates stands for."""
-
-    name: str
-    folder: Path
-    below_root: str
+        return [_with_suffix(self.base / self.template.replace("{name}", frame.name), self.kind)]
 
 
 def find_sources(
-    options: FileOptions, place: ScenePlace, frames: Sequence[FrameSource], folders: Folders
+    options: FileOptions, entry: SceneEntry, frames: Sequence[FrameSource], folders: Folders
 ) -> dict[str, LabelSource]:
     """The label sources of a scene with these frames; `gt` is the ground truth.
 
@@ -92,129 +98,71 @@ def find_sources(
     that cannot be listed.
     """
     sources: dict[str, LabelSource] = {}
-    base = place.folder if options.labels_root is None else options.labels_root
+    base = options.labels_root or entry.folder
     if not os.path.isdir(base):  # noqa: PTH112  Path.is_dir raises where the name is too long
         raise ConfigError(f"{base}: there is no such folder; mend labels_root")
     for kind in KINDS:
-        for backbone, template in _templates(kind, options, place, base).items():
-            source = _source(kind, base, template, frames, folders)
-            name = f"{backbone}-scores" if kind == "scores" and not isinstance(options.scores, dict) else backbone
+        templates: dict[str, str] = {}
+        for backbone, template in _stated(kind, options).items():
+            if backbone is not None:
+                templates[backbone] = template.filled(scene=entry.below_root)
+                continue
+            suffix = "-scores" if kind == "scores" else ""
+            folders_of = matching_folders(base, template, "backbone", scene=entry.below_root)
+            templates |= {f"{name}{suffix}": filled for name, filled in folders_of.items()}
+        for name, filled in templates.items():
+            source = LabelSource.of(kind, base, filled, frames, folders)
             if name in sources:
-                raise ConfigError(f"{place.folder}: two label sources are called '{name}'; rename one")
+                raise ConfigError(f"{entry.folder}: two label sources are called '{name}'; rename one")
             if source.first is not None:
                 sources[name] = source
             elif frames:
                 logger.warning("%s: no file of any frame, such as %s; left out", name, source.missing(frames[0])[0])
     if not sources and (options.labels or options.scores or options.labels_root):
         logger.warning(
-            "%s: no label maps in %s fit the options labels and scores; looked for %s",
-            place.name, base, ", ".join(label_paths(options, place, frames)),
+            "%s: no label maps in %s fit the options labels and scores; expected %s",
+            entry.name, base, ", ".join(label_paths(options, entry, frames)),
         )  # fmt: skip
     if options.ground_truth and GROUND_TRUTH not in sources:
         truth = Template("ground_truth", options.ground_truth, ("scene", "name"), ("name",))
-        source = _source("labels", place.folder, truth.filled(scene=place.below_root), frames, folders)
+        source = LabelSource.of("labels", entry.folder, truth.filled(scene=entry.below_root), frames, folders)
         sources |= {GROUND_TRUTH: source} if source.first is not None else {}
     return sources
 
 
-def label_paths(options: FileOptions, place: ScenePlace, frames: Sequence[FrameSource]) -> list[str]:
-    """Where label maps and scores are looked for: the paths of the first frame, with BACKBONE for any name."""
-    base, paths = options.labels_root or place.folder, []
-    for kind in KINDS:
-        templates = _stated(kind, options)
-        for template in templates.values() if isinstance(templates, dict) else [templates] if templates else []:
-            name = template.replace("{scene}", place.below_root).replace("{backbone}", "BACKBONE")
-            path = base / name.replace("{name}", frames[0].name if frames else "NAME")
-            paths.append(str(path if path.suffix.lower() in SUFFIXES[kind] else f"{path}{SUFFIXES[kind][0]}"))
-    return paths
+def label_paths(options: FileOptions, entry: SceneEntry, frames: Sequence[FrameSource]) -> list[str]:
+    """Paths of label maps and scores that would be read: the paths of the first frame, with BACKBONE for any name."""
+    values = {"scene": entry.below_root, "backbone": "BACKBONE", "name": frames[0].name if frames else "NAME"}
+    base = options.labels_root or entry.folder
+    return [
+        _with_suffix(base / template.filled(**values), kind)
+        for kind in KINDS
+        for template in _stated(kind, options).values()
+    ]
 
 
-def find_regions(
-    options: FileOptions, place: ScenePlace, frames: Sequence[FrameSource], folders: Folders, sources: Collection[str]
-) -> dict[str, LabelSource]:
-    """Maps of regions without classes, regions/{backbone}/{name}; a folder without a file of any frame is none.
-
-    Raises DataError where the name is one of `sources`, too.
-    """
-    base = place.folder if options.labels_root is None else options.labels_root
-    template = Template("regions", REGIONS, ("backbone", "name"), ("backbone", "name"))
-    regions = {
-        backbone: _source("labels", base, filled, frames, folders)
-        for backbone, filled in matching_folders(base, template, "backbone", scene=place.below_root).items()
-    }
-    if both := next((name for name in regions if name in sources), None):
-        raise DataError(f"{base / 'regions' / both}: labels/{both} is called '{both}' too; rename one")
-    return {backbone: source for backbone, source in regions.items() if source.first is not None}
-
-
-def find_masks(options: FileOptions, place: ScenePlace, folders: Folders) -> LabelSource | None:
-    """Where the masks of frames are; None without the option."""
-    if options.masks is None:
-        return None
-    template = Template("masks", options.masks, ("scene", "name"), ("name",)).filled(scene=place.below_root)
-    return LabelSource("masks", place.folder, template, folders)
-
-
-def _stated(kind: Kind, options: FileOptions) -> str | dict[str, str] | None:
-    """The template of every backbone, or one of each by its name; None where there are none of that kind."""
+def _stated(kind: Kind, options: FileOptions) -> dict[str | None, Template]:
+    """The template of each backbone that has one of its own, or that of all, under None."""
     stated = options.labels if kind == "labels" else options.scores
-    if stated is not None:
-        return stated
-    if options.labels_root is not None:
-        return SEPARATE if kind == "labels" else None
-    return DEFAULTS[kind]
-
-
-def _templates(kind: Kind, options: FileOptions, place: ScenePlace, base: Path) -> dict[str, str]:
-    """By backbone, a template in which only {name} is left."""
-    stated = _stated(kind, options)
     if isinstance(stated, dict):
-        templates = {key: Template(f"{kind}.{key}", text, ("scene", "name"), ("name",)) for key, text in stated.items()}
-        return {key: template.filled(scene=place.below_root) for key, template in templates.items()}
-    if stated is None:
+        return {key: Template(f"{kind}.{key}", text, ("scene", "name"), ("name",)) for key, text in stated.items()}
+    if stated is None and options.labels_root is not None and kind == "scores":
         return {}
-    template = Template(kind, stated, ("scene", "backbone", "name"), ("backbone", "name"))
-    return matching_folders(base, template, "backbone", scene=place.below_root)
+    if stated is None:
+        stated = DEFAULTS[kind] if options.labels_root is None else SEPARATE
+    return {None: Template(kind, stated, ("scene", "backbone", "name"), ("backbone", "name"))}
 
 
-def _source(kind: Kind, base: Path, template: str, frames: Sequence[FrameSource], folders: Folders) -> LabelSource:
-    """One source, with the first frame that has a file."""
-    source = LabelSource(kind, base, template, folders)
-    there = ((frame.name, file) for frame in frames if (file := source.file(frame)) is not None)
-    return replace(source, first=next(there, None))
+def _with_suffix(path: Path, kind: Kind) -> str:
+    return str(path if path.suffix.lower() in SUFFIXES[kind] else f"{path}{SUFFIXES[kind][0]}")
 
-
-def label_space(options: FileOptions, folder: Path, name: str, source: LabelSource) -> LabelSpace | None:
-    """The classes of option taxonomies, else of a label_space.yaml next to its maps, else of the scene in `folder`.
-
-    None where nothing says it. Raises ConfigError for one that cannot be used.
-    """
-    if name in options.taxonomies:
-        return LabelSpace.load(options.taxonomies[name])
-    assert source.first is not None
-    frame, file = source.first
-    for parent in Path(file).parents[: 1 + frame.count("/")]:  # a frame's name may be a path: cam0/0001
-        if (classes := parent / LABEL_SPACE_FILE).is_file():
-            return LabelSpace.load(classes)
-    try:
-        if options.classes is not None:
-            return LabelSpace(name="classes of the scene", classes=options.classes)
-        return None if options.taxonomy is None else LabelSpace.load(options.taxonomy)
-    except ConfigError as error:
-        raise ConfigError(f"{folder}: {error}") from error
-
-
-# What the ids of a label map mean where that is not the taxonomy's own: other tables, ids for 'no label'.
 
 NO_ID = IGNORE_16BIT - 1
 """In a table of class ids: an id that is not in it."""
 
 
-# The label maps, scores and masks of a scene's frames, read into the ids of its taxonomies, in their own pixels.
-
-
 class LabelMaps:
-    """The predictions for the frames of a scene: the label sources, their classes, and the maps themselves.
+    """The predictions for the frames of a scene: the label sources, their classes, and the maps in their own pixels.
 
     class_ids  by label source a table from the ids of its files to those of its taxonomy, where they differ
     folders    what lies where maps may be
@@ -225,29 +173,41 @@ class LabelMaps:
     def __init__(
         self,
         options: FileOptions,
-        place: ScenePlace,
+        entry: SceneEntry,
         frames: Sequence[FrameSource],
         class_ids: Mapping[str, UInt16],
         folders: Folders,
     ) -> None:
-        labels = find_sources(options, place, frames, folders)
-        regions = find_regions(options, place, frames, folders, labels)
+        labels, base = find_sources(options, entry, frames, folders), options.labels_root or entry.folder
+        template = Template("regions", REGIONS, ("backbone", "name"), ("backbone", "name"))
+        regions = {
+            name: LabelSource.of("labels", base, filled, frames, folders)
+            for name, filled in matching_folders(base, template, "backbone", scene=entry.below_root).items()
+        }
+        if both := next((name for name in regions if name in labels), None):
+            raise DataError(f"{base / 'regions' / both}: labels/{both} is called '{both}' too; rename one")
+        regions = {name: source for name, source in regions.items() if source.first is not None}
         self.backbones = tuple(name for name in labels if name != GROUND_TRUTH)
         self.ground_truth = GROUND_TRUTH in labels
         self.regions = tuple(regions)
+        self.class_ids = class_ids
         self._options = options
-        self._folder = place.folder
+        self._folder = entry.folder
         self._frames = frames
         self._sources = {**labels, **regions}
-        self._masks = find_masks(options, place, folders)
-        self._class_ids = class_ids
+        self._masks: LabelSource | None = None
+        if options.masks is not None:
+            masks = Template("masks", options.masks, ("scene", "name"), ("name",)).filled(scene=entry.below_root)
+            self._masks = LabelSource("masks", entry.folder, masks, folders)
         self._spaces: dict[str, LabelSpace | None] = {}
 
     def source(self, backbone: str) -> LabelSource:
         """The files of a label source. Raises ConfigError where there is none of that name."""
         known = self._sources
         if backbone not in known:
-            hint = nearest(backbone, known) if known else "put its label maps into labels/NAME/, or set option labels"
+            hint = (
+                nearest(backbone, [*known]) if known else "put its label maps into labels/NAME/, or set option labels"
+            )
             raise ConfigError(f"{self._folder}: backbone '{backbone}' is not there; {hint}")
         return known[backbone]
 
@@ -259,14 +219,34 @@ class LabelMaps:
             raise DataError(
                 f"{self._folder}: {listed(lost, str(self._folder))}; choose frames that have them, or add them"
             )
-        return Path(file)
+        return file
 
     def space(self, backbone: str) -> LabelSpace | None:
-        """The classes of a label source, None where nothing says them; what says them is read once."""
+        """The classes of a label source, read once; None for regions, and where nothing says them.
+
+        They are those of option taxonomies, else of a label_space.yaml next to its maps, else of the scene.
+        Raises ConfigError for one that cannot be used.
+        """
         if backbone not in self._spaces:
-            source, none = self.source(backbone), backbone in self.regions
-            self._spaces[backbone] = None if none else label_space(self._options, self._folder, backbone, source)
+            source = self.source(backbone)
+            self._spaces[backbone] = None if backbone in self.regions else self._stated_space(backbone, source)
         return self._spaces[backbone]
+
+    def _stated_space(self, backbone: str, source: LabelSource) -> LabelSpace | None:
+        options = self._options
+        if backbone in options.taxonomies:
+            return LabelSpace.load(options.taxonomies[backbone])
+        assert source.first is not None
+        frame, file = source.first
+        for parent in file.parents[: 1 + frame.count("/")]:  # a frame's name may be a path: cam0/0001
+            if (classes := parent / LABEL_SPACE_FILE).is_file():
+                return LabelSpace.load(classes)
+        try:
+            if options.classes is not None:
+                return LabelSpace(name="classes of the scene", classes=options.classes)
+            return None if options.taxonomy is None else LabelSpace.load(options.taxonomy)
+        except ConfigError as error:
+            raise ConfigError(f"{self._folder}: {error}") from error
 
     def label_space(self, backbone: str, where: Path) -> LabelSpace:
         """The same; raises DataError with `where` where nothing says them, ConfigError where it has none."""
@@ -276,7 +256,7 @@ class LabelMaps:
         space = self.space(backbone)
         if space is None:
             assert source.first is not None
-            folder = Path(source.first[1]).parent
+            folder = source.first[1].parent
             raise DataError(
                 f"{where}: the classes of '{backbone}' are not known; set classes: [name, ...] in id order, taxonomy:"
                 f" NAME, or taxonomies: {{{backbone}: NAME}}, or put a {LABEL_SPACE_FILE} into {folder}"
@@ -286,8 +266,8 @@ class LabelMaps:
     def labels(self, backbone: str, path: Path, read: Read) -> Labels:
         """Ids (H, W) of one file, whose bytes `read` gives. Raises DataError that names it."""
         labels = read_labels(path, self.space(backbone), read)
-        if backbone in self._class_ids:
-            ids: Labels = self._class_ids[backbone][labels]
+        if backbone in self.class_ids:
+            ids: Labels = self.class_ids[backbone][labels]
             if (unknown := ids == NO_ID).any():
                 raise DataError(
                     f"{path}: the id {labels[unknown][0]} is not in the table of classes; is it the right table?"
@@ -309,13 +289,4 @@ class LabelMaps:
 
     def mask_file(self, frame: FrameSource) -> Path | None:
         """The mask of a frame, where it has one."""
-        file = None if self._masks is None else self._masks.file(frame)
-        return None if file is None else Path(file)
-
-    def mask(self, path: Path, read: Read) -> UInt8:
-        """(H, W): 1 where a mask leaves out. Raises DataError that names it."""
-        return read_mask(path, read).astype(np.uint8)
-
-    def table_bytes(self, backbone: str) -> bytes:
-        """The table of its ids, as bytes that are equal where it is."""
-        return self._class_ids[backbone].tobytes() if backbone in self._class_ids else b""
+        return None if self._masks is None else self._masks.file(frame)

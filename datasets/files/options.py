@@ -2,22 +2,16 @@
 
 from __future__ import annotations
 
-import dataclasses
-import functools
 import os
 import re
-from bisect import bisect_left
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Collection
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
-from typing import Annotated, Any, Literal, Self, overload
+from typing import Annotated, Literal, Self
 
-import numpy as np
-import numpy.typing as npt
 from pydantic import Field, PositiveInt, model_validator
 
 from semstab.config import Settings
-from semstab.core.types import Float64
 from semstab.datasets import GROUND_TRUTH
 from semstab.datasets.formats.disk import natural, subfolders
 from semstab.datasets.geometry.cameras import Camera, Poses
@@ -46,10 +40,6 @@ CameraAxes = Annotated[
     Field(description="axes of the camera: opencv, opengl, or ned (x forward, y right, z down)"),
 ]
 UpAxis = Annotated[Literal["x", "y", "z", "-x", "-y", "-z"] | None, Field(description="the world's up axis")]
-Crs = Annotated[
-    str | None,
-    Field(description="projected reference system of the world in metres: EPSG:32615, a PROJ string or WKT"),
-]
 PixelCentre = Annotated[
     float | None, Field(ge=0, le=1, description="where the intrinsics have the centre of the first pixel: 0 or 0.5")
 ]
@@ -114,7 +104,9 @@ class FileSettings(Settings):
     camera_axes: CameraAxes = "opencv"
     up_axis: UpAxis = None
     metres_per_unit: MetresPerUnit = 1.0
-    crs: Crs = None
+    crs: str | None = Field(
+        None, description="projected reference system of the world in metres: EPSG:32615, a PROJ string or WKT"
+    )
     offset: Offset = None
 
     intrinsics_size: Size = None
@@ -132,15 +124,6 @@ class FileSettings(Settings):
         return self
 
 
-Surface = Annotated[
-    Path | None,
-    Field(description="mesh, cloud (LAS, LAZ, PLY) or height raster (GeoTIFF) that depth is cast from, not from files"),
-]
-SurfaceCell = Annotated[
-    Positive | None, Field(description="metres of a cell of the grid that a cloud or a raster becomes, seen from above")
-]
-
-
 class FileOptions(FileSettings):
     """Options of any dataset of files: where they are, and how they are read."""
 
@@ -151,8 +134,13 @@ class FileOptions(FileSettings):
     labels_root: Path | None = Field(
         None, description="folder of label maps and scores; the scene's own where not given"
     )
-    surface: Surface = None
-    surface_cell: SurfaceCell = None
+    surface: Path | None = Field(
+        None,
+        description="mesh, cloud (LAS, LAZ, PLY) or height raster (GeoTIFF) that depth is cast from, not from files",
+    )
+    surface_cell: Positive | None = Field(
+        None, description="metres of a cell of the grid that a cloud or a raster becomes, seen from above"
+    )
     casts: Path | Literal[False] | None = Field(
         None, description="folder where cast depth is kept, or false; semstab/casts in the user's cache by default"
     )
@@ -179,33 +167,24 @@ class Template:
     required: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
-        names = PLACEHOLDER.findall(self.text)
-        for name in names:
-            if name not in self.known:
-                raise ConfigError(f"{self._says}: unknown {{{name}}}; known: {_listed(self.known)}")
-        for name in self.required:
-            if name not in names:
-                raise ConfigError(f"{self._says}: needs {{{name}}}")
+        names, where = PLACEHOLDER.findall(self.text), f"{self.option}: {self.text[:200]!r}"
+        known = ", ".join(f"{{{name}}}" for name in self.known)
+        if unknown := next((name for name in names if name not in self.known), None):
+            raise ConfigError(f"{where}: unknown {{{unknown}}}; known: {known}")
+        if lacking := next((name for name in self.required if name not in names), None):
+            raise ConfigError(f"{where}: needs {{{lacking}}}")
         if any(brace in PLACEHOLDER.sub("", self.text) for brace in "{}"):
-            raise ConfigError(f"{self._says}: a brace is not closed; placeholders are {_listed(self.known)}")
+            raise ConfigError(f"{where}: a brace is not closed; placeholders are {known}")
         path = PurePosixPath(self.text)
         if path.is_absolute() or ".." in path.parts or UNSAFE.search(self.text) or not path.parts:
             raise ConfigError(
-                f"{self._says}: leaves its folder; write a path inside it, and set root, or labels_root for labels that"
+                f"{where}: leaves its folder; write a path inside it, and set root, or labels_root for labels that"
                 " stand elsewhere"
             )
 
     def filled(self, **values: str) -> str:
         """The path with the placeholders that are given replaced."""
         return PLACEHOLDER.sub(lambda match: values.get(match[1], match[0]), self.text)
-
-    @property
-    def _says(self) -> str:
-        return f"{self.option}: {self.text[:200]!r}"
-
-
-def _listed(names: Collection[str]) -> str:
-    return ", ".join(f"{{{name}}}" for name in names) or "none"
 
 
 def matching_folders(base: Path, template: Template, placeholder: str, **values: str) -> dict[str, str]:
@@ -230,7 +209,8 @@ def inside(root: Path, folder: Path, relative: str, where: str) -> Path:
 
     Raises DataError with `where` (the file that names the path) where it does not, or no path can be called so.
     """
-    _require_path(relative, where)
+    if UNSAFE.search(relative) or len(relative) > LONGEST:
+        raise DataError(f"{where}: {relative[:40]!r} cannot be the path of a file")
     path = folder / relative
     if ".." not in relative and not relative.startswith("/"):
         return path
@@ -241,64 +221,34 @@ def inside(root: Path, folder: Path, relative: str, where: str) -> Path:
     return path if ".." not in path.parts else Path(os.path.normpath(path))
 
 
-def inside_text(root: Path, relative: str, where: str) -> str:
-    """The same of a path relative to the root, as text, which may have more dots and slashes than it needs."""
-    if ".." in relative or relative.startswith("/"):
-        return str(inside(root, root, relative, where))
-    _require_path(relative, where)
-    return f"{root}/{relative}"
-
-
-def _require_path(relative: str, where: str) -> None:
-    if UNSAFE.search(relative) or len(relative) > LONGEST:
-        raise DataError(f"{where}: {relative[:40]!r} cannot be the path of a file")
-
-
 class Folders:
-    """The contents of folders, each listed once: names as bytes in order, a fifth of a set's memory.
-
-    Several threads may ask.
-    """
+    """The contents of folders, each listed once. Several threads may ask."""
 
     def __init__(self) -> None:
-        self._names: dict[str, npt.NDArray[np.bytes_]] = {}
+        self._names: dict[str, frozenset[str]] = {}
 
     def has(self, path: Path) -> bool:
         """Return whether there is a file or folder of that path."""
-        return self._has(*os.path.split(path))
+        folder, name = os.path.split(path)
+        if folder not in self._names:
+            try:
+                self._names[folder] = frozenset(os.listdir(folder or "."))  # noqa: PTH208  names, not paths
+            except OSError:
+                self._names[folder] = frozenset()
+        return name in self._names[folder]
 
     def one_of(self, path: Path, suffixes: Collection[str]) -> Path | None:
         """The path where it has one of the suffixes, else that with the first suffix there is a file of."""
-        file = self.file(str(path), suffixes)
-        return None if file is None else Path(file)
-
-    def file(self, path: str, suffixes: Collection[str]) -> str | None:
-        """The same as text."""
-        parent, name = os.path.split(path)
-        if os.path.splitext(name)[1].lower() in suffixes:  # noqa: PTH122  of ten thousand names
-            return path if self._has(parent, name) else None
-        suffix = next((suffix for suffix in suffixes if self._has(parent, name + suffix)), None)
-        return None if suffix is None else path + suffix
-
-    def _has(self, folder: str, name: str) -> bool:
-        listed, wanted = self._listed(folder), os.fsencode(name)
-        at = bisect_left(listed, wanted)
-        return at < len(listed) and bool(listed[at] == wanted)
-
-    def _listed(self, folder: str) -> npt.NDArray[np.bytes_]:
-        if folder not in self._names:
-            try:
-                names = os.listdir(os.fsencode(folder or "."))  # noqa: PTH208  names, not paths
-            except OSError:
-                names = []
-            self._names[folder] = np.sort(np.array(names, dtype=np.bytes_))
-        return self._names[folder]
+        if path.suffix.lower() in suffixes:
+            return path if self.has(path) else None
+        candidates = (path.with_name(path.name + suffix) for suffix in suffixes)
+        return next((candidate for candidate in candidates if self.has(candidate)), None)
 
 
 # Where the files of a frame are.
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, slots=True)
 class FrameSource:
     """Where one frame comes from.
 
@@ -330,61 +280,3 @@ class FrameSource:
     color: Path | None = None
     depth_scale: float | None = None
     timestamp: float | None = None
-
-    @property
-    def called(self) -> tuple[str, ...]:
-        """The names that its label maps may have, its own first."""
-        return self.name, *self.aliases
-
-
-FIELDS = tuple(field.name for field in dataclasses.fields(FrameSource))
-PATHS = tuple(FIELDS.index(name) for name in ("depth", "pose_file", "color", "photograph"))
-
-
-class FrameTable(Sequence[FrameSource]):
-    """The sources of a sequence's frames: tuples with paths as text, a third of the memory of the objects.
-
-    Raises DataError, with the file of its pose, for a name that cannot be part of a path.
-    """
-
-    def __init__(self, frames: Iterable[FrameSource], folder: Path) -> None:
-        self._rows: list[tuple[Any, ...]] = []
-        for frame in frames:
-            inside_text(folder, frame.name, str(frame.pose_file))  # files of predictions are called so
-            values = [getattr(frame, field) for field in FIELDS]
-            self._rows.append(tuple(str(value) if isinstance(value, Path) else value for value in values))
-        self._source = functools.lru_cache(maxsize=64)(self._made)
-
-    def __len__(self) -> int:
-        return len(self._rows)
-
-    @overload
-    def __getitem__(self, at: int) -> FrameSource: ...
-    @overload
-    def __getitem__(self, at: slice) -> Sequence[FrameSource]: ...
-    def __getitem__(self, at: int | slice) -> FrameSource | Sequence[FrameSource]:
-        """The source of a frame, or those of some."""
-        some = range(len(self))[at]
-        return self._source(some) if isinstance(some, int) else [self._source(k) for k in some]
-
-    @property
-    def names(self) -> list[str]:
-        """The names of all frames, as path templates have them."""
-        return [row[0] for row in self._rows]
-
-    @property
-    def times(self) -> Float64 | None:
-        """(len,) seconds of each frame; None where one has none."""
-        times = [row[FIELDS.index("timestamp")] for row in self._rows]
-        return None if None in times else np.array(times, dtype=np.float64)
-
-    @property
-    def distorted(self) -> bool:
-        """Return whether label maps of some frames are those of distorted photographs."""
-        return any(row[FIELDS.index("label_lens")] is not None for row in self._rows)
-
-    def _made(self, k: int) -> FrameSource:
-        row = list(self._rows[k])
-        for at in PATHS:
-            row[at] = None if row[at] is None else Path(row[at])
-        return FrameSource(*row)

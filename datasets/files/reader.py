@@ -8,21 +8,21 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Generic, TypeVar
 
+from semstab.config import nearest
 from semstab.core.types import UInt16
-from semstab.datasets.files.labels import ScenePlace
-from semstab.datasets.files.options import FileOptions, Folders, FrameSource, FrameTable
+from semstab.datasets.files.labels import SceneEntry
+from semstab.datasets.files.options import FileOptions, Folders, FrameSource, inside
 from semstab.datasets.files.scene import FileScene
-from semstab.datasets.files.surfaces import SEEN_FROM_ABOVE, Surface, usual_folder
-from semstab.datasets.formats.disk import naturally, subfolders
+from semstab.datasets.files.surfaces import SEEN_FROM_ABOVE, Surface
+from semstab.datasets.formats.disk import files_named, natural, subfolders
 from semstab.datasets.formats.images import COLOR_SUFFIXES
 from semstab.datasets.geometry.cameras import Camera, Poses
-from semstab.datasets.scene import Dataset, nearest
+from semstab.datasets.scene import Dataset
 from semstab.errors import ConfigError, DataError
 from semstab.model.georeference import Georeference
 
 DEEPEST = 3
 """Levels of folders below root that are searched for scenes."""
-
 
 Options = TypeVar("Options", bound=FileOptions)
 
@@ -43,30 +43,42 @@ class FileDataset(Dataset, Generic[Options]):
 
     def __init__(self, options: Options) -> None:
         self.options = options
-        self._places = {place.name: place for place in self.find_scenes(options.root)}
+        self._entries = {entry.name: entry for entry in self.find_scenes(options.root)}
 
     @property
     def scenes(self) -> tuple[str, ...]:
         """Names of the scenes, in natural order: their paths below root, with - between folders."""
-        return tuple(self._places)
+        return tuple(self._entries)
 
     def scene(self, name: str) -> FileScene:
         """Open one. Raises ConfigError for a name that is not there, and what `FileScene` raises."""
-        if name not in self._places:
-            raise ConfigError(f"{self.options.root}: scene '{name}' is not there; {nearest(name, self._places)}")
-        place = self._places[name]
-        options = self.settled(place.folder)
-        frames = FrameTable(self.frames(place.folder), place.folder)
+        if name not in self._entries:
+            raise ConfigError(f"{self.options.root}: scene '{name}' is not there; {nearest(name, self.scenes)}")
+        entry = self._entries[name]
+        options = self.settled(entry.folder)
+        frames = tuple(self.frames(entry.folder))
+        for frame in frames:
+            inside(entry.folder, entry.folder, frame.name, str(frame.pose_file))  # files of predictions have its name
         if not frames:
-            raise DataError(f"{place.folder}: holds no frame; expected {self.looks_like}")
-        georeference = self.georeference(place.folder, options)
-        scene = FileScene(place, frames, options, self.class_ids(), _surface(options, georeference))
+            raise DataError(f"{entry.folder}: holds no frame; expected {self.looks_like}")
+        georeference = self.georeference(entry.folder, options)
+        surface = None
+        if options.surface is not None:
+            if options.surface.suffix.lower() in SEEN_FROM_ABOVE and options.up_axis not in (None, "z"):
+                raise ConfigError(
+                    f"{options.surface}: is a surface over x and y, but up_axis is {options.up_axis}; turn it, or take"
+                    " a mesh"
+                )
+            cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+            casts = None if options.casts is False else options.casts or cache / "semstab" / "casts"
+            surface = Surface(options.surface, options.surface_cell, georeference, casts)
+        scene = FileScene(entry, frames, options, self.class_ids(), surface)
         scene.georeference = georeference
         scene.labels_like_depth = self.labels_like_depth
-        scene.settings_file = None if self.settings_file is None else place.folder / self.settings_file
+        scene.settings_file = None if self.settings_file is None else entry.folder / self.settings_file
         return scene
 
-    def find_scenes(self, root: Path) -> Iterable[ScenePlace]:
+    def find_scenes(self, root: Path) -> Iterable[SceneEntry]:
         """The scenes below the root, in natural order; raises what `find_scenes` raises."""
         return find_scenes(root, self.is_scene, self.looks_like)
 
@@ -88,7 +100,7 @@ class FileDataset(Dataset, Generic[Options]):
         there = files_named(folder, before, after)
         if self.options.surface is None:
             return there
-        return {name: folder / f"{before}{name}{after}" for name in naturally({*there, *instead})}
+        return {name: folder / f"{before}{name}{after}" for name in sorted({*there, *instead}, key=natural)}
 
     def has_depth(self, folder: Path) -> bool:
         """Return whether a folder of depth images is there, or needs not be, as a surface gives the depth."""
@@ -107,7 +119,7 @@ class FileDataset(Dataset, Generic[Options]):
         """The frames of a scene's folder, in order, each with a name of its own. Raises DataError with the file."""
 
 
-def find_scenes(root: Path, is_scene: Callable[[Path], bool], looks_like: str) -> list[ScenePlace]:
+def find_scenes(root: Path, is_scene: Callable[[Path], bool], looks_like: str) -> list[SceneEntry]:
     """The root where it is a scene itself, else the scenes below it in natural order; one holds no other.
 
     Raises DataError where there is none, or two would have one name.
@@ -116,31 +128,21 @@ def find_scenes(root: Path, is_scene: Callable[[Path], bool], looks_like: str) -
         raise DataError(f"{root}: there is no such folder; set root to a scene or to the folder above scenes")
     if is_scene(root):
         name = root.resolve().name or "scene"
-        return [ScenePlace(name, root, name)]
-    relative = [path.relative_to(root).parts for path in _below(root, is_scene, DEEPEST)]
+        return [SceneEntry(name, root, name)]
+
+    def below(folder: Path, levels: int) -> Iterator[Path]:
+        for name in subfolders(folder) if levels else ():
+            inner = folder / name
+            yield from [inner] if is_scene(inner) else below(inner, levels - 1)
+
+    relative = [path.relative_to(root).parts for path in below(root, DEEPEST)]
     if not relative:
         raise DataError(f"{root}: no scene here, nor {DEEPEST} folders deep; one holds {looks_like}")
-    places = [ScenePlace("-".join(parts), root.joinpath(*parts), "/".join(parts)) for parts in relative]
-    names = [place.name for place in places]
+    entries = [SceneEntry("-".join(parts), root.joinpath(*parts), "/".join(parts)) for parts in relative]
+    names = [entry.name for entry in entries]
     if repeated := sorted({name for name in names if names.count(name) > 1}):
         raise DataError(f"{root}: two scenes would be called '{repeated[0]}'; rename one, or set root deeper")
-    return places
-
-
-def files_named(folder: Path, before: str, after: str) -> dict[str, Path]:
-    """The files 'BEFORE name AFTER' of a folder by name, in natural order; none where there is no folder.
-
-    Raises DataError where the folder cannot be listed.
-    """
-    try:
-        entries = os.listdir(folder)  # noqa: PTH208  names, not paths
-    except FileNotFoundError:
-        return {}
-    except OSError as error:
-        raise DataError(f"{folder}: the folder cannot be listed ({error.strerror})") from error
-    fitting = (entry for entry in entries if entry.startswith(before) and entry.endswith(after))
-    names = (entry[len(before) : len(entry) - len(after)] for entry in fitting if not entry.startswith("."))
-    return {name: folder / f"{before}{name}{after}" for name in naturally(names) if name}
+    return entries
 
 
 def images_named(folder: Path, before: str = "", after: str = "") -> list[str]:
@@ -184,23 +186,3 @@ def frames_of(
         )
         for k, (name, path) in enumerate(depth.items())
     )
-
-
-def _surface(options: FileOptions, georeference: Georeference | None) -> Surface | None:
-    """The surface of the options. Raises ConfigError for heights over another axis than z."""
-    if options.surface is None:
-        return None
-    if options.surface.suffix.lower() in SEEN_FROM_ABOVE and options.up_axis not in (None, "z"):
-        raise ConfigError(
-            f"{options.surface}: is a surface over x and y, but up_axis is {options.up_axis}; turn it, or take a mesh"
-        )
-    casts = None if options.casts is False else options.casts or usual_folder()
-    return Surface(options.surface, options.surface_cell, georeference, casts)
-
-
-def _below(folder: Path, is_scene: Callable[[Path], bool], levels: int) -> Iterator[Path]:
-    for name in subfolders(folder) if levels else ():
-        if is_scene(folder / name):
-            yield folder / name
-        else:
-            yield from _below(folder / name, is_scene, levels - 1)

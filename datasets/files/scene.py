@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -12,14 +12,14 @@ from typing import Any
 import numpy as np
 
 from semstab.core.prefetch import prefetch
-from semstab.core.types import Float32, Float64, Mask, UInt8, UInt16
-from semstab.datasets.files.depth import CastDepth, StoredDepth, shape_of
-from semstab.datasets.files.labels import LabelMaps, ScenePlace, label_paths
-from semstab.datasets.files.options import FileOptions, Folders, FrameSource, FrameTable
+from semstab.core.types import Float32, Float64, UInt8, UInt16
+from semstab.datasets.files.depth import shape_of, stored_depth, stored_scale
+from semstab.datasets.files.labels import LabelMaps, SceneEntry, label_paths
+from semstab.datasets.files.options import FileOptions, Folders, FrameSource
 from semstab.datasets.files.surfaces import Surface, View
 from semstab.datasets.formats import disk
 from semstab.datasets.formats.disk import read_pose
-from semstab.datasets.formats.images import Read, read_color
+from semstab.datasets.formats.images import Read, read_color, read_mask
 from semstab.datasets.geometry.cameras import UP_AXES, Camera, Poses, to_camera_to_world
 from semstab.datasets.geometry.lenses import Labels, Pixels, Scores, at_image, fit, fitted, undistorted
 from semstab.datasets.scene import Scene
@@ -32,12 +32,6 @@ PLACES = {
     "casts", "images",
 }  # fmt: skip
 """Options that say where things are, not what the numbers mean; label spaces and tables count by their content."""
-
-AT_ONCE = 64
-"""Files that a thread reads one after the other for their digests."""
-
-BATCH = 4096
-"""Frames whose files are in memory by name at once, for their digests."""
 
 DEPTH, LABELS, MASK = "depth", "labels of ", "mask"
 """Kinds of a frame's files."""
@@ -53,32 +47,33 @@ class FileScene(Scene):
 
     def __init__(
         self,
-        place: ScenePlace,
-        frames: FrameTable,
+        entry: SceneEntry,
+        frames: Sequence[FrameSource],
         options: FileOptions,
         class_ids: Mapping[str, UInt16] | None = None,
         surface: Surface | None = None,
     ) -> None:
-        if len(set(frames.names)) < len(frames):
-            raise DataError(f"{place.folder}: two frames have one name; frames need names of their own")
-        self.name = place.name
-        self.folder = place.folder
+        if len({frame.name for frame in frames}) < len(frames):
+            raise DataError(f"{entry.folder}: two frames have one name; frames need names of their own")
+        self.name = entry.name
+        self.folder = entry.folder
         self.options = options
         self.skips_incomplete = options.incomplete == "skip"
         self.up = np.array(UP_AXES[options.up_axis], dtype=np.float64) if options.up_axis else None
         self._frames = frames
         self._folders = Folders()
-        self._maps = LabelMaps(options, place, frames, class_ids or {}, self._folders)
+        self._maps = LabelMaps(options, entry, frames, class_ids or {}, self._folders)
         self.backbones = self._maps.backbones
         self.ground_truth = self._maps.ground_truth
         self.regions = self._maps.regions
-        self.label_paths = tuple(label_paths(options, place, frames))
-        self._digests: dict[str, UInt8] = {}
-        self._tracked: list[bool | None] = [None] * len(frames)
-        self._depth = StoredDepth(options) if surface is None else CastDepth(surface, options, self._views)
+        self.label_paths = tuple(label_paths(options, entry, frames))
+        self._digests: dict[tuple[int, str], bytes] = {}
+        self._tracked: dict[int, bool] = {}
+        self._surface = surface
+        self._surface_seen = False
         self.surface = None if surface is None else surface.path
         self.depth_from = None if surface is None else f"rays cast at {surface.path}"
-        self.on_photographs = frames.distorted
+        self.on_photographs = any(frame.label_lens is not None for frame in frames)
 
     def __len__(self) -> int:
         """Number of frames of the sequence, those that lack a file or a pose among them."""
@@ -89,19 +84,20 @@ class FileScene(Scene):
         """(len,) seconds on the dataset's own clock; None where it has none."""
         if self.options.frames_per_second is not None:
             return np.arange(len(self)) / self.options.frames_per_second
-        return self._frames.times
+        times = [frame.timestamp for frame in self._frames]
+        return None if None in times else np.array(times, dtype=np.float64)
 
     def tracked(self, index: int) -> bool:
         """Return whether the frame has a pose; one that is not finite means that tracking was lost. Read once."""
-        source, known = self._frame(index), self._tracked[index]
-        if known is None:
-            known = self._tracked[index] = bool(np.isfinite(self._stored_pose(source)).all())
-        return known
+        source = self._frame(index)
+        if index not in self._tracked:
+            self._tracked[index] = bool(np.isfinite(self._stored_pose(source)).all())
+        return self._tracked[index]
 
     def missing(self, index: int, sources: Sequence[str] = (), *, color: bool = False) -> list[str]:
         """Paths of the files that the frame lacks: depth, pose, the labels of these sources, colour."""
         frame = self._frame(index)
-        files = [self._depth.path(frame), *([frame.pose_file] if frame.pose is None else [])]
+        files = [self.surface or frame.depth, *([frame.pose_file] if frame.pose is None else [])]
         lost = [str(path) for path in files if not self._folders.has(path)]
         lost += [path for name in sources for path in self._maps.source(name).missing(frame)]
         if color and self._color_file(frame) is None:
@@ -118,7 +114,7 @@ class FileScene(Scene):
     @property
     def depth_scale(self) -> float | None:
         """Units of its stored depth in a metre: the option, else the usual scale of its kind of file."""
-        return self._depth.scale(self._frames[0])
+        return stored_scale(self._frames[0], self.options) if self._surface is None else None
 
     def label_space(self, backbone: str) -> LabelSpace:
         """The classes of that label source.
@@ -173,8 +169,16 @@ class FileScene(Scene):
 
     def depth(self, index: int) -> Float32:
         """Depth (H, W) float32 in metres along the optical axis; needs no labels. Raises DataError with the file."""
-        source, read = self._frame(index), self._reader(index, DEPTH)
-        return self._depth.depth(source, read, lambda shape: self.intrinsics(index, shape), lambda: self.T_wc(index))
+        if self._surface is None:
+            read = self._reader(index, DEPTH)
+            return stored_depth(self._frame(index), self.options, read, lambda shape: self.intrinsics(index, shape))
+        depth = self._surface.depth(self._view(index))
+        if not self._surface_seen and not depth.any():
+            self._surface.require_seen(self._view(k) for k in range(len(self)) if self.tracked(k))
+        self._surface_seen = True
+        if self.options.max_depth is not None:
+            depth[depth >= self.options.max_depth] = 0
+        return depth
 
     def color(self, index: int) -> UInt8 | None:
         """Colour (H, W, 3) uint8 RGB, None where the frame has none; needs no labels. Raises DataError."""
@@ -229,39 +233,32 @@ class FileScene(Scene):
         settings = self.options.model_dump(mode="json", exclude=PLACES)
         digest = hashlib.blake2b(digest_size=16)
         digest.update(json.dumps([settings, space.to_dict() if space else None]).encode())
-        digest.update(self._maps.table_bytes(backbone))
-        for first in range(0, len(indices), BATCH):
-            some = indices[first : first + BATCH]
-            files = [self._images(index, backbone) for index in some]
-            self._read_digests(
-                [
-                    (index, what, path)
-                    for index, own in zip(some, files, strict=True)
-                    for what, path in own.items()
-                    if self._known_digest(index, what) is None
-                ]
-            )
-            for index, own in zip(some, files, strict=True):
-                source = self._frame(index)
-                digest.update(source.name.encode() + b"\0" + self._geometry_bytes(source))
-                digest.update(self._depth.digest(source) or b"")
-                for what in own:
-                    digest.update(self._known_digest(index, what) or b"")
+        if (table := self._maps.class_ids.get(backbone)) is not None:
+            digest.update(table.tobytes())
+        files = [self._images(index, backbone) for index in indices]
+        unread = [k for k, own in enumerate(files) if own.keys() - self._digests.keys()]
+        for fetched in prefetch(lambda k: {key: disk.file_digest(path) for key, path in files[k].items()}, unread):
+            self._digests = fetched.item | self._digests
+        for index, own in zip(indices, files, strict=True):
+            source = self._frame(index)
+            cameras = (source.camera, source.label_camera, source.depth_scale, source.label_lens)
+            digest.update(source.name.encode() + b"\0" + self._stored_pose(source).tobytes() + repr(cameras).encode())
+            digest.update(b"" if self._surface is None else self._surface.digest)
+            for key in own:
+                digest.update(self._digests[key])
         return digest.hexdigest()
 
-    def _images(self, index: int, backbone: str) -> dict[str, Path]:
+    def _images(self, index: int, backbone: str) -> dict[tuple[int, str], Path]:
         """The files that a frame is made of, but for its pose: depth where it is stored, labels, a mask."""
         source = self._frame(index)
-        depth = source.depth if self._depth.digest(source) is None else None
+        depth = source.depth if self._surface is None else None
         labels, mask = self._maps.file(source, backbone), self._maps.mask_file(source)
         files = {DEPTH: depth, LABELS + backbone: labels, MASK: mask}
-        return {what: path for what, path in files.items() if path is not None}
+        return {(index, what): path for what, path in files.items() if path is not None}
 
-    def _views(self) -> Iterator[View]:
-        """Those of the frames that have a pose."""
-        for index in filter(self.tracked, range(len(self))):
-            shape = shape_of(self._frame(index), self.options)
-            yield View(self.intrinsics(index, shape), self.T_wc(index), shape)
+    def _view(self, index: int) -> View:
+        shape = shape_of(self._frame(index), self.options)
+        return View(self.intrinsics(index, shape), self.T_wc(index), shape)
 
     def _framed(
         self,
@@ -273,12 +270,14 @@ class FileScene(Scene):
         color: bool,
         files: Mapping[str, Path] | None = None,
     ) -> Frame:
-        """The frame with labels or scores that have the depth's pixels."""
         source, timestamps = self._frame(index), self.timestamps
         image = self._color_file(source)  # named also where it is not read: a recording takes the file as it is
-        mask = self._maps.mask_file(source)
+        mask, masked = self._maps.mask_file(source), None
+        if mask is not None:  # outside of the mask's view nothing is masked
+            values = read_mask(mask, self._reader(index, MASK)).astype(np.uint8)
+            masked = self._stored(index, values, depth.shape, mask, "the mask is") == 1
         shown = image if source.color_lens is None else None  # a distorted one is not what the depth's camera sees
-        known = {"depth": self._depth.path(source), "pose": source.pose_file, "color": shown, "mask": mask}
+        known = {"depth": self.surface or source.depth, "pose": source.pose_file, "color": shown, "mask": mask}
         known |= dict(files or {})
         return Frame(
             index=int(index),
@@ -288,21 +287,16 @@ class FileScene(Scene):
             labels=labels,
             scores=scores,
             color=self.color(index) if color else None,
-            mask=None if mask is None else self._mask(index, mask, depth.shape),
+            mask=masked,
             timestamp=None if timestamps is None else float(timestamps[index]),
             files={what: str(path) for what, path in known.items() if path is not None},
         )
 
-    def _mask(self, index: int, path: Path, shape: tuple[int, ...]) -> Mask:
-        """The masked pixels of a frame, at the depth's pixels; outside of the mask's view nothing is masked."""
-        mask = self._maps.mask(path, self._reader(index, MASK))
-        masked: Mask = self._stored(index, mask, shape, path, "the mask is") == 1
-        return masked
-
     def _stored(self, index: int, values: Pixels, shape: tuple[int, ...], path: Path, what: str) -> Pixels:
         """The content of a file at the depth's pixels; where it must have them, `Frame` raises an error."""
-        as_they_are = self.labels_like_depth and self._frame(index).label_lens is None
-        return values if as_they_are else self._fitted(index, values, shape, str(path), what)
+        if self.labels_like_depth and self._frame(index).label_lens is None:
+            return values
+        return self._fitted(index, values, shape, str(path), what)
 
     def _fitted(
         self, index: int, values: Pixels, shape: tuple[int, ...], where: str, what: str = "the image is"
@@ -318,43 +312,20 @@ class FileScene(Scene):
         K = camera.at(values.shape, self.options.pixel_centre or 0.0)
         return fit(values, K, self.intrinsics(index, shape), (shape[0], shape[1]))
 
-    def _geometry_bytes(self, source: FrameSource) -> bytes:
-        """The pose and the cameras of a frame, as bytes that are equal where they are."""
-        cameras = (source.camera, source.label_camera, source.depth_scale, source.label_lens)
-        return self._stored_pose(source).tobytes() + repr(cameras).encode()
-
     def _reader(self, index: int, what: str) -> Read:
         """Give the content of a frame's file; its digest is remembered, so that `digest` need not read it again."""
 
         def read(path: Path) -> bytes:
             data = disk.read_bytes(path)
-            self._remember_digest(index, what, disk.digest(data))
+            self._digests[index, what] = disk.digest(data)
             return data
 
         return read
-
-    def _remember_digest(self, index: int, what: str, digest: bytes) -> None:
-        digests = self._digests.setdefault(what, np.zeros((len(self), len(digest)), dtype=np.uint8))
-        digests[index] = np.frombuffer(digest, dtype=np.uint8)
-
-    def _read_digests(self, files: Sequence[tuple[int, str, Path]]) -> None:
-        """Read files of frames for their digests, some in each of several threads."""
-        some = [files[first : first + AT_ONCE] for first in range(0, len(files), AT_ONCE)]
-        digests = prefetch(lambda k: [disk.file_digest(path) for _, _, path in some[k]], range(len(some)))
-        for own, fetched in zip(some, digests, strict=True):
-            for (index, what, _), digest in zip(own, fetched.item, strict=True):
-                self._remember_digest(index, what, digest)
-
-    def _known_digest(self, index: int, what: str) -> bytes | None:
-        """The digest of a frame's file; None where it was not read."""
-        digest = self._digests[what][index].tobytes() if what in self._digests else b""
-        return digest if any(digest) else None
 
     def _stored_pose(self, source: FrameSource) -> Poses:
         return read_pose(source.pose_file) if source.pose is None else source.pose
 
     def _color_file(self, source: FrameSource) -> Path | None:
-        """The colour image of a frame, where there is one."""
         return source.color if source.color is not None and self._folders.has(source.color) else None
 
     def _frame(self, index: int) -> FrameSource:

@@ -8,11 +8,9 @@ import math
 import os
 import re
 import reprlib
-import struct
 import zipfile
-import zlib
 from array import array
-from collections.abc import Container, Iterable, Iterator, Mapping
+from collections.abc import Container, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -47,6 +45,11 @@ def read_bytes(path: Path, limit: int = MAX_BYTES) -> bytes:
     return data
 
 
+def read_text(path: Path, limit: int) -> str:
+    """The text of a file; raises what `read_bytes` raises."""
+    return read_bytes(path, limit).decode("utf-8-sig", errors="replace")
+
+
 def digest(data: bytes) -> bytes:
     """A hash of a file's content."""
     return hashlib.new(DIGEST, data).digest()
@@ -67,13 +70,6 @@ def natural(name: str) -> tuple[list[str | int], str]:
     return [int(part[:4000]) if part.isdecimal() else part for part in re.split(r"(\d+)", name)], name
 
 
-def naturally(names: Iterable[str]) -> list[str]:
-    """The names in natural order; of names alike but for their digits, as of a camera, that is the usual order."""
-    listed = sorted(names)
-    alike = len({re.sub("[0-9]", "0", name) for name in listed}) < 2
-    return listed if alike else sorted(listed, key=natural)
-
-
 def subfolders(folder: Path) -> list[str]:
     """Names in natural order. Raises DataError where the folder cannot be listed."""
     return sorted((entry.name for entry in _entries(folder) if entry.is_dir()), key=natural)
@@ -87,12 +83,21 @@ def files_by_stem(folder: Path, suffixes: Container[str]) -> dict[str, str]:
     files: dict[str, str] = {}
     for entry in _entries(folder):
         stem, suffix = os.path.splitext(entry.name)  # noqa: PTH122  of a hundred thousand names
-        if suffix.lower() not in suffixes or not entry.is_file():
-            continue
-        if stem in files:
-            raise DataError(f"{folder / entry.name}: {files[stem]} is the same frame; keep one of the two")
-        files[stem] = entry.name
+        if suffix.lower() in suffixes and entry.is_file():
+            if stem in files:
+                raise DataError(f"{folder / entry.name}: {files[stem]} is the same frame; keep one of the two")
+            files[stem] = entry.name
     return files
+
+
+def files_named(folder: Path, before: str, after: str) -> dict[str, Path]:
+    """The files 'BEFORE name AFTER' of a folder by name, in natural order; none where there is no folder.
+
+    Raises DataError where the folder cannot be listed.
+    """
+    fitting = (entry.name for entry in _entries(folder) if entry.name.startswith(before) and entry.name.endswith(after))
+    names = sorted((name[len(before) : len(name) - len(after)] for name in fitting), key=natural)
+    return {name: folder / f"{before}{name}{after}" for name in names if name}
 
 
 def _entries(folder: Path) -> Iterator[os.DirEntry[str]]:
@@ -108,22 +113,14 @@ def _entries(folder: Path) -> Iterator[os.DirEntry[str]]:
 
 # npy and npz bytes to an array of plain numbers: the whole one, or one DataError with the file; nothing is run.
 
-MAX_ARRAY_BYTES = 2**29
-"""Largest array of an image; scores, of many classes, may be larger."""
-MAX_SCORE_BYTES = 2**32
-
 NPY_DTYPE = re.compile(rb"""['"]descr['"]\s*:\s*['"]([<>|=]?(?:b1|[iu][1248]|f[248]))['"]""")
 NPY_ORDER = re.compile(rb"""['"]fortran_order['"]\s*:\s*(True|False)""")
 NPY_SHAPE = re.compile(rb"""['"]shape['"]\s*:\s*\(([\d\s,]{0,200})\)""")
 
 
-def decode_array(path: Path, data: bytes, key: str, limit: int | None = None) -> npt.NDArray[Any]:
+def decode_array(path: Path, data: bytes, key: str) -> npt.NDArray[Any]:
     """The array of an .npy file, or of an .npz file the one called `key` or the only one; read-only."""
-    return (
-        _decode_npz(path, data, key, limit or MAX_ARRAY_BYTES)
-        if path.suffix.lower() == ".npz"
-        else _decode_npy(str(path), data)
-    )
+    return _decode_npz(path, data, key) if path.suffix.lower() == ".npz" else _decode_npy(str(path), data)
 
 
 def _decode_npy(where: str, data: bytes) -> npt.NDArray[Any]:
@@ -140,41 +137,28 @@ def _decode_npy(where: str, data: bytes) -> npt.NDArray[Any]:
         raise DataError(f"{where}: the .npy header is damaged, or the array does not hold plain numbers; save it anew")
     kind = np.dtype(dtype[1].decode())
     sizes = tuple(int(n) for n in re.findall(rb"\d+", shape[1]))
-    needed, found = math.prod(sizes) * kind.itemsize, len(data) - start
+    needed, there = math.prod(sizes) * kind.itemsize, len(data) - start
     if needed == 0 or len(sizes) > 4:
         raise DataError(f"{where}: an array of shape {sizes} cannot hold an image; {AGAIN}")
-    if found != needed:
-        raise DataError(f"{where}: the array {sizes} of {kind} needs {needed} bytes, the file has {found}; {AGAIN}")
+    if there != needed:
+        raise DataError(f"{where}: the array {sizes} of {kind} needs {needed} bytes, the file has {there}; {AGAIN}")
     array = np.frombuffer(data, kind, offset=start).reshape(sizes, order="F" if order[1] == b"True" else "C")
     return array.astype(kind.newbyteorder("="), copy=False)
 
 
-def _decode_npz(path: Path, data: bytes, key: str, limit: int) -> npt.NDArray[Any]:
-    damage = (zipfile.BadZipFile, zlib.error, struct.error, OSError, EOFError, ValueError, LookupError, RuntimeError)
+def _decode_npz(path: Path, data: bytes, key: str) -> npt.NDArray[Any]:
     try:
         with zipfile.ZipFile(io.BytesIO(data)) as archive:
-            info = _member(path, archive, key, limit)
-            with archive.open(info) as member:
-                content = member.read(info.file_size)  # bounded; the checksum is verified at its end
+            members = {name.removesuffix(".npy"): name for name in archive.namelist()}
+            name = next(iter(members.values())) if len(members) == 1 else members.get(key)
+            if name is None:
+                raise DataError(f"{path}: holds arrays {reprlib.repr(sorted(members))}; name one '{key}'")
+            content = archive.read(name)
     except DataError:
         raise
-    except damage as error:
+    except Exception as error:
         raise DataError(f"{path}: not a whole .npz archive ({one_line(error)}); {AGAIN}") from error
-    return _decode_npy(f"{path} ({reprlib.repr(info.filename)})", content)
-
-
-def _member(path: Path, archive: zipfile.ZipFile, key: str, limit: int) -> zipfile.ZipInfo:
-    """The member called `key`, or the only one. Raises DataError where there is none that can be read."""
-    members = {info.filename.removesuffix(".npy"): info for info in archive.infolist()}
-    info = next(iter(members.values())) if len(members) == 1 else members.get(key)
-    if info is None:
-        raise DataError(f"{path}: holds arrays {reprlib.repr(sorted(members))}; name one '{key}'")
-    if info.file_size > limit or info.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
-        raise DataError(
-            f"{path}: {reprlib.repr(info.filename)} claims {info.file_size} bytes (at most {limit}), compression"
-            f" {info.compress_type} (stored or deflated are read); save it with numpy"
-        )
-    return info
+    return _decode_npy(f"{path} ({reprlib.repr(name)})", content)
 
 
 # JSON files of datasets: an object with numbers where numbers are expected, or one DataError with the file.
@@ -184,14 +168,27 @@ MAX_JSON_BYTES = 2**28
 
 def read_object(path: Path) -> dict[str, Any]:
     """The object in a file. Raises DataError where there is none."""
-    data = read_bytes(path, MAX_JSON_BYTES)
+    content = read_content(path, MAX_JSON_BYTES)
+    if not isinstance(content, dict):
+        raise DataError(f"{path}: expected an object with named values, got a {type(content).__name__}")
+    return content
+
+
+def read_content(path: Path, limit: int) -> Any:
+    """The content of a JSON file of at most `limit` bytes. Raises DataError where it is none."""
+    data = read_bytes(path, limit)
     try:
-        content = parse_json(data)
+        return parse_json(data)
     except ValueError as error:
         raise DataError(f"{path}: not valid JSON ({one_line(error)[:120]})") from error
-    if not isinstance(content, dict):
-        raise DataError(f"{path}: expected an object with named values, found a {type(content).__name__}")
-    return content
+
+
+def pixels(content: Mapping[str, Any], key: str, where: str) -> int:
+    """The side of an image in an object. Raises DataError with `where` (the file) and the key."""
+    value = number(content, key, where)
+    if not 1 <= value <= 2**24:
+        raise DataError(f"{where}: '{key}' is {value:g}; expected a number of pixels")
+    return int(value)
 
 
 def number(content: Mapping[str, Any], key: str, where: str) -> float:
@@ -228,12 +225,10 @@ def read_pose(path: Path) -> Float64:
     Raises DataError for anything else.
     """
     numbers = _numbers(path)
-    if len(numbers) == 12:
-        numbers += [0, 0, 0, 1]
-    if len(numbers) != 16:
+    if len(numbers) not in (12, 16):
         hint = " (position and quaternion?)" if len(numbers) in (7, 8) else ""
-        raise DataError(f"{path}: expected a 4x4 or 3x4 matrix, found {len(numbers)} numbers{hint}; convert it")
-    return np.array(numbers, dtype=np.float64).reshape(4, 4)
+        raise DataError(f"{path}: expected a 4x4 or 3x4 matrix, got {len(numbers)} numbers{hint}; convert it")
+    return np.array([*numbers, 0, 0, 0, 1][:16], dtype=np.float64).reshape(4, 4)
 
 
 def read_intrinsics(path: Path) -> Intrinsics:
@@ -241,7 +236,7 @@ def read_intrinsics(path: Path) -> Intrinsics:
     numbers = _numbers(path)
     if len(numbers) not in (9, 16):
         raise DataError(
-            f"{path}: expected a 3x3 camera matrix, found {len(numbers)} numbers; write fx 0 cx 0 fy cy 0 0 1"
+            f"{path}: expected a 3x3 camera matrix, got {len(numbers)} numbers; write fx 0 cx 0 fy cy 0 0 1"
         )
     side = 3 if len(numbers) == 9 else 4
     K = np.array(numbers, dtype=np.float64).reshape(side, side)[:3, :3]
@@ -254,8 +249,7 @@ def read_intrinsics(path: Path) -> Intrinsics:
 
 
 def _numbers(path: Path) -> list[float]:
-    data = read_bytes(path, MAX_TEXT_BYTES)
-    words = data.decode("utf-8-sig", errors="replace").replace(",", " ").split()
+    words = read_text(path, MAX_TEXT_BYTES).replace(",", " ").split()
     try:
         return [float(word) for word in words]
     except ValueError as error:
@@ -272,8 +266,7 @@ def records(path: Path) -> Iterator[tuple[int, str]]:
 
     Raises DataError where the file cannot be read or is larger than any such table.
     """
-    data = read_bytes(path, MAX_TABLE_BYTES)
-    for number, line in enumerate(data.decode("utf-8-sig", errors="replace").split("\n"), start=1):
+    for number, line in enumerate(read_text(path, MAX_TABLE_BYTES).split("\n"), start=1):
         text = line.strip()
         if text and not text.startswith("#"):
             yield number, text
@@ -293,11 +286,6 @@ def read_table(path: Path, columns: int, what: str) -> Float64:
     if not values:
         raise DataError(f"{path}: holds no line; expected lines of {what}")
     return np.frombuffer(values, dtype=np.float64).reshape(-1, columns)
-
-
-def read_matrices(path: Path) -> Float64:
-    """(n, 4, 4) from a flattened matrix a line. Raises what `read_table` raises."""
-    return read_table(path, 16, "a flattened 4x4 matrix").reshape(-1, 4, 4)
 
 
 def to_number(word: str, path: Path, line: int) -> float:

@@ -11,21 +11,24 @@ import io
 import os
 import re
 import struct
-import zlib
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from types import ModuleType
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 import numpy.typing as npt
 
 from semstab.core.types import Float32, Mask, UInt8, UInt16, UInt32
-from semstab.datasets.formats.disk import AGAIN, MAX_SCORE_BYTES, decode_array, read_bytes
+from semstab.datasets.formats.disk import AGAIN, decode_array, read_bytes
 from semstab.datasets.geometry.lenses import Labels
 from semstab.errors import ConfigError, DataError, one_line
 from semstab.model.labels import IGNORE_8BIT, IGNORE_16BIT, LabelSpace
+
+if TYPE_CHECKING:
+    from PIL.ImageFile import ImageFile
 
 DEPTH_SUFFIXES = (".png", ".npy", ".npz", ".exr", ".tiff", ".tif")
 LABEL_SUFFIXES = (".png", ".npy", ".npz")
@@ -35,9 +38,6 @@ MASK_SUFFIXES = (".png",)
 
 MILLIMETRES = 1000.0
 NO_CLASS = IGNORE_16BIT
-PIXELS_AT_ONCE = 2**20
-"""Pixels of a label map of colours at a time: the lookup takes many times the memory of the image."""
-
 MAX_PIXELS = 2**28
 MAX_IMAGE_BYTES = 2**29
 """Largest decoded image: RGB of 178 megapixels."""
@@ -55,7 +55,13 @@ def read_depth(path: Path, scale: float | None = None, read: Read = read_bytes) 
     data = read(path)
     suffix = path.suffix.lower()
     if suffix == ".png":
-        depth, scale = _decode_depth_png(path, data), scale or MILLIMETRES
+        with _whole_png(path, data) as png:
+            if png.kind != "grey" or png.bits != 16:
+                raise DataError(
+                    f"{path}: expected 16-bit grey, got {png.bits}-bit {png.kind} (a picture of the depth?);"
+                    " export the depth values"
+                )
+            depth, scale = png.samples(), scale or MILLIMETRES
     elif suffix in (".tiff", ".tif"):
         depth = _decode_tiff(path, data)
     elif suffix == ".exr":
@@ -80,14 +86,17 @@ def read_labels(path: Path, space: LabelSpace | None = None, read: Read = read_b
     data = read(path)
     if path.suffix.lower() != ".png":
         return _narrow(path, decode_array(path, data, "labels"), space)
-    png = parse_png(path, data)
-    if png.kind in ("grey", "palette"):
-        return png.indices()
-    if png.kind not in ("RGB", "RGBA") or png.bits != 8:
-        raise DataError(f"{path}: a {png.bits}-bit {png.kind} PNG cannot hold labels; save ids as 8- or 16-bit grey")
+    with _whole_png(path, data) as png:
+        if png.kind not in ("grey", "palette") and (png.kind not in ("RGB", "RGBA") or png.bits != 8):
+            raise DataError(
+                f"{path}: a {png.bits}-bit {png.kind} PNG cannot hold labels; save ids as 8- or 16-bit grey"
+            )
+        samples = png.samples()
+    if samples.ndim == 2:
+        return samples
     if space is None:
         raise DataError(f"{path}: the labels are colours; set classes or taxonomy, so that each has a class")
-    return _labels_by_color(path, _opaque(path, png.samples()), space)
+    return _labels_by_color(path, samples, space)
 
 
 def read_scores(
@@ -98,7 +107,7 @@ def read_scores(
     `size` is (H, W) of the depth, to recognise the other layout. Raises DataError where the file has another
     type or layout, or is damaged.
     """
-    scores = decode_array(path, read(path), "scores", MAX_SCORE_BYTES)
+    scores = decode_array(path, read(path), "scores")
     if scores.ndim != 3 or scores.dtype.kind != "f":
         raise DataError(
             f"{path}: scores must be float16 or float32 with three axes, got {scores.dtype} of shape {scores.shape}"
@@ -115,10 +124,10 @@ def read_mask(path: Path, read: Read = read_bytes) -> Mask:
 
     Raises DataError where it is no one-channel PNG, or damaged.
     """
-    png = parse_png(path, read(path))
-    if png.kind not in ("grey", "palette"):
-        raise DataError(f"{path}: a {png.bits}-bit {png.kind} PNG is no mask; save it as grey, 0 where left out")
-    mask: Mask = png.indices() == 0
+    with _whole_png(path, read(path)) as png:
+        if png.kind not in ("grey", "palette"):
+            raise DataError(f"{path}: a {png.bits}-bit {png.kind} PNG is no mask; save it as grey, 0 where left out")
+        mask: Mask = png.samples() == 0
     return mask
 
 
@@ -127,7 +136,11 @@ def read_color(path: Path) -> UInt8:
     data = read_bytes(path)
     suffix = path.suffix.lower()
     if suffix == ".png":
-        return parse_png(path, data).rgb()
+        with _whole_png(path, data) as png:
+            if png.kind == "grey" and png.bits == 16:
+                return np.repeat((png.samples() >> 8).astype(np.uint8)[..., None], 3, axis=2)
+            png.image.info.pop("transparency", None)  # Pillow warns of it
+            return np.array(png.image.convert("RGB"))
     return _decode_color_tiff(path, data) if suffix in (".tif", ".tiff") else _decode_jpeg(path, data)
 
 
@@ -135,21 +148,8 @@ def color_size(path: Path) -> Size:
     """(width, height) of a colour image, from its header. Raises DataError where that is damaged."""
     from PIL import Image
 
-    try:
-        with Image.open(path) as image:
-            return image.size
-    except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
-        raise DataError(f"{path}: not an image ({one_line(error)})") from error
-
-
-def _decode_depth_png(path: Path, data: bytes) -> npt.NDArray[Any]:
-    png = parse_png(path, data)
-    if png.kind != "grey" or png.bits != 16:
-        raise DataError(
-            f"{path}: expected 16-bit grey, found {png.bits}-bit {png.kind} (a picture of the depth?);"
-            " export the depth values"
-        )
-    return png.samples()
+    with _one_line(path, "colour"), Image.open(path) as image:
+        return image.size
 
 
 # --- labels ---------------------------------------------------------------------------------------------------------
@@ -168,31 +168,19 @@ def _narrow(path: Path, ids: npt.NDArray[Any], space: LabelSpace | None) -> Labe
     return ids.astype(np.uint8) if fits else ids.astype(np.uint16)
 
 
-def _opaque(path: Path, image: UInt8) -> UInt8:
-    """RGB of an RGB or fully opaque RGBA image."""
+def _labels_by_color(path: Path, image: UInt8, space: LabelSpace) -> Labels:
+    """Ids (H, W) of an RGB or fully opaque RGBA image."""
     if image.shape[2] == 4 and (transparent := image[..., 3] < 255).any():
         y, x = np.argwhere(transparent)[0]
         raise DataError(f"{path}: pixel ({x}, {y}) is transparent, so its label colour is not exact; save as RGB")
-    return image[..., :3]
-
-
-def _labels_by_color(path: Path, rgb: UInt8, space: LabelSpace) -> Labels:
-    table, (H, W) = _ids_by_color(space), rgb.shape[:2]
-    ids = np.empty((H, W), dtype=np.uint8 if max(space.ids) < IGNORE_8BIT else np.uint16)
-    rows, count, first = max(1, PIXELS_AT_ONCE // W), 0, (0, 0)
-    for top in range(0, H, rows):
-        part = table[_packed(rgb[top : top + rows])]
-        if (unknown := part == NO_CLASS).any():
-            y, x = np.argwhere(unknown)[0]
-            first = first if count else (top + int(y), int(x))
-            count += int(np.count_nonzero(unknown))
-        ids[top : top + rows] = part
-    if count:
+    ids = _ids_by_color(space)[_packed(image)]
+    if (unknown := ids == NO_CLASS).any():
+        y, x = np.argwhere(unknown)[0]
         raise DataError(
-            f"{path}: colour {tuple(rgb[first].tolist())} at pixel ({first[1]}, {first[0]}) ({count} pixels) is no"
-            f" class of '{space.name}'; set taxonomy to the one whose colours the image has"
+            f"{path}: colour {tuple(image[y, x, :3].tolist())} at pixel ({x}, {y}) ({np.count_nonzero(unknown)} pixels)"
+            f" is no class of '{space.name}'; set taxonomy to the one whose colours the image has"
         )
-    return ids
+    return ids.astype(np.uint8) if max(space.ids) < IGNORE_8BIT else ids
 
 
 @functools.lru_cache(maxsize=2)
@@ -207,99 +195,69 @@ def _ids_by_color(space: LabelSpace) -> UInt16:
 
 
 def _packed(rgb: UInt8) -> UInt32:
-    """RGB (..., 3) as one 24-bit number each."""
+    """RGB, or RGB and more, (..., 3) as one 24-bit number each."""
     r, g, b = (rgb[..., channel].astype(np.uint32) for channel in range(3))
     return (r << np.uint32(16)) | (g << np.uint32(8)) | b
 
 
-# --- PNG ------------------------------------------------------------------------------------------------------------
+# --- PNG and JPEG by Pillow, because OpenCV fills the rest of a truncated image with grey -----------------------------
 
 PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
-PNG_CHANNELS: Mapping[int, int] = {0: 1, 2: 3, 3: 1, 4: 2, 6: 4}
 PNG_KINDS: Mapping[int, str] = {0: "grey", 2: "RGB", 3: "palette", 4: "grey+alpha", 6: "RGBA"}
 
 
 @dataclass(frozen=True)
 class Png:
-    """A PNG whose checksums hold: its kind, bits of a sample, all chunks, and the bytes without ancillary chunks."""
+    """A PNG whose checksums hold: its kind, the bits of a sample, and the image, which is not decoded yet."""
 
-    path: Path
     kind: str
     bits: int
-    chunks: list[tuple[bytes, memoryview]]
-    data: bytes
+    image: ImageFile
 
     def samples(self) -> npt.NDArray[Any]:
-        """Samples (H, W) or, in RGB order, (H, W, channels), uint8 or uint16; palettes expanded."""
-        image = self._decode("IMREAD_UNCHANGED")
-        return image if image.ndim == 2 else image[..., [2, 1, 0, 3][: image.shape[2]]]
-
-    def indices(self) -> npt.NDArray[Any]:
-        """The stored sample (H, W) of each pixel of a grey or palette image: of a palette the index, not the colour."""
-        image = self._decode("IMREAD_UNCHANGED", as_grey=True)
-        if self.bits < 8:  # the decoder stretches 1, 2 and 4 bits to 0..255
-            image = image // np.uint8(255 // (2**self.bits - 1))
-        return image
-
-    def rgb(self) -> UInt8:
-        """Colour (H, W, 3) uint8 of an image of any kind."""
-        return np.ascontiguousarray(self._decode("IMREAD_COLOR")[..., ::-1])
-
-    def _decode(self, mode: str, as_grey: bool = False) -> npt.NDArray[Any]:
-        """Decode the chunks; a palette image that is declared grey decodes to its indices."""
-        data = self.data
-        if as_grey and self.kind == "palette":
-            header = bytearray(self.chunks[0][1])
-            header[17] = 0  # colour type grey
-            header[21:] = struct.pack(">I", zlib.crc32(header[4:21]))
-            data = b"".join(
-                (PNG_SIGNATURE, header, *(chunk for kind, chunk in self.chunks if kind in (b"IDAT", b"IEND")))
-            )
-        return _imdecode(self.path, data, mode)
+        """The stored sample of each pixel, (H, W) or (H, W, channels), uint8 or uint16; of a palette the index."""
+        samples = np.array(self.image)
+        if self.kind != "grey" or self.bits >= 8:
+            return samples
+        # Pillow reads one bit as bool and stretches two and four to 0..255
+        return samples.astype(np.uint8) if self.bits == 1 else samples // np.uint8(255 // (2**self.bits - 1))
 
 
-def parse_png(path: Path, data: bytes) -> Png:
-    """Check every chunk up to the end marker; drop the ancillary ones, of which decoders complain on stderr."""
-    if not data.startswith(PNG_SIGNATURE):
+@contextmanager
+def _whole_png(path: Path, data: bytes) -> Iterator[Png]:
+    """A PNG that is whole; it is decoded within the context."""
+    from PIL import PngImagePlugin
+
+    if not data.startswith(PNG_SIGNATURE) or data[12:16] != b"IHDR":
         raise DataError(f"{path}: not a PNG image (it begins with {data[:8]!r}); {AGAIN}")
-    view, start = memoryview(data), len(PNG_SIGNATURE)
-    chunks: list[tuple[bytes, memoryview]] = []
-    while not chunks or chunks[-1][0] != b"IEND":
-        end = start + 12 + int.from_bytes(view[start : start + 4], "big")
-        if end > len(data):
-            raise DataError(f"{path}: the PNG is truncated after {len(data)} bytes; {AGAIN}")
-        if zlib.crc32(view[start + 4 : end - 4]) != int.from_bytes(view[end - 4 : end], "big"):
-            raise DataError(f"{path}: the PNG is damaged (checksum of the chunk at byte {start}); {AGAIN}")
-        kind = data[start + 4 : start + 8]
-        chunks.append((kind, view[start:end]))
-        start = end
-    if chunks[0][0] != b"IHDR" or len(chunks[0][1]) != 25:
-        raise DataError(f"{path}: the PNG has no header; {AGAIN}")
-    width, height, bits, color_type = struct.unpack_from(">IIBB", chunks[0][1], 8)
-    if color_type not in PNG_KINDS or bits not in (1, 2, 4, 8, 16):
-        raise DataError(f"{path}: the PNG header is damaged (colour type {color_type}, {bits} bits); {AGAIN}")
-    _check_pixels(path, width, height, PNG_CHANNELS[color_type] * max(1, bits // 8))
-    critical = [chunk for kind, chunk in chunks if kind[:1].isupper()]
-    plain = data if len(critical) == len(chunks) else b"".join((PNG_SIGNATURE, *critical))
-    return Png(path, PNG_KINDS[color_type], bits, chunks, plain)
+    with _one_line(path, "PNG"):
+        PngImagePlugin.PngImageFile(io.BytesIO(data)).verify()  # while it decodes, Pillow leaves out the checksums
+        image = PngImagePlugin.PngImageFile(io.BytesIO(data))
+        _check_pixels(path, *image.size, len(image.getbands()))
+        yield Png(PNG_KINDS[data[25]], data[24], image)
 
 
-# --- JPEG, TIFF, EXR ------------------------------------------------------------------------------------------------
+@contextmanager
+def _one_line(path: Path, what: str) -> Iterator[None]:
+    """Turn what Pillow raises for damaged files into DataError."""
+    try:
+        yield
+    except DataError:
+        raise
+    except Exception as error:
+        raise DataError(f"{path}: not a whole {what} image ({one_line(error)}); {AGAIN}") from error
 
 
 def _decode_jpeg(path: Path, data: bytes) -> UInt8:
-    """RGB (H, W, 3). Pillow, because OpenCV fills the rest of a truncated JPEG with grey."""
     from PIL import JpegImagePlugin
 
-    damage = (OSError, SyntaxError, ValueError, TypeError, LookupError, EOFError, struct.error, ZeroDivisionError)
-    try:
+    with _one_line(path, "JPEG"):
         image = JpegImagePlugin.JpegImageFile(io.BytesIO(data))
         _check_pixels(path, *image.size, 3)
         return np.array(image.convert("RGB"))
-    except DataError:
-        raise
-    except damage as error:
-        raise DataError(f"{path}: not a whole JPEG image ({one_line(error)}); {AGAIN}") from error
+
+
+# --- TIFF and EXR by OpenCV, twice as fast as Pillow ------------------------------------------------------------------
 
 
 def _decode_color_tiff(path: Path, data: bytes) -> UInt8:
@@ -315,34 +273,28 @@ def _decode_tiff(path: Path, data: bytes) -> npt.NDArray[Any]:
     tags = _checked_tags(path, data)
     bits, channels, sample = tags.get(258, 1), tags.get(277, 1), tags.get(339, 1)
     if channels != 1:
-        raise DataError(f"{path}: expected one channel of 32-bit float, found {channels} channels")
+        raise DataError(f"{path}: expected one channel of 32-bit float, got {channels} channels")
     if (sample, bits) not in ((3, 32), (3, 64), (1, 16)):
         kind = {1: "unsigned", 2: "signed", 3: "float"}.get(sample, "other")
-        raise DataError(f"{path}: expected 32-bit float metres, found {bits}-bit {kind}; convert it")
+        raise DataError(f"{path}: expected 32-bit float metres, got {bits}-bit {kind}; convert it")
     return _imdecode(path, data, "IMREAD_UNCHANGED")
 
 
 def _checked_tags(path: Path, data: bytes, pixel_bytes: int = 1) -> dict[int, int]:
-    """The tags of a TIFF whose size can be read."""
+    """The first value of each short or long tag of the first image of a TIFF whose size can be read."""
+    tags = {}
     try:
-        tags = _tiff_tags(data)
+        order = {b"II*\0": "<", b"MM\0*": ">"}[data[:4]]
+        (start,) = struct.unpack_from(order + "I", data, 4)
+        (count,) = struct.unpack_from(order + "H", data, start)
+        for entry in range(start + 2, start + 2 + 12 * count, 12):
+            tag, kind, _, value = struct.unpack_from(order + "HHII", data, entry)
+            (short,) = struct.unpack_from(order + "H", data, entry + 8)
+            tags[tag] = short if kind == 3 else value
         width, height = tags[256], tags[257]
     except (struct.error, KeyError) as error:
         raise DataError(f"{path}: not a whole TIFF image; {AGAIN}") from error
     _check_pixels(path, width, height, pixel_bytes)
-    return tags
-
-
-def _tiff_tags(data: bytes) -> dict[int, int]:
-    """The first value of each short or long tag of the first image. Raises struct.error, KeyError where damaged."""
-    order = {b"II*\0": "<", b"MM\0*": ">"}[data[:4]]
-    (start,) = struct.unpack_from(order + "I", data, 4)
-    (count,) = struct.unpack_from(order + "H", data, start)
-    tags = {}
-    for entry in range(start + 2, start + 2 + 12 * count, 12):
-        tag, kind, _, value = struct.unpack_from(order + "HHII", data, entry)
-        (short,) = struct.unpack_from(order + "H", data, entry + 8)
-        tags[tag] = short if kind == 3 else value
     return tags
 
 
@@ -362,11 +314,8 @@ def _decode_exr(path: Path, data: bytes) -> npt.NDArray[Any]:
     if depth.ndim == 3 and (depth[..., :1] == depth[..., :3]).all():  # Blender writes depth as three equal channels
         depth = depth[..., 0]
     if depth.ndim != 2:
-        raise DataError(f"{path}: expected one channel, found {depth.shape[2]}; export the depth channel alone")
+        raise DataError(f"{path}: expected one channel, got {depth.shape[2]}; export the depth channel alone")
     return depth
-
-
-# --- OpenCV ---------------------------------------------------------------------------------------------------------
 
 
 @functools.cache

@@ -15,6 +15,7 @@ from semstab.errors import DataError
 from semstab.model.frames import Intrinsics
 
 LARGEST = 1e9
+FxFyCxCy = tuple[float, float, float, float]
 
 
 @dataclass(frozen=True)
@@ -33,6 +34,14 @@ class Camera:
             if not least <= abs(value) <= LARGEST:
                 raise DataError(f"intrinsics: {name} = {value:g} pixels is none of a camera; is the file damaged?")
 
+    @classmethod
+    def stated(cls, numbers: FxFyCxCy, size: tuple[int, int] | None, where: str) -> Camera:
+        """A camera as the file `where` states it. Raises DataError that names it for numbers that no camera has."""
+        try:
+            return cls(Intrinsics(*numbers), size)
+        except DataError as error:
+            raise DataError(f"{where}: {error}") from error
+
     def at(self, shape: tuple[int, ...], centre: float = 0.0) -> Intrinsics:
         """Intrinsics, pixel centres at integers, of an image of the whole field of view and of that shape (H, W, ...).
 
@@ -41,9 +50,6 @@ class Camera:
         stated, size = self.intrinsics, (shape[1], shape[0])
         K = Intrinsics(stated.fx, stated.fy, stated.cx - centre, stated.cy - centre)
         return K if self.size in (None, size) else K.resized(self.size or size, size)
-
-
-FxFyCxCy = tuple[float, float, float, float]
 
 
 def camera_of(stated: FxFyCxCy | None, usual: FxFyCxCy, size: tuple[int, int]) -> Camera:
@@ -82,7 +88,12 @@ def to_camera_to_world(T: Poses, convention: str, axes: str, where: str) -> Pose
     if (largest := np.abs(T).max()) > LARGEST_COORDINATE:
         raise DataError(f"{where}: the pose holds {largest:g}, which no camera's has; is the file damaged?")
     if convention == "world_to_camera":
-        T = _inverse(T, where)
+        try:
+            T = np.linalg.inv(T).astype(np.float64, copy=False)
+        except np.linalg.LinAlgError as error:
+            raise DataError(
+                f"{where}: the pose cannot be inverted, so it is not rigid; leave this frame out"
+            ) from error
     T = T.copy()
     T[:3, :3] = T[:3, :3] @ CAMERA_AXES[axes]
     return T
@@ -113,11 +124,7 @@ def from_quaternions(translations: Poses, quaternions: Poses, path: Path) -> Pos
 
 
 def at_times(
-    times: Float64,
-    poses: Poses,
-    wanted: Float64,
-    max_gap: float,
-    method: Literal["interpolate", "nearest"],
+    times: Float64, poses: Poses, wanted: Float64, max_gap: float, method: Literal["interpolate", "nearest"]
 ) -> Poses:
     """(m, 4, 4) at `wanted` seconds of a trajectory (n, 4, 4) at ascending `times`: the nearest, or between the two.
 
@@ -150,13 +157,6 @@ def _between(times: Float64, poses: Poses, wanted: Float64) -> Poses:
     for axis in range(3):
         T[:, axis, 3] = np.interp(at, times, poses[:, axis, 3])
     return T
-
-
-def _inverse(T: Poses, where: str) -> Poses:
-    try:
-        return np.linalg.inv(T).astype(np.float64, copy=False)
-    except np.linalg.LinAlgError as error:
-        raise DataError(f"{where}: the pose cannot be inverted, so it is not rigid; leave this frame out") from error
 
 
 # Depth that was stored as the distance along a pixel's ray, brought to the distance along the optical axis.

@@ -32,46 +32,29 @@ FAR = 2.0**40
 """Pixels from which a position is anyway outside of any image, and still a whole number when it is rounded."""
 
 
-def fit(values: Pixels, K: Intrinsics, K_depth: Intrinsics, shape: tuple[int, int]) -> Pixels:
-    """`fit_labels` of a label map, `fit_scores` of scores."""
-    fitting: Any = fit_labels if values.ndim == 2 else fit_scores
-    fitted: Pixels = fitting(values, K, K_depth, shape)
-    return fitted
+def fit(values: Pixels, K: Intrinsics, K_fit: Intrinsics, shape: tuple[int, int]) -> Pixels:
+    """A label map (H', W') or scores (H', W', K) as a camera with K_fit and an image (H, W) sees them.
 
-
-def fit_labels(labels: Labels, K: Intrinsics, K_depth: Intrinsics, shape: tuple[int, int]) -> Labels:
-    """The label map as a camera with K_depth and an image (H, W) sees it: of each pixel the nearest label.
-
-    K belongs to the label map. Both images share centre and axes. Pixels that K does not see are ignored.
+    K belongs to `values`. Both images share centre and axes. Of labels each pixel gets the nearest; scores are linear
+    between pixel centres, and beyond the outer centres the outer pixels hold. What K does not see is ignored: labels
+    of 255 (65535), scores of 0.
     """
-    return _nearest(labels, K, K_depth, shape, ignore_id(labels))
-
-
-def fit_depth(depth: Float32, K_depth: Intrinsics, K: Intrinsics, shape: tuple[int, int]) -> Float32:
-    """Depth as a camera with K and an image (H, W) sees it: of each pixel the nearest depth, 0 where there is none."""
-    return _nearest(depth, K_depth, K, shape, 0)
-
-
-def fit_scores(scores: Scores, K: Intrinsics, K_depth: Intrinsics, shape: tuple[int, int]) -> Scores:
-    """Scores (H', W', K) as a camera with K_depth and an image (H, W) sees them: linear between pixel centres.
-
-    Beyond the outer centres the outer pixels hold. Pixels that K does not see get scores of 0, which no one uses.
-    """
-    v, u = _positions(K, K_depth, shape)
-    wide = scores.astype(np.result_type(scores.dtype, np.float32), copy=False)
-    fitted = _linear(_linear(wide, v, axis=0), u, axis=1)
-    inside = (_within(v, scores.shape[0])[:, None]) & _within(u, scores.shape[1])
-    return np.where(inside[..., None], fitted, wide.dtype.type(0))
+    if values.ndim == 2:
+        return _nearest(values, K, K_fit, shape, int(ignore_id(values)))
+    v, u = _positions(K, K_fit, shape)
+    wide = values.astype(np.result_type(values.dtype, np.float32), copy=False)
+    mixed = _linear(_linear(wide, v, axis=0), u, axis=1)
+    seen = _within(v, values.shape[0])[:, None] & _within(u, values.shape[1])
+    return cast(Pixels, np.where(seen[..., None], mixed, wide.dtype.type(0)))
 
 
 def _nearest(values: Pixels, K: Intrinsics, K_fit: Intrinsics, shape: tuple[int, int], fill: int) -> Pixels:
     v, u = _positions(K, K_fit, shape)
     rows, columns = (np.floor(x + 0.5 + TIE).astype(np.intp) for x in (v, u))
     H, W = values.shape
-    fitted: Any = values[rows.clip(0, H - 1)[:, None], columns.clip(0, W - 1)]
-    outside = ~(_within(rows, H)[:, None] & _within(columns, W))
-    fitted[outside] = fill
-    return cast(Pixels, fitted)
+    nearest: Any = values[rows.clip(0, H - 1)[:, None], columns.clip(0, W - 1)]
+    nearest[~(_within(rows, H)[:, None] & _within(columns, W))] = fill
+    return cast(Pixels, nearest)
 
 
 def _positions(K: Intrinsics, K_depth: Intrinsics, shape: tuple[int, int]) -> tuple[Float64, Float64]:
@@ -110,7 +93,7 @@ def fitted(values: Pixels, shape: tuple[int, ...], where: str, what: str = "the 
     """
     if values.shape[:2] == shape:
         return values
-    _require_one_view(values.shape, shape, where, what)
+    require_same_view(values.shape, shape, where, f"{what} {{}} but depth is {{}}")
     h, w = shape[:2]
     target = Intrinsics(1, 1, (w - 1) / 2, (h - 1) / 2)
     return fit(values, Camera(target, (w, h)).at(values.shape), target, (h, w))
@@ -123,15 +106,11 @@ def at_image(frame: Frame, shape: tuple[int, int], where: str, K: Intrinsics | N
     """
     depth = frame.depth
     if K is None:
-        _require_one_view(shape, frame.shape, where, "the image is")
+        require_same_view(shape, frame.shape, where, "the image is {} but depth is {}")
         K = frame.intrinsics.resized((frame.shape[1], frame.shape[0]), (shape[1], shape[0]))
     if (K, shape) != (frame.intrinsics, frame.shape):
-        depth = fit_depth(depth, frame.intrinsics, K, shape)
+        depth = _nearest(depth, frame.intrinsics, K, shape, 0)
     return Frame(frame.index, depth, K, frame.T_wc, labels=np.zeros(shape, np.uint8), timestamp=frame.timestamp)
-
-
-def _require_one_view(image: tuple[int, ...], depth: tuple[int, ...], where: str, what: str) -> None:
-    require_same_view(image, depth, where, f"{what} {{}} but depth is {{}}")
 
 
 def require_same_view(shape: tuple[int, ...], other: tuple[int, ...], where: str, what: str) -> None:
@@ -179,7 +158,6 @@ def undistorted(
     require_same_view(values.shape, (size[1], size[0]), where, f"{what} {{}} but its camera {{}}")
     x, y = _source_pixels(lens, (values.shape[0], values.shape[1]), K, shape)
     remap: Any = cv2.remap
-    image: Any
     if values.ndim == 2:
         image = remap(values, x, y, cv2.INTER_NEAREST, borderValue=int(ignore_id(values)))
     else:

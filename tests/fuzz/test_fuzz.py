@@ -118,8 +118,8 @@ def test_sizes_in_laz_are_held_against_the_file_before_memory_is_taken(tmp_path)
     record = content.index(b"laszip encoded") - 2 + 54
     for place, form, value, match in (
         (record + 12, "<I", 2**31 - 1, "chunks of 2,147,483,647 points"),
-        (record + 36, "<H", 60_000, "have 30 bytes, and 60000 where compressed"),
-        (247, "<Q", 10**9, "fewer points than the 1,000,000,000"),
+        (record + 36, "<H", 60_000, "do not hold"),
+        (247, "<Q", 10**9, "do not hold the 1,000,000,000 points"),
     ):
         damaged = bytearray(content)
         struct.pack_into(form, damaged, place, value)
