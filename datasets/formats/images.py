@@ -93,7 +93,7 @@ def read_labels(path: Path, space: LabelSpace | None = None, read: Read = read_b
             )
         samples = png.samples()
     if samples.ndim == 2:
-        return samples
+        return samples.copy()  # Pillow's own memory cannot be written to
     if space is None:
         raise DataError(f"{path}: the labels are colours; set classes or taxonomy, so that each has a class")
     return _labels_by_color(path, samples, space)
@@ -140,7 +140,7 @@ def read_color(path: Path) -> UInt8:
             if png.kind == "grey" and png.bits == 16:
                 return np.repeat((png.samples() >> 8).astype(np.uint8)[..., None], 3, axis=2)
             png.image.info.pop("transparency", None)  # Pillow warns of it
-            return np.array(png.image.convert("RGB"))
+            return np.array(png.image if png.image.mode == "RGB" else png.image.convert("RGB"))
     return _decode_color_tiff(path, data) if suffix in (".tif", ".tiff") else _decode_jpeg(path, data)
 
 
@@ -173,7 +173,9 @@ def _labels_by_color(path: Path, image: UInt8, space: LabelSpace) -> Labels:
     if image.shape[2] == 4 and (transparent := image[..., 3] < 255).any():
         y, x = np.argwhere(transparent)[0]
         raise DataError(f"{path}: pixel ({x}, {y}) is transparent, so its label colour is not exact; save as RGB")
-    ids = _ids_by_color(space)[_packed(image)]
+    table, ids = _ids_by_color(space), np.empty(image.shape[:2], np.uint16)
+    for top in range(0, len(ids), rows := max(1, 2**16 // ids.shape[1])):  # what fits into the processor's cache
+        ids[top : top + rows] = table[_packed(image[top : top + rows])]
     if (unknown := ids == NO_CLASS).any():
         y, x = np.argwhere(unknown)[0]
         raise DataError(
@@ -216,7 +218,7 @@ class Png:
 
     def samples(self) -> npt.NDArray[Any]:
         """The stored sample of each pixel, (H, W) or (H, W, channels), uint8 or uint16; of a palette the index."""
-        samples = np.array(self.image)
+        samples = np.asarray(self.image)
         if self.kind != "grey" or self.bits >= 8:
             return samples
         # Pillow reads one bit as bool and stretches two and four to 0..255
