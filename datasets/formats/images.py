@@ -221,8 +221,10 @@ class Png:
     def samples(self) -> npt.NDArray[Any]:
         """The stored sample of each pixel, (H, W) or (H, W, channels), uint8 or uint16; of a palette the index."""
         if self.kind in ("RGB", "RGBA") or (self.kind == "grey" and self.bits >= 8):
-            image = _imdecode(self.path, _critical_chunks(self.data), "IMREAD_UNCHANGED")  # a fifth faster than Pillow
-            return image if image.ndim == 2 else image[..., [2, 1, 0, 3][: image.shape[2]]]
+            image: npt.NDArray[Any] = _imdecode(
+                self.path, _critical_chunks(self.data), "IMREAD_UNCHANGED"
+            )  # a fifth faster than Pillow
+            return image if self.kind == "grey" else image[..., [2, 1, 0, 3][: len(self.kind)]]
         samples = np.array(self.image)
         if self.kind != "grey":
             return samples
