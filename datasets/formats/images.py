@@ -173,8 +173,9 @@ def _labels_by_color(path: Path, image: UInt8, space: LabelSpace) -> Labels:
     if image.shape[2] == 4 and (transparent := image[..., 3] < 255).any():
         y, x = np.argwhere(transparent)[0]
         raise DataError(f"{path}: pixel ({x}, {y}) is transparent, so its label colour is not exact; save as RGB")
-    table, ids = _ids_by_color(space), np.empty(image.shape[:2], np.uint16)
-    for top in range(0, len(ids), rows := max(1, 2**16 // ids.shape[1])):  # what fits into the processor's cache
+    table, (H, W) = _ids_by_color(space), image.shape[:2]
+    ids, rows = np.empty((H, W), np.uint16), max(1, 2**16 // W)  # as many as fit into the processor's cache
+    for top in range(0, H, rows):
         ids[top : top + rows] = table[_packed(image[top : top + rows])]
     if (unknown := ids == NO_CLASS).any():
         y, x = np.argwhere(unknown)[0]
