@@ -140,7 +140,7 @@ def read_color(path: Path) -> UInt8:
             if png.kind == "grey" and png.bits == 16:
                 return np.repeat((png.samples() >> 8).astype(np.uint8)[..., None], 3, axis=2)
             png.image.info.pop("transparency", None)  # Pillow warns of it
-            return np.array(png.image.convert("RGB"))
+            return np.array(png.image if png.image.mode == "RGB" else png.image.convert("RGB"))
     return _decode_color_tiff(path, data) if suffix in (".tif", ".tiff") else _decode_jpeg(path, data)
 
 
@@ -173,7 +173,10 @@ def _labels_by_color(path: Path, image: UInt8, space: LabelSpace) -> Labels:
     if image.shape[2] == 4 and (transparent := image[..., 3] < 255).any():
         y, x = np.argwhere(transparent)[0]
         raise DataError(f"{path}: pixel ({x}, {y}) is transparent, so its label colour is not exact; save as RGB")
-    ids = _ids_by_color(space)[_packed(image)]
+    table, (H, W) = _ids_by_color(space), image.shape[:2]
+    ids, rows = np.empty((H, W), np.uint16), max(1, 2**16 // W)  # as many as fit into the processor's cache
+    for top in range(0, H, rows):
+        ids[top : top + rows] = table[_packed(image[top : top + rows])]
     if (unknown := ids == NO_CLASS).any():
         y, x = np.argwhere(unknown)[0]
         raise DataError(
@@ -210,17 +213,34 @@ PNG_KINDS: Mapping[int, str] = {0: "grey", 2: "RGB", 3: "palette", 4: "grey+alph
 class Png:
     """A PNG whose checksums hold: its kind, the bits of a sample, and the image, which is not decoded yet."""
 
+    path: Path
+    data: bytes
     kind: str
     bits: int
     image: ImageFile
 
     def samples(self) -> npt.NDArray[Any]:
         """The stored sample of each pixel, (H, W) or (H, W, channels), uint8 or uint16; of a palette the index."""
+        if self.kind in ("RGB", "RGBA") or (self.kind == "grey" and self.bits >= 8):
+            image: npt.NDArray[Any] = _imdecode(
+                self.path, _critical_chunks(self.data), "IMREAD_UNCHANGED"
+            )  # a fifth faster than Pillow
+            return image if self.kind == "grey" else image[..., [2, 1, 0, 3][: len(self.kind)]]
         samples = np.array(self.image)
-        if self.kind != "grey" or self.bits >= 8:
+        if self.kind != "grey":
             return samples
         # Pillow reads one bit as bool and stretches two and four to 0..255
         return samples.astype(np.uint8) if self.bits == 1 else samples // np.uint8(255 // (2**self.bits - 1))
+
+
+def _critical_chunks(data: bytes) -> bytes:
+    """A whole PNG without ancillary chunks, of which OpenCV complains on stderr."""
+    parts, start = [PNG_SIGNATURE], len(PNG_SIGNATURE)
+    while start < len(data):
+        end = start + 12 + int.from_bytes(data[start : start + 4], "big")
+        parts += [data[start:end]] if data[start + 4 : start + 5].isupper() else []
+        start = end
+    return b"".join(parts)
 
 
 @contextmanager
@@ -234,7 +254,7 @@ def _whole_png(path: Path, data: bytes) -> Iterator[Png]:
         PngImagePlugin.PngImageFile(io.BytesIO(data)).verify()  # while it decodes, Pillow leaves out the checksums
         image = PngImagePlugin.PngImageFile(io.BytesIO(data))
         _check_pixels(path, *image.size, len(image.getbands()))
-        yield Png(PNG_KINDS[data[25]], data[24], image)
+        yield Png(path, data, PNG_KINDS[data[25]], data[24], image)
 
 
 @contextmanager
