@@ -8,7 +8,10 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
+import numpy as np
+
 from semstab.config import Config, Exclusion, Part, Perturbation, as_range, nearest
+from semstab.core.types import Mask
 from semstab.datasets import GROUND_TRUTH, Scene
 from semstab.datasets.scene import Selected, select_frames
 from semstab.errors import ConfigError, DataError
@@ -123,7 +126,8 @@ def read(task: Task, index: int, pixel_stride: int = 1, *, color: bool = False) 
 
 def prepare(task: Task, frame: Frame, pixel_stride: int = 1) -> Frame:
     """The scene's frame without what moves, its labels as rows 0..K-1 of the run's label space, noise, pixel stride."""
-    frame = in_label_space(task.mapping, _still(task, frame))
+    frame = _still(task, frame)
+    frame = in_label_space(task.mapping, dataclasses.replace(frame, unlabelled=_unlabelled(frame)))
     if task.top_k is not None and frame.scores is not None:
         frame = keep_largest(frame, task.top_k)
     if task.perturbation is not None:
@@ -136,6 +140,18 @@ def _still(task: Task, frame: Frame) -> Frame:
     if frame.labels is not None:
         classes = tuple(task.mapping.source.ids[k] for k in classes)
     return leave_out(frame, classes, masks=task.exclude.masks)
+
+
+def _unlabelled(frame: Frame) -> Mask | None:
+    """(H, W) the pixels with depth to which the model gave no label; None where there are none.
+
+    Classes that the run's taxonomy leaves out are labels, and so is what was left out because it moves.
+    """
+    none: Mask = frame.predicted == frame.ignore_id
+    if not none.any():
+        return None
+    none &= (frame.depth > 0) & (frame.depth < np.inf)
+    return none if frame.left_out is None else none & ~frame.left_out
 
 
 def in_label_space(mapping: LabelMapping, frame: Frame) -> Frame:

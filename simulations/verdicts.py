@@ -23,7 +23,7 @@ from semstab.statistics.accumulate import cluster_sums_of
 from semstab.statistics.ceiling import ceiling_share
 from semstab.statistics.cluster_sums import FUNCTIONALS, sums_for
 from semstab.statistics.intervals import confidence_intervals, headline_specs
-from semstab.statistics.verdict import RELIABLE, TENTATIVE, level_probabilities, verdict
+from semstab.statistics.verdict import LIMITS, level_probabilities, verdict
 
 FLIGHTS = 8
 FRAMES = (10, 20, 40, 80, 160)
@@ -34,7 +34,7 @@ EASES = {"alike": (0.8, 1.0, 1.3), "bad": (1.2, 1.5, 1.8), "lasting": (0.9, 1.2,
 
 def true_level(share: float) -> Level:
     """Return the level of a share of the ceiling that is known."""
-    return "stable" if share >= RELIABLE else "usable" if share >= TENTATIVE else "unstable"
+    return "stable" if share >= LIMITS.stable else "usable" if share >= LIMITS.usable else "unstable"
 
 
 def verdicts(flight: Flight, count: int, seed: int) -> Iterator[tuple[StabilityVerdict, Level, float]]:

@@ -12,6 +12,7 @@ from pydantic import ValidationError
 
 from semstab.datasets import GROUND_TRUTH, open_dataset
 from semstab.datasets.city import City, CityScene, SimulatedBackbone
+from semstab.datasets.city.labellers import LABELLERS
 from semstab.datasets.city.mesh import Surface
 from semstab.datasets.city.simulation import Caster, Simulation, View
 from semstab.errors import ConfigError, DataError
@@ -209,7 +210,7 @@ def test_a_surface_without_triangles_is_never_hit() -> None:
 def test_scenes_and_backbones(small: City) -> None:
     assert small.scenes == ("scene0", "scene1", "scene2", "scene3", "scene4")
     scene = small.scene("scene2")
-    assert scene.backbones == ("sim-steady", "sim-flicker", "sim-soft")
+    assert scene.backbones == ("sim-steady", "sim-flicker", "sim-soft", *(f"trick-{name}" for name in LABELLERS))
     assert scene.ground_truth
     assert np.array_equal(scene.up, [0, 0, 1])
     assert len(scene) == 3

@@ -37,7 +37,7 @@ from semstab.statistics import (
 )
 from semstab.statistics.agreement import PSA
 from semstab.statistics.intervals import probability_above
-from semstab.statistics.verdict import TENTATIVE, level_probabilities
+from semstab.statistics.verdict import LIMITS, level_probabilities
 
 SIDE, F = 24, 8
 
@@ -189,7 +189,7 @@ def judged(low, high, wrong=UNKNOWN, voxels=5000, blocks=40, ceiling=None, class
 def of_class(name, low, high, *, matters=True):
     share = between(low, high)
     return ClassCeilingShare(
-        name, 200.0, matters, 0.5, 0.9, share, 1 - probability_above(share, TENTATIVE, "agreement")
+        name, 200.0, matters, 0.5, 0.9, share, 1 - probability_above(share, LIMITS.usable, "agreement")
     )
 
 

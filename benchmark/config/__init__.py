@@ -117,6 +117,17 @@ class Exclusion(Settings):
     masks: bool = Field(True, description="pixels under the masks of the dataset, where it has some")
 
 
+class VerdictSettings(Settings):
+    """What a verdict asks for; see docs/metrics.md, The verdict."""
+
+    stable: float = Field(0.8, gt=0, lt=1, description="share of the ceiling from which labels may be relied on")
+    usable: float = Field(2 / 3, gt=0, lt=1, description="and from which on they may be acted on with care")
+    labelled: float = Field(0.9, ge=0, le=1, description="part of the locations that a stable model labels at least")
+    class_locations: float = Field(
+        100.0, ge=1, description="voxels that a class dominates from which on it is judged, and named in the verdict"
+    )
+
+
 class Config(Settings):
     """What determines the numbers of a run or a study: scenes x backbones x backends x variations."""
 
@@ -177,6 +188,7 @@ class Config(Settings):
     scope: ScopeSetting = Field(
         THIS_SCENE, description="of the verdict and its intervals: 'this scene' flown again, or 'other scenes' like it"
     )
+    verdict: VerdictSettings = VerdictSettings()
     threads: int | None = Field(
         None, ge=1, exclude=True, description="threads that decode frames ahead; changes no number, so it is not kept"
     )

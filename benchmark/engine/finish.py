@@ -48,6 +48,7 @@ from semstab.model.statistics import MapStatistics
 from semstab.model.voxels import VoxelTable
 from semstab.statistics import Analysis, MapSample, ObservationSample, analyse
 from semstab.statistics.agreement import alpha_columns, alpha_of, ratio_of
+from semstab.statistics.verdict import Limits
 from semstab.task import Task, read
 
 WORST = 3
@@ -171,7 +172,7 @@ def analyse_sample(task: Task, config: Config, sample: MapSample, observations: 
     """The statistics of a map; its true labels are right, and bound how far geometry lets labels agree."""
     return analyse(
         sample, observations, name=task.backbone, edges=config.strata, critical=config.critical_classes,
-        scope=config.scope,
+        scope=config.scope, limits=Limits(**config.verdict.model_dump()),
     )  # fmt: skip
 
 

@@ -13,6 +13,7 @@ import numpy as np
 
 from semstab.backends import FusionBackend, create, takes_option
 from semstab.backends.numpy_reference import NumpySample
+from semstab.check.registration import depth_edges, label_edges
 from semstab.check.reprojection import evenly
 from semstab.config import Config
 from semstab.core.prefetch import Fetched
@@ -333,11 +334,23 @@ def _overview(task: Task, decoded: Frame) -> dict[str, Any]:
 CLIPS = (8, 16)
 """Frames a clip, as VSPW reports."""
 
-COLUMNS = ("compensated_flicker_percent", "compensated_share", "vc8", "vc16", "self_vc8", "self_vc16")
+COLUMNS = ("compensated_flicker_percent", "compensated_share", "vc8", "vc16", "self_vc8", "self_vc16", "edge_recall")
 """Numbers of a frame and those before it, by the name of their mean over all frames."""
+
+EDGES_EVERY = 8
+"""Of so many frames one is searched for edges."""
 
 SIDE = 640
 """Pixels of the longer side from which on every n-th pixel of each axis is measured, so that fusion does not wait."""
+
+
+def edge_recall(frame: Frame) -> float:
+    """Return which part of the edges of depth has a border of labels within two pixels; NaN without edges."""
+    import cv2
+
+    edges, borders = depth_edges(frame.depth) & frame.valid, label_edges(frame.predicted, frame.ignore_id)
+    near = cv2.dilate(borders.astype(np.uint8), np.ones((5, 5), np.uint8)) > 0
+    return mean(near[edges].astype(np.float64))
 
 
 class ImageSpaceMeter:
@@ -362,7 +375,8 @@ class ImageSpaceMeter:
             each.skip() if true is None else each.add(sample.predicted, sample.valid & true.valid, true.predicted)
             for each in self._by_truth
         ]
-        self.rows.append((flicker, share, *by_truth, *by_itself))
+        recall = math.nan if len(self.rows) % EDGES_EVERY else edge_recall(sample)
+        self.rows.append((flicker, share, *by_truth, *by_itself, recall))
         self._previous = frame
         return flicker
 

@@ -39,6 +39,7 @@ FORMAT = 9
 
 IN_KEYS = ("voxel_size", "pixel_stride", "top_k", "exclude", "perturbation", "strata", "statistics", "critical_classes",
     "scope",
+    "verdict",
 )  # fmt: skip
 """Settings that a unit's numbers depend on as they stand; of the others, what they select is in its key: the digest of
 the input, frames, classes, the backend."""
@@ -251,7 +252,7 @@ def _planned_regions(config: Config, scenes: Mapping[str, Scene]) -> Iterator[Pl
         for backbone in selected(config.region_maps, scene.backbones, scene.regions, "region map", name):
             settings = _base_settings(config, name, [backbone])
             unit, frames = [name, backbone], frame_indices(scene, settings, [backbone])
-            fused_only = {"voxel_size", "strata", "statistics", "critical_classes", "scope"}
+            fused_only = {"voxel_size", "strata", "statistics", "critical_classes", "scope", "verdict"}
             key = _hash(settings, {"regions": unit, "frames": frames}, fused_only)
             yield PlannedRegions(settings, scene, backbone, key)
 

@@ -72,6 +72,9 @@ class LeftOut:
     most: float
 
 
+IMAGES = ("depth", "labels", "scores", "color", "mask", "left_out", "unlabelled")
+
+
 @dataclass(frozen=True, eq=False)
 class Frame:
     """One observation of the scene, validated where it is made; its arrays are read-only views.
@@ -85,6 +88,7 @@ class Frame:
     color       (H, W, 3) uint8 RGB, optional
     mask        (H, W) bool, True where a thing moves that is not to be fused, optional; `semstab.pixels.preparation`
     left_out    (H, W) bool, the pixels that were left out of fusion for what they show, optional
+    unlabelled  (H, W) bool, the pixels with depth to which a model gave no label, optional
     scores_left_out  what was left out of the scores, where only the largest are kept
     timestamp   seconds, optional
     files       which file each field came from ('depth', 'pose', 'labels', ...); error messages name it
@@ -101,6 +105,7 @@ class Frame:
     color: UInt8 | None = None
     mask: Mask | None = None
     left_out: Mask | None = None
+    unlabelled: Mask | None = None
     scores_left_out: LeftOut | None = None
     timestamp: float | None = None
     files: Mapping[str, str] = field(default_factory=dict)
@@ -117,7 +122,7 @@ class Frame:
             self._set("scores", self._checked_scores(np.asarray(self.scores)))
         if self.color is not None:
             self._set("color", self._checked_color(np.asarray(self.color)))
-        for name in ("mask", "left_out"):
+        for name in ("mask", "left_out", "unlabelled"):
             if (marked := getattr(self, name)) is not None:
                 self._set(name, self._checked_mask(name, np.asarray(marked)))
 
@@ -172,7 +177,7 @@ class Frame:
     @property
     def _images(self) -> dict[str, npt.NDArray[Any]]:
         """Those that the frame has, by field."""
-        images = {name: getattr(self, name) for name in ("depth", "labels", "scores", "color", "mask", "left_out")}
+        images = {name: getattr(self, name) for name in IMAGES}
         return {name: image for name, image in images.items() if image is not None}
 
     def every(self, stride: int) -> Frame:

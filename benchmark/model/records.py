@@ -58,6 +58,7 @@ class ImageSpace:
 
     flicker_percent              pixels valid in both of two consecutive frames whose label differs
     compensated_flicker_percent  the same after the previous map is warped by depth and pose, occluded pixels left out
+    edge_recall                  share of the edges of depth with a border of labels within two pixels
     compensated_share            co-visible share: pixels that the warped map reaches, of the valid ones, 0 to 1
     vc8, vc16                    video consistency over clips of 8 and 16 frames, 0 to 1: of the pixels whose ground
                                  truth stays the same, those whose prediction does; NaN without ground truth
@@ -67,6 +68,7 @@ class ImageSpace:
     flicker_percent: float = math.nan
     compensated_flicker_percent: float = math.nan
     compensated_share: float = math.nan
+    edge_recall: float = math.nan
     vc8: float = math.nan
     vc16: float = math.nan
     self_vc8: float = math.nan

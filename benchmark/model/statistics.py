@@ -406,7 +406,10 @@ class ExcessOverChance:
 
 @dataclass(frozen=True)
 class MapStatistics:
-    """All that the statistics say of one map."""
+    """All that the statistics say of one map.
+
+    labelled  the part of the locations with depth that have a label in half of their observations or more
+    """
 
     schema: int
     name: str
@@ -430,6 +433,7 @@ class MapStatistics:
     fusion_rules: tuple[RuleOutcome, ...] | None
     strata: tuple[StratumStatistics, ...]
     excess_over_chance: ExcessOverChance
+    labelled: float = math.nan
 
     @property
     def order_known(self) -> bool:

@@ -25,7 +25,7 @@ from semstab.report.remedies import advice, remedies
 from semstab.report.tables import tables
 from semstab.report.tables.table import to_terminal
 from semstab.statistics.agreement import ALPHA
-from semstab.statistics.verdict import RELIABLE, TENTATIVE
+from semstab.statistics.verdict import LIMITS
 from semstab.task import Task
 
 WIDTH = 80
@@ -117,7 +117,7 @@ def _verdict(run: UnitSummary) -> Iterator[str]:
     if found.ceiling_share is not None and not math.isnan(found.ceiling_share.share.value):
         share = f", {_percent(found.ceiling_share.share.value)} of its ceiling {found.ceiling_share.ceiling.value:.2f}"
     yield f"  {level}{_probability(found.verdict)}    alpha {alpha.value:.2f}{_interval(alpha)}{share}"
-    yield f"  act on labels from {_percent(RELIABLE)} of the ceiling on, with care from {_percent(TENTATIVE)}"
+    yield f"  act on labels from {_percent(LIMITS.stable)} of the ceiling on, with care from {_percent(LIMITS.usable)}"
     psa = found.headline.psa.value
     yield f"  two frames see the same class at {_percent(psa)} of the locations"
     wrong = found.headline.wrong_of_stable

@@ -29,10 +29,7 @@ from semstab.statistics.agreement import psa, ratio_of
 from semstab.statistics.cluster_sums import ClusterSums, value
 from semstab.statistics.intervals import EstimateSpec, confidence_intervals, probability_above, scope_of, spec_of
 from semstab.statistics.observations import ObservationSample
-from semstab.statistics.verdict import TENTATIVE
-
-SUPPORT = 100.0
-"""Voxels of its own from which on a class is judged, where no critical classes are named."""
+from semstab.statistics.verdict import LIMITS, Limits
 
 
 def ceiling_share(
@@ -41,18 +38,18 @@ def ceiling_share(
     sums: ClusterSums | None = None,
     *,
     critical: Sequence[str] = (),
-    least: float = SUPPORT,
+    limits: Limits = LIMITS,
 ) -> CeilingShare:
     """Alpha between frames in the sampled voxels beside what it would be of the same cells, of all classes and of each.
 
     table     the whole map: how many places a class has
     sums      of the map with that sample, where they are there already
-    critical  names of the classes that matter; where none is given, those with `least` places or more
+    critical  names of the classes that matter; where none is given, those with enough
     """
     sums = cluster_sums_of(table, sample=sample) if sums is None else sums
     places = locations_by_class(table)
     found = confidence_intervals(ceiling_specs(sums, table.K))
-    return ceiling_share_from(places, sums, found, critical=critical, least=least)
+    return ceiling_share_from(places, sums, found, critical=critical, limits=limits)
 
 
 def locations_by_class(table: VoxelTable) -> Float64:
@@ -77,7 +74,7 @@ def ceiling_share_from(
     found: Sequence[Interval],
     *,
     critical: Sequence[str] = (),
-    least: float = SUPPORT,
+    limits: Limits = LIMITS,
 ) -> CeilingShare:
     """The same from the sums of a map with a sample; places (K,) of each class.
 
@@ -96,11 +93,11 @@ def ceiling_share_from(
             ClassCeilingShare(
                 name,
                 float(places[k]),
-                name in named if named else bool(places[k] >= least),
+                name in named if named else bool(places[k] >= limits.class_locations),
                 value(sums.seen, "alpha_between", k),
                 value(sums, "ceiling", k),
                 of_classes[k],
-                1 - probability_above(of_classes[k], TENTATIVE, "agreement"),
+                1 - probability_above(of_classes[k], limits.usable, "agreement"),
             )
             for k, name in enumerate(names)
         ),

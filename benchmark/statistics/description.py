@@ -63,7 +63,7 @@ from semstab.statistics.sections import (
     row_columns,
     rule_outcomes,
 )
-from semstab.statistics.verdict import verdict
+from semstab.statistics.verdict import LIMITS, Limits, verdict
 
 SCHEMA = 1
 
@@ -146,6 +146,7 @@ def analyse(
     edges: Sequence[int] = STRATA,
     critical: Sequence[str] = (),
     scope: Scope = THIS_SCENE,
+    limits: Limits = LIMITS,
 ) -> Analysis:
     """Return all statistics of one map; the same seed gives the same numbers.
 
@@ -155,6 +156,7 @@ def analyse(
     edges     upper bounds of the strata of OP
     critical  the classes that the verdict depends on; where none is named, all with enough locations
     scope     of the headline and the share of the ceiling, where frames tell of it
+    limits    of the verdict
 
     Intervals are at 95 %, those of all other numbers for these frames; undefined numbers are NaN, and a section
     that cannot be computed is None.
@@ -192,8 +194,9 @@ def analyse(
     means, whole = dict(zip(MEANS, found, strict=True)), sample.summary.summary(table.voxel_size, table.classes, edges)
     reach = None
     if observations is not None:
-        reach = ceiling_share_from(locations_by_class(table), influence, reached, critical=critical)
+        reach = ceiling_share_from(locations_by_class(table), influence, reached, critical=critical, limits=limits)
     headline, count = HeadlineStatistics(*judged), len(places.cell)
+    labelled = math.nan if observations is None else observations.labelled
     repeats = whole.means.voxels[SBD.key]
     repeated = Repeated(repeats, repeats / whole.voxels if whole.voxels else math.nan)
     flips_of_map = flipping.flipping(unsteady, table.classes)
@@ -215,6 +218,8 @@ def analyse(
             voxels=repeated.voxels,
             share=repeated.share,
             blocks=count,
+            labelled=labelled,
+            limits=limits,
         ),
         agreement=_agreement(means, class_agreement_of(class_sums(table, events), table.classes)),
         flipping=flips_of_map,
@@ -228,6 +233,7 @@ def analyse(
         fusion_rules=None if events is None else rule_outcomes(table, events, truth),
         strata=_strata(whole, table, columns, edges),
         excess_over_chance=ExcessOverChance(means["coin"], means["steadier"]),
+        labelled=labelled,
     )
     return Analysis(summary, whole, influence, sample, shares, drawn)
 

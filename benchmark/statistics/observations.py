@@ -21,7 +21,7 @@ from semstab.core.types import Float64, Int32, Int64, Mask, UInt16, UInt32
 from semstab.errors import DataError, one_line
 from semstab.model.events import Events
 from semstab.model.evidence import Evidence
-from semstab.model.measures import dominant
+from semstab.model.measures import dominant, mean
 from semstab.model.voxels import index_columns
 from semstab.statistics.loops import CELLS, DIGITS, SHIFTS, SPAN, WITHIN
 
@@ -119,7 +119,7 @@ LEAST_FRAMES = 2
 COLUMNS = "key", "view", "label", "weight", "drawn"
 """Of entries."""
 
-SCHEMA = 2
+SCHEMA = 3
 Entries = tuple[Int64, Int32, UInt16, Float64]
 
 
@@ -132,6 +132,7 @@ class ObservationSample:
            where they see of its cells what a frame sees of itself
     views  of all frames, in order of integration
     soft   whether the evidence is scores
+    labelled  see `CellObservations.labelled_share`
     """
 
     seen: Events
@@ -140,6 +141,7 @@ class ObservationSample:
     shift: Float64
     views: Views
     soft: bool
+    labelled: float = 1.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -148,7 +150,7 @@ class CellObservations:
 
     key     (m,) int64 of the cell, see `keys`
     view    (m,) int32 row of `views`
-    label   (m,) uint16
+    label   (m,) uint16; K of the pixels with depth that have no label
     weight  (m,) pixels of that label, or the sum of their scores
     drawn   (m,) uint32, the hash of the voxel; in the sample are those below `share`
     low     voxel at which keys begin
@@ -179,19 +181,32 @@ class CellObservations:
         """Observations of the voxels, and what comes from seeing other parts of them."""
         from semstab.statistics.loops.observations import same_cells
 
-        key, view, label, weight = self._in_order()
+        key, view, label, weight = self.labelled()._in_order()
         kept, of = np.empty(len(key), np.bool_), np.empty(len(key), np.int32)
         classes, shift = np.empty(len(key), np.uint16), np.empty(len(key))
         m = same_cells(key, view, label, weight, CELLS**3, self.K, LEAST_FRAMES, kept, of, classes, shift)
         seen = self._log(key, view, label, weight, kept)
-        return ObservationSample(seen, of[:m], classes[:m], shift[:m], self.views, self.soft)
+        return ObservationSample(seen, of[:m], classes[:m], shift[:m], self.views, self.soft, self.labelled_share())
+
+    def labelled(self) -> CellObservations:
+        """Return the entries of pixels that have a label."""
+        return self.only(self.label < self.K)
+
+    def labelled_share(self) -> float:
+        """Return which part of the voxels that two frames saw has a label in half of its observations or more."""
+        voxel, of = np.unique(np.stack([self.key >> DIGITS, self.view]), axis=1, return_inverse=True)
+        pixels, own = (np.bincount(of.ravel(), w) for w in (self.weight, self.weight * (self.label < self.K)))
+        _, of = np.unique(voxel[0], return_inverse=True)
+        frames, labelled = np.bincount(of), np.bincount(of, 2 * own >= pixels)
+        return mean((2 * labelled >= frames)[frames >= 2].astype(np.float64))
 
     def without(self, classes: Sequence[int]) -> CellObservations:
         """Return the entries of voxels whose fused class is none of these."""
         if not len(classes) or not len(self):
             return self
-        _, of = np.unique(self.key >> DIGITS, return_inverse=True)
-        return self.only(~np.isin(dominant(self.observations().table()), classes)[of])
+        own, at = np.unique((self.key >> DIGITS)[self.label < self.K]), self.key >> DIGITS
+        left = own[~np.isin(dominant(self.observations().table()), classes)]
+        return self.only(np.isin(at, left))
 
     def only(self, rows: Any) -> CellObservations:
         """Some of the entries."""
@@ -216,8 +231,8 @@ class CellObservations:
 
     def observations(self) -> Events:
         """The log of the sampled voxels: what the entries of a voxel and a frame say together."""
-        own = self._in_order()
-        return self._log(*own, np.ones(len(self), np.bool_))
+        own = self.labelled()._in_order()
+        return self._log(*own, np.ones(len(own[0]), np.bool_))
 
     def _in_order(self) -> Entries:
         """Keys, views, labels and weights by voxel and frame, entries of one as they come."""
@@ -275,7 +290,7 @@ class CellObservations:
             with pq.ParquetFile(path) as file:  # pq.read_table imports pandas
                 content = file.read()
             about = parse_json((content.schema.metadata or {})[b"semstab"])
-            if (about.pop("kind"), about.pop("schema")) != ("Looks", SCHEMA):
+            if (about.pop("kind"), about.pop("schema")) not in (("Looks", 2), ("Looks", SCHEMA)):
                 raise DataError("of another kind, or of another version, which sampled other voxels: run it again")
             views = Views.of(about.pop("views"))
             about["classes"] = tuple(about["classes"])

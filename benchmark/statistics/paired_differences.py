@@ -268,7 +268,7 @@ def common_observations(maps: Sequence[CellObservations]) -> CommonObservations:
     """What samples of the same frames have in common. Raises DataError where they differ in K or voxel size."""
     if len({(looks.K, looks.voxel_size) for looks in maps}) > 1:
         raise DataError("samples of other classes or voxel sizes cannot be compared; fuse both alike")
-    maps = _of_the_same_voxels(maps)
+    maps = _of_the_same_voxels([looks.labelled() for looks in maps])
     look, first = _numbered(maps)
     pixels = np.stack([np.bincount(own, looks.weight, len(first)) for own, looks in zip(look, maps, strict=True)])
     least, most = pixels.min(axis=0), pixels.max(axis=0)

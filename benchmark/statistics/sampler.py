@@ -95,18 +95,19 @@ class Sampler:
             self._take(entries)
 
     def _drawn(self, frame: Frame) -> Pixels:
-        """The frame's valid pixels in sampled voxels; the label of soft ones is the same for all."""
+        """The frame's pixels with depth in sampled voxels; soft ones are labelled 0, what has no label K."""
         from semstab.statistics.loops.observations import draw
 
         (H, W), camera, T_wc = frame.shape, frame.intrinsics, fixed(frame.T_wc)
         ray_x, ray_y = (np.arange(W) - camera.cx) / camera.fx, (np.arange(H) - camera.cy) / camera.fy
         cell, drawn = np.empty(H * W, np.int64), np.empty(H * W, np.uint32)
         label, pixel = np.empty(H * W, np.uint16), np.empty(H * W, np.int32)
-        valid = fixed(frame.valid)
-        labels = valid.view(np.uint8) if frame.labels is None else fixed(frame.labels)
+        there = frame.valid if frame.unlabelled is None else frame.valid | frame.unlabelled
+        own = np.zeros(frame.shape, np.uint16) if frame.labels is None else frame.labels.astype(np.uint16)
+        labels = np.where(frame.valid, own, np.uint16(self.K))
         n = draw(
-            fixed(frame.depth), valid, labels, ray_x, ray_y, T_wc, self.voxel_size, self._share, self._origin, REACH,
-            cell, drawn, label, pixel,
+            fixed(frame.depth), fixed(there), labels, ray_x, ray_y, T_wc, self.voxel_size, self._share, self._origin,
+            REACH, cell, drawn, label, pixel,
         )  # fmt: skip
         near = slice(n) if cell[:n].min(initial=0) >= 0 else np.flatnonzero(cell[:n] >= 0)
         return Pixels(cell[near], drawn[near], label[near], pixel[near])
@@ -161,8 +162,11 @@ class Sampler:
         from semstab.statistics.loops.observations import add_rows
 
         assert frame.scores is not None
-        _, of, _ = pixels.grouped(numbered=True)
-        for piece in _pieces(of, max(1, PIECE // self.K)):
+        m, of, count = pixels.grouped(numbered=True)
+        none = np.flatnonzero(pixels.label[:m] == self.K)
+        yield pixels.cell[none], pixels.label[none], count[none], pixels.drawn[none]
+        labelled = np.flatnonzero(pixels.label[of] != self.K)
+        for piece in (labelled[part] for part in _pieces(of[labelled], max(1, PIECE // self.K))):
             some = piece[pixels.drawn[of[piece]] < self._share]  # less than before, if the pieces before were too many
             s = frame.scores[np.divmod(pixels.pixel[some], frame.shape[1])].astype(np.float64)
             s /= s.sum(axis=1, keepdims=True)

@@ -4,17 +4,31 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from dataclasses import dataclass
 
 from semstab.core.types import THIS_SCENE
 from semstab.model.statistics import CeilingShare, Flipping, HeadlineStatistics, Interval, Level, StabilityVerdict
 from semstab.statistics.cluster_sums import Scale
 from semstab.statistics.intervals import LEAST_FRAMES, probability_above
 
-RELIABLE = 0.8
-"""Krippendorff's alpha from which data may be relied on (Krippendorff 2018, Content Analysis, ch. 12)."""
 
-TENTATIVE = 2 / 3
-"""Alpha from which tentative conclusions are allowed; below, none (same source)."""
+@dataclass(frozen=True)
+class Limits:
+    """What a verdict asks for.
+
+    stable, usable  Krippendorff's alpha, or share of its ceiling, from which data may be relied on, and from which
+                    tentative conclusions are allowed (Krippendorff 2018, Content Analysis, ch. 12)
+    labelled        part of the locations that a stable model labels at least
+    class_locations voxels that a class dominates from which on it is judged, where no critical classes are named
+    """
+
+    stable: float = 0.8
+    usable: float = 2 / 3
+    labelled: float = 0.9
+    class_locations: float = 100.0
+
+
+LIMITS = Limits()
 
 DECIDED = 0.6
 """A level is stated if it has at least this probability."""
@@ -48,9 +62,9 @@ ACTED_ON, LEAST_FLIPS = ("stable", "usable"), 0.001
 ONE_CLASS = "hardly more than one class was predicted, so that agreement says nothing"
 
 
-def level_probabilities(found: Interval, scale: Scale) -> Mapping[Level, float]:
+def level_probabilities(found: Interval, scale: Scale, limits: Limits = LIMITS) -> Mapping[Level, float]:
     """Return how probable each level is, given alpha or its share of the ceiling; NaN without an interval."""
-    reliable, tentative = (probability_above(found, threshold, scale) for threshold in (RELIABLE, TENTATIVE))
+    reliable, tentative = (probability_above(found, threshold, scale) for threshold in (limits.stable, limits.usable))
     return {"stable": reliable, "usable": tentative - reliable, "unstable": 1 - tentative}
 
 
@@ -63,6 +77,8 @@ def verdict(
     voxels: int,
     share: float,
     blocks: int,
+    labelled: float = math.nan,
+    limits: Limits = LIMITS,
 ) -> StabilityVerdict:
     """Return the most probable level, from voxels with OP >= 2 only.
 
@@ -71,12 +87,16 @@ def verdict(
     flips          the locations about which frames do not agree: few of them hide in any mean
     voxels, share  how many they are, and of all voxels
     blocks         in how many cubes of space they lie
+    labelled       part of the locations with depth that have a label; a model that labels too few is at most usable
     """
     basis, scale = _basis(headline, ceiling)
     level: Level = "no verdict"
     probability = math.nan
     if voxels >= LEAST_VOXELS and blocks >= LEAST_BLOCKS:
-        level, probability = _level(headline, ceiling, level_probabilities(basis, scale))
+        level, probability = _level(headline, ceiling, level_probabilities(basis, scale, limits))
+    silent = labelled < limits.labelled
+    if silent and level == "stable":
+        level, probability = "usable", level_probabilities(basis, scale, limits)["usable"] + probability
     support = f"{voxels} locations seen twice or more, {share:.0%} of the map"
     if level == "no verdict":
         enough = voxels >= LEAST_VOXELS and blocks >= LEAST_BLOCKS
@@ -87,6 +107,8 @@ def verdict(
     parts.append(_alpha(headline.alpha_between) if ceiling is None else _share_of_ceiling(ceiling))
     if not math.isnan(wrong.low):
         parts.append(f"{wrong.value:.0%} of the stable locations are wrong ({wrong.low:.0%} to {wrong.high:.0%})")
+    if silent:
+        parts.append(f"{1 - labelled:.0%} of the locations have no label in most frames")
     if flips is not None and level in ACTED_ON:
         parts += _flips(flips)
     how_sure = "" if math.isnan(probability) else f" ({probability:.0%})"

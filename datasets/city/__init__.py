@@ -17,6 +17,7 @@ from pydantic import BaseModel
 
 from semstab.config import nearest
 from semstab.core.types import Float64, UInt8
+from semstab.datasets.city.labellers import relabelled
 from semstab.datasets.city.mesh import uavid8
 from semstab.datasets.city.options import FLIGHTS, CityOptions, SimulatedBackbone
 from semstab.datasets.city.simulation import Caster, Rendered, Simulation, View, render
@@ -106,7 +107,7 @@ class CityScene(Scene):
         if model is not None:
             view = View(index, rendered, self.camera, T_wc, self.origin)
             simulation = Simulation(model, self._options.seed, backbone, self.name)
-            labels, scores = (None, simulation.scores(view)) if model.softness else (simulation.labels(view), None)
+            labels, scores = (None, simulation.scores(view)) if model.softness else (relabelled(simulation, view), None)
         where = f"city/{self.name}/frame {index}"
         return Frame(
             index=index,

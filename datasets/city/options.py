@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import re
 from dataclasses import dataclass
-from typing import Annotated
+from typing import Annotated, Literal, get_args
 
 import numpy as np
 from pydantic import AfterValidator, Field, field_validator
@@ -40,6 +40,12 @@ def _known_class(name: str) -> str:
 ClassName = Annotated[str, AfterValidator(_known_class)]
 
 
+Labeller = Literal[
+    "", "constant", "two-class", "blur-31", "blur-81", "coarse-16", "coarse-48", "border-ignoring", "hard-ignoring",
+    "world-locked", "by-row",
+]  # fmt: skip
+
+
 class SimulatedBackbone(Settings):
     """How one simulated backbone errs. Each draw is a function of the seed, the backbone's and the scene's name, and of
 
@@ -72,6 +78,7 @@ class SimulatedBackbone(Settings):
         60.0, gt=0, le=1000, description="distance from which view errors grow no further, metres"
     )
     softness: float = Field(0.0, ge=0, le=0.49, description="largest score that goes to other classes; 0: class ids")
+    labeller: Labeller = Field("", description="what makes the labels over, so that they agree for a wrong reason")
     difficulty: dict[ClassName, Annotated[float, Field(ge=0, le=100)]] = Field(
         default_factory=dict, description="factors on place, view and flicker by true class; 1 where not given"
     )
@@ -100,7 +107,12 @@ BACKBONES = {
         ("sim-flicker", 0.02, 0.08, 0.11, 2.0, 1.2, 0.0),
         ("sim-soft", 0.04, 0.06, 0.05, 1.2, 1.6, 0.4),
     )
+} | {
+    f"trick-{name}": SimulatedBackbone(view=0.08, flicker=0.11, border=2.0, cell=1.2, difficulty=_SMALL_THINGS,
+                                       labeller=name)
+    for name in get_args(Labeller) if name
 }  # fmt: skip
+"""The simulated backbones, and labellers that a verdict must not fall for (`labellers`)."""
 
 
 class CityOptions(Settings):

@@ -280,16 +280,35 @@ def _require_whole_chunks(path: Path, header: Any) -> None:
     """Raise ValueError where the table of chunks of a LAZ file does not fit its header and size."""
     import lazrs
 
-    laz = lazrs.LazVlr(header.vlrs[header.vlrs.index("LasZipVlr")].record_data)
+    record = header.vlrs[header.vlrs.index("LasZipVlr")].record_data
+    laz = lazrs.LazVlr(record)
     with path.open("rb") as file:
         file.seek(header.offset_to_point_data)
         points, lengths = np.array(lazrs.read_chunk_table(file, laz), dtype=np.int64).reshape(-1, 2).T
-        end = file.tell() + lengths.sum()
+        first = file.tell()
     size = header.point_format.size
-    if laz.item_size() != size or points.sum() < header.point_count or end > path.stat().st_size:
+    if laz.item_size() != size or points.sum() < header.point_count or first + lengths.sum() > path.stat().st_size:
         raise ValueError(f"its {len(points)} chunks do not hold the {header.point_count:,} points of its header")
     if points.max(initial=0) * size > POINT_BYTES_AT_ONCE:
         raise ValueError(f"it has chunks of {points.max():,} points; compress it anew (laszip writes 50,000)")
+    if layers := _layers_of(record):  # lazrs aborts the process where it cannot have the memory that a layer claims
+        with path.open("rb") as file:
+            for length in lengths.tolist():
+                file.seek(first + size + 4)
+                if size + 4 + 4 * layers + sum(struct.unpack(f"<{layers}I", file.read(4 * layers))) != length:
+                    raise ValueError(f"a chunk at byte {first} has layers that do not fit into it")
+                first += length
+
+
+LAZ_LAYERS = {10: 9, 11: 1, 12: 2, 13: 1}
+"""Layers of LAZ's items that are compressed in layers (LAS 1.4); item 14, extra bytes, has one a byte."""
+
+
+def _layers_of(record: bytes) -> int:
+    """Return how many layers a chunk has, by the items of the LASzip record; 0 if it is compressed point by point."""
+    (items,) = struct.unpack_from("<H", record, 32)
+    kinds = [struct.unpack_from("<HH", record, 34 + 6 * item) for item in range(items)]
+    return sum(length if kind == 14 else LAZ_LAYERS.get(kind, 0) for kind, length in kinds)
 
 
 # Rays cast at triangles with embree, which lets other threads work meanwhile, as Open3D's binding does not.

@@ -25,7 +25,7 @@ from semstab.report.figures.style import Figure
 from semstab.statistics.agreement import ALPHA, PSA
 from semstab.statistics.intervals import LEAST_FRAMES
 from semstab.statistics.model_comparison import compared
-from semstab.statistics.verdict import RELIABLE, TENTATIVE
+from semstab.statistics.verdict import LIMITS
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure as Canvas
@@ -62,7 +62,7 @@ def _agreement(judged: Judged) -> Iterator[Figure]:
                     PSA.word: _estimates(judged, lambda found: found.agreement.psa),
                     ALPHA.word: _estimates(judged, lambda found: found.agreement.alpha),
                 },
-                {ALPHA.word: (TENTATIVE, RELIABLE)},
+                {ALPHA.word: (LIMITS.usable, LIMITS.stable)},
             ),
         )
 
