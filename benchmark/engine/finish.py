@@ -20,7 +20,7 @@ from semstab.core.types import Float64
 from semstab.datasets import Scene
 from semstab.datasets.formats.disk import file_digest
 from semstab.engine.series import Series
-from semstab.engine.streams import LiveMap, Stream
+from semstab.engine.streams import LiveMap, Stream, alpha_sums
 from semstab.engine.tiles import OBSERVATIONS, TRUE_OBSERVATIONS, TileResult
 from semstab.engine.up_axis import estimate_up
 from semstab.engine.work import Outcome, Start
@@ -47,7 +47,7 @@ from semstab.model.results import (
 from semstab.model.statistics import MapStatistics
 from semstab.model.voxels import VoxelTable
 from semstab.statistics import Analysis, MapSample, ObservationSample, analyse
-from semstab.statistics.agreement import alpha_columns, alpha_of, ratio_of
+from semstab.statistics.agreement import alpha_of, ratio_of
 from semstab.task import Task, read
 
 WORST = 3
@@ -75,8 +75,15 @@ def finish(live: LiveMap, stream: Stream, watch: Stopwatch) -> Outcome:
         sizes = () if live.sizes is None else live.sizes.alphas()
         give_back(least=SMALL)
     with watch("statistics"):
-        truth = _truth_table(live)
-        analysis = analyse_map(live, table, events, truth) if work.judged else None
+        truth, analysis = _truth_table(live), None
+        if work.judged:
+            observations = None if live.sampler is None else live.sampler.sample()
+            if observations is not None and live.truth_sampler is not None:
+                observations = observations.against(live.truth_sampler.sample())
+            log = events if config.statistics else None
+            analysis = analyse_sample(
+                task, config, MapSample.draw(table, log, truth, edges=config.strata), observations
+            )
         give_back(least=SMALL)
     with watch("measure"):
         summary = unit_summary(
@@ -144,16 +151,6 @@ def _truth_table(live: LiveMap) -> VoxelTable | None:
     if live.truth is None:
         return None
     return dataclasses.replace(live.truth.table(), classes=live.task.mapping.target.classes)
-
-
-def analyse_map(live: LiveMap, table: VoxelTable, events: Events | None, truth: VoxelTable | None) -> Analysis:
-    """The statistics of a map that is fused whole."""
-    observations = None if live.sampler is None else live.sampler.sample()
-    if observations is not None and live.truth_sampler is not None:
-        observations = observations.against(live.truth_sampler.sample())
-    config = live.work.config
-    sample = MapSample.draw(table, events if config.statistics else None, truth, edges=config.strata)
-    return analyse_sample(live.task, config, sample, observations)
 
 
 def analyse_sample(task: Task, config: Config, sample: MapSample, observations: ObservationSample | None) -> Analysis:
@@ -227,8 +224,7 @@ def reduced_sums(table: VoxelTable) -> Float64:
     """The sums over voxels from which `reduced_of` follows."""
     values, recurrent = vss(table), table.op >= RECURRENT
     means = [values.sum(), len(values), values[recurrent].sum(), np.count_nonzero(recurrent)]
-    alpha = (alpha_columns(table.rows(some)).sum(axis=0) for some in table.evidence.chunks())
-    return np.concatenate([means, sum(alpha, np.zeros(3 + table.K))])
+    return np.concatenate([means, alpha_sums(table)])
 
 
 def reduced_of(sums: Float64) -> ReducedScores:
@@ -288,7 +284,12 @@ def _overview_saver(live: LiveMap, stream: Stream) -> Savers:
     if not (live.work.image_space and stream.overview):
         return {}
     name = slug(live.unit.scene, live.unit.backbone)
-    return {f"{OVERVIEW}/{name}.npz": partial(_save_arrays, stream.overview)}
+
+    def save(path: Path) -> None:
+        with atomic_path(path) as temporary:
+            np.savez_compressed(temporary, **stream.overview)
+
+    return {f"{OVERVIEW}/{name}.npz": save}
 
 
 def _tile_savers(
@@ -347,9 +348,3 @@ def save_voxels(
     """Write a voxel table together with its measures, and further columns (n,) by name."""
     own = {measure.key: measure.of for measure in measures()}
     table.save(path, columns, {**own, "label": dominant}, tile)
-
-
-def _save_arrays(arrays: Mapping[str, Any], path: Path) -> None:
-    named: dict[str, Any] = dict(arrays)
-    with atomic_path(path) as temporary:
-        np.savez_compressed(temporary, **named)
