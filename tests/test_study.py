@@ -236,14 +236,6 @@ def test_a_backend_that_breaks_fails_its_own_units(root, tmp_path, monkeypatch) 
     assert result.agreement == ()
 
 
-def test_a_unit_without_a_valid_pixel_says_what_is_missing(root, tmp_path) -> None:
-    for path in (root / "labels/a").iterdir():
-        cv2.imwrite(str(path), np.full((6, 8), 255, np.uint8))
-    result = run_study(configure(root, sweeps={}, backends=["numpy"]), tmp_path / "out")
-    assert [record.unit.backbone for record in result.select()] == ["b"]
-    assert "no pixel of 5 frames is valid" in result.failures[0].message
-
-
 def test_the_result_is_read_back_from_its_folder(finished, out, tmp_path) -> None:
     folder, result, _ = finished
     again = load_result(folder)
@@ -427,17 +419,6 @@ def test_what_does_not_fit_together_is_refused_before_anything_is_read(root, tmp
     with pytest.raises((ConfigError, DataError), match=message):
         run_study(configure(root, **settings), tmp_path / "out")
     assert not (tmp_path / "out").exists()
-
-
-def test_a_folder_of_something_else_is_refused(root, tmp_path) -> None:
-    config = configure(root, sweeps={}, backends=["numpy"])
-    with pytest.raises(ConfigError, match="is not empty and holds no run or study"):
-        run_study(config, root)
-    (tmp_path / "file").write_text("")
-    with pytest.raises(ConfigError, match="is a file"):
-        run_study(config, tmp_path / "file")
-    (tmp_path / "empty").mkdir()
-    run_study(config, tmp_path / "empty")
 
 
 def test_a_worker_that_does_not_see_the_folder_sends_the_voxels_back(root, tmp_path) -> None:
