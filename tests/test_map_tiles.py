@@ -483,7 +483,7 @@ def test_what_cannot_be_tiled_is_refused_in_one_line(settings, message, wall) ->
 # --- Which frames see which tiles -------------------------------------------------------------------------------------
 
 
-@hypothesis_settings(max_examples=40, deadline=None)
+@hypothesis_settings(max_examples=20, deadline=None)
 @given(st.integers(0, 10**6), st.sampled_from([8, 32, 128]), st.floats(0.1, 0.7))
 def test_no_pixel_falls_into_a_tile_that_its_frustum_does_not_meet(seed, size, voxel_size) -> None:
     """Of cameras that look anywhere, at depth in any range."""

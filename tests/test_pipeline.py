@@ -260,17 +260,17 @@ def test_disagreement_is_reported_after_everything_is_written(root, tmp_path, mo
     assert json.loads((tmp_path / "run" / "summary.json").read_text())["agreement"][0]["agrees"] is False
 
 
-def test_a_scene_without_a_valid_pixel_says_what_is_missing(root) -> None:
-    for path in (root / "labels/a").iterdir():
-        cv2.imwrite(str(path), np.full((6, 8), 255, np.uint8))
-    with pytest.raises(DataError, match=r"wall, a: no pixel of 3 frames is valid .*depth in 100%.*label in 0%"):
-        semstab.engine.run(configure(root))
-
-
-def test_a_label_outside_the_taxonomy_names_its_file(root) -> None:
-    path = root / "labels/a/0002.png"
-    cv2.imwrite(str(path), np.full((6, 8), 9, np.uint8))
-    with pytest.raises(DataError, match=r"labels/a/0002\.png: label id 9 \(48 pixels\) is outside the taxonomy"):
+@pytest.mark.parametrize(
+    ("files", "label", "message"),
+    [
+        ("*.png", 255, r"wall, a: no pixel of 3 frames is valid .*depth in 100%.*label in 0%"),
+        ("0002.png", 9, r"labels/a/0002\.png: label id 9 \(48 pixels\) is outside the taxonomy"),
+    ],
+)
+def test_labels_that_cannot_be_fused_are_one_line(root, files, label, message) -> None:
+    for path in (root / "labels/a").glob(files):
+        cv2.imwrite(str(path), np.full((6, 8), label, np.uint8))
+    with pytest.raises(DataError, match=message):
         semstab.engine.run(configure(root))
 
 

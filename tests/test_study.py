@@ -37,6 +37,21 @@ def root(tmp_path):
     return tiny_study.write(tmp_path / "wall")
 
 
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory):
+    """The folder of a finished study, its result, and what an observer counted."""
+    folder, counting = tmp_path_factory.mktemp("finished"), Counting()
+    config = configure(tiny_study.write(folder / "wall"))
+    result = run_study(config, folder / "out", observers=[counting], command=["semstab-bench", "study"])
+    return folder / "out", result, counting
+
+
+@pytest.fixture
+def out(finished, tmp_path):
+    """A copy of its folder."""
+    return shutil.copytree(finished[0], tmp_path / "out")
+
+
 def count(config, out, **options) -> Counting:
     counting = Counting()
     run_study(config, out, observers=[counting], **options)
@@ -74,9 +89,8 @@ def test_the_grid_goes_through_every_sweep_scene_and_backbone(root) -> None:
     assert [cell.unit.backend for cell in cells if cell.variation.sweep == BACKENDS] == ["numba", "numba"]
 
 
-def test_a_point_at_the_base_settings_is_the_base_unit(root, tmp_path) -> None:
-    counting, out = Counting(), tmp_path / "out"
-    result = run_study(configure(root), out, observers=[counting])
+def test_a_point_at_the_base_settings_is_the_base_unit(finished) -> None:
+    out, result, counting = finished
     of_a = [record for record in result.records if record.unit.backbone == "a"]
     base = of_a[0]
     twins = [record.variation for record in of_a[1:] if record.key == base.key]
@@ -110,9 +124,8 @@ def test_frames_are_decoded_once_for_all_units_of_a_backbone(root, tmp_path, mon
 
 
 def test_maps_that_exceed_the_memory_bound_are_put_off_and_the_numbers_are_the_same(
-    root, tmp_path, monkeypatch
+    root, tmp_path, finished, monkeypatch
 ) -> None:
-    run_study(configure(root), tmp_path / "whole")
     decoded: list[int] = []
     frame = FileScene.frame
 
@@ -125,7 +138,7 @@ def test_maps_that_exceed_the_memory_bound_are_put_off_and_the_numbers_are_the_s
     monkeypatch.setattr("semstab.engine.passes.resident_bytes", lambda: next(grown))
     run_study(configure(root, memory_gb=0.0005), tmp_path / "tight")
     assert len(decoded) > 25
-    assert summary(tmp_path / "tight") == summary(tmp_path / "whole")
+    assert summary(tmp_path / "tight") == summary(finished[0])
 
 
 def test_a_unit_that_would_not_fit_into_memory_fails_before_it_is_fused(root, tmp_path, monkeypatch) -> None:
@@ -138,7 +151,7 @@ def test_a_unit_that_would_not_fit_into_memory_fails_before_it_is_fused(root, tm
     assert [record.variation.sweep for record in result.records] == ["pixel_stride"] * 2
 
 
-def test_an_interrupted_study_goes_on_where_it_was(root, tmp_path) -> None:
+def test_an_interrupted_study_goes_on_where_it_was(root, tmp_path, finished) -> None:
     config, out = configure(root), tmp_path / "out"
     with pytest.raises(KeyboardInterrupt):
         run_study(config, out, observers=[Interrupting(4)])
@@ -146,14 +159,11 @@ def test_an_interrupted_study_goes_on_where_it_was(root, tmp_path) -> None:
     resumed = count(config, out)
     assert (resumed.kept, len(resumed.computed)) == (4, 13 - 4)
     assert count(config, out).computed == []
-    run_study(config, tmp_path / "whole")
-    assert summary(out) == summary(tmp_path / "whole")
+    assert summary(out) == summary(finished[0])
     assert not list(out.rglob(".*"))
 
 
-def test_a_changed_setting_computes_only_what_it_touches(root, tmp_path) -> None:
-    out = tmp_path / "out"
-    run_study(configure(root), out)
+def test_a_changed_setting_computes_only_what_it_touches(root, out) -> None:
     finer = tiny_study.SWEEPS | {"voxel_size": [0.125, 0.25, 0.5]}
     assert count(configure(root, sweeps=finer), out).computed == [
         "wall__a__numpy voxel_size 0.125", "wall__b__numpy voxel_size 0.125"
@@ -166,9 +176,7 @@ def test_a_changed_setting_computes_only_what_it_touches(root, tmp_path) -> None
     assert len(count(configure(root, strata=[1, 4]), out).computed) == 13
 
 
-def test_what_was_a_sweep_becomes_the_base_with_all_that_a_base_has(root, tmp_path) -> None:
-    out = tmp_path / "out"
-    run_study(configure(root), out)
+def test_what_was_a_sweep_becomes_the_base_with_all_that_a_base_has(root, out, tmp_path) -> None:
     coarse = configure(root, voxel_size=0.5, sweeps={}, backends=["numpy"])
     assert len(count(coarse, out).computed) == 2  # now with its voxels and in image space
     run_study(coarse, tmp_path / "fresh")
@@ -177,9 +185,8 @@ def test_what_was_a_sweep_becomes_the_base_with_all_that_a_base_has(root, tmp_pa
     assert sorted(count(configure(root), out).computed) == ["wall__a__numpy base None", "wall__b__numpy base None"]
 
 
-def test_a_changed_input_computes_what_reads_it(root, tmp_path) -> None:
-    out, config = tmp_path / "out", configure(root)
-    run_study(config, out)
+def test_a_changed_input_computes_what_reads_it(root, out) -> None:
+    config = configure(root)
     cv2.imwrite(str(root / "labels/a/0003.png"), np.zeros((6, 8), np.uint8))  # not among the base frames
     assert count(config, out).computed == ["wall__a__numpy frame_count 10"]
     cv2.imwrite(str(root / "labels/b/0002.png"), np.zeros((6, 8), np.uint8))
@@ -229,18 +236,9 @@ def test_a_backend_that_breaks_fails_its_own_units(root, tmp_path, monkeypatch) 
     assert result.agreement == ()
 
 
-def test_a_unit_without_a_valid_pixel_says_what_is_missing(root, tmp_path) -> None:
-    for path in (root / "labels/a").iterdir():
-        cv2.imwrite(str(path), np.full((6, 8), 255, np.uint8))
-    result = run_study(configure(root, sweeps={}, backends=["numpy"]), tmp_path / "out")
-    assert [record.unit.backbone for record in result.select()] == ["b"]
-    assert "no pixel of 5 frames is valid" in result.failures[0].message
-
-
-def test_the_result_is_read_back_from_its_folder(root, tmp_path) -> None:
-    out = tmp_path / "out"
-    result = run_study(configure(root), out, command=["semstab-bench", "study"])
-    again = load_result(out)
+def test_the_result_is_read_back_from_its_folder(finished, out, tmp_path) -> None:
+    folder, result, _ = finished
+    again = load_result(folder)
     assert json.dumps(to_json(again)) == json.dumps(to_json(result))
     assert again.manifest["command"] == ["semstab-bench", "study"]
     assert again.manifest["units"] == {
@@ -252,6 +250,10 @@ def test_the_result_is_read_back_from_its_folder(root, tmp_path) -> None:
     assert (again.scenes, again.backbones) == (("wall",), ("a", "b"))
     with pytest.raises(DataError, match=r"summary\.json: cannot be read"):
         load_result(tmp_path)
+    content = json.loads((out / "summary.json").read_text())
+    (out / "summary.json").write_text(json.dumps({**content, "schema": 1}))
+    with pytest.raises(DataError, match=r"summary\.json: not a summary of this version of semstab; run it again"):
+        load_result(out)
     (out / "summary.json").write_text('{"name": "x"}')
     with pytest.raises(DataError, match=r"summary\.json: not a summary of this version"):
         load_result(out)
@@ -332,14 +334,6 @@ def test_the_base_backbones_are_compared_where_statistics_are_wanted(root, tmp_p
     for other in (load_result(tmp_path / "out"), run_study(config, tmp_path / "out")):  # read, kept
         assert to_json(other.comparisons) == to_json(result.comparisons)
         assert to_json([r.statistics for r in other.records]) == to_json([r.statistics for r in result.records])
-
-
-def test_the_summary_of_an_earlier_version_is_refused(root, tmp_path) -> None:
-    run_study(configure(root, sweeps={}, backends=["numpy"]), tmp_path / "out")
-    content = json.loads((tmp_path / "out" / "summary.json").read_text())
-    (tmp_path / "out" / "summary.json").write_text(json.dumps({**content, "schema": 1}))
-    with pytest.raises(DataError, match=r"summary\.json: not a summary of this version of semstab; run it again"):
-        load_result(tmp_path / "out")
 
 
 def psa_by_definition(events) -> float:
@@ -425,17 +419,6 @@ def test_what_does_not_fit_together_is_refused_before_anything_is_read(root, tmp
     with pytest.raises((ConfigError, DataError), match=message):
         run_study(configure(root, **settings), tmp_path / "out")
     assert not (tmp_path / "out").exists()
-
-
-def test_a_folder_of_something_else_is_refused(root, tmp_path) -> None:
-    config = configure(root, sweeps={}, backends=["numpy"])
-    with pytest.raises(ConfigError, match="is not empty and holds no run or study"):
-        run_study(config, root)
-    (tmp_path / "file").write_text("")
-    with pytest.raises(ConfigError, match="is a file"):
-        run_study(config, tmp_path / "file")
-    (tmp_path / "empty").mkdir()
-    run_study(config, tmp_path / "empty")
 
 
 def test_a_worker_that_does_not_see_the_folder_sends_the_voxels_back(root, tmp_path) -> None:

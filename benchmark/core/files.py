@@ -6,7 +6,6 @@ import errno
 import fcntl
 import hashlib
 import json
-import math
 import os
 import stat
 import struct
@@ -32,7 +31,6 @@ TEMPORARY = ".semstab-"
 """How names of files begin that are not whole yet."""
 
 MAX_YAML_BYTES = 2**24
-MAX_ALIASED = 10**5
 
 
 @contextmanager
@@ -202,27 +200,10 @@ def parse_yaml(text: str, where: str) -> Any:
     """
     try:
         loader = yaml.SafeLoader(text)
-        node = loader.get_single_node()
-        values: dict[int, float] = {}
-        if _expanded(node, values) > len(values) + MAX_ALIASED:
-            raise ConfigError(f"{where}: its aliases (*name) stand for more than {MAX_ALIASED} values; write them out")
-        return None if node is None else loader.construct_document(node)
-    except ConfigError:
-        raise
+        return loader.get_single_data()
     except (yaml.YAMLError, ValueError, LookupError, AttributeError, TypeError, RecursionError) as error:
         # PyYAML lets other errors than its own escape, for example for the date 2020-13-45
         raise ConfigError(f"{where}: not valid YAML ({one_line(error)})") from error
-
-
-def _expanded(node: Any, known: dict[int, float]) -> float:
-    """How many values a YAML node stands for with its aliases written out: infinity where it holds itself."""
-    if id(node) not in known:
-        known[id(node)] = math.inf
-        parts = getattr(node, "value", ())
-        parts = parts if isinstance(parts, list) else ()
-        children = (child for part in parts for child in (part if isinstance(part, tuple) else (part,)))
-        known[id(node)] = 1 + sum(_expanded(child, known) for child in children)
-    return known[id(node)]
 
 
 # Arrays that are kept for a later start: read as they were written, or not at all.

@@ -37,35 +37,21 @@ class Rows:
 
     def append(self, row: Iterable[float]) -> None:
         """Add a row."""
-        self._make_room(1)
+        if self._used == len(self._rows):
+            room = np.empty((max(FIRST, 2 * self._used), self.columns))
+            room[: self._used] = self._rows
+            self._rows = room
         self._rows[self._used] = [*row]
         self._used += 1
-
-    def extend(self, rows: Float64) -> None:
-        """Add rows (m, columns)."""
-        self._make_room(len(rows))
-        self._rows[self._used : self._used + len(rows)] = rows
-        self._used += len(rows)
 
     def row(self, at: int) -> list[float]:
         """Return one row. Raises IndexError where there is none."""
         return self._rows[range(len(self))[at]].tolist()  # type: ignore[no-any-return]
 
-    def column(self, k: int, first: int = 0, last: int | None = None) -> Float64:
-        """Return a copy (n,) of the k-th number of each row, from row `first` up to but without row `last`."""
-        return self._rows[: len(self), k][first:last].copy()
+    def column(self, k: int) -> Float64:
+        """Return a copy (n,) of the k-th number of each row."""
+        return self._rows[: len(self), k].copy()
 
-    def put(self, k: int, values: Float64) -> None:
-        """Replace the k-th number of every row by these (n,)."""
-        self._rows[: len(self), k] = values
-
-    def table(self, first: int = 0, step: int = 1) -> Float64:
-        """Return a copy (n, columns) of every step-th row from row `first` on."""
-        return self._rows[first : len(self) : step].copy()
-
-    def _make_room(self, more: int) -> None:
-        """Make the array large enough for so many more rows."""
-        if self._used + more > len(self._rows):
-            room = np.empty((max(FIRST, 2 * len(self._rows), self._used + more), self.columns))
-            room[: self._used] = self._rows[: self._used]
-            self._rows = room
+    def table(self) -> Float64:
+        """Return a copy (n, columns) of the rows."""
+        return self._rows[: len(self)].copy()

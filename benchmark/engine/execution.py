@@ -132,7 +132,11 @@ def _compute(plan: Plan, folder: Folder, executor: Executor, observers: Observer
                 own: Outcome | None = outcome
                 unit = tiled.get(outcome.identity)
                 if unit is not None and outcome.tile is not None:
-                    own = _take_tile(unit, outcome, units, observers)
+                    units.add_seconds(outcome)
+                    with units.watch("assemble"):
+                        own = unit.take(outcome)
+                    step, what = unit.step(), unit.name
+                    observers.tell(lambda observer, step=step, what=what: observer.advanced(step, what))  # type: ignore[misc]
                 if own is not None:
                     _keep(planned[own.identity], own, folder, units, executor, observers, in_tiles=unit is not None)
     return units
@@ -164,16 +168,6 @@ def _begin(
         else:
             whole.append(Work.of(each, start))
     return whole, tiled
-
-
-def _take_tile(unit: TiledUnit, outcome: Outcome, units: UnitResults, observers: Observers) -> Outcome | None:
-    """Take a tile; the unit's own outcome where it came to its end."""
-    units.add_seconds(outcome)
-    with units.watch("assemble"):
-        own = unit.take(outcome)
-    step = unit.step()
-    observers.tell(lambda observer: observer.advanced(step, unit.name))
-    return own
 
 
 def _keep(

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import dataclasses
 import tempfile
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -16,13 +17,12 @@ from semstab.backends.numpy_reference import ONE_IN, NumpySample, in_sample
 from semstab.config import Config
 from semstab.core.files import atomic_path
 from semstab.core.process import Stopwatch, give_back
-from semstab.core.types import Float64
+from semstab.core.types import Float64, Mask
 from semstab.datasets import Scene
 from semstab.datasets.formats.disk import file_digest
 from semstab.engine.series import Series
-from semstab.engine.streams import LiveMap, Stream
+from semstab.engine.streams import LiveMap, Stream, alpha_sums
 from semstab.engine.tiles import OBSERVATIONS, TileResult
-from semstab.engine.up_axis import estimate_up
 from semstab.engine.work import Outcome, Start
 from semstab.errors import DataError
 from semstab.metrics import compare, summarise
@@ -47,7 +47,7 @@ from semstab.model.results import (
 from semstab.model.statistics import MapStatistics
 from semstab.model.voxels import VoxelTable
 from semstab.statistics import Analysis, MapSample, ObservationSample, analyse
-from semstab.statistics.agreement import alpha_columns, alpha_of, ratio_of
+from semstab.statistics.agreement import alpha_of, ratio_of
 from semstab.statistics.verdict import Limits
 from semstab.task import Task, read
 
@@ -79,8 +79,14 @@ def finish(live: LiveMap, stream: Stream, watch: Stopwatch) -> Outcome:
         sizes = () if live.sizes is None else live.sizes.alphas()
         give_back(least=SMALL)
     with watch("statistics"):
-        truth = _truth_table(live)
-        analysis = analyse_map(live, table, events, truth) if work.judged else None
+        truth, analysis = _truth_table(live), None
+        if work.judged:
+            seen = live.sampled_observations()
+            observations = None if seen is None else seen.sample()
+            log = events if config.statistics else None
+            analysis = analyse_sample(
+                task, config, MapSample.draw(table, log, truth, edges=config.strata), observations
+            )
         give_back(least=SMALL)
     with watch("measure"):
         summary = unit_summary(
@@ -159,15 +165,6 @@ def _truth_table(live: LiveMap) -> VoxelTable | None:
     return dataclasses.replace(live.truth.table(), classes=live.task.mapping.target.classes)
 
 
-def analyse_map(live: LiveMap, table: VoxelTable, events: Events | None, truth: VoxelTable | None) -> Analysis:
-    """The statistics of a map that is fused whole."""
-    seen = live.sampled_observations()
-    observations = None if seen is None else seen.sample()
-    config = live.work.config
-    sample = MapSample.draw(table, events if config.statistics else None, truth, edges=config.strata)
-    return analyse_sample(live.task, config, sample, observations)
-
-
 def analyse_sample(task: Task, config: Config, sample: MapSample, observations: ObservationSample | None) -> Analysis:
     """The statistics of a map; its true labels are right, and bound how far geometry lets labels agree."""
     return analyse(
@@ -241,8 +238,7 @@ def reduced_sums(table: VoxelTable) -> Float64:
     """The sums over voxels from which `reduced_of` follows."""
     values, recurrent = vss(table), table.op >= RECURRENT
     means = [values.sum(), len(values), values[recurrent].sum(), np.count_nonzero(recurrent)]
-    alpha = (alpha_columns(table.rows(some)).sum(axis=0) for some in table.evidence.chunks())
-    return np.concatenate([means, sum(alpha, np.zeros(3 + table.K))])
+    return np.concatenate([means, alpha_sums(table)])
 
 
 def reduced_of(sums: Float64) -> ReducedScores:
@@ -302,7 +298,12 @@ def _overview_saver(live: LiveMap, stream: Stream) -> Savers:
     if not (live.work.image_space and stream.overview):
         return {}
     name = slug(live.unit.scene, live.unit.backbone)
-    return {f"{OVERVIEW}/{name}.npz": partial(_save_arrays, stream.overview)}
+
+    def save(path: Path) -> None:
+        with atomic_path(path) as temporary:
+            np.savez_compressed(temporary, **stream.overview)
+
+    return {f"{OVERVIEW}/{name}.npz": save}
 
 
 def _tile_savers(
@@ -362,7 +363,97 @@ def save_voxels(
     table.save(path, columns, {**own, "label": dominant}, tile)
 
 
-def _save_arrays(arrays: Mapping[str, Any], path: Path) -> None:
-    named: dict[str, Any] = dict(arrays)
-    with atomic_path(path) as temporary:
-        np.savez_compressed(temporary, **named)
+# --- The up axis, where a dataset does not give it: the normal of the ground plane in the fused map -------------------
+
+PLANES = 4
+"""Planes that are considered, the largest first; the ground is one of them."""
+
+THICKNESS = 0.01
+"""A plane's points lie within this share of the scene's size on either side: ground is rough, and rises and falls."""
+
+POINTS = 10_000
+"""Points used, drawn at random from more."""
+
+ITERATIONS = 2_000
+"""Draws of three points a plane. They all lie in a plane of 15% of the points once in 300 draws."""
+
+DRAW_CHUNKS = 50
+"""Parts of these draws whose points are counted together."""
+
+
+@dataclass(frozen=True, eq=False)
+class Plane:
+    """A plane in the map.
+
+    normal  (3,) unit vector towards the cameras
+    share   of the points that lie in it, 0 to 1
+    """
+
+    normal: Float64
+    share: float
+
+
+def estimate_up(points: VoxelTable | npt.ArrayLike, poses: Sequence[npt.ArrayLike] | npt.ArrayLike) -> Float64:
+    """The world's up axis (3,), a unit vector: the normal, towards the cameras, of the plane that is likely the ground.
+
+    points  a fused map, whose voxels count by area; or world points (n, 3), metres
+    poses   (m, 4, 4) camera-to-world of the frames behind it, OpenCV axes; or (m, 3, 3): down, forward and centre
+
+    The cameras alone do not tell: up in their images is up in the world for a level camera, and straight ahead for one
+    that looks down. So the largest planes of the map are found (RANSAC, seeded: the same input gives the same answer),
+    and of those which the cameras see from above, the one with the largest share * cos(angle to the up of a camera that
+    looks 27 degrees down) is taken: before a level camera a wall counts half as much as a floor of its size.
+
+    It is wrong where the ground is not among the largest planes (a façade filmed from the street, a table top that is
+    tilted), where cameras are rolled by tens of degrees, and by the ground's own slope. Say `up_axis` instead then.
+    Raises DataError where there are fewer than 3 points, or no plane with the cameras above it.
+    """
+    at = points.centers if isinstance(points, VoxelTable) else np.asarray(points, dtype=np.float64)
+    down, forward, centre = np.asarray(poses, dtype=np.float64)[:, :3, -3:].transpose(2, 0, 1)
+    prior = -(2 * down + forward).mean(axis=0)
+    prior /= np.linalg.norm(prior)
+    planes = list(_planes(at, centre)) if len(at) >= 3 else []
+    scores = [plane.share * float(plane.normal @ prior) for plane in planes]
+    if max(scores, default=0.0) <= 0:
+        raise DataError(f"no ground plane found under the cameras in {len(at)} points; say which axis is up (up_axis)")
+    return planes[int(np.argmax(scores))].normal
+
+
+def _planes(points: Float64, cameras: Float64) -> Iterator[Plane]:
+    """The largest planes, each found among the points that the ones before it left."""
+    origin = np.median(points, axis=0)
+    rest, cameras = points - origin, cameras - origin
+    rng = np.random.default_rng(0)
+    if len(rest) > POINTS:
+        rest = rng.choice(rest, POINTS, replace=False, shuffle=False)
+    total = len(rest)
+    low, high = np.percentile(rest, [5, 95], axis=0)
+    distance = THICKNESS * float(np.linalg.norm(high - low))
+    for _ in range(PLANES):
+        if len(rest) < 3 or distance == 0:
+            return
+        inlier = _largest_plane(rest, distance, rng)
+        if not inlier.any():
+            return
+        mean = rest[inlier].mean(axis=0)
+        normal = np.linalg.eigh(np.cov(rest[inlier].T))[1][:, 0]  # the least squares' plane of the inliers
+        above = np.median((cameras - mean) @ normal) > 0
+        yield Plane(normal if above else -normal, np.count_nonzero(inlier) / total)
+        rest = rest[~inlier]
+
+
+def _largest_plane(points: Float64, distance: float, rng: np.random.Generator) -> Mask:
+    """Which points (n,) lie within a distance of that plane through three of them which has most (RANSAC).
+
+    Here and not by Open3D, as a run that fuses without it takes a second to load it.
+    """
+    a, b, c = points[rng.integers(len(points), size=(3, ITERATIONS))]
+    normal = np.cross(b - a, c - a)
+    normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), np.finfo(float).tiny)
+    offset = np.where(normal.any(axis=1), -(normal * a).sum(axis=1), np.inf)  # three points in a line are no plane
+    plane = np.column_stack([normal, offset]).astype(np.float32)
+    homogeneous = np.vstack([points.T, np.ones(len(points))]).astype(np.float32)
+    within = [np.count_nonzero(np.abs(some @ homogeneous) <= distance, axis=1) for some in np.split(plane, DRAW_CHUNKS)]
+    best = plane[int(np.argmax(np.concatenate(within)))]
+    inlier: Mask = np.abs(best @ homogeneous) <= distance
+    return inlier

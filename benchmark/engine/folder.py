@@ -304,12 +304,10 @@ def _claimed(path: Path) -> dict[str, Any] | None:
 
 def _is_earlier(folder: Path, layouts: Collection[str] = (LAYOUT,)) -> bool:
     settings = folder / SETTINGS
-    return (folder / "study.yaml").exists() or (settings.exists() and _first_line(settings) not in layouts)
-
-
-def _first_line(path: Path) -> str:
-    with path.open(encoding="utf-8", errors="replace") as lines:
-        return lines.readline(200).rstrip("\n")
+    if not settings.exists():
+        return (folder / "study.yaml").exists()
+    with settings.open(encoding="utf-8", errors="replace") as lines:
+        return (folder / "study.yaml").exists() or lines.readline(200).rstrip("\n") not in layouts
 
 
 def _first_change(old: Mapping[str, Any], new: Mapping[str, Any], prefix: str = "") -> str | None:

@@ -18,7 +18,7 @@ from semstab.datasets import GROUND_TRUTH, Dataset, Scene, open_dataset
 from semstab.engine.finish import finish, finish_tile
 from semstab.engine.memory import MemoryBudget
 from semstab.engine.observer import Observers
-from semstab.engine.streams import Decoded, LiveMap, Stream, in_order, live_maps, streams_of
+from semstab.engine.streams import Decoded, LiveMap, Stream, frame_order, streams_of
 from semstab.engine.work import Job, Outcome, Work, failed
 from semstab.errors import DataError
 from semstab.metrics import macro_mean, matched_region_flicker
@@ -81,10 +81,14 @@ class Fusion:
     def __init__(self, scene: Scene, works: Sequence[Work], observers: Observers) -> None:
         self.watch, self.put_off = Stopwatch(), list[Work]()
         self._scene, self._observers, self._start = scene, observers, works[0].start
-        self._failed: list[Outcome] = []
-        maps = [*live_maps(works, scene, self._failing_works)]
+        self._failed, maps = list[Outcome](), list[LiveMap]()
+        for work in works:
+            try:
+                maps.append(LiveMap.of(work, scene))
+            except Exception as error:  # noqa: BLE001 - a failing unit is reported, and the others continue
+                self._failed += failed([work], error)
         self.streams = streams_of(maps, self.watch, observers)
-        self.order = in_order(self.streams)
+        self.order = frame_order(self.streams)
         self._memory_before = resident_bytes()
         self._budget = MemoryBudget(works[0].config.memory_gb, self._start.width)
         bound = self._start.memory_bytes
@@ -114,12 +118,9 @@ class Fusion:
             color = self._observers.want_color or any(stream.shown == index for stream in self.streams)
             frame = scene.frame(index, backbone, color=color)
             truth = _ground_truth(scene, index) if any(stream.truth_task is not None for stream in wanting) else None
-            model = None
-            name = (
-                scene.filtering(backbone).model if any(stream.quality is not None for stream in wanting) else backbone
-            )
-            if name != backbone:  # without filters
-                model = scene.frame(index, name, color=False)
+            measures_quality = any(stream.quality is not None for stream in wanting)
+            name = scene.filtering(backbone).model if measures_quality else backbone  # without filters
+            model = None if name == backbone else scene.frame(index, name, color=False)
             return Decoded(index, frame, truth, model)
         except Exception as error:  # noqa: BLE001 - raised again by `Stream.prepare`
             return Decoded(index, error=error)
@@ -134,13 +135,6 @@ class Fusion:
             self._failed += failed([live.work for live in lost], error)
             self._give_up(lost)
 
-    @contextlib.contextmanager
-    def _failing_works(self, works: Sequence[Work]) -> Iterator[None]:
-        try:
-            yield
-        except Exception as error:  # noqa: BLE001 - as above
-            self._failed += failed(works, error)
-
     def _give_up(self, lost: Sequence[LiveMap]) -> None:
         for stream in self.streams:
             stream.maps = [live for live in stream.maps if live not in lost]
@@ -152,9 +146,9 @@ class Fusion:
         return seconds
 
     def failures(self) -> list[Outcome]:
-        """The outcomes of the works that failed."""
-        found, self._failed = self._failed, []
-        return found
+        """Return the outcomes of the works that failed."""
+        failures, self._failed = self._failed, []
+        return failures
 
     def finished(self) -> Iterator[tuple[Stream, LiveMap]]:
         """Each map that came to its end; it is let go of before the next one."""

@@ -7,7 +7,7 @@ import dataclasses
 import math
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any, overload
+from typing import Any
 
 import numpy as np
 
@@ -76,7 +76,7 @@ NUMBERS = (*REPORT, *ROW)
 INTEGERS = ("frame", "points", "voxels", "new_voxels", "map_voxels")
 
 
-class Series(Sequence[FrameRow]):
+class Series:
     """The rows of a time series, kept as numbers.
 
     numbers  NUMBERS of the first ones
@@ -122,14 +122,8 @@ class Series(Sequence[FrameRow]):
         """The rows in turn, each made when it is wanted."""
         return map(_row, self._rows)
 
-    @overload
-    def __getitem__(self, at: int) -> FrameRow: ...
-    @overload
-    def __getitem__(self, at: slice) -> Sequence[FrameRow]: ...
-    def __getitem__(self, at: int | slice) -> FrameRow | Sequence[FrameRow]:
-        """A row, or some."""
-        if isinstance(at, slice):
-            return [_row(self._rows.row(k)) for k in range(len(self))[at]]
+    def __getitem__(self, at: int) -> FrameRow:
+        """Return a row."""
         return _row(self._rows.row(at))
 
 

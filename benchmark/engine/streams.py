@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import math
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -20,6 +20,7 @@ from semstab.core.prefetch import Fetched
 from semstab.core.process import Stopwatch
 from semstab.core.rows import Rows
 from semstab.core.types import Float64
+from semstab.datasets import Scene
 from semstab.engine.observer import Observers
 from semstab.engine.series import FrameRow, Series
 from semstab.engine.tiles import FrameTiles
@@ -41,9 +42,6 @@ WARM_UP_STRIDE = 8
 
 POSE = 9
 """Numbers of a row of poses: down, forward and centre of a camera."""
-
-POSES = 1 << 16
-"""Of more cameras every n-th counts for the up axis."""
 
 OVERVIEW_WIDTH = 1280
 """Pixels of the frame that is kept for figures."""
@@ -78,8 +76,9 @@ class LiveMap:
     tiles: FrameTiles | None = None
 
     @classmethod
-    def of(cls, work: Work, task: Task) -> LiveMap:
-        """An empty map for a work."""
+    def of(cls, work: Work, scene: Scene) -> LiveMap:
+        """Return an empty map for a work on its scene."""
+        (task,) = tasks_of(scene, work.config)
         task = dataclasses.replace(task, left_out=work.left_out)
         config, K, backend = work.config, len(task.mapping.target), None
         has_truth = config.statistics and truth_task(task) is not None
@@ -230,7 +229,7 @@ class Stream:
     @property
     def poses(self) -> Float64:
         """(F, 3, 3) down, forward and centre of cameras in the world; of none where up need not be estimated."""
-        return np.zeros((0, 3, 3)) if self._poses is None else some_poses(self._poses)
+        return np.zeros((0, 3, 3)) if self._poses is None else self._poses.table().reshape(-1, 3, 3)
 
     def prepare(self, fetched: Fetched[Decoded]) -> Prepared:
         """The frame as the stream's maps fuse it, with its colour only where an observer wants it."""
@@ -298,23 +297,10 @@ def streams_of(maps: Iterable[LiveMap], watch: Stopwatch, observers: Observers) 
     return [Stream(group, watch, observers) for group in groups.values()]
 
 
-def in_order(streams: Iterable[Stream]) -> Sequence[int]:
+def frame_order(streams: Iterable[Stream]) -> Sequence[int]:
     """The frames of all of them."""
     first, *others = {stream.frames for stream in streams} or {range(0)}
     return first if isinstance(first, range) and not others else sorted({*first}.union(*others))
-
-
-def some_poses(rows: Rows) -> Float64:
-    """(F, 3, 3) of each row, or of every n-th where there are more than are needed to tell the up axis."""
-    return rows.table(step=max(1, -(-len(rows) // POSES))).reshape(-1, 3, 3)
-
-
-def live_maps(works: Iterable[Work], scene: Any, failing: Callable[[Sequence[Work]], Any]) -> Iterator[LiveMap]:
-    """Empty maps for works; none for one that fails."""
-    for work in works:
-        with failing([work]):
-            (task,) = tasks_of(scene, work.config)
-            yield LiveMap.of(work, task)
 
 
 def _as_set(frames: Iterable[int]) -> range | frozenset[int]:
@@ -425,13 +411,13 @@ class SizeSample:
         backend = create("numba", voxel_size=voxel_size, num_classes=self._K)
         for frame in frames:
             backend.integrate(frame)
-        return SizeAlpha(voxel_size, len(self._indices), alpha_of_table(backend.table()))
+        return SizeAlpha(voxel_size, len(self._indices), float(alpha_of(alpha_sums(backend.table()))))
 
 
-def alpha_of_table(table: VoxelTable) -> float:
-    """Krippendorff's alpha of a map."""
+def alpha_sums(table: VoxelTable) -> Float64:
+    """Return the sums over voxels from which Krippendorff's alpha of a map follows."""
     sums = (alpha_columns(table.rows(some)).sum(axis=0) for some in table.evidence.chunks())
-    return float(alpha_of(sum(sums, np.zeros(3 + table.K))))
+    return sum(sums, np.zeros(3 + table.K))
 
 
 def _one_hot(frame: Frame, K: int) -> Frame:

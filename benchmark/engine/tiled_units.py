@@ -48,7 +48,7 @@ class TiledUnit:
         self._results: dict[str, TileResult] = {}
         self._samples: list[MapSample] = []
         self._bound: int | None = None
-        self._tiles: dict[str, tuple[TileTask, list[int]]] | None = None
+        self._tiles: dict[str, tuple[TileTask, list[int] | None]] | None = None
         self._waiting: list[tuple[TileTask, list[int] | None]] = [(self._frames, None)]
         self._advanced, self._failed = 0, False
         if self._take_over(self._frames):
@@ -105,19 +105,19 @@ class TiledUnit:
     def _begin_tiles(self) -> list[tuple[TileTask, list[int] | None]]:
         """The tiles that are still to be computed; files of the unit that belong to none of them are removed."""
         frames = self._results[self._frames.name]
-        tasks = [
+        tasks: list[tuple[TileTask, list[int] | None]] = [
             (dataclasses.replace(self._frames, place=place, origin=frames.origin), own)
             for place, own in frames.tiles().items()
         ]
         self._tiles = {task.name: (task, own) for task, own in tasks}
-        waiting = [(task, own) for task, own in tasks if not self._take_over(task)]
+        waiting: list[tuple[TileTask, list[int] | None]] = [own for own in tasks if not self._take_over(own[0])]
         self._folder.clear(self.planned, {name for result in self._results.values() for name in result.files})
-        return [*waiting]
+        return waiting
 
     def _take_over(self, task: TileTask) -> bool:
         """Take a result from the folder, if its files are there as they were."""
-        result = self._stored(task)
-        if result is None:
+        result = TileResult.load(self._folder.path / task.folder / f"{task.name}.npz")
+        if result is None or not self._folder.are_whole(result.files):
             return False
         self._results[task.name] = result
         if (name := f"{task.folder}/{task.name}.sample") in result.files:
@@ -126,11 +126,6 @@ class TiledUnit:
                 self._samples = [MapSample.merged(self._samples)]
                 self._bound = self._samples[0].bound()
         return True
-
-    def _stored(self, task: TileTask) -> TileResult | None:
-        """A result in the folder, if its files are there as they were."""
-        result = TileResult.load(self._folder.path / task.folder / f"{task.name}.npz")
-        return result if result is not None and self._folder.are_whole(result.files) else None
 
 
 def assembled(

@@ -6,6 +6,7 @@ import math
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 
+from semstab.datasets import GROUND_TRUTH
 from semstab.metrics import macro_mean
 from semstab.model.measures import VSS
 from semstab.model.records import Record, Result
@@ -13,9 +14,13 @@ from semstab.model.results import UnitSummary, VoxelAdvice
 from semstab.report.averages import ENOUGH, Pooled, by_backbone, pooled
 from semstab.report.findings import Answer, Finding
 from semstab.report.tables.stability import comparable
+from semstab.statistics.verdict import LIMITS
 
 HARDLY_ANY, MOSTLY_ONCE = 0.1, 0.5
 """Shares of voxels seen once: below the first they need no sentence, from the second on they need a warning."""
+
+LEAST_RECALL = 0.25
+"""Share of the edges of depth with a border of labels below which labels that agree are said to be coarse."""
 
 ONE_CLASS = 0.9
 """Share of one class from which on it makes most of the numbers."""
@@ -47,11 +52,39 @@ def warnings(result: Result) -> Iterator[str]:
             " help: --voxel-size"
         )
     yield from dict.fromkeys(text for scene, found in result.advice.items() if (text := _size(scene, found, result)))
+    stable = [record for record in result.select() if _is_untested(record)]
+    if stable:
+        names = ", ".join(dict.fromkeys(record.unit.backbone for record in stable))
+        yield f"stable says that frames of {names} agree, not that they are right: no ground truth was compared"
     if mixed(runs):
         yield "labels and soft scores do not compare by VSS, entropy or alpha: semstab-bench show RUN reduced"
+    for record in result.select():
+        yield from (f"{_name(record.summary, result)}: {text}" for text in _suspicions(record))
     for run in runs:
         if (drowned := _one_class(run)) is not None:
             yield f"{_name(run, result)}: {drowned}"
+
+
+def _is_untested(record: Record) -> bool:
+    """Whether a verdict is stable, of a map that was not compared with the ground truth."""
+    found = record.statistics
+    return bool(
+        found and found.verdict.level == "stable" and found.correctness is None and record.unit.backbone != GROUND_TRUTH
+    )
+
+
+def _suspicions(record: Record) -> Iterator[str]:
+    """Reasons for which frames may agree though the labels are worth little."""
+    found, recall = record.statistics, record.image_space.edge_recall
+    if found is None or found.verdict.level not in ("stable", "usable"):
+        return
+    if found.labelled < LIMITS.labelled:
+        yield f"{1 - found.labelled:.0%} of the locations have no label in most frames; what is left out cannot flicker"
+    if recall < LEAST_RECALL and record.unit.backbone != GROUND_TRUTH:
+        yield (
+            f"only {recall:.0%} of the edges of depth have a border of labels near them: are labels coarse, blurred, or"
+            " of few things?"
+        )
 
 
 def _seen_once(run: UnitSummary) -> int:
