@@ -1,0 +1,77 @@
+"""What do verdicts make of labellers that agree with themselves for the wrong reasons?
+
+    python simulations/labellers.py [--scene scene0] [--frames 20] [--width 384]
+
+Runs the simulated labellers of the city (datasets/city/labellers.py) without ground truth, as users do, and with it.
+Prints a table in Markdown.
+"""
+
+from __future__ import annotations
+
+import argparse
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+
+import semstab
+from semstab.datasets.city.options import BACKBONES
+from semstab.report.narrative import warnings
+
+HEAD = (
+    "labeller", "alpha", "share, %", "labelled, %", "edges met, %", "flicker, %", "verdict without truth", "warned of",
+    "verdict with truth", "wrong of stable, %", "accuracy, %",
+)  # fmt: skip
+REASONS = {
+    "no label": "no labels",
+    "edges of depth": "coarse",
+    "not that they are right": "no truth",
+    "covers": "one class",
+}
+"""What a warning says, and its name in the table."""
+
+
+def rows(scene: str, frames: int, width: int) -> Iterator[list[str]]:
+    """Yield the cells of each labeller."""
+    names = [name for name in BACKBONES if name != "sim-soft"]
+    options = {"frames": frames, "width": width, "height": round(width * 9 / 16)}
+    settings = {"dataset": {"name": "city", "options": options}, "scenes": [scene], "check": None}
+    with tempfile.TemporaryDirectory() as folder:
+        results = []
+        for statistics in (False, True):
+            out = Path(folder) / str(statistics)
+            semstab.run(
+                semstab.load_config(overrides={**settings, "backbones": names, "statistics": statistics}),
+                out=out,
+                report=False,
+            )
+            results.append(semstab.load_result(out))
+        plain, judged = results
+        for name in names:
+            (own,), (true,) = plain.select(backbone=name), judged.select(backbone=name)
+            found, right, share = own.statistics, true.statistics, own.statistics.ceiling_share.share.value
+            said = [text for text in warnings(plain) if name in text or text.startswith("stable says")]
+            reasons = [
+                reason for part, reason in REASONS.items() if any(part in text and name in text for text in said)
+            ]
+            numbers = right.headline.wrong_of_stable.value, right.correctness.accuracy.value
+            yield [
+                name, f"{found.headline.alpha_between.value:.2f}", f"{100 * share:.0f}", f"{100 * found.labelled:.0f}",
+                f"{100 * own.image_space.edge_recall:.0f}", f"{own.image_space.compensated_flicker_percent:.1f}",
+                found.verdict.level, ", ".join(reasons), right.verdict.level, f"{100 * numbers[0]:.0f}",
+                f"{100 * numbers[1]:.0f}",
+            ]  # fmt: skip
+
+
+def main() -> None:
+    """Print the table."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--scene", default="scene0")
+    parser.add_argument("--frames", type=int, default=20)
+    parser.add_argument("--width", type=int, default=384)
+    arguments = parser.parse_args()
+    for cells in (HEAD, ["---"] * len(HEAD), *rows(arguments.scene, arguments.frames, arguments.width)):
+        print("|", " | ".join(cells), "|", flush=True)
+
+
+if __name__ == "__main__":
+    main()
