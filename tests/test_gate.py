@@ -257,6 +257,22 @@ def test_reports_hold_whatever_names_are():
     assert "skipped" in gate_report.junit(dataclasses.replace(result, undecided="pass"))
 
 
+def test_a_plan_says_how_many_frames_a_rule_needs(run):
+    """The standard error falls with the square root of the frames: half the margin takes four times as many."""
+    rules = ["--rule", "alpha drop < 0.1", "--rule", "alpha drop < 0.05", "--rule", "coverage drop < 0.1"]
+    done = cli("gate", f"{run}:a", "--against", f"{run}:b", "--plan", *rules)
+    assert done.exit_code == 0
+    wide, narrow = (
+        int(n.replace(",", "")) for n in re.findall(r"alpha drop < [\d.]+: ([\d,]+) \(9 now\)", done.output)
+    )
+    assert narrow == pytest.approx(4 * wide, rel=0.1)
+    assert "coverage drop < 0.1: no number of frames tells" in done.output
+    result = gate(f"{run}:a", f"{run}:b", gate_config(rules=["alpha drop < 0.1"]))
+    (each,) = result.judgements
+    half = (each.found.high - each.found.low) / 2
+    assert wide == pytest.approx(9 * (half / 0.1) ** 2, rel=1.5)
+
+
 def test_the_documented_workflow_is_yaml():
     import yaml
 

@@ -82,6 +82,7 @@ def gate(
     save_baseline: Annotated[
         Path | None, typer.Option(metavar="FILE", help="Keep NEW as a small summary, where the gate passes.")
     ] = None,
+    plan: Annotated[bool, typer.Option("--plan", metavar="", help="Say how many frames each rule needs.")] = False,
     quiet: Quiet = False,
 ) -> None:
     """Fail where a new model is shown to be worse: exit code 4 where a rule fails."""
@@ -98,9 +99,9 @@ def gate(
         result = judge(new, against, gate_config(config, rule or (), level, undecided, scope))
         for file in out or ():
             gate_report.write(result, file)
-        for line in gate_report.lines(result, console.width):
+        for line in gate_report.plan(result) if plan else gate_report.lines(result, console.width):
             console.print(line, markup=False, highlight=False, soft_wrap=True)
-        if result.failed:
+        if result.failed and not plan:
             raise typer.Exit(FAILED)
     if save_baseline is not None:
         save_summary(open_run(new), save_baseline)

@@ -35,7 +35,7 @@ from semstab.model.statistics import Interval
 from semstab.statistics.agreement import ALPHA, ALPHA_BETWEEN, PSA
 from semstab.statistics.cluster_sums import ClusterSums, of_space_alone, sums_for, value
 from semstab.statistics.correctness import ACCURACY, ECE, MIOU
-from semstab.statistics.intervals import estimate, mean_of, mean_over_frames
+from semstab.statistics.intervals import LEAST_FRAMES, estimate, mean_of, mean_over_frames, standard_error
 
 # What a rule may be about: the numbers that follow from the sums of a run, and what to run for those it lacks.
 
@@ -279,6 +279,10 @@ def gate_config(
 # What a gate found: rule by rule, and whether the new run may pass.
 
 
+POWER = 0.8
+"""How probable it is to be that a rule is decided, where frames are planned."""
+
+
 @dataclass(frozen=True)
 class Judgement:
     """What became of a rule.
@@ -297,6 +301,21 @@ class Judgement:
     def about(self) -> str:
         """The scope of the interval: what varies."""
         return self.found.scope
+
+    def frames_needed(self, level: float) -> int | None:
+        """Return from how many frames on the rule is decided with a probability of POWER; None where none tell.
+
+        A rule on a change is to pass where nothing changed; one on a value where the value is what was found. The
+        standard error falls with the square root of the frames of this scene.
+        """
+        from scipy import special
+
+        error = standard_error(self.found, 1 - 2 * level)
+        margin = abs(self.rule.limit - (0.0 if self.rule.change else self.found.value))
+        if self.found.scope == THESE_FRAMES or not (error > 0 and margin > 0):
+            return None
+        z = float(special.ndtri(1 - level) + special.ndtri(POWER))
+        return max(LEAST_FRAMES, math.ceil(self.found.frames * (z * error / margin) ** 2))
 
     @property
     def reason(self) -> str:

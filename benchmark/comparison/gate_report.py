@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from xml.etree import ElementTree
 
-from semstab.comparison.gate import GateResult, Judgement, Verdict
+from semstab.comparison.gate import POWER, GateResult, Judgement, Verdict
 from semstab.core.files import write_text
 from semstab.core.json_form import to_json
 from semstab.errors import ConfigError
@@ -42,6 +42,15 @@ def lines(result: GateResult, width: int = 80) -> Iterator[str]:
         yield from _wrapped(f"{'':{INDENT}}{each.values}", width, INDENT)
         yield from _wrapped(f"{'':{INDENT}}{each.reason} ({each.about})", width, INDENT)
     yield headline(result)
+
+
+def plan(result: GateResult) -> Iterator[str]:
+    """For the terminal: how many frames each rule needs, by the spread of these runs."""
+    yield f"frames from which on a rule is decided with a probability of {POWER:.0%}, by the spread of these runs"
+    for each in result.judgements:
+        needed, now = each.frames_needed(result.level), each.found.frames
+        said = f"{needed:,} ({now} now)" if needed else "no number of frames tells"
+        yield f"  {each.rule.text}: {said}"
 
 
 def _wrapped(line: str, width: int, indent: int) -> list[str]:

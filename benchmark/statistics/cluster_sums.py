@@ -154,7 +154,7 @@ def distinct_rows(rows: npt.NDArray[np.integer]) -> tuple[Int64, Int64]:
 Statistic = Callable[[Float64], Float64]
 Scale = Literal["share", "agreement", "plain"]
 
-SCHEMA = 3
+OF_0_3, SCHEMA = 2, 3
 MOST_CELLS, MOST_GROUPS = 256, 64
 """Cubes of space and groups of frames that are kept apart, at most."""
 
@@ -276,7 +276,8 @@ class ClusterSums:
             with pq.ParquetFile(path) as file:  # pq.read_table imports pandas
                 content = file.read()
             about = parse_json((content.schema.metadata or {})[b"semstab"])
-            if (about.pop("kind"), about.pop("schema")) != ("InfluenceSums", SCHEMA):
+            kind, version = about.pop("kind"), about.pop("schema")
+            if kind != "InfluenceSums" or version not in (OF_0_3, SCHEMA):
                 raise DataError("of another kind or version")
             about = dataclasses.asdict(from_json(SumsMeta, about, path))
             part, *keys = (_key(arrow.values_of(content.column(name)), name) for name in KEYS)
@@ -286,14 +287,14 @@ class ClusterSums:
             if np.any(np.abs(columns) > LARGEST**2):
                 raise DataError("a sum is larger than a map can have it")
             parts: list[ClusterSums | None] = []
-            for number in range(3):
+            for number in range(1 if version == OF_0_3 else 3):  # its sample had another ceiling
                 own = part == number
                 some = about | ({"truth": False} if number else {})
                 sums = columns[own, : width(about["K"], truth=some["truth"])].astype(np.float64)
                 cell, frame = np.stack([key[own] for key in keys[:3]], axis=1), keys[3][own]
                 made = cls(cell.astype(np.int32), frame.astype(np.int32), sums, **some)
                 parts.append(made if own.any() or not number else None)
-            whole, seen, same_cells = parts
+            whole, seen, same_cells = (*parts, None, None)[:3]
             if seen is not None and (same_cells is None or not np.array_equal(seen.frame, same_cells.frame)):
                 raise DataError("the sums of the sample, and of its cells, are of other rows")
         except (OSError, LookupError, TypeError, ValueError, OverflowError, pa.ArrowException) as error:
