@@ -104,6 +104,7 @@ def test_a_series_over_frames_and_how_much_of_a_map_is_covered():
     assert coverage(part, whole).value == pytest.approx(kept[table.op >= 2].mean() - 1)
     assert (coverage(whole, whole).low, coverage(whole, whole).high) == (0.0, 0.0)
     assert same_flight(whole, whole)
+    assert whole.frame_count == whole.coarsened(whole.edge, 2 * whole.step).frame_count
     assert not same_flight(whole, part)
     other = cluster_sums_of(table, log, 1 - truth)
     assert difference(whole, other, "accuracy").high > 0

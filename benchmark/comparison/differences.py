@@ -342,7 +342,7 @@ def _scene(scene: str, runs: Sequence[RunHandle], scope: Scope) -> tuple[SceneCo
 
 
 def _found(scene: str, common: Common, against: tuple[Against, ...]) -> SceneComparison:
-    frames = min((sums.frames * sums.step for sums in common.sums), default=0)
+    frames = min((sums.frame_count for sums in common.sums), default=0)
     voxels = len(common.tables[0]) if common.tables else 0
     voxels = int((common.tables[0].op >= 2).sum()) if voxels else 0
     return SceneComparison(

@@ -275,6 +275,7 @@ def _sums_of_log(
         K,
         events.classes,
         truth,
+        len(np.unique(events.frame)),
     )
 
 
@@ -301,6 +302,7 @@ def _with_frames(whole: ClusterSums, seen: ClusterSums) -> ClusterSums:
         frame=np.concatenate([seen.frame, np.full(len(cells), -1)]).astype(np.int32),
         columns=np.concatenate([by_frame, left]),
         step=seen.step,
+        fused=seen.fused,
     )
 
 

@@ -102,7 +102,8 @@ class ClusterIndex:
     """The cube of space and the group of frames of rows (m,), some of which belong to no frame.
 
     cubes   (G, 3) sorted, of an edge in metres; row (m,) which of them each row is in
-    frames  (F,) the groups of `step` frames, sorted; known (r,) the rows that belong to one, column (r,) which of them
+    frames  (F,) the groups of frames, sorted, of so many each on average (per_group, 0 where they are not known)
+    known   (r,) the rows that belong to one, column (r,) which of them
     """
 
     cubes: Int64
@@ -111,19 +112,19 @@ class ClusterIndex:
     known: Int64
     column: Int64
     edge: float
-    step: int
+    per_group: float
 
     @classmethod
     def of(
-        cls, cell: npt.NDArray[np.integer], frame: npt.NDArray[np.integer] | None, edge: float, step: int = 0
+        cls, cell: npt.NDArray[np.integer], frame: npt.NDArray[np.integer] | None, edge: float, per_group: float = 0
     ) -> ClusterIndex:
         """Index rows by cube (m, 3) and group of frames (m,), -1 where unknown; without frames all are of one."""
         cubes, row = distinct_rows(cell)
         if frame is None:
             return cls(cubes, row, np.array([-1]), np.arange(len(row)), np.zeros(len(row), np.int64), edge, 0)
-        known = np.flatnonzero((frame >= 0) | (step == 0))
+        known = np.flatnonzero((frame >= 0) | (per_group == 0))
         frames, column = np.unique(frame[known].astype(np.int64), return_inverse=True)
-        return cls(cubes, row, frames, known, column, edge, step)
+        return cls(cubes, row, frames, known, column, edge, per_group)
 
     def by_cube(self, values: Float64) -> Float64:
         """Return the sums (G,) of values (m,)."""
@@ -178,6 +179,7 @@ class ClusterSums:
              `observations`; its pairwise agreement is shared out among them in `psa` and `agreeing`
     edge     metres, a power of 2
     step     frames of a group, a power of 2; 0 where they are not known
+    fused    how many frames they come from
     truth    whether ground truth is in it
     seen     the same of the sampled voxels alone, where there is an `ObservationSample`; same_cells of what they would
              be had frames seen the same cells of each voxel, in the same rows
@@ -192,6 +194,7 @@ class ClusterSums:
     K: int
     classes: tuple[str, ...] = ()
     truth: bool = False
+    fused: int = 0
     seen: ClusterSums | None = None
     same_cells: ClusterSums | None = None
 
@@ -206,12 +209,19 @@ class ClusterSums:
     @functools.cached_property
     def index(self) -> ClusterIndex:
         """The cube and the group of frames of each row."""
-        return ClusterIndex.of(self.cell, self.frame, self.edge, self.step)
+        groups = len(np.unique(self.frame[self.frame >= 0]))
+        per_group = self.fused / groups if self.fused and groups and self.step else self.step
+        return ClusterIndex.of(self.cell, self.frame, self.edge, per_group)
 
     @property
     def frames(self) -> int:
         """Return how many groups of frames there are; 0 where they are not known."""
         return len(self.index.frames) if self.step else 0
+
+    @property
+    def frame_count(self) -> int:
+        """Return how many frames they come from, about; 0 where they are not known."""
+        return round(self.frames * self.index.per_group)
 
     @property
     def cells(self) -> int:
@@ -249,7 +259,7 @@ class ClusterSums:
         import pyarrow.parquet as pq
 
         parts = [part for part in (self, self.seen, self.same_cells) if part is not None]
-        about = {name: getattr(self, name) for name in ("edge", "step", "voxel_size", "K", "classes", "truth")}
+        about = {name: getattr(self, name) for name in ("edge", "step", "voxel_size", "K", "classes", "truth", "fused")}
         lengths = [len(part.frame) for part in parts]
         cell, frame = np.concatenate([part.cell for part in parts]), np.concatenate([part.frame for part in parts])
         columns = np.zeros((sum(lengths), self.columns.shape[1]))
@@ -321,6 +331,7 @@ class SumsMeta:
     K: int
     classes: tuple[str, ...]
     truth: bool
+    fused: int = 0
 
     def __post_init__(self) -> None:
         if not (0 < self.voxel_size < math.inf and self.K > 0 and len(self.classes) in (0, self.K)):

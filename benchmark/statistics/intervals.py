@@ -61,7 +61,7 @@ class EstimateSpec:
     @property
     def answered(self) -> Scope:
         """The scope of the interval: one group of frames does not tell how frames differ."""
-        told = self.grid is not None and self.grid.step and len(self.grid.frames) > 1
+        told = self.grid is not None and self.grid.per_group and len(self.grid.frames) > 1
         return self.scope if told else THESE_FRAMES
 
 
@@ -204,7 +204,7 @@ def spec_of_observations(
 
 def scope_of(sums: ClusterSums, wanted: Scope = THIS_SCENE) -> Scope:
     """Return what verdicts on a map are about: what is wanted if frames tell of it, else these frames."""
-    return wanted if sums.frames * sums.step >= LEAST_FRAMES else THESE_FRAMES
+    return wanted if sums.frame_count >= LEAST_FRAMES else THESE_FRAMES
 
 
 def headline_specs(sums: ClusterSums, wanted: Scope = THIS_SCENE) -> Iterator[EstimateSpec]:
@@ -283,7 +283,7 @@ def _ends(found: float, spread: Spread, unseen: float, scale: Scale, level: floa
 
 
 def _interval(found: float, low: float, high: float, grid: Influences, spread: Spread, scope: Scope) -> Interval:
-    frames = len(grid.frames) * grid.step
+    frames = round(len(grid.frames) * grid.per_group)
     few = scope != THESE_FRAMES and frames < LEAST_FRAMES
     return Interval(
         found,

@@ -160,7 +160,7 @@ class Influences:
     size: Float64
     all: Float64
     edge: float
-    step: int
+    per_group: float
     one_off: float
 
     def unseen(self, level: float) -> float:
@@ -180,7 +180,7 @@ class Influences:
             cell[np.ix_(at, to)] += sign * grid.cell
             size[np.ix_(at, to)] += grid.size
         return Influences(
-            places, frames, block, cell, size, everything, self.edge, self.step, max(self.one_off, other.one_off)
+            places, frames, block, cell, size, everything, self.edge, self.per_group, max(self.one_off, other.one_off)
         )
 
 
@@ -210,7 +210,7 @@ def influences(
         size[np.ix_(some, seen)],
         everything[some],
         index.edge,
-        index.step,
+        index.per_group,
         one_off=abs(float(gradient[0] * total[1])),
     )
 
@@ -238,7 +238,7 @@ class Effects:
         some = grid.size.sum(axis=1) > 0
         cell, size = grid.cell[some], grid.size[some]
         by_location, by_frame = size.sum(axis=1), size.sum(axis=0)
-        if grid.step == 0 or len(by_frame) < 2 or len(by_location) < 2:
+        if grid.per_group == 0 or len(by_frame) < 2 or len(by_location) < 2:
             return cls(grid, 0.0, 0.0, None, None)
         normal = np.diag(by_frame) - size.T @ (size / by_location[:, None])
         right = cell.sum(axis=0) - size.T @ (cell.sum(axis=1) / by_location)
