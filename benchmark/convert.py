@@ -30,7 +30,7 @@ from semstab.core.files import (
 )
 from semstab.core.prefetch import prefetch
 from semstab.core.types import Float32, Float64, UInt16
-from semstab.datasets import GROUND_TRUTH, Scene, open_dataset
+from semstab.datasets import Scene, open_dataset
 from semstab.datasets.files.labels import LABEL_SPACE_FILE
 from semstab.datasets.formats.disk import read_intrinsics
 from semstab.datasets.formats.images import MILLIMETRES
@@ -305,7 +305,7 @@ def convert(
 
 def convert_scene(scene: Scene, config: Config, path: Path, depth_error: float, progress: Reporter) -> Converted:
     """Write one scene; see `convert`."""
-    known = (*scene.backbones, *((GROUND_TRUTH,) if scene.ground_truth else ()))
+    known = (*scene.backbones, *scene.by_name)
     backbones = selected(config.backbones, known, (), "backbone", scene.name)
     indices = frame_indices(scene, config, backbones)
     dataset = config.dataset.model_dump(mode="json")

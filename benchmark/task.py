@@ -57,8 +57,7 @@ def tasks_of(scene: Scene, config: Config, beside: Sequence[str] = ()) -> Iterat
     Frames are those that have labels of all of them, and of the label sources `beside` them: what is compared is fused
     from the same frames.
     """
-    extra = (GROUND_TRUTH,) if scene.ground_truth else ()
-    names = selected(config.backbones, scene.backbones, extra, "backbone", scene.name)
+    names = selected(config.backbones, scene.backbones, scene.by_name, "backbone", scene.name)
     if not names:
         places = f"looked for {', '.join(scene.label_paths)}; " if scene.label_paths else ""
         raise DataError(f"{scene.name}: there are no label maps; {places}add them, or choose with --scene")

@@ -49,6 +49,7 @@ class Scene(ABC):
     name               the scene's name, usable in a file name
     backbones          names of the label sources, without the ground truth
     ground_truth       whether `frame(i, "gt")` works too
+    further            label sources that are read by name only, none of 'all'
     regions            maps of regions without classes, which `frame` reads by name and nothing fuses
     up                 (3,) unit vector of the world's up axis, or None where it is not known
     georeference       where it lies on Earth, or None where that is not known
@@ -65,6 +66,7 @@ class Scene(ABC):
     name: str
     backbones: tuple[str, ...]
     ground_truth: bool = False
+    further: Sequence[str] = ()
     regions: tuple[str, ...] = ()
     up: Float64 | None = None
     georeference: Georeference | None = None
@@ -97,6 +99,11 @@ class Scene(ABC):
     @abstractmethod
     def digest(self, indices: list[int], backbone: str) -> str:
         """A hash of the content behind those frames: the same digest means the same numbers."""
+
+    @property
+    def by_name(self) -> tuple[str, ...]:
+        """The label sources that are read only if they are named: the ground truth, and `further` ones."""
+        return (*((GROUND_TRUTH,) if self.ground_truth else ()), *self.further)
 
     @property
     def timestamps(self) -> Float64 | None:

@@ -210,7 +210,8 @@ def test_a_surface_without_triangles_is_never_hit() -> None:
 def test_scenes_and_backbones(small: City) -> None:
     assert small.scenes == ("scene0", "scene1", "scene2", "scene3", "scene4")
     scene = small.scene("scene2")
-    assert scene.backbones == ("sim-steady", "sim-flicker", "sim-soft", *(f"trick-{name}" for name in LABELLERS))
+    assert scene.backbones == ("sim-steady", "sim-flicker", "sim-soft")
+    assert scene.further == tuple(f"trick-{name}" for name in LABELLERS)
     assert scene.ground_truth
     assert np.array_equal(scene.up, [0, 0, 1])
     assert len(scene) == 3

@@ -31,7 +31,7 @@ from semstab.check.reprojection import Sample, View, clusters, evenly, label_sou
 from semstab.config import Config
 from semstab.core.json_form import to_json
 from semstab.core.prefetch import prefetch
-from semstab.datasets import GROUND_TRUTH, Scene, open_dataset
+from semstab.datasets import Scene, open_dataset
 from semstab.errors import DataError
 from semstab.model.frames import Frame
 from semstab.model.labels import IGNORE_8BIT, IGNORE_16BIT, LabelSpace
@@ -215,8 +215,7 @@ def check(config: Config) -> Iterator[SceneCheck]:
 
 def check_scene(scene: Scene, config: Config) -> SceneCheck:
     """Check one scene under the configuration's selection of frames, backbones, taxonomy, voxel size and stride."""
-    extra = (GROUND_TRUTH,) if scene.ground_truth else ()
-    backbones = list(selected(config.backbones, scene.backbones, extra, "backbone", scene.name))
+    backbones = list(selected(config.backbones, scene.backbones, scene.by_name, "backbone", scene.name))
     indices = frame_indices(scene, config, backbones)
     first = backbones[0] if backbones else label_source(scene)
     look = Look(scene, indices, first, clusters(len(indices), CLUSTERS), POINTS, fused=FUSED_FRAMES, with_color=True)
@@ -452,8 +451,7 @@ def advise(sample: Sample | None, config: Config) -> VoxelAdvice | None:
 
 def _coverage(config: Config, scene: Scene) -> Coverage | None:
     """What a scene's frames share; None where they cannot be read: whoever needs them says so."""
-    extra = (GROUND_TRUTH,) if scene.ground_truth else ()
-    backbones = selected(config.backbones, scene.backbones, extra, "backbone", scene.name)
+    backbones = selected(config.backbones, scene.backbones, scene.by_name, "backbone", scene.name)
     with contextlib.suppress(DataError):
         indices = frame_indices(scene, config, backbones)
         look = Look(scene, indices, None, clusters(len(indices), CLUSTERS), POINTS, passing_over=True)

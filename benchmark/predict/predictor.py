@@ -131,7 +131,7 @@ class StoredSequence:
     labels_like_depth = True
 
     def __init__(self, scene: Scene, source: str, color: bool) -> None:
-        if source not in (*scene.backbones, *((GROUND_TRUTH,) if scene.ground_truth else ())):
+        if source not in (*scene.backbones, *scene.by_name):
             known = ", ".join(scene.backbones) or "none"
             raise ConfigError(f"{scene.name}: there are no labels '{source}' for filters to take; there is {known}")
         self.scene, self.source, self.name, self._color = scene, source, scene.name, color

@@ -63,7 +63,8 @@ class CityScene(Scene):
 
     def __init__(self, name: str, options: CityOptions) -> None:
         self.name = name
-        self.backbones = tuple(options.backbones)
+        self.backbones = tuple(name for name, model in options.backbones.items() if not model.labeller)
+        self.further = tuple(name for name in options.backbones if name not in self.backbones)
         self.up = np.array([0.0, 0.0, 1.0])
         self._options = options
         self._flight = FLIGHTS[name]
@@ -174,6 +175,6 @@ class CityScene(Scene):
         if backbone == GROUND_TRUTH:
             return None
         if backbone not in self._options.backbones:
-            known = (*self.backbones, GROUND_TRUTH)
+            known = (*self.backbones, *self.by_name)
             raise ConfigError(f"city: backbone '{backbone}' is not known; {nearest(backbone, known)}")
         return self._options.backbones[backbone]
