@@ -285,7 +285,7 @@ def test_every_scene_is_checked_and_every_problem_counted(tmp_path):
 def damage_image(folder):
     path = folder / "labels/net/001.png"
     path.write_bytes(path.read_bytes()[:50])
-    return "labels/net/001.png: the PNG is truncated"
+    return "labels/net/001.png: not a whole PNG image"
 
 
 def damage_depth(folder):

@@ -68,11 +68,11 @@ class ImageSpace:
     flicker_percent: float = math.nan
     compensated_flicker_percent: float = math.nan
     compensated_share: float = math.nan
-    edge_recall: float = math.nan
     vc8: float = math.nan
     vc16: float = math.nan
     self_vc8: float = math.nan
     self_vc16: float = math.nan
+    edge_recall: float = math.nan
 
 
 @dataclass(frozen=True)
