@@ -128,6 +128,10 @@ class Scene(ABC):
         """Units of stored depth in a metre, None where depth is not stored."""
         return None
 
+    def frame_name(self, index: int) -> str:
+        """What people know a frame by: its files' name, else its index."""
+        return str(index)
+
     def filtering(self, backbone: str) -> Filtering:
         """The filters of a label source."""
         return Filtering(backbone)

@@ -36,8 +36,9 @@ def test_rows_come_out_as_they_went_in(given_rows) -> None:
     with tempfile.TemporaryDirectory() as folder:
         series.save_csv(Path(folder) / "series.csv")
         header, *lines = csv.reader((Path(folder) / "series.csv").read_text().splitlines())
-    assert header == [*FRAME_COLUMNS]
-    assert lines == [["" if cell is None else str(cell) for cell in row.cells().values()] for row in given_rows]
+    assert header == [*FRAME_COLUMNS, "name"]
+    written = [[*row.cells().values(), row.report.frame] for row in given_rows]
+    assert lines == [["" if cell is None else str(cell) for cell in cells] for cells in written]
 
 
 def test_a_row_takes_a_few_hundred_bytes() -> None:

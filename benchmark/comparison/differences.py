@@ -326,15 +326,15 @@ def _scene(scene: str, runs: Sequence[RunHandle], scope: Scope) -> tuple[SceneCo
     for n, own, of_classes in zip(numbers, everything, classes, strict=True):
         found = Against(names[n], own, of_classes)
         if common.regions is not None:
-            worse = worse_areas(common, n)
+            worse, named = worse_areas(common, n), entries[n].named
             changes[names[n]] = worse.changes
             found = dataclasses.replace(
                 found,
                 compared=worse.changes.compared,
                 worse=worse.changes.worse,
                 better=worse.changes.better,
-                areas=worse.areas,
-                top_frames=worse.top_frames,
+                areas=tuple(dataclasses.replace(area, frames=named(area.frames)) for area in worse.areas),
+                top_frames=named(worse.top_frames),
                 columns=Path(COLUMNS) / f"{slug(scene, names[0], names[n])}.parquet",
             )
         against.append(found)

@@ -28,6 +28,7 @@ from semstab.datasets import GROUND_TRUTH
 from semstab.engine.folder import load_result
 from semstab.errors import ConfigError, DataError, one_line
 from semstab.model import earlier
+from semstab.model.contrast import FrameShare
 from semstab.model.georeference import Georeference
 from semstab.model.records import ImageSpace, Record
 from semstab.model.results import UnitSummary
@@ -68,6 +69,14 @@ class Entry:
     def flicker(self) -> Flicker:
         """Flicker of each frame but the first."""
         return self.read_flicker()
+
+    def named(self, frames: Sequence[FrameShare]) -> tuple[FrameShare, ...]:
+        """Return frames under the names of their files, where the run kept them."""
+        if self.record is None or self.record.series is None:
+            return tuple(frames)
+        with self.record.series.open(encoding="utf-8", newline="") as lines:
+            names = {row["frame"]: row.get("name") or "" for row in csv.DictReader(lines)}
+        return tuple(replace(each, name=names.get(str(each.frame), "")) for each in frames)
 
     @property
     def classes(self) -> tuple[str, ...]:

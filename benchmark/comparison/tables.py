@@ -212,7 +212,7 @@ def _area_row(area: Area) -> Row:
 
 def top_frames(frames: Sequence[FrameShare]) -> str:
     """'13 (30%), 4 (26%)'."""
-    listed = ", ".join(f"{own.frame} ({own.share:.0%})" for own in frames[:NAMED_FRAMES])
+    listed = ", ".join(f"{own.name or own.frame} ({own.share:.0%})" for own in frames[:NAMED_FRAMES])
     return listed + (", ..." if len(frames) > NAMED_FRAMES else "")
 
 
@@ -220,7 +220,8 @@ def _frames(comparison: RunComparison) -> Table:
     columns = (Column("frame", "Frame"), Column("share_percent", "Share of what was lost (%)", 1))
     groups = tuple(
         Group(
-            heading(comparison, scene.scene, own), tuple((str(each.frame), 100 * each.share) for each in own.top_frames)
+            heading(comparison, scene.scene, own),
+            tuple((each.name or str(each.frame), 100 * each.share) for each in own.top_frames),
         )
         for scene in comparison.scenes
         for own in scene.against

@@ -223,7 +223,7 @@ def unit_summary(
         scores_left_out=_scores_left_out(rows),
         statistics=statistics,
         reduced=reduced,
-        worst_frames=tuple(_worst(rows)),
+        worst_frames=tuple(_worst(rows, task.scene)),
         sizes=sizes,
     )
 
@@ -246,13 +246,13 @@ def reduced_of(sums: Float64) -> ReducedScores:
     return ReducedScores(float(ratio_of(sums[:2])), float(ratio_of(sums[2:4])), float(alpha_of(sums[4:])))
 
 
-def _worst(rows: Series) -> list[FrameDrift]:
+def _worst(rows: Series, scene: Scene) -> list[FrameDrift]:
     """The frames that moved the map most, of those that met as many known voxels as half of the frames do."""
     known, drift = rows.column("voxels") - rows.column("new_voxels"), rows.drift
     met = np.flatnonzero(known >= max(1, np.median(known) if len(known) else 0))
     worst = met[np.argsort(-drift[met], kind="stable")][:WORST]
-    frames = rows.column("frame")
-    return [FrameDrift(int(frames[k]), float(drift[k]), int(known[k])) for k in worst]
+    frames = rows.column("frame").astype(np.int64).tolist()
+    return [FrameDrift(frames[k], float(drift[k]), int(known[k]), scene.frame_name(frames[k])) for k in worst]
 
 
 def up_axis(scene: Scene, points: VoxelTable | Float64, poses: Float64) -> tuple[float, float, float] | None:
@@ -284,7 +284,7 @@ def _savers(
     savers[f"{VOXELS}/{unit.slug}.parquet"] = partial(save_voxels, table, columns=columns)
     if analysis is not None:
         savers[f"{INFLUENCE}/{unit.slug}.parquet"] = analysis.sums.save
-    savers[f"{FRAMES}/{unit.slug}.csv"] = live.rows.save_csv
+    savers[f"{FRAMES}/{unit.slug}.csv"] = partial(live.rows.save_csv, names=live.task.scene.frame_name)
     if (seen := live.sampled_observations()) is not None:
         savers[f"{LOOKS}/{unit.slug}.parquet"] = seen.save
     if events is not None and config.events:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import dataclasses
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -107,12 +107,12 @@ class Series:
         report = (getattr(row.report, name) for name in REPORT)
         self._rows.append([*report, *(getattr(row, name) for name in ROW)])
 
-    def save_csv(self, path: Path) -> None:
-        """Write FRAME_COLUMNS as text, with a header, atomically."""
+    def save_csv(self, path: Path, names: Callable[[int], str] = str) -> None:
+        """Write FRAME_COLUMNS as text and the frames' names, with a header, atomically."""
         with atomic_path(path) as temporary, temporary.open("w", encoding="utf-8", newline="") as file:
-            writer = csv.DictWriter(file, FRAME_COLUMNS, lineterminator="\n")
+            writer = csv.DictWriter(file, (*FRAME_COLUMNS, "name"), lineterminator="\n")
             writer.writeheader()
-            writer.writerows(row.cells() for row in self)
+            writer.writerows(row.cells() | {"name": names(row.report.frame)} for row in self)
 
     def __len__(self) -> int:
         """The number of frames."""

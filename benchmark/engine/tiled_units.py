@@ -150,7 +150,9 @@ def assembled(
     files = {name: digest for name, digest in files.items() if not name.startswith(tasks[0].folder)}
     seen = folder / tasks[0].folder / f"{tasks[0].size}_{OBSERVATIONS}"
     if planned.kept:
-        files |= _saved(folder, f"{FRAMES}/{unit.slug}.csv", rows.save_csv)
+        files |= _saved(
+            folder, f"{FRAMES}/{unit.slug}.csv", functools.partial(rows.save_csv, names=task.scene.frame_name)
+        )
         if seen.exists():
             files |= _saved(folder, f"{LOOKS}/{unit.slug}.parquet", CellObservations.load(seen).save)
         if analysis is not None:

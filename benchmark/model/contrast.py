@@ -210,10 +210,11 @@ class Contrast:
 
 @dataclass(frozen=True)
 class FrameShare:
-    """A frame, and its share of what was lost."""
+    """A frame, its share of what was lost, and what people know it by."""
 
     frame: int
     share: float
+    name: str = ""
 
 
 @dataclass(frozen=True)

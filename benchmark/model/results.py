@@ -207,6 +207,7 @@ class FrameDrift:
     frame: int
     drift: float
     voxels: int
+    name: str = ""
 
 
 @dataclass(frozen=True)

@@ -167,6 +167,10 @@ class PredictedScene(Scene):
         """The inner scene's, where it has any."""
         return self._inner.timestamps
 
+    def frame_name(self, index: int) -> str:
+        """Return the inner scene's."""
+        return self._inner.frame_name(index)
+
     def tracked(self, index: int) -> bool:
         """Whether the frame has a pose."""
         return self._inner.tracked(index)

@@ -78,7 +78,7 @@ def _one(result: Result, record: Record) -> Iterator[str]:
     yield from _flicker(record)
     yield from _classes([record])
     if run.worst_frames:
-        yield f"  most drift in frames    {' '.join(str(frame.frame) for frame in run.worst_frames)}"
+        yield f"  most drift in frames    {' '.join(frame.name or str(frame.frame) for frame in run.worst_frames)}"
     means = "  ".join(f"{m.word} {recurrent[m]:.{m.digits[0]}f}{f' {m.unit}' if m.unit else ''}" for m in measures())
     yield f"  paper (OP>=3)  {means}"
     yield ""

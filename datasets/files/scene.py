@@ -94,6 +94,10 @@ class FileScene(Scene):
             self._tracked[index] = bool(np.isfinite(self._stored_pose(source)).all())
         return self._tracked[index]
 
+    def frame_name(self, index: int) -> str:
+        """Return the name that the frame's files have in common."""
+        return self._frame(index).name
+
     def missing(self, index: int, sources: Sequence[str] = (), *, color: bool = False) -> list[str]:
         """Paths of the files that the frame lacks: depth, pose, the labels of these sources, colour."""
         frame = self._frame(index)
