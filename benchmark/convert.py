@@ -236,7 +236,7 @@ class SceneFolder:
             form = DepthFormat(None if scale is None else float(scale))
             if form.scale is not None and not 0 < form.scale < np.inf:
                 raise ValueError(f"depth_scale is {scale}")
-        except (DataError, LookupError, TypeError, ValueError) as error:
+        except (DataError, LookupError, TypeError, ValueError, OverflowError) as error:
             raise DataError(f"{manifest}: damaged; delete {self.path}, and the scene is converted again") from error
         if key != self._key:
             raise ConfigError(

@@ -87,7 +87,7 @@ def _quadrants(result: Result) -> list[Table]:
         Column("stable_wrong_percent", "wrong", 1, "lower", over="Stable (%)"),
         Column("unstable_right_percent", "right", 1, over="Unstable (%)"),
         Column("unstable_wrong_percent", "wrong", 1, "lower", over="Unstable (%)"),
-        Column("wrong_of_stable_percent", "Of the stable, wrong (%)", 1, "lower"),
+        Column("wrong_of_stable_percent", "False-stable rate (%)", 1, "lower"),
     )
     numbers = (
         _quadrant(lambda found: found.voxels),

@@ -173,17 +173,19 @@ def verdicts(result: Result) -> list[Table]:
         Column("verdict", "Verdict"),
         Column("probability_percent", "Probability (%)", 0),
         Column("reached_percent", "% of ceiling", 0, "higher"),
-        Column("wrong_of_stable_percent", "Of the stable, wrong (%)", 0, "lower"),
+        Column("labelled_percent", "Labelled (%)", 0, "higher"),
+        Column("wrong_of_stable_percent", "False-stable rate (%)", 0, "lower"),
         REPEATED,
         Column("repeated_percent", "of the map (%)", 0),
-        Column("advice", "What to do"),
+        Column("advice", "Recommendation"),
     )
     groups = tuple(Group(name, tuple(_verdict_row(*row) for row in rows)) for name, rows in judged.items())
     caption = (
         f"{SEEN_TWICE} % of ceiling: alpha between frames over its ceiling. The verdict is the most probable level for"
         " the same scene flown again: stable where that is at least 80, usable from 67, unstable below; undecided where"
         " no level has 60 %; misleading where more than 5% of the stable locations are wrong, which only ground truth"
-        " tells."
+        " tells. Labelled: locations that have a label in half of their observations or more; below 90 a model is at"
+        " most usable."
         f" {INTERVALS}"
     )
     return [Table("verdicts", "Verdicts", caption, columns, groups)]
@@ -305,6 +307,7 @@ def _verdict_row(record: Record, found: MapStatistics) -> Row:
         found.verdict.level,
         100 * found.verdict.probability,
         UNDEFINED if found.ceiling_share is None else found.ceiling_share.share.percent,
+        100 * found.labelled,
         UNDEFINED if right is None else right.quadrants.wrong_of_stable.percent,
         found.repeated.voxels,
         100 * found.repeated.share,
