@@ -163,7 +163,7 @@ def _metres(size: float) -> str:
 
 COLUMNS = ("model", "verdict", "alpha (95 % CI)", "agree", "flicker", "VSS", "SBD", "mIoU")
 UNITS = ("", "", "", "%", "%", "OP>=3", "bits", "%")
-WIDTHS = (12, -14, -20, 6, 8, 6, 7, 5)
+WIDTHS = (12, -15, -19, 6, 8, 6, 7, 5)
 """Of the columns of several models; text stands left, below 0."""
 
 
@@ -219,7 +219,7 @@ def _differences(result: Result) -> Iterator[str]:
     for comparison in result.comparisons:
         first = comparison.backbones[0]
         for row in comparison.paired.differences:
-            if row.measure == ALPHA.key and first in (row.a, row.b):
+            if row.measure == ALPHA.key and first in (row.a, row.b) and not math.isnan(row.difference.value):
                 sign = 1.0 if row.b == first else -1.0
                 other = row.a if row.b == first else row.b
                 value = sign * row.difference.value
