@@ -226,7 +226,7 @@ def draw_correlogram(backbones: Mapping[str, Correlogram]) -> Figure:
     Points are open where the band is for these frames alone.
     """
     from matplotlib.lines import Line2D
-    from matplotlib.ticker import NullFormatter
+    from matplotlib.ticker import NullLocator
 
     figure = canvas(PAGE, 2.5)
     panels = figure.subplots(1, len(AXES), sharey=True)
@@ -236,8 +236,12 @@ def draw_correlogram(backbones: Mapping[str, Correlogram]) -> Figure:
             _draw_bins(axes, getattr(found, axis), color(k))
         if axis in ("time", "baseline"):
             axes.set_xscale("log")
-            axes.xaxis.set_major_formatter("{x:g}")
-            axes.xaxis.set_minor_formatter(NullFormatter())
+            low, high = axes.get_xlim()
+            round_ones = [digit * 10.0**power for power in range(-4, 6) for digit in (1, 2, 5)]
+            ticks = [tick for tick in round_ones if low <= tick <= high]
+            axes.set_xticks(ticks if len(ticks) > 1 else [low * (high / low) ** part for part in (0.1, 0.5, 0.9)])
+            axes.xaxis.set_major_formatter("{x:.3g}")
+            axes.xaxis.set_minor_locator(NullLocator())
         else:
             axes.locator_params(axis="x", nbins=4)
         axes.set_xlabel(title)
