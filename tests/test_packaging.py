@@ -11,6 +11,7 @@ import tarfile
 import zipfile
 from email import message_from_bytes
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -40,7 +41,8 @@ def built(tmp_path_factory: pytest.TempPathFactory) -> tuple[list[Path], Path, P
         shutil.copy(SOURCE / name, copy)
     files = [path.relative_to(copy) for folder in PACKAGES for path in (copy / folder).rglob("*") if path.is_file()]
     with tarfile.open(build("build_sdist", copy, base)) as sdist:
-        sdist.extractall(base / "unpacked", filter="data")
+        trusted: dict[str, Any] = {"filter": "data"} if hasattr(tarfile, "data_filter") else {}  # from 3.11.4 on
+        sdist.extractall(base / "unpacked", **trusted)
     (unpacked,) = (base / "unpacked").iterdir()
     return files, unpacked, build("build_wheel", unpacked, base)
 
