@@ -46,8 +46,13 @@ RENAMED: dict[str, str | None] = {
     "correlogram": None,
     "influence/": None,
     "tested_voxels": None,
-    "place": "area",
-    "wrong_place": "wrong_area",
+    "columns.place": "area",
+    "columns.wrong_place": "wrong_area",
+    "more.place": "area",
+    "more.wrong_place": "wrong_area",
+    "looks": "observations",
+    "class_agreement.alpha_between": None,
+    "rows.alpha_between": None,  # of the sample, which the truth no longer cuts
     "drift_p": None,  # of stretches that have nothing in common, not of single observations
     "drift_q": None,
     "trend_q": None,
