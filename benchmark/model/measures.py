@@ -15,7 +15,7 @@ from typing import Any, Literal, Protocol, TypeVar
 import numpy as np
 import numpy.typing as npt
 
-from semstab.core.json_form import fields_of
+from semstab.core.json_form import number
 from semstab.core.types import Float64, Int32, Int64, Mask
 from semstab.errors import ConfigError
 from semstab.model.evidence import Evidence, row_chunks
@@ -306,7 +306,9 @@ class MeasureMeans:
     @classmethod
     def of_json_content(cls, content: Any) -> MeasureMeans:
         """The entries of all measures."""
-        rare = [measure.key for measure in measures() if measure.lowest_op > 1]
-        counts = fields_of(content, {f"{key}_voxels": int for key in rare})
-        value = fields_of(content, {measure.key: float for measure in measures()})
-        return cls(value, {key: counts[f"{key}_voxels"] for key in rare})
+        rare = {measure.key: f"{measure.key}_voxels" for measure in measures() if measure.lowest_op > 1}
+        for key in (*(measure.key for measure in measures()), *rare.values()):
+            if key not in content:
+                raise ValueError(f"{key} is missing")
+        counts = {key: content[entry] for key, entry in rare.items()}
+        return cls({measure.key: number(content[measure.key]) for measure in measures()}, counts)
