@@ -12,7 +12,7 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from semstab.core.rows import Rows
+from semstab.core.arrays import Rows
 from semstab.engine.series import FRAME_COLUMNS, NUMBERS, FrameRow, Series
 from semstab.model.results import FrameReport
 

@@ -1,14 +1,17 @@
-"""Nested data classes of arrays as arrays by name, as a file of arrays has them, and back."""
+"""Data classes of arrays as arrays by name and back, rows that grow, and columns of Arrow."""
 
 from __future__ import annotations
 
 import dataclasses
 import types
-from collections.abc import Mapping
+from array import array
+from collections.abc import Iterable, Iterator, Mapping
 from typing import TYPE_CHECKING, Any, TypeVar, Union, cast, get_args, get_origin, get_type_hints
 
 import numpy as np
 import numpy.typing as npt
+
+from semstab.core.types import Float64
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -17,32 +20,32 @@ if TYPE_CHECKING:
 T = TypeVar("T")
 Arrays = dict[str, npt.NDArray[Any]]
 
-SEPARATOR = "/"
-
 
 def to_arrays(value: Any, name: str = "") -> Arrays:
-    """All that a data class holds by its path: arrays, numbers, names, mappings and data classes of these.
+    """Return all that a data class holds by its path: arrays, numbers, names, mappings, data classes; None is left out.
 
-    What is None is left out.
+    >>> to_arrays({"a": {"b": 3}})
+    {'a/b': array(3)}
     """
     if value is None:
         return {}
     if dataclasses.is_dataclass(value):
-        return _joined({field.name: getattr(value, field.name) for field in dataclasses.fields(value)}, name)
-    if isinstance(value, Mapping):
-        return _joined(value, name)
-    return {name: np.asarray(value)}
+        value = {field.name: getattr(value, field.name) for field in dataclasses.fields(value)}
+    if not isinstance(value, Mapping):
+        return {name: np.asarray(value)}
+    below = f"{name}/" if name else ""
+    return {path: each for field, own in value.items() for path, each in to_arrays(own, below + field).items()}
 
 
 def from_arrays(cls: type[T], arrays: Mapping[str, npt.NDArray[Any]], name: str = "") -> T:
-    """What `to_arrays` made them of. Raises KeyError where one is not there."""
-    hints = get_type_hints(cls)
-    fields = {field.name: _path(name, field.name) for field in dataclasses.fields(cls)}  # type: ignore[arg-type]
-    return cls(**{field: _read(hints[field], arrays, path) for field, path in fields.items()})
+    """Return the data class that `to_arrays` took apart. Raises KeyError where an array of it is missing."""
+    below, hints = f"{name}/" if name else "", get_type_hints(cls)
+    names = [field.name for field in dataclasses.fields(cls)]  # type: ignore[arg-type]
+    return cls(**{field: _read(hints[field], arrays, below + field) for field in names})
 
 
 def _read(kind: Any, arrays: Mapping[str, npt.NDArray[Any]], path: str) -> Any:
-    inside = {key.removeprefix(path + SEPARATOR): key for key in arrays if key.startswith(path + SEPARATOR)}
+    inside = {key.removeprefix(f"{path}/"): key for key in arrays if key.startswith(f"{path}/")}
     if get_origin(kind) in (Union, types.UnionType):
         kind = next(own for own in get_args(kind) if own is not types.NoneType)
         if path not in arrays and not inside:
@@ -57,12 +60,37 @@ def _read(kind: Any, arrays: Mapping[str, npt.NDArray[Any]], path: str) -> Any:
     return arrays[path] if origin is np.ndarray else kind(arrays[path][()])
 
 
-def _joined(values: Mapping[str, Any], name: str) -> Arrays:
-    return {key: own for field, value in values.items() for key, own in to_arrays(value, _path(name, field)).items()}
+class Rows:
+    """A table of float64 that grows row by row; rows (n, columns) are the first ones."""
 
+    def __init__(self, columns: int, rows: Float64 | None = None) -> None:
+        self.columns = columns
+        self._numbers = array("d", b"" if rows is None else np.asarray(rows, dtype=np.float64).tobytes())
 
-def _path(name: str, field: str) -> str:
-    return f"{name}{SEPARATOR}{field}" if name else field
+    def __len__(self) -> int:
+        """Return the number of rows."""
+        return len(self._numbers) // self.columns
+
+    def __iter__(self) -> Iterator[list[float]]:
+        """Yield each row in turn."""
+        return (self.row(k) for k in range(len(self)))
+
+    def append(self, row: Iterable[float | None]) -> None:
+        """Add a row, None as NaN."""
+        self._numbers.extend(np.nan if value is None else value for value in row)
+
+    def row(self, at: int) -> list[float]:
+        """Return one row. Raises IndexError where there is none."""
+        start = range(len(self))[at] * self.columns
+        return self._numbers[start : start + self.columns].tolist()
+
+    def column(self, k: int) -> Float64:
+        """Return a copy (n,) of the k-th number of each row."""
+        return np.array(self._numbers[k :: self.columns])
+
+    def table(self) -> Float64:
+        """Return a copy (n, columns) of the rows."""
+        return np.array(self._numbers).reshape(-1, self.columns)
 
 
 # Arrays of numpy as columns of Arrow, and back.

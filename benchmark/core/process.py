@@ -1,4 +1,4 @@
-"""What a process that fuses frame after frame asks of its threads, of the system's memory, and of rerun."""
+"""Memory, threads and clocks of a process that fuses frame after frame."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import sys
 import threading
 import time
 from collections import defaultdict
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -26,84 +26,66 @@ PROC, CGROUPS = Path("/proc/self"), Path("/sys/fs/cgroup")
 
 V1_FILES = ("memory.limit_in_bytes", "memory.usage_in_bytes", ("total_inactive_file", "total_active_file"))
 V2_FILES = ("memory.max", "memory.current", ("inactive_file", "active_file"))
-"""Names of a group's limit, of what it uses, and of the entries of memory.stat that say what of that is page cache."""
+"""Names of a group's limit, of what it uses, and of the entries of memory.stat that are page cache."""
 
 
 def available_bytes() -> int:
-    """Memory that this process can still take."""
+    """Return the memory that this process can still take."""
     import psutil
 
-    return max(0, min([int(psutil.virtual_memory().available), *_of_groups(PROC, CGROUPS), *_of_process()]))
+    free = [int(psutil.virtual_memory().available), *_group_limits(PROC, CGROUPS)]
+    try:
+        import resource
+    except ImportError:
+        return min(free)
+    limit, _ = resource.getrlimit(resource.RLIMIT_AS)  # `ulimit -v` bounds the address space
+    if limit != resource.RLIM_INFINITY:
+        free.append(limit - int(psutil.Process().memory_info().vms))
+    return max(0, min(free))
 
 
 def resident_bytes() -> int:
-    """Memory that this process takes."""
-    return int(_process(os.getpid()).memory_info().rss)
-
-
-@functools.cache
-def _process(pid: int):  # type: ignore[no-untyped-def]
+    """Return the memory that this process takes."""
     import psutil
 
-    return psutil.Process(pid)
+    return int(psutil.Process().memory_info().rss)
 
 
 def group_bytes(proc: Path, cgroups: Path) -> int | None:
-    """What the control groups of a process leave to it; None where none of them has a limit.
+    """Return what the control groups of a process leave to it; None where none of them has a limit.
 
     proc     as /proc/self: its file `cgroup` names the groups
     cgroups  as /sys/fs/cgroup: version 2, or version 1 with a folder `memory`
     """
-    return min(_of_groups(proc, cgroups), default=None)
+    return min(_group_limits(proc, cgroups), default=None)
 
 
-def _of_groups(proc: Path, cgroups: Path) -> Iterator[int]:
-    """Of each group from the process's own up to the root: every one of them bounds those below it."""
-    for controllers, path in _groups(proc):
-        root, files = (cgroups, V2_FILES) if not controllers else (cgroups / "memory", V1_FILES)
-        if controllers and "memory" not in controllers:
-            continue
-        own = root / path.lstrip("/")
-        for folder in (own, *own.parents):  # in a container, the path may be that of the host: then only the root is
-            if folder.is_relative_to(root) and (left := _left(folder, *files)) is not None:
-                yield left
+def _group_limits(proc: Path, cgroups: Path) -> Iterator[int]:
+    """Yield what each group leaves, from the process's own up to the root: each bounds those below it.
 
-
-def _groups(proc: Path) -> Iterator[tuple[list[str], str]]:
-    """Controllers and path of each group, by lines such as '4:memory:/user' or, of version 2, '0::/user'."""
+    Lines of `cgroup` are such as '4:memory:/user' or, of version 2, '0::/user'. Page cache is given back when memory
+    is short.
+    """
     try:
         lines = (proc / "cgroup").read_text().splitlines()
     except OSError:
         return
     for line in lines:
         _, controllers, path = (*line.split(":", 2), "", "")[:3]
-        yield [name for name in controllers.split(",") if name], path
-
-
-def _left(folder: Path, limit: str, used: str, cache: tuple[str, ...]) -> int | None:
-    """A group's limit less what it uses; page cache is given back when memory is short."""
-    try:
-        most, taken = ((folder / name).read_text().strip() for name in (limit, used))
-        stat = _stat(folder)
-        return None if most == "max" else int(most) - int(taken) + sum(stat.get(name, 0) for name in cache)
-    except (OSError, ValueError):
-        return None
-
-
-def _stat(folder: Path) -> Mapping[str, int]:
-    lines = (line.split() for line in (folder / "memory.stat").read_text().splitlines())
-    return {name: int(value) for name, value in lines}
-
-
-def _of_process() -> Iterator[int]:
-    """What `ulimit -v` leaves of the address space."""
-    try:
-        import resource
-    except ImportError:
-        return
-    limit, _ = resource.getrlimit(resource.RLIMIT_AS)
-    if limit != resource.RLIM_INFINITY:
-        yield limit - int(_process(os.getpid()).memory_info().vms)
+        if controllers and "memory" not in controllers.split(","):
+            continue
+        root, (limit, used, cache) = (cgroups / "memory", V1_FILES) if controllers else (cgroups, V2_FILES)
+        own = root / path.lstrip("/")
+        for folder in (own, *own.parents):  # in a container, the path may be that of the host: then only the root is
+            if not folder.is_relative_to(root):
+                break
+            try:
+                most, taken = ((folder / name).read_text().strip() for name in (limit, used))
+                stat = dict(entry.split() for entry in (folder / "memory.stat").read_text().splitlines())
+                if most != "max":
+                    yield int(most) - int(taken) + sum(int(stat.get(name, 0)) for name in cache)
+            except (OSError, ValueError):
+                continue
 
 
 TRIM_THRESHOLD, MMAP_THRESHOLD, ARENA_MAX = -1, -3, -8
@@ -120,7 +102,7 @@ def settle() -> None:
 
     Threads that wait do not spin, for they would take the time of those that decode the next frames. Memory of a
     decoded image is used for the next one, instead of being returned to the system, which clears it each time (glibc).
-    Rerun logs nothing of its own to the terminal: what cannot be recorded is said in one line.
+    Rerun logs nothing of its own to the terminal.
     """
     os.environ.setdefault("RUST_LOG", "off")
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
@@ -182,6 +164,6 @@ class Stopwatch:
 
 @dataclass
 class Lap:
-    """What one timed block took."""
+    """The time of one block."""
 
     seconds: float = math.nan

@@ -11,8 +11,8 @@ from typing import Any
 
 import numpy as np
 
+from semstab.core.arrays import Rows
 from semstab.core.files import atomic_path
-from semstab.core.rows import Rows
 from semstab.core.types import Float64
 from semstab.model.results import STAGES, FrameReport
 

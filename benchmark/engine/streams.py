@@ -16,9 +16,9 @@ from semstab.backends.numpy_reference import NumpySample
 from semstab.check.registration import depth_edges, label_edges
 from semstab.check.reprojection import evenly
 from semstab.config import Config
+from semstab.core.arrays import Rows
 from semstab.core.prefetch import Fetched
 from semstab.core.process import Stopwatch
-from semstab.core.rows import Rows
 from semstab.core.types import Float64
 from semstab.datasets import Scene
 from semstab.engine.observer import Observers

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from semstab.core.rows import Rows
+from semstab.core.arrays import Rows
 from semstab.core.types import Float64
 from semstab.datasets.formats.disk import file_digest
 from semstab.engine.finish import analyse_sample, no_voxels, reduced_of, save_voxels, unit_summary, up_axis

@@ -11,9 +11,9 @@ from typing import Any
 
 import numpy as np
 
+from semstab.core.arrays import Rows
 from semstab.core.files import parse_json, read_arrays, write_arrays
 from semstab.core.json_form import from_json, to_json
-from semstab.core.rows import Rows
 from semstab.core.types import Float64, Int32
 from semstab.engine.series import NUMBERS, Series
 from semstab.errors import DataError

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from semstab.core.rows import Rows
+from semstab.core.arrays import Rows
 from semstab.core.types import Float64, Int32, Int64, UInt16, UInt32
 from semstab.model.frames import Frame
 from semstab.model.labels import fixed
