@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import difflib
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -112,9 +111,7 @@ def selected(
     """The wanted names, all known ones where none are named; `extra` ones only by name."""
     for name in wanted or ():
         if name not in (*known, *extra):
-            near = difflib.get_close_matches(name, [*known, *extra], n=1)
-            hint = f"did you mean '{near[0]}'?" if near else f"there is {', '.join([*known, *extra]) or 'none'}"
-            raise ConfigError(f"{where}: no {kind} '{name}'; {hint}")
+            raise ConfigError(f"{where}: no {kind} '{name}'; {nearest(name, [*known, *extra])}")
     return list(dict.fromkeys(wanted)) if wanted is not None else known
 
 

@@ -111,7 +111,7 @@ def test_the_default_run_folder_is_new_each_time(wall, tmp_path) -> None:
         (("--config", "bad.yaml"), "unknown setting 'voxel_sise'; did you mean 'voxel_size'?"),
         (("--data", "wall", "--voxel-size", "0"), "voxel_size: input should be greater than"),
         (("--data", "wall", "--backend", "opn3d"), "did you mean 'open3d'?"),
-        (("--data", "wall", "--backbone", "c"), "no backbone 'c'; there is a, b, gt"),
+        (("--data", "wall", "--backbone", "c"), "no backbone 'c'; known: a, b, gt"),
         (("--data", "wall", "--frames", "3"), "--frames 3"),
         (("--data", "wall", "--set", "x"), "write KEY=VALUE"),
         (("--data", "wall", "--device", "CUDA:7"), "CUDA"),

@@ -277,7 +277,7 @@ def test_labels_that_cannot_be_fused_are_one_line(root, files, label, message) -
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        ({"backbones": ["c"]}, "wall: no backbone 'c'; there is a, b, gt"),
+        ({"backbones": ["c"]}, "wall: no backbone 'c'; known: a, b, gt"),
         ({"scenes": ["wal"]}, "posed_folder: no scene 'wal'; did you mean 'wall'"),
         ({"frames": {"start": 9}}, "wall: the selection of frames leaves none of its 3"),
         ({"backends": ["open4d"]}, "backend 'open4d' is not known; did you mean 'open3d'"),

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 import itertools
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, Literal, Self
@@ -27,7 +26,7 @@ from semstab.config.settings import (
     validated,
 )
 from semstab.core.types import THIS_SCENE
-from semstab.errors import ConfigError
+from semstab.errors import ConfigError, nearest
 
 __all__ = [
     "BackendConfig",
@@ -332,9 +331,3 @@ class Config(Settings):
     def to_yaml(self) -> str:
         """YAML that reads back to the same settings."""
         return yaml.safe_dump(self.model_dump(mode="json"), sort_keys=False, allow_unicode=True)
-
-
-def nearest(name: str, known: Sequence[str]) -> str:
-    """A hint at what may be meant by a name that is not known."""
-    near = difflib.get_close_matches(name, known, n=1)
-    return f"did you mean '{near[0]}'?" if near else f"known: {', '.join(known)}"

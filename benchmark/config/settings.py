@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 import itertools
 import math
 import operator
@@ -16,7 +15,7 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationEr
 
 from semstab.core.files import MAX_YAML_BYTES, parse_yaml, read_limited
 from semstab.core.types import THIS_SCENE, Scope
-from semstab.errors import ConfigError, one_line
+from semstab.errors import ConfigError, nearest, one_line
 
 Model = TypeVar("Model", bound=BaseModel)
 
@@ -83,9 +82,7 @@ def explain(error: ValidationError, model: type[BaseModel]) -> str:
     if problem["type"] == "extra_forbidden":
         unknown = name.rpartition(".")[2]
         known = sorted(_keys_at(model, problem["loc"][:-1]))
-        near = difflib.get_close_matches(unknown, known, n=1)
-        hint = f"did you mean '{near[0]}'?" if near else f"known: {', '.join(known)}"
-        return f"unknown setting '{name}'; {hint}"
+        return f"unknown setting '{name}'; {nearest(unknown, known)}"
     message = problem["msg"].removeprefix("Value error, ")
     if not name:  # of the settings as a whole
         return message

@@ -35,21 +35,21 @@ def compiled(**options: Any) -> Callable[[Any], Any]:
     def decorate(function: Any) -> Any:
         dispatcher = nb.njit(error_model="numpy", nogil=True, **options)(function)
         try:
-            dispatcher._cache = _Kept(function)
+            dispatcher._cache = _Cache(function)
         except RuntimeError:  # there is no place for its cache
             if folder := _own_temporary_folder():
                 settings.CACHE_DIR = folder
                 with contextlib.suppress(RuntimeError):
-                    dispatcher._cache = _Kept(function)
+                    dispatcher._cache = _Cache(function)
         return dispatcher
 
     return decorate
 
 
-class _Kept(FunctionCache):
-    """What numba keeps of a function, taken only where all that it was compiled from is as it was.
+class _Cache(FunctionCache):
+    """Compiled code of a function, taken only where all that it was compiled from is as it was.
 
-    numba alone looks at the function's own file, not at those of the functions and constants that it takes in.
+    numba alone checks the function's own file, not those of the functions and constants that it takes in.
     """
 
     def __init__(self, function: Any) -> None:
@@ -58,17 +58,17 @@ class _Kept(FunctionCache):
         self._cache_file = IndexDataCacheFile(self.cache_path, self._impl.filename_base, stamp)  # type: ignore[no-untyped-call]
 
     def load_overload(self, signature: Any, context: Any) -> Any:
-        """Compiled code, None where there is none; what is damaged is compiled again."""
+        """Return compiled code; None where there is none, or where it is damaged: unpickling raises anything."""
         try:
             return super().load_overload(signature, context)  # type: ignore[no-untyped-call]
-        except Exception:  # noqa: BLE001  whatever unpickling raises
+        except Exception:  # noqa: BLE001
             return None
 
     def save_overload(self, signature: Any, data: Any) -> None:
-        """Keep compiled code; without it another process compiles anew."""
+        """Keep compiled code; where the index is damaged, anew; where the disk is full, not at all."""
         try:
             super().save_overload(signature, data)  # type: ignore[no-untyped-call]
-        except Exception:  # noqa: BLE001  the index is damaged, or the disk is full
+        except Exception:  # noqa: BLE001
             with contextlib.suppress(Exception):
                 self._cache_file.flush()  # type: ignore[no-untyped-call]
                 super().save_overload(signature, data)  # type: ignore[no-untyped-call]
@@ -78,19 +78,17 @@ def _stamp(function: Any, seen: frozenset[Any]) -> tuple[Any, ...]:
     """The file of a function, by time and size, and the same of what it names: compiled functions, numbers, arrays."""
     file = Path(function.__code__.co_filename)
     stamp: list[Any] = [(file.name, file.stat().st_mtime, file.stat().st_size) if file.exists() else file.name]
-    for name in sorted(_names(function.__code__)):
+    names, codes = set[str](), [function.__code__]
+    for code in codes:  # with those of functions inside it, which are added as they come
+        names.update(code.co_names)
+        codes += [each for each in code.co_consts if isinstance(each, types.CodeType)]
+    for name in sorted(names):
         value = function.__globals__.get(name)
         if isinstance(value, Dispatcher) and value.py_func not in seen:
             stamp.append(_stamp(value.py_func, seen | {function}))
         elif isinstance(value, bool | int | float | str | tuple | np.ndarray | np.generic):
             stamp.append((name, value.tobytes() if isinstance(value, np.ndarray) else repr(value)))
     return tuple(stamp)
-
-
-def _names(code: types.CodeType) -> set[str]:
-    """What a function and those in it name."""
-    inner = (each for each in code.co_consts if isinstance(each, types.CodeType))
-    return set(code.co_names).union(*map(_names, inner))
 
 
 serial = compiled()
@@ -123,12 +121,12 @@ def is_kept(function: Any) -> bool:
 
 
 def _own_temporary_folder() -> str | None:
-    """A folder that nobody else can write to, as code is loaded from it; None where there can be none."""
-    folder = Path(tempfile.gettempdir()) / f"semstab-compiled-{os.getuid() if hasattr(os, 'getuid') else ''}"
+    """Return a folder that nobody else can write to, as code is loaded from it; None where there can be none."""
+    folder = Path(tempfile.gettempdir()) / f"semstab-compiled-{os.getuid()}"
     try:
         folder.mkdir(mode=0o700, exist_ok=True)
-        found = folder.lstat()
+        status = folder.lstat()
     except OSError:
         return None
-    own = not hasattr(os, "getuid") or (found.st_uid == os.getuid() and not found.st_mode & 0o022)
-    return str(folder) if stat.S_ISDIR(found.st_mode) and own else None
+    own = stat.S_ISDIR(status.st_mode) and status.st_uid == os.getuid() and not status.st_mode & 0o022
+    return str(folder) if own else None

@@ -8,11 +8,8 @@ import hashlib
 import json
 import os
 import stat
-import struct
 import tempfile
-import tokenize
 import zipfile
-import zlib
 from collections.abc import Collection, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from io import BufferedReader
@@ -43,7 +40,8 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
     temporary = Path(name)
     try:
         yield temporary
-        temporary.chmod(0o666 & ~_umask())
+        os.umask(mask := os.umask(0))
+        temporary.chmod(0o666 & ~mask)
         temporary.replace(path)
     except OSError as error:  # one from writing, a full disk for example, does not know its file
         if error.filename is None and error.errno is not None:
@@ -80,12 +78,6 @@ def remove_leftovers(folder: Path) -> None:
     """Remove what `atomic_path` left where its process was killed; nobody else may be writing there."""
     for path in folder.glob(f"{TEMPORARY}*"):
         path.unlink()
-
-
-def _umask() -> int:
-    mask = os.umask(0)
-    os.umask(mask)
-    return mask
 
 
 def write_text(path: str | Path, text: str) -> None:
@@ -169,10 +161,9 @@ def read_json(path: str | Path) -> Any:
 
 
 def read_limited(path: str | Path, limit: int) -> bytes:
-    """The content of a file. Raises OSError, too, for what is no file (a pipe, a device), or larger than the limit."""
+    """Return the content of a file. Raises OSError, too, for a pipe, a device, and what is larger than the limit."""
     with open_file(path) as file:
-        size = os.fstat(file.fileno()).st_size
-        if size > limit:
+        if (size := os.fstat(file.fileno()).st_size) > limit:
             raise OSError(errno.EFBIG, f"{size} bytes are too many for such a file, at most {limit}")
         return file.read()
 
@@ -181,16 +172,12 @@ def open_file(path: str | Path) -> BufferedReader:
     """A file, to read bytes from. Raises OSError, too, for what is no regular file: a pipe, a device."""
     if "\0" in str(path):
         raise OSError(errno.EINVAL, "no file can be called so")
-    file = open(path, "rb", opener=_without_waiting)  # noqa: SIM115  an opener; the caller closes it
+    # a pipe to which nobody writes opens at once
+    file = open(path, "rb", opener=lambda name, flags: os.open(name, flags | os.O_NONBLOCK))  # noqa: SIM115
     if not stat.S_ISREG(os.fstat(file.fileno()).st_mode):
         file.close()
         raise OSError(errno.EINVAL, "it is no regular file")
     return file
-
-
-def _without_waiting(path: str, flags: int) -> int:
-    """Open a pipe at once, though nobody writes to it."""
-    return os.open(path, flags | os.O_NONBLOCK)
 
 
 def parse_yaml(text: str, where: str) -> Any:
@@ -199,24 +186,17 @@ def parse_yaml(text: str, where: str) -> Any:
     Raises ConfigError in one line that starts with `where` where it is not valid.
     """
     try:
-        loader = yaml.SafeLoader(text)
-        return loader.get_single_data()
+        return yaml.SafeLoader(text).get_single_data()
     except (yaml.YAMLError, ValueError, LookupError, AttributeError, TypeError, RecursionError) as error:
         # PyYAML lets other errors than its own escape, for example for the date 2020-13-45
         raise ConfigError(f"{where}: not valid YAML ({one_line(error)})") from error
 
 
-# Arrays that are kept for a later start: read as they were written, or not at all.
+# Arrays for a later start: read as they were written, or not at all.
 
 Arrays = Mapping[str, npt.NDArray[Any]]
 
 DIGEST = "digest"
-
-DAMAGED = (
-    OSError, ValueError, LookupError, TypeError, EOFError, RuntimeError, MemoryError, zipfile.BadZipFile, zlib.error,
-    struct.error, tokenize.TokenError, SyntaxError,
-)  # fmt: skip
-"""What numpy raises on a damaged .npz file."""
 
 
 def write_arrays(path: Path, arrays: Mapping[str, Any], *, packed: bool = True) -> None:
@@ -228,11 +208,11 @@ def write_arrays(path: Path, arrays: Mapping[str, Any], *, packed: bool = True) 
 
 
 def read_arrays(path: Path) -> Arrays | None:
-    """What `write_arrays` wrote; None where it is not there, or not as it was."""
+    """Return what `write_arrays` wrote; None where it is missing, or not as it was."""
     try:
         with path.open("rb") as file, np.load(file) as content:
             arrays = {name: content[name] for name in content.files}
-    except DAMAGED:
+    except Exception:  # noqa: BLE001  numpy raises a dozen kinds of them on a damaged .npz file
         return None
     digest = arrays.pop(DIGEST, None)
     whole = all(isinstance(array, np.ndarray) for array in arrays.values())  # else bytes, where it is none

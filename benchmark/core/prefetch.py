@@ -1,10 +1,11 @@
-"""Reading ahead: worker threads prepare the items that come next, while the caller works on this one."""
+"""Reading ahead in worker threads while the caller works on an item, and keeping what was loaded last."""
 
 from __future__ import annotations
 
 import os
+import threading
 import time
-from collections import deque
+from collections import OrderedDict, deque
 from collections.abc import Callable, Generator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
@@ -14,7 +15,7 @@ LOOK_AHEAD_BYTES = 1 << 30
 MOST_THREADS = 8
 """Used where no number is given: more threads than this only hold more frames in memory."""
 
-T = TypeVar("T")
+K, T = TypeVar("K"), TypeVar("T")
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,3 +78,20 @@ def prefetch(
 def _timed(read: Callable[[int], T], index: int) -> tuple[T, float]:
     started = time.perf_counter()
     return read(index), time.perf_counter() - started
+
+
+class SizedCache(Generic[K, T]):
+    """Loads by key, and keeps what was used last while its sizes sum to at most `most`, one thing at least."""
+
+    def __init__(self, load: Callable[[K], T], size: Callable[[T], int], most: int) -> None:
+        self._load, self._size, self._most = load, size, most
+        self._loaded, self._lock = OrderedDict[K, T](), threading.Lock()
+
+    def __getitem__(self, key: K) -> T:
+        with self._lock:
+            if key not in self._loaded:
+                self._loaded[key] = self._load(key)
+            self._loaded.move_to_end(key)
+            while len(self._loaded) > 1 and sum(map(self._size, self._loaded.values())) > self._most:
+                self._loaded.popitem(last=False)
+            return self._loaded[key]

@@ -6,15 +6,14 @@ Built-in entries are one line each; other packages add theirs with the entry poi
 
 from __future__ import annotations
 
-import difflib
 import functools
 import importlib
 from collections.abc import Mapping
 from dataclasses import dataclass
-from importlib.metadata import EntryPoint, entry_points
+from importlib.metadata import entry_points
 from typing import Any
 
-from semstab.errors import ConfigError, MissingDependencyError, one_line
+from semstab.errors import ConfigError, MissingDependencyError, nearest, one_line
 
 
 @dataclass(frozen=True)
@@ -39,16 +38,17 @@ class Registry:
 
     @functools.cached_property
     def _plugins(self) -> dict[str, Entry]:
-        """Those of other packages, read once: looking through all that are installed takes a while."""
-        return {point.name: _plugin(point) for point in entry_points(group=f"semstab.{self.kind}s")}
+        points = entry_points(group=f"semstab.{self.kind}s")  # read once: it looks through all that is installed
+        return {
+            point.name: Entry(point.value, f"from the package {point.dist.name if point.dist else point.module}")
+            for point in points
+        }
 
     def entry(self, name: str) -> Entry:
         """The entry of that name. Raises ConfigError, with the nearest known name, where there is none."""
         entries = self.entries()
         if name not in entries:
-            near = difflib.get_close_matches(name, entries, n=1)
-            hint = f"did you mean '{near[0]}'?" if near else f"known: {', '.join(sorted(entries))}"
-            raise ConfigError(f"{self.kind} '{name}' is not known; {hint}")
+            raise ConfigError(f"{self.kind} '{name}' is not known; {nearest(name, sorted(entries))}")
         return entries[name]
 
     def load(self, name: str) -> Any:
@@ -64,8 +64,3 @@ class Registry:
         except Exception as error:  # RuntimeError: torchvision of another torch; OSError: a shared library is missing
             hint = entry.install or "install what it needs"
             raise MissingDependencyError(f"{self.kind} '{name}' cannot be used ({one_line(error)}); {hint}") from error
-
-
-def _plugin(point: EntryPoint) -> Entry:
-    package = point.dist.name if point.dist else point.module
-    return Entry(point.value, f"from the package {package}")

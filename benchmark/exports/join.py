@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
-from semstab.core.at_hand import AtHand
 from semstab.core.files import atomic_path
+from semstab.core.prefetch import SizedCache
 from semstab.core.types import Float64, Int64
 from semstab.datasets.files.surfaces import open_las, points_at_once
 from semstab.errors import ConfigError, DataError
@@ -156,7 +156,7 @@ class _Finder:
 
     def __init__(self, chosen: Chosen, radius: float) -> None:
         self.chosen, self.tally, self._radius = chosen, Tally(), radius
-        self._lookups = AtHand(self.lookup, lambda lookup: len(lookup.table), AT_HAND)
+        self._lookups = SizedCache(self.lookup, lambda lookup: len(lookup.table), AT_HAND)
 
     def lookup(self, place: Place) -> VoxelLookup:
         """Return the lookup of a tile with voxels."""

@@ -13,9 +13,8 @@ import numpy as np
 
 from semstab.backends.shared.association import Observations, back_project, observe
 from semstab.config import nearest
-from semstab.core.at_hand import AtHand
 from semstab.core.files import write_json
-from semstab.core.prefetch import prefetch
+from semstab.core.prefetch import SizedCache, prefetch
 from semstab.core.types import Float64, Int64, Mask, UInt8, UInt16
 from semstab.engine.folder import SETTINGS, load_result
 from semstab.engine.units import make_plan
@@ -95,7 +94,7 @@ class FusedLabels:
 
     def __init__(self, tiles: Tiles[VoxelTable], belief: Belief, num_classes: int) -> None:
         self._tiles, self._belief, self._K = tiles, belief, num_classes
-        self._lookups: AtHand[Place, VoxelLookup] = AtHand(
+        self._lookups: SizedCache[Place, VoxelLookup] = SizedCache(
             lambda place: VoxelLookup(self._tiles[place]), lambda lookup: len(lookup.table), AT_HAND
         )
 

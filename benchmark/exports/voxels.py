@@ -15,8 +15,8 @@ import numpy as np
 import numpy.typing as npt
 
 from semstab.config import nearest
-from semstab.core.at_hand import AtHand
 from semstab.core.files import atomic_path
+from semstab.core.prefetch import SizedCache
 from semstab.core.types import Float64, UInt8
 from semstab.errors import ConfigError, DataError
 from semstab.metrics import CATEGORIES, categories
@@ -119,7 +119,7 @@ class Chosen:
         self._files = {(0, 0) if tile is None else (tile.x, tile.y): file for file, tile in tiles.items()}
         self.size = next(None if tile is None else tile.size for tile in tiles.values())
         self._highest = 0
-        self._at_hand = AtHand(self._read, lambda voxels: len(voxels.table), AT_HAND)
+        self._at_hand = SizedCache(self._read, lambda voxels: len(voxels.table), AT_HAND)
 
     def __contains__(self, place: Place) -> bool:
         return place in self._files

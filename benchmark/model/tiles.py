@@ -9,7 +9,7 @@ from typing import Any, Generic, TypeVar
 
 import numpy as np
 
-from semstab.core.at_hand import AtHand
+from semstab.core.prefetch import SizedCache
 from semstab.core.types import Float64, Int64
 from semstab.model import parquet
 from semstab.model.events import Events
@@ -34,7 +34,7 @@ class Tiles(Generic[T]):
     def __init__(self, load: Mapping[Place, Callable[[], T]], size: int | None, voxel_size: float) -> None:
         self.size, self.voxel_size = size, voxel_size
         self._load: Mapping[Place, Callable[[], T]] = load
-        self._tables: AtHand[Place, T] = AtHand(lambda place: self._load[place](), len, AT_HAND)
+        self._tables: SizedCache[Place, T] = SizedCache(lambda place: self._load[place](), len, AT_HAND)
 
     @classmethod
     def open(cls, path: str | Path, kind: type[T]) -> Tiles[T]:
