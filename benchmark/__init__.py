@@ -26,73 +26,31 @@ if TYPE_CHECKING:
 __version__ = "0.4.0"
 
 __all__ = [
-    "AcceptanceThresholds",
-    "Belief",
-    "Config",
-    "ConfigError",
-    "DataError",
-    "Events",
-    "Frame",
-    "GateConfig",
-    "Intrinsics",
-    "LabelSpace",
-    "MissingDependencyError",
-    "SemstabError",
-    "VoxelTable",
-    "backbones",
-    "backends",
-    "compare",
-    "datasets",
-    "engine",
-    "export",
-    "gate",
-    "load",
-    "load_config",
-    "load_result",
-    "load_study",
-    "metrics",
-    "relabel",
-    "run",
-    "run_study",
-    "statistics",
-]
+    "AcceptanceThresholds", "Belief", "Config", "ConfigError", "DataError", "Events", "Frame", "GateConfig",
+    "Intrinsics", "LabelSpace", "MissingDependencyError", "SemstabError", "VoxelTable", "backbones", "backends",
+    "compare", "datasets", "engine", "export", "gate", "load", "load_config", "load_result", "load_study", "metrics",
+    "relabel", "run", "run_study", "statistics",
+]  # fmt: skip
 
 _HOMES = {
-    "Belief": "exports.relabel",
-    "AcceptanceThresholds": "statistics.acceptance",
-    "Config": "config",
-    "ConfigError": "errors",
-    "DataError": "errors",
-    "Events": "model.events",
-    "Frame": "model.frames",
-    "GateConfig": "comparison.gate",
-    "Intrinsics": "model.frames",
-    "LabelSpace": "model.labels",
-    "MissingDependencyError": "errors",
-    "SemstabError": "errors",
-    "VoxelTable": "model.voxels",
-    "compare": "comparison.writing",
-    "export": "exports",
-    "gate": "comparison.gate",
-    "load": "report.loaded",
-    "load_config": "settings",
-    "load_result": "engine.folder",
-    "load_study": "settings",
-    "relabel": "exports.relabel",
-    "run": "api",
-    "run_study": "api",
-}
+    "AcceptanceThresholds": "statistics.acceptance", "Belief": "exports.relabel", "Config": "config",
+    "ConfigError": "errors", "DataError": "errors", "Events": "model.events", "Frame": "model.frames",
+    "GateConfig": "comparison.gate", "Intrinsics": "model.frames", "LabelSpace": "model.labels",
+    "MissingDependencyError": "errors", "SemstabError": "errors", "VoxelTable": "model.voxels",
+    "compare": "comparison.writing", "export": "exports", "gate": "comparison.gate", "load": "report.loaded",
+    "load_config": "settings", "load_result": "engine.folder", "load_study": "settings", "relabel": "exports.relabel",
+    "run": "api", "run_study": "api",
+}  # fmt: skip
+"""The module of each public name; other public names are modules."""
 
 
 def __getattr__(name: str) -> Any:
     """Import the public names when they are first used: `import semstab` stays instant."""
-    if name in ("backbones", "backends", "datasets", "engine", "metrics", "statistics"):
-        return importlib.import_module(f"semstab.{name}")
-    if name in _HOMES:
-        value = getattr(importlib.import_module(f"semstab.{_HOMES[name]}"), name)
-        globals()[name] = value
-        return value
-    raise AttributeError(f"module 'semstab' has no attribute '{name}'")
+    if name not in __all__:
+        raise AttributeError(f"module 'semstab' has no attribute '{name}'")
+    module = importlib.import_module(f"semstab.{_HOMES.get(name, name)}")
+    globals()[name] = value = getattr(module, name) if name in _HOMES else module
+    return value
 
 
 def __dir__() -> list[str]:

@@ -1,4 +1,4 @@
-"""From a file and options to the configuration of a run or a study, with all that its dataset brings along."""
+"""Load the configuration of a run or a study: a file, options over it, and the defaults of its dataset below it."""
 
 from __future__ import annotations
 
@@ -40,7 +40,11 @@ def load_study(study: str | Path, overrides: Mapping[str, Any] | None = None) ->
     It is called as its file, and checked against no backend that it does not name. Raises ConfigError where there is no
     such study.
     """
-    path = _find(str(study))
+    path = _shipped("studies") / f"{study}.yaml" if str(study) in shipped_studies() else Path(study)
+    if path.suffix not in (".yaml", ".yml"):
+        raise ConfigError(
+            f"study '{study}' is not known; {nearest(str(study), shipped_studies())}, or name a .yaml file"
+        )
     content = _over(read_yaml(path), overrides or {})
     own = {"name": path.stem, "check": None}
     return Config.build(merge(merge(dataset_defaults(content), own), content), str(path))
@@ -52,11 +56,11 @@ def shipped_studies() -> tuple[str, ...]:
 
 
 def dataset_defaults(content: Mapping[str, Any]) -> dict[str, Any]:
-    """The settings that ship for the dataset which the content names, or for the built-in one."""
+    """Return the settings that ship for the dataset which the content names, or for the built-in one."""
     dataset = content.get("dataset")
     name = dataset.get("name") if isinstance(dataset, Mapping) else dataset
-    shipped = {path.stem: path for path in _shipped("datasets").glob("*.yaml")}.get(str(name or "city"))
-    return {} if shipped is None else read_yaml(shipped)
+    files = {path.stem: path for path in _shipped("datasets").glob("*.yaml")}
+    return read_yaml(files[key]) if (key := str(name or "city")) in files else {}
 
 
 def predicted_config(
@@ -85,22 +89,14 @@ def filtered_config(filters: Sequence[str], path: str | Path | None, overrides: 
     dataset = open_dataset(config.dataset.name, config.dataset.options)
     scene = dataset.scene((config.scenes or dataset.scenes)[0])
     names = config.backbones or [name for name in scene.backbones if name not in config.region_maps]
-    truth = [name for name in names if name == GROUND_TRUTH]
-    predictors = [
-        validated(
-            PredictorConfig,
-            {
-                "backbone": STORED,
-                "options": {"source": name},
-                "scores": StoredSequence(scene, name, False).has_scores,
-                "filters": filters,
-            },
-        )
-        for name in names
-        if name not in truth
-    ]
+    predictors = []
+    for name in names:
+        if name != GROUND_TRUTH:
+            scores = StoredSequence(scene, name, False).has_scores
+            stored = {"backbone": STORED, "options": {"source": name}, "scores": scores, "filters": filters}
+            predictors.append(validated(PredictorConfig, stored))
     content = merge(dataset_defaults({"dataset": config.dataset.model_dump()}), _over(_of_file(path), overrides))
-    selected = [*(predictor.source_name for predictor in predictors), *truth]
+    selected = [*(predictor.source_name for predictor in predictors), *(name for name in names if name == GROUND_TRUTH)]
     return predicted_config(predictors, None, {**content, "backbones": selected})
 
 
@@ -120,29 +116,15 @@ def _of_file(path: str | Path | None) -> dict[str, Any]:
     return {} if path is None else read_yaml(path)
 
 
-def _in_full(content: Mapping[str, Any]) -> dict[str, Any]:
-    """Settings whose short forms are written out, so that others go on top of them group by group."""
-    long = dict(content)
-    if isinstance(dataset := long.get("dataset"), str):
-        long["dataset"] = {"name": dataset}
-    if "frames" in long:
-        long["frames"] = in_full(long["frames"])
-    return long
-
-
 def _over(content: Mapping[str, Any], overrides: Mapping[str, Any]) -> dict[str, Any]:
-    """Overrides on top of a file; scene_frames are named by their scenes, so none at all clears what the file says."""
-    merged = merge(_in_full(content), _in_full(overrides))
-    return merged | {"scene_frames": {}} if overrides.get("scene_frames") == {} else merged
-
-
-def _find(study: str) -> Path:
-    if study in shipped_studies():
-        return _shipped("studies") / f"{study}.yaml"
-    path = Path(study)
-    if path.suffix not in (".yaml", ".yml"):
-        raise ConfigError(f"study '{study}' is not known; {nearest(study, shipped_studies())}, or name a .yaml file")
-    return path
+    """Overrides on top of a file, short forms written out; no `scene_frames` at all clear those of the file."""
+    long = [dict(content), dict(overrides)]
+    for each in long:
+        if isinstance(dataset := each.get("dataset"), str):
+            each["dataset"] = {"name": dataset}
+        if "frames" in each:
+            each["frames"] = in_full(each["frames"])
+    return merge(*long) | ({"scene_frames": {}} if overrides.get("scene_frames") == {} else {})
 
 
 def _shipped(kind: str) -> Path:

@@ -58,15 +58,19 @@ def tasks_of(scene: Scene, config: Config, beside: Sequence[str] = ()) -> Iterat
     """
     names = selected(config.backbones, scene.backbones, scene.by_name, "backbone", scene.name)
     if not names:
-        places = f"looked for {', '.join(scene.label_paths)}; " if scene.label_paths else ""
-        raise DataError(f"{scene.name}: there are no label maps; {places}add them, or choose with --scene")
-    frames = chosen_frames(scene, config, [*dict.fromkeys((*names, *beside))])
+        searched = f"searched {', '.join(scene.label_paths)}; " if scene.label_paths else ""
+        raise DataError(f"{scene.name}: there are no label maps; {searched}add them, or choose with --scene")
+    frames = _chosen_frames(scene, config, [*dict.fromkeys((*names, *beside))])
     indices = as_range(frames.indices)
     for backbone in names:
         source = scene.label_space(backbone)
         target = source if config.taxonomy is None else LabelSpace.load(config.taxonomy)
         mapping = source.mapping_to(target)
-        _require_classes(config.exclude, mapping, scene.name)
+        predicted = [*dict.fromkeys((*source.classes, *target.classes))]
+        for setting, known in (("classes", target.classes), ("predicted_classes", predicted)):
+            for name in getattr(config.exclude, setting):
+                if name not in known and not (setting == "predicted_classes" and mapping.named([name])):
+                    raise ConfigError(f"{scene.name}: exclude.{setting}: no class '{name}'; {nearest(name, known)}")
         fused_by = tuple(backend.name for backend in config.fused_by() if applies(backend, scene.name, backbone))
         yield Task(
             scene, backbone, indices, mapping, fused_by, config.perturbation, config.exclude, config.top_k,
@@ -79,21 +83,7 @@ def applies(part: Part, scene: str, backbone: str) -> bool:
     return scene in (part.scenes or [scene]) and backbone in (part.backbones or [backbone])
 
 
-def _require_classes(exclude: Exclusion, mapping: LabelMapping, where: str) -> None:
-    fused, predicted = mapping.target.classes, [*dict.fromkeys((*mapping.source.classes, *mapping.target.classes))]
-    for setting, names, known in (
-        ("classes", exclude.classes, fused), ("predicted_classes", exclude.predicted_classes, predicted),
-    ):  # fmt: skip
-        for name in names:
-            if name not in known and not (setting == "predicted_classes" and mapping.named([name])):
-                raise ConfigError(f"{where}: exclude.{setting}: no class '{name}'; {nearest(name, known)}")
-
-
-def chosen_frames(scene: Scene, config: Config, sources: Sequence[str] = ()) -> Selected:
-    """The frames of a scene that the configuration selects, to be read with the labels of these sources.
-
-    Raises ConfigError where there is none, and what `select_frames` raises.
-    """
+def _chosen_frames(scene: Scene, config: Config, sources: Sequence[str]) -> Selected:
     chosen = select_frames(scene, config.frames, sources)
     if not chosen.indices:
         raise ConfigError(f"{scene.name}: the selection of frames leaves none of its {len(scene)}; mend 'frames'")
@@ -101,8 +91,11 @@ def chosen_frames(scene: Scene, config: Config, sources: Sequence[str] = ()) -> 
 
 
 def frame_indices(scene: Scene, config: Config, sources: Sequence[str] = ()) -> list[int]:
-    """The indices of `chosen_frames`."""
-    return chosen_frames(scene, config, sources).indices
+    """Return the frames of a scene that the configuration selects, to be read with the labels of these sources.
+
+    Raises ConfigError where there is none, and what `select_frames` raises.
+    """
+    return _chosen_frames(scene, config, sources).indices
 
 
 def selected(
@@ -122,20 +115,16 @@ def read(task: Task, index: int, pixel_stride: int = 1, *, color: bool = False) 
 
 def prepare(task: Task, frame: Frame, pixel_stride: int = 1) -> Frame:
     """The scene's frame without what moves, its labels as rows 0..K-1 of the run's label space, noise, pixel stride."""
-    frame = _still(task, frame)
-    frame = in_label_space(task.mapping, dataclasses.replace(frame, unlabelled=_unlabelled(frame)))
+    classes = task.mapping.named(task.exclude.predicted_classes)
+    if frame.labels is not None:
+        classes = tuple(task.mapping.source.ids[k] for k in classes)
+    frame = leave_out(frame, classes, masks=task.exclude.masks)
+    frame = _in_label_space(task.mapping, dataclasses.replace(frame, unlabelled=_unlabelled(frame)))
     if task.top_k is not None and frame.scores is not None:
         frame = keep_largest(frame, task.top_k)
     if task.perturbation is not None:
         frame = perturb(frame, task.perturbation, task.scene.name)
     return frame.every(pixel_stride)
-
-
-def _still(task: Task, frame: Frame) -> Frame:
-    classes = task.mapping.named(task.exclude.predicted_classes)
-    if frame.labels is not None:
-        classes = tuple(task.mapping.source.ids[k] for k in classes)
-    return leave_out(frame, classes, masks=task.exclude.masks)
 
 
 def _unlabelled(frame: Frame) -> Mask | None:
@@ -150,7 +139,7 @@ def _unlabelled(frame: Frame) -> Mask | None:
     return none if frame.left_out is None else none & ~frame.left_out
 
 
-def in_label_space(mapping: LabelMapping, frame: Frame) -> Frame:
+def _in_label_space(mapping: LabelMapping, frame: Frame) -> Frame:
     """The frame with its labels as rows 0..K-1 of the mapping's target, or its scores (H, W, K) for them."""
     if frame.labels is not None:
         return dataclasses.replace(frame, labels=mapping.labels(frame.labels, frame.where("labels")))

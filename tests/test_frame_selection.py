@@ -102,7 +102,7 @@ def test_a_range_of_time_includes_both_ends_and_no_frame_of_unknown_time(setting
 
 
 def test_a_range_of_time_needs_time_stamps():
-    with pytest.raises(ConfigError, match="need time stamps, which this sequence has not"):
+    with pytest.raises(ConfigError, match="need time stamps; this sequence has none"):
         FrameSelection(from_time=0).indices(5)
 
 

@@ -81,8 +81,6 @@ def test_every_setting_is_in_the_key_of_a_unit_or_has_a_reason_not_to_be() -> No
         ({"sweeps": {"voxel_size": [1, 0.5, 1.0]}}, "name each value once"),
         ({"backends": ["numpy", "numpy"]}, "backends: each backend can be named once"),
         ({"backends": [{"name": "numpy", "scenes": ["s"]}]}, "backends: the first backend fuses every unit"),
-        ({"backend": "numpy"}, r"'backend' is now the first of 'backends'; write backends: \[numba, open3d, ...\]"),
-        ({"backends": {"values": ["numpy"]}}, "'backends' is now a list, the base backend first; write backends: "),
         ({"perturbation": {"seed": 3}}, "perturbation: leave its seed out; 'seed' counts"),
         ({"region_maps": ["x"], "backbones": ["x"]}, "region_maps: 'x' is named among the backbones too"),
         ({"strata": [2, 1]}, "strata: edges must be ascending"),

@@ -3,17 +3,15 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, Literal, Self
 
 import yaml
-from pydantic import Field, ValidationError, ValidationInfo, field_validator, model_validator
+from pydantic import Field, ValidationError, ValidationInfo, field_validator
 
 from semstab.config.settings import (
-    Counts,
     Deviation,
     FrameSelection,
-    Lengths,
     Noise,
     Part,
     ScopeSetting,
@@ -29,41 +27,18 @@ from semstab.core.types import THIS_SCENE
 from semstab.errors import ConfigError, nearest
 
 __all__ = [
-    "BackendConfig",
-    "Config",
-    "Counts",
-    "DatasetConfig",
-    "Deviation",
-    "Exclusion",
-    "FrameSelection",
-    "Lengths",
-    "Noise",
-    "Part",
-    "Perturbation",
-    "Settings",
-    "Sweeps",
-    "as_range",
-    "explain",
-    "merge",
-    "nearest",
-    "read_yaml",
-    "validated",
-]
+    "BackendConfig", "Config", "DatasetConfig", "Deviation", "Exclusion", "FrameSelection", "Noise", "Part",
+    "Perturbation", "Settings", "Sweeps", "as_range", "explain", "merge", "nearest", "read_yaml", "validated",
+]  # fmt: skip
 
-BASE = "base"
-"""The units at the configuration's own settings, fused by its first backend."""
-
-SHARED = "shared_taxonomy"
-"""The units fused in the taxonomy that backbones are compared in."""
-
-BACKENDS = "backends"
-"""The base units fused by the other backends."""
-
-LEAST_TILE = 8
-"""Voxels along the edge of the smallest tiles."""
+BASE, SHARED, BACKENDS = "base", "shared_taxonomy", "backends"
+"""Units at the configuration's own settings by its first backend; in the shared taxonomy; by the other backends."""
 
 SAMPLE = "sample"
 """The check that follows a random set of voxels, not all of them."""
+
+LEAST_TILE = 8
+"""Voxels along the edge of the smallest tiles."""
 
 
 class DatasetConfig(Settings):
@@ -78,9 +53,7 @@ class BackendConfig(Part):
 
     name: str = Field(description="a name from `semstab-bench list`")
     options: dict[str, Any] = Field(default_factory=dict, description="options of that backend")
-    check: bool | None = Field(
-        None, description="whether it must agree with the others; not if it associates otherwise than pixel by pixel"
-    )
+    check: bool | None = Field(None, description="whether it must agree; by default where it associates by pixel")
 
 
 class Perturbation(Settings):
@@ -103,69 +76,49 @@ class Perturbation(Settings):
 
 
 class Exclusion(Settings):
-    """What is left out of maps by the class of a location, or of fusion because it moves (`pixels.preparation`)."""
+    """Locations left out of maps by their class, or pixels left out of fusion because they move."""
 
-    classes: tuple[str, ...] = Field(
-        (), description="locations whose fused class is one of these, by its name in the run's taxonomy"
-    )
+    classes: tuple[str, ...] = Field((), description="locations whose fused class is one of these, in the taxonomy")
     predicted_classes: tuple[str, ...] = Field(
-        (),
-        description="pixels that are predicted as one of these moving things, by a name of the backbone's or of the"
-        " run's taxonomy; it also removes what is predicted so by mistake",
+        (), description="pixels predicted as one of these moving things, by a name of the backbone's or of the taxonomy"
     )
     masks: bool = Field(True, description="pixels under the masks of the dataset, where it has some")
 
 
 class VerdictSettings(Settings):
-    """What a verdict asks for; see docs/metrics.md, The verdict."""
+    """Thresholds of the verdict; see docs/metrics.md, The verdict."""
 
     stable: float = Field(0.8, gt=0, lt=1, description="share of the ceiling from which labels may be relied on")
     usable: float = Field(2 / 3, gt=0, lt=1, description="and from which on they may be acted on with care")
     labelled: float = Field(0.9, ge=0, le=1, description="part of the locations that a stable model labels at least")
-    class_locations: float = Field(
-        100.0, ge=1, description="voxels that a class dominates from which on it is judged, and named in the verdict"
-    )
+    class_locations: float = Field(100.0, ge=1, description="voxels that a class must dominate to be judged")
 
 
 class Config(Settings):
-    """What determines the numbers of a run or a study: scenes x backbones x backends x variations."""
+    """Settings that determine the numbers of a run or a study: scenes x backbones x backends x variations."""
 
-    name: str = Field("run", min_length=1, description="what the report calls it; a study's is its file's by default")
+    name: str = Field("run", min_length=1, description="the title of the report; a study's is its file's by default")
     description: str = Field("", description="one line")
     dataset: DatasetConfig = DatasetConfig()
     scenes: list[str] | None = Field(None, description="scenes of the dataset; all of them where not given")
     backbones: list[str] | None = Field(None, description="label sources; all but the ground truth where not given")
-    region_maps: list[str] = Field(
-        default_factory=list,
-        description="label sources whose ids mean nothing across frames (raw SAM); only their flicker is measured",
-    )
+    region_maps: list[str] = Field([], description="label sources whose ids mean nothing across frames (raw SAM)")
     backends: list[BackendConfig] = Field(
-        [BackendConfig(name="numba")],
-        min_length=1,
-        description="fusion backends: the first one fuses every unit, the others the same frames of the base units",
+        [BackendConfig(name="numba")], min_length=1, description="the first fuses every unit, others the base units"
     )
     check: str | None = Field(
-        SAMPLE,
-        description="what the backends are checked against: sample, the numpy reference on one in 16 voxels; or a"
-        " backend that fuses all base units beside them, numpy for one; null for nothing",
+        SAMPLE, description="sample: the numpy reference on one in 16 voxels; a backend that fuses all base units; null"
     )
     tolerance: float = Field(1e-9, ge=0, description="largest difference at which two backends agree")
     taxonomy: str | None = Field(None, description="label space to fuse in; the dataset's own where not given")
     shared_taxonomy: str | None = Field(None, description="label space in which backbones are compared; null: none")
     voxel_size: float = Field(
-        0.2,
-        ge=1e-9,
-        le=1e9,
-        description="edge of a voxel, metres; where it is not given, what `check` suggests for data of files",
+        0.2, ge=1e-9, le=1e9, description="edge, metres; where not given, the suggestion of `check` for data of files"
     )
     pixel_stride: int = Field(1, ge=1, description="use every n-th pixel of each axis")
-    top_k: int | None = Field(
-        None, ge=1, description="fuse the so many largest scores of each pixel; null: all, without loss"
-    )
+    top_k: int | None = Field(None, ge=1, description="fuse the so many largest scores of each pixel; null: all")
     frames: FrameSelection = FrameSelection()
-    scene_frames: dict[str, FrameSelection] = Field(
-        default_factory=dict, description="frames of single scenes, instead of `frames`"
-    )
+    scene_frames: dict[str, FrameSelection] = Field({}, description="frames of single scenes, instead of `frames`")
     exclude: Exclusion = Exclusion()
     perturbation: Perturbation | None = Field(None, description="noise in every unit; null for none")
     strata: list[int] = Field([1, 2, 5], min_length=1, description="upper OP edges of the persistence strata")
@@ -173,41 +126,23 @@ class Config(Settings):
     seed: int = Field(0, ge=0, description="of the noise; the n-th repeat of a sweep takes seed + n")
     events: bool = Field(False, description="also write the log of observations, where a backend keeps one")
     statistics: bool = Field(
-        False,
-        description="statistics also of the order of observations, of right and wrong, and of backbones beside each"
-        " other; keeps every observation, fuses the ground truth too",
+        False, description="also statistics of order, correctness and model comparison; fuses the ground truth too"
     )
-    frame_quality: bool = Field(
-        False, description="also judge each frame's labels: right, foreseen, late; `remedies` does"
-    )
-    critical_classes: list[str] = Field(
-        default_factory=list,
-        description="classes that the verdict depends on; all that have enough places where none is named",
-    )
-    scope: ScopeSetting = Field(
-        THIS_SCENE, description="of the verdict and its intervals: 'this scene' flown again, or 'other scenes' like it"
-    )
+    frame_quality: bool = Field(False, description="also judge each frame's labels; the filters study does")
+    critical_classes: list[str] = Field([], description="classes of the verdict; all frequent ones if none is named")
+    scope: ScopeSetting = Field(THIS_SCENE, description="of intervals: 'these frames', 'this scene', 'other scenes'")
     verdict: VerdictSettings = VerdictSettings()
-    threads: int | None = Field(
-        None, ge=1, exclude=True, description="threads that decode frames ahead; changes no number, so it is not kept"
-    )
+
+    # These change no number, so they are not stored with a run.
+    threads: int | None = Field(None, ge=1, exclude=True, description="threads that decode frames ahead")
     memory_gb: float | None = Field(
-        None,
-        gt=0,
-        le=1e9,
-        exclude=True,
-        description="memory that maps may take, GB; what is free where not given; not kept",
+        None, gt=0, le=1e9, exclude=True, description="memory that maps may take, GB; what is free where not given"
     )
     tile_size: int | Literal["off"] | None = Field(
-        None,
-        exclude=True,
-        description="edge of a tile, voxels, a power of 2: maps are fused tile by tile; where not given, only those"
-        " that would not fit, in tiles of a chosen size; off: such a map is refused; not kept",
+        None, exclude=True, description="edge of tiles, voxels, a power of 2; by default only where a map needs them"
     )
-    svg: bool = Field(False, exclude=True, description="also write figures as SVG, for print; not kept")
-    check_geometry: bool = Field(
-        True, exclude=True, description="refuse data whose depth and poses contradict each other; not kept"
-    )
+    svg: bool = Field(False, exclude=True, description="also write figures as SVG, for print")
+    check_geometry: bool = Field(True, exclude=True, description="refuse data whose depth and poses contradict")
 
     if not TYPE_CHECKING:
 
@@ -227,21 +162,6 @@ class Config(Settings):
     @classmethod
     def _one_is_a_list(cls, value: Any) -> Any:
         return [value] if isinstance(value, str) else value
-
-    @model_validator(mode="before")
-    @classmethod
-    def _of_earlier_versions(cls, content: Any) -> Any:
-        """Say what to write instead of a study's settings of version 0.1."""
-        if isinstance(content, Mapping):
-            others = content.get("backends")
-            if "backend" in content:
-                raise ValueError("'backend' is now the first of 'backends'; write backends: [numba, open3d, ...]")
-            if isinstance(others, Mapping):
-                raise ValueError(
-                    "'backends' is now a list, the base backend first;"
-                    " write backends: [numba, {name: open3d, scenes: [...]}]"
-                )
-        return content
 
     @field_validator("backends", mode="before")
     @classmethod
@@ -274,17 +194,13 @@ class Config(Settings):
             raise ValueError(f"'{both[0]}' is named among the backbones too; use one of the two")
         return value
 
-    @field_validator("tile_size", mode="before")
+    @field_validator("tile_size", mode="wrap")
     @classmethod
-    def _off_is_no_switch(cls, value: Any) -> Any:
-        return "off" if value is False else value  # YAML reads the bare word so
-
-    @field_validator("tile_size")
-    @classmethod
-    def _a_power_of_two(cls, value: int | str | None) -> int | str | None:
-        if isinstance(value, int) and (value < LEAST_TILE or value & (value - 1)):
+    def _a_power_of_two(cls, value: Any, validate: Callable[[Any], Any]) -> int | str | None:
+        size = validate("off" if value is False else value)  # YAML reads the bare word as false
+        if isinstance(size, int) and (size < LEAST_TILE or size & (size - 1)):
             raise ValueError(f"use a power of 2 from {LEAST_TILE}, or off")
-        return value
+        return size
 
     @field_validator("strata")
     @classmethod

@@ -1,4 +1,4 @@
-"""What every group of settings shares: closed to unknown keys, read from YAML, explained in one line."""
+"""Groups of settings: closed to unknown keys, read from YAML, explained in one line; sweeps; frame selections."""
 
 from __future__ import annotations
 
@@ -92,8 +92,7 @@ def explain(error: ValidationError, model: type[BaseModel]) -> str:
 def _keys_at(model: type[BaseModel], path: tuple[int | str, ...]) -> Iterator[str]:
     for part in path:
         field = model.model_fields.get(str(part))
-        inner = list(_models_in(field.annotation)) if field else []
-        model = inner[0] if inner else model
+        model = next(_models_in(field.annotation), model) if field else model
     yield from model.model_fields
 
 
@@ -104,7 +103,7 @@ def _models_in(annotation: Any) -> Iterator[type[BaseModel]]:
         yield from _models_in(inner)
 
 
-# What a configuration varies: one thing at a time, all else as in its base settings.
+# Variations of a configuration: one thing at a time, all else as in its base settings.
 
 Deviation = Annotated[float, Field(ge=0, le=1e9)]
 
@@ -176,21 +175,20 @@ Indices = list[int]
 """Frames of a sequence, counted from 0, in ascending order."""
 
 
-def slice_of(text: str) -> dict[str, int]:
-    """'START:STOP:STRIDE' as settings; each part may be empty. Raises ConfigError for anything else."""
-    parts = text.split(":")
-    if len(parts) > 3 or not all(re.fullmatch(r"\s*[0-9]{0,18}\s*", part) for part in parts):
-        raise ConfigError(f"write START:STOP:STRIDE, for example 0:80:4 or ::4, not {text}")
-    if len(parts) == 1:
-        raise ConfigError(f"write {text}:{int(text or 0) + 1} for one frame, :{text} for the first {text}")
-    return {key: int(part) for key, part in zip(("start", "stop", "stride"), parts, strict=False) if part.strip()}
-
-
 def in_full(selection: Any) -> Any:
-    """A selection of frames as settings, where it is 'START:STOP:STRIDE' or a bare list of frames."""
-    if isinstance(selection, str | int):
-        return slice_of(str(selection))
-    return {"list": selection} if isinstance(selection, Sequence) else selection
+    """Return a selection of frames as settings, also of START:STOP:STRIDE (parts may be empty) or a list of frames.
+
+    Raises ConfigError for another text.
+    """
+    if not isinstance(selection, str | int):
+        return {"list": selection} if isinstance(selection, Sequence) else selection
+    parts = str(selection).split(":")
+    if len(parts) > 3 or not all(re.fullmatch(r"\s*[0-9]{0,18}\s*", part) for part in parts):
+        raise ConfigError(f"write START:STOP:STRIDE, for example 0:80:4 or ::4, not {selection}")
+    if len(parts) == 1:
+        number = int(parts[0] or 0)
+        raise ConfigError(f"write {number}:{number + 1} for one frame, :{number} for the first {number}")
+    return {key: int(part) for key, part in zip(("start", "stop", "stride"), parts, strict=False) if part.strip()}
 
 
 class FrameSelection(Settings):
@@ -203,19 +201,14 @@ class FrameSelection(Settings):
     stop: int | None = Field(None, ge=1)
     stride: int = Field(1, ge=1)
     count: int | None = Field(None, ge=1)
-    spacing: Literal["stride", "even"] = Field(
-        "stride", description="which `count` frames: stride, the first ones; even, from the first to the last one"
-    )
-    list: tuple[Annotated[int, Field(ge=0)], ...] | None = Field(
-        None, min_length=1, description="these frames, ascending from 0, and no others"
-    )
+    spacing: Literal["stride", "even"] = "stride"
+    list: tuple[Annotated[int, Field(ge=0)], ...] | None = Field(None, min_length=1, description="ascending, from 0")
     from_time: float | None = Field(None, allow_inf_nan=False, description="seconds on the scene's own clock")
     to_time: float | None = Field(None, allow_inf_nan=False, description="seconds on the scene's own clock, included")
 
     @model_validator(mode="before")
     @classmethod
     def _a_slice_or_a_list(cls, content: Any) -> Any:
-        """'START:STOP:STRIDE' and a bare list of frames are settings, too."""
         return in_full(content)
 
     @model_validator(mode="after")
@@ -253,18 +246,18 @@ class FrameSelection(Settings):
             if self.list[-1] >= length:
                 raise ConfigError(f"frames.list: there is no frame {self.list[-1]}; the sequence has {length}, from 0")
             return [*self.list]
-        extent = [*range(length)][self.start : self.stop]
+        chosen = [*range(length)][self.start : self.stop]
         if self.needs_time:
-            extent = self._in_time(extent, timestamps)
-        chosen = extent[:: self.stride]
-        return chosen[: self.count] if self.spacing == "stride" else _evenly(chosen, self.count or len(chosen))
-
-    def _in_time(self, extent: Indices, timestamps: Sequence[float] | None) -> Indices:
-        if timestamps is None:
-            raise ConfigError("frames: from_time and to_time need time stamps, which this sequence has not; use start")
-        first = -math.inf if self.from_time is None else self.from_time
-        last = math.inf if self.to_time is None else self.to_time
-        return [index for index in extent if first <= timestamps[index] <= last]
+            if timestamps is None:
+                raise ConfigError("frames: from_time and to_time need time stamps; this sequence has none; use start")
+            first = -math.inf if self.from_time is None else self.from_time
+            last = math.inf if self.to_time is None else self.to_time
+            chosen = [index for index in chosen if first <= timestamps[index] <= last]
+        chosen = chosen[:: self.stride]
+        if self.spacing == "stride" or not chosen:
+            return chosen[: self.count]
+        count, end = min(self.count or len(chosen), len(chosen)), len(chosen) - 1
+        return [chosen[round(k * end / max(1, count - 1))] for k in range(count)]  # at equal distances to within one
 
 
 def as_range(indices: Sequence[int]) -> Sequence[int]:
@@ -273,9 +266,3 @@ def as_range(indices: Sequence[int]) -> Sequence[int]:
         return indices
     even = range(indices[0], indices[-1] + 1, max(1, indices[1] - indices[0]))
     return even if len(even) == len(indices) and all(map(operator.eq, even, indices)) else indices
-
-
-def _evenly(items: Indices, count: int) -> Indices:
-    """At most `count` of the items, the first and the last included, at equal distances to within one."""
-    count, last = min(count, len(items)), len(items) - 1
-    return [items[round(k * last / max(1, count - 1))] for k in range(count)]
