@@ -15,10 +15,9 @@ import typer
 from typer.core import TyperCommand, TyperGroup
 
 from semstab import __version__
-from semstab.cli.data import check, convert, predict
 from semstab.cli.finished import calibrate, compare, conform, export, gate, list_, relabel
 from semstab.cli.options import say
-from semstab.cli.running import remedies, run, show, study, view
+from semstab.cli.running import check, convert, predict, remedies, run, show, study, view
 from semstab.core.process import settle
 from semstab.errors import OUT_OF_MEMORY, SemstabError, one_line
 
@@ -121,7 +120,7 @@ class Group(TyperGroup):
             say(f"error: {error}")
             raise typer.Exit(error.exit_code) from error
         except KeyboardInterrupt as error:
-            say("interrupted; what was finished is kept, and the same command with the same --out goes on from there")
+            say("interrupted; what was finished is kept, and the same command with the same --out resumes there")
             raise typer.Exit(INTERRUPTED) from error
         except OSError as error:
             say(f"error: {error.filename or 'input or output'}: {error.strerror or error}")

@@ -1,34 +1,25 @@
-"""The command compare."""
+"""Commands over finished runs: compare, gate, calibrate, export, relabel; conform and list."""
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
-from semstab.cli.options import Quiet, ScopeOption, say
-
-if TYPE_CHECKING:
-    from semstab.core.registry import Registry
+from semstab.cli.options import Quiet, ScopeOption, print_lines, say
 
 
 def compare(
-    runs: Annotated[
-        list[str],
-        typer.Argument(
-            metavar="RUN...", help="Folders of runs or studies, the one to compare with first; RUN:BACKBONE."
-        ),
-    ],
-    out: Annotated[
-        Path | None, typer.Option("--out", "-o", help="Folder for report.html, tables, figures, JSON, Markdown.")
-    ] = None,
+    runs: Annotated[list[str], typer.Argument(
+        metavar="RUN...", help="Folders of runs or studies, the one to compare with first; RUN:BACKBONE.")],
+    out: Annotated[Path | None, typer.Option(
+        "--out", "-o", help="Folder for report.html, tables, figures, JSON, Markdown.")] = None,
     scope: ScopeOption = None,
-    markdown: Annotated[
-        bool, typer.Option("--markdown", metavar="", help="Print Markdown, for a pull request.")
-    ] = False,
+    markdown: Annotated[bool, typer.Option(
+        "--markdown", metavar="", help="Print Markdown, for a pull request.")] = False,
     quiet: Quiet = False,
-) -> None:
+) -> None:  # fmt: skip
     """What differs between runs: by how much, how surely, in which classes and places, and which frames did it."""
     from rich.console import Console
 
@@ -38,17 +29,16 @@ def compare(
     from semstab.core.types import THIS_SCENE
 
     with Console(stderr=True, quiet=quiet).status("opening") as status:
-        found = compare(
+        comparison = compare(
             runs, out, scope=scope or THIS_SCENE, progress=lambda scene: status.update(f"comparing {scene}")
         )
-    console = Console(quiet=quiet)
     if markdown:
-        console.print(as_markdown(found), soft_wrap=True, markup=False, highlight=False)
+        print_lines([as_markdown(comparison)], quiet=quiet)
         return
     if not quiet:
-        print_comparison(found, console)
+        print_comparison(comparison, Console())
     if out is not None:
-        console.print(f"folder: {out}; report: {out / 'report.html'}", soft_wrap=True, markup=False, highlight=False)
+        print_lines([f"folder: {out}; report: {out / 'report.html'}"], quiet=quiet)
 
 
 # The commands gate and calibrate: quality gates, and thresholds from which labels may be acted on.
@@ -58,33 +48,24 @@ FAILED = 4
 
 def gate(
     new: Annotated[str, typer.Argument(metavar="NEW", help="Folder of a finished run, or FOLDER:BACKBONE.")],
-    against: Annotated[
-        str | None, typer.Option(metavar="BASE", help="The baseline: a folder likewise, or a small summary.")
-    ] = None,
-    rule: Annotated[
-        list[str] | None,
-        typer.Option("--rule", "-r", metavar="RULE", help="E.g. 'alpha drop < 0.02', 'class car: recall > 0.6'."),
-    ] = None,
-    config: Annotated[
-        Path | None, typer.Option("--config", "-c", help="YAML file: rules, level, undecided, scope.")
-    ] = None,
-    level: Annotated[
-        float | None, typer.Option(help="How often a rule may err on each side.", show_default="0.05")
-    ] = None,
-    undecided: Annotated[
-        str | None, typer.Option(metavar="pass|fail", help="What becomes of rules that stay open.", show_default="pass")
-    ] = None,
+    against: Annotated[str | None, typer.Option(
+        metavar="BASE", help="The baseline: a folder likewise, or a small summary.")] = None,
+    rule: Annotated[list[str] | None, typer.Option(
+        "--rule", "-r", metavar="RULE", help="E.g. 'alpha drop < 0.02', 'class car: recall > 0.6'.")] = None,
+    config: Annotated[Path | None, typer.Option(
+        "--config", "-c", help="YAML file: rules, level, undecided, scope.")] = None,
+    level: Annotated[float | None, typer.Option(
+        help="How often a rule may err on each side.", show_default="0.05")] = None,
+    undecided: Annotated[str | None, typer.Option(
+        metavar="pass|fail", help="Verdict on rules that stay open.", show_default="pass")] = None,
     scope: ScopeOption = None,
-    out: Annotated[
-        list[Path] | None,
-        typer.Option("--out", "-o", metavar="FILE", help=".xml (JUnit), .md (pull request), .json; repeatable."),
-    ] = None,
-    save_baseline: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="Keep NEW as a small summary, where the gate passes.")
-    ] = None,
+    out: Annotated[list[Path] | None, typer.Option(
+        "--out", "-o", metavar="FILE", help=".xml (JUnit), .md (pull request), .json; repeatable.")] = None,
+    save_baseline: Annotated[Path | None, typer.Option(
+        metavar="FILE", help="Keep NEW as a small summary, where the gate passes.")] = None,
     plan: Annotated[bool, typer.Option("--plan", metavar="", help="Say how many frames each rule needs.")] = False,
     quiet: Quiet = False,
-) -> None:
+) -> None:  # fmt: skip
     """Fail where a new model is shown to be worse: exit code 4 where a rule fails."""
     from rich.console import Console
 
@@ -94,18 +75,16 @@ def gate(
     from semstab.comparison.runs import open_run, save_summary
 
     gate_report.require_formats(out or ())
-    console = Console(quiet=quiet)
     if save_baseline is None or rule or config:
         result = judge(new, against, gate_config(config, rule or (), level, undecided, scope))
         for file in out or ():
             gate_report.write(result, file)
-        for line in gate_report.plan(result) if plan else gate_report.lines(result, console.width):
-            console.print(line, markup=False, highlight=False, soft_wrap=True)
+        print_lines(gate_report.plan(result) if plan else gate_report.lines(result, Console().width), quiet=quiet)
         if result.failed and not plan:
             raise typer.Exit(FAILED)
     if save_baseline is not None:
         save_summary(open_run(new), save_baseline)
-        console.print(f"{save_baseline}: a baseline of {save_baseline.stat().st_size:,} bytes", markup=False)
+        print_lines([f"{save_baseline}: a baseline of {save_baseline.stat().st_size:,} bytes"], quiet=quiet)
 
 
 def calibrate(
@@ -116,14 +95,11 @@ def calibrate(
     quiet: Quiet = False,
 ) -> None:
     """For each class the least evidence at which its labels are right often enough to be acted on."""
-    from rich.console import Console
-
     from semstab.comparison.calibration import calibrate_run, lines
 
-    found = calibrate_run(run, precision=precision, confidence=confidence)
-    found.save(out)
-    for line in lines(found):
-        Console(quiet=quiet).print(line, markup=False, highlight=False, soft_wrap=True)
+    thresholds = calibrate_run(run, precision=precision, confidence=confidence)
+    thresholds.save(out)
+    print_lines(lines(thresholds), quiet=quiet)
 
 
 # The command conform.
@@ -158,56 +134,41 @@ def conform(
 Run = Annotated[Path, typer.Argument(metavar="RUN", help="Folder of a finished run.")]
 Scene = Annotated[str | None, typer.Option("--scene", "-s", help="Scene; needed where the run has several.")]
 Backbone = Annotated[str | None, typer.Option("--backbone", "-m", help="Label source; needed where there are several.")]
-CommitFile = Annotated[
-    Path | None,
-    typer.Option("--thresholds", metavar="FILE", help="Only labels above the thresholds of `semstab-bench calibrate`."),
-]
+Thresholds = Annotated[Path | None, typer.Option(
+    "--thresholds", metavar="FILE", help="Only labels above the thresholds of `semstab-bench calibrate`.")]  # fmt: skip
 Backend = Annotated[str | None, typer.Option("--backend", "-b", help="Whose map; the run's first backend by default.")]
 
 
 def export(
     run: Run,
-    to: Annotated[
-        list[Path], typer.Option("--to", metavar="FILE", help=".ply .las .laz .tif .glb .parquet or .csv; repeatable.")
-    ],
+    to: Annotated[list[Path], typer.Option(
+        "--to", metavar="FILE", help=".ply .las .laz .tif .glb .parquet or .csv; repeatable.")],
     scene: Scene = None,
     backbone: Backbone = None,
     backend: Backend = None,
-    measure: Annotated[
-        list[str] | None, typer.Option(help="Column that goes along: vss, sbd, entropy, margin, op, ...; repeatable.")
-    ] = None,
+    measure: Annotated[list[str] | None, typer.Option(
+        help="Column that goes along: vss, sbd, entropy, margin, op, ...; repeatable.")] = None,
     min_op: Annotated[int, typer.Option(min=1, help="Only voxels that so many frames saw.")] = 1,
     classes: Annotated[list[str] | None, typer.Option("--class", help="Only voxels of this class; repeatable.")] = None,
-    commit: CommitFile = None,
+    thresholds: Thresholds = None,
     cell: Annotated[int, typer.Option(min=1, help="Edge of a cell of .tif, in voxels.")] = 1,
     asprs: Annotated[Path | None, typer.Option(metavar="FILE", help="YAML 'CLASS: CODE' for .las and .laz.")] = None,
-    classify: Annotated[
-        Path | None, typer.Option(metavar="CLOUD", help="Classify this .las, .laz or .ply cloud, and write it.")
-    ] = None,
-    radius: Annotated[
-        float | None, typer.Option(min=0, help="Metres from a point to the voxel that it may take; a voxel's edge.")
-    ] = None,
-    join: Annotated[
-        Path | None,
-        typer.Option(metavar="FILE", help="Parquet with more columns of the voxels: OUT/columns of compare."),
-    ] = None,
+    classify: Annotated[Path | None, typer.Option(
+        metavar="CLOUD", help="Classify this .las, .laz or .ply cloud, and write it.")] = None,
+    radius: Annotated[float | None, typer.Option(
+        min=0, help="Metres from a point to the voxel that it may take; a voxel's edge.")] = None,
+    join: Annotated[Path | None, typer.Option(
+        metavar="FILE", help="Parquet with more columns of the voxels: OUT/columns of compare.")] = None,
     quiet: Quiet = False,
-) -> None:
+) -> None:  # fmt: skip
     """The fused map as a point cloud, raster, mesh or table, with how far to trust each location."""
-    from rich.console import Console
-
     from semstab.exports import export as write
 
-    unit = {"scene": scene, "backbone": backbone, "backend": backend}
-    written = write(
-        run, to, **unit, measures=measure, min_op=min_op, classes=classes or (),
-        commit=commit, cell=cell, asprs=asprs, radius=radius,
-        classify=classify, join=join,
-    )  # fmt: skip
-    console = Console(quiet=quiet)
-    for file in written:
-        for line in (f"{file.path}: {file.content}", *(f"  {note}" for note in file.notes)):
-            console.print(line, soft_wrap=True, markup=False, highlight=False)
+    for file in write(
+        run, to, scene=scene, backbone=backbone, backend=backend, measures=measure, min_op=min_op,
+        classes=classes or (), commit=thresholds, cell=cell, asprs=asprs, radius=radius, classify=classify, join=join,
+    ):  # fmt: skip
+        print_lines([f"{file.path}: {file.content}", *(f"  {note}" for note in file.notes)], quiet=quiet)
 
 
 def relabel(
@@ -216,19 +177,17 @@ def relabel(
     scene: Scene = None,
     backbone: Backbone = None,
     backend: Backend = None,
-    name: Annotated[str | None, typer.Option(help="What the maps are called; BACKBONE-fused by default.")] = None,
+    name: Annotated[str | None, typer.Option(help="Name of the new maps; BACKBONE-fused by default.")] = None,
     min_op: Annotated[int, typer.Option(min=1, help="Ignore pixels of voxels that fewer frames saw.")] = 1,
     min_psa: Annotated[float, typer.Option(help="Ignore pixels of voxels on which fewer pairs of frames agree.")] = 0.0,
-    category: Annotated[
-        list[str] | None, typer.Option(help="Keep pixels of voxels of this category alone; repeatable.")
-    ] = None,
-    commit: CommitFile = None,
-    leave_one_out: Annotated[
-        bool, typer.Option("--leave-one-out", help="Label each frame by the other frames, without its own vote.")
-    ] = False,
+    category: Annotated[list[str] | None, typer.Option(
+        help="Keep pixels of voxels of this category alone; repeatable.")] = None,
+    thresholds: Thresholds = None,
+    leave_one_out: Annotated[bool, typer.Option(
+        "--leave-one-out", help="Label each frame by the other frames, without its own vote.")] = False,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace maps of other settings.")] = False,
     quiet: Quiet = False,
-) -> None:
+) -> None:  # fmt: skip
     """The fused classes back in every frame: label maps of a new source, unstable voxels ignored."""
     from rich.console import Console
 
@@ -237,15 +196,14 @@ def relabel(
     from semstab.exports.relabel import relabel as write
     from semstab.statistics.acceptance import AcceptanceThresholds
 
-    thresholds = None if commit is None else AcceptanceThresholds.load(commit)
-    belief = Belief(min_op, min_psa, tuple(category or ()), leave_one_out, thresholds)
+    loaded = None if thresholds is None else AcceptanceThresholds.load(thresholds)
+    belief = Belief(min_op, min_psa, tuple(category or ()), leave_one_out, loaded)
     with frame_bar(Console(stderr=True, quiet=quiet)) as bar:
         report = write(
             run, out, belief=belief, scene=scene, backbone=backbone, backend=backend, name=name, overwrite=overwrite,
             progress=bar,
         )  # fmt: skip
-    for line in report.lines():
-        Console(quiet=quiet).print(line, soft_wrap=True, markup=False, highlight=False)
+    print_lines(report.lines(), quiet=quiet)
 
 
 # The command list.
@@ -258,6 +216,7 @@ def list_() -> None:
     from rich.table import Table
 
     from semstab import backbones, backends, datasets
+    from semstab.errors import MissingDependencyError
     from semstab.model.labels import LabelSpace, shipped_taxonomies
     from semstab.predict import filters
     from semstab.settings import load_study, shipped_studies
@@ -267,23 +226,15 @@ def list_() -> None:
         table.add_column(name)
     for registry in (backends.REGISTRY, datasets.REGISTRY, backbones.REGISTRY, filters.REGISTRY):
         for name, entry in sorted(registry.entries().items()):
-            table.add_row(registry.kind, name, _ready(registry, name), escape(entry.summary))
+            try:
+                registry.load(name)  # an entry is ready where all that is behind its name imports
+                ready = "[green]ready"
+            except MissingDependencyError as error:
+                ready = f"[yellow]{escape(str(error))}"
+            table.add_row(registry.kind, name, ready, escape(entry.summary))
     for name in shipped_taxonomies():
         space = LabelSpace.load(name)
         table.add_row("taxonomy", name, "[green]ready", f"K = {len(space)}: {', '.join(space.classes)}")
     for name in shipped_studies():
         table.add_row("study", name, "[green]ready", load_study(name).description)
     Console().print(table)
-
-
-def _ready(registry: Registry, name: str) -> str:
-    """'ready', where what is behind the name really imports, or what to install."""
-    from rich.markup import escape
-
-    from semstab.errors import MissingDependencyError
-
-    try:
-        registry.load(name)
-    except MissingDependencyError as error:
-        return f"[yellow]{escape(str(error))}"
-    return "[green]ready"

@@ -1,8 +1,9 @@
-"""The commands run, study and view."""
+"""The commands that compute: run, study, remedies, check, predict, convert; and show and view of what they left."""
 
 from __future__ import annotations
 
 import gc
+import re
 import sys
 import time
 from pathlib import Path
@@ -10,198 +11,368 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from semstab.cli import options as completion
-from semstab.cli.options import (
-    Backbones,
-    Classes,
-    ConfigFile,
-    DataFolder,
-    DatasetName,
-    DatasetOptions,
-    DatasetSettings,
-    Filters,
-    Frames,
-    Jobs,
-    Quiet,
-    Report,
-    Rerun,
-    Scenes,
-    Scheduler,
-    ScopeOption,
-    TileSize,
-    TrustGeometry,
-    Verbose,
-    VoxelSize,
-    chosen,
-    overrides,
-    say,
-    with_options,
-)
-from semstab.errors import ConfigError
+from semstab.cli import options as opt
+from semstab.cli.options import chosen, print_lines, say
+from semstab.errors import ConfigError, DataError
 
 if TYPE_CHECKING:
     from semstab.config import Config
     from semstab.engine import Executor, Observer
-    from semstab.recording import Recording
 
 
 DISAGREE = 3
 
-Models = Annotated[
-    list[str] | None,
-    typer.Option(
-        "--predict",
-        metavar="NAME[,KEY=VALUE...]",
-        help="Model that makes the labels, nothing on disk: a name of `list`, FILE.py:NAME; repeatable.",
-    ),
-]
-
 
 def run(
-    backend: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--backend",
-            "-b",
-            help="Fusion backend; repeatable.",
-            show_default="numba",
-            autocompletion=completion.backends,
-        ),
-    ] = None,
-    config: ConfigFile = None,
-    data: DataFolder = None,
-    dataset: DatasetName = None,
-    scene: Scenes = None,
-    backbone: Backbones = None,
-    taxonomy: Annotated[
-        str | None,
-        typer.Option(
-            help="Taxonomy to fuse in: a name or a YAML file.",
-            show_default="the dataset's; city: uavid7",
-            autocompletion=completion.taxonomies,
-        ),
-    ] = None,
-    voxel_size: VoxelSize = None,
-    pixel_stride: Annotated[
-        int | None, typer.Option(help="Use every n-th pixel of each axis.", show_default="1")
-    ] = None,
-    top_k: Annotated[
-        int | None,
-        typer.Option("--top-k", help="Fuse the so many largest soft scores of each pixel.", show_default="all"),
-    ] = None,
-    frames: Frames = None,
-    device: Annotated[
-        str | None,
-        typer.Option(help="CPU:0, or CUDA:0 for backends that take a device.", show_default="the backend's own"),
-    ] = None,
-    check: Annotated[
-        str | None,
-        typer.Option(
-            metavar="sample|BACKEND|none",
-            help="Check voxel by voxel against the numpy reference on a random sample, or against a backend on all.",
-            show_default="sample; of the built-in city numpy",
-        ),
-    ] = None,
+    backend: Annotated[list[str] | None, typer.Option(
+        "--backend", "-b", help="Fusion backend; repeatable.", show_default="numba", autocompletion=opt.backends,
+    )] = None,
+    config: opt.ConfigFile = None,
+    data: opt.DataFolder = None,
+    dataset: opt.DatasetName = None,
+    scene: opt.Scenes = None,
+    backbone: opt.Backbones = None,
+    taxonomy: Annotated[str | None, typer.Option(
+        help="Taxonomy to fuse in: a name or a YAML file.", show_default="the dataset's; city: uavid7",
+        autocompletion=opt.taxonomies,
+    )] = None,
+    voxel_size: opt.VoxelSize = None,
+    pixel_stride: Annotated[int | None, typer.Option(
+        help="Use every n-th pixel of each axis.", show_default="1")] = None,
+    top_k: Annotated[int | None, typer.Option(
+        "--top-k", help="Fuse the so many largest soft scores of each pixel.", show_default="all")] = None,
+    frames: opt.Frames = None,
+    device: Annotated[str | None, typer.Option(
+        help="CPU:0, or CUDA:0 for backends that take a device.", show_default="the backend's own")] = None,
+    check: Annotated[str | None, typer.Option(
+        metavar="sample|BACKEND|none", show_default="sample; of the built-in city numpy",
+        help="Check voxel by voxel against the numpy reference on a random sample, or against a backend on all.",
+    )] = None,
     seed: Annotated[int | None, typer.Option(help="Seed of a simulated dataset.", show_default="0")] = None,
-    settings: Annotated[
-        list[str] | None,
-        typer.Option("--set", metavar="KEY=VALUE", help="Any setting, e.g. dataset.options.width=640."),
-    ] = None,
-    options: DatasetOptions = None,
-    trust_geometry: TrustGeometry = False,
+    settings: Annotated[list[str] | None, typer.Option(
+        "--set", metavar="KEY=VALUE", help="Any setting, e.g. dataset.options.width=640.")] = None,
+    options: opt.DatasetOptions = None,
+    trust_geometry: opt.TrustGeometry = False,
     events: Annotated[bool | None, typer.Option("--events", help="Also write the log of observations.")] = None,
-    statistics: Annotated[
-        bool | None,
-        typer.Option("--statistics", help="Also test drift, judge by ground truth, compare backbones; takes longer."),
-    ] = None,
-    scope: ScopeOption = None,
+    statistics: Annotated[bool | None, typer.Option(
+        "--statistics", help="Also test drift, judge by ground truth, compare backbones; takes longer.")] = None,
+    scope: opt.ScopeOption = None,
     out: Annotated[Path | None, typer.Option("--out", "-o", help="Run folder.", show_default="runs/TIME")] = None,
-    rerun: Rerun = None,
-    report: Report = "on",
-    jobs: Jobs = 1,
-    scheduler: Scheduler = None,
-    tile_size: TileSize = None,
-    predict: Models = None,
-    classes: Classes = None,
-    filters: Filters = None,
-    quiet: Quiet = False,
-    verbose: Verbose = False,
-) -> None:
+    rerun: opt.Rerun = None,
+    report: opt.Report = "on",
+    jobs: opt.Jobs = 1,
+    scheduler: opt.Scheduler = None,
+    tile_size: opt.TileSize = None,
+    predict: opt.Models = None,
+    classes: opt.Classes = None,
+    filters: opt.Filters = None,
+    quiet: opt.Quiet = False,
+    verbose: opt.Verbose = False,
+) -> None:  # fmt: skip
     """Fuse every selected backbone with every selected backend, measure, compare. This is the default command."""
+    from datetime import datetime
+
+    from semstab.predict.predictor import parse_predictor
+    from semstab.settings import filtered_config, load_config, predicted_config
+
     named = {
-        "backends": backend,
-        "scenes": scene,
-        "backbones": backbone,
-        "taxonomy": taxonomy,
-        "voxel_size": voxel_size,
-        "pixel_stride": pixel_stride,
-        "top_k": top_k,
-        "check": check,
-        "events": events,
-        "statistics": statistics,
-        "scope": scope,
-        "check_geometry": False if trust_geometry else None,
+        "backends": backend, "scenes": scene, "backbones": backbone, "taxonomy": taxonomy, "voxel_size": voxel_size,
+        "pixel_stride": pixel_stride, "top_k": top_k, "check": check, "events": events, "statistics": statistics,
+        "scope": scope, "check_geometry": False if trust_geometry else None,
         "tile_size": tile_size if tile_size is None or not tile_size.isdigit() else int(tile_size),
-    }
-    content = chosen(named, with_options(settings, options), dataset, data, frames, seed)
+    }  # fmt: skip
+    content = chosen(named, settings, options, dataset, data, frames, seed)
     if check in ("none", "off"):
         content["check"] = None
-    resolved = _load(config, content, predict or [], classes, filters or [])
+    if classes is not None and not predict:
+        raise ConfigError("--classes names what a model predicts; say which one with --predict")
+    if predict:
+        given = {} if classes is None else {"classes": classes}
+        loaded = predicted_config([parse_predictor(text, given, filters or []) for text in predict], config, content)
+    else:
+        loaded = filtered_config(filters, config, content) if filters else load_config(config, content)
     if device is not None:
-        resolved = _on_device(resolved, device)
-    execute(resolved, out or _default_out(), executor_of(jobs, scheduler), rerun, report, quiet=quiet, verbose=verbose)
+        loaded = _on_device(loaded, device)
+    out = out or Path("runs") / datetime.now().astimezone().strftime("%Y-%m-%d_%H-%M-%S")
+    execute(loaded, out, executor_of(jobs, scheduler), rerun, report, quiet=quiet, verbose=verbose)
 
 
 def study(
-    file: Annotated[
-        str,
-        typer.Argument(
-            metavar="FILE", help="Study file, or a shipped study: see `list`.", autocompletion=completion.studies
-        ),
-    ],
+    file: Annotated[str, typer.Argument(
+        metavar="FILE", help="Study file, or a shipped study: see `list`.", autocompletion=opt.studies)],
     out: Annotated[Path | None, typer.Option("--out", "-o", help="Study folder.", show_default="studies/NAME")] = None,
-    jobs: Jobs = 1,
-    scheduler: Scheduler = None,
-    only: Annotated[
-        list[str] | None, typer.Option(metavar="PART", help="A sweep, shared_taxonomy or backends; repeatable.")
-    ] = None,
-    settings: Annotated[
-        list[str] | None,
-        typer.Option("--set", metavar="KEY=VALUE", help="Any setting, e.g. sweeps.voxel_size=[0.1,0.4]."),
-    ] = None,
-    options: DatasetOptions = None,
-    rerun: Rerun = "off",
-    report: Report = "on",
-    trust_geometry: TrustGeometry = False,
-    quiet: Quiet = False,
-    verbose: Verbose = False,
-) -> None:
-    """Everything that the paper reports: scenes x backbones x backends x variations. Goes on where it was."""
+    jobs: opt.Jobs = 1,
+    scheduler: opt.Scheduler = None,
+    only: Annotated[list[str] | None, typer.Option(
+        metavar="PART", help="A sweep, shared_taxonomy or backends; repeatable.")] = None,
+    settings: Annotated[list[str] | None, typer.Option(
+        "--set", metavar="KEY=VALUE", help="Any setting, e.g. sweeps.voxel_size=[0.1,0.4].")] = None,
+    options: opt.DatasetOptions = None,
+    rerun: opt.Rerun = "off",
+    report: opt.Report = "on",
+    trust_geometry: opt.TrustGeometry = False,
+    quiet: opt.Quiet = False,
+    verbose: opt.Verbose = False,
+) -> None:  # fmt: skip
+    """Everything that the paper reports: scenes x backbones x backends x variations. Resumes where it was."""
     from semstab.model.results import slug
     from semstab.settings import load_study
 
-    config = load_study(
-        file, overrides({"check_geometry": False if trust_geometry else None}, with_options(settings, options))
+    config = load_study(file, chosen({"check_geometry": False if trust_geometry else None}, settings, options))
+    config = config if only is None else config.only(only)
+    out = out or Path("studies") / slug(config.name)
+    execute(config, out, executor_of(jobs, scheduler), rerun, report, quiet=quiet, verbose=verbose)
+
+
+def remedies(
+    data: opt.DataFolder = None,
+    dataset: opt.DatasetName = None,
+    scene: opt.Scenes = None,
+    backbone: opt.Backbones = None,
+    predict: opt.Models = None,
+    classes: opt.Classes = None,
+    filters: opt.Filters = None,
+    frames: opt.Frames = None,
+    voxel_size: opt.VoxelSize = None,
+    taxonomy: Annotated[str | None, typer.Option(help="Taxonomy to fuse and judge in: a name or a file.")] = None,
+    settings: opt.DatasetSettings = None,
+    options: opt.DatasetOptions = None,
+    trust_geometry: opt.TrustGeometry = False,
+    out: Annotated[Path, typer.Option("--out", "-o", help="Study folder.")] = Path("studies/remedies"),
+    report: opt.Report = "on",
+    jobs: opt.Jobs = 1,
+    quiet: opt.Quiet = False,
+) -> None:
+    """Which filter makes this model more stable: how right, how late, at what price. Resumes where it was.
+
+    --filter tries others than the usual ones; chains are written with a plus sign, ema-warped:0.6+threshold:0.5.
+    """
+    from semstab.predict.predictor import parse_predictor
+    from semstab.remedies import remedies_config
+
+    named: dict[str, Any] = {"scenes": scene, "voxel_size": voxel_size, "taxonomy": taxonomy}
+    named["check_geometry"] = False if trust_geometry else None
+    models = [parse_predictor(text, {} if classes is None else {"classes": classes}) for text in predict or []]
+    content = chosen(named, settings, options, dataset, data, frames)
+    config, left_out = remedies_config(
+        models, backbone or [], filters or [], content, kept=out.absolute() / "predictions"
     )
-    if only is not None:
-        config = config.only(only)
-    execute(
-        config,
-        out or Path("studies") / slug(config.name),
-        executor_of(jobs, scheduler),
-        rerun,
-        report,
+    for line in left_out if not quiet else ():
+        say(line)
+    execute(config, out, executor_of(jobs, None), "off", report, quiet=quiet)
+
+
+def execute(
+    config: Config, out: Path, executor: Executor, rerun: str | None, report: str, *, quiet: bool, verbose: bool = False
+) -> None:
+    """Run it, print the answer, and end with the exit code that it calls for."""
+    began = time.monotonic()
+    from rich.console import Console
+
+    from semstab.api import run_study
+    from semstab.report.remedies import remedies
+    from semstab.report.terminal import ProgressBar, failure_lines, print_remedies, print_summary
+
+    if report not in ("on", "off"):
+        raise ConfigError(f"--report {report}: write on or off")
+    recording = []
+    if rerun != "off":
+        from semstab.recording import Recording, Target
+
+        recording.append(Recording(Target.parse(rerun, out / "recording.rrd"), run=out))
+        if executor.elsewhere and recording[0].target.live:
+            raise ConfigError("--rerun: a viewer follows a run in one process; leave out --jobs and --scheduler")
+    observers: list[Observer] = [ProgressBar(Console(stderr=True, quiet=quiet)), *recording]
+    gc.freeze()  # modules stay: looking for garbage among them takes half a second of a short run
+    try:
+        result = run_study(config, out, executor=executor, observers=observers, command=sys.argv, report=report == "on")
+        for line in failure_lines(result):
+            say(f"error: {line}")
+        if remedies(result) and not quiet:
+            print_remedies(result, Console())
+        elif result.select() and not quiet:
+            print_summary(result, Console(), out=out, seconds=time.monotonic() - began, verbose=verbose)
+        else:
+            print_lines([f"  folder  {out}"], quiet=quiet)
+        for each in recording:
+            each.serve()
+    finally:
+        for observer in observers:
+            observer.close()
+    if result.failures:
+        raise typer.Exit(2)
+    if not result.agrees:
+        say(f"error: the backends disagree; the agreement in {out / 'summary.json'} says where")
+        raise typer.Exit(DISAGREE)
+
+
+def executor_of(jobs: int, scheduler: str | None) -> Executor:
+    """Return where the work is done: here, in processes of this machine, on a cluster."""
+    import logging
+
+    from semstab.engine import DaskCluster, InProcess, LocalProcesses
+
+    if scheduler is None:
+        return LocalProcesses(jobs) if jobs > 1 else InProcess()
+    if jobs > 1:
+        raise ConfigError("--jobs and --scheduler: the scheduler's workers do the work; leave --jobs out")
+    cluster = DaskCluster(scheduler)
+    for name in ("distributed", "distributed.client"):  # a unit that fails is one line of the run's own
+        logging.getLogger(name).setLevel(logging.CRITICAL)
+    return cluster
+
+
+def _on_device(config: Config, device: str) -> Config:
+    from semstab.backends import takes_option
+
+    names = [backend.name for backend in config.backends]
+    if not any(takes_option(name, "device") for name in names):
+        raise ConfigError(f"--device {device}: none of {', '.join(names)} runs on a device")
+    changed = [
+        each.model_copy(update={"options": each.options | {"device": device}})
+        if takes_option(each.name, "device")
+        else each
+        for each in config.backends
+    ]
+    return config.model_copy(update={"backends": changed})
+
+
+def check(
+    config: opt.ConfigFile = None,
+    data: opt.DataFolder = None,
+    dataset: opt.DatasetName = None,
+    scene: opt.Scenes = None,
+    backbone: opt.Backbones = None,
+    voxel_size: opt.VoxelSize = None,
+    frames: opt.Frames = None,
+    settings: opt.DatasetSettings = None,
+    options: opt.DatasetOptions = None,
+    json_file: Annotated[Path | None, typer.Option("--json", metavar="FILE", help="Also write all numbers.")] = None,
+    quiet: opt.Quiet = False,
+) -> None:
+    """Does this dataset make sense: poses, depth, units, labels? Exit code 0 where it does, 2 where not."""
+    from rich.console import Console
+
+    from semstab.check import SCHEMA
+    from semstab.check import check as check_scenes
+    from semstab.check.display import print_check
+    from semstab.core.files import write_json
+    from semstab.settings import load_config, resolve
+
+    named = {"scenes": scene, "backbones": backbone, "voxel_size": voxel_size}
+    selected = resolve(load_config(config, chosen(named, settings, options, dataset, data, frames)))
+    console, results = Console(quiet=quiet), []
+    for checked in check_scenes(selected):
+        print_check(checked, console)
+        results.append(checked)
+    if json_file is not None:
+        write_json(json_file, {"schema": SCHEMA, "scenes": [checked.to_dict() for checked in results]})
+    if problems := [f"{checked.scene}: {problem}" for checked in results for problem in checked.problems]:
+        first, *more = problems
+        raise DataError(f"{first}" + (f" (and {len(more)} more, see above)" if more else ""))
+
+
+def predict(
+    backbone: Annotated[str, typer.Option(
+        "--backbone", "-m", help="Model, as named by `list`; or FILE.py:NAME, package.module:NAME.",
+        autocompletion=opt.models,
+    )],
+    images: Annotated[str | None, typer.Option(metavar="GLOB", help="Image files, quoted; or choose scenes.")] = None,
+    data: opt.DataFolder = None,
+    dataset: opt.DatasetName = None,
+    scene: opt.Scenes = None,
+    frames: opt.Frames = None,
+    out: Annotated[Path | None, typer.Option(
+        "--out", "-o", help="Folder above labels/ and scores/.", show_default="the scene's own")] = None,
+    name: Annotated[str | None, typer.Option(help="Name of the predictions.", show_default="the model's name")] = None,
+    model: Annotated[str | None, typer.Option(help="Folder that save_pretrained wrote, or a hub id.")] = None,
+    revision: Annotated[str | None, typer.Option(help="Branch, tag or commit on the hub.")] = None,
+    device: Annotated[str | None, typer.Option(help="cpu, cuda, cuda:1, mps.", show_default="cpu")] = None,
+    dtype: Annotated[str | None, typer.Option(help="float32, bfloat16 or float16.", show_default="float32")] = None,
+    image_size: Annotated[str | None, typer.Option(
+        metavar="N|HxW", help="Shorter side, or height and width, that the model sees.")] = None,
+    classes: opt.Classes = None,
+    batch: Annotated[int, typer.Option(min=1, help="Images at a time.")] = 1,
+    threads: Annotated[int | None, typer.Option(min=1, help="Threads of the model on a CPU.")] = None,
+    taxonomy: Annotated[str | None, typer.Option(help="Give labels in this taxonomy: a name or a YAML file.")] = None,
+    mapping: Annotated[str | None, typer.Option(
+        help="strict, or lenient: near classes count as well.", show_default="strict")] = None,
+    filters: opt.Filters = None,
+    scores: Annotated[bool, typer.Option("--scores", help="Also keep soft scores.")] = False,
+    top_k: Annotated[int | None, typer.Option(
+        min=1, metavar="N", help="Of these only each pixel's N largest; 0 for the rest.")] = None,
+    settings: Annotated[list[str] | None, typer.Option(
+        "--set", metavar="KEY=VALUE", help="Any option of the model, or dataset.options.KEY=VALUE.")] = None,
+    options: opt.DatasetOptions = None,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace predictions of other settings.")] = False,
+    quiet: opt.Quiet = False,
+) -> None:  # fmt: skip
+    """Run a segmentation model over images; label maps go where `run` and `study` read them. Resumes where it was."""
+    from semstab.predict import command
+    from semstab.settings import load_config, resolve
+
+    size: int | list[int] | None = None
+    if image_size is not None:
+        sides = image_size.lower().split("x")
+        if len(sides) > 2 or not all(re.fullmatch(r"[0-9]{1,9}", side) for side in sides):
+            raise ConfigError(f"--image-size {image_size}: write the shorter side, for example 512, or HEIGHTxWIDTH")
+        size = int(sides[0]) if len(sides) == 1 else [int(side) for side in sides]
+    named = {
+        "model": model, "revision": revision, "device": device, "dtype": dtype, "threads": threads, "classes": classes,
+        "image_size": size,
+    }  # fmt: skip
+    content = chosen(named, settings, options, dataset, data, frames)
+    indices, group = content.pop("frames", {}), content.pop("dataset", None)
+    if group is not None and data is None and dataset is None:
+        raise ConfigError("--option says how a dataset is read; choose one with --data or --dataset")
+    given = {"name": name, "taxonomy": taxonomy, "mapping": mapping, "scores": scores, "filters": filters}
+    command.run(
+        predictor={"backbone": backbone, **{key: value for key, value in given.items() if value is not None}},
+        options=content,
+        images=images,
+        dataset=None if group is None else resolve(load_config(None, {"dataset": group})).dataset,
+        scenes=None if scene == ["all"] else scene,
+        frames=indices,
+        out=out,
+        batch=batch,
+        overwrite=overwrite,
         quiet=quiet,
-        verbose=verbose,
+        top_k=top_k,
     )
+
+
+def convert(
+    out: Annotated[Path, typer.Option("--out", "-o", help="Folder in which each scene becomes a folder.")],
+    config: opt.ConfigFile = None,
+    data: opt.DataFolder = None,
+    dataset: opt.DatasetName = None,
+    scene: opt.Scenes = None,
+    backbone: opt.Backbones = None,
+    frames: opt.Frames = None,
+    settings: opt.DatasetSettings = None,
+    options: opt.DatasetOptions = None,
+    depth_error: Annotated[float, typer.Option(
+        min=0, metavar="METRES", help="Store depth in 16 bits where no pixel is off by more.")] = 0.0,
+    quiet: opt.Quiet = False,
+) -> None:  # fmt: skip
+    """Write any dataset as posed folders. Resumes where it was."""
+    from rich.console import Console
+
+    from semstab.convert import convert, frame_bar, print_converted
+    from semstab.settings import load_config, resolve
+
+    content = chosen({"scenes": scene, "backbones": backbone}, settings, options, dataset, data, frames)
+    selected, console = resolve(load_config(config, content)), Console(quiet=quiet, markup=False)
+    with frame_bar(Console(stderr=True, quiet=quiet)) as bar:
+        for converted in convert(selected, out, depth_error=depth_error, progress=bar):
+            print_converted(converted, console)
 
 
 def show(
     run: Annotated[Path, typer.Argument(metavar="RUN", help="Folder of a finished run.")],
-    what: Annotated[
-        list[str] | None, typer.Argument(metavar="[TABLE]...", help="Tables to print, by the beginning of their names.")
-    ] = None,
-) -> None:
+    what: Annotated[list[str] | None, typer.Argument(
+        metavar="[TABLE]...", help="Tables to print, by the beginning of their names.")] = None,
+) -> None:  # fmt: skip
     """Print the answer of a finished run again, or its tables, without computing."""
     from rich.console import Console
 
@@ -210,18 +381,17 @@ def show(
     from semstab.report.tables.table import to_terminal
     from semstab.report.terminal import print_summary
 
-    result, console = load_result(run), Console()
+    result = load_result(run)
     there = {table.name: table for table in tables(result)}
     if not what:
-        print_summary(result, console, out=run)
-        console.print(f"  tables  {', '.join(there)}", highlight=False, markup=False)
+        print_summary(result, Console(), out=run)
+        print_lines([f"  tables  {', '.join(there)}"])
         return
     for name in what:
-        chosen_tables = [table for key, table in there.items() if key.startswith(name)]
-        if not chosen_tables:
+        matching = [table for key, table in there.items() if key.startswith(name)]
+        if not matching:
             raise ConfigError(f"{run}: no table '{name}'; there are {', '.join(there)}")
-        for table in chosen_tables:
-            console.print(f"{to_terminal(table)}\n", highlight=False, markup=False, soft_wrap=True)
+        print_lines(f"{to_terminal(table)}\n" for table in matching)
 
 
 def view(run: Annotated[Path, typer.Argument(metavar="RUN", help="Run folder, or an .rrd file.")]) -> None:
@@ -239,154 +409,3 @@ def view(run: Annotated[Path, typer.Argument(metavar="RUN", help="Run folder, or
         say(f"making {recording}")
         record_finished(run, recording)
     raise typer.Exit(subprocess.run([*viewer_command(), str(recording)], check=False).returncode)
-
-
-def execute(
-    config: Config,
-    out: Path,
-    executor: Executor,
-    rerun: str | None,
-    report: str,
-    *,
-    quiet: bool = False,
-    verbose: bool = False,
-) -> None:
-    """Run it, print the answer, and end with the exit code that it calls for."""
-    began = time.monotonic()
-    from rich.console import Console
-
-    from semstab.api import run_study
-    from semstab.report.remedies import remedies
-    from semstab.report.terminal import ProgressBar, failure_lines, print_remedies, print_summary
-
-    if report not in ("on", "off"):
-        raise ConfigError(f"--report {report}: write on or off")
-    recording = _recording(rerun, out)
-    if executor.elsewhere and any(each.target.live for each in recording):
-        raise ConfigError("--rerun: a viewer follows a run in one process; leave out --jobs and --scheduler")
-    observers: list[Observer] = [ProgressBar(Console(stderr=True, quiet=quiet)), *recording]
-    gc.freeze()  # modules stay: looking for garbage among them takes half a second of a short run
-    try:
-        told: dict[str, Any] = {"executor": executor, "observers": observers, "command": sys.argv}
-        result = run_study(config, out, **told, report=report == "on")
-        for line in failure_lines(result):
-            say(f"error: {line}")
-        if not quiet:
-            console = Console()
-            if remedies(result):
-                print_remedies(result, console)
-            elif result.select():
-                print_summary(result, console, out=out, seconds=time.monotonic() - began, verbose=verbose)
-            else:
-                console.print(f"  folder  {out}", highlight=False, markup=False, soft_wrap=True)
-        for each in recording:
-            each.serve()
-    finally:
-        for observer in observers:
-            observer.close()
-    if result.failures:
-        raise typer.Exit(2)
-    if not result.agrees:
-        say(f"error: the backends disagree; the agreement in {out / 'summary.json'} says where")
-        raise typer.Exit(DISAGREE)
-
-
-def _recording(rerun: str | None, out: Path) -> list[Recording]:
-    if rerun == "off":
-        return []
-    from semstab.recording import Recording, Target
-
-    return [Recording(Target.parse(rerun, out / "recording.rrd"), run=out)]
-
-
-def executor_of(jobs: int, scheduler: str | None) -> Executor:
-    """Where the work is done: here, in processes of this machine, on a cluster."""
-    import logging
-
-    from semstab.engine import DaskCluster, InProcess, LocalProcesses
-
-    if scheduler is None:
-        return LocalProcesses(jobs) if jobs > 1 else InProcess()
-    if jobs > 1:
-        raise ConfigError("--jobs and --scheduler: the scheduler's workers do the work; leave --jobs out")
-    cluster = DaskCluster(scheduler)
-    for name in ("distributed", "distributed.client"):  # what becomes of a unit is said in one line
-        logging.getLogger(name).setLevel(logging.CRITICAL)
-    return cluster
-
-
-def _load(
-    path: Path | None, overrides: dict[str, Any], predict: list[str], classes: str | None, filters: list[str]
-) -> Config:
-    """The configuration; with models whose predictions take the place of the dataset's labels, or filters over them."""
-    from semstab.settings import filtered_config, load_config, predicted_config
-
-    if predict:
-        from semstab.predict.predictor import parse_predictor
-
-        options = {} if classes is None else {"classes": classes}
-        return predicted_config([parse_predictor(text, options, filters) for text in predict], path, overrides)
-    if classes is not None:
-        raise ConfigError("--classes names what a model predicts; say which one with --predict")
-    return filtered_config(filters, path, overrides) if filters else load_config(path, overrides)
-
-
-def _on_device(config: Config, device: str) -> Config:
-    from semstab.backends import takes_option
-
-    placed = [
-        backend.model_copy(update={"options": backend.options | {"device": device}})
-        if takes_option(backend.name, "device")
-        else backend
-        for backend in config.backends
-    ]
-    if placed == config.backends and not any(backend.options.get("device") == device for backend in placed):
-        raise ConfigError(f"--device {device}: none of {', '.join(b.name for b in placed)} runs on a device")
-    return config.model_copy(update={"backends": placed})
-
-
-def _default_out() -> Path:
-    from datetime import datetime
-
-    return Path("runs") / datetime.now().astimezone().strftime("%Y-%m-%d_%H-%M-%S")
-
-
-# The command remedies.
-
-
-def remedies(
-    data: DataFolder = None,
-    dataset: DatasetName = None,
-    scene: Scenes = None,
-    backbone: Backbones = None,
-    predict: Models = None,
-    classes: Classes = None,
-    filters: Filters = None,
-    frames: Frames = None,
-    voxel_size: VoxelSize = None,
-    taxonomy: Annotated[str | None, typer.Option(help="Taxonomy to fuse and judge in: a name or a file.")] = None,
-    settings: DatasetSettings = None,
-    options: DatasetOptions = None,
-    trust_geometry: TrustGeometry = False,
-    out: Annotated[Path, typer.Option("--out", "-o", help="Study folder.")] = Path("studies/remedies"),
-    report: Report = "on",
-    jobs: Jobs = 1,
-    quiet: Quiet = False,
-) -> None:
-    """What would steady this model: filters over it, how right, how late, at what price. Goes on where it was.
-
-    --filter tries others than the usual ones; chains are written with a plus sign, ema-warped:0.6+threshold:0.5.
-    """
-    from semstab.predict.predictor import parse_predictor
-    from semstab.remedies import remedies_config
-
-    named: dict[str, Any] = {"scenes": scene, "voxel_size": voxel_size, "taxonomy": taxonomy}
-    named["check_geometry"] = False if trust_geometry else None
-    models = [parse_predictor(text, {} if classes is None else {"classes": classes}) for text in predict or []]
-    content = chosen(named, with_options(settings, options), dataset, data, frames)
-    config, left_out = remedies_config(
-        models, backbone or [], filters or [], content, kept=out.absolute() / "predictions"
-    )
-    for line in left_out if not quiet else ():
-        say(line)
-    execute(config, out, executor_of(jobs, None), "off", report, quiet=quiet)

@@ -197,7 +197,7 @@ class Config(Settings):
     @field_validator("tile_size", mode="wrap")
     @classmethod
     def _a_power_of_two(cls, value: Any, validate: Callable[[Any], Any]) -> int | str | None:
-        size = validate("off" if value is False else value)  # YAML reads the bare word as false
+        size: int | str | None = validate("off" if value is False else value)  # YAML reads the bare word as false
         if isinstance(size, int) and (size < LEAST_TILE or size & (size - 1)):
             raise ValueError(f"use a power of 2 from {LEAST_TILE}, or off")
         return size

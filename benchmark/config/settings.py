@@ -9,7 +9,7 @@ import re
 import reprlib
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, Any, Literal, Self, TypeVar
+from typing import Annotated, Any, Generic, Literal, Self, TypeVar
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, field_validator, model_validator
 
@@ -18,6 +18,7 @@ from semstab.core.types import THIS_SCENE, Scope
 from semstab.errors import ConfigError, nearest, one_line
 
 Model = TypeVar("Model", bound=BaseModel)
+V = TypeVar("V")
 
 
 class Settings(BaseModel):
@@ -69,10 +70,8 @@ def validated(model: type[Model], content: Any, where: str = "") -> Model:
         return model.model_validate(content)
     except ValidationError as error:
         raise ConfigError(f"{where}{explain(error, model)}") from error
-    except UnicodeEncodeError as error:  # pydantic reads text as UTF-8; YAML's "\\ud800" is half a character
-        raise ConfigError(f"{where}{error.object[:80]!r} is no text ({error.reason})") from error
-    except TypeError as error:  # pydantic passes some groups on by name
-        raise ConfigError(f"{where}a setting has a name that is no text ({one_line(error)})") from error
+    except (UnicodeEncodeError, TypeError) as error:  # YAML's "\\ud800" is half a character, names may be numbers
+        raise ConfigError(f"{where}a name or a text is no text ({one_line(error)})") from error
 
 
 def explain(error: ValidationError, model: type[BaseModel]) -> str:
@@ -115,39 +114,32 @@ class Part(Settings):
     backbones: list[str] | None = Field(None, min_length=1, description="some of the backbones; all where not given")
 
 
-class Values(Part):
+class Values(Part, Generic[V]):
     """Values of a swept setting; a bare list is its values."""
+
+    values: list[V] = Field(min_length=1)
 
     @model_validator(mode="before")
     @classmethod
     def _a_list_is_values(cls, content: Any) -> Any:
         return {"values": content} if isinstance(content, list) else content
 
-    @field_validator("values", mode="after", check_fields=False)
+    @field_validator("values")
     @classmethod
-    def _each_value_once(cls, values: list[Any]) -> list[Any]:
+    def _each_value_once(cls, values: list[V]) -> list[V]:
         if any(a == b for a, b in itertools.combinations(values, 2)):
             raise ValueError("name each value once")
         return values
 
 
-class Lengths(Values):
-    """Values in metres."""
-
-    values: list[Annotated[float, Field(ge=1e-9, le=1e9)]] = Field(min_length=1)
-
-
-class Counts(Values):
-    """Whole numbers from 1."""
-
-    values: list[Annotated[int, Field(ge=1)]] = Field(min_length=1)
-
-
-class Noise(Values):
+class Noise(Values[Deviation]):
     """Standard deviations; each but 0 is drawn `repeats` times, with seeds of their own."""
 
-    values: list[Deviation] = Field(min_length=1)
     repeats: int = Field(1, ge=1)
+
+
+Lengths = Values[Annotated[float, Field(ge=1e-9, le=1e9)]]
+Counts = Values[Annotated[int, Field(ge=1)]]
 
 
 class Sweeps(Settings):
@@ -162,7 +154,7 @@ class Sweeps(Settings):
     frame_count: Counts | None = Field(None, description="so many frames, evenly over the extent of `frames`")
     pixel_stride: Counts | None = Field(None, description="use every n-th pixel of each axis")
 
-    def given(self) -> Iterator[tuple[str, Lengths | Counts | Noise]]:
+    def given(self) -> Iterator[tuple[str, Values[Any]]]:
         """The sweeps that there are, by name."""
         for name, part in self:
             if part is not None:

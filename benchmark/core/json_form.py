@@ -86,7 +86,7 @@ def from_json(cls: type[T], content: Any, where: str | Path) -> T:
     from pydantic import ValidationError
 
     try:
-        return cast(T, _validator(cls).validate_python(content))
+        return cast(T, _validator(cast(Any, cls)).validate_python(content))
     except ValidationError as error:
         line = _line(error.errors(include_url=False)[0])
     except RecursionError:
@@ -105,10 +105,10 @@ def number(content: Any) -> float:
 
 @functools.cache
 def _validator(cls: Any) -> SchemaValidator:
-    from pydantic import ConfigDict, TypeAdapter
+    from pydantic import TypeAdapter
     from pydantic_core import SchemaValidator
 
-    return SchemaValidator(_adapted(TypeAdapter(cls).core_schema), ConfigDict())
+    return SchemaValidator(_adapted(TypeAdapter(cls).core_schema))
 
 
 def _adapted(schema: Any) -> Any:
@@ -119,7 +119,7 @@ def _adapted(schema: Any) -> Any:
         return [_adapted(item) for item in schema]
     if not isinstance(schema, dict):
         return schema
-    kind, cls = schema.get("type"), schema.get("cls")
+    kind, cls = schema.get("type"), cast(Any, schema.get("cls"))
     own = {key: _adapted(value) for key, value in schema.items()} | ({"strict": True} if kind in EXACT else {})
     inline = [f.name for f in dataclasses.fields(cls) if "inline" in f.metadata] if kind == "dataclass" else []
 

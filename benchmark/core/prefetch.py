@@ -15,7 +15,8 @@ LOOK_AHEAD_BYTES = 1 << 30
 MOST_THREADS = 8
 """Used where no number is given: more threads than this only hold more frames in memory."""
 
-K, T = TypeVar("K"), TypeVar("T")
+K = TypeVar("K")
+T = TypeVar("T")
 
 
 @dataclass(frozen=True, eq=False)

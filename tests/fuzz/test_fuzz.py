@@ -158,7 +158,7 @@ def test_digits_without_end_are_sorted_and_half_characters_refused(tmp_path) -> 
     with pytest.raises(ConfigError, match=r"prompts\.yaml: "):
         read_prompts(tmp_path / "prompts.yaml")
     (tmp_path / "run.yaml").write_text("0x1f: []\n")
-    with pytest.raises(ConfigError, match=r"run\.yaml: a setting has a name that is no text"):
+    with pytest.raises(ConfigError, match=r"run\.yaml: a name or a text is no text"):
         load_config(tmp_path / "run.yaml")
 
 
