@@ -16,15 +16,8 @@ import numpy as np
 from pydantic import BaseModel, Field
 
 from semstab.core.files import open_file
-from semstab.datasets.files.options import (
-    FileOptions,
-    Folders,
-    FrameSource,
-    PixelCentre,
-    PoseConvention,
-    Template,
-    inside,
-)
+from semstab.datasets.files import options as opt
+from semstab.datasets.files.options import FileOptions, Folders, FrameSource, Template, inside
 from semstab.datasets.files.reader import FileDataset
 from semstab.datasets.formats.disk import AGAIN, natural, to_number
 from semstab.datasets.formats.images import DEPTH_SUFFIXES
@@ -37,16 +30,11 @@ MODEL_FOLDERS = ("sparse", "sparse/0", ".")
 class ColmapOptions(FileOptions):
     """Options with the defaults of the format."""
 
-    pose_convention: PoseConvention = "world_to_camera"
-    pixel_centre: PixelCentre = 0.5
-    model: str | None = Field(
-        None, description="folder of the sparse model in the scene's; sparse, sparse/0 or the scene's own by default"
-    )
+    pose_convention: opt.PoseConvention = "world_to_camera"
+    pixel_centre: opt.PixelCentre = 0.5
+    model: str | None = Field(None, description="folder of the sparse model; by default sparse, sparse/0 or the scene")
     images: str = Field("images", description="folder of the (undistorted) images in the scene's")
-    depth: str = Field(
-        "stereo/depth_maps/{image}.geometric.bin",
-        description="template of depth maps: {image} is the image's name in the model, {name} the same without suffix",
-    )
+    depth: str = Field("stereo/depth_maps/{image}.geometric.bin", description="template: {image}, {name} (no suffix)")
 
 
 class Colmap(FileDataset[ColmapOptions]):

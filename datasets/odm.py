@@ -13,18 +13,10 @@ from typing import Literal
 from pydantic import BaseModel, Field
 
 from semstab.core.files import open_file
+from semstab.datasets.files import options as opt
 from semstab.datasets.files.depth import HEADER_BYTES, dmap_header
 from semstab.datasets.files.labels import SceneEntry
-from semstab.datasets.files.options import (
-    DepthKind,
-    FileOptions,
-    Folders,
-    FrameSource,
-    PoseConvention,
-    Template,
-    UpAxis,
-    inside,
-)
+from semstab.datasets.files.options import FileOptions, Folders, FrameSource, Template, inside
 from semstab.datasets.files.reader import FileDataset
 from semstab.datasets.files.scene import FileScene
 from semstab.datasets.formats.disk import natural, subfolders
@@ -157,24 +149,16 @@ def depth_files(project: Project, kind: Kind | None, names: Mapping[str, str], t
 class OdmOptions(FileOptions):
     """Options with the defaults of the project."""
 
-    depth_from: Kind | None = Field(
-        None,
-        description="mesh, dsm, mve, openmvs, or files (option depth); the first of them that the project has where not"
-        " given",
-    )
+    depth_from: Kind | None = Field(None, description="source of depth; by default the first that the project has")
     depth: str = Field("depth/{name}", description="template of depth files in the project")
-    images: Path | None = Field(
-        None, description="folder of the images that the poses are of, where it is not in the project"
-    )
+    images: Path | None = Field(None, description="folder of the posed images, where it is not in the project")
     labels_on: Literal["undistorted", "original"] | None = Field(
-        None,
-        description="the images that labels were predicted on: undistorted ones or original photographs; those that the"
-        " poses are of where not given",
+        None, description="images that labels were predicted on; by default the posed ones"
     )
     reconstruction: int | None = Field(None, ge=0, description="which of several reconstructions, counted from 0")
-    depth_kind: DepthKind = None
-    pose_convention: PoseConvention = "world_to_camera"
-    up_axis: UpAxis = "z"
+    depth_kind: opt.DepthKind = None
+    pose_convention: opt.PoseConvention = "world_to_camera"
+    up_axis: opt.UpAxis = "z"
 
 
 class Odm(FileDataset[OdmOptions]):

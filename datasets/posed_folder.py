@@ -9,17 +9,8 @@ from pathlib import Path
 from pydantic import BaseModel
 
 from semstab.config import read_yaml, validated
-from semstab.datasets.files.options import (
-    CameraAxes,
-    DepthKind,
-    FileOptions,
-    FileSettings,
-    FrameSource,
-    MetresPerUnit,
-    PixelCentre,
-    PoseConvention,
-    ScoresLayout,
-)
+from semstab.datasets.files import options as opt
+from semstab.datasets.files.options import FileOptions, FrameSource
 from semstab.datasets.files.reader import FileDataset
 from semstab.datasets.formats.disk import files_by_stem, natural, read_intrinsics
 from semstab.datasets.formats.images import COLOR_SUFFIXES, DEPTH_SUFFIXES
@@ -32,12 +23,12 @@ MASKS = "mask/{name}"
 class PosedOptions(FileOptions):
     """Options that replace scene.yaml; the rest has the defaults of `FileSettings`, and masks are in mask/."""
 
-    scores_layout: ScoresLayout = None
-    depth_kind: DepthKind = None
-    pose_convention: PoseConvention = None
-    camera_axes: CameraAxes = None
-    metres_per_unit: MetresPerUnit = None
-    pixel_centre: PixelCentre = None
+    scores_layout: opt.ScoresLayout = None
+    depth_kind: opt.DepthKind = None
+    pose_convention: opt.PoseConvention = None
+    camera_axes: opt.CameraAxes = None
+    metres_per_unit: opt.MetresPerUnit = None
+    pixel_centre: opt.PixelCentre = None
 
 
 class PosedFolder(FileDataset[PosedOptions]):
@@ -71,17 +62,17 @@ class PosedFolder(FileDataset[PosedOptions]):
     def settled(self, folder: Path) -> FileOptions:
         """scene.yaml, where there is one, with the options on top. Raises ConfigError with the file and the setting."""
         settings = _scene_settings(folder / SETTINGS_FILE)
-        options = {key: getattr(self.options, key) for key in FileSettings.model_fields}
+        options = {key: getattr(self.options, key) for key in opt.FileSettings.model_fields}
         given = {key: value for key, value in options.items() if value not in (None, (), {})}
         if "taxonomy" in given or "classes" in given:  # one of the two is enough to replace either
             given = {"taxonomy": None, "classes": None} | given
         return self.options.model_copy(update=dict(settings) | given)
 
 
-def _scene_settings(path: Path) -> FileSettings:
+def _scene_settings(path: Path) -> opt.FileSettings:
     """The settings of scene.yaml; taxonomy files in it are relative to its folder."""
     content = read_yaml(path) if path.is_file() else {}
-    settings = validated(FileSettings, {"masks": MASKS} | content, f"{path}: ")
+    settings = validated(opt.FileSettings, {"masks": MASKS} | content, f"{path}: ")
     taxonomies = {key: _resolved(path, value) for key, value in settings.taxonomies.items()}
     taxonomy = settings.taxonomy and _resolved(path, settings.taxonomy)
     return settings.model_copy(update={"taxonomy": taxonomy, "taxonomies": taxonomies})

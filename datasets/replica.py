@@ -10,17 +10,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from pydantic import BaseModel, Field
+from pydantic import BaseModel
 
-from semstab.datasets.files.options import (
-    FileOptions,
-    FourIntrinsics,
-    FrameSource,
-    GroundTruth,
-    UpAxis,
-    VoidIds,
-    zero_is_void,
-)
+from semstab.datasets.files import options as opt
+from semstab.datasets.files.options import FileOptions, FrameSource
 from semstab.datasets.files.reader import FileDataset, frames_of, images_named
 from semstab.datasets.formats.disk import number, read_object, read_table
 from semstab.datasets.geometry.cameras import Camera, camera_of
@@ -48,10 +41,10 @@ CAMERA_FILE = "cam_params.json"
 class ReplicaOptions(FileOptions):
     """Options with the defaults of the formats; the depth scale is 6553.5 or 1000, by export."""
 
-    up_axis: UpAxis = "z"
-    intrinsics: FourIntrinsics = None
-    ground_truth: GroundTruth = "semantic_class/semantic_class_{name}.png"
-    void_ids: VoidIds = Field(default_factory=zero_is_void)
+    up_axis: opt.UpAxis = "z"
+    intrinsics: opt.FourIntrinsics = None
+    ground_truth: opt.GroundTruth = "semantic_class/semantic_class_{name}.png"
+    void_ids: opt.VoidIds = opt.ZERO_IS_VOID
 
 
 class Replica(FileDataset[ReplicaOptions]):

@@ -14,17 +14,9 @@ from pydantic import BaseModel, Field
 
 from semstab.core.types import UInt16
 from semstab.datasets import GROUND_TRUTH
+from semstab.datasets.files import options as opt
 from semstab.datasets.files.labels import NO_ID
-from semstab.datasets.files.options import (
-    DepthScale,
-    FileOptions,
-    FrameSource,
-    GroundTruth,
-    Size,
-    UpAxis,
-    VoidIds,
-    zero_is_void,
-)
+from semstab.datasets.files.options import FileOptions, FrameSource
 from semstab.datasets.files.reader import FileDataset, frames_of
 from semstab.datasets.formats.disk import MAX_TABLE_BYTES, files_named, read_intrinsics, read_text
 from semstab.datasets.geometry.cameras import Camera
@@ -37,16 +29,14 @@ Which = Literal["depth", "color"]
 class ScanNetOptions(FileOptions):
     """Options with the defaults of the format."""
 
-    depth_scale: DepthScale = 1000
-    up_axis: UpAxis = "z"
-    ground_truth: GroundTruth = "label-filt/{name}.png"
-    void_ids: VoidIds = Field(default_factory=zero_is_void)
+    depth_scale: opt.DepthScale = 1000
+    up_axis: opt.UpAxis = "z"
+    ground_truth: opt.GroundTruth = "label-filt/{name}.png"
+    void_ids: opt.VoidIds = opt.ZERO_IS_VOID
     intrinsics: Which = Field("depth", description="whose intrinsics the depth images have: those of depth or colour")
     label_camera: Which = Field("color", description="whose field of view label maps have: that of colour or depth")
-    color_size: Size = (1296, 968)
-    class_table: Path | None = Field(
-        None, description="scannetv2-labels.combined.tsv: translates the ids of the ground truth"
-    )
+    color_size: opt.Size = (1296, 968)
+    class_table: Path | None = Field(None, description="scannetv2-labels.combined.tsv, for ids of the ground truth")
     class_column: str = Field("nyu40id", description="column of that table with the ids of the taxonomy")
 
 

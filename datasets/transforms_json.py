@@ -33,9 +33,7 @@ class TransformsOptions(FileOptions):
     camera_axes: CameraAxes = "opengl"
     pixel_centre: PixelCentre = 0.5
     transforms: str = Field("transforms.json", description="file of the cameras in the scene's folder")
-    depth: str | None = Field(
-        None, description="template of depth maps with {name}, for frames without depth_file_path or depth_path"
-    )
+    depth: str | None = Field(None, description="template with {name}, for frames without depth_file_path")
 
 
 class TransformsJson(FileDataset[TransformsOptions]):

@@ -14,15 +14,8 @@ import numpy.typing as npt
 from pydantic import BaseModel, Field
 
 from semstab.core.types import Float64
-from semstab.datasets.files.options import (
-    DepthScale,
-    FileOptions,
-    FourIntrinsics,
-    FrameSource,
-    Positive,
-    UpAxis,
-    inside,
-)
+from semstab.datasets.files import options as opt
+from semstab.datasets.files.options import FileOptions, FrameSource, inside
 from semstab.datasets.files.reader import FileDataset
 from semstab.datasets.formats.disk import read_table, records, to_number
 from semstab.datasets.geometry.cameras import at_times, camera_of, from_quaternions, nearest
@@ -43,13 +36,11 @@ USUAL = (525.0, 525.0, 319.5, 239.5)
 class TumOptions(FileOptions):
     """Options with the defaults of the format."""
 
-    depth_scale: DepthScale = 5000
-    up_axis: UpAxis = "z"
-    intrinsics: FourIntrinsics = None
-    max_difference: Positive = Field(0.02, description="seconds by which things of one frame may differ")
-    poses: Literal["interpolate", "nearest"] = Field(
-        "interpolate", description="the pose at a depth image's time: between its two neighbours, or the nearest"
-    )
+    depth_scale: opt.DepthScale = 5000
+    up_axis: opt.UpAxis = "z"
+    intrinsics: opt.FourIntrinsics = None
+    max_difference: opt.Positive = Field(0.02, description="seconds by which things of one frame may differ")
+    poses: Literal["interpolate", "nearest"] = Field("interpolate", description="the pose at a depth image's time")
     trajectory: str = Field("groundtruth.txt", description="file of the poses: t tx ty tz qx qy qz qw")
 
 

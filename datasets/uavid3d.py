@@ -13,18 +13,8 @@ from typing import Any, Literal
 from pydantic import BaseModel, Field
 
 from semstab.datasets.colmap import has_model, read_model
-from semstab.datasets.files.options import (
-    CameraAxes,
-    FileOptions,
-    Folders,
-    FourIntrinsics,
-    FrameSource,
-    GroundTruth,
-    PixelCentre,
-    PoseConvention,
-    Template,
-    inside,
-)
+from semstab.datasets.files import options as opt
+from semstab.datasets.files.options import FileOptions, Folders, FrameSource, Template, inside
 from semstab.datasets.files.reader import FileDataset
 from semstab.datasets.formats.disk import files_named, read_intrinsics
 from semstab.datasets.formats.images import COLOR_SUFFIXES, DEPTH_SUFFIXES
@@ -55,18 +45,16 @@ class Uavid3dOptions(FileOptions):
 
     images: str = Field("images/{name}", description="template of the colour images")
     depth: str = Field("depth/{name}", description="template of the depth maps")
-    pose_format: PoseFormat = Field(
-        "colmap", description="a COLMAP model, a transforms.json, or a 4x4 matrix a frame as text"
-    )
+    pose_format: PoseFormat = Field("colmap", description="COLMAP model, transforms.json, or 4x4 matrices as text")
     model: str = Field("sparse", description="folder of the COLMAP model, text or binary")
     transforms: str = Field("transforms.json", description="file of the cameras")
     pose: str = Field("pose/{name}.txt", description="template of the matrices")
-    intrinsics: FourIntrinsics = None
+    intrinsics: opt.FourIntrinsics = None
     intrinsics_file: str = Field("intrinsics.txt", description="3x3 matrix, where poses are matrices")
-    ground_truth: GroundTruth = "Labels/{name}.png"
-    pose_convention: PoseConvention = None
-    camera_axes: CameraAxes = None
-    pixel_centre: PixelCentre = None
+    ground_truth: opt.GroundTruth = "Labels/{name}.png"
+    pose_convention: opt.PoseConvention = None
+    camera_axes: opt.CameraAxes = None
+    pixel_centre: opt.PixelCentre = None
 
 
 class Uavid3d(FileDataset[Uavid3dOptions]):

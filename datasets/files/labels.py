@@ -14,15 +14,8 @@ import numpy as np
 from semstab.config import nearest
 from semstab.core.types import UInt16
 from semstab.datasets.files.options import FileOptions, Folders, FrameSource, Template, inside, matching_folders
-from semstab.datasets.formats.images import (
-    LABEL_SUFFIXES,
-    MASK_SUFFIXES,
-    SCORE_SUFFIXES,
-    Read,
-    Size,
-    read_labels,
-    read_scores,
-)
+from semstab.datasets.formats import images
+from semstab.datasets.formats.images import Read, Size
 from semstab.datasets.geometry.lenses import Labels, Scores
 from semstab.datasets.scene import GROUND_TRUTH, listed
 from semstab.errors import ConfigError, DataError
@@ -32,7 +25,11 @@ logger = logging.getLogger("semstab")
 
 Kind = Literal["labels", "scores", "masks"]
 KINDS: tuple[Kind, ...] = ("labels", "scores")
-SUFFIXES: Mapping[Kind, tuple[str, ...]] = {"labels": LABEL_SUFFIXES, "scores": SCORE_SUFFIXES, "masks": MASK_SUFFIXES}
+SUFFIXES: Mapping[Kind, tuple[str, ...]] = {
+    "labels": images.LABEL_SUFFIXES,
+    "scores": images.SCORE_SUFFIXES,
+    "masks": images.MASK_SUFFIXES,
+}
 DEFAULTS: Mapping[Kind, str] = {"labels": "labels/{backbone}/{name}", "scores": "scores/{backbone}/{name}"}
 REGIONS = "regions/{backbone}/{name}"
 LABEL_SPACE_FILE = "label_space.yaml"
@@ -265,7 +262,7 @@ class LabelMaps:
 
     def labels(self, backbone: str, path: Path, read: Read) -> Labels:
         """Ids (H, W) of one file, whose bytes `read` gives. Raises DataError that names it."""
-        labels = read_labels(path, self.space(backbone), read)
+        labels = images.read_labels(path, self.space(backbone), read)
         if backbone in self.class_ids:
             ids: Labels = self.class_ids[backbone][labels]
             if (unknown := ids == NO_ID).any():
@@ -279,7 +276,7 @@ class LabelMaps:
 
     def scores(self, backbone: str, path: Path, size: Size, read: Read) -> Scores:
         """Scores (H, W, K) of one file; `size` is (H, W) of the depth. Raises DataError that names it."""
-        scores = read_scores(path, self._options.scores_layout or "KHW", size, read)
+        scores = images.read_scores(path, self._options.scores_layout or "KHW", size, read)
         if void := self._options.void_ids.get(backbone):
             space = self.space(backbone)
             ids = range(scores.shape[2]) if space is None else space.ids
