@@ -69,15 +69,11 @@ class Colmap(FileDataset[ColmapOptions]):
             color = inside(options.root, folder, f"{options.images}/{image.name}", str(path))
             frames.append(
                 FrameSource(
-                    name=image.frame,
-                    depth=depth,
-                    pose=image.T_cw,
-                    pose_file=path,
-                    camera=image.camera,
+                    name=image.frame, depth=depth, pose=image.T_cw, pose_file=path, camera=image.camera,
                     color=color if folders.has(color) else None,
                     depth_scale=1 / (options.metres_per_unit or 1.0) if depth.suffix == ".bin" else None,
                 )
-            )
+            )  # fmt: skip
         return frames
 
     def _model(self, folder: Path) -> Path | None:

@@ -241,18 +241,12 @@ class Odm(FileDataset[OdmOptions]):
             color = find_image(images, shot.name, contents, where)
             frames.append(
                 FrameSource(
-                    name=name,
-                    depth=depth[shot.name],
-                    pose=shot.T_cw,
-                    pose_file=project.poses,
-                    camera=shot.camera,
-                    color=color,
-                    color_lens=shot.lens,
-                    label_lens=lenses.get(name),
+                    name=name, depth=depth[shot.name], pose=shot.T_cw, pose_file=project.poses, camera=shot.camera,
+                    color=color, color_lens=shot.lens, label_lens=lenses.get(name),
                     photograph=find_image(photographs, shot.name, contents, where) if project.undistorted else color,
                     aliases=written_names(shot.name),
                 )
-            )
+            )  # fmt: skip
         return sorted(frames, key=lambda frame: natural(frame.name))
 
     def _label_lenses(self, project: Project, shots: Mapping[str, Shot]) -> dict[str, Lens | None]:

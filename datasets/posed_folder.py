@@ -52,12 +52,10 @@ class PosedFolder(FileDataset[PosedOptions]):
         suffix = next((os.path.splitext(file)[1] for file in depth.values()), DEPTH_SUFFIXES[0])  # noqa: PTH122
         for name in sorted({*depth, *poses}, key=natural):
             yield FrameSource(
-                name=name,
-                depth=folder / "depth" / depth.get(name, name + suffix),
-                pose_file=folder / "pose" / poses.get(name, f"{name}.txt"),
-                camera=camera,
+                name=name, depth=folder / "depth" / depth.get(name, name + suffix),
+                pose_file=folder / "pose" / poses.get(name, f"{name}.txt"), camera=camera,
                 color=folder / "color" / colors.get(name, name + COLOR_SUFFIXES[0]),
-            )
+            )  # fmt: skip
 
     def settled(self, folder: Path) -> FileOptions:
         """scene.yaml, where there is one, with the options on top. Raises ConfigError with the file and the setting."""

@@ -89,15 +89,12 @@ def read_transforms(path: Path, root: Path, folder: Path, depth: Template | None
             raise DataError(f"{where}: has no depth_file_path; add it, or set depth: 'depth/{{name}}.png'")
         frames.append(
             FrameSource(
-                name=name,
-                depth=folders.one_of(stated, DEPTH_SUFFIXES) or stated,
-                pose=matrix(entry.get("transform_matrix"), f"{where}: transform_matrix"),
-                pose_file=path,
-                camera=_camera(ChainMap(entry, content), where),
-                color=folders.one_of(image, COLOR_SUFFIXES),
+                name=name, depth=folders.one_of(stated, DEPTH_SUFFIXES) or stated,
+                pose=matrix(entry.get("transform_matrix"), f"{where}: transform_matrix"), pose_file=path,
+                camera=_camera(ChainMap(entry, content), where), color=folders.one_of(image, COLOR_SUFFIXES),
                 depth_scale=scale,
             )
-        )
+        )  # fmt: skip
     return sorted(frames, key=lambda frame: natural(frame.name))
 
 

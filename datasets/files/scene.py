@@ -284,17 +284,11 @@ class FileScene(Scene):
         known = {"depth": self.surface or source.depth, "pose": source.pose_file, "color": shown, "mask": mask}
         known |= dict(files or {})
         return Frame(
-            index=int(index),
-            depth=depth,
-            intrinsics=self.intrinsics(index, depth.shape),
-            T_wc=self.T_wc(index),
-            labels=labels,
-            scores=scores,
-            color=self.color(index) if color else None,
-            mask=masked,
+            index=int(index), depth=depth, intrinsics=self.intrinsics(index, depth.shape), T_wc=self.T_wc(index),
+            labels=labels, scores=scores, color=self.color(index) if color else None, mask=masked,
             timestamp=None if timestamps is None else float(timestamps[index]),
             files={what: str(path) for what, path in known.items() if path is not None},
-        )
+        )  # fmt: skip
 
     def _stored(self, index: int, values: Pixels, shape: tuple[int, ...], path: Path, what: str) -> Pixels:
         """The content of a file at the depth's pixels; where it must have them, `Frame` raises an error."""
