@@ -1,12 +1,21 @@
-"""The installed `semstab-bench`, run as a process of its own."""
+"""The command line: `bench` in this process, or as the installed `semstab-bench` in a process of its own."""
 
 from __future__ import annotations
 
+import contextlib
+import logging
 import os
 import subprocess
 import sys
 from collections.abc import Sequence
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+from unittest import mock
+
+from typer.testing import CliRunner
+
+from semstab.cli import app
 
 COMMAND = str(Path(sys.executable).with_name("semstab-bench"))
 
@@ -31,13 +40,28 @@ def bench(
     columns: int = 160,
     report: bool = False,
     recording: bool = False,
+    apart: bool = False,
     **more: str,
-) -> subprocess.CompletedProcess[str]:
-    """What it did, in a terminal of so many columns; it ends with this code. `more` is of its environment."""
-    done = subprocess.run(
-        command(words, report, recording),
-        cwd=cwd, env=environment(columns, **more), capture_output=True, text=True, check=False,
-    )  # fmt: skip
+) -> Any:
+    """Its stdout and stderr, in a terminal of so many columns; it ends with this code.
+
+    apart  in a process of its own; `more` is of its environment then
+    """
+    line, variables = command(words, report, recording), environment(columns, **more)
+    if apart or more:
+        done: Any = subprocess.run(line, cwd=cwd, env=variables, capture_output=True, text=True, check=False)
+    else:
+        logger, handler = logging.getLogger("semstab"), logging.lastResort
+        assert handler is not None
+        logger.addHandler(handler)  # as in a process without pytest's own handler
+        try:
+            with contextlib.chdir(cwd), mock.patch.dict(os.environ, variables), mock.patch.object(sys, "argv", line):
+                result = CliRunner().invoke(app, line[1:])
+        finally:
+            logger.removeHandler(handler)
+        if result.exception is not None and not isinstance(result.exception, SystemExit):
+            raise result.exception
+        done = SimpleNamespace(returncode=result.exit_code, stdout=result.stdout, stderr=result.stderr)
     assert done.returncode == code, done.stderr
     assert "Traceback" not in done.stderr
     return done

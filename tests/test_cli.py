@@ -47,7 +47,7 @@ def test_help_imports_nothing_heavy(tmp_path) -> None:
 
 
 def test_list_names_what_there_is(tmp_path) -> None:
-    result = bench("list", cwd=tmp_path, columns=200)
+    result = bench("list", cwd=tmp_path, columns=200, apart=True)
     for word in ("open3d", "numpy", "city", "posed_folder", "uavid7", "ready"):
         assert word in result.stdout
     studies = [line.split() for line in result.stdout.splitlines() if line.split()[:1] == ["study"]]
@@ -166,7 +166,7 @@ def damage_intrinsics(wall: Path) -> str:
 
 def test_a_lost_pose_is_left_out_and_said(wall, tmp_path) -> None:
     np.savetxt(wall / "pose/0001.txt", np.full((4, 4), np.nan))
-    result = bench("--data", wall, "--backend", "numpy", "--rerun", "off", "--out", "run", cwd=tmp_path)
+    result = bench("--data", wall, "--backend", "numpy", "--out", "run", cwd=tmp_path, apart=True)
     assert result.stderr.count("wall: 1 of 3 selected frames have no pose (tracking was lost) and are left out: 1") == 1
 
 
