@@ -109,12 +109,9 @@ def test_code_is_compiled_again_where_what_it_takes_in_has_changed_or_is_damaged
         path = f"{tmp_path}{os.pathsep}{Path(semstab.__file__).parents[1]}"
         kept = {k: v for k, v in os.environ.items() if not k.startswith(("NUMBA", "PYTHON"))}
         done = subprocess.run(
-            [sys.executable, tmp_path / "caller.py"],
-            env=kept | {"PYTHONPATH": path},
-            capture_output=True,
-            text=True,
+            [sys.executable, tmp_path / "caller.py"], env=kept | {"PYTHONPATH": path}, capture_output=True, text=True,
             check=False,
-        )
+        )  # fmt: skip
         return done.stdout.strip() or done.stderr
 
     (tmp_path / "helpers.py").write_text(HELPERS)

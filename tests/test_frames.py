@@ -16,12 +16,9 @@ PATHS = {name: f"scene3/{name}/0012.png" for name in ("depth", "pose", "labels",
 def a_frame(**changes):
     """A good frame of 2x3 pixels, but for the changes."""
     fields = {
-        "index": 12,
-        "depth": np.ones((2, 3), np.float32),
-        "intrinsics": CAMERA,
-        "T_wc": np.eye(4),
+        "index": 12, "depth": np.ones((2, 3), np.float32), "intrinsics": CAMERA, "T_wc": np.eye(4),
         "labels": np.zeros((2, 3), np.uint8),
-    }
+    }  # fmt: skip
     return Frame(**fields | changes)
 
 

@@ -50,17 +50,13 @@ def test_depth_of_16_bit_png_is_millimetres_unless_a_scale_is_given(tmp_path):
 @pytest.mark.parametrize(
     ("name", "content"),
     [
-        ("d.npy", npy_bytes(METRES)),
-        ("d.NPY", npy_bytes(np.asfortranarray(METRES))),
-        ("d.npy", npy_bytes(METRES.astype(">f4"))),
-        ("d.npy", npy_bytes(METRES.astype(np.float64))),
-        ("d.npz", npz_bytes(depth=METRES, other=IDS)),
-        ("d.npz", npz_bytes(compress=True, whatever=METRES)),
-        ("d.tiff", tiff_bytes(METRES)),
-        ("d.tif", tiff_bytes(METRES, cv2.IMWRITE_TIFF_COMPRESSION, 1)),
+        ("d.npy", npy_bytes(METRES)), ("d.NPY", npy_bytes(np.asfortranarray(METRES))),
+        ("d.npy", npy_bytes(METRES.astype(">f4"))), ("d.npy", npy_bytes(METRES.astype(np.float64))),
+        ("d.npz", npz_bytes(depth=METRES, other=IDS)), ("d.npz", npz_bytes(compress=True, whatever=METRES)),
+        ("d.tiff", tiff_bytes(METRES)), ("d.tif", tiff_bytes(METRES, cv2.IMWRITE_TIFF_COMPRESSION, 1)),
         ("d.tif", tiff_bytes(METRES.astype(np.float64))),
     ],
-)
+)  # fmt: skip
 def test_depth_of_float_files_is_metres(tmp_path, name, content):
     path = written(tmp_path / name, content)
     depth = read_depth(path)
@@ -168,14 +164,11 @@ def test_transparent_label_colours_are_refused(tmp_path):
 @pytest.mark.parametrize(
     ("array", "space", "dtype"),
     [
-        (IDS, None, np.uint8),
-        (IDS.astype(np.uint16), None, np.uint16),
-        (IDS.astype(np.int64), None, np.uint8),
-        (IDS.astype(">i4"), None, np.uint8),
-        (IDS.astype(np.int32) + 300, None, np.uint16),
+        (IDS, None, np.uint8), (IDS.astype(np.uint16), None, np.uint16), (IDS.astype(np.int64), None, np.uint8),
+        (IDS.astype(">i4"), None, np.uint8), (IDS.astype(np.int32) + 300, None, np.uint16),
         (IDS.astype(np.int32) + 250, LabelSpace("wide", ("a", "b"), ids=(0, 400)), np.uint16),
     ],
-)
+)  # fmt: skip
 def test_labels_of_arrays_are_narrowed(tmp_path, array, space, dtype):
     for name, content in (("l.npy", npy_bytes(array)), ("l.npz", npz_bytes(ids=array))):
         labels = read_labels(written(tmp_path / name, content), space)
@@ -256,16 +249,12 @@ def read_khw(path):
 
 
 WHOLE = {
-    "depth.png": (saved(MILLIMETRES), read_depth),
-    "labels.png": (saved(IDS), read_labels),
-    "color.png": (saved(NOISE), read_color),
-    "color.jpg": (saved(NOISE, "JPEG"), read_color),
-    "depth.npy": (npy_bytes(METRES), read_depth),
-    "depth.npz": (npz_bytes(depth=METRES), read_depth),
-    "labels.npz": (npz_bytes(compress=True, labels=IDS), read_labels),
-    "depth.tiff": (tiff_bytes(METRES), read_depth),
+    "depth.png": (saved(MILLIMETRES), read_depth), "labels.png": (saved(IDS), read_labels),
+    "color.png": (saved(NOISE), read_color), "color.jpg": (saved(NOISE, "JPEG"), read_color),
+    "depth.npy": (npy_bytes(METRES), read_depth), "depth.npz": (npz_bytes(depth=METRES), read_depth),
+    "labels.npz": (npz_bytes(compress=True, labels=IDS), read_labels), "depth.tiff": (tiff_bytes(METRES), read_depth),
     "scores.npz": (npz_bytes(compress=True, scores=SCORES.transpose(2, 0, 1).astype(np.float16)), read_khw),
-}
+}  # fmt: skip
 
 
 @pytest.mark.parametrize("name", list(WHOLE))
@@ -371,20 +360,13 @@ def test_nothing_is_unpickled(tmp_path):
 FUZZ = settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 READERS = {
     ".png": [read_depth, read_color, lambda path: read_labels(path, SPACE)],
-    ".npy": [read_depth, read_labels, read_khw],
-    ".npz": [read_depth, read_labels, read_khw],
-    ".jpg": [read_color],
-    ".tiff": [read_depth],
-    ".exr": [read_depth],
-}
+    ".npy": [read_depth, read_labels, read_khw], ".npz": [read_depth, read_labels, read_khw], ".jpg": [read_color],
+    ".tiff": [read_depth], ".exr": [read_depth],
+}  # fmt: skip
 BEGINNINGS = {
-    ".png": PNG_SIGNATURE,
-    ".npy": b"\x93NUMPY\x01\0",
-    ".npz": b"PK\x03\x04",
-    ".jpg": b"\xff\xd8\xff",
-    ".tiff": b"II*\0",
-    ".exr": b"v/1\x01\x02\0\0\0dataWindow\0box2i\0\x10\0\0\0",
-}
+    ".png": PNG_SIGNATURE, ".npy": b"\x93NUMPY\x01\0", ".npz": b"PK\x03\x04", ".jpg": b"\xff\xd8\xff",
+    ".tiff": b"II*\0", ".exr": b"v/1\x01\x02\0\0\0dataWindow\0box2i\0\x10\0\0\0",
+}  # fmt: skip
 
 
 def survives(path: Path) -> None:
@@ -407,12 +389,9 @@ def test_random_bytes_are_an_array_or_a_data_error(tmp_path, suffix, content):
 
 
 @given(
-    size=st.tuples(st.integers(0, 9), st.integers(0, 9)),
-    bits=st.sampled_from([1, 2, 3, 4, 8, 16]),
-    kind=st.integers(0, 7),
-    samples=st.binary(max_size=120),
-    compressed=st.booleans(),
-)
+    size=st.tuples(st.integers(0, 9), st.integers(0, 9)), bits=st.sampled_from([1, 2, 3, 4, 8, 16]),
+    kind=st.integers(0, 7), samples=st.binary(max_size=120), compressed=st.booleans(),
+)  # fmt: skip
 @FUZZ
 def test_png_with_right_checksums_is_an_array_or_a_data_error(tmp_path, size, bits, kind, samples, compressed):
     content = raw_png(*size, bits, kind, zlib.compress(samples) if compressed else samples)

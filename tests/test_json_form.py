@@ -50,17 +50,10 @@ class Whole:
 
 
 WHOLE = Whole(
-    level="low",
-    parts=(Part("a", 1.5, (1, 2.0)), Part("b", 2.0)),
-    by_name={"x": {"y": 0.1 + 0.2}},
-    path=Path("a") / "b",
-    first=Part("first", 3.0),
-    sum=Sum(7.0),
-    maybe=Part("c", -1.0),
-    count=3,
-    flag=True,
+    level="low", parts=(Part("a", 1.5, (1, 2.0)), Part("b", 2.0)), by_name={"x": {"y": 0.1 + 0.2}},
+    path=Path("a") / "b", first=Part("first", 3.0), sum=Sum(7.0), maybe=Part("c", -1.0), count=3, flag=True,
     rest={"any": [1, None]},
-)
+)  # fmt: skip
 
 
 def content() -> Any:
@@ -106,23 +99,19 @@ def damaged(key: str, value: object) -> Any:
 @pytest.mark.parametrize(
     ("key", "value", "said"),
     [
-        ("level", "middle", "level: should be 'high' or 'low', is 'middle'"),
-        ("level", ["low"], "level: should be"),
+        ("level", "middle", "level: should be 'high' or 'low', is 'middle'"), ("level", ["low"], "level: should be"),
         ("parts", {"a": 1}, "parts: should be a valid tuple"),
         ("parts", [{"name": "a", "value": 1.0}, {"name": "b"}], "parts[1].value: is missing"),
         ("parts", [{"name": "a", "value": "1"}], "parts[0].value: should be a number, is '1'"),
         ("parts", [{"name": "a", "value": 1.0, "pair": [1]}], "parts[0].pair[1]: is missing"),
         ("parts", [{"name": "a", "value": 10**400}], "parts[0].value: should be a number"),
         ("by_name", {"x": {"y": True}}, "by_name.x.y: should be a number, is True"),
-        ("path", 3, "path: is not a valid path"),
-        ("name", 3, "name: should be a valid string"),
-        ("total", "x", "sum: should be a number, is 'x'"),
-        ("maybe", 3, "maybe: should be a dictionary"),
-        ("count", 3.0, "count: should be a valid integer"),
-        ("count", None, "count: should be a valid integer"),
+        ("path", 3, "path: is not a valid path"), ("name", 3, "name: should be a valid string"),
+        ("total", "x", "sum: should be a number, is 'x'"), ("maybe", 3, "maybe: should be a dictionary"),
+        ("count", 3.0, "count: should be a valid integer"), ("count", None, "count: should be a valid integer"),
         ("flag", 1, "flag: should be a valid boolean"),
     ],
-)
+)  # fmt: skip
 def test_damaged_content_is_one_line_with_file_and_field(key: str, value: object, said: str) -> None:
     with pytest.raises(DataError) as caught:
         from_json(Whole, damaged(key, value), "kept/unit.json")

@@ -177,26 +177,18 @@ def test_a_taxonomy_from_a_file(tmp_path):
 
 
 BROKEN_FILES = {
-    "not YAML": "classes: [road, {name: tree",
-    "not YAML in two lines": "classes:\n  - road\n - tree\n",
-    "a date that is none": "name: 2020-13-45",
-    "empty": "",
-    "a list": "[road, tree]",
-    "no classes": "name: mine",
-    "classes not a list": "classes: road",
-    "an unknown key": "classes: [a, b]\nclases: [c]",
+    "not YAML": "classes: [road, {name: tree", "not YAML in two lines": "classes:\n  - road\n - tree\n",
+    "a date that is none": "name: 2020-13-45", "empty": "", "a list": "[road, tree]", "no classes": "name: mine",
+    "classes not a list": "classes: road", "an unknown key": "classes: [a, b]\nclases: [c]",
     "a class without a name": "classes: [{id: 0}, b]",
     "an unknown key of a class": "classes: [{name: a, colour: [0, 0, 0]}, b]",
-    "a name that is a number": "classes: [1, b]",
-    "an id that is text": "classes: [{name: a, id: one}, b]",
+    "a name that is a number": "classes: [1, b]", "an id that is text": "classes: [{name: a, id: one}, b]",
     "an id that is a truth value": "classes: [{name: a, id: true}, b]",
     "a colour of two": "classes: [{name: a, color: [1, 2]}, b]",
     "a colour beyond 255": "classes: [{name: a, color: [1, 2, 256]}, b]",
-    "members not a list": "classes: [{name: a, members: c}, b]",
-    "ignored not names": "classes: [a, b]\nignored: [1]",
-    "nothing there": None,
-    "not text": b"\xff\xfe\x00",
-}
+    "members not a list": "classes: [{name: a, members: c}, b]", "ignored not names": "classes: [a, b]\nignored: [1]",
+    "nothing there": None, "not text": b"\xff\xfe\x00",
+}  # fmt: skip
 
 
 @pytest.mark.parametrize("content", BROKEN_FILES.values(), ids=BROKEN_FILES.keys())
@@ -213,20 +205,14 @@ def test_a_taxonomy_file_that_is_none_is_one_line_with_its_name(tmp_path, conten
 @pytest.mark.parametrize(
     ("fields", "message"),
     [
-        ({"classes": ()}, "0 class"),
-        ({"classes": ("a",)}, "at least 2"),
-        ({"ids": (0,)}, "1 ids for 2 classes"),
-        ({"colors": ((0, 0, 0),) * 3}, "3 colors for 2 classes"),
-        ({"members": ((),)}, "1 members for 2 classes"),
-        ({"ids": (1, 1)}, "distinct"),
-        ({"ids": (-1, 1)}, "distinct, 0 to 65534"),
-        ({"ids": (0, 65535)}, "distinct, 0 to 65534"),
-        ({"ids": (0, 255)}, "255 means 'ignore'"),
+        ({"classes": ()}, "0 class"), ({"classes": ("a",)}, "at least 2"), ({"ids": (0,)}, "1 ids for 2 classes"),
+        ({"colors": ((0, 0, 0),) * 3}, "3 colors for 2 classes"), ({"members": ((),)}, "1 members for 2 classes"),
+        ({"ids": (1, 1)}, "distinct"), ({"ids": (-1, 1)}, "distinct, 0 to 65534"),
+        ({"ids": (0, 65535)}, "distinct, 0 to 65534"), ({"ids": (0, 255)}, "255 means 'ignore'"),
         ({"classes": ("Low vegetation", "low_vegetation")}, "'low vegetation' is named twice"),
-        ({"members": (("c",), ("c",))}, "'c' is named twice"),
-        ({"ignored": ("a",)}, "'a' is named twice"),
+        ({"members": (("c",), ("c",))}, "'c' is named twice"), ({"ignored": ("a",)}, "'a' is named twice"),
     ],
-)
+)  # fmt: skip
 def test_a_label_space_that_contradicts_itself_is_refused(fields, message):
     with pytest.raises(ConfigError, match=message) as error:
         LabelSpace(**{"name": "mine", "classes": ("a", "b")} | fields)

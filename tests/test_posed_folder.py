@@ -312,14 +312,11 @@ def test_a_pose_that_is_not_rigid_names_its_file(folder, T, convention, match):
 @pytest.mark.parametrize(
     ("text", "match"),
     [
-        ("10 11 3 2", "got 4 numbers"),
-        ("10 0 0 0 11 0 3 2 1", "is no camera matrix"),
-        ("10 0 3 0 nan 2 0 0 1", "is no camera matrix"),
-        ("10 1 3 0 11 2 0 0 1", "skew"),
-        ("-10 0 3 0 11 2 0 0 1", "focal lengths must be positive"),
-        ("ten", "expected numbers"),
+        ("10 11 3 2", "got 4 numbers"), ("10 0 0 0 11 0 3 2 1", "is no camera matrix"),
+        ("10 0 3 0 nan 2 0 0 1", "is no camera matrix"), ("10 1 3 0 11 2 0 0 1", "skew"),
+        ("-10 0 3 0 11 2 0 0 1", "focal lengths must be positive"), ("ten", "expected numbers"),
     ],
-)
+)  # fmt: skip
 def test_intrinsics_that_are_none_are_refused(folder, text, match):
     (folder / "intrinsics.txt").write_text(text)
     fails(DataError, rf"intrinsics\.txt: .*{match}", opened, folder)

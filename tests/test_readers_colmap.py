@@ -7,29 +7,9 @@ import json
 import math
 import struct
 
+import dataset_writers as ds
 import numpy as np
 import pytest
-from dataset_writers import (
-    COUNT,
-    FORMATS,
-    H,
-    W,
-    assert_same_voxels,
-    camera_json,
-    city,
-    four,
-    numbers,
-    opened,
-    save,
-    save_depth_map,
-    source,
-    stored,
-    with_axes,
-    write_colmap,
-    write_labels,
-    write_lines,
-    write_transforms,
-)
 from posed_scene import fails
 
 from semstab.config import read_yaml
@@ -41,15 +21,15 @@ from semstab.datasets.uavid3d import Uavid3dOptions
 from semstab.errors import ConfigError, DataError
 from semstab.settings import load_config, resolve
 
-TEXT, BINARY = FORMATS["colmap, text"], FORMATS["colmap, binary"]
+TEXT, BINARY = ds.FORMATS["colmap, text"], ds.FORMATS["colmap, binary"]
 
 
 @pytest.fixture(params=["text", "binary"])
 def scene(request, tmp_path):
     """(folder, names, frames) of a workspace of either kind."""
-    names = write_colmap(tmp_path, source(), binary=request.param == "binary")
-    write_labels(tmp_path, names, source())
-    return tmp_path, names, source()
+    names = ds.write_colmap(tmp_path, ds.source(), binary=request.param == "binary")
+    ds.write_labels(tmp_path, names, ds.source())
+    return tmp_path, names, ds.source()
 
 
 # --- as COLMAP writes them
@@ -58,11 +38,11 @@ def scene(request, tmp_path):
 def test_models_that_colmap_itself_wrote(tmp_path):
     """pycolmap writes text and binary, with rigs, frames and points beside them; both are read alike."""
     pycolmap = pytest.importorskip("pycolmap", reason="needs pycolmap")
-    frames = source()
-    fx, fy, cx, cy = four(frames[0])
+    frames = ds.source()
+    fx, fy, cx, cy = ds.four(frames[0])
     model = pycolmap.Reconstruction()
     model.add_camera_with_trivial_rig(
-        pycolmap.Camera(camera_id=3, model="PINHOLE", width=W, height=H, params=[fx, fy, cx + 0.5, cy + 0.5])
+        pycolmap.Camera(camera_id=3, model="PINHOLE", width=ds.W, height=ds.H, params=[fx, fy, cx + 0.5, cy + 0.5])
     )
     for k, frame in enumerate(frames):
         image = pycolmap.Image(name=f"a b/{k}.png", camera_id=3, image_id=9 - k)
@@ -71,12 +51,12 @@ def test_models_that_colmap_itself_wrote(tmp_path):
         path.parent.mkdir(parents=True, exist_ok=True)
         depth = pycolmap.DepthMap.from_array(np.ascontiguousarray(frame.depth), 0.1, 100.0)
         depth.write(str(path))
-    write_labels(tmp_path, [f"a b/{k}" for k in range(COUNT)], frames)
+    ds.write_labels(tmp_path, [f"a b/{k}" for k in range(ds.COUNT)], frames)
     for kind in ("text", "binary"):
         (tmp_path / "sparse" / kind).mkdir(parents=True)
         getattr(model, f"write_{kind}")(str(tmp_path / "sparse" / kind))
-        scene = opened(TEXT, tmp_path, model=f"sparse/{kind}")
-        assert_same_voxels([scene.frame(k, "net") for k in range(COUNT)], frames)
+        scene = ds.opened(TEXT, tmp_path, model=f"sparse/{kind}")
+        ds.assert_same_voxels([scene.frame(k, "net") for k in range(ds.COUNT)], frames)
 
 
 def test_a_depth_map_by_hand(tmp_path):
@@ -109,7 +89,7 @@ def test_another_depth_map_is_refused(tmp_path, content, match):
 
 
 def set_camera(folder, line):
-    write_lines(folder / "sparse/cameras.txt", [line])
+    ds.write_lines(folder / "sparse/cameras.txt", [line])
 
 
 @pytest.mark.parametrize(
@@ -118,9 +98,9 @@ def set_camera(folder, line):
      ("SIMPLE_RADIAL", [40, 24, 16, 0], (40, 40)), ("OPENCV", [40, 41, 24, 16, 0, 0, 0, 0], (40, 41))],
 )  # fmt: skip
 def test_cameras_that_do_not_distort(tmp_path, model, parameters, focals):
-    write_colmap(tmp_path, city())
-    set_camera(tmp_path, f"7 {model} {W} {H} {numbers(parameters)}")
-    K = opened(TEXT, tmp_path).intrinsics(0, (H, W))
+    ds.write_colmap(tmp_path, ds.city())
+    set_camera(tmp_path, f"7 {model} {ds.W} {ds.H} {ds.numbers(parameters)}")
+    K = ds.opened(TEXT, tmp_path).intrinsics(0, (ds.H, ds.W))
     assert (K.fx, K.fy, K.cx, K.cy) == (*focals, 23.5, 15.5)
 
 
@@ -130,81 +110,76 @@ def test_cameras_that_do_not_distort(tmp_path, model, parameters, focals):
      ("OPENCV_FISHEYE", [40, 41, 24, 16, 0, 0, 0, 0]), ("FOV", [40, 41, 24, 16, 0])],
 )  # fmt: skip
 def test_a_camera_that_distorts_is_refused_with_advice(tmp_path, model, parameters):
-    write_colmap(tmp_path, city())
-    set_camera(tmp_path, f"7 {model} {W} {H} {numbers(parameters)}")
-    fails(
-        DataError,
-        rf"cameras\.txt: camera 7 is {model}, which distorts; undistort .*image_undistorter",
-        opened,
-        TEXT,
-        tmp_path,
-    )
+    ds.write_colmap(tmp_path, ds.city())
+    set_camera(tmp_path, f"7 {model} {ds.W} {ds.H} {ds.numbers(parameters)}")
+    match = rf"cameras\.txt: camera 7 is {model}, which distorts; undistort .*image_undistorter"
+    fails(DataError, match, ds.opened, TEXT, tmp_path)
 
 
 def test_a_camera_that_no_image_has_may_distort(tmp_path):
-    write_colmap(tmp_path, city())
+    ds.write_colmap(tmp_path, ds.city())
     with (tmp_path / "sparse/cameras.txt").open("a") as file:
-        file.write(f"8 FOV {W} {H} 40 40 24 16 0.3\n")
-    assert len(opened(TEXT, tmp_path)) == COUNT
+        file.write(f"8 FOV {ds.W} {ds.H} 40 40 24 16 0.3\n")
+    assert len(ds.opened(TEXT, tmp_path)) == ds.COUNT
 
 
 @pytest.mark.parametrize(
     ("line", "match"),
     [
-        (f"7 PINHOLE {W} {H} 40 40 24", "line 1 is .*expected CAMERA_ID MODEL"),
-        (f"7 PINHOL {W} {H} 40 40 24 16", "line 1 is .*expected CAMERA_ID MODEL"),
-        (f"7 PINHOLE {W} {H} 40 40 24 x", "line 1: 'x' is not a number"),
-        (f"7 PINHOLE {W}.5 {H} 40 40 24 16", r"line 1: '48\.5' is not a whole number"),
-        (f"7 PINHOLE 0 {H} 40 40 24 16", "images of 0x32 pixels"),
-        (f"7 PINHOLE {W} {H} -40 40 24 16", "camera 7: .*focal lengths must be positive"),
-        (f"7 PINHOLE {W} {H} 40 40 nan 16", "camera 7: .*all values finite"),
-        (f"6 PINHOLE {W} {H} 40 40 24 16", r"image 'cam 0/0000\.png' has camera 7, which is not in cameras\.txt"),
+        (f"7 PINHOLE {ds.W} {ds.H} 40 40 24", "line 1 is .*expected CAMERA_ID MODEL"),
+        (f"7 PINHOL {ds.W} {ds.H} 40 40 24 16", "line 1 is .*expected CAMERA_ID MODEL"),
+        (f"7 PINHOLE {ds.W} {ds.H} 40 40 24 x", "line 1: 'x' is not a number"),
+        (f"7 PINHOLE {ds.W}.5 {ds.H} 40 40 24 16", r"line 1: '48\.5' is not a whole number"),
+        (f"7 PINHOLE 0 {ds.H} 40 40 24 16", "images of 0x32 pixels"),
+        (f"7 PINHOLE {ds.W} {ds.H} -40 40 24 16", "camera 7: .*focal lengths must be positive"),
+        (f"7 PINHOLE {ds.W} {ds.H} 40 40 nan 16", "camera 7: .*all values finite"),
+        (f"6 PINHOLE {ds.W} {ds.H} 40 40 24 16", r"image 'cam 0/0000\.png' has camera 7, which is not in cameras\.txt"),
     ],
 )
 def test_another_camera_is_refused(tmp_path, line, match):
-    write_colmap(tmp_path, city())
+    ds.write_colmap(tmp_path, ds.city())
     set_camera(tmp_path, line)
-    fails(DataError, match, opened, TEXT, tmp_path)
+    fails(DataError, match, ds.opened, TEXT, tmp_path)
 
 
 def test_depth_maps_may_be_smaller_than_the_cameras_images(tmp_path):
     """COLMAP bounds the size of its stereo: the intrinsics follow the depth map."""
-    names = write_colmap(tmp_path, city())
-    for name, frame in zip(names, city(), strict=True):
-        save_depth_map(tmp_path / f"stereo/depth_maps/{name}.png.geometric.bin", frame.depth[::2, ::2])
-    K = opened(TEXT, tmp_path).intrinsics(0, opened(TEXT, tmp_path).depth(0).shape)
-    assert K.fx == pytest.approx(city()[0].intrinsics.fx / 2)
-    assert K.cx == pytest.approx((W / 2 - 1) / 2)
+    names = ds.write_colmap(tmp_path, ds.city())
+    for name, frame in zip(names, ds.city(), strict=True):
+        ds.save_depth_map(tmp_path / f"stereo/depth_maps/{name}.png.geometric.bin", frame.depth[::2, ::2])
+    K = ds.opened(TEXT, tmp_path).intrinsics(0, ds.opened(TEXT, tmp_path).depth(0).shape)
+    assert K.fx == pytest.approx(ds.city()[0].intrinsics.fx / 2)
+    assert K.cx == pytest.approx((ds.W / 2 - 1) / 2)
 
 
 # --- images
 
 
 def test_metres_of_a_model_without_scale(scene):
-    """A model in units of 4 m: depth maps and positions grow together, so the voxels are those of the source."""
+    """A model in units of 4 m: depth maps and positions grow together, so the voxels are those of the ds.source."""
     folder, names, frames = scene
     small = [frame.T_wc.copy() for frame in frames]
     for name, frame in zip(names, frames, strict=True):
-        save_depth_map(folder / f"stereo/depth_maps/{name}.png.geometric.bin", frame.depth / 4)
-    found = opened(TEXT, folder, metres_per_unit=4)
+        ds.save_depth_map(folder / f"stereo/depth_maps/{name}.png.geometric.bin", frame.depth / 4)
+    found = ds.opened(TEXT, folder, metres_per_unit=4)
     np.testing.assert_allclose(found.depth(0), frames[0].depth, rtol=1e-6)
     np.testing.assert_allclose(found.T_wc(2)[:3, 3], small[2][:3, 3] * 4, rtol=1e-12)
 
 
 def test_depth_can_come_from_elsewhere(tmp_path):
-    frames = source(1000)
-    names = write_colmap(tmp_path, frames)
+    frames = ds.source(1000)
+    names = ds.write_colmap(tmp_path, frames)
     for name, frame in zip(names, frames, strict=True):
-        save(tmp_path / f"my depth/{name}.png", stored(frame, 1000))
-    write_labels(tmp_path, names, frames)
-    found = opened(TEXT, tmp_path, depth="my depth/{name}")
-    assert_same_voxels([found.frame(k, "net") for k in range(COUNT)], frames)
+        ds.save(tmp_path / f"my depth/{name}.png", ds.stored(frame, 1000))
+    ds.write_labels(tmp_path, names, frames)
+    found = ds.opened(TEXT, tmp_path, depth="my depth/{name}")
+    ds.assert_same_voxels([found.frame(k, "net") for k in range(ds.COUNT)], frames)
 
 
 def test_frames_go_by_name_not_by_id(scene):
     folder, names, _ = scene
-    found = opened(TEXT, folder)
-    assert [found.frame(k, "net").files["labels"] for k in range(COUNT)] == [
+    found = ds.opened(TEXT, folder)
+    assert [found.frame(k, "net").files["labels"] for k in range(ds.COUNT)] == [
         f"{folder}/labels/net/{name}.png" for name in names
     ]
 
@@ -222,26 +197,26 @@ def test_frames_go_by_name_not_by_id(scene):
     ],
 )  # fmt: skip
 def test_another_list_of_images_is_refused(tmp_path, change, match):
-    names = write_colmap(tmp_path, city())
-    write_labels(tmp_path, names, city())
+    names = ds.write_colmap(tmp_path, ds.city())
+    ds.write_labels(tmp_path, names, ds.city())
     path = tmp_path / "sparse/images.txt"
-    write_lines(path, change(path.read_text().splitlines()))
-    fails(DataError, match, opened, TEXT, tmp_path)
+    ds.write_lines(path, change(path.read_text().splitlines()))
+    fails(DataError, match, ds.opened, TEXT, tmp_path)
 
 
 def test_a_pose_that_is_not_finite_is_lost(tmp_path):
-    write_colmap(tmp_path, city())
+    ds.write_colmap(tmp_path, ds.city())
     path = tmp_path / "sparse/images.txt"
     lines = path.read_text().splitlines()
     lines[2] = "100 nan nan nan nan 0 0 0 7 cam 0/0000.png"
-    write_lines(path, lines)
-    found = opened(TEXT, tmp_path)
-    assert [found.tracked(k) for k in range(COUNT)] == [False, True, True, True]
+    ds.write_lines(path, lines)
+    found = ds.opened(TEXT, tmp_path)
+    assert [found.tracked(k) for k in range(ds.COUNT)] == [False, True, True, True]
 
 
 @pytest.mark.parametrize("name", ["cameras.bin", "images.bin"])
 def test_a_binary_file_cut_anywhere_is_refused(tmp_path, name):
-    write_colmap(tmp_path, city(), binary=True)
+    ds.write_colmap(tmp_path, ds.city(), binary=True)
     path = tmp_path / "sparse" / name
     whole = path.read_bytes()
     for length in range(0, len(whole), 3):
@@ -250,7 +225,7 @@ def test_a_binary_file_cut_anywhere_is_refused(tmp_path, name):
 
 
 def test_counts_that_a_file_cannot_hold_take_no_memory(tmp_path):
-    write_colmap(tmp_path, city(), binary=True)
+    ds.write_colmap(tmp_path, ds.city(), binary=True)
     path = tmp_path / "sparse/images.bin"
     whole = path.read_bytes()
     end = whole.index(b".png\0") + 5
@@ -263,19 +238,19 @@ def test_counts_that_a_file_cannot_hold_take_no_memory(tmp_path):
 
 
 def test_an_unknown_camera_model_is_named(tmp_path):
-    write_colmap(tmp_path, city(), binary=True)
-    (tmp_path / "sparse/cameras.bin").write_bytes(struct.pack("<QIiQQ4d", 1, 7, 44, W, H, 1, 1, 1, 1))
+    ds.write_colmap(tmp_path, ds.city(), binary=True)
+    (tmp_path / "sparse/cameras.bin").write_bytes(struct.pack("<QIiQQ4d", 1, 7, 44, ds.W, ds.H, 1, 1, 1, 1))
     fails(DataError, "camera 7 has the model 44, which is not known", read_model, tmp_path / "sparse")
 
 
 def test_a_missing_half_of_a_model_is_named(tmp_path):
-    write_colmap(tmp_path, city())
+    ds.write_colmap(tmp_path, ds.city())
     (tmp_path / "sparse/images.txt").unlink()
-    fails(DataError, r"images\.txt: cannot be read", opened, TEXT, tmp_path)
-    write = functools.partial(write_colmap, tmp_path, city())
+    fails(DataError, r"images\.txt: cannot be read", ds.opened, TEXT, tmp_path)
+    write = functools.partial(ds.write_colmap, tmp_path, ds.city())
     write()
     (tmp_path / "sparse/cameras.txt").unlink()
-    fails(DataError, r"no scene here, nor 3 folders deep; one holds a sparse model", opened, TEXT, tmp_path)
+    fails(DataError, r"no scene here, nor 3 folders deep; one holds a sparse model", ds.opened, TEXT, tmp_path)
 
 
 # --- UAVid-3D-Scenes
@@ -293,22 +268,22 @@ def write_scene(folder, kind="colmap"):
     """The default layout with poses of a kind; depth as .npy, labels of 'net', ground truth in UAVid's colours."""
     palette = np.array(uavid8().colors, np.uint8)
     if kind == "colmap":
-        names = write_colmap(folder, source())
+        names = ds.write_colmap(folder, ds.source())
     elif kind == "transforms":
-        names = write_transforms(folder, source(1000))
+        names = ds.write_transforms(folder, ds.source(1000))
         content = json.loads((folder / "transforms.json").read_text())
         content["frames"] = [{k: v for k, v in f.items() if k != "depth_file_path"} for f in content["frames"]]
         (folder / "transforms.json").write_text(json.dumps(content))
     else:
-        names = [f"{k:04d}" for k in range(COUNT)]
-        for name, frame in zip(names, source(), strict=True):
-            write_lines(folder / f"pose/{name}.txt", [" ".join(map(repr, row)) for row in frame.T_wc.tolist()])
-        np.savetxt(folder / "intrinsics.txt", source()[0].intrinsics.matrix)
-    for name, frame in zip(names, source(), strict=True):
-        save(folder / f"depth/{name}.npy", frame.depth * (1000 if kind == "transforms" else 1))
-        save(folder / f"images/{name}.png", frame.color)
-        save(folder / f"Labels/{name}.png", palette[frame.labels])
-    write_labels(folder, names, source())
+        names = [f"{k:04d}" for k in range(ds.COUNT)]
+        for name, frame in zip(names, ds.source(), strict=True):
+            ds.write_lines(folder / f"pose/{name}.txt", [" ".join(map(repr, row)) for row in frame.T_wc.tolist()])
+        np.savetxt(folder / "intrinsics.txt", ds.source()[0].intrinsics.matrix)
+    for name, frame in zip(names, ds.source(), strict=True):
+        ds.save(folder / f"depth/{name}.npy", frame.depth * (1000 if kind == "transforms" else 1))
+        ds.save(folder / f"images/{name}.png", frame.color)
+        ds.save(folder / f"Labels/{name}.png", palette[frame.labels])
+    ds.write_labels(folder, names, ds.source())
     return names
 
 
@@ -319,13 +294,13 @@ def test_each_format_of_poses_gives_the_voxels_of_the_source(tmp_path, kind):
     scenes = uavid(tmp_path, pose_format=kind)
     assert [scene.name for scene in scenes] == ["scene0", "scene1"]
     scene = scenes[0]
-    assert (len(scene), scene.backbones, scene.ground_truth) == (COUNT, ("net",), True)
-    found = [scene.frame(k, "net") for k in range(COUNT)]
-    np.testing.assert_allclose(found[1].depth, source()[1].depth, rtol=1e-6)
+    assert (len(scene), scene.backbones, scene.ground_truth) == (ds.COUNT, ("net",), True)
+    found = [scene.frame(k, "net") for k in range(ds.COUNT)]
+    np.testing.assert_allclose(found[1].depth, ds.source()[1].depth, rtol=1e-6)
     if kind != "transforms":  # whose depth is rounded to float millimetres
-        assert_same_voxels(found, source())
-    assert found[0].color.shape == (H, W, 3)
-    np.testing.assert_array_equal(scene.frame(2, "gt").labels, source()[2].labels)
+        ds.assert_same_voxels(found, ds.source())
+    assert found[0].color.shape == (ds.H, ds.W, 3)
+    np.testing.assert_array_equal(scene.frame(2, "gt").labels, ds.source()[2].labels)
     assert scene.label_space("net").classes == uavid8().classes
 
 
@@ -335,13 +310,8 @@ def test_the_shipped_file_says_the_defaults():
     defaults = Uavid3dOptions(root=".").model_dump(mode="json")
     assert said == {key: defaults[key] for key in said}
     own = set(Uavid3dOptions.model_fields) - {
-        "root",
-        "incomplete",
-        "scores_layout",
-        "classes",
-        "taxonomies",
-        "void_ids",
-    }
+        "root", "incomplete", "scores_layout", "classes", "taxonomies", "void_ids",
+    }  # fmt: skip
     assert set(said) == own - {"frames_per_second"}
 
 
@@ -353,20 +323,20 @@ def test_a_run_starts_from_the_shipped_file(tmp_path):
 
 def test_what_the_guess_gets_wrong_is_said_by_options(tmp_path):
     """Another layout: colours in rgb/, depth as 16-bit PNG at 256 a metre, world-to-camera matrices in OpenGL axes."""
-    frames = source(256)
+    frames = ds.source(256)
     for k, frame in enumerate(frames):
-        save(tmp_path / f"s/rgb/{k:03d}.jpg", frame.color)
-        save(tmp_path / f"s/metric/d_{k:03d}.png", stored(frame, 256))
-        write_labels(tmp_path / "s", [f"{k:03d}"], [frame])
-        T = np.linalg.inv(with_axes(frame.T_wc, "opengl"))
-        write_lines(tmp_path / f"s/cams/{k:03d}_cam.txt", [" ".join(map(repr, row)) for row in T.tolist()])
+        ds.save(tmp_path / f"s/rgb/{k:03d}.jpg", frame.color)
+        ds.save(tmp_path / f"s/metric/d_{k:03d}.png", ds.stored(frame, 256))
+        ds.write_labels(tmp_path / "s", [f"{k:03d}"], [frame])
+        T = np.linalg.inv(ds.with_axes(frame.T_wc, "opengl"))
+        ds.write_lines(tmp_path / f"s/cams/{k:03d}_cam.txt", [" ".join(map(repr, row)) for row in T.tolist()])
     K = frames[0].intrinsics
     (scene,) = uavid(
         tmp_path, images="rgb/{name}.jpg", depth="metric/d_{name}.png", depth_scale=256, pose_format="matrix",
         pose="cams/{name}_cam.txt", pose_convention="world_to_camera", camera_axes="opengl",
         intrinsics=[K.fx, K.fy, K.cx, K.cy],
     )  # fmt: skip
-    assert_same_voxels([scene.frame(k, "net") for k in range(COUNT)], frames)
+    ds.assert_same_voxels([scene.frame(k, "net") for k in range(ds.COUNT)], frames)
 
 
 @pytest.mark.parametrize(
@@ -397,14 +367,14 @@ def test_classes_can_replace_the_taxonomy(tmp_path):
 
 # --- transforms.json
 
-NERF = FORMATS["transforms_json, nerfstudio"]
+NERF = ds.FORMATS["transforms_json, nerfstudio"]
 
 
 @pytest.fixture
 def nerf(tmp_path):
     """A folder, and how to change its transforms.json."""
-    names = write_transforms(tmp_path, source(1000))
-    write_labels(tmp_path, names, source(1000))
+    names = ds.write_transforms(tmp_path, ds.source(1000))
+    ds.write_labels(tmp_path, names, ds.source(1000))
     path = tmp_path / "transforms.json"
 
     def change(frame=None, **values):
@@ -421,72 +391,65 @@ def nerf(tmp_path):
     [
         ({"k1": 0.1}, r"transforms\.json: frame \d: the camera \(with k1, k2, ...\) distorts; undistort"),
         ({"camera_model": "OPENCV_FISHEYE"}, r"the camera \('OPENCV_FISHEYE'\) distorts"),
-        ({"fl_x": "-", "fl_y": "-"}, "'fl_x' is missing"),
-        ({"fl_x": "40"}, "'fl_x' is '40'; expected a number"),
-        ({"fl_x": 0}, "focal lengths must be positive"),
-        ({"fl_x": True}, "'fl_x' is True"),
-        ({"fl_x": 10**400}, "'fl_x' is 1000"),
-        ({"w": 0}, "'w' is 0; expected a number of pixels"),
-        ({"w": "-", "cx": "-"}, "'cx' is missing"),
-        ({"frames": []}, "'frames' must be a list"),
+        ({"fl_x": "-", "fl_y": "-"}, "'fl_x' is missing"), ({"fl_x": "40"}, "'fl_x' is '40'; expected a number"),
+        ({"fl_x": 0}, "focal lengths must be positive"), ({"fl_x": True}, "'fl_x' is True"),
+        ({"fl_x": 10**400}, "'fl_x' is 1000"), ({"w": 0}, "'w' is 0; expected a number of pixels"),
+        ({"w": "-", "cx": "-"}, "'cx' is missing"), ({"frames": []}, "'frames' must be a list"),
         ({"frames": [1]}, "'frames' must be a list"),
         ({"integer_depth_scale": 0}, "'integer_depth_scale' is 0; expected the metres"),
     ],
-)
+)  # fmt: skip
 def test_values_that_cannot_be_are_named(nerf, change, match):
-    fails(DataError, match, opened, NERF, nerf(**change))
+    fails(DataError, match, ds.opened, NERF, nerf(**change))
 
 
 @pytest.mark.parametrize(
     ("change", "match"),
     [
         ({"file_path": "../../secret.png"}, r"frame 1: the path '../../secret.png' leaves"),
-        ({"depth_file_path": "/etc/passwd"}, "leaves"),
-        ({"file_path": 7}, "file_path is 7; expected a path"),
-        ({"file_path": None}, "'file_path' is missing"),
-        ({"file_path": "a\nb"}, "cannot be the path of a file"),
+        ({"depth_file_path": "/etc/passwd"}, "leaves"), ({"file_path": 7}, "file_path is 7; expected a path"),
+        ({"file_path": None}, "'file_path' is missing"), ({"file_path": "a\nb"}, "cannot be the path of a file"),
         ({"file_path": "images/frame_00000.png"}, "two frames have one name"),
         ({"depth_file_path": None}, "frame 1: has no depth_file_path; add it, or set depth"),
         ({"transform_matrix": [[1, 2], [3]]}, "frame 1: transform_matrix: expected a"),
-        ({"transform_matrix": "x"}, "expected a"),
-        ({"transform_matrix": None}, "expected a"),
+        ({"transform_matrix": "x"}, "expected a"), ({"transform_matrix": None}, "expected a"),
         ({"transform_matrix": [[[1]]]}, "expected a 4x4 matrix"),
     ],
-)
+)  # fmt: skip
 def test_frames_that_cannot_be_are_named(nerf, change, match):
-    fails(DataError, match, opened, NERF, nerf(1, **change))
+    fails(DataError, match, ds.opened, NERF, nerf(1, **change))
 
 
 @pytest.mark.parametrize("text", ["", "[1]", "{", "[" * 200_000, "\xff", '{"frames": [{"a": 1}]}', "nullx"])
 def test_text_that_is_no_transforms_is_refused(tmp_path, text):
     (tmp_path / "transforms.json").write_text(text, encoding="latin-1")
-    fails(DataError, r"transforms\.json: ", opened, NERF, tmp_path)
+    fails(DataError, r"transforms\.json: ", ds.opened, NERF, tmp_path)
 
 
 def test_a_matrix_that_is_not_finite_is_lost(nerf):
     folder = nerf(0, transform_matrix=[[math.nan] * 4] * 4)  # the last frame: the file has them in reverse
-    scene = opened(NERF, folder)
-    assert [scene.tracked(k) for k in range(COUNT)] == [True, True, True, False]
+    scene = ds.opened(NERF, folder)
+    assert [scene.tracked(k) for k in range(ds.COUNT)] == [True, True, True, False]
 
 
 def test_focal_lengths_from_angles_and_a_centre_in_the_middle(nerf):
-    fx = city()[0].intrinsics.fx
-    folder = nerf(fl_x="-", fl_y="-", cx="-", cy="-", camera_angle_x=2 * math.atan(W / 2 / fx))
-    K = opened(NERF, folder).intrinsics(0, (H, W))
-    assert (K.fx, K.fy, K.cx, K.cy) == (pytest.approx(fx), K.fx, (W - 1) / 2, (H - 1) / 2)
+    fx = ds.city()[0].intrinsics.fx
+    folder = nerf(fl_x="-", fl_y="-", cx="-", cy="-", camera_angle_x=2 * math.atan(ds.W / 2 / fx))
+    K = ds.opened(NERF, folder).intrinsics(0, (ds.H, ds.W))
+    assert (K.fx, K.fy, K.cx, K.cy) == (pytest.approx(fx), K.fx, (ds.W - 1) / 2, (ds.H - 1) / 2)
 
 
 def test_images_in_several_folders_have_names_with_folders(tmp_path):
-    frames = source(1000)[:2]
+    frames = ds.source(1000)[:2]
     entries = []
     for k, frame in enumerate(frames):
-        save(tmp_path / f"images/cam{k}/1.v2.png", frame.color)
-        save(tmp_path / f"depth/cam{k}/1.v2.png", stored(frame, 1000))
-        write_labels(tmp_path, [f"cam{k}/1.v2"], [frame])
-        T = with_axes(frame.T_wc, "opengl")[:3].tolist()
-        entries.append({"file_path": f"images\\cam{k}\\1.v2.png", "transform_matrix": T} | camera_json(frame))
+        ds.save(tmp_path / f"images/cam{k}/1.v2.png", frame.color)
+        ds.save(tmp_path / f"depth/cam{k}/1.v2.png", ds.stored(frame, 1000))
+        ds.write_labels(tmp_path, [f"cam{k}/1.v2"], [frame])
+        T = ds.with_axes(frame.T_wc, "opengl")[:3].tolist()
+        entries.append({"file_path": f"images\\cam{k}\\1.v2.png", "transform_matrix": T} | ds.camera_json(frame))
     (tmp_path / "transforms.json").write_text(json.dumps({"frames": entries}))
-    scene = opened(NERF, tmp_path, depth="depth/{name}.png")
+    scene = ds.opened(NERF, tmp_path, depth="depth/{name}.png")
     found = [scene.frame(k, "net") for k in range(2)]
-    assert_same_voxels(found, frames)
+    ds.assert_same_voxels(found, frames)
     assert found[1].files["labels"] == f"{tmp_path}/labels/net/cam1/1.v2.png"

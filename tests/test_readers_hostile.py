@@ -6,10 +6,9 @@ import os
 from pathlib import Path
 
 import pytest
-from dataset_writers import CLASSES, COUNT, FORMATS, opened, write_labelled, write_lines
+from dataset_writers import FORMATS, opened, write_labelled, write_lines
 from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
-from image_files import raw_png
 from posed_scene import fails, first_frame, write_scene
 from posed_scene import opened as opened_folder
 
@@ -19,11 +18,8 @@ from semstab.datasets.formats.disk import read_table, records
 from semstab.datasets.scannet import read_class_table
 from semstab.datasets.scene import select_frames
 from semstab.datasets.transforms_json import read_transforms
-from semstab.engine import run
 from semstab.errors import ConfigError, DataError, SemstabError, one_line
-from semstab.model.voxels import VoxelTable
 from semstab.predict.folder import PredictionFolder
-from semstab.settings import load_config
 
 
 def write(form, folder: Path) -> list[str]:
@@ -154,18 +150,6 @@ def test_any_text_is_read_or_refused_in_one_line(tmp_path, content):
 
 
 # --- as a run
-
-
-def test_a_run_reads_a_dataset_and_names_a_damaged_file(tmp_path):
-    names = write(FORMATS["hololens"], tmp_path / "data")
-    options = {"root": str(tmp_path / "data"), "classes": CLASSES}
-    dataset = {"name": "hololens", "options": options}
-    config = load_config(overrides={"dataset": dataset, "backends": ["numpy"], "check": None, "voxel_size": 0.1})
-    (summary,) = run(config, out=tmp_path / "out").runs
-    assert (summary.unit.scene, summary.unit.backbone, summary.frames) == ("data", "net", COUNT)
-    assert VoxelTable.load(tmp_path / f"out/voxels/{summary.unit.slug}.parquet").op.max() > 1
-    (tmp_path / f"data/labels/net/{names[COUNT - 1]}.png").write_bytes(raw_png(60_000, 60_000, 8, 0, b""))
-    fails(DataError, "claims 60000x60000 pixels", run, config, out=tmp_path / "again")
 
 
 # --- files that are none, aliases without end, names that lead out

@@ -30,27 +30,19 @@ def classes(folder: Path, said: str):
     ("said", "match"),
     [
         ("depth_scal: 5\n", "unknown setting 'depth_scal'; did you mean 'depth_scale'"),
-        ("depth_scale: 0\n", "depth_scale: "),
-        ("depth_scale: .nan\n", "depth_scale: "),
-        ("camera_axes: blender\n", "camera_axes: "),
-        ("up_axis: w\n", "up_axis: "),
-        ("classes: [a, no]\n", "classes.1: "),
-        ("intrinsics_size: [640]\n", "intrinsics_size"),
+        ("depth_scale: 0\n", "depth_scale: "), ("depth_scale: .nan\n", "depth_scale: "),
+        ("camera_axes: blender\n", "camera_axes: "), ("up_axis: w\n", "up_axis: "),
+        ("classes: [a, no]\n", "classes.1: "), ("intrinsics_size: [640]\n", "intrinsics_size"),
         ("intrinsics_size: [640, 0]\n", "intrinsics_size"),
         ("classes: [a, b]\ntaxonomy: uavid7\n", "give classes or taxonomy, not both"),
-        ("up_axis: z\nclasses: [a\n", r"not valid YAML .*line \d"),
-        ("- a\n", "expected settings"),
+        ("up_axis: z\nclasses: [a\n", r"not valid YAML .*line \d"), ("- a\n", "expected settings"),
         ("classes: !!python/object/apply:os.getcwd []\n", "not valid YAML"),
-        ("depth_scale: 2020-13-45\n", "not valid YAML"),
-        ("!!int ''", "not valid YAML"),
-        ("!!bool x", "not valid YAML"),
-        ("!!timestamp x", "not valid YAML"),
-        ("? [a]: b\n: c", "not valid YAML"),
-        pytest.param("[" * 1500, "not valid YAML", id="deep"),
-        ("\0", "not valid YAML"),
+        ("depth_scale: 2020-13-45\n", "not valid YAML"), ("!!int ''", "not valid YAML"), ("!!bool x", "not valid YAML"),
+        ("!!timestamp x", "not valid YAML"), ("? [a]: b\n: c", "not valid YAML"),
+        pytest.param("[" * 1500, "not valid YAML", id="deep"), ("\0", "not valid YAML"),
         ("'\ud800'", "not a text file"),
     ],
-)
+)  # fmt: skip
 def test_settings_that_cannot_be_used_are_named(folder, said, match):
     (folder / "scene.yaml").write_bytes(said.encode("utf-8", errors="surrogatepass"))
     fails(ConfigError, rf"scene\.yaml: .*{match}", opened, folder)

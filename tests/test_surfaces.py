@@ -161,15 +161,12 @@ def test_a_run_is_kept_while_its_surface_is_the_same(flight, mesh, tmp_path) -> 
 @pytest.mark.parametrize(
     "form",
     [
-        ("scannet", write_scannet, "depth"),
-        ("seven_scenes", write_seven_scenes, "*.depth.png"),
-        ("replica", write_replica, "results/depth*"),
-        ("replica", write_semantic_nerf, "depth"),
-        ("tartanair", write_tartanair, "depth_left"),
-        ("tum", write_tum, "depth*"),
+        ("scannet", write_scannet, "depth"), ("seven_scenes", write_seven_scenes, "*.depth.png"),
+        ("replica", write_replica, "results/depth*"), ("replica", write_semantic_nerf, "depth"),
+        ("tartanair", write_tartanair, "depth_left"), ("tum", write_tum, "depth*"),
     ],
     ids=lambda form: form[1].__name__,
-)
+)  # fmt: skip
 def test_frames_are_listed_without_depth_files(form, mesh, tmp_path) -> None:
     name, write, depth = form
     frames = [down.frame(k) for k in range(3)]
@@ -179,11 +176,8 @@ def test_frames_are_listed_without_depth_files(form, mesh, tmp_path) -> None:
     fx, fy, cx, cy = down.K.fx, down.K.fy, down.K.cx, down.K.cy
     camera = {} if name == "scannet" else {"intrinsics": [fx, fy, cx, cy]}
     options = {
-        "root": tmp_path / "scene",
-        "surface": mesh,
-        "casts": False,
-        "intrinsics_size": (down.W, down.H),
-    } | camera
+        "root": tmp_path / "scene", "surface": mesh, "casts": False, "intrinsics_size": (down.W, down.H),
+    } | camera  # fmt: skip
     if name == "tum":
         options["max_difference"] = 0.06
     scene = open_dataset(name, options).scene("scene")
