@@ -43,6 +43,6 @@ def run_study(
     command: Sequence[str] = (),
     report: bool = True,
 ) -> Result:
-    """The same of a study: a unit that fails is among the result's failures, and the others finish."""
+    """Return the same of a study: a unit that fails is among the result's failures, and the others finish."""
     reporting = [Reporting(out)] if report else []
     return execute_study(as_config(config), out, executor=executor, observers=[*observers, *reporting], command=command)

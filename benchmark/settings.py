@@ -19,7 +19,7 @@ from semstab.predict.predictor import PredictorConfig, StoredSequence
 def load_config(
     settings: str | Path | Mapping[str, Any] | None = None, overrides: Mapping[str, Any] | None = None
 ) -> Config:
-    """The configuration of a file, or of settings by name, over what ships for its dataset in configs/datasets/.
+    """Return the configuration of a file, or of settings by name, over the defaults in configs/datasets/.
 
     Overrides go on top. Raises ConfigError.
     """
@@ -30,15 +30,14 @@ def load_config(
 
 
 def as_config(settings: Config | Mapping[str, Any] | str | Path) -> Config:
-    """A configuration, or what `load_config` makes of a file or a dict."""
+    """Return a configuration, or what `load_config` makes of a file or a dict."""
     return settings if isinstance(settings, Config) else load_config(settings)
 
 
 def load_study(study: str | Path, overrides: Mapping[str, Any] | None = None) -> Config:
-    """The same of a study's file, or of a shipped study by its name.
+    """Return the configuration of a study's file, or of a shipped study by its name.
 
-    It is called as its file, and checked against no backend that it does not name. Raises ConfigError where there is no
-    such study.
+    Its name is the file's, and only backends that it names check it. Raises ConfigError for an unknown study.
     """
     path = _shipped("studies") / f"{study}.yaml" if str(study) in shipped_studies() else Path(study)
     if path.suffix not in (".yaml", ".yml"):
@@ -51,7 +50,7 @@ def load_study(study: str | Path, overrides: Mapping[str, Any] | None = None) ->
 
 
 def shipped_studies() -> tuple[str, ...]:
-    """Names of the studies that ship with semstab."""
+    """Return the names of the studies that ship with semstab."""
     return tuple(sorted(path.stem for path in _shipped("studies").glob("*.yaml")))
 
 
@@ -66,7 +65,7 @@ def dataset_defaults(content: Mapping[str, Any]) -> dict[str, Any]:
 def predicted_config(
     predictors: Sequence[PredictorConfig], path: str | Path | None, overrides: Mapping[str, Any]
 ) -> Config:
-    """The configuration of a file with overrides on top, its dataset's labels replaced by predictions.
+    """Return the configuration of a file with overrides on top, its dataset's labels replaced by predictions.
 
     Without a list of backbones in `overrides` all predictors are used.
     """
@@ -81,7 +80,7 @@ def predicted_config(
 
 
 def filtered_config(filters: Sequence[str], path: str | Path | None, overrides: Mapping[str, Any]) -> Config:
-    """The configuration of a file with overrides on top, filters over the label sources that it selects.
+    """Return the configuration of a file with overrides on top, filters over the label sources that it selects.
 
     Sources with scores give scores. Raises what opening the dataset raises.
     """
@@ -101,7 +100,7 @@ def filtered_config(filters: Sequence[str], path: str | Path | None, overrides: 
 
 
 def resolve(config: Config) -> Config:
-    """The configuration with every default of its dataset's options filled in, paths absolute.
+    """Return the configuration with every default of its dataset's options filled in, paths absolute.
 
     Sequential backbones that predict in a run are shown the frames that it selects.
     """

@@ -1,4 +1,4 @@
-"""A backbone on a scene: which frames, how its labels become rows of evidence, and a frame of it, ready to fuse."""
+"""A backbone on a scene: its frames, how its labels become rows of evidence, and a frame of it, ready to fuse."""
 
 from __future__ import annotations
 
@@ -41,17 +41,17 @@ class Task:
 
     @property
     def units(self) -> list[Unit]:
-        """One a backend."""
+        """Return one unit for each backend."""
         return [Unit(self.scene.name, self.backbone, backend) for backend in self.backends]
 
     @cached_property
     def digest(self) -> str:
-        """A hash of the input behind it."""
+        """Return a hash of the input behind it."""
         return self.scene.digest([*self.indices], self.backbone)
 
 
 def tasks_of(scene: Scene, config: Config, beside: Sequence[str] = ()) -> Iterator[Task]:
-    """The configuration's backbones on an open scene, checked; no image is read.
+    """Yield the configuration's backbones on an open scene, checked; no image is read.
 
     Frames are those that have labels of all of them, and of the label sources `beside` them: what is compared is fused
     from the same frames.
@@ -79,7 +79,7 @@ def tasks_of(scene: Scene, config: Config, beside: Sequence[str] = ()) -> Iterat
 
 
 def applies(part: Part, scene: str, backbone: str) -> bool:
-    """Whether a part of the configuration takes in that backbone on that scene."""
+    """Return whether a part of the configuration takes in that backbone on that scene."""
     return scene in (part.scenes or [scene]) and backbone in (part.backbones or [backbone])
 
 
@@ -101,7 +101,7 @@ def frame_indices(scene: Scene, config: Config, sources: Sequence[str] = ()) -> 
 def selected(
     wanted: list[str] | None, known: Sequence[str], extra: Sequence[str], kind: str, where: str
 ) -> Sequence[str]:
-    """The wanted names, all known ones where none are named; `extra` ones only by name."""
+    """Return the wanted names, all known ones where none are named; `extra` ones only by name."""
     for name in wanted or ():
         if name not in (*known, *extra):
             raise ConfigError(f"{where}: no {kind} '{name}'; {nearest(name, [*known, *extra])}")
@@ -109,12 +109,12 @@ def selected(
 
 
 def read(task: Task, index: int, pixel_stride: int = 1, *, color: bool = False) -> Frame:
-    """A frame of the task, ready to fuse; colour only where it is wanted."""
+    """Return a frame of the task, ready to fuse; colour only where it is wanted."""
     return prepare(task, task.scene.frame(index, task.backbone, color=color), pixel_stride)
 
 
 def prepare(task: Task, frame: Frame, pixel_stride: int = 1) -> Frame:
-    """The scene's frame without what moves, its labels as rows 0..K-1 of the run's label space, noise, pixel stride."""
+    """Return a scene's frame, ready to fuse: no moving things, rows 0..K-1 of the label space, noise, pixel stride."""
     classes = task.mapping.named(task.exclude.predicted_classes)
     if frame.labels is not None:
         classes = tuple(task.mapping.source.ids[k] for k in classes)
@@ -128,7 +128,7 @@ def prepare(task: Task, frame: Frame, pixel_stride: int = 1) -> Frame:
 
 
 def _unlabelled(frame: Frame) -> Mask | None:
-    """(H, W) the pixels with depth to which the model gave no label; None where there are none.
+    """Return (H, W) the pixels with depth to which the model gave no label; None where there are none.
 
     Classes that the run's taxonomy leaves out are labels, and so is what was left out because it moves.
     """
@@ -140,7 +140,7 @@ def _unlabelled(frame: Frame) -> Mask | None:
 
 
 def _in_label_space(mapping: LabelMapping, frame: Frame) -> Frame:
-    """The frame with its labels as rows 0..K-1 of the mapping's target, or its scores (H, W, K) for them."""
+    """Return the frame with its labels as rows 0..K-1 of the mapping's target, or its scores (H, W, K) for them."""
     if frame.labels is not None:
         return dataclasses.replace(frame, labels=mapping.labels(frame.labels, frame.where("labels")))
     assert frame.scores is not None
@@ -148,7 +148,7 @@ def _in_label_space(mapping: LabelMapping, frame: Frame) -> Frame:
 
 
 def truth_task(task: Task) -> Task | None:
-    """The ground truth in the unit's label space; None where there is none, or where it does not map to that."""
+    """Return the ground truth in the unit's label space; None where there is none, or where it does not map to that."""
     if not task.scene.ground_truth or task.backbone == GROUND_TRUTH:
         return None
     try:

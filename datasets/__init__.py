@@ -49,12 +49,12 @@ REGISTRY = Registry(
 
 
 def options_model(name: str) -> type[BaseModel]:
-    """The pydantic model of a dataset's options."""
+    """Return the pydantic model of a dataset's options."""
     return cast("type[BaseModel]", REGISTRY.load(name).Options)
 
 
 def resolved(config: DatasetConfig) -> DatasetConfig:
-    """The dataset with every default of its options filled in, paths absolute.
+    """Return the dataset with every default of its options filled in, paths absolute.
 
     Raises ConfigError for a dataset or an option that cannot be used.
     """

@@ -56,7 +56,7 @@ class Colmap(FileDataset[ColmapOptions]):
         return self._model(folder) is not None
 
     def frames(self, folder: Path) -> list[FrameSource]:
-        """One a registered image. Raises what `read_model` raises."""
+        """Return a frame for each registered image. Raises what `read_model` raises."""
         options, folders = self.options, Folders()
         model = self._model(folder)
         assert model is not None
@@ -111,7 +111,7 @@ class ModelImage:
 
     @property
     def frame(self) -> str:
-        """The name without its suffix: the frame's name in path templates."""
+        """Return the name without its suffix: the frame's name in path templates."""
         return os.path.splitext(self.name)[0]  # noqa: PTH122  a name, not a path
 
 
@@ -185,7 +185,7 @@ def _cameras_bin(file: BinaryIO, path: Path) -> Iterator[tuple[int, Stated]]:
 
 
 def _images_txt(file: BinaryIO, path: Path) -> Iterator[Registered]:
-    """Each image has two lines, of which the second, with its points, may be empty."""
+    """Yield the images, two lines each, of which the second, with its points, may be empty."""
     lines = _lines(file)
     for line, text in lines:
         words = text.split(maxsplit=9)
@@ -219,7 +219,7 @@ def _images_bin(file: BinaryIO, path: Path) -> Iterator[Registered]:
 
 
 def _lines(file: BinaryIO) -> Iterator[tuple[int, str]]:
-    """Number and stripped text of every line: points can take gigabytes, so no file is read whole."""
+    """Yield number and stripped text of every line: points can take gigabytes, so no file is read whole."""
     for number, line in enumerate(file, start=1):
         yield number, line.decode("utf-8", errors="replace").strip()
 

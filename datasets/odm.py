@@ -57,7 +57,7 @@ class Project:
 
 
 def find_project(folder: Path) -> Project | None:
-    """The project in a folder, of OpenDroneMap or of OpenSfM; None where nothing is reconstructed."""
+    """Return the project in a folder, of OpenDroneMap or of OpenSfM; None where nothing is reconstructed."""
     for opensfm in (folder / "opensfm", folder):
         for poses in (opensfm / UNDISTORTED, opensfm / DISTORTED):
             if poses.is_file():
@@ -74,28 +74,28 @@ ADDED_SUFFIXES = ("", ".tif", ".jpg", ".png")
 
 
 def bare_name(shot: str) -> str:
-    """A shot's name without the suffixes of images: DJI_0018 of DJI_0018.JPG.tif."""
+    """Return a shot's name without the suffixes of images: DJI_0018 of DJI_0018.JPG.tif."""
     while Path(shot).suffix and Path(shot).suffix in PHOTO_SUFFIXES:
         shot = shot[: -len(Path(shot).suffix)]
     return shot
 
 
 def written_names(shot: str) -> tuple[str, ...]:
-    """The names that files of a shot may have: its own, and without and with any suffixes."""
+    """Return the names that files of a shot may have: its own, and without and with any suffixes."""
     bare = bare_name(shot)
     names = (f"{bare}{suffix}{added}" for suffix in PHOTO_SUFFIXES for added in ADDED_SUFFIXES)
     return tuple(dict.fromkeys((shot, *(f"{shot}{added}" for added in ADDED_SUFFIXES), bare, *names)))
 
 
 def frame_names(shots: Iterable[str]) -> list[str]:
-    """The frames' names: the shots' without suffixes, or as they are where these would not differ."""
+    """Return the frames' names: the shots' without suffixes, or as they are where these would not differ."""
     names = list(shots)
     bare = [bare_name(name) for name in names]
     return bare if len(set(bare)) == len(names) else names
 
 
 def find_image(folders: Iterable[Path], shot: str, contents: Folders, where: str) -> Path | None:
-    """The image of a shot in the first folder that has one; `where` is the file that names the shot."""
+    """Return the image of a shot in the first folder that has one; `where` is the file that names the shot."""
     for folder in folders:
         for written in written_names(shot):
             path = inside(folder, folder, written, where)
@@ -131,7 +131,7 @@ def find_depth(project: Project, kind: Kind, template: str) -> Path | None:
 
 
 def depth_files(project: Project, kind: Kind | None, names: Mapping[str, str], template: Template) -> dict[str, Path]:
-    """The depth map that each shot has, or would have, by its name; `names` are the frames' by those of their shots."""
+    """Return the depth map of each shot, there or not, by its name; `names`: those of frames by those of shots."""
     if kind == "mve":
         return {shot: project.folder / MVE.format(k) for k, shot in enumerate(names)}
     if kind == "openmvs":
@@ -177,7 +177,7 @@ class Odm(FileDataset[OdmOptions]):
         super().__init__(options)
 
     def find_scenes(self, root: Path) -> Iterator[SceneEntry]:
-        """The projects, and the submodels of each after it."""
+        """Yield the projects, and the submodels of each after it."""
         for entry in super().find_scenes(root):
             yield entry
             parts = entry.folder / "submodels"
@@ -191,7 +191,7 @@ class Odm(FileDataset[OdmOptions]):
         return find_project(folder) is not None
 
     def settled(self, folder: Path) -> OdmOptions:
-        """The options with the source of depth that the project has.
+        """Return the options with the source of depth that the project has.
 
         Raises DataError where it has none, or not the one that is asked for.
         """
@@ -218,7 +218,7 @@ class Odm(FileDataset[OdmOptions]):
         return scene
 
     def georeference(self, folder: Path, options: FileOptions) -> Georeference | None:
-        """The reference of the options, else the project's coords.txt and proj.txt, else OpenSfM's reference."""
+        """Return the reference of the options, else the project's coords.txt and proj.txt, else OpenSfM's reference."""
         if options.crs is not None:
             return super().georeference(folder, options)
         project = self._project(folder)
@@ -226,7 +226,7 @@ class Odm(FileDataset[OdmOptions]):
         return georeference_of(folder / GEOREFERENCING, project.opensfm, T_cw)
 
     def frames(self, folder: Path) -> list[FrameSource]:
-        """One a shot, in the natural order of their names. Raises what `read_reconstruction` raises."""
+        """Return a frame for each shot, in natural order of names. Raises what `read_reconstruction` raises."""
         project = self._project(folder)
         shots, contents, where = self._shots(project.poses), Folders(), str(project.poses)
         names = frame_names(shot.name for shot in shots)
@@ -250,7 +250,7 @@ class Odm(FileDataset[OdmOptions]):
         return sorted(frames, key=lambda frame: natural(frame.name))
 
     def _label_lenses(self, project: Project, shots: Mapping[str, Shot]) -> dict[str, Lens | None]:
-        """The lens of the photograph that a frame's label map belongs to, where they belong to photographs."""
+        """Return the lens of the photograph that a frame's label map belongs to, where they belong to photographs."""
         if (self.options.labels_on or ("undistorted" if project.undistorted else "original")) != "original":
             return {}
         if project.undistorted:

@@ -48,7 +48,7 @@ class Shot:
 
 
 def read_reconstruction(path: Path, wanted: int | None = None) -> list[Shot]:
-    """The shots of the only reconstruction of a file, or of the one with that number, in its order.
+    """Return the shots of the only reconstruction of a file, or of the one with that number, in its order.
 
     Raises DataError for a damaged file, several reconstructions where none is wanted, or an unknown camera model.
     """
@@ -105,7 +105,7 @@ def _vector(values: Mapping[str, Any], key: str, where: str) -> list[float]:
 
 
 def _lens(values: Mapping[str, Any], where: str) -> tuple[Camera, Lens | None]:
-    """The pinhole that stands for a camera, and its lens where it distorts.
+    """Return the pinhole that stands for a camera, and its lens where it distorts.
 
     The pinhole is that of OpenSfM's own undistorted images: the mean focal length, the centre of the image.
     """
@@ -177,7 +177,7 @@ def _crs(coords: Path, proj: Path) -> str:
 
 
 def _read_coords(path: Path) -> tuple[float, float, Float64]:
-    """Offset to the east and north, and the positions (n, 3) of the photographs relative to it."""
+    """Return the offset to the east and north, and the positions (n, 3) of the photographs relative to it."""
     lines = [line.split() for line in read_text(path, MAX_TEXT_BYTES).splitlines()[1:] if line.strip()]
     try:
         numbers = [[float(word) for word in line] for line in lines]
@@ -191,7 +191,7 @@ def _read_coords(path: Path) -> tuple[float, float, Float64]:
 
 
 def _topocentric(opensfm: Path) -> Georeference | None:
-    """East, north and up about OpenSfM's reference, as a transverse Mercator projection about the same point.
+    """Return east, north and up about OpenSfM's reference, as a transverse Mercator projection about the same point.
 
     Within a kilometre the two differ by centimetres: by the height above the ellipsoid over the Earth's radius.
     """

@@ -44,7 +44,7 @@ class PosedFolder(FileDataset[PosedOptions]):
         return (folder / ("depth" if self.options.surface is None else "pose")).is_dir()
 
     def frames(self, folder: Path) -> Iterator[FrameSource]:
-        """One a name of a depth image or a pose. Raises DataError for two files of one frame."""
+        """Yield a frame for each name of a depth image or a pose. Raises DataError for two files of one frame."""
         depth = files_by_stem(folder / "depth", DEPTH_SUFFIXES)
         poses = files_by_stem(folder / "pose", (".txt",))
         colors = files_by_stem(folder / "color", COLOR_SUFFIXES)
@@ -68,7 +68,7 @@ class PosedFolder(FileDataset[PosedOptions]):
 
 
 def _scene_settings(path: Path) -> opt.FileSettings:
-    """The settings of scene.yaml; taxonomy files in it are relative to its folder."""
+    """Return the settings of scene.yaml; taxonomy files in it are relative to its folder."""
     content = read_yaml(path) if path.is_file() else {}
     settings = validated(opt.FileSettings, {"masks": MASKS} | content, f"{path}: ")
     taxonomies = {key: _resolved(path, value) for key, value in settings.taxonomies.items()}

@@ -58,7 +58,7 @@ class Replica(FileDataset[ReplicaOptions]):
         return self._export(folder) is not None
 
     def frames(self, folder: Path) -> Iterable[FrameSource]:
-        """One a depth image. Raises DataError where there are not as many poses."""
+        """Return a frame for each depth image. Raises DataError where there are not as many poses."""
         export = self._export(folder)
         assert export is not None
         poses = read_table(folder / export.trajectory, 16, "a flattened 4x4 matrix").reshape(-1, 4, 4)
@@ -76,7 +76,7 @@ class Replica(FileDataset[ReplicaOptions]):
         return next(there, None)
 
     def _camera(self, folder: Path, export: Export) -> tuple[Camera, float]:
-        """The camera and the depth scale: of the options, of cam_params.json, or the export's usual ones."""
+        """Return the camera and the depth scale: of the options, of cam_params.json, or the export's usual ones."""
         numbers, size, scale = export.intrinsics, export.size, export.depth_scale
         path = next((p for p in (folder / CAMERA_FILE, folder.parent / CAMERA_FILE) if p.is_file()), None)
         if path is not None:

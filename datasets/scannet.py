@@ -52,7 +52,7 @@ class ScanNet(FileDataset[ScanNetOptions]):
         return there and _matrix_file(folder, self.options.intrinsics).is_file()
 
     def frames(self, folder: Path) -> Iterable[FrameSource]:
-        """One a depth image."""
+        """Return a frame for each depth image."""
         camera = self._camera(folder, self.options.intrinsics)
         label_camera = None
         if self.options.label_camera != self.options.intrinsics and _matrix_file(folder, "color").is_file():
@@ -61,7 +61,7 @@ class ScanNet(FileDataset[ScanNetOptions]):
         return frames_of(folder, depth, camera, pose="pose/{name}.txt", color="color/{name}", label_camera=label_camera)
 
     def class_ids(self) -> Mapping[str, UInt16]:
-        """The ids of the ground truth as those of the class table's column, where a table is given."""
+        """Return the ids of the ground truth as those of the class table's column, where a table is given."""
         table = self.options.class_table
         return {} if table is None else {GROUND_TRUTH: read_class_table(table, self.options.class_column)}
 

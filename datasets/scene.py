@@ -81,15 +81,15 @@ class Scene(ABC):
 
     @abstractmethod
     def __len__(self) -> int:
-        """Number of frames of the sequence, those that lack a file or a pose among them."""
+        """Return the number of frames of the sequence, those that lack a file or a pose among them."""
 
     @abstractmethod
     def label_space(self, backbone: str) -> LabelSpace:
-        """The classes of that backbone's label maps or scores."""
+        """Return the classes of that backbone's label maps or scores."""
 
     @abstractmethod
     def frame(self, index: int, backbone: str, *, color: bool = True) -> Frame:
-        """Frame 0 <= index < len, with that backbone's labels or scores in its own label space.
+        """Return frame 0 <= index < len, with that backbone's labels or scores in its own label space.
 
         Without `color` a scene may leave colour out, where that saves time.
 
@@ -98,16 +98,16 @@ class Scene(ABC):
 
     @abstractmethod
     def digest(self, indices: list[int], backbone: str) -> str:
-        """A hash of the content behind those frames: the same digest means the same numbers."""
+        """Return a hash of the content behind those frames: the same digest means the same numbers."""
 
     @property
     def by_name(self) -> tuple[str, ...]:
-        """The label sources that are read only if they are named: the ground truth, and `further` ones."""
+        """Return the label sources that are read only if they are named: the ground truth, and `further` ones."""
         return (*((GROUND_TRUTH,) if self.ground_truth else ()), *self.further)
 
     @property
     def timestamps(self) -> Float64 | None:
-        """(len,) seconds on the scene's own clock, ascending; None where it has none. Reads no image."""
+        """Return (len,) seconds on the scene's own clock, ascending; None where it has none. Reads no image."""
         return None
 
     def tracked(self, index: int) -> bool:
@@ -115,7 +115,7 @@ class Scene(ABC):
         return True
 
     def missing(self, index: int, sources: Sequence[str] = (), *, color: bool = False) -> list[str]:
-        """Files that the frame lacks, to be read with the labels of these sources, or its colour. Reads no image."""
+        """Return files that the frame lacks, among labels of these sources, and its colour. Reads no image."""
         return []
 
     @property
@@ -125,7 +125,7 @@ class Scene(ABC):
 
     @property
     def depth_scale(self) -> float | None:
-        """Units of stored depth in a metre, None where depth is not stored."""
+        """Return units of stored depth in a metre, None where depth is not stored."""
         return None
 
     def frame_name(self, index: int) -> str:
@@ -133,11 +133,11 @@ class Scene(ABC):
         return str(index)
 
     def filtering(self, backbone: str) -> Filtering:
-        """The filters of a label source."""
+        """Return the filters of a label source."""
         return Filtering(backbone)
 
     def geometry(self, index: int, *, color: bool = False) -> Frame:
-        """The frame but for its labels: all pixels are of class 0. Raises DataError that names the file."""
+        """Return the frame but for its labels: all pixels are of class 0. Raises DataError that names the file."""
         sources = (*((GROUND_TRUTH,) if self.ground_truth else ()), *self.backbones[:1])
         for source in sources:  # the ground truth is the cheapest, but may be sparse
             try:
@@ -150,34 +150,34 @@ class Scene(ABC):
         raise DataError(f"{self.name}: there are no labels, and without any this dataset yields no depth")
 
     def depth(self, index: int) -> Float32:
-        """Depth (H, W) float32 in metres along the optical axis."""
+        """Return depth (H, W) float32 in metres along the optical axis."""
         return self.geometry(index).depth
 
     def T_wc(self, index: int) -> Float64:
-        """Pose (4, 4) camera-to-world in metres, OpenCV camera axes."""
+        """Return pose (4, 4) camera-to-world in metres, OpenCV camera axes."""
         return self.geometry(index).T_wc
 
     def intrinsics(self, index: int, shape: tuple[int, ...]) -> Intrinsics:
-        """Intrinsics of the frame's depth image, of shape (H, W); pixels."""
+        """Return intrinsics of the frame's depth image, of shape (H, W); pixels."""
         return self.geometry(index).intrinsics
 
     def color(self, index: int) -> UInt8 | None:
-        """Colour (H, W, 3) uint8 RGB, None where the frame has none."""
+        """Return colour (H, W, 3) uint8 RGB, None where the frame has none."""
         return self.geometry(index, color=True).color
 
     def image(self, index: int) -> UInt8:
-        """Colour (H, W, 3) uint8 RGB. Raises DataError where the frame has none."""
+        """Return colour (H, W, 3) uint8 RGB. Raises DataError where the frame has none."""
         color = self.color(index)
         if color is None:
             raise DataError(f"{self.name}, {self.image_name(index)}: the frame has no colour image to predict on")
         return color
 
     def image_name(self, index: int) -> str:
-        """The name of the frame's files, without suffix."""
+        """Return the name of the frame's files, without suffix."""
         return f"{index:06d}"
 
     def predicted(self, index: int, *, labels: Labels | None = None, scores: Scores | None = None) -> Frame:
-        """The frame with labels (H, W) or scores (H, W, K) that were predicted on its colour image; no colour.
+        """Return the frame with labels (H, W) or scores (H, W, K) that were predicted on its colour image; no colour.
 
         They are brought to the depth's pixels. Raises DataError where image and depth do not show the same view.
         """
@@ -188,7 +188,7 @@ class Scene(ABC):
         return dataclasses.replace(frame, labels=labels, scores=scores, color=None)
 
     def view(self, index: int, shape: tuple[int, int]) -> Frame:
-        """Depth and pose of the frame at the pixels of its colour image, of shape (H, W); all labels are 0.
+        """Return depth and pose of the frame at the pixels of its colour image, of shape (H, W); all labels are 0.
 
         Raises DataError where image and depth do not show the same view.
         """
@@ -203,7 +203,7 @@ class Dataset(ABC):
     @property
     @abstractmethod
     def scenes(self) -> tuple[str, ...]:
-        """Names of the scenes, in order."""
+        """Return the names of the scenes, in order."""
 
     @abstractmethod
     def scene(self, name: str) -> Scene:
@@ -216,7 +216,7 @@ MAX_LISTED = 5
 
 
 def listed(missing: Sequence[str], folder: str = "") -> str:
-    """The number of missing files and the first of them, as they are called in the folder."""
+    """Return the number of missing files and the first of them, as they are called in the folder."""
     missing = [path.removeprefix(f"{folder}{os.sep}") for path in missing]
     more = f", ... ({len(missing) - MAX_LISTED} more)" if len(missing) > MAX_LISTED else ""
     return f"{len(missing)} missing: {', '.join(missing[:MAX_LISTED])}{more}"
@@ -242,14 +242,14 @@ class Selected:
 
     @property
     def left_out(self) -> int:
-        """How many frames were selected, but left out."""
+        """Return how many frames were selected, but left out."""
         return len(self.incomplete) + len(self.lost)
 
 
 def select_frames(
     scene: Scene, selection: FrameSelection, sources: Sequence[str] = (), *, color: bool = False
 ) -> Selected:
-    """The selected frames of a sequence, to be read with the labels of these sources (or its colour) and no others.
+    """Return the selected frames of a sequence, to be read with the labels of these sources, or its colour.
 
     A warning names the frames that are left out. Reads no image. Raises ConfigError for a frame or a time that the
     scene does not have, DataError where selected frames lack files and the scene does not leave such frames out.

@@ -46,7 +46,7 @@ class SevenScenes(FileDataset[SevenScenesOptions]):
         return (folder / "frame-000000.pose.txt").is_file() or any(folder.glob("frame-*.pose.txt"))
 
     def frames(self, folder: Path) -> Iterable[FrameSource]:
-        """One a depth image."""
+        """Return a frame for each depth image."""
         color = self.options.color_intrinsics
         camera = camera_of(self.options.intrinsics, USUAL, IMAGE_SIZE)
         files = (parent / INTRINSICS_FILE for parent in (folder, folder.parent))  # 3DMatch has it above the frames

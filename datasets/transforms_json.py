@@ -51,7 +51,7 @@ class TransformsJson(FileDataset[TransformsOptions]):
         return inside(self.options.root, folder, self.options.transforms, "option transforms").is_file()
 
     def frames(self, folder: Path) -> list[FrameSource]:
-        """One an entry of 'frames'. Raises what `read_transforms` raises."""
+        """Return a frame for each entry of 'frames'. Raises what `read_transforms` raises."""
         path = inside(self.options.root, folder, self.options.transforms, "option transforms")
         depth = self.options.depth or ("depth/{name}" if self.options.surface is not None else None)
         template = None if depth is None else Template("depth", depth, ("name",), ("name",))
@@ -59,7 +59,7 @@ class TransformsJson(FileDataset[TransformsOptions]):
 
 
 def read_transforms(path: Path, root: Path, folder: Path, depth: Template | None = None) -> list[FrameSource]:
-    """The frames of a transforms.json, whose paths are relative to it and stay in root.
+    """Return the frames of a transforms.json, whose paths are relative to it and stay in root.
 
     `depth` says, relative to `folder`, where depth maps are that the file does not name.
     Raises DataError that names the file and the frame for missing or damaged values, distortion, or no depth.
@@ -99,7 +99,7 @@ def read_transforms(path: Path, root: Path, folder: Path, depth: Template | None
 
 
 def _named(entry: Mapping[str, Any], keys: tuple[str, ...], path: Path, root: Path, where: str) -> Path | None:
-    """The path that the first of the keys holds; None where there is none."""
+    """Return the path that the first of the keys holds; None where there is none."""
     value = next((entry[key] for key in keys if entry.get(key) is not None), None)
     if value is None:
         return None
@@ -109,7 +109,7 @@ def _named(entry: Mapping[str, Any], keys: tuple[str, ...], path: Path, root: Pa
 
 
 def _camera(values: Mapping[str, Any], where: str) -> Camera:
-    """The camera of a frame; its own values go before those of the file."""
+    """Return the camera of a frame; its own values go before those of the file."""
     model = values.get("camera_model")
     coefficients = [number(values, key, where) for key in DISTORTION if values.get(key) is not None]
     if model not in PINHOLES or any(coefficients):

@@ -59,7 +59,7 @@ class Tum(FileDataset[TumOptions]):
         return (folder / self._list(folder)).is_file()
 
     def frames(self, folder: Path) -> list[FrameSource]:
-        """One a depth image that has a colour image; where no pose is near, its pose is NaN.
+        """Return a frame for each depth image that has a colour image; where no pose is near, its pose is NaN.
 
         Where a surface gives the depth and no depth.txt is there, one a colour image.
 

@@ -87,7 +87,7 @@ class Uavid3d(FileDataset[Uavid3dOptions]):
         return self._inside(folder, self._pose.text).parent.is_dir()
 
     def frames(self, folder: Path) -> list[FrameSource]:
-        """One a pose. Raises what `read_model` or `read_transforms` raises."""
+        """Return a frame for each pose. Raises what `read_model` or `read_transforms` raises."""
         options, folders = self.options, Folders()
         if options.pose_format == "transforms":
             path = self._inside(folder, options.transforms)

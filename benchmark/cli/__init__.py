@@ -57,7 +57,7 @@ INTERRUPTED = 130
 
 
 def _without_kind(options: list[Any]) -> list[Any]:
-    """A flag takes no value: the help says no kind of it, as typer does."""
+    """Show flags without a kind of value, which they do not take."""
     for option in options:
         if getattr(option, "is_flag", False):
             option.metavar = ""
@@ -92,7 +92,7 @@ class Group(TyperGroup):
     """Runs `run` where no command is named, shows its options in the help, and reports every error in one line."""
 
     def get_params(self, ctx: Any) -> list[Any]:
-        """The options that stand before the command, and --help."""
+        """Return the options that stand before the command, and --help."""
         return _without_kind(super().get_params(ctx))
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
@@ -112,7 +112,7 @@ class Group(TyperGroup):
             self.params = own
 
     def invoke(self, ctx: Any) -> Any:
-        """The one place that catches: bad input is one line and exit code 2."""
+        """Catch every error, here alone: bad input is one line and exit code 2."""
         try:
             with interruptible():
                 return super().invoke(ctx)
@@ -176,7 +176,7 @@ class _Once(logging.Filter):
         self._said: set[str] = set()
 
     def filter(self, record: logging.LogRecord) -> bool:
-        """Whether it was not said before."""
+        """Return whether it was not said before."""
         message = record.getMessage()
         new = message not in self._said
         self._said.add(message)

@@ -71,7 +71,7 @@ class Perturbation(Settings):
 
     @property
     def adds_noise(self) -> bool:
-        """Whether it changes a frame at all."""
+        """Return whether it changes a frame at all."""
         return any(value for name, value in self if name != "seed")
 
 
@@ -182,7 +182,7 @@ class Config(Settings):
     @field_validator("perturbation")
     @classmethod
     def _noise_or_none(cls, value: Perturbation | None) -> Perturbation | None:
-        """Settings that add no noise are none, so that they are compared as such."""
+        """Treat settings that add no noise as none, so that they are compared as such."""
         if value is not None and value.seed:
             raise ValueError("leave its seed out; 'seed' counts, which stands beside 'perturbation'")
         return value if value is not None and value.adds_noise else None
@@ -216,17 +216,17 @@ class Config(Settings):
 
     @property
     def sets_voxel_size(self) -> bool:
-        """Whether it says a voxel size, or leaves it to the data."""
+        """Return whether it says a voxel size, or leaves it to the data."""
         return "voxel_size" in self.model_fields_set
 
     def fused_by(self) -> list[BackendConfig]:
-        """The backends that fuse the base units: those named, and the one they are checked against."""
+        """Return the backends that fuse the base units: those named, and the one they are checked against."""
         named = [backend.name for backend in self.backends]
         extra = [BackendConfig(name=self.check)] if self.check not in (None, SAMPLE, *named) else []
         return [*self.backends, *extra]
 
     def only(self, parts: Sequence[str]) -> Config:
-        """The base units and these parts alone: sweeps, 'shared_taxonomy', 'backends'.
+        """Return the base units and these parts alone: sweeps, 'shared_taxonomy', 'backends'.
 
         Raises ConfigError for a part that there is not.
         """

@@ -28,7 +28,7 @@ class Settings(BaseModel):
 
 
 def read_yaml(path: str | Path) -> dict[str, Any]:
-    """The mapping in a YAML file. Raises ConfigError in one line where there is none."""
+    """Return the mapping in a YAML file. Raises ConfigError in one line where there is none."""
     try:
         text = read_limited(path, MAX_YAML_BYTES).decode("utf-8")
     except OSError as error:
@@ -44,7 +44,7 @@ def read_yaml(path: str | Path) -> dict[str, Any]:
 
 
 def merge(base: Mapping[str, Any], over: Mapping[str, Any]) -> dict[str, Any]:
-    """Settings of `over` on top of `base`, group by group."""
+    """Return the settings of `over` on top of `base`, group by group."""
     merged = dict(base)
     for key, value in over.items():
         both = isinstance(value, Mapping) and isinstance(merged.get(key), Mapping)
@@ -65,7 +65,7 @@ class ScopeOption(BaseModel):
 
 
 def validated(model: type[Model], content: Any, where: str = "") -> Model:
-    """The settings that a content holds. Raises ConfigError in one line, which begins with `where`."""
+    """Return the settings that a content holds. Raises ConfigError in one line, which begins with `where`."""
     try:
         return model.model_validate(content)
     except ValidationError as error:
@@ -75,7 +75,7 @@ def validated(model: type[Model], content: Any, where: str = "") -> Model:
 
 
 def explain(error: ValidationError, model: type[BaseModel]) -> str:
-    """The first problem of a pydantic error as one line: the setting, what is wrong, the nearest known key."""
+    """Return the first problem of a pydantic error as one line: the setting, what is wrong, the nearest known key."""
     problem = error.errors()[0]
     name = ".".join(" ".join(str(part).split()) for part in problem["loc"])
     if problem["type"] == "extra_forbidden":
@@ -155,7 +155,7 @@ class Sweeps(Settings):
     pixel_stride: Counts | None = Field(None, description="use every n-th pixel of each axis")
 
     def given(self) -> Iterator[tuple[str, Values[Any]]]:
-        """The sweeps that there are, by name."""
+        """Yield the sweeps that there are, by name."""
         for name, part in self:
             if part is not None:
                 yield name, part
@@ -216,11 +216,6 @@ class FrameSelection(Settings):
             raise ValueError("from_time lies after to_time")
         return self
 
-    @property
-    def needs_time(self) -> bool:
-        """Whether frames are chosen by the time they were taken at."""
-        return self.from_time is not None or self.to_time is not None
-
     @classmethod
     def of(cls, indices: Sequence[int]) -> Self:
         """Of exactly these frames, ascending; in a few numbers where they are a range."""
@@ -229,7 +224,7 @@ class FrameSelection(Settings):
         return cls(list=tuple(indices))
 
     def indices(self, length: int, timestamps: Sequence[float] | None = None) -> Indices:
-        """The selected indices of a sequence of that length, whose frames were taken at `timestamps` (seconds).
+        """Return the selected indices of a sequence of that length, whose frames were taken at `timestamps` (seconds).
 
         A frame whose time is not known (NaN) lies in no range of time. Raises ConfigError for a listed frame that is
         not there, or a range of time where the sequence has none.
@@ -239,7 +234,7 @@ class FrameSelection(Settings):
                 raise ConfigError(f"frames.list: there is no frame {self.list[-1]}; the sequence has {length}, from 0")
             return [*self.list]
         chosen = [*range(length)][self.start : self.stop]
-        if self.needs_time:
+        if self.from_time is not None or self.to_time is not None:
             if timestamps is None:
                 raise ConfigError("frames: from_time and to_time need time stamps; this sequence has none; use start")
             first = -math.inf if self.from_time is None else self.from_time
@@ -253,7 +248,7 @@ class FrameSelection(Settings):
 
 
 def as_range(indices: Sequence[int]) -> Sequence[int]:
-    """The same as a range where they are evenly spaced: a hundred thousand numbers in lists and sets take 15 MB."""
+    """Return evenly spaced indices as a range: a hundred thousand numbers in lists and sets take 15 MB."""
     if len(indices) < 2:
         return indices
     even = range(indices[0], indices[-1] + 1, max(1, indices[1] - indices[0]))

@@ -97,7 +97,7 @@ class Rows:
 
 
 def column(values: npt.NDArray[Any]) -> pa.Array:
-    """The values (n,) as Arrow has them, numbers without a copy.
+    """Return the values (n,) as Arrow has them, numbers without a copy.
 
     `pyarrow.array` imports pandas, where that is installed, to see whether it was given a part of it: most of a second.
     """
@@ -110,7 +110,7 @@ def column(values: npt.NDArray[Any]) -> pa.Array:
 
 
 def values_of(column: pa.ChunkedArray) -> npt.NDArray[Any]:
-    """A column as numpy has it (n,), numbers in one piece without a copy; `to_numpy` imports pandas as well."""
+    """Return a column as numpy has it (n,), numbers in one piece without a copy; `to_numpy` imports pandas as well."""
     import pyarrow as pa
 
     if column.null_count or not (pa.types.is_integer(column.type) or pa.types.is_floating(column.type)):

@@ -1,4 +1,4 @@
-"""How loops are compiled, and where numba keeps what it compiled: beside the code, or where that can be written."""
+"""Compiled loops, and the folder of numba's cache: beside the code, or another that can be written."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ if sys.platform == "linux":  # the TBB that Open3D loads is too old for numba, w
 
 
 def compiled(**options: Any) -> Callable[[Any], Any]:
-    """A decorator that compiles a function at its first call, and keeps the code for later processes.
+    """Return a decorator that compiles a function at its first call, and keeps the code for later processes.
 
     numba keeps it in __pycache__ beside the source, or else below HOME. Where neither can be written it goes below the
     temporary folder, and if that cannot be either each process compiles anew; numba alone would refuse the import.
@@ -75,7 +75,7 @@ class _Cache(FunctionCache):
 
 
 def _stamp(function: Any, seen: frozenset[Any]) -> tuple[Any, ...]:
-    """The file of a function, by time and size, and the same of what it names: compiled functions, numbers, arrays."""
+    """Return time and size of the file of a function, and of what it names: compiled functions, numbers, arrays."""
     file = Path(function.__code__.co_filename)
     stamp: list[Any] = [(file.name, file.stat().st_mtime, file.stat().st_size) if file.exists() else file.name]
     names, codes = set[str](), [function.__code__]
@@ -114,7 +114,7 @@ def in_chunks(loop: Any, *arguments: Any) -> None:
 
 
 def is_kept(function: Any) -> bool:
-    """Whether an earlier process left the code of a compiled function."""
+    """Return whether an earlier process left the code of a compiled function."""
     source = f"{function.__module__.rpartition('.')[2]}.{function.__qualname__}-*.nbi"
     folder = function.stats.cache_path
     return folder is not None and any(Path(folder).glob(source))

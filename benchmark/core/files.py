@@ -92,7 +92,7 @@ def write_json(path: str | Path, value: Any) -> None:
 
 
 def csv_text(text: str) -> str:
-    """A name for a cell of a CSV file, in which a spreadsheet sees no formula."""
+    """Return a name for a cell of a CSV file, in which a spreadsheet sees no formula."""
     return f"'{text}" if text.startswith(("=", "+", "-", "@", "\t", "\r")) else text
 
 
@@ -122,14 +122,14 @@ def write_stack(
 
 
 def cache_folder() -> Path:
-    """Where what can be made again is kept: SEMSTAB_CACHE, or semstab below XDG_CACHE_HOME, which is ~/.cache."""
+    """Return the folder of caches: SEMSTAB_CACHE, or semstab below XDG_CACHE_HOME, which is ~/.cache."""
     if own := os.environ.get("SEMSTAB_CACHE"):
         return Path(own)
     return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "semstab"
 
 
 def content_key(settings: Mapping[str, Any]) -> str:
-    """A hash of settings that JSON holds, in any order."""
+    """Return a hash of settings that JSON holds, in any order."""
     return hashlib.blake2b(json.dumps(settings, sort_keys=True).encode(), digest_size=16).hexdigest()
 
 
@@ -142,7 +142,7 @@ def keep_only(written: Collection[Path], folder: Path) -> None:
 
 
 def parse_json(text: str | bytes) -> Any:
-    """The content of JSON. Raises ValueError where it is none, or nested too deeply."""
+    """Return the content of JSON. Raises ValueError where it is none, or nested too deeply."""
     try:
         return json.loads(text)
     except RecursionError as error:
@@ -169,7 +169,7 @@ def read_limited(path: str | Path, limit: int) -> bytes:
 
 
 def open_file(path: str | Path) -> BufferedReader:
-    """A file, to read bytes from. Raises OSError, too, for what is no regular file: a pipe, a device."""
+    """Return a file, to read bytes from. Raises OSError, too, for what is no regular file: a pipe, a device."""
     if "\0" in str(path):
         raise OSError(errno.EINVAL, "no file can be called so")
     # a pipe to which nobody writes opens at once
@@ -181,7 +181,7 @@ def open_file(path: str | Path) -> BufferedReader:
 
 
 def parse_yaml(text: str, where: str) -> Any:
-    """The content of a YAML text, without tags that make objects.
+    """Return the content of a YAML text, without tags that make objects.
 
     Raises ConfigError in one line that starts with `where` where it is not valid.
     """

@@ -29,7 +29,7 @@ class Fetched(Generic[T]):
 
 
 def default_threads() -> int:
-    """One a core that this process may use, at least 2, at most `MOST_THREADS`."""
+    """Return one thread for each core that this process may use, at least 2, at most `MOST_THREADS`."""
     return min(max(2, len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else 2), MOST_THREADS)
 
 

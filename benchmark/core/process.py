@@ -122,7 +122,7 @@ def give_back(*, least: int = 0) -> None:
 
 @functools.cache
 def _libc() -> Any:
-    """The C library; nothing where its memory cannot be settled."""
+    """Return the C library; nothing where its memory cannot be settled."""
     import ctypes
 
     return ctypes.CDLL(None) if sys.platform == "linux" else None

@@ -33,7 +33,7 @@ class Registry:
         self.builtin = dict(builtin)
 
     def entries(self) -> dict[str, Entry]:
-        """Every known entry by name; a built-in name is not replaced by a plug-in's."""
+        """Return every known entry by name; a built-in name is not replaced by a plug-in's."""
         return self._plugins | self.builtin
 
     @functools.cached_property
@@ -45,7 +45,7 @@ class Registry:
         }
 
     def entry(self, name: str) -> Entry:
-        """The entry of that name. Raises ConfigError, with the nearest known name, where there is none."""
+        """Return the entry of that name. Raises ConfigError, with the nearest known name, where there is none."""
         entries = self.entries()
         if name not in entries:
             raise ConfigError(f"{self.kind} '{name}' is not known; {nearest(name, sorted(entries))}")

@@ -41,7 +41,7 @@ SAMPLES: Mapping[bytes, np.dtype[Any]] = {b"DR": np.dtype("<f4"), b"D2": np.dtyp
 
 
 def read_mvei(path: Path, scale: float | None = None, read: Read = read_bytes) -> Float32:
-    """Depth (H, W) of a depth-LN.mvei, float32, as lengths of rays; 0 where there is none.
+    """Return depth (H, W) of a depth-LN.mvei, float32, as lengths of rays; 0 where there is none.
 
     `scale` is units in a metre. Raises DataError where the file is no depth map, or truncated.
     """
@@ -91,14 +91,14 @@ def dmap_header(path: Path, data: bytes) -> DmapHeader:
 
 
 def read_dmap(path: Path, scale: float | None = None, read: Read = read_bytes) -> Float32:
-    """Depth (H, W) of a .dmap along the optical axis, float32, 0 where there is none; raises as `read_mvei`."""
+    """Return depth (H, W) of a .dmap along the optical axis, float32, 0 where there is none; raises as `read_mvei`."""
     data = read(path)
     header = dmap_header(path, data)
     return _metres(path, data, header.start, header.shape, header.dtype, (scale or 1) / 2.0**header.exponent)
 
 
 def read_depth_map(path: Path, scale: float | None = None, read: Read = read_bytes) -> Float32:
-    """Depth (H, W) of COLMAP's .bin, float32: the text 'width&height&channels&', then values, x fastest.
+    """Return depth (H, W) of COLMAP's .bin, float32: the text 'width&height&channels&', then values, x fastest.
 
     `scale` is units in a metre. Raises DataError for a normal map, another format, or a truncated file.
     """
@@ -113,7 +113,7 @@ def read_depth_map(path: Path, scale: float | None = None, read: Read = read_byt
 
 
 def _metres(path: Path, data: bytes, start: int, shape: tuple[int, int], dtype: np.dtype[Any], scale: float) -> Float32:
-    """Samples (H, W) of `scale` units in a metre, as float32 metres. Raises DataError where there are not as many."""
+    """Return samples (H, W) of `scale` units in a metre as float32 metres. Raises DataError where some are missing."""
     if not (min(shape) > 0 and math.prod(shape) <= MAX_PIXELS):
         raise DataError(f"{path}: claims {shape[1]}x{shape[0]} pixels; is it damaged?")
     end = start + math.prod(shape) * dtype.itemsize
@@ -132,7 +132,7 @@ FORMATS = {".bin": read_depth_map, ".mvei": read_mvei, ".dmap": read_dmap}
 
 
 def stored_scale(frame: FrameSource, options: FileOptions) -> float:
-    """Units of a frame's depth file in a metre: those of the options, else the usual ones of its kind of file."""
+    """Return units of a frame's depth file in a metre: those of the options, else the usual ones of its kind."""
     usual = MILLIMETRES if frame.depth.suffix.lower() == ".png" else 1.0
     return options.depth_scale or frame.depth_scale or usual
 
@@ -140,7 +140,7 @@ def stored_scale(frame: FrameSource, options: FileOptions) -> float:
 def stored_depth(
     frame: FrameSource, options: FileOptions, read: Read, camera: Callable[[tuple[int, int]], Intrinsics]
 ) -> Float32:
-    """Depth (H, W) of a frame's file in metres along the optical axis; values that mean 'no depth' become 0.
+    """Return depth (H, W) of a frame's file in metres along the optical axis; values that mean 'no depth' become 0.
 
     camera  gives the intrinsics of the depth image of a shape
     """
@@ -157,7 +157,7 @@ def stored_depth(
 
 
 def shape_of(frame: FrameSource, options: FileOptions) -> tuple[int, int]:
-    """(H, W) of the cast depth of a frame: the size of its camera, else of its depth file or colour image.
+    """Return (H, W) of the cast depth of a frame: the size of its camera, else of its depth file or colour image.
 
     Raises DataError where none is known.
     """

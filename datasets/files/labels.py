@@ -64,13 +64,13 @@ class LabelSource:
 
     @classmethod
     def of(cls, kind: Kind, base: Path, template: str, frames: Sequence[FrameSource], folders: Folders) -> LabelSource:
-        """One source, with the first frame that has a file."""
+        """Return one source, with the first frame that has a file."""
         source = cls(kind, base, template, folders)
         there = ((frame.name, file) for frame in frames if (file := source.file(frame)) is not None)
         return replace(source, first=next(there, None))
 
     def file(self, frame: FrameSource) -> Path | None:
-        """The file of a frame, under its own name or another that it has."""
+        """Return the file of a frame, under its own name or another that it has."""
         for name in (frame.name, *frame.aliases):
             path = inside(self.base, self.base, self.template.replace("{name}", name), str(self.base))
             if (file := self.folders.one_of(path, SUFFIXES[self.kind])) is not None:
@@ -87,7 +87,7 @@ class LabelSource:
 def find_sources(
     options: FileOptions, entry: SceneEntry, frames: Sequence[FrameSource], folders: Folders
 ) -> dict[str, LabelSource]:
-    """The label sources of a scene with these frames; `gt` is the ground truth.
+    """Return the label sources of a scene with these frames; `gt` is the ground truth.
 
     labels of X are the backbone X, scores of X found by a template are X-scores, so that neither name depends on what
     else is there. A folder without a file of any frame is left out with a warning.
@@ -128,7 +128,7 @@ def find_sources(
 
 
 def label_paths(options: FileOptions, entry: SceneEntry, frames: Sequence[FrameSource]) -> list[str]:
-    """Paths of label maps and scores that would be read: the paths of the first frame, with BACKBONE for any name."""
+    """Return the paths of label maps and scores of the first frame, with BACKBONE for any name."""
     values = {"scene": entry.below_root, "backbone": "BACKBONE", "name": frames[0].name if frames else "NAME"}
     base = options.labels_root or entry.folder
     return [
@@ -139,7 +139,7 @@ def label_paths(options: FileOptions, entry: SceneEntry, frames: Sequence[FrameS
 
 
 def _stated(kind: Kind, options: FileOptions) -> dict[str | None, Template]:
-    """The template of each backbone that has one of its own, or that of all, under None."""
+    """Return the template of each backbone that has one of its own, or that of all, under None."""
     stated = options.labels if kind == "labels" else options.scores
     if isinstance(stated, dict):
         return {key: Template(f"{kind}.{key}", text, ("scene", "name"), ("name",)) for key, text in stated.items()}
@@ -199,7 +199,7 @@ class LabelMaps:
         self._spaces: dict[str, LabelSpace | None] = {}
 
     def source(self, backbone: str) -> LabelSource:
-        """The files of a label source. Raises ConfigError where there is none of that name."""
+        """Return the files of a label source. Raises ConfigError where there is none of that name."""
         known = self._sources
         if backbone not in known:
             hint = (
@@ -209,7 +209,7 @@ class LabelMaps:
         return known[backbone]
 
     def file(self, frame: FrameSource, backbone: str) -> Path:
-        """The file of a frame. Raises DataError where it is not there."""
+        """Return the file of a frame. Raises DataError where it is not there."""
         source = self.source(backbone)
         if (file := source.file(frame)) is None:
             lost = [path for each in self._frames for path in source.missing(each)]
@@ -219,7 +219,7 @@ class LabelMaps:
         return file
 
     def space(self, backbone: str) -> LabelSpace | None:
-        """The classes of a label source, read once; None for regions, and where nothing says them.
+        """Return the classes of a label source, read once; None for regions, and where nothing says them.
 
         They are those of option taxonomies, else of a label_space.yaml next to its maps, else of the scene.
         Raises ConfigError for one that cannot be used.
@@ -246,7 +246,7 @@ class LabelMaps:
             raise ConfigError(f"{self._folder}: {error}") from error
 
     def label_space(self, backbone: str, where: Path) -> LabelSpace:
-        """The same; raises DataError with `where` where nothing says them, ConfigError where it has none."""
+        """Return the same; raises DataError with `where` where nothing says them, ConfigError where it has none."""
         source = self.source(backbone)
         if backbone in self.regions:
             raise ConfigError(f"{self._folder}: '{backbone}' holds regions without classes, which cannot be fused")
@@ -261,7 +261,7 @@ class LabelMaps:
         return space
 
     def labels(self, backbone: str, path: Path, read: Read) -> Labels:
-        """Ids (H, W) of one file, whose bytes `read` gives. Raises DataError that names it."""
+        """Return ids (H, W) of one file, whose bytes `read` gives. Raises DataError that names it."""
         labels = images.read_labels(path, self.space(backbone), read)
         if backbone in self.class_ids:
             ids: Labels = self.class_ids[backbone][labels]
@@ -275,7 +275,7 @@ class LabelMaps:
         return labels
 
     def scores(self, backbone: str, path: Path, size: Size, read: Read) -> Scores:
-        """Scores (H, W, K) of one file; `size` is (H, W) of the depth. Raises DataError that names it."""
+        """Return scores (H, W, K) of one file; `size` is (H, W) of the depth. Raises DataError that names it."""
         scores = images.read_scores(path, self._options.scores_layout or "KHW", size, read)
         if void := self._options.void_ids.get(backbone):
             space = self.space(backbone)
@@ -285,5 +285,5 @@ class LabelMaps:
         return scores
 
     def mask_file(self, frame: FrameSource) -> Path | None:
-        """The mask of a frame, where it has one."""
+        """Return the mask of a frame, where it has one."""
         return None if self._masks is None else self._masks.file(frame)

@@ -48,7 +48,7 @@ GroundTruth = Annotated[str | None, Field(description="template of ground truth 
 VoidIds = Annotated[dict[str, tuple[Id, ...]], Field(description="ids that mean 'no label', by label source, or gt")]
 
 
-ZERO_IS_VOID = {GROUND_TRUTH: (0,)}
+ZERO_IS_VOID: dict[str, tuple[int, ...]] = {GROUND_TRUTH: (0,)}
 """`void_ids` of a dataset whose ground truth has 0 where there is no label."""
 
 
@@ -150,12 +150,12 @@ class Template:
             )
 
     def filled(self, **values: str) -> str:
-        """The path with the placeholders that are given replaced."""
+        """Return the path with the placeholders that are given replaced."""
         return PLACEHOLDER.sub(lambda match: values.get(match[1], match[0]), self.text)
 
 
 def matching_folders(base: Path, template: Template, placeholder: str, **values: str) -> dict[str, str]:
-    """The folders on disk that fit the part of a template with `placeholder`: its value to the template with it.
+    """Return the folders on disk that fit the part of a template with `placeholder`: its value to the template with it.
 
     Raises ConfigError where the placeholder is not in the name of a folder, or after one that is still open.
     """
@@ -205,7 +205,7 @@ class Folders:
         return name in self._names[folder]
 
     def one_of(self, path: Path, suffixes: Collection[str]) -> Path | None:
-        """The path where it has one of the suffixes, else that with the first suffix there is a file of."""
+        """Return the path where it has one of the suffixes, else that with the first suffix there is a file of."""
         if path.suffix.lower() in suffixes:
             return path if self.has(path) else None
         candidates = (path.with_name(path.name + suffix) for suffix in suffixes)

@@ -47,7 +47,7 @@ class FileDataset(Dataset, Generic[Options]):
 
     @property
     def scenes(self) -> tuple[str, ...]:
-        """Names of the scenes, in natural order: their paths below root, with - between folders."""
+        """Return the names of the scenes, in natural order: their paths below root, with - between folders."""
         return tuple(self._entries)
 
     def scene(self, name: str) -> FileScene:
@@ -79,21 +79,21 @@ class FileDataset(Dataset, Generic[Options]):
         return scene
 
     def find_scenes(self, root: Path) -> Iterable[SceneEntry]:
-        """The scenes below the root, in natural order; raises what `find_scenes` raises."""
+        """Return the scenes below the root, in natural order; raises what `find_scenes` raises."""
         return find_scenes(root, self.is_scene, self.looks_like)
 
     def settled(self, folder: Path) -> FileOptions:
-        """The options with which a scene's folder is read."""
+        """Return the options with which a scene's folder is read."""
         return self.options
 
     def georeference(self, folder: Path, options: FileOptions) -> Georeference | None:
-        """Where a scene lies on Earth: what the options say, else None. Raises what `Georeference.of` raises."""
+        """Return where a scene lies on Earth: what the options say, else None. Raises what `Georeference.of` raises."""
         if options.crs is None:
             return None
         return Georeference.of(options.crs, options.offset or (0.0, 0.0, 0.0), f"{folder}: crs")
 
     def depth_files(self, folder: Path, before: str, after: str, *, instead: Iterable[str]) -> dict[str, Path]:
-        """The depth images of a folder by name, as `files_named` finds them.
+        """Return the depth images of a folder by name, as `files_named` finds them.
 
         instead  names of frames, by their poses or images, which a surface gives depth where no depth image is there
         """
@@ -116,11 +116,11 @@ class FileDataset(Dataset, Generic[Options]):
 
     @abstractmethod
     def frames(self, folder: Path) -> Iterable[FrameSource]:
-        """The frames of a scene's folder, in order, each with a name of its own. Raises DataError with the file."""
+        """Return the frames of a scene's folder, in order, of different names. Raises DataError with the file."""
 
 
 def find_scenes(root: Path, is_scene: Callable[[Path], bool], looks_like: str) -> list[SceneEntry]:
-    """The root where it is a scene itself, else the scenes below it in natural order; one holds no other.
+    """Return the root where it is a scene itself, else the scenes below it in natural order; one holds no other.
 
     Raises DataError where there is none, or two would have one name.
     """
@@ -146,7 +146,7 @@ def find_scenes(root: Path, is_scene: Callable[[Path], bool], looks_like: str) -
 
 
 def images_named(folder: Path, before: str = "", after: str = "") -> list[str]:
-    """The names of a folder's colour images 'BEFORE name AFTER.png', or of another kind."""
+    """Return the names of a folder's colour images 'BEFORE name AFTER.png', or of another kind."""
     return [name for suffix in COLOR_SUFFIXES for name in files_named(folder, before, f"{after}{suffix}")]
 
 
@@ -162,7 +162,7 @@ def frames_of(
     depth_scale: float | None = None,
     what: str = "depth images",
 ) -> Iterator[FrameSource]:
-    """One a depth image, with its colour where there is any; `pose` and `color` are templates with {name}.
+    """Yield a frame for each depth image, with its colour if any; `pose` and `color` are templates with {name}.
 
     poses  (n, 4, 4) in the same order, where `pose` is the file of them all
 

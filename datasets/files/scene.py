@@ -76,12 +76,12 @@ class FileScene(Scene):
         self.on_photographs = any(frame.label_lens is not None for frame in frames)
 
     def __len__(self) -> int:
-        """Number of frames of the sequence, those that lack a file or a pose among them."""
+        """Return the number of frames of the sequence, those that lack a file or a pose among them."""
         return len(self._frames)
 
     @cached_property
     def timestamps(self) -> Float64 | None:
-        """(len,) seconds on the dataset's own clock; None where it has none."""
+        """Return (len,) seconds on the dataset's own clock; None where it has none."""
         if self.options.frames_per_second is not None:
             return np.arange(len(self)) / self.options.frames_per_second
         times = [frame.timestamp for frame in self._frames]
@@ -99,7 +99,7 @@ class FileScene(Scene):
         return self._frame(index).name
 
     def missing(self, index: int, sources: Sequence[str] = (), *, color: bool = False) -> list[str]:
-        """Paths of the files that the frame lacks: depth, pose, the labels of these sources, colour."""
+        """Return paths of the files that the frame lacks: depth, pose, the labels of these sources, colour."""
         frame = self._frame(index)
         files = [self.surface or frame.depth, *([frame.pose_file] if frame.pose is None else [])]
         lost = [str(path) for path in files if not self._folders.has(path)]
@@ -117,18 +117,18 @@ class FileScene(Scene):
 
     @property
     def depth_scale(self) -> float | None:
-        """Units of its stored depth in a metre: the option, else the usual scale of its kind of file."""
+        """Return units of its stored depth in a metre: the option, else the usual scale of its kind of file."""
         return stored_scale(self._frames[0], self.options) if self._surface is None else None
 
     def label_space(self, backbone: str) -> LabelSpace:
-        """The classes of that label source.
+        """Return the classes of that label source.
 
         Raises DataError where nothing says them, ConfigError where there is no such source, or it has none.
         """
         return self._maps.label_space(backbone, self.settings_file or self.folder)
 
     def frame(self, index: int, backbone: str, *, color: bool = True) -> Frame:
-        """Frame 0 <= index < len with that source's labels or scores, and colour where there is any and it is wanted.
+        """Return frame 0 <= index < len with that source's labels or scores, and colour where it has any.
 
         Labels of another size than the depth are brought to its pixels. Raises DataError that names the file,
         ConfigError where there is no such frame or backbone.
@@ -144,12 +144,12 @@ class FileScene(Scene):
         return self._framed(index, depth, labels, scores, color=color, files={kind: file})
 
     def geometry(self, index: int, *, color: bool = False) -> Frame:
-        """The frame but for its labels: all pixels are of class 0. Raises DataError that names the file."""
+        """Return the frame but for its labels: all pixels are of class 0. Raises DataError that names the file."""
         depth = self.depth(index)
         return self._framed(index, depth, np.zeros(depth.shape, dtype=np.uint8), None, color=color)
 
     def predicted(self, index: int, *, labels: Labels | None = None, scores: Scores | None = None) -> Frame:
-        """The frame with labels (H, W) or scores (H, W, K) that were predicted on its colour image; no colour.
+        """Return the frame with labels (H, W) or scores (H, W, K) that were predicted on its colour image; no colour.
 
         They are brought to the depth's pixels. Raises DataError that names the file.
         """
@@ -160,7 +160,7 @@ class FileScene(Scene):
         return self._framed(index, depth, labels, scores, color=False)
 
     def view(self, index: int, shape: tuple[int, int]) -> Frame:
-        """Depth and pose of the frame at the pixels of its colour image, of shape (H, W); all labels are 0."""
+        """Return depth and pose of the frame at the pixels of its colour image, of shape (H, W); all labels are 0."""
         source = self._frame(index)
         if source.label_lens is not None:
             raise DataError(
@@ -172,7 +172,7 @@ class FileScene(Scene):
         return at_image(self.geometry(index), shape, str(source.color or source.name), K)
 
     def depth(self, index: int) -> Float32:
-        """Depth (H, W) float32 in metres along the optical axis; needs no labels. Raises DataError with the file."""
+        """Return depth (H, W) float32 in metres along the optical axis. Raises DataError with the file."""
         if self._surface is None:
             read = self._reader(index, DEPTH)
             return stored_depth(self._frame(index), self.options, read, lambda shape: self.intrinsics(index, shape))
@@ -185,7 +185,7 @@ class FileScene(Scene):
         return depth
 
     def color(self, index: int) -> UInt8 | None:
-        """Colour (H, W, 3) uint8 RGB, None where the frame has none; needs no labels. Raises DataError."""
+        """Return colour (H, W, 3) uint8 RGB, None where the frame has none; needs no labels. Raises DataError."""
         source = self._frame(index)
         path = self._color_file(source)
         if path is None or source.color_lens is None:
@@ -196,7 +196,7 @@ class FileScene(Scene):
         return undistorted(read_color(path), source.color_lens, self.intrinsics(index, shape), shape, str(path))
 
     def image(self, index: int) -> UInt8:
-        """The image that models predict on: in colour, or the distorted photograph where label maps belong to it."""
+        """Return the image that models predict on: in colour, or the distorted photograph of the label maps."""
         source = self._frame(index)
         if source.label_lens is None:
             return super().image(index)
@@ -208,16 +208,16 @@ class FileScene(Scene):
         return read_color(source.photograph)
 
     def image_name(self, index: int) -> str:
-        """The frame's name in path templates."""
+        """Return the frame's name in path templates."""
         return self._frame(index).name
 
     def intrinsics(self, index: int, shape: tuple[int, ...]) -> Intrinsics:
-        """Intrinsics of the frame's depth image, of shape (H, W); pixels."""
+        """Return intrinsics of the frame's depth image, of shape (H, W); pixels."""
         camera, options = self._frame(index).camera, self.options
         return Camera(camera.intrinsics, options.intrinsics_size or camera.size).at(shape, options.pixel_centre or 0.0)
 
     def T_wc(self, index: int) -> Poses:
-        """Pose (4, 4) camera-to-world in metres, OpenCV camera axes; needs no labels.
+        """Return pose (4, 4) camera-to-world in metres, OpenCV camera axes; needs no labels.
 
         Raises DataError that names the file. That the pose is rigid is checked by `Frame`.
         """
@@ -229,7 +229,7 @@ class FileScene(Scene):
         return to_camera_to_world(stored, convention, axes, str(source.pose_file))
 
     def digest(self, indices: Sequence[int], backbone: str) -> str:
-        """A hash of the settings, the classes, and the depth, poses and labels of those frames; colour does not count.
+        """Return a hash of the settings, the classes, and the depth, poses and labels of those frames.
 
         Of the images it is the content that `frame` read, where it did; others are read for it.
         """
@@ -253,7 +253,7 @@ class FileScene(Scene):
         return digest.hexdigest()
 
     def _images(self, index: int, backbone: str) -> dict[tuple[int, str], Path]:
-        """The files that a frame is made of, but for its pose: depth where it is stored, labels, a mask."""
+        """Return the files that a frame is made of, but for its pose: depth where it is stored, labels, a mask."""
         source = self._frame(index)
         depth = source.depth if self._surface is None else None
         labels, mask = self._maps.file(source, backbone), self._maps.mask_file(source)
@@ -291,7 +291,7 @@ class FileScene(Scene):
         )  # fmt: skip
 
     def _stored(self, index: int, values: Pixels, shape: tuple[int, ...], path: Path, what: str) -> Pixels:
-        """The content of a file at the depth's pixels; where it must have them, `Frame` raises an error."""
+        """Return the content of a file at the depth's pixels; where it must have them, `Frame` raises an error."""
         if self.labels_like_depth and self._frame(index).label_lens is None:
             return values
         return self._fitted(index, values, shape, str(path), what)
@@ -299,7 +299,7 @@ class FileScene(Scene):
     def _fitted(
         self, index: int, values: Pixels, shape: tuple[int, ...], where: str, what: str = "the image is"
     ) -> Pixels:
-        """Labels (H', W') or scores (H', W', K) as the depth's camera sees them."""
+        """Return labels (H', W') or scores (H', W', K) as the depth's camera sees them."""
         source = self._frame(index)
         if source.label_lens is not None:
             K = self.intrinsics(index, shape)

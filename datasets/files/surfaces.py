@@ -47,7 +47,7 @@ class Heights(NamedTuple):
 
 
 def read_heights(path: Path, cell: float | None, georeference: Georeference | None) -> Heights:
-    """The first band of a GeoTIFF, in the scene's coordinates, averaged to cells of `cell` metres where that is given.
+    """Return the first band of a GeoTIFF, in the scene's coordinates, averaged to cells of `cell` metres if given.
 
     A larger one than `MOST_CELLS` becomes coarser. Raises DataError for a rotated raster, ConfigError where it lies in
     another projection than the scene.
@@ -70,7 +70,7 @@ def read_heights(path: Path, cell: float | None, georeference: Georeference | No
 
 
 def heights_of_points(path: Path, points: Float64, cell: float | None) -> Heights:
-    """A grid of points (n, 3): in each cell their `HEIGHT_QUANTILE`. Raises DataError where it would be too large."""
+    """Return a grid of points (n, 3): in each cell their `HEIGHT_QUANTILE`. Raises DataError if it is too large."""
     points = points[np.isfinite(points).all(axis=1)]
     if len(points) < 4:
         raise DataError(f"{path}: a cloud of {len(points)} points is no surface")
@@ -116,12 +116,12 @@ class Triangles:
 
     @property
     def bounds(self) -> Float64:
-        """(2, 3) the least and the largest coordinates."""
+        """Return (2, 3) the least and the largest coordinates."""
         return np.stack([self.vertices.min(axis=0), self.vertices.max(axis=0)])
 
 
 def read_triangles(path: Path, cell: float | None, georeference: Georeference | None) -> Triangles:
-    """The surface in a file: GeoTIFF is a height raster, LAS, LAZ and PLY without faces a cloud, all else a mesh.
+    """Return the surface in a file: GeoTIFF is a height raster, LAS, LAZ, PLY without faces a cloud, else a mesh.
 
     Rasters and clouds become a grid over x and y, with cells of `cell` metres where that is given. GeoTIFF, LAS and LAZ
     lie in the projection of the georeference, and the rest in the scene's coordinates.
@@ -184,7 +184,7 @@ def _of_points(path: Path, points: Float64, cell: float | None) -> Triangles:
 
 
 def _of_heights(heights: Heights, what: str) -> Triangles:
-    """Two triangles between four neighbouring cells that all have a height."""
+    """Return two triangles between four neighbouring cells that all have a height."""
     z = heights.z
     rows, columns = z.shape
     corner = np.arange(z.size, dtype=np.int32).reshape(z.shape)
@@ -222,7 +222,7 @@ POINT_BYTES_AT_ONCE = 2**26
 
 @contextmanager
 def open_las(path: Path) -> Iterator[Any]:
-    """A laspy.LasReader. Whatever is wrong with the file is a DataError of one line, also while it is read."""
+    """Yield a laspy.LasReader. Whatever is wrong with the file is a DataError of one line, also while it is read."""
     import laspy
 
     try:
@@ -240,7 +240,7 @@ def open_las(path: Path) -> Iterator[Any]:
 
 
 def points_at_once(header: Any) -> int:
-    """How many points of a LAS file to read at a time."""
+    """Return how many points of a LAS file to read at a time."""
     return int(max(1, POINT_BYTES_AT_ONCE // header.point_format.size))
 
 
@@ -343,7 +343,7 @@ class Caster:
         self._scene.run(nothing, nothing + 1, query="DISTANCE")  # builds the tree, which one thread must do
 
     def depth(self, view: View) -> Float32:
-        """Depth (H, W) along the optical axis in metres, 0 where a ray hits nothing."""
+        """Return depth (H, W) along the optical axis in metres, 0 where a ray hits nothing."""
         (H, W), K, R = view.shape, view.intrinsics, view.T_wc[:3, :3]
         x = (np.arange(W) - K.cx) / K.fx
         y = (np.arange(H) - K.cy) / K.fy
@@ -382,7 +382,7 @@ class Casts:
         self._surface = surface
 
     def get(self, view: View) -> Float32 | None:
-        """The depth (H, W) of a view, None where it is not there or damaged."""
+        """Return the depth (H, W) of a view, None where it is missing or damaged."""
         import pyarrow as pa
 
         file, (H, W) = self._file(view), view.shape
@@ -444,17 +444,17 @@ class Surface:
 
     @cached_property
     def digest(self) -> bytes:
-        """Bytes that are equal where the surface is."""
+        """Return bytes that are equal where the surface is."""
         offset = None if self._georeference is None else self._georeference.offset
         return file_digest(self.path) + repr((self._cell, offset)).encode()
 
     @cached_property
     def triangles(self) -> Triangles:
-        """The surface in the scene's coordinates. Raises what `read_triangles` raises."""
+        """Return the surface in the scene's coordinates. Raises what `read_triangles` raises."""
         return read_triangles(self.path, self._cell, self._georeference)
 
     def depth(self, view: View) -> Float32:
-        """Depth (H, W) of a view along the optical axis in metres, 0 where it sees no surface."""
+        """Return depth (H, W) of a view along the optical axis in metres, 0 where it sees no surface."""
         depth = self._casts.get(view)
         if depth is None:
             depth = self._cast(view)
@@ -480,7 +480,7 @@ class Surface:
 
 
 def _apart(triangles: Triangles, centres: Float64) -> str:
-    """Where the cameras are relative to a surface that they do not see, and what to do."""
+    """Return where the cameras are relative to a surface that they do not see, and what to do."""
     low, high = triangles.bounds
     nearest = np.clip(centres, low, high)
     closest = np.linalg.norm(centres - nearest, axis=1).argmin()

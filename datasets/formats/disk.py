@@ -30,7 +30,7 @@ DIGEST = "sha256"
 
 
 def read_bytes(path: Path, limit: int = MAX_BYTES) -> bytes:
-    """The content of a file of at most `limit` bytes.
+    """Return the content of a file of at most `limit` bytes.
 
     Raises DataError where it cannot be read, is no file, too large or empty, or is a Git LFS pointer.
     """
@@ -46,17 +46,17 @@ def read_bytes(path: Path, limit: int = MAX_BYTES) -> bytes:
 
 
 def read_text(path: Path, limit: int) -> str:
-    """The text of a file; raises what `read_bytes` raises."""
+    """Return the text of a file; raises what `read_bytes` raises."""
     return read_bytes(path, limit).decode("utf-8-sig", errors="replace")
 
 
 def digest(data: bytes) -> bytes:
-    """A hash of a file's content."""
+    """Return a hash of a file's content."""
     return hashlib.new(DIGEST, data).digest()
 
 
 def file_digest(path: Path) -> bytes:
-    """The same of a file that was not read. Raises DataError where it cannot be."""
+    """Return the same of a file that was not read. Raises DataError where it cannot be."""
     try:
         with open_file(path) as file:
             return hashlib.file_digest(file, DIGEST).digest()
@@ -71,12 +71,12 @@ def natural(name: str) -> tuple[list[str | int], str]:
 
 
 def subfolders(folder: Path) -> list[str]:
-    """Names in natural order. Raises DataError where the folder cannot be listed."""
+    """Return names in natural order. Raises DataError where the folder cannot be listed."""
     return sorted((entry.name for entry in _entries(folder) if entry.is_dir()), key=natural)
 
 
 def files_by_stem(folder: Path, suffixes: Container[str]) -> dict[str, str]:
-    """Names of the files with one of these suffixes.
+    """Return the names of the files with one of these suffixes.
 
     Raises DataError for two of one stem, or a folder that cannot be listed.
     """
@@ -91,7 +91,7 @@ def files_by_stem(folder: Path, suffixes: Container[str]) -> dict[str, str]:
 
 
 def files_named(folder: Path, before: str, after: str) -> dict[str, Path]:
-    """The files 'BEFORE name AFTER' of a folder by name, in natural order; none where there is no folder.
+    """Return the files 'BEFORE name AFTER' of a folder by name, in natural order; none where there is no folder.
 
     Raises DataError where the folder cannot be listed.
     """
@@ -101,7 +101,7 @@ def files_named(folder: Path, before: str, after: str) -> dict[str, Path]:
 
 
 def _entries(folder: Path) -> Iterator[os.DirEntry[str]]:
-    """The entries of a folder, but for hidden entries; nothing where there is no folder."""
+    """Yield the entries of a folder, but for hidden entries; nothing where there is no folder."""
     try:
         with os.scandir(folder) as entries:
             yield from (entry for entry in entries if not entry.name.startswith("."))
@@ -119,7 +119,7 @@ NPY_SHAPE = re.compile(rb"""['"]shape['"]\s*:\s*\(([\d\s,]{0,200})\)""")
 
 
 def decode_array(path: Path, data: bytes, key: str) -> npt.NDArray[Any]:
-    """The array of an .npy file, or of an .npz file the one called `key` or the only one; read-only."""
+    """Return the array of an .npy file, or of an .npz file the one called `key` or the only one; read-only."""
     return _decode_npz(path, data, key) if path.suffix.lower() == ".npz" else _decode_npy(str(path), data)
 
 
@@ -167,7 +167,7 @@ MAX_JSON_BYTES = 2**28
 
 
 def read_object(path: Path) -> dict[str, Any]:
-    """The object in a file. Raises DataError where there is none."""
+    """Return the object in a file. Raises DataError where there is none."""
     content = read_content(path, MAX_JSON_BYTES)
     if not isinstance(content, dict):
         raise DataError(f"{path}: expected an object with named values, got a {type(content).__name__}")
@@ -175,7 +175,7 @@ def read_object(path: Path) -> dict[str, Any]:
 
 
 def read_content(path: Path, limit: int) -> Any:
-    """The content of a JSON file of at most `limit` bytes. Raises DataError where it is none."""
+    """Return the content of a JSON file of at most `limit` bytes. Raises DataError where it is none."""
     data = read_bytes(path, limit)
     try:
         return parse_json(data)
@@ -184,7 +184,7 @@ def read_content(path: Path, limit: int) -> Any:
 
 
 def pixels(content: Mapping[str, Any], key: str, where: str) -> int:
-    """The side of an image in an object. Raises DataError with `where` (the file) and the key."""
+    """Return the side of an image in an object. Raises DataError with `where` (the file) and the key."""
     value = number(content, key, where)
     if not 1 <= value <= 2**24:
         raise DataError(f"{where}: '{key}' is {value:g}; expected a number of pixels")
@@ -192,7 +192,7 @@ def pixels(content: Mapping[str, Any], key: str, where: str) -> int:
 
 
 def number(content: Mapping[str, Any], key: str, where: str) -> float:
-    """A finite number of an object. Raises DataError with `where` (the file) and the key."""
+    """Return a finite number of an object. Raises DataError with `where` (the file) and the key."""
     value = content.get(key)
     if value is None:
         raise DataError(f"{where}: '{key}' is missing; add it")
@@ -202,7 +202,7 @@ def number(content: Mapping[str, Any], key: str, where: str) -> float:
 
 
 def matrix(value: Any, where: str) -> Poses:
-    """(4, 4) from rows of 3x4 or 4x4 numbers, NaN and infinity among them. Raises DataError with `where`."""
+    """Return (4, 4) from rows of 3x4 or 4x4 numbers, NaN and infinity among them. Raises DataError with `where`."""
     try:
         T = np.array(value, dtype=np.float64)
     except (ValueError, TypeError, OverflowError) as error:
@@ -220,7 +220,7 @@ MAX_TEXT_BYTES = 2**16
 
 
 def read_pose(path: Path) -> Float64:
-    """A (4, 4) matrix from 16 numbers, or from the 12 of its upper rows, apart by whitespace or commas.
+    """Return a (4, 4) matrix from 16 numbers, or from the 12 of its upper rows, apart by whitespace or commas.
 
     Raises DataError for anything else.
     """
@@ -232,7 +232,7 @@ def read_pose(path: Path) -> Float64:
 
 
 def read_intrinsics(path: Path) -> Intrinsics:
-    """Intrinsics in pixels from a 3x3 or 4x4 matrix. Raises DataError for anything else."""
+    """Return intrinsics in pixels from a 3x3 or 4x4 matrix. Raises DataError for anything else."""
     numbers = _numbers(path)
     if len(numbers) not in (9, 16):
         raise DataError(
@@ -262,7 +262,7 @@ MAX_TABLE_BYTES = 2**28
 
 
 def records(path: Path) -> Iterator[tuple[int, str]]:
-    """Number, from 1, and text of each line that is neither empty nor a comment (#).
+    """Yield number, from 1, and text of each line that is neither empty nor a comment (#).
 
     Raises DataError where the file cannot be read or is larger than any such table.
     """
@@ -273,7 +273,7 @@ def records(path: Path) -> Iterator[tuple[int, str]]:
 
 
 def read_table(path: Path, columns: int, what: str) -> Float64:
-    """(n, columns) numbers, apart by whitespace or commas; `what` says in errors what a line is.
+    """Return (n, columns) numbers, apart by whitespace or commas; `what` says in errors what a line is.
 
     Raises DataError that names the line for another number of words, or one that is no number; and for no line.
     """
@@ -289,7 +289,7 @@ def read_table(path: Path, columns: int, what: str) -> Float64:
 
 
 def to_number(word: str, path: Path, line: int) -> float:
-    """One number. Raises DataError that names the line."""
+    """Return one number. Raises DataError that names the line."""
     try:
         return float(word)
     except ValueError as error:

@@ -47,7 +47,7 @@ Read = Callable[[Path], bytes]
 
 
 def read_depth(path: Path, scale: float | None = None, read: Read = read_bytes) -> Float32:
-    """Depth (H, W) in metres, float32, as stored: what marks a pixel invalid stays.
+    """Return depth (H, W) in metres, float32, as stored: what marks a pixel invalid stays.
 
     `scale` is units per metre; not given, a 16-bit PNG holds millimetres and float files hold metres.
     Raises DataError for another type, more than one channel, integers without a scale, or a damaged file.
@@ -120,7 +120,7 @@ def read_scores(
 
 
 def read_mask(path: Path, read: Read = read_bytes) -> Mask:
-    """Mask (H, W) bool, True where the image is 0: black is left out, as COLMAP and nerfstudio have it.
+    """Return mask (H, W) bool, True where the image is 0: black is left out, as COLMAP and nerfstudio have it.
 
     Raises DataError where it is no one-channel PNG, or damaged.
     """
@@ -132,7 +132,7 @@ def read_mask(path: Path, read: Read = read_bytes) -> Mask:
 
 
 def read_color(path: Path) -> UInt8:
-    """Colour (H, W, 3) uint8 RGB from PNG, JPEG or TIFF, not rotated by EXIF. Raises DataError for a damaged file."""
+    """Return colour (H, W, 3) uint8 RGB of PNG, JPEG or TIFF, not rotated by EXIF. Raises DataError if damaged."""
     data = read_bytes(path)
     suffix = path.suffix.lower()
     if suffix == ".png":
@@ -145,7 +145,7 @@ def read_color(path: Path) -> UInt8:
 
 
 def color_size(path: Path) -> Size:
-    """(width, height) of a colour image, from its header. Raises DataError where that is damaged."""
+    """Return (width, height) of a colour image, from its header. Raises DataError where that is damaged."""
     from PIL import Image
 
     with _one_line(path, "colour"), Image.open(path) as image:
@@ -156,7 +156,7 @@ def color_size(path: Path) -> Size:
 
 
 def _narrow(path: Path, ids: npt.NDArray[Any], space: LabelSpace | None) -> Labels:
-    """Integer ids of any width as uint8 where the classes (without `space`: the ids) fit, else uint16."""
+    """Return integer ids of any width as uint8 where the classes (without `space`: the ids) fit, else uint16."""
     if ids.ndim != 2 or ids.size == 0 or ids.dtype.kind not in "ui":
         raise DataError(f"{path}: labels must be integer ids (H, W), got {ids.dtype} of shape {ids.shape}")
     if ids.dtype in (np.uint8, np.uint16):
@@ -169,7 +169,7 @@ def _narrow(path: Path, ids: npt.NDArray[Any], space: LabelSpace | None) -> Labe
 
 
 def _labels_by_color(path: Path, image: UInt8, space: LabelSpace) -> Labels:
-    """Ids (H, W) of an RGB or fully opaque RGBA image."""
+    """Return ids (H, W) of an RGB or fully opaque RGBA image."""
     if image.shape[2] == 4 and (transparent := image[..., 3] < 255).any():
         y, x = np.argwhere(transparent)[0]
         raise DataError(f"{path}: pixel ({x}, {y}) is transparent, so its label colour is not exact; save as RGB")
@@ -188,7 +188,7 @@ def _labels_by_color(path: Path, image: UInt8, space: LabelSpace) -> Labels:
 
 @functools.lru_cache(maxsize=2)
 def _ids_by_color(space: LabelSpace) -> UInt16:
-    """(2^24,) class id of each packed colour. Raises ConfigError where two classes share a colour."""
+    """Return (2^24,) class id of each packed colour. Raises ConfigError where two classes share a colour."""
     if len(set(space.colors)) < len(space):
         shared = next(color for color in space.colors if space.colors.count(color) > 1)
         raise ConfigError(f"taxonomy {space.name}: two classes have the colour {shared}; give each its own")
@@ -198,7 +198,7 @@ def _ids_by_color(space: LabelSpace) -> UInt16:
 
 
 def _packed(rgb: UInt8) -> UInt32:
-    """RGB, or RGB and more, (..., 3) as one 24-bit number each."""
+    """Return RGB, or RGB and more, (..., 3) as one 24-bit number each."""
     r, g, b = (rgb[..., channel].astype(np.uint32) for channel in range(3))
     return (r << np.uint32(16)) | (g << np.uint32(8)) | b
 
@@ -220,7 +220,7 @@ class Png:
     image: ImageFile
 
     def samples(self) -> npt.NDArray[Any]:
-        """The stored sample of each pixel, (H, W) or (H, W, channels), uint8 or uint16; of a palette the index."""
+        """Return the stored samples (H, W) or (H, W, channels), uint8 or uint16; of a palette the indices."""
         if self.kind in ("RGB", "RGBA") or (self.kind == "grey" and self.bits >= 8):
             image: npt.NDArray[Any] = _imdecode(
                 self.path, _critical_chunks(self.data), "IMREAD_UNCHANGED"
@@ -234,7 +234,7 @@ class Png:
 
 
 def _critical_chunks(data: bytes) -> bytes:
-    """A whole PNG without ancillary chunks, of which OpenCV complains on stderr."""
+    """Return a whole PNG without ancillary chunks, of which OpenCV complains on stderr."""
     parts, start = [PNG_SIGNATURE], len(PNG_SIGNATURE)
     while start < len(data):
         end = start + 12 + int.from_bytes(data[start : start + 4], "big")
@@ -245,7 +245,7 @@ def _critical_chunks(data: bytes) -> bytes:
 
 @contextmanager
 def _whole_png(path: Path, data: bytes) -> Iterator[Png]:
-    """A PNG that is whole; it is decoded within the context."""
+    """Yield a PNG that is whole; it is decoded within the context."""
     from PIL import PngImagePlugin
 
     if not data.startswith(PNG_SIGNATURE) or data[12:16] != b"IHDR":
@@ -281,7 +281,7 @@ def _decode_jpeg(path: Path, data: bytes) -> UInt8:
 
 
 def _decode_color_tiff(path: Path, data: bytes) -> UInt8:
-    """RGB (H, W, 3) of an 8-bit image, or of a deeper one its upper bits."""
+    """Return RGB (H, W, 3) of an 8-bit image, or of a deeper one its upper bits."""
     channels = _checked_tags(path, data, pixel_bytes=3).get(277, 1)
     if channels not in (1, 3, 4):
         raise DataError(f"{path}: {channels} channels are no colour; save RGB")
@@ -289,7 +289,7 @@ def _decode_color_tiff(path: Path, data: bytes) -> UInt8:
 
 
 def _decode_tiff(path: Path, data: bytes) -> npt.NDArray[Any]:
-    """One channel (H, W), of the type it was stored in."""
+    """Return one channel (H, W), of the type it was stored in."""
     tags = _checked_tags(path, data)
     bits, channels, sample = tags.get(258, 1), tags.get(277, 1), tags.get(339, 1)
     if channels != 1:
@@ -301,7 +301,7 @@ def _decode_tiff(path: Path, data: bytes) -> npt.NDArray[Any]:
 
 
 def _checked_tags(path: Path, data: bytes, pixel_bytes: int = 1) -> dict[int, int]:
-    """The first value of each short or long tag of the first image of a TIFF whose size can be read."""
+    """Return the first value of each short or long tag of the first image of a TIFF whose size can be read."""
     tags = {}
     try:
         order = {b"II*\0": "<", b"MM\0*": ">"}[data[:4]]
@@ -319,7 +319,7 @@ def _checked_tags(path: Path, data: bytes, pixel_bytes: int = 1) -> dict[int, in
 
 
 def _decode_exr(path: Path, data: bytes) -> npt.NDArray[Any]:
-    """One channel (H, W), where the installed OpenCV reads EXR at all (the wheels of OpenCV 5 do not)."""
+    """Return one channel (H, W), where the installed OpenCV reads EXR at all (the wheels of OpenCV 5 do not)."""
     window = data.find(b"dataWindow\0box2i\0")
     if not data.startswith(b"v/1\x01") or window < 0 or len(data) < window + 37:
         raise DataError(f"{path}: not a whole EXR image; {AGAIN}")

@@ -36,14 +36,14 @@ class Camera:
 
     @classmethod
     def stated(cls, numbers: FxFyCxCy, size: tuple[int, int] | None, where: str) -> Camera:
-        """A camera as the file `where` states it. Raises DataError that names it for numbers that no camera has."""
+        """Return a camera as the file `where` states it. Raises DataError for numbers that no camera has."""
         try:
             return cls(Intrinsics(*numbers), size)
         except DataError as error:
             raise DataError(f"{where}: {error}") from error
 
     def at(self, shape: tuple[int, ...], centre: float = 0.0) -> Intrinsics:
-        """Intrinsics, pixel centres at integers, of an image of the whole field of view and of that shape (H, W, ...).
+        """Return intrinsics, pixel centres at integers, of an image of the whole field of view, of shape (H, W, ...).
 
         `centre` is where the dataset has the centre of the first pixel: 0, or 0.5 where it counts from the corner.
         """
@@ -53,7 +53,7 @@ class Camera:
 
 
 def camera_of(stated: FxFyCxCy | None, usual: FxFyCxCy, size: tuple[int, int]) -> Camera:
-    """The stated intrinsics, of the depth images as they are, or else a dataset's usual ones, of images of a size."""
+    """Return the stated intrinsics, of the depth images as they are, or a dataset's usual ones, of images of a size."""
     return Camera(Intrinsics(*stated)) if stated is not None else Camera(Intrinsics(*usual), size)
 
 
@@ -100,7 +100,7 @@ def to_camera_to_world(T: Poses, convention: str, axes: str, where: str) -> Pose
 
 
 def from_quaternions(translations: Poses, quaternions: Poses, path: Path) -> Poses:
-    """(n, 4, 4) from translations (n, 3) and quaternions (n, 4) in the order x y z w; NaN where one is not finite.
+    """Return (n, 4, 4) of translations (n, 3) and quaternions (n, 4), order x y z w; NaN where one is not finite.
 
     Raises DataError that names the file and the pose, counted from 1, for a quaternion that is not of length 1.
     """
@@ -126,7 +126,7 @@ def from_quaternions(translations: Poses, quaternions: Poses, path: Path) -> Pos
 def at_times(
     times: Float64, poses: Poses, wanted: Float64, max_gap: float, method: Literal["interpolate", "nearest"]
 ) -> Poses:
-    """(m, 4, 4) at `wanted` seconds of a trajectory (n, 4, 4) at ascending `times`: the nearest, or between the two.
+    """Return (m, 4, 4) at `wanted` seconds of a trajectory (n, 4, 4) at ascending `times`: nearest, or between two.
 
     NaN where no pose is within `max_gap` seconds, or the nearest pose is NaN. Between two poses the position is
     linear and the rotation spherically linear (slerp); before the first and after the last one they hold.
@@ -163,14 +163,14 @@ def _between(times: Float64, poses: Poses, wanted: Float64) -> Poses:
 
 
 def ray_lengths(camera: Intrinsics, u: npt.ArrayLike, v: npt.ArrayLike) -> Float64:
-    """Length of the rays through pixels (u, v) from the camera to the plane one metre ahead, metres."""
+    """Return the length of the rays through pixels (u, v) from the camera to the plane one metre ahead, metres."""
     x = (np.asarray(u, dtype=np.float64) - camera.cx) / camera.fx
     y = (np.asarray(v, dtype=np.float64) - camera.cy) / camera.fy
     return np.sqrt(x**2 + y**2 + 1)
 
 
 def planar(depth: Float32, camera: Intrinsics) -> Float32:
-    """Planar depth (H, W), metres, from distances along the rays; what marks a pixel invalid stays invalid."""
+    """Return planar depth (H, W), metres, from distances along the rays; what marks a pixel invalid stays invalid."""
     H, W = depth.shape
     along_axis: Float32 = (depth / ray_lengths(camera, np.arange(W), np.arange(H)[:, None])).astype(np.float32)
     return along_axis

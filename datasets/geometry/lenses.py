@@ -33,7 +33,7 @@ FAR = 2.0**40
 
 
 def fit(values: Pixels, K: Intrinsics, K_fit: Intrinsics, shape: tuple[int, int]) -> Pixels:
-    """A label map (H', W') or scores (H', W', K) as a camera with K_fit and an image (H, W) sees them.
+    """Return a label map (H', W') or scores (H', W', K) as a camera with K_fit and an image (H, W) sees them.
 
     K belongs to `values`. Both images share centre and axes. Of labels each pixel gets the nearest; scores are linear
     between pixel centres, and beyond the outer centres the outer pixels hold. What K does not see is ignored: labels
@@ -70,7 +70,7 @@ def _within(positions: npt.NDArray[Any], length: int) -> Mask:
 
 
 def _linear(values: npt.NDArray[Any], at: Float64, axis: int) -> npt.NDArray[Any]:
-    """Values between the pixel centres of one axis."""
+    """Return values between the pixel centres of one axis."""
     last = values.shape[axis] - 1
     x = at.clip(0, last)
     low = np.floor(x).astype(np.intp)
@@ -87,7 +87,7 @@ SHAPE_TOLERANCE = 0.02
 
 
 def fitted(values: Pixels, shape: tuple[int, ...], where: str, what: str = "the image is") -> Pixels:
-    """Labels (H', W') or scores (H', W', K) at the pixels of an image (H, W) of the same view.
+    """Return labels (H', W') or scores (H', W', K) at the pixels of an image (H, W) of the same view.
 
     Nearest for ids, linear for scores. Raises DataError with `where`, its file, for another shape of image.
     """
@@ -100,7 +100,7 @@ def fitted(values: Pixels, shape: tuple[int, ...], where: str, what: str = "the 
 
 
 def at_image(frame: Frame, shape: tuple[int, int], where: str, K: Intrinsics | None = None) -> Frame:
-    """A frame's depth and pose at the pixels of its colour image (H, W); no labels, depth 0 where it is not known.
+    """Return a frame's depth and pose at the pixels of its colour image (H, W); no labels, depth 0 if unknown.
 
     K is the image's, where it shows another view than the depth. Raises DataError with `where` for another shape.
     """
@@ -146,7 +146,7 @@ class Lens:
 def undistorted(
     values: Pixels, lens: Lens, K: Intrinsics, shape: tuple[int, int], where: str, what: str = "the image is"
 ) -> Pixels:
-    """An image of the lens, ids (H', W') or channels (H', W', C), as a pinhole with K and an image (H, W) sees it.
+    """Return an image of the lens, ids (H', W') or channels (H', W', C), as a pinhole with K and (H, W) sees it.
 
     Of ids the nearest, of channels linear between pixel centres; what the lens does not see is ignored, or 0.
     Raises DataError with `where`, its file, where the image is not of the lens's shape.
