@@ -21,7 +21,7 @@ class SemstabError(Exception):
     exit_code = 2
 
     def __init__(self, message: str = "") -> None:
-        super().__init__(told(message))
+        super().__init__(sanitize(message))
 
 
 class ConfigError(SemstabError, ValueError):
@@ -48,10 +48,10 @@ def nearest(name: str, known: Sequence[str]) -> str:
     return f"did you mean '{near[0]}'?" if near else f"known: {', '.join(known) or 'none'}"
 
 
-def told(text: str) -> str:
+def sanitize(text: str) -> str:
     """Return a text as a line for people: escaped where a character has no shape of its own, in bounds.
 
-    >>> told("no scene 'a\\nb'")
+    >>> sanitize("no scene 'a\\nb'")
     "no scene 'a\\\\nb'"
     """
     head = LONGEST_LINE * 2 // 3

@@ -19,9 +19,9 @@ from collections.abc import Callable, Sequence
 from statistics import median
 from typing import Any
 
-from semstab.core.process import settle
+from semstab.core.process import configure_process
 
-settle()  # as the command line does, before anything starts threads
+configure_process()  # as the command line does, before anything starts threads
 
 import flight  # noqa: E402
 import numpy as np  # noqa: E402

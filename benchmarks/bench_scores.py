@@ -20,9 +20,9 @@ from collections.abc import Callable
 from statistics import median
 from typing import Any
 
-from semstab.core.process import settle
+from semstab.core.process import configure_process
 
-settle()  # as the command line does, before anything starts threads
+configure_process()  # as the command line does, before anything starts threads
 
 import flight  # noqa: E402
 import numba as nb  # noqa: E402

@@ -47,8 +47,8 @@ def write_scene(root: Path) -> None:
 
 UNTIL_FUSED = """
 import os, sys
-from semstab.core.process import settle
-settle()
+from semstab.core.process import configure_process
+configure_process()
 from semstab import backends
 made = backends.create
 def create(*arguments, **options):

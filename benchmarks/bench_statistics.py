@@ -30,7 +30,7 @@ import room
 from semstab import Frame, statistics
 from semstab.backends import create
 from semstab.core.files import write_json
-from semstab.core.process import settle
+from semstab.core.process import configure_process
 from semstab.datasets import open_dataset
 from semstab.metrics import flicker_percent, summarise
 from semstab.model.events import Events
@@ -188,7 +188,7 @@ def measure(arguments: argparse.Namespace) -> dict[str, Any]:
 
 def main() -> None:
     """Print the table."""
-    settle()  # as the command line does
+    configure_process()  # as the command line does
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--json", help="also write the figures there")
     parser.add_argument("--frames", type=int, default=200)

@@ -45,7 +45,7 @@ class Colmap(FileDataset[ColmapOptions]):
     """
 
     Options: type[BaseModel] = ColmapOptions
-    looks_like = "a sparse model (cameras and images, .bin or .txt) in sparse/, and depth maps"
+    contents = "a sparse model (cameras and images, .bin or .txt) in sparse/, and depth maps"
 
     def __init__(self, options: ColmapOptions) -> None:
         self._depth = Template("depth", options.depth, ("image", "name"))

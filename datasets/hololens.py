@@ -27,7 +27,7 @@ class HoloLens(FileDataset[HoloLensOptions]):
     """{name} is the image's name without suffix: 00003. Frames go in the alphabetical order of their images."""
 
     Options: type[BaseModel] = HoloLensOptions
-    looks_like = "images/, depth/, poses.txt and K.txt"
+    contents = "images/, depth/, poses.txt and K.txt"
 
     def is_scene(self, folder: Path) -> bool:
         """Return whether poses.txt and K.txt are there."""

@@ -169,7 +169,7 @@ class Odm(FileDataset[OdmOptions]):
     """
 
     Options: type[BaseModel] = OdmOptions
-    looks_like = f"opensfm/{UNDISTORTED} or opensfm/{DISTORTED}, which is there once a project is reconstructed"
+    contents = f"opensfm/{UNDISTORTED} or opensfm/{DISTORTED}, which is there once a project is reconstructed"
 
     def __init__(self, options: OdmOptions) -> None:
         self._depth = Template("depth", options.depth, ("name",), ("name",))

@@ -35,7 +35,7 @@ class PosedFolder(FileDataset[PosedOptions]):
     """{name} is the name that a frame's files share: of depth/{name}.png, pose/{name}.txt, color/{name}.png, ..."""
 
     Options: type[BaseModel] = PosedOptions
-    looks_like = "depth/, pose/ and intrinsics.txt"
+    contents = "depth/, pose/ and intrinsics.txt"
     labels_like_depth = True
     settings_file = SETTINGS_FILE
 

@@ -51,7 +51,7 @@ class Replica(FileDataset[ReplicaOptions]):
     """{name} is the number in the file's name: 000012 of results/frame000012.jpg, 12 of rgb/rgb_12.png."""
 
     Options: type[BaseModel] = ReplicaOptions
-    looks_like = "results/ and traj.txt (NICE-SLAM's export), or depth/ and traj_w_c.txt (Semantic-NeRF's)"
+    contents = "results/ and traj.txt (NICE-SLAM's export), or depth/ and traj_w_c.txt (Semantic-NeRF's)"
 
     def is_scene(self, folder: Path) -> bool:
         """Return whether the trajectory of one of the exports is there."""

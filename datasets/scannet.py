@@ -44,7 +44,7 @@ class ScanNet(FileDataset[ScanNetOptions]):
     """{name} is the frame's number: 120. A frame whose pose is -inf has lost tracking."""
 
     Options: type[BaseModel] = ScanNetOptions
-    looks_like = "depth/, pose/ and intrinsic/intrinsic_depth.txt"
+    contents = "depth/, pose/ and intrinsic/intrinsic_depth.txt"
 
     def is_scene(self, folder: Path) -> bool:
         """Return whether depth/, pose/ and the intrinsics of the depth are there; with a surface, the latter two."""

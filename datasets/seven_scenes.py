@@ -39,7 +39,7 @@ class SevenScenes(FileDataset[SevenScenesOptions]):
     """
 
     Options: type[BaseModel] = SevenScenesOptions
-    looks_like = "files frame-NNNNNN.depth.png and frame-NNNNNN.pose.txt"
+    contents = "files frame-NNNNNN.depth.png and frame-NNNNNN.pose.txt"
 
     def is_scene(self, folder: Path) -> bool:
         """Return whether the first frame's pose or of any frame is there."""

@@ -34,7 +34,7 @@ class TartanAir(FileDataset[TartanAirOptions]):
     """{name} is the frame's number: 000012. The ground truth are the mesh ids of seg_left/."""
 
     Options: type[BaseModel] = TartanAirOptions
-    looks_like = "depth_left/ and pose_left.txt (or _right)"
+    contents = "depth_left/ and pose_left.txt (or _right)"
 
     def __init__(self, options: TartanAirOptions) -> None:
         side = options.camera

@@ -44,7 +44,7 @@ class TransformsJson(FileDataset[TransformsOptions]):
     """
 
     Options: type[BaseModel] = TransformsOptions
-    looks_like = "transforms.json"
+    contents = "transforms.json"
 
     def is_scene(self, folder: Path) -> bool:
         """Return whether the file of the cameras is there."""

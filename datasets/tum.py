@@ -52,7 +52,7 @@ class Tum(FileDataset[TumOptions]):
     """
 
     Options: type[BaseModel] = TumOptions
-    looks_like = "depth.txt, groundtruth.txt and rgb.txt"
+    contents = "depth.txt, groundtruth.txt and rgb.txt"
 
     def is_scene(self, folder: Path) -> bool:
         """Return whether depth.txt is there, or with a surface rgb.txt."""

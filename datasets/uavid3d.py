@@ -71,7 +71,7 @@ class Uavid3d(FileDataset[Uavid3dOptions]):
         )
         if "{" in self._pose.text.rpartition("/")[0] or self._pose.text.count("{name}") > 1:
             raise ConfigError(f"pose: {self._pose.text!r}: {{name}} must be once, in the name of the file")
-        self.looks_like = {
+        self.contents = {
             "colmap": f"a COLMAP model in {options.model}/ (options pose_format, model)",
             "transforms": f"{options.transforms} (options pose_format, transforms)",
             "matrix": f"{options.pose} (options pose_format, pose)",

@@ -8,13 +8,13 @@ from pathlib import Path
 import pytest
 
 import semstab
-from semstab.core.process import settle
+from semstab.core.process import configure_process
 
 pytest.register_assert_rewrite("semstab.testing")
 signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell lets what it starts in the background ignore Ctrl-C
 os.environ["SEMSTAB_CACHE"] = tempfile.mkdtemp(prefix="semstab-cache-")
 atexit.register(shutil.rmtree, os.environ["SEMSTAB_CACHE"], ignore_errors=True)
-settle()  # threads that spin would take the time of the other workers' tests
+configure_process()  # threads that spin would take the time of the other workers' tests
 
 
 def pytest_configure() -> None:

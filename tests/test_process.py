@@ -11,7 +11,7 @@ import pytest
 FAULTS = """
 import resource
 import numpy as np
-from semstab.core.process import settle
+from semstab.core.process import configure_process
 {call}
 def faults():
     return resource.getrusage(resource.RUSAGE_SELF).ru_minflt
@@ -34,12 +34,13 @@ def faults(call: str) -> int:
     not hasattr(os, "confstr") or "glibc" not in (os.confstr("CS_GNU_LIBC_VERSION") or ""), reason="glibc"
 )
 def test_memory_of_an_image_is_used_again() -> None:
-    assert faults("settle()") < 10
+    assert faults("configure_process()") < 10
     assert faults("") > 50
 
 
 def test_a_choice_of_the_user_is_kept() -> None:
-    script = "import os; from semstab.core.process import settle; settle(); print(os.environ['OMP_WAIT_POLICY'])"
+    script = "import os; from semstab.core import process; process.configure_process()"
+    script += "; print(os.environ['OMP_WAIT_POLICY'])"
     for chosen, expected in ({}, "PASSIVE"), ({"OMP_WAIT_POLICY": "ACTIVE"}, "ACTIVE"):
         environment = {k: v for k, v in os.environ.items() if k != "OMP_WAIT_POLICY"} | chosen
         result = subprocess.run(

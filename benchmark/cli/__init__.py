@@ -18,7 +18,7 @@ from semstab import __version__
 from semstab.cli.finished import calibrate, compare, conform, export, gate, list_, relabel
 from semstab.cli.options import say
 from semstab.cli.running import check, convert, predict, remedies, run, show, study, view
-from semstab.core.process import settle
+from semstab.core.process import configure_process
 from semstab.errors import OUT_OF_MEMORY, SemstabError, one_line
 
 # Ctrl-C, which may come in the midst of anything: an import, a callback from compiled code.
@@ -185,7 +185,7 @@ class _Once(logging.Filter):
 
 def main() -> None:
     """Entry point of the console script."""
-    settle()
+    configure_process()
     logging.getLogger("semstab").addFilter(_Once())
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):

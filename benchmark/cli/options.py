@@ -10,7 +10,7 @@ from typing import Annotated, Any
 
 import typer
 
-from semstab.errors import ConfigError, SemstabError, told
+from semstab.errors import ConfigError, SemstabError, sanitize
 
 # Names that the shell completes: of backends, datasets, backbones, taxonomies, studies, scenes and label sources.
 
@@ -157,7 +157,7 @@ def select_dataset(content: dict[str, Any], name: str | None, data: Path | None,
 
 def say(text: str) -> None:
     """Print a line beside the results: on standard error."""
-    typer.echo(told(text), err=True)
+    typer.echo(sanitize(text), err=True)
 
 
 def print_lines(lines: Iterable[str], *, quiet: bool = False) -> None:

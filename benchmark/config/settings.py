@@ -205,9 +205,9 @@ class FrameSelection(Settings):
 
     @model_validator(mode="after")
     def _one_way_to_say_it(self) -> Self:
-        said = [name for name, field in type(self).model_fields.items() if getattr(self, name) != field.default]
-        if self.list is not None and said != ["list"]:
-            raise ValueError(f"list says which frames; leave out {', '.join(said[:-1])}")
+        changed = [name for name, field in type(self).model_fields.items() if getattr(self, name) != field.default]
+        if self.list is not None and changed != ["list"]:
+            raise ValueError(f"list says which frames; leave out {', '.join(changed[:-1])}")
         if self.list is not None and any(a >= b for a, b in itertools.pairwise(self.list)):
             raise ValueError("the frames of a list must ascend, each once")
         if self.spacing == "even" and self.count is None:

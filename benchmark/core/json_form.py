@@ -136,9 +136,9 @@ def _adapted(schema: Any) -> Any:
 
 def _line(problem: ErrorDetails) -> str:
     path = "".join(f"[{step}]" if isinstance(step, int) else f".{step}" for step in problem["loc"]).removeprefix(".")
-    said = problem["msg"].removeprefix("Value error, ").removeprefix("Input ")
+    message = problem["msg"].removeprefix("Value error, ").removeprefix("Input ")
     if problem["type"] == "missing":
-        said = "is missing"
+        message = "is missing"
     elif problem["type"] != "value_error":
-        said += f", is {reprlib.repr(problem['input'])}"
-    return one_line(Exception(f"{path[:LONGEST] or 'content'}: {said[:LONGEST]}"))
+        message += f", is {reprlib.repr(problem['input'])}"
+    return one_line(Exception(f"{path[:LONGEST] or 'content'}: {message[:LONGEST]}"))

@@ -97,7 +97,7 @@ KEPT = 1 << 30
 """Bytes of freed memory that are kept."""
 
 
-def settle() -> None:
+def configure_process() -> None:
     """Prepare this process; to be called before any thread is started. Changes no result.
 
     Threads that wait do not spin, for they would take the time of those that decode the next frames. Memory of a
@@ -111,8 +111,8 @@ def settle() -> None:
             libc.mallopt(parameter, value)
 
 
-def give_back(*, least: int = 0) -> None:
-    """Return freed memory to the system at once: what `settle` has kept for the next images (glibc).
+def trim_malloc(*, least: int = 0) -> None:
+    """Return freed memory to the system at once: what `configure_process` has kept for the next images (glibc).
 
     least  bytes that the process must have: of a small one what comes next uses it again, and need not clear it
     """

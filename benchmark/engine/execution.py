@@ -14,7 +14,7 @@ from pathlib import Path
 
 from semstab.check import Verdict, advise, quick_look, refuse_unsound, with_voxel_size
 from semstab.config import Config
-from semstab.core.process import give_back
+from semstab.core.process import trim_malloc
 from semstab.engine.executors import Executor, InProcess
 from semstab.engine.folder import Folder, require_file_names
 from semstab.engine.memory import planned_sizes
@@ -154,7 +154,7 @@ def _begin(
     """Works of the units that are fused whole, and the units in tiles; those that cannot be fused fail."""
     with units.watch("sizing"):
         sizing = planned_sizes(config, missing, executor.width)
-        give_back()
+        trim_malloc()
     for line in sizing.lines:
         logger.warning("%s", line)
     whole, tiled = list[Work](), dict[str, TiledUnit]()

@@ -16,7 +16,7 @@ from multiprocessing.connection import Connection
 from typing import Any, Protocol
 
 from semstab.core.prefetch import default_threads
-from semstab.core.process import available_bytes, follow_parent, settle
+from semstab.core.process import available_bytes, configure_process, follow_parent
 from semstab.engine.observer import Observers
 from semstab.engine.passes import run_job
 from semstab.engine.work import Job, Outcome, failed
@@ -181,7 +181,7 @@ def _check_start(pool: cf.ProcessPoolExecutor) -> None:
 def _start_worker(listening: Connection, threads: int) -> None:
     """Set a worker process up: with its share of the cores, and so that it ends with its parent."""
     os.environ.setdefault("OMP_NUM_THREADS", str(threads))  # read when Open3D is loaded
-    settle()
+    configure_process()
     _use_threads(threads)
     follow_parent(listening)
 
@@ -284,7 +284,7 @@ def _run_settled(job: Job) -> tuple[Outcome, ...]:
 
     It runs a job in each of its threads at once: frames are decoded in turn where nothing else is said.
     """
-    settle()
+    configure_process()
     with contextlib.suppress(ValueError):  # called outside of a worker
         _use_threads(_distributed().get_worker().state.nthreads)
     start = dataclasses.replace(job[0].start, threads=job[0].start.threads or 0)

@@ -16,7 +16,7 @@ import numpy.typing as npt
 from semstab.backends.numpy_reference import ONE_IN, NumpySample, in_sample
 from semstab.config import Config
 from semstab.core.files import atomic_path
-from semstab.core.process import Stopwatch, give_back
+from semstab.core.process import Stopwatch, trim_malloc
 from semstab.core.types import Float64, Mask
 from semstab.datasets import Scene
 from semstab.datasets.formats.disk import file_digest
@@ -74,10 +74,10 @@ def finish(live: LiveMap, stream: Stream, watch: Stopwatch) -> Outcome:
         if not len(table):
             raise no_voxels(task, config)
         live.backend = None  # the statistics have its memory
-        give_back(least=SMALL)
+        trim_malloc(least=SMALL)
     with watch("voxel sizes"):
         sizes = () if live.sizes is None else live.sizes.alphas()
-        give_back(least=SMALL)
+        trim_malloc(least=SMALL)
     with watch("statistics"):
         truth, analysis = _truth_table(live), None
         if work.judged:
@@ -87,7 +87,7 @@ def finish(live: LiveMap, stream: Stream, watch: Stopwatch) -> Outcome:
             analysis = analyse_sample(
                 task, config, MapSample.draw(table, log, truth, edges=config.strata), observations
             )
-        give_back(least=SMALL)
+        trim_malloc(least=SMALL)
     with watch("measure"):
         summary = unit_summary(
             task,
@@ -124,7 +124,7 @@ def finish_tile(live: LiveMap, stream: Stream, watch: Stopwatch) -> Outcome:
             events = None if log is None else dataclasses.replace(log, classes=table.classes)
             whole, (table, events) = table, _left(live, table, events)
             truth, live.backend = _truth_table(live), None
-            give_back(least=SMALL)
+            trim_malloc(least=SMALL)
         with watch("statistics"):
             log = events if config.statistics else None
             if work.judged:

@@ -14,7 +14,7 @@ from semstab.backends.numpy_reference import ONE_IN
 from semstab.check.reprojection import evenly
 from semstab.config import Config
 from semstab.core.prefetch import default_threads
-from semstab.core.process import available_bytes, give_back, resident_bytes
+from semstab.core.process import available_bytes, resident_bytes, trim_malloc
 from semstab.core.types import Int64
 from semstab.engine.units import Planned, PlannedUnit
 from semstab.errors import ConfigError, DataError, OutgrownError
@@ -328,7 +328,7 @@ class MemoryBudget:
         if self._beyond(taken) >= AMPLE * (taken + end):
             self._seen = taken
             return None
-        give_back()  # else freed memory would count
+        trim_malloc()  # else freed memory would count
         taken = self._taken(expected)
         self._seen, self._largest_step = taken, max(self._largest_step, taken - self._seen)
         self._left = self._beyond(taken)

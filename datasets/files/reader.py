@@ -32,12 +32,12 @@ class FileDataset(Dataset, Generic[Options]):
 
     Raises DataError where there is no scene.
 
-    looks_like         the contents of a scene's folder, for error messages
+    contents           the files of a scene's folder, for error messages
     labels_like_depth  whether label maps that are made for it have the depth's pixels, not those of the images
     settings_file      name of a file in a scene's folder that says what no option says, which `settled` reads
     """
 
-    looks_like: str
+    contents: str
     labels_like_depth = False
     settings_file: str | None = None
 
@@ -60,7 +60,7 @@ class FileDataset(Dataset, Generic[Options]):
         for frame in frames:
             inside(entry.folder, entry.folder, frame.name, str(frame.pose_file))  # files of predictions have its name
         if not frames:
-            raise DataError(f"{entry.folder}: holds no frame; expected {self.looks_like}")
+            raise DataError(f"{entry.folder}: holds no frame; expected {self.contents}")
         georeference = self.georeference(entry.folder, options)
         surface = None
         if options.surface is not None:
@@ -80,7 +80,7 @@ class FileDataset(Dataset, Generic[Options]):
 
     def find_scenes(self, root: Path) -> Iterable[SceneEntry]:
         """Return the scenes below the root, in natural order; raises what `find_scenes` raises."""
-        return find_scenes(root, self.is_scene, self.looks_like)
+        return find_scenes(root, self.is_scene, self.contents)
 
     def settled(self, folder: Path) -> FileOptions:
         """Return the options with which a scene's folder is read."""
@@ -119,7 +119,7 @@ class FileDataset(Dataset, Generic[Options]):
         """Return the frames of a scene's folder, in order, of different names. Raises DataError with the file."""
 
 
-def find_scenes(root: Path, is_scene: Callable[[Path], bool], looks_like: str) -> list[SceneEntry]:
+def find_scenes(root: Path, is_scene: Callable[[Path], bool], contents: str) -> list[SceneEntry]:
     """Return the root where it is a scene itself, else the scenes below it in natural order; one holds no other.
 
     Raises DataError where there is none, or two would have one name.
@@ -137,7 +137,7 @@ def find_scenes(root: Path, is_scene: Callable[[Path], bool], looks_like: str) -
 
     relative = [path.relative_to(root).parts for path in below(root, DEEPEST)]
     if not relative:
-        raise DataError(f"{root}: no scene here, nor {DEEPEST} folders deep; one holds {looks_like}")
+        raise DataError(f"{root}: no scene here, nor {DEEPEST} folders deep; one holds {contents}")
     entries = [SceneEntry("-".join(parts), root.joinpath(*parts), "/".join(parts)) for parts in relative]
     names = [entry.name for entry in entries]
     if repeated := sorted({name for name in names if names.count(name) > 1}):

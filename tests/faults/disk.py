@@ -120,5 +120,5 @@ if __name__ == "__main__":
     if MARK not in os.environ:
         os.execvpe(
             "unshare", ["unshare", "-rm", sys.executable, *sys.argv], os.environ | {MARK: "1", "RUST_LOG": "off"}
-        )  # as `settle` has it
+        )  # as `configure_process` has it
     sys.exit(main(int((sys.argv[1:] or ["12"])[0]), (sys.argv[2:] or [""])[0]))

@@ -16,7 +16,7 @@ from typer.testing import CliRunner
 from semstab.cli import app
 from semstab.datasets import open_dataset
 from semstab.engine import load_result
-from semstab.errors import LONGEST_LINE, ConfigError, DataError, told
+from semstab.errors import LONGEST_LINE, ConfigError, DataError, sanitize
 from semstab.report.figures.style import Figure, canvas
 from semstab.report.tables import tables
 from semstab.report.tables.table import to_csv
@@ -72,8 +72,8 @@ def test_a_horror_is_one_line(wall, tmp_path, monkeypatch, words) -> None:
 
 
 def test_a_message_keeps_its_beginning_and_its_end() -> None:
-    assert told("ä 'b'") == "ä 'b'"
-    assert told("a\nb\udcff\x00") == r"a\nb\udcff\x00"
+    assert sanitize("ä 'b'") == "ä 'b'"
+    assert sanitize("a\nb\udcff\x00") == r"a\nb\udcff\x00"
     for text in ("x: " + LONG + "; mend it", "x: " + "\n" * 500 + "; mend it", "x: " + "9" * 450 + "; mend it"):
         line = str(ConfigError(text))
         assert line.startswith("x: ")
