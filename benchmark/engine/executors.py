@@ -16,7 +16,7 @@ from multiprocessing.connection import Connection
 from typing import Any, Protocol
 
 from semstab.core.prefetch import default_threads
-from semstab.core.process import available_bytes, follow_parent, settle
+from semstab.core.process import follow_parent, settle
 from semstab.engine.observer import Observers
 from semstab.engine.passes import run_job
 from semstab.engine.work import Job, Outcome, failed
@@ -92,11 +92,11 @@ class LocalProcesses:
         Where a process dies, nobody knows of which job: those that were at work are tried again, then once more one by
         one. The job whose process dies then fails, and the others finish.
         """
-        begun, share = list[Job](), available_bytes() / 2
+        begun = list[Job]()
 
         def shared() -> Job | None:
             job = next_job()
-            return None if job is None else self._with_a_share(job, share)
+            return None if job is None else self._with_a_share(job)
 
         while True:
             for _ in range(2):
@@ -155,12 +155,11 @@ class LocalProcesses:
     def close(self) -> None:
         """Processes end with what they were started for."""
 
-    def _with_a_share(self, job: Job, free: float) -> Job:
+    def _with_a_share(self, job: Job) -> Job:
         """The job with its share of threads and memory."""
         start = job[0].start
-        memory = free if start.memory_bytes is None else start.memory_bytes
         threads = max(1, (start.threads or default_threads()) // self.width)
-        own = dataclasses.replace(start, threads=threads, memory_bytes=memory / self.width, width=self.width)
+        own = dataclasses.replace(start, threads=threads, width=self.width)
         return tuple(dataclasses.replace(work, start=own) for work in job)
 
 

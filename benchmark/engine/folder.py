@@ -165,8 +165,7 @@ class Folder:
     @contextlib.contextmanager
     def started(self, config: Config) -> Iterator[Start]:
         """A start, by whose name workers know the folder while the block lasts."""
-        memory = None if config.memory_gb is None else config.memory_gb * 1e9
-        start = Start(uuid.uuid4().hex, self.path, config.threads, memory)
+        start = Start(uuid.uuid4().hex, self.path, config.threads)
         for name in WRITTEN:
             for folder in (self.path / name, *self.path.glob(f"{name}/*/")):
                 remove_leftovers(folder)

@@ -13,7 +13,7 @@ from dataclasses import replace
 import numpy as np
 
 from semstab.core.prefetch import Fetched, prefetch
-from semstab.core.process import Stopwatch, available_bytes, resident_bytes
+from semstab.core.process import Stopwatch
 from semstab.datasets import GROUND_TRUTH, Dataset, Scene, open_dataset
 from semstab.engine.finish import finish, finish_tile
 from semstab.engine.memory import MemoryBudget
@@ -75,7 +75,7 @@ def fuse_sequence(fusion: Fusion) -> Iterator[Outcome]:
 class Fusion:
     """The maps of a pass, and the bookkeeping around it: failures, memory, time by stage.
 
-    Where maps take more than the memory bound, works are put off to another pass.
+    Where all maps do not fit into the memory, some works are put off to another pass.
     """
 
     def __init__(self, scene: Scene, works: Sequence[Work], observers: Observers) -> None:
@@ -89,10 +89,7 @@ class Fusion:
                 self._failed += failed([work], error)
         self.streams = streams_of(maps, self.watch, observers)
         self.order = frame_order(self.streams)
-        self._memory_before = resident_bytes()
         self._budget = MemoryBudget(works[0].config.memory_gb, self._start.width)
-        bound = self._start.memory_bytes
-        self._bound = available_bytes() / 2 if bound is None else bound
 
     def start(self) -> None:
         """Show observers the maps that they watch."""
@@ -159,19 +156,17 @@ class Fusion:
                 live.release()
 
     def keep_within_memory(self) -> bool:
-        """Put maps off, or give up one that outgrows the memory; whether there is still one to fuse."""
+        """Put maps off, or give up one that outgrows the memory. Return whether one is left to fuse."""
         maps = [live for stream in self.streams for live in stream.maps]
-        if len(maps) > 1 and resident_bytes() - self._memory_before > self._bound:
-            later = sorted(maps, key=lambda live: not live.work.watched)[max(1, len(maps) // 2) :]
-            later = [live for live in later if not live.work.watched]
-            self.put_off += [live.work for live in later]
-            self._give_up(later)
-            maps = [live for live in maps if live not in later]
         growing = [live for live in maps if live.rows and live.backend is not None]
-        largest = self._budget.lacking(growing) if growing else None
-        if largest is not None:
-            with self.failing([largest]):
-                raise self._budget.outgrown(largest)
+        if growing and (largest := self._budget.lacking(growing)) is not None:
+            later = sorted(maps, key=lambda live: not live.work.watched)[max(1, len(maps) // 2) :]
+            if later := [live for live in later if not live.work.watched]:
+                self.put_off += [live.work for live in later]
+                self._give_up(later)
+            else:
+                with self.failing([largest]):
+                    raise self._budget.outgrown(largest)
         return any(stream.maps for stream in self.streams)
 
 

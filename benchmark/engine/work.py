@@ -25,17 +25,15 @@ FRAMES = "frames"
 class Start:
     """What all works of one start of a run share.
 
-    name          by which a worker opens the dataset once, and knows the folder
-    folder        of the run or study
-    threads       that decode frames ahead; 0: each when it is wanted, None: as many as the machine has for it
-    memory_bytes  that maps of a pass may take before some are put off to another pass; None: half of what is free
-    width         processes that share the machine's memory
+    name     by which a worker opens the dataset once, and knows the folder
+    folder   of the run or study
+    threads  that decode frames ahead; 0: each when it is wanted, None: as many as the machine has for it
+    width    processes that share the machine's memory
     """
 
     name: str
     folder: Path
     threads: int | None = None
-    memory_bytes: float | None = None
     width: int = 1
 
     @property
