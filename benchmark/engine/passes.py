@@ -15,7 +15,7 @@ import numpy as np
 from semstab.core.prefetch import Fetched, prefetch
 from semstab.core.process import Stopwatch
 from semstab.datasets import GROUND_TRUTH, Dataset, Scene, open_dataset
-from semstab.engine.finish import finish, finish_tile
+from semstab.engine.finish import finish
 from semstab.engine.memory import MemoryBudget
 from semstab.engine.observer import Observers
 from semstab.engine.streams import Decoded, LiveMap, Stream, frame_order, streams_of
@@ -67,8 +67,7 @@ def fuse_sequence(fusion: Fusion) -> Iterator[Outcome]:
                 break  # no map is left
     for stream, live in fusion.finished():
         with fusion.failing([live]):
-            end = finish if live.work.tile is None else finish_tile
-            yield replace(end(live, stream, fusion.watch), seconds=fusion.lap())
+            yield replace(finish(live, stream, fusion.watch), seconds=fusion.lap())
     yield from fusion.failures()
 
 

@@ -153,11 +153,6 @@ class LiveMap:
             return None
         return self.sampler.looks(self.task.mapping.target.classes).without(self.left_out)
 
-    def table(self) -> VoxelTable:
-        """The voxels of its map."""
-        assert self.backend is not None
-        return dataclasses.replace(self.backend.table(), classes=self.task.mapping.target.classes)
-
 
 def new_map(config: Config, num_classes: int, work: Work | None = None) -> FusionBackend:
     """An empty map; it keeps the history where that is to be written, or statistics are computed from it."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import math
 from collections.abc import Mapping, Sequence
@@ -88,74 +89,70 @@ def _ranges(corners: Float64) -> tuple[tuple[Float64, float], tuple[Float64, flo
 
 
 @dataclass(frozen=True, eq=False)
-class TileResult:
-    """The result of one tile, or of the pass over all frames, kept until the whole unit is there.
+class TileMeta:
+    """The fields of a result that are no arrays.
 
     files    digests of its files, by their path in the folder
-    series   (F, C) NUMBERS of each frame
-    sums     of its voxels, by name, as `TableSums` has them
-    reduced  sums of the map of labels that soft scores were reduced to; empty where there are none
     checked  how far it agrees with the reference on a sample of its voxels
-    image    (F, C) stability of each frame in image coordinates, poses (F, 3, 3) of the cameras: of all frames
-    origin   voxel of the first camera, seen (m, 3) a frame and a tile that it meets, ascending by frame
+    origin   voxel of the first camera
     """
 
     files: Mapping[str, str]
-    series: Float64
-    voxels: int = 0
-    sums: Mapping[str, Float64] = field(default_factory=dict)
-    reduced: Float64 = field(default_factory=lambda: np.zeros(0))
     checked: Agreement | None = None
     sizes: tuple[SizeAlpha, ...] = ()
     quality: FrameQuality | None = None
+    origin: tuple[int, int, int] | None = None
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class TileResult(TileMeta):
+    """The result of a whole unit, of one tile, or of the pass over all frames; those of tiles make a unit's.
+
+    series   (F, C) NUMBERS of each frame
+    sums     of its voxels, by name, as `TableSums` has them
+    reduced  sums of the map of labels that soft scores were reduced to; empty where there are none
+    image    (F, C) stability of each frame in image coordinates, poses (F, 3, 3) of the cameras: of all frames
+    seen     (m, 3) a frame and a tile that it meets, ascending by frame
+    """
+
+    series: Float64
+    sums: Mapping[str, Float64] = field(default_factory=dict)
+    reduced: Float64 = field(default_factory=lambda: np.zeros(0))
     image: Float64 = field(default_factory=lambda: np.zeros((0, 0)))
     poses: Float64 = field(default_factory=lambda: np.zeros((0, 3, 3)))
-    origin: tuple[int, int, int] | None = None
     seen: Int32 = field(default_factory=lambda: np.zeros((0, 3), np.int32))
 
     def save(self, path: Path) -> None:
         """Write it, atomically."""
-        about = to_json(TileMeta(self.files, self.voxels, self.checked, self.sizes, self.quality, self.origin))
         arrays: dict[str, Any] = {name: getattr(self, name) for name in ARRAYS}
         arrays |= {f"sums {name}": value for name, value in self.sums.items()}
-        write_arrays(path, {"about": np.frombuffer(json.dumps(about).encode(), np.uint8), **arrays})
+        meta = to_json({field.name: getattr(self, field.name) for field in dataclasses.fields(TileMeta)})
+        write_arrays(path, {"meta": np.frombuffer(json.dumps(meta).encode(), np.uint8), **arrays})
 
     @classmethod
     def load(cls, path: Path) -> TileResult | None:
         """Read the file that `save` wrote; None where there is none, or it is damaged or of another version."""
         arrays = read_arrays(path)
-        if arrays is None or not {"about", *ARRAYS} <= arrays.keys() or arrays["series"].shape[1:] != (len(NUMBERS),):
+        if arrays is None or not {"meta", *ARRAYS} <= arrays.keys() or arrays["series"].shape[1:] != (len(NUMBERS),):
             return None
         try:
-            about = from_json(TileMeta, parse_json(arrays["about"].tobytes()), path)
+            meta = from_json(TileMeta, parse_json(arrays["meta"].tobytes()), path)
         except (DataError, ValueError):
             return None
         sums = {name[5:]: array for name, array in arrays.items() if name.startswith("sums ")}
         own: dict[str, Any] = {name: arrays[name] for name in ARRAYS}
-        return cls(**own, **vars(about), sums=sums)
+        return cls(**vars(meta), **own, sums=sums)
 
     def tiles(self) -> dict[tuple[int, int], list[int]]:
         """The frames that meet each tile, in order, by its place."""
-        found: dict[tuple[int, int], list[int]] = {}
+        frames: dict[tuple[int, int], list[int]] = {}
         for index, x, y in self.seen.tolist():
-            found.setdefault((x, y), []).append(index)
-        return dict(sorted(found.items()))
-
-
-@dataclass(frozen=True)
-class TileMeta:
-    """The fields of a result that are no arrays."""
-
-    files: Mapping[str, str]
-    voxels: int
-    checked: Agreement | None
-    sizes: tuple[SizeAlpha, ...]
-    quality: FrameQuality | None
-    origin: tuple[int, int, int] | None
+            frames.setdefault((x, y), []).append(index)
+        return dict(sorted(frames.items()))
 
 
 ARRAYS = ("series", "reduced", "image", "poses", "seen")
-"""The fields that are arrays, beside the sums."""
+"""The fields of a result that are arrays, without the sums."""
 
 # --- The time series of a unit in tiles -------------------------------------------------------------------------------
 
