@@ -22,7 +22,7 @@ from semstab.engine.observer import Observer, Observers
 from semstab.engine.passes import share_open_scenes
 from semstab.engine.results import UnitResults, advice_of, manifest, result_of
 from semstab.engine.tiled_units import TiledUnit
-from semstab.engine.units import Plan, Planned, PlannedUnit, make_plan
+from semstab.engine.units import Plan, PlannedUnit, make_plan
 from semstab.engine.work import Job, Outcome, Start, Work, jobs_of
 from semstab.errors import ConfigError, DataError
 from semstab.model.records import Result
@@ -144,7 +144,7 @@ def _compute(plan: Plan, folder: Folder, executor: Executor, observers: Observer
 
 def _begin(
     config: Config,
-    missing: Sequence[Planned],
+    missing: Sequence[PlannedUnit],
     folder: Folder,
     units: UnitResults,
     executor: Executor,
@@ -163,7 +163,7 @@ def _begin(
             _keep(
                 each, Outcome(each.identity, error=error, cause=ConfigError(error)), folder, units, executor, observers
             )
-        elif isinstance(each, PlannedUnit) and (size := sizing.tile_sizes.get(each.identity)) is not None:
+        elif not each.regions and (size := sizing.tile_sizes.get(each.identity)) is not None:
             tiled[each.identity] = TiledUnit(each, size, folder, start)
         else:
             whole.append(Work.of(each, start))
@@ -171,7 +171,7 @@ def _begin(
 
 
 def _keep(
-    each: Planned,
+    each: PlannedUnit,
     outcome: Outcome,
     folder: Folder,
     units: UnitResults,
@@ -186,8 +186,7 @@ def _keep(
         content = dataclasses.replace(content, advice=units.advice.get(each.unit.scene))
         with units.watch("keep"):
             folder.save(dataclasses.replace(outcome, content=content))
-            if isinstance(each, PlannedUnit):
-                folder.clear(each, content.files)
+            folder.clear(each, content.files)
         units.contents[outcome.identity] = content
     else:
         error = units.errors[outcome.identity] = outcome.error or ""
@@ -196,19 +195,19 @@ def _keep(
             units.causes.setdefault(error, outcome.cause)
     if not in_tiles:
         units.add_seconds(outcome)
-        if executor.elsewhere or not isinstance(each, PlannedUnit):
+        if executor.elsewhere or each.regions:
             what = f"{each.unit.scene} · {each.unit.backbone}"
             observers.tell(lambda observer: observer.advanced(each.frames, what))
     observers.tell(lambda observer: observer.unit_finished(each, content, outcome.table, outcome.error))
 
 
-def _check_geometry(config: Config, missing: Sequence[Planned], units: UnitResults, observers: Observers) -> None:
+def _check_geometry(config: Config, missing: Sequence[PlannedUnit], units: UnitResults, observers: Observers) -> None:
     """Check the geometry of each scene with units to compute, and judge the voxel size.
 
     A scene that cannot be read is left to its units to report. Raises DataError where depth and poses contradict each
     other.
     """
-    tasks = {each.task.scene.name: each.task for each in reversed(missing) if isinstance(each, PlannedUnit)}
+    tasks = {each.task.scene.name: each.task for each in reversed(missing) if not each.regions}
     verdicts: dict[str, Verdict] = {}
     advice: VoxelAdvice | None
     for task in reversed(tasks.values()):

@@ -20,7 +20,7 @@ from semstab.config import Config, read_yaml
 from semstab.core.files import TEMPORARY, FolderLock, atomic_path, read_json, remove_leftovers, write_json, write_text
 from semstab.core.json_form import from_json, to_json
 from semstab.datasets.formats.disk import file_digest
-from semstab.engine.units import Planned, PlannedUnit
+from semstab.engine.units import PlannedUnit
 from semstab.engine.work import TILES, Outcome, Start
 from semstab.errors import ConfigError, DataError
 from semstab.model import earlier
@@ -91,7 +91,7 @@ class Folder:
         """Let another process have it."""
         self._lock.release()
 
-    def finished(self, planned: Planned) -> UnitContent | None:
+    def finished(self, planned: PlannedUnit) -> UnitContent | None:
         """What an earlier start left of a unit, if its input is the same and nothing that is wanted is missing.
 
         The input is read to compare it only where there is such a unit at all.
@@ -176,18 +176,18 @@ class Folder:
         finally:
             start.marker.unlink(missing_ok=True)
 
-    def _is_whole(self, planned: Planned, content: UnitContent) -> bool:
+    def _is_whole(self, planned: PlannedUnit, content: UnitContent) -> bool:
         """Whether the unit's file has what is wanted of it, and its other files are there as they were."""
-        if isinstance(planned, PlannedUnit):
-            has = content.summary is not None and (content.image_space is not None or not planned.image_space)
-            has = has and (
-                not planned.judged or (content.summary is not None and content.summary.statistics is not None)
-            )
-            has = has and (content.checked is not None or not planned.sampled)
-            wanted = self._wanted(planned, content)
-        else:
-            has, wanted = content.regions is not None, []
-        return has and self.are_whole({name: content.files.get(name) for name in wanted})
+        if planned.regions:
+            return content.regions is not None
+        summary = content.summary
+        return (
+            summary is not None
+            and (content.image_space is not None or not planned.image_space)
+            and (summary.statistics is not None or not planned.judged)
+            and (content.checked is not None or not planned.sampled)
+            and self.are_whole({name: content.files.get(name) for name in self._wanted(planned, content)})
+        )
 
     def are_whole(self, files: Mapping[str, str | None]) -> bool:
         """Whether files are there, with these digests; the first that is not as it was is told."""

@@ -15,7 +15,7 @@ from semstab.config import Config
 from semstab.core.prefetch import default_threads
 from semstab.core.process import available_bytes, give_back, resident_bytes
 from semstab.core.types import Int64
-from semstab.engine.units import Planned, PlannedUnit
+from semstab.engine.units import PlannedUnit
 from semstab.errors import ConfigError, DataError, OutgrownError
 from semstab.model.frames import Frame
 from semstab.pixels.preparation import perturb
@@ -111,11 +111,11 @@ class Sizing:
     lines: list[str] = field(default_factory=list)
 
 
-def planned_sizes(config: Config, missing: Iterable[Planned], width: int) -> Sizing:
+def planned_sizes(config: Config, missing: Iterable[PlannedUnit], width: int) -> Sizing:
     """Estimate the units that are to be fused; where one cannot be read, computing it will say so."""
     sizing, together = Sizing(), dict[object, list[PlannedUnit]]()
     for each in missing:
-        if isinstance(each, PlannedUnit):  # watched units of a sequence are in memory together; others can be put off
+        if not each.regions:  # watched units of a sequence are in memory together; others can be put off
             key = (each.unit.scene, each.unit.backbone) if each.kept else each.identity
             together.setdefault(key, []).append(each)
     for group in together.values():

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from semstab.config import Config, FrameSelection, as_range
 from semstab.core.files import TEMPORARY
-from semstab.engine.units import Planned, PlannedUnit
+from semstab.engine.units import PlannedUnit
 from semstab.errors import OUT_OF_MEMORY, OutgrownError, SemstabError, one_line
 from semstab.model.records import UnitContent
 from semstab.model.voxels import Extent, VoxelTable
@@ -102,14 +102,12 @@ class Work:
     tile: TileTask | None = None
 
     @classmethod
-    def of(cls, planned: Planned, start: Start) -> Work:
+    def of(cls, planned: PlannedUnit, start: Start) -> Work:
         """The whole of a planned unit."""
-        unit = planned.unit
-        if not isinstance(planned, PlannedUnit):
-            return cls(start, unit.scene, unit.backbone, planned.identity, planned.config, regions=True)
+        unit, wanted = planned.unit, (planned.image_space, planned.kept, planned.judged, planned.sampled)
         config = planned.config.model_copy(update={"frames": FrameSelection.of(planned.task.indices)})
-        wanted = (planned.image_space, planned.kept, planned.judged, planned.sampled)
-        return cls(start, unit.scene, unit.backbone, planned.identity, config, *wanted, planned.task.left_out)
+        own = (unit.scene, unit.backbone, planned.identity, config)
+        return cls(start, *own, *wanted, planned.task.left_out, planned.regions)
 
     def in_tile(self, tile: TileTask, frames: Sequence[int] | None = None) -> Work:
         """The same of one tile and these frames alone."""
