@@ -9,7 +9,6 @@ import importlib
 import importlib.metadata
 import multiprocessing
 import os
-import time
 from collections.abc import Callable, Generator
 from concurrent.futures.process import BrokenProcessPool
 from multiprocessing.connection import Connection
@@ -23,9 +22,6 @@ from semstab.engine.work import Job, Outcome, failed
 from semstab.errors import ConfigError, MissingDependencyError
 
 CONNECT_SECONDS = 10
-MOMENT = 0.2
-"""Seconds for which the number of workers, which come and go, holds: to ask takes as long as a small job."""
-
 AWAY = OSError, RuntimeError, AttributeError
 """What a client of Dask raises where its scheduler does not answer, while it gives it up, and once it has none."""
 
@@ -89,20 +85,14 @@ class LocalProcesses:
     def run(self, next_job: NextJob, observers: Observers) -> Generator[Outcome, None, None]:
         """Yield outcomes as jobs finish.
 
-        Where a process dies, nobody knows of which job: those that were at work are tried again, then once more one by
-        one. The job whose process dies then fails, and the others finish.
+        Where a process dies, nobody knows of which job: those that were at work are run again, one by one. The job
+        whose process dies then fails, and the others finish.
         """
         begun = list[Job]()
-
-        def shared() -> Job | None:
-            job = next_job()
-            return None if job is None else self._with_a_share(job)
-
         while True:
-            for _ in range(2):
-                with contextlib.suppress(BrokenProcessPool):
-                    yield from self._run(begun, shared, self.width)
-                    return
+            with contextlib.suppress(BrokenProcessPool):
+                yield from self._run(begun, next_job, self.width)
+                return
             while begun:
                 try:
                     yield from self._run(begun, lambda: None, 1)
@@ -115,22 +105,20 @@ class LocalProcesses:
 
         Each is submitted before outcomes are yielded: no process waits for whoever takes them.
         """
-        futures = dict[cf.Future[tuple[Outcome, ...]], Job]()
-        waiting = [*begun]
+        futures, waiting = dict[cf.Future[tuple[Outcome, ...]], Job](), [*begun]
 
-        def taken() -> Job | None:
-            if waiting:
-                return waiting.pop(0)
-            if (job := next_job()) is not None:
-                begun.append(job)
-            return job
+        def take() -> bool:
+            if not waiting and (job := next_job()) is not None:
+                begun.append(self._with_a_share(job))
+                waiting.append(begun[-1])
+            return bool(waiting)
 
-        def submit(job: Job | None = None) -> None:
-            while job is not None or (len(futures) < width and (job := taken()) is not None):
-                futures[pool.submit(_run_all, job)] = job
-                job = None
+        def submit() -> None:
+            while len(futures) < width and take():
+                futures[pool.submit(_run_all, waiting[0])] = waiting[0]
+                del waiting[0]
 
-        if (first := taken()) is None:
+        if not take():
             return
         context = multiprocessing.get_context("spawn")
         listening, alive = context.Pipe(duplex=False)
@@ -138,7 +126,7 @@ class LocalProcesses:
         pool = cf.ProcessPoolExecutor(width, context, initializer=_start_worker, initargs=(listening, share))
         try:
             _check_start(pool)
-            submit(first)
+            submit()
             while futures:
                 done, _ = cf.wait(futures, return_when=cf.FIRST_COMPLETED)
                 for future in done:
@@ -209,7 +197,6 @@ class DaskCluster:
             raise ConfigError(
                 f"{scheduler}: no Dask scheduler answers ({error}); start one with 'dask scheduler'"
             ) from error
-        self._asked = 0.0
         self.width = self._threads() or 1
         self.name = f"Dask, {self.width} threads"
 
@@ -220,20 +207,25 @@ class DaskCluster:
         and that is sent before outcomes are yielded, so that nobody waits for it.
         Raises ConfigError where the scheduler went away and jobs are left.
         """
-        futures = dict[Any, Job]()
+        futures, waiting = dict[Any, Job](), list[Job]()
         finished = _distributed().as_completed(loop=self._client.loop)
 
-        def send(job: Job | None = None) -> None:
+        def take() -> bool:
+            if not waiting and (job := next_job()) is not None:
+                waiting.append(job)
+            return bool(waiting)
+
+        def send() -> None:
             free = self._threads() - len(futures)
-            while job is not None or (free > 0 and (job := next_job()) is not None):
+            while free > 0 and take():
+                job, free = waiting.pop(), free - 1
                 futures[future := self._client.submit(_run_settled, job, pure=False)] = job
                 finished.add(future)
-                job, free = None, free - 1
 
-        if (first := next_job()) is None:
+        if not take():
             return
         self._require_same_version()
-        send(first)
+        send()
         try:
             for future in finished:
                 job = futures.pop(future)
@@ -242,20 +234,18 @@ class DaskCluster:
                 send()
                 yield from outcomes
                 send()
-            if next_job() is not None:
+            if take():
                 raise ConfigError(LOST)
         finally:
             if futures:
                 self._client.cancel(list(futures))
 
     def _threads(self) -> int:
-        """Of the workers that there are now, or were a moment ago; 0 where the scheduler does not answer."""
-        if (now := time.monotonic()) - self._asked > MOMENT:
-            try:
-                self.width = max(1, sum(self._client.nthreads().values()))
-            except AWAY:
-                return 0
-            self._asked = now
+        """Threads of the workers that there are now; 0 where the scheduler does not answer."""
+        try:
+            self.width = max(1, sum(self._client.nthreads().values()))
+        except AWAY:
+            return 0
         return self.width
 
     def close(self) -> None:
