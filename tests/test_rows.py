@@ -7,10 +7,10 @@ import pickle
 import numpy as np
 import pytest
 
-from semstab.core.rows import FIRST, Rows
+from semstab.core.rows import Rows
 
 
-@pytest.mark.parametrize("count", [0, 1, FIRST, 5 * FIRST + 1])
+@pytest.mark.parametrize("count", [0, 1, 321])
 def test_rows_are_what_went_in(count) -> None:
     expected = np.random.default_rng(0).random((count, 3))
     appended, continued = Rows(3), Rows(3, expected[:7])

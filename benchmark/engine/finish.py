@@ -17,12 +17,11 @@ from semstab.backends.numpy_reference import ONE_IN, NumpySample, in_sample
 from semstab.config import Config
 from semstab.core.files import atomic_path
 from semstab.core.process import Stopwatch, give_back
-from semstab.core.rows import Rows
 from semstab.core.types import Float64, Mask
 from semstab.datasets import Scene
 from semstab.datasets.formats.disk import file_digest
 from semstab.engine.series import Series
-from semstab.engine.streams import COLUMNS, ImageSpaceMeter, LiveMap, Stream, alpha_sums
+from semstab.engine.streams import ImageSpaceMeter, LiveMap, Stream, alpha_sums
 from semstab.engine.tiles import OBSERVATIONS, TileResult
 from semstab.engine.work import Outcome, Start
 from semstab.errors import DataError
@@ -203,7 +202,7 @@ def unit_content(
 def in_image_space(content: UnitContent, task: Task, result: TileResult, points: VoxelTable | Float64) -> UnitContent:
     """Return the content with stability in image coordinates, the quality of single frames and the scene's up axis."""
     assert content.summary is not None
-    meter = ImageSpaceMeter(Rows(len(COLUMNS), result.image))
+    meter = ImageSpaceMeter(result.image)
     return dataclasses.replace(
         content,
         image_space=meter.result(content.summary.flicker_percent),
@@ -339,38 +338,23 @@ THICKNESS = 0.01
 POINTS = 10_000
 """Points used, drawn at random from more."""
 
-ITERATIONS = 2_000
-"""Draws of three points a plane. They all lie in a plane of 15% of the points once in 300 draws."""
-
-DRAW_CHUNKS = 50
-"""Parts of these draws whose points are counted together."""
-
-
-@dataclass(frozen=True, eq=False)
-class Plane:
-    """A plane in the map.
-
-    normal  (3,) unit vector towards the cameras
-    share   of the points that lie in it, 0 to 1
-    """
-
-    normal: Float64
-    share: float
+ITERATIONS, DRAW_CHUNKS = 2_000, 50
+"""Draws of three points a plane, and parts of them whose points are counted together. They all lie in a plane of 15 %
+of the points once in 300 draws."""
 
 
 def estimate_up(points: VoxelTable | npt.ArrayLike, poses: Sequence[npt.ArrayLike] | npt.ArrayLike) -> Float64:
-    """The world's up axis (3,), a unit vector: the normal, towards the cameras, of the plane that is likely the ground.
+    """Return the world's up axis (3,): the normal, towards the cameras, of the plane that is likely the ground.
 
     points  a fused map, whose voxels count by area; or world points (n, 3), metres
     poses   (m, 4, 4) camera-to-world of the frames behind it, OpenCV axes; or (m, 3, 3): down, forward and centre
 
-    The cameras alone do not tell: up in their images is up in the world for a level camera, and straight ahead for one
-    that looks down. So the largest planes of the map are found (RANSAC, seeded: the same input gives the same answer),
-    and of those which the cameras see from above, the one with the largest share * cos(angle to the up of a camera that
-    looks 27 degrees down) is taken: before a level camera a wall counts half as much as a floor of its size.
+    Up in the image is up in the world for a level camera, and straight ahead for one that looks down. So of the largest
+    planes of the map (RANSAC, seeded) the cameras see from above, the one with the largest share * cos(angle to the up
+    of a camera that looks 27 degrees down) is taken: before a level camera a wall counts half as much as a floor.
 
-    It is wrong where the ground is not among the largest planes (a façade filmed from the street, a table top that is
-    tilted), where cameras are rolled by tens of degrees, and by the ground's own slope. Say `up_axis` instead then.
+    It is wrong where the ground is not among the largest planes (a façade filmed from the street, a tilted table top),
+    where cameras are rolled by tens of degrees, and by the ground's own slope. Set `up_axis` instead then.
     Raises DataError where there are fewer than 3 points, or no plane with the cameras above it.
     """
     at = points.centers if isinstance(points, VoxelTable) else np.asarray(points, dtype=np.float64)
@@ -378,14 +362,14 @@ def estimate_up(points: VoxelTable | npt.ArrayLike, poses: Sequence[npt.ArrayLik
     prior = -(2 * down + forward).mean(axis=0)
     prior /= np.linalg.norm(prior)
     planes = list(_planes(at, centre)) if len(at) >= 3 else []
-    scores = [plane.share * float(plane.normal @ prior) for plane in planes]
+    scores = [share * float(normal @ prior) for normal, share in planes]
     if max(scores, default=0.0) <= 0:
         raise DataError(f"no ground plane found under the cameras in {len(at)} points; say which axis is up (up_axis)")
-    return planes[int(np.argmax(scores))].normal
+    return planes[int(np.argmax(scores))][0]
 
 
-def _planes(points: Float64, cameras: Float64) -> Iterator[Plane]:
-    """The largest planes, each found among the points that the ones before it left."""
+def _planes(points: Float64, cameras: Float64) -> Iterator[tuple[Float64, float]]:
+    """Normal (3,) towards the cameras, and share of the points, of the largest planes: each in what others left."""
     origin = np.median(points, axis=0)
     rest, cameras = points - origin, cameras - origin
     rng = np.random.default_rng(0)
@@ -403,7 +387,7 @@ def _planes(points: Float64, cameras: Float64) -> Iterator[Plane]:
         mean = rest[inlier].mean(axis=0)
         normal = np.linalg.eigh(np.cov(rest[inlier].T))[1][:, 0]  # the least squares' plane of the inliers
         above = np.median((cameras - mean) @ normal) > 0
-        yield Plane(normal if above else -normal, np.count_nonzero(inlier) / total)
+        yield normal if above else -normal, np.count_nonzero(inlier) / total
         rest = rest[~inlier]
 
 
@@ -419,6 +403,5 @@ def _largest_plane(points: Float64, distance: float, rng: np.random.Generator) -
     plane = np.column_stack([normal, offset]).astype(np.float32)
     homogeneous = np.vstack([points.T, np.ones(len(points))]).astype(np.float32)
     within = [np.count_nonzero(np.abs(some @ homogeneous) <= distance, axis=1) for some in np.split(plane, DRAW_CHUNKS)]
-    best = plane[int(np.argmax(np.concatenate(within)))]
-    inlier: Mask = np.abs(best @ homogeneous) <= distance
+    inlier: Mask = np.abs(plane[int(np.argmax(np.concatenate(within)))] @ homogeneous) <= distance
     return inlier

@@ -150,9 +150,7 @@ class Fusion:
         """Each map that came to its end; it is let go of before the next one."""
         for stream in self.streams:
             while stream.maps:
-                live = stream.maps.pop(0)
-                yield stream, live
-                live.release()
+                yield stream, stream.maps.pop(0)
 
     def keep_within_memory(self) -> bool:
         """Put maps off, or give up one that outgrows the memory. Return whether one is left to fuse."""

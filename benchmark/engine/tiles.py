@@ -14,7 +14,6 @@ import numpy as np
 
 from semstab.core.files import parse_json, read_arrays, write_arrays
 from semstab.core.json_form import from_json, to_json
-from semstab.core.rows import Rows
 from semstab.core.types import Float64, Int32
 from semstab.engine.series import NUMBERS, Series
 from semstab.errors import DataError
@@ -183,7 +182,7 @@ def joined_series(frames: Float64, tiles: Sequence[Float64]) -> Series:
     rows[:, column["map_voxels"]] = voxels
     for name in MEANS:
         rows[:, column[name]] = totals[name] / np.where(voxels > 0, voxels, math.nan)
-    return Series(Rows(len(NUMBERS), rows))
+    return Series(rows)
 
 
 def _latest(frame: Float64, own: Float64, values: Float64) -> Float64:
