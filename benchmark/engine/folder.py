@@ -10,7 +10,7 @@ import logging
 import os
 import shutil
 import uuid
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -102,7 +102,11 @@ class Folder:
             file = self._files.get(unit_key(planned.identity, planned.digest))
         except DataError:
             return None  # the input cannot be read: computing the unit will say so
-        content = None if file is None else _read_unit(file)
+        try:
+            content = None if file is None else from_json(UnitContent, read_json(file), file)
+        except DataError:
+            logger.warning("%s: damaged; the unit is computed again", file)
+            return None
         return content if content is not None and self._is_whole(planned, content) else None
 
     def save(self, outcome: Outcome) -> None:
@@ -156,7 +160,8 @@ class Folder:
 
     def save_result(self, result: Result) -> None:
         """Write summary.json and manifest.json."""
-        content = to_json(dataclasses.replace(result, records=_in(self.path, result.records), manifest={}))
+        records = _with_files(result.records, lambda file: file.relative_to(self.path))
+        content = to_json(dataclasses.replace(result, records=records, manifest={}))
         runs = content.pop("records")
         del content["manifest"]
         write_json(self.path / "summary.json", {"schema": SCHEMA, "runs": runs, **content})
@@ -235,14 +240,7 @@ def load_result(folder: str | Path) -> Result:
     result = from_json(Result, {**content, "records": content.get("runs")}, path)
     if problem := _contradiction(result):
         raise DataError(f"{path}: {problem}; it is damaged, or another version's; run it again")
-    records = tuple(
-        dataclasses.replace(
-            record,
-            voxels_file=record.voxels_file and folder / record.voxels_file,
-            truth_file=record.truth_file and folder / record.truth_file,
-        )
-        for record in result.records
-    )
+    records = _with_files(result.records, lambda file: folder / file)
     manifest = from_json(dict[str, Any], read_json(folder / "manifest.json"), folder / "manifest.json")
     return dataclasses.replace(result, records=records, manifest=manifest)
 
@@ -264,24 +262,16 @@ def _contradiction(result: Result) -> str | None:
     return next((f"{file} is not in the folder" for file in outside), None)
 
 
-def _in(folder: Path, records: Sequence[Record]) -> tuple[Record, ...]:
-    """The records with their files as they are called in the folder, which may be moved."""
+def _with_files(records: Sequence[Record], change: Callable[[Path], Path]) -> tuple[Record, ...]:
+    """The records with other paths of their files: in summary.json as they are called in the folder."""
     return tuple(
         dataclasses.replace(
             record,
-            voxels_file=record.voxels_file and record.voxels_file.relative_to(folder),
-            truth_file=record.truth_file and record.truth_file.relative_to(folder),
+            voxels_file=record.voxels_file and change(record.voxels_file),
+            truth_file=record.truth_file and change(record.truth_file),
         )
         for record in records
     )
-
-
-def _read_unit(file: Path) -> UnitContent | None:
-    try:
-        return from_json(UnitContent, read_json(file), file)
-    except DataError:
-        logger.warning("%s: damaged; the unit is computed again", file)
-        return None
 
 
 def _claimed(path: Path) -> dict[str, Any] | None:
@@ -309,15 +299,16 @@ def _is_earlier(folder: Path, layouts: Collection[str] = (LAYOUT,)) -> bool:
         return (folder / "study.yaml").exists() or lines.readline(200).rstrip("\n") not in layouts
 
 
-def _first_change(old: Mapping[str, Any], new: Mapping[str, Any], prefix: str = "") -> str | None:
+def _first_change(old: Mapping[str, Any], new: Mapping[str, Any]) -> str | None:
     """The first setting that is there twice and differs."""
-    for key, a in old.items():
-        if key not in new or key in ("name", "description", "scenes", "backbones", "backends", "sweeps"):
-            continue
-        b = new[key]
-        if isinstance(a, dict) and isinstance(b, dict):
-            if change := _first_change(a, b, f"{prefix}{key}."):
-                return change
-        elif a != b:
-            return f"{prefix}{key}: {a} there, {b} here"
-    return None
+    there, here = dict(_flat(old)), dict(_flat(new))
+    changed = (name for name in there if name in here and there[name] != here[name])
+    return next((f"{name}: {there[name]} there, {here[name]} here" for name in changed), None)
+
+
+def _flat(settings: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+    for key, value in settings.items():
+        if isinstance(value, dict) and key != "sweeps":
+            yield from _flat(value, f"{prefix}{key}.")
+        elif key not in ("name", "description", "scenes", "backbones", "backends", "sweeps"):
+            yield f"{prefix}{key}", value
