@@ -11,16 +11,7 @@ if TYPE_CHECKING:
     from semstab.engine.folder import load_result
     from semstab.engine.observer import Observer
 
-__all__ = [
-    "DaskCluster",
-    "Executor",
-    "InProcess",
-    "LocalProcesses",
-    "Observer",
-    "load_result",
-    "run",
-    "run_study",
-]
+__all__ = ["DaskCluster", "Executor", "InProcess", "LocalProcesses", "Observer", "load_result", "run", "run_study"]
 
 _HOMES = {
     "DaskCluster": "executors",

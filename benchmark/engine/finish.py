@@ -317,10 +317,7 @@ def written(start: Start, savers: Savers) -> tuple[dict[str, str], dict[str, byt
 
 
 def save_voxels(
-    table: VoxelTable,
-    path: Path,
-    columns: Mapping[str, npt.NDArray[Any]] | None = None,
-    tile: Tile | None = None,
+    table: VoxelTable, path: Path, columns: Mapping[str, npt.NDArray[Any]] | None = None, tile: Tile | None = None
 ) -> None:
     """Write a voxel table together with its measures, and further columns (n,) by name."""
     own = {measure.key: measure.of for measure in measures()}

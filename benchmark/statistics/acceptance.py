@@ -167,54 +167,39 @@ def calibrate(
 class _Labels:
     """The labels of one class: where they are (n, 3), whether right (n,), and their evidence (n,) of each kind."""
 
-    def __init__(
-        self,
-        index: Int32,
-        right: Mask,
-        evidence: Mapping[Evidence, Float64],
-        size: float,
-    ) -> None:
+    def __init__(self, index: Int32, right: Mask, evidence: Mapping[Evidence, Float64], size: float) -> None:
         self._right, self._evidence = right, evidence
         if len(index):
             self._cell, self._of, self._edge = cubes_of((index[:, 0], index[:, 1], index[:, 2]), size)
 
     def least(self, precision: float, error: float) -> Threshold:
         """The threshold that leaves most of them."""
-        tried, kept = self._tried()
+        tried, left = self._tried()
         best = Threshold(never=True)
-        for by, at in sorted(tried, key=lambda pair: -kept[pair]):
+        for by, at in sorted(tried, key=lambda pair: -left[pair]):
             share, low = self._share(by, at, error / len(tried))
-            found = Threshold(by=by, at_least=at, never=low < precision, precision=share, low=low, voxels=kept[by, at])
+            found = Threshold(by=by, at_least=at, never=low < precision, precision=share, low=low, voxels=left[by, at])
             if low >= precision:
                 return found
             best = max(best, found, key=lambda each: each.low)
         return best
 
     def _tried(self) -> tuple[list[tuple[Evidence, float]], dict[tuple[Evidence, float], int]]:
-        """Thresholds that leave different labels, and how many each leaves."""
+        """Thresholds that leave different labels, chosen without a look at what is right, and how many each leaves."""
         tried: dict[bytes, tuple[Evidence, float]] = {}
-        kept = {}
-        for by in self._evidence:
-            for at in self._steps(by):
-                some = self._evidence[by] >= at
-                kept[tried.setdefault(np.packbits(some).tobytes(), (by, at))] = int(some.sum())
-        return list(tried.values()), kept
-
-    def _steps(self, by: Evidence) -> list[float]:
-        """Thresholds that are tried, chosen without a look at what is right."""
-        if not len(self._right):
-            return []
-        quantiles = np.quantile(self._evidence[by], np.arange(STEPS) / STEPS, method="lower")
-        return [float(at) for at in np.unique(quantiles)]
+        left = {}
+        for by, values in self._evidence.items() if len(self._right) else ():
+            for at in np.unique(np.quantile(values, np.arange(STEPS) / STEPS, method="lower")).tolist():
+                some = values >= at
+                left[tried.setdefault(np.packbits(some).tobytes(), (by, at))] = int(some.sum())
+        return list(tried.values()), left
 
     def _share(self, by: Evidence, at: float, error: float) -> tuple[float, float]:
         """The share of those with so much evidence that is right, and its lower end."""
         some = self._evidence[by] >= at
         of, cells = self._of[some], len(self._cell)
         right, every = self._right[some].astype(np.float64), np.ones(len(of))
-        sums: Float64 = np.stack(
-            [np.bincount(of, weights=each, minlength=cells) for each in (right, every)], axis=1
-        ).astype(float)
+        sums: Float64 = np.stack([np.bincount(of, each, cells) for each in (right, every)], axis=1).astype(np.float64)
         sums = sums[sums[:, 1] > 0]
         if np.count_nonzero(sums[:, 0] < sums[:, 1]) <= FEW_CUBES:
             return _of_few(sums, error)

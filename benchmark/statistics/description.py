@@ -48,7 +48,7 @@ from semstab.statistics.correctness import (
 )
 from semstab.statistics.correlogram import correlogram
 from semstab.statistics.drift import expected_sbd, voxel_drift
-from semstab.statistics.intervals import confidence_intervals, grouped_intervals, headline_specs
+from semstab.statistics.intervals import confidence_intervals, headline_specs
 from semstab.statistics.observations import ObservationSample
 from semstab.statistics.sample import MapSample
 from semstab.statistics.sections import (
@@ -184,18 +184,15 @@ def analyse(
     drawn, log = log_sums(table, sample, places, drift, seed)
     if truth is not None:
         drawn["true_label"] = truth.label
-    found, judged, (unsteady,), reached, of_flips = grouped_intervals(
-        of_places.specs(MEANS),
-        headline_specs(influence, scope),
-        flipping.specs(),
-        () if observations is None else ceiling_specs(influence, table.K, scope),
-        () if log is None else log.places.specs(OF_FLIPS),
-    )
-    means, whole = dict(zip(MEANS, found, strict=True)), sample.summary.summary(table.voxel_size, table.classes, edges)
+    (unsteady,) = confidence_intervals(flipping.specs())
+    of_flips = [] if log is None else confidence_intervals(log.places.specs(OF_FLIPS))
+    means = dict(zip(MEANS, confidence_intervals(of_places.specs(MEANS)), strict=True))
+    whole = sample.summary.summary(table.voxel_size, table.classes, edges)
     reach = None
     if observations is not None:
+        reached = confidence_intervals(ceiling_specs(influence, table.K, scope))
         reach = ceiling_share_from(locations_by_class(table), influence, reached, critical=critical, limits=limits)
-    headline, count = HeadlineStatistics(*judged), len(places.cell)
+    headline, count = HeadlineStatistics(*confidence_intervals(headline_specs(influence, scope))), len(places.cell)
     labelled = math.nan if observations is None else observations.labelled
     repeats = whole.means.voxels[SBD.key]
     repeated = Repeated(repeats, repeats / whole.voxels if whole.voxels else math.nan)

@@ -74,11 +74,6 @@ def confidence_intervals(specs: Iterable[EstimateSpec]) -> list[Interval]:
         ]
 
 
-def grouped_intervals(*groups: Iterable[EstimateSpec]) -> list[list[Interval]]:
-    """Return the confidence intervals of groups of numbers."""
-    return [confidence_intervals(group) for group in groups]
-
-
 def estimate(
     sums: ClusterSums, key: str, k: int | None = None, scope: Scope = THIS_SCENE, level: float = LEVEL
 ) -> Interval:

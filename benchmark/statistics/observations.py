@@ -239,14 +239,7 @@ class CellObservations:
         order = np.lexsort((self.view, self.key >> DIGITS))
         return self.key[order], self.view[order], self.label[order], self.weight[order]
 
-    def _log(
-        self,
-        key: Int64,
-        view: Int32,
-        label: UInt16,
-        weight: Float64,
-        kept: Mask,
-    ) -> Events:
+    def _log(self, key: Int64, view: Int32, label: UInt16, weight: Float64, kept: Mask) -> Events:
         """The log of the kept ones of entries that are in order."""
         from semstab.statistics.loops.observations import look
 

@@ -75,7 +75,7 @@ class Spread:
         return float(2 * special.stdtr(self.degrees, -abs(value) / math.sqrt(self.variance)))
 
 
-EXACT, UNKNOWN_SPREAD = Spread(0.0, math.inf), Spread(math.nan, 0.0)
+EXACT = Spread(0.0, math.inf)
 
 
 @dataclass(frozen=True, eq=False)
@@ -268,7 +268,15 @@ class Effects:
     @functools.cached_property
     def locations(self) -> Variances:
         """The variances over new locations."""
-        return _of_locations(self.grid, self.unit)
+        grid = self.grid
+        of = _neighbours(grid.places.astype(np.float64), MOST_LOCATIONS)
+        weight: Float64 = np.bincount(of, weights=grid.all).astype(np.float64)
+        effect = np.bincount(of, weights=grid.block)
+        at = np.stack([np.bincount(of, weights=grid.all * axis) / weight for axis in grid.places.T], axis=1)
+        apart = np.linalg.norm(at[:, None] - at[None], axis=2)
+        centre = weight @ at / weight.sum()
+        extent = 2 * math.sqrt(float(weight @ ((at - centre) ** 2).sum(axis=1)) / float(weight.sum()))
+        return variances(effect / weight, weight, np.diag(self.unit / weight), apart, [own * extent for own in REACHES])
 
 
 def _of_frames(effect: Float64, weight: Float64, noise: Float64, at: Float64) -> Variances:
@@ -276,18 +284,6 @@ def _of_frames(effect: Float64, weight: Float64, noise: Float64, at: Float64) ->
     step = float(np.median(np.diff(at)))  # effects last for so many frames that were fused
     ranges = [-step / math.log(rho) if rho > 0 else 0.0 for rho in LASTING]
     return variances(effect, weight, noise, np.abs(np.subtract.outer(at, at)), ranges)
-
-
-def _of_locations(grid: Influences, unit: float) -> Variances:
-    """Return the variances over new locations, where the noise of an observation has that variance."""
-    of = _neighbours(grid.places.astype(np.float64), MOST_LOCATIONS)
-    weight: Float64 = np.bincount(of, weights=grid.all).astype(np.float64)
-    effect = np.bincount(of, weights=grid.block)
-    at = np.stack([np.bincount(of, weights=grid.all * axis) / weight for axis in grid.places.T], axis=1)
-    apart = np.linalg.norm(at[:, None] - at[None], axis=2)
-    centre = weight @ at / weight.sum()
-    extent = 2 * math.sqrt(float(weight @ ((at - centre) ** 2).sum(axis=1)) / float(weight.sum()))
-    return variances(effect / weight, weight, np.diag(unit / weight), apart, [own * extent for own in REACHES])
 
 
 def _neighbours(points: Float64, most: int) -> Int64:
