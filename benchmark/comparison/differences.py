@@ -86,18 +86,11 @@ def over_scenes(found: Sequence[Sequence[Contrast]]) -> tuple[Contrast, ...]:
     groups: dict[tuple[str, str], list[Contrast]] = {}
     for row in (row for rows in found for row in rows):
         groups.setdefault((row.measure, row.of), []).append(row)
-    return tuple(
-        Contrast(
-            measure,
-            of,
-            macro_mean([row.base for row in rows]),
-            macro_mean([row.other for row in rows]),
-            mean_of([row.difference for row in rows]),
-            math.nan,
-            "",
-        )
-        for (measure, of), rows in groups.items()
-    )
+    means = []
+    for (measure, of), rows in groups.items():
+        base, other = macro_mean([row.base for row in rows]), macro_mean([row.other for row in rows])
+        means.append(Contrast(measure, of, base, other, mean_of([row.difference for row in rows]), math.nan, ""))
+    return tuple(means)
 
 
 def corrected(lists: Sequence[Sequence[Contrast]]) -> list[tuple[Contrast, ...]]:
@@ -150,13 +143,10 @@ def _row(
     key = quantity.key
     before, after = value(base, key, k), value(other, key, k)
     if not (math.isnan(before) and math.isnan(after)):
-        yield Contrast(key, of, before, after, _difference(base, other, key, k, common), math.nan, "")
-
-
-def _difference(base: ClusterSums, other: ClusterSums, key: str, k: int | None, common: Common) -> Interval:
-    scope = THESE_FRAMES if THESE_FRAMES in map(scope_of, (base, other)) else common.scope
-    apart = common.basis == "flights"
-    return sums_difference(key, other, base, k, scope=scope, same_frames=common.same_frames, apart=apart)
+        scope = THESE_FRAMES if THESE_FRAMES in map(scope_of, (base, other)) else common.scope
+        apart = common.basis == "flights"
+        change = sums_difference(key, other, base, k, scope=scope, same_frames=common.same_frames, apart=apart)
+        yield Contrast(key, of, before, after, change, math.nan, "")
 
 
 def sums_difference(
@@ -238,14 +228,9 @@ def _against_all(common: Common, base: Entry, other: Entry, names: Sequence[str]
         if not _comparable(quantity, common):
             continue
         for k, name in enumerate(names):
-            if _enough(before, k):
+            seen = before["observations"].sum() / max(before["voxels"].sum(), 1e-9)
+            if before["evidence"][:, k].sum() >= LEAST_VOXELS * seen:  # of evidence that is worth so many voxels
                 yield from _row(quantity, before, after, common, k, name)
-
-
-def _enough(sums: ClusterSums, k: int) -> bool:
-    """Whether a class has evidence worth so many voxels."""
-    seen = sums["observations"].sum() / max(sums["voxels"].sum(), 1e-9)
-    return bool(sums["evidence"][:, k].sum() >= LEAST_VOXELS * seen)
 
 
 def _of_locations(common: Common, names: Sequence[str], number: int) -> Iterator[Contrast]:

@@ -174,16 +174,11 @@ def _put(n: int, at: Int64, values: Int64) -> Int64:
 
 def _columns(own: Changed, area: Int64, wrong_area: Int64 | None) -> dict[str, npt.NDArray[Any]]:
     table = own.table
-    found: dict[str, npt.NDArray[Any]] = {
-        "ix": table.ix,
-        "iy": table.iy,
-        "iz": table.iz,
-        "change": own.change,
-        "area": area.astype(np.int32),
-    }
+    columns: dict[str, npt.NDArray[Any]] = {"ix": table.ix, "iy": table.iy, "iz": table.iz, "change": own.change}
+    columns["area"] = area.astype(np.int32)
     if own.right is not None and wrong_area is not None:
-        found |= {"right_change": own.right.astype(np.int8), "wrong_area": wrong_area.astype(np.int32)}
-    return found
+        columns |= {"right_change": own.right.astype(np.int8), "wrong_area": wrong_area.astype(np.int32)}
+    return columns
 
 
 # --- Places -----------------------------------------------------------------------------------------------------------
@@ -252,18 +247,11 @@ def _areas(
         of = int(label[where][0])
         listed.append(
             Area(
-                k,
-                what,
-                names[of],
-                "" if seen is None else seen.confused_with(of, names),
-                len(cells),
-                float(loss[where].mean()),
-                (x, y, z),
-                float(np.linalg.norm(np.ptp(cells, axis=0) + voxel_size)),
-                int(improved_alike[k - 1]),
-                () if seen is None else _top_frames(seen),
+                k, what, names[of], "" if seen is None else seen.confused_with(of, names), len(cells),
+                float(loss[where].mean()), (x, y, z), float(np.linalg.norm(np.ptp(cells, axis=0) + voxel_size)),
+                int(improved_alike[k - 1]), () if seen is None else _top_frames(seen),
             )
-        )
+        )  # fmt: skip
     return listed
 
 

@@ -48,8 +48,8 @@ OTHER_SIZES = f"voxels of {{sizes}}: {BY_CUBES}, and what depends on their size 
 
 OBSERVATIONS_DECIDED = (
     "labels stand beside scores: each observation is reduced to its largest class; the share of the ceiling and"
+    " alpha between frames, which forgive what a score leaves open, are left out"
 )
-OBSERVATIONS_DECIDED += " alpha between frames, which forgive what a score leaves open, are left out"
 NOT_DECIDED = "labels stand beside scores, and common observations are not known: of agreement nothing can be compared"
 
 
@@ -167,9 +167,9 @@ def joint_class(tables: Iterable[VoxelTable]) -> Int64:
 
 def _by_observations(names: Sequence[str], records: Sequence[Record], regions: Regions) -> Common | None:
     """The observations that all made; None where the observations of one were not kept, or are of other frames."""
-    observations = [_observations_of(record) for record in records]
-    there = [own for own in observations if own is not None]
-    if len(there) < len(observations) or not _same_frames(there):
+    files = [file for record in records if (file := record.looks_file) is not None and file.is_file()]
+    there = [CellObservations.load(file) for file in files]
+    if len(there) < len(records) or not _same_frames(there):
         return None
     shared = compared_observations(dict(zip(names, there, strict=True)))
     tables = tuple(log.table() for log in shared.logs.values())
@@ -182,18 +182,8 @@ def _by_observations(names: Sequence[str], records: Sequence[Record], regions: R
     notes = _fewer_frames(there)
     apart = Region(dict(zip(names, tables, strict=True)), None, truth) if notes or shared.found.decided else None
     of_observations = None if apart is None else lambda: [apart]
-    return Common(
-        "observations",
-        notes,
-        sums,
-        False,
-        tables,
-        logs,
-        label,
-        shared.found,
-        of_observations,
-        frames_differ=bool(notes),
-    )
+    own = (tables, logs, label, shared.found, of_observations)
+    return Common("observations", notes, sums, False, *own, frames_differ=bool(notes))
 
 
 def _by_voxels(regions: Regions) -> Common:
@@ -237,11 +227,6 @@ def _sums(table: VoxelTable, log: Events | None, label: Int64 | None) -> Cluster
 
 def _some(log: Events | None, where: Mask) -> Events | None:
     return None if log is None else observations(log, np.flatnonzero(where[log.voxel]))
-
-
-def _observations_of(record: Record) -> CellObservations | None:
-    file = record.looks_file
-    return CellObservations.load(file) if file is not None and file.is_file() else None
 
 
 def _same_frames(observations: Sequence[CellObservations]) -> bool:

@@ -77,13 +77,10 @@ ANSWERS = (
 
 def tables(comparison: RunComparison) -> list[Table]:
     """All that there is something for."""
-    made = [
-        _differences(comparison),
-        _by_class(comparison),
-        _areas(comparison),
-        _frames(comparison),
-        *_what_was_compared(comparison),
-    ]
+    covered = {scene.scene: scene.coverage for scene in comparison.scenes if scene.coverage}
+    observations = {scene.scene: scene.observations for scene in comparison.scenes if scene.observations is not None}
+    made = [_differences(comparison), _by_class(comparison), _areas(comparison), _frames(comparison)]
+    made += [coverage_table(covered), ignored_table(observations)]
     return [table for table in made if any(group.rows for group in table.groups)] + [everything(comparison)]
 
 
@@ -102,9 +99,7 @@ def heading(comparison: RunComparison, scope: str, own: Against) -> str:
 
 def scope(row: Contrast) -> str:
     """What a difference answers, or why it claims nothing, in a word or two."""
-    if row.difference.undecided:
-        return "undecided"
-    return row.difference.scope
+    return "undecided" if row.difference.undecided else row.difference.scope
 
 
 # --- Parts ------------------------------------------------------------------------------------------------------------
@@ -112,14 +107,10 @@ def scope(row: Contrast) -> str:
 
 def _differences(comparison: RunComparison) -> Table:
     columns = (
-        Column("measure", "Measure"),
-        Column("base", comparison.base, 4),
-        Column("other", "The run", 4),
-        Column("difference", "Difference", 4, signed=True),
-        Column("p_holm", "p (Holm)", 4),
-        Column("answers", "Answers for"),
-        Column("change", "Change"),
-    )
+        Column("measure", "Measure"), Column("base", comparison.base, 4), Column("other", "The run", 4),
+        Column("difference", "Difference", 4, signed=True), Column("p_holm", "p (Holm)", 4),
+        Column("answers", "Answers for"), Column("change", "Change"),
+    )  # fmt: skip
     groups = tuple(Group(heading(comparison, scope, own), _rows(own, HEADLINES)) for scope, own in scopes(comparison))
     macro = " Over all scenes each scene counts once." if len(comparison.scenes) > 1 else ""
     caption = (
@@ -175,19 +166,11 @@ def _class_rows(own: Against, shown: Sequence[Quantity]) -> tuple[Row, ...]:
 
 def _areas(comparison: RunComparison) -> Table:
     columns = (
-        Column("number", "Area", 0),
-        Column("what", "Lost"),
-        Column("class", "Class"),
-        Column("confused_with", "Confused with"),
-        Column("voxels", "Voxels", 0),
-        Column("loss", "Loss", 2),
-        Column("x", "x", 2, over="Centre (m)"),
-        Column("y", "y", 2, over="Centre (m)"),
-        Column("z", "z", 2, over="Centre (m)"),
-        Column("size", "Size (m)", 2),
-        Column("improved_alike", "Improved alike", 0),
-        Column("frames", "Top contributing frames"),
-    )
+        Column("number", "Area", 0), Column("what", "Lost"), Column("class", "Class"),
+        Column("confused_with", "Confused with"), Column("voxels", "Voxels", 0), Column("loss", "Loss", 2),
+        *(Column(axis, axis, 2, over="Centre (m)") for axis in "xyz"), Column("size", "Size (m)", 2),
+        Column("improved_alike", "Improved alike", 0), Column("frames", "Top contributing frames"),
+    )  # fmt: skip
     groups = tuple(
         Group(heading(comparison, scene.scene, own), tuple(_area_row(area) for area in own.areas))
         for scene in comparison.scenes
@@ -230,27 +213,14 @@ def _frames(comparison: RunComparison) -> Table:
     return Table("comparison_frames", "Top contributing frames", caption, columns, groups, "scope")
 
 
-def _what_was_compared(comparison: RunComparison) -> list[Table]:
-    covered = coverage_table({scene.scene: scene.coverage for scene in comparison.scenes if scene.coverage})
-    observations = {scene.scene: scene.observations for scene in comparison.scenes if scene.observations is not None}
-    return [covered, ignored_table(observations)]
-
-
 def everything(comparison: RunComparison) -> Table:
     """All contrasts, one a row."""
     columns = (
-        Column("run", "Run"),
-        Column("class", "Class"),
-        Column("measure", "Measure"),
-        Column("base", "Base", 6),
-        Column("other", "The run", 6),
-        Column("difference", "Difference", 6, signed=True),
-        Column("holds_for", "Holds for"),
-        Column("p", "p", 6),
-        Column("p_holm", "p (Holm)", 6),
-        Column("change", "Change"),
-        Column("undecided", "Undecided"),
-    )
+        Column("run", "Run"), Column("class", "Class"), Column("measure", "Measure"), Column("base", "Base", 6),
+        Column("other", "The run", 6), Column("difference", "Difference", 6, signed=True),
+        Column("holds_for", "Holds for"), Column("p", "p", 6), Column("p_holm", "p (Holm)", 6),
+        Column("change", "Change"), Column("undecided", "Undecided"),
+    )  # fmt: skip
     groups = tuple(Group(scope, tuple(_all_rows(own))) for scope, own in scopes(comparison))
     return Table("comparison_all", "All that was compared", ANSWERS, columns, groups, "scope")
 

@@ -169,12 +169,7 @@ def markdown(comparison: RunComparison, made: Sequence[Table] | None = None) -> 
     """The comparison for a pull request: what was comparison, then the tables."""
     shown = [table for table in (made or tables(comparison)) if table.name != "comparison_all"]
     names = ", ".join(each.name for each in comparison.runs[1:])
-    head = [
-        f"## {names} against {comparison.base}",
-        "",
-        *(f"- {relations(text)}" for text in sentences(comparison)),
-        "",
-    ]
+    head = [f"## {names} against {comparison.base}", "", *(f"- {relations(s)}" for s in sentences(comparison)), ""]
     return "\n".join([*head, *map(to_markdown, shown)])
 
 

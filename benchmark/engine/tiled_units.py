@@ -155,8 +155,8 @@ def assembled(
             files |= _saved(folder, f"{LOOKS}/{unit.slug}.parquet", observations.save)
         if analysis is not None:
             files |= _saved(folder, f"{INFLUENCE}/{unit.slug}.parquet", analysis.sums.save)
-        for each in tasks if analysis is not None and config.statistics else ():
-            files |= _with_columns(each, unit.slug, analysis, folder)
+            for each in tasks if config.statistics else ():
+                files |= _with_columns(each, unit.slug, analysis, folder)
     reduced = [tile.reduced for tile in tiles if len(tile.reduced)]
     checked = [tile.checked for tile in tiles if tile.checked is not None]
     result = dataclasses.replace(

@@ -136,9 +136,9 @@ class Sampler:
     def _so_far(self) -> CellObservations:
         """What is there until the next frame changes it."""
         x, y, z = (0, 0, 0) if self._origin is None else (self._origin - REACH).tolist()
-        columns = (column[: self._entries] for column in self._columns)
-        views = Views.of(self._views.table())
-        return CellObservations(*columns, (x, y, z), views, self.voxel_size, self.K, self._share, self._soft)
+        key, view, label, weight, drawn = (column[: self._entries] for column in self._columns)
+        own = (key, view, label, weight, drawn, (x, y, z), Views.of(self._views.table()))
+        return CellObservations(*own, self.voxel_size, self.K, self._share, self._soft)
 
     def _labels(self, _frame: Frame, pixels: Pixels) -> Iterator[Entries]:
         """Entries (cell, class, pixels, hash) of a frame's labels."""
