@@ -390,8 +390,8 @@ def gate(new: str | Path, against: str | Path | None, config: GateConfig) -> Gat
             pairs = _pairs(rule, own, base, scenes)
             _require_values(rule, pairs)
             judged.append(_judged(rule, pairs, config.level / len(rules), config.scope))
-    named = ["" if run is None else f"{run.backbone} ({run.source})" for run in (own, base)]
-    return GateResult(*named, scenes, config.level, config.undecided, tuple(judged), tuple(notes))
+    judged_run, against_run = ("" if run is None else f"{run.backbone} ({run.source})" for run in (own, base))
+    return GateResult(judged_run, against_run, scenes, config.level, config.undecided, tuple(judged), tuple(notes))
 
 
 def _notes(own: RunHandle, base: RunHandle | None, scenes: Sequence[str]) -> list[str]:

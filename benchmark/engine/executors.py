@@ -12,7 +12,7 @@ import os
 from collections.abc import Callable, Generator
 from concurrent.futures.process import BrokenProcessPool
 from multiprocessing.connection import Connection
-from typing import Any, Protocol
+from typing import Any
 
 from semstab.core.prefetch import default_threads
 from semstab.core.process import follow_parent, settle
@@ -31,7 +31,7 @@ NextJob = Callable[[], Job | None]
 """Gives the next job; None where there is none, until outcomes that were yielded call for more."""
 
 
-class Executor(Protocol):
+class Executor:
     """Runs jobs.
 
     name       for the manifest
@@ -40,38 +40,32 @@ class Executor(Protocol):
     """
 
     name: str
-    width: int
-    elsewhere: bool
+    width = 1
+    elsewhere = False
 
     def run(self, next_job: NextJob, observers: Observers) -> Generator[Outcome, None, None]:
         """Yield outcomes as works finish, in any order. Closing the iterator stops the rest.
 
-        A job is asked for when there is somebody to do it. `observers` see the work that is done in this very process.
+        A job is taken when there is somebody to do it. `observers` see the work that is done in this very process.
         """
-        ...
+        raise NotImplementedError
 
     def close(self) -> None:
         """Nothing more is to be run."""
-        ...
 
 
-class InProcess:
+class InProcess(Executor):
     """One job after the other, in this process."""
 
     name = "in this process"
-    width = 1
-    elsewhere = False
 
     def run(self, next_job: NextJob, observers: Observers) -> Generator[Outcome, None, None]:
         """Run them in order."""
         while (job := next_job()) is not None:
             yield from run_job(job, observers)
 
-    def close(self) -> None:
-        """Nothing is left behind."""
 
-
-class LocalProcesses:
+class LocalProcesses(Executor):
     """That many processes on this machine, which share its cores and its free memory."""
 
     elsewhere = True
@@ -140,9 +134,6 @@ class LocalProcesses:
             alive.close()  # ends processes that are still at work: after an interruption, or where one of them died
             pool.shutdown(wait=False, cancel_futures=True)
 
-    def close(self) -> None:
-        """Processes end with what they were started for."""
-
     def _with_a_share(self, job: Job) -> Job:
         """The job with its share of threads and memory."""
         start = job[0].start
@@ -182,7 +173,7 @@ def _use_threads(count: int) -> None:
     pa.set_cpu_count(count)
 
 
-class DaskCluster:
+class DaskCluster(Executor):
     """The workers of a Dask scheduler, for example tcp://127.0.0.1:8786; they must have semstab and see the data.
 
     Raises MissingDependencyError without dask, ConfigError where no scheduler answers.

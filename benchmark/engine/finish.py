@@ -79,12 +79,13 @@ def finish(live: LiveMap, stream: Stream, watch: Stopwatch) -> Outcome:
         None if fused is None else fused.checked,
         sizes,
         _quality(stream),
+        live.origin,
         series=live.rows.numbers,
         sums=sums,
         reduced=np.zeros(0) if fused is None else fused.reduced,
         image=np.zeros((0, 0)) if stream.image_space is None else stream.image_space.rows.table(),
         poses=stream.poses,
-        **({} if live.tiles is None else live.tiles.result()),
+        seen=np.concatenate([np.zeros((0, 3), np.int32), *live.tiles]),
     )
     if tile is not None:
         with watch("write"):

@@ -16,6 +16,7 @@ from typing import Any
 
 import yaml
 
+from semstab.backends import keeps_log
 from semstab.config import Config, read_yaml
 from semstab.core.files import TEMPORARY, FolderLock, atomic_path, read_json, remove_leftovers, write_json, write_text
 from semstab.core.json_form import from_json, to_json
@@ -99,7 +100,7 @@ class Folder:
         if not any(name.startswith(planned.identity) for name in self._files):
             return None
         try:
-            file = self._files.get(unit_key(planned.identity, planned.digest))
+            file = self._files.get(unit_key(planned.identity, planned.task.digest))
         except DataError:
             return None  # the input cannot be read: computing the unit will say so
         try:
@@ -211,7 +212,7 @@ class Folder:
         wanted = [*voxels, f"{FRAMES}/{unit.slug}.csv"] if planned.kept else []
         if planned.kept and planned.judged:
             wanted.append(f"{INFLUENCE}/{unit.slug}.parquet")
-        if planned.kept and planned.config.events and planned.logged:
+        if planned.kept and planned.config.events and keeps_log(planned.unit.backend):
             wanted += _in_tiles(unit, content, EVENTS) or [f"{EVENTS}/{unit.slug}.parquet"]
         return wanted + ([f"{OVERVIEW}/{slug(unit.scene, unit.backbone)}.npz"] if planned.image_space else [])
 

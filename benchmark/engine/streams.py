@@ -20,11 +20,11 @@ from semstab.config import Config
 from semstab.core.prefetch import Fetched
 from semstab.core.process import Stopwatch
 from semstab.core.rows import Rows
-from semstab.core.types import Float64
+from semstab.core.types import Float64, Int32
 from semstab.datasets import Scene
 from semstab.engine.observer import Observers
 from semstab.engine.series import FrameRow, Series
-from semstab.engine.tiles import FrameTiles
+from semstab.engine.tiles import tiles_met
 from semstab.engine.work import Work
 from semstab.errors import DataError
 from semstab.metrics import FrameQualityMeter, SelfConsistency, VideoConsistency, compensated_flicker, flicker_percent
@@ -59,7 +59,7 @@ class LiveMap:
     sizes      some frames, to be fused at other voxel sizes
     hard       of soft scores, a map of each pixel's likeliest class
     frames     indices of those that go into it
-    tiles      which tiles each frame meets, where nothing is fused
+    tiles      (n, 3) each frame and a tile that it meets, where nothing is fused; origin the voxel of its first camera
     """
 
     work: Work
@@ -74,7 +74,8 @@ class LiveMap:
     observations: int = 0
     soft: bool = False
     frames: range | frozenset[int] = range(0)
-    tiles: FrameTiles | None = None
+    tiles: list[Int32] = field(default_factory=list)
+    origin: tuple[int, int, int] | None = None
 
     @classmethod
     def of(cls, work: Work, scene: Scene) -> LiveMap:
@@ -88,8 +89,6 @@ class LiveMap:
                 live.truth = new_map(config, K, work.within, log=False)
             if work.sampled:
                 live.reference = NumpySample(config.voxel_size, K, work.within)
-        elif work.tile is not None:
-            live.tiles = FrameTiles(config.voxel_size, work.tile.size)
         if work.judged and work.measures_images:
             live.sampler = Sampler(config.voxel_size, K)
             if work.image_space and not config.frame_quality:
@@ -134,8 +133,13 @@ class LiveMap:
         if self.sizes is not None:
             with watch("voxel sizes"):
                 self.sizes.add(prepared.frame)
-        if self.tiles is not None:
-            self.tiles.add(prepared.frame)
+        if not self.work.fuses and self.work.tile is not None:
+            frame, voxel_size = prepared.frame, self.work.config.voxel_size
+            if self.origin is None:
+                x, y, z = np.floor(frame.T_wc[:3, 3] / voxel_size).astype(int).tolist()
+                self.origin = x, y, z
+            met = tiles_met(frame, voxel_size, self.work.tile.size)
+            self.tiles.append(np.column_stack([np.full(len(met), frame.index, np.int32), met]))
 
     @property
     def left_out(self) -> list[int]:

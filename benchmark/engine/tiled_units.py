@@ -42,7 +42,7 @@ class TiledUnit:
     def __init__(self, planned: PlannedUnit, size: int, folder: Folder, start: Start) -> None:
         self.planned, self._folder = planned, folder
         self._work = Work.of(planned, start)
-        self._frames = TileTask(unit_key(planned.identity, planned.digest), size)
+        self._frames = TileTask(unit_key(planned.identity, planned.task.digest), size)
         self._results: dict[str, TileResult] = {}
         self._samples: list[MapSample] = []
         self._bound: int | None = None

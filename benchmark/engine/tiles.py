@@ -31,27 +31,6 @@ MARGIN = 1.0
 """Voxels by which a frustum is widened: a pixel at its side may be rounded into the next voxel."""
 
 
-class FrameTiles:
-    """Notes which tiles the frustum of each frame meets, from its pose and the range of its depth."""
-
-    def __init__(self, voxel_size: float, size: int) -> None:
-        self._voxel_size, self._size = voxel_size, size
-        self._origin: tuple[int, int, int] | None = None
-        self._seen: list[Int32] = []
-
-    def add(self, frame: Frame) -> None:
-        """The next frame. Raises DataError where it meets more tiles than a map can have."""
-        if self._origin is None:
-            x, y, z = np.floor(frame.T_wc[:3, 3] / self._voxel_size).astype(int).tolist()
-            self._origin = x, y, z
-        tiles = tiles_met(frame, self._voxel_size, self._size)
-        self._seen.append(np.column_stack([np.full(len(tiles), frame.index, np.int32), tiles]))
-
-    def result(self) -> dict[str, Any]:
-        """The fields of a `TileResult`."""
-        return {"origin": self._origin, "seen": np.concatenate([np.zeros((0, 3), np.int32), *self._seen])}
-
-
 def tiles_met(frame: Frame, voxel_size: float, size: int) -> Int32:
     """(n, 2) the tiles of that edge in voxels that the frustum between the least and the largest depth meets.
 

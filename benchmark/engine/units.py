@@ -38,9 +38,9 @@ logger = logging.getLogger("semstab")
 FORMAT = 9
 """Part of every key: raise it with any change of the numbers that a unit's settings and input lead to."""
 
-IN_KEYS = ("voxel_size", "pixel_stride", "top_k", "exclude", "perturbation", "strata", "statistics", "critical_classes",
-    "scope",
-    "verdict",
+IN_KEYS = (
+    "voxel_size", "pixel_stride", "top_k", "exclude", "perturbation", "strata", "statistics", "critical_classes",
+    "scope", "verdict",
 )  # fmt: skip
 """Settings that a unit's numbers depend on as they stand; of the others, what they select is in its key: the digest of
 the input, frames, classes, the backend."""
@@ -81,19 +81,9 @@ class PlannedUnit:
         return len(self.task.indices)
 
     @property
-    def digest(self) -> str:
-        """A hash of its input."""
-        return self.task.digest
-
-    @property
     def regions(self) -> bool:
         """Whether it is the flicker of regions without classes, and nothing is fused."""
         return self.variation.sweep == REGIONS
-
-    @property
-    def logged(self) -> bool:
-        """Whether its backend can give the log of its observations."""
-        return keeps_log(self.unit.backend)
 
     def merged_with(self, other: PlannedUnit) -> PlannedUnit:
         """Return the same unit as the other one, with what is wanted of either."""

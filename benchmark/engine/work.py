@@ -132,11 +132,6 @@ class Work:
         return self.tile is None or self.tile.place is None
 
     @property
-    def tile_name(self) -> str | None:
-        """The name of its tile; None of a whole unit."""
-        return None if self.tile is None else self.tile.name
-
-    @property
     def within(self) -> Extent | None:
         """The voxels that its map is restricted to."""
         return None if self.tile is None else self.tile.extent
@@ -173,21 +168,19 @@ class Outcome:
 
 
 def failed(works: Iterable[Work], error: str | Exception) -> list[Outcome]:
-    """The outcomes of works that could not be computed."""
-    if isinstance(error, str):
-        return [Outcome(work.identity, tile=work.tile_name, error=error) for work in works]
-    trace = "" if isinstance(error, SemstabError) else "".join(traceback.format_exception(error))
-    if isinstance(error, (OutgrownError, MemoryError)):
-        error = error.with_traceback(None)  # its frames would keep the map in memory
-    line = message(error)
-    return [Outcome(work.identity, tile=work.tile_name, error=line, cause=error, trace=trace) for work in works]
+    """Return the outcomes of works that could not be computed; an error that is not semstab's own says its type."""
+    trace, cause = "", None
+    if not isinstance(error, str):
+        trace = "" if isinstance(error, SemstabError) else "".join(traceback.format_exception(error))
+        if isinstance(error, (OutgrownError, MemoryError)):
+            error = error.with_traceback(None)  # its frames would keep the map in memory
+        cause, error = error, str(error) if isinstance(error, SemstabError) else _one_line(error)
+    tiles = [(work.identity, None if work.tile is None else work.tile.name) for work in works]
+    return [Outcome(own, tile=tile, error=error, cause=cause, trace=trace) for own, tile in tiles]
 
 
-def message(error: Exception) -> str:
-    """One line; an error that is not semstab's own says its type."""
-    if isinstance(error, MemoryError):
-        return OUT_OF_MEMORY
-    return str(error) if isinstance(error, SemstabError) else f"{type(error).__name__}: {one_line(error)}"
+def _one_line(error: Exception) -> str:
+    return OUT_OF_MEMORY if isinstance(error, MemoryError) else f"{type(error).__name__}: {one_line(error)}"
 
 
 def jobs_of(works: Iterable[Work], width: int) -> list[Job]:
