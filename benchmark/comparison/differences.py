@@ -65,8 +65,8 @@ LEVEL = 0.05
 
 def contrasts(common: Common, base: Entry, other: Entry, number: int) -> tuple[Contrast, ...]:
     """All that is compared of a scene, in the order of `quantities`; `number` is the other run's among the runs."""
-    found = {row.measure: row for row in _rows(common, base, other, number)}
-    return tuple(found[quantity.key] for quantity in quantities() if quantity.key in found)
+    result = {row.measure: row for row in _rows(common, base, other, number)}
+    return tuple(result[quantity.key] for quantity in quantities() if quantity.key in result)
 
 
 def by_class(common: Common, base: Entry, other: Entry, number: int) -> tuple[Contrast, ...]:
@@ -81,10 +81,10 @@ def by_class(common: Common, base: Entry, other: Entry, number: int) -> tuple[Co
     return tuple(sorted(rows, key=lambda row: (names.index(row.of), order[row.measure])))
 
 
-def over_scenes(found: Sequence[Sequence[Contrast]]) -> tuple[Contrast, ...]:
+def over_scenes(result: Sequence[Sequence[Contrast]]) -> tuple[Contrast, ...]:
     """The macro mean of each measure (and class) over the scenes that have it."""
     groups: dict[tuple[str, str], list[Contrast]] = {}
-    for row in (row for rows in found for row in rows):
+    for row in (row for rows in result for row in rows):
         groups.setdefault((row.measure, row.of), []).append(row)
     means = []
     for (measure, of), rows in groups.items():
@@ -173,8 +173,8 @@ def sums_difference(
     scope, number = THESE_FRAMES if of_space_alone(key, k) else scope, functional(key, k)
     if apart:
         return unpaired(estimate(new, key, k, scope, level), estimate(base, key, k, scope, level), level)
-    found, most = difference(new, base, key, k, scope, same_frames=same_frames, level=level), number.high - number.low
-    return dataclasses.replace(found, low=max(found.low, -most), high=min(found.high, most))
+    result, most = difference(new, base, key, k, scope, same_frames=same_frames, level=level), number.high - number.low
+    return dataclasses.replace(result, low=max(result.low, -most), high=min(result.high, most))
 
 
 def flicker_difference(new: Flicker, base: Flicker, *, paired: bool = True, level: float = INTERVAL_LEVEL) -> Interval:
@@ -202,19 +202,19 @@ def _of_voxels(measure: Measure, base: VoxelTable, other: VoxelTable, edge: floa
     cubes, columns = Cubes.of(base, edge, where=known), np.stack([after - before, known], axis=1)
     before, after = before[known], after[known]
     change = cubes.estimate(columns, ratio_of, (-measure.largest, measure.largest), "plain")
-    found = no_difference(change) if np.array_equal(before, after) else _with_p_value(change)
-    return Contrast(measure.key, "", mean(before), mean(after), found, math.nan, "")
+    result = no_difference(change) if np.array_equal(before, after) else _with_p_value(change)
+    return Contrast(measure.key, "", mean(before), mean(after), result, math.nan, "")
 
 
-def _with_p_value(found: Interval, level: float = INTERVAL_LEVEL) -> Interval:
+def _with_p_value(interval: Interval, level: float = INTERVAL_LEVEL) -> Interval:
     """Return the interval with the p-value that the number is 0."""
     from scipy import special
 
-    error = standard_error(found, level)
+    error = standard_error(interval, level)
     if not error > 0:
-        return found
-    degrees = found.degrees if found.degrees > 0 else math.inf
-    return dataclasses.replace(found, p_value=float(2 * special.stdtr(degrees, -abs(found.value) / error)))
+        return interval
+    degrees = interval.degrees if interval.degrees > 0 else math.inf
+    return dataclasses.replace(interval, p_value=float(2 * special.stdtr(degrees, -abs(interval.value) / error)))
 
 
 # --- By class ---------------------------------------------------------------------------------------------------------
@@ -287,8 +287,8 @@ def find(
     changes: dict[tuple[str, str], Changes] = {}
     for scene in shared_scenes(handles):
         progress(scene)
-        found, own = _scene(scene, handles, scope)
-        scenes.append(found)
+        rows, own = _scene(scene, handles, scope)
+        scenes.append(rows)
         changes |= {(scene, name): each for name, each in own.items()}
     result = RunComparison(
         schema=SCHEMA,
@@ -309,12 +309,12 @@ def _scene(scene: str, runs: Sequence[RunHandle], scope: Scope) -> tuple[SceneCo
     classes = corrected([by_class(common, entries[0], entries[n], n) for n in numbers])
     against, changes = [], {}
     for n, own, of_classes in zip(numbers, everything, classes, strict=True):
-        found = Against(names[n], own, of_classes)
+        result = Against(names[n], own, of_classes)
         if common.regions is not None:
             worse, named = worse_areas(common, n), entries[n].named
             changes[names[n]] = worse.changes
-            found = dataclasses.replace(
-                found,
+            result = dataclasses.replace(
+                result,
                 compared=worse.changes.compared,
                 worse=worse.changes.worse,
                 better=worse.changes.better,
@@ -322,7 +322,7 @@ def _scene(scene: str, runs: Sequence[RunHandle], scope: Scope) -> tuple[SceneCo
                 top_frames=named(worse.top_frames),
                 columns=Path(COLUMNS) / f"{slug(scene, names[0], names[n])}.parquet",
             )
-        against.append(found)
+        against.append(result)
     return _found(scene, common, tuple(against)), changes
 
 

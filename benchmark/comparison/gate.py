@@ -100,10 +100,10 @@ NAMED = {_plain(name): each for each in MEASURES for name in (each.name, each.qu
 
 def measure_named(name: str, where: str) -> GateMeasure:
     """By any of its names. Raises ConfigError, which says where, for one that there is not."""
-    found = NAMED.get(_plain(name))
-    if found is None:
+    result = NAMED.get(_plain(name))
+    if result is None:
         raise ConfigError(f"{where}: no measure '{name}'; {nearest(_plain(name), [each.name for each in MEASURES])}")
-    return found
+    return result
 
 
 # The rules of a gate, as text: 'alpha drop < 0.02', 'class human: recall > 0.6'.
@@ -158,17 +158,17 @@ class Rule:
 
 def parse(text: str) -> Rule:
     """A rule from its text. Raises ConfigError with the grammar where it is none."""
-    found = RULE.fullmatch(text)
-    if found is None:
+    result = RULE.fullmatch(text)
+    if result is None:
         raise ConfigError(f"rule '{text}': not understood; write {GRAMMAR}, e.g. 'alpha drop < 0.02'")
-    measure = measure_named(found["measure"], f"rule '{text}'")
-    limit = float(found["limit"])
-    if found["percent"] and measure.quantity.unit != "%":
+    measure = measure_named(result["measure"], f"rule '{text}'")
+    limit = float(result["limit"])
+    if result["percent"] and measure.quantity.unit != "%":
         limit /= 100
     change: Change | None = None
-    if found["change"]:
-        change = "drop" if found["change"].lower() == "drop" else "rise"
-    rule = Rule(text.strip(), measure, change, found["relation"][0] == "<", limit, found["scene"], found["class"])
+    if result["change"]:
+        change = "drop" if result["change"].lower() == "drop" else "rise"
+    rule = Rule(text.strip(), measure, change, result["relation"][0] == "<", limit, result["scene"], result["class"])
     _check_rule(rule)
     return rule
 
@@ -190,15 +190,17 @@ def _check_rule(rule: Rule) -> None:
 Verdict = Literal["passes", "fails", "undecided"]
 
 
-def verdict(rule: Rule, found: Interval) -> Verdict:
+def verdict(rule: Rule, interval: Interval) -> Verdict:
     """What an interval, each of whose ends is passed with the gate's level, says of a rule.
 
     Passes where the whole of it keeps to the limit. Fails where none of it does; a loss fails as soon as it is shown
     and not shown to be smaller than the limit.
     """
-    if found.undecided or math.isnan(found.low) or math.isnan(found.high):
+    if interval.undecided or math.isnan(interval.low) or math.isnan(interval.high):
         return "undecided"
-    low, high, limit = (found.low, found.high, rule.limit) if rule.below else (-found.high, -found.low, -rule.limit)
+    low, high, limit = (
+        (interval.low, interval.high, rule.limit) if rule.below else (-interval.high, -interval.low, -rule.limit)
+    )
     if high < limit:
         return "passes"
     return "fails" if low > (min(limit, 0.0) if rule.bounds_a_loss else limit) else "undecided"
@@ -218,13 +220,13 @@ def bounded(
     if base is None or rule.change is None:
         return estimate(new, key, k, THESE_FRAMES if of_space_alone(key, k) else scope, both)
     same_frames = True if scope == THESE_FRAMES else None
-    found = sums_difference(key, new, base, k, scope=scope, same_frames=same_frames, level=both)
-    return found if rule.change == "rise" else negative(found)
+    result = sums_difference(key, new, base, k, scope=scope, same_frames=same_frames, level=both)
+    return result if rule.change == "rise" else negative(result)
 
 
-def negative(found: Interval) -> Interval:
+def negative(interval: Interval) -> Interval:
     """Return the interval of the opposite number."""
-    return dataclasses.replace(found, value=0.0 - found.value, low=0.0 - found.high, high=0.0 - found.low)
+    return dataclasses.replace(interval, value=0.0 - interval.value, low=0.0 - interval.high, high=0.0 - interval.low)
 
 
 # The settings of a gate: its rules, the level, what is to become of what is undecided.
@@ -397,8 +399,8 @@ def gate(new: str | Path, against: str | Path | None, config: GateConfig) -> Gat
 def _notes(own: RunHandle, base: RunHandle | None, scenes: Sequence[str]) -> list[str]:
     left = [scene for scene in own.scenes if scene not in scenes]
     missing = [scene for scene in (base.scenes if base else ()) if scene not in scenes]
-    said = [f"not in the baseline, and not compared: {', '.join(left)}"] if left else []
-    return said + ([f"of the baseline alone, and not compared: {', '.join(missing)}"] if missing else [])
+    text = [f"not in the baseline, and not compared: {', '.join(left)}"] if left else []
+    return text + ([f"of the baseline alone, and not compared: {', '.join(missing)}"] if missing else [])
 
 
 # --- Before anything is judged ----------------------------------------------------------------------------------------
@@ -479,9 +481,9 @@ def _require_values(rule: Rule, pairs: Sequence[Pair]) -> None:
 
 def _judged(rule: Rule, pairs: Sequence[Pair], level: float, scope: Scope) -> Judgement:
     """Over the mean of the scenes, which err by themselves, or in the one that the rule names."""
-    found = mean_of([_found(rule, new, old, level, scope) for new, old in pairs], 1 - 2 * level)
+    result = mean_of([_found(rule, new, old, level, scope) for new, old in pairs], 1 - 2 * level)
     values = [[math.nan if entry is None else _value(rule, entry) for entry in pair] for pair in pairs]
-    return Judgement(rule, verdict(rule, found), found, *(float(mean) for mean in np.mean(values, axis=0)))
+    return Judgement(rule, verdict(rule, result), result, *(float(mean) for mean in np.mean(values, axis=0)))
 
 
 def _value(rule: Rule, entry: Entry) -> float:
@@ -500,5 +502,5 @@ def _found(rule: Rule, new: Entry, base: Entry | None, level: float, scope: Scop
         raise ConfigError(f"rule '{rule.text}': flicker is known by frame alone; judge it with --scope this-scene")
     if base is None:
         return mean_over_frames(np.array([*new.flicker]), np.array([*new.flicker.values()]), 1 - 2 * level)
-    found = flicker_difference(new.flicker, base.flicker, level=1 - 2 * level)
-    return found if rule.change == "rise" else negative(found)
+    result = flicker_difference(new.flicker, base.flicker, level=1 - 2 * level)
+    return result if rule.change == "rise" else negative(result)

@@ -46,8 +46,8 @@ def plan(result: GateResult) -> Iterator[str]:
     yield f"frames from which on a rule is decided with a probability of {POWER:.0%}, by the spread of these runs"
     for each in result.judgements:
         needed, now = each.frames_needed(result.level), each.found.frames
-        said = f"{needed:,} ({now} now)" if needed else "no number of frames tells"
-        yield f"  {each.rule.text}: {said}"
+        text = f"{needed:,} ({now} now)" if needed else "no number of frames tells"
+        yield f"  {each.rule.text}: {text}"
 
 
 def _wrapped(line: str, width: int, indent: int) -> list[str]:

@@ -97,10 +97,10 @@ class Common:
 
 def pair(entries: Sequence[Entry], names: Sequence[str], scope: Scope = THIS_SCENE) -> Common:
     """The most that all runs of a scene have in common. Raises DataError where a file of a run cannot be read."""
-    found = _paired(entries, names)
+    result = _paired(entries, names)
     mixed = len({entry.summary.reduced is None for entry in entries}) > 1
-    told = (OBSERVATIONS_DECIDED if found.basis == "observations" else NOT_DECIDED,) if mixed else ()
-    return replace(found, scope=scope, mixed=mixed, notes=(*found.notes, *told))
+    notes = (OBSERVATIONS_DECIDED if result.basis == "observations" else NOT_DECIDED,) if mixed else ()
+    return replace(result, scope=scope, mixed=mixed, notes=(*result.notes, *notes))
 
 
 def _paired(entries: Sequence[Entry], names: Sequence[str]) -> Common:
@@ -117,10 +117,10 @@ def _paired(entries: Sequence[Entry], names: Sequence[str]) -> Common:
     covered = coverage_of(names, [held(region.tables) for region in regions()])
     if not any(row.common_share for row in covered):
         return _apart(entries, "the maps have no voxel in common: other locations, or other frames of reference")
-    found = _by_observations(names, records, regions) or _by_voxels(regions)
+    result = _by_observations(names, records, regions) or _by_voxels(regions)
     shown = share_of(min(row.voxels for row in covered))
-    notes = (*found.notes, *_notes(covered), *((SHOWN.format(n=round(1 / shown)),) if shown < 1 else ()))
-    return replace(found, notes=notes, regions=found.regions or regions, coverage=covered, shown=shown)
+    notes = (*result.notes, *_notes(covered), *((SHOWN.format(n=round(1 / shown)),) if shown < 1 else ()))
+    return replace(result, notes=notes, regions=result.regions or regions, coverage=covered, shown=shown)
 
 
 def _truth(records: Sequence[Record]) -> Tiles[VoxelTable] | None:

@@ -249,8 +249,8 @@ BASES: dict[Basis, str] = {
 
 def sentences(comparison: RunComparison) -> list[str]:
     """One run after the other, then what could not be compared."""
-    told = [sentence for own in comparison.overall for sentence in _of_run(comparison, own)]
-    return [*told, *(sentence for scene in comparison.scenes for sentence in _what(scene))]
+    notes = [sentence for own in comparison.overall for sentence in _of_run(comparison, own)]
+    return [*notes, *(sentence for scene in comparison.scenes for sentence in _what(scene))]
 
 
 def _of_run(comparison: RunComparison, own: Against) -> Iterator[str]:
@@ -260,8 +260,8 @@ def _of_run(comparison: RunComparison, own: Against) -> Iterator[str]:
     classes = {
         name: [row for row in own.by_class if row.of == name] for name in dict.fromkeys(r.of for r in own.by_class)
     }
-    told = {name: _changes(rows, by_key(BY_CLASS)) for name, rows in classes.items()}
-    if listed := [f"{name} {text}" for name, text in told.items() if text]:
+    notes = {name: _changes(rows, by_key(BY_CLASS)) for name, rows in classes.items()}
+    if listed := [f"{name} {text}" for name, text in notes.items() if text]:
         more = f"; and {len(listed) - MOST_CLASSES} more classes" if len(listed) > MOST_CLASSES else ""
         yield f"{own.other} by class: {'. '.join(listed[:MOST_CLASSES])}{more}."
     for scene in comparison.scenes:
@@ -284,10 +284,10 @@ def _stability(comparison: RunComparison, own: Against) -> str:
         return f"{own.other} is as stable as {comparison.base}: {numbers}, the same everywhere."
     interval = f"{row.difference.value:+z.3f} ({row.difference.low:+z.3f} to {row.difference.high:+z.3f})"
     p = "" if math.isnan(row.p_holm) else f", p {row.p_holm:.2g}"
-    said = {"better": "is more stable than", "worse": "is less stable than"}
+    text = {"better": "is more stable than", "worse": "is less stable than"}
     if row.change:
         return (
-            f"{own.other} {said[row.change]} {comparison.base}: {numbers}, {interval}{p}, for {row.difference.scope}."
+            f"{own.other} {text[row.change]} {comparison.base}: {numbers}, {interval}{p}, for {row.difference.scope}."
         )
     why = f"; undecided: {row.difference.undecided}" if row.difference.undecided else ""
     return (

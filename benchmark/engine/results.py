@@ -64,9 +64,9 @@ class UnitResults:
     def counts(self) -> dict[str, Any]:
         """Numbers of all units, of those finished by an earlier start, of those computed and of those that failed."""
         failed = len(self.errors)
-        kept = self.finished_before
-        computed = len(self.contents) - kept
-        return {"units": len(self.contents) + failed, "kept": kept, "computed": computed, "failed": failed}
+        left = self.finished_before
+        computed = len(self.contents) - left
+        return {"units": len(self.contents) + failed, "kept": left, "computed": computed, "failed": failed}
 
 
 def result_of(plan: Plan, folder: Folder, units: UnitResults) -> Result:
@@ -149,11 +149,13 @@ def _comparisons(config: Config, records: Sequence[Record], tables: Tables) -> I
         there = [record for record in base if record.unit.scene == scene]
         if len(there) > 1:
             files = {record.unit.backbone: record.looks_file for record in there}
-            looks = {
+            observations = {
                 name: CellObservations.load(file) for name, file in files.items() if file is not None and file.exists()
             }
             regions = _regions_of(there, config, tables)
-            if (compared := _compared_maps(scene, regions, looks if len(looks) == len(there) else None)) is not None:
+            if (
+                compared := _compared_maps(scene, regions, observations if len(observations) == len(there) else None)
+            ) is not None:
                 yield compared
 
 

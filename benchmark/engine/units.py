@@ -219,11 +219,11 @@ def _varied_units(config: Config, base: Sequence[PlannedUnit], scenes: Mapping[s
             varied = each.config.model_copy(update=_changed_settings(config, variation, value, each.config))
             (task,) = tasks_of(scenes[each.unit.scene], varied, compared[each.unit.scene])
             _check_count(variation, task)
-            kept, (backend, *_) = variation.sweep == BACKENDS, varied.backends
-            reference = kept and backend.name not in [named.name for named in config.backends]
+            left, (backend, *_) = variation.sweep == BACKENDS, varied.backends
+            reference = left and backend.name not in [named.name for named in config.backends]
             judged = varied.statistics or not reference
-            sampled = kept and _is_sampled(config, backend)
-            yield PlannedUnit(variation, varied, task, identity(varied, task), False, kept, judged, sampled)
+            sampled = left and _is_sampled(config, backend)
+            yield PlannedUnit(variation, varied, task, identity(varied, task), False, left, judged, sampled)
 
 
 def _variations(config: Config) -> Iterator[tuple[Variation, Part, Any]]:

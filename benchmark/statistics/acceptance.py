@@ -84,10 +84,10 @@ class AcceptanceThresholds(BaseModel):
     @classmethod
     def load(cls, path: str | Path) -> AcceptanceThresholds:
         """Read what `save` wrote. Raises ConfigError, which names the file and the setting."""
-        found = validated(cls, read_yaml(path), f"{path}: ")
-        if found.schema_ != SCHEMA:
-            raise ConfigError(f"{path}: schema {found.schema_}, this version reads {SCHEMA}; calibrate again")
-        return found
+        result = validated(cls, read_yaml(path), f"{path}: ")
+        if result.schema_ != SCHEMA:
+            raise ConfigError(f"{path}: schema {result.schema_}, this version reads {SCHEMA}; calibrate again")
+        return result
 
     def save(self, path: str | Path) -> None:
         """Write YAML, atomically."""
@@ -146,21 +146,21 @@ def calibrate(
     true = np.concatenate([truth.label for _, truth in maps])
     size, names = tables[0].voxel_size, tables[0].classes
     values = {by: np.concatenate([np.asarray(of(table), float) for table in tables]) for by, of in EVIDENCE.items()}
-    found = {}
+    result = {}
     for k, name in enumerate(names):
         rows = np.flatnonzero((label == k) & (true >= 0))
         own = {by: value[rows] for by, value in values.items()}
         sample = _Labels(index[rows], true[rows] == k, own, size)
-        found[name] = sample.least(precision, 1 - confidence)
+        result[name] = sample.least(precision, 1 - confidence)
     every = AcceptanceThresholds(
-        schema=SCHEMA, precision=precision, confidence=confidence, voxel_size=size, calibrated_on=on, classes=found
+        schema=SCHEMA, precision=precision, confidence=confidence, voxel_size=size, calibrated_on=on, classes=result
     )
     decided = [every.decide(table) for table in tables]
     left = float((np.concatenate(decided) >= 0).mean())
     of_class = {
         name: float((np.concatenate(decided) == k).sum() / max((label == k).sum(), 1)) for k, name in enumerate(names)
     }
-    classes = {name: each.model_copy(update={"left": of_class[name]}) for name, each in found.items()}
+    classes = {name: each.model_copy(update={"left": of_class[name]}) for name, each in result.items()}
     return every.model_copy(update={"left": left, "classes": classes})
 
 
@@ -178,10 +178,10 @@ class _Labels:
         best = Threshold(never=True)
         for by, at in sorted(tried, key=lambda pair: -left[pair]):
             share, low = self._share(by, at, error / len(tried))
-            found = Threshold(by=by, at_least=at, never=low < precision, precision=share, low=low, voxels=left[by, at])
+            result = Threshold(by=by, at_least=at, never=low < precision, precision=share, low=low, voxels=left[by, at])
             if low >= precision:
-                return found
-            best = max(best, found, key=lambda each: each.low)
+                return result
+            best = max(best, result, key=lambda each: each.low)
         return best
 
     def _tried(self) -> tuple[list[tuple[Evidence, float]], dict[tuple[Evidence, float], int]]:
@@ -203,10 +203,10 @@ class _Labels:
         sums = sums[sums[:, 1] > 0]
         if np.count_nonzero(sums[:, 0] < sums[:, 1]) <= FEW_CUBES:
             return _of_few(sums, error)
-        found = interval_of_cubes(
+        result = interval_of_cubes(
             self._cell[np.unique(of)], self._edge, sums, ratio_of, "share", (0.0, 1.0), 1 - 2 * error
         )
-        return found.value, found.low if found.decided else 0.0
+        return result.value, result.low if result.decided else 0.0
 
 
 def _of_few(sums: Float64, error: float) -> tuple[float, float]:

@@ -277,10 +277,10 @@ def _joined_logs(parts: Sequence[Region]) -> dict[str, Events] | None:
     return {name: Events.joined([own[name] for own in logs]) for name in logs[0]} if logs else None
 
 
-def truth_at(regions: Regions, places: VoxelTable) -> VoxelTable | None:
+def truth_at(regions: Regions, locations: VoxelTable) -> VoxelTable | None:
     """The ground truth's voxels that these are of; None without any."""
-    found = [own.truth.rows(shared_rows(own.truth, places)[0]) for own in regions() if own.truth is not None]
-    return VoxelTable.joined(found) if found else None
+    result = [own.truth.rows(shared_rows(own.truth, locations)[0]) for own in regions() if own.truth is not None]
+    return VoxelTable.joined(result) if result else None
 
 
 def _by_rule(regions: Regions, *, mixed: bool) -> RuleComparison:

@@ -62,9 +62,11 @@ ACTED_ON, LEAST_FLIPS = ("stable", "usable"), 0.001
 ONE_CLASS = "hardly more than one class was predicted, so that agreement says nothing"
 
 
-def level_probabilities(found: Interval, scale: Scale, limits: Limits = LIMITS) -> Mapping[Level, float]:
+def level_probabilities(interval: Interval, scale: Scale, limits: Limits = LIMITS) -> Mapping[Level, float]:
     """Return how probable each level is, given alpha or its share of the ceiling; NaN without an interval."""
-    reliable, tentative = (probability_above(found, threshold, scale) for threshold in (limits.stable, limits.usable))
+    reliable, tentative = (
+        probability_above(interval, threshold, scale) for threshold in (limits.stable, limits.usable)
+    )
     return {"stable": reliable, "usable": tentative - reliable, "unstable": 1 - tentative}
 
 
