@@ -139,7 +139,6 @@ def _comparable(quantity: Quantity, common: Common) -> bool:
 def _row(
     quantity: Quantity, base: ClusterSums, other: ClusterSums, common: Common, k: int | None = None, of: str = ""
 ) -> Iterator[Contrast]:
-    """A number of the sums, where either run has it."""
     key = quantity.key
     before, after = value(base, key, k), value(other, key, k)
     if not (math.isnan(before) and math.isnan(after)):

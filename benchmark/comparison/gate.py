@@ -198,9 +198,8 @@ def verdict(rule: Rule, interval: Interval) -> Verdict:
     """
     if interval.undecided or math.isnan(interval.low) or math.isnan(interval.high):
         return "undecided"
-    low, high, limit = (
-        (interval.low, interval.high, rule.limit) if rule.below else (-interval.high, -interval.low, -rule.limit)
-    )
+    shown, limit = (interval, rule.limit) if rule.below else (negative(interval), -rule.limit)
+    low, high = shown.low, shown.high
     if high < limit:
         return "passes"
     return "fails" if low > (min(limit, 0.0) if rule.bounds_a_loss else limit) else "undecided"
@@ -495,7 +494,6 @@ def _value(rule: Rule, entry: Entry) -> float:
 
 
 def _found(rule: Rule, new: Entry, base: Entry | None, level: float, scope: Scope) -> Interval:
-    """What a rule bounds, in one scene."""
     if rule.measure.quantity is not FLICKER:
         return bounded(rule, new.sums, None if base is None else base.sums, k=_k(rule, new), level=level, scope=scope)
     if scope == OTHER_SCENES:

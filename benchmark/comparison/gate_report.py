@@ -92,7 +92,6 @@ def _cell(text: str) -> str:
 
 
 def _code(text: str) -> str:
-    """As code in Markdown, where nothing in it means anything."""
     return "`" + _cell(text).replace("`", "'") + "`"
 
 

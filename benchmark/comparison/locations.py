@@ -296,7 +296,6 @@ class Seen:
 
 
 def _top_frames(seen: Seen) -> tuple[FrameShare, ...]:
-    """The frames that lost most, as far as they account for it."""
     frames, of = np.unique(seen.frame, return_inverse=True)
     lost = np.maximum(np.bincount(of, weights=seen.lost, minlength=len(frames)), 0.0)
     if not lost.sum() > 0:
@@ -310,7 +309,6 @@ def _top_frames(seen: Seen) -> tuple[FrameShare, ...]:
 
 
 def _observations(common: Common, number: int, index: Int32) -> Observations | None:
-    """The common observations at the voxels (n, 3), in one order; None where they were not kept."""
     if not common.logs:
         return None
     base, other = (_rows_of(common.logs[k], index) for k in (0, number))

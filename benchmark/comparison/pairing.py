@@ -124,7 +124,6 @@ def _paired(entries: Sequence[Entry], names: Sequence[str]) -> Common:
 
 
 def _truth(records: Sequence[Record]) -> Tiles[VoxelTable] | None:
-    """The map of the ground truth, of the first run that fused it."""
     files = [file for record in records if (file := record.truth_file) is not None and file.exists()]
     return Tiles.open(files[0], VoxelTable) if files else None
 
@@ -281,7 +280,6 @@ def _no_voxels(entries: Sequence[Entry]) -> str:
 
 
 def _notes(covered: Sequence[MapCoverage]) -> list[str]:
-    """Where a map has hardly anything in common with the others."""
     return [
         f"only {row.common_share:.1%} of the voxels of {row.backbone} are in all maps: are the frames of reference the"
         " same?"

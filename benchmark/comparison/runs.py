@@ -206,7 +206,6 @@ def _require_same_scene(scene: str, one: Entry, other: Entry) -> None:
 
 
 def _chosen(path: Path, there: Sequence[str], wanted: str) -> str:
-    """Return the wanted backbone, or the only one."""
     if wanted:
         if wanted not in there:
             raise ConfigError(f"{path}: no backbone '{wanted}'; {nearest(wanted, there)}")

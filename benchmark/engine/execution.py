@@ -166,7 +166,6 @@ class _Execution:
         self._observers.tell(lambda observer: observer.advanced(frames, what))
 
     def _keep(self, each: PlannedUnit, outcome: Outcome, *, in_tiles: bool = False) -> None:
-        """Keep a finished unit, or the reason why it failed, and tell the observers."""
         units, folder, content = self.units, self._folder, outcome.content
         if content is not None:
             content = dataclasses.replace(content, advice=units.advice.get(each.unit.scene))

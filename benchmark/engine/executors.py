@@ -135,7 +135,6 @@ class LocalProcesses(Executor):
             pool.shutdown(wait=False, cancel_futures=True)
 
     def _with_a_share(self, job: Job) -> Job:
-        """The job with its share of threads and memory."""
         start = job[0].start
         threads = max(1, (start.threads or default_threads()) // self.width)
         own = dataclasses.replace(start, threads=threads, width=self.width)

@@ -149,7 +149,6 @@ def analyse_sample(task: Task, config: Config, sample: MapSample, observations: 
 
 
 def _quality(stream: Stream) -> FrameQuality | None:
-    """The quality of the labels of single frames, where it is asked for."""
     if stream.quality is None:
         return None
     made = stream.task.scene.filtering(stream.task.backbone)

@@ -218,7 +218,6 @@ class Folder:
 
 
 def _in_tiles(unit: Unit, content: UnitContent, of: str = VOXELS) -> list[str]:
-    """The files of the unit's tiles, where it has any."""
     return [name for name in content.files if name.startswith(f"{of}/{unit.slug}/")]
 
 
@@ -301,7 +300,6 @@ def _is_earlier(folder: Path, layouts: Collection[str] = (LAYOUT,)) -> bool:
 
 
 def _first_change(old: Mapping[str, Any], new: Mapping[str, Any]) -> str | None:
-    """The first setting that is there twice and differs."""
     there, here = dict(_flat(old)), dict(_flat(new))
     changed = (name for name in there if name in here and there[name] != here[name])
     return next((f"{name}: {there[name]} there, {here[name]} here" for name in changed), None)

@@ -184,7 +184,6 @@ def _dataset(_start: str, name: str, options: str) -> Dataset:
 
 
 def _ground_truth(scene: Scene, index: int) -> Frame | None:
-    """A frame with its ground truth; None where the frame has none."""
     try:
         return scene.frame(index, GROUND_TRUTH, color=False)
     except DataError:
@@ -207,7 +206,6 @@ def _measured_regions(scene: Scene, work: Work) -> Outcome:
 
 
 def _region_frames(scene: Scene, work: Work) -> Iterator[Frame]:
-    """The sampled frames with the regions' own ids."""
     config = work.config
 
     def decode(index: int) -> Frame:

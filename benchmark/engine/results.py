@@ -118,7 +118,11 @@ def _agreements(config: Config, records: Sequence[Record], tables: Tables, *, mu
           need not agree
     """
     checked = {backend.name for backend in config.fused_by() if must_agree(backend)}
-    for group in _by_backend(records).values():
+    groups: dict[tuple[str, str], list[Record]] = {}
+    for record in records:
+        if record.variation.sweep in (BASE, BACKENDS):  # those of the first backend come first
+            groups.setdefault((record.unit.scene, record.unit.backbone), []).append(record)
+    for group in groups.values():
         for a, b in itertools.combinations(group, 2) if must else zip(group[:1] * len(group), group[1:], strict=False):
             if must == ({a.unit.backend, b.unit.backend} <= checked):
                 yield _alike(config, a, b, tables)
@@ -131,15 +135,6 @@ def _alike(config: Config, a: Record, b: Record, tables: Tables) -> Agreement:
     if not (a.in_tiles or b.in_tiles):
         return compare(tables.of(a), tables.of(b), units, tolerance=config.tolerance)
     return together([compare(one, other, units, tolerance=config.tolerance) for one, other in side_by_side(maps)])
-
-
-def _by_backend(records: Sequence[Record]) -> dict[tuple[str, str], list[Record]]:
-    """The records at the base settings of each scene and backbone, those of the first backend first."""
-    groups: dict[tuple[str, str], list[Record]] = {}
-    for record in records:
-        if record.variation.sweep in (BASE, BACKENDS):
-            groups.setdefault((record.unit.scene, record.unit.backbone), []).append(record)
-    return groups
 
 
 def _comparisons(config: Config, records: Sequence[Record], tables: Tables) -> Iterator[BackboneComparison]:
@@ -220,7 +215,8 @@ REPORTED_PACKAGES = ("numpy", "open3d", "opencv-python-headless", "pyarrow", "re
 def manifest(
     config: Config, inputs: Mapping[str, str], seconds: Mapping[str, float], command: Sequence[str]
 ) -> dict[str, Any]:
-    """The content of manifest.json: versions, digests of the inputs, wall-clock seconds by stage, peak memory."""
+    """Return the content of manifest.json: versions, digests of the inputs, seconds by stage, peak memory."""
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss  # in kB on Linux, bytes on macOS
     return {
         "schema": SCHEMA,
         "semstab": _version("semstab"),
@@ -231,7 +227,7 @@ def manifest(
         "seed": config.dataset.options.get("seed"),
         "inputs": dict(inputs),
         "seconds": dict(seconds),
-        "peak_memory_bytes": _peak_memory(),
+        "peak_memory_bytes": peak if sys.platform == "darwin" else 1024 * peak,
     }
 
 
@@ -240,9 +236,3 @@ def _version(package: str) -> str | None:
         return importlib.metadata.version(package)
     except importlib.metadata.PackageNotFoundError:
         return None
-
-
-def _peak_memory() -> int:
-    """Peak resident memory of this process; Linux counts it in kB, macOS in bytes."""
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    return peak if sys.platform == "darwin" else peak * 1024

@@ -20,7 +20,7 @@ from semstab.config import Config
 from semstab.core.prefetch import Fetched
 from semstab.core.process import Stopwatch
 from semstab.core.rows import Rows
-from semstab.core.types import Float64, Int32
+from semstab.core.types import Float64, Int32, UInt8, UInt16
 from semstab.datasets import Scene
 from semstab.engine.observer import Observers
 from semstab.engine.series import FrameRow, Series
@@ -391,11 +391,17 @@ class SizeSample:
     def alphas(self) -> tuple[SizeAlpha, ...]:
         """Krippendorff's alpha at each voxel size; none where the scene is larger than a map of the smallest."""
         soft = any(frame.scores is not None for frame in self._frames)
-        frames = [_one_hot(frame, self._K) if soft and frame.scores is None else frame for frame in self._frames]
+        frames = self._frames
+        if soft:
+            frames = [frame if frame.labels is None else self._one_hot(frame, frame.labels) for frame in frames]
         try:
             return tuple(self._at(factor * self._voxel_size, frames) for factor in FACTORS) if frames else ()
         except DataError:
             return ()
+
+    def _one_hot(self, frame: Frame, labels: UInt8 | UInt16) -> Frame:
+        scores = np.eye(self._K, dtype=np.float32)[np.where(frame.valid, labels, 0)]
+        return dataclasses.replace(frame, labels=None, scores=scores, depth=np.where(frame.valid, frame.depth, 0))
 
     def _at(self, voxel_size: float, frames: Sequence[Frame]) -> SizeAlpha:
         backend = create("numba", voxel_size=voxel_size, num_classes=self._K)
@@ -408,10 +414,3 @@ def alpha_sums(table: VoxelTable) -> Float64:
     """Return the sums over voxels from which Krippendorff's alpha of a map follows."""
     sums = (alpha_columns(table.rows(some)).sum(axis=0) for some in table.evidence.chunks())
     return sum(sums, np.zeros(3 + table.K))
-
-
-def _one_hot(frame: Frame, K: int) -> Frame:
-    assert frame.labels is not None
-    labels = np.where(frame.valid, frame.labels, 0)
-    scores = np.eye(K, dtype=np.float32)[labels]
-    return dataclasses.replace(frame, labels=None, scores=scores, depth=np.where(frame.valid, frame.depth, 0))

@@ -191,7 +191,6 @@ def _with_columns(task: TileTask, slug: str, analysis: Analysis, folder: Path) -
 
 
 def _saved(folder: Path, name: str, save: Callable[[Path], None]) -> dict[str, str]:
-    """The digest of a file that is written, by its path in the folder."""
     save(folder / name)
     return {name: file_digest(folder / name).hex()}
 

@@ -148,7 +148,6 @@ def make_plan(config: Config) -> Plan:
 
 
 def _base_settings(config: Config, scene: str, backbones: list[str] | None) -> Config:
-    """The settings of a scene's base units, fused by the first backend."""
     noise = config.perturbation
     return config.model_copy(
         update={
@@ -191,7 +190,6 @@ def must_agree(backend: BackendConfig) -> bool:
 
 
 def _check_classes(critical: Sequence[str], task: Task) -> None:
-    """Raise ConfigError for a critical class that the unit's taxonomy has not."""
     space = task.mapping.target
     for name in critical:
         if name not in space.classes:
@@ -239,7 +237,6 @@ def _variations(config: Config) -> Iterator[tuple[Variation, Part, Any]]:
 
 
 def _changed_settings(config: Config, variation: Variation, value: Any, base: Config) -> dict[str, Any]:
-    """The settings in which a variation differs from a base unit."""
     sweep = variation.sweep
     if sweep == BACKENDS:  # its map is compared with the base one, whose statistics are enough where they are full
         logged = next((backend.name for backend in config.fused_by() if keeps_log(backend.name)), None)
@@ -291,7 +288,6 @@ def _hash(config: Config, content: Mapping[str, Any], without: Iterable[str] = (
 
 
 def _restricted(base: Sequence[PlannedUnit], part: Part, name: str) -> list[PlannedUnit]:
-    """The base units of the scenes and backbones that a part names."""
     _check_names(part.scenes, [each.unit.scene for each in base], f"{name}.scenes")
     _check_names(part.backbones, [each.unit.backbone for each in base], f"{name}.backbones")
     return [each for each in base if applies(part, each.unit.scene, each.unit.backbone)]
