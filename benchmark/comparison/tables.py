@@ -9,7 +9,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from rich.console import Console
 
 from semstab.comparison.locations import MOST
-from semstab.model.contrast import Against, Area, Basis, Contrast, FrameShare, RunComparison, SceneComparison
+from semstab.model.contrast import Against, Area, Basis, Contrast, FrameShare, RunComparison
 from semstab.model.measures import ENTROPY, VSS, Quantity, measures
 from semstab.model.statistics import Interval
 from semstab.report.tables.correctness import coverage_table, ignored_table
@@ -249,8 +249,12 @@ BASES: dict[Basis, str] = {
 
 def sentences(comparison: RunComparison) -> list[str]:
     """One run after the other, then what could not be compared."""
-    notes = [sentence for own in comparison.overall for sentence in _of_run(comparison, own)]
-    return [*notes, *(sentence for scene in comparison.scenes for sentence in _what(scene))]
+    lines = [sentence for own in comparison.overall for sentence in _of_run(comparison, own)]
+    for scene in comparison.scenes:
+        if scene.basis in ("observations", "voxels"):
+            lines.append(f"{scene.scene}: {scene.voxels:,} voxels, {BASES[scene.basis]}.")
+        lines += [f"{scene.scene}: {note}." for note in scene.notes]
+    return lines
 
 
 def _of_run(comparison: RunComparison, own: Against) -> Iterator[str]:
@@ -317,12 +321,6 @@ def _of_areas(areas: Sequence[Area]) -> str:
         f"{count} {lost} ({alike}); the largest is {first.voxels} voxels of"
         f" {first.of}{confused_with}, at ({x:.2f}, {y:.2f}, {z:.2f}) m{frames}"
     )
-
-
-def _what(scene: SceneComparison) -> Iterator[str]:
-    if scene.basis in ("observations", "voxels"):
-        yield f"{scene.scene}: {scene.voxels:,} voxels, {BASES[scene.basis]}."
-    yield from (f"{scene.scene}: {note}." for note in scene.notes)
 
 
 # --- In a terminal of 80 columns --------------------------------------------------------------------------------------
