@@ -187,36 +187,17 @@ def keeps_log(name: str) -> bool:
     return takes_option(name, "history") or getattr(REGISTRY.load(name), "keeps_log", False)
 
 
-def expected_bytes(
-    name: str, voxels: int, observations: int, num_classes: int, *, soft: bool = False, filled: float = 0.0
-) -> int:
+def expected_bytes(name: str, voxels: int, observations: int, num_classes: int, *, soft: bool = False) -> int:
     """Bytes that a backend's map of that size takes, roughly; 0 for one that does not say.
 
-    A backend says it with a static method of that name, those three parameters, `soft` where a map of scores takes
-    other than one of labels, and `filled` where it takes memory for whole blocks: the share of the voxels of one of
-    4 x 4 x 4 that a frame sees, 0 where that is not known.
+    A backend says it with a static method of that name, those three parameters, and `soft` where a map of scores takes
+    other than one of labels.
     """
     says = getattr(REGISTRY.load(name), "expected_bytes", None)
     if says is None:
         return 0
-    known = {"soft": soft} | ({"filled": filled} if filled else {})
-    more = {key: value for key, value in known.items() if key in inspect.signature(says).parameters}
+    more = {"soft": soft} if "soft" in inspect.signature(says).parameters else {}
     return int(says(voxels, observations, num_classes, **more))
-
-
-def takes_blocks(name: str) -> bool:
-    """A backend's map takes memory for whole blocks of space: see `expected_bytes`."""
-    says = getattr(REGISTRY.load(name), "expected_bytes", None)
-    return says is not None and "filled" in inspect.signature(says).parameters
-
-
-def frame_bytes(name: str, voxels: int, num_classes: int) -> int:
-    """Bytes that a backend takes next to its map while it fuses a frame of so many voxels; 0 for one that does not say.
-
-    A backend says it with a static method of that name and these two parameters.
-    """
-    says = getattr(REGISTRY.load(name), "frame_bytes", None)
-    return 0 if says is None else int(says(voxels, num_classes))
 
 
 def _options(cls: Any) -> list[str]:

@@ -65,11 +65,6 @@ class NumpyReference:
         """A dictionary's entry and the evidence a voxel; an observation is in the history, and sorted for a table."""
         return voxels * (240 + 9 * num_classes) + observations * (90 + (25 * num_classes if soft else 0))
 
-    @staticmethod
-    def frame_bytes(voxels: int, num_classes: int) -> int:
-        """The evidence of each voxel that the frame touches: its own, and that before and after it."""
-        return 3 * 8 * num_classes * voxels
-
     def integrate(self, frame: Frame) -> FrameReport:
         """Append the frame's observations to the history."""
         started = time.perf_counter()

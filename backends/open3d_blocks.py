@@ -85,16 +85,14 @@ class Open3DBlocks(FusionBackend):
         self.grid = self._new_grid(max(LEAST_BLOCKS, INITIAL_BYTES // (voxel_bytes * block_resolution**3)))
 
     @staticmethod
-    def expected_bytes(
-        voxels: int, observations: int, num_classes: int, soft: bool = False, filled: float = FILLED
-    ) -> int:
+    def expected_bytes(voxels: int, observations: int, num_classes: int, soft: bool = False) -> int:
         """The attributes of all voxels of a block, of which frames see that share, the more the more frames there are.
 
         A grid has room for more; it grows into another one, but of two maps, of scores and of labels, one after the
         other. An empty one has blocks.
         """
         room = SPARE if soft else SPARE + GROWING
-        return int(max(room * voxels / (OFTEN * filled), LEAST_BLOCKS * 4**3) * (8 * num_classes + 48))
+        return int(max(room * voxels / (OFTEN * FILLED), LEAST_BLOCKS * 4**3) * (8 * num_classes + 48))
 
     def integrate(self, frame: Frame) -> FrameReport:
         """Fuse one frame: aggregate its pixels to voxels, activate the blocks, update the touched voxels."""

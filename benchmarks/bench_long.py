@@ -71,7 +71,7 @@ def steps(root: Path) -> dict[str, tuple[float, float]]:
     plan = make_plan(Config.model_validate({"dataset": dataset, "voxel_size": 0.5, "backends": ["numba"]}))
     end("open again, select frames")
     (unit,) = plan.units
-    _ = unit.digest
+    _ = unit.task.digest
     end("hash the input")
     sent = pickle.dumps(Work.of(unit, Start("", root)).in_tile(TileTask("", 64, (0, 0)), unit.task.indices[:4096]))
     end(f"pickle a task of 4096 frames: {len(sent) / 1e3:.0f} kB")

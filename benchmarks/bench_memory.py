@@ -15,7 +15,8 @@ import json
 import subprocess
 import sys
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +25,7 @@ import numpy as np
 
 import semstab
 from semstab.core.files import write_json
-from semstab.engine.memory import GB, MemoryModel, filled_share, process_bytes, voxels_in
+from semstab.engine.memory import GB, map_bytes, process_bytes
 from semstab.model.voxels import VoxelTable
 
 HERE = Path(__file__).resolve().parent
@@ -70,26 +71,25 @@ def taken(found: dict[str, float]) -> tuple[float, str]:
     return (found["all"] - found["digest"]) * GB, stage
 
 
-def largest_tile(out: Path, model: MemoryModel, observed: float) -> tuple[float, int]:
+def largest_tile(out: Path, estimate: Callable[[float, float], float], observed: float) -> tuple[float, int]:
     """Bytes, as estimated, and voxels of the largest tile of a run; `observed` is how often a voxel is seen."""
     voxels = max(map(len, VoxelTable.iter_tiles(next((out / "voxels").iterdir()))))
-    return model.map_bytes(voxels, observed * voxels), voxels
+    return estimate(voxels, observed * voxels), voxels
 
 
 def measured(scene: Path, out: Path, backend: str, K: int, kind: str, most_gb: float) -> Iterator[dict[str, Any]]:
     """At once, then in tiles."""
     soft, (width, height) = kind == "scores", SIZE[kind]
     first = flight.frame(0, width, height, K)
-    seen = voxels_in(first, VOXEL_SIZE, K)
-    of = MemoryModel(backend, K, soft, sampled=backend == "numba", touched=len(seen), filled=filled_share(seen))
-    if of.map_bytes(most := FRAMES[kind] * MOST_VOXELS[kind], most) > most_gb * GB:
-        print(f"{backend:>8} {K:4} {kind:>7} left out: {of.map_bytes(most, most) / GB:.2g} GB")
+    estimate = partial(map_bytes, backend, K, soft=soft, sampled=backend == "numba")
+    if estimate(most := FRAMES[kind] * MOST_VOXELS[kind], most) > most_gb * GB:
+        print(f"{backend:>8} {K:4} {kind:>7} left out: {estimate(most, most) / GB:.2g} GB")
         return
     found, stage = taken(stages(scene, out, backend, VOXEL_SIZE, "--set", "memory_gb=1000", "--tile-size", "off"))
     (summary,) = semstab.load_result(out).runs
     voxels, looks = summary.table.voxels, summary.table.observations
     own = {"backend": backend, "K": K, "kind": kind, "voxels": voxels}
-    whole = of.map_bytes(voxels, looks)
+    whole = estimate(voxels, looks)
     yield {
         **own,
         "run": "whole",
@@ -99,12 +99,12 @@ def measured(scene: Path, out: Path, backend: str, K: int, kind: str, most_gb: f
     }
     limit, out = whole / 3 / GB, out.with_name(f"{backend}-tiles")
     found, stage = taken(stages(scene, out, backend, VOXEL_SIZE, "--set", f"memory_gb={limit}"))
-    tile, voxels = largest_tile(out, of, looks / voxels)
+    tile, voxels = largest_tile(out, estimate, looks / voxels)
     yield {
         **own,
         "run": "tiles",
         "bytes": found,
-        "estimate": tile + process_bytes(first, K, None, soft=soft, in_tiles=True),
+        "estimate": tile + process_bytes(first, K, None, soft=soft),
         "stage": stage,
     }
 

@@ -149,10 +149,9 @@ def fused(watch: Watch, folder: Path, voxel_size: float, K: int) -> Any:
 
 def sections(table: VoxelTable, events: Events) -> dict[str, Callable[[], Any]]:
     """What of the statistics is timed by itself."""
-    drift = statistics.voxel_drift(table, events)
     return {
         "drift of each voxel": lambda: statistics.voxel_drift(table, events),
-        "drift of the scene": lambda: statistics.scene_drift(table, events, drift),
+        "drift of the scene": lambda: statistics.drift.order_test(table, events),
         "fusion rules": lambda: fuse_all(events, statistics.RULES, evidence=table.evidence),
         "flips": lambda: statistics.flips(events),
         "agreement by class": lambda: statistics.class_agreement(table, events),

@@ -91,7 +91,7 @@ def test_runs_of_other_scenes_and_classes_are_refused(run):
     entry.__dict__["sums"] = dataclasses.replace(entry.sums, classes=("floor", *entry.classes[1:]))
     fails(
         DataError,
-        re.escape(f"class 0 is {entry.read_sums().classes[0]} and floor"),
+        re.escape(f"class 0 is {one.scenes['wall'].classes[0]} and floor"),
         shared_scenes,
         [one, dataclasses.replace(one, scenes={"wall": entry})],
     )

@@ -19,7 +19,7 @@ from records import record, study, voxels
 import semstab
 from semstab.core.json_form import to_json
 from semstab.engine import Observer, load_result, run_study
-from semstab.engine.memory import MemoryModel
+from semstab.engine.memory import map_bytes
 from semstab.errors import ConfigError
 from semstab.metrics import sbd
 from semstab.model.events import Events
@@ -169,7 +169,7 @@ def test_backbones_of_different_classes_are_not_compared(tmp_path) -> None:
 
 def test_the_log_counts_as_memory(tmp_path) -> None:
     root = tiny_scene.write(tmp_path / "wall", ("a",), frames=30)
-    without, expected = (MemoryModel("numba", 3, logged=wanted).map_bytes(222, 30 * 48) for wanted in (False, True))
+    without, expected = (map_bytes("numba", 3, 222, 30 * 48, logged=wanted) for wanted in (False, True))
     held = 30 * 48 * (3 * 8 + 40)  # the log alone, as `Events` has it
     assert expected - without > held
     with pytest.raises(ConfigError, match="no statistics; or set memory_gb"):

@@ -11,7 +11,7 @@ import tiny_scene
 from posed_config import configure
 
 import semstab
-from semstab.backends import create, expected_bytes, frame_bytes
+from semstab.backends import create, expected_bytes
 from semstab.backends.shared import observations
 from semstab.backends.shared.observations import Change
 from semstab.config import Config
@@ -39,21 +39,11 @@ def test_the_estimate_holds_for_a_flight_and_saturates_over_one_place(tmp_path) 
     root = tiny_scene.write(tmp_path / "wall", backbones=("a",), frames=60)
     plan, config = planned(root, voxel_size=0.05, pixel_stride=1)
     table = semstab.engine.run(config).runs[0].table
-    size = memory.map_size(plan.tasks[0], plan.units[0].config, 3)
+    size = memory.map_size(plan.tasks[0], plan.units[0].config)
     assert size.voxels == pytest.approx(table.voxels, rel=0.3)
     assert size.observations == pytest.approx(table.observations, rel=0.3)
     still = dataclasses.replace(plan.tasks[0], indices=[0] * 60)
-    assert memory.map_size(still, plan.units[0].config, 3).voxels == pytest.approx(48)
-
-
-@pytest.mark.parametrize("share", [0.02, 0.2, 0.7])
-def test_the_size_of_a_map_follows_from_how_many_sampled_voxels_are_distinct(share) -> None:
-    """Frames that see a share of a place at random."""
-    rng, places = np.random.default_rng(0), 10_000
-    each = round(share * places)
-    seen = [rng.choice(places, each, replace=False) for _ in range(8)]
-    distinct = len(np.unique(np.concatenate(seen)))
-    assert memory._drawn_from(distinct, each, 8) == pytest.approx(places, rel=0.15)
+    assert memory.map_size(still, plan.units[0].config).voxels == pytest.approx(48)
 
 
 def test_a_unit_that_will_not_fit_is_refused_before_a_frame_is_fused(root, tmp_path) -> None:
@@ -74,14 +64,14 @@ def test_a_unit_that_will_not_fit_is_fused_in_tiles(root, monkeypatch) -> None:
     assert "2.5e-07 GB are there: fused in tiles of" in sizing.lines[0]
 
 
-def test_tiles_are_as_large_as_the_memory_allows_and_as_many_as_processes_need() -> None:
-    model = memory.MemoryModel("numba", 7)
+def test_tiles_are_as_large_as_the_memory_allows_and_as_many_as_processes_need(root) -> None:
+    (unit,) = planned(root, backends=["numba"], check=None)[0].units
     size = memory.MapSize(voxels=1e8, observations=3e8, by_column=2.0)
-    edges = [size.tile_edge(model, budget, 1) for budget in (1e8, 4e8, 16e8)]
+    edges = [memory._tile_edge(unit, size, budget, 1, soft=False) for budget in (1e8, 4e8, 16e8)]
     assert edges[1] == 2 * edges[0]
     assert edges[2] == 4 * edges[0]
-    assert model.map_bytes(2 * edges[0] ** 2, 6 * edges[0] ** 2) < 1e8
-    assert memory.MapSize(1e6, 3e6, 2.0).tile_edge(model, 1e12, 8) ** 2 * 2 * 2 * 8 <= 1e6
+    assert memory.map_bytes("numba", 3, 2 * edges[0] ** 2, 6 * edges[0] ** 2) < 1e8
+    assert memory._tile_edge(unit, memory.MapSize(1e6, 3e6, 2.0), 1e12, 8, soft=False) ** 2 * 2 * 2 * 8 <= 1e6
 
 
 def test_one_frame_is_enough_where_there_is_ample_room(root, monkeypatch) -> None:
@@ -118,21 +108,6 @@ def test_maps_take_what_their_backend_expects(name) -> None:
     assert held / 3 < expected_bytes(name, voxels, voxels, 7) < 3 * held
 
 
-def test_blocks_of_which_frames_see_little_take_as_much_as_full_ones() -> None:
-    """Pixels further apart than voxels; the map had to grow."""
-    side = 100
-    frame = Frame(
-        0, np.full((side, side), 30.0), Intrinsics(30, 30, 50, 50), np.eye(4), np.zeros((side, side), "uint8")
-    )
-    backend = create("open3d", voxel_size=0.2, num_classes=7)
-    seen = backend.integrate(frame).map_voxels
-    held = sum(backend.grid.attribute(column).numpy().nbytes for column in backend.attributes)
-    full, filled = 1 / 4, memory.filled_share(memory.voxels_in(frame, 0.2, 7))
-    assert filled < full / 3
-    assert held / 1.5 < expected_bytes("open3d", seen, seen, 7, soft=True, filled=filled) < 1.5 * held
-    assert held / 1.5 > expected_bytes("open3d", seen, seen, 7, soft=True, filled=full)
-
-
 def test_a_backend_that_does_not_say_counts_as_nothing(monkeypatch) -> None:
     from semstab.backends import REGISTRY
 
@@ -151,7 +126,7 @@ def test_what_a_frame_does_to_a_map_is_the_same_bit_by_bit_in_pieces(monkeypatch
 
 
 def test_the_reference_with_many_classes_takes_little_more_than_its_map_for_a_frame() -> None:
-    """At most a few vectors of all classes for each voxel that the frame touches, as `frame_bytes` says."""
+    """At most a few vectors of all classes for each voxel that the frame touches, own, before and after."""
     K, shape = 150, (240, 320)
     depth = np.ones(shape, np.float32)
     labels = np.zeros(shape, np.uint8)
@@ -161,6 +136,4 @@ def test_the_reference_with_many_classes_takes_little_more_than_its_map_for_a_fr
     voxels = reference.integrate(frame).voxels
     _, peak = tracemalloc.get_traced_memory()
     tracemalloc.stop()
-    assert (
-        peak < expected_bytes("numpy", voxels, voxels, K) + frame_bytes("numpy", voxels, K) + 100 * observations.PIECE
-    )
+    assert peak < expected_bytes("numpy", voxels, voxels, K) + 3 * 8 * K * voxels + 100 * observations.PIECE

@@ -12,8 +12,7 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from semstab.core.arrays import Rows
-from semstab.engine.series import FRAME_COLUMNS, NUMBERS, FrameRow, Series
+from semstab.engine.series import FRAME_COLUMNS, FrameRow, Series
 from semstab.model.results import FrameReport
 
 counts, numbers = st.integers(0, 2**53), st.floats()
@@ -32,7 +31,7 @@ def test_rows_come_out_as_they_went_in(given_rows) -> None:
         series.append(row)
     assert repr(list(series)) == repr([series[k] for k in range(len(series))]) == repr(given_rows)
     assert repr(series.drift.tolist()) == repr([row.report.drift for row in given_rows])
-    assert repr(list(Series(Rows(len(NUMBERS), series.numbers)))) == repr(given_rows)
+    assert repr(list(Series(series.numbers))) == repr(given_rows)
     with tempfile.TemporaryDirectory() as folder:
         series.save_csv(Path(folder) / "series.csv")
         header, *lines = csv.reader((Path(folder) / "series.csv").read_text().splitlines())

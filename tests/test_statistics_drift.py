@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
+from types import SimpleNamespace
 
 import numba
 import numpy as np
@@ -17,8 +18,8 @@ from semstab.errors import ConfigError
 from semstab.metrics import sbd, vss
 from semstab.model.events import Events
 from semstab.model.information import js_divergence, normalise
-from semstab.statistics import benjamini_hochberg, expected_sbd, flips, scene_drift, voxel_drift
-from semstab.statistics.drift import in_stretches, order_test, persistence
+from semstab.statistics import benjamini_hochberg, expected_sbd, flips, voxel_drift
+from semstab.statistics.drift import in_stretches, order_test, persistence, trend_columns
 
 
 def sbd_of(evidence):
@@ -186,17 +187,15 @@ def test_the_same_seed_gives_the_same_numbers_for_any_number_of_threads():
     np.testing.assert_array_equal(alone.p_value, together.p_value)
     np.testing.assert_array_equal(alone.null, together.null)
     assert not np.array_equal(together.null, other.null)
-    a, b = (scene_drift(events.table(), events, together, seed=1, frame_orders=50) for _ in range(2))
+    a, b = (order_test(events.table(), events, seed=1, frame_orders=50) for _ in range(2))
     assert a == b
 
 
 def test_an_empty_log_and_one_without_disagreement():
     for labels in (np.zeros((0, 3), dtype=int), [[1, 1, 1]]):
         events = log_of(labels)
-        drift = small(events)
-        scene = scene_drift(events.table(), events, drift)
-        assert math.isnan(scene.p_value)
-        assert math.isnan(scene.trend)
+        assert math.isnan(order_test(events.table(), events).p_value)
+        assert not len(trend_columns(events.table(), small(events))[0])
         assert len(flips(events).rate) == len(labels)
 
 
@@ -214,8 +213,11 @@ def scene(labels, K=2, frame_orders=99):
 
 
 def drift_of(events, frame_orders=99):
+    """The tests of a scene, with the share of the disagreement that goes one way in time, and in random order."""
     table = events.table()
-    return scene_drift(table, events, small(events, draws=1, most=1), seed=0, frame_orders=frame_orders)
+    one_way, by_chance, total = trend_columns(table, small(events, draws=1, most=1))[1].sum(axis=0)
+    test = order_test(table, events, frame_orders=frame_orders)
+    return SimpleNamespace(**vars(test), trend=one_way / total, trend_null=by_chance / total)
 
 
 def test_the_scene_test_keeps_its_level_when_voxels_err_together():
@@ -282,23 +284,13 @@ def test_stretches_are_the_means_of_their_observations():
     np.testing.assert_allclose(found.evidence, [mean for _, _, mean in expected])
 
 
-def test_the_statistics_of_the_scene_are_means_over_its_voxels():
-    rng = np.random.default_rng(12)
-    events = log_of(rng.integers(-1, 2, size=(60, 7)).clip(min=[0] + [-1] * 6))
-    table, drift = events.table(), small(events)
-    found = scene_drift(table, events, drift, frame_orders=9)
-    assert found.sbd == pytest.approx(np.nanmean(sbd(table)))
-    assert found.null == pytest.approx(np.nanmean(drift.null))
-
-
 def test_frames_need_not_be_numbered_from_zero_nor_come_in_order():
     """The observed order is the order of integration; the null does not depend on the frames' numbers."""
     plain = log_of(np.random.default_rng(0).integers(0, 2, size=(400, 36)))
     other = Events(
         plain.ix, plain.iy, plain.iz, plain.voxel, 1000 - plain.frame, plain.evidence, plain.pixels, plain.voxel_size
     )
-    a, b = (scene_drift(e.table(), e, small(e), frame_orders=199) for e in (plain, other))
-    assert a.sbd == b.sbd
+    a, b = (drift_of(e, 199) for e in (plain, other))
     assert a.trend == b.trend
     assert a.trend_p == pytest.approx(b.trend_p, abs=0.15)
 

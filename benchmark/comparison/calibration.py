@@ -53,14 +53,14 @@ def _with_truth(record: Record, truth_file: Path) -> tuple[VoxelTable, Truth]:
     return VoxelTable.joined([table for table, _ in parts]), Truth(label >= 0, label)
 
 
-def lines(found: AcceptanceThresholds) -> Iterator[str]:
+def lines(result: AcceptanceThresholds) -> Iterator[str]:
     """For the terminal."""
     yield (
-        f"labels that are right with a probability of {found.precision:g} or more, class by class at a confidence of"
-        f" {found.confidence:g}; calibrated on {found.calibrated_on}"
+        f"labels that are right with a probability of {result.precision:g} or more, class by class at a confidence of"
+        f" {result.confidence:g}; calibrated on {result.calibrated_on}"
     )
-    width = min(max(map(len, found.classes), default=0), 20)
-    for name, own in found.classes.items():
+    width = min(max(map(len, result.classes), default=0), 20)
+    for name, own in result.classes.items():
         right = f"{own.by:<6} >= {own.at_least:<5.3g} right in {own.precision:.3f}, at least {own.low:.3f}"
         if not own.voxels:
             yield f"  {name[:width]:<{width}}  never: no label of it has a known truth"
@@ -68,6 +68,6 @@ def lines(found: AcceptanceThresholds) -> Iterator[str]:
             yield f"  {name[:width]:<{width}}  never; best {right} ({own.voxels:,} voxels)"
         else:
             yield f"  {name[:width]:<{width}}  {right}: {own.left:.0%} left"
-    yield f"{found.left:.1%} of the voxels are left"
-    if any(own.never for own in found.classes.values()):
+    yield f"{result.left:.1%} of the voxels are left"
+    if any(own.never for own in result.classes.values()):
         yield "more locations, in other scenes, show more: errors near each other count as few"

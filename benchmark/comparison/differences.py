@@ -65,8 +65,8 @@ LEVEL = 0.05
 
 def contrasts(common: Common, base: Entry, other: Entry, number: int) -> tuple[Contrast, ...]:
     """All that is compared of a scene, in the order of `quantities`; `number` is the other run's among the runs."""
-    found = {row.measure: row for row in _rows(common, base, other, number)}
-    return tuple(found[quantity.key] for quantity in quantities() if quantity.key in found)
+    result = {row.measure: row for row in _rows(common, base, other, number)}
+    return tuple(result[quantity.key] for quantity in quantities() if quantity.key in result)
 
 
 def by_class(common: Common, base: Entry, other: Entry, number: int) -> tuple[Contrast, ...]:
@@ -81,23 +81,16 @@ def by_class(common: Common, base: Entry, other: Entry, number: int) -> tuple[Co
     return tuple(sorted(rows, key=lambda row: (names.index(row.of), order[row.measure])))
 
 
-def over_scenes(found: Sequence[Sequence[Contrast]]) -> tuple[Contrast, ...]:
+def over_scenes(result: Sequence[Sequence[Contrast]]) -> tuple[Contrast, ...]:
     """The macro mean of each measure (and class) over the scenes that have it."""
     groups: dict[tuple[str, str], list[Contrast]] = {}
-    for row in (row for rows in found for row in rows):
+    for row in (row for rows in result for row in rows):
         groups.setdefault((row.measure, row.of), []).append(row)
-    return tuple(
-        Contrast(
-            measure,
-            of,
-            macro_mean([row.base for row in rows]),
-            macro_mean([row.other for row in rows]),
-            mean_of([row.difference for row in rows]),
-            math.nan,
-            "",
-        )
-        for (measure, of), rows in groups.items()
-    )
+    means = []
+    for (measure, of), rows in groups.items():
+        base, other = macro_mean([row.base for row in rows]), macro_mean([row.other for row in rows])
+        means.append(Contrast(measure, of, base, other, mean_of([row.difference for row in rows]), math.nan, ""))
+    return tuple(means)
 
 
 def corrected(lists: Sequence[Sequence[Contrast]]) -> list[tuple[Contrast, ...]]:
@@ -146,17 +139,13 @@ def _comparable(quantity: Quantity, common: Common) -> bool:
 def _row(
     quantity: Quantity, base: ClusterSums, other: ClusterSums, common: Common, k: int | None = None, of: str = ""
 ) -> Iterator[Contrast]:
-    """A number of the sums, where either run has it."""
     key = quantity.key
     before, after = value(base, key, k), value(other, key, k)
     if not (math.isnan(before) and math.isnan(after)):
-        yield Contrast(key, of, before, after, _difference(base, other, key, k, common), math.nan, "")
-
-
-def _difference(base: ClusterSums, other: ClusterSums, key: str, k: int | None, common: Common) -> Interval:
-    scope = THESE_FRAMES if THESE_FRAMES in map(scope_of, (base, other)) else common.scope
-    apart = common.basis == "flights"
-    return sums_difference(key, other, base, k, scope=scope, same_frames=common.same_frames, apart=apart)
+        scope = THESE_FRAMES if THESE_FRAMES in map(scope_of, (base, other)) else common.scope
+        apart = common.basis == "flights"
+        change = sums_difference(key, other, base, k, scope=scope, same_frames=common.same_frames, apart=apart)
+        yield Contrast(key, of, before, after, change, math.nan, "")
 
 
 def sums_difference(
@@ -183,8 +172,8 @@ def sums_difference(
     scope, number = THESE_FRAMES if of_space_alone(key, k) else scope, functional(key, k)
     if apart:
         return unpaired(estimate(new, key, k, scope, level), estimate(base, key, k, scope, level), level)
-    found, most = difference(new, base, key, k, scope, same_frames=same_frames, level=level), number.high - number.low
-    return dataclasses.replace(found, low=max(found.low, -most), high=min(found.high, most))
+    result, most = difference(new, base, key, k, scope, same_frames=same_frames, level=level), number.high - number.low
+    return dataclasses.replace(result, low=max(result.low, -most), high=min(result.high, most))
 
 
 def flicker_difference(new: Flicker, base: Flicker, *, paired: bool = True, level: float = INTERVAL_LEVEL) -> Interval:
@@ -212,19 +201,19 @@ def _of_voxels(measure: Measure, base: VoxelTable, other: VoxelTable, edge: floa
     cubes, columns = Cubes.of(base, edge, where=known), np.stack([after - before, known], axis=1)
     before, after = before[known], after[known]
     change = cubes.estimate(columns, ratio_of, (-measure.largest, measure.largest), "plain")
-    found = no_difference(change) if np.array_equal(before, after) else _with_p_value(change)
-    return Contrast(measure.key, "", mean(before), mean(after), found, math.nan, "")
+    result = no_difference(change) if np.array_equal(before, after) else _with_p_value(change)
+    return Contrast(measure.key, "", mean(before), mean(after), result, math.nan, "")
 
 
-def _with_p_value(found: Interval, level: float = INTERVAL_LEVEL) -> Interval:
+def _with_p_value(interval: Interval, level: float = INTERVAL_LEVEL) -> Interval:
     """Return the interval with the p-value that the number is 0."""
     from scipy import special
 
-    error = standard_error(found, level)
+    error = standard_error(interval, level)
     if not error > 0:
-        return found
-    degrees = found.degrees if found.degrees > 0 else math.inf
-    return dataclasses.replace(found, p_value=float(2 * special.stdtr(degrees, -abs(found.value) / error)))
+        return interval
+    degrees = interval.degrees if interval.degrees > 0 else math.inf
+    return dataclasses.replace(interval, p_value=float(2 * special.stdtr(degrees, -abs(interval.value) / error)))
 
 
 # --- By class ---------------------------------------------------------------------------------------------------------
@@ -238,14 +227,9 @@ def _against_all(common: Common, base: Entry, other: Entry, names: Sequence[str]
         if not _comparable(quantity, common):
             continue
         for k, name in enumerate(names):
-            if _enough(before, k):
+            seen = before["observations"].sum() / max(before["voxels"].sum(), 1e-9)
+            if before["evidence"][:, k].sum() >= LEAST_VOXELS * seen:  # of evidence that is worth so many voxels
                 yield from _row(quantity, before, after, common, k, name)
-
-
-def _enough(sums: ClusterSums, k: int) -> bool:
-    """Whether a class has evidence worth so many voxels."""
-    seen = sums["observations"].sum() / max(sums["voxels"].sum(), 1e-9)
-    return bool(sums["evidence"][:, k].sum() >= LEAST_VOXELS * seen)
 
 
 def _of_locations(common: Common, names: Sequence[str], number: int) -> Iterator[Contrast]:
@@ -302,8 +286,8 @@ def find(
     changes: dict[tuple[str, str], Changes] = {}
     for scene in shared_scenes(handles):
         progress(scene)
-        found, own = _scene(scene, handles, scope)
-        scenes.append(found)
+        rows, own = _scene(scene, handles, scope)
+        scenes.append(rows)
         changes |= {(scene, name): each for name, each in own.items()}
     result = RunComparison(
         schema=SCHEMA,
@@ -324,12 +308,12 @@ def _scene(scene: str, runs: Sequence[RunHandle], scope: Scope) -> tuple[SceneCo
     classes = corrected([by_class(common, entries[0], entries[n], n) for n in numbers])
     against, changes = [], {}
     for n, own, of_classes in zip(numbers, everything, classes, strict=True):
-        found = Against(names[n], own, of_classes)
+        result = Against(names[n], own, of_classes)
         if common.regions is not None:
             worse, named = worse_areas(common, n), entries[n].named
             changes[names[n]] = worse.changes
-            found = dataclasses.replace(
-                found,
+            result = dataclasses.replace(
+                result,
                 compared=worse.changes.compared,
                 worse=worse.changes.worse,
                 better=worse.changes.better,
@@ -337,7 +321,7 @@ def _scene(scene: str, runs: Sequence[RunHandle], scope: Scope) -> tuple[SceneCo
                 top_frames=named(worse.top_frames),
                 columns=Path(COLUMNS) / f"{slug(scene, names[0], names[n])}.parquet",
             )
-        against.append(found)
+        against.append(result)
     return _found(scene, common, tuple(against)), changes
 
 

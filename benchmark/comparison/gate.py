@@ -62,11 +62,6 @@ class GateMeasure:
     only_change: bool = False
     lacking: str = "run it again with more overlap between frames"
 
-    @property
-    def key(self) -> str:
-        """Of the number among the sums."""
-        return self.quantity.key
-
 
 MEASURES = (
     GateMeasure(PSA, "psa"),
@@ -105,15 +100,10 @@ NAMED = {_plain(name): each for each in MEASURES for name in (each.name, each.qu
 
 def measure_named(name: str, where: str) -> GateMeasure:
     """By any of its names. Raises ConfigError, which says where, for one that there is not."""
-    found = NAMED.get(_plain(name))
-    if found is None:
-        raise ConfigError(f"{where}: no measure '{name}'; {nearest(_plain(name), listed())}")
-    return found
-
-
-def listed() -> Sequence[str]:
-    """The names of all measures."""
-    return [measure.name for measure in MEASURES]
+    result = NAMED.get(_plain(name))
+    if result is None:
+        raise ConfigError(f"{where}: no measure '{name}'; {nearest(_plain(name), [each.name for each in MEASURES])}")
+    return result
 
 
 # The rules of a gate, as text: 'alpha drop < 0.02', 'class human: recall > 0.6'.
@@ -168,17 +158,17 @@ class Rule:
 
 def parse(text: str) -> Rule:
     """A rule from its text. Raises ConfigError with the grammar where it is none."""
-    found = RULE.fullmatch(text)
-    if found is None:
+    result = RULE.fullmatch(text)
+    if result is None:
         raise ConfigError(f"rule '{text}': not understood; write {GRAMMAR}, e.g. 'alpha drop < 0.02'")
-    measure = measure_named(found["measure"], f"rule '{text}'")
-    limit = float(found["limit"])
-    if found["percent"] and measure.quantity.unit != "%":
+    measure = measure_named(result["measure"], f"rule '{text}'")
+    limit = float(result["limit"])
+    if result["percent"] and measure.quantity.unit != "%":
         limit /= 100
     change: Change | None = None
-    if found["change"]:
-        change = "drop" if found["change"].lower() == "drop" else "rise"
-    rule = Rule(text.strip(), measure, change, found["relation"][0] == "<", limit, found["scene"], found["class"])
+    if result["change"]:
+        change = "drop" if result["change"].lower() == "drop" else "rise"
+    rule = Rule(text.strip(), measure, change, result["relation"][0] == "<", limit, result["scene"], result["class"])
     _check_rule(rule)
     return rule
 
@@ -200,15 +190,16 @@ def _check_rule(rule: Rule) -> None:
 Verdict = Literal["passes", "fails", "undecided"]
 
 
-def verdict(rule: Rule, found: Interval) -> Verdict:
+def verdict(rule: Rule, interval: Interval) -> Verdict:
     """What an interval, each of whose ends is passed with the gate's level, says of a rule.
 
     Passes where the whole of it keeps to the limit. Fails where none of it does; a loss fails as soon as it is shown
     and not shown to be smaller than the limit.
     """
-    if found.undecided or math.isnan(found.low) or math.isnan(found.high):
+    if interval.undecided or math.isnan(interval.low) or math.isnan(interval.high):
         return "undecided"
-    low, high, limit = (found.low, found.high, rule.limit) if rule.below else (-found.high, -found.low, -rule.limit)
+    shown, limit = (interval, rule.limit) if rule.below else (negative(interval), -rule.limit)
+    low, high = shown.low, shown.high
     if high < limit:
         return "passes"
     return "fails" if low > (min(limit, 0.0) if rule.bounds_a_loss else limit) else "undecided"
@@ -224,17 +215,17 @@ def bounded(
     scope: Scope = THIS_SCENE,
 ) -> Interval:
     """Return what a rule bounds, from sums: a value, a drop or a rise; each end is missed with probability `level`."""
-    key, both = rule.measure.key, 1 - 2 * level
+    key, both = rule.measure.quantity.key, 1 - 2 * level
     if base is None or rule.change is None:
         return estimate(new, key, k, THESE_FRAMES if of_space_alone(key, k) else scope, both)
     same_frames = True if scope == THESE_FRAMES else None
-    found = sums_difference(key, new, base, k, scope=scope, same_frames=same_frames, level=both)
-    return found if rule.change == "rise" else negative(found)
+    result = sums_difference(key, new, base, k, scope=scope, same_frames=same_frames, level=both)
+    return result if rule.change == "rise" else negative(result)
 
 
-def negative(found: Interval) -> Interval:
+def negative(interval: Interval) -> Interval:
     """Return the interval of the opposite number."""
-    return dataclasses.replace(found, value=0.0 - found.value, low=0.0 - found.high, high=0.0 - found.low)
+    return dataclasses.replace(interval, value=0.0 - interval.value, low=0.0 - interval.high, high=0.0 - interval.low)
 
 
 # The settings of a gate: its rules, the level, what is to become of what is undecided.
@@ -397,23 +388,18 @@ def gate(new: str | Path, against: str | Path | None, config: GateConfig) -> Gat
             rules, absent = _with_a_value(rules, own, base, scenes)
             notes += [f"{given.text}: seen nowhere twice, and left out: {', '.join(absent)}"] if absent else []
         for rule in rules:
-            _require_values(rule, own, base, scenes)
-        judged += [_judged(rule, own, base, scenes, config.level / len(rules), config.scope) for rule in rules]
-    return GateResult(
-        _named(own), "" if base is None else _named(base), scenes, config.level, config.undecided, tuple(judged),
-        tuple(notes),
-    )  # fmt: skip
-
-
-def _named(run: RunHandle) -> str:
-    return f"{run.backbone} ({run.source})"
+            pairs = _pairs(rule, own, base, scenes)
+            _require_values(rule, pairs)
+            judged.append(_judged(rule, pairs, config.level / len(rules), config.scope))
+    judged_run, against_run = ("" if run is None else f"{run.backbone} ({run.source})" for run in (own, base))
+    return GateResult(judged_run, against_run, scenes, config.level, config.undecided, tuple(judged), tuple(notes))
 
 
 def _notes(own: RunHandle, base: RunHandle | None, scenes: Sequence[str]) -> list[str]:
     left = [scene for scene in own.scenes if scene not in scenes]
     missing = [scene for scene in (base.scenes if base else ()) if scene not in scenes]
-    said = [f"not in the baseline, and not compared: {', '.join(left)}"] if left else []
-    return said + ([f"of the baseline alone, and not compared: {', '.join(missing)}"] if missing else [])
+    text = [f"not in the baseline, and not compared: {', '.join(left)}"] if left else []
+    return text + ([f"of the baseline alone, and not compared: {', '.join(missing)}"] if missing else [])
 
 
 # --- Before anything is judged ----------------------------------------------------------------------------------------
@@ -448,17 +434,18 @@ def _has(rule: Rule, entry: Entry) -> bool:
         return len(entry.flicker) > 1
     if rule.measure.quantity is COVERAGE:
         return True
-    columns = sums_for(entry.sums, rule.measure.key, _k(rule, entry))
+    columns = sums_for(entry.sums, rule.measure.quantity.key, _k(rule, entry))
     return bool(columns.size) and (rule.measure.quantity is not SBD_EXCESS or bool(columns[:, 1].any()))
+
+
+Pair = tuple[Entry, Entry | None]
 
 
 def _k(rule: Rule, entry: Entry) -> int | None:
     return None if rule.class_name is None else entry.classes.index(rule.class_name)
 
 
-def _pairs(
-    rule: Rule, own: RunHandle, base: RunHandle | None, scenes: Sequence[str]
-) -> list[tuple[Entry, Entry | None]]:
+def _pairs(rule: Rule, own: RunHandle, base: RunHandle | None, scenes: Sequence[str]) -> list[Pair]:
     """The runs on each scene that a rule is about; of a rule on a value the new one alone."""
     named = [rule.scene] if rule.scene else scenes
     return [(own.scenes[scene], base.scenes[scene] if base and rule.change else None) for scene in named]
@@ -468,38 +455,34 @@ def _with_a_value(
     rules: Sequence[Rule], own: RunHandle, base: RunHandle | None, scenes: Sequence[str]
 ) -> tuple[tuple[Rule, ...], list[str]]:
     """The rules of classes that some run has a value of, and the names of the other classes."""
-    there = [
-        any(not math.isnan(_value(rule, entry)) for pair in _pairs(rule, own, base, scenes) for entry in pair if entry)
-        for rule in rules
-    ]
-    kept = tuple(rule for rule, has in zip(rules, there, strict=True) if has)
-    return kept or tuple(rules), [str(rule.class_name) for rule, has in zip(rules, there, strict=True) if not has]
+
+    def has_value(rule: Rule) -> bool:
+        entries = (entry for pair in _pairs(rule, own, base, scenes) for entry in pair if entry is not None)
+        return any(not math.isnan(_value(rule, entry)) for entry in entries)
+
+    there = tuple(filter(has_value, rules))
+    return there or tuple(rules), [str(rule.class_name) for rule in rules if rule not in there]
 
 
-def _require_values(rule: Rule, own: RunHandle, base: RunHandle | None, scenes: Sequence[str]) -> None:
+def _require_values(rule: Rule, pairs: Sequence[Pair]) -> None:
     """Raise ConfigError for a rule that cannot be evaluated, with what it takes."""
-    for new, old in _pairs(rule, own, base, scenes):
+    for new, old in pairs:
         for entry in (new, old):
-            if entry is None or rule.measure.quantity is COVERAGE:
-                continue
-            where = f"rule '{rule.text}': {entry.where}"
-            if math.isnan(_value(rule, entry)):
-                whose = f" of {rule.class_name}" if rule.class_name else ""
-                raise ConfigError(f"{where} has no {rule.measure.name}{whose}: {NOTHING}; {rule.measure.lacking}")
-        if old is None:
-            continue
-        if rule.measure.quantity in OF_EVIDENCE and (new.summary.reduced is None) != (old.summary.reduced is None):
+            if entry is not None and rule.measure.quantity is not COVERAGE and math.isnan(_value(rule, entry)):
+                named = f"{rule.measure.name} of {rule.class_name}" if rule.class_name else rule.measure.name
+                raise ConfigError(
+                    f"rule '{rule.text}': {entry.where} has no {named}: {NOTHING}; {rule.measure.lacking}"
+                )
+        mixed = old is not None and (new.summary.reduced is None) != (old.summary.reduced is None)
+        if mixed and rule.measure.quantity in OF_EVIDENCE:
             raise ConfigError(f"rule '{rule.text}': {SCORES}")
 
 
-def _judged(
-    rule: Rule, own: RunHandle, base: RunHandle | None, scenes: Sequence[str], level: float, scope: Scope
-) -> Judgement:
+def _judged(rule: Rule, pairs: Sequence[Pair], level: float, scope: Scope) -> Judgement:
     """Over the mean of the scenes, which err by themselves, or in the one that the rule names."""
-    pairs = _pairs(rule, own, base, scenes)
-    found = mean_of([_found(rule, new, old, level, scope) for new, old in pairs], 1 - 2 * level)
+    result = mean_of([_found(rule, new, old, level, scope) for new, old in pairs], 1 - 2 * level)
     values = [[math.nan if entry is None else _value(rule, entry) for entry in pair] for pair in pairs]
-    return Judgement(rule, verdict(rule, found), found, *(float(mean) for mean in np.mean(values, axis=0)))
+    return Judgement(rule, verdict(rule, result), result, *(float(mean) for mean in np.mean(values, axis=0)))
 
 
 def _value(rule: Rule, entry: Entry) -> float:
@@ -507,16 +490,15 @@ def _value(rule: Rule, entry: Entry) -> float:
         return float(np.mean(list(entry.flicker.values())))
     if rule.measure.quantity is COVERAGE:
         return math.nan
-    return value(entry.sums, rule.measure.key, _k(rule, entry))
+    return value(entry.sums, rule.measure.quantity.key, _k(rule, entry))
 
 
 def _found(rule: Rule, new: Entry, base: Entry | None, level: float, scope: Scope) -> Interval:
-    """What a rule bounds, in one scene."""
     if rule.measure.quantity is not FLICKER:
         return bounded(rule, new.sums, None if base is None else base.sums, k=_k(rule, new), level=level, scope=scope)
     if scope == OTHER_SCENES:
         raise ConfigError(f"rule '{rule.text}': flicker is known by frame alone; judge it with --scope this-scene")
     if base is None:
         return mean_over_frames(np.array([*new.flicker]), np.array([*new.flicker.values()]), 1 - 2 * level)
-    found = flicker_difference(new.flicker, base.flicker, level=1 - 2 * level)
-    return found if rule.change == "rise" else negative(found)
+    result = flicker_difference(new.flicker, base.flicker, level=1 - 2 * level)
+    return result if rule.change == "rise" else negative(result)

@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from xml.etree import ElementTree
 
-from semstab.comparison.gate import POWER, GateResult, Judgement, Verdict
+from semstab.comparison.gate import POWER, GateResult, Verdict
 from semstab.core.files import write_text
 from semstab.core.json_form import to_json
 from semstab.errors import ConfigError
@@ -23,12 +23,9 @@ SIGNS: Mapping[Verdict, str] = {"passes": "✅", "fails": "❌", "undecided": "�
 def headline(result: GateResult) -> str:
     """'1 fails, 2 pass: the gate fails'; a gate with rules that the data leave open is undecided, never passed."""
     counts = [(n, verdict) for verdict in ("fails", "undecided", "passes") if (n := result.count(verdict))]
-    said = ", ".join(f"{n} {_plural(verdict, n)}" for n, verdict in counts)
-    return f"{said}: the gate {OUTCOMES[result.outcome]}"
-
-
-def _plural(verdict: str, n: int) -> str:
-    return verdict if n == 1 or verdict == "undecided" else {"fails": "fail", "passes": "pass"}[verdict]
+    plural = {"fails": "fail", "passes": "pass", "undecided": "undecided"}
+    listed = ", ".join(f"{n} {verdict if n == 1 else plural[verdict]}" for n, verdict in counts)
+    return f"{listed}: the gate {OUTCOMES[result.outcome]}"
 
 
 def lines(result: GateResult, width: int = 80) -> Iterator[str]:
@@ -49,8 +46,8 @@ def plan(result: GateResult) -> Iterator[str]:
     yield f"frames from which on a rule is decided with a probability of {POWER:.0%}, by the spread of these runs"
     for each in result.judgements:
         needed, now = each.frames_needed(result.level), each.found.frames
-        said = f"{needed:,} ({now} now)" if needed else "no number of frames tells"
-        yield f"  {each.rule.text}: {said}"
+        text = f"{needed:,} ({now} now)" if needed else "no number of frames tells"
+        yield f"  {each.rule.text}: {text}"
 
 
 def _wrapped(line: str, width: int, indent: int) -> list[str]:
@@ -95,7 +92,6 @@ def _cell(text: str) -> str:
 
 
 def _code(text: str) -> str:
-    """As code in Markdown, where nothing in it means anything."""
     return "`" + _cell(text).replace("`", "'") + "`"
 
 
@@ -133,13 +129,9 @@ def junit(result: GateResult) -> str:
             ElementTree.SubElement(case, "failure", message=_xml(f"{each.values}: {each.reason}"))
         elif each.verdict == "undecided":
             ElementTree.SubElement(case, "skipped", message=_xml(f"undecided: {each.reason}"))
-        ElementTree.SubElement(case, "system-out").text = _xml(_story(each))
+        ElementTree.SubElement(case, "system-out").text = _xml(f"{each.values}; {each.reason} ({each.about})")
     ElementTree.indent(suite)
     return '<?xml version="1.0" encoding="UTF-8"?>\n' + ElementTree.tostring(suite, encoding="unicode") + "\n"
-
-
-def _story(each: Judgement) -> str:
-    return f"{each.values}; {each.reason} ({each.about})"
 
 
 def _xml(text: str) -> str:

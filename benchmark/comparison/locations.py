@@ -122,25 +122,25 @@ class Worse:
 def worse_areas(common: Common, number: int) -> Worse:
     """Of a run against the base; the top contributing frames are known where the observations were kept."""
     compared = worse = better = 0
-    kept, shown = list[Changed](), list[Changed]()
+    left, shown = list[Changed](), list[Changed]()
     for own in _changed(common, number):
         compared += len(own.change)
         worse += int(np.count_nonzero(own.change <= -WORSE))
         better += int(np.count_nonzero(own.change >= WORSE))
-        kept.append(own.rows(own.matters))
+        left.append(own.rows(own.matters))
         shown.append(own.rows(own.matters | in_share(own.table, common.shown)))
-    found, seen = Changed.joined(kept), Changed.joined(shown)
-    index = found.table.index
-    area, improved_alike = _clusters(index, found.label, -found.change, WORSE)
+    result, seen = Changed.joined(left), Changed.joined(shown)
+    index = result.table.index
+    area, improved_alike = _clusters(index, result.label, -result.change, WORSE)
     observations = _observations(common, number, index)
-    names = found.table.classes or tuple(str(k) for k in range(found.table.K))
-    size = found.table.voxel_size
-    listed = _areas("agreement", area, improved_alike, -found.change, index, size, found.label, names, observations)
+    names = result.table.classes or tuple(str(k) for k in range(result.table.K))
+    size = result.table.voxel_size
+    listed = _areas("agreement", area, improved_alike, -result.change, index, size, result.label, names, observations)
     wrong_area = None
-    if found.true is not None and found.right is not None:
-        loss = -found.right.astype(float)
-        wrong_area, wrong_rivals = _clusters(index, found.true, loss, 1.0)
-        listed += _areas("truth", wrong_area, wrong_rivals, loss, index, size, found.true, names, observations)
+    if result.true is not None and result.right is not None:
+        loss = -result.right.astype(float)
+        wrong_area, wrong_rivals = _clusters(index, result.true, loss, 1.0)
+        listed += _areas("truth", wrong_area, wrong_rivals, loss, index, size, result.true, names, observations)
 
     def numbers(table: VoxelTable) -> tuple[Int64, Int64 | None]:
         """The areas of some voxels (n,), which hold those that matter among them."""
@@ -155,7 +155,7 @@ def worse_areas(common: Common, number: int) -> Worse:
             yield _columns(own, *numbers(own.table))
 
     changes = Changes(seen, compared, worse, better, *numbers(seen.table), parts)
-    top_frames = () if observations is None else _top_frames(observations.among(area > 0, found.label))
+    top_frames = () if observations is None else _top_frames(observations.among(area > 0, result.label))
     return Worse(tuple(listed), top_frames, changes)
 
 
@@ -167,23 +167,18 @@ def _changed(common: Common, number: int) -> Iterator[Changed]:
 
 
 def _put(n: int, at: Int64, values: Int64) -> Int64:
-    found = np.zeros(n, dtype=np.int64)
-    found[at] = values
-    return found
+    result = np.zeros(n, dtype=np.int64)
+    result[at] = values
+    return result
 
 
 def _columns(own: Changed, area: Int64, wrong_area: Int64 | None) -> dict[str, npt.NDArray[Any]]:
     table = own.table
-    found: dict[str, npt.NDArray[Any]] = {
-        "ix": table.ix,
-        "iy": table.iy,
-        "iz": table.iz,
-        "change": own.change,
-        "area": area.astype(np.int32),
-    }
+    columns: dict[str, npt.NDArray[Any]] = {"ix": table.ix, "iy": table.iy, "iz": table.iz, "change": own.change}
+    columns["area"] = area.astype(np.int32)
     if own.right is not None and wrong_area is not None:
-        found |= {"right_change": own.right.astype(np.int8), "wrong_area": wrong_area.astype(np.int32)}
-    return found
+        columns |= {"right_change": own.right.astype(np.int8), "wrong_area": wrong_area.astype(np.int32)}
+    return columns
 
 
 # --- Places -----------------------------------------------------------------------------------------------------------
@@ -210,11 +205,11 @@ def _connected(index: Int32, label: Int64, loss: Float64, where: Mask) -> tuple[
     mass: Float64 = np.bincount(of, weights=loss[rows]).astype(np.float64)
     count = np.bincount(of)
     order = np.lexsort((np.arange(len(mass)), -mass))
-    kept = order[count[order] >= LEAST]
+    left = order[count[order] >= LEAST]
     rank = np.zeros(len(mass), dtype=np.int64)
-    rank[kept] = np.arange(1, len(kept) + 1)
+    rank[left] = np.arange(1, len(left) + 1)
     number[rows] = rank[of]
-    return number, mass[kept]
+    return number, mass[left]
 
 
 def _touching(index: Int32, label: Int64) -> tuple[Int64, Int64]:
@@ -222,13 +217,13 @@ def _touching(index: Int32, label: Int64) -> tuple[Int64, Int64]:
     low, size = index.min(axis=0).astype(np.int64) - 1, np.ptp(index, axis=0).astype(np.int64) + 3
     x, y, z = (index.astype(np.int64) - low).T
     key = (x * size[1] + y) * size[2] + z  # ascending, as the voxels are
-    found: list[tuple[Int64, Int64]] = []
+    result: list[tuple[Int64, Int64]] = []
     for dx, dy, dz in itertools.product((0, 1), (-1, 0, 1), (-1, 0, 1)):
         if (step := (dx * size[1] + dy) * size[2] + dz) > 0:
             at = np.minimum(np.searchsorted(key, key + step), len(key) - 1)
             there = np.flatnonzero((key[at] == key + step) & (label[at] == label))
-            found.append((there, at[there]))
-    first, second = zip(*found, strict=True)
+            result.append((there, at[there]))
+    first, second = zip(*result, strict=True)
     return np.concatenate(first), np.concatenate(second)
 
 
@@ -252,18 +247,11 @@ def _areas(
         of = int(label[where][0])
         listed.append(
             Area(
-                k,
-                what,
-                names[of],
-                "" if seen is None else seen.confused_with(of, names),
-                len(cells),
-                float(loss[where].mean()),
-                (x, y, z),
-                float(np.linalg.norm(np.ptp(cells, axis=0) + voxel_size)),
-                int(improved_alike[k - 1]),
-                () if seen is None else _top_frames(seen),
+                k, what, names[of], "" if seen is None else seen.confused_with(of, names), len(cells),
+                float(loss[where].mean()), (x, y, z), float(np.linalg.norm(np.ptp(cells, axis=0) + voxel_size)),
+                int(improved_alike[k - 1]), () if seen is None else _top_frames(seen),
             )
-        )
+        )  # fmt: skip
     return listed
 
 
@@ -302,13 +290,12 @@ class Seen:
 
     def confused_with(self, of: int, names: Sequence[str]) -> str:
         """The class that stands where the area's own is missing."""
-        said = np.maximum(self.lost, 0) @ self.says if len(self.lost) else np.zeros(len(names))
-        said[of] = 0
-        return names[int(said.argmax())] if said.max(initial=0) > 0 else ""
+        text = np.maximum(self.lost, 0) @ self.says if len(self.lost) else np.zeros(len(names))
+        text[of] = 0
+        return names[int(text.argmax())] if text.max(initial=0) > 0 else ""
 
 
 def _top_frames(seen: Seen) -> tuple[FrameShare, ...]:
-    """The frames that lost most, as far as they account for it."""
     frames, of = np.unique(seen.frame, return_inverse=True)
     lost = np.maximum(np.bincount(of, weights=seen.lost, minlength=len(frames)), 0.0)
     if not lost.sum() > 0:
@@ -322,7 +309,6 @@ def _top_frames(seen: Seen) -> tuple[FrameShare, ...]:
 
 
 def _observations(common: Common, number: int, index: Int32) -> Observations | None:
-    """The common observations at the voxels (n, 3), in one order; None where they were not kept."""
     if not common.logs:
         return None
     base, other = (_rows_of(common.logs[k], index) for k in (0, number))

@@ -48,8 +48,8 @@ OTHER_SIZES = f"voxels of {{sizes}}: {BY_CUBES}, and what depends on their size 
 
 OBSERVATIONS_DECIDED = (
     "labels stand beside scores: each observation is reduced to its largest class; the share of the ceiling and"
+    " alpha between frames, which forgive what a score leaves open, are left out"
 )
-OBSERVATIONS_DECIDED += " alpha between frames, which forgive what a score leaves open, are left out"
 NOT_DECIDED = "labels stand beside scores, and common observations are not known: of agreement nothing can be compared"
 
 
@@ -97,10 +97,10 @@ class Common:
 
 def pair(entries: Sequence[Entry], names: Sequence[str], scope: Scope = THIS_SCENE) -> Common:
     """The most that all runs of a scene have in common. Raises DataError where a file of a run cannot be read."""
-    found = _paired(entries, names)
+    result = _paired(entries, names)
     mixed = len({entry.summary.reduced is None for entry in entries}) > 1
-    told = (OBSERVATIONS_DECIDED if found.basis == "observations" else NOT_DECIDED,) if mixed else ()
-    return replace(found, scope=scope, mixed=mixed, notes=(*found.notes, *told))
+    notes = (OBSERVATIONS_DECIDED if result.basis == "observations" else NOT_DECIDED,) if mixed else ()
+    return replace(result, scope=scope, mixed=mixed, notes=(*result.notes, *notes))
 
 
 def _paired(entries: Sequence[Entry], names: Sequence[str]) -> Common:
@@ -117,14 +117,13 @@ def _paired(entries: Sequence[Entry], names: Sequence[str]) -> Common:
     covered = coverage_of(names, [held(region.tables) for region in regions()])
     if not any(row.common_share for row in covered):
         return _apart(entries, "the maps have no voxel in common: other locations, or other frames of reference")
-    found = _by_observations(names, records, regions) or _by_voxels(regions)
+    result = _by_observations(names, records, regions) or _by_voxels(regions)
     shown = share_of(min(row.voxels for row in covered))
-    notes = (*found.notes, *_notes(covered), *((SHOWN.format(n=round(1 / shown)),) if shown < 1 else ()))
-    return replace(found, notes=notes, regions=found.regions or regions, coverage=covered, shown=shown)
+    notes = (*result.notes, *_notes(covered), *((SHOWN.format(n=round(1 / shown)),) if shown < 1 else ()))
+    return replace(result, notes=notes, regions=result.regions or regions, coverage=covered, shown=shown)
 
 
 def _truth(records: Sequence[Record]) -> Tiles[VoxelTable] | None:
-    """The map of the ground truth, of the first run that fused it."""
     files = [file for record in records if (file := record.truth_file) is not None and file.exists()]
     return Tiles.open(files[0], VoxelTable) if files else None
 
@@ -167,9 +166,9 @@ def joint_class(tables: Iterable[VoxelTable]) -> Int64:
 
 def _by_observations(names: Sequence[str], records: Sequence[Record], regions: Regions) -> Common | None:
     """The observations that all made; None where the observations of one were not kept, or are of other frames."""
-    observations = [_observations_of(record) for record in records]
-    there = [own for own in observations if own is not None]
-    if len(there) < len(observations) or not _same_frames(there):
+    files = [file for record in records if (file := record.looks_file) is not None and file.is_file()]
+    there = [CellObservations.load(file) for file in files]
+    if len(there) < len(records) or not _same_frames(there):
         return None
     shared = compared_observations(dict(zip(names, there, strict=True)))
     tables = tuple(log.table() for log in shared.logs.values())
@@ -182,18 +181,8 @@ def _by_observations(names: Sequence[str], records: Sequence[Record], regions: R
     notes = _fewer_frames(there)
     apart = Region(dict(zip(names, tables, strict=True)), None, truth) if notes or shared.found.decided else None
     of_observations = None if apart is None else lambda: [apart]
-    return Common(
-        "observations",
-        notes,
-        sums,
-        False,
-        tables,
-        logs,
-        label,
-        shared.found,
-        of_observations,
-        frames_differ=bool(notes),
-    )
+    own = (tables, logs, label, shared.found, of_observations)
+    return Common("observations", notes, sums, False, *own, frames_differ=bool(notes))
 
 
 def _by_voxels(regions: Regions) -> Common:
@@ -237,11 +226,6 @@ def _sums(table: VoxelTable, log: Events | None, label: Int64 | None) -> Cluster
 
 def _some(log: Events | None, where: Mask) -> Events | None:
     return None if log is None else observations(log, np.flatnonzero(where[log.voxel]))
-
-
-def _observations_of(record: Record) -> CellObservations | None:
-    file = record.looks_file
-    return CellObservations.load(file) if file is not None and file.is_file() else None
 
 
 def _same_frames(observations: Sequence[CellObservations]) -> bool:
@@ -296,7 +280,6 @@ def _no_voxels(entries: Sequence[Entry]) -> str:
 
 
 def _notes(covered: Sequence[MapCoverage]) -> list[str]:
-    """Where a map has hardly anything in common with the others."""
     return [
         f"only {row.common_share:.1%} of the voxels of {row.backbone} are in all maps: are the frames of reference the"
         " same?"

@@ -6,6 +6,7 @@ A small summary holds what a later comparison needs but voxels, in one file that
 from __future__ import annotations
 
 import csv
+import dataclasses
 import functools
 import io
 import json
@@ -13,11 +14,10 @@ import math
 import tempfile
 import zipfile
 import zlib
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import partial
 from pathlib import Path
-from typing import TypeVar
+from typing import Any
 
 import numpy as np
 
@@ -34,41 +34,59 @@ from semstab.model.records import ImageSpace, Record
 from semstab.model.results import UnitSummary
 from semstab.statistics.cluster_sums import ClusterSums
 
-T = TypeVar("T")
-
 Flicker = Mapping[int, float]
 """Percent of the pixels whose label differs from that of the frame before, camera motion removed, by frame index."""
 
 
-@dataclass(frozen=True, eq=False)
-class Entry:
-    """A unit that is compared: a label source on a scene.
+@dataclass(frozen=True, eq=False, kw_only=True)
+class EntryNumbers:
+    """Numbers of a unit that is compared.
 
-    where   the folder or the file that it comes from
-    record  what its folder holds of it; None of a small summary, which holds no voxels
-    up      the scene's up axis, where it is known
-    seed    of a simulated scene
+    up    the scene's up axis, where it is known
+    seed  of a simulated scene
     """
 
-    where: Path
     summary: UnitSummary
     image_space: ImageSpace
     georeference: Georeference | None
     up: tuple[float, float, float] | None
     seed: int | None
-    record: Record | None
-    read_sums: Callable[[], ClusterSums]
-    read_flicker: Callable[[], Flicker]
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Entry(EntryNumbers):
+    """A unit that is compared: a label source on a scene.
+
+    where   the folder or the file that it comes from
+    record  what its folder holds of it; None of a small summary, which holds no voxels
+    small   sums and flicker of a small summary
+    """
+
+    where: Path
+    record: Record | None = None
+    small: tuple[ClusterSums, Flicker] | None = None
 
     @functools.cached_property
     def sums(self) -> ClusterSums:
         """Its sums by frame and cube of space. Raises DataError where the run has none."""
-        return self.read_sums()
+        if self.small is not None:
+            return self.small[0]
+        assert self.record is not None
+        file = self.record.influence_file
+        if file is None or not file.is_file():
+            raise DataError(f"{self.where}: has no sums by frame and cube of {self.record.unit.slug}; run it again")
+        try:
+            return ClusterSums.load(file)
+        except DataError as error:
+            raise DataError(f"{error}; run it again") from error
 
     @functools.cached_property
     def flicker(self) -> Flicker:
         """Flicker of each frame but the first."""
-        return self.read_flicker()
+        if self.small is not None:
+            return self.small[1]
+        assert self.record is not None
+        return _flicker(self.record.series)
 
     def named(self, frames: Sequence[FrameShare]) -> tuple[FrameShare, ...]:
         """Return frames under the names of their files, where the run kept them."""
@@ -141,12 +159,12 @@ def open_run(named: str | Path) -> RunHandle:
     backbone = _chosen(path, result.backbones, wanted)
     seed = result.manifest.get("seed")
     scenes = {
-        record.unit.scene: Entry(
-            path, record.summary, record.image_space, result.georeference.get(record.unit.scene),
-            result.up.get(record.unit.scene), seed if isinstance(seed, int) else None, record,
-            functools.partial(_sums, path, record), functools.partial(_flicker, record.series),
+        scene: Entry(
+            summary=record.summary, image_space=record.image_space, georeference=result.georeference.get(scene),
+            up=result.up.get(scene), seed=seed if isinstance(seed, int) else None, where=path, record=record,
         )
         for record in result.select(backbone=backbone)
+        for scene in [record.unit.scene]
     }  # fmt: skip
     return RunHandle(backbone, path, backbone, scenes)
 
@@ -188,7 +206,6 @@ def _require_same_scene(scene: str, one: Entry, other: Entry) -> None:
 
 
 def _chosen(path: Path, there: Sequence[str], wanted: str) -> str:
-    """Return the wanted backbone, or the only one."""
     if wanted:
         if wanted not in there:
             raise ConfigError(f"{path}: no backbone '{wanted}'; {nearest(wanted, there)}")
@@ -200,16 +217,6 @@ def _chosen(path: Path, there: Sequence[str], wanted: str) -> str:
         listed = ", ".join(own[:4]) + (", ..." if len(own) > 4 else "")
         raise ConfigError(f"{path}: holds several label sources ({listed}); name one: {path}:{own[0]}")
     return own[0]
-
-
-def _sums(folder: Path, record: Record) -> ClusterSums:
-    file = record.influence_file
-    if file is None or not file.is_file():
-        raise DataError(f"{folder}: has no sums by frame and cube of {record.unit.slug}; run it again")
-    try:
-        return ClusterSums.load(file)
-    except DataError as error:
-        raise DataError(f"{error}; run it again") from error
 
 
 def _flicker(file: Path | None) -> Flicker:
@@ -242,14 +249,9 @@ MANY_GROUPS = 32
 """Groups of frames down to which these are joined, before cubes are."""
 
 
-@dataclass(frozen=True)
-class _Scene:
+@dataclass(frozen=True, kw_only=True)
+class _Scene(EntryNumbers):
     name: str
-    summary: UnitSummary
-    image_space: ImageSpace
-    georeference: Georeference | None
-    up: tuple[float, float, float] | None
-    seed: int | None
     frames: tuple[int, ...]
     flicker: tuple[float, ...]
 
@@ -271,12 +273,9 @@ def save_summary(run: RunHandle, path: str | Path, most: int = 1_000_000) -> Non
     take more.
     """
     scenes = tuple(
-        _Scene(
-            name, own.summary, own.image_space, own.georeference, own.up, own.seed, (*own.flicker,),
-            (*own.flicker.values(),),
-        )
+        _Scene(**_numbers(own), name=name, frames=(*own.flicker,), flicker=(*own.flicker.values(),))
         for name, own in run.scenes.items()
-    )  # fmt: skip
+    )
     content = json.dumps({"kind": KIND, "schema": SCHEMA, **to_json(_Content(run.backbone, scenes))})
     sums = [own.sums for own in run.scenes.values()]
     while len(data := _archive(content, sums)) > most:
@@ -316,15 +315,12 @@ def load_summary(path: str | Path) -> tuple[str, dict[str, Entry]]:
             except DataError as error:
                 raise DataError(f"{path}: the sums of {own.name} are damaged; write the summary again") from error
             flicker = dict(zip(own.frames, own.flicker, strict=True))
-            scenes[own.name] = Entry(
-                path, own.summary, own.image_space, own.georeference, own.up, own.seed, None,
-                partial(_same, sums), partial(_same, flicker),
-            )  # fmt: skip
+            scenes[own.name] = Entry(**_numbers(own), where=path, small=(sums, flicker))
     return content.backbone, scenes
 
 
-def _same(value: T) -> T:
-    return value
+def _numbers(own: EntryNumbers) -> dict[str, Any]:
+    return {field.name: getattr(own, field.name) for field in dataclasses.fields(EntryNumbers)}
 
 
 def _archive(content: str, sums: list[ClusterSums]) -> bytes:

@@ -9,7 +9,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from rich.console import Console
 
 from semstab.comparison.locations import MOST
-from semstab.model.contrast import Against, Area, Basis, Contrast, FrameShare, RunComparison, SceneComparison
+from semstab.model.contrast import Against, Area, Basis, Contrast, FrameShare, RunComparison
 from semstab.model.measures import ENTROPY, VSS, Quantity, measures
 from semstab.model.statistics import Interval
 from semstab.report.tables.correctness import coverage_table, ignored_table
@@ -77,13 +77,10 @@ ANSWERS = (
 
 def tables(comparison: RunComparison) -> list[Table]:
     """All that there is something for."""
-    made = [
-        _differences(comparison),
-        _by_class(comparison),
-        _areas(comparison),
-        _frames(comparison),
-        *_what_was_compared(comparison),
-    ]
+    covered = {scene.scene: scene.coverage for scene in comparison.scenes if scene.coverage}
+    observations = {scene.scene: scene.observations for scene in comparison.scenes if scene.observations is not None}
+    made = [_differences(comparison), _by_class(comparison), _areas(comparison), _frames(comparison)]
+    made += [coverage_table(covered), ignored_table(observations)]
     return [table for table in made if any(group.rows for group in table.groups)] + [everything(comparison)]
 
 
@@ -102,9 +99,7 @@ def heading(comparison: RunComparison, scope: str, own: Against) -> str:
 
 def scope(row: Contrast) -> str:
     """What a difference answers, or why it claims nothing, in a word or two."""
-    if row.difference.undecided:
-        return "undecided"
-    return row.difference.scope
+    return "undecided" if row.difference.undecided else row.difference.scope
 
 
 # --- Parts ------------------------------------------------------------------------------------------------------------
@@ -112,14 +107,10 @@ def scope(row: Contrast) -> str:
 
 def _differences(comparison: RunComparison) -> Table:
     columns = (
-        Column("measure", "Measure"),
-        Column("base", comparison.base, 4),
-        Column("other", "The run", 4),
-        Column("difference", "Difference", 4, signed=True),
-        Column("p_holm", "p (Holm)", 4),
-        Column("answers", "Answers for"),
-        Column("change", "Change"),
-    )
+        Column("measure", "Measure"), Column("base", comparison.base, 4), Column("other", "The run", 4),
+        Column("difference", "Difference", 4, signed=True), Column("p_holm", "p (Holm)", 4),
+        Column("answers", "Answers for"), Column("change", "Change"),
+    )  # fmt: skip
     groups = tuple(Group(heading(comparison, scope, own), _rows(own, HEADLINES)) for scope, own in scopes(comparison))
     macro = " Over all scenes each scene counts once." if len(comparison.scenes) > 1 else ""
     caption = (
@@ -175,19 +166,11 @@ def _class_rows(own: Against, shown: Sequence[Quantity]) -> tuple[Row, ...]:
 
 def _areas(comparison: RunComparison) -> Table:
     columns = (
-        Column("number", "Area", 0),
-        Column("what", "Lost"),
-        Column("class", "Class"),
-        Column("confused_with", "Confused with"),
-        Column("voxels", "Voxels", 0),
-        Column("loss", "Loss", 2),
-        Column("x", "x", 2, over="Centre (m)"),
-        Column("y", "y", 2, over="Centre (m)"),
-        Column("z", "z", 2, over="Centre (m)"),
-        Column("size", "Size (m)", 2),
-        Column("improved_alike", "Improved alike", 0),
-        Column("frames", "Top contributing frames"),
-    )
+        Column("number", "Area", 0), Column("what", "Lost"), Column("class", "Class"),
+        Column("confused_with", "Confused with"), Column("voxels", "Voxels", 0), Column("loss", "Loss", 2),
+        *(Column(axis, axis, 2, over="Centre (m)") for axis in "xyz"), Column("size", "Size (m)", 2),
+        Column("improved_alike", "Improved alike", 0), Column("frames", "Top contributing frames"),
+    )  # fmt: skip
     groups = tuple(
         Group(heading(comparison, scene.scene, own), tuple(_area_row(area) for area in own.areas))
         for scene in comparison.scenes
@@ -230,27 +213,14 @@ def _frames(comparison: RunComparison) -> Table:
     return Table("comparison_frames", "Top contributing frames", caption, columns, groups, "scope")
 
 
-def _what_was_compared(comparison: RunComparison) -> list[Table]:
-    covered = coverage_table({scene.scene: scene.coverage for scene in comparison.scenes if scene.coverage})
-    observations = {scene.scene: scene.observations for scene in comparison.scenes if scene.observations is not None}
-    return [covered, ignored_table(observations)]
-
-
 def everything(comparison: RunComparison) -> Table:
     """All contrasts, one a row."""
     columns = (
-        Column("run", "Run"),
-        Column("class", "Class"),
-        Column("measure", "Measure"),
-        Column("base", "Base", 6),
-        Column("other", "The run", 6),
-        Column("difference", "Difference", 6, signed=True),
-        Column("holds_for", "Holds for"),
-        Column("p", "p", 6),
-        Column("p_holm", "p (Holm)", 6),
-        Column("change", "Change"),
-        Column("undecided", "Undecided"),
-    )
+        Column("run", "Run"), Column("class", "Class"), Column("measure", "Measure"), Column("base", "Base", 6),
+        Column("other", "The run", 6), Column("difference", "Difference", 6, signed=True),
+        Column("holds_for", "Holds for"), Column("p", "p", 6), Column("p_holm", "p (Holm)", 6),
+        Column("change", "Change"), Column("undecided", "Undecided"),
+    )  # fmt: skip
     groups = tuple(Group(scope, tuple(_all_rows(own))) for scope, own in scopes(comparison))
     return Table("comparison_all", "All that was compared", ANSWERS, columns, groups, "scope")
 
@@ -279,8 +249,12 @@ BASES: dict[Basis, str] = {
 
 def sentences(comparison: RunComparison) -> list[str]:
     """One run after the other, then what could not be compared."""
-    told = [sentence for own in comparison.overall for sentence in _of_run(comparison, own)]
-    return [*told, *(sentence for scene in comparison.scenes for sentence in _what(scene))]
+    lines = [sentence for own in comparison.overall for sentence in _of_run(comparison, own)]
+    for scene in comparison.scenes:
+        if scene.basis in ("observations", "voxels"):
+            lines.append(f"{scene.scene}: {scene.voxels:,} voxels, {BASES[scene.basis]}.")
+        lines += [f"{scene.scene}: {note}." for note in scene.notes]
+    return lines
 
 
 def _of_run(comparison: RunComparison, own: Against) -> Iterator[str]:
@@ -290,8 +264,8 @@ def _of_run(comparison: RunComparison, own: Against) -> Iterator[str]:
     classes = {
         name: [row for row in own.by_class if row.of == name] for name in dict.fromkeys(r.of for r in own.by_class)
     }
-    told = {name: _changes(rows, by_key(BY_CLASS)) for name, rows in classes.items()}
-    if listed := [f"{name} {text}" for name, text in told.items() if text]:
+    notes = {name: _changes(rows, by_key(BY_CLASS)) for name, rows in classes.items()}
+    if listed := [f"{name} {text}" for name, text in notes.items() if text]:
         more = f"; and {len(listed) - MOST_CLASSES} more classes" if len(listed) > MOST_CLASSES else ""
         yield f"{own.other} by class: {'. '.join(listed[:MOST_CLASSES])}{more}."
     for scene in comparison.scenes:
@@ -314,10 +288,10 @@ def _stability(comparison: RunComparison, own: Against) -> str:
         return f"{own.other} is as stable as {comparison.base}: {numbers}, the same everywhere."
     interval = f"{row.difference.value:+z.3f} ({row.difference.low:+z.3f} to {row.difference.high:+z.3f})"
     p = "" if math.isnan(row.p_holm) else f", p {row.p_holm:.2g}"
-    said = {"better": "is more stable than", "worse": "is less stable than"}
+    text = {"better": "is more stable than", "worse": "is less stable than"}
     if row.change:
         return (
-            f"{own.other} {said[row.change]} {comparison.base}: {numbers}, {interval}{p}, for {row.difference.scope}."
+            f"{own.other} {text[row.change]} {comparison.base}: {numbers}, {interval}{p}, for {row.difference.scope}."
         )
     why = f"; undecided: {row.difference.undecided}" if row.difference.undecided else ""
     return (
@@ -347,12 +321,6 @@ def _of_areas(areas: Sequence[Area]) -> str:
         f"{count} {lost} ({alike}); the largest is {first.voxels} voxels of"
         f" {first.of}{confused_with}, at ({x:.2f}, {y:.2f}, {z:.2f}) m{frames}"
     )
-
-
-def _what(scene: SceneComparison) -> Iterator[str]:
-    if scene.basis in ("observations", "voxels"):
-        yield f"{scene.scene}: {scene.voxels:,} voxels, {BASES[scene.basis]}."
-    yield from (f"{scene.scene}: {note}." for note in scene.notes)
 
 
 # --- In a terminal of 80 columns --------------------------------------------------------------------------------------

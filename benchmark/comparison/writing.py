@@ -16,7 +16,7 @@ from semstab.core.json_form import from_json
 from semstab.core.types import THIS_SCENE
 from semstab.errors import ConfigError
 from semstab.model import parquet
-from semstab.model.contrast import Against, RunComparison
+from semstab.model.contrast import Against, RunComparison, SceneComparison
 from semstab.model.results import slug
 from semstab.model.statistics import Estimate
 from semstab.report import blocks, filled
@@ -86,20 +86,27 @@ def _forest_by_class(comparison: RunComparison) -> Iterator[Figure]:
         )
 
 
-def _maps(comparison: ComparisonData) -> Iterator[Figure]:
+def _changed(comparison: ComparisonData) -> Iterator[tuple[SceneComparison, Against, Changes]]:
+    """The scenes and runs of which is known what changed in each voxel."""
     for scene in comparison.result.scenes:
         for own in scene.against:
-            if (scene.scene, own.other) in comparison.changes and scene.scene in comparison.up:
-                yield Figure(
-                    slug("comparison_map", scene.scene, own.other),
-                    f"Where it changed: {scene.scene}, {own.other} less {comparison.result.base}",
-                    "The largest change in each column of voxels that both saw twice or more: agreement between frames,"
-                    " and where ground truth is known what is wrong now or right now. Numbers are those of the areas"
-                    " that got worse.",
-                    f"Maps of {scene.scene} from above: orange where {own.other} is worse, blue where it is better.",
-                    partial(_draw, comparison.changes[scene.scene, own.other], comparison.up[scene.scene], own),
-                    unit=slug(scene.scene, own.other),
-                )
+            if (changes := comparison.changes.get((scene.scene, own.other))) is not None:
+                yield scene, own, changes
+
+
+def _maps(comparison: ComparisonData) -> Iterator[Figure]:
+    for scene, own, changes in _changed(comparison):
+        if scene.scene in comparison.up:
+            yield Figure(
+                slug("comparison_map", scene.scene, own.other),
+                f"Where it changed: {scene.scene}, {own.other} less {comparison.result.base}",
+                "The largest change in each column of voxels that both saw twice or more: agreement between frames,"
+                " and where ground truth is known what is wrong now or right now. Numbers are those of the areas"
+                " that got worse.",
+                f"Maps of {scene.scene} from above: orange where {own.other} is worse, blue where it is better.",
+                partial(_draw, changes, comparison.up[scene.scene], own),
+                unit=slug(scene.scene, own.other),
+            )
 
 
 def _draw(changes: Changes, up: tuple[float, float, float], own: Against) -> Canvas:
@@ -169,12 +176,7 @@ def markdown(comparison: RunComparison, made: Sequence[Table] | None = None) -> 
     """The comparison for a pull request: what was comparison, then the tables."""
     shown = [table for table in (made or tables(comparison)) if table.name != "comparison_all"]
     names = ", ".join(each.name for each in comparison.runs[1:])
-    head = [
-        f"## {names} against {comparison.base}",
-        "",
-        *(f"- {relations(text)}" for text in sentences(comparison)),
-        "",
-    ]
+    head = [f"## {names} against {comparison.base}", "", *(f"- {relations(s)}" for s in sentences(comparison)), ""]
     return "\n".join([*head, *map(to_markdown, shown)])
 
 
@@ -211,24 +213,20 @@ def _topics(made: Sequence[Table], drawn: Sequence[Figure], folder: Path) -> Ite
 
 def _write_columns(comparison: ComparisonData, folder: Path) -> None:
     written = []
-    for scene in comparison.result.scenes:
-        for own in scene.against:
-            if own.columns is not None:
-                changes = comparison.changes[scene.scene, own.other]
-                written.append(folder / own.columns)
-                table = changes.shown.table
-                parquet.write(written[-1], changes.parts(), KIND, table.voxel_size, table.classes)
+    for _, own, changes in _changed(comparison):
+        if own.columns is not None:
+            written.append(folder / own.columns)
+            table = changes.shown.table
+            parquet.write(written[-1], changes.parts(), KIND, table.voxel_size, table.classes)
     if written:
         keep_only(written, written[0].parent)
 
 
 def _recorded(comparison: ComparisonData) -> Iterator[tuple[tuple[str, str], tuple[Any, ...]]]:
-    for scene in comparison.result.scenes:
-        for own in scene.against:
-            if (changes := comparison.changes.get((scene.scene, own.other))) is not None:
-                areas = [(area.what, f"{area.number} {area.of}", area.centre) for area in own.areas]
-                title, shown = heading(comparison.result, scene.scene, own), changes.shown
-                yield (scene.scene, own.other), (title, shown.table, shown.change, shown.right, areas)
+    for scene, own, changes in _changed(comparison):
+        areas = [(area.what, f"{area.number} {area.of}", area.centre) for area in own.areas]
+        title, shown = heading(comparison.result, scene.scene, own), changes.shown
+        yield (scene.scene, own.other), (title, shown.table, shown.change, shown.right, areas)
 
 
 def _require_own(folder: Path) -> None:

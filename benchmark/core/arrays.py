@@ -63,9 +63,9 @@ def _read(kind: Any, arrays: Mapping[str, npt.NDArray[Any]], path: str) -> Any:
 class Rows:
     """A table of float64 that grows row by row; rows (n, columns) are the first ones."""
 
-    def __init__(self, columns: int, rows: Float64 | None = None) -> None:
+    def __init__(self, columns: int, rows: npt.ArrayLike = ()) -> None:
         self.columns = columns
-        self._numbers = array("d", b"" if rows is None else np.asarray(rows, dtype=np.float64).tobytes())
+        self._numbers = array("d", np.asarray(rows, dtype=np.float64).tobytes())
 
     def __len__(self) -> int:
         """Return the number of rows."""

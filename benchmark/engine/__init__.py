@@ -11,27 +11,12 @@ if TYPE_CHECKING:
     from semstab.engine.folder import load_result
     from semstab.engine.observer import Observer
 
-__all__ = [
-    "DaskCluster",
-    "Executor",
-    "InProcess",
-    "LocalProcesses",
-    "Observer",
-    "load_result",
-    "run",
-    "run_study",
-]
+__all__ = ["DaskCluster", "Executor", "InProcess", "LocalProcesses", "Observer", "load_result", "run", "run_study"]
 
 _HOMES = {
-    "DaskCluster": "executors",
-    "Executor": "executors",
-    "InProcess": "executors",
-    "LocalProcesses": "executors",
-    "Observer": "observer",
-    "load_result": "folder",
-    "run": "execution",
-    "run_study": "execution",
-}
+    "DaskCluster": "executors", "Executor": "executors", "InProcess": "executors", "LocalProcesses": "executors",
+    "Observer": "observer", "load_result": "folder", "run": "execution", "run_study": "execution",
+}  # fmt: skip
 
 
 def __getattr__(name: str) -> Any:

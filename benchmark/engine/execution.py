@@ -22,11 +22,10 @@ from semstab.engine.observer import Observer, Observers
 from semstab.engine.passes import share_open_scenes
 from semstab.engine.results import UnitResults, advice_of, manifest, result_of
 from semstab.engine.tiled_units import TiledUnit
-from semstab.engine.units import Plan, Planned, PlannedUnit, make_plan
+from semstab.engine.units import Plan, PlannedUnit, make_plan
 from semstab.engine.work import Job, Outcome, Start, Work, jobs_of
 from semstab.errors import ConfigError, DataError
 from semstab.model.records import Result
-from semstab.model.results import VoxelAdvice
 from semstab.settings import resolve
 
 logger = logging.getLogger("semstab")
@@ -87,7 +86,7 @@ def _execute(
     require_file_names(out, (each.unit for each in plan.units))
     folder = Folder(out, config)
     try:
-        units = _compute(plan, folder, executor, observers)
+        units = _Execution(plan, folder, executor, observers).units
         units.advice = advice or advice_of(plan, units.contents)
         result = result_of(plan, folder, units)
         units.watch.seconds["all"] = time.perf_counter() - started
@@ -105,118 +104,102 @@ def _execute(
     return result, units.causes
 
 
-def _compute(plan: Plan, folder: Folder, executor: Executor, observers: Observers) -> UnitResults:
+class _Execution:
     """The units that an earlier start finished, and all others, kept as they finish."""
-    planned, units = plan.distinct(), UnitResults()
-    with units.watch("digest"):
-        units.contents = {
-            key: content for key, each in planned.items() if (content := folder.finished(each)) is not None
-        }
-    units.finished_before, finished = len(units.contents), dict(units.contents)
-    observers.tell(lambda observer: observer.run_started(plan, finished))
-    missing = [each for identity, each in planned.items() if identity not in finished]
-    if plan.config.check_geometry:
-        with units.watch("check"):
-            _check_geometry(plan.config, missing, units, observers)
-    with folder.started(plan.config) as start, share_open_scenes(start.name, plan.scenes):
-        whole, tiled = _begin(plan.config, missing, folder, units, executor, observers, start)
-        queue = deque(jobs_of(whole, executor.width))
+
+    def __init__(self, plan: Plan, folder: Folder, executor: Executor, observers: Observers) -> None:
+        self.units, self._folder, self._executor, self._observers = UnitResults(), folder, executor, observers
+        planned, units = plan.distinct(), self.units
+        with units.watch("digest"):
+            there = ((key, folder.finished(each)) for key, each in planned.items())
+            units.contents = {key: content for key, content in there if content is not None}
+        units.finished_before, finished = len(units.contents), dict(units.contents)
+        observers.tell(lambda observer: observer.run_started(plan, finished))
+        missing = [each for identity, each in planned.items() if identity not in finished]
+        if plan.config.check_geometry:
+            with units.watch("check"):
+                self._check_geometry(plan.config, missing)
+        with folder.started(plan.config) as start, share_open_scenes(start.name, plan.scenes):
+            self._compute(planned, *self._begin(plan.config, missing, start))
+
+    def _compute(
+        self, planned: Mapping[str, PlannedUnit], whole: Sequence[Work], tiled: Mapping[str, TiledUnit]
+    ) -> None:
+        queue = deque(jobs_of(whole, self._executor.width))
         ended = [outcome for unit in tiled.values() if (outcome := unit.ended()) is not None]
 
         def next_job() -> Job | None:
             return queue.popleft() if queue else next(filter(None, (unit.next_job() for unit in tiled.values())), None)
 
-        outcomes = executor.run(next_job, observers)
-        with contextlib.closing(outcomes):
+        with contextlib.closing(self._executor.run(next_job, self._observers)) as outcomes:
             for outcome in itertools.chain(ended, outcomes):
                 own: Outcome | None = outcome
                 unit = tiled.get(outcome.identity)
                 if unit is not None and outcome.tile is not None:
-                    units.add_seconds(outcome)
-                    with units.watch("assemble"):
+                    self.units.add_seconds(outcome)
+                    with self.units.watch("assemble"):
                         own = unit.take(outcome)
-                    step, what = unit.step(), unit.name
-                    observers.tell(lambda observer, step=step, what=what: observer.advanced(step, what))  # type: ignore[misc]
+                    self._advance(unit.step(), unit.name)
                 if own is not None:
-                    _keep(planned[own.identity], own, folder, units, executor, observers, in_tiles=unit is not None)
-    return units
+                    self._keep(planned[own.identity], own, in_tiles=unit is not None)
 
+    def _begin(
+        self, config: Config, missing: Sequence[PlannedUnit], start: Start
+    ) -> tuple[list[Work], dict[str, TiledUnit]]:
+        """Works of the units that are fused whole, and the units in tiles; those that cannot be fused fail."""
+        with self.units.watch("sizing"):
+            sizing = planned_sizes(config, missing, self._executor.width)
+            trim_malloc()
+        for line in sizing.lines:
+            logger.warning("%s", line)
+        whole, tiled = list[Work](), dict[str, TiledUnit]()
+        for each in missing:
+            if (error := sizing.refused.get(each.identity)) is not None:
+                self._keep(each, Outcome(each.identity, error=error, cause=ConfigError(error)))
+            elif (size := sizing.tile_sizes.get(each.identity)) is not None:
+                tiled[each.identity] = TiledUnit(each, size, self._folder, start)
+            else:
+                whole.append(Work.of(each, start))
+        return whole, tiled
 
-def _begin(
-    config: Config,
-    missing: Sequence[Planned],
-    folder: Folder,
-    units: UnitResults,
-    executor: Executor,
-    observers: Observers,
-    start: Start,
-) -> tuple[list[Work], dict[str, TiledUnit]]:
-    """Works of the units that are fused whole, and the units in tiles; those that cannot be fused fail."""
-    with units.watch("sizing"):
-        sizing = planned_sizes(config, missing, executor.width)
-        trim_malloc()
-    for line in sizing.lines:
-        logger.warning("%s", line)
-    whole, tiled = list[Work](), dict[str, TiledUnit]()
-    for each in missing:
-        if (error := sizing.refused.get(each.identity)) is not None:
-            _keep(
-                each, Outcome(each.identity, error=error, cause=ConfigError(error)), folder, units, executor, observers
-            )
-        elif isinstance(each, PlannedUnit) and (size := sizing.tile_sizes.get(each.identity)) is not None:
-            tiled[each.identity] = TiledUnit(each, size, folder, start)
-        else:
-            whole.append(Work.of(each, start))
-    return whole, tiled
+    def _advance(self, frames: int, what: str) -> None:
+        self._observers.tell(lambda observer: observer.advanced(frames, what))
 
-
-def _keep(
-    each: Planned,
-    outcome: Outcome,
-    folder: Folder,
-    units: UnitResults,
-    executor: Executor,
-    observers: Observers,
-    *,
-    in_tiles: bool = False,
-) -> None:
-    """Keep a finished unit, or the reason why it failed, and tell the observers."""
-    content = outcome.content
-    if content is not None:
-        content = dataclasses.replace(content, advice=units.advice.get(each.unit.scene))
-        with units.watch("keep"):
-            folder.save(dataclasses.replace(outcome, content=content))
-            if isinstance(each, PlannedUnit):
+    def _keep(self, each: PlannedUnit, outcome: Outcome, *, in_tiles: bool = False) -> None:
+        units, folder, content = self.units, self._folder, outcome.content
+        if content is not None:
+            content = dataclasses.replace(content, advice=units.advice.get(each.unit.scene))
+            with units.watch("keep"):
+                folder.save(dataclasses.replace(outcome, content=content))
                 folder.clear(each, content.files)
-        units.contents[outcome.identity] = content
-    else:
-        error = units.errors[outcome.identity] = outcome.error or ""
-        folder.save_trace(outcome)
-        if outcome.cause is not None:
-            units.causes.setdefault(error, outcome.cause)
-    if not in_tiles:
-        units.add_seconds(outcome)
-        if executor.elsewhere or not isinstance(each, PlannedUnit):
-            what = f"{each.unit.scene} · {each.unit.backbone}"
-            observers.tell(lambda observer: observer.advanced(each.frames, what))
-    observers.tell(lambda observer: observer.unit_finished(each, content, outcome.table, outcome.error))
+            units.contents[outcome.identity] = content
+        else:
+            error = units.errors[outcome.identity] = outcome.error or ""
+            folder.save_trace(outcome)
+            if outcome.cause is not None:
+                units.causes.setdefault(error, outcome.cause)
+        if not in_tiles:
+            units.add_seconds(outcome)
+            if self._executor.elsewhere or each.regions:
+                self._advance(each.frames, f"{each.unit.scene} · {each.unit.backbone}")
+        self._observers.tell(lambda observer: observer.unit_finished(each, content, outcome.table, outcome.error))
 
+    def _check_geometry(self, config: Config, missing: Sequence[PlannedUnit]) -> None:
+        """Check the geometry of each scene with units to compute, and judge the voxel size.
 
-def _check_geometry(config: Config, missing: Sequence[Planned], units: UnitResults, observers: Observers) -> None:
-    """Check the geometry of each scene with units to compute, and judge the voxel size.
-
-    A scene that cannot be read is left to its units to report. Raises DataError where depth and poses contradict each
-    other.
-    """
-    tasks = {each.task.scene.name: each.task for each in reversed(missing) if isinstance(each, PlannedUnit)}
-    verdicts: dict[str, Verdict] = {}
-    advice: VoxelAdvice | None
-    for task in reversed(tasks.values()):
-        with contextlib.suppress(DataError):
-            verdicts[task.scene.name], sample = quick_look(task.scene, task.indices, config.dataset.options)
-            if (advice := advise(sample, config)) is not None:
-                units.advice[task.scene.name] = advice
-    for scene, verdict in verdicts.items():
-        refuse_unsound(scene, verdict)
-        observers.tell(lambda observer, scene=scene, verdict=verdict: observer.geometry_checked(tasks[scene], verdict))  # type: ignore[misc]
-    units.geometry = verdicts
+        A scene that cannot be read is left to its units to report. Raises DataError where depth and poses contradict
+        each other.
+        """
+        tasks = {each.task.scene.name: each.task for each in reversed(missing) if not each.regions}
+        verdicts: dict[str, Verdict] = {}
+        for task in reversed(tasks.values()):
+            with contextlib.suppress(DataError):
+                verdicts[task.scene.name], sample = quick_look(task.scene, task.indices, config.dataset.options)
+                if (advice := advise(sample, config)) is not None:
+                    self.units.advice[task.scene.name] = advice
+        for scene, verdict in verdicts.items():
+            refuse_unsound(scene, verdict)
+            self._observers.tell(
+                lambda observer, scene=scene, verdict=verdict: observer.geometry_checked(tasks[scene], verdict)  # type: ignore[misc]
+            )
+        self.units.geometry = verdicts

@@ -9,23 +9,19 @@ import importlib
 import importlib.metadata
 import multiprocessing
 import os
-import time
 from collections.abc import Callable, Generator
 from concurrent.futures.process import BrokenProcessPool
 from multiprocessing.connection import Connection
-from typing import Any, Protocol
+from typing import Any
 
 from semstab.core.prefetch import default_threads
-from semstab.core.process import available_bytes, configure_process, follow_parent
+from semstab.core.process import configure_process, follow_parent
 from semstab.engine.observer import Observers
 from semstab.engine.passes import run_job
 from semstab.engine.work import Job, Outcome, failed
 from semstab.errors import ConfigError, MissingDependencyError
 
 CONNECT_SECONDS = 10
-MOMENT = 0.2
-"""Seconds for which the number of workers, which come and go, holds: to ask takes as long as a small job."""
-
 AWAY = OSError, RuntimeError, AttributeError
 """What a client of Dask raises where its scheduler does not answer, while it gives it up, and once it has none."""
 
@@ -35,7 +31,7 @@ NextJob = Callable[[], Job | None]
 """Gives the next job; None where there is none, until outcomes that were yielded call for more."""
 
 
-class Executor(Protocol):
+class Executor:
     """Runs jobs.
 
     name       for the manifest
@@ -44,38 +40,32 @@ class Executor(Protocol):
     """
 
     name: str
-    width: int
-    elsewhere: bool
+    width = 1
+    elsewhere = False
 
     def run(self, next_job: NextJob, observers: Observers) -> Generator[Outcome, None, None]:
         """Yield outcomes as works finish, in any order. Closing the iterator stops the rest.
 
-        A job is asked for when there is somebody to do it. `observers` see the work that is done in this very process.
+        A job is taken when there is somebody to do it. `observers` see the work that is done in this very process.
         """
-        ...
+        raise NotImplementedError
 
     def close(self) -> None:
         """Nothing more is to be run."""
-        ...
 
 
-class InProcess:
+class InProcess(Executor):
     """One job after the other, in this process."""
 
     name = "in this process"
-    width = 1
-    elsewhere = False
 
     def run(self, next_job: NextJob, observers: Observers) -> Generator[Outcome, None, None]:
         """Run them in order."""
         while (job := next_job()) is not None:
             yield from run_job(job, observers)
 
-    def close(self) -> None:
-        """Nothing is left behind."""
 
-
-class LocalProcesses:
+class LocalProcesses(Executor):
     """That many processes on this machine, which share its cores and its free memory."""
 
     elsewhere = True
@@ -89,20 +79,14 @@ class LocalProcesses:
     def run(self, next_job: NextJob, observers: Observers) -> Generator[Outcome, None, None]:
         """Yield outcomes as jobs finish.
 
-        Where a process dies, nobody knows of which job: those that were at work are tried again, then once more one by
-        one. The job whose process dies then fails, and the others finish.
+        Where a process dies, nobody knows of which job: those that were at work are run again, one by one. The job
+        whose process dies then fails, and the others finish.
         """
-        begun, share = list[Job](), available_bytes() / 2
-
-        def shared() -> Job | None:
-            job = next_job()
-            return None if job is None else self._with_a_share(job, share)
-
+        begun = list[Job]()
         while True:
-            for _ in range(2):
-                with contextlib.suppress(BrokenProcessPool):
-                    yield from self._run(begun, shared, self.width)
-                    return
+            with contextlib.suppress(BrokenProcessPool):
+                yield from self._run(begun, next_job, self.width)
+                return
             while begun:
                 try:
                     yield from self._run(begun, lambda: None, 1)
@@ -115,22 +99,20 @@ class LocalProcesses:
 
         Each is submitted before outcomes are yielded: no process waits for whoever takes them.
         """
-        futures = dict[cf.Future[tuple[Outcome, ...]], Job]()
-        waiting = [*begun]
+        futures, waiting = dict[cf.Future[tuple[Outcome, ...]], Job](), [*begun]
 
-        def taken() -> Job | None:
-            if waiting:
-                return waiting.pop(0)
-            if (job := next_job()) is not None:
-                begun.append(job)
-            return job
+        def take() -> bool:
+            if not waiting and (job := next_job()) is not None:
+                begun.append(self._with_a_share(job))
+                waiting.append(begun[-1])
+            return bool(waiting)
 
-        def submit(job: Job | None = None) -> None:
-            while job is not None or (len(futures) < width and (job := taken()) is not None):
-                futures[pool.submit(_run_all, job)] = job
-                job = None
+        def submit() -> None:
+            while len(futures) < width and take():
+                futures[pool.submit(_run_all, waiting[0])] = waiting[0]
+                del waiting[0]
 
-        if (first := taken()) is None:
+        if not take():
             return
         context = multiprocessing.get_context("spawn")
         listening, alive = context.Pipe(duplex=False)
@@ -138,7 +120,7 @@ class LocalProcesses:
         pool = cf.ProcessPoolExecutor(width, context, initializer=_start_worker, initargs=(listening, share))
         try:
             _check_start(pool)
-            submit(first)
+            submit()
             while futures:
                 done, _ = cf.wait(futures, return_when=cf.FIRST_COMPLETED)
                 for future in done:
@@ -152,15 +134,10 @@ class LocalProcesses:
             alive.close()  # ends processes that are still at work: after an interruption, or where one of them died
             pool.shutdown(wait=False, cancel_futures=True)
 
-    def close(self) -> None:
-        """Processes end with what they were started for."""
-
-    def _with_a_share(self, job: Job, free: float) -> Job:
-        """The job with its share of threads and memory."""
+    def _with_a_share(self, job: Job) -> Job:
         start = job[0].start
-        memory = free if start.memory_bytes is None else start.memory_bytes
         threads = max(1, (start.threads or default_threads()) // self.width)
-        own = dataclasses.replace(start, threads=threads, memory_bytes=memory / self.width, width=self.width)
+        own = dataclasses.replace(start, threads=threads, width=self.width)
         return tuple(dataclasses.replace(work, start=own) for work in job)
 
 
@@ -195,7 +172,7 @@ def _use_threads(count: int) -> None:
     pa.set_cpu_count(count)
 
 
-class DaskCluster:
+class DaskCluster(Executor):
     """The workers of a Dask scheduler, for example tcp://127.0.0.1:8786; they must have semstab and see the data.
 
     Raises MissingDependencyError without dask, ConfigError where no scheduler answers.
@@ -210,7 +187,6 @@ class DaskCluster:
             raise ConfigError(
                 f"{scheduler}: no Dask scheduler answers ({error}); start one with 'dask scheduler'"
             ) from error
-        self._asked = 0.0
         self.width = self._threads() or 1
         self.name = f"Dask, {self.width} threads"
 
@@ -221,20 +197,25 @@ class DaskCluster:
         and that is sent before outcomes are yielded, so that nobody waits for it.
         Raises ConfigError where the scheduler went away and jobs are left.
         """
-        futures = dict[Any, Job]()
+        futures, waiting = dict[Any, Job](), list[Job]()
         finished = _distributed().as_completed(loop=self._client.loop)
 
-        def send(job: Job | None = None) -> None:
+        def take() -> bool:
+            if not waiting and (job := next_job()) is not None:
+                waiting.append(job)
+            return bool(waiting)
+
+        def send() -> None:
             free = self._threads() - len(futures)
-            while job is not None or (free > 0 and (job := next_job()) is not None):
+            while free > 0 and take():
+                job, free = waiting.pop(), free - 1
                 futures[future := self._client.submit(_run_settled, job, pure=False)] = job
                 finished.add(future)
-                job, free = None, free - 1
 
-        if (first := next_job()) is None:
+        if not take():
             return
         self._require_same_version()
-        send(first)
+        send()
         try:
             for future in finished:
                 job = futures.pop(future)
@@ -243,20 +224,18 @@ class DaskCluster:
                 send()
                 yield from outcomes
                 send()
-            if next_job() is not None:
+            if take():
                 raise ConfigError(LOST)
         finally:
             if futures:
                 self._client.cancel(list(futures))
 
     def _threads(self) -> int:
-        """Of the workers that there are now, or were a moment ago; 0 where the scheduler does not answer."""
-        if (now := time.monotonic()) - self._asked > MOMENT:
-            try:
-                self.width = max(1, sum(self._client.nthreads().values()))
-            except AWAY:
-                return 0
-            self._asked = now
+        """Threads of the workers that there are now; 0 where the scheduler does not answer."""
+        try:
+            self.width = max(1, sum(self._client.nthreads().values()))
+        except AWAY:
+            return 0
         return self.width
 
     def close(self) -> None:
@@ -280,7 +259,7 @@ class DaskCluster:
 
 
 def _run_settled(job: Job) -> tuple[Outcome, ...]:
-    """Run a job in a worker of the cluster, which has nobody else to settle it, with as many threads as are its own.
+    """Run a job in a worker of the cluster, with as many threads as are its own.
 
     It runs a job in each of its threads at once: frames are decoded in turn where nothing else is said.
     """

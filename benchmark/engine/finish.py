@@ -21,11 +21,11 @@ from semstab.core.types import Float64, Mask
 from semstab.datasets import Scene
 from semstab.datasets.formats.disk import file_digest
 from semstab.engine.series import Series
-from semstab.engine.streams import LiveMap, Stream, alpha_sums
+from semstab.engine.streams import ImageSpaceMeter, LiveMap, Stream, alpha_sums
 from semstab.engine.tiles import OBSERVATIONS, TileResult
 from semstab.engine.work import Outcome, Start
 from semstab.errors import DataError
-from semstab.metrics import compare, summarise
+from semstab.metrics import compare
 from semstab.metrics.agreement import rows_of
 from semstab.metrics.summary import TableSums
 from semstab.model.events import Events
@@ -33,20 +33,9 @@ from semstab.model.frames import LeftOut
 from semstab.model.measures import dominant, mean, measures, vss
 from semstab.model.parquet import Tile
 from semstab.model.records import EVENTS, FRAMES, INFLUENCE, LOOKS, OVERVIEW, TRUTH, VOXELS, FrameQuality, UnitContent
-from semstab.model.results import (
-    RECURRENT,
-    STAGES,
-    Agreement,
-    FrameDrift,
-    ReducedScores,
-    SizeAlpha,
-    TableSummary,
-    UnitSummary,
-    slug,
-)
-from semstab.model.statistics import MapStatistics
+from semstab.model.results import RECURRENT, STAGES, Agreement, FrameDrift, ReducedScores, UnitSummary, slug
 from semstab.model.voxels import VoxelTable
-from semstab.statistics import Analysis, MapSample, ObservationSample, analyse
+from semstab.statistics import Analysis, CellObservations, MapSample, ObservationSample, analyse
 from semstab.statistics.agreement import alpha_of, ratio_of
 from semstab.statistics.verdict import Limits
 from semstab.task import Task, read
@@ -62,93 +51,85 @@ Savers = dict[str, Callable[[Path], None]]
 
 
 def finish(live: LiveMap, stream: Stream, watch: Stopwatch) -> Outcome:
-    """Measure a finished map and write its files. Raises DataError where no pixel was valid."""
-    task, config, work = live.task, live.work.config, live.work
-    with watch("table"):
-        table = live.table()
-        if not len(table):
-            raise no_voxels(task, config)
-        events = live.backend.events() if live.backend is not None and (config.statistics or config.events) else None
-        events = None if events is None else dataclasses.replace(events, classes=table.classes)
-        whole, (table, events) = table, _left(live, table, events)
-        if not len(table):
-            raise no_voxels(task, config)
-        live.backend = None  # the statistics have its memory
-        trim_malloc(least=SMALL)
+    """Measure a map, a tile of one or the pass over the frames of tiles, and write its files.
+
+    Raises DataError where no pixel of a whole map was valid.
+    """
+    work, config, tile = live.work, live.work.config, live.work.tile
+    fused = _fused_map(live, watch) if work.fuses else None
+    if fused is not None and tile is None and not len(fused.table):
+        raise no_voxels(live.task, config)
     with watch("voxel sizes"):
         sizes = () if live.sizes is None else live.sizes.alphas()
-        trim_malloc(least=SMALL)
+    observations, sums, sample, analysis = live.sampled_observations(), dict[str, Float64](), None, None
     with watch("statistics"):
-        truth, analysis = _truth_table(live), None
-        if work.judged:
-            seen = live.sampled_observations()
-            observations = None if seen is None else seen.sample()
-            log = events if config.statistics else None
-            analysis = analyse_sample(
-                task, config, MapSample.draw(table, log, truth, edges=config.strata), observations
-            )
+        if fused is not None and work.judged:
+            log = fused.events if config.statistics else None
+            sample = MapSample.draw(fused.table, log, fused.truth, edges=config.strata)
+        if fused is not None:
+            sums = (TableSums.of(fused.table, config.strata) if sample is None else sample.summary).arrays()
+        if sample is not None and tile is None:
+            seen = None if observations is None else observations.sample()
+            analysis = analyse_sample(live.task, config, sample, seen)
         trim_malloc(least=SMALL)
+    with watch("write"):
+        files, returned = written(work.start, _savers(live, stream, fused, observations, sample, analysis))
+    result = TileResult(
+        files,
+        None if fused is None else fused.checked,
+        sizes,
+        _quality(stream),
+        live.origin,
+        series=live.rows.numbers,
+        sums=sums,
+        reduced=np.zeros(0) if fused is None else fused.reduced,
+        image=np.zeros((0, 0)) if stream.image_space is None else stream.image_space.rows.table(),
+        poses=stream.poses,
+        seen=np.concatenate([np.zeros((0, 3), np.int32), *live.tiles]),
+    )
+    if tile is not None:
+        with watch("write"):
+            _, own = written(work.start, {f"{tile.folder}/{tile.name}.npz": result.save})
+        return Outcome(work.identity, tile=tile.name, files=returned | own)
+    assert fused is not None
     with watch("measure"):
-        summary = unit_summary(
-            task,
-            live.rows,
-            summarise(table, config.strata) if analysis is None else analysis.table,
-            None if analysis is None else analysis.summary,
-            None if live.hard is None else reduced_of(reduced_sums(_left(live, live.hard.table())[0])),
-            sizes,
-        )
-    with watch("write"):
-        files, returned = written(work.start, _savers(live, stream, table, events, truth, analysis))
-    with watch("reference"):
-        checked = None if live.reference is None else _checked(live, whole, live.reference)
-    content = UnitContent(task.digest, summary, files=files, checked=checked)
-    if work.image_space and stream.image_space is not None:
-        content = dataclasses.replace(
-            content,
-            image_space=stream.image_space.result(summary.flicker_percent),
-            up=up_axis(task.scene, table, stream.poses),
-            quality=_quality(stream),
-        )
-    return Outcome(work.identity, content, files=returned, table=table if work.watched else None)
+        content = unit_content(live.task, config, live.rows, result, analysis)
+        if work.image_space:
+            content = in_image_space(content, live.task, result, fused.table)
+    return Outcome(work.identity, content, files=returned, table=fused.table if work.watched else None)
 
 
-def finish_tile(live: LiveMap, stream: Stream, watch: Stopwatch) -> Outcome:
-    """Write the result of a tile, or of the pass over all frames: sums, rows of the series, and voxels."""
-    work, config, tile = live.work, live.work.config, live.work.tile
-    assert tile is not None
-    sums, whole, table, events, truth, sample = dict[str, Any](), None, None, None, None, None
-    if work.fuses:
-        with watch("table"):
-            table = live.table()
-            log = live.backend.events() if live.backend is not None and (config.statistics or config.events) else None
-            events = None if log is None else dataclasses.replace(log, classes=table.classes)
-            whole, (table, events) = table, _left(live, table, events)
-            truth, live.backend = _truth_table(live), None
-            trim_malloc(least=SMALL)
-        with watch("statistics"):
-            log = events if config.statistics else None
-            if work.judged:
-                sample = MapSample.draw(table, log, truth, edges=config.strata).below(tile.bound)
-            sums = (TableSums.of(table, config.strata) if sample is None else sample.summary).arrays()
+@dataclass(frozen=True, eq=False)
+class FusedMap:
+    """A map at its end, without the locations whose fused class is left out.
+
+    truth    the map of the ground truth, where that was fused
+    reduced  sums of the map of labels that soft scores were reduced to; empty where there are none
+    checked  how far it agrees with the reference on a sample of its voxels
+    """
+
+    table: VoxelTable
+    events: Events | None
+    truth: VoxelTable | None
+    reduced: Float64
+    checked: Agreement | None
+
+
+def _fused_map(live: LiveMap, watch: Stopwatch) -> FusedMap:
+    """The tables of a map, whose backend is let go: the statistics have its memory."""
+    assert live.backend is not None
+    config, classes = live.work.config, live.task.mapping.target.classes
+    with watch("table"):
+        table = dataclasses.replace(live.backend.table(), classes=classes)
+        events = live.backend.events() if config.statistics or config.events else None
+        truth = None if live.truth is None else dataclasses.replace(live.truth.table(), classes=classes)
+        reduced = np.zeros(0) if live.hard is None else reduced_sums(_left(live, live.hard.table())[0])
+        live.backend = live.truth = live.hard = None
     with watch("reference"):
-        checked = None if whole is None or live.reference is None else _checked(live, whole, live.reference)
-    with watch("write"):
-        files, returned = written(work.start, _tile_savers(live, stream, table, events, truth, sample))
-        result = TileResult(
-            files,
-            live.rows.numbers,
-            voxels=0 if table is None else len(table),
-            sums=sums,
-            reduced=np.zeros(0) if live.hard is None else reduced_sums(_left(live, live.hard.table())[0]),
-            checked=checked,
-            sizes=() if live.sizes is None else live.sizes.alphas(),
-            quality=_quality(stream),
-            image=np.zeros((0, 0)) if stream.image_space is None else stream.image_space.rows.table(),
-            poses=stream.poses,
-            **({} if live.tiles is None else live.tiles.result()),
-        )
-        _, own = written(work.start, {f"{tile.folder}/{tile.name}.npz": result.save})
-    return Outcome(work.identity, tile=tile.name, files=returned | own)
+        checked = None if live.reference is None else _checked(live, table, live.reference)
+        trim_malloc(least=SMALL)
+    events = None if events is None else dataclasses.replace(events, classes=classes)
+    return FusedMap(*_left(live, table, events), truth, reduced, checked)
 
 
 def _left(live: LiveMap, table: VoxelTable, events: Events | None = None) -> tuple[VoxelTable, Events | None]:
@@ -157,12 +138,6 @@ def _left(live: LiveMap, table: VoxelTable, events: Events | None = None) -> tup
         return table, events
     keep = np.flatnonzero(~np.isin(dominant(table), live.left_out))
     return table.rows(keep), None if events is None else events.rows(keep)
-
-
-def _truth_table(live: LiveMap) -> VoxelTable | None:
-    if live.truth is None:
-        return None
-    return dataclasses.replace(live.truth.table(), classes=live.task.mapping.target.classes)
 
 
 def analyse_sample(task: Task, config: Config, sample: MapSample, observations: ObservationSample | None) -> Analysis:
@@ -174,7 +149,6 @@ def analyse_sample(task: Task, config: Config, sample: MapSample, observations: 
 
 
 def _quality(stream: Stream) -> FrameQuality | None:
-    """The quality of the labels of single frames, where it is asked for."""
     if stream.quality is None:
         return None
     made = stream.task.scene.filtering(stream.task.backbone)
@@ -200,20 +174,16 @@ def _checked(live: LiveMap, table: VoxelTable, reference: NumpySample) -> Agreem
     return dataclasses.replace(compare(drawn, expected, units, tolerance=live.work.config.tolerance), one_in=ONE_IN)
 
 
-def unit_summary(
-    task: Task,
-    rows: Series,
-    table: TableSummary,
-    statistics: MapStatistics | None,
-    reduced: ReducedScores | None,
-    sizes: tuple[SizeAlpha, ...],
-) -> UnitSummary:
-    """The report on a unit, from its map, its time series and the statistics of the map."""
-    return UnitSummary(
+def unit_content(
+    task: Task, config: Config, rows: Series, result: TileResult, analysis: Analysis | None
+) -> UnitContent:
+    """Return the content of a unit from its time series, its result and the statistics of its map."""
+    sums = TableSums.read(result.sums)
+    summary = UnitSummary(
         unit=task.units[0],
         taxonomy=task.mapping.target.name,
         frames=len(task.indices),
-        table=table,
+        table=sums.summary(config.voxel_size, task.mapping.target.classes, config.strata),
         flicker_percent=mean(rows.column("flicker_percent")),
         fuse_ms_per_frame=mean(1e3 * rows.column("seconds")),
         stages_ms={stage: mean(1e3 * rows.column(f"{stage}_seconds")) for stage in STAGES},
@@ -221,10 +191,23 @@ def unit_summary(
         frames_left_out=task.left_out,
         frames_empty=int(np.count_nonzero(rows.column("points") == 0)),
         scores_left_out=_scores_left_out(rows),
-        statistics=statistics,
-        reduced=reduced,
+        statistics=None if analysis is None else analysis.summary,
+        reduced=reduced_of(result.reduced) if len(result.reduced) else None,
         worst_frames=tuple(_worst(rows, task.scene)),
-        sizes=sizes,
+        sizes=result.sizes,
+    )
+    return UnitContent(task.digest, summary, files=result.files, checked=result.checked)
+
+
+def in_image_space(content: UnitContent, task: Task, result: TileResult, points: VoxelTable | Float64) -> UnitContent:
+    """Return the content with stability in image coordinates, the quality of single frames and the scene's up axis."""
+    assert content.summary is not None
+    meter = ImageSpaceMeter(result.image)
+    return dataclasses.replace(
+        content,
+        image_space=meter.result(content.summary.flicker_percent),
+        up=up_axis(task.scene, points, result.poses),
+        quality=result.quality,
     )
 
 
@@ -271,71 +254,52 @@ def up_axis(scene: Scene, points: VoxelTable | Float64, poses: Float64) -> tuple
 def _savers(
     live: LiveMap,
     stream: Stream,
-    table: VoxelTable,
-    events: Events | None,
-    truth: VoxelTable | None,
+    fused: FusedMap | None,
+    observations: CellObservations | None,
+    sample: MapSample | None,
     analysis: Analysis | None,
 ) -> Savers:
-    """The files of a unit that is fused whole, beside its summary."""
-    config, unit, savers = live.work.config, live.unit, _overview_saver(live, stream)
-    if not live.work.kept:
+    """The files of a unit, of a tile, or of the pass over the frames of tiles.
+
+    A tile's voxels to which statistics add columns wait in its folder until the whole map is there.
+    """
+    work, config, unit, tile, savers = live.work, live.work.config, live.unit, live.work.tile, Savers()
+    if work.image_space and stream.overview:
+        savers[f"{OVERVIEW}/{slug(unit.scene, unit.backbone)}.npz"] = partial(_save_overview, stream.overview)
+    if tile is not None and observations is not None:
+        savers[f"{tile.folder}/{tile.size}_{OBSERVATIONS}"] = observations.save
+    if tile is None and work.kept:
+        savers[f"{FRAMES}/{unit.slug}.csv"] = partial(live.rows.save_csv, names=live.task.scene.frame_name)
+        if observations is not None:
+            savers[f"{LOOKS}/{unit.slug}.parquet"] = observations.save
+        if analysis is not None:
+            savers[f"{INFLUENCE}/{unit.slug}.parquet"] = analysis.sums.save
+    if fused is None or not len(fused.table):
         return savers
-    columns = analysis.columns(table, truth) if config.statistics and analysis is not None else {}
-    savers[f"{VOXELS}/{unit.slug}.parquet"] = partial(save_voxels, table, columns=columns)
-    if analysis is not None:
-        savers[f"{INFLUENCE}/{unit.slug}.parquet"] = analysis.sums.save
-    savers[f"{FRAMES}/{unit.slug}.csv"] = partial(live.rows.save_csv, names=live.task.scene.frame_name)
-    if (seen := live.sampled_observations()) is not None:
-        savers[f"{LOOKS}/{unit.slug}.parquet"] = seen.save
-    if events is not None and config.events:
-        savers[f"{EVENTS}/{unit.slug}.parquet"] = events.save
-    if truth is not None and live.work.image_space:
-        savers[f"{TRUTH}/{unit.slug}.parquet"] = truth.save
+    if tile is not None and sample is not None:
+        savers[f"{tile.folder}/{tile.name}.sample"] = sample.below(tile.bound).save
+    if not work.kept:
+        return savers
+    own = None if tile is None or tile.place is None else Tile(*tile.place, tile.size, tile.key)
+
+    def path(folder: str, *, waits: bool) -> str:
+        if tile is None or own is None:
+            return f"{folder}/{unit.slug}.parquet"
+        return f"{tile.folder}/{folder}/{own.name}" if waits else f"{folder}/{unit.slug}/{own.name}"
+
+    columns = analysis.columns(fused.table, fused.truth) if config.statistics and analysis is not None else {}
+    voxels = path(VOXELS, waits=config.statistics and work.judged)
+    savers[voxels] = partial(save_voxels, fused.table, columns=columns, tile=own)
+    if fused.events is not None and config.events:
+        savers[path(EVENTS, waits=False)] = partial(fused.events.save, tile=own)
+    if fused.truth is not None and (work.image_space if own is None else len(fused.truth)):
+        savers[path(TRUTH, waits=not work.image_space)] = partial(fused.truth.save, tile=own)
     return savers
 
 
-def _overview_saver(live: LiveMap, stream: Stream) -> Savers:
-    if not (live.work.image_space and stream.overview):
-        return {}
-    name = slug(live.unit.scene, live.unit.backbone)
-
-    def save(path: Path) -> None:
-        with atomic_path(path) as temporary:
-            np.savez_compressed(temporary, **stream.overview)
-
-    return {f"{OVERVIEW}/{name}.npz": save}
-
-
-def _tile_savers(
-    live: LiveMap,
-    stream: Stream,
-    table: VoxelTable | None,
-    events: Events | None,
-    truth: VoxelTable | None,
-    sample: MapSample | None,
-) -> Savers:
-    """The files of a tile; voxels to which statistics add columns wait until the whole map is there."""
-    work, config, tile, slug_of_unit = live.work, live.work.config, live.work.tile, live.unit.slug
-    assert tile is not None
-    if table is None or tile.place is None:
-        savers = _overview_saver(live, stream)
-        if (seen := live.sampled_observations()) is not None:
-            savers[f"{tile.folder}/{tile.size}_{OBSERVATIONS}"] = seen.save
-        return savers
-    own, savers = Tile(*tile.place, tile.size, tile.key), Savers()
-    if not len(table):
-        return savers
-    if sample is not None:
-        savers[f"{tile.folder}/{tile.name}.sample"] = sample.save
-    if work.kept:
-        folder = f"{tile.folder}/{VOXELS}" if config.statistics and work.judged else f"{VOXELS}/{slug_of_unit}"
-        savers[f"{folder}/{own.name}"] = partial(save_voxels, table, tile=own)
-        if events is not None and config.events:
-            savers[f"{EVENTS}/{slug_of_unit}/{own.name}"] = partial(events.save, tile=own)
-    if work.kept and truth is not None and len(truth):
-        folder = f"{TRUTH}/{slug_of_unit}" if work.image_space else f"{tile.folder}/{TRUTH}"
-        savers[f"{folder}/{own.name}"] = partial(truth.save, tile=own)
-    return savers
+def _save_overview(overview: Mapping[str, Any], path: Path) -> None:
+    with atomic_path(path) as temporary:
+        np.savez_compressed(temporary, **overview)
 
 
 def written(start: Start, savers: Savers) -> tuple[dict[str, str], dict[str, bytes]]:
@@ -353,10 +317,7 @@ def written(start: Start, savers: Savers) -> tuple[dict[str, str], dict[str, byt
 
 
 def save_voxels(
-    table: VoxelTable,
-    path: Path,
-    columns: Mapping[str, npt.NDArray[Any]] | None = None,
-    tile: Tile | None = None,
+    table: VoxelTable, path: Path, columns: Mapping[str, npt.NDArray[Any]] | None = None, tile: Tile | None = None
 ) -> None:
     """Write a voxel table together with its measures, and further columns (n,) by name."""
     own = {measure.key: measure.of for measure in measures()}
@@ -374,38 +335,23 @@ THICKNESS = 0.01
 POINTS = 10_000
 """Points used, drawn at random from more."""
 
-ITERATIONS = 2_000
-"""Draws of three points a plane. They all lie in a plane of 15% of the points once in 300 draws."""
-
-DRAW_CHUNKS = 50
-"""Parts of these draws whose points are counted together."""
-
-
-@dataclass(frozen=True, eq=False)
-class Plane:
-    """A plane in the map.
-
-    normal  (3,) unit vector towards the cameras
-    share   of the points that lie in it, 0 to 1
-    """
-
-    normal: Float64
-    share: float
+ITERATIONS, DRAW_CHUNKS = 2_000, 50
+"""Draws of three points a plane, and parts of them whose points are counted together. They all lie in a plane of 15 %
+of the points once in 300 draws."""
 
 
 def estimate_up(points: VoxelTable | npt.ArrayLike, poses: Sequence[npt.ArrayLike] | npt.ArrayLike) -> Float64:
-    """The world's up axis (3,), a unit vector: the normal, towards the cameras, of the plane that is likely the ground.
+    """Return the world's up axis (3,): the normal, towards the cameras, of the plane that is likely the ground.
 
     points  a fused map, whose voxels count by area; or world points (n, 3), metres
     poses   (m, 4, 4) camera-to-world of the frames behind it, OpenCV axes; or (m, 3, 3): down, forward and centre
 
-    The cameras alone do not tell: up in their images is up in the world for a level camera, and straight ahead for one
-    that looks down. So the largest planes of the map are found (RANSAC, seeded: the same input gives the same answer),
-    and of those which the cameras see from above, the one with the largest share * cos(angle to the up of a camera that
-    looks 27 degrees down) is taken: before a level camera a wall counts half as much as a floor of its size.
+    Up in the image is up in the world for a level camera, and straight ahead for one that looks down. So of the largest
+    planes of the map (RANSAC, seeded) the cameras see from above, the one with the largest share * cos(angle to the up
+    of a camera that looks 27 degrees down) is taken: before a level camera a wall counts half as much as a floor.
 
-    It is wrong where the ground is not among the largest planes (a façade filmed from the street, a table top that is
-    tilted), where cameras are rolled by tens of degrees, and by the ground's own slope. Say `up_axis` instead then.
+    It is wrong where the ground is not among the largest planes (a façade filmed from the street, a tilted table top),
+    where cameras are rolled by tens of degrees, and by the ground's own slope. Set `up_axis` instead then.
     Raises DataError where there are fewer than 3 points, or no plane with the cameras above it.
     """
     at = points.centers if isinstance(points, VoxelTable) else np.asarray(points, dtype=np.float64)
@@ -413,14 +359,14 @@ def estimate_up(points: VoxelTable | npt.ArrayLike, poses: Sequence[npt.ArrayLik
     prior = -(2 * down + forward).mean(axis=0)
     prior /= np.linalg.norm(prior)
     planes = list(_planes(at, centre)) if len(at) >= 3 else []
-    scores = [plane.share * float(plane.normal @ prior) for plane in planes]
+    scores = [share * float(normal @ prior) for normal, share in planes]
     if max(scores, default=0.0) <= 0:
         raise DataError(f"no ground plane found under the cameras in {len(at)} points; say which axis is up (up_axis)")
-    return planes[int(np.argmax(scores))].normal
+    return planes[int(np.argmax(scores))][0]
 
 
-def _planes(points: Float64, cameras: Float64) -> Iterator[Plane]:
-    """The largest planes, each found among the points that the ones before it left."""
+def _planes(points: Float64, cameras: Float64) -> Iterator[tuple[Float64, float]]:
+    """Normal (3,) towards the cameras, and share of the points, of the largest planes: each in what others left."""
     origin = np.median(points, axis=0)
     rest, cameras = points - origin, cameras - origin
     rng = np.random.default_rng(0)
@@ -438,7 +384,7 @@ def _planes(points: Float64, cameras: Float64) -> Iterator[Plane]:
         mean = rest[inlier].mean(axis=0)
         normal = np.linalg.eigh(np.cov(rest[inlier].T))[1][:, 0]  # the least squares' plane of the inliers
         above = np.median((cameras - mean) @ normal) > 0
-        yield Plane(normal if above else -normal, np.count_nonzero(inlier) / total)
+        yield normal if above else -normal, np.count_nonzero(inlier) / total
         rest = rest[~inlier]
 
 
@@ -454,6 +400,5 @@ def _largest_plane(points: Float64, distance: float, rng: np.random.Generator) -
     plane = np.column_stack([normal, offset]).astype(np.float32)
     homogeneous = np.vstack([points.T, np.ones(len(points))]).astype(np.float32)
     within = [np.count_nonzero(np.abs(some @ homogeneous) <= distance, axis=1) for some in np.split(plane, DRAW_CHUNKS)]
-    best = plane[int(np.argmax(np.concatenate(within)))]
-    inlier: Mask = np.abs(best @ homogeneous) <= distance
+    inlier: Mask = np.abs(plane[int(np.argmax(np.concatenate(within)))] @ homogeneous) <= distance
     return inlier

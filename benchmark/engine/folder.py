@@ -10,17 +10,18 @@ import logging
 import os
 import shutil
 import uuid
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import yaml
 
+from semstab.backends import keeps_log
 from semstab.config import Config, read_yaml
 from semstab.core.files import TEMPORARY, FolderLock, atomic_path, read_json, remove_leftovers, write_json, write_text
 from semstab.core.json_form import from_json, to_json
 from semstab.datasets.formats.disk import file_digest
-from semstab.engine.units import Planned, PlannedUnit
+from semstab.engine.units import PlannedUnit
 from semstab.engine.work import TILES, Outcome, Start
 from semstab.errors import ConfigError, DataError
 from semstab.model import earlier
@@ -91,7 +92,7 @@ class Folder:
         """Let another process have it."""
         self._lock.release()
 
-    def finished(self, planned: Planned) -> UnitContent | None:
+    def finished(self, planned: PlannedUnit) -> UnitContent | None:
         """What an earlier start left of a unit, if its input is the same and nothing that is wanted is missing.
 
         The input is read to compare it only where there is such a unit at all.
@@ -99,10 +100,14 @@ class Folder:
         if not any(name.startswith(planned.identity) for name in self._files):
             return None
         try:
-            file = self._files.get(unit_key(planned.identity, planned.digest))
+            file = self._files.get(unit_key(planned.identity, planned.task.digest))
         except DataError:
             return None  # the input cannot be read: computing the unit will say so
-        content = None if file is None else _read_unit(file)
+        try:
+            content = None if file is None else from_json(UnitContent, read_json(file), file)
+        except DataError:
+            logger.warning("%s: damaged; the unit is computed again", file)
+            return None
         return content if content is not None and self._is_whole(planned, content) else None
 
     def save(self, outcome: Outcome) -> None:
@@ -156,7 +161,8 @@ class Folder:
 
     def save_result(self, result: Result) -> None:
         """Write summary.json and manifest.json."""
-        content = to_json(dataclasses.replace(result, records=_in(self.path, result.records), manifest={}))
+        records = _with_files(result.records, lambda file: file.relative_to(self.path))
+        content = to_json(dataclasses.replace(result, records=records, manifest={}))
         runs = content.pop("records")
         del content["manifest"]
         write_json(self.path / "summary.json", {"schema": SCHEMA, "runs": runs, **content})
@@ -165,8 +171,7 @@ class Folder:
     @contextlib.contextmanager
     def started(self, config: Config) -> Iterator[Start]:
         """A start, by whose name workers know the folder while the block lasts."""
-        memory = None if config.memory_gb is None else config.memory_gb * 1e9
-        start = Start(uuid.uuid4().hex, self.path, config.threads, memory)
+        start = Start(uuid.uuid4().hex, self.path, config.threads)
         for name in WRITTEN:
             for folder in (self.path / name, *self.path.glob(f"{name}/*/")):
                 remove_leftovers(folder)
@@ -177,18 +182,18 @@ class Folder:
         finally:
             start.marker.unlink(missing_ok=True)
 
-    def _is_whole(self, planned: Planned, content: UnitContent) -> bool:
+    def _is_whole(self, planned: PlannedUnit, content: UnitContent) -> bool:
         """Whether the unit's file has what is wanted of it, and its other files are there as they were."""
-        if isinstance(planned, PlannedUnit):
-            has = content.summary is not None and (content.image_space is not None or not planned.image_space)
-            has = has and (
-                not planned.judged or (content.summary is not None and content.summary.statistics is not None)
-            )
-            has = has and (content.checked is not None or not planned.sampled)
-            wanted = self._wanted(planned, content)
-        else:
-            has, wanted = content.regions is not None, []
-        return has and self.are_whole({name: content.files.get(name) for name in wanted})
+        if planned.regions:
+            return content.regions is not None
+        summary = content.summary
+        return (
+            summary is not None
+            and (content.image_space is not None or not planned.image_space)
+            and (summary.statistics is not None or not planned.judged)
+            and (content.checked is not None or not planned.sampled)
+            and self.are_whole({name: content.files.get(name) for name in self._wanted(planned, content)})
+        )
 
     def are_whole(self, files: Mapping[str, str | None]) -> bool:
         """Whether files are there, with these digests; the first that is not as it was is told."""
@@ -207,13 +212,12 @@ class Folder:
         wanted = [*voxels, f"{FRAMES}/{unit.slug}.csv"] if planned.kept else []
         if planned.kept and planned.judged:
             wanted.append(f"{INFLUENCE}/{unit.slug}.parquet")
-        if planned.kept and planned.config.events and planned.logged:
+        if planned.kept and planned.config.events and keeps_log(planned.unit.backend):
             wanted += _in_tiles(unit, content, EVENTS) or [f"{EVENTS}/{unit.slug}.parquet"]
         return wanted + ([f"{OVERVIEW}/{slug(unit.scene, unit.backbone)}.npz"] if planned.image_space else [])
 
 
 def _in_tiles(unit: Unit, content: UnitContent, of: str = VOXELS) -> list[str]:
-    """The files of the unit's tiles, where it has any."""
     return [name for name in content.files if name.startswith(f"{of}/{unit.slug}/")]
 
 
@@ -236,14 +240,7 @@ def load_result(folder: str | Path) -> Result:
     result = from_json(Result, {**content, "records": content.get("runs")}, path)
     if problem := _contradiction(result):
         raise DataError(f"{path}: {problem}; it is damaged, or another version's; run it again")
-    records = tuple(
-        dataclasses.replace(
-            record,
-            voxels_file=record.voxels_file and folder / record.voxels_file,
-            truth_file=record.truth_file and folder / record.truth_file,
-        )
-        for record in result.records
-    )
+    records = _with_files(result.records, lambda file: folder / file)
     manifest = from_json(dict[str, Any], read_json(folder / "manifest.json"), folder / "manifest.json")
     return dataclasses.replace(result, records=records, manifest=manifest)
 
@@ -265,24 +262,16 @@ def _contradiction(result: Result) -> str | None:
     return next((f"{file} is not in the folder" for file in outside), None)
 
 
-def _in(folder: Path, records: Sequence[Record]) -> tuple[Record, ...]:
-    """The records with their files as they are called in the folder, which may be moved."""
+def _with_files(records: Sequence[Record], change: Callable[[Path], Path]) -> tuple[Record, ...]:
+    """The records with other paths of their files: in summary.json as they are called in the folder."""
     return tuple(
         dataclasses.replace(
             record,
-            voxels_file=record.voxels_file and record.voxels_file.relative_to(folder),
-            truth_file=record.truth_file and record.truth_file.relative_to(folder),
+            voxels_file=record.voxels_file and change(record.voxels_file),
+            truth_file=record.truth_file and change(record.truth_file),
         )
         for record in records
     )
-
-
-def _read_unit(file: Path) -> UnitContent | None:
-    try:
-        return from_json(UnitContent, read_json(file), file)
-    except DataError:
-        logger.warning("%s: damaged; the unit is computed again", file)
-        return None
 
 
 def _claimed(path: Path) -> dict[str, Any] | None:
@@ -310,15 +299,15 @@ def _is_earlier(folder: Path, layouts: Collection[str] = (LAYOUT,)) -> bool:
         return (folder / "study.yaml").exists() or lines.readline(200).rstrip("\n") not in layouts
 
 
-def _first_change(old: Mapping[str, Any], new: Mapping[str, Any], prefix: str = "") -> str | None:
-    """The first setting that is there twice and differs."""
-    for key, a in old.items():
-        if key not in new or key in ("name", "description", "scenes", "backbones", "backends", "sweeps"):
-            continue
-        b = new[key]
-        if isinstance(a, dict) and isinstance(b, dict):
-            if change := _first_change(a, b, f"{prefix}{key}."):
-                return change
-        elif a != b:
-            return f"{prefix}{key}: {a} there, {b} here"
-    return None
+def _first_change(old: Mapping[str, Any], new: Mapping[str, Any]) -> str | None:
+    there, here = dict(_flat(old)), dict(_flat(new))
+    changed = (name for name in there if name in here and there[name] != here[name])
+    return next((f"{name}: {there[name]} there, {here[name]} here" for name in changed), None)
+
+
+def _flat(settings: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+    for key, value in settings.items():
+        if isinstance(value, dict) and key != "sweeps":
+            yield from _flat(value, f"{prefix}{key}.")
+        elif key not in ("name", "description", "scenes", "backbones", "backends", "sweeps"):
+            yield f"{prefix}{key}", value

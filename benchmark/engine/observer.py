@@ -10,7 +10,7 @@ if TYPE_CHECKING:
     from semstab.check import Verdict
     from semstab.config import Config
     from semstab.engine.series import FrameRow
-    from semstab.engine.units import Plan, Planned
+    from semstab.engine.units import Plan, PlannedUnit
     from semstab.model.frames import Frame
     from semstab.model.records import Result, UnitContent
     from semstab.model.results import Unit
@@ -44,7 +44,7 @@ class Observer:
         """So many frames went into a map, wherever that is; `what` names the unit."""
 
     def unit_finished(
-        self, planned: Planned, content: UnitContent | None, table: VoxelTable | None, error: str | None
+        self, planned: PlannedUnit, content: UnitContent | None, table: VoxelTable | None, error: str | None
     ) -> None:
         """A unit is computed and kept, or failed for the reason in `error`.
 

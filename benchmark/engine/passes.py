@@ -7,18 +7,19 @@ import functools
 import itertools
 import json
 import math
+from collections import defaultdict
 from collections.abc import Generator, Iterator, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
 
 from semstab.core.prefetch import Fetched, prefetch
-from semstab.core.process import Stopwatch, available_bytes, resident_bytes
+from semstab.core.process import Stopwatch
 from semstab.datasets import GROUND_TRUTH, Dataset, Scene, open_dataset
-from semstab.engine.finish import finish, finish_tile
+from semstab.engine.finish import finish
 from semstab.engine.memory import MemoryBudget
 from semstab.engine.observer import Observers
-from semstab.engine.streams import Decoded, LiveMap, Stream, frame_order, streams_of
+from semstab.engine.streams import Decoded, LiveMap, frame_order, streams_of
 from semstab.engine.work import Job, Outcome, Work, failed
 from semstab.errors import DataError
 from semstab.metrics import macro_mean, matched_region_flicker
@@ -51,7 +52,6 @@ def run_job(job: Job, observers: Observers | None = None) -> Iterator[Outcome]:
 
 def fuse_sequence(fusion: Fusion) -> Iterator[Outcome]:
     """Fuse the frames of a sequence into all maps that want them; then measure and write each map."""
-    fusion.start()
     with contextlib.closing(fusion.decoded_frames()) as frames:
         for index, fetched in zip(fusion.order, frames, strict=True):
             for stream in (stream for stream in fusion.streams if index in stream.frames):
@@ -65,46 +65,42 @@ def fuse_sequence(fusion: Fusion) -> Iterator[Outcome]:
                     stream.notify(frame, rows)
             if not fusion.keep_within_memory():
                 break  # no map is left
-    for stream, live in fusion.finished():
-        with fusion.failing([live]):
-            end = finish if live.work.tile is None else finish_tile
-            yield replace(end(live, stream, fusion.watch), seconds=fusion.lap())
-    yield from fusion.failures()
+    for stream in fusion.streams:
+        while stream.maps:
+            live = stream.maps.pop(0)  # let go of before the next one
+            with fusion.failing([live]):
+                yield replace(finish(live, stream, fusion.watch), seconds=fusion.lap())
+    yield from fusion.failed
 
 
 class Fusion:
     """The maps of a pass, and the bookkeeping around it: failures, memory, time by stage.
 
-    Where maps take more than the memory bound, works are put off to another pass.
+    failed   outcomes of the works that failed
+    put_off  works for another pass, where all maps do not fit into the memory
     """
 
     def __init__(self, scene: Scene, works: Sequence[Work], observers: Observers) -> None:
-        self.watch, self.put_off = Stopwatch(), list[Work]()
-        self._scene, self._observers, self._start = scene, observers, works[0].start
-        self._failed, maps = list[Outcome](), list[LiveMap]()
+        self.watch, self.put_off, self.failed = Stopwatch(), list[Work](), list[Outcome]()
+        self._scene, self._observers, self._threads = scene, observers, works[0].start.threads
+        maps = list[LiveMap]()
         for work in works:
             try:
                 maps.append(LiveMap.of(work, scene))
             except Exception as error:  # noqa: BLE001 - a failing unit is reported, and the others continue
-                self._failed += failed([work], error)
+                self.failed += failed([work], error)
         self.streams = streams_of(maps, self.watch, observers)
         self.order = frame_order(self.streams)
-        self._memory_before = resident_bytes()
-        self._budget = MemoryBudget(works[0].config.memory_gb, self._start.width)
-        bound = self._start.memory_bytes
-        self._bound = available_bytes() / 2 if bound is None else bound
-
-    def start(self) -> None:
-        """Show observers the maps that they watch."""
+        self._budget = MemoryBudget(works[0].config.memory_gb, works[0].start.width)
         for stream in self.streams:
             if watched := stream.watched:
                 backends = {live.unit: live.backend for live in watched if live.backend is not None}
                 task, config = stream.task, watched[0].work.config
-                self._observers.tell(lambda observer: observer.group_started(task, config, backends))  # noqa: B023
+                observers.tell(lambda observer: observer.group_started(task, config, backends))  # noqa: B023
 
     def decoded_frames(self) -> Generator[Fetched[Decoded], None, None]:
         """Frames in order, decoded ahead by threads."""
-        fetched = prefetch(self._decode, self.order, threads=self._start.threads, size=lambda each: each.nbytes)
+        fetched = prefetch(self._decode, self.order, threads=self._threads, size=lambda each: each.nbytes)
         with contextlib.closing(fetched):
             for each in fetched:
                 self.watch.seconds["read"] += each.waited
@@ -132,7 +128,7 @@ class Fusion:
         try:
             yield
         except Exception as error:  # noqa: BLE001 - a failing unit is reported, and the others continue
-            self._failed += failed([live.work for live in lost], error)
+            self.failed += failed([live.work for live in lost], error)
             self._give_up(lost)
 
     def _give_up(self, lost: Sequence[LiveMap]) -> None:
@@ -140,38 +136,22 @@ class Fusion:
             stream.maps = [live for live in stream.maps if live not in lost]
 
     def lap(self) -> dict[str, float]:
-        """The seconds of each stage since the last outcome."""
-        seconds = dict(self.watch.seconds)
-        self.watch.seconds.clear()
-        return seconds
-
-    def failures(self) -> list[Outcome]:
-        """Return the outcomes of the works that failed."""
-        failures, self._failed = self._failed, []
-        return failures
-
-    def finished(self) -> Iterator[tuple[Stream, LiveMap]]:
-        """Each map that came to its end; it is let go of before the next one."""
-        for stream in self.streams:
-            while stream.maps:
-                live = stream.maps.pop(0)
-                yield stream, live
-                live.release()
+        """Return the seconds of each stage since the last outcome."""
+        seconds, self.watch.seconds = self.watch.seconds, defaultdict(float)
+        return dict(seconds)
 
     def keep_within_memory(self) -> bool:
-        """Put maps off, or give up one that outgrows the memory; whether there is still one to fuse."""
+        """Put maps off, or give up one that outgrows the memory. Return whether one is left to fuse."""
         maps = [live for stream in self.streams for live in stream.maps]
-        if len(maps) > 1 and resident_bytes() - self._memory_before > self._bound:
-            later = sorted(maps, key=lambda live: not live.work.watched)[max(1, len(maps) // 2) :]
-            later = [live for live in later if not live.work.watched]
-            self.put_off += [live.work for live in later]
-            self._give_up(later)
-            maps = [live for live in maps if live not in later]
         growing = [live for live in maps if live.rows and live.backend is not None]
-        largest = self._budget.lacking(growing) if growing else None
-        if largest is not None:
-            with self.failing([largest]):
-                raise self._budget.outgrown(largest)
+        if growing and (largest := self._budget.lacking(growing)) is not None:
+            later = sorted(maps, key=lambda live: not live.work.watched)[max(1, len(maps) // 2) :]
+            if later := [live for live in later if not live.work.watched]:
+                self.put_off += [live.work for live in later]
+                self._give_up(later)
+            else:
+                with self.failing([largest]):
+                    raise self._budget.outgrown(largest)
         return any(stream.maps for stream in self.streams)
 
 
@@ -204,7 +184,6 @@ def _dataset(_start: str, name: str, options: str) -> Dataset:
 
 
 def _ground_truth(scene: Scene, index: int) -> Frame | None:
-    """A frame with its ground truth; None where the frame has none."""
     try:
         return scene.frame(index, GROUND_TRUTH, color=False)
     except DataError:
@@ -227,7 +206,6 @@ def _measured_regions(scene: Scene, work: Work) -> Outcome:
 
 
 def _region_frames(scene: Scene, work: Work) -> Iterator[Frame]:
-    """The sampled frames with the regions' own ids."""
     config = work.config
 
     def decode(index: int) -> Frame:

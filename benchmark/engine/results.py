@@ -22,7 +22,7 @@ from semstab.engine.work import Outcome
 from semstab.metrics import compare
 from semstab.metrics.agreement import together
 from semstab.model.events import Events
-from semstab.model.records import REGIONS, Failure, Record, RegionFlicker, Result, Tables, UnitContent
+from semstab.model.records import REGIONS, Failure, Record, Result, Tables, UnitContent
 from semstab.model.results import Agreement, VoxelAdvice
 from semstab.model.tiles import Tiles, side_by_side
 from semstab.model.voxels import VoxelTable
@@ -64,9 +64,9 @@ class UnitResults:
     def counts(self) -> dict[str, Any]:
         """Numbers of all units, of those finished by an earlier start, of those computed and of those that failed."""
         failed = len(self.errors)
-        kept = self.finished_before
-        computed = len(self.contents) - kept
-        return {"units": len(self.contents) + failed, "kept": kept, "computed": computed, "failed": failed}
+        left = self.finished_before
+        computed = len(self.contents) - left
+        return {"units": len(self.contents) + failed, "kept": left, "computed": computed, "failed": failed}
 
 
 def result_of(plan: Plan, folder: Folder, units: UnitResults) -> Result:
@@ -75,8 +75,9 @@ def result_of(plan: Plan, folder: Folder, units: UnitResults) -> Result:
     records = tuple(folder.record(each, contents[each.identity]) for each in plan.units if each.identity in contents)
     tables = Tables(most=len({record.unit.backend for record in records}))
     with units.watch("agreement"):
-        agreement = (*_samples(plan, contents), *_agreement(plan.config, records, tables))
-        compared = tuple(_compared(plan.config, records, tables))
+        own = [contents[each.identity].checked for each in plan.units if each.sampled and each.identity in contents]
+        agreement = (*filter(None, own), *_agreements(plan.config, records, tables, must=True))
+        compared = tuple(_agreements(plan.config, records, tables, must=False))
     with units.watch("comparisons"):
         scenes = tuple(_comparisons(plan.config, records, tables)) if plan.config.statistics else ()
         comparisons = claimed_together(scenes)
@@ -93,14 +94,16 @@ def result_of(plan: Plan, folder: Folder, units: UnitResults) -> Result:
         comparisons=comparisons,
         up=_up_axes(plan.units, contents),
         georeference={name: known for name, scene in plan.scenes.items() if (known := scene.georeference) is not None},
-        regions=tuple(_regions(plan, contents)),
+        regions=tuple(
+            content.regions for each in plan.regions if (content := contents.get(each.identity)) and content.regions
+        ),
         compared=compared,
         advice=units.advice,
     )
 
 
 def advice_of(plan: Plan, contents: Mapping[str, UnitContent]) -> dict[str, VoxelAdvice]:
-    """Where the voxel size lies in each scene, as it was looked at when its base units were computed."""
+    """Return where the voxel size lies in each scene, as was estimated when its base units were computed."""
     return {
         each.unit.scene: content.advice
         for each in plan.units
@@ -108,30 +111,21 @@ def advice_of(plan: Plan, contents: Mapping[str, UnitContent]) -> dict[str, Voxe
     }
 
 
-def _samples(plan: Plan, contents: Mapping[str, UnitContent]) -> Iterator[Agreement]:
-    """Of units with the reference, on a sample of their voxels."""
-    for each in plan.units:
-        content = contents.get(each.identity)
-        if each.sampled and content is not None and content.checked is not None:
-            yield content.checked
+def _agreements(config: Config, records: Sequence[Record], tables: Tables, *, must: bool) -> Iterator[Agreement]:
+    """How far backends agree on each scene and backbone that both fused.
 
-
-def _agreement(config: Config, records: Sequence[Record], tables: Tables) -> Iterator[Agreement]:
-    """Of each pair of backends that must agree, on each scene and backbone that both fused."""
+    must  for each pair of those that must agree; else for the first backend and each other one, where one of the two
+          need not agree
+    """
     checked = {backend.name for backend in config.fused_by() if must_agree(backend)}
-    for group in _by_backend(records).values():
-        there = [record for record in group if record.unit.backend in checked]
-        for a, b in itertools.combinations(there, 2):
-            yield _alike(config, a, b, tables)
-
-
-def _compared(config: Config, records: Sequence[Record], tables: Tables) -> Iterator[Agreement]:
-    """Of the first backend and each other one, where one of the two need not agree."""
-    free = {backend.name for backend in config.fused_by() if not must_agree(backend)}
-    for first, *others in _by_backend(records).values():
-        for other in others:
-            if free & {first.unit.backend, other.unit.backend}:
-                yield _alike(config, first, other, tables)
+    groups: dict[tuple[str, str], list[Record]] = {}
+    for record in records:
+        if record.variation.sweep in (BASE, BACKENDS):  # those of the first backend come first
+            groups.setdefault((record.unit.scene, record.unit.backbone), []).append(record)
+    for group in groups.values():
+        for a, b in itertools.combinations(group, 2) if must else zip(group[:1] * len(group), group[1:], strict=False):
+            if must == ({a.unit.backend, b.unit.backend} <= checked):
+                yield _alike(config, a, b, tables)
 
 
 def _alike(config: Config, a: Record, b: Record, tables: Tables) -> Agreement:
@@ -143,28 +137,20 @@ def _alike(config: Config, a: Record, b: Record, tables: Tables) -> Agreement:
     return together([compare(one, other, units, tolerance=config.tolerance) for one, other in side_by_side(maps)])
 
 
-def _by_backend(records: Sequence[Record]) -> dict[tuple[str, str], list[Record]]:
-    """The records at the base settings of each scene and backbone, those of the first backend first."""
-    groups: dict[tuple[str, str], list[Record]] = {}
-    for record in records:
-        if record.variation.sweep in (BASE, BACKENDS):
-            groups.setdefault((record.unit.scene, record.unit.backbone), []).append(record)
-    return groups
-
-
 def _comparisons(config: Config, records: Sequence[Record], tables: Tables) -> Iterator[BackboneComparison]:
-    """The base units of each scene beside each other; accuracy where there is ground truth."""
-    base = [record for record in records if record.variation.sweep == BASE]
+    """The comparison of each scene's base units; with accuracy where there is ground truth."""
+    base = [record for record in records if record.variation.sweep == BASE and record.unit.backbone != GROUND_TRUTH]
     for scene in dict.fromkeys(record.unit.scene for record in base):
-        there = [record for record in base if record.unit.scene == scene and record.unit.backbone != GROUND_TRUTH]
+        there = [record for record in base if record.unit.scene == scene]
         if len(there) > 1:
-            regions = _regions_of(there, config, tables)
-            kept = {record.unit.backbone: record.looks_file for record in there}
-            looks = {
-                name: CellObservations.load(file) for name, file in kept.items() if file is not None and file.exists()
+            files = {record.unit.backbone: record.looks_file for record in there}
+            observations = {
+                name: CellObservations.load(file) for name, file in files.items() if file is not None and file.exists()
             }
-            compared = _compared_maps(scene, regions, looks if len(looks) == len(there) else None)
-            if compared is not None:
+            regions = _regions_of(there, config, tables)
+            if (
+                compared := _compared_maps(scene, regions, observations if len(observations) == len(there) else None)
+            ) is not None:
                 yield compared
 
 
@@ -200,22 +186,10 @@ def _regions_of(there: Sequence[Record], config: Config, tables: Tables) -> Regi
 
     def regions() -> Iterator[Region]:
         for own in side_by_side([*maps, *logs, *truths]):
-            found, events, truth = (
-                own[: len(maps)],
-                own[len(maps) : len(maps) + len(logs)],
-                own[len(maps) + len(logs) :],
-            )
-            log = dict(zip(names, events, strict=True)) if logs else None
-            yield Region(dict(zip(names, found, strict=True)), log, truth[0] if truth else None)
+            log = dict(zip(names, own[len(maps) :], strict=False)) if logs else None
+            yield Region(dict(zip(names, own, strict=False)), log, own[-1] if truths else None)
 
     return regions
-
-
-def _regions(plan: Plan, contents: Mapping[str, UnitContent]) -> Iterator[RegionFlicker]:
-    for each in plan.regions:
-        content = contents.get(each.identity)
-        if content is not None and content.regions is not None:
-            yield content.regions
 
 
 def _up_axes(
@@ -241,7 +215,8 @@ REPORTED_PACKAGES = ("numpy", "open3d", "opencv-python-headless", "pyarrow", "re
 def manifest(
     config: Config, inputs: Mapping[str, str], seconds: Mapping[str, float], command: Sequence[str]
 ) -> dict[str, Any]:
-    """The content of manifest.json: versions, digests of the inputs, wall-clock seconds by stage, peak memory."""
+    """Return the content of manifest.json: versions, digests of the inputs, seconds by stage, peak memory."""
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss  # in kB on Linux, bytes on macOS
     return {
         "schema": SCHEMA,
         "semstab": _version("semstab"),
@@ -252,7 +227,7 @@ def manifest(
         "seed": config.dataset.options.get("seed"),
         "inputs": dict(inputs),
         "seconds": dict(seconds),
-        "peak_memory_bytes": _peak_memory(),
+        "peak_memory_bytes": peak if sys.platform == "darwin" else 1024 * peak,
     }
 
 
@@ -261,9 +236,3 @@ def _version(package: str) -> str | None:
         return importlib.metadata.version(package)
     except importlib.metadata.PackageNotFoundError:
         return None
-
-
-def _peak_memory() -> int:
-    """Peak resident memory of this process; Linux counts it in kB, macOS in bytes."""
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    return peak if sys.platform == "darwin" else peak * 1024

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from semstab.core.arrays import Rows
 from semstab.core.files import atomic_path
@@ -48,21 +49,14 @@ class FrameRow:
     most_scores_left_out: float = math.nan
 
     def stage_ms(self) -> dict[str, float]:
-        """Milliseconds of each of `STAGES`; NaN where it is not known."""
+        """Return the milliseconds of each of `STAGES`; NaN where it is not known."""
         seconds = vars(self.report) | vars(self)
         return {stage: 1e3 * seconds[f"{stage}_seconds"] for stage in STAGES}
 
     def cells(self) -> dict[str, Any]:
-        """The row by column name, an undefined number as None."""
-        row = vars(self.report) | {
-            "timestamp": self.timestamp,
-            "flicker_percent": self.flicker_percent,
-            "compensated_flicker_percent": self.compensated_flicker_percent,
-            "left_out": self.left_out,
-            "drift": self.report.drift,
-            "fuse_ms": self.report.seconds * 1e3,
-            **{f"{stage}_ms": value for stage, value in self.stage_ms().items()},
-        }
+        """Return the row by column name, an undefined number as None."""
+        row = vars(self.report) | vars(self) | {"drift": self.report.drift, "fuse_ms": self.report.seconds * 1e3}
+        row |= {f"{stage}_ms": value for stage, value in self.stage_ms().items()}
         return {name: None if row[name] is None or row[name] != row[name] else row[name] for name in FRAME_COLUMNS}
 
 
@@ -79,11 +73,11 @@ INTEGERS = ("frame", "points", "voxels", "new_voxels", "map_voxels")
 class Series:
     """The rows of a time series, kept as numbers.
 
-    numbers  NUMBERS of the first ones
+    numbers  (F, C) the NUMBERS of the first ones
     """
 
-    def __init__(self, numbers: Rows | None = None) -> None:
-        self._rows = Rows(len(NUMBERS)) if numbers is None else numbers
+    def __init__(self, numbers: npt.ArrayLike = ()) -> None:
+        self._rows = Rows(len(NUMBERS), numbers)
 
     @property
     def numbers(self) -> Float64:
@@ -91,7 +85,7 @@ class Series:
         return self._rows.table()
 
     def column(self, name: str) -> Float64:
-        """(F,) one of the NUMBERS."""
+        """Return one of the NUMBERS of each row (F,)."""
         return self._rows.column(NUMBERS.index(name))
 
     @property
@@ -103,9 +97,8 @@ class Series:
         return drift
 
     def append(self, row: FrameRow) -> None:
-        """One more frame."""
-        report = (getattr(row.report, name) for name in REPORT)
-        self._rows.append([*report, *(getattr(row, name) for name in ROW)])
+        """Add a frame."""
+        self._rows.append([*(getattr(row.report, name) for name in REPORT), *(getattr(row, name) for name in ROW)])
 
     def save_csv(self, path: Path, names: Callable[[int], str] = str) -> None:
         """Write FRAME_COLUMNS as text and the frames' names, with a header, atomically."""
@@ -115,11 +108,11 @@ class Series:
             writer.writerows(row.cells() | {"name": names(row.report.frame)} for row in self)
 
     def __len__(self) -> int:
-        """The number of frames."""
+        """Return the number of frames."""
         return len(self._rows)
 
     def __iter__(self) -> Iterator[FrameRow]:
-        """The rows in turn, each made when it is wanted."""
+        """Yield the rows in turn, each made when it is wanted."""
         return map(_row, self._rows)
 
     def __getitem__(self, at: int) -> FrameRow:

@@ -10,6 +10,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from semstab.backends import FusionBackend, create, takes_option
 from semstab.backends.numpy_reference import NumpySample
@@ -19,11 +20,11 @@ from semstab.config import Config
 from semstab.core.arrays import Rows
 from semstab.core.prefetch import Fetched
 from semstab.core.process import Stopwatch
-from semstab.core.types import Float64
+from semstab.core.types import Float64, Int32, UInt8, UInt16
 from semstab.datasets import Scene
 from semstab.engine.observer import Observers
 from semstab.engine.series import FrameRow, Series
-from semstab.engine.tiles import FrameTiles
+from semstab.engine.tiles import tiles_met
 from semstab.engine.work import Work
 from semstab.errors import DataError
 from semstab.metrics import FrameQualityMeter, SelfConsistency, VideoConsistency, compensated_flicker, flicker_percent
@@ -31,7 +32,7 @@ from semstab.model.frames import Frame
 from semstab.model.measures import mean
 from semstab.model.records import ImageSpace
 from semstab.model.results import FrameReport, SizeAlpha, Unit
-from semstab.model.voxels import VoxelTable
+from semstab.model.voxels import Extent, VoxelTable
 from semstab.statistics import Sampler
 from semstab.statistics.agreement import alpha_columns, alpha_of
 from semstab.statistics.observations import CellObservations
@@ -53,17 +54,17 @@ class LiveMap:
 
     backend    None where nothing is fused
     truth      takes the ground truth of the same frames
-    sampler  takes the sample of observations that statistics need
+    sampler    takes the sample of observations that statistics need
     reference  follows a sample of its voxels, where it is checked so
     sizes      some frames, to be fused at other voxel sizes
     hard       of soft scores, a map of each pixel's likeliest class
     frames     indices of those that go into it
-    tiles      which tiles each frame meets, where nothing is fused
+    tiles      (n, 3) each frame and a tile that it meets, where nothing is fused; origin the voxel of its first camera
     """
 
     work: Work
     task: Task
-    backend: FusionBackend | None
+    backend: FusionBackend | None = None
     truth: FusionBackend | None = None
     sampler: Sampler | None = None
     reference: NumpySample | None = None
@@ -73,27 +74,25 @@ class LiveMap:
     observations: int = 0
     soft: bool = False
     frames: range | frozenset[int] = range(0)
-    tiles: FrameTiles | None = None
+    tiles: list[Int32] = field(default_factory=list)
+    origin: tuple[int, int, int] | None = None
 
     @classmethod
     def of(cls, work: Work, scene: Scene) -> LiveMap:
         """Return an empty map for a work on its scene."""
         (task,) = tasks_of(scene, work.config)
-        task = dataclasses.replace(task, left_out=work.left_out)
-        config, K, backend = work.config, len(task.mapping.target), None
-        has_truth = config.statistics and truth_task(task) is not None
-        live = cls(work, task, backend, frames=_as_set(task.indices))
+        task, config, K = dataclasses.replace(task, left_out=work.left_out), work.config, len(task.mapping.target)
+        live = cls(work, task, frames=_as_set(task.indices))
         if work.fuses:
-            live.backend = new_map(config, K, work)
-            live.truth = _without_log(config, K, work) if has_truth else None
-        elif work.tile is not None:
-            live.tiles = FrameTiles(config.voxel_size, work.tile.size)
+            live.backend = new_map(config, K, work.within)
+            if config.statistics and truth_task(task) is not None:
+                live.truth = new_map(config, K, work.within, log=False)
+            if work.sampled:
+                live.reference = NumpySample(config.voxel_size, K, work.within)
         if work.judged and work.measures_images:
             live.sampler = Sampler(config.voxel_size, K)
-        if work.sampled and work.fuses:
-            live.reference = NumpySample(config.voxel_size, K, work.within)
-        if work.image_space and work.judged and work.measures_images and not config.frame_quality:
-            live.sizes = SizeSample(task, config)  # filters share the sizes of what they are put over
+            if work.image_space and not config.frame_quality:
+                live.sizes = SizeSample(task, config)  # filters share the sizes of what they are put over
         return live
 
     @property
@@ -118,7 +117,7 @@ class LiveMap:
                 self.reference.integrate(frame)
         if frame.scores is not None and self.work.image_space:
             with watch("reduced scores"):
-                self.hard = self.hard or _without_log(self.work.config, K, self.work)
+                self.hard = self.hard or new_map(config, K, self.work.within, log=False)
                 self.hard.integrate(dataclasses.replace(frame, labels=frame.predicted, scores=None))
         if self.truth is not None and prepared.truth is not None:
             self.truth.integrate(prepared.truth)
@@ -134,13 +133,13 @@ class LiveMap:
         if self.sizes is not None:
             with watch("voxel sizes"):
                 self.sizes.add(prepared.frame)
-        if self.tiles is not None:
-            self.tiles.add(prepared.frame)
-
-    def release(self) -> None:
-        """Let go of all that takes memory: the work is finished."""
-        self.backend = self.truth = self.hard = self.reference = None
-        self.sampler = self.sizes = None
+        if not self.work.fuses and self.work.tile is not None:
+            frame, voxel_size = prepared.frame, self.work.config.voxel_size
+            if self.origin is None:
+                x, y, z = np.floor(frame.T_wc[:3, 3] / voxel_size).astype(int).tolist()
+                self.origin = x, y, z
+            met = tiles_met(frame, voxel_size, self.work.tile.size)
+            self.tiles.append(np.column_stack([np.full(len(met), frame.index, np.int32), met]))
 
     @property
     def left_out(self) -> list[int]:
@@ -153,23 +152,13 @@ class LiveMap:
             return None
         return self.sampler.looks(self.task.mapping.target.classes).without(self.left_out)
 
-    def table(self) -> VoxelTable:
-        """The voxels of its map."""
-        assert self.backend is not None
-        return dataclasses.replace(self.backend.table(), classes=self.task.mapping.target.classes)
 
-
-def new_map(config: Config, num_classes: int, work: Work | None = None) -> FusionBackend:
-    """An empty map; it keeps the history where that is to be written, or statistics are computed from it."""
+def new_map(config: Config, num_classes: int, within: Extent | None = None, *, log: bool = True) -> FusionBackend:
+    """Return an empty map; it keeps its log where that is to be written, or statistics are computed from it."""
     (backend,) = config.backends
-    wanted = (config.events or config.statistics) and takes_option(backend.name, "history")
+    wanted = log and (config.events or config.statistics) and takes_option(backend.name, "history")
     options = ({"history": True} if wanted else {}) | backend.options
-    within = None if work is None else work.within
     return create(backend.name, voxel_size=config.voxel_size, num_classes=num_classes, within=within, **options)
-
-
-def _without_log(config: Config, num_classes: int, work: Work) -> FusionBackend:
-    return new_map(config.model_copy(update={"statistics": False, "events": False}), num_classes, work)
 
 
 _warm: set[tuple[str, str, int, bool]] = set()
@@ -222,14 +211,15 @@ class Stream:
         quality = base and maps[0].work.config.frame_quality
         self.quality = FrameQualityMeter(len(self.task.mapping.target)) if quality else None
         self.truth_task = truth_task(self.task) if base or maps[0].work.config.statistics else None
-        self._poses = Rows(POSE) if base and self.task.scene.up is None else None
+        self._poses = Rows(POSE)
+        self._estimates_up = base and self.task.scene.up is None
         self.shown = self.task.indices[len(self.task.indices) // 2] if base else None
         self.overview: dict[str, Any] = {}
 
     @property
     def poses(self) -> Float64:
         """(F, 3, 3) down, forward and centre of cameras in the world; of none where up need not be estimated."""
-        return np.zeros((0, 3, 3)) if self._poses is None else self._poses.table().reshape(-1, 3, 3)
+        return self._poses.table().reshape(-1, 3, 3)
 
     def prepare(self, fetched: Fetched[Decoded]) -> Prepared:
         """The frame as the stream's maps fuse it, with its colour only where an observer wants it."""
@@ -258,7 +248,7 @@ class Stream:
             with self._watch("frame quality"):
                 model = frame if decoded.model is None else prepare(self.task, decoded.model, self.pixel_stride)
                 self.quality.add(frame, model, now.truth)
-        if self._poses is not None:
+        if self._estimates_up:
             self._poses.append(frame.T_wc[:3, 1:].ravel())
         self._previous = frame if self._sequential else None
         cut = frame.scores_left_out
@@ -342,8 +332,8 @@ def edge_recall(frame: Frame) -> float:
 class ImageSpaceMeter:
     """Takes the sampled frames of a unit in order; only the last one stays in memory. rows has COLUMNS of each."""
 
-    def __init__(self, rows: Rows | None = None) -> None:
-        self.rows = Rows(len(COLUMNS)) if rows is None else rows
+    def __init__(self, rows: npt.ArrayLike = ()) -> None:
+        self.rows = Rows(len(COLUMNS), rows)
         self._previous: Frame | None = None
         self._by_truth = [VideoConsistency(n) for n in CLIPS]
         self._by_itself = [SelfConsistency(n) for n in CLIPS]
@@ -401,11 +391,17 @@ class SizeSample:
     def alphas(self) -> tuple[SizeAlpha, ...]:
         """Krippendorff's alpha at each voxel size; none where the scene is larger than a map of the smallest."""
         soft = any(frame.scores is not None for frame in self._frames)
-        frames = [_one_hot(frame, self._K) if soft and frame.scores is None else frame for frame in self._frames]
+        frames = self._frames
+        if soft:
+            frames = [frame if frame.labels is None else self._one_hot(frame, frame.labels) for frame in frames]
         try:
             return tuple(self._at(factor * self._voxel_size, frames) for factor in FACTORS) if frames else ()
         except DataError:
             return ()
+
+    def _one_hot(self, frame: Frame, labels: UInt8 | UInt16) -> Frame:
+        scores = np.eye(self._K, dtype=np.float32)[np.where(frame.valid, labels, 0)]
+        return dataclasses.replace(frame, labels=None, scores=scores, depth=np.where(frame.valid, frame.depth, 0))
 
     def _at(self, voxel_size: float, frames: Sequence[Frame]) -> SizeAlpha:
         backend = create("numba", voxel_size=voxel_size, num_classes=self._K)
@@ -418,10 +414,3 @@ def alpha_sums(table: VoxelTable) -> Float64:
     """Return the sums over voxels from which Krippendorff's alpha of a map follows."""
     sums = (alpha_columns(table.rows(some)).sum(axis=0) for some in table.evidence.chunks())
     return sum(sums, np.zeros(3 + table.K))
-
-
-def _one_hot(frame: Frame, K: int) -> Frame:
-    assert frame.labels is not None
-    labels = np.where(frame.valid, frame.labels, 0)
-    scores = np.eye(K, dtype=np.float32)[labels]
-    return dataclasses.replace(frame, labels=None, scores=scores, depth=np.where(frame.valid, frame.depth, 0))

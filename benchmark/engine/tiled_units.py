@@ -10,12 +10,10 @@ from pathlib import Path
 
 import numpy as np
 
-from semstab.core.arrays import Rows
 from semstab.core.types import Float64
 from semstab.datasets.formats.disk import file_digest
-from semstab.engine.finish import analyse_sample, no_voxels, reduced_of, save_voxels, unit_summary, up_axis
+from semstab.engine.finish import analyse_sample, in_image_space, no_voxels, save_voxels, unit_content
 from semstab.engine.folder import Folder, unit_key
-from semstab.engine.streams import COLUMNS, ImageSpaceMeter
 from semstab.engine.tiles import OBSERVATIONS, TileResult, joined_series
 from semstab.engine.units import PlannedUnit
 from semstab.engine.work import Job, Outcome, Start, TileTask, Work, failed
@@ -25,7 +23,7 @@ from semstab.metrics.summary import TableSums
 from semstab.model.parquet import tile_of
 from semstab.model.records import FRAMES, INFLUENCE, LOOKS, TRUTH, VOXELS, UnitContent
 from semstab.model.voxels import VoxelTable
-from semstab.statistics import Analysis, CellObservations, MapSample, ObservationSample
+from semstab.statistics import Analysis, CellObservations, MapSample
 from semstab.statistics.sample import MOST_VOXELS
 
 GUESS = 4
@@ -44,7 +42,7 @@ class TiledUnit:
     def __init__(self, planned: PlannedUnit, size: int, folder: Folder, start: Start) -> None:
         self.planned, self._folder = planned, folder
         self._work = Work.of(planned, start)
-        self._frames = TileTask(unit_key(planned.identity, planned.digest), size)
+        self._frames = TileTask(unit_key(planned.identity, planned.task.digest), size)
         self._results: dict[str, TileResult] = {}
         self._samples: list[MapSample] = []
         self._bound: int | None = None
@@ -142,53 +140,38 @@ def assembled(
     if sums is None or not sums.total[2]:
         raise no_voxels(task, config)
     rows = joined_series(frames.series, [tile.series for tile in tiles])
-    files = {name: digest for each in (frames, *tiles) for name, digest in each.files.items()}
+    seen = folder / tasks[0].folder / f"{tasks[0].size}_{OBSERVATIONS}"
+    observations = CellObservations.load(seen) if seen.exists() else None
     analysis = None
     if sample is not None:  # sums in the order of the tiles, not in that of their ends
-        observations = _observations(tasks[0], folder)
-        analysis = analyse_sample(task, config, dataclasses.replace(sample, summary=sums), observations)
+        sample = dataclasses.replace(sample, summary=sums)
+        analysis = analyse_sample(task, config, sample, None if observations is None else observations.sample())
+    files = {name: digest for each in (frames, *tiles) for name, digest in each.files.items()}
     files = {name: digest for name, digest in files.items() if not name.startswith(tasks[0].folder)}
-    seen = folder / tasks[0].folder / f"{tasks[0].size}_{OBSERVATIONS}"
     if planned.kept:
-        files |= _saved(
-            folder, f"{FRAMES}/{unit.slug}.csv", functools.partial(rows.save_csv, names=task.scene.frame_name)
-        )
-        if seen.exists():
-            files |= _saved(folder, f"{LOOKS}/{unit.slug}.parquet", CellObservations.load(seen).save)
+        save_rows = functools.partial(rows.save_csv, names=task.scene.frame_name)
+        files |= _saved(folder, f"{FRAMES}/{unit.slug}.csv", save_rows)
+        if observations is not None:
+            files |= _saved(folder, f"{LOOKS}/{unit.slug}.parquet", observations.save)
         if analysis is not None:
             files |= _saved(folder, f"{INFLUENCE}/{unit.slug}.parquet", analysis.sums.save)
-    if planned.kept and analysis is not None and config.statistics:
-        for each in tasks:
-            files |= _with_columns(each, unit.slug, analysis, folder)
+            for each in tasks if config.statistics else ():
+                files |= _with_columns(each, unit.slug, analysis, folder)
     reduced = [tile.reduced for tile in tiles if len(tile.reduced)]
-    summary = unit_summary(
-        task,
-        rows,
-        sums.summary(config.voxel_size, task.mapping.target.classes, config.strata),
-        None if analysis is None else analysis.summary,
-        reduced_of(np.sum(reduced, axis=0)) if reduced else None,
-        frames.sizes,
-    )
     checked = [tile.checked for tile in tiles if tile.checked is not None]
-    agreement = together(checked) if checked and len(checked) == len(tiles) else None
-    content = UnitContent(planned.digest, summary, files=files, checked=agreement)
+    result = dataclasses.replace(
+        frames,
+        files=files,
+        sums=sums.arrays(),
+        reduced=np.sum(reduced, axis=0) if reduced else np.zeros(0),
+        checked=together(checked) if checked and len(checked) == len(tiles) else None,
+    )
+    content = unit_content(task, config, rows, result, analysis)
     if not planned.image_space:
         return content
-    meter = ImageSpaceMeter(Rows(len(COLUMNS), frames.image))
     voxels = [folder / name for name in files if name.startswith(f"{VOXELS}/")]
     centers = _centers(voxels, config.voxel_size, -(-int(sums.total[2]) // UP_VOXELS))
-    return dataclasses.replace(
-        content,
-        image_space=meter.result(summary.flicker_percent),
-        quality=frames.quality,
-        up=up_axis(task.scene, centers, frames.poses),
-    )
-
-
-def _observations(task: TileTask, folder: Path) -> ObservationSample | None:
-    """The sample of observations of all frames."""
-    file = folder / task.folder / f"{task.size}_{OBSERVATIONS}"
-    return CellObservations.load(file).sample() if file.exists() else None
+    return in_image_space(content, task, result, centers)
 
 
 def _with_columns(task: TileTask, slug: str, analysis: Analysis, folder: Path) -> dict[str, str]:
@@ -208,7 +191,6 @@ def _with_columns(task: TileTask, slug: str, analysis: Analysis, folder: Path) -
 
 
 def _saved(folder: Path, name: str, save: Callable[[Path], None]) -> dict[str, str]:
-    """The digest of a file that is written, by its path in the folder."""
     save(folder / name)
     return {name: file_digest(folder / name).hex()}
 

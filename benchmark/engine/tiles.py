@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import math
 from collections.abc import Mapping, Sequence
@@ -11,7 +12,6 @@ from typing import Any
 
 import numpy as np
 
-from semstab.core.arrays import Rows
 from semstab.core.files import parse_json, read_arrays, write_arrays
 from semstab.core.json_form import from_json, to_json
 from semstab.core.types import Float64, Int32
@@ -29,27 +29,6 @@ MOST_TILES = 1 << 16
 
 MARGIN = 1.0
 """Voxels by which a frustum is widened: a pixel at its side may be rounded into the next voxel."""
-
-
-class FrameTiles:
-    """Notes which tiles the frustum of each frame meets, from its pose and the range of its depth."""
-
-    def __init__(self, voxel_size: float, size: int) -> None:
-        self._voxel_size, self._size = voxel_size, size
-        self._origin: tuple[int, int, int] | None = None
-        self._seen: list[Int32] = []
-
-    def add(self, frame: Frame) -> None:
-        """The next frame. Raises DataError where it meets more tiles than a map can have."""
-        if self._origin is None:
-            x, y, z = np.floor(frame.T_wc[:3, 3] / self._voxel_size).astype(int).tolist()
-            self._origin = x, y, z
-        tiles = tiles_met(frame, self._voxel_size, self._size)
-        self._seen.append(np.column_stack([np.full(len(tiles), frame.index, np.int32), tiles]))
-
-    def result(self) -> dict[str, Any]:
-        """The fields of a `TileResult`."""
-        return {"origin": self._origin, "seen": np.concatenate([np.zeros((0, 3), np.int32), *self._seen])}
 
 
 def tiles_met(frame: Frame, voxel_size: float, size: int) -> Int32:
@@ -88,74 +67,70 @@ def _ranges(corners: Float64) -> tuple[tuple[Float64, float], tuple[Float64, flo
 
 
 @dataclass(frozen=True, eq=False)
-class TileResult:
-    """The result of one tile, or of the pass over all frames, kept until the whole unit is there.
+class TileMeta:
+    """The fields of a result that are no arrays.
 
     files    digests of its files, by their path in the folder
-    series   (F, C) NUMBERS of each frame
-    sums     of its voxels, by name, as `TableSums` has them
-    reduced  sums of the map of labels that soft scores were reduced to; empty where there are none
     checked  how far it agrees with the reference on a sample of its voxels
-    image    (F, C) stability of each frame in image coordinates, poses (F, 3, 3) of the cameras: of all frames
-    origin   voxel of the first camera, seen (m, 3) a frame and a tile that it meets, ascending by frame
+    origin   voxel of the first camera
     """
 
     files: Mapping[str, str]
-    series: Float64
-    voxels: int = 0
-    sums: Mapping[str, Float64] = field(default_factory=dict)
-    reduced: Float64 = field(default_factory=lambda: np.zeros(0))
     checked: Agreement | None = None
     sizes: tuple[SizeAlpha, ...] = ()
     quality: FrameQuality | None = None
+    origin: tuple[int, int, int] | None = None
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class TileResult(TileMeta):
+    """The result of a whole unit, of one tile, or of the pass over all frames; those of tiles make a unit's.
+
+    series   (F, C) NUMBERS of each frame
+    sums     of its voxels, by name, as `TableSums` has them
+    reduced  sums of the map of labels that soft scores were reduced to; empty where there are none
+    image    (F, C) stability of each frame in image coordinates, poses (F, 3, 3) of the cameras: of all frames
+    seen     (m, 3) a frame and a tile that it meets, ascending by frame
+    """
+
+    series: Float64
+    sums: Mapping[str, Float64] = field(default_factory=dict)
+    reduced: Float64 = field(default_factory=lambda: np.zeros(0))
     image: Float64 = field(default_factory=lambda: np.zeros((0, 0)))
     poses: Float64 = field(default_factory=lambda: np.zeros((0, 3, 3)))
-    origin: tuple[int, int, int] | None = None
     seen: Int32 = field(default_factory=lambda: np.zeros((0, 3), np.int32))
 
     def save(self, path: Path) -> None:
         """Write it, atomically."""
-        about = to_json(TileMeta(self.files, self.voxels, self.checked, self.sizes, self.quality, self.origin))
         arrays: dict[str, Any] = {name: getattr(self, name) for name in ARRAYS}
         arrays |= {f"sums {name}": value for name, value in self.sums.items()}
-        write_arrays(path, {"about": np.frombuffer(json.dumps(about).encode(), np.uint8), **arrays})
+        meta = to_json({field.name: getattr(self, field.name) for field in dataclasses.fields(TileMeta)})
+        write_arrays(path, {"meta": np.frombuffer(json.dumps(meta).encode(), np.uint8), **arrays})
 
     @classmethod
     def load(cls, path: Path) -> TileResult | None:
         """Read the file that `save` wrote; None where there is none, or it is damaged or of another version."""
         arrays = read_arrays(path)
-        if arrays is None or not {"about", *ARRAYS} <= arrays.keys() or arrays["series"].shape[1:] != (len(NUMBERS),):
+        if arrays is None or not {"meta", *ARRAYS} <= arrays.keys() or arrays["series"].shape[1:] != (len(NUMBERS),):
             return None
         try:
-            about = from_json(TileMeta, parse_json(arrays["about"].tobytes()), path)
+            meta = from_json(TileMeta, parse_json(arrays["meta"].tobytes()), path)
         except (DataError, ValueError):
             return None
         sums = {name[5:]: array for name, array in arrays.items() if name.startswith("sums ")}
         own: dict[str, Any] = {name: arrays[name] for name in ARRAYS}
-        return cls(**own, **vars(about), sums=sums)
+        return cls(**vars(meta), **own, sums=sums)
 
     def tiles(self) -> dict[tuple[int, int], list[int]]:
         """The frames that meet each tile, in order, by its place."""
-        found: dict[tuple[int, int], list[int]] = {}
+        frames: dict[tuple[int, int], list[int]] = {}
         for index, x, y in self.seen.tolist():
-            found.setdefault((x, y), []).append(index)
-        return dict(sorted(found.items()))
-
-
-@dataclass(frozen=True)
-class TileMeta:
-    """The fields of a result that are no arrays."""
-
-    files: Mapping[str, str]
-    voxels: int
-    checked: Agreement | None
-    sizes: tuple[SizeAlpha, ...]
-    quality: FrameQuality | None
-    origin: tuple[int, int, int] | None
+            frames.setdefault((x, y), []).append(index)
+        return dict(sorted(frames.items()))
 
 
 ARRAYS = ("series", "reduced", "image", "poses", "seen")
-"""The fields that are arrays, beside the sums."""
+"""The fields of a result that are arrays, without the sums."""
 
 # --- The time series of a unit in tiles -------------------------------------------------------------------------------
 
@@ -186,7 +161,7 @@ def joined_series(frames: Float64, tiles: Sequence[Float64]) -> Series:
     rows[:, column["map_voxels"]] = voxels
     for name in MEANS:
         rows[:, column[name]] = totals[name] / np.where(voxels > 0, voxels, math.nan)
-    return Series(Rows(len(NUMBERS), rows))
+    return Series(rows)
 
 
 def _latest(frame: Float64, own: Float64, values: Float64) -> Float64:

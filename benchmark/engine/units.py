@@ -6,9 +6,9 @@ import dataclasses
 import hashlib
 import json
 import logging
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property, partial
+from functools import cached_property
 from typing import Any
 
 from semstab.backends import REGISTRY, create, keeps_log
@@ -27,6 +27,7 @@ from semstab.config import (
 )
 from semstab.datasets import Scene, open_dataset
 from semstab.errors import ConfigError
+from semstab.model.labels import LabelSpace
 from semstab.model.measures import measures
 from semstab.model.records import REGIONS, Variation
 from semstab.model.results import Unit
@@ -37,17 +38,14 @@ logger = logging.getLogger("semstab")
 FORMAT = 9
 """Part of every key: raise it with any change of the numbers that a unit's settings and input lead to."""
 
-IN_KEYS = ("voxel_size", "pixel_stride", "top_k", "exclude", "perturbation", "strata", "statistics", "critical_classes",
-    "scope",
-    "verdict",
+IN_KEYS = (
+    "voxel_size", "pixel_stride", "top_k", "exclude", "perturbation", "strata", "statistics", "critical_classes",
+    "scope", "verdict",
 )  # fmt: skip
 """Settings that a unit's numbers depend on as they stand; of the others, what they select is in its key: the digest of
 the input, frames, classes, the backend."""
 
 NOISES = tuple(name for name in Perturbation.model_fields if name != "seed")
-
-Change = Callable[[Config], Config]
-"""What a variation does to the settings of a base unit."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,61 +81,14 @@ class PlannedUnit:
         return len(self.task.indices)
 
     @property
-    def digest(self) -> str:
-        """A hash of its input."""
-        return self.task.digest
+    def regions(self) -> bool:
+        """Whether it is the flicker of regions without classes, and nothing is fused."""
+        return self.variation.sweep == REGIONS
 
-    def beside(self, other: Planned) -> Planned:
-        """The same unit, with what is wanted of either."""
-        if not isinstance(other, PlannedUnit):
-            return self
-        return dataclasses.replace(
-            other,
-            image_space=other.image_space or self.image_space,
-            kept=other.kept or self.kept,
-            judged=other.judged or self.judged,
-            sampled=other.sampled or self.sampled,
-        )
-
-    @property
-    def logged(self) -> bool:
-        """Whether its backend can give the log of its observations."""
-        return keeps_log(self.unit.backend)
-
-
-@dataclass(frozen=True, eq=False)
-class PlannedRegions:
-    """A label source of regions without classes on a scene; config and identity are as in `PlannedUnit`."""
-
-    config: Config
-    scene: Scene
-    backbone: str
-    identity: str
-    image_space: bool = False
-    kept: bool = False
-
-    @property
-    def variation(self) -> Variation:
-        """It is varied in nothing."""
-        return Variation(REGIONS)
-
-    @property
-    def unit(self) -> Unit:
-        """Its scene and backbone; no backend fuses it."""
-        return Unit(self.scene.name, self.backbone, "none")
-
-    @property
-    def frames(self) -> int:
-        """How many are compared with the one before."""
-        return len(frame_indices(self.scene, self.config, [self.backbone]))
-
-    @property
-    def digest(self) -> str:
-        """A hash of its input."""
-        return self.scene.digest(frame_indices(self.scene, self.config, [self.backbone]), self.backbone)
-
-
-Planned = PlannedUnit | PlannedRegions
+    def merged_with(self, other: PlannedUnit) -> PlannedUnit:
+        """Return the same unit as the other one, with what is wanted of either."""
+        wanted = ("image_space", "kept", "judged", "sampled")
+        return dataclasses.replace(other, **{name: getattr(self, name) or getattr(other, name) for name in wanted})
 
 
 @dataclass(frozen=True, eq=False)
@@ -147,18 +98,18 @@ class Plan:
     config: Config
     scenes: Mapping[str, Scene]
     units: tuple[PlannedUnit, ...]
-    regions: tuple[PlannedRegions, ...]
+    regions: tuple[PlannedUnit, ...]
 
-    def every(self) -> list[Planned]:
+    def every(self) -> list[PlannedUnit]:
         """The units, then the regions."""
         return [*self.units, *self.regions]
 
-    def distinct(self) -> dict[str, Planned]:
+    def distinct(self) -> dict[str, PlannedUnit]:
         """What is to be computed, by its identity, with all that is wanted of it anywhere."""
-        distinct: dict[str, Planned] = {each.identity: each for each in self.regions}
-        for each in self.units:
+        distinct: dict[str, PlannedUnit] = {}
+        for each in (*self.regions, *self.units):
             known = distinct.get(each.identity)
-            distinct[each.identity] = each if known is None else each.beside(known)
+            distinct[each.identity] = each if known is None else each.merged_with(known)
         return distinct
 
     @cached_property
@@ -197,7 +148,6 @@ def make_plan(config: Config) -> Plan:
 
 
 def _base_settings(config: Config, scene: str, backbones: list[str] | None) -> Config:
-    """The settings of a scene's base units, fused by the first backend."""
     noise = config.perturbation
     return config.model_copy(
         update={
@@ -240,86 +190,72 @@ def must_agree(backend: BackendConfig) -> bool:
 
 
 def _check_classes(critical: Sequence[str], task: Task) -> None:
-    """Raise ConfigError for a critical class that the unit's taxonomy has not."""
     space = task.mapping.target
     for name in critical:
         if name not in space.classes:
             raise ConfigError(f"critical_classes: '{name}' is no class of {space.name}: {', '.join(space.classes)}")
 
 
-def _planned_regions(config: Config, scenes: Mapping[str, Scene]) -> Iterator[PlannedRegions]:
+def _planned_regions(config: Config, scenes: Mapping[str, Scene]) -> Iterator[PlannedUnit]:
+    space = LabelSpace("regions", ("region", "none"))  # regions have no classes, but a label space has two
     for name, scene in scenes.items():
         for backbone in selected(config.region_maps, scene.backbones, scene.regions, "region map", name):
             settings = _base_settings(config, name, [backbone])
-            unit, frames = [name, backbone], frame_indices(scene, settings, [backbone])
+            frames = frame_indices(scene, settings, [backbone])
+            task = Task(scene, backbone, frames, space.mapping_to(space), ("none",))
             fused_only = {"voxel_size", "strata", "statistics", "critical_classes", "scope", "verdict"}
-            key = _hash(settings, {"regions": unit, "frames": frames}, fused_only)
-            yield PlannedRegions(settings, scene, backbone, key)
+            key = _hash(settings, {"regions": [name, backbone], "frames": frames}, fused_only)
+            yield PlannedUnit(Variation(REGIONS), settings, task, key, image_space=False, kept=False)
 
 
 def _varied_units(config: Config, base: Sequence[PlannedUnit], scenes: Mapping[str, Scene]) -> Iterator[PlannedUnit]:
-    beside: dict[str, list[str]] = {}
+    compared: dict[str, list[str]] = {}
     for each in base:
-        beside.setdefault(each.unit.scene, []).append(each.unit.backbone)
-    for variation, part, change in _variations(config):
+        compared.setdefault(each.unit.scene, []).append(each.unit.backbone)
+    for variation, part, value in _variations(config):
         for each in _restricted(base, part, variation.sweep):
-            varied = change(each.config)
-            (task,) = tasks_of(scenes[each.unit.scene], varied, beside[each.unit.scene])
+            varied = each.config.model_copy(update=_changed_settings(config, variation, value, each.config))
+            (task,) = tasks_of(scenes[each.unit.scene], varied, compared[each.unit.scene])
             _check_count(variation, task)
-            kept, (backend, *_) = variation.sweep == BACKENDS, varied.backends
-            reference = kept and backend.name not in [named.name for named in config.backends]
+            left, (backend, *_) = variation.sweep == BACKENDS, varied.backends
+            reference = left and backend.name not in [named.name for named in config.backends]
             judged = varied.statistics or not reference
-            sampled = kept and _is_sampled(config, backend)
-            yield PlannedUnit(variation, varied, task, identity(varied, task), False, kept, judged, sampled)
+            sampled = left and _is_sampled(config, backend)
+            yield PlannedUnit(variation, varied, task, identity(varied, task), False, left, judged, sampled)
 
 
-def _variations(config: Config) -> Iterator[tuple[Variation, Part, Change]]:
-    """Each point of each sweep, where it applies, and what it changes."""
+def _variations(config: Config) -> Iterator[tuple[Variation, Part, Any]]:
+    """Each point of each sweep, where it applies, and its value; then the taxonomy or the backend that is changed."""
     if config.shared_taxonomy is not None:
-        yield Variation(SHARED), Part(), partial(_changed, {"taxonomy": config.shared_taxonomy})
+        yield Variation(SHARED), Part(), config.shared_taxonomy
     for sweep, part in config.sweeps.given():
         for value in part.values:
-            repeats = part.repeats if isinstance(part, Noise) and value else 1
-            for repeat in range(repeats):
-                yield Variation(sweep, float(value), repeat), part, _change(sweep, value, config.seed + repeat)
-    _, *others = config.fused_by()
-    logged = next((backend.name for backend in config.fused_by() if keeps_log(backend.name)), None)
-    for backend in others:
-        yield Variation(BACKENDS), backend, partial(_fused_by, backend, config.statistics and backend.name == logged)
+            for repeat in range(part.repeats if isinstance(part, Noise) and value else 1):
+                yield Variation(sweep, float(value), repeat), part, value
+    for backend in config.fused_by()[1:]:
+        yield Variation(BACKENDS), backend, backend
 
 
-def _change(sweep: str, value: float, seed: int) -> Change:
+def _changed_settings(config: Config, variation: Variation, value: Any, base: Config) -> dict[str, Any]:
+    sweep = variation.sweep
+    if sweep == BACKENDS:  # its map is compared with the base one, whose statistics are enough where they are full
+        logged = next((backend.name for backend in config.fused_by() if keeps_log(backend.name)), None)
+        backend = BackendConfig(name=value.name, options=value.options)
+        return {"backends": [backend], "statistics": config.statistics and value.name == logged}
     if sweep == "frame_count":
-        return partial(_evenly_sampled, int(value))
+        return {"frames": _evenly_sampled(int(value), base)}
     if sweep in NOISES:
-        return partial(_disturbed, {sweep: value, "seed": seed})
-    return partial(_changed, {sweep: value})
+        update = {sweep: value, "seed": config.seed + variation.repeat}
+        disturbed = (base.perturbation or Perturbation()).model_copy(update=update)
+        return {"perturbation": disturbed if disturbed.adds_noise else None, "seed": disturbed.seed}
+    return {"taxonomy" if sweep == SHARED else sweep: value}
 
 
-def _changed(settings: Mapping[str, Any], base: Config) -> Config:
-    return base.model_copy(update=settings)
-
-
-def _disturbed(noise: Mapping[str, Any], base: Config) -> Config:
-    """With that noise beside what there is in every unit."""
-    disturbed = (base.perturbation or Perturbation()).model_copy(update=noise)
-    seed = disturbed.seed
-    return base.model_copy(update={"perturbation": disturbed if disturbed.adds_noise else None, "seed": seed})
-
-
-def _fused_by(backend: BackendConfig, statistics: bool, base: Config) -> Config:
-    """By another backend; its map is compared with the base one, whose statistics are enough where they are full."""
-    named = BackendConfig(name=backend.name, options=backend.options)
-    return base.model_copy(update={"backends": [named], "statistics": statistics})
-
-
-def _evenly_sampled(count: int, base: Config) -> Config:
+def _evenly_sampled(count: int, base: Config) -> FrameSelection:
     """`count` frames, evenly spaced over the extent of the base's: from its start to its stop, or over its list."""
     extent = base.frames.model_dump(include={"start", "stop", "from_time", "to_time"})
-    even = FrameSelection(**extent, spacing="even", count=count)
-    if (listed := base.frames.list) is not None:
-        even = FrameSelection(list=[listed[k] for k in even.indices(len(listed))])
-    return base.model_copy(update={"frames": even})
+    even, listed = FrameSelection(**extent, spacing="even", count=count), base.frames.list
+    return even if listed is None else FrameSelection(list=[listed[k] for k in even.indices(len(listed))])
 
 
 def _check_count(variation: Variation, task: Task) -> None:
@@ -334,14 +270,14 @@ def _check_count(variation: Variation, task: Task) -> None:
 
 def identity(config: Config, task: Task) -> str:
     """Hash of the settings that a unit's numbers depend on, beside its input."""
-    mapping, beside = task.mapping, task.scene.filtering(task.backbone)
+    mapping, filtering = task.mapping, task.scene.filtering(task.backbone)
     content = {
         "unit": dataclasses.asdict(task.units[0]),
         "options": config.backends[0].options,
         "frames": [*task.indices],
         "taxonomy": [mapping.target.name, mapping.target.classes, mapping.source.ids, mapping.rows],
     }
-    return _hash(config, content | ({"beside": beside.model} if config.frame_quality else {}))
+    return _hash(config, content | ({"beside": filtering.model} if config.frame_quality else {}))
 
 
 def _hash(config: Config, content: Mapping[str, Any], without: Iterable[str] = ()) -> str:
@@ -352,7 +288,6 @@ def _hash(config: Config, content: Mapping[str, Any], without: Iterable[str] = (
 
 
 def _restricted(base: Sequence[PlannedUnit], part: Part, name: str) -> list[PlannedUnit]:
-    """The base units of the scenes and backbones that a part names."""
     _check_names(part.scenes, [each.unit.scene for each in base], f"{name}.scenes")
     _check_names(part.backbones, [each.unit.backbone for each in base], f"{name}.backbones")
     return [each for each in base if applies(part, each.unit.scene, each.unit.backbone)]

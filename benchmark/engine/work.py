@@ -9,7 +9,7 @@ from pathlib import Path
 
 from semstab.config import Config, FrameSelection, as_range
 from semstab.core.files import TEMPORARY
-from semstab.engine.units import Planned, PlannedUnit
+from semstab.engine.units import PlannedUnit
 from semstab.errors import OUT_OF_MEMORY, OutgrownError, SemstabError, one_line
 from semstab.model.records import UnitContent
 from semstab.model.voxels import Extent, VoxelTable
@@ -25,17 +25,15 @@ FRAMES = "frames"
 class Start:
     """What all works of one start of a run share.
 
-    name          by which a worker opens the dataset once, and knows the folder
-    folder        of the run or study
-    threads       that decode frames ahead; 0: each when it is wanted, None: as many as the machine has for it
-    memory_bytes  that maps of a pass may take before some are put off to another pass; None: half of what is free
-    width         processes that share the machine's memory
+    name     by which a worker opens the dataset once, and knows the folder
+    folder   of the run or study
+    threads  that decode frames ahead; 0: each when it is wanted, None: as many as the machine has for it
+    width    processes that share the machine's memory
     """
 
     name: str
     folder: Path
     threads: int | None = None
-    memory_bytes: float | None = None
     width: int = 1
 
     @property
@@ -104,14 +102,12 @@ class Work:
     tile: TileTask | None = None
 
     @classmethod
-    def of(cls, planned: Planned, start: Start) -> Work:
+    def of(cls, planned: PlannedUnit, start: Start) -> Work:
         """The whole of a planned unit."""
-        unit = planned.unit
-        if not isinstance(planned, PlannedUnit):
-            return cls(start, unit.scene, unit.backbone, planned.identity, planned.config, regions=True)
+        unit, wanted = planned.unit, (planned.image_space, planned.kept, planned.judged, planned.sampled)
         config = planned.config.model_copy(update={"frames": FrameSelection.of(planned.task.indices)})
-        wanted = (planned.image_space, planned.kept, planned.judged, planned.sampled)
-        return cls(start, unit.scene, unit.backbone, planned.identity, config, *wanted, planned.task.left_out)
+        own = (unit.scene, unit.backbone, planned.identity, config)
+        return cls(start, *own, *wanted, planned.task.left_out, planned.regions)
 
     def in_tile(self, tile: TileTask, frames: Sequence[int] | None = None) -> Work:
         """The same of one tile and these frames alone."""
@@ -134,11 +130,6 @@ class Work:
     def measures_images(self) -> bool:
         """Whether it takes the frames in sequence, to measure them in image coordinates."""
         return self.tile is None or self.tile.place is None
-
-    @property
-    def tile_name(self) -> str | None:
-        """The name of its tile; None of a whole unit."""
-        return None if self.tile is None else self.tile.name
 
     @property
     def within(self) -> Extent | None:
@@ -177,21 +168,19 @@ class Outcome:
 
 
 def failed(works: Iterable[Work], error: str | Exception) -> list[Outcome]:
-    """The outcomes of works that could not be computed."""
-    if isinstance(error, str):
-        return [Outcome(work.identity, tile=work.tile_name, error=error) for work in works]
-    trace = "" if isinstance(error, SemstabError) else "".join(traceback.format_exception(error))
-    if isinstance(error, (OutgrownError, MemoryError)):
-        error = error.with_traceback(None)  # its frames would keep the map in memory
-    line = message(error)
-    return [Outcome(work.identity, tile=work.tile_name, error=line, cause=error, trace=trace) for work in works]
+    """Return the outcomes of works that could not be computed; an error that is not semstab's own says its type."""
+    trace, cause = "", None
+    if not isinstance(error, str):
+        trace = "" if isinstance(error, SemstabError) else "".join(traceback.format_exception(error))
+        if isinstance(error, (OutgrownError, MemoryError)):
+            error = error.with_traceback(None)  # its frames would keep the map in memory
+        cause, error = error, str(error) if isinstance(error, SemstabError) else _one_line(error)
+    tiles = [(work.identity, None if work.tile is None else work.tile.name) for work in works]
+    return [Outcome(own, tile=tile, error=error, cause=cause, trace=trace) for own, tile in tiles]
 
 
-def message(error: Exception) -> str:
-    """One line; an error that is not semstab's own says its type."""
-    if isinstance(error, MemoryError):
-        return OUT_OF_MEMORY
-    return str(error) if isinstance(error, SemstabError) else f"{type(error).__name__}: {one_line(error)}"
+def _one_line(error: Exception) -> str:
+    return OUT_OF_MEMORY if isinstance(error, MemoryError) else f"{type(error).__name__}: {one_line(error)}"
 
 
 def jobs_of(works: Iterable[Work], width: int) -> list[Job]:

@@ -234,7 +234,7 @@ class Flipping:
 
 @dataclass(frozen=True)
 class DriftTests:
-    """The order of observations, tested: `SceneDrift` and how many voxels were tested one by one, and found.
+    """The order of observations, tested: `OrderTest` and how many voxels were tested one by one, and found.
 
     sbd_p, trend_p   whether stretches of time could have come in any order: so many `stretches`, over `voxels`
     trend_excess     the trend less that in random order

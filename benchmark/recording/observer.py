@@ -23,7 +23,7 @@ from semstab.datasets import Scene
 from semstab.engine.folder import load_result
 from semstab.engine.observer import Observer
 from semstab.engine.series import FrameRow
-from semstab.engine.units import Plan, Planned, PlannedUnit, make_plan
+from semstab.engine.units import Plan, PlannedUnit, make_plan
 from semstab.errors import ConfigError, SemstabError, one_line
 from semstab.model.frames import Frame
 from semstab.model.labels import LabelSpace
@@ -99,7 +99,7 @@ class Recording(Observer):
             background.submit(frame.index, frame.timestamp, show)
 
     def unit_finished(
-        self, planned: Planned, content: UnitContent | None, table: VoxelTable | None, error: str | None
+        self, planned: PlannedUnit, content: UnitContent | None, table: VoxelTable | None, error: str | None
     ) -> None:
         """Log the unit's voxels and final numbers, at the time of its last frame."""
         if planned.unit not in self._unfinished or self._group is None:

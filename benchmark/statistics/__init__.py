@@ -5,18 +5,8 @@ several; docs/metrics.md derives each measure.
 """
 
 from semstab.model.contrast import BackboneComparison
-from semstab.model.statistics import (
-    ClassAgreement,
-    Correctness,
-    Estimate,
-    Losses,
-    MapStatistics,
-    Quadrants,
-    Reliability,
-    StabilityVerdict,
-)
+from semstab.model.statistics import Estimate, Reliability
 from semstab.statistics.agreement import (
-    Uncertainty,
     alpha_between,
     class_agreement,
     decompose,
@@ -26,51 +16,29 @@ from semstab.statistics.agreement import (
     psa,
 )
 from semstab.statistics.ceiling import ceiling, ceiling_share, losses, rendered
-from semstab.statistics.correctness import Truth, correctness, join_truth, quadrants, reliability, stable_wrong
+from semstab.statistics.correctness import correctness, join_truth, quadrants, reliability, stable_wrong
 from semstab.statistics.correlogram import correlogram
 from semstab.statistics.description import Analysis, analyse, describe
-from semstab.statistics.drift import (
-    Flips,
-    SceneDrift,
-    VoxelDrift,
-    benjamini_hochberg,
-    expected_sbd,
-    flips,
-    scene_drift,
-    voxel_drift,
-)
-from semstab.statistics.fusion_rules import RULES, Fused, fuse
+from semstab.statistics.drift import benjamini_hochberg, expected_sbd, flips, voxel_drift
+from semstab.statistics.fusion_rules import RULES, fuse
 from semstab.statistics.model_comparison import compare_backbones, coverage, paired
 from semstab.statistics.observations import CellObservations, ObservationSample, Views
 from semstab.statistics.paired_differences import claimed_together, standardised
-from semstab.statistics.sample import MOST_VOXELS, MapSample
+from semstab.statistics.sample import MapSample
 from semstab.statistics.sampler import Sampler
 from semstab.statistics.verdict import verdict
 
 __all__ = [
-    "MOST_VOXELS",
     "RULES",
     "Analysis",
     "BackboneComparison",
     "CellObservations",
-    "ClassAgreement",
-    "Correctness",
     "Estimate",
-    "Flips",
-    "Fused",
-    "Losses",
     "MapSample",
-    "MapStatistics",
     "ObservationSample",
-    "Quadrants",
     "Reliability",
     "Sampler",
-    "SceneDrift",
-    "StabilityVerdict",
-    "Truth",
-    "Uncertainty",
     "Views",
-    "VoxelDrift",
     "alpha_between",
     "analyse",
     "benjamini_hochberg",
@@ -97,7 +65,6 @@ __all__ = [
     "quadrants",
     "reliability",
     "rendered",
-    "scene_drift",
     "stable_wrong",
     "standardised",
     "verdict",

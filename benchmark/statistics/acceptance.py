@@ -84,10 +84,10 @@ class AcceptanceThresholds(BaseModel):
     @classmethod
     def load(cls, path: str | Path) -> AcceptanceThresholds:
         """Read what `save` wrote. Raises ConfigError, which names the file and the setting."""
-        found = validated(cls, read_yaml(path), f"{path}: ")
-        if found.schema_ != SCHEMA:
-            raise ConfigError(f"{path}: schema {found.schema_}, this version reads {SCHEMA}; calibrate again")
-        return found
+        result = validated(cls, read_yaml(path), f"{path}: ")
+        if result.schema_ != SCHEMA:
+            raise ConfigError(f"{path}: schema {result.schema_}, this version reads {SCHEMA}; calibrate again")
+        return result
 
     def save(self, path: str | Path) -> None:
         """Write YAML, atomically."""
@@ -146,82 +146,67 @@ def calibrate(
     true = np.concatenate([truth.label for _, truth in maps])
     size, names = tables[0].voxel_size, tables[0].classes
     values = {by: np.concatenate([np.asarray(of(table), float) for table in tables]) for by, of in EVIDENCE.items()}
-    found = {}
+    result = {}
     for k, name in enumerate(names):
         rows = np.flatnonzero((label == k) & (true >= 0))
         own = {by: value[rows] for by, value in values.items()}
         sample = _Labels(index[rows], true[rows] == k, own, size)
-        found[name] = sample.least(precision, 1 - confidence)
+        result[name] = sample.least(precision, 1 - confidence)
     every = AcceptanceThresholds(
-        schema=SCHEMA, precision=precision, confidence=confidence, voxel_size=size, calibrated_on=on, classes=found
+        schema=SCHEMA, precision=precision, confidence=confidence, voxel_size=size, calibrated_on=on, classes=result
     )
     decided = [every.decide(table) for table in tables]
     left = float((np.concatenate(decided) >= 0).mean())
     of_class = {
         name: float((np.concatenate(decided) == k).sum() / max((label == k).sum(), 1)) for k, name in enumerate(names)
     }
-    classes = {name: each.model_copy(update={"left": of_class[name]}) for name, each in found.items()}
+    classes = {name: each.model_copy(update={"left": of_class[name]}) for name, each in result.items()}
     return every.model_copy(update={"left": left, "classes": classes})
 
 
 class _Labels:
     """The labels of one class: where they are (n, 3), whether right (n,), and their evidence (n,) of each kind."""
 
-    def __init__(
-        self,
-        index: Int32,
-        right: Mask,
-        evidence: Mapping[Evidence, Float64],
-        size: float,
-    ) -> None:
+    def __init__(self, index: Int32, right: Mask, evidence: Mapping[Evidence, Float64], size: float) -> None:
         self._right, self._evidence = right, evidence
         if len(index):
             self._cell, self._of, self._edge = cubes_of((index[:, 0], index[:, 1], index[:, 2]), size)
 
     def least(self, precision: float, error: float) -> Threshold:
         """The threshold that leaves most of them."""
-        tried, kept = self._tried()
+        tried, left = self._tried()
         best = Threshold(never=True)
-        for by, at in sorted(tried, key=lambda pair: -kept[pair]):
+        for by, at in sorted(tried, key=lambda pair: -left[pair]):
             share, low = self._share(by, at, error / len(tried))
-            found = Threshold(by=by, at_least=at, never=low < precision, precision=share, low=low, voxels=kept[by, at])
+            result = Threshold(by=by, at_least=at, never=low < precision, precision=share, low=low, voxels=left[by, at])
             if low >= precision:
-                return found
-            best = max(best, found, key=lambda each: each.low)
+                return result
+            best = max(best, result, key=lambda each: each.low)
         return best
 
     def _tried(self) -> tuple[list[tuple[Evidence, float]], dict[tuple[Evidence, float], int]]:
-        """Thresholds that leave different labels, and how many each leaves."""
+        """Thresholds that leave different labels, chosen without a look at what is right, and how many each leaves."""
         tried: dict[bytes, tuple[Evidence, float]] = {}
-        kept = {}
-        for by in self._evidence:
-            for at in self._steps(by):
-                some = self._evidence[by] >= at
-                kept[tried.setdefault(np.packbits(some).tobytes(), (by, at))] = int(some.sum())
-        return list(tried.values()), kept
-
-    def _steps(self, by: Evidence) -> list[float]:
-        """Thresholds that are tried, chosen without a look at what is right."""
-        if not len(self._right):
-            return []
-        quantiles = np.quantile(self._evidence[by], np.arange(STEPS) / STEPS, method="lower")
-        return [float(at) for at in np.unique(quantiles)]
+        left = {}
+        for by, values in self._evidence.items() if len(self._right) else ():
+            for at in np.unique(np.quantile(values, np.arange(STEPS) / STEPS, method="lower")).tolist():
+                some = values >= at
+                left[tried.setdefault(np.packbits(some).tobytes(), (by, at))] = int(some.sum())
+        return list(tried.values()), left
 
     def _share(self, by: Evidence, at: float, error: float) -> tuple[float, float]:
         """The share of those with so much evidence that is right, and its lower end."""
         some = self._evidence[by] >= at
         of, cells = self._of[some], len(self._cell)
         right, every = self._right[some].astype(np.float64), np.ones(len(of))
-        sums: Float64 = np.stack(
-            [np.bincount(of, weights=each, minlength=cells) for each in (right, every)], axis=1
-        ).astype(float)
+        sums: Float64 = np.stack([np.bincount(of, each, cells) for each in (right, every)], axis=1).astype(np.float64)
         sums = sums[sums[:, 1] > 0]
         if np.count_nonzero(sums[:, 0] < sums[:, 1]) <= FEW_CUBES:
             return _of_few(sums, error)
-        found = interval_of_cubes(
+        result = interval_of_cubes(
             self._cell[np.unique(of)], self._edge, sums, ratio_of, "share", (0.0, 1.0), 1 - 2 * error
         )
-        return found.value, found.low if found.decided else 0.0
+        return result.value, result.low if result.decided else 0.0
 
 
 def _of_few(sums: Float64, error: float) -> tuple[float, float]:

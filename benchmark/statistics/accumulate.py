@@ -145,11 +145,7 @@ class CubeSums:
         return CubeSums(self.cell, self.edge, {**self.sums, **further})
 
     def estimate(
-        self,
-        name: str,
-        statistic: Statistic,
-        bounds: tuple[float, float] = (0.0, 1.0),
-        scale: Scale | None = None,
+        self, name: str, statistic: Statistic, bounds: tuple[float, float] = (0.0, 1.0), scale: Scale | None = None
     ) -> Interval:
         """Return the statistic of sums (..., C), the second of which counts, with its interval; see `Mean`."""
         return confidence_intervals(self.specs({name: Mean(name, statistic, bounds, scale)}))[0]

@@ -47,9 +47,9 @@ def ceiling_share(
     critical  names of the classes that matter; where none is given, those with enough
     """
     sums = cluster_sums_of(table, sample=sample) if sums is None else sums
-    places = locations_by_class(table)
-    found = confidence_intervals(ceiling_specs(sums, table.K))
-    return ceiling_share_from(places, sums, found, critical=critical, limits=limits)
+    locations = locations_by_class(table)
+    result = confidence_intervals(ceiling_specs(sums, table.K))
+    return ceiling_share_from(locations, sums, result, critical=critical, limits=limits)
 
 
 def locations_by_class(table: VoxelTable) -> Float64:
@@ -69,21 +69,21 @@ def ceiling_specs(sums: ClusterSums, K: int, wanted: Scope = THIS_SCENE) -> Iter
 
 
 def ceiling_share_from(
-    places: Float64,
+    locations: Float64,
     sums: ClusterSums,
-    found: Sequence[Interval],
+    result: Sequence[Interval],
     *,
     critical: Sequence[str] = (),
     limits: Limits = LIMITS,
 ) -> CeilingShare:
     """The same from the sums of a map with a sample; places (K,) of each class.
 
-    found  the answers to `ceiling_specs`
+    result  the answers to `ceiling_specs`
     """
     assert sums.seen is not None
-    names = sums.classes or tuple(str(k) for k in range(len(places)))
+    names = sums.classes or tuple(str(k) for k in range(len(locations)))
     named = set(critical) & set(names)
-    alpha, ceiling, reached, *of_classes = found
+    alpha, ceiling, reached, *of_classes = result
     return CeilingShare(
         voxels=round(float(sums.seen["voxels"].sum())),
         alpha=alpha,
@@ -92,8 +92,8 @@ def ceiling_share_from(
         classes=tuple(
             ClassCeilingShare(
                 name,
-                float(places[k]),
-                name in named if named else bool(places[k] >= limits.class_locations),
+                float(locations[k]),
+                name in named if named else bool(locations[k] >= limits.class_locations),
                 value(sums.seen, "alpha_between", k),
                 value(sums, "ceiling", k),
                 of_classes[k],

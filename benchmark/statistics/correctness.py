@@ -52,8 +52,8 @@ def join_truth(table: VoxelTable, truth: VoxelTable) -> Truth:
     Raises DataError where the maps differ in K or voxel size.
     """
     require_same_grid(table, truth)
-    found = truth.evidence.concentration
-    label = np.where(found.largest > PURE, found.label.astype(np.int64), -1)
+    result = truth.evidence.concentration
+    label = np.where(result.largest > PURE, result.label.astype(np.int64), -1)
     if not same_voxels(table, truth):
         (rows, true_rows), true = shared_rows(table, truth), label
         label = np.full(len(table), -1)
@@ -120,8 +120,8 @@ def _judged_by_group(judged: Predictions, group: Int64, groups: int) -> Float64:
     bins = np.clip(np.ceil(confidence * BINS - 1e-9).astype(np.int64) - 1, 0, BINS - 1)
 
     def sums(width: int, within: Any, weights: Any = None) -> Float64:
-        found = np.bincount(of * width + within, weights=weights, minlength=groups * width)
-        return found.astype(np.float64).reshape(groups, width)
+        result = np.bincount(of * width + within, weights=weights, minlength=groups * width)
+        return result.astype(np.float64).reshape(groups, width)
 
     return np.hstack([
         sums(1, 0), sums(1, 0, right), sums(1, 0, judged.error[some]),
@@ -190,13 +190,13 @@ def by_stratum(judged: Predictions, op: Int32, known: Mask, edges: Sequence[int]
     return tuple(correctness_of(own, name) for own, name in zip([sums.sum(axis=0), *sums], names, strict=True))
 
 
-def quadrants(table: VoxelTable, truth: Truth, places: Cubes, *, stable: float = STABLE) -> Quadrants:
+def quadrants(table: VoxelTable, truth: Truth, cubes: Cubes, *, stable: float = STABLE) -> Quadrants:
     """Count voxels by stability and correctness, never those with OP < 3: two frames agree by chance too easily.
 
     A voxel counts as stable by the probability that it is (`steady`), so that the shares do not depend on how often
-    places were seen. `places` are those of all of the table's voxels.
+    places were seen. `cubes` are those of all of the table's voxels.
     """
-    return quadrants_of(quadrant_sums(table, truth, stability_posterior(table, stable=stable), places.edge))
+    return quadrants_of(quadrant_sums(table, truth, stability_posterior(table, stable=stable), cubes.edge))
 
 
 QUADRANTS = ("stable_right", "stable_wrong", "unstable_right", "unstable_wrong")
@@ -205,11 +205,11 @@ QUADRANTS = ("stable_right", "stable_wrong", "unstable_right", "unstable_wrong")
 def quadrant_sums(table: VoxelTable, truth: Truth, stable: Float64, edge: float) -> CubeSums:
     """What `quadrants_of` is a function of, over cubes of that edge, by the probability (n,) that each is stable."""
     counted, likely, right = _masks(table, truth, stable)
-    places = Cubes.of(table, edge, where=counted)
+    cubes = Cubes.of(table, edge, where=counted)
     parts = (likely * right, likely * ~right, (1 - likely) * right, (1 - likely) * ~right)
-    sums = places.means(dict(zip(QUADRANTS, parts, strict=True)))
+    sums = cubes.means(dict(zip(QUADRANTS, parts, strict=True)))
     wrong, every = sums["stable_wrong"][:, 0], sums["stable_right"][:, 0] + sums["stable_wrong"][:, 0]
-    return CubeSums(places.cell, edge, sums | {"wrong_of_stable": np.stack([wrong, every], axis=1)})
+    return CubeSums(cubes.cell, edge, sums | {"wrong_of_stable": np.stack([wrong, every], axis=1)})
 
 
 def quadrants_of(sums: CubeSums) -> Quadrants:

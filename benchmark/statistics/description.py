@@ -48,7 +48,7 @@ from semstab.statistics.correctness import (
 )
 from semstab.statistics.correlogram import correlogram
 from semstab.statistics.drift import expected_sbd, voxel_drift
-from semstab.statistics.intervals import confidence_intervals, grouped_intervals, headline_specs
+from semstab.statistics.intervals import confidence_intervals, headline_specs
 from semstab.statistics.observations import ObservationSample
 from semstab.statistics.sample import MapSample
 from semstab.statistics.sections import (
@@ -169,33 +169,30 @@ def analyse(
     drift = None if events is None else voxel_drift(table, events, seed=seed)
     null = expected_sbd(table) if drift is None else drift.null
     columns = row_columns(table, null)
-    places = Cubes.of(table)
-    of_places = place_sums(table, columns, places)
+    cubes = Cubes.of(table)
+    of_places = place_sums(table, columns, cubes)
     influence = cluster_sums_of(
         table,
         events,
         None if truth is None else truth.label,
         sample=None if observations is None else observations,
         sbd_excess=columns["sbd_excess"],
-        cubes=places,
+        cubes=cubes,
         stable=stable,
     )
-    flipping = FlippingSums.of(table, stable, places)
-    drawn, log = log_sums(table, sample, places, drift, seed)
+    flipping = FlippingSums.of(table, stable, cubes)
+    drawn, log = log_sums(table, sample, cubes, drift, seed)
     if truth is not None:
         drawn["true_label"] = truth.label
-    found, judged, (unsteady,), reached, of_flips = grouped_intervals(
-        of_places.specs(MEANS),
-        headline_specs(influence, scope),
-        flipping.specs(),
-        () if observations is None else ceiling_specs(influence, table.K, scope),
-        () if log is None else log.places.specs(OF_FLIPS),
-    )
-    means, whole = dict(zip(MEANS, found, strict=True)), sample.summary.summary(table.voxel_size, table.classes, edges)
+    (unsteady,) = confidence_intervals(flipping.specs())
+    of_flips = [] if log is None else confidence_intervals(log.places.specs(OF_FLIPS))
+    means = dict(zip(MEANS, confidence_intervals(of_places.specs(MEANS)), strict=True))
+    whole = sample.summary.summary(table.voxel_size, table.classes, edges)
     reach = None
     if observations is not None:
+        reached = confidence_intervals(ceiling_specs(influence, table.K, scope))
         reach = ceiling_share_from(locations_by_class(table), influence, reached, critical=critical, limits=limits)
-    headline, count = HeadlineStatistics(*judged), len(places.cell)
+    headline, count = HeadlineStatistics(*confidence_intervals(headline_specs(influence, scope))), len(cubes.cell)
     labelled = math.nan if observations is None else observations.labelled
     repeats = whole.means.voxels[SBD.key]
     repeated = Repeated(repeats, repeats / whole.voxels if whole.voxels else math.nan)
@@ -229,7 +226,7 @@ def analyse(
         drift=_drift(repeats, means, of_places, log, of_flips),
         uncertainty=EntropyParts(means["entropy"], means["entropy_within"], means["entropy_between"]),
         geometry=None if limit is None else losses(table, limit),
-        correctness=None if truth is None else _correctness(table, truth, stable, places, edges),
+        correctness=None if truth is None else _correctness(table, truth, stable, cubes, edges),
         fusion_rules=None if events is None else rule_outcomes(table, events, truth),
         strata=_strata(whole, table, columns, edges),
         excess_over_chance=ExcessOverChance(means["coin"], means["steadier"]),
@@ -247,10 +244,10 @@ def _agreement(means: Mapping[str, Interval], classes: tuple[ClassAgreement, ...
 
 
 def _drift(
-    repeats: int, means: Mapping[str, Interval], places: CubeSums, log: LogSums | None, of_flips: Sequence[Interval]
+    repeats: int, means: Mapping[str, Interval], locations: CubeSums, log: LogSums | None, of_flips: Sequence[Interval]
 ) -> DriftStatistics:
     """SBD against its null; without a log only for one-hot evidence, and without tests."""
-    tests, rates, sampled = None, None, places["psa"][1]
+    tests, rates, sampled = None, None, locations["psa"][1]
     if log is not None:
         one_way, by_chance, all_of_it = log.trend
         since, excess = confidence_intervals(log.places.specs(OF_CHANGES))
@@ -269,7 +266,7 @@ def _drift(
         rate, null, beyond = of_flips
         rates = FlipRates(rate, null, beyond, since)
     return DriftStatistics(
-        voxels=round(places["null"][1] / sampled * repeats) if sampled else 0,
+        voxels=round(locations["null"][1] / sampled * repeats) if sampled else 0,
         sbd=means["sbd"],
         null=means["null"],
         excess=means["excess"],
@@ -279,15 +276,15 @@ def _drift(
 
 
 def _correctness(
-    table: VoxelTable, truth: Truth, stable: Float64, places: Cubes, edges: Sequence[int]
+    table: VoxelTable, truth: Truth, stable: Float64, cubes: Cubes, edges: Sequence[int]
 ) -> CorrectnessStatistics:
     judged = Predictions.of(table.evidence, truth.label)
-    right = places.means({"right": np.where(truth.known, judged.right, np.nan)})
+    right = cubes.means({"right": np.where(truth.known, judged.right, np.nan)})
     return CorrectnessStatistics(
-        accuracy=CubeSums(places.cell, places.edge, right).estimate("right", ratio_of),
+        accuracy=CubeSums(cubes.cell, cubes.edge, right).estimate("right", ratio_of),
         strata=by_stratum(judged, table.op, truth.known, edges),
         reliability=reliability_of(judged_sums(judged, truth.known & (table.op >= 2))),
-        quadrants=quadrants_of(quadrant_sums(table, truth, stable, places.edge)),
+        quadrants=quadrants_of(quadrant_sums(table, truth, stable, cubes.edge)),
     )
 
 

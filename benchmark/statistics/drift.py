@@ -19,7 +19,7 @@ from semstab.core.types import Float64, Int64, Mask, UInt16, UInt64
 from semstab.errors import ConfigError
 from semstab.model.events import Events
 from semstab.model.evidence import Evidence, row_chunks
-from semstab.model.measures import Quantity, mean, sbd
+from semstab.model.measures import Quantity, sbd
 from semstab.model.voxels import VoxelTable
 from semstab.statistics.agreement import ONE_HOT
 from semstab.statistics.variance import longest_effect
@@ -99,7 +99,8 @@ def expected_sbd(table: VoxelTable) -> Float64:
     times = np.rint(evidence.weight[entries]).astype(np.int64)
     pairs, which = np.unique(times * (LONGEST_TABLE + 1) + T[of], return_inverse=True)
     part, drifts = np.zeros(len(pairs)), one_hot_drifts(int(T.max(initial=2, where=known)))
-    in_chunks(expected_one_hot, *np.divmod(pairs, LONGEST_TABLE + 1), _log_factorials(LONGEST_TABLE + 1), drifts, part)
+    log_factorials = np.concatenate([[0.0], np.cumsum(np.log(np.arange(1, LONGEST_TABLE + 1)))])
+    in_chunks(expected_one_hot, *np.divmod(pairs, LONGEST_TABLE + 1), log_factorials, drifts, part)
     total = np.bincount(of, weights=part[which], minlength=len(table))
     return np.where(known, total / np.maximum(T - 1, 1), np.nan)
 
@@ -227,12 +228,6 @@ def streams(table: VoxelTable, rows: Any, seed: int) -> UInt64:
     return drawn
 
 
-def _log_factorials(count: int) -> Float64:
-    """log 0!, log 1!, ..., (count,)."""
-    logs: Float64 = np.concatenate([[0.0], np.cumsum(np.log(np.arange(1, count)))])
-    return logs
-
-
 def _spread_out(values: Float64, where: Mask) -> Float64:
     """The values at the voxels that they belong to, NaN elsewhere."""
     out = np.full(len(where), np.nan)
@@ -285,31 +280,16 @@ MOST_STRETCHES, LEAST_STRETCHES, LEAST_SPAN = 12, 6, 4
 
 
 @dataclass(frozen=True)
-class SceneDrift:
+class OrderTest:
     """The order of observations over all voxels, tested by putting stretches of time into random orders.
 
-    sbd, null    means over the voxels with OP >= 2, bits
-    p_value      of a mean SBD this far from what random orders of the stretches give, either way; NaN where errors last
-                 so long that there are fewer than LEAST_STRETCHES, or no place was seen in LEAST_SPAN of them
-    trend        share of all disagreement, over voxels with OP >= 3, that goes one way in time; null: in random order
-    trend_p      of a trend this large
-    stretches    of time that were put in other orders
-    voxels       whose observations tell, a random sample
+    p_value    of a mean SBD this far from what random orders of the stretches give, either way; NaN where errors last
+               so long that there are fewer than LEAST_STRETCHES, or no location was seen in LEAST_SPAN of them
+    trend_p    of a share of all disagreement this large that goes one way in time, over voxels with OP >= 3
+    stretches  of time that were put in other orders
+    voxels     whose observations tell, a random sample
+    lasting    frames that err alike
     """
-
-    sbd: float
-    null: float
-    p_value: float
-    trend: float
-    trend_null: float
-    trend_p: float
-    stretches: int
-    voxels: int
-
-
-@dataclass(frozen=True)
-class OrderTest:
-    """The parts of `SceneDrift` that follow from a sample of the voxels; `lasting`: frames that err alike."""
 
     p_value: float
     trend_p: float
@@ -318,30 +298,11 @@ class OrderTest:
     lasting: int = 1
 
 
-def scene_drift(
-    table: VoxelTable, events: Events, drift: VoxelDrift, *, seed: int = 0, frame_orders: int = ORDERS
-) -> SceneDrift:
-    """Test whether stretches of time are exchangeable, in `frame_orders` random orders.
+def order_test(table: VoxelTable, events: Events, *, seed: int = 0, frame_orders: int = ORDERS) -> OrderTest:
+    """Put the stretches of time of a sample of a map's observations, about SAMPLE of them, into random orders.
 
     What neighbouring voxels have in common in a frame stays in common, and so does what frames of one stretch have.
-    `drift` is what `voxel_drift` says of the same map.
     """
-    test = order_test(table, events, seed=seed, frame_orders=frame_orders)
-    one_way, by_chance, disagreement = trend_columns(table, drift)[1].sum(axis=0)
-    return SceneDrift(
-        sbd=mean(sbd(table)),
-        null=mean(drift.null),
-        p_value=test.p_value,
-        trend=one_way / disagreement if disagreement else math.nan,
-        trend_null=by_chance / disagreement if disagreement else math.nan,
-        trend_p=test.trend_p,
-        stretches=test.stretches,
-        voxels=test.voxels,
-    )
-
-
-def order_test(table: VoxelTable, events: Events, *, seed: int = 0, frame_orders: int = ORDERS) -> OrderTest:
-    """Put the stretches of time of a sample of a map's observations, about SAMPLE of them, into random orders."""
     from semstab.core.compiled import CHUNKS, in_chunks
     from semstab.statistics.loops import orders as loops
 

@@ -61,8 +61,8 @@ class EstimateSpec:
     @property
     def answered(self) -> Scope:
         """The scope of the interval: one group of frames does not tell how frames differ."""
-        told = self.grid is not None and self.grid.per_group and len(self.grid.frames) > 1
-        return self.scope if told else THESE_FRAMES
+        notes = self.grid is not None and self.grid.per_group and len(self.grid.frames) > 1
+        return self.scope if notes else THESE_FRAMES
 
 
 def confidence_intervals(specs: Iterable[EstimateSpec]) -> list[Interval]:
@@ -72,11 +72,6 @@ def confidence_intervals(specs: Iterable[EstimateSpec]) -> list[Interval]:
             Interval(own.value, math.nan, math.nan, undecided=NO_PLACES) if own.grid is None else _answer(own, own.grid)
             for own in specs
         ]
-
-
-def grouped_intervals(*groups: Iterable[EstimateSpec]) -> list[list[Interval]]:
-    """Return the confidence intervals of groups of numbers."""
-    return [confidence_intervals(group) for group in groups]
 
 
 def estimate(
@@ -116,39 +111,39 @@ def difference(
     sums there is no difference anywhere: exactly 0, without a p-value.
     """
     a, b = aligned(a, b)
-    found = value(a, key, k) - value(b, key, k)
-    if identical(a, b, key, k) and not math.isnan(found):
+    result = value(a, key, k) - value(b, key, k)
+    if identical(a, b, key, k) and not math.isnan(result):
         return no_difference(estimate(a, key, k, scope, level))
     one, other = grid_of(a, key, k), grid_of(b, key, k)
     if one is None or other is None:
-        return Interval(found, math.nan, math.nan, undecided=NO_PLACES)
+        return Interval(result, math.nan, math.nan, undecided=NO_PLACES)
     scope = scope if a.step else THESE_FRAMES
     paired = (not a.step or same_flight(a, b)) if same_frames is None else same_frames
     between = one.minus(other)
     with one_thread():
         spread = spread_of(between, scope) if paired else spread_of_flights(one, other, between, scope)
     half = spread.half(level)
-    low, high = found - half, found + half
+    low, high = result - half, result + half
     if spread.variance <= TINY:
         ends = confidence_intervals(spec_of(sums, key, k, scope, level) for sums in (a, b))
         low, high = ends[0].low - ends[1].high, ends[0].high - ends[1].low
-    return dataclasses.replace(_interval(found, low, high, between, spread, scope), p_value=spread.p_value(found))
+    return dataclasses.replace(_interval(result, low, high, between, spread, scope), p_value=spread.p_value(result))
 
 
 def identical(a: ClusterSums, b: ClusterSums, key: str, k: int | None = None) -> bool:
     """Whether a number is of the very same sums in two maps, so that it has no difference, anywhere."""
-    found = []
+    result = []
     for part in aligned(a, b):
         columns = sums_for(part, key, k)
         rows = parts_of(part, functional(key, k))[:1]
         where = columns.any(axis=1) & bool(rows)
-        found.append([columns[where], *(own[where] for each in rows for own in (each.cell, each.frame))])
-    return all(np.array_equal(one, other, equal_nan=True) for one, other in zip(*found, strict=True))
+        result.append([columns[where], *(own[where] for each in rows for own in (each.cell, each.frame))])
+    return all(np.array_equal(one, other, equal_nan=True) for one, other in zip(*result, strict=True))
 
 
-def no_difference(found: Interval) -> Interval:
+def no_difference(interval: Interval) -> Interval:
     """A difference that there is nowhere, of places and frames as found."""
-    return dataclasses.replace(found, value=0.0, low=0.0, high=0.0, degrees=math.inf, undecided="", p_value=math.nan)
+    return dataclasses.replace(interval, value=0.0, low=0.0, high=0.0, degrees=math.inf, undecided="", p_value=math.nan)
 
 
 def interval_of_cubes(
@@ -196,10 +191,10 @@ def spec_of_observations(
 
     Its interval is for this scene flown again where frames tell of it, else for these frames.
     """
-    found = float(statistic(columns.sum(axis=0)))
+    result = float(statistic(columns.sum(axis=0)))
     grid = influences(ClusterIndex.of(cell, frame, edge, step), columns, statistic, halves)
-    told = grid is not None and len(grid.frames) * step >= LEAST_FRAMES
-    return EstimateSpec(found, grid, THIS_SCENE if told else THESE_FRAMES, "agreement", (-1.0, 1.0), level)
+    notes = grid is not None and len(grid.frames) * step >= LEAST_FRAMES
+    return EstimateSpec(result, grid, THIS_SCENE if notes else THESE_FRAMES, "agreement", (-1.0, 1.0), level)
 
 
 def scope_of(sums: ClusterSums, wanted: Scope = THIS_SCENE) -> Scope:
@@ -214,15 +209,15 @@ def headline_specs(sums: ClusterSums, wanted: Scope = THIS_SCENE) -> Iterator[Es
 
 
 def _answer(spec: EstimateSpec, grid: Influences) -> Interval:
-    found, scope, level = spec.value, spec.answered, spec.level
+    result, scope, level = spec.value, spec.answered, spec.level
     spread = spread_of(grid, scope)
-    if math.isnan(found):
+    if math.isnan(result):
         low, high = math.nan, math.nan
     elif spec.scale == "share":
-        low, high = _share_ends(found, spread, len(grid.places), level)
+        low, high = _share_ends(result, spread, len(grid.places), level)
     else:
-        low, high = _ends(found, spread, grid.unseen(level), spec.scale, level)
-    return _interval(found, max(low, spec.bounds[0]), min(high, spec.bounds[1]), grid, spread, scope)
+        low, high = _ends(result, spread, grid.unseen(level), spec.scale, level)
+    return _interval(result, max(low, spec.bounds[0]), min(high, spec.bounds[1]), grid, spread, scope)
 
 
 def grid_of(sums: ClusterSums, key: str, k: int | None = None) -> Influences | None:
@@ -235,20 +230,20 @@ def grid_of(sums: ClusterSums, key: str, k: int | None = None) -> Influences | N
     return influences(rows.index, columns, number.of, halves)
 
 
-def probability_above(found: Interval, threshold: float, scale: Scale) -> float:
+def probability_above(interval: Interval, threshold: float, scale: Scale) -> float:
     """Return how probable a number is above a threshold, from its interval at 95 %; NaN where nothing is claimed."""
     from scipy import special
 
-    low, high = found.low, found.high
+    low, high = interval.low, interval.high
     if scale == "agreement":  # by the end that no bound cuts off, on the scale of log(1 - x)
-        value, error = -math.log(max(1 - found.value, TINY)), -math.log(max(1 - found.value, TINY))
+        value, error = -math.log(max(1 - interval.value, TINY)), -math.log(max(1 - interval.value, TINY))
         error -= -math.log(max(1 - low, TINY))
         above = -math.log(max(1 - threshold, TINY))
     else:
-        value, error, above = found.value, max(found.value - low, high - found.value), threshold
+        value, error, above = interval.value, max(interval.value - low, high - interval.value), threshold
     if math.isnan(value) or math.isnan(error):
         return math.nan
-    degrees = found.degrees if found.degrees > 0 else math.inf
+    degrees = interval.degrees if interval.degrees > 0 else math.inf
     error /= float(special.stdtrit(degrees, (1 + LEVEL) / 2))
     return float(special.stdtr(degrees, (value - above) / error)) if error > TINY else float(value >= above)
 
@@ -261,32 +256,32 @@ def _share_ends(p: float, spread: Spread, units: int, level: float) -> tuple[flo
     from scipy import special
 
     p = min(max(p, 0.0), 1.0)
-    looks: float = units
+    observations: float = units
     if spread.variance > TINY and 0 < p < 1:
         quantile = special.stdtrit([max(units - 1, 1), spread.degrees], (1 + level) / 2)
-        looks = p * (1 - p) / spread.variance * (quantile[0] / quantile[1]) ** 2
-    tail, hits = (1 - level) / 2, looks * p
-    low = special.betaincinv(hits, looks - hits + 1, tail) if hits > 0 else 0.0
-    high = special.betaincinv(hits + 1, looks - hits, 1 - tail) if hits < looks else 1.0
+        observations = p * (1 - p) / spread.variance * (quantile[0] / quantile[1]) ** 2
+    tail, hits = (1 - level) / 2, observations * p
+    low = special.betaincinv(hits, observations - hits + 1, tail) if hits > 0 else 0.0
+    high = special.betaincinv(hits + 1, observations - hits, 1 - tail) if hits < observations else 1.0
     return float(low), float(high)
 
 
-def _ends(found: float, spread: Spread, unseen: float, scale: Scale, level: float) -> tuple[float, float]:
+def _ends(result: float, spread: Spread, unseen: float, scale: Scale, level: float) -> tuple[float, float]:
     """By Student's t, for agreement on the scale log(1 - found), so that no end passes 1; or what may be unseen."""
     if spread.variance <= TINY:
-        return found - unseen, found if scale == "agreement" else found + unseen
+        return result - unseen, result if scale == "agreement" else result + unseen
     half = spread.half(level)
-    if scale == "plain" or 1 - found <= TINY:
-        return found - half, found + half
-    ratio = min(half / (1 - found), 30.0)
-    return 1 - (1 - found) * math.exp(ratio), 1 - (1 - found) * math.exp(-ratio)
+    if scale == "plain" or 1 - result <= TINY:
+        return result - half, result + half
+    ratio = min(half / (1 - result), 30.0)
+    return 1 - (1 - result) * math.exp(ratio), 1 - (1 - result) * math.exp(-ratio)
 
 
-def _interval(found: float, low: float, high: float, grid: Influences, spread: Spread, scope: Scope) -> Interval:
+def _interval(result: float, low: float, high: float, grid: Influences, spread: Spread, scope: Scope) -> Interval:
     frames = round(len(grid.frames) * grid.per_group)
     few = scope != THESE_FRAMES and frames < LEAST_FRAMES
     return Interval(
-        found,
+        result,
         low,
         high,
         scope=scope,
@@ -302,19 +297,19 @@ def _interval(found: float, low: float, high: float, grid: Influences, spread: S
 
 def unpaired(a: Interval, b: Interval, level: float = LEVEL) -> Interval:
     """A number less another one of which nothing is shared, from their intervals (Zou and Donner 2008)."""
-    found = a.value - b.value
-    low = found - math.hypot(a.value - a.low, b.high - b.value)
-    high = found + math.hypot(a.high - a.value, b.value - b.low)
-    return _combined(found, low, high, (a, b), 1.0, level)
+    result = a.value - b.value
+    low = result - math.hypot(a.value - a.low, b.high - b.value)
+    high = result + math.hypot(a.high - a.value, b.value - b.low)
+    return _combined(result, low, high, (a, b), 1.0, level)
 
 
-def mean_of(found: Sequence[Interval], level: float = LEVEL) -> Interval:
+def mean_of(result: Sequence[Interval], level: float = LEVEL) -> Interval:
     """The mean of numbers, of scenes for example, of which each errs by itself."""
-    n = len(found)
-    value = sum(own.value for own in found) / n
-    low = value - math.hypot(*(own.value - own.low for own in found)) / n
-    high = value + math.hypot(*(own.high - own.value for own in found)) / n
-    return found[0] if n == 1 else _combined(value, low, high, found, 1 / n, level)
+    n = len(result)
+    value = sum(own.value for own in result) / n
+    low = value - math.hypot(*(own.value - own.low for own in result)) / n
+    high = value + math.hypot(*(own.high - own.value for own in result)) / n
+    return result[0] if n == 1 else _combined(value, low, high, result, 1 / n, level)
 
 
 def _combined(
@@ -342,13 +337,13 @@ def _combined(
     )
 
 
-def standard_error(found: Interval, level: float = LEVEL) -> float:
+def standard_error(interval: Interval, level: float = LEVEL) -> float:
     """That which an interval by Student's t stands for."""
     from scipy import special
 
-    if not found.degrees > 0:
-        return (found.high - found.low) / 2 / float(special.ndtri((1 + level) / 2))
-    return (found.high - found.low) / 2 / float(special.stdtrit(found.degrees, (1 + level) / 2))
+    if not interval.degrees > 0:
+        return (interval.high - interval.low) / 2 / float(special.ndtri((1 + level) / 2))
+    return (interval.high - interval.low) / 2 / float(special.stdtrit(interval.degrees, (1 + level) / 2))
 
 
 # Intervals of what has no sums by frame and cube: a series over frames, and how much of a map another one covers.
@@ -363,11 +358,11 @@ def mean_over_frames(frame: npt.NDArray[np.integer], values: Float64, level: flo
     groups = np.array_split(np.argsort(frame, kind="stable"), min(len(frame), MOST_GROUPS))
     effect, size = np.array([values[own].mean() for own in groups]), np.array([len(own) for own in groups])
     spread = spread_of_frames(effect, size / size.sum(), np.array([frame[own].mean() for own in groups]))
-    found, half = float(values.mean()), spread.half(level)
+    result, half = float(values.mean()), spread.half(level)
     few = TOO_FEW.format(least=LEAST_FRAMES) if len(values) < LEAST_FRAMES else ""
     return Interval(
-        found, found - half, found + half, THIS_SCENE, len(values), degrees=spread.degrees, undecided=few,
-        p_value=spread.p_value(found),
+        result, result - half, result + half, THIS_SCENE, len(values), degrees=spread.degrees, undecided=few,
+        p_value=spread.p_value(result),
     )  # fmt: skip
 
 
@@ -390,8 +385,8 @@ def coverage(new: ClusterSums, base: ClusterSums, level: float = LEVEL) -> Inter
         np.bincount(at, weights=part["voxels"][:, 0], minlength=len(cell)) for at, part in zip(of, parts, strict=True)
     )
     columns = np.stack([after - before, after + before, before], axis=1)
-    found = interval_of_cubes(cell, edge, columns, lambda s: ratio_of(s[..., [0, 2]]), "plain", level=level)
-    return no_difference(found) if np.allclose(after, before, rtol=1e-9) else found
+    result = interval_of_cubes(cell, edge, columns, lambda s: ratio_of(s[..., [0, 2]]), "plain", level=level)
+    return no_difference(result) if np.allclose(after, before, rtol=1e-9) else result
 
 
 def same_flight(a: ClusterSums, b: ClusterSums) -> bool:

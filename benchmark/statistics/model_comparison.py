@@ -220,11 +220,7 @@ def compare_backbones(
 
 
 def compare_regions(
-    regions: Regions,
-    *,
-    looks: Mapping[str, CellObservations] | None = None,
-    scene: str = "",
-    seed: int = 0,
+    regions: Regions, *, looks: Mapping[str, CellObservations] | None = None, scene: str = "", seed: int = 0
 ) -> BackboneComparison:
     """What `compare_backbones` says of maps that are seen region by region; whole ones without samples of looks."""
     first = next(iter(regions()))
@@ -281,10 +277,10 @@ def _joined_logs(parts: Sequence[Region]) -> dict[str, Events] | None:
     return {name: Events.joined([own[name] for own in logs]) for name in logs[0]} if logs else None
 
 
-def truth_at(regions: Regions, places: VoxelTable) -> VoxelTable | None:
+def truth_at(regions: Regions, locations: VoxelTable) -> VoxelTable | None:
     """The ground truth's voxels that these are of; None without any."""
-    found = [own.truth.rows(shared_rows(own.truth, places)[0]) for own in regions() if own.truth is not None]
-    return VoxelTable.joined(found) if found else None
+    result = [own.truth.rows(shared_rows(own.truth, locations)[0]) for own in regions() if own.truth is not None]
+    return VoxelTable.joined(result) if result else None
 
 
 def _by_rule(regions: Regions, *, mixed: bool) -> RuleComparison:
@@ -303,30 +299,19 @@ def _by_rule(regions: Regions, *, mixed: bool) -> RuleComparison:
             where[own] = True
             for rule, fused in zip(sums, fusion_rules.fuse_all(log, fusion_rules.RULES), strict=True):
                 sums[rule][name] = sums[rule].get(name, 0.0) + rule_sums(fused, where, truth)
-    values = {rule: {name: rule_means_of(own) for name, own in found.items()} for rule, found in sums.items()}
+    values = {rule: {name: rule_means_of(own) for name, own in by_name.items()} for rule, by_name in sums.items()}
     orders = {
-        quantity.key: {rule: _order(quantity, take, found) for rule, found in values.items()}
-        for quantity, take in _judged_by(known).items()
+        quantity.key: {rule: _order(quantity, by_name) for rule, by_name in values.items()}
+        for quantity in (*measures(), *((ACCURACY, MIOU, ECE) if known else ()))
     }
     changes = {key: len(set(by_rule.values())) > 1 for key, by_rule in orders.items()}
     return RuleComparison(voxels, values, orders, changes)
 
 
-def _judged_by(truth: bool) -> dict[Quantity, Callable[[RuleMeans], float]]:
-    """What puts backbones into an order."""
-    measured: dict[Quantity, Callable[[RuleMeans], float]] = {measure: _mean_of(measure) for measure in measures()}
-    right: dict[Quantity, Callable[[RuleMeans], float]] = {
-        ACCURACY: lambda row: row.accuracy,
-        MIOU: lambda row: row.miou,
-        ECE: lambda row: row.ece,
+def _order(quantity: Quantity, rows: Mapping[str, RuleMeans]) -> tuple[str, ...]:
+    """The backbones by a measure, or by how right they are; the best first."""
+    values: dict[str, float] = {
+        name: row[quantity] if isinstance(quantity, Measure) else getattr(row, quantity.key)
+        for name, row in rows.items()
     }
-    return measured | (right if truth else {})
-
-
-def _mean_of(measure: Measure) -> Callable[[RuleMeans], float]:
-    return lambda row: row[measure]
-
-
-def _order(quantity: Quantity, take: Callable[[RuleMeans], float], found: Mapping[str, RuleMeans]) -> tuple[str, ...]:
-    values = {name: take(row) for name, row in found.items()}
     return tuple(sorted(values, key=lambda name: (math.isnan(values[name]), quantity.sign * values[name])))

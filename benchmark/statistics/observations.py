@@ -182,10 +182,10 @@ class CellObservations:
         from semstab.statistics.loops.observations import same_cells
 
         key, view, label, weight = self.labelled()._in_order()
-        kept, of = np.empty(len(key), np.bool_), np.empty(len(key), np.int32)
+        left, of = np.empty(len(key), np.bool_), np.empty(len(key), np.int32)
         classes, shift = np.empty(len(key), np.uint16), np.empty(len(key))
-        m = same_cells(key, view, label, weight, CELLS**3, self.K, LEAST_FRAMES, kept, of, classes, shift)
-        seen = self._log(key, view, label, weight, kept)
+        m = same_cells(key, view, label, weight, CELLS**3, self.K, LEAST_FRAMES, left, of, classes, shift)
+        seen = self._log(key, view, label, weight, left)
         return ObservationSample(seen, of[:m], classes[:m], shift[:m], self.views, self.soft, self.labelled_share())
 
     def labelled(self) -> CellObservations:
@@ -239,28 +239,21 @@ class CellObservations:
         order = np.lexsort((self.view, self.key >> DIGITS))
         return self.key[order], self.view[order], self.label[order], self.weight[order]
 
-    def _log(
-        self,
-        key: Int64,
-        view: Int32,
-        label: UInt16,
-        weight: Float64,
-        kept: Mask,
-    ) -> Events:
+    def _log(self, key: Int64, view: Int32, label: UInt16, weight: Float64, kept: Mask) -> Events:
         """The log of the kept ones of entries that are in order."""
         from semstab.statistics.loops.observations import look
 
         n = len(self)
         first, of, starts = np.empty(n, np.int64), np.empty(n, np.int32), np.empty(n + 1, np.int64)
-        pixels, share, said = np.empty(n), np.empty(n), np.empty(n, np.uint16)
-        n, m = look(key, view, label, weight, kept, self.K, first, of, pixels, starts, said, share)
+        pixels, share, text = np.empty(n), np.empty(n), np.empty(n, np.uint16)
+        n, m = look(key, view, label, weight, kept, self.K, first, of, pixels, starts, text, share)
         first, of = first[:n], of[:n]
         at = key[first[np.flatnonzero(np.diff(of, prepend=-1))]]
         return Events(
             **index_columns(cells_of(at, self.low) // CELLS),
             voxel=of,
             frame=self.views.frame.astype(np.int32)[view[first]],
-            evidence=Evidence(starts[: n + 1], said[:m], share[:m], self.K),
+            evidence=Evidence(starts[: n + 1], text[:m], share[:m], self.K),
             pixels=np.rint(pixels[:n]).astype(np.int32),
             voxel_size=self.voxel_size,
             classes=self.classes,

@@ -104,7 +104,7 @@ def differences(
     common: OnCommonLocations | None,
 ) -> tuple[PairedDifference, ...]:
     """Of each measure and pair of backbones; only the primary measure is tested."""
-    found = []
+    result = []
     for measure, own in columns.items():
         for a, b in itertools.combinations(own, 2):
             if common is None:
@@ -113,13 +113,13 @@ def differences(
                 interval = common.tested(primary, a, b)
             else:
                 interval = common.difference(measure, a, b, own, statistics[measure])
-            found.append(_row(measure, a, b, interval, tested=measure == primary))
-    return _claimed(found)
+            result.append(_row(measure, a, b, interval, tested=measure == primary))
+    return _claimed(result)
 
 
-def _row(measure: Quantity, a: str, b: str, found: Interval, *, tested: bool) -> PairedDifference:
-    p = found.p_value if tested else float("nan")
-    return PairedDifference(measure.key, a, b, found.ends, p, float("nan"), found.scope, found.undecided)
+def _row(measure: Quantity, a: str, b: str, interval: Interval, *, tested: bool) -> PairedDifference:
+    p = interval.p_value if tested else float("nan")
+    return PairedDifference(measure.key, a, b, interval.ends, p, float("nan"), interval.scope, interval.undecided)
 
 
 # --- What is claimed --------------------------------------------------------------------------------------------------
@@ -127,11 +127,11 @@ def _row(measure: Quantity, a: str, b: str, found: Interval, *, tested: bool) ->
 
 def claimed_together(comparisons: Sequence[BackboneComparison]) -> tuple[BackboneComparison, ...]:
     """Scenes of one study: p-values of all that may be claimed in any of them, corrected together."""
-    rows = _claimed([row for found in comparisons for row in found.paired.differences])
-    ends = np.cumsum([0, *(len(found.paired.differences) for found in comparisons)])
+    rows = _claimed([row for result in comparisons for row in result.paired.differences])
+    ends = np.cumsum([0, *(len(result.paired.differences) for result in comparisons)])
     return tuple(
-        dataclasses.replace(found, paired=dataclasses.replace(found.paired, differences=rows[low:high]))
-        for found, (low, high) in zip(comparisons, itertools.pairwise(ends.tolist()), strict=True)
+        dataclasses.replace(result, paired=dataclasses.replace(result.paired, differences=rows[low:high]))
+        for result, (low, high) in zip(comparisons, itertools.pairwise(ends.tolist()), strict=True)
     )
 
 
@@ -223,12 +223,12 @@ def standardised_of(sums: CubeSums, weights: Float64) -> dict[str, Estimate]:
     Its interval is that of a ratio of sums with the same influences: a voxel's value counts by how far it is from the
     mean of its stratum.
     """
-    S, found = len(weights), {}
+    S, result = len(weights), {}
     for key, own in sums.sums.items():
         total, count = own[:, :S].sum(axis=0), own[:, S:].sum(axis=0)
         used = (weights > 0) & (count > 0)
         if not used.any():
-            found[key] = UNDEFINED
+            result[key] = UNDEFINED
             continue
         each = np.where(used, weights, 0.0) / weights[used].sum() / np.where(used, count, 1)
         mean_of = total / np.where(used, count, 1)
@@ -236,8 +236,8 @@ def standardised_of(sums: CubeSums, weights: Float64) -> dict[str, Estimate]:
         value = float(each @ total)
         above = own[:, :S] @ each - own[:, S:] @ (each * mean_of)
         columns = {key: np.stack([above + value * size, size], axis=1)}
-        found[key] = CubeSums(sums.cell, sums.edge, columns).estimate(key, ratio_of).ends
-    return found
+        result[key] = CubeSums(sums.cell, sums.edge, columns).estimate(key, ratio_of).ends
+    return result
 
 
 def _stratum(table: VoxelTable, edges: Sequence[int]) -> Int64:
@@ -266,18 +266,18 @@ class CommonObservations:
 
 def common_observations(maps: Sequence[CellObservations]) -> CommonObservations:
     """What samples of the same frames have in common. Raises DataError where they differ in K or voxel size."""
-    if len({(looks.K, looks.voxel_size) for looks in maps}) > 1:
+    if len({(sample.K, sample.voxel_size) for sample in maps}) > 1:
         raise DataError("samples of other classes or voxel sizes cannot be compared; fuse both alike")
-    maps = _of_the_same_voxels([looks.labelled() for looks in maps])
+    maps = _of_the_same_voxels([sample.labelled() for sample in maps])
     look, first = _numbered(maps)
-    pixels = np.stack([np.bincount(own, looks.weight, len(first)) for own, looks in zip(look, maps, strict=True)])
+    pixels = np.stack([np.bincount(own, sample.weight, len(first)) for own, sample in zip(look, maps, strict=True)])
     least, most = pixels.min(axis=0), pixels.max(axis=0)
-    places = CellObservations.joined(maps).only(first)
+    locations = CellObservations.joined(maps).only(first)
     logs, ignoring = [], []
-    for looks, own, seen in zip(maps, look, pixels, strict=True):
-        shared = dataclasses.replace(looks, weight=looks.weight * (least / np.where(seen > 0, seen, 1.0))[own])
+    for sample, own, seen in zip(maps, look, pixels, strict=True):
+        shared = dataclasses.replace(sample, weight=sample.weight * (least / np.where(seen > 0, seen, 1.0))[own])
         logs.append(shared.only(least[own] > 0).observations())
-        ignoring.append(_filled(looks, places, most - seen).observations())
+        ignoring.append(_filled(sample, locations, most - seen).observations())
     total = most.sum()
     missing = tuple(float(1 - seen.sum() / total) if total else math.nan for seen in pixels)
     return CommonObservations(tuple(logs), tuple(ignoring), missing)
@@ -285,29 +285,29 @@ def common_observations(maps: Sequence[CellObservations]) -> CommonObservations:
 
 def _of_the_same_voxels(maps: Sequence[CellObservations]) -> list[CellObservations]:
     """The voxels that are in all samples by their hash, with the frames of all numbered alike."""
-    share = min(looks.share for looks in maps)
-    views = Views.joined([looks.views for looks in maps])
+    share = min(sample.share for sample in maps)
+    views = Views.joined([sample.views for sample in maps])
     views = views.take(np.sort(np.unique(views.frame, return_index=True)[1]))
     same = []
-    for looks in maps:
-        kept = looks.only(looks.drawn < share)
-        rank = views.rank(looks.views.frame)
-        same.append(dataclasses.replace(kept, view=rank[kept.view].astype(np.int32), views=views, share=share))
+    for sample in maps:
+        left = sample.only(sample.drawn < share)
+        rank = views.rank(sample.views.frame)
+        same.append(dataclasses.replace(left, view=rank[left.view].astype(np.int32), views=views, share=share))
     return same
 
 
 def _numbered(maps: Sequence[CellObservations]) -> tuple[list[Int64], Int64]:
     """The number of each entry's look, the same in all maps, and one entry of each look among those of all maps."""
-    F = max((len(looks.views) for looks in maps), default=1)
+    F = max((len(sample.views) for sample in maps), default=1)
     all_of_them = CellObservations.joined(maps)
     _, cell = np.unique(all_of_them.key, return_inverse=True)
     _, first, look = np.unique(cell * F + all_of_them.view, return_index=True, return_inverse=True)
-    return np.split(look, np.cumsum([len(looks) for looks in maps])[:-1]), first
+    return np.split(look, np.cumsum([len(sample) for sample in maps])[:-1]), first
 
 
-def _filled(looks: CellObservations, places: CellObservations, ignored: Float64) -> CellObservations:
+def _filled(looks: CellObservations, locations: CellObservations, ignored: Float64) -> CellObservations:
     """A map's entries, and those of a further class that has the pixels `ignored` of each of the places."""
-    further = dataclasses.replace(places, label=np.full(len(places), looks.K, np.uint16), weight=ignored).only(
+    further = dataclasses.replace(locations, label=np.full(len(locations), looks.K, np.uint16), weight=ignored).only(
         ignored > 0
     )
     return dataclasses.replace(CellObservations.joined([looks, further]), K=looks.K + 1, classes=())
@@ -330,8 +330,8 @@ def psa_bounds(log: Events) -> tuple[float, float]:
     again = T >= 2
     if not again.any():
         return math.nan, math.nan
-    said = log.evidence[:, :-1]
-    known = said.sum(axis=1)
+    text = log.evidence[:, :-1]
+    known = text.sum(axis=1)
 
     def pairs(values: Float64) -> Float64:
         total = np.add.reduceat(values, starts, axis=0)
@@ -339,7 +339,7 @@ def psa_bounds(log: Events) -> tuple[float, float]:
         products: Float64 = ((total**2).sum(axis=1) - own)[again] / (T * (T - 1))[again]
         return products
 
-    low = pairs(said)
+    low = pairs(text)
     high = low + 1 - pairs(known[:, None])
     return float(low.mean()), float(high.mean())
 

@@ -66,13 +66,7 @@ class Sampler:
     origin  (3,) voxel of the first camera, where the first frame that is added is not the map's first
     """
 
-    def __init__(
-        self,
-        voxel_size: float,
-        num_classes: int,
-        budget: int = BUDGET,
-        origin: Voxel | None = None,
-    ) -> None:
+    def __init__(self, voxel_size: float, num_classes: int, budget: int = BUDGET, origin: Voxel | None = None) -> None:
         self.voxel_size, self.K, self.budget = voxel_size, num_classes, budget
         self._share = 1 << 32
         self._origin: Int64 | None = None if origin is None else np.array(origin, dtype=np.int64)
@@ -143,14 +137,8 @@ class Sampler:
         """What is there until the next frame changes it."""
         x, y, z = (0, 0, 0) if self._origin is None else (self._origin - REACH).tolist()
         key, view, label, weight, drawn = (column[: self._entries] for column in self._columns)
-        return CellObservations(
-            key, view, label, weight, drawn, (x, y, z), self._seen_from(),
-            self.voxel_size, self.K, self._share, self._soft,
-        )  # fmt: skip
-
-    def _seen_from(self) -> Views:
-        frame, x, y, z, when = (self._views.column(k) for k in range(VIEW))
-        return Views(frame.astype(np.int64), np.stack([x, y, z], axis=1), when)
+        own = (key, view, label, weight, drawn, (x, y, z), Views.of(self._views.table()))
+        return CellObservations(*own, self.voxel_size, self.K, self._share, self._soft)
 
     def _labels(self, _frame: Frame, pixels: Pixels) -> Iterator[Entries]:
         """Entries (cell, class, pixels, hash) of a frame's labels."""

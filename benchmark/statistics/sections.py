@@ -89,10 +89,10 @@ OF_CHANGES: Mapping[str, Mean] = {
 """Over fewer voxels."""
 
 
-def place_sums(table: VoxelTable, columns: Columns, places: Cubes) -> CubeSums:
+def place_sums(table: VoxelTable, columns: Columns, cubes: Cubes) -> CubeSums:
     """Return the sums over cubes of the voxels with OP >= 2 of which `MEANS` are functions."""
     T, op, agreement = table.op.astype(np.float64), table.op, columns["psa"]
-    sums = places.means(
+    sums = cubes.means(
         {
             "psa": agreement,
             "vss": vss(table),
@@ -117,7 +117,7 @@ def place_sums(table: VoxelTable, columns: Columns, places: Cubes) -> CubeSums:
     )
     weight = table.evidence.weight
     each = np.repeat(T, np.diff(table.evidence.starts))
-    by_observation, by_voxel = places.sums_by_class(table.evidence, weight, weight / each)
+    by_observation, by_voxel = cubes.sums_by_class(table.evidence, weight, weight / each)
     further = {
         **{name: [sums[name][:, :1], observations] for name in ("within", "between")},
         "coin": [sums.pop("of two"), sums.pop("of more")],
@@ -125,7 +125,7 @@ def place_sums(table: VoxelTable, columns: Columns, places: Cubes) -> CubeSums:
         "alpha": [agreeing, observations, own, by_observation],
         "voxel_weighted": [sums["psa"], own_of_one, by_voxel],
     }
-    return CubeSums(places.cell, places.edge, sums | {name: np.hstack(parts) for name, parts in further.items()})
+    return CubeSums(cubes.cell, cubes.edge, sums | {name: np.hstack(parts) for name, parts in further.items()})
 
 
 # --- Locations that flip
@@ -151,10 +151,10 @@ class FlippingSums:
     together: Float64
 
     @classmethod
-    def of(cls, table: VoxelTable, stable: Float64, places: Cubes) -> FlippingSums:
+    def of(cls, table: VoxelTable, stable: Float64, cubes: Cubes) -> FlippingSums:
         """Of a table, by the probability (n,) of `steady`, over the cubes of its voxels with OP >= 2."""
         unsteady = np.round((1 - stable) / UNIT) * UNIT
-        share = CubeSums(places.cell, places.edge, places.means({"": unsteady}))
+        share = CubeSums(cubes.cell, cubes.edge, cubes.means({"": unsteady}))
         return cls(share, int(np.count_nonzero(table.op >= ENOUGH)), _together(table, unsteady))
 
     def specs(self) -> Iterator[EstimateSpec]:
@@ -163,8 +163,8 @@ class FlippingSums:
 
     def flipping(self, share: Interval, classes: Sequence[str] = ()) -> Flipping:
         """That share, as it was answered, and the two classes that stand together most often there."""
-        places = self.share[""][1]
-        seen = float(self.often / places) if places else float("nan")
+        locations = self.share[""][1]
+        seen = float(self.often / locations) if locations else float("nan")
         total = float(self.together.sum())
         if not total > 0:
             return Flipping(share, seen)
@@ -200,21 +200,21 @@ class LogSums:
 
 
 def log_sums(
-    table: VoxelTable, sample: MapSample, places: Cubes, drift: VoxelDrift | None, seed: int
+    table: VoxelTable, sample: MapSample, cubes: Cubes, drift: VoxelDrift | None, seed: int
 ) -> tuple[Columns, LogSums | None]:
     """The columns and sums that need a log; none without one."""
     if sample.events is None or drift is None:
         return {}, None
     changes = flips(sample.events)
     tell, trend = trend_columns(table, drift)
-    trends = places.rows(tell).sums(trend)
+    trends = cubes.rows(tell).sums(trend)
     means = {
         "flip_rate": changes.rate,
         "flip_null": changes.null,
         "flip_excess": changes.rate - changes.null,
         "frames_since": changes.since,
     }
-    sums = places.means(means)
+    sums = cubes.means(means)
     sums["trend_excess"] = np.stack([trends[:, 0] - trends[:, 1], trends[:, 2]], axis=1)
     test = order_test(table, sample.events, seed=seed)
     tested, op = drift, table.op
@@ -225,7 +225,7 @@ def log_sums(
     drift_q = benjamini_hochberg(np.where(op >= TESTABLE, tested.p_value, np.nan))
     trend_q = benjamini_hochberg(rounded_up(np.where(op >= TESTABLE, tested.trend_p, np.nan)))
     log = LogSums(
-        CubeSums(places.cell, places.edge, sums),
+        CubeSums(cubes.cell, cubes.edge, sums),
         trends.sum(axis=0),
         test,
         int(np.count_nonzero(~np.isnan(trend_q))),

@@ -75,7 +75,7 @@ class Spread:
         return float(2 * special.stdtr(self.degrees, -abs(value) / math.sqrt(self.variance)))
 
 
-EXACT, UNKNOWN_SPREAD = Spread(0.0, math.inf), Spread(math.nan, 0.0)
+EXACT = Spread(0.0, math.inf)
 
 
 @dataclass(frozen=True, eq=False)
@@ -127,16 +127,16 @@ def variances(
     whiten = np.linalg.inv(np.linalg.cholesky(error)) @ contrasts.T
     seen, largest = whiten @ effect, (n - 1) / special.chdtri(n - 1, 1 - UNLIKELY)
     sizes = effect.var() * n / (n - 1) * np.geomspace(SMALLEST, largest, SIZES)
-    logs, found = [], []
+    logs, result = [], []
     for reach, prior in zip(ranges, PRIOR, strict=True):
         alike = np.exp(-distance / reach) if reach > 0 else np.eye(n)
         own, vectors = np.linalg.eigh(whiten @ alike @ whiten.T)
         total = 1 + np.outer(sizes, np.maximum(own, 0.0))
         logs.append(math.log(prior) - 0.5 * (np.log(total) + (vectors.T @ seen) ** 2 / total).sum(axis=1))
-        found.append(sizes * (weight @ alike @ weight))
+        result.append(sizes * (weight @ alike @ weight))
     log = np.concatenate(logs)
     likely = np.exp(log - log.max())
-    return Variances(likely / likely.sum(), np.concatenate(found))
+    return Variances(likely / likely.sum(), np.concatenate(result))
 
 
 # --- Influences -------------------------------------------------------------------------------------------------------
@@ -169,10 +169,10 @@ class Influences:
 
     def minus(self, other: Influences) -> Influences:
         """Return the influences on the difference of two numbers."""
-        places, rows = np.unique(np.concatenate([self.places, other.places]), axis=0, return_inverse=True)
+        locations, rows = np.unique(np.concatenate([self.places, other.places]), axis=0, return_inverse=True)
         frames, columns = np.unique(np.concatenate([self.frames, other.frames]), return_inverse=True)
-        block, everything = np.zeros(len(places)), np.zeros(len(places))
-        cell, size = np.zeros((len(places), len(frames))), np.zeros((len(places), len(frames)))
+        block, everything = np.zeros(len(locations)), np.zeros(len(locations))
+        cell, size = np.zeros((len(locations), len(frames))), np.zeros((len(locations), len(frames)))
         row, column = np.split(rows.ravel(), [len(self.places)]), np.split(columns, [len(self.frames)])
         for grid, sign, at, to in zip((self, other), (1.0, -1.0), row, column, strict=True):
             block[at] += sign * grid.block
@@ -180,7 +180,15 @@ class Influences:
             cell[np.ix_(at, to)] += sign * grid.cell
             size[np.ix_(at, to)] += grid.size
         return Influences(
-            places, frames, block, cell, size, everything, self.edge, self.per_group, max(self.one_off, other.one_off)
+            locations,
+            frames,
+            block,
+            cell,
+            size,
+            everything,
+            self.edge,
+            self.per_group,
+            max(self.one_off, other.one_off),
         )
 
 
@@ -268,7 +276,15 @@ class Effects:
     @functools.cached_property
     def locations(self) -> Variances:
         """The variances over new locations."""
-        return _of_locations(self.grid, self.unit)
+        grid = self.grid
+        of = _neighbours(grid.places.astype(np.float64), MOST_LOCATIONS)
+        weight: Float64 = np.bincount(of, weights=grid.all).astype(np.float64)
+        effect = np.bincount(of, weights=grid.block)
+        at = np.stack([np.bincount(of, weights=grid.all * axis) / weight for axis in grid.places.T], axis=1)
+        apart = np.linalg.norm(at[:, None] - at[None], axis=2)
+        centre = weight @ at / weight.sum()
+        extent = 2 * math.sqrt(float(weight @ ((at - centre) ** 2).sum(axis=1)) / float(weight.sum()))
+        return variances(effect / weight, weight, np.diag(self.unit / weight), apart, [own * extent for own in REACHES])
 
 
 def _of_frames(effect: Float64, weight: Float64, noise: Float64, at: Float64) -> Variances:
@@ -276,18 +292,6 @@ def _of_frames(effect: Float64, weight: Float64, noise: Float64, at: Float64) ->
     step = float(np.median(np.diff(at)))  # effects last for so many frames that were fused
     ranges = [-step / math.log(rho) if rho > 0 else 0.0 for rho in LASTING]
     return variances(effect, weight, noise, np.abs(np.subtract.outer(at, at)), ranges)
-
-
-def _of_locations(grid: Influences, unit: float) -> Variances:
-    """Return the variances over new locations, where the noise of an observation has that variance."""
-    of = _neighbours(grid.places.astype(np.float64), MOST_LOCATIONS)
-    weight: Float64 = np.bincount(of, weights=grid.all).astype(np.float64)
-    effect = np.bincount(of, weights=grid.block)
-    at = np.stack([np.bincount(of, weights=grid.all * axis) / weight for axis in grid.places.T], axis=1)
-    apart = np.linalg.norm(at[:, None] - at[None], axis=2)
-    centre = weight @ at / weight.sum()
-    extent = 2 * math.sqrt(float(weight @ ((at - centre) ** 2).sum(axis=1)) / float(weight.sum()))
-    return variances(effect / weight, weight, np.diag(unit / weight), apart, [own * extent for own in REACHES])
 
 
 def _neighbours(points: Float64, most: int) -> Int64:

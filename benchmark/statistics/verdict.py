@@ -62,9 +62,11 @@ ACTED_ON, LEAST_FLIPS = ("stable", "usable"), 0.001
 ONE_CLASS = "hardly more than one class was predicted, so that agreement says nothing"
 
 
-def level_probabilities(found: Interval, scale: Scale, limits: Limits = LIMITS) -> Mapping[Level, float]:
+def level_probabilities(interval: Interval, scale: Scale, limits: Limits = LIMITS) -> Mapping[Level, float]:
     """Return how probable each level is, given alpha or its share of the ceiling; NaN without an interval."""
-    reliable, tentative = (probability_above(found, threshold, scale) for threshold in (limits.stable, limits.usable))
+    reliable, tentative = (
+        probability_above(interval, threshold, scale) for threshold in (limits.stable, limits.usable)
+    )
     return {"stable": reliable, "usable": tentative - reliable, "unstable": 1 - tentative}
 
 
@@ -89,14 +91,14 @@ def verdict(
     blocks         in how many cubes of space they lie
     labelled       part of the locations with depth that have a label; a model that labels too few is at most usable
     """
-    basis, scale = _basis(headline, ceiling)
+    basis = headline.alpha_between if ceiling is None else ceiling.share
     level: Level = "no verdict"
     probability = math.nan
     if voxels >= LEAST_VOXELS and blocks >= LEAST_BLOCKS:
-        level, probability = _level(headline, ceiling, level_probabilities(basis, scale, limits))
+        level, probability = _level(headline, ceiling, level_probabilities(basis, "agreement", limits))
     silent = labelled < limits.labelled
     if silent and level == "stable":
-        level, probability = "usable", level_probabilities(basis, scale, limits)["usable"] + probability
+        level, probability = "usable", level_probabilities(basis, "agreement", limits)["usable"] + probability
     support = f"{voxels} locations seen twice or more, {share:.0%} of the map"
     if level == "no verdict":
         enough = voxels >= LEAST_VOXELS and blocks >= LEAST_BLOCKS
@@ -117,11 +119,6 @@ def verdict(
         probability,
         f"{backbone}: {level}{how_sure}, {ADVICE[level]}: {', '.join(parts)}; {support}; {_for(basis)}",
     )
-
-
-def _basis(headline: HeadlineStatistics, ceiling: CeilingShare | None) -> tuple[Interval, Scale]:
-    """Return the number that decides."""
-    return (headline.alpha_between, "agreement") if ceiling is None else (ceiling.share, "agreement")
 
 
 def _level(

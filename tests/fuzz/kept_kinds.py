@@ -46,7 +46,7 @@ def of_kept(folder: Path) -> Iterator[Kind]:
     yield Kind("tile of a map", (tile,), lambda file: VoxelTable.load(file.parent))
     task = make_plan(config).tasks[0]
     result = folder / "8_frames.npz"
-    TileResult({"a.csv": "0"}, np.zeros((3, len(NUMBERS))), sums={"strata": np.zeros(4)}).save(result)
+    TileResult({"a.csv": "0"}, series=np.zeros((3, len(NUMBERS))), sums={"strata": np.zeros(4)}).save(result)
     yield Kind("result of a tile", (result,), TileResult.load)
     view = View(Intrinsics(12, 12, 7.5, 5.5), np.eye(4), (12, 16))
     casts = Casts(folder / "casts", b"surface")
