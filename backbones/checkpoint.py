@@ -263,11 +263,6 @@ def load_processor(checkpoint: Checkpoint, processing: Processing, **settings: A
     return processor
 
 
-def model_type(checkpoint: Checkpoint) -> str:
-    """What transformers calls the checkpoint's kind: 'segformer', 'mask2former', ..."""
-    return str(checkpoint.load(transformers.AutoConfig).model_type)
-
-
 # Settings of the backbone `transformers`.
 
 
