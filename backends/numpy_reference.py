@@ -67,8 +67,8 @@ class NumpyReference:
 
     @staticmethod
     def frame_bytes(voxels: int, num_classes: int) -> int:
-        """The evidence of each voxel that the frame touches: its own, and that before and after it."""
-        return 3 * 8 * num_classes * voxels
+        """The evidence of each voxel that the frame touches: its own, before and after it, and terms of its change."""
+        return 10 * 8 * num_classes * voxels
 
     def integrate(self, frame: Frame) -> FrameReport:
         """Append the frame's observations to the history."""

@@ -99,18 +99,8 @@ def keys_of_row(depth, labels, ray_x, ray_y, T, size, ox, oy, oz, ignore, rays, 
     return lost
 
 
-@serial
-def keep_columns(keys, columns):
-    """Take out, with -1, the keys outside of columns: lowest and highest but one of the first two coordinates."""
-    mask = 2 * HALF - 1
-    for u in range(keys.shape[0]):
-        i, j = keys[u] >> 42, (keys[u] >> 21) & mask
-        inside = (i >= columns[0]) & (i < columns[1]) & (j >= columns[2]) & (j < columns[3])
-        keys[u] = keys[u] if inside else -1
-
-
 def columns_of(within, origin):
-    """The columns for `keep_columns` of an extent or None: (4,), as packed keys count, or (0,) for all."""
+    """Lowest and highest but one of the first two coordinates, as packed keys count, (4,); or (0,) for all voxels."""
     if within is None:
         return np.zeros(0, dtype=np.int64)
     (x0, y0), (x1, y1) = within.low, within.high

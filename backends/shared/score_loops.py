@@ -12,7 +12,7 @@ from numba.core import cgutils, types
 from numba.extending import intrinsic
 
 from semstab.backends.shared.keys import PARTITIONS, mix, partition_of
-from semstab.backends.shared.pixel_keys import ask_for, keep_columns, keys_of_row, touch
+from semstab.backends.shared.pixel_keys import ask_for, keys_of_row, touch
 from semstab.backends.shared.tile_loops import runs_of_eight
 from semstab.core.compiled import parallel, serial
 
@@ -196,7 +196,7 @@ LINE = 16
 
 @parallel
 def sum_scores(
-    depth, labels, scores, ending, K, ray_x, ray_y, T, size, origin, within, rays, margin, room, row_keys,
+    depth, labels, scores, ending, K, ray_x, ray_y, T, size, origin, rays, margin, room, row_keys,
     tables, table_rows, stretches, scales, key, count, sums, entries, lost, spread,
 ):  # fmt: skip
     """The voxels of each band, some of them twice, with the sums of their pixels' scores, each scaled to sum 1.
@@ -206,7 +206,6 @@ def sum_scores(
     labels   (W,) 0 wherever there is depth: scores have no ignore id
     scores   (H * W * K,), see `vectors`
     ending   the last scores of at least a tile's row, and room for as many: where reading goes beyond the image
-    within   see `keep_columns`
     key      (bands * room,) packed voxels, their pixels in `count`, and their sums (bands * room * stride,) in `sums`
     lost     (bands,) whether a pixel with depth is out of reach
     spread   (bands, PARTITIONS) of the voxels by partition
@@ -223,8 +222,6 @@ def sum_scores(
             lost[band] |= keys_of_row(
                 depth[v], labels, ray_x, ray_y[v], T, size, ox, oy, oz, 1, rays, margin, keys[v - first]
             )
-            if within.shape[0]:
-                keep_columns(keys[v - first], within)
         table[:] = -1
         own_key, own_count = key[band * room : (band + 1) * room], count[band * room : (band + 1) * room]
         own_sums = sums[band * room * stride : (band + 1) * room * stride]
