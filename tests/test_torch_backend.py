@@ -94,7 +94,7 @@ def survey(seed, camera=(4.5e5, 5.5e6, 80.0), shape=(90, 160)):
 def voxel_of_pixels(frame, dtype):
     """(H, W, 3) voxel indices from the map's origin, as the backend finds them."""
     origin = tuple(int(x) for x in np.floor(frame.T_wc[:3, 3] / 0.2))
-    seen = torch_operations.associate(DepthView.of_frame(frame, CPU), MapGrid(0.2, origin, dtype))
+    seen = torch_operations.associate(DepthView(torch.tensor(frame.depth), frame), MapGrid(0.2, origin, dtype))
     key = seen.keys[seen.voxel.to(torch.int64)].numpy()
     return np.stack([key >> 42, (key >> 21) & (2**21 - 1), key & (2**21 - 1)], axis=-1) - 2**20 + origin
 
