@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import logging
 import time
-from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import numba as nb
@@ -47,42 +46,31 @@ from semstab.model.voxels import Extent, VoxelTable, index_columns
 # The log of observations that the numba backend keeps on request.
 
 
-@dataclass(frozen=True, eq=False)
-class _Seen:
-    """A frame's observations in the log: rows of the map, pixels, and entries as in `Observed`, without empty ones."""
-
-    frame: int
-    row: Int32
-    pixels: Int32
-    entries: UInt16
-    label: UInt16
-    weight: Float64
-
-
 class History:
     """Every observation of a map, frame after frame."""
 
     def __init__(self, voxel_size: float, num_classes: int) -> None:
         self.voxel_size = voxel_size
         self.num_classes = num_classes
-        self._seen: list[_Seen] = []
+        self._seen: list[tuple[int, Int32, Int32, UInt16, UInt16, Float64]] = []
+        """Of each frame its index, rows of the map, pixels, and entries as in `Observed`, without empty ones."""
 
     def append(self, seen: Observed, row: Int64, frame: int) -> None:
         """Keep a copy of the observations of the map's rows that outlives the next frame."""
         some, n = seen.weight > 0, len(seen.key)
         entries = np.add.reduceat(some, seen.start[:-1], dtype=np.uint16) if n else np.zeros(0, np.uint16)
-        pixels = seen.pixels.astype(np.int32)
-        self._seen.append(_Seen(frame, row.astype(np.int32), pixels, entries, seen.label[some], seen.weight[some]))
+        rows, pixels = row.astype(np.int32), seen.pixels.astype(np.int32)
+        self._seen.append((frame, rows, pixels, entries, seen.label[some], seen.weight[some]))
 
     def events(self, order: Int32, index: dict[str, Any]) -> Events:
         """The observations in order of integration within a voxel; voxels are the map's rows in that order."""
         rank = np.empty(len(order), np.int64)
         rank[order] = np.arange(len(order))
         observations, entries = np.zeros(len(order) + 1, np.int64), np.zeros(len(order) + 1, np.int64)
-        for seen in self._seen:
-            voxel = rank[seen.row] + 1  # a voxel is in a frame once
+        for _, row, _, number, *_ in self._seen:
+            voxel = rank[row] + 1  # a voxel is in a frame once
             observations[voxel] += 1
-            entries[voxel] += seen.entries
+            entries[voxel] += number
         place, entry = np.cumsum(observations), np.cumsum(entries)  # where each voxel's next observation goes
         voxels = np.repeat(np.arange(len(order), dtype=np.int32), observations[1:])
         frame, pixels = (np.empty(len(voxels), np.int32) for _ in range(2))
@@ -90,18 +78,9 @@ class History:
         starts[-1] = entry[-1]
         label, weight = np.empty(entry[-1], np.uint16), np.empty(entry[-1])
         for seen in self._seen:
-            place_observations(
-                rank, seen.frame, seen.row, seen.pixels, seen.entries, seen.label, seen.weight,
-                place, entry, frame, pixels, starts, label, weight,
-            )  # fmt: skip
-        return Events(
-            **index,
-            voxel=voxels,
-            frame=frame,
-            evidence=Evidence(starts, label, weight, self.num_classes),
-            pixels=pixels,
-            voxel_size=self.voxel_size,
-        )
+            place_observations(rank, *seen, place, entry, frame, pixels, starts, label, weight)
+        evidence = Evidence(starts, label, weight, self.num_classes)
+        return Events(**index, voxel=voxels, frame=frame, evidence=evidence, pixels=pixels, voxel_size=self.voxel_size)
 
 
 FULL = 0.7
