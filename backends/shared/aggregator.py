@@ -183,7 +183,6 @@ class Aggregator:
         """
         space, (H, W), K = self._space, frame.shape, self.num_classes
         ray_x, ray_y = _rays(frame)
-        rays, margin = frame_terms(ray_x, frame.T_wc, self.voxel_size)
         rows, columns, table = score_loops.ROWS, score_loops.COLUMNS, 1 << score_loops.TABLE_BITS
         bands, threads = -(-H // rows), nb.get_num_threads()
         stride = -(-K // LANES) * LANES
@@ -198,7 +197,7 @@ class Aggregator:
             spread = np.zeros((bands, PARTITIONS), dtype=np.int64)
             score_loops.sum_scores(
                 fixed(frame.depth), np.zeros(W, dtype=np.uint8), scores, ending, K, ray_x, ray_y,
-                fixed(frame.T_wc), self.voxel_size, origin, rays, margin, room,
+                fixed(frame.T_wc), self.voxel_size, origin, room,
                 space.room("keys", threads, rows, W), space.room("table", threads, table),
                 space.room("table_row", threads, table, dtype=np.int32),
                 space.room("score stretches", threads, 3, columns + 2 * LANES),

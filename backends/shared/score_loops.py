@@ -12,7 +12,7 @@ from numba.core import cgutils, types
 from numba.extending import intrinsic
 
 from semstab.backends.shared.keys import PARTITIONS, mix, partition_of
-from semstab.backends.shared.pixel_keys import ask_for, keys_of_row, touch
+from semstab.backends.shared.pixel_keys import ask_for, exact_keys_of_row, touch
 from semstab.backends.shared.tile_loops import runs_of_eight
 from semstab.core.compiled import parallel, serial
 
@@ -196,7 +196,7 @@ LINE = 16
 
 @parallel
 def sum_scores(
-    depth, labels, scores, ending, K, ray_x, ray_y, T, size, origin, rays, margin, room, row_keys,
+    depth, labels, scores, ending, K, ray_x, ray_y, T, size, origin, room, row_keys,
     tables, table_rows, stretches, scales, key, count, sums, entries, lost, spread,
 ):  # fmt: skip
     """The voxels of each band, some of them twice, with the sums of their pixels' scores, each scaled to sum 1.
@@ -219,9 +219,7 @@ def sum_scores(
         keys, table = row_keys[thread], tables[thread]
         first, last = band * ROWS, min(H, (band + 1) * ROWS)
         for v in range(first, last):
-            lost[band] |= keys_of_row(
-                depth[v], labels, ray_x, ray_y[v], T, size, ox, oy, oz, 1, rays, margin, keys[v - first]
-            )
+            lost[band] |= exact_keys_of_row(depth[v], labels, ray_x, ray_y[v], T, size, ox, oy, oz, 1, keys[v - first])
         table[:] = -1
         own_key, own_count = key[band * room : (band + 1) * room], count[band * room : (band + 1) * room]
         own_sums = sums[band * room * stride : (band + 1) * room * stride]
