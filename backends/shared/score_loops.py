@@ -12,7 +12,7 @@ from numba.core import cgutils, types
 from numba.extending import intrinsic
 
 from semstab.backends.shared.keys import PARTITIONS, mix, partition_of
-from semstab.backends.shared.pixel_keys import ask_for, exact_keys_of_row, touch
+from semstab.backends.shared.pixel_keys import exact_keys_of_row
 from semstab.backends.shared.tile_loops import runs_of_eight
 from semstab.core.compiled import parallel, serial
 
@@ -24,9 +24,6 @@ from semstab.core.compiled import parallel, serial
 # value.
 
 LANES = 8
-
-SOON = 8
-"""Rows of sums that are asked for before their turn comes."""
 
 NUMBERS = {types.float32: ir.FloatType(), types.float64: ir.DoubleType(), types.uint16: ir.HalfType()}
 
@@ -72,8 +69,7 @@ def add_two(
     sums[to : to + K] += scale[u] * scores[at + u * K : at + (u + 1) * K], or = where `fresh`, and likewise of u + 1 if
     that is below `end`; it is read in any case, as nobody can predict whether it is, and must be there.
 
-    `sums` is float64, and has room for a multiple of `LANES` values at `to`: those beyond K get 0 added. Rows of
-    as many lie one behind the other, and a later one, which may not have been written to yet, is asked for.
+    `sums` is float64, and has room for a multiple of `LANES` values at `to`: those beyond K get 0 added.
     """
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
@@ -87,7 +83,6 @@ def add_two(
             for pixel, counts in zip(pixels, counted, strict=True)
         ]
         row = builder.gep(_data(context, builder, signature, arguments, 6), [to])
-        ahead = builder.mul(builder.and_(builder.add(K, INT(LANES - 1)), INT(-LANES)), INT(SOON))
 
         def add(values: list[Any], k: Any) -> None:
             place = builder.bitcast(builder.gep(row, [k]), DOUBLES.as_pointer())
@@ -96,7 +91,6 @@ def add_two(
                 scaled = builder.fmul(builder.select(counts, value, ZEROS), factor, flags=["contract"])
                 total = builder.fadd(total, scaled, flags=["contract"])
             builder.store(total, place, align=8)
-            ask_for(builder, builder.gep(row, [builder.add(k, ahead)]))
 
         _by_eights(context, builder, signature.args[0], array, places, K, add)
         return context.get_dummy_value()
@@ -187,12 +181,6 @@ TABLE_BITS = 13
 GOLDEN = np.uint64(0x9E3779B97F4A7C15)
 SHIFT = np.uint64(64 - TABLE_BITS)
 
-AHEAD = 512
-"""Scores that are asked for before their turn comes."""
-
-LINE = 16
-"""Of them, as many as a line of the cache holds in float32."""
-
 
 @parallel
 def sum_scores(
@@ -255,8 +243,6 @@ def _add_stretch(scores, at, K, stride, words, scale, run_word, run_end, table, 
     for u in range(0, pixels, LANES):
         some = words[u] & words[u + 1] & words[u + 2] & words[u + 3]
         if (some & words[u + 4] & words[u + 5] & words[u + 6] & words[u + 7]) >= 0:
-            for ahead in range(at + u * K + AHEAD, min(at + (u + LANES) * K + AHEAD, scores.shape[0]), LINE):
-                touch(scores, ahead)
             scale_eight(scores, at + u * K, K, words, scale, u)
     runs = 0
     for u in range(0, pixels, LANES):
@@ -324,10 +310,6 @@ def merge_rows(edges, key, pixels, row, again, first, sums, K, voxels):
                 again[repeated], first[repeated] = row[i], row[v]
                 repeated += 1
         for i in range(low, repeated):
-            soon = min(i + SOON, repeated - 1)
-            for k in range(0, K, LANES):
-                touch(sums, again[soon] + k)
-                touch(sums, first[soon] + k)
             to, added = sums[first[i] : first[i] + K], sums[again[i] : again[i] + K]
             for k in range(K):
                 to[k] += added[k]
