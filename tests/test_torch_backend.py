@@ -122,11 +122,6 @@ def test_single_precision_differs_only_next_to_a_voxel_face():
     assert 0 < differing < 1e-4 * points
 
 
-def test_single_precision_takes_less_memory():
-    double, single = new_map(num_classes=20), new_map(num_classes=20, precision="float32")
-    assert single.maps.bytes < 0.7 * double.maps.bytes
-
-
 def test_the_numbers_do_not_depend_on_how_pixels_are_grouped(monkeypatch):
     """Integer sums have no order: one chunk, or chunks of a few pixels, give the same bits."""
     frames = [*random_frames(3, count=4), survey(0, camera=(0, 0, 80), shape=(20, 30))]
@@ -134,11 +129,6 @@ def test_the_numbers_do_not_depend_on_how_pixels_are_grouped(monkeypatch):
     for size in (50, 333):
         monkeypatch.setattr(torch_operations, "chunk_of", lambda device, size=size: size)
         assert_equal(fused(frames), whole)
-
-
-def test_the_same_frames_give_the_same_bits():
-    frames = random_frames(5, count=4)
-    assert_equal(fused(frames), fused(frames))
 
 
 def test_sums_of_scores_are_as_fine_as_they_say():
