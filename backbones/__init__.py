@@ -72,7 +72,7 @@ class Prediction:
 
     labels  (H, W) uint8 or uint16: ids of its label space, 255 (65535) where it says nothing; of a backbone without
             classes, region ids from 1, `UNASSIGNED` where there is no region
-    scores  (H, W, K) float32 that sum to 1 over the classes, or None where they were not asked for
+    scores  (H, W, K) float32 that sum to 1 over the classes, or None where only labels are wanted
     """
 
     labels: Labels
@@ -101,7 +101,7 @@ class Backbone(Protocol):
                     sequence in order, all of them, from the first one after `reset`
     wants_geometry  whether `predict` is also given `geometry=`, one `Frame` an image: its depth, intrinsics and pose at
                     the image's own pixels, depth 0 where it is not known; labels are all 0, there is no colour
-    streams         whether `stream` keeps less in memory than `predict`: it is asked where scores are many
+    streams         whether `stream` keeps less in memory than `predict`: it is called where scores are many
     """
 
     label_space: LabelSpace | None = None
@@ -151,7 +151,7 @@ def streamed(prediction: Prediction) -> Streamed:
 def ask(
     backbone: Backbone, images: Sequence[Image], *, scores: bool = False, geometry: Sequence[Frame] = ()
 ) -> list[Prediction]:
-    """What a backbone says about images; it is told their geometry where it wants it."""
+    """Return the predictions of a backbone, which gets the geometry of the images where it wants it."""
     more = {"geometry": geometry} if backbone.wants_geometry else {}
     return backbone.predict(images, scores=scores, **more)
 

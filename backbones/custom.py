@@ -236,19 +236,19 @@ class OwnModel(Backbone):
         return {**about, "classes": list(self.label_space.classes)}
 
     def _predict(self, image: Image, frame: Sequence[Any], scores: bool) -> Prediction:
-        found = guarded(self._code.text, lambda: _array(self._call(image, *frame)))
+        output = guarded(self._code.text, lambda: _array(self._call(image, *frame)))
         shape, K = image.shape[:2], len(self.label_space or ())
-        if found.shape == shape and found.dtype.kind in "iu":
+        if output.shape == shape and output.dtype.kind in "iu":
             if scores:
                 raise DataError(
                     f"{self._code.text}: gives labels, no scores; leave scores out, or let it give (H, W, K)"
                 )
-            return Prediction(_ids(found, K, self._code.text))
-        if found.shape == (*shape, K) and found.dtype.kind == "f":
-            soft = found.astype(np.float32, copy=False)
+            return Prediction(_ids(output, K, self._code.text))
+        if output.shape == (*shape, K) and output.dtype.kind == "f":
+            soft = output.astype(np.float32, copy=False)
             return Prediction(_ids(soft.argmax(axis=2), K, self._code.text), soft if scores else None)
         raise DataError(
-            f"{self._code.text}: gave {found.dtype} of shape {found.shape} for an image of {shape}; give labels"
+            f"{self._code.text}: gave {output.dtype} of shape {output.shape} for an image of {shape}; give labels"
             f" {shape} of whole numbers, or scores {(*shape, K)}"
         )
 
@@ -265,29 +265,29 @@ def is_path(value: Any) -> bool:
     return isinstance(value, str) and bool(Path(value).suffix or "/" in value) and Path(value).expanduser().exists()
 
 
-def _array(found: Any) -> npt.NDArray[Any]:
+def _array(output: Any) -> npt.NDArray[Any]:
     """An array of what a model gives; tensors come from where they are."""
-    return np.asarray(found.detach().cpu().numpy() if hasattr(found, "detach") else found)
+    return np.asarray(output.detach().cpu().numpy() if hasattr(output, "detach") else output)
 
 
-def _ids(found: npt.NDArray[Any], classes: int, who: str) -> Labels:
+def _ids(labels: npt.NDArray[Any], classes: int, who: str) -> Labels:
     """Labels as the narrowest type. Raises DataError for one that is no class and not ignored."""
     ignore = IGNORE_8BIT if classes <= IGNORE_8BIT else IGNORE_16BIT
-    wrong = (found >= classes) & (found != ignore)
+    wrong = (labels >= classes) & (labels != ignore)
     if wrong.any():
-        raise DataError(f"{who}: gave the label {found[wrong][0]}, but has {classes} classes, 0 to {classes - 1}")
-    return narrowed(np.where(found < 0, ignore, found), classes)
+        raise DataError(f"{who}: gave the label {labels[wrong][0]}, but has {classes} classes, 0 to {classes - 1}")
+    return narrowed(np.where(labels < 0, ignore, labels), classes)
 
 
 def _label_space(code: Code, made: Any, classes: Sequence[str] | str | None) -> LabelSpace:
-    found = class_names(classes) if classes is not None else None
+    names = class_names(classes) if classes is not None else None
     for owner in (made, code.module):
-        for name in ("label_space", "classes", "names", "CLASSES"):
-            found = getattr(owner, name, None) if found is None else found
-    if isinstance(found, LabelSpace):
-        return found
-    if isinstance(found, Mapping):  # from ids, as Ultralytics has it
-        found = [found[k] for k in sorted(found)]
-    if found is None or isinstance(found, str) or not all(isinstance(name, str) for name in found):
+        for attribute in ("label_space", "classes", "names", "CLASSES"):
+            names = getattr(owner, attribute, None) if names is None else names
+    if isinstance(names, LabelSpace):
+        return names
+    if isinstance(names, Mapping):  # from ids, as Ultralytics has it
+        names = [names[k] for k in sorted(names)]
+    if names is None or isinstance(names, str) or not all(isinstance(name, str) for name in names):
         raise ConfigError(f"{code.text}: its classes are not known; give it classes = [...], or say --classes a,b,c")
-    return LabelSpace(code.name, tuple(found))
+    return LabelSpace(code.name, tuple(names))

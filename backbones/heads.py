@@ -6,7 +6,7 @@ import contextlib
 import logging
 import warnings
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, ClassVar, Protocol
+from typing import Any, ClassVar
 
 import torch
 import transformers
@@ -27,19 +27,8 @@ SQUARE = ("dpt", "tipsv2_dpt", "data2vec-vision")
 """Kinds whose code takes square images only."""
 
 
-class Head(Protocol):
-    """A loaded checkpoint.
-
-    names    its classes in the order of `maps`
-    softmax  whether scores are the softmax of the maps; else each map's share of their sum
-    """
-
-    names: Mapping[int, str]
-    softmax: bool
-
-    def maps(self, images: Sequence[Image]) -> list[torch.Tensor]:
-        """(K, h, w) of each image, of whatever size."""
-        ...
+# Each head is a loaded checkpoint. `names`: its classes in the order of its maps. `maps(images)`: (K, h, w) of each
+# image, of whatever size. `softmax`: whether scores are the softmax of the maps, else each map's share of their sum.
 
 
 class SemanticHead:
@@ -177,8 +166,11 @@ class PromptedHead:
         return [each.reshape(K, *each.shape[-2:]) for each in logits]
 
 
+Head = SemanticHead | UniversalHead | PromptedHead
+
+
 def load_head(checkpoint: Checkpoint, options: SegmenterOptions, kind: str) -> Head:
-    """What loads a kind of checkpoint. Raises DataError, with the kinds that there are, for another one."""
+    """Load a kind of checkpoint. Raises DataError, with the kinds that there are, for another one."""
     if kind in SEMANTIC:
         return SemanticHead(checkpoint, options, kind)
     if options.engine != "torch":

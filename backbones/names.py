@@ -128,22 +128,22 @@ class InTaxonomy(Wrapped):
 
     def stream(self, image: Image) -> Streamed:
         """See `Backbone`; the target's maps are in memory at once."""
-        found = self.inner.stream(image)
-        labels = self._mapping.labels(found.labels, "prediction")
-        return Streamed(labels, lambda: self._maps(found, labels != ignore_id(labels)))
+        streamed = self.inner.stream(image)
+        labels = self._mapping.labels(streamed.labels, "prediction")
+        return Streamed(labels, lambda: self._maps(streamed, labels != ignore_id(labels)))
 
     def identity(self) -> dict[str, Any]:
         """That of the inner backbone, and where each class goes."""
         rows = list(self._mapping.rows)
         return {**self.inner.identity(), "taxonomy": self._mapping.target.to_dict(), "rows": rows}
 
-    def _maps(self, found: Streamed, said: Mask) -> Iterator[Float32]:
+    def _maps(self, streamed: Streamed, labelled: Mask) -> Iterator[Float32]:
         """Those of classes that fall together added up, 0 where the label is ignored."""
-        totals = np.zeros((len(self._mapping.target), *said.shape), dtype=np.float32)
-        for row, scores in zip(self._mapping.rows, found.maps(), strict=True):
+        totals = np.zeros((len(self._mapping.target), *labelled.shape), dtype=np.float32)
+        for row, scores in zip(self._mapping.rows, streamed.maps(), strict=True):
             if row is not None:
                 totals[row] += scores
-        yield from (total * said for total in totals)
+        yield from (total * labelled for total in totals)
 
 
 def _names(name: str) -> list[str]:
@@ -155,24 +155,24 @@ def _names(name: str) -> list[str]:
 # Names of classes as a user says them.
 
 
-def class_names(said: Sequence[str] | str) -> Sequence[str] | LabelSpace:
+def class_names(classes: Sequence[str] | str) -> Sequence[str] | LabelSpace:
     """'a,b,c', a list, a text file with a name a line, or a taxonomy's YAML.
 
     Raises ConfigError where they are none, or cannot be read.
     """
-    if not isinstance(said, str):
-        return said
-    path = Path(said).expanduser()
+    if not isinstance(classes, str):
+        return classes
+    path = Path(classes).expanduser()
     if path.suffix in (".yaml", ".yml"):
         return LabelSpace.load(path)
     if path.suffix and path.is_file():
         try:
             text = read_limited(path, MAX_YAML_BYTES).decode("utf-8")
         except (OSError, ValueError) as error:
-            raise ConfigError(f"classes {said}: cannot be read ({one_line(error)})") from error
+            raise ConfigError(f"classes {classes}: cannot be read ({one_line(error)})") from error
         names = [line.strip() for line in text.splitlines()]
     else:
-        names = [name.strip() for name in said.split(",")]
-    if not (found := [name for name in names if name]):
-        raise ConfigError(f"classes {said}: holds no name")
-    return found
+        names = [name.strip() for name in classes.split(",")]
+    if not (names := [name for name in names if name]):
+        raise ConfigError(f"classes {classes}: holds no name")
+    return names

@@ -96,8 +96,8 @@ class TorchFile:
     def __call__(self, pixels: Array) -> list[Array]:
         """Its outputs, in order."""
         with self._torch.inference_mode():
-            found = self._module(self._torch.from_numpy(pixels).to(self._device))
-        outputs = list(found.values()) if isinstance(found, Mapping) else found
+            result = self._module(self._torch.from_numpy(pixels).to(self._device))
+        outputs = list(result.values()) if isinstance(result, Mapping) else result
         outputs = outputs if isinstance(outputs, list | tuple) else [outputs]
         return [output.detach().cpu().numpy() for output in outputs]
 
@@ -201,8 +201,8 @@ class NetworkFile(Backbone):
         return {"file": self._digest, **settings, "classes": list(self.label_space.classes)}
 
     def _seen_size(self) -> tuple[int, int] | None:
-        said, shape = self._options.size, self._network.shape
-        wanted = (said, said) if isinstance(said, int) else said
+        wanted, shape = self._options.size, self._network.shape
+        wanted = (wanted, wanted) if isinstance(wanted, int) else wanted
         sides = shape[2:4] if self._options.layout == "nchw" else shape[1:3]
         if len(sides) != 2 or sides[0] is None or sides[1] is None:
             return wanted
@@ -262,15 +262,15 @@ class NetworkFile(Backbone):
 
     def _map(self, output: Array, classes: tuple[int, ...]) -> Array:
         """The output of one image as (K, h, w), of labels as (h, w). Raises DataError where it is none."""
-        found = output[0] if output.ndim > 2 and output.shape[0] == 1 else output
-        if not classes and found.ndim == 3 and 1 in (found.shape[0], found.shape[-1]):
-            found = found[0] if found.shape[0] == 1 else found[..., 0]
-        if classes and found.ndim == 3 and self._options.layout == "nhwc":
-            found = found.transpose(2, 0, 1)
-        if found.ndim != 2 + len(classes) or found.shape[: len(classes)] != classes:
+        values = output[0] if output.ndim > 2 and output.shape[0] == 1 else output
+        if not classes and values.ndim == 3 and 1 in (values.shape[0], values.shape[-1]):
+            values = values[0] if values.shape[0] == 1 else values[..., 0]
+        if classes and values.ndim == 3 and self._options.layout == "nhwc":
+            values = values.transpose(2, 0, 1)
+        if values.ndim != 2 + len(classes) or values.shape[: len(classes)] != classes:
             what = f"{classes[0]} classes" if classes else "labels"
             raise DataError(f"{self._path}: its output of shape {output.shape} holds no {what}; mend classes or output")
-        return found
+        return values
 
 
 def is_network(name: str) -> bool:

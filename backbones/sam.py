@@ -178,7 +178,7 @@ class SamProposer:
         packed: list[UInt8] = []
         scores: list[float] = []
         boxes: list[Sequence[int]] = []
-        for batch in grid.split(options.points_per_batch):
+        for batch in torch.split(grid, options.points_per_batch):
             output = self.model(**encoded.embedding, input_points=batch[None, :, None, :], multimask_output=True)
             ratings, logits = output.iou_scores[0].flatten().float(), output.pred_masks[0].flatten(0, 1)
             for k in torch.nonzero(ratings > options.pred_iou).flatten().tolist():  # all at full size take gigabytes

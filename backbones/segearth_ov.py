@@ -103,7 +103,7 @@ class Prompts(Settings):
 
     @property
     def queries(self) -> list[tuple[int, str]]:
-        """Class id and name of everything that is asked for."""
+        """Class id and name of each query."""
         return [(k, part.strip()) for k, entry in enumerate(self.classes) for part in entry.split(",")]
 
     def label_space(self) -> LabelSpace:
@@ -263,7 +263,7 @@ CLIP_STD = (0.26862954, 0.26130258, 0.27577711)
 
 
 class SegEarthOptions(ModelOptions):
-    """Which CLIP, what it is asked, and how the image is shown to it."""
+    """Which CLIP, its prompts, and how the image is shown to it."""
 
     model: str = Field("openai/clip-vit-base-patch16", description="a CLIP folder, or an id on the Hugging Face hub")
     prompts: Path | None = Field(None, description="YAML file like configs/backbones/segearth_uavid.yaml, the default")
@@ -354,8 +354,8 @@ class SegEarthOV(Backbone):
         for _, name in prompts.queries:
             sentences = [template.format(name) for template in prompts.templates]
             tokens = tokenizer(sentences, padding=True, truncation=True, return_tensors="pt").to(self._model.device)
-            found = self._model.get_text_features(**tokens)
-            each = nn.functional.normalize(getattr(found, "pooler_output", found), dim=-1)
+            output = self._model.get_text_features(**tokens)
+            each = nn.functional.normalize(getattr(output, "pooler_output", output), dim=-1)
             features.append(nn.functional.normalize(each.mean(dim=0), dim=-1))
         return torch.stack(features)
 

@@ -89,9 +89,9 @@ def _shares(
     total = weight(0)
     for k in range(1, len(maps)):
         total = total + weight(k)
-    said = total > 0 if sure is None else sure & (total > 0)
+    labelled = total > 0 if sure is None else sure & (total > 0)
     for k in range(len(maps)):
-        yield torch.where(said, weight(k) / total, 0.0).cpu().numpy()
+        yield torch.where(labelled, weight(k) / total, 0.0).cpu().numpy()
 
 
 def label_space(id2label: Mapping[int, str], name: str) -> LabelSpace:

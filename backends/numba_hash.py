@@ -196,7 +196,7 @@ class NumbaHash:
     def table(self) -> VoxelTable:
         """The map so far."""
         order = self._order()
-        index = self.index_of(order)
+        index = index_of_keys(self._records["key"][order], self.origin)
         columns = ("op", "drift_sum", "pixels", "first_frame", "last_frame", "self_sum", "frame_entropy_sum")
         values: dict[str, Any] = {name: self._records[name][order] for name in columns}
         evidence = self._evidence_of(order)
@@ -237,7 +237,8 @@ class NumbaHash:
         if self._history is None:
             return None
         order = self._order()
-        return self._history.events(order, index_columns(self.index_of(order)))
+        index = index_of_keys(self._records["key"][order], self.origin)
+        return self._history.events(order, index_columns(index))
 
     def _make_slots(self, needed: int) -> None:
         size = self._slots.shape[1]

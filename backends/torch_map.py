@@ -130,19 +130,19 @@ class TorchMaps:
         """
         started = time.perf_counter()
         view = DepthView.of(depth, intrinsics, T_wc, index, self.device)
-        said = {
+        predicted = {
             name: evidence_of(of_name, view, self._columns_of(name).num_classes, _where(view, of_name.kind, name))
             for name, of_name in predictions.items()
         }
-        return self.fuse(view, said, started)
+        return self.fuse(view, predicted, started)
 
     @torch.no_grad()
     @torch.inference_mode(False)
-    def fuse(self, view: DepthView, said: Mapping[str, Labels | Scores], started: float) -> dict[str, FrameReport]:
+    def fuse(self, view: DepthView, predicted: Mapping[str, Labels | Scores], started: float) -> dict[str, FrameReport]:
         """Fuse a view that is on the device, with predictions of some backbones; timed from `started`."""
         grid = self._grid or self._first_grid(view)
         seen = associate(view, grid)
-        evidence = {name: self._evidence(seen, image, name, view) for name, image in said.items()}
+        evidence = {name: self._evidence(seen, image, name, view) for name, image in predicted.items()}
         rows, voxels = self._look_up(seen, evidence, view, grid)
         associated = time.perf_counter()
         self.storage.make_room(voxels, f"frame {view.camera.index}")
@@ -154,7 +154,7 @@ class TorchMaps:
         sums = torch.stack(changes).tolist() if changes else []
         return {
             name: self._totals[name].add(view.camera.index, Change.of(of_name), started, associated)
-            for name, of_name in zip(said, sums, strict=True)
+            for name, of_name in zip(predicted, sums, strict=True)
         }
 
     def table(self, name: str) -> VoxelTable:
@@ -177,14 +177,14 @@ class TorchMaps:
             raise ConfigError(f"there is no map of '{name}'; there is {', '.join(self.storage.columns)}")
         return self.storage.columns[name]
 
-    def _evidence(self, seen: Association, said: Labels | Scores, name: str, view: DepthView) -> ViewEvidence:
+    def _evidence(self, seen: Association, predicted: Labels | Scores, name: str, view: DepthView) -> ViewEvidence:
         K = self.storage.columns[name].num_classes
-        if isinstance(said, Labels):
-            return count_labels(seen, said, K)
-        if len(said.values) != K:
-            kind = "logits" if said.softmax else "scores"
-            raise DataError(f"{_where(view, kind, name)}: {kind} hold {len(said.values)} classes, the map {K}")
-        return sum_scores(seen, said, K)
+        if isinstance(predicted, Labels):
+            return count_labels(seen, predicted, K)
+        if len(predicted.values) != K:
+            kind = "logits" if predicted.softmax else "scores"
+            raise DataError(f"{_where(view, kind, name)}: {kind} hold {len(predicted.values)} classes, the map {K}")
+        return sum_scores(seen, predicted, K)
 
     def _look_up(
         self, seen: Association, evidence: Mapping[str, ViewEvidence], view: DepthView, grid: MapGrid
@@ -308,8 +308,8 @@ class TorchMap(FusionBackend):
 
         Raises DataError, with the map unchanged, where the frame cannot be fused.
         """
-        said = TensorPrediction(labels=labels, scores=scores, logits=logits)
-        return self.maps.integrate_tensors(depth, intrinsics, T_wc, {"": said}, index=index)[""]
+        predicted = TensorPrediction(labels=labels, scores=scores, logits=logits)
+        return self.maps.integrate_tensors(depth, intrinsics, T_wc, {"": predicted}, index=index)[""]
 
     def table(self) -> VoxelTable:
         """The map so far, brought to memory."""

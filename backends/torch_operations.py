@@ -142,14 +142,14 @@ def _uploaded(terms: list[npt.NDArray[Any]], dtype: torch.dtype, device: torch.d
 # --- Evidence ---------------------------------------------------------------------------------------------------------
 
 
-def count_labels(seen: Association, said: Labels, num_classes: int) -> ViewEvidence:
+def count_labels(seen: Association, predicted: Labels, num_classes: int) -> ViewEvidence:
     """Pixels of each class in each voxel."""
     n, K, voxels = len(seen.keys), num_classes, seen.voxel.reshape(-1)
     sums = voxels.new_zeros(K * n)
     flags = seen.keys.new_tensor([-1, 0, 0])
     for part in parts(len(voxels), chunk_of(sums.device)):
-        voxel, label = voxels[part], said.ids[part].to(torch.int64)
-        given = (label >= 0) & (label != said.ignore) & (voxel != NONE)
+        voxel, label = voxels[part], predicted.ids[part].to(torch.int64)
+        given = (label >= 0) & (label != predicted.ignore) & (voxel != NONE)
         wrong = (torch.where(given, label, -1).max(), (given & (voxel == LOST)).any(), flags[2])
         flags = torch.maximum(flags, torch.stack([flag.to(torch.int64) for flag in wrong]))
         cells = (label * n + voxel)[given & (voxel >= 0) & (label < K)]
@@ -158,18 +158,18 @@ def count_labels(seen: Association, said: Labels, num_classes: int) -> ViewEvide
     return ViewEvidence(sums, sums.sum(dim=0), 1.0, flags)
 
 
-def sum_scores(seen: Association, said: Scores, num_classes: int) -> ViewEvidence:
+def sum_scores(seen: Association, predicted: Scores, num_classes: int) -> ViewEvidence:
     """Sums of the normalised scores in each voxel."""
     n, K, voxels = len(seen.keys), num_classes, seen.voxel.reshape(-1)
-    scale = score_scale(len(voxels), double=said.values.dtype == torch.float64 or not said.softmax)
+    scale = score_scale(len(voxels), double=predicted.values.dtype == torch.float64 or not predicted.softmax)
     sums, pixels = seen.keys.new_zeros(K * n), seen.keys.new_zeros(n)
     flags = seen.keys.new_tensor([-1, 0, 0])
     classes = torch.arange(K, device=sums.device)[:, None]
     for part in parts(len(voxels), chunk_of(sums.device) // K):
-        voxel, values = voxels[part], said.values[:, part]
-        s, usable = shares(values, softmax=said.softmax)
+        voxel, values = voxels[part], predicted.values[:, part]
+        s, usable = shares(values, softmax=predicted.softmax)
         usable &= voxel != NONE
-        below = (values < 0) & torch.isfinite(values) & (not said.softmax)
+        below = (values < 0) & torch.isfinite(values) & (not predicted.softmax)
         wrong = (flags[0], (usable & (voxel == LOST)).any(), below.any())
         flags = torch.maximum(flags, torch.stack([flag.to(torch.int64) for flag in wrong]))
         usable &= voxel != LOST

@@ -51,8 +51,8 @@ def scale_eight(_typing: Any, scores: Any, _at: Any, _K: Any, keys: Any, scale: 
             builder.fcmp_ordered(">", total, ZEROS),
             builder.fcmp_ordered("<", total, ir.Constant(DOUBLES, [float("inf")] * LANES)),
         )
-        kept = builder.select(sound, builder.load(key, align=8), ir.Constant(INTS, [-1] * LANES))
-        builder.store(kept, key, align=8)
+        chosen = builder.select(sound, builder.load(key, align=8), ir.Constant(INTS, [-1] * LANES))
+        builder.store(chosen, key, align=8)
         builder.store(builder.fdiv(ir.Constant(DOUBLES, [1.0] * LANES), total), scales, align=8)
         return context.get_dummy_value()
 
@@ -157,8 +157,9 @@ def _by_eights(
         do([widened(eight(start, k)) for start in starts], k)
     with builder.if_then(builder.icmp_signed(">", rest, INT(0))):
         lanes = ir.Constant(INTS, list(range(LANES)))
-        kept, nothing = builder.icmp_signed("<", lanes, spread(builder, rest, INTS)), ir.Constant(vector, [0.0] * LANES)
-        do([widened(builder.select(kept, eight(start, whole), nothing)) for start in starts], whole)
+        inside = builder.icmp_signed("<", lanes, spread(builder, rest, INTS))
+        nothing = ir.Constant(vector, [0.0] * LANES)
+        do([widened(builder.select(inside, eight(start, whole), nothing)) for start in starts], whole)
 
 
 def spread(builder: Any, value: Any, vector: Any) -> Any:
