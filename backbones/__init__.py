@@ -5,7 +5,9 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol, cast
+from functools import partial
+from pathlib import Path
+from typing import Any, Protocol
 
 import numpy as np
 import numpy.typing as npt
@@ -17,6 +19,9 @@ from semstab.core.types import Float32, UInt8, UInt16
 from semstab.model.frames import Frame
 from semstab.model.labels import IGNORE_8BIT, LabelSpace
 
+SEGMENTER, SAM = "semstab.backbones.segmenter:Segmenter", "semstab.backbones.sam:"
+WITH_SEGFORMER, WITH_SAM = "pip install 'semstab[segformer]'", "pip install 'semstab[sam]'"
+
 REGISTRY = Registry(
     "backbone",
     {
@@ -25,29 +30,21 @@ REGISTRY = Registry(
             "k-means of colour and texture, one codebook a sequence: a baseline without weights",
         ),
         "transformers": Entry(
-            "semstab.backbones.segmenter:Segmenter",
+            SEGMENTER,
             "any transformers checkpoint that segments: SegFormer, UPerNet, Mask2Former, OneFormer, EoMT, CLIPSeg, ...",
-            install="pip install 'semstab[segformer]'",
+            install=WITH_SEGFORMER,
         ),
-        "segformer": Entry(
-            "semstab.backbones.segmenter:Segmenter",
-            "the same by its first name",
-            install="pip install 'semstab[segformer]'",
-        ),
-        "sam-raw": Entry(
-            "semstab.backbones.sam:SamRaw",
-            "Segment Anything's proposals as regions without classes",
-            install="pip install 'semstab[sam]'",
-        ),
+        "segformer": Entry(SEGMENTER, "the same by its first name", install=WITH_SEGFORMER),
+        "sam-raw": Entry(SAM + "SamRaw", "Segment Anything's proposals as regions without classes", install=WITH_SAM),
         "sam-heuristic": Entry(
-            "semstab.backbones.sam:SamHeuristic",
+            SAM + "SamHeuristic",
             "Segment Anything's proposals with classes from rules on colour, size and shape",
-            install="pip install 'semstab[sam]'",
+            install=WITH_SAM,
         ),
         "sam-vote": Entry(
-            "semstab.backbones.sam:SamVote",
+            SAM + "SamVote",
             "another backbone's labels, by majority inside Segment Anything's proposals",
-            install="pip install 'semstab[sam]'",
+            install=WITH_SAM,
         ),
         "segearth-ov": Entry(
             "semstab.backbones.segearth_ov:SegEarthOV",
@@ -75,7 +72,7 @@ class Prediction:
 
     labels  (H, W) uint8 or uint16: ids of its label space, 255 (65535) where it says nothing; of a backbone without
             classes, region ids from 1, `UNASSIGNED` where there is no region
-    scores  (H, W, K) float32 that sum to 1 over the classes, or None where they were not asked for
+    scores  (H, W, K) float32 that sum to 1 over the classes, or None where only labels are wanted
     """
 
     labels: Labels
@@ -104,7 +101,7 @@ class Backbone(Protocol):
                     sequence in order, all of them, from the first one after `reset`
     wants_geometry  whether `predict` is also given `geometry=`, one `Frame` an image: its depth, intrinsics and pose at
                     the image's own pixels, depth 0 where it is not known; labels are all 0, there is no colour
-    streams         whether `stream` keeps less in memory than `predict`: it is asked where scores are many
+    streams         whether `stream` keeps less in memory than `predict`: it is called where scores are many
     """
 
     label_space: LabelSpace | None = None
@@ -148,17 +145,25 @@ class Backbone(Protocol):
 def streamed(prediction: Prediction) -> Streamed:
     """A prediction whose scores, where it has any, are handed out class by class."""
     scores = prediction.scores
-    if scores is None:
-        return Streamed(prediction.labels, lambda: iter(()))
-    return Streamed(prediction.labels, lambda: (scores[..., k] for k in range(scores.shape[2])))
+    return Streamed(prediction.labels, lambda: iter(() if scores is None else np.moveaxis(scores, 2, 0)))
 
 
 def ask(
     backbone: Backbone, images: Sequence[Image], *, scores: bool = False, geometry: Sequence[Frame] = ()
 ) -> list[Prediction]:
-    """What a backbone says about images; it is told their geometry where it wants it."""
+    """Return the predictions of a backbone, which gets the geometry of the images where it wants it."""
     more = {"geometry": geometry} if backbone.wants_geometry else {}
     return backbone.predict(images, scores=scores, **more)
+
+
+def content_digest(path: Path) -> str:
+    """A hash of a file, or of the names and contents of all files in a folder."""
+    digest = hashlib.blake2b(digest_size=16)
+    for file in [path] if path.is_file() else sorted(each for each in path.rglob("*") if each.is_file()):
+        digest.update(b"" if file == path else str(file.relative_to(path)).encode() + b"\0")
+        with file.open("rb") as opened:
+            hashlib.file_digest(opened, lambda: digest)
+    return digest.hexdigest()
 
 
 def image_digest(image: Image) -> str:
@@ -173,23 +178,26 @@ def narrowed(ids: npt.NDArray[Any], classes: int) -> Labels:
     return ids.astype(np.uint8) if classes <= IGNORE_8BIT else ids.astype(np.uint16)
 
 
-def backbone_class(name: str) -> Any:
-    """What makes backbones of that name: a registered class, a user's (FILE.py:NAME, package.module:NAME), a network's
-    file (net.onnx).
+def maker(name: str) -> tuple[type[BaseModel], Callable[[Any], Backbone]]:
+    """The options of backbones of that name, and their constructor, which takes them.
 
-    It has `Options` and is called with them. Raises ConfigError, DataError, MissingDependencyError.
+    A name is that of a registered class, of a user's code (FILE.py:NAME, package.module:NAME), or of a network's file
+    (net.onnx). Raises ConfigError, DataError, MissingDependencyError.
     """
-    from semstab.backbones.custom import Own, is_code
-    from semstab.backbones.network import NetworkMaker, is_network
+    from semstab.backbones.custom import is_code, own_maker
+    from semstab.backbones.network import NetworkFile, NetworkOptions, is_network
 
     if is_network(name):
-        return NetworkMaker(name)
-    return Own(name) if is_code(name) else REGISTRY.load(name)
+        return NetworkOptions, partial(NetworkFile, Path(name).expanduser())
+    if is_code(name):
+        return own_maker(name)
+    registered = REGISTRY.load(name)
+    return registered.Options, registered
 
 
 def options_model(name: str) -> type[BaseModel]:
-    """The pydantic model of a backbone's options. Raises what `backbone_class` raises."""
-    return cast("type[BaseModel]", backbone_class(name).Options)
+    """The pydantic model of a backbone's options. Raises what `maker` raises."""
+    return maker(name)[0]
 
 
 def create(name: str, **options: Any) -> Backbone:
@@ -198,5 +206,5 @@ def create(name: str, **options: Any) -> Backbone:
     Raises ConfigError for an unknown name or option, DataError for a model that cannot be loaded,
     MissingDependencyError where its packages are not installed.
     """
-    made_by = backbone_class(name)
-    return cast(Backbone, made_by(validated(made_by.Options, options, f"backbone '{name}': ")))
+    model, make = maker(name)
+    return make(validated(model, options, f"backbone '{name}': "))

@@ -1,4 +1,4 @@
-"""The border: what a backbone says is checked here once, so that nobody inside has to doubt it."""
+"""Backbones around others; the predictions of each are checked here once."""
 
 from __future__ import annotations
 
@@ -52,12 +52,12 @@ class Wrapped(Backbone):
         return self.ask(images, scores, geometry)
 
     def ask(self, images: Sequence[Image], scores: bool, geometry: Sequence[Frame]) -> list[Prediction]:
-        """What the inner backbone says; it is told the geometry where it wants it."""
+        """Return the predictions of the inner backbone, which gets the geometry where it wants it."""
         inner = geometry if self.inner.wants_geometry else ()
         return ask(self.inner, images, scores=scores, geometry=inner)
 
     def identity(self) -> dict[str, Any]:
-        """That of the inner backbone."""
+        """Return the identity of the inner backbone."""
         return self.inner.identity()
 
 
@@ -71,7 +71,7 @@ SUM_TOLERANCE = 0.01
 
 
 class Checked(Wrapped):
-    """A backbone whose every answer is looked at: one line says what is wrong with it.
+    """A backbone whose predictions are checked: one line says what is wrong with them.
 
     Raises ConfigError for a class that is no backbone, DataError for predictions that are none of these images.
     """
@@ -100,17 +100,17 @@ class Checked(Wrapped):
         self, images: Sequence[Image], *, scores: bool = False, geometry: Sequence[Frame] = ()
     ) -> list[Prediction]:
         """See `Backbone`; scores that were not asked for are left out."""
-        found = self.ask(images, scores, geometry)
-        if not isinstance(found, Sequence) or len(found) != len(images):
-            what = f"{len(found)} predictions" if isinstance(found, Sequence) else _kind(found)
+        answer = self.ask(images, scores, geometry)
+        if not isinstance(answer, Sequence) or len(answer) != len(images):
+            what = f"{len(answer)} predictions" if isinstance(answer, Sequence) else _kind(answer)
             raise self._wrong(f"gave {what} for {len(images)} images; give a list with one each")
-        return [self._checked(prediction, image, scores) for prediction, image in zip(found, images, strict=True)]
+        return [self._checked(prediction, image, scores) for prediction, image in zip(answer, images, strict=True)]
 
     def stream(self, image: Image) -> Streamed:
         """See `Backbone`."""
-        found = self.inner.stream(image)
-        self._check_labels(found.labels, image.shape[:2])
-        return Streamed(found.labels, lambda: self._maps(found, image.shape[:2]))
+        answer = self.inner.stream(image)
+        self._check_labels(answer.labels, image.shape[:2])
+        return Streamed(answer.labels, lambda: self._maps(answer, image.shape[:2]))
 
     def identity(self) -> dict[str, Any]:
         """That of the backbone, which JSON must hold."""
@@ -134,10 +134,9 @@ class Checked(Wrapped):
         self._check_scores(prediction.scores, image.shape[:2])
         return prediction
 
-    def _maps(self, found: Streamed, shape: tuple[int, ...]) -> Iterator[Float32]:
-        """The maps, looked at as they come."""
+    def _maps(self, answer: Streamed, shape: tuple[int, ...]) -> Iterator[Float32]:
         K, count, total = len(self.label_space or ()), 0, np.zeros((*shape, 1), dtype=np.float32)
-        for scores in found.maps():
+        for scores in answer.maps():
             count += 1
             if scores.shape != shape or not (scores >= 0).all():
                 raise self._wrong(
@@ -181,8 +180,6 @@ def _add_up(scores: npt.NDArray[np.floating[Any]]) -> bool:
 
 
 def _kind(value: Any) -> str:
-    return (
-        "nothing"
-        if value is None
-        else f"a {type(value).__name__}" + (f" of {value.dtype}" if isinstance(value, np.ndarray) else "")
-    )
+    if value is None:
+        return "nothing"
+    return f"a {type(value).__name__}" + (f" of {value.dtype}" if isinstance(value, np.ndarray) else "")

@@ -1,4 +1,4 @@
-"""Pretrained models from a folder or from the hub: found, loaded whole, or one error that says what to do."""
+"""Pretrained models from a folder or from the hub: located, loaded whole, or one error that says what to do."""
 
 from __future__ import annotations
 
@@ -166,8 +166,9 @@ def _digest(folder: Path) -> str:
 def _cached(options: ModelOptions) -> Path | None:
     """The folder of the hub's cache, where an earlier download left the whole model there."""
     try:
-        found = huggingface_hub.snapshot_download(options.model, revision=options.revision, local_files_only=True)
-        folder = Path(str(found))
+        folder = Path(
+            str(huggingface_hub.snapshot_download(options.model, revision=options.revision, local_files_only=True))
+        )
         _require_model(folder)
     except (OSError, ValueError):  # DataError is a ValueError: a part of a model
         return None
@@ -246,8 +247,8 @@ def load_processor(checkpoint: Checkpoint, processing: Processing, **settings: A
     """
     if processing == "torchvision" and importlib.util.find_spec("torchvision") is None:
         raise ConfigError("processor: torchvision is not installed; leave it out, or pip install torchvision")
-    said = checkpoint.preprocessing()
-    kind = said.get("image_processor_type") or said.get("feature_extractor_type")
+    own = checkpoint.preprocessing()
+    kind = own.get("image_processor_type") or own.get("feature_extractor_type")
     if processing == "pil" and kind == "SegformerFeatureExtractor":
         processor = checkpoint.load(SegformerImageProcessorPil, **settings)
     else:
@@ -261,11 +262,6 @@ def load_processor(checkpoint: Checkpoint, processing: Processing, **settings: A
     if getattr(processor, "do_center_crop", None):
         processor.do_center_crop = False
     return processor
-
-
-def model_type(checkpoint: Checkpoint) -> str:
-    """What transformers calls the checkpoint's kind: 'segformer', 'mask2former', ..."""
-    return str(checkpoint.load(transformers.AutoConfig).model_type)
 
 
 # Settings of the backbone `transformers`.

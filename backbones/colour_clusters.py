@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -19,9 +18,6 @@ from semstab.errors import ConfigError
 from semstab.model.labels import IGNORE_8BIT, LabelSpace
 
 Features = Float32
-
-LIGHTNESS = 0
-"""The feature by which clusters are numbered."""
 
 
 class ColourClusterOptions(Settings):
@@ -72,7 +68,12 @@ class ColourClusters(Backbone):
     def fit(self, images: Sequence[Image]) -> ColourClusters:
         """With the codebook of these images. Raises ConfigError where they have fewer pixels than clusters."""
         rng = np.random.default_rng(self.options.seed)
-        drawn = [_drawn(pixel_features(image, self.options.scale), self.options.samples, rng) for image in images]
+        drawn = []
+        for image in images:
+            pixels = pixel_features(image, self.options.scale).reshape(-1, 4)
+            if len(pixels) > self.options.samples:
+                pixels = pixels[np.sort(rng.choice(len(pixels), self.options.samples, replace=False))]
+            drawn.append(pixels)
         return ColourClusters(self.options, _codebook(np.concatenate(drawn), self.options))
 
     def predict(self, images: Sequence[Image], *, scores: bool = False) -> list[Prediction]:
@@ -98,14 +99,6 @@ def pixel_features(image: Image, scale: float) -> Features:
     return np.dstack([mean, np.sqrt(np.maximum(variance, 0))]).astype(np.float32)
 
 
-def _drawn(features: Features, samples: int, rng: np.random.Generator) -> Features:
-    """(samples, D) pixels without repetition; all of them where there are fewer."""
-    pixels = features.reshape(-1, features.shape[2])
-    if len(pixels) <= samples:
-        return pixels
-    return pixels[np.sort(rng.choice(len(pixels), samples, replace=False))]
-
-
 def _codebook(pixels: Features, options: ColourClusterOptions) -> Codebook:
     if len(pixels) < options.clusters:
         raise ConfigError(f"colour-clusters: {len(pixels)} pixels cannot make {options.clusters} clusters; use fewer")
@@ -116,7 +109,7 @@ def _codebook(pixels: Features, options: ColourClusterOptions) -> Codebook:
     compactness, _, centres = cv2.kmeans(
         normalised, options.clusters, np.empty(0, np.int32), stop, 3, cv2.KMEANS_PP_CENTERS
     )
-    ordered = np.ascontiguousarray(centres[np.argsort(centres[:, LIGHTNESS], kind="stable")], dtype=np.float32)
+    ordered = np.ascontiguousarray(centres[np.argsort(centres[:, 0], kind="stable")], dtype=np.float32)
     return Codebook(mean, deviation, ordered, variance=max(compactness / pixels.size, 1e-6))
 
 
@@ -124,13 +117,8 @@ def _predict(features: Features, codebook: Codebook, scores: bool) -> Prediction
     normalised = (features - codebook.mean) / codebook.deviation
     # ||x - c||^2 less ||x||^2, which is the same for every centre
     distance = (codebook.centres**2).sum(axis=1) - 2 * (normalised @ codebook.centres.T)
-    prediction = Prediction(distance.argmin(axis=2).astype(np.uint8))
-    return dataclasses.replace(prediction, scores=_posterior(distance, codebook.variance)) if scores else prediction
-
-
-def _posterior(distance: Features, variance: float) -> Features:
-    """Softmax of -distance / (2 variance) over the clusters."""
-    exponent = (distance.min(axis=2, keepdims=True) - distance) / np.float32(2 * variance)
-    weight = np.exp(exponent)
-    posterior: Features = weight / weight.sum(axis=2, keepdims=True)
-    return posterior
+    labels = distance.argmin(axis=2).astype(np.uint8)
+    if not scores:
+        return Prediction(labels)
+    weight = np.exp((distance.min(axis=2, keepdims=True) - distance) / np.float32(2 * codebook.variance))
+    return Prediction(labels, weight / weight.sum(axis=2, keepdims=True))

@@ -21,7 +21,7 @@ import numpy as np
 import numpy.typing as npt
 from pydantic import BaseModel, ConfigDict, Field
 
-from semstab.backbones import Backbone, Image, Labels, Prediction, narrowed
+from semstab.backbones import Backbone, Image, Labels, Prediction, content_digest, narrowed
 from semstab.backbones.border import Wrapped
 from semstab.backbones.names import class_names
 from semstab.errors import ConfigError, DataError, MissingDependencyError, one_line
@@ -54,11 +54,14 @@ class Code:
     def load(cls, text: str) -> Code:
         """Import it. Raises ConfigError where it is not there, MissingDependencyError, DataError where it fails."""
         place, _, name = text.rpartition(":")
-        if not place or not name.isidentifier():
+        in_file = place.endswith(".py")
+        if not name.isidentifier() or not (in_file or MODULE.fullmatch(place)):
             raise ConfigError(
                 f"backbone '{text}': write FILE.py:NAME or package.module:NAME, NAME a class or a function"
             )
-        module = guarded(text, lambda: _of_file(Path(place)) if place.endswith(".py") else _of_package(place, text))
+        if not in_file:
+            _may_import_from(Path.cwd())
+        module = guarded(text, lambda: _of_file(Path(place)) if in_file else importlib.import_module(place))
         target = getattr(module, name, None)
         if target is None:
             own = [key for key, value in vars(module).items() if callable(value) and not key.startswith("_")]
@@ -73,7 +76,7 @@ class Code:
     def digest(self) -> str:
         """Of the file that it stands in."""
         file = self.module.__file__
-        return "" if file is None else hashlib.blake2b(Path(file).read_bytes(), digest_size=16).hexdigest()
+        return "" if file is None else content_digest(Path(file))
 
     def accepts(self, options: dict[str, Any], *more: Any) -> None:
         """Raises ConfigError where it cannot be called with `more` and these options."""
@@ -137,13 +140,6 @@ def _of_file(path: Path) -> ModuleType:
     return module
 
 
-def _of_package(place: str, text: str) -> ModuleType:
-    if not MODULE.fullmatch(place):
-        raise ConfigError(f"backbone '{text}': write FILE.py:NAME or package.module:NAME, NAME a class or a function")
-    _may_import_from(Path.cwd())
-    return importlib.import_module(place)
-
-
 def _may_import_from(folder: Path) -> None:
     """Last, so that nothing there takes the place of an installed package."""
     if str(folder) not in sys.path:
@@ -160,27 +156,25 @@ class OwnOptions(BaseModel):
     )
 
 
-class Own:
-    """Makes backbones of a user's class or function; has `Options` and is called with them, like a backbone's class."""
+def own_maker(text: str) -> tuple[type[BaseModel], Callable[[Any], Backbone]]:
+    """The options of a user's class or function, and what makes a backbone of it with them.
 
-    def __init__(self, text: str) -> None:
-        self.code = Code.load(text)
-        self._is_backbone = isinstance(self.code.target, type) and Backbone in self.code.target.__mro__
-        own = getattr(self.code.target, "Options", None) if self._is_backbone else None
-        self.has_options = isinstance(own, type) and issubclass(own, BaseModel)
-        self.Options: type[BaseModel] = own if self.has_options and own is not None else OwnOptions
+    Both raise ConfigError, DataError, MissingDependencyError, each in one line.
+    """
+    code = Code.load(text)
+    cls: Any = code.target
+    if not (isinstance(cls, type) and Backbone in cls.__mro__):
+        return OwnOptions, lambda options: OwnModel(code, dict(options.model_extra or {}), options.classes)
+    own = getattr(cls, "Options", None)
+    if isinstance(own, type) and issubclass(own, BaseModel):
+        return own, lambda options: OfCode(guarded(text, lambda: cls(options)), code, {})
 
-    def __call__(self, options: BaseModel) -> Backbone:
-        """The backbone. Raises ConfigError, DataError, MissingDependencyError, each in one line."""
-        code = self.code
-        if self.has_options:
-            return OfCode(guarded(code.text, lambda: code.target(options)), code, {})
-        assert isinstance(options, OwnOptions)
+    def make(options: BaseModel) -> Backbone:
         extra = dict(options.model_extra or {})
-        if self._is_backbone:
-            code.accepts(extra)
-            return OfCode(guarded(code.text, lambda: code.target(**extra)), code, extra)
-        return OwnModel(code, extra, options.classes)
+        code.accepts(extra)
+        return OfCode(guarded(text, lambda: cls(**extra)), code, extra)
+
+    return OwnOptions, make
 
 
 class OfCode(Wrapped):
@@ -233,7 +227,7 @@ class OwnModel(Backbone):
     ) -> list[Prediction]:
         """See `Backbone`. Raises DataError for an answer that is neither labels nor scores."""
         shown = zip(images, geometry, strict=True) if self.wants_geometry else zip(images, strict=True)
-        return [self._one(image, frame, scores) for image, *frame in shown]
+        return [self._predict(image, frame, scores) for image, *frame in shown]
 
     def identity(self) -> dict[str, Any]:
         """Its file, its options, its classes."""
@@ -241,27 +235,29 @@ class OwnModel(Backbone):
         about = {"code": self._code.digest, "name": self._code.name, "options": contents(self._options)}
         return {**about, "classes": list(self.label_space.classes)}
 
-    def _one(self, image: Image, frame: Sequence[Any], scores: bool) -> Prediction:
-        found = guarded(self._code.text, lambda: _array(self._call(image, *frame)))
+    def _predict(self, image: Image, frame: Sequence[Any], scores: bool) -> Prediction:
+        output = guarded(self._code.text, lambda: _array(self._call(image, *frame)))
         shape, K = image.shape[:2], len(self.label_space or ())
-        if found.shape == shape and found.dtype.kind in "iu":
+        if output.shape == shape and output.dtype.kind in "iu":
             if scores:
                 raise DataError(
                     f"{self._code.text}: gives labels, no scores; leave scores out, or let it give (H, W, K)"
                 )
-            return Prediction(_ids(found, K, self._code.text))
-        if found.shape == (*shape, K) and found.dtype.kind == "f":
-            soft = found.astype(np.float32, copy=False)
+            return Prediction(_ids(output, K, self._code.text))
+        if output.shape == (*shape, K) and output.dtype.kind == "f":
+            soft = output.astype(np.float32, copy=False)
             return Prediction(_ids(soft.argmax(axis=2), K, self._code.text), soft if scores else None)
         raise DataError(
-            f"{self._code.text}: gave {found.dtype} of shape {found.shape} for an image of {shape}; give labels"
+            f"{self._code.text}: gave {output.dtype} of shape {output.shape} for an image of {shape}; give labels"
             f" {shape} of whole numbers, or scores {(*shape, K)}"
         )
 
 
 def contents(options: Mapping[str, Any]) -> dict[str, Any]:
     """Options by what they say; a file or a folder by what is in it."""
-    return {key: _content(value) for key, value in options.items()}
+    return {
+        key: content_digest(Path(value).expanduser()) if is_path(value) else value for key, value in options.items()
+    }
 
 
 def is_path(value: Any) -> bool:
@@ -269,41 +265,29 @@ def is_path(value: Any) -> bool:
     return isinstance(value, str) and bool(Path(value).suffix or "/" in value) and Path(value).expanduser().exists()
 
 
-def _content(value: Any) -> Any:
-    if not is_path(value):
-        return value
-    path = Path(value).expanduser()
-    digest = hashlib.blake2b(digest_size=16)
-    for file in [path] if path.is_file() else sorted(each for each in path.rglob("*") if each.is_file()):
-        digest.update(b"" if file == path else str(file.relative_to(path)).encode() + b"\0")
-        with file.open("rb") as opened:
-            digest.update(hashlib.file_digest(opened, "blake2b").digest())
-    return digest.hexdigest()
-
-
-def _array(found: Any) -> npt.NDArray[Any]:
+def _array(output: Any) -> npt.NDArray[Any]:
     """An array of what a model gives; tensors come from where they are."""
-    return np.asarray(found.detach().cpu().numpy() if hasattr(found, "detach") else found)
+    return np.asarray(output.detach().cpu().numpy() if hasattr(output, "detach") else output)
 
 
-def _ids(found: npt.NDArray[Any], classes: int, who: str) -> Labels:
+def _ids(labels: npt.NDArray[Any], classes: int, who: str) -> Labels:
     """Labels as the narrowest type. Raises DataError for one that is no class and not ignored."""
     ignore = IGNORE_8BIT if classes <= IGNORE_8BIT else IGNORE_16BIT
-    wrong = (found >= classes) & (found != ignore)
+    wrong = (labels >= classes) & (labels != ignore)
     if wrong.any():
-        raise DataError(f"{who}: gave the label {found[wrong][0]}, but has {classes} classes, 0 to {classes - 1}")
-    return narrowed(np.where(found < 0, ignore, found), classes)
+        raise DataError(f"{who}: gave the label {labels[wrong][0]}, but has {classes} classes, 0 to {classes - 1}")
+    return narrowed(np.where(labels < 0, ignore, labels), classes)
 
 
 def _label_space(code: Code, made: Any, classes: Sequence[str] | str | None) -> LabelSpace:
-    found = class_names(classes) if classes is not None else None
+    names = class_names(classes) if classes is not None else None
     for owner in (made, code.module):
-        for name in ("label_space", "classes", "names", "CLASSES"):
-            found = getattr(owner, name, None) if found is None else found
-    if isinstance(found, LabelSpace):
-        return found
-    if isinstance(found, Mapping):  # from ids, as Ultralytics has it
-        found = [found[k] for k in sorted(found)]
-    if found is None or isinstance(found, str) or not all(isinstance(name, str) for name in found):
+        for attribute in ("label_space", "classes", "names", "CLASSES"):
+            names = getattr(owner, attribute, None) if names is None else names
+    if isinstance(names, LabelSpace):
+        return names
+    if isinstance(names, Mapping):  # from ids, as Ultralytics has it
+        names = [names[k] for k in sorted(names)]
+    if names is None or isinstance(names, str) or not all(isinstance(name, str) for name in names):
         raise ConfigError(f"{code.text}: its classes are not known; give it classes = [...], or say --classes a,b,c")
-    return LabelSpace(code.name, tuple(found))
+    return LabelSpace(code.name, tuple(names))

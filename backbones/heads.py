@@ -6,7 +6,7 @@ import contextlib
 import logging
 import warnings
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, ClassVar, Protocol
+from typing import Any, ClassVar
 
 import torch
 import transformers
@@ -20,8 +20,6 @@ from semstab.errors import ConfigError, DataError, MissingDependencyError, one_l
 
 logger = logging.getLogger("semstab")
 
-Logits = Callable[[torch.Tensor], torch.Tensor]
-
 MULTIPLE = 32
 """Images are brought to multiples of this, the stride of the deepest features."""
 
@@ -29,19 +27,8 @@ SQUARE = ("dpt", "tipsv2_dpt", "data2vec-vision")
 """Kinds whose code takes square images only."""
 
 
-class Head(Protocol):
-    """A loaded checkpoint.
-
-    names    its classes in the order of `maps`
-    softmax  whether scores are the softmax of the maps; else each map's share of their sum
-    """
-
-    names: Mapping[int, str]
-    softmax: bool
-
-    def maps(self, images: Sequence[Image]) -> list[torch.Tensor]:
-        """(K, h, w) of each image, of whatever size."""
-        ...
+# Each head is a loaded checkpoint. `names`: its classes in the order of its maps. `maps(images)`: (K, h, w) of each
+# image, of whatever size. `softmax`: whether scores are the softmax of the maps, else each map's share of their sum.
 
 
 class SemanticHead:
@@ -55,12 +42,17 @@ class SemanticHead:
         model = checkpoint.load_model(AutoModelForSemanticSegmentation, options)
         self.names: Mapping[int, str] = model.config.id2label
         self._size = _square(kind, model.config, self._processor, options) if kind in SQUARE else options.image_size
-        self.engine = _engine(model, options, checkpoint.revision)
+        self.engine: Callable[[torch.Tensor], torch.Tensor] = (
+            OnnxEngine(model, options, checkpoint.revision)
+            if options.engine == "onnx"
+            else lambda pixels: model(pixel_values=pixels.to(model.device, model.dtype)).logits
+        )
         self._kind = kind
 
     def maps(self, images: Sequence[Image]) -> list[torch.Tensor]:
         """The logits. Raises ConfigError where the model cannot see images of that size."""
-        height, width = self._seen(images[0].shape)
+        shorter = self._size or _shorter_side(self._processor)
+        height, width = shorter if isinstance(shorter, tuple) else working_size(images[0].shape[:2], shorter)
         pixels = self._processor(
             images=list(images),
             size={"height": height, "width": width},
@@ -76,12 +68,6 @@ class SemanticHead:
                 f"image_size: a '{self._kind}' model cannot see {height}x{width} ({one_line(error)}); give the size"
                 " that it was made for"
             ) from error
-
-    def _seen(self, image: tuple[int, ...]) -> tuple[int, int]:
-        """(height, width) at which the model sees an image of that size."""
-        if isinstance(self._size, tuple):
-            return self._size
-        return working_size(image[:2], self._size or _shorter_side(self._processor))
 
 
 class UniversalHead:
@@ -102,9 +88,23 @@ class UniversalHead:
         self._processor = load_processor(checkpoint, options.processor, **more)
         self._model = checkpoint.load_model(AutoModelForUniversalSegmentation, options)
         self.names: Mapping[int, str] = self._model.config.id2label
-        self._task = _task(checkpoint, self._model.config) if kind == "oneformer" else None
+        self._task = None
+        if kind == "oneformer":
+            task: Any = checkpoint.load(AutoTokenizer)(
+                "the task is semantic", padding="max_length", max_length=self._model.config.task_seq_len,
+                truncation=True, return_tensors="pt",
+            )  # fmt: skip
+            self._task = task["input_ids"] * task["attention_mask"]
         self._windows = kind.startswith("eomt")
-        self._size = _universal_size(options.image_size, kind)
+        self._size: dict[str, Any] = {}  # the checkpoint's own
+        if options.image_size is not None and self._windows:
+            raise ConfigError(
+                f"image_size: an '{kind}' model sees windows of the size that it was made for; leave it out"
+            )
+        if isinstance(options.image_size, int):
+            self._size = {"size": {"shortest_edge": options.image_size, "longest_edge": 4 * options.image_size}}
+        elif options.image_size is not None:
+            self._size = {"size": dict(zip(("height", "width"), options.image_size, strict=True))}
         size = self._processor.size
         self._masks = self.MASKS.get(kind)
         if self._windows:
@@ -112,24 +112,24 @@ class UniversalHead:
 
     def maps(self, images: Sequence[Image]) -> list[torch.Tensor]:
         """The sums."""
-        told = {"images": list(images), "input_data_format": "channels_last", "return_tensors": "pt", **self._size}
+        settings = {"images": list(images), "input_data_format": "channels_last", "return_tensors": "pt", **self._size}
         if self._task is not None:
-            told["task_inputs"] = ["semantic"] * len(images)
-        inputs = self._processor(**told)
-        seen = {"pixel_values": inputs["pixel_values"].to(self._model.device, self._model.dtype)}
+            settings["task_inputs"] = ["semantic"] * len(images)
+        inputs = self._processor(**settings)
+        given = {"pixel_values": inputs["pixel_values"].to(self._model.device, self._model.dtype)}
         if self._task is not None:
-            seen["task_inputs"] = self._task.expand(len(images), -1)
+            given["task_inputs"] = self._task.expand(len(images), -1)
         if "pixel_mask" in inputs:
-            seen["pixel_mask"] = inputs["pixel_mask"].to(self._model.device)
-        found = self._model(**seen)
+            given["pixel_mask"] = inputs["pixel_mask"].to(self._model.device)
+        output = self._model(**given)
         sums = [
             class_sums(classes, masks, self._masks)
-            for classes, masks in zip(found.class_queries_logits, found.masks_queries_logits, strict=True)
+            for classes, masks in zip(output.class_queries_logits, output.masks_queries_logits, strict=True)
         ]
         if self._windows and len(inputs["patch_offsets"]):
             return _merged(sums, inputs, images)
         if self._windows and self._processor.do_pad:  # transformers would stretch the padding over the image, too
-            height, width = self._processor(**told, do_pad=False)["pixel_values"].shape[-2:]
+            height, width = self._processor(**settings, do_pad=False)["pixel_values"].shape[-2:]
             return [each[:, :height, :width] for each in sums]
         return sums
 
@@ -151,7 +151,7 @@ class PromptedHead:
         self._model = checkpoint.load_model(CLIPSegForImageSegmentation, options)
         tokens = checkpoint.load(AutoTokenizer)(list(options.prompts), padding=True, return_tensors="pt")
         with torch.inference_mode():
-            self._asked = self._model.get_conditional_embeddings(
+            self._prompts = self._model.get_conditional_embeddings(
                 len(options.prompts), **{key: value.to(self._model.device) for key, value in tokens.items()}
             )
         side = options.image_size or self._processor.size["height"]
@@ -159,22 +159,18 @@ class PromptedHead:
 
     def maps(self, images: Sequence[Image]) -> list[torch.Tensor]:
         """The logits."""
-        told = {"images": list(images), "input_data_format": "channels_last", "return_tensors": "pt", **self._seen}
-        pixels = self._processor(**told)["pixel_values"].to(self._model.device, self._model.dtype)
-        return [self._maps(image) for image in pixels]
+        settings = {"images": list(images), "input_data_format": "channels_last", "return_tensors": "pt", **self._seen}
+        pixels = self._processor(**settings)["pixel_values"].to(self._model.device, self._model.dtype)
+        K, more = len(self._prompts), {"conditional_embeddings": self._prompts, "interpolate_pos_encoding": True}
+        logits = [self._model(pixel_values=image.expand(K, -1, -1, -1), **more).logits for image in pixels]
+        return [each.reshape(K, *each.shape[-2:]) for each in logits]
 
-    def _maps(self, pixels: torch.Tensor) -> torch.Tensor:
-        K = len(self._asked)
-        logits = self._model(
-            pixel_values=pixels.expand(K, -1, -1, -1),
-            conditional_embeddings=self._asked,
-            interpolate_pos_encoding=True,
-        ).logits
-        return torch.as_tensor(logits).reshape(K, *logits.shape[-2:])
+
+Head = SemanticHead | UniversalHead | PromptedHead
 
 
 def load_head(checkpoint: Checkpoint, options: SegmenterOptions, kind: str) -> Head:
-    """What loads a kind of checkpoint. Raises DataError, with the kinds that there are, for another one."""
+    """Load a kind of checkpoint. Raises DataError, with the kinds that there are, for another one."""
     if kind in SEMANTIC:
         return SemanticHead(checkpoint, options, kind)
     if options.engine != "torch":
@@ -208,13 +204,6 @@ def working_size(image: tuple[int, ...], shorter: int) -> tuple[int, int]:
     return height, width
 
 
-def _engine(model: Any, options: SegmenterOptions, revision: str) -> Logits:
-    """What turns pixels (N, 3, h, w) into logits (N, K, h', w')."""
-    if options.engine == "onnx":
-        return OnnxEngine(model, options, revision)
-    return lambda pixels: torch.as_tensor(model(pixel_values=pixels.to(model.device, model.dtype)).logits)
-
-
 def _square(kind: str, config: Any, processor: Any, options: SegmenterOptions) -> tuple[int, int]:
     """The side of the square that the model sees; an image is squeezed into it, which is said."""
     wanted, made_for = options.image_size, getattr(config, "image_size", None) or _shorter_side(processor)
@@ -231,26 +220,6 @@ def _shorter_side(processor: Any) -> int:
     """Of the images that the checkpoint was made for, pixels."""
     size = processor.size
     return int(size.get("shortest_edge") or min(size["height"], size["width"]))
-
-
-def _universal_size(wanted: int | tuple[int, int] | None, kind: str) -> dict[str, Any]:
-    """What the preprocessing is told of the size; nothing where the checkpoint's own is right."""
-    if wanted is None:
-        return {}
-    if kind.startswith("eomt"):
-        raise ConfigError(f"image_size: an '{kind}' model sees windows of the size that it was made for; leave it out")
-    if isinstance(wanted, int):
-        return {"size": {"shortest_edge": wanted, "longest_edge": 4 * wanted}}
-    return {"size": dict(zip(("height", "width"), wanted, strict=True))}
-
-
-def _task(checkpoint: Checkpoint, config: Any) -> torch.Tensor:
-    """(1, n) the tokens of OneFormer's task, 0 where there is none."""
-    told = checkpoint.load(AutoTokenizer)(
-        "the task is semantic", padding="max_length", max_length=config.task_seq_len, truncation=True,
-        return_tensors="pt",
-    )  # fmt: skip
-    return torch.as_tensor(told["input_ids"] * told["attention_mask"])
 
 
 def _merged(sums: Sequence[torch.Tensor], inputs: Any, images: Sequence[Image]) -> list[torch.Tensor]:
@@ -314,16 +283,16 @@ class OnnxEngine:
     def _session(self, example: torch.Tensor) -> Any:
         import onnxruntime
 
-        said = {"revision": self._revision, "shape": list(example.shape)}
         versions = {"torch": torch.__version__, "transformers": transformers.__version__}
-        file = cache_folder() / "onnx" / f"{content_key(said | versions)}.onnx"
-        told = {"sess_options": self._settings, "providers": ["CPUExecutionProvider"]}
+        key = content_key({"revision": self._revision, "shape": list(example.shape), **versions})
+        file = cache_folder() / "onnx" / f"{key}.onnx"
+        settings = {"sess_options": self._settings, "providers": ["CPUExecutionProvider"]}
         with contextlib.suppress(Exception):  # it is not there, or damaged
-            return onnxruntime.InferenceSession(file, **told)
+            return onnxruntime.InferenceSession(file, **settings)
         content = _export(self._model, example)
         with contextlib.suppress(OSError), atomic_path(file) as temporary:
             temporary.write_bytes(content)
-        return onnxruntime.InferenceSession(content, **told)
+        return onnxruntime.InferenceSession(content, **settings)
 
 
 class _Logits(torch.nn.Module):

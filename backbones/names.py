@@ -43,13 +43,14 @@ class Vocabulary:
 
     def matches(self, space: LabelSpace) -> bool:
         """Whether a model's classes come from this vocabulary."""
-        return {name_key(name) for name in self.recognised_by} <= {key for name in space.classes for key in _keys(name)}
+        own = {name_key(part) for name in space.classes for part in _names(name)}
+        return {name_key(name) for name in self.recognised_by} <= own
 
     def target_of(self, name: str, leniency: Leniency) -> str | None:
         """The class of UAVid that a name is, None where it is none."""
         tables = (self.strict, self.lenient) if leniency == "lenient" else (self.strict,)
-        found = {name_key(member): target for table in tables for target, names in table.items() for member in names}
-        return next((found[key] for key in _keys(name) if key in found), None)
+        targets = {name_key(each): target for table in tables for target, names in table.items() for each in names}
+        return next((targets[key] for key in map(name_key, _names(name)) if key in targets), None)
 
 
 @functools.cache
@@ -71,10 +72,10 @@ def class_mapping(source: LabelSpace, target: LabelSpace, leniency: Leniency = "
     known, rows, lost = target.row_of, [], []
     for name in source.classes:
         candidates = _candidates(name, vocabulary, leniency)
-        found = next((known[key] for key in map(name_key, candidates) if key in known), None)
-        if found is None:
+        row = next((known[key] for key in map(name_key, candidates) if key in known), None)
+        if row is None:
             lost.append(name)
-        rows.append(None if found == LEFT_OUT else found)
+        rows.append(None if row == LEFT_OUT else row)
     if lost and leniency == "strict":
         raise ConfigError(
             f"taxonomy {target.name}: no class takes '{', '.join(lost)}' of {source.name}; add the names to a class's"
@@ -90,12 +91,11 @@ def class_mapping(source: LabelSpace, target: LabelSpace, leniency: Leniency = "
 
 
 def _candidates(name: str, vocabulary: Vocabulary | None, leniency: Leniency) -> Sequence[str]:
-    """What a class may be called in the target, the best first."""
-    own = [name, *_parts(name)]
-    if vocabulary is None:
-        return own
-    said = vocabulary.target_of(name, leniency)
-    return [*own, vocabulary.rest] if said is None else [said, *own]
+    """Names of a class in the target, the best first."""
+    target = None if vocabulary is None else vocabulary.target_of(name, leniency)
+    if vocabulary is None or target is not None:
+        return [*([target] if target else []), *_names(name)]
+    return [*_names(name), vocabulary.rest]
 
 
 class InTaxonomy(Wrapped):
@@ -117,67 +117,62 @@ class InTaxonomy(Wrapped):
         self, images: Sequence[Image], *, scores: bool = False, geometry: Sequence[Frame] = ()
     ) -> list[Prediction]:
         """See `Backbone`."""
-        return [self._mapped(prediction) for prediction in self.ask(images, scores, geometry)]
+        predictions = []
+        for each in self.ask(images, scores, geometry):
+            labels, mapped = self._mapping.labels(each.labels, "prediction"), None
+            if each.scores is not None:
+                mapped = np.array(self._mapping.scores(each.scores, "prediction"), dtype=np.float32)
+                mapped[labels == ignore_id(labels)] = 0
+            predictions.append(Prediction(labels, mapped))
+        return predictions
 
     def stream(self, image: Image) -> Streamed:
         """See `Backbone`; the target's maps are in memory at once."""
-        found = self.inner.stream(image)
-        labels = self._mapping.labels(found.labels, "prediction")
-        return Streamed(labels, lambda: self._maps(found, labels != ignore_id(labels)))
+        streamed = self.inner.stream(image)
+        labels = self._mapping.labels(streamed.labels, "prediction")
+        return Streamed(labels, lambda: self._maps(streamed, labels != ignore_id(labels)))
 
     def identity(self) -> dict[str, Any]:
         """That of the inner backbone, and where each class goes."""
         rows = list(self._mapping.rows)
         return {**self.inner.identity(), "taxonomy": self._mapping.target.to_dict(), "rows": rows}
 
-    def _maps(self, found: Streamed, said: Mask) -> Iterator[Float32]:
+    def _maps(self, streamed: Streamed, labelled: Mask) -> Iterator[Float32]:
         """Those of classes that fall together added up, 0 where the label is ignored."""
-        totals = np.zeros((len(self._mapping.target), *said.shape), dtype=np.float32)
-        for row, scores in zip(self._mapping.rows, found.maps(), strict=True):
+        totals = np.zeros((len(self._mapping.target), *labelled.shape), dtype=np.float32)
+        for row, scores in zip(self._mapping.rows, streamed.maps(), strict=True):
             if row is not None:
                 totals[row] += scores
-        yield from (total * said for total in totals)
-
-    def _mapped(self, prediction: Prediction) -> Prediction:
-        labels = self._mapping.labels(prediction.labels, "prediction")
-        if prediction.scores is None:
-            return Prediction(labels)
-        scores = np.array(self._mapping.scores(prediction.scores, "prediction"), dtype=np.float32)
-        scores[labels == ignore_id(labels)] = 0
-        return Prediction(labels, scores)
+        yield from (total * labelled for total in totals)
 
 
-def _keys(name: str) -> list[str]:
-    return [name_key(name), *(name_key(part) for part in _parts(name))]
-
-
-def _parts(name: str) -> list[str]:
-    """The synonyms of a name like 'door;double door' or 'building, edifice'."""
+def _names(name: str) -> list[str]:
+    """The name, and the synonyms in one like 'door;double door' or 'building, edifice'."""
     parts = [part.strip() for part in re.split(r"[;,]", name)]
-    return parts if len(parts) > 1 else []
+    return [name, *parts] if len(parts) > 1 else [name]
 
 
 # Names of classes as a user says them.
 
 
-def class_names(said: Sequence[str] | str) -> Sequence[str] | LabelSpace:
+def class_names(classes: Sequence[str] | str) -> Sequence[str] | LabelSpace:
     """'a,b,c', a list, a text file with a name a line, or a taxonomy's YAML.
 
     Raises ConfigError where they are none, or cannot be read.
     """
-    if not isinstance(said, str):
-        return said
-    path = Path(said).expanduser()
+    if not isinstance(classes, str):
+        return classes
+    path = Path(classes).expanduser()
     if path.suffix in (".yaml", ".yml"):
         return LabelSpace.load(path)
     if path.suffix and path.is_file():
         try:
             text = read_limited(path, MAX_YAML_BYTES).decode("utf-8")
         except (OSError, ValueError) as error:
-            raise ConfigError(f"classes {said}: cannot be read ({one_line(error)})") from error
+            raise ConfigError(f"classes {classes}: cannot be read ({one_line(error)})") from error
         names = [line.strip() for line in text.splitlines()]
     else:
-        names = [name.strip() for name in said.split(",")]
-    if not (found := [name for name in names if name]):
-        raise ConfigError(f"classes {said}: holds no name")
-    return found
+        names = [name.strip() for name in classes.split(",")]
+    if not (names := [name for name in names if name]):
+        raise ConfigError(f"classes {classes}: holds no name")
+    return names

@@ -3,20 +3,19 @@
 from __future__ import annotations
 
 import contextlib
-import hashlib
 import logging
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, Literal, Protocol
+from typing import Any, Literal
 
 import cv2
 import numpy as np
 import numpy.typing as npt
 import PIL.Image
-from pydantic import BaseModel, Field, PositiveInt
+from pydantic import Field, PositiveInt
 
-from semstab.backbones import Backbone, Image, Prediction, narrowed
+from semstab.backbones import Backbone, Image, Prediction, content_digest, narrowed
 from semstab.backbones.names import class_names
 from semstab.config import Settings
 from semstab.core.types import Float32, Int64
@@ -30,23 +29,12 @@ Array = npt.NDArray[Any]
 ONNX_TYPES = {"tensor(float)": np.float32, "tensor(float16)": np.float16, "tensor(uint8)": np.uint8}
 
 
-class Network(Protocol):
-    """A network of one image.
+class OnnxFile:
+    """A network of one image, run by ONNX Runtime on the CPU.
 
     shape  that its input must have, None for each free side; empty where nothing is known
     dtype  of its input
     """
-
-    shape: tuple[int | None, ...]
-    dtype: npt.DTypeLike
-
-    def __call__(self, pixels: Array) -> list[Array]:
-        """Its outputs, in order."""
-        ...
-
-
-class OnnxFile:
-    """Run by ONNX Runtime on the CPU."""
 
     def __init__(self, path: Path, device: str, threads: int | None) -> None:
         try:
@@ -108,15 +96,14 @@ class TorchFile:
     def __call__(self, pixels: Array) -> list[Array]:
         """Its outputs, in order."""
         with self._torch.inference_mode():
-            found = self._module(self._torch.from_numpy(pixels).to(self._device))
-        outputs = list(found.values()) if isinstance(found, Mapping) else found
+            result = self._module(self._torch.from_numpy(pixels).to(self._device))
+        outputs = list(result.values()) if isinstance(result, Mapping) else result
         outputs = outputs if isinstance(outputs, list | tuple) else [outputs]
         return [output.detach().cpu().numpy() for output in outputs]
 
     def _script(self, path: Path) -> Any:
-        module = self._torch.jit.load(  # type: ignore[no-untyped-call]
-            path, map_location=self._device
-        ).eval()
+        jit: Any = self._torch.jit
+        module = jit.load(path, map_location=self._device).eval()
         _only(path, [each.name for each in module.forward.schema.arguments[1:] if not each.has_default_value()])
         return module
 
@@ -132,7 +119,7 @@ FORMATS: Mapping[str, type[OnnxFile | TorchFile]] = {".onnx": OnnxFile, ".pt": T
 """By suffix."""
 
 
-def load_network(path: Path, device: str, threads: int | None) -> Network:
+def load_network(path: Path, device: str, threads: int | None) -> OnnxFile | TorchFile:
     """The network of a file. Raises ConfigError, DataError or MissingDependencyError that names it."""
     if path.suffix not in FORMATS:
         raise ConfigError(f"{path}: no network is read from '{path.suffix}'; name a file of {', '.join(FORMATS)}")
@@ -162,9 +149,6 @@ def _quiet() -> Iterator[None]:
         notes.setLevel(level)
 
 
-Maps = Float32
-
-
 class NetworkOptions(Settings):
     """How an image is given to the network, and what it gives back."""
 
@@ -187,19 +171,6 @@ class NetworkOptions(Settings):
     threads: int | None = Field(None, ge=1, description="threads on a CPU")
 
 
-class NetworkMaker:
-    """Makes backbones of one file; has `Options` and is called with them, like a backbone's class."""
-
-    Options: type[BaseModel] = NetworkOptions
-
-    def __init__(self, name: str) -> None:
-        self.path = Path(name).expanduser()
-
-    def __call__(self, options: NetworkOptions) -> Backbone:
-        """The backbone."""
-        return NetworkFile(self.path, options)
-
-
 class NetworkFile(Backbone):
     """The class of the largest output, upsampled bilinearly to the image; images are resized by Pillow, bilinearly."""
 
@@ -217,7 +188,7 @@ class NetworkFile(Backbone):
             if len(getattr(options, what)) not in (1, 3) or (what == "std" and 0 in options.std):
                 raise ConfigError(f"{path}: {what}: give three numbers, or one; std above 0")
         self._size = self._seen_size()
-        self._digest = hashlib.blake2b(path.read_bytes(), digest_size=16).hexdigest()
+        self._digest = content_digest(path)
 
     def predict(self, images: Sequence[Image], *, scores: bool = False) -> list[Prediction]:
         """See `Backbone`. Raises DataError for an output that is none of these classes."""
@@ -230,9 +201,8 @@ class NetworkFile(Backbone):
         return {"file": self._digest, **settings, "classes": list(self.label_space.classes)}
 
     def _seen_size(self) -> tuple[int, int] | None:
-        """(height, width) that it sees; None where that is each image's own."""
-        said, shape = self._options.size, self._network.shape
-        wanted = (said, said) if isinstance(said, int) else said
+        wanted, shape = self._options.size, self._network.shape
+        wanted = (wanted, wanted) if isinstance(wanted, int) else wanted
         sides = shape[2:4] if self._options.layout == "nchw" else shape[1:3]
         if len(sides) != 2 or sides[0] is None or sides[1] is None:
             return wanted
@@ -261,7 +231,10 @@ class NetworkFile(Backbone):
         if not scores:
             return Prediction(narrowed(labels, K))
         full = np.dstack([upsampled(each, shape) for each in maps]).reshape(*shape, K)
-        return Prediction(narrowed(labels, K), _softmax(full) if gives == "logits" else _shares(full))
+        if gives == "logits":
+            full = np.exp(full - full.max(axis=2, keepdims=True))
+        total = full.sum(axis=2, keepdims=True)
+        return Prediction(narrowed(labels, K), np.divide(full, total, out=np.zeros_like(full), where=total > 0))
 
     def _pixels(self, image: Image) -> Array:
         """(1, 3, h, w) or (1, h, w, 3) as the network takes it."""
@@ -289,15 +262,15 @@ class NetworkFile(Backbone):
 
     def _map(self, output: Array, classes: tuple[int, ...]) -> Array:
         """The output of one image as (K, h, w), of labels as (h, w). Raises DataError where it is none."""
-        found = output[0] if output.ndim > 2 and output.shape[0] == 1 else output
-        if not classes and found.ndim == 3 and 1 in (found.shape[0], found.shape[-1]):
-            found = found[0] if found.shape[0] == 1 else found[..., 0]
-        if classes and found.ndim == 3 and self._options.layout == "nhwc":
-            found = found.transpose(2, 0, 1)
-        if found.ndim != 2 + len(classes) or found.shape[: len(classes)] != classes:
+        values = output[0] if output.ndim > 2 and output.shape[0] == 1 else output
+        if not classes and values.ndim == 3 and 1 in (values.shape[0], values.shape[-1]):
+            values = values[0] if values.shape[0] == 1 else values[..., 0]
+        if classes and values.ndim == 3 and self._options.layout == "nhwc":
+            values = values.transpose(2, 0, 1)
+        if values.ndim != 2 + len(classes) or values.shape[: len(classes)] != classes:
             what = f"{classes[0]} classes" if classes else "labels"
             raise DataError(f"{self._path}: its output of shape {output.shape} holds no {what}; mend classes or output")
-        return found
+        return values
 
 
 def is_network(name: str) -> bool:
@@ -305,12 +278,12 @@ def is_network(name: str) -> bool:
     return Path(name).suffix in FORMATS
 
 
-def upsampled(values: Maps, shape: tuple[int, int]) -> Maps:
+def upsampled(values: Float32, shape: tuple[int, int]) -> Float32:
     """A map (h, w) at (H, W), bilinear, pixel areas aligned."""
     return np.asarray(cv2.resize(np.ascontiguousarray(values), shape[::-1], interpolation=cv2.INTER_LINEAR), np.float32)
 
 
-def largest(maps: Maps, shape: tuple[int, int]) -> Int64:
+def largest(maps: Float32, shape: tuple[int, int]) -> Int64:
     """(H, W) which of the maps (K, h, w), upsampled, is the largest, the lowest on ties; one at a time."""
     best, label = upsampled(maps[0], shape), np.zeros(shape, dtype=np.int64)
     for k in range(1, len(maps)):
@@ -318,14 +291,3 @@ def largest(maps: Maps, shape: tuple[int, int]) -> Int64:
         label[value > best] = k
         np.maximum(value, best, out=best)
     return label
-
-
-def _softmax(values: Maps) -> Maps:
-    weight = np.exp(values - values.max(axis=2, keepdims=True))
-    return np.asarray(weight / weight.sum(axis=2, keepdims=True), np.float32)
-
-
-def _shares(values: Maps) -> Maps:
-    total = values.sum(axis=2, keepdims=True)
-    shares: Maps = np.divide(values, total, out=np.zeros_like(values), where=total > 0)
-    return shares

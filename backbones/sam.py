@@ -1,18 +1,18 @@
 """Backbones `sam-raw`, `sam-heuristic` and `sam-vote`: Segment Anything's proposals as regions, by rules, by votes.
 
-Segment Anything (Kirillov et al. 2023) rates masks at a grid of points; the stable ones are kept, each once. The point
-grid, the stability score and the suppression of duplicates follow section 5 and appendix B of the article, without
-the crops of its largest setting. The pipeline of transformers is not used: it needs torchvision, has all masks of a
-batch at the image's size in memory, and reads no SAM 2 without torchvision's preprocessing.
+Segment Anything (Kirillov et al. 2023) rates masks at a grid of points; the stable ones stay, each once (section 5 and
+appendix B, without crops). The pipeline of transformers needs torchvision, and all masks of a batch at full size.
 """
 
 from __future__ import annotations
 
 import importlib.resources
-from collections.abc import Callable, Iterator, Mapping, Sequence
+import itertools
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
-from typing import Any, Self
+from typing import Any, NamedTuple, Self
 
 import cv2
 import numpy as np
@@ -25,7 +25,7 @@ from semstab.backbones.border import Checked, Wrapped
 from semstab.backbones.checkpoint import Checkpoint, ImageModelOptions, bilinear, load_processor
 from semstab.config import Settings, read_yaml, validated
 from semstab.core.files import content_key, read_arrays, write_arrays
-from semstab.core.types import Float64, Int64, Mask, UInt8, UInt16
+from semstab.core.types import Float64, Mask, UInt8, UInt16
 from semstab.errors import ConfigError, DataError
 from semstab.model.frames import Frame
 from semstab.model.labels import LabelSpace, ignore_id
@@ -35,74 +35,46 @@ from semstab.model.labels import LabelSpace, ignore_id
 IMAGENET_MEAN, IMAGENET_STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
 
 
-@dataclass(frozen=True, eq=False)
-class EncodedImage:
+class EncodedImage(NamedTuple):
     """An image as the model has encoded it.
 
     embedding  arguments of the model
     extent     (height, width) of the image in the pixels in which points are given
-    full_size  brings mask logits (h, w) to the image's size
+    padded     (height, width) of these pixels with the padding, None without any
     """
 
     embedding: Mapping[str, Any]
     extent: tuple[int, int]
-    full_size: Callable[[torch.Tensor], torch.Tensor]
+    padded: tuple[int, int] | None
 
 
-class Sam:
-    """Segment Anything (Kirillov et al. 2023), and SAM-HQ (Ke et al. 2023), which takes the same arguments."""
-
-    def __init__(self, model: Any, checkpoint: Checkpoint, options: ImageModelOptions) -> None:
-        self._model = model
-        self._processor = load_processor(checkpoint, options.processor)
-
-    def encode(self, image: Image) -> EncodedImage:
-        """Encode an image: its longer side is resized to the model's, the rest is padding."""
-        inputs = self._processor(images=image, input_data_format="channels_last", return_tensors="pt")
-        height, width = (int(side) for side in inputs["reshaped_input_sizes"][0])
-        pixels = inputs["pixel_values"].to(self._model.device, self._model.dtype)
-        encoded = self._model.get_image_embeddings(pixels)
-        if isinstance(encoded, torch.Tensor):
-            embedding = {"image_embeddings": encoded}
-        else:
-            embedding = {"image_embeddings": encoded[0], "intermediate_embeddings": encoded[1]}
-
-        def full_size(logits: torch.Tensor) -> torch.Tensor:
-            square = bilinear(logits[None], tuple(pixels.shape[-2:]))
-            return bilinear(square[..., :height, :width], image.shape[:2])[0]
-
-        return EncodedImage(embedding, (height, width), full_size)
+def encode_sam(model: Any, processor: Any, image: Image) -> EncodedImage:
+    """Segment Anything, and SAM-HQ (Ke et al. 2023): the longer side is resized to the model's, the rest is padding."""
+    inputs = processor(images=image, input_data_format="channels_last", return_tensors="pt")
+    height, width = (int(side) for side in inputs["reshaped_input_sizes"][0])
+    pixels = inputs["pixel_values"].to(model.device, model.dtype)
+    encoded = model.get_image_embeddings(pixels)
+    more = () if isinstance(encoded, torch.Tensor) else encoded
+    names = ("image_embeddings", "intermediate_embeddings")
+    embedding = dict(zip(names, more or (encoded,), strict=False))
+    return EncodedImage(embedding, (height, width), (pixels.shape[-2], pixels.shape[-1]))
 
 
-class Sam2:
-    """Segment Anything 2 (Ravi et al. 2024) on single images, squeezed into the model's square.
-
-    The preprocessing of transformers needs torchvision; this does the same in torch.
-    """
-
-    def __init__(self, model: Any, checkpoint: Checkpoint, options: ImageModelOptions) -> None:
-        self._model = model
-        side = int(model.config.prompt_encoder_config.image_size)
-        settings = checkpoint.preprocessing()
-        self._size = (side, side)
-        try:
-            self._mean, self._std = (
-                torch.tensor(settings.get(key) or usual).reshape(3, 1, 1)
-                for key, usual in (("image_mean", IMAGENET_MEAN), ("image_std", IMAGENET_STD))
-            )
-        except (TypeError, ValueError, RuntimeError) as error:
-            raise DataError(f"{checkpoint.folder}: image_mean and image_std are three numbers each") from error
-
-    def encode(self, image: Image) -> EncodedImage:
-        """Encode an image."""
-        pixels = torch.from_numpy(image).permute(2, 0, 1)[None].float() / 255
-        small = torch.nn.functional.interpolate(pixels, size=self._size, mode="bilinear", antialias=True)
-        normalised = ((small - self._mean) / self._std).to(self._model.device, self._model.dtype)
-        embedding = {"image_embeddings": self._model.get_image_embeddings(normalised)}
-        return EncodedImage(embedding, self._size, lambda logits: bilinear(logits[None], image.shape[:2])[0])
+def encode_sam2(model: Any, settings: Mapping[str, Any], image: Image) -> EncodedImage:
+    """Segment Anything 2 (Ravi et al. 2024): the image is squeezed into a square; transformers needs torchvision."""
+    side = int(model.config.prompt_encoder_config.image_size)
+    try:
+        mean = torch.tensor(settings.get("image_mean") or IMAGENET_MEAN).reshape(3, 1, 1)
+        std = torch.tensor(settings.get("image_std") or IMAGENET_STD).reshape(3, 1, 1)
+    except (TypeError, ValueError, RuntimeError) as error:
+        raise DataError("preprocessor_config.json: image_mean and image_std are three numbers each") from error
+    pixels = torch.from_numpy(image).permute(2, 0, 1)[None].float() / 255
+    small = torch.nn.functional.interpolate(pixels, size=(side, side), mode="bilinear", antialias=True)
+    normalised = ((small - mean) / std).to(model.device, model.dtype)
+    return EncodedImage({"image_embeddings": model.get_image_embeddings(normalised)}, (side, side), None)
 
 
-KINDS: Mapping[str, type[Sam | Sam2]] = {"SamModel": Sam, "SamHQModel": Sam, "Sam2Model": Sam2}
+KINDS = ("SamModel", "SamHQModel", "Sam2Model")
 
 # Proposals: masks at a grid of points, those that the model rates well and that are stable, each once.
 
@@ -150,15 +122,9 @@ class Proposals:
         H, W = self.shape
         return np.unpackbits(self.packed[k], count=H * W).reshape(H, W).astype(np.bool_)
 
-    @property
-    def areas(self) -> Int64:
-        """(n,) pixels of each."""
-        areas: Int64 = np.bitwise_count(self.packed).sum(axis=1, dtype=np.int64)
-        return areas
-
     def by_area(self, min_area: int) -> Iterator[Mask]:
         """Yield the masks of at least that many pixels, the largest first; of equal ones the better rated first."""
-        areas = self.areas
+        areas = np.bitwise_count(self.packed).sum(axis=1, dtype=np.int64)
         for k in np.lexsort((-self.scores, -areas)):
             if areas[k] >= max(1, min_area):
                 yield self.mask(int(k))
@@ -180,7 +146,10 @@ class SamProposer:
                 f"{self.checkpoint.folder}: a '{self.model.config.model_type}' model; name one of sam, sam_hq, sam2 (or"
                 " sam2_video)"
             )
-        self._encoder = KINDS[kind](self.model, self.checkpoint, options)
+        if kind == "Sam2Model":
+            self._encode = partial(encode_sam2, self.model, self.checkpoint.preprocessing())
+        else:
+            self._encode = partial(encode_sam, self.model, load_processor(self.checkpoint, options.processor))
 
     def identity(self) -> dict[str, Any]:
         """Return the checkpoint's revision and the settings."""
@@ -194,45 +163,37 @@ class SamProposer:
         key = content_key({**settings, "version": CACHE_VERSION})
         file = self.options.cache / key / f"{image_digest(image)}.npz"
         if (cached := read_arrays(file)) is not None:
-            return Proposals((int(cached["shape"][0]), int(cached["shape"][1])), cached["packed"], cached["scores"])
+            H, W = cached["shape"].tolist()
+            return Proposals((H, W), cached["packed"], cached["scores"])
         proposals = self._propose(image)
-        write_arrays(file, {"shape": proposals.shape, "packed": proposals.packed, "scores": proposals.scores})
+        write_arrays(file, vars(proposals))
         return proposals
 
     @torch.inference_mode()
     def _propose(self, image: Image) -> Proposals:
-        """Ask the model at all points, and drop duplicates."""
-        encoded, options = self._encoder.encode(image), self.options
+        """Ask the model at all points; of masks that it rates well and that are stable, drop duplicates."""
+        encoded, options, (H, W) = self._encode(image), self.options, image.shape[:2]
         points = point_grid(options.points_per_side) * np.array(encoded.extent[::-1])
+        grid = torch.as_tensor(points, dtype=self.model.dtype, device=self.model.device)
         packed: list[UInt8] = []
         scores: list[float] = []
         boxes: list[Sequence[int]] = []
-        for start in range(0, len(points), options.points_per_batch):
-            for mask, score in self._masks_at(points[start : start + options.points_per_batch], encoded):
-                packed.append(np.packbits(mask))
-                scores.append(score)
-                boxes.append(cv2.boundingRect(mask.astype(np.uint8)))
-        best = np.array(cv2.dnn.NMSBoxes(boxes, scores, 0.0, options.nms_iou), dtype=np.int64)
-        (H, W), width = image.shape[:2], -(-image.shape[0] * image.shape[1] // 8)
-        return Proposals(
-            (H, W), np.array(packed, np.uint8).reshape(-1, width)[best], np.array(scores, np.float64)[best]
-        )
-
-    def _masks_at(self, points: Float64, encoded: EncodedImage) -> Iterator[tuple[Mask, float]]:
-        """Yield the masks (H, W) at points that the model rates well and that are stable, with their scores.
-
-        One at a time: all of them at the size of a large image would take gigabytes.
-        """
-        grid = torch.as_tensor(points, dtype=self.model.dtype, device=self.model.device)
-        output = self.model(**encoded.embedding, input_points=grid[None, :, None, :], multimask_output=True)
-        scores = output.iou_scores[0].flatten().float()
-        logits = output.pred_masks[0].flatten(0, 1)
-        for k in torch.nonzero(scores > self.options.pred_iou).flatten().tolist():
-            full = encoded.full_size(logits[k].float())
-            if stability_score(full, self.options.stability_offset) >= self.options.stability:
+        for batch in torch.split(grid, options.points_per_batch):
+            output = self.model(**encoded.embedding, input_points=batch[None, :, None, :], multimask_output=True)
+            ratings, logits = output.iou_scores[0].flatten().float(), output.pred_masks[0].flatten(0, 1)
+            for k in torch.nonzero(ratings > options.pred_iou).flatten().tolist():  # all at full size take gigabytes
+                low = logits[k : k + 1].float()
+                if encoded.padded is not None:
+                    low = bilinear(low, encoded.padded)[..., : encoded.extent[0], : encoded.extent[1]]
+                full = bilinear(low, (H, W))[0]
                 mask = (full > 0).cpu().numpy()
-                if mask.any():
-                    yield mask, float(scores[k])
+                if mask.any() and stability_score(full, options.stability_offset) >= options.stability:
+                    packed.append(np.packbits(mask))
+                    scores.append(float(ratings[k]))
+                    boxes.append(cv2.boundingRect(mask.astype(np.uint8)))
+        best = np.array(cv2.dnn.NMSBoxes(boxes, scores, 0.0, options.nms_iou), dtype=np.int64)
+        masks = np.array(packed, np.uint8).reshape(len(packed), -(-H * W // 8))
+        return Proposals((H, W), masks[best], np.array(scores, np.float64)[best])
 
 
 def point_grid(side: int) -> Float64:
@@ -268,22 +229,21 @@ class SamRaw(Backbone):
 
     def predict(self, images: Sequence[Image], *, scores: bool = False) -> list[Prediction]:
         """See `Backbone`; there are no scores."""
-        return [Prediction(self._labels(image)) for image in images]
+        min_area = self.proposer.options.min_area
+        return [Prediction(self._labels(image, self.proposer.propose(image).by_area(min_area))) for image in images]
 
     def identity(self) -> dict[str, Any]:
         """Return the checkpoint's revision and the settings."""
         return self.proposer.identity()
 
-    def _labels(self, image: Image) -> Labels:
-        return region_map(self.proposer.propose(image), self.proposer.options.min_area)
+    def _labels(self, image: Image, masks: Iterator[Mask]) -> Labels:
+        return region_map(masks, image.shape[:2])
 
 
-def region_map(proposals: Proposals, min_area: int) -> UInt16:
-    """Return (H, W) regions 1, 2, ...: masks painted by area, the largest first; UNASSIGNED where there is none."""
-    regions = np.full(proposals.shape, UNASSIGNED, dtype=np.uint16)
-    for k, mask in enumerate(proposals.by_area(min_area), start=1):
-        if k > MOST_REGIONS:
-            break
+def region_map(masks: Iterable[Mask], shape: tuple[int, ...]) -> UInt16:
+    """Return (H, W) regions 1, 2, ...: masks painted one over the other; UNASSIGNED where there is none."""
+    regions = np.full(shape, UNASSIGNED, dtype=np.uint16)
+    for k, mask in enumerate(itertools.islice(masks, MOST_REGIONS), start=1):
         regions[mask] = k
     return regions
 
@@ -355,9 +315,7 @@ class Rules(Settings):
 class SamHeuristicOptions(SamOptions):
     """The proposals and the rules."""
 
-    rules: Path | None = Field(
-        None, description="YAML file like configs/backbones/sam_heuristic.yaml, which is the default"
-    )
+    rules: Path | None = Field(None, description="YAML file like configs/backbones/sam_heuristic.yaml, the default")
 
 
 class SamHeuristic(SamRaw):
@@ -374,10 +332,10 @@ class SamHeuristic(SamRaw):
         """Return the checkpoint's revision, the settings and the rules."""
         return self.proposer.identity() | {"rules": self.rules.model_dump(mode="json")}
 
-    def _labels(self, image: Image) -> Labels:
+    def _labels(self, image: Image, masks: Iterator[Mask]) -> Labels:
         hsv = cv2.cvtColor(image, cv2.COLOR_RGB2HSV).astype(np.uint8, copy=False)
         labels = np.full(image.shape[:2], self.rules.names.index(self.rules.rest), dtype=np.uint8)
-        for mask in self.proposer.propose(image).by_area(self.proposer.options.min_area):
+        for mask in masks:
             labels[mask] = self.rules.class_of(mask_features(hsv, mask))
         return labels
 
@@ -440,7 +398,7 @@ class SamVote(Wrapped):
         """See `Backbone`; there are no scores."""
         min_area = self.proposer.options.min_area
         return [
-            Prediction(majority(vote.labels, self.proposer.propose(image), min_area))
+            Prediction(majority(vote.labels, self.proposer.propose(image).by_area(min_area)))
             for image, vote in zip(images, self.ask(images, False, geometry), strict=True)
         ]
 
@@ -449,10 +407,10 @@ class SamVote(Wrapped):
         return self.proposer.identity() | {"voter": self.options.voter, "voter_options": self.inner.identity()}
 
 
-def majority(labels: Labels, proposals: Proposals, min_area: int) -> Labels:
-    """Return the labels (H, W) with each mask in the label that most of its pixels had, the largest mask first."""
+def majority(labels: Labels, masks: Iterable[Mask]) -> Labels:
+    """Return the labels (H, W) with each mask, one over the other, in the label that most of its pixels had."""
     voted = labels.copy()
-    for mask in proposals.by_area(min_area):
+    for mask in masks:
         inside = labels[mask]
         votes = np.bincount(inside[inside != ignore_id(labels)])
         if votes.size:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import importlib.resources
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -15,7 +14,7 @@ from pydantic import BaseModel, Field, field_validator, model_validator
 from torch import nn
 from transformers import AutoTokenizer, CLIPModel
 
-from semstab.backbones import Backbone, Image, Prediction, narrowed
+from semstab.backbones import Backbone, Image, Prediction, content_digest, narrowed
 from semstab.backbones.checkpoint import Checkpoint, ModelOptions, bilinear
 from semstab.config import Settings, read_yaml, validated
 from semstab.core.types import Float32
@@ -52,16 +51,13 @@ def self_self_attention(attention: Any, tokens: torch.Tensor) -> torch.Tensor:
 
     attention  a transformers CLIPAttention
     """
-    q, k, v = (_heads(project(tokens), attention) for project in (attention.q_proj, attention.k_proj, attention.v_proj))
+    q, k, v = (
+        project(tokens).view(*tokens.shape[:2], attention.num_heads, attention.head_dim).transpose(1, 2)
+        for project in (attention.q_proj, attention.k_proj, attention.v_proj)
+    )
     like_q, like_k, like_v = (torch.softmax(x @ x.mT * attention.scale, dim=-1) for x in (q, k, v))
     mixed = (like_q + like_k + like_v) @ v
-    out: torch.Tensor = attention.out_proj(mixed.transpose(1, 2).flatten(2))
-    return out
-
-
-def _heads(x: torch.Tensor, attention: Any) -> torch.Tensor:
-    """(N, T, D) to (N, heads, T, D / heads)."""
-    return x.view(*x.shape[:2], attention.num_heads, attention.head_dim).transpose(1, 2)
+    return torch.as_tensor(attention.out_proj(mixed.transpose(1, 2).flatten(2)))
 
 
 # What an open-vocabulary model is asked: classes, their other names, and sentences around them.
@@ -107,7 +103,7 @@ class Prompts(Settings):
 
     @property
     def queries(self) -> list[tuple[int, str]]:
-        """Class id and name of everything that is asked for."""
+        """Class id and name of each query."""
         return [(k, part.strip()) for k, entry in enumerate(self.classes) for part in entry.split(",")]
 
     def label_space(self) -> LabelSpace:
@@ -123,8 +119,7 @@ def read_prompts(path: Path | None) -> Prompts:
 
 # SimFeatUp: features of patches upsampled 16 times, along the edges of the image (Li et al. 2025, CVPR).
 #
-# After FeatUp (Fu et al. 2024, ICLR). One learned joint bilateral upsampler is applied four times, each doubling the
-# resolution. The names of the parameters are those of the public checkpoints.
+# After FeatUp (Fu et al. 2024, ICLR); the names of the parameters are those of the public checkpoints.
 
 KEY_DIM = 32
 PREFIX = "upsampler."
@@ -162,16 +157,12 @@ class JointBilateralUpsampler(nn.Module):
         key = self.range_proj(guidance)
         likeness = torch.stack([(key * neighbour).sum(dim=1) for neighbour in self._neighbours(key)], dim=1)
         temperature = self.range_temp.exp().clamp(1e-4, 1e4)
-        kernel = (temperature * likeness).softmax(dim=1) * self._spatial_kernel()
-        kernel = kernel / kernel.sum(dim=1, keepdim=True).clamp(min=1e-7)
-        corrected: torch.Tensor = kernel + 0.1 * self.fixup_proj(torch.cat([kernel, guidance], dim=1))
-        return corrected
-
-    def _spatial_kernel(self) -> torch.Tensor:
-        """(1, taps, 1, 1) exp(-|delta|^2 / (2 sigma^2)), each axis of the window being -1 to 1."""
         axis = torch.linspace(-1, 1, self.diameter, dtype=self.sigma_spatial.dtype, device=self.sigma_spatial.device)
-        squared = axis[:, None] ** 2 + axis[None, :] ** 2
-        return torch.exp(-squared / (2 * self.sigma_spatial**2)).reshape(1, -1, 1, 1)
+        squared = axis[:, None] ** 2 + axis[None, :] ** 2  # each axis of the window is -1 to 1
+        spatial = torch.exp(-squared / (2 * self.sigma_spatial**2)).reshape(1, -1, 1, 1)
+        kernel = (temperature * likeness).softmax(dim=1) * spatial
+        kernel = kernel / kernel.sum(dim=1, keepdim=True).clamp(min=1e-7)
+        return torch.as_tensor(kernel + 0.1 * self.fixup_proj(torch.cat([kernel, guidance], dim=1)))
 
     def _neighbours(self, x: torch.Tensor) -> list[torch.Tensor]:
         """Of each tap the image (N, C, H, W), moved so that a pixel holds that neighbour; mirrored at the border."""
@@ -192,6 +183,8 @@ class SimFeatUp(nn.Module):
     @classmethod
     def load(cls, path: Path, channels: int, device: torch.device, dtype: torch.dtype) -> SimFeatUp:
         """From a checkpoint, ready to use. Raises DataError where the file is none, or has other shapes."""
+        if not path.is_file():
+            raise DataError(f"{path}: there is no SimFeatUp checkpoint; leave upsampler out for bilinear upsampling")
         try:
             content = torch.load(path, map_location="cpu", weights_only=True)
             weights = content.get("state_dict", content)
@@ -217,8 +210,7 @@ class SimFeatUp(nn.Module):
         for _ in range(DOUBLINGS):
             size = (2 * features.shape[-2], 2 * features.shape[-1])
             features = self.up(features, nn.functional.adaptive_avg_pool2d(image, size))
-        corrected: torch.Tensor = features + 0.1 * self.fixup_proj(features)
-        return corrected
+        return torch.as_tensor(features + 0.1 * self.fixup_proj(features))
 
 
 def _two_layers(inputs: int, hidden: int, outputs: int) -> nn.Sequential:
@@ -246,15 +238,14 @@ def slide(
     logits_of  one window (3, h, w) to its logits (Q, h, w); h and w are `window`, or less where the image is smaller
     """
     H, W = pixels.shape[1:]
-    total, count = None, torch.zeros(H, W, dtype=pixels.dtype, device=pixels.device)
+    total, count = pixels.new_zeros(()), pixels.new_zeros(H, W)
     for top in starts(H, window, stride):
         for left in starts(W, window, stride):
             place = (..., slice(top, top + window), slice(left, left + window))
             logits = logits_of(pixels[place])
-            total = logits.new_zeros(len(logits), H, W) if total is None else total
+            total = total if total.ndim else logits.new_zeros(len(logits), H, W)
             total[place] += logits
             count[place] += 1
-    assert total is not None
     return total / count
 
 
@@ -272,7 +263,7 @@ CLIP_STD = (0.26862954, 0.26130258, 0.27577711)
 
 
 class SegEarthOptions(ModelOptions):
-    """Which CLIP, what it is asked, and how the image is shown to it."""
+    """Which CLIP, its prompts, and how the image is shown to it."""
 
     model: str = Field("openai/clip-vit-base-patch16", description="a CLIP folder, or an id on the Hugging Face hub")
     prompts: Path | None = Field(None, description="YAML file like configs/backbones/segearth_uavid.yaml, the default")
@@ -307,7 +298,10 @@ class SegEarthOV(Backbone):
             raise ConfigError(f"segearth-ov: stride {self.stride} leaves gaps between windows of {self.window} pixels")
         self.queries = self._text_features(self.checkpoint.load(AutoTokenizer), self.prompts)
         self._class_of_query = torch.tensor([k for k, _ in self.prompts.queries], device=self._model.device)
-        self._upsampler = _load_upsampler(options.upsampler, self._model)
+        self._upsampler = None
+        if options.upsampler is not None:
+            channels, device = int(self._model.config.projection_dim), self._model.device
+            self._upsampler = SimFeatUp.load(options.upsampler, channels, device, self._model.dtype)
 
     @torch.inference_mode()
     def predict(self, images: Sequence[Image], *, scores: bool = False) -> list[Prediction]:
@@ -323,14 +317,16 @@ class SegEarthOV(Backbone):
             "window": self.window,
             "stride": self.stride,
             "prompts": self.prompts.model_dump(mode="json"),
-            "upsampler": "bilinear" if upsampler is None else _file_digest(upsampler),
+            "upsampler": "bilinear" if upsampler is None else content_digest(upsampler),
         }
 
     def _prediction(self, image: Image, scores: bool) -> Prediction:
         pixels = torch.as_tensor(normalised(image, self.options.resize)).to(self._model.device, self._model.dtype)
         logits = slide(pixels, self.window, self.stride, self.window_logits)
         full = bilinear(logits.float(), image.shape[:2])
-        probability = self._class_probability((self.options.sharpness * full).softmax(dim=0))
+        of_queries = (self.options.sharpness * full).softmax(dim=0)
+        classes = range(len(self.prompts.classes))  # of each class its likeliest name
+        probability = torch.stack([of_queries[self._class_of_query == k].amax(dim=0) for k in classes])
         best, label = probability.max(dim=0)
         if self.prompts.background is not None:
             background = self.prompts.names.index(self.prompts.background)
@@ -340,11 +336,6 @@ class SegEarthOV(Backbone):
             return Prediction(labels)
         share = (probability / probability.sum(dim=0)).permute(1, 2, 0).contiguous()
         return Prediction(labels, share.cpu().numpy())
-
-    def _class_probability(self, probability: torch.Tensor) -> torch.Tensor:
-        """(classes, H, W): of each class its likeliest name, from (queries, H, W)."""
-        rows = range(len(self.prompts.classes))
-        return torch.stack([probability[self._class_of_query == k].amax(dim=0) for k in rows])
 
     def window_logits(self, window: torch.Tensor) -> torch.Tensor:
         """(queries, h, w) cosines of a window (3, h, w)."""
@@ -363,8 +354,8 @@ class SegEarthOV(Backbone):
         for _, name in prompts.queries:
             sentences = [template.format(name) for template in prompts.templates]
             tokens = tokenizer(sentences, padding=True, truncation=True, return_tensors="pt").to(self._model.device)
-            found = self._model.get_text_features(**tokens)
-            each = nn.functional.normalize(getattr(found, "pooler_output", found), dim=-1)
+            output = self._model.get_text_features(**tokens)
+            each = nn.functional.normalize(getattr(output, "pooler_output", output), dim=-1)
             features.append(nn.functional.normalize(each.mean(dim=0), dim=-1))
         return torch.stack(features)
 
@@ -380,16 +371,3 @@ def normalised(image: Image, longer: int) -> Float32:
     mean, deviation = (np.array(values, dtype=np.float32) for values in (CLIP_MEAN, CLIP_STD))
     scaled = (small.astype(np.float32) / np.float32(255) - mean) / deviation
     return np.ascontiguousarray(scaled.transpose(2, 0, 1))
-
-
-def _load_upsampler(path: Path | None, model: Any) -> SimFeatUp | None:
-    if path is None:
-        return None
-    if not path.is_file():
-        raise DataError(f"{path}: there is no SimFeatUp checkpoint; leave upsampler out for bilinear upsampling")
-    return SimFeatUp.load(path, int(model.config.projection_dim), model.device, model.dtype)
-
-
-def _file_digest(path: Path) -> str:
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "blake2b").hexdigest()[:32]

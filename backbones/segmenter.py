@@ -7,10 +7,11 @@ from typing import Any
 
 import numpy as np
 import torch
+import transformers
 from pydantic import BaseModel
 
 from semstab.backbones import Backbone, Image, Prediction, Streamed, narrowed
-from semstab.backbones.checkpoint import Checkpoint, SegmenterOptions, bilinear, model_type
+from semstab.backbones.checkpoint import Checkpoint, SegmenterOptions, bilinear
 from semstab.backbones.heads import load_head
 from semstab.core.types import Float32
 from semstab.errors import ConfigError
@@ -33,7 +34,7 @@ class Segmenter(Backbone):
     def __init__(self, options: SegmenterOptions) -> None:
         self.options = options
         self.checkpoint = Checkpoint.find(options)
-        kind = model_type(self.checkpoint)
+        kind = str(self.checkpoint.load(transformers.AutoConfig).model_type)
         if kind != "clipseg" and (options.prompts or options.threshold):
             raise ConfigError(f"prompts and threshold are for 'clipseg' models, not for '{kind}'; leave them out")
         self.head = load_head(self.checkpoint, options, kind)
@@ -42,9 +43,16 @@ class Segmenter(Backbone):
     @torch.inference_mode()
     def predict(self, images: Sequence[Image], *, scores: bool = False) -> list[Prediction]:
         """See `Backbone`."""
-        found = [self._streamed(maps, images[0].shape[:2]) for maps in self.head.maps(images)]
-        K = len(self.head.names)
-        return [Prediction(each.labels, _gathered(each, K) if scores else None) for each in found]
+        predictions = []
+        for maps in self.head.maps(images):
+            each = self._streamed(maps, images[0].shape[:2])
+            all_scores = None
+            if scores:
+                all_scores = np.empty((*each.labels.shape, len(maps)), dtype=np.float32)
+                for k, values in enumerate(each.maps()):
+                    all_scores[..., k] = values
+            predictions.append(Prediction(each.labels, all_scores))
+        return predictions
 
     @torch.inference_mode()
     def stream(self, image: Image) -> Streamed:
@@ -81,17 +89,9 @@ def _shares(
     total = weight(0)
     for k in range(1, len(maps)):
         total = total + weight(k)
-    said = total > 0 if sure is None else sure & (total > 0)
+    labelled = total > 0 if sure is None else sure & (total > 0)
     for k in range(len(maps)):
-        yield torch.where(said, weight(k) / total, 0.0).cpu().numpy()
-
-
-def _gathered(found: Streamed, classes: int) -> Float32:
-    """All its scores, (H, W, K)."""
-    scores = np.empty((*found.labels.shape, classes), dtype=np.float32)
-    for k, values in enumerate(found.maps()):
-        scores[..., k] = values
-    return scores
+        yield torch.where(labelled, weight(k) / total, 0.0).cpu().numpy()
 
 
 def label_space(id2label: Mapping[int, str], name: str) -> LabelSpace:

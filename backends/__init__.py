@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import inspect
-from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, Protocol, cast, runtime_checkable
 
 import numpy as np
@@ -23,6 +23,8 @@ OPEN3D_LIBRARIES = "libusb-1.0-0 libegl1 libgl1 libx11-6 libudev1 libidn2-0 libg
 GIVEN = ("voxel_size", "num_classes", "within")
 """Settings of every map; the rest are options of its backend."""
 
+WITH_OPEN3D = f"pip install open3d, and on Debian or Ubuntu: apt-get install {OPEN3D_LIBRARIES}"
+
 REGISTRY = Registry(
     "backend",
     {
@@ -38,7 +40,7 @@ REGISTRY = Registry(
         "open3d": Entry(
             "semstab.backends.open3d_blocks:Open3DBlocks",
             "Open3D VoxelBlockGrid with semantic attributes on hashed voxel blocks; CPU or CUDA",
-            install=f"pip install open3d, and on Debian or Ubuntu: apt-get install {OPEN3D_LIBRARIES}",
+            install=WITH_OPEN3D,
         ),
         "torch": Entry(
             "semstab.backends.torch_map:TorchMap",
@@ -48,7 +50,7 @@ REGISTRY = Registry(
         "open3d-projective": Entry(
             "semstab.backends.open3d_projective:Open3DProjective",
             "voxels look up their pixel, as Open3D's integration does; to compare: differs from the others by design",
-            install=f"pip install open3d, and on Debian or Ubuntu: apt-get install {OPEN3D_LIBRARIES}",
+            install=WITH_OPEN3D,
         ),
     },
 )
@@ -154,22 +156,16 @@ def create(
     if unknown := sorted(set(options) - set(known)):
         listed = f"it takes {', '.join(known)}" if known else "it takes none"
         raise ConfigError(f"backend '{name}' has no option '{unknown[0]}'; {listed}")
-    if within is not None:
-        return _restricted(cls, name, voxel_size, num_classes, within, options)
-    return cast(FusionBackend, cls(voxel_size=voxel_size, num_classes=num_classes, **options))
-
-
-def _restricted(
-    cls: Any, name: str, voxel_size: float, num_classes: int, within: Extent, options: Mapping[str, Any]
-) -> FusionBackend:
-    from semstab.backends.shared.association import Restricted
-
+    make: Any = partial(cls, voxel_size=voxel_size, num_classes=num_classes, **options)
+    if within is None:
+        return cast(FusionBackend, make())
     if not restrictable(name):
         raise ConfigError(f"backend '{name}' does not associate pixel by pixel; it cannot be restricted to a part")
     if "within" in inspect.signature(cls).parameters:
-        return cast(FusionBackend, cls(voxel_size=voxel_size, num_classes=num_classes, within=within, **options))
-    whole = create(name, voxel_size=voxel_size, num_classes=num_classes, **options)
-    return Restricted(whole, voxel_size, within)
+        return cast(FusionBackend, make(within=within))
+    from semstab.backends.shared.association import Restricted
+
+    return Restricted(make(), voxel_size, within)
 
 
 def restrictable(name: str) -> bool:

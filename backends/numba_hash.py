@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import logging
 import time
-from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import numba as nb
@@ -19,21 +18,20 @@ import numpy.typing as npt
 
 from semstab.backends import Changes
 from semstab.backends.numba_loops import (
+    DENSE,
     SLOT,
     count_chain,
-    count_rows,
     look_up,
     place_observations,
     read_chain,
     record_types,
     rehash,
-    unchain,
     update,
     update_dense,
 )
 from semstab.backends.shared.aggregator import Aggregator
 from semstab.backends.shared.association import check_depth, check_frame, check_settings
-from semstab.backends.shared.keys import PARTITIONS, columns_of_keys, index_of_keys, partitions_of
+from semstab.backends.shared.keys import PARTITIONS, index_of_keys
 from semstab.backends.shared.observations import Change, MapTotal, Observed, ObservedScores
 from semstab.backends.shared.score_loops import LANES
 from semstab.core.compiled import is_kept, settings
@@ -43,21 +41,9 @@ from semstab.model.events import Events
 from semstab.model.evidence import Evidence
 from semstab.model.frames import Frame, Intrinsics
 from semstab.model.results import FrameReport
-from semstab.model.voxels import Extent, VoxelTable
+from semstab.model.voxels import Extent, VoxelTable, index_columns
 
 # The log of observations that the numba backend keeps on request.
-
-
-@dataclass(frozen=True, eq=False)
-class _Seen:
-    """A frame's observations in the log: rows of the map, pixels, and entries as in `Observed`, without empty ones."""
-
-    frame: int
-    row: Int32
-    pixels: Int32
-    entries: UInt16
-    label: UInt16
-    weight: Float64
 
 
 class History:
@@ -66,24 +52,25 @@ class History:
     def __init__(self, voxel_size: float, num_classes: int) -> None:
         self.voxel_size = voxel_size
         self.num_classes = num_classes
-        self._seen: list[_Seen] = []
+        self._seen: list[tuple[int, Int32, Int32, UInt16, UInt16, Float64]] = []
+        """Of each frame its index, rows of the map, pixels, and entries as in `Observed`, without empty ones."""
 
     def append(self, seen: Observed, row: Int64, frame: int) -> None:
         """Keep a copy of the observations of the map's rows that outlives the next frame."""
         some, n = seen.weight > 0, len(seen.key)
         entries = np.add.reduceat(some, seen.start[:-1], dtype=np.uint16) if n else np.zeros(0, np.uint16)
-        pixels = seen.pixels.astype(np.int32)
-        self._seen.append(_Seen(frame, row.astype(np.int32), pixels, entries, seen.label[some], seen.weight[some]))
+        rows, pixels = row.astype(np.int32), seen.pixels.astype(np.int32)
+        self._seen.append((frame, rows, pixels, entries, seen.label[some], seen.weight[some]))
 
     def events(self, order: Int32, index: dict[str, Any]) -> Events:
         """The observations in order of integration within a voxel; voxels are the map's rows in that order."""
         rank = np.empty(len(order), np.int64)
         rank[order] = np.arange(len(order))
         observations, entries = np.zeros(len(order) + 1, np.int64), np.zeros(len(order) + 1, np.int64)
-        for seen in self._seen:
-            voxel = rank[seen.row] + 1  # a voxel is in a frame once
+        for _, row, _, number, *_ in self._seen:
+            voxel = rank[row] + 1  # a voxel is in a frame once
             observations[voxel] += 1
-            entries[voxel] += seen.entries
+            entries[voxel] += number
         place, entry = np.cumsum(observations), np.cumsum(entries)  # where each voxel's next observation goes
         voxels = np.repeat(np.arange(len(order), dtype=np.int32), observations[1:])
         frame, pixels = (np.empty(len(voxels), np.int32) for _ in range(2))
@@ -91,18 +78,9 @@ class History:
         starts[-1] = entry[-1]
         label, weight = np.empty(entry[-1], np.uint16), np.empty(entry[-1])
         for seen in self._seen:
-            place_observations(
-                rank, seen.frame, seen.row, seen.pixels, seen.entries, seen.label, seen.weight,
-                place, entry, frame, pixels, starts, label, weight,
-            )  # fmt: skip
-        return Events(
-            **index,
-            voxel=voxels,
-            frame=frame,
-            evidence=Evidence(starts, label, weight, self.num_classes),
-            pixels=pixels,
-            voxel_size=self.voxel_size,
-        )
+            place_observations(rank, *seen, place, entry, frame, pixels, starts, label, weight)
+        evidence = Evidence(starts, label, weight, self.num_classes)
+        return Events(**index, voxel=voxels, frame=frame, evidence=evidence, pixels=pixels, voxel_size=self.voxel_size)
 
 
 FULL = 0.7
@@ -161,8 +139,8 @@ class NumbaHash:
 
     @staticmethod
     def expected_bytes(voxels: int, observations: int, num_classes: int, soft: bool = False) -> int:
-        """A record, its share of the nodes or a dense row of scores, and room to grow; a table has the hash's place."""
-        return (75 + (9 * num_classes if soft else 0)) * voxels
+        """A record, its share of the nodes or a dense row of scores, and room to grow; the hash."""
+        return (110 + (9 * num_classes if soft else 0)) * voxels
 
     def integrate(self, frame: Frame) -> FrameReport:
         """Fuse one frame: pixels to observations, then each partition of the map."""
@@ -217,24 +195,20 @@ class NumbaHash:
 
     def table(self) -> VoxelTable:
         """The map so far."""
-        self._slots = np.empty((PARTITIONS, 0), dtype=SLOT)  # made anew for a further frame: the table needs the memory
-        self._records.resize(max(len(self), 1), refcheck=False)
         order = self._order()
-        index = columns_of_keys(self._records["key"], order, self.origin)
+        index = index_of_keys(self._records["key"][order], self.origin)
         columns = ("op", "drift_sum", "pixels", "first_frame", "last_frame", "self_sum", "frame_entropy_sum")
         values: dict[str, Any] = {name: self._records[name][order] for name in columns}
-        starts = np.zeros(len(order) + 1, dtype=np.int64)
-        count_chain(self._records, self._nodes, self._dense, order, starts)
+        evidence = self._evidence_of(order)
+        return VoxelTable(**index_columns(index), **values, evidence=evidence, voxel_size=self.voxel_size)
+
+    def _evidence_of(self, rows: Int32) -> Evidence:
+        starts = np.zeros(len(rows) + 1, dtype=np.int64)
+        count_chain(self._records, self._nodes, self._dense, rows, starts)
         np.cumsum(starts, out=starts)
         label, weight = np.empty(starts[-1], dtype=np.uint16), np.empty(starts[-1])
-        read_chain(self._records, self._nodes, self._dense, order, starts, label, weight)
-        del order
-        return VoxelTable(
-            **index,
-            **values,
-            evidence=Evidence(starts, label, weight, self.num_classes),
-            voxel_size=self.voxel_size,
-        )
+        read_chain(self._records, self._nodes, self._dense, rows, starts, label, weight)
+        return Evidence(starts, label, weight, self.num_classes)
 
     def _order(self) -> Int32:
         """The voxels' rows in the order of the table; packed keys sort like (ix, iy, iz)."""
@@ -247,9 +221,7 @@ class NumbaHash:
 
     def evidence_of(self, rows: Int64) -> Float64:
         """Evidence (n, K) of the voxels of those rows."""
-        evidence = np.zeros((len(rows), self.num_classes))
-        unchain(self._records, self._nodes, self._dense, rows, evidence)
-        return evidence
+        return np.asarray(self._evidence_of(rows.astype(np.int32)))
 
     @property
     def origin(self) -> Int64:
@@ -265,34 +237,24 @@ class NumbaHash:
         if self._history is None:
             return None
         order = self._order()
-        return self._history.events(order, columns_of_keys(self._records["key"], order, self.origin))
+        index = index_of_keys(self._records["key"][order], self.origin)
+        return self._history.events(order, index_columns(index))
 
     def _make_slots(self, needed: int) -> None:
-        there = self._slots.shape[1]
-        size = there or 64
+        size = self._slots.shape[1]
         while needed > FULL * size:
             size *= 2
-        if size > there:
+        if size > self._slots.shape[1]:
             slots = np.empty((PARTITIONS, size), dtype=SLOT)
-            rehash(self._slots if there else self._listed(), slots)
+            rehash(self._slots, slots)
             self._slots = slots
-
-    def _listed(self) -> npt.NDArray[Any]:
-        """Keys and rows of all voxels by partition, as `rehash` takes them."""
-        keys = self._records["key"][: len(self)]
-        partition = partitions_of(keys)
-        row = np.argsort(partition, kind="stable")
-        partition, at = partition[row], np.arange(len(row)) - np.repeat(np.cumsum(self._used) - self._used, self._used)
-        slots = np.empty((PARTITIONS, int(self._used.max())), dtype=SLOT)
-        slots["row"] = -1
-        slots["key"][partition, at], slots["row"][partition, at] = keys[row], row
-        return slots
 
     def _make_dense(self, seen: ObservedScores, row: Int64, new: Int64) -> Int64:
         """Room for a dense row for each of the frame's voxels; where those of each partition begin."""
-        needed = new.copy()
+        needed = new
         if self._dense_used < len(self):  # else only the frame's new voxels have none
-            count_rows(row, seen.bounds, self._records, needed)
+            without = (row < 0) | (self._records["next"][np.maximum(row, 0)] > DENSE)
+            needed = np.diff(np.concatenate([[0], np.cumsum(without)])[seen.bounds])
         base = self._dense_used + np.concatenate([[0], np.cumsum(needed)])
         self._dense_used = int(base[-1])
         used, stride = self._dense_used, self._dense.shape[1]

@@ -239,21 +239,6 @@ def update(
 
 
 @parallel
-def unchain(records, nodes, dense, order, evidence):
-    """Evidence (n, K) of the records in that order."""
-    for i in nb.prange(order.shape[0]):
-        record = records[order[i]]
-        if record.next <= DENSE:
-            evidence[i] = dense[DENSE - record.next, : evidence.shape[1]]
-            continue
-        evidence[i, record.label] = record.value
-        at = np.int64(record.next)
-        while at >= 0:
-            evidence[i, nodes[at].label] = nodes[at].value
-            at = np.int64(nodes[at].next)
-
-
-@parallel
 def count_chain(records, nodes, dense, order, count):
     """How many classes the records in that order have evidence of: count[1:] of (n + 1,)."""
     for i in nb.prange(order.shape[0]):
@@ -312,17 +297,6 @@ def place_observations(
 
 
 # Compiled loops that add soft scores to the numba backend's map: to dense rows of evidence, one a voxel.
-
-
-@parallel
-def count_rows(row, bounds, records, needed):
-    """How many of the frame's voxels have no dense row yet, by partition."""
-    for p in nb.prange(PARTITIONS):
-        n = 0
-        for v in range(bounds[p], bounds[p + 1]):
-            touch(records, max(row[min(v + AHEAD, bounds[p + 1] - 1)], 0))
-            n += row[v] < 0 or records[max(row[v], 0)].next > DENSE
-        needed[p] = n
 
 
 @parallel

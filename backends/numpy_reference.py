@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 import time
 from collections import defaultdict
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -34,8 +34,7 @@ ODD = np.array([-0x61C8864680B583EB, -0x3D4D51C2D82B14B1, 0x165667B19E3779F9])
 """Of each axis, to mix an index's bits (odd numbers of Steele and Vigna's splitmix and of xxHash)."""
 
 
-@dataclass(frozen=True, eq=False)
-class _Seen:
+class _Seen(NamedTuple):
     """The evidence of a frame for voxels, by their rows (n,): mean evidence, of which most is 0, and pixels (n,)."""
 
     rows: Int32

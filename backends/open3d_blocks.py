@@ -54,13 +54,9 @@ class Open3DBlocks(FusionBackend):
     """
 
     def __init__(
-        self,
-        voxel_size: float,
-        num_classes: int,
-        device: str = "CPU:0",
-        block_resolution: int = 4,
+        self, voxel_size: float, num_classes: int, device: str = "CPU:0", block_resolution: int = 4,
         within: Extent | None = None,
-    ) -> None:
+    ) -> None:  # fmt: skip
         check_settings(voxel_size, num_classes)
         if not 1 <= block_resolution <= 64:
             raise ConfigError(f"block_resolution = {block_resolution}: use 1 to 64 (4 suits surfaces)")

@@ -21,7 +21,7 @@ from semstab.backends.shared.aggregator import Aggregator
 from semstab.backends.shared.association import check_depth, check_frame
 from semstab.backends.shared.keys import PARTITIONS
 from semstab.backends.shared.observations import Observed
-from semstab.core.types import Float64, Int64, UInt16
+from semstab.core.types import Int64
 from semstab.errors import ConfigError
 from semstab.model.frames import Frame
 from semstab.model.labels import IGNORE_8BIT
@@ -50,12 +50,7 @@ class Open3DProjective(Open3DBlocks):
     """Pixels are not associated one by one: no agreement with the other backends is to be expected."""
 
     def __init__(
-        self,
-        voxel_size: float,
-        num_classes: int,
-        device: str = "CPU:0",
-        block_resolution: int = 4,
-        band: float = 1.0,
+        self, voxel_size: float, num_classes: int, device: str = "CPU:0", block_resolution: int = 4, band: float = 1.0
     ) -> None:
         super().__init__(voxel_size, num_classes, device, block_resolution)
         if not (math.isfinite(band) and band > 0):
@@ -130,18 +125,15 @@ class Projector(Aggregator):
         return blocks[block] * self.block_resolution + self._local[local], pixel[near]
 
     def _observed(self, frame: Frame, pixel: Int64) -> Observed:
-        """The evidence of the pixels (n,), each for its voxel."""
+        """The evidence of the pixels (n,), each for its voxel: one label each, or K normalised scores."""
         n = len(pixel)
-        labels, weights = self._evidence(frame, pixel)
+        if frame.labels is not None:
+            labels, weights = frame.labels.reshape(-1)[pixel].astype(np.uint16), np.ones(n)
+        else:
+            scores: Any = frame.scores
+            s = scores.reshape(-1, self.num_classes)[pixel].astype(np.float64)
+            weights = (s / s.sum(axis=1, keepdims=True)).reshape(-1)
+            labels = np.tile(np.arange(self.num_classes, dtype=np.uint16), n)
         start = np.arange(n + 1, dtype=np.int64) * (len(labels) // max(n, 1))
         bounds = np.linspace(0, n, PARTITIONS + 1).astype(np.int64)
         return Observed(np.arange(n), np.ones(n, dtype=np.int64), start, labels, weights, bounds)
-
-    def _evidence(self, frame: Frame, pixel: Int64) -> tuple[UInt16, Float64]:
-        """Classes and evidence of the pixels, row after row: one label each, or K normalised scores."""
-        if frame.labels is not None:
-            return frame.labels.reshape(-1)[pixel].astype(np.uint16), np.ones(len(pixel))
-        scores: Any = frame.scores
-        s = scores.reshape(-1, self.num_classes)[pixel].astype(np.float64)
-        s /= s.sum(axis=1, keepdims=True)
-        return np.tile(np.arange(self.num_classes, dtype=np.uint16), len(pixel)), s.reshape(-1)

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import numpy.typing as npt
@@ -39,7 +39,7 @@ from semstab.backends.torch_storage import (
     Storage,
     TensorPrediction,
     evidence_of,
-    evidence_of_frame,
+    on_device,
 )
 from semstab.errors import ConfigError, DataError
 from semstab.model.evidence import Evidence
@@ -130,21 +130,19 @@ class TorchMaps:
         """
         started = time.perf_counter()
         view = DepthView.of(depth, intrinsics, T_wc, index, self.device)
-        said = {
+        predicted = {
             name: evidence_of(of_name, view, self._columns_of(name).num_classes, _where(view, of_name.kind, name))
             for name, of_name in predictions.items()
         }
-        return self.fuse(view, said, started)
+        return self.fuse(view, predicted, started)
 
-    def fuse(self, view: DepthView, said: Mapping[str, Labels | Scores], started: float) -> dict[str, FrameReport]:
-        """Fuse a view that is on the device, with what some backbones say of its pixels; timed from `started`."""
-        with torch.inference_mode(False), torch.no_grad():
-            return self._fuse(view, said, started)
-
-    def _fuse(self, view: DepthView, said: Mapping[str, Labels | Scores], started: float) -> dict[str, FrameReport]:
+    @torch.no_grad()
+    @torch.inference_mode(False)
+    def fuse(self, view: DepthView, predicted: Mapping[str, Labels | Scores], started: float) -> dict[str, FrameReport]:
+        """Fuse a view that is on the device, with predictions of some backbones; timed from `started`."""
         grid = self._grid or self._first_grid(view)
         seen = associate(view, grid)
-        evidence = {name: self._evidence(seen, image, name, view) for name, image in said.items()}
+        evidence = {name: self._evidence(seen, image, name, view) for name, image in predicted.items()}
         rows, voxels = self._look_up(seen, evidence, view, grid)
         associated = time.perf_counter()
         self.storage.make_room(voxels, f"frame {view.camera.index}")
@@ -156,7 +154,7 @@ class TorchMaps:
         sums = torch.stack(changes).tolist() if changes else []
         return {
             name: self._totals[name].add(view.camera.index, Change.of(of_name), started, associated)
-            for name, of_name in zip(said, sums, strict=True)
+            for name, of_name in zip(predicted, sums, strict=True)
         }
 
     def table(self, name: str) -> VoxelTable:
@@ -165,11 +163,11 @@ class TorchMaps:
         used = torch.nonzero(self.storage.hash.keys != EMPTY)[:, 0]
         keys, order = torch.sort(self.storage.hash.keys[used])  # packed keys sort like (ix, iy, iz)
         rows = self.storage.hash.rows[used[order]].to(torch.int64)
-        seen = columns.op[rows] > 0
+        seen = columns.values["op"][rows] > 0
         keys, rows = keys[seen].cpu(), rows[seen]
-        values: dict[str, Any] = {column: _at_home(getattr(columns, column), rows) for column in Columns.NAMES[1:]}
+        values: dict[str, Any] = {name: _at_home(columns.values[name], rows) for name in Columns.TYPES}
         values["evidence"] = Evidence.read(
-            len(rows), columns.num_classes, lambda some: _at_home(columns.evidence, rows[some])
+            len(rows), columns.num_classes, lambda some: _at_home(columns.values["evidence"], rows[some])
         )
         index = index_of_keys(keys.numpy(), self._grid.origin if self._grid else (0, 0, 0))
         return VoxelTable(**index_columns(index), **values, voxel_size=self.voxel_size)
@@ -179,14 +177,14 @@ class TorchMaps:
             raise ConfigError(f"there is no map of '{name}'; there is {', '.join(self.storage.columns)}")
         return self.storage.columns[name]
 
-    def _evidence(self, seen: Association, said: Labels | Scores, name: str, view: DepthView) -> ViewEvidence:
+    def _evidence(self, seen: Association, predicted: Labels | Scores, name: str, view: DepthView) -> ViewEvidence:
         K = self.storage.columns[name].num_classes
-        if isinstance(said, Labels):
-            return count_labels(seen, said, K)
-        if len(said.values) != K:
-            kind = "logits" if said.softmax else "scores"
-            raise DataError(f"{_where(view, kind, name)}: {kind} hold {len(said.values)} classes, the map {K}")
-        return sum_scores(seen, said, K)
+        if isinstance(predicted, Labels):
+            return count_labels(seen, predicted, K)
+        if len(predicted.values) != K:
+            kind = "logits" if predicted.softmax else "scores"
+            raise DataError(f"{_where(view, kind, name)}: {kind} hold {len(predicted.values)} classes, the map {K}")
+        return sum_scores(seen, predicted, K)
 
     def _look_up(
         self, seen: Association, evidence: Mapping[str, ViewEvidence], view: DepthView, grid: MapGrid
@@ -202,22 +200,16 @@ class TorchMaps:
         added, *flags = torch.cat([new.sum()[None], *wrong]).tolist()  # the one wait for the device before the update
         for n, name in enumerate(evidence):
             highest, lost, negative = flags[3 * n : 3 * n + 3]
-            self._check(name, highest, bool(lost), bool(negative), view, grid, seen)
+            K = self.storage.columns[name].num_classes
+            if highest >= K:
+                where = _where(view, "labels", name)
+                raise DataError(f"{where}: label id {highest} is outside 0 to {K - 1}; map it or ignore it")
+            if negative:
+                where = _where(view, "scores", name)
+                raise DataError(f"{where}: scores are negative; give logits as logits, or apply a softmax first")
+            if lost:
+                raise out_of_reach(view.frame(seen.voxel == LOST), grid.origin, grid.voxel_size)
         return torch.where(new, row_of_new, rows), self.storage.voxels + int(added)
-
-    def _check(
-        self, name: str, highest: int, lost: bool, negative: bool, view: DepthView, grid: MapGrid, seen: Association
-    ) -> None:
-        """Raise DataError where a label, score or point is none that the map can hold."""
-        K = self.storage.columns[name].num_classes
-        if highest >= K:
-            where = _where(view, "labels", name)
-            raise DataError(f"{where}: label id {highest} is outside 0 to {K - 1}; map it or ignore it")
-        if negative:
-            where = _where(view, "scores", name)
-            raise DataError(f"{where}: scores are negative; give logits as logits, or apply a softmax first")
-        if lost:
-            raise out_of_reach(view.frame(seen.voxel == LOST), grid.origin, grid.voxel_size)
 
     def _first_grid(self, view: DepthView) -> MapGrid:
         """Keys that count from the camera's voxel. Raises DataError where the camera is out of reach."""
@@ -290,8 +282,13 @@ class TorchMap(FusionBackend):
         """Fuse one frame, copied to the device."""
         started = time.perf_counter()
         check_depth(frame)
-        view, said = DepthView.of_frame(frame, self.device), evidence_of_frame(frame, self.device)
-        return self.maps.fuse(view, {"": said}, started)[""]
+        view = DepthView(on_device(frame.depth, self.device), frame)
+        if frame.labels is not None:
+            seen: Labels | Scores = Labels(on_device(frame.labels, self.device).reshape(-1), frame.ignore_id)
+        else:
+            scores = on_device(cast(Image, frame.scores), self.device)
+            seen = Scores(scores.reshape(-1, scores.shape[2]).T, softmax=False)
+        return self.maps.fuse(view, {"": seen}, started)[""]
 
     def integrate_tensors(
         self,
@@ -311,8 +308,8 @@ class TorchMap(FusionBackend):
 
         Raises DataError, with the map unchanged, where the frame cannot be fused.
         """
-        said = TensorPrediction(labels=labels, scores=scores, logits=logits)
-        return self.maps.integrate_tensors(depth, intrinsics, T_wc, {"": said}, index=index)[""]
+        predicted = TensorPrediction(labels=labels, scores=scores, logits=logits)
+        return self.maps.integrate_tensors(depth, intrinsics, T_wc, {"": predicted}, index=index)[""]
 
     def table(self) -> VoxelTable:
         """The map so far, brought to memory."""

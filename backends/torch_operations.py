@@ -80,9 +80,9 @@ def parts(total: int, size: int) -> Iterator[slice]:
 def associate(view: DepthView, grid: MapGrid) -> Association:
     """The voxels of a view, ascending by key, and the one of each pixel."""
     H, W = view.depth.shape
-    keys_of = _Keys(view, grid)
+    terms = (camera_terms if grid.dtype == torch.float64 else camera_terms_single)(view, grid)
     rows = parts(H, chunk_of(view.depth.device) // W)
-    runs = [torch.unique_consecutive(keys_of(part), return_counts=True) for part in rows]
+    runs = [torch.unique_consecutive(_keys(view, grid, terms, part), return_counts=True) for part in rows]
     key, length = (torch.cat(part) for part in zip(*runs, strict=True))
     keys, place = torch.unique(key, return_inverse=True)
     nowhere = int((keys < 0).sum())
@@ -91,40 +91,22 @@ def associate(view: DepthView, grid: MapGrid) -> Association:
     return Association(keys[nowhere:], pixels.reshape(H, W))
 
 
-class _Keys:
-    """Packed keys of the pixels of a view, NONE without depth, LOST out of reach."""
-
-    def __init__(self, view: DepthView, grid: MapGrid) -> None:
-        self.depth = view.depth
-        self.grid = grid
-        self.terms = (camera_terms if grid.dtype == torch.float64 else camera_terms_single)(view, grid)
-
-    def __call__(self, rows: slice) -> torch.Tensor:
-        """Of some rows of the image, (pixels,) int64."""
-        d = self.depth[rows]
-        ok = (d > 0) & (d < torch.inf)
-        d = torch.where(ok, d, 0)
-        q = self._double(d, rows) if self.grid.dtype == torch.float64 else self._single(d, rows)
-        near = ((q >= -HALF) & (q < HALF)).all(dim=0)
-        i, j, k = torch.where(near, q, 0).to(torch.int64) + HALF
-        key = torch.where(near, (i << 42) | (j << 21) | k, LOST)
-        return torch.where(ok, key, NONE).reshape(-1)
-
-    def _double(self, d: torch.Tensor, rows: slice) -> torch.Tensor:
-        """Voxel indices (3, H, W) that count from the origin, in the protocol's order of operations.
-
-        All operands are tensors: by a number, torch divides on a CUDA device as if it multiplied by the reciprocal.
-        """
-        ray_x, ray_y, T, r, origin = self.terms
-        d = d.to(torch.float64)
-        x = ray_x * d
-        y = ray_y[rows] * d
-        return torch.floor((((T[:, 0] * x + T[:, 1] * y) + T[:, 2] * d) + T[:, 3]) / r) - origin
-
-    def _single(self, d: torch.Tensor, rows: slice) -> torch.Tensor:
-        """The same in float32, counted from the camera's voxel: see `camera_terms_single`."""
-        a, b, start, origin = self.terms
-        return torch.floor(d * (a + b[:, rows]) + start) + origin
+def _keys(view: DepthView, grid: MapGrid, terms: list[torch.Tensor], rows: slice) -> torch.Tensor:
+    """Packed keys (pixels,) int64 of some rows of a view, NONE without depth, LOST out of reach."""
+    depth = view.depth[rows]
+    ok = (depth > 0) & (depth < torch.inf)
+    d = torch.where(ok, depth, 0).to(grid.dtype)
+    if grid.dtype == torch.float64:  # by a number, not a tensor, torch divides on a CUDA device as by the reciprocal
+        ray_x, ray_y, T, r, origin = terms
+        x, y = ray_x * d, ray_y[rows] * d
+        q = torch.floor((((T[:, 0] * x + T[:, 1] * y) + T[:, 2] * d) + T[:, 3]) / r) - origin
+    else:
+        a, b, start, origin = terms
+        q = torch.floor(d * (a + b[:, rows]) + start) + origin
+    near = ((q >= -HALF) & (q < HALF)).all(dim=0)
+    i, j, k = torch.where(near, q, 0).to(torch.int64) + HALF
+    key = torch.where(near, (i << 42) | (j << 21) | k, LOST)
+    return torch.where(ok, key, NONE).reshape(-1)
 
 
 def camera_terms(view: DepthView, grid: MapGrid) -> list[torch.Tensor]:
@@ -160,14 +142,14 @@ def _uploaded(terms: list[npt.NDArray[Any]], dtype: torch.dtype, device: torch.d
 # --- Evidence ---------------------------------------------------------------------------------------------------------
 
 
-def count_labels(seen: Association, said: Labels, num_classes: int) -> ViewEvidence:
+def count_labels(seen: Association, predicted: Labels, num_classes: int) -> ViewEvidence:
     """Pixels of each class in each voxel."""
     n, K, voxels = len(seen.keys), num_classes, seen.voxel.reshape(-1)
     sums = voxels.new_zeros(K * n)
     flags = seen.keys.new_tensor([-1, 0, 0])
     for part in parts(len(voxels), chunk_of(sums.device)):
-        voxel, label = voxels[part], said.ids[part].to(torch.int64)
-        given = (label >= 0) & (label != said.ignore) & (voxel != NONE)
+        voxel, label = voxels[part], predicted.ids[part].to(torch.int64)
+        given = (label >= 0) & (label != predicted.ignore) & (voxel != NONE)
         wrong = (torch.where(given, label, -1).max(), (given & (voxel == LOST)).any(), flags[2])
         flags = torch.maximum(flags, torch.stack([flag.to(torch.int64) for flag in wrong]))
         cells = (label * n + voxel)[given & (voxel >= 0) & (label < K)]
@@ -176,18 +158,18 @@ def count_labels(seen: Association, said: Labels, num_classes: int) -> ViewEvide
     return ViewEvidence(sums, sums.sum(dim=0), 1.0, flags)
 
 
-def sum_scores(seen: Association, said: Scores, num_classes: int) -> ViewEvidence:
+def sum_scores(seen: Association, predicted: Scores, num_classes: int) -> ViewEvidence:
     """Sums of the normalised scores in each voxel."""
     n, K, voxels = len(seen.keys), num_classes, seen.voxel.reshape(-1)
-    scale = score_scale(len(voxels), double=said.values.dtype == torch.float64 or not said.softmax)
+    scale = score_scale(len(voxels), double=predicted.values.dtype == torch.float64 or not predicted.softmax)
     sums, pixels = seen.keys.new_zeros(K * n), seen.keys.new_zeros(n)
     flags = seen.keys.new_tensor([-1, 0, 0])
     classes = torch.arange(K, device=sums.device)[:, None]
     for part in parts(len(voxels), chunk_of(sums.device) // K):
-        voxel, values = voxels[part], said.values[:, part]
-        s, usable = shares(values, softmax=said.softmax)
+        voxel, values = voxels[part], predicted.values[:, part]
+        s, usable = shares(values, softmax=predicted.softmax)
         usable &= voxel != NONE
-        below = (values < 0) & torch.isfinite(values) & (not said.softmax)
+        below = (values < 0) & torch.isfinite(values) & (not predicted.softmax)
         wrong = (flags[0], (usable & (voxel == LOST)).any(), below.any())
         flags = torch.maximum(flags, torch.stack([flag.to(torch.int64) for flag in wrong]))
         usable &= voxel != LOST
@@ -226,32 +208,29 @@ def update(columns: Columns, rows: torch.Tensor, evidence: ViewEvidence, frame: 
 def _observe(
     columns: Columns, rows: torch.Tensor, s_bar: torch.Tensor, pixels: torch.Tensor, frame: int
 ) -> torch.Tensor:
-    op = columns.op[rows]
+    held = columns.values
+    op = held["op"][rows]
     new = op == 0
-    before = columns.evidence[rows].to(torch.float64)
-    after = (before + s_bar).to(columns.evidence.dtype)
+    before = held["evidence"][rows].to(torch.float64)
+    after = (before + s_bar).to(held["evidence"].dtype)
     p = before / op.clamp(min=1)[:, None]
     q = after.to(torch.float64) / (op + 1)[:, None]
     entropy_p, entropy_q = _entropy_bits(p), _entropy_bits(q)
     divergence = _entropy_bits((p + q) / 2) - (entropy_p + entropy_q) / 2  # Jensen-Shannon, by entropies
     drift = torch.where(new, 0, divergence.clamp(0, 1))
-    columns.evidence[rows] = after
-    columns.op[rows] = op + 1
-    columns.pixels[rows] += pixels
-    columns.drift_sum[rows] += drift
-    columns.self_sum[rows] += (s_bar * s_bar).sum(dim=1)
-    columns.frame_entropy_sum[rows] += _entropy_bits(s_bar)
-    columns.first_frame[rows] = torch.where(new, frame, columns.first_frame[rows].clamp(max=frame))
-    columns.last_frame[rows] = torch.where(new, frame, columns.last_frame[rows].clamp(min=frame))
+    held["evidence"][rows] = after
+    held["op"][rows] = op + 1
+    held["pixels"][rows] += pixels
+    held["drift_sum"][rows] += drift
+    held["self_sum"][rows] += (s_bar * s_bar).sum(dim=1)
+    held["frame_entropy_sum"][rows] += _entropy_bits(s_bar)
+    held["first_frame"][rows] = torch.where(new, frame, held["first_frame"][rows].clamp(max=frame))
+    held["last_frame"][rows] = torch.where(new, frame, held["last_frame"][rows].clamp(min=frame))
+    vss, entropy = q.amax(dim=1) - p.amax(dim=1), entropy_q - entropy_p
     sums = (
-        pixels.sum(),
-        pixels.new_tensor(len(rows)),
-        new.sum(),
-        drift.sum(),
-        (q.amax(dim=1) - p.amax(dim=1)).sum(),
-        (entropy_q - entropy_p).sum(),
+        pixels.sum(), pixels.new_tensor(len(rows)), new.sum(), drift.sum(), vss.sum(), entropy.sum(),
         (op + 1 == RECURRENT).sum(),
-    )
+    )  # fmt: skip
     return torch.stack([value.to(torch.float64) for value in sums])
 
 

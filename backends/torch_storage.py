@@ -10,7 +10,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, Self
+from typing import Any, ClassVar
 
 import numpy as np
 import numpy.typing as npt
@@ -93,8 +93,8 @@ class VoxelHash:
 
 def mix(key: torch.Tensor) -> torch.Tensor:
     """The finaliser of splitmix64: every bit of the key moves every bit of the hash."""
-    key = (key ^ _shifted(key, 30)) * (0xBF58476D1CE4E5B9 - (1 << 64))
-    key = (key ^ _shifted(key, 27)) * (0x94D049BB133111EB - (1 << 64))
+    for bits, odd in ((30, 0xBF58476D1CE4E5B9), (27, 0x94D049BB133111EB)):
+        key = (key ^ _shifted(key, bits)) * (odd - (1 << 64))
     return key ^ _shifted(key, 31)
 
 
@@ -109,54 +109,42 @@ def slots_for(voxels: int) -> int:
 
 
 class Columns:
-    """One backbone's columns of a VoxelTable, (N,) or (N, K), with room for rows to come; all 0 where never seen."""
+    """One backbone's columns of a VoxelTable by name, (N,) or (N, K), with room for more rows; 0 where never seen."""
 
-    NAMES = ("evidence", "op", "drift_sum", "pixels", "first_frame", "last_frame", "self_sum", "frame_entropy_sum")
+    TYPES: ClassVar = {
+        "op": torch.int32, "drift_sum": torch.float64, "pixels": torch.int64, "first_frame": torch.int32,
+        "last_frame": torch.int32, "self_sum": torch.float64, "frame_entropy_sum": torch.float64,
+    }  # fmt: skip
 
     def __init__(self, num_classes: int, evidence: torch.dtype, device: torch.device) -> None:
-        def column(dtype: torch.dtype, *width: int) -> torch.Tensor:
-            return torch.zeros((0, *width), dtype=dtype, device=device)
-
         self.num_classes = num_classes
-        self.evidence = column(evidence, num_classes)
-        self.op = column(torch.int32)
-        self.drift_sum = column(torch.float64)
-        self.pixels = column(torch.int64)
-        self.first_frame = column(torch.int32)
-        self.last_frame = column(torch.int32)
-        self.self_sum = column(torch.float64)
-        self.frame_entropy_sum = column(torch.float64)
+        self.values = {"evidence": torch.zeros((0, num_classes), dtype=evidence, device=device)}
+        self.values |= {name: torch.zeros(0, dtype=dtype, device=device) for name, dtype in self.TYPES.items()}
 
     @property
     def capacity(self) -> int:
         """Rows that there is room for in every column."""
-        return min(len(getattr(self, name)) for name in self.NAMES)
+        return min(map(len, self.values.values()))
 
     @property
     def row_bytes(self) -> int:
         """Memory of a row."""
-        columns = [getattr(self, name) for name in self.NAMES]
-        return sum(column.element_size() * math.prod(column.shape[1:]) for column in columns)
+        return sum(column.element_size() * math.prod(column.shape[1:]) for column in self.values.values())
 
     def grow(self, capacity: int) -> None:
         """Make room for that many rows. One column is copied at a time, and its old copy freed before the next."""
-        for name in self.NAMES:
-            old = getattr(self, name)
+        for name in self.values:
+            old = self.values[name]
             if len(old) < capacity:
-                new = torch.zeros((capacity, *old.shape[1:]), dtype=old.dtype, device=old.device)
-                new[: len(old)] = old
-                setattr(self, name, new)
+                self.values[name] = old.new_zeros((capacity, *old.shape[1:]))
+                self.values[name][: len(old)] = old
 
 
 class Storage:
     """The hash, and the columns of each backbone, which share its rows; both grow within a bound on their memory."""
 
     def __init__(
-        self,
-        num_classes: Mapping[str, int],
-        evidence: torch.dtype,
-        device: torch.device,
-        memory_gb: float | None,
+        self, num_classes: Mapping[str, int], evidence: torch.dtype, device: torch.device, memory_gb: float | None
     ) -> None:
         self.voxels = 0
         self.hash = VoxelHash(slots_for(0), device)
@@ -208,7 +196,7 @@ class Storage:
         """The most memory taken while it grows: what it is then, and the column or hash that is copied."""
         columns = self.columns.values()
         then = SLOT_BYTES * slots_for(voxels) + voxels * sum(c.row_bytes for c in columns)
-        copied = max(self.hash.bytes, *(c.evidence.element_size() * c.evidence.numel() for c in columns))
+        copied = max(self.hash.bytes, *(c.values["evidence"].nbytes for c in columns))
         return then + copied
 
     def _grow(self, voxels: int) -> None:
@@ -249,22 +237,23 @@ class TensorPrediction:
 
     def __post_init__(self) -> None:
         if len(self._given) != 1:
-            raise DataError(f"a prediction takes labels, scores or logits, one of them; got {self._given or 'none'}")
+            raise DataError(
+                f"a prediction takes labels, scores or logits, one of them; got {list(self._given) or 'none'}"
+            )
 
     @property
     def kind(self) -> str:
         """'labels', 'scores' or 'logits'."""
-        return self._given[0]
+        return next(iter(self._given))
 
     @property
     def image(self) -> Image:
         """The one that is given."""
-        image: Image = getattr(self, self.kind)
-        return image
+        return self._given[self.kind]
 
     @property
-    def _given(self) -> list[str]:
-        return [name for name in ("labels", "scores", "logits") if getattr(self, name) is not None]
+    def _given(self) -> dict[str, Image]:
+        return {name: image for name, image in vars(self).items() if image is not None}
 
 
 @dataclass(frozen=True, eq=False)
@@ -296,11 +285,6 @@ class DepthView:
                 f"{camera.where('depth')}: depth is {_type(image)}; convert it to metres (float32) with its depth scale"
             )
         return cls(image.to(torch.float32).contiguous(), camera)
-
-    @classmethod
-    def of_frame(cls, frame: Frame, device: torch.device) -> Self:
-        """The view of a frame, which is valid already."""
-        return cls(on_device(frame.depth, device), frame)
 
     @cached_property
     def rays(self) -> tuple[Float64, Float64]:
@@ -351,15 +335,6 @@ def evidence_of(prediction: TensorPrediction, view: DepthView, num_classes: int,
     if kind == "labels":
         return Labels(image.reshape(-1), _ignored_id(image.dtype, num_classes))
     return Scores(image.reshape(len(image), -1), softmax=kind == "logits")
-
-
-def evidence_of_frame(frame: Frame, device: torch.device) -> Labels | Scores:
-    """The labels or scores of a frame, as a prediction for its pixels."""
-    if frame.labels is not None:
-        return Labels(on_device(frame.labels, device).reshape(-1), frame.ignore_id)
-    assert frame.scores is not None
-    scores = on_device(frame.scores, device)
-    return Scores(scores.reshape(-1, scores.shape[2]).T, softmax=False)
 
 
 def on_device(image: Image, device: torch.device) -> torch.Tensor:

@@ -31,7 +31,7 @@ import numpy.typing as npt  # noqa: E402
 
 import semstab  # noqa: E402
 from semstab import backends  # noqa: E402
-from semstab.backends.shared.pixel_keys import frame_terms, keys_of_row  # noqa: E402
+from semstab.backends.shared.pixel_keys import exact_keys_of_row  # noqa: E402
 from semstab.backends.shared.score_loops import LANES, scale_eight  # noqa: E402
 from semstab.core.compiled import parallel  # noqa: E402
 from semstab.core.files import write_json  # noqa: E402
@@ -48,12 +48,12 @@ def read(scores, scales):
 
 
 @parallel
-def find_keys(depth, labels, ray_x, ray_y, T, size, origin, rays, margin, keys):
+def find_keys(depth, labels, ray_x, ray_y, T, size, origin, keys):
     """The voxel of each pixel."""
     for v in nb.prange(depth.shape[0]):
-        keys_of_row(
-            depth[v], labels, ray_x, ray_y[v], T, size, float(origin[0]), float(origin[1]), float(origin[2]), 1, rays,
-            margin, keys[nb.get_thread_id()],
+        exact_keys_of_row(
+            depth[v], labels, ray_x, ray_y[v], T, size, float(origin[0]), float(origin[1]), float(origin[2]), 1,
+            keys[nb.get_thread_id()],
         )  # fmt: skip
 
 
@@ -88,7 +88,6 @@ def steps(frame: semstab.Frame, K: int) -> dict[str, Callable[[], object]]:
     flat = flat.view(np.uint16) if flat.dtype == np.float16 else flat
     ray_x = (np.arange(W) - frame.intrinsics.cx) / frame.intrinsics.fx
     ray_y = (np.arange(H) - frame.intrinsics.cy) / frame.intrinsics.fy
-    rays, margin = frame_terms(ray_x, frame.T_wc, VOXEL)
     depth, T = np.array(frame.depth), np.array(frame.T_wc)
     origin = np.floor(T[:3, 3] / VOXEL).astype(np.int64)
     keys, labels, scales = np.empty((64, W), dtype=np.int64), np.zeros(W, dtype=np.uint8), np.empty((64, LANES))
@@ -98,7 +97,7 @@ def steps(frame: semstab.Frame, K: int) -> dict[str, Callable[[], object]]:
     evidence = np.zeros((report.voxels, K))
     return {
         "read": lambda: read(flat, scales),
-        "keys": lambda: find_keys(depth, labels, ray_x, ray_y, T, VOXEL, origin, rays, margin, keys),
+        "keys": lambda: find_keys(depth, labels, ray_x, ray_y, T, VOXEL, origin, keys),
         "rows": lambda: touch_rows(evidence, order),
         "frame": lambda: map_.integrate(frame),
     }

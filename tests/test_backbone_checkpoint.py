@@ -42,12 +42,6 @@ def test_a_folder_that_is_not_there(tmp_path):
     )
 
 
-def test_a_file_in_the_place_of_a_folder(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "model").write_text("")
-    fails(DataError, "^model: there is no such folder", model="model")
-
-
 def test_a_folder_without_a_model(tmp_path):
     fails(DataError, "holds no config.json, so no model", model=str(tmp_path))
 

@@ -24,13 +24,6 @@ def test_a_label_and_scores_a_pixel(fitted):
         np.testing.assert_array_equal(prediction.scores.argmax(axis=2), prediction.labels)
 
 
-def test_the_same_again_and_in_batches(fitted):
-    again = create("colour-clusters", clusters=6, samples=500).fit(IMAGES)
-    assert again.identity() == fitted.identity()
-    for image, prediction in zip(IMAGES, fitted.predict(IMAGES), strict=True):
-        np.testing.assert_array_equal(again.predict([image])[0].labels, prediction.labels)
-
-
 def test_flat_colours_become_clusters_by_lightness():
     colours = np.array([[250, 250, 250], [10, 10, 10], [30, 120, 60]], dtype=np.uint8)  # light, dark, green
     image = np.repeat(np.repeat(colours[[0, 1, 2]][None], 40, axis=0), 40, axis=1)
@@ -39,10 +32,6 @@ def test_flat_colours_become_clusters_by_lightness():
     assert [labels[20, x] for x in (20, 60, 100)] == [2, 0, 1]
     assert (labels[:, 5:35] == 2).all()
     assert (labels[:, 85:115] == 1).all()
-
-
-def test_clusters_are_numbered_by_lightness(fitted):
-    assert (np.diff(fitted.codebook.centres[:, 0]) >= 0).all()
 
 
 def test_ids_stay_when_the_camera_moves(fitted):
@@ -88,9 +77,3 @@ def test_it_must_be_fitted():
 def test_more_clusters_than_pixels_are_refused():
     with pytest.raises(ConfigError, match="4 pixels cannot make 8 clusters"):
         create("colour-clusters").fit([IMAGES[0][:2, :2]])
-
-
-@pytest.mark.parametrize("option", [{"clusters": 1}, {"clusters": 255}, {"scale": 0}, {"seed": -1}, {"fit_frames": 0}])
-def test_options_that_cannot_be_used(option):
-    with pytest.raises(ConfigError, match=rf"^backbone 'colour-clusters': {next(iter(option))}: "):
-        create("colour-clusters", **option)

@@ -17,11 +17,9 @@ from semstab.backbones.segearth_ov import (
     CLIP_MEAN,
     CLIP_STD,
     JointBilateralUpsampler,
-    Prompts,
     SimFeatUp,
     dense_features,
     normalised,
-    padded,
     read_prompts,
     self_self_attention,
     slide,
@@ -88,12 +86,6 @@ def test_features_are_clips_own_up_to_the_last_block(clip):
     assert patches.shape == (2, 12, 4, 4)
     torch.testing.assert_close(whole, expected[:, 0], atol=1e-4, rtol=1e-4)
     torch.testing.assert_close(patches[1, :, 2, 3], expected[1, 1 + 2 * 4 + 3], atol=1e-4, rtol=1e-4)
-
-
-@torch.inference_mode()
-def test_windows_of_another_size_get_interpolated_positions(clip):
-    whole, patches = dense_features(clip, random(1, 3, 24, 40))
-    assert (whole.shape, patches.shape) == ((1, 12), (1, 12, 3, 5))
 
 
 # --- SimFeatUp --------------------------------------------------------------------------------------------------------
@@ -232,15 +224,6 @@ def test_overlapping_windows_are_averaged(height, width, window, data):
     np.testing.assert_allclose(found[0], total / count, rtol=1e-6)
 
 
-@pytest.mark.parametrize("shape", [(16, 16), (17, 16), (20, 9), (1, 1)])
-def test_padding_to_multiples(shape):
-    image = random(1, 3, *shape)
-    larger, place = padded(image, 8)
-    assert all(side % 8 == 0 and 0 <= side - own < 8 for side, own in zip(larger.shape[2:], shape, strict=True))
-    torch.testing.assert_close(larger[:, :, *place], image)
-    assert (larger != 0).sum() == (image != 0).sum()
-
-
 def test_the_image_is_shown_in_clips_colours():
     pixels = normalised(np.full((30, 60, 3), 255, dtype=np.uint8), 20)
     assert (pixels.shape, pixels.dtype) == ((3, 10, 20), np.float32)
@@ -255,12 +238,6 @@ def test_the_shipped_prompts_are_those_for_uavid():
     prompts = read_prompts(None)
     assert prompts.names == ["background", "building", "road", "car", "tree", "vegetation", "human"]
     assert (prompts.background, prompts.prob_threshold, len(set(prompts.templates))) == ("background", 0.3, 80)
-
-
-def test_synonyms_stand_after_commas():
-    prompts = Prompts(classes=["car, lorry,van", "tree"])
-    assert prompts.names == ["car", "tree"]
-    assert prompts.queries == [(0, "car"), (0, "lorry"), (0, "van"), (1, "tree")]
 
 
 @pytest.mark.parametrize(
@@ -304,13 +281,6 @@ def test_a_label_and_scores_a_pixel(backbone):
         np.testing.assert_allclose(prediction.scores.sum(axis=2), 1, atol=1e-5)
         decided = prediction.labels != 0
         np.testing.assert_array_equal(prediction.scores.argmax(axis=2)[decided], prediction.labels[decided])
-
-
-def test_the_same_again_and_in_batches(options, backbone):
-    together = backbone.predict(IMAGES)
-    again = create("segearth-ov", **options)
-    for image, prediction in zip(IMAGES, together, strict=True):
-        np.testing.assert_array_equal(again.predict([image])[0].labels, prediction.labels)
 
 
 @torch.inference_mode()

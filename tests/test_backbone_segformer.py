@@ -13,7 +13,6 @@ from torch.nn.functional import interpolate
 
 from semstab.backbones import create, segmenter
 from semstab.backbones.checkpoint import bilinear
-from semstab.backbones.heads import working_size
 from semstab.backbones.segmenter import label_space, largest_upsampled
 from semstab.errors import ConfigError, DataError
 
@@ -62,12 +61,6 @@ def test_it_is_what_the_checkpoint_says(folder, backbone):
     np.testing.assert_allclose(prediction.scores, logits[0].softmax(dim=0).permute(1, 2, 0), atol=1e-6)
 
 
-def test_the_same_again(folder, backbone):
-    again = create("segformer", model=str(folder), image_size=64)
-    for a, b in zip(backbone.predict(IMAGES), again.predict(IMAGES), strict=True):
-        np.testing.assert_array_equal(a.labels, b.labels)
-
-
 def test_batches_do_not_matter(backbone):
     together = backbone.predict(IMAGES, scores=True)
     for image, prediction in zip(IMAGES, together, strict=True):
@@ -76,26 +69,9 @@ def test_batches_do_not_matter(backbone):
         assert (alone.labels != prediction.labels).mean() < 1e-3
 
 
-def test_classes_are_those_of_the_checkpoint_without_white_space():
-    assert create("segformer", model=str(tiny("segformer"))).label_space.classes == ("building", "road", "tree", "car")
-
-
 def test_classes_go_by_number_and_repeated_names_get_it():
     assert label_space({2: "c", 0: "a", 1: "b"}, "m").classes == ("a", "b", "c")
     assert label_space({0: "a", 1: "A ", 2: "b"}, "m").classes == ("a 0", "A 1", "b")
-
-
-@pytest.mark.parametrize(
-    ("image", "shorter", "size"),
-    [
-        ((360, 540), 512, (512, 768)),
-        ((540, 360), 512, (768, 512)),
-        ((2160, 3840), 512, (512, 896)),
-        ((9, 900), 8, (32, 800)),
-    ],
-)
-def test_the_image_keeps_its_shape(image, shorter, size):
-    assert working_size(image, shorter) == size
 
 
 @pytest.mark.parametrize(("image_size", "seen"), [(None, (64, 96)), (32, (32, 64)), ((32, 128), (32, 128))])

@@ -210,16 +210,6 @@ def test_numba_keeps_the_same_history(soft):
     np.testing.assert_allclose(actual.evidence, expected.evidence, atol=1e-12)
 
 
-def test_an_empty_history():
-    events = numba_map(1.0, 3, history=True).events()
-    assert (len(events), events.evidence.shape) == (0, (0, 3))
-
-
-@pytest.mark.parametrize("name", ["open3d", "numba"])
-def test_a_fast_map_keeps_no_history_unasked(name):
-    assert backends.create(name, voxel_size=1.0, num_classes=3).events() is None
-
-
 @pytest.mark.parametrize(
     ("name", "options", "message"),
     [
@@ -257,15 +247,6 @@ def test_the_numbers_do_not_depend_on_the_number_of_threads(name):
 
 
 NO_TIMES = {"seconds": 0.0, "association_seconds": 0.0, "update_seconds": 0.0}
-
-
-def test_numba_leaves_the_number_of_threads_as_it_was():
-    import numba
-
-    before = numba.get_num_threads()
-    backend = backends.create("numba", voxel_size=1.0, num_classes=3, threads=1)
-    backend.integrate(sight_line(0, [(0.5, 0)]))
-    assert numba.get_num_threads() == before
 
 
 def test_points_beyond_the_reach_are_refused_with_their_extent():

@@ -112,52 +112,6 @@ def test_a_wall_is_two_layers_thick():
     assert set(voxels(wide.table())) == {*expected, (0, 0, 1)}  # at 1.5 m the next centre is 3.3 pixels off
 
 
-def test_each_voxel_has_the_label_of_its_own_pixel():
-    """The middle voxels of both layers fall on the middle pixel; the other pixels inside them have no say."""
-    labels = np.zeros((5, 5), np.uint8)
-    labels[2, 2] = 1
-    backend = projective(1.0, num_classes=2)
-    backend.integrate(wall(0, labels=labels))
-    table = backend.table()
-    middle = [row for row, (x, y, _) in enumerate(voxels(table)) if (x, y) == (0, 0)]
-    assert table.evidence[middle].tolist() == [[0, 1], [0, 1]]
-    assert table.evidence.sum(axis=0).tolist() == [16, 2]
-
-
-def test_pixels_without_a_label_or_depth_tell_nothing():
-    labels, depth = np.zeros((5, 5), np.uint8), np.full((5, 5), 2.6, np.float32)
-    labels[2, 2], depth[0, 0], depth[0, 4] = 255, 0, np.nan
-    backend = projective(1.0)
-    backend.integrate(wall(0, depth=depth, labels=labels))
-    missing = {(0, 0, 2), (0, 0, 3), (-1, -1, 2), (1, -1, 2)}  # at 3.5 m the corner voxels fall on other pixels
-    expected = {(x, y, z) for x in (-1, 0, 1) for y in (-1, 0, 1) for z in (2, 3)} - missing
-    assert set(voxels(backend.table())) == expected
-
-
-def test_soft_scores_are_normalised():
-    scores = np.zeros((5, 5, 3), np.float16)
-    scores[..., :2] = (3, 1)
-    frame = wall(0)
-    backend = projective(1.0, num_classes=3)
-    backend.integrate(Frame(0, frame.depth, frame.intrinsics, frame.T_wc, scores=scores))
-    table = backend.table()
-    assert table.evidence.tolist() == [[0.75, 0.25, 0]] * 18
-    assert table.self_sum == pytest.approx(0.75**2 + 0.25**2)
-    assert table.frame_entropy_sum == pytest.approx(0.811, abs=5e-4)
-
-
-def test_beliefs_drift_as_in_the_paper():
-    """Labels 0, 0, 1 of the whole wall: D_JS((1, 0), (2/3, 1/3)) = 0.1909 bits, once."""
-    backend = projective(1.0, num_classes=2)
-    reports = [backend.integrate(wall(t, labels=label)) for t, label in enumerate([0, 0, 1])]
-    table = backend.table()
-    assert table.op.tolist() == [3] * 18
-    assert vss(table) == pytest.approx(2 / 3)
-    assert sbd(table) == pytest.approx(0.19087 / 2, abs=1e-5)
-    assert [report.drift for report in reports] == pytest.approx([math.nan, 0, 0.19087], abs=1e-5, nan_ok=True)
-    assert (table.first_frame.tolist(), table.last_frame.tolist()) == ([0] * 18, [2] * 18)
-
-
 def test_the_report_counts_look_ups():
     backend = projective(1.0)
     report = backend.integrate(wall(7))

@@ -108,14 +108,6 @@ def test_a_pixel_out_of_reach_without_a_prediction_does_not_matter() -> None:
         backend.integrate(dataclasses.replace(frame, depth=depth, scores=scores))
 
 
-def test_the_largest_evidence_of_a_dense_row_is_the_lowest_on_ties() -> None:
-    frame = soft_frame(np.random.default_rng(6), 0, 8, "float32")
-    flat = dataclasses.replace(frame, scores=np.ones_like(frame.scores))
-    backend = backends.create("numba", voxel_size=0.3, num_classes=8)
-    backend.integrate(flat)
-    assert np.array_equal(backend.changes.after, np.zeros(len(backend)))
-
-
 @pytest.mark.parametrize("K", [7, 150])
 def test_a_map_of_scores_takes_what_is_expected(K) -> None:
     """Within a factor of three; the frame's own work space, which does not grow with the map, is left out."""

@@ -72,17 +72,6 @@ def test_a_belief_changes_by_at_most_the_share_that_is_left_out(k) -> None:
     assert 0.01 < bound.mean() <= 1 - k / K
 
 
-def test_less_than_half_of_the_classes_are_kept_as_entries() -> None:
-    """And the map of the reference is the same."""
-    cut = keep_largest(frame(), 2)
-    tables = []
-    for name in ("numpy", "numba"):
-        backend = backends.create(name, voxel_size=0.05, num_classes=K)
-        backend.integrate(cut)
-        tables.append(backend.table())
-    np.testing.assert_allclose(tables[0].evidence[:], tables[1].evidence[:], atol=1e-12)
-
-
 def test_a_run_tells_what_its_flag_left_out(tmp_path) -> None:
     """Of random scores much: the summary has the mean and the bound, the terminal says them; of all of them nothing."""
     scene = write_scene(tmp_path / "scene")

@@ -12,16 +12,13 @@ from semstab.backends.shared import score_loops, tile_loops
 from semstab.backends.shared.association import INDEX_LIMIT, back_project, check_frame, voxel_index
 from semstab.backends.shared.keys import HALF, PARTITIONS, index_of_keys, out_of_reach, partitions_of
 from semstab.backends.shared.observations import Observed, ObservedScores, WorkSpace
-from semstab.backends.shared.pixel_keys import columns_of, frame_terms, keep_columns
+from semstab.backends.shared.pixel_keys import columns_of, frame_terms
 from semstab.backends.shared.score_loops import LANES
 from semstab.backends.shared.tile_loops import NEAR, REACH
-from semstab.core.types import Float64, Int32, Int64, Mask, UInt8
+from semstab.core.types import Float64, Int32, Int64, UInt8
 from semstab.model.frames import Frame
 from semstab.model.labels import fixed
 from semstab.model.voxels import Extent
-
-FIRST_ENTRIES = 1 << 15
-"""Entries that a band of labels has room for at first: more than a quarter of its pixels in an image of 3840x2160."""
 
 FIRST_VOXELS = 1 << 12
 """Voxels that a band of scores has room for at first."""
@@ -39,7 +36,7 @@ class Aggregator:
         self.within = within
         known = None if within is None else within.origin
         self.origin: Int64 | None = None if known is None else np.array(known, dtype=np.int64)
-        self._entries, self._voxels = FIRST_ENTRIES, FIRST_VOXELS
+        self._voxels = FIRST_VOXELS
         self._space = WorkSpace()
 
     def observe(self, frame: Frame) -> Observed | ObservedScores:
@@ -93,25 +90,21 @@ class Aggregator:
         bands, threads = -(-H // rows), nb.get_num_threads()
         tables = space.room("table", threads, table)
         tables[:] = -1
-        while True:
-            room = min(self._entries, rows * W + (columns + 1) * rows + 2 * table)
-            word, count = space.room("word", bands * room), space.room("count", bands * room, dtype=np.int32)
-            partition = space.room("partition", bands * room, dtype=np.uint8)
-            entries, lost = np.zeros(bands, dtype=np.int64), np.zeros(bands, dtype=np.int64)
-            spread = np.zeros((bands, PARTITIONS), dtype=np.int64)
-            low, high = np.zeros((bands, 4), dtype=np.int64), np.full((bands, 4), -1)
-            tile_loops.find_words(
-                fixed(frame.depth), fixed(frame.labels), ray_x, ray_y, fixed(frame.T_wc), self.voxel_size, origin,
-                corner, columns_of(self.within, origin), rays, down, begin, face, frame.ignore_id, room,
-                space.room("stretches", threads, 4, columns + 2 * tile_loops.LANES), tables,
-                space.room("table_count", threads, table, dtype=np.int32),
-                word, count, partition, entries, lost, spread, low, high,
-            )  # fmt: skip
-            if lost.any() or high[:, 3].max() >= self.num_classes:
-                return None
-            if entries.min() >= 0:
-                break
-            self._entries *= 4
+        room = rows * W + (columns + 1) * rows + 2 * table  # memory that is not written to is not taken
+        word, count = space.room("word", bands * room), space.room("count", bands * room, dtype=np.int32)
+        partition = space.room("partition", bands * room, dtype=np.uint8)
+        entries, lost = np.zeros(bands, dtype=np.int64), np.zeros(bands, dtype=np.int64)
+        spread = np.zeros((bands, PARTITIONS), dtype=np.int64)
+        low, high = np.zeros((bands, 4), dtype=np.int64), np.full((bands, 4), -1)
+        tile_loops.find_words(
+            fixed(frame.depth), fixed(frame.labels), ray_x, ray_y, fixed(frame.T_wc), self.voxel_size, origin,
+            corner, columns_of(self.within, origin), rays, down, begin, face, frame.ignore_id, room,
+            space.room("stretches", threads, 4, columns + 2 * tile_loops.LANES), tables,
+            space.room("table_count", threads, table, dtype=np.int32),
+            word, count, partition, entries, lost, spread, low, high,
+        )  # fmt: skip
+        if lost.any() or high[:, 3].max() >= self.num_classes:
+            return None
         extent = low[:, :3].min(axis=0), high.max(axis=0)
         return self._merged_labels(word, count, partition, room, entries, spread, *extent, corner)
 
@@ -155,29 +148,27 @@ class Aggregator:
         valid = frame.valid
         index = voxel_index(back_project(frame, valid), self.voxel_size, frame) - origin[:, None] + HALF
         near = ((index >= 0) & (index < 2 * HALF)).all(axis=0)
-        x, y, z = index if near.all() else index[:, near]
+        x, y, z = index[:, near]
         key, label = (x << 42) | (y << 21) | z, frame.labels[valid][near].astype(np.int64)
         if self.within is not None:
-            inside = _within(key, columns_of(self.within, origin))
+            inside = self.within.holds(index_of_keys(key, origin).T)
             key, label = key[inside], label[inside]
         if label.max(initial=0) >= self.num_classes:
             check_frame(frame, self.num_classes)
         if not near.all():
             raise out_of_reach(frame, origin, self.voxel_size)
-        runs = np.flatnonzero((np.diff(key, prepend=-1) != 0) | (np.diff(label, prepend=-1) != 0))
-        length = np.diff(runs, append=len(key))
-        keys, first, voxel = np.unique(key[runs], return_index=True, return_inverse=True)
+        keys, voxel, pixels = np.unique(key, return_inverse=True, return_counts=True)
         partition = partitions_of(keys)
-        order = np.argsort((partition << 40) | first)
+        order = np.argsort(partition, kind="stable")
         place = np.empty_like(order)
         place[order] = np.arange(len(order))
-        entries, entry = np.unique(place[voxel] * self.num_classes + label[runs], return_inverse=True)
+        entries, weight = np.unique(place[voxel] * self.num_classes + label, return_counts=True)
         return Observed(
             key=keys[order],
-            pixels=np.bincount(place[voxel], length, len(order)).astype(np.int64),
+            pixels=pixels[order],
             start=np.searchsorted(entries, np.arange(len(order) + 1) * self.num_classes),
             label=(entries % self.num_classes).astype(np.uint16),
-            weight=np.bincount(entry, length, len(entries)).astype(np.float64),
+            weight=weight.astype(np.float64),
             bounds=np.searchsorted(partition[order], np.arange(PARTITIONS + 1)),
         )
 
@@ -192,7 +183,6 @@ class Aggregator:
         """
         space, (H, W), K = self._space, frame.shape, self.num_classes
         ray_x, ray_y = _rays(frame)
-        rays, margin = frame_terms(ray_x, frame.T_wc, self.voxel_size)
         rows, columns, table = score_loops.ROWS, score_loops.COLUMNS, 1 << score_loops.TABLE_BITS
         bands, threads = -(-H // rows), nb.get_num_threads()
         stride = -(-K // LANES) * LANES
@@ -207,7 +197,7 @@ class Aggregator:
             spread = np.zeros((bands, PARTITIONS), dtype=np.int64)
             score_loops.sum_scores(
                 fixed(frame.depth), np.zeros(W, dtype=np.uint8), scores, ending, K, ray_x, ray_y,
-                fixed(frame.T_wc), self.voxel_size, origin, columns_of(None, origin), rays, margin, room,
+                fixed(frame.T_wc), self.voxel_size, origin, room,
                 space.room("keys", threads, rows, W), space.room("table", threads, table),
                 space.room("table_row", threads, table, dtype=np.int32),
                 space.room("score stretches", threads, 3, columns + 2 * LANES),
@@ -221,8 +211,10 @@ class Aggregator:
             self._voxels *= 4
         seen = self._merged_scores(key, count, sums, room, entries, spread)
         some = seen.rows(slice(None, None, max(1, len(seen.key) // SAMPLE)))
-        lean = seen if 2 * np.count_nonzero(some) >= some.size else seen.sparse()
-        return lean if self.within is None else lean.only(_within(lean.key, columns_of(self.within, origin)))
+        dense = 2 * np.count_nonzero(some) >= some.size
+        if self.within is not None:
+            seen = seen.only(self.within.holds(index_of_keys(seen.key, origin).T))
+        return seen if dense else seen.sparse()
 
     def _merged_scores(
         self, key: Int64, count: Int32, sums: Float64, room: int, entries: Int64, spread: Int64
@@ -255,14 +247,6 @@ def _offsets(spread: Int64) -> tuple[Int64, Int64]:
     ends = np.cumsum(spread.T.reshape(-1))
     offset = np.concatenate([[0], ends[:-1]]).reshape(PARTITIONS, -1)
     return offset, np.append(offset[:, 0], ends[-1])
-
-
-def _within(key: Int64, columns: Int64) -> Mask:
-    """Which of the keys (n,) are within columns, see `keep_columns`."""
-    inside = key.copy()
-    keep_columns(inside, columns)
-    chosen: Mask = inside >= 0
-    return chosen
 
 
 def _flat(scores: Any) -> Any:

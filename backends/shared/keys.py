@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 import numpy.typing as npt
 
@@ -22,16 +20,6 @@ def index_of_keys(keys: Int64, origin: npt.ArrayLike) -> Int64:
     mask = 2 * HALF - 1
     index: Int64 = np.stack([keys >> 42, (keys >> 21) & mask, keys & mask], axis=1) - HALF + np.asarray(origin)
     return index
-
-
-def columns_of_keys(keys: Int64, order: npt.NDArray[np.integer], origin: npt.ArrayLike) -> dict[str, Any]:
-    """Voxel indices ix, iy, iz (n,) of the packed keys in that order."""
-    ordered, mask = keys[order], 2 * HALF - 1
-    shift = np.asarray(origin) - HALF
-    return {
-        name: ((ordered >> bits & mask) + shift[axis]).astype(np.int32)
-        for axis, (name, bits) in enumerate({"ix": 42, "iy": 21, "iz": 0}.items())
-    }
 
 
 def out_of_reach(frame: Frame, origin: npt.ArrayLike, voxel_size: float) -> DataError:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any
 
@@ -35,16 +35,6 @@ class Observed:
     weight: Float64
     bounds: Int64
 
-    def only(self, some: Mask) -> Observed:
-        """Those of some of the voxels (n,)."""
-        size = np.diff(self.start)
-        entries = np.repeat(some, size)
-        start = np.concatenate([[0], np.cumsum(size[some])])
-        return Observed(
-            self.key[some], self.pixels[some], start, self.label[entries], self.weight[entries],
-            _bounds_of(self.bounds, some),
-        )  # fmt: skip
-
 
 @dataclass(frozen=True, eq=False)
 class ObservedScores:
@@ -72,8 +62,8 @@ class ObservedScores:
 
     def only(self, some: Mask) -> ObservedScores:
         """Those of some of the voxels (n,)."""
-        own = self.key[some], self.pixels[some], self.row[some]
-        return ObservedScores(*own, self.sums, _bounds_of(self.bounds, some), self.K)
+        bounds = np.concatenate([[0], np.cumsum(some)])[self.bounds]
+        return ObservedScores(self.key[some], self.pixels[some], self.row[some], self.sums, bounds, self.K)
 
     def sparse(self) -> Observed:
         """The same by entries, of which there are none for classes without evidence."""
@@ -81,12 +71,6 @@ class ObservedScores:
         voxel, label = np.nonzero(sums)
         start = np.searchsorted(voxel, np.arange(len(self.key) + 1))
         return Observed(self.key, self.pixels, start, label.astype(np.uint16), sums[voxel, label], self.bounds)
-
-
-def _bounds_of(bounds: Int64, some: Mask) -> Int64:
-    """First voxel of each partition among some of the voxels."""
-    before: Int64 = np.concatenate([[0], np.cumsum(some)])[bounds]
-    return before
 
 
 LINE = 64
@@ -103,21 +87,14 @@ class WorkSpace:
         """An array of that shape with whatever is in it."""
         size = int(np.prod(shape))
         if name not in self._arrays or len(self._arrays[name]) < size:
-            self._arrays[name] = _aligned(max(size, 1), np.dtype(dtype))
+            length = max(size, 1) * np.dtype(dtype).itemsize
+            room = np.empty(length + LINE, dtype=np.uint8)
+            start = -room.ctypes.data % LINE
+            self._arrays[name] = room[start : start + length].view(dtype)
         return self._arrays[name][:size].reshape(shape)
 
 
-def _aligned(size: int, dtype: np.dtype[Any]) -> npt.NDArray[Any]:
-    """An array that begins with a line of the cache."""
-    room = np.empty(size * dtype.itemsize + LINE, dtype=np.uint8)
-    start = -room.ctypes.data % LINE
-    return room[start : start + size * dtype.itemsize].view(dtype)
-
-
 # Totals of a map as it grows, whatever holds its voxels, and the report of each frame made of them.
-
-PIECE = 1 << 20
-"""Numbers of evidence that are worked on together, about: each takes some hundred bytes meanwhile."""
 
 
 @dataclass(frozen=True)
@@ -156,33 +133,17 @@ class Change:
         pixels         (n,) of the frame
         """
         known = op > 1
-        pieces = [_voxel_by_voxel(before[some], after[some], known[some]) for some in _pieces(*after.shape)]
-        drift, vss, vss_before, entropy, entropy_before = map(np.concatenate, zip(*pieces, strict=True))
+        before, after = np.asfortranarray(before), np.asfortranarray(after)  # sums over few classes run along n
+        p_after, p_before = normalise(after), normalise(before.T[:, known].T)
         return cls(
             points=int(pixels.sum()),
             voxels=len(op),
             new=int(np.count_nonzero(~known)),
-            drift=float(drift.sum()),
-            vss=float(vss.sum() - vss_before.sum()),
-            entropy=float(entropy.sum() - entropy_before.sum()),
+            drift=float(js_divergence(p_after.T[:, known].T, p_before).sum()),
+            vss=float(p_after.max(axis=1).sum() - p_before.max(axis=1).sum()),
+            entropy=float(entropy_bits(p_after).sum() - entropy_bits(p_before).sum()),
             recurrent=int(np.count_nonzero(op == RECURRENT)),
         )
-
-
-def _pieces(rows: int, columns: int) -> Iterator[slice]:
-    """Of about as many rows each, so that arrays of that many columns take little memory; one where there is none."""
-    count = max(1, -(-rows * columns // PIECE))
-    return (slice(k * rows // count, (k + 1) * rows // count) for k in range(count))
-
-
-def _voxel_by_voxel(before: Float64, after: Float64, known: Mask) -> tuple[Float64, ...]:
-    """Drift and VSS of touched voxels, VSS before of the known ones, entropy likewise."""
-    before, after = np.asfortranarray(before), np.asfortranarray(after)  # sums over few classes run along n
-    p_after = normalise(after)
-    p_before = normalise(before.T[:, known].T)
-    drift = np.zeros(len(known))
-    drift[known] = js_divergence(p_after.T[:, known].T, p_before)
-    return drift, p_after.max(axis=1), p_before.max(axis=1), entropy_bits(p_after), entropy_bits(p_before)
 
 
 class MapTotal:

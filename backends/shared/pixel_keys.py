@@ -11,13 +11,10 @@ from numba.core import cgutils, types
 from numba.extending import intrinsic
 
 from semstab.backends.shared.keys import HALF
-from semstab.core.compiled import compiled, serial
+from semstab.core.compiled import serial
 from semstab.core.types import Float64
 
 Floats = npt.NDArray[np.floating]
-
-BLOCK = 256
-"""Pixels whose keys are computed again where one of them is in doubt."""
 
 
 @serial
@@ -56,61 +53,8 @@ def exact_keys_of_row(depth, labels, ray_x, ray_y, T, size, ox, oy, oz, ignore, 
     return lost
 
 
-@compiled(fastmath={"contract"})
-def keys_fused(depth, labels, ignore, ray_a, ray_b, ray_c, a0, b0, c0, ta, tb, tc, margin, out):
-    """Packed keys of pixels at depth (ray + a0) + ta along each axis, -1 where one does not count; and any doubt.
-
-    In doubt is a point out of reach, or within `margin` of a voxel's face: here it is rounded otherwise than by the
-    protocol's expression, which has divisions, and may lie on the other side.
-    """
-    inner = 0.5 - margin
-    doubt = outside = 0
-    for u in range(depth.shape[0]):
-        d = np.float64(depth[u])
-        ok = (d > 0.0) & (d < np.inf) & (labels[u] != ignore)
-        d = d if ok else 0.0
-        a = d * (ray_a[u] + a0) + ta
-        b = d * (ray_b[u] + b0) + tb
-        c = d * (ray_c[u] + c0) + tc
-        whole_a, whole_b, whole_c = np.floor(a), np.floor(b), np.floor(c)
-        doubt |= ok & (
-            (abs(a - whole_a - 0.5) > inner) | (abs(b - whole_b - 0.5) > inner) | (abs(c - whole_c - 0.5) > inner)
-        )
-        i, j, k = np.int64(np.int32(whole_a)), np.int64(np.int32(whole_b)), np.int64(np.int32(whole_c))
-        outside |= i | j | k
-        out[u] = ((i << 42) | (j << 21) | k) if ok else -1
-    return doubt | (outside >> 21)
-
-
-@serial
-def keys_of_row(depth, labels, ray_x, ray_y, T, size, ox, oy, oz, ignore, rays, margin, out):
-    """The keys and result of `exact_keys_of_row` in less time; `frame_terms` makes rays and margin."""
-    a0 = (T[0, 1] * ray_y + T[0, 2]) / size
-    b0 = (T[1, 1] * ray_y + T[1, 2]) / size
-    c0 = (T[2, 1] * ray_y + T[2, 2]) / size
-    ta, tb, tc = T[0, 3] / size - ox + HALF, T[1, 3] / size - oy + HALF, T[2, 3] / size - oz + HALF
-    lost = 0
-    for first in range(0, depth.shape[0], BLOCK):
-        to = min(first + BLOCK, depth.shape[0])
-        d, lab, keys = depth[first:to], labels[first:to], out[first:to]
-        ray_a, ray_b, ray_c = rays[0, first:to], rays[1, first:to], rays[2, first:to]
-        if keys_fused(d, lab, ignore, ray_a, ray_b, ray_c, a0, b0, c0, ta, tb, tc, margin, keys):
-            lost |= exact_keys_of_row(d, lab, ray_x[first:to], ray_y, T, size, ox, oy, oz, ignore, keys)
-    return lost
-
-
-@serial
-def keep_columns(keys, columns):
-    """Take out, with -1, the keys outside of columns: lowest and highest but one of the first two coordinates."""
-    mask = 2 * HALF - 1
-    for u in range(keys.shape[0]):
-        i, j = keys[u] >> 42, (keys[u] >> 21) & mask
-        inside = (i >= columns[0]) & (i < columns[1]) & (j >= columns[2]) & (j < columns[3])
-        keys[u] = keys[u] if inside else -1
-
-
 def columns_of(within, origin):
-    """The columns for `keep_columns` of an extent or None: (4,), as packed keys count, or (0,) for all."""
+    """Lowest and highest but one of the first two coordinates, as packed keys count, (4,); or (0,) for all voxels."""
     if within is None:
         return np.zeros(0, dtype=np.int64)
     (x0, y0), (x1, y1) = within.low, within.high
@@ -118,8 +62,8 @@ def columns_of(within, origin):
     return np.clip(edges, 0, 2 * HALF).astype(np.int64)
 
 
-def frame_terms(ray_x: Floats, T: Float64, size: float, reach: int = HALF) -> tuple[Float64, float]:
-    """Rays (3, W) of the columns along the world's axes, in voxels a metre of depth, and the margin of `keys_fused`.
+def frame_terms(ray_x: Floats, T: Float64, size: float, reach: int) -> tuple[Float64, float]:
+    """Rays (3, W) of the columns along the world's axes, in voxels a metre of depth, and the margin of a voxel's face.
 
     The margin bounds what rounding can move a point by, voxels. Of a point within reach no term is above
     8 reach + |t| / r voxels, and each of a dozen operations rounds its result by 2^-53 of that at most.

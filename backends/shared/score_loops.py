@@ -12,7 +12,7 @@ from numba.core import cgutils, types
 from numba.extending import intrinsic
 
 from semstab.backends.shared.keys import PARTITIONS, mix, partition_of
-from semstab.backends.shared.pixel_keys import ask_for, keep_columns, keys_of_row, touch
+from semstab.backends.shared.pixel_keys import exact_keys_of_row
 from semstab.backends.shared.tile_loops import runs_of_eight
 from semstab.core.compiled import parallel, serial
 
@@ -24,9 +24,6 @@ from semstab.core.compiled import parallel, serial
 # value.
 
 LANES = 8
-
-SOON = 8
-"""Rows of sums that are asked for before their turn comes."""
 
 NUMBERS = {types.float32: ir.FloatType(), types.float64: ir.DoubleType(), types.uint16: ir.HalfType()}
 
@@ -54,8 +51,8 @@ def scale_eight(_typing: Any, scores: Any, _at: Any, _K: Any, keys: Any, scale: 
             builder.fcmp_ordered(">", total, ZEROS),
             builder.fcmp_ordered("<", total, ir.Constant(DOUBLES, [float("inf")] * LANES)),
         )
-        kept = builder.select(sound, builder.load(key, align=8), ir.Constant(INTS, [-1] * LANES))
-        builder.store(kept, key, align=8)
+        chosen = builder.select(sound, builder.load(key, align=8), ir.Constant(INTS, [-1] * LANES))
+        builder.store(chosen, key, align=8)
         builder.store(builder.fdiv(ir.Constant(DOUBLES, [1.0] * LANES), total), scales, align=8)
         return context.get_dummy_value()
 
@@ -72,8 +69,7 @@ def add_two(
     sums[to : to + K] += scale[u] * scores[at + u * K : at + (u + 1) * K], or = where `fresh`, and likewise of u + 1 if
     that is below `end`; it is read in any case, as nobody can predict whether it is, and must be there.
 
-    `sums` is float64, and has room for a multiple of `LANES` values at `to`: those beyond K get 0 added. Rows of
-    as many lie one behind the other, and a later one, which may not have been written to yet, is asked for.
+    `sums` is float64, and has room for a multiple of `LANES` values at `to`: those beyond K get 0 added.
     """
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
@@ -87,7 +83,6 @@ def add_two(
             for pixel, counts in zip(pixels, counted, strict=True)
         ]
         row = builder.gep(_data(context, builder, signature, arguments, 6), [to])
-        ahead = builder.mul(builder.and_(builder.add(K, INT(LANES - 1)), INT(-LANES)), INT(SOON))
 
         def add(values: list[Any], k: Any) -> None:
             place = builder.bitcast(builder.gep(row, [k]), DOUBLES.as_pointer())
@@ -96,7 +91,6 @@ def add_two(
                 scaled = builder.fmul(builder.select(counts, value, ZEROS), factor, flags=["contract"])
                 total = builder.fadd(total, scaled, flags=["contract"])
             builder.store(total, place, align=8)
-            ask_for(builder, builder.gep(row, [builder.add(k, ahead)]))
 
         _by_eights(context, builder, signature.args[0], array, places, K, add)
         return context.get_dummy_value()
@@ -163,8 +157,9 @@ def _by_eights(
         do([widened(eight(start, k)) for start in starts], k)
     with builder.if_then(builder.icmp_signed(">", rest, INT(0))):
         lanes = ir.Constant(INTS, list(range(LANES)))
-        kept, nothing = builder.icmp_signed("<", lanes, spread(builder, rest, INTS)), ir.Constant(vector, [0.0] * LANES)
-        do([widened(builder.select(kept, eight(start, whole), nothing)) for start in starts], whole)
+        inside = builder.icmp_signed("<", lanes, spread(builder, rest, INTS))
+        nothing = ir.Constant(vector, [0.0] * LANES)
+        do([widened(builder.select(inside, eight(start, whole), nothing)) for start in starts], whole)
 
 
 def spread(builder: Any, value: Any, vector: Any) -> Any:
@@ -187,16 +182,10 @@ TABLE_BITS = 13
 GOLDEN = np.uint64(0x9E3779B97F4A7C15)
 SHIFT = np.uint64(64 - TABLE_BITS)
 
-AHEAD = 512
-"""Scores that are asked for before their turn comes."""
-
-LINE = 16
-"""Of them, as many as a line of the cache holds in float32."""
-
 
 @parallel
 def sum_scores(
-    depth, labels, scores, ending, K, ray_x, ray_y, T, size, origin, within, rays, margin, room, row_keys,
+    depth, labels, scores, ending, K, ray_x, ray_y, T, size, origin, room, row_keys,
     tables, table_rows, stretches, scales, key, count, sums, entries, lost, spread,
 ):  # fmt: skip
     """The voxels of each band, some of them twice, with the sums of their pixels' scores, each scaled to sum 1.
@@ -206,7 +195,6 @@ def sum_scores(
     labels   (W,) 0 wherever there is depth: scores have no ignore id
     scores   (H * W * K,), see `vectors`
     ending   the last scores of at least a tile's row, and room for as many: where reading goes beyond the image
-    within   see `keep_columns`
     key      (bands * room,) packed voxels, their pixels in `count`, and their sums (bands * room * stride,) in `sums`
     lost     (bands,) whether a pixel with depth is out of reach
     spread   (bands, PARTITIONS) of the voxels by partition
@@ -220,11 +208,7 @@ def sum_scores(
         keys, table = row_keys[thread], tables[thread]
         first, last = band * ROWS, min(H, (band + 1) * ROWS)
         for v in range(first, last):
-            lost[band] |= keys_of_row(
-                depth[v], labels, ray_x, ray_y[v], T, size, ox, oy, oz, 1, rays, margin, keys[v - first]
-            )
-            if within.shape[0]:
-                keep_columns(keys[v - first], within)
+            lost[band] |= exact_keys_of_row(depth[v], labels, ray_x, ray_y[v], T, size, ox, oy, oz, 1, keys[v - first])
         table[:] = -1
         own_key, own_count = key[band * room : (band + 1) * room], count[band * room : (band + 1) * room]
         own_sums = sums[band * room * stride : (band + 1) * room * stride]
@@ -260,8 +244,6 @@ def _add_stretch(scores, at, K, stride, words, scale, run_word, run_end, table, 
     for u in range(0, pixels, LANES):
         some = words[u] & words[u + 1] & words[u + 2] & words[u + 3]
         if (some & words[u + 4] & words[u + 5] & words[u + 6] & words[u + 7]) >= 0:
-            for ahead in range(at + u * K + AHEAD, min(at + (u + LANES) * K + AHEAD, scores.shape[0]), LINE):
-                touch(scores, ahead)
             scale_eight(scores, at + u * K, K, words, scale, u)
     runs = 0
     for u in range(0, pixels, LANES):
@@ -329,10 +311,6 @@ def merge_rows(edges, key, pixels, row, again, first, sums, K, voxels):
                 again[repeated], first[repeated] = row[i], row[v]
                 repeated += 1
         for i in range(low, repeated):
-            soon = min(i + SOON, repeated - 1)
-            for k in range(0, K, LANES):
-                touch(sums, again[soon] + k)
-                touch(sums, first[soon] + k)
             to, added = sums[first[i] : first[i] + K], sums[again[i] : again[i] + K]
             for k in range(K):
                 to[k] += added[k]

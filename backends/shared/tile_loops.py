@@ -213,8 +213,8 @@ def find_words(
 ):  # fmt: skip
     """Entries of each band of ROWS rows: words with counts, some of them twice; their extent and spread by partition.
 
-    Where a band has more than `room` of them, its number in `entries` is -1, and its rest is left undone. `lost`: a
-    pixel is out of reach of the words. low, high (bands, 4): of the coordinates, and of the label.
+    Each band has `room` for them. `lost`: a pixel is out of reach of the words. low, high (bands, 4): of the
+    coordinates, and of the label.
     """
     H, W = depth.shape
     for band in nb.prange(entries.shape[0]):
@@ -227,9 +227,6 @@ def find_words(
         n = np.int64(0)
         for first in range(0, W, COLUMNS):
             to = min(first + COLUMNS, W)
-            if n + COLUMNS * ROWS + table.shape[0] > room:
-                n = np.int64(-1)
-                break
             own = words[: -(-(to - first) // LANES) * LANES + 1]
             for y in range(band * ROWS, min(H, (band + 1) * ROWS)):
                 for u in range(to, min(W, to + COLUMNS), 16):
@@ -244,15 +241,11 @@ def find_words(
                 if columns.shape[0]:
                     _keep_columns(own, columns, corner)
                 n = _enter_runs(own, run_word, run_end, table, table_count, own_word, own_count, n)
-        if n < 0:
-            table[:] = -1
-            entries[band] = -1
-        else:
-            n = _flush(table, table_count, own_word, own_count, n)
-            entries[band] = _describe(
-                own_word, own_count, n, corner, partition[band * room : (band + 1) * room], spread[band], low[band],
-                high[band],
-            )  # fmt: skip
+        n = _flush(table, table_count, own_word, own_count, n)
+        entries[band] = _describe(
+            own_word, own_count, n, corner, partition[band * room : (band + 1) * room], spread[band], low[band],
+            high[band],
+        )  # fmt: skip
 
 
 @serial
