@@ -296,7 +296,7 @@ def _recording(rerun: str | None, out: Path) -> list[Recording]:
         return []
     from semstab.recording import Recording, Target
 
-    return [Recording(Target.parse(rerun, out / "recording.rrd"), run=out)]
+    return [Recording(Target.parse(rerun, out / "recording.rrd"))]
 
 
 def executor_of(jobs: int, scheduler: str | None) -> Executor:
