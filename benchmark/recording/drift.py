@@ -191,7 +191,7 @@ class DriftLog:
     ) -> None:
         """Log of each of the top voxels a lane with its dominant class, its moves in words, and where it is."""
         rows, names = self.top_voxels(), classes.classes
-        centers = (self.map.index_of(rows) + 0.5) * self.map.voxel_size
+        centers: Float64 = (self.map.index_of(rows) + 0.5) * self.map.voxel_size
         bits, first_frame, op = (self.map.column(name, rows) for name in ("drift_sum", "first_frame", "op"))
         dominant, sbd = self.map.evidence_of(rows).argmax(axis=1), mean_drift(bits, op)
         every = np.concatenate([np.zeros(0, dtype=MOVE), *self._moves])

@@ -239,7 +239,9 @@ def _scene(scene: str, tasks: list[Task], shown: Shown) -> rrb.Container:
 def _overview(scene: str, tasks: list[Task], shown: Shown) -> rrb.Container:
     legend = shown.legend
     below = legend.height(LINES) + TITLE
-    tabs = [_maps(name, tasks, shown.bounds, LEFT[1] - TITLE - below) for name in color_modes()]
+    tabs: list[rrb.Container | rrb.View] = [
+        _maps(name, tasks, shown.bounds, LEFT[1] - TITLE - below) for name in color_modes()
+    ]
     if len(legend.entries) > legend.room:
         tabs.append(_legend(scene, "all_classes", "All classes", legend.height()))
     classes = _legend(scene, "legend", "Classes", legend.height(LINES))

@@ -9,9 +9,10 @@ import threading
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import cast
+from typing import Any, cast
 
 import numpy as np
+import numpy.typing as npt
 import rerun as rr
 
 from semstab.backends import FusionBackend, GrowingMap
@@ -129,7 +130,9 @@ class GroupLog:
 
         def job() -> None:
             stride, coarse = stride_of(frame.shape), stride_of(frame.shape, COARSE_SIDE)
-            pictures = {"labels": (np.ascontiguousarray(frame.predicted[::stride, ::stride]), stride)}
+            pictures: dict[str, tuple[npt.NDArray[Any], int]] = {
+                "labels": (np.ascontiguousarray(frame.predicted[::stride, ::stride]), stride)
+            }
             if changes is not None:
                 pictures |= {name: (picture, coarse) for name, picture in changes.pictures(coarse).items()}
             for name, (picture, every) in pictures.items():
