@@ -184,18 +184,10 @@ COMPARED = ("drift", "map_vss", "map_entropy", "map_recurrent", "new_voxels", "f
 """Series of two backends that are seen in one plot."""
 
 
-@dataclass
-class Shown:
-    """What the layout of a scene depends on: its legend, and the bounds, None while the viewer chooses."""
-
-    legend: Legend
-    bounds: SceneBounds | None = None
-
-
-def blueprint(plan: Plan, shown: Mapping[str, Shown]) -> rrb.Blueprint:
-    """Return the layout of a plan, with what is known of its scenes so far."""
+def blueprint(plan: Plan, legends: Mapping[str, Legend], bounds: Mapping[str, SceneBounds | None]) -> rrb.Blueprint:
+    """Return the layout of a plan, with the legends and bounds of its scenes so far."""
     by_scene = itertools.groupby(plan.tasks, key=lambda task: task.scene.name)
-    scenes = [_scene(scene, list(tasks), shown[scene]) for scene, tasks in by_scene]
+    scenes = [_scene(scene, list(tasks), legends[scene], bounds[scene]) for scene, tasks in by_scene]
     return rrb.Blueprint(
         rrb.Tabs(*scenes) if len(scenes) > 1 else scenes[0],
         rrb.BlueprintPanel(state="collapsed"),
@@ -225,22 +217,21 @@ def view_3d(
     )  # fmt: skip
 
 
-def _scene(scene: str, tasks: list[Task], shown: Shown) -> rrb.Container:
+def _scene(scene: str, tasks: list[Task], legend: Legend, bounds: SceneBounds | None) -> rrb.Container:
     flips = [_flips(scene, task) for task in tasks]
     comparisons = [
-        _comparison(task, drawn(task), other, shown.bounds)
+        _comparison(task, drawn(task), other, bounds)
         for task in tasks
         for other in task.backends
         if other != drawn(task)
     ]
-    return rrb.Tabs(_overview(scene, tasks, shown), *flips, *comparisons, name=scene)
+    return rrb.Tabs(_overview(scene, tasks, legend, bounds), *flips, *comparisons, name=scene)
 
 
-def _overview(scene: str, tasks: list[Task], shown: Shown) -> rrb.Container:
-    legend = shown.legend
+def _overview(scene: str, tasks: list[Task], legend: Legend, bounds: SceneBounds | None) -> rrb.Container:
     below = legend.height(LINES) + TITLE
     tabs: list[rrb.Container | rrb.View] = [
-        _maps(name, tasks, shown.bounds, LEFT[1] - TITLE - below) for name in color_modes()
+        _maps(name, tasks, bounds, LEFT[1] - TITLE - below) for name in color_modes()
     ]
     if len(legend.entries) > legend.room:
         tabs.append(_legend(scene, "all_classes", "All classes", legend.height()))

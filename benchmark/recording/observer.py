@@ -35,7 +35,7 @@ from semstab.model.results import Unit, UnitSummary
 from semstab.model.voxels import VoxelTable
 from semstab.recording import drift, timeline
 from semstab.recording.camera import COARSE_SIDE, CameraLog, label_context, over_camera, stride_of
-from semstab.recording.layout import Legend, SceneBounds, Shown, blueprint, drawn, is_pointwise
+from semstab.recording.layout import Legend, SceneBounds, blueprint, drawn, is_pointwise
 from semstab.recording.target import DEFAULT_URL, Target, is_whole
 from semstab.recording.timeline import Background, Clock, path
 from semstab.recording.voxel_maps import VoxelLogger, agreement_report, load_map, log_difference
@@ -59,7 +59,8 @@ class SceneLog:
 
     def __init__(self, tasks: list[Task]) -> None:
         self._tasks, self.name = tasks, tasks[0].scene.name
-        self.shown = Shown(Legend([task.mapping.target for task in tasks]))
+        self.legend = Legend([task.mapping.target for task in tasks])
+        self.bounds: SceneBounds | None = None
         self.origin: Int64
         self.camera: CameraLog | None = None
 
@@ -69,7 +70,7 @@ class SceneLog:
             axis = int(np.abs(up).argmax())
             axes = f"RIGHT_HAND_{'XYZ'[axis]}_{'UP' if up[axis] > 0 else 'DOWN'}"
             stream.log(path(self.name), getattr(rr.ViewCoordinates, axes), static=True)
-        self.shown.legend.log(stream, self.name)
+        self.legend.log(stream, self.name)
         for task in self._tasks:
             contexts = {"labels": label_context(task.mapping.target), **drift.contexts()}
             for name, context in contexts.items():
@@ -88,12 +89,12 @@ class SceneLog:
 
     def see(self, stream: rr.RecordingStream, task: Task, table: VoxelTable) -> None:
         """Take from a finished map the order of the legend and, of the first one, the bounds of its views."""
-        self.shown.legend.see(task.mapping.target, dominant(table))
-        self.shown.legend.log(stream, self.name)
-        if self.shown.bounds is None and len(table) and self.camera is not None:
+        self.legend.see(task.mapping.target, dominant(table))
+        self.legend.log(stream, self.name)
+        if self.bounds is None and len(table) and self.camera is not None:
             some = table.index[:: math.ceil(len(table) / SAMPLE)]
             points = ((some - self.origin + 0.5) * table.voxel_size).astype(np.float64)
-            self.shown.bounds = SceneBounds(points, self.camera.poses, task.scene.up)
+            self.bounds = SceneBounds(points, self.camera.poses, task.scene.up)
 
 
 class GroupLog:
@@ -385,7 +386,8 @@ class Recording(Observer):
 
     def _send_layout(self, stream: rr.RecordingStream) -> None:
         """Send the layout; a viewer that follows the run stays at the one that it got first."""
-        layout = blueprint(self._plan, {name: scene.shown for name, scene in self._scenes.items()})
+        legends = {name: scene.legend for name, scene in self._scenes.items()}
+        layout = blueprint(self._plan, legends, {name: scene.bounds for name, scene in self._scenes.items()})
         stream.send_blueprint(layout, make_default=True, make_active=self._sent == 0 or not self.target.live)
         self._sent += 1
 

@@ -7,6 +7,7 @@ those that got no new voxels without their indices.
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -17,7 +18,7 @@ import rerun as rr
 from rerun.blueprint.encodings import ComponentSourceKind, VisualizerComponentMapping
 
 from semstab.backends import GrowingMap
-from semstab.core.types import Int64, UInt32
+from semstab.core.types import Float64, Int32, Int64, UInt32
 from semstab.metrics import CATEGORY_COLORS, dominant, vss
 from semstab.metrics.agreement import shared_rows
 from semstab.metrics.summary import categorise
@@ -100,10 +101,10 @@ def packed(colors: npt.ArrayLike) -> UInt32:
 def components(index: Int64 | None, size: float, classes: LabelSpace, voxels: Voxels) -> list[Any]:
     """Return a grid that shows the dominant class, with all else that it can show; see `visualizer`.
 
-    index  (n, 3) relative to the map's origin: small, so that the viewer's float32 keeps it exact; None where only
-           colours and values changed
+    index   (n, 3) relative to the map's origin: small, so that the viewer's float32 keeps it exact; None where only
+            colours and values changed
+    voxels  measured, so that each is computed in one pass
     """
-    voxels = Voxels(voxels.op, voxels.evidence.measured(), voxels.drift_sum)
     where: dict[str, Any] = {}
     if index is not None:
         where = {"voxel_indices": index.astype(np.int32), "voxel_size": [size] * 3}
@@ -197,21 +198,19 @@ class VoxelLogger:
             if self._changed[c] == 0 or sizes[c] > self._allowed:
                 break
             self._allowed -= sizes[c]
-            jobs.append(self._job(stream, fused, int(c), int(sizes[c])))
+            at = np.arange(self._edges[c], self._edges[c] + sizes[c])
+            index = fused.index_of(at) - self._origin if self._drawn[c] != sizes[c] else None
+            values = fused.column("op", at), fused.evidence_of(at), fused.column("drift_sum", at)
+            jobs.append(functools.partial(self._log, stream, int(c), index, fused.voxel_size, *values))
             self._changed[c], self._drawn[c] = 0, sizes[c]
         return jobs
 
-    def _job(self, stream: rr.RecordingStream, fused: GrowingMap, c: int, size: int) -> Callable[[], None]:
-        """Return a job that logs a chunk as it is now."""
-        rows = np.arange(self._edges[c], self._edges[c] + size)
-        index = fused.index_of(rows) - self._origin if self._drawn[c] != size else None
-        op, evidence, drift_sum = fused.column("op", rows), fused.evidence_of(rows), fused.column("drift_sum", rows)
-
-        def job() -> None:
-            voxels = Voxels(op, Evidence.of(evidence), drift_sum)
-            stream.log(chunk(self._entity, c), *components(index, fused.voxel_size, self._classes, voxels))
-
-        return job
+    def _log(
+        self, stream: rr.RecordingStream, c: int, index: Int64 | None, size: float,
+        op: Int32, evidence: Float64 | Evidence, drift_sum: Float64,
+    ) -> None:  # fmt: skip
+        voxels = Voxels(op, Evidence.of(evidence).measured(), drift_sum)
+        stream.log(chunk(self._entity, c), *components(index, size, self._classes, voxels))
 
     def finish(self, stream: rr.RecordingStream, table: VoxelTable, factor: int = 1) -> str:
         """Log the final map in place of the growing one; return how it was thinned, where it is too large.
@@ -223,9 +222,8 @@ class VoxelLogger:
         for c, part in enumerate(np.split(rows, self._edges[1:-1])):
             if len(part):
                 at = np.s_[part[0] : part[-1] + 1] if factor == 1 else part  # what is not thinned is not copied
-                voxels = Voxels(table.op[at], table.evidence.take(at), table.drift_sum[at])
-                size = table.voxel_size * factor
-                stream.log(chunk(self._entity, c), *components(index[at] // factor, size, self._classes, voxels))
+                values = table.op[at], table.evidence.take(at), table.drift_sum[at]
+                self._log(stream, c, index[at] // factor, table.voxel_size * factor, *values)
             elif self._drawn[c]:
                 stream.log(chunk(self._entity, c), rr.Clear(recursive=False))
         thin = f"; drawn: one voxel of each block of {factor}x{factor}x{factor}, as large as the block"
