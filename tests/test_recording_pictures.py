@@ -22,6 +22,7 @@ import semstab
 from semstab import backends, metrics
 from semstab.backends.numba_hash import NumbaHash
 from semstab.engine.units import make_plan
+from semstab.errors import DataError
 from semstab.model.frames import Frame, Intrinsics
 from semstab.model.labels import LabelSpace
 from semstab.model.measures import SBD_MAX
@@ -129,12 +130,13 @@ def test_colour_of_any_format_is_encoded_as_a_small_jpeg(tmp_path, kind) -> None
     }[kind]  # fmt: skip
     file = tmp_path / "color.jpg"
     file.write_bytes(data)
-    seen = camera.CameraLog("wall", np.zeros(3))
-    color = seen.color(frame(0, np.zeros((6, 8)), {"color": str(file)}))
+    view = frame(0, np.zeros((6, 8)), {"color": str(file)})
     if kind in ("cut off", "not an image"):
-        assert color is None
-        assert seen.unread == f"{file}: the image cannot be decoded"
+        with pytest.raises(DataError, match=r"color\.jpg: the image cannot be decoded"):
+            camera.color_of(view)
         return
+    color = camera.color_of(view)
+    assert color is not None
     decoded = cv2.imdecode(np.frombuffer(color, np.uint8), cv2.IMREAD_COLOR)
     assert decoded.shape[:2] == (6, 8)
     np.testing.assert_allclose(decoded.mean(axis=(0, 1)), (10, 20, 200), atol=12 if kind == "cmyk" else 4)

@@ -1,4 +1,4 @@
-"""Pictures of the camera: pose, colour and depth.
+"""What is recorded once a scene: axes, legend, and the camera with pose, colour and depth.
 
 The camera has the frame's size. Pictures are smaller where that saves much; transforms lay them over each other.
 """
@@ -9,16 +9,20 @@ import functools
 import io
 import math
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 import rerun as rr
 
-from semstab.core.types import Float64
+from semstab.core.types import Float64, Int64
+from semstab.errors import DataError
+from semstab.metrics import dominant
 from semstab.model.frames import Frame, Intrinsics
 from semstab.model.labels import IGNORE_8BIT, IGNORE_16BIT, LabelSpace
+from semstab.model.voxels import VoxelTable
+from semstab.recording import drift
+from semstab.recording.layout import Legend, SceneBounds
 from semstab.recording.timeline import Background, path
+from semstab.task import Task
 
 IMAGE_SIDE, COARSE_SIDE = 640, 320
 """Pixels a side at most, of colour and labels; of depth and of what is looked up for each pixel."""
@@ -44,24 +48,63 @@ def label_context(classes: LabelSpace) -> rr.AnnotationContext:
     return rr.AnnotationContext(infos + [info for info in ignored if info.id >= len(classes)])
 
 
-class CameraLog:
-    """The camera of a scene: its pictures are logged once a frame, whichever backbones and backends fuse it.
+SAMPLE = 20_000
+"""Voxels of a scene from which its camera pose follows."""
 
-    translation  (3,) metres, the origin of the scene's maps
-    unread       why a colour image is missing, where one is
+ORIGIN_STEP = 1000.0
+"""Metres; map origins are multiples of it: a scene near its world's origin keeps its coordinates."""
+
+
+class SceneLog:
+    """A scene of a plan: its axes, its legend, the origin of its maps, and its camera.
+
+    The camera's pictures are logged once a frame, whichever backbones and backends fuse it.
+
+    origin  (3,) voxels, None before anything of the scene is logged
+    bounds  of its first finished map, None before that
     """
 
-    def __init__(self, scene: str, translation: npt.NDArray[np.floating[Any]]) -> None:
-        self._scene = scene
-        self._translation = translation
+    def __init__(self, tasks: list[Task]) -> None:
+        self._tasks, self.name = tasks, tasks[0].scene.name
+        self.legend = Legend([task.mapping.target for task in tasks])
+        self.origin: Int64 | None = None
+        self.bounds: SceneBounds | None = None
+        self._translation = np.zeros(3)
         self._poses: dict[int, Float64] = {}
         self._intrinsics: tuple[Intrinsics, tuple[int, int]] | None = None
-        self.unread: str | None = None
+        self._unread = False
 
-    @property
-    def poses(self) -> Float64:
-        """(n, 4, 4) so far, relative to the map's origin."""
-        return np.array([*self._poses.values()]).reshape(-1, 4, 4)
+    def log_static(self, stream: rr.RecordingStream) -> None:
+        """Log what holds in all frames: axes, legends, names and colours."""
+        if (up := self._tasks[0].scene.up) is not None:  # the axis of the world that is nearest to it
+            axis = int(np.abs(up).argmax())
+            axes = f"RIGHT_HAND_{'XYZ'[axis]}_{'UP' if up[axis] > 0 else 'DOWN'}"
+            stream.log(path(self.name), getattr(rr.ViewCoordinates, axes), static=True)
+        self.legend.log(stream, self.name)
+        for task in self._tasks:
+            for name, context in {"labels": label_context(task.mapping.target), **drift.contexts()}.items():
+                stream.log(path(self.name, "camera", task.backbone, name), context, static=True)
+
+    def begin(self, stream: rr.RecordingStream, position: Float64, voxel_size: float) -> Int64:
+        """Return the origin of the scene's maps, near the first camera position (3,), metres, that is known."""
+        if self.origin is None:
+            steps = np.round(position / ORIGIN_STEP).astype(np.int64)
+            self.origin = steps * round(ORIGIN_STEP / voxel_size)
+            at = self._translation = self.origin * voxel_size
+            if steps.any():
+                where = ", ".join(f"{name} = {value:.3f} m" for name, value in zip("xyz", at, strict=True))
+                text = f"map coordinates are relative to {where} of the scene's world"
+                stream.log(path(self.name, "log"), rr.TextLog(text))
+        return self.origin
+
+    def see(self, stream: rr.RecordingStream, task: Task, table: VoxelTable) -> None:
+        """Take from a finished map the order of the legend and, of the first one, the bounds of its views."""
+        self.legend.see(task.mapping.target, dominant(table))
+        self.legend.log(stream, self.name)
+        if self.bounds is None and len(table):
+            some = table.index[:: math.ceil(len(table) / SAMPLE)]
+            points = ((some + 0.5) * table.voxel_size - self._translation).astype(np.float64)
+            self.bounds = SceneBounds(points, np.array([*self._poses.values()]).reshape(-1, 4, 4), task.scene.up)
 
     def log(self, stream: rr.RecordingStream, frame: Frame, background: Background) -> None:
         """Log the frame's pose, camera, colour and depth, where that has not happened yet, and the track up to it."""
@@ -71,43 +114,53 @@ class CameraLog:
         pose[:3, 3] -= self._translation
         if self._intrinsics != (frame.intrinsics, frame.shape):
             self._intrinsics = frame.intrinsics, frame.shape
-            stream.log(path(self._scene, "camera"), _pinhole(frame))
-        stream.log(path(self._scene, "camera"), rr.Transform3D(translation=pose[:3, 3], mat3x3=pose[:3, :3]))
+            stream.log(path(self.name, "camera"), _pinhole(frame))
+        stream.log(path(self.name, "camera"), rr.Transform3D(translation=pose[:3, 3], mat3x3=pose[:3, :3]))
         n = len(self._poses)
         if n % (n // 100 + 1) == 0:  # long ones not with every frame: their size would grow with its square
-            track = rr.LineStrips3D([self.poses[:, :3, 3]], colors=(255, 255, 255))
-            stream.log(path(self._scene, "trajectory"), track)
+            track = rr.LineStrips3D([[each[:3, 3] for each in self._poses.values()]], colors=(255, 255, 255))
+            stream.log(path(self.name, "trajectory"), track)
         background.submit(frame.index, frame.timestamp, functools.partial(self._log_images, stream, frame))
 
     def _log_images(self, stream: rr.RecordingStream, frame: Frame) -> None:
         stride = stride_of(frame.shape, COARSE_SIDE)
         depth = frame.depth[::stride, ::stride]
         depth = np.where(np.isfinite(depth), depth, 0).astype(np.float16)  # to 0.05 %
-        stream.log(path(self._scene, "depth"), rr.DepthImage(depth, meter=1.0, colormap="turbo"))
-        if (jpeg := self.color(frame)) is not None:
+        stream.log(path(self.name, "depth"), rr.DepthImage(depth, meter=1.0, colormap="turbo"))
+        try:
+            jpeg = color_of(frame)
+        except DataError as error:
+            if not self._unread:
+                stream.log(path(self.name, "log"), rr.TextLog(f"without colour: {error}"))
+            self._unread = True
+            return
+        if jpeg is not None:
             (H, W), stride = frame.shape, stride_of(frame.shape)
             image = rr.EncodedImage(contents=jpeg, media_type="image/jpeg", draw_order=-20)
             whole = rr.Transform3D(scale=[W / -(-W // stride), H / -(-H // stride), 1])
-            stream.log(path(self._scene, "camera", "color"), image, whole)
+            stream.log(path(self.name, "camera", "color"), image, whole)
 
-    def color(self, frame: Frame) -> bytes | None:
-        """Return colour as JPEG, in the size of the labels; None where the frame has none, or it cannot be read."""
-        from PIL import Image
 
-        stride, file = stride_of(frame.shape), Path(frame.files.get("color", ""))
-        if frame.color is None and not file.is_file():
-            return None
-        H, W = (-(-side // stride) for side in frame.shape)
-        buffer = io.BytesIO()
-        try:
-            with Image.open(file) if frame.color is None else Image.fromarray(frame.color) as image:
-                image.draft("RGB", (W, H))  # JPEG decodes to 1/2, 1/4 and 1/8 of its size in less time
-                small = image.convert("RGB").resize((W, H), Image.Resampling.BOX)
-        except (OSError, Image.DecompressionBombError):
-            self.unread = self.unread or f"{file}: the image cannot be decoded"
-            return None
-        small.save(buffer, "JPEG", quality=JPEG_QUALITY)
-        return buffer.getvalue()
+def color_of(frame: Frame) -> bytes | None:
+    """Return colour as JPEG, in the size of the labels; None where the frame has none.
+
+    Raises DataError where its file cannot be read.
+    """
+    from PIL import Image
+
+    stride, file = stride_of(frame.shape), Path(frame.files.get("color", ""))
+    if frame.color is None and not file.is_file():
+        return None
+    H, W = (-(-side // stride) for side in frame.shape)
+    buffer = io.BytesIO()
+    try:
+        with Image.open(file) if frame.color is None else Image.fromarray(frame.color) as image:
+            image.draft("RGB", (W, H))  # JPEG decodes to 1/2, 1/4 and 1/8 of its size in less time
+            small = image.convert("RGB").resize((W, H), Image.Resampling.BOX)
+    except (OSError, Image.DecompressionBombError) as error:
+        raise DataError(f"{file}: the image cannot be decoded") from error
+    small.save(buffer, "JPEG", quality=JPEG_QUALITY)
+    return buffer.getvalue()
 
 
 def _pinhole(frame: Frame) -> rr.Pinhole:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import logging
-import math
 import threading
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -26,7 +25,6 @@ from semstab.engine.observer import Observer
 from semstab.engine.series import FrameRow
 from semstab.engine.units import Plan, Planned, PlannedUnit, make_plan
 from semstab.errors import ConfigError, SemstabError, one_line
-from semstab.metrics import dominant
 from semstab.model.frames import Frame
 from semstab.model.labels import LabelSpace
 from semstab.model.measures import measures
@@ -34,8 +32,8 @@ from semstab.model.records import Result, UnitContent
 from semstab.model.results import Unit, UnitSummary
 from semstab.model.voxels import VoxelTable
 from semstab.recording import drift, timeline
-from semstab.recording.camera import COARSE_SIDE, CameraLog, label_context, over_camera, stride_of
-from semstab.recording.layout import Legend, SceneBounds, blueprint, drawn, is_pointwise
+from semstab.recording.camera import COARSE_SIDE, SceneLog, over_camera, stride_of
+from semstab.recording.layout import blueprint, drawn, is_pointwise
 from semstab.recording.target import DEFAULT_URL, Target, is_whole
 from semstab.recording.timeline import Background, Clock, path
 from semstab.recording.voxel_maps import VoxelLogger, agreement_report, load_map, log_difference
@@ -46,55 +44,6 @@ logger = logging.getLogger("semstab")
 
 BYTES_A_VOXEL = 120
 """Memory that the recording's own map takes for a voxel, besides 8 bytes for each class."""
-
-SAMPLE = 20_000
-"""Voxels of a scene from which its camera pose follows."""
-
-ORIGIN_STEP = 1000.0
-"""Metres; map origins are multiples of it: a scene near its world's origin keeps its coordinates."""
-
-
-class SceneLog:
-    """A scene of a plan: where its maps begin, its camera, its legend."""
-
-    def __init__(self, tasks: list[Task]) -> None:
-        self._tasks, self.name = tasks, tasks[0].scene.name
-        self.legend = Legend([task.mapping.target for task in tasks])
-        self.bounds: SceneBounds | None = None
-        self.origin: Int64
-        self.camera: CameraLog | None = None
-
-    def log_static(self, stream: rr.RecordingStream) -> None:
-        """Log what holds in all frames: axes, legends, names and colours."""
-        if (up := self._tasks[0].scene.up) is not None:  # the axis of the world that is nearest to it
-            axis = int(np.abs(up).argmax())
-            axes = f"RIGHT_HAND_{'XYZ'[axis]}_{'UP' if up[axis] > 0 else 'DOWN'}"
-            stream.log(path(self.name), getattr(rr.ViewCoordinates, axes), static=True)
-        self.legend.log(stream, self.name)
-        for task in self._tasks:
-            contexts = {"labels": label_context(task.mapping.target), **drift.contexts()}
-            for name, context in contexts.items():
-                stream.log(path(self.name, "camera", task.backbone, name), context, static=True)
-
-    def begin(self, stream: rr.RecordingStream, position: Float64, voxel_size: float) -> None:
-        """Choose the origin of the scene's maps, in voxels, near the first camera position that is known."""
-        steps = np.round(position / ORIGIN_STEP).astype(np.int64)
-        self.origin = steps * round(ORIGIN_STEP / voxel_size)
-        at = self.origin * voxel_size
-        self.camera = CameraLog(self.name, at)
-        if steps.any():
-            where = ", ".join(f"{name} = {value:.3f} m" for name, value in zip("xyz", at, strict=True))
-            text = f"map coordinates are relative to {where} of the scene's world"
-            stream.log(path(self.name, "log"), rr.TextLog(text))
-
-    def see(self, stream: rr.RecordingStream, task: Task, table: VoxelTable) -> None:
-        """Take from a finished map the order of the legend and, of the first one, the bounds of its views."""
-        self.legend.see(task.mapping.target, dominant(table))
-        self.legend.log(stream, self.name)
-        if self.bounds is None and len(table) and self.camera is not None:
-            some = table.index[:: math.ceil(len(table) / SAMPLE)]
-            points = ((some - self.origin + 0.5) * table.voxel_size).astype(np.float64)
-            self.bounds = SceneBounds(points, self.camera.poses, task.scene.up)
 
 
 class GroupLog:
@@ -233,9 +182,7 @@ class Recording(Observer):
         group = self._group or self._begin(task, frame.T_wc[:3, 3])
         for unit, row in rows.items():
             timeline.log_row(stream, unit, group.task, row.cells())
-        camera = self._scenes[task.scene.name].camera
-        assert camera is not None
-        camera.log(stream, frame, background)
+        self._scenes[task.scene.name].log(stream, frame, background)
         group.log(stream, frame, background)
 
     def unit_finished(
@@ -309,9 +256,6 @@ class Recording(Observer):
         try:
             if self._background is not None:
                 self._background.close()
-            for name, scene in self._scenes.items():
-                if scene.camera is not None and scene.camera.unread is not None:
-                    stream.log(path(name, "log"), rr.TextLog(f"without colour: {scene.camera.unread}"))
         finally:
             try:
                 stream.flush()
@@ -338,10 +282,11 @@ class Recording(Observer):
         """Begin the log of a backbone on a scene, with all backends of the plan."""
         stream, _ = self._opened()
         scene, voxel_size = self._scenes[task.scene.name], self._plan.config.voxel_size
-        if scene.camera is None:
-            scene.begin(stream, task.scene.T_wc(task.indices[0])[:3, 3] if position is None else position, voxel_size)
+        if position is None:
+            position = task.scene.T_wc(task.indices[0])[:3, 3]
+        origin = scene.begin(stream, position, voxel_size)
         own = next(each for each in self._plan.tasks if (each.scene.name, each.backbone) == (scene.name, task.backbone))
-        self._group = GroupLog(own, voxel_size, scene.origin, self._live, followed=followed)
+        self._group = GroupLog(own, voxel_size, origin, self._live, followed=followed)
         self._live = None
         return self._group
 
