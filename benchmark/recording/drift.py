@@ -31,10 +31,11 @@ LEVEL_EDGES = SBD_MAX * (np.arange(LEVELS + 1) / LEVELS) ** 2
 AGREES, CONTRADICTS = 1, 2
 
 PICTURES = {
-    "contradictions": "labels that contradict the map (orange)",
-    "drift": f"drift (red little, white {SBD_MAX:.2f} bits; blue first seen)",
+    "contradictions": "contradictions (orange)",
+    "drift": f"drift (red to white, {SBD_MAX:.2f} bits; blue: new)",
 }
-"""The pictures of a frame by entity, and the titles of their views; the first one is seen first."""
+"""The pictures of a frame by entity, and the titles of their views; the first one is seen first: where labels are not
+the dominant class that their voxel had before the frame."""
 
 
 def levels_of(drift: Float32) -> UInt8:
@@ -190,6 +191,8 @@ class DriftLog:
         clock: Clock,
     ) -> None:
         """Log of each of the top voxels a lane with its dominant class, its moves in words, and where it is."""
+        if not self._views:
+            return
         rows, names = self.top_voxels(), classes.classes
         centers: Float64 = (self.map.index_of(rows) + 0.5) * self.map.voxel_size
         bits, first_frame, op = (self.map.column(name, rows) for name in ("drift_sum", "first_frame", "op"))

@@ -31,8 +31,9 @@ from semstab.model.measures import measures
 from semstab.model.records import Result, UnitContent
 from semstab.model.results import Unit, UnitSummary
 from semstab.model.voxels import VoxelTable
-from semstab.recording import drift, timeline
+from semstab.recording import timeline
 from semstab.recording.camera import COARSE_SIDE, SceneLog, over_camera, stride_of
+from semstab.recording.drift import DriftLog
 from semstab.recording.layout import blueprint, drawn, is_pointwise
 from semstab.recording.target import DEFAULT_URL, Target, is_whole
 from semstab.recording.timeline import Background, Clock, path
@@ -58,25 +59,21 @@ class GroupLog:
     ) -> None:
         self.task, self.origin = task, origin
         self._scene, self._classes = task.scene.name, task.mapping.target
-        self._translation = origin * voxel_size
-        self._drift = drift.DriftLog(voxel_size, len(self._classes), live) if followed else None
+        self._size = voxel_size
+        self.drift = DriftLog(voxel_size, len(self._classes), live) if followed else None
         self._maps: dict[str, VoxelLogger] = {}
         self._tables: dict[str, VoxelTable] = {}  # by backend, as they are finished
-        self._seen = 0
-        self.table: VoxelTable | None = None
-        """Its last finished map."""
         self.last: tuple[int, float | None] = (task.indices[-1], None)
         """Number and timestamp of the last frame."""
 
     def log(self, stream: rr.RecordingStream, frame: Frame, background: Background) -> None:
         """Log the labels of a frame that all units fused, what it did to the map, and the map that grows."""
-        self._seen += 1
         self.last = frame.index, frame.timestamp
         changes, jobs = None, list[Callable[[], None]]()
-        if self._drift is not None:
-            changes = self._drift.follow(frame)
+        if self.drift is not None:
+            changes = self.drift.follow(frame)
             if is_pointwise(drawn(self.task)):
-                jobs = self._map(drawn(self.task)).update(stream, self._drift.map)
+                jobs = self._map(drawn(self.task)).update(stream, self.drift.map)
 
         def job() -> None:
             stride, coarse = stride_of(frame.shape), stride_of(frame.shape, COARSE_SIDE)
@@ -101,7 +98,6 @@ class GroupLog:
         factor  of a table that is thinned already: it is not compared
         """
         unit, first = summary.unit, drawn(self.task)
-        self.table = table
         if factor == 1:
             self._tables[unit.backend] = table
         if first in self._tables and factor == 1:
@@ -121,8 +117,8 @@ class GroupLog:
 
     def log_flips(self, stream: rr.RecordingStream, clock: Clock) -> None:
         """Log the voxels that drifted most, and the frames that contributed most."""
-        if self._drift is not None and self._seen:
-            self._drift.log(stream, self._scene, self.task.backbone, self._classes, self._translation, clock)
+        if self.drift is not None:
+            self.drift.log(stream, self._scene, self.task.backbone, self._classes, self.origin * self._size, clock)
 
     def _log_difference(self, stream: rr.RecordingStream, first: str, second: str, tolerance: float) -> None:
         backbone, pair = self.task.backbone, f"{first} and {second}"
@@ -256,6 +252,7 @@ class Recording(Observer):
         try:
             if self._background is not None:
                 self._background.close()
+            self._send_layout(stream)
         finally:
             try:
                 stream.flush()
@@ -311,22 +308,22 @@ class Recording(Observer):
         stream, background = self._opened()
         self._logged.add(summary.unit)
         tolerance = self._plan.config.tolerance
-        background.submit(*group.last, lambda: group.log_unit(stream, summary, table, tolerance, factor))
+
+        def job() -> None:
+            group.log_unit(stream, summary, table, tolerance, factor)
+            self._scenes[summary.unit.scene].see(stream, group.task, table)
+            if self._sent == 1:  # later ones wait for the end: each has all scenes
+                self._send_layout(stream)
+
+        background.submit(*group.last, job)
 
     def _end_group(self) -> None:
-        """Log the flips of the group that is fused, and the layout with its maps."""
+        """Log the flips of the group that is fused."""
         group, self._group, self._live, self._unfinished = self._group, None, None, set()
         if group is None:
             return
         stream, background = self._opened()
-
-        def job() -> None:
-            if group.table is not None:
-                self._scenes[group.task.scene.name].see(stream, group.task, group.table)
-                self._send_layout(stream)
-            group.log_flips(stream, self._clock)
-
-        background.submit(*group.last, job)
+        background.submit(*group.last, lambda: group.log_flips(stream, self._clock))
         background.drain()
 
     def _send_layout(self, stream: rr.RecordingStream) -> None:

@@ -24,7 +24,7 @@ from semstab.metrics.agreement import shared_rows
 from semstab.metrics.summary import categorise
 from semstab.model.evidence import Evidence
 from semstab.model.labels import LabelSpace
-from semstab.model.measures import Measure, Voxels, bits, measures, sbd
+from semstab.model.measures import Voxels, bits, measures, sbd
 from semstab.model.records import Record
 from semstab.model.results import RECURRENT
 from semstab.model.statistics import LagBin, MapStatistics
@@ -44,33 +44,28 @@ class ColorMode:
     colormap: rr.components.Colormap | None = None
     range: tuple[float, float] | None = None
 
-    @classmethod
-    def of(cls, measure: Measure) -> ColorMode:
-        """Return the mode of a measure: 'SBD (0 to 0.31 bits; black: seen once)'."""
-        low, high = measure.range
-        ends = f"{low:.2g}{' and less' if low > 0 else ''} to {high:.2g}{' and more' if high < measure.largest else ''}"
-        once = "; black: seen once" if measure.lowest_op == 2 else ""
-        once = f"; black: OP < {measure.lowest_op}" if measure.lowest_op > 2 else once
-        title = f"{measure.title} ({f'{ends} {measure.unit}'.strip()}{once})"
-        colors = rr.components.Colormap
-        return cls(measure.title, title, colors.Viridis if measure.better == "higher" else colors.Plasma, measure.range)
-
 
 def color_modes() -> dict[str, ColorMode]:
     """Return the modes of the maps by name."""
+    colors, modes = rr.components.Colormap, {"class": ColorMode("Class", "dominant class")}
+    for measure in measures():  # 'SBD (0 to 0.31 bits; black: OP < 2)'
+        low, high = measure.range
+        ends = f"{low:.2g}{' and less' if low > 0 else ''} to {high:.2g}{' and more' if high < measure.largest else ''}"
+        undefined = f"; black: OP < {measure.lowest_op}" if measure.lowest_op > 1 else ""
+        title = f"{measure.title} ({f'{ends} {measure.unit}'.strip()}{undefined})"
+        colormap = colors.Viridis if measure.better == "higher" else colors.Plasma
+        modes[measure.key] = ColorMode(measure.title, title, colormap, measure.range)
     category = f"category (blue stable, orange uncertain, yellow drifting, grey OP < {RECURRENT})"
-    return {
-        "class": ColorMode("Class", "dominant class"),
-        **{measure.key: ColorMode.of(measure) for measure in measures()},
-        "op": ColorMode("OP", "OP (1 to 10 and more)", rr.components.Colormap.Viridis, (1.0, 10.0)),
-        "category": ColorMode("Category", category),
-    }
+    modes["op"] = ColorMode("OP", "OP (1 to 10 and more)", colors.Viridis, (1.0, 10.0))
+    return modes | {"category": ColorMode("Category", category)}
 
 
 MAX_VOXELS = 2_000_000
 """Voxels of one map; a larger one is thinned at its end."""
 
-CHUNKS = 32
+CHUNKS = 10
+"""Of a map. A layout has an entry for each chunk in each view, which takes kilobytes."""
+
 BUDGET = 2_000_000
 """Voxels that are logged of one map while it grows; those at its end come on top, at most MAX_VOXELS."""
 
