@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
 import io
 import re
 import signal
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -185,6 +187,15 @@ def frame(index: int, labels: np.ndarray, files: dict[str, str] | None = None) -
     return Frame(index, depth, camera_, T_wc, labels=labels.astype(np.uint8), files=files or {})
 
 
+@contextlib.contextmanager
+def saved(path: Path) -> Iterator[rr.RecordingStream]:
+    stream = rr.RecordingStream("test")
+    stream.save(path)
+    yield stream
+    stream.flush()
+    stream.disconnect()
+
+
 @pytest.mark.parametrize("evidence", ["float64", "float32"])
 def test_what_numba_says_of_a_frame_is_what_happened(evidence) -> None:
     rng = np.random.default_rng(5)
@@ -253,11 +264,8 @@ def test_the_voxel_that_flickers_comes_first_with_its_top_contributing_frames(tm
     worst = table.centers[table.drift_sum.argmax()]
     (row, *_) = log.top_voxels()
     np.testing.assert_allclose((log.map.index_of([row])[0] + 0.5) * 1.0, worst)
-    stream = rr.RecordingStream("test")
-    stream.save(tmp_path / "flips.rrd")
-    log.log(stream, "s", "net", CLASSES, np.zeros(3), Clock())
-    stream.flush()
-    stream.disconnect()
+    with saved(tmp_path / "flips.rrd") as stream:
+        log.log(stream, "s", "net", CLASSES, np.zeros(3), Clock())
     verify(tmp_path / "flips.rrd")
     rows = read(tmp_path / "flips.rrd")
     reference = backends.create("numpy", voxel_size=1.0, num_classes=3)
@@ -312,23 +320,26 @@ def test_the_log_of_flips_is_bounded_and_keeps_those_of_the_worst(monkeypatch) -
     assert bounded.top_voxels()[0] == log.top_voxels()[0]
 
 
+def grow(path: Path, labels: list[np.ndarray], *, finish: bool) -> tuple[dict[str, list[dict[str, Any]]], NumbaHash]:
+    """The rows of a map that grows by these frames, and the map."""
+    fused = NumbaHash(voxel_size=0.25, num_classes=3)
+    growing = voxel_maps.VoxelLogger("/map", CLASSES, np.zeros(3, dtype=np.int64), frames=len(labels))
+    with saved(path) as stream:
+        for index, each in enumerate(labels):
+            stream.set_time("frame", sequence=index)
+            fused.integrate(frame(index, each))
+            for job in growing.update(stream, fused):
+                job()
+        if finish:
+            growing.finish(stream, fused.table())
+    return read(path), fused
+
+
 def test_what_a_growing_map_logs_is_bounded(monkeypatch, tmp_path) -> None:
     monkeypatch.setattr(voxel_maps, "BUDGET", 600)
     monkeypatch.setattr(voxel_maps, "MAX_VOXELS", 2000)
-    fused = NumbaHash(voxel_size=0.25, num_classes=3)
-    growing = voxel_maps.VoxelLogger("/map", CLASSES, np.zeros(3, dtype=np.int64), frames=20)
-    stream = rr.RecordingStream("test")
-    stream.save(tmp_path / "grown.rrd")
-    rng = np.random.default_rng(0)
-    for index in range(20):  # every voxel changes with every frame
-        stream.set_time("frame", sequence=index)
-        fused.integrate(frame(index, rng.integers(0, 3, (12, 16))))
-        for job in growing.update(stream, fused):
-            job()
-    growing.finish(stream, fused.table())
-    stream.flush()
-    stream.disconnect()
-    rows = read(tmp_path / "grown.rrd")
+    rng = np.random.default_rng(0)  # every voxel changes with every frame
+    rows, fused = grow(tmp_path / "grown.rrd", [rng.integers(0, 3, (12, 16)) for _ in range(20)], finish=True)
     logged = sum(len(row["vss:values"]) for at in rows for row in rows[at] if at.startswith("/map/"))
     assert 300 + len(fused) < logged <= 600 + len(fused)
     voxels = grid(rows, "/map")
@@ -336,21 +347,10 @@ def test_what_a_growing_map_logs_is_bounded(monkeypatch, tmp_path) -> None:
     np.testing.assert_array_equal(voxels["voxel_indices"], fused.table().index)
 
 
-def test_a_chunk_that_got_no_new_voxels_is_logged_without_its_places(tmp_path) -> None:
-    fused = NumbaHash(voxel_size=0.25, num_classes=3)
-    growing = voxel_maps.VoxelLogger("/map", CLASSES, np.zeros(3, dtype=np.int64), frames=4)
-    stream = rr.RecordingStream("test")
-    stream.save(tmp_path / "grown.rrd")
-    for index in range(4):
-        stream.set_time("frame", sequence=index)
-        fused.integrate(frame(index, np.full((12, 16), index % 3)))
-        for job in growing.update(stream, fused):
-            job()
-    stream.flush()
-    stream.disconnect()
-    rows = read(tmp_path / "grown.rrd")
-    placed = {row["frame"]: row.get("VoxelGridMap:voxel_indices") is not None for row in rows["/map/00"]}
-    assert placed == {0: True, 1: False, 2: False, 3: False}
+def test_a_chunk_that_got_no_new_voxels_is_logged_without_its_indices(tmp_path) -> None:
+    rows, fused = grow(tmp_path / "grown.rrd", [np.full((12, 16), index % 3) for index in range(4)], finish=False)
+    located = {row["frame"]: row.get("VoxelGridMap:voxel_indices") is not None for row in rows["/map/00"]}
+    assert located == {0: True, 1: False, 2: False, 3: False}
     voxels, table = grid(rows, "/map"), fused.table()
     np.testing.assert_array_equal(voxels["voxel_indices"], table.index)
     np.testing.assert_array_equal(voxels["op"], table.op)
