@@ -69,7 +69,7 @@ class SceneLog:
         self.legend = Legend([task.mapping.target for task in tasks])
         self.origin: Int64 | None = None
         self.bounds: SceneBounds | None = None
-        self._translation = np.zeros(3)
+        self._translation: Float64 = np.zeros(3)
         self._poses: dict[int, Float64] = {}
         self._intrinsics: tuple[Intrinsics, tuple[int, int]] | None = None
         self._unread = False
@@ -90,7 +90,7 @@ class SceneLog:
         if self.origin is None:
             steps = np.round(position / ORIGIN_STEP).astype(np.int64)
             self.origin = steps * round(ORIGIN_STEP / voxel_size)
-            at = self._translation = self.origin * voxel_size
+            at = self._translation = (self.origin * voxel_size).astype(np.float64)
             if steps.any():
                 where = ", ".join(f"{name} = {value:.3f} m" for name, value in zip("xyz", at, strict=True))
                 text = f"map coordinates are relative to {where} of the scene's world"
@@ -125,7 +125,7 @@ class SceneLog:
     def _log_images(self, stream: rr.RecordingStream, frame: Frame) -> None:
         stride = stride_of(frame.shape, COARSE_SIDE)
         depth = frame.depth[::stride, ::stride]
-        depth = np.where(np.isfinite(depth), depth, 0).astype(np.float16)  # to 0.05 %
+        depth = np.where(depth <= np.finfo(np.float16).max, depth, 0).astype(np.float16)  # to 0.05 %
         stream.log(path(self.name, "depth"), rr.DepthImage(depth, meter=1.0, colormap="turbo"))
         try:
             jpeg = color_of(frame)

@@ -105,7 +105,7 @@ class FrameChanges:
 SHOWN = 10
 """Voxels that are shown of a backbone on a scene, at least APART voxels apart: one of each location that drifts."""
 
-APART, CANDIDATES = 5, 2000
+APART, CANDIDATES = 5, 20_000
 
 MAX_MOVES = 2_000_000
 """Moves that are remembered of a backbone on a scene; past them, those of the voxels that drifted least are dropped."""
@@ -165,9 +165,8 @@ class DriftLog:
             every = np.concatenate(self._moves)
             order = np.argsort(-self.map.column("drift_sum")[every["row"]], kind="stable")[: MAX_MOVES // 2]
             self._moves = [every[np.sort(order)]]
-        return FrameChanges(
-            frame, changes.key.copy(), changes.drift, changes.before, self.map.voxel_size, self.map.origin
-        )
+        own = changes.key.copy(), changes.drift, changes.before
+        return FrameChanges(frame, *own, self.map.voxel_size, self.map.origin)
 
     def top_voxels(self) -> Int64:
         """Return the rows of the voxels that drifted most, one of each location, the one that drifted most first."""
@@ -177,8 +176,10 @@ class DriftLog:
         index = self.map.index_of(rows)
         chosen: list[int] = []
         for k in np.lexsort([*index.T[::-1], -total[rows]]):
-            if len(chosen) < SHOWN and np.all(np.abs(index[chosen] - index[k]).max(axis=1, initial=0) >= APART):
+            if np.all(np.abs(index[chosen] - index[k]).max(axis=1) >= APART):
                 chosen.append(int(k))
+            if len(chosen) == SHOWN:
+                break
         return rows[chosen]
 
     def log(
@@ -194,7 +195,7 @@ class DriftLog:
         if not self._views:
             return
         rows, names = self.top_voxels(), classes.classes
-        centers: Float64 = (self.map.index_of(rows) + 0.5) * self.map.voxel_size
+        centers = ((self.map.index_of(rows) + 0.5) * self.map.voxel_size).astype(np.float64)
         bits, first_frame, op = (self.map.column(name, rows) for name in ("drift_sum", "first_frame", "op"))
         dominant, sbd = self.map.evidence_of(rows).argmax(axis=1), mean_drift(bits, op)
         every = np.concatenate([np.zeros(0, dtype=MOVE), *self._moves])

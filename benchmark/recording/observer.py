@@ -209,11 +209,11 @@ class Recording(Observer):
         """Log what the run's folder has of the units that are not logged yet; with pictures read frames again."""
         stream, background = self._opened()
         for task in self._plan.tasks:
+            of_task = {"scene": task.scene.name, "backbone": task.backbone}
             records = [
                 each
-                for each in (*result.select(BASE), *result.select(BACKENDS))
-                if (each.unit.scene, each.unit.backbone) == (task.scene.name, task.backbone)
-                and each.unit not in self._logged
+                for each in (*result.select(BASE, **of_task), *result.select(BACKENDS, **of_task))
+                if each.unit not in self._logged
             ]
             if not records:
                 continue
