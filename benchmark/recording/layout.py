@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 import itertools
 import math
 from collections.abc import Iterable, Mapping, Sequence
@@ -30,16 +29,16 @@ from semstab.task import Task
 # The camera pose from which a map fills its view.
 
 FIELD_OF_VIEW = math.radians(55)
-"""Of the viewer's eyes, from bottom to top."""
+"""The viewer's, from bottom to top."""
 
 MARGIN = 0.96
-"""Of a view's half height and half width, what is seen in it."""
+"""Share of a view's half height and half width that the map fills."""
 
 OUTLIERS = 0.005
 """Share of a map's voxels that may lie beyond each edge of its view."""
 
 BACKGROUND = (72, 72, 78)
-"""Of the maps: neither end of the colour maps vanishes in it."""
+"""Behind the maps: neither end of the colour maps vanishes in it."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,7 +67,7 @@ def camera_pose(bounds: SceneBounds | None, aspect: float) -> rrb.EyeControls3D 
 def direction(bounds: SceneBounds) -> tuple[Float64, Float64]:
     """Return unit vectors from a scene to the eye, and up.
 
-    Where the world's up is known it looks down on the points, across their longest extent; else from the cameras' side.
+    Where the world's up is known the eye is above the points, across their longest extent; else from the cameras' side.
     """
     points, cameras, up = bounds.points, bounds.cameras, bounds.up
     middle = (points.min(axis=0) + points.max(axis=0)) / 2
@@ -83,7 +82,6 @@ def direction(bounds: SceneBounds) -> tuple[Float64, Float64]:
     return toward / np.linalg.norm(toward), up / np.linalg.norm(up)
 
 
-@functools.lru_cache(maxsize=256)
 def fit(bounds: SceneBounds, aspect: float) -> tuple[Float64, float]:
     """Return where an eye looks, and from how far, so that points and cameras fill a view of that width by height.
 
@@ -113,7 +111,7 @@ def fit(bounds: SceneBounds, aspect: float) -> tuple[Float64, float]:
 # The classes of a scene's maps and their colours, in a grid.
 
 WIDTH, LINE, LETTER = 780.0, 24.0, 7.0
-"""Of the legend, of one of its lines, and of a letter, in points of a window of 1500."""
+"""Width of the legend, height of a line and width of a letter, in points of a window of 1500."""
 
 DOT, GAP = 20.0, 34.0
 """Width of a dot, and of the space around a name."""
@@ -122,7 +120,7 @@ LABEL = -13.5
 """The viewer draws a label below its point: from the middle of the label to its point."""
 
 LINES = 2
-"""Of the legend that is always seen; all classes are in a tab."""
+"""Lines of the legend that is always seen; all classes are in a tab."""
 
 
 class Legend:
@@ -162,9 +160,9 @@ class Legend:
         for name, shown in ("legend", self.entries[: self.room]), ("all_classes", self.entries):
             names, colors = zip(*shown, strict=True)
             middle = DOT + LETTER / 2 * np.array([len(each) for each in names])
-            beside = at[: len(shown)] + np.stack([middle, np.full(len(shown), LABEL)], axis=1)
+            right_of = at[: len(shown)] + np.stack([middle, np.full(len(shown), LABEL)], axis=1)
             dots = rr.Points2D(at[: len(shown)], colors=colors, radii=rr.Radius.ui_points(5.0))
-            words = rr.Points2D(beside, colors=(255, 255, 255), labels=names, radii=0.0, show_labels=True)
+            words = rr.Points2D(right_of, colors=(255, 255, 255), labels=names, radii=0.0, show_labels=True)
             stream.log(path(scene, name), dots, static=True)
             stream.log(path(scene, name, "names"), words, static=True)
 
@@ -376,7 +374,7 @@ def record_changes(
     up: Mapping[str, tuple[float, float, float]],
     sentences: Sequence[str],
 ) -> None:
-    """Write a recording with a tab for each scene and run, and the sentences beside it."""
+    """Write a recording with a tab for each scene and run, and the sentences next to it."""
     file.unlink(missing_ok=True)
     stream = Target(file).open()
     text = "\n".join(f"- {text}" for text in sentences)

@@ -80,18 +80,13 @@ class Target:
         stream.set_log_time_enabled(False)
         return stream
 
-    @property
-    def viewer_url(self) -> str | None:
-        """The address of the viewer, or of the server; None where there is none."""
-        return DEFAULT_URL if self.viewer in ("spawn", "serve") else self.viewer
-
     def _viewer(self) -> rr.GrpcSink | rr.GrpcServerSink:
         if self.viewer == "serve":
             address = _address(DEFAULT_URL)
             if not _is_free(address):
                 raise ConfigError(f"--rerun serve: port {address[1]} is taken; end what listens there, or use connect")
             return rr.GrpcServerSink(*address)
-        url = str(self.viewer_url)
+        url = DEFAULT_URL if self.viewer == "spawn" else str(self.viewer)
         if self.viewer == "spawn" and _is_free(_address(url)):
             _spawn(url)
         if (reason := _why_no_viewer(url)) is not None:
@@ -150,10 +145,9 @@ def _is_free(address: tuple[str, int]) -> bool:
 
 
 def _why_no_viewer(url: str) -> str | None:
-    """None where a gRPC server answers: with less the SDK would wait for one at the end of the run."""
+    """Return None where a gRPC server answers: with less the SDK would wait for one at the end of the run."""
     try:
-        connection = socket.create_connection(_address(url), timeout=ANSWER_SECONDS)
-        with connection:
+        with socket.create_connection(_address(url), timeout=ANSWER_SECONDS) as connection:
             if not url.startswith("rerun+http:"):
                 return None  # it is encrypted
             connection.sendall(HTTP2_PREFACE)

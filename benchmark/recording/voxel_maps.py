@@ -64,7 +64,7 @@ MAX_VOXELS = 2_000_000
 """Voxels of one map; a larger one is thinned at its end."""
 
 CHUNKS = 10
-"""Of a map. A layout has an entry for each chunk in each view, which takes kilobytes."""
+"""Parts of a map; a layout has an entry for each of them in each view, which takes kilobytes."""
 
 BUDGET = 2_000_000
 """Voxels that are logged of one map while it grows; those at its end come on top, at most MAX_VOXELS."""
