@@ -209,10 +209,11 @@ class Recording(Observer):
         """Log what the run's folder has of the units that are not logged yet; with pictures read frames again."""
         stream, background = self._opened()
         for task in self._plan.tasks:
-            of_task = {"scene": task.scene.name, "backbone": task.backbone}
+            scene, backbone = task.scene.name, task.backbone
             records = [
                 each
-                for each in (*result.select(BASE, **of_task), *result.select(BACKENDS, **of_task))
+                for sweep in (BASE, BACKENDS)
+                for each in result.select(sweep, scene=scene, backbone=backbone)
                 if each.unit not in self._logged
             ]
             if not records:
@@ -221,7 +222,7 @@ class Recording(Observer):
                 if pictures and not isinstance(task.scene, _ClosedScene):
                     self._replay_frames(task, records[0].summary)
             except (SemstabError, OSError) as error:
-                logger.warning("%s, %s: recorded without pictures (%s)", task.scene.name, task.backbone, error)
+                logger.warning("%s, %s: recorded without pictures (%s)", scene, backbone, error)
             background.drain()
             self._clock.set(stream, task.indices[-1])
             group = self._group or self._begin(task, followed=False)
