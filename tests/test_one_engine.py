@@ -105,9 +105,7 @@ def test_the_command_takes_jobs_and_says_what_does_not_go_together(root, tmp_pat
 def test_a_study_writes_frame_series_and_where_asked_a_recording_of_its_base_units(root, tmp_path) -> None:
     content = settings(root, sweeps={"voxel_size": [0.5]}, name="tiny")
     out = tmp_path / "study"
-    semstab.engine.run_study(
-        load_config(overrides=content), out, observers=[Recording(Target(out / "recording.rrd"), run=out)]
-    )
+    semstab.engine.run_study(load_config(overrides=content), out, observers=[Recording(Target(out / "recording.rrd"))])
     slugs = {f"wall__{backbone}__{backend}" for backbone in "ab" for backend in ("numba", "numpy")}
     assert {file.stem for file in (out / "frames").iterdir()} == slugs
     result = load_result(out)
@@ -128,7 +126,7 @@ def test_a_recording_of_several_processes_has_the_series_and_maps_of_the_folder(
     found = []
     for name, executor in (("one", None), ("two", LocalProcesses(2))):
         out = tmp_path / name
-        recording = Recording(Target(out / "recording.rrd"), run=out)
+        recording = Recording(Target(out / "recording.rrd"))
         semstab.engine.run(config, out=out, executor=executor, observers=[recording])
         assert lacks_pictures(out, out / "recording.rrd") == (name == "two")
         if name == "two":

@@ -179,7 +179,7 @@ def execute(
     if rerun != "off":
         from semstab.recording import Recording, Target
 
-        recording.append(Recording(Target.parse(rerun, out / "recording.rrd"), run=out))
+        recording.append(Recording(Target.parse(rerun, out / "recording.rrd")))
         if executor.elsewhere and recording[0].target.live:
             raise ConfigError("--rerun: a viewer follows a run in one process; leave out --jobs and --scheduler")
     observers: list[Observer] = [ProgressBar(Console(stderr=True, quiet=quiet)), *recording]

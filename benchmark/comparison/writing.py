@@ -167,7 +167,7 @@ def write(comparison: ComparisonData, out: str | Path) -> None:
     _write_columns(comparison, folder)
     write_text(folder / REPORT, page(comparison.result, made, drawn, folder))
     if comparison.changes:
-        from semstab.recording.changes import record_changes
+        from semstab.recording import record_changes
 
         record_changes(folder / RECORDING, dict(_recorded(comparison)), comparison.up, sentences(comparison.result))
 

@@ -3,8 +3,11 @@
 Entities, all below the scene's name:
 
 camera, camera/color                    Transform3D and Pinhole; EncodedImage (JPEG)
-camera/BACKBONE/labels, .../drift       SegmentationImage: classes; drift that the frame caused at each pixel's voxel.
-                                        Smaller ones have a Transform3D, which spreads them over the camera's image
+camera/BACKBONE/labels                  SegmentationImage: classes
+camera/BACKBONE/contradictions          the same: where labels are not the dominant class of the map
+                                        before the frame
+camera/BACKBONE/drift                   the same: drift that the frame caused at each pixel's voxel. A Transform3D
+                                        spreads each picture over the camera's image
 depth, trajectory                       DepthImage; LineStrips3D
 map/BACKBONE/BACKEND/CHUNK              VoxelGridMap, coloured by class; components category:colors, op:values
                                         and KEY:values of each measure, which the views map to its own
@@ -14,8 +17,7 @@ flips_report/BACKBONE, flips_at/...     TextDocument: the top contributing frame
 camera/BACKBONE/flips                   Points2D: those voxels in the frame, where their numbers lie inside its image
 difference/BACKBONE/A and B/PART        VoxelGridMap: voxels where two backends differ
 difference_report/BACKBONE/A and B      TextDocument: how many they are
-legend, all_classes                     Points2D: the classes in use and their colours
-drift_legend                            SegmentationImage: the levels of drift
+legend, all_classes                     Points2D: the classes and their colours, those with the most voxels first
 log                                     TextLog: each unit's final numbers
 
 and in the recording of a comparison
@@ -24,9 +26,13 @@ change/RUN/agreement, .../truth         VoxelGridMap: what each voxel that chang
 change/RUN/.../same, .../locations      Points3D: the other voxels; the locations that got worse, with their numbers
 """
 
+from semstab.recording.layout import record_changes
 from semstab.recording.observer import Recording, lacks_pictures, record_finished
 from semstab.recording.target import Target, viewer_command
 from semstab.recording.timeline import SERIES
 from semstab.recording.voxel_maps import color_modes
 
-__all__ = ["SERIES", "Recording", "Target", "color_modes", "lacks_pictures", "record_finished", "viewer_command"]
+__all__ = [
+    "SERIES", "Recording", "Target", "color_modes", "lacks_pictures", "record_changes", "record_finished",
+    "viewer_command",
+]  # fmt: skip

@@ -1,12 +1,11 @@
-"""The drift that each frame caused: its picture in the camera, and the top contributing frames of drifting voxels."""
+"""Pictures of what each frame did to the map, and the top contributing frames of the voxels that drifted most."""
 
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import PurePath
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -14,135 +13,99 @@ import rerun as rr
 
 from semstab.backends import GrowingMap
 from semstab.backends.numba_hash import NumbaHash
-from semstab.core.types import Float32, Float64, Int32, Int64, Mask, UInt8
+from semstab.backends.shared.association import back_project, voxel_index
+from semstab.backends.shared.keys import HALF
+from semstab.core.types import Float32, Float64, Int64, Mask, UInt8, UInt16
 from semstab.model.frames import Frame, Intrinsics
-from semstab.model.labels import GLOW, Color, LabelSpace, between
+from semstab.model.labels import GLOW, LabelSpace, between
 from semstab.model.measures import SBD_MAX, mean_drift
-from semstab.recording.kernels import find_voxels
 from semstab.recording.timeline import LINE_COLORS, Clock, path
 
-# The picture: levels of drift, in colours that no class has, and their legend.
+# The pictures: levels of drift, in colours that no class is given, and labels that contradict the map.
 
 NO_VOXEL, FIRST_SEEN, NO_DRIFT = 0, 1, 2
 LEVELS = 24
 LEVEL_EDGES = SBD_MAX * (np.arange(LEVELS + 1) / LEVELS) ** 2
 """Bits at which one level of drift ends and the next begins: finer where drift is small; the last one is open."""
 
-RAMPS: tuple[tuple[Color, ...], ...] = (
-    GLOW,
-    ((0, 100, 120), (0, 160, 190), (0, 220, 240), (130, 245, 255), (215, 255, 255)),
-    ((120, 0, 110), (200, 0, 190), (255, 60, 220), (255, 150, 235), (255, 220, 250)),
-    ((30, 100, 0), (70, 170, 0), (130, 235, 30), (190, 255, 110), (230, 255, 200)),
-)
-"""What drifts lights up like a glowing body; where a taxonomy of the user's has such a colour, in another hue."""
+AGREES, CONTRADICTS = 1, 2
 
-NEAR = 40.0
-"""Distance in RGB from which on two colours are told apart."""
-
-LEGEND = (-1.0, LEVELS + 3.0), (0.0, 2.8)
-"""What is seen of the legend, across and down, in squares of a level."""
+PICTURES = {
+    "contradictions": "contradictions (orange)",
+    "drift": f"drift (red to white, {SBD_MAX:.2f} bits; blue: new)",
+}
+"""The pictures of a frame by entity, and the titles of their views; the first one is seen first: where labels are not
+the dominant class that their voxel had before the frame."""
 
 
-def ramp(classes: LabelSpace) -> Float64:
-    """Colours (LEVELS, 3) of the levels: the first of RAMPS that no class's colour is near, else the farthest."""
-    ramps = [between(colors, LEVELS) for colors in RAMPS]
-    worn = np.array(classes.colors, dtype=np.float64)
-    distance = [float(np.linalg.norm(r[:, None] - worn, axis=2).min()) for r in ramps]
-    clear = [number for number, least in enumerate(distance) if least >= NEAR]
-    return ramps[clear[0] if clear else int(np.argmax(distance))]
-
-
-def levels_of(drift: Float32, seen: Mask) -> UInt8:
-    """Picture of drift in bits (H, W), NaN where a voxel is seen for the first time; `seen` where there is a voxel."""
+def levels_of(drift: Float32) -> UInt8:
+    """Return the level of drift in bits (n,), NaN where a voxel is seen for the first time."""
     level = np.searchsorted(LEVEL_EDGES[1:-1], drift, side="right") + NO_DRIFT + 1
     level[drift == 0] = NO_DRIFT
     level[np.isnan(drift)] = FIRST_SEEN
-    level[~seen] = NO_VOXEL
     return level.astype(np.uint8)
 
 
-def context(classes: LabelSpace) -> rr.AnnotationContext:
-    """Names and colours of the levels; over the colour image only what drifts is seen, and dimly what is new."""
+def contexts() -> dict[str, rr.AnnotationContext]:
+    """Return names and colours in each picture; over the colour image what is as expected is dark."""
     names = [f"{low:.4f} to {high:.4f} bits" for low, high in itertools.pairwise(LEVEL_EDGES)]
     names[-1] = f"{LEVEL_EDGES[-2]:.4f} bits and more"
-    glow = ramp(classes).astype(int)
-    infos: list[tuple[int, str, tuple[int, ...]]] = [
-        (NO_VOXEL, "no voxel", (0, 0, 0, 200)),
-        (FIRST_SEEN, "first seen", (40, 60, 110, 170)),
-        (NO_DRIFT, "no drift", (0, 0, 0, 150)),
-    ]
-    infos += [(NO_DRIFT + 1 + k, name, (*glow[k].tolist(), 255)) for k, name in enumerate(names)]
-    return rr.AnnotationContext([rr.AnnotationInfo(*info) for info in infos])
-
-
-def log_legend(stream: rr.RecordingStream, entity: str, classes: LabelSpace) -> None:
-    """The levels side by side in their colours, and what they mean where that is round."""
-    stream.log(entity, context(classes), static=True)
-    shown = np.array([[FIRST_SEEN, NO_VOXEL, *range(NO_DRIFT + 1, NO_DRIFT + 1 + LEVELS)]], dtype=np.uint8)
-    stream.log(f"{entity}/levels", rr.SegmentationImage(shown), static=True)
-    ticks = [0.01, 0.05, 0.1, 0.2]
-    at = [2 + LEVELS * (bits / SBD_MAX) ** 0.5 for bits in ticks]
-    labels = ["first seen", *(f"{bits:g}" for bits in ticks), f"{SBD_MAX:.2f} bits"]
-    points = np.array([(x, 1.2) for x in (0.5, *at, LEVELS + 1.0)])
-    names = rr.Points2D(points, colors=(255, 255, 255), labels=labels, radii=0.0, show_labels=True)
-    stream.log(f"{entity}/names", names, static=True)
-
-
-# The map that is followed.
-
-
-class Tracker:
-    """Follows a map voxel by voxel: a live one, which fuses each frame anyway, or else one of its own."""
-
-    def __init__(self, voxel_size: float, num_classes: int, live: GrowingMap | None = None) -> None:
-        self.map: GrowingMap = NumbaHash(voxel_size, num_classes) if live is None else live
-        self._is_own = live is None
-
-    def follow(self, frame: Frame) -> FrameDrift:
-        """Return the drift that a frame caused, which live maps have fused by now."""
-        if self._is_own:
-            self.map.integrate(frame)
-        changes = self.map.changes
-        return FrameDrift(frame, changes.key.copy(), changes.drift, self.map.voxel_size, self.map.origin)
+    none, glow = (NO_VOXEL, "no voxel", (0, 0, 0, 200)), between(GLOW, LEVELS).astype(int).tolist()
+    infos = {
+        "contradictions": [
+            none,
+            (AGREES, "as the map", (0, 0, 0, 150)),
+            (CONTRADICTS, "contradicts the map", (255, 120, 0, 255)),
+        ],
+        "drift": [
+            none,
+            (FIRST_SEEN, "first seen", (40, 60, 110, 170)),
+            (NO_DRIFT, "no drift", (0, 0, 0, 150)),
+            *((NO_DRIFT + 1 + k, name, (*glow[k], 255)) for k, name in enumerate(names)),
+        ],
+    }
+    return {name: rr.AnnotationContext(each) for name, each in infos.items()}
 
 
 @dataclass(frozen=True, eq=False)
-class FrameDrift:
-    """The drift that a frame caused at each voxel that it saw, whatever becomes of the map.
+class FrameChanges:
+    """What a frame did to the n voxels that it saw, whatever becomes of the map.
 
-    key    (n,) int64 packed voxel index, relative to the origin
-    drift  (n,) float32 bits, NaN where the voxel was not seen before
+    key     (n,) int64 packed voxel index, relative to the origin
+    drift   (n,) float32 bits, NaN where the voxel was not seen before
+    before  (n,) uint16 dominant class before the frame; where the voxel was not seen, after it
     """
 
     frame: Frame
     key: Int64
     drift: Float32
+    before: UInt16
     voxel_size: float
     origin: Int64
 
-    def at(self, stride: int) -> tuple[Float32, Mask]:
-        """Drift behind every stride-th pixel (H', W'), and where there is a voxel: where there is none, drift is 0."""
-        found = self.voxels_at(stride)
-        seen = found >= 0
-        drift = np.zeros(found.shape, dtype=np.float32)
-        drift[seen] = self.drift[found[seen]]
-        return drift, seen
-
-    def voxels_at(self, stride: int) -> Int32:
-        """Which of the n voxels is behind every stride-th pixel (H', W'); -1 where a pixel does not count."""
-        H, W = self.frame.shape
-        camera, pick = self.frame.intrinsics, np.s_[::stride, ::stride]
-        rays = (np.arange(W)[::stride] - camera.cx) / camera.fx, (np.arange(H)[::stride] - camera.cy) / camera.fy
-        depth = np.where(self.frame.valid[pick], self.frame.depth[pick], np.float32(0))
-        found = np.full(depth.shape, -1, dtype=np.int32)
-        find_voxels(depth, *rays, np.array(self.frame.T_wc), self.voxel_size, self.origin, self.key, found)
-        return found
+    def pictures(self, stride: int) -> dict[str, UInt8]:
+        """Return each of PICTURES, of every stride-th pixel (H', W'); the stride is a power of 2."""
+        frame = self.frame.every(stride)  # rays divided by a power of 2 stay exact: each pixel falls into its voxel
+        x, y, z = voxel_index(back_project(frame), self.voxel_size, frame) - self.origin[:, None] + HALF
+        order = np.argsort(self.key)
+        voxel = order[np.searchsorted(self.key, x << 42 | y << 21 | z, sorter=order)]
+        contradicts = frame.predicted[frame.valid] != self.before[voxel]
+        shown = {
+            "contradictions": np.where(contradicts, CONTRADICTS, AGREES),
+            "drift": levels_of(self.drift)[voxel],
+        }
+        pictures = {name: np.full(frame.shape, NO_VOXEL, np.uint8) for name in PICTURES}
+        for name, picture in pictures.items():
+            picture[frame.valid] = shown[name]
+        return pictures
 
 
 # The voxels that drifted most, and the frames that contributed most to that.
 
 SHOWN = 10
-"""Voxels that are shown of a backbone on a scene."""
+"""Voxels that are shown of a backbone on a scene, at least APART voxels apart: one of each location that drifts."""
+
+APART, CANDIDATES = 5, 20_000
 
 MAX_MOVES = 2_000_000
 """Moves that are remembered of a backbone on a scene; past them, those of the voxels that drifted least are dropped."""
@@ -158,29 +121,8 @@ MOVE = np.dtype([("row", np.int32), ("frame", np.int32), ("before", np.uint16), 
 COLORS = (*LINE_COLORS, (255, 255, 255), (170, 255, 195), (220, 190, 255))
 
 
-@dataclass(frozen=True)
-class DriftingVoxel:
-    """A voxel that drifted much.
-
-    number  from 1, the one that drifted most first
-    center  (3,) metres, world
-    bits    its drift, summed over all frames
-    moves   records of `MOVE`, in the order of the frames
-    """
-
-    number: int
-    center: Float64
-    first_frame: int
-    first_class: int
-    op: int
-    sbd: float
-    bits: float
-    moves: npt.NDArray[np.void]
-
-
-@dataclass(frozen=True, eq=False)
-class View:
-    """A frame without its images: number and time, the camera that projects into it, and its label file."""
+class View(NamedTuple):
+    """A frame without its images: its time, the camera that projects into it, and its label file."""
 
     timestamp: float | None
     intrinsics: Intrinsics
@@ -190,117 +132,112 @@ class View:
 
     def project(self, points: Float64) -> tuple[Float64, Mask]:
         """Return where points (n, 3) are in the viewer's image (n, 2), and which have their number inside it."""
-        R, t = self.T_wc[:3, :3], self.T_wc[:3, 3]
-        x, y, z = self.intrinsics.matrix @ ((points - t) @ R).T
-        before = z > 0
-        pixels = np.stack([x, y], axis=1) / np.where(before, z, 1.0)[:, None] + 0.5  # its pixel centres are at halves
+        x, y, z = self.intrinsics.matrix @ ((points - self.T_wc[:3, 3]) @ self.T_wc[:3, :3]).T
+        pixels = np.stack([x, y], axis=1) / np.where(z > 0, z, 1.0)[:, None] + 0.5  # its pixel centres are at halves
         size = np.array(self.shape[::-1], dtype=np.float64)
         first, last = NUMBER * size.max()
-        return pixels, before & np.all((pixels >= first) & (pixels <= size - last), axis=1)
+        return pixels, (z > 0) & np.all((pixels >= first) & (pixels <= size - last), axis=1)
 
 
-class ContributionLog:
-    """Remembers which frames moved a voxel's belief, above all its dominant class, and their label files."""
+class DriftLog:
+    """Follows a map voxel by voxel, a live one or else one of its own, and remembers which frames moved a belief."""
 
-    def __init__(self) -> None:
-        self.moves: list[npt.NDArray[np.void]] = []
-        """Records of `MOVE`, in the order of the frames."""
+    def __init__(self, voxel_size: float, num_classes: int, live: GrowingMap | None = None) -> None:
+        self.map: GrowingMap = NumbaHash(voxel_size, num_classes) if live is None else live
+        self._is_own = live is None
+        self._moves: list[npt.NDArray[np.void]] = []  # records of MOVE, in the order of the frames
         self._views: dict[int, View] = {}
 
-    def update(self, tracker: Tracker, frame: Frame) -> None:
-        """Remember the moves of the frame that the tracker followed last."""
-        changes = tracker.map.changes
+    def follow(self, frame: Frame) -> FrameChanges:
+        """Return what a frame did to the map; live maps have fused it by now."""
+        if self._is_own:
+            self.map.integrate(frame)
+        changes = self.map.changes
         at = np.flatnonzero((changes.before != changes.after) | (changes.drift >= MOVED_BITS))
         moves = np.zeros(len(at), dtype=MOVE)
         moves["row"], moves["frame"], moves["bits"] = changes.row[at], frame.index, changes.drift[at]
         moves["before"], moves["after"] = changes.before[at], changes.after[at]
-        self.moves += [moves] if len(moves) else []
+        self._moves += [moves] if len(moves) else []
         file = PurePath(frame.files.get("labels") or frame.files.get("scores") or "")
         name = file.name if file.suffix else ""
         self._views[frame.index] = View(frame.timestamp, frame.intrinsics, np.array(frame.T_wc), frame.shape, name)
-        if sum(map(len, self.moves)) > MAX_MOVES:  # half as many stay: those of the voxels that drifted most
-            every = np.concatenate(self.moves)
-            order = np.argsort(-tracker.map.column("drift_sum")[every["row"]], kind="stable")[: MAX_MOVES // 2]
-            self.moves = [every[np.sort(order)]]
+        if sum(map(len, self._moves)) > MAX_MOVES:  # half as many stay: those of the voxels that drifted most
+            every = np.concatenate(self._moves)
+            order = np.argsort(-self.map.column("drift_sum")[every["row"]], kind="stable")[: MAX_MOVES // 2]
+            self._moves = [every[np.sort(order)]]
+        own = changes.key.copy(), changes.drift, changes.before
+        return FrameChanges(frame, *own, self.map.voxel_size, self.map.origin)
 
-    def top_voxels(self, tracker: Tracker) -> Iterator[DriftingVoxel]:
-        """Yield the voxels that drifted most, each with the frames that moved it."""
-        fused, total = tracker.map, tracker.map.column("drift_sum")
-        least = np.partition(total, -SHOWN)[-SHOWN] if len(total) > SHOWN else 0.0
+    def top_voxels(self) -> Int64:
+        """Return the rows of the voxels that drifted most, one of each location, the one that drifted most first."""
+        total = self.map.column("drift_sum")
+        least = np.partition(total, -CANDIDATES)[-CANDIDATES] if len(total) > CANDIDATES else 0.0
         rows = np.flatnonzero((total >= least) & (total > 0))
-        rows = rows[np.lexsort([*fused.index_of(rows).T[::-1], -total[rows]])][:SHOWN]
-        first_frame, op = (fused.column(name, rows) for name in ("first_frame", "op"))
-        centers = (fused.index_of(rows) + 0.5) * fused.voxel_size
-        dominant, sbd = fused.evidence_of(rows).argmax(axis=1), mean_drift(total[rows], op)
-        moves = np.concatenate([np.zeros(0, dtype=MOVE), *self.moves])
-        for i, row in enumerate(rows):
-            own = moves[moves["row"] == row]
-            first = int(own["before"][0]) if len(own) else int(dominant[i])
-            yield DriftingVoxel(
-                i + 1, centers[i], int(first_frame[i]), first, int(op[i]), float(sbd[i]), float(total[row]), own
-            )
+        index = self.map.index_of(rows)
+        chosen: list[int] = []
+        for k in np.lexsort([*index.T[::-1], -total[rows]]):
+            if np.all(np.abs(index[chosen] - index[k]).max(axis=1) >= APART):
+                chosen.append(int(k))
+            if len(chosen) == SHOWN:
+                break
+        return rows[chosen]
 
     def log(
         self,
         stream: rr.RecordingStream,
         scene: str,
         backbone: str,
-        voxels: list[DriftingVoxel],
         classes: LabelSpace,
         translation: npt.NDArray[np.floating[Any]],
         clock: Clock,
     ) -> None:
-        """Log a lane with each voxel's dominant class, a line of text for each move, and where the voxels are."""
-        names = list(classes.classes)
-        lanes = rr.StateConfiguration(values=names, labels=names, colors=[(*color, 255) for color in classes.colors])
-        for voxel in voxels:
-            lane = path(scene, "flips", backbone, f"voxel_{voxel.number}")
-            stream.log(lane, lanes, static=True)
-            flips = voxel.moves[voxel.moves["before"] != voxel.moves["after"]]
-            states = [(voxel.first_frame, voxel.first_class), *zip(flips["frame"], flips["after"], strict=True)]
-            for frame, state in states:
-                clock.set(stream, int(frame), self._views[int(frame)].timestamp)
-                stream.log(lane, rr.StateChange(state=names[state]))
-        report = rr.TextDocument(self._report(backbone, voxels, classes), media_type=rr.MediaType.MARKDOWN)
-        stream.log(path(scene, "flips_report", backbone), report, static=True)
-        if not voxels:
+        """Log of each of the top voxels a lane with its dominant class, its moves in words, and where it is."""
+        if not self._views:
             return
-        centers = np.array([voxel.center for voxel in voxels])
-        labels, colors = (
-            [f"{voxel.number}" for voxel in voxels],
-            list(itertools.islice(itertools.cycle(COLORS), len(voxels))),
+        rows, names = self.top_voxels(), classes.classes
+        centers = ((self.map.index_of(rows) + 0.5) * self.map.voxel_size).astype(np.float64)
+        bits, first_frame, op = (self.map.column(name, rows) for name in ("drift_sum", "first_frame", "op"))
+        dominant, sbd = self.map.evidence_of(rows).argmax(axis=1), mean_drift(bits, op)
+        every = np.concatenate([np.zeros(0, dtype=MOVE), *self._moves])
+        lines = [f"**{backbone}**: the voxels with the largest drift, and the frames that moved them", ""]
+        lines += [] if len(rows) else ["No voxel drifted."]
+        lanes = rr.StateConfiguration(values=names, labels=names, colors=[(*color, 255) for color in classes.colors])
+        for i, row in enumerate(rows):
+            moves = every[every["row"] == row]
+            first = int(moves["before"][0]) if len(moves) else int(dominant[i])
+            x, y, z = centers[i]
+            lines.append(
+                f"- **voxel {i + 1}** at ({x:.2f}, {y:.2f}, {z:.2f}) m: OP {op[i]}, drift {bits[i]:.3f} bits in all,"
+                f" SBD {sbd[i]:.4f} bits; {names[first]} in frame {first_frame[i]}"
+            )
+            lane = path(scene, "flips", backbone, f"voxel_{i + 1}")
+            stream.log(lane, lanes, static=True)
+            clock.set(stream, int(first_frame[i]), self._views[int(first_frame[i])].timestamp)
+            stream.log(lane, rr.StateChange(state=names[first]))
+            for _, frame, before, after, moved in moves.tolist():
+                view, change = self._views[frame], f"stays {names[before]}"
+                if before != after:
+                    change = f"**{names[before]} → {names[after]}**"
+                    clock.set(stream, frame, view.timestamp)
+                    stream.log(lane, rr.StateChange(state=names[after]))
+                lines.append(f"    - frame {frame}{f' ({view.file})' if view.file else ''}: {change}, {moved:.4f} bits")
+        report = rr.TextDocument("\n".join(lines) + "\n", media_type=rr.MediaType.MARKDOWN)
+        stream.log(path(scene, "flips_report", backbone), report, static=True)
+        if not len(rows):
+            return
+        labels, colors = [f"{i + 1}" for i in range(len(rows))], COLORS[: len(rows)]
+        points = rr.Points3D(
+            centers - translation, labels=labels, colors=colors, radii=rr.Radius.ui_points(5.0), show_labels=True
         )
-        radii = rr.Radius.ui_points([5.0] * len(voxels))
-        points = rr.Points3D(centers - translation, labels=labels, colors=colors, radii=radii, show_labels=True)
         stream.log(path(scene, "flips_at", backbone), points, static=True)
         for index, view in self._views.items():  # in the view of an image 3D points would stand beside it as well
             pixels, inside = view.project(centers)
-            seen = np.flatnonzero(inside)
             clock.set(stream, index, view.timestamp)
             numbers = rr.Points2D(
-                pixels[seen],
-                labels=[labels[k] for k in seen],
-                colors=[colors[k] for k in seen],
-                radii=rr.Radius.ui_points([4.0] * len(seen)),
+                pixels[inside],
+                labels=list(itertools.compress(labels, inside)),
+                colors=list(itertools.compress(colors, inside)),
+                radii=rr.Radius.ui_points(4.0),
                 show_labels=True,
             )
             stream.log(path(scene, "camera", backbone, "flips"), numbers)
-
-    def _report(self, backbone: str, voxels: list[DriftingVoxel], classes: LabelSpace) -> str:
-        """Markdown: the top contributing frames of each voxel."""
-        lines = [f"**{backbone}**: the voxels with the largest drift, and the frames that moved them"]
-        lines += [""] if voxels else ["", "No voxel drifted."]
-        for voxel in voxels:
-            x, y, z = voxel.center
-            lines.append(
-                f"- **voxel {voxel.number}** at ({x:.2f}, {y:.2f}, {z:.2f}) m: OP {voxel.op}, drift {voxel.bits:.3f}"
-                f" bits in all, SBD {voxel.sbd:.4f} bits; {classes.classes[voxel.first_class]} in frame"
-                f" {voxel.first_frame}"
-            )
-            for move in voxel.moves:
-                file = self._views[int(move["frame"])].file
-                before, after = (classes.classes[move[when]] for when in ("before", "after"))
-                change = f"**{before} → {after}**" if before != after else f"stays {before}"
-                where = f"frame {move['frame']}{f' ({file})' if file else ''}"
-                lines.append(f"    - {where}: {change}, {move['bits']:.4f} bits")
-        return "\n".join(lines) + "\n"

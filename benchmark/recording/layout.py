@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import functools
 import itertools
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -15,34 +15,35 @@ import rerun as rr
 import rerun.blueprint as rrb
 
 from semstab.backends import REGISTRY
-from semstab.core.types import Float64
+from semstab.core.types import Float64, UInt8
 from semstab.engine.units import Plan
 from semstab.model.labels import Color, LabelSpace
-from semstab.model.measures import ENTROPY, VSS
-from semstab.model.results import RECURRENT, Unit
-from semstab.recording import drift
+from semstab.model.results import Unit
+from semstab.model.voxels import VoxelTable
+from semstab.recording.drift import PICTURES
+from semstab.recording.target import Target
 from semstab.recording.timeline import SERIES, entity, path
-from semstab.recording.voxel_maps import DIFFERENCE, chunk, color_modes, defaults, visualizer
+from semstab.recording.voxel_maps import CHUNKS, DIFFERENCE, chunk, color_modes, defaults, packed, thinned, visualizer
 from semstab.task import Task
 
 # The camera pose from which a map fills its view.
 
 FIELD_OF_VIEW = math.radians(55)
-"""Of the viewer's eyes, from bottom to top."""
+"""The viewer's, from bottom to top."""
 
 MARGIN = 0.96
-"""Of a view's half height and half width, what is seen in it."""
+"""Share of a view's half height and half width that the map fills."""
 
 OUTLIERS = 0.005
 """Share of a map's voxels that may lie beyond each edge of its view."""
 
 BACKGROUND = (72, 72, 78)
-"""Of the maps: neither end of the colour maps vanishes in it."""
+"""Behind the maps: neither end of the colour maps vanishes in it."""
 
 
 @dataclass(frozen=True, eq=False)
 class SceneBounds:
-    """What a scene's maps show, from which follows where they are seen from.
+    """Points and cameras that the views of a scene's maps show.
 
     points   (n, 3) metres, of the voxels or a sample of them
     cameras  (m, 4, 4) poses in the same world
@@ -55,7 +56,7 @@ class SceneBounds:
 
 
 def camera_pose(bounds: SceneBounds | None, aspect: float) -> rrb.EyeControls3D | None:
-    """From where a view of that width by height shows it; None where the viewer chooses."""
+    """Return from where a view of that width by height shows a scene; None where the viewer chooses."""
     if bounds is None:
         return None
     target, distance = fit(bounds, aspect)
@@ -64,9 +65,9 @@ def camera_pose(bounds: SceneBounds | None, aspect: float) -> rrb.EyeControls3D 
 
 
 def direction(bounds: SceneBounds) -> tuple[Float64, Float64]:
-    """Unit vectors from a bounds to the eye, and up.
+    """Return unit vectors from a scene to the eye, and up.
 
-    Where the world's up is known it looks down on the points, across their longest extent; else from the cameras' side.
+    Where the world's up is known the eye is above the points, across their longest extent; else from the cameras' side.
     """
     points, cameras, up = bounds.points, bounds.cameras, bounds.up
     middle = (points.min(axis=0) + points.max(axis=0)) / 2
@@ -81,11 +82,10 @@ def direction(bounds: SceneBounds) -> tuple[Float64, Float64]:
     return toward / np.linalg.norm(toward), up / np.linalg.norm(up)
 
 
-@functools.lru_cache(maxsize=256)
 def fit(bounds: SceneBounds, aspect: float) -> tuple[Float64, float]:
-    """Where an eye looks, and from how far, for a view of that width by height to be full of points and cameras.
+    """Return where an eye looks, and from how far, so that points and cameras fill a view of that width by height.
 
-    With the depth z of a point towards the eye, and its place (x, y) across, the view holds it where
+    With the depth z of a point towards the eye, and its position (x, y) across, the view holds it where
     |x - x0| <= aspect * h * (d - z) and |y - y0| <= h * (d - z), h the tangent of half the field of view: so the edges
     of x - aspect * h * z and x + aspect * h * z say what d has to be, and likewise those of y.
     """
@@ -95,8 +95,8 @@ def fit(bounds: SceneBounds, aspect: float) -> tuple[Float64, float]:
     across = np.stack([right, np.cross(toward, right)])
     half = MARGIN * math.tan(FIELD_OF_VIEW / 2) * np.array([aspect, 1.0])
 
-    def edges(places: Float64, trimmed: float) -> tuple[Any, Any]:
-        at, near = places @ across.T, np.outer(places @ toward, half)
+    def edges(points: Float64, trimmed: float) -> tuple[Any, Any]:
+        at, near = points @ across.T, np.outer(points @ toward, half)
         return np.quantile(at - near, trimmed, axis=0), np.quantile(at + near, 1 - trimmed, axis=0)
 
     low, high = edges(bounds.points, OUTLIERS)
@@ -108,148 +108,84 @@ def fit(bounds: SceneBounds, aspect: float) -> tuple[Float64, float]:
     return (low + high) / 2 @ across + middle * toward, distance - middle
 
 
-# The classes of a scene's maps and their colours, laid out like words on lines.
+# The classes of a scene's maps and their colours, in a grid.
 
-WIDTH, LINE = 780.0, 24.0
-"""Of the legend and of one of its lines, in points of a window of 1500."""
+WIDTH, LINE, LETTER = 780.0, 24.0, 7.0
+"""Width of the legend, height of a line and width of a letter, in points of a window of 1500."""
 
-LETTER, DOT, GAP = 7.0, 20.0, 34.0
-"""Width of a letter, of a dot, and of what is around a name and between it and the next."""
+DOT, GAP = 20.0, 34.0
+"""Width of a dot, and of the space around a name."""
 
 LABEL = -13.5
 """The viewer draws a label below its point: from the middle of the label to its point."""
 
 LINES = 2
-"""Of the legend that is always seen; what it leaves out is in a tab."""
-
-Entry = tuple[str, Color]
+"""Lines of the legend that is always seen; all classes are in a tab."""
 
 
 class Legend:
-    """Names and colours of a scene's classes: those of its maps, and in a tab all that a frame may show."""
+    """Names and colours of a scene's classes, those with the most voxels first."""
 
     def __init__(self, spaces: Iterable[LabelSpace]) -> None:
-        self._voxels: dict[Entry, int] = {
-            entry: 0 for space in spaces for entry in zip(space.classes, space.colors, strict=True)
-        }
+        spaces = list(spaces)
+        self._voxels = {entry: 0 for space in spaces for entry in zip(space.classes, space.colors, strict=True)}
+        longest = max(len(name) for name, _ in self._voxels)
+        self._columns = max(1, int(WIDTH / (DOT + GAP + LETTER * longest)))
 
     def see(self, classes: LabelSpace, label: npt.NDArray[np.integer]) -> None:
-        """A finished map has voxels of these dominant classes."""
+        """Count the voxels (n,) of a finished map by dominant class."""
         voxels = np.bincount(label, minlength=len(classes)).tolist()
         for entry, n in zip(zip(classes.classes, classes.colors, strict=True), voxels, strict=True):
             self._voxels[entry] += n
 
     @property
-    def entries(self) -> list[Entry]:
-        """All, those with the most voxels first."""
+    def entries(self) -> list[tuple[str, Color]]:
+        """All names and colours."""
         return sorted(self._voxels, key=lambda entry: -self._voxels[entry])
 
     @property
-    def used(self) -> list[Entry]:
-        """Those that the maps show; all, while no map is finished."""
-        return [entry for entry in self.entries if self._voxels[entry]] or self.entries
+    def room(self) -> int:
+        """How many classes the legend that is always seen has room for."""
+        return LINES * self._columns
 
-    @property
-    def shown(self) -> int:
-        """How many of these the legend that is always seen has room for."""
-        names = [name for name, _ in self.used]
-        if _lines(names) <= LINES:
-            return len(names)
-        return max((n for n in range(len(names)) if _lines([*names[:n], _rest(len(names) - n)]) <= LINES), default=0)
+    def height(self, lines: int | None = None) -> float:
+        """Return the height of that many lines at most, of all if not given."""
+        needed = math.ceil(len(self._voxels) / self._columns)
+        return LINE * (needed if lines is None else min(needed, lines))
 
-    @property
-    def is_whole(self) -> bool:
-        """Whether it has all classes."""
-        return self.shown == len(self.entries)
-
-    def size(self, *, whole: bool) -> tuple[float, float]:
-        """Width and height of the legend that is always seen, or of that of all classes."""
-        lines = _lines([name for name, _ in (self.entries if whole else self.used)])
-        return WIDTH, LINE * (lines if whole else min(lines, LINES))
-
-    def log(self, stream: rr.RecordingStream, entity: str, all_classes: str) -> None:
-        """Both legends, each below an entity of its own."""
-        used, shown = self.used, self.shown
-        _log(stream, all_classes, self.entries)
-        _log(stream, entity, used[:shown], _rest(len(used) - shown) if shown < len(used) else "")
-
-
-def _rest(classes: int) -> str:
-    return f"and {classes} more: tab All classes"
-
-
-def _log(stream: rr.RecordingStream, entity: str, entries: Sequence[Entry], rest: str = "") -> None:
-    """Dots in the classes' colours, and their names in white: a label has its point's colour, which may be dark."""
-    names = [*(name for name, _ in entries), *([rest] if rest else [])]
-    at = _places(names)
-    middle = DOT + LETTER / 2 * np.array([len(name) for name in names])
-    beside = at + np.stack([middle, np.full(len(at), LABEL)], axis=1)
-    dots = rr.Points2D(at[: len(entries)], colors=[color for _, color in entries], radii=rr.Radius.ui_points(5.0))
-    words = rr.Points2D(beside, colors=(255, 255, 255), labels=names, radii=0.0, show_labels=True)
-    stream.log(entity, dots, static=True)
-    stream.log(f"{entity}/names", words, static=True)
-
-
-def _lines(names: Sequence[str]) -> int:
-    return round(float(_places(names)[:, 1].max()) / LINE + 0.5)
-
-
-def _places(names: Sequence[str]) -> Float64:
-    """(n, 2) where the dots are; a name is right of its dot."""
-    left, line = 0.0, 0
-    at = []
-    for name in names:
-        width = DOT + LETTER * len(name) + GAP
-        if left + width > WIDTH and left > 0:
-            left, line = 0.0, line + 1
-        at.append((left + DOT / 2, (line + 0.5) * LINE))
-        left += width
-    return np.array(at)
+    def log(self, stream: rr.RecordingStream, scene: str) -> None:
+        """Log dots in the classes' colours, and their names in white, as a label has its point's colour."""
+        k = np.arange(len(self._voxels))
+        at = np.stack([k % self._columns * WIDTH / self._columns + DOT / 2, (k // self._columns + 0.5) * LINE], axis=1)
+        for name, shown in ("legend", self.entries[: self.room]), ("all_classes", self.entries):
+            names, colors = zip(*shown, strict=True)
+            middle = DOT + LETTER / 2 * np.array([len(each) for each in names])
+            right_of = at[: len(shown)] + np.stack([middle, np.full(len(shown), LABEL)], axis=1)
+            dots = rr.Points2D(at[: len(shown)], colors=colors, radii=rr.Radius.ui_points(5.0))
+            words = rr.Points2D(right_of, colors=(255, 255, 255), labels=names, radii=0.0, show_labels=True)
+            stream.log(path(scene, name), dots, static=True)
+            stream.log(path(scene, name, "names"), words, static=True)
 
 
 # The views.
 
 # In a window of 1500 x 850 points, as laptops have it; in others the proportions are alike.
 LEFT, TITLE = (808, 538), 27
-"""Width and height of what is left of the camera, and the height of a view's title or of a row of tabs."""
-DRIFT_LEGEND = TITLE + 70
-"""Height of the legend of drift, with its title."""
-DIFFERENCE_ASPECT, COMPARED_ASPECT = 2.2, 1.6
+"""Width and height of the left part, and the height of a view's title or of a row of tabs."""
+DIFFERENCE_ASPECT, COMPARED_ASPECT, CHANGE_ASPECT = 2.2, 1.6, 1.2
 
-MOST_BESIDE = 4
-"""Maps that are seen at once; more have a tab each."""
+SIDE_BY_SIDE = 4
+"""Maps and cameras that are seen at once; more have a tab each."""
 
-OVERVIEW = ("drift", "compensated_flicker", "map_vss", "map_recurrent")
-COMPARED = {
-    "drift": "Drift (bits)",
-    "map_vss": VSS.title,
-    "map_entropy": ENTROPY.title,
-    "map_recurrent": f"OP >= {RECURRENT}",
-    "new_voxels": "New voxels",
-    "fuse_ms": "Fusion (ms)",
-}
-"""Series of two backends that are seen side by side, and short titles: a backend's name may be long."""
+OVERVIEW = ("drift", "compensated_flicker_percent", "map_vss", "map_recurrent")
+COMPARED = ("drift", "map_vss", "map_entropy", "map_recurrent", "new_voxels", "fuse_ms")
+"""Series of two backends that are seen in one plot."""
 
 
-@dataclass
-class Shown:
-    """What the layout of a scene depends on.
-
-    chunks  of how many chunks of a map the views say how they are coloured
-    bounds  where its maps are seen from; else the viewer chooses
-    spans   by backbone, the lowest and highest value of each of COMPARED in all backends
-    """
-
-    legend: Legend
-    chunks: int
-    bounds: SceneBounds | None = None
-    spans: dict[str, dict[str, tuple[float, float]]] = field(default_factory=dict)
-
-
-def blueprint(plan: Plan, shown: Mapping[str, Shown]) -> rrb.Blueprint:
-    """Return the layout of a plan, with what is known of its scenes so far."""
+def blueprint(plan: Plan, legends: Mapping[str, Legend], bounds: Mapping[str, SceneBounds | None]) -> rrb.Blueprint:
+    """Return the layout of a plan, with the legends and bounds of its scenes so far."""
     by_scene = itertools.groupby(plan.tasks, key=lambda task: task.scene.name)
-    scenes = [_scene(scene, list(tasks), shown[scene]) for scene, tasks in by_scene]
+    scenes = [_scene(scene, list(tasks), legends[scene], bounds[scene]) for scene, tasks in by_scene]
     return rrb.Blueprint(
         rrb.Tabs(*scenes) if len(scenes) > 1 else scenes[0],
         rrb.BlueprintPanel(state="collapsed"),
@@ -259,179 +195,147 @@ def blueprint(plan: Plan, shown: Mapping[str, Shown]) -> rrb.Blueprint:
 
 
 def drawn(task: Task) -> str:
-    """The backend whose map is drawn while it grows: the first that fuses as the recorder's tracker does."""
+    """Return the backend whose map is drawn while it grows: the first that fuses as the recorder's own map does."""
     alike = [name for name in task.backends if is_pointwise(name)]
     return (alike or list(task.backends))[0]
 
 
-@functools.cache
 def is_pointwise(backend: str) -> bool:
-    """Whether a backend fuses as the reference does."""
+    """Return whether a backend fuses as the reference does."""
     return bool(getattr(REGISTRY.load(backend), "pointwise", True))
 
 
-def compared(task: Task) -> list[tuple[str, str]]:
-    """Pairs of backends whose maps are compared: the drawn one with each other one."""
-    return [(drawn(task), other) for other in task.backends if other != drawn(task)]
+def view_3d(
+    scene: str, contents: list[str], name: str, bounds: SceneBounds | None, aspect: float, **coloring: Any
+) -> rrb.Spatial3DView:
+    """Return a view of a scene, seen from where its bounds fill that width by height."""
+    return rrb.Spatial3DView(
+        origin=path(scene), contents=contents, name=name, background=BACKGROUND, line_grid=False,
+        eye_controls=camera_pose(bounds, aspect), **coloring,
+    )  # fmt: skip
 
 
-def distinct(task: Task) -> list[str]:
-    """The backends whose series are drawn over each other: of those that fuse alike one, as their lines coincide."""
-    return [name for name in task.backends if name == drawn(task) or not is_pointwise(name)]
-
-
-def _scene(scene: str, tasks: list[Task], shown: Shown) -> rrb.Container:
+def _scene(scene: str, tasks: list[Task], legend: Legend, bounds: SceneBounds | None) -> rrb.Container:
     flips = [_flips(scene, task) for task in tasks]
-    comparisons = [_comparison(task, *pair, shown) for task in tasks for pair in compared(task)]
-    overview = _overview(scene, tasks, shown)
-    return rrb.Tabs(overview, *flips, *comparisons, name=scene)
+    comparisons = [
+        _comparison(task, drawn(task), other, bounds)
+        for task in tasks
+        for other in task.backends
+        if other != drawn(task)
+    ]
+    return rrb.Tabs(_overview(scene, tasks, legend, bounds), *flips, *comparisons, name=scene)
 
 
-def _overview(scene: str, tasks: list[Task], shown: Shown) -> rrb.Container:
-    legend, bounds, chunks = shown.legend, shown.bounds, shown.chunks
-    _, height = legend.size(whole=False)
-    area = LEFT[0], LEFT[1] - TITLE - (height + TITLE)
-    all_classes = [] if legend.is_whole else [_legend(scene, "all_classes", "All classes", legend.size(whole=True))]
-    maps = rrb.Tabs(*(_maps(name, tasks, bounds, area, chunks) for name in color_modes()), *all_classes)
-    classes = _legend(scene, "legend", "Classes", legend.size(whole=False))
-    left = rrb.Vertical(maps, classes, row_shares=[LEFT[1] - height - TITLE, height + TITLE])
-    levels = rrb.VisualBounds2D(x_range=drift.LEGEND[0], y_range=drift.LEGEND[1])
-    drift_view = rrb.Spatial2DView(
-        origin=path(scene, "drift_legend"), name="Drift of a frame at each pixel", visual_bounds=levels
-    )
-    right = rrb.Vertical(_cameras(scene, tasks), drift_view, row_shares=[LEFT[1] - DRIFT_LEGEND, DRIFT_LEGEND])
+def _overview(scene: str, tasks: list[Task], legend: Legend, bounds: SceneBounds | None) -> rrb.Container:
+    below = legend.height(LINES) + TITLE
+    tabs: list[rrb.Container | rrb.View] = [
+        _maps(name, tasks, bounds, LEFT[1] - TITLE - below) for name in color_modes()
+    ]
+    if len(legend.entries) > legend.room:
+        tabs.append(_legend(scene, "all_classes", "All classes", legend.height()))
+    classes = _legend(scene, "legend", "Classes", legend.height(LINES))
+    left = rrb.Vertical(rrb.Tabs(*tabs), classes, row_shares=[LEFT[1] - below, below])
+    depth = rrb.Spatial2DView(origin=path(scene, "depth"), name="Depth")
+    right = rrb.Tabs(*(_cameras(scene, tasks, picture) for picture in PICTURES), depth)
     top = rrb.Horizontal(left, right, column_shares=[5, 4])
     return rrb.Vertical(top, _below(scene, tasks), row_shares=[5, 2], name="Overview")
 
 
-def _legend(scene: str, entity: str, name: str, size: tuple[float, float]) -> rrb.Spatial2DView:
-    bounds = rrb.VisualBounds2D(x_range=(0, size[0]), y_range=(0, size[1]))
+def _legend(scene: str, entity: str, name: str, height: float) -> rrb.Spatial2DView:
+    bounds = rrb.VisualBounds2D(x_range=(0, WIDTH), y_range=(0, height))
     return rrb.Spatial2DView(origin=path(scene, entity), name=name, visual_bounds=bounds)
 
 
-def _below(scene: str, tasks: list[Task]) -> rrb.Container:
-    first = rrb.Horizontal(*(_plot(scene, name, tasks) for name in OVERVIEW), name="Time series")
-    more = [_plot(scene, name, tasks) for name in SERIES if name not in OVERVIEW and not name.endswith("_ms")]
-    times = [_plot(scene, name, tasks) for name in SERIES if name.endswith("_ms")]
-    notes = rrb.TextLogView(origin=path(scene, "log"), name="Notes")
-    agreement = [
-        rrb.TextDocumentView(origin=path(scene, "agreement", task.backbone), name=task.backbone) for task in tasks
-    ]
-    return rrb.Tabs(
-        first,
-        rrb.Horizontal(*agreement, name="Agreement of frames"),
-        rrb.Horizontal(*more, name="More series"),
-        rrb.Horizontal(*times, name="Milliseconds"),
-        notes,
-    )
+def _maps(name: str, tasks: list[Task], bounds: SceneBounds | None, height: float) -> rrb.Container:
+    """Return the maps of all backbones, coloured by a measure."""
+    mode = color_modes()[name]
+    apart = len(tasks) > SIDE_BY_SIDE
+    columns = 1 if apart else min(len(tasks), 2)
+    rows = 1 if apart else math.ceil(len(tasks) / columns)
+    aspect = LEFT[0] / columns / ((height - TITLE * apart) / rows - TITLE)
+    views = [_map(f"{task.backbone}: {mode.title}", task, drawn(task), bounds, aspect, name) for task in tasks]
+    return rrb.Tabs(*views, name=mode.tab) if apart else rrb.Grid(*views, grid_columns=columns, name=mode.tab)
 
 
-def _plot(scene: str, name: str, tasks: list[Task]) -> rrb.TimeSeriesView:
-    legend_at = rrb.PlotLegend(rrb.Corner2D.LeftTop, visible=name in ("map_recurrent", "fuse_ms"))
-    lines = [
-        entity(name, Unit(scene, task.backbone, backend))
-        for task in tasks
-        for backend in (task.backends if name.endswith("_ms") else distinct(task))
-    ]
-    return rrb.TimeSeriesView(
-        origin=path(scene, "series", name), contents=list(dict.fromkeys(lines)), name=SERIES[name],
-        plot_legend=legend_at,
-    )  # fmt: skip
+def _map(
+    title: str, task: Task, backend: str, bounds: SceneBounds | None, aspect: float, name: str = "class"
+) -> rrb.Spatial3DView:
+    """Return a backend's map; coloured other than by class, the views say so of each of its chunks."""
+    scene, backbone = task.scene.name, task.backbone
+    entity = path(scene, "map", backbone, backend)
+    around = [path(scene, "camera"), path(scene, "trajectory"), path(scene, "flips_at", backbone)]
+    chunks = [] if name == "class" else [chunk(entity, number) for number in range(CHUNKS)]
+    coloring = {"defaults": defaults(name), "overrides": dict.fromkeys(chunks, visualizer(name))}
+    return view_3d(scene, [f"{entity}/**", *around], title, bounds, aspect, **coloring)
 
 
-def _flips(scene: str, task: Task) -> rrb.Container:
-    """The voxels that drifted most and their top contributing frames, next to the camera."""
-    lanes = rrb.StateTimelineView(
-        origin=path(scene, "flips", task.backbone), name="Dominant class of the voxels that drifted most"
-    )
-    frames = rrb.TextDocumentView(origin=path(scene, "flips_report", task.backbone), name="Top contributing frames")
-    left = rrb.Vertical(lanes, frames)
-    right = rrb.Vertical(*_camera_views(scene, task))
-    return rrb.Horizontal(left, right, column_shares=[5, 4], name=f"Flips: {task.backbone}")
+def _cameras(scene: str, tasks: list[Task], picture: str) -> rrb.Container:
+    """Return the labels of each backbone next to a picture of the frame."""
+    rows = [rrb.Horizontal(*_camera(scene, task, picture), name=task.backbone) for task in tasks]
+    return (rrb.Vertical if len(rows) < SIDE_BY_SIDE else rrb.Tabs)(*rows, name=picture.capitalize())
 
 
-def _cameras(scene: str, tasks: list[Task]) -> rrb.Container:
-    """Labels and drift of each backbone beside each other; depth in a tab of its own."""
-    rows = [rrb.Horizontal(*_camera_views(scene, task), name=task.backbone) for task in tasks]
-    pictures = rrb.Vertical(*rows, name="Camera") if len(rows) <= 3 else rrb.Tabs(*rows, name="Camera")
-    return rrb.Tabs(pictures, rrb.Spatial2DView(origin=path(scene, "depth"), name="Depth"))
-
-
-def _camera_views(scene: str, task: Task) -> list[rrb.View]:
-    color, labels = path(scene, "camera", "color"), path(scene, "camera", task.backbone, "labels")
-    drift, flips = (path(scene, "camera", task.backbone, name) for name in ("drift", "flips"))
-    origin = path(scene, "camera")
+def _camera(scene: str, task: Task, picture: str) -> list[rrb.View]:
+    origin, color = path(scene, "camera"), path(scene, "camera", "color")
+    labels, shown, flips = (path(scene, "camera", task.backbone, name) for name in ("labels", picture, "flips"))
     seen_through: Any = {labels: rr.SegmentationImage.from_fields(opacity=0.6).visualizer()}
+    title = f"{task.backbone}: {PICTURES[picture]}"
     return [
         rrb.Spatial2DView(
             origin=origin, contents=[color, labels], overrides=seen_through, name=f"{task.backbone}: labels"
         ),
-        rrb.Spatial2DView(origin=origin, contents=[color, drift, flips], name=f"{task.backbone}: drift of this frame"),
+        rrb.Spatial2DView(origin=origin, contents=[color, shown, flips], name=title),
     ]
 
 
-def _maps(
-    name: str, tasks: list[Task], bounds: SceneBounds | None, area: tuple[float, float], chunks: int
-) -> rrb.Container:
-    columns, aspect = _arrangement(len(tasks), bounds, area)
-    mode, colored = color_modes()[name], 0 if name == "class" else chunks
-    views = [_map(f"{task.backbone}: {mode.title}", task, drawn(task), bounds, aspect, name, colored) for task in tasks]
-    if len(views) > MOST_BESIDE:
-        return rrb.Tabs(*views, name=mode.tab)
-    return rrb.Grid(*views, grid_columns=columns, name=mode.tab)
-
-
-def _arrangement(views: int, bounds: SceneBounds | None, area: tuple[float, float]) -> tuple[int, float]:
-    """In how many columns so many views of a bounds show it largest, and how much wider than high each one is."""
-    if views > MOST_BESIDE:
-        return 1, area[0] / (area[1] - 2 * TITLE)
-    cells = {}
-    for columns in range(1, views + 1):
-        height = area[1] / math.ceil(views / columns) - TITLE
-        aspect = area[0] / columns / height
-        scale = height if bounds is None else height / fit(bounds, aspect)[1]
-        cells[columns] = scale, aspect
-    best = max(cells, key=lambda columns: cells[columns][0])
-    return best, cells[best][1]
-
-
-def _map(
-    title: str,
-    task: Task,
-    backend: str,
-    bounds: SceneBounds | None,
-    aspect: float,
-    name: str = "class",
-    chunks: int = 0,
-) -> rrb.Spatial3DView:
-    """A backend's map; coloured other than by class, the views say so of each of its chunks."""
-    scene = task.scene.name
-    entity = path(scene, "map", task.backbone, backend)
-    around = [path(scene, "camera"), path(scene, "trajectory"), path(scene, "flips_at", task.backbone)]
-    return rrb.Spatial3DView(
-        origin=path(scene),
-        contents=[f"{entity}/**", *around],
-        defaults=defaults(name),
-        overrides=dict.fromkeys([chunk(entity, number) for number in range(chunks)], visualizer(name)),
-        name=title,
-        background=BACKGROUND,
-        line_grid=False,
-        eye_controls=camera_pose(bounds, aspect),
+def _below(scene: str, tasks: list[Task]) -> rrb.Container:
+    more = [name for name in SERIES if name not in OVERVIEW and not name.endswith("_ms")]
+    times = [name for name in SERIES if name.endswith("_ms")]
+    agreement = [
+        rrb.TextDocumentView(origin=path(scene, "agreement", task.backbone), name=task.backbone) for task in tasks
+    ]
+    return rrb.Tabs(
+        rrb.Horizontal(*(_plot(scene, name, tasks) for name in OVERVIEW), name="Time series"),
+        rrb.Horizontal(*agreement, name="Agreement of frames"),
+        rrb.Horizontal(*(_plot(scene, name, tasks) for name in more), name="More series"),
+        rrb.Horizontal(*(_plot(scene, name, tasks) for name in times), name="Milliseconds"),
+        rrb.TextLogView(origin=path(scene, "log"), name="Notes"),
     )
 
 
-def _comparison(task: Task, first: str, second: str, shown: Shown) -> rrb.Container:
-    """Two backends: their maps and where these differ, and the same series side by side, in the same range."""
-    scene, backbone = task.scene.name, task.backbone
-    bounds, spans = shown.bounds, shown.spans.get(backbone, {})
-    pair = f"{first} and {second}"
-    difference = rrb.Spatial3DView(
-        origin=path(scene),
-        contents=[path(scene, "difference", backbone, pair, part) for part in DIFFERENCE],
-        name=f"Where they differ: orange in {first} only, blue in {second} only, else |VSS difference| (0 to 0.5)",
-        background=BACKGROUND,
-        line_grid=False,
-        eye_controls=camera_pose(bounds, DIFFERENCE_ASPECT),
+def _plot(scene: str, name: str, tasks: list[Task]) -> rrb.TimeSeriesView:
+    """Return a series of all backbones; of backends that fuse alike one line is drawn, but for their times."""
+    lines = [
+        entity(name, Unit(scene, task.backbone, backend))
+        for task in tasks
+        for backend in task.backends
+        if name.endswith("_ms") or backend == drawn(task) or not is_pointwise(backend)
+    ]
+    legend = rrb.PlotLegend(rrb.Corner2D.LeftTop, visible=name in ("map_recurrent", "fuse_ms"))
+    return rrb.TimeSeriesView(
+        origin=path(scene, "series", name), contents=list(dict.fromkeys(lines)), name=SERIES[name], plot_legend=legend
+    )
+
+
+def _flips(scene: str, task: Task) -> rrb.Container:
+    """Return the voxels that drifted most and their top contributing frames, next to the camera."""
+    lanes = rrb.StateTimelineView(
+        origin=path(scene, "flips", task.backbone), name="Dominant class of the voxels that drifted most"
+    )
+    frames = rrb.TextDocumentView(origin=path(scene, "flips_report", task.backbone), name="Top contributing frames")
+    pictures = rrb.Vertical(*_camera(scene, task, "drift"))
+    return rrb.Horizontal(rrb.Vertical(lanes, frames), pictures, column_shares=[5, 4], name=f"Flips: {task.backbone}")
+
+
+def _comparison(task: Task, first: str, second: str, bounds: SceneBounds | None) -> rrb.Container:
+    """Return two backends: their maps and where these differ, and their series in the same plots."""
+    scene, backbone, pair = task.scene.name, task.backbone, f"{first} and {second}"
+    difference = view_3d(
+        scene,
+        [path(scene, "difference", backbone, pair, part) for part in DIFFERENCE],
+        f"Where they differ: orange in {first} only, blue in {second} only, else |VSS difference| (0 to 0.5)",
+        bounds,
+        DIFFERENCE_ASPECT,
     )
     report = rrb.TextDocumentView(origin=path(scene, "difference_report", backbone, pair), name="Difference")
     maps = rrb.Horizontal(
@@ -440,26 +344,82 @@ def _comparison(task: Task, first: str, second: str, shown: Shown) -> rrb.Contai
     )
     plots = [
         rrb.TimeSeriesView(
-            origin=entity(name, Unit(scene, backbone, backend)),
-            name=f"{title}: {backend}",
-            axis_y=_axis(spans.get(name)),
-            plot_legend=rrb.PlotLegend(visible=False),
+            origin=path(scene, "series", name),
+            contents=[entity(name, Unit(scene, backbone, backend)) for backend in (first, second)],
+            name=SERIES[name],
         )
-        for name, title in COMPARED.items()
-        for backend in (first, second)
+        for name in COMPARED
     ]
-    return rrb.Horizontal(
-        rrb.Vertical(report, difference, maps, row_shares=[1, 5, 4]),
-        rrb.Grid(*plots, grid_columns=2),
-        column_shares=[5, 4],
-        name=f"{backbone}: {pair}",
-    )
+    left = rrb.Vertical(report, difference, maps, row_shares=[1, 5, 4])
+    right = rrb.Grid(*plots, grid_columns=2)
+    return rrb.Horizontal(left, right, column_shares=[5, 4], name=f"{backbone}: {pair}")
 
 
-def _axis(span: tuple[float, float] | None) -> rrb.ScalarAxis | None:
-    """From the lowest to the highest value, with a margin; where they are one, the viewer chooses."""
-    if span is None or span[0] == span[1]:
-        return None
-    low, high = span
-    margin = 0.05 * (high - low)
-    return rrb.ScalarAxis(range=(low - margin, high + margin))
+# Changes between two maps: each voxel by how much, the locations that got worse by number.
+
+WORSE, SAME, BETTER, WHITE = (213, 94, 0), (150, 150, 150), (86, 180, 233), (255, 255, 255)
+LEAST = 0.05
+"""A change from which on a voxel is drawn as one."""
+
+CHANGES = {"agreement": "Agreement between frames", "truth": "Right and wrong"}
+
+Change = tuple[str, VoxelTable, npt.NDArray[Any], npt.NDArray[Any] | None, Sequence[tuple[str, str, tuple[float, ...]]]]
+"""A title, the voxels, the gain of each (n,), -1 to 1, in agreement and where truth tells; and locations: in which of
+the two they lost, their names and centres."""
+
+
+def record_changes(
+    file: Path,
+    changes: Mapping[tuple[str, str], Change],
+    up: Mapping[str, tuple[float, float, float]],
+    sentences: Sequence[str],
+) -> None:
+    """Write a recording with a tab for each scene and run, and the sentences next to it."""
+    file.unlink(missing_ok=True)
+    stream = Target(file).open()
+    text = "\n".join(f"- {text}" for text in sentences)
+    stream.log("/results", rr.TextDocument(text, media_type="text/markdown"), static=True)
+    tabs = [_log_change(stream, *names, change, up.get(names[0])) for names, change in changes.items()]
+    results = rrb.TextDocumentView(origin="/results", name="Results")
+    shown = rrb.Horizontal(rrb.Tabs(*tabs) if len(tabs) > 1 else tabs[0], results, column_shares=[3, 1])
+    stream.send_blueprint(rrb.Blueprint(shown, collapse_panels=True), make_default=True, make_active=True)
+    stream.flush()
+    stream.disconnect()
+
+
+def _log_change(
+    stream: rr.RecordingStream, scene: str, run: str, change: Change, up: tuple[float, float, float] | None
+) -> rrb.Container:
+    title, table, agreement, right, locations = change
+    origin = np.round(table.index.mean(axis=0)).astype(np.int64) if len(table) else np.zeros(3, np.int64)
+    index = table.index.astype(np.int64) - origin
+    factor, rows = thinned(index)
+    points = ((index[rows] + 0.5) * table.voxel_size).astype(np.float64)
+    bounds = SceneBounds(points, np.zeros((0, 4, 4)), None if up is None else np.array(up))
+    views = []
+    for (name, what), values in zip(CHANGES.items(), (agreement, right), strict=True):
+        if values is None:
+            continue
+        entity = path(scene, "change", run, name)
+        changed = np.abs(values[rows]) >= LEAST
+        cells = (index[rows][changed] // factor).astype(np.int32)
+        colors = packed(_shades(values[rows][changed]))
+        stream.log(entity, rr.VoxelGridMap(cells, [table.voxel_size * factor] * 3, colors=colors), static=True)
+        rest = rr.Points3D(points[~changed], colors=SAME, radii=rr.Radius.ui_points(1.0))  # they do not hide the others
+        stream.log(f"{entity}/same", rest, static=True)
+        if own := [(label, centre) for where, label, centre in locations if where == name]:
+            labels, centres = zip(*own, strict=True)
+            at = np.array(centres) - origin * table.voxel_size
+            numbers = rr.Points3D(at, labels=labels, colors=WHITE, radii=rr.Radius.ui_points(4.0))
+            stream.log(f"{entity}/locations", numbers, static=True)
+        shown = f"{what}: orange worse, blue better, grey points as before"
+        views.append(view_3d(scene, [f"{entity}/**"], shown, bounds, CHANGE_ASPECT))
+    return rrb.Vertical(*views, name=title)
+
+
+def _shades(values: npt.NDArray[Any]) -> UInt8:
+    """Return colours (n, 3) from orange by grey to blue."""
+    share = np.clip(np.abs(values), 0, 1)[:, None]
+    end = np.where((values < 0)[:, None], WORSE, BETTER)
+    shades: UInt8 = np.round(share * end + (1 - share) * np.array(SAME)).astype(np.uint8)
+    return shades

@@ -3,22 +3,22 @@
 from __future__ import annotations
 
 import contextlib
-import functools
 import logging
 import threading
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import cast
+from typing import Any, cast
 
 import numpy as np
+import numpy.typing as npt
 import rerun as rr
 
 from semstab.backends import FusionBackend, GrowingMap
 from semstab.config import BACKENDS, BASE, Config
 from semstab.core.prefetch import prefetch
 from semstab.core.process import available_bytes
-from semstab.core.types import Float64
+from semstab.core.types import Float64, Int64
 from semstab.datasets import Scene
 from semstab.engine.folder import load_result
 from semstab.engine.observer import Observer
@@ -27,15 +27,17 @@ from semstab.engine.units import Plan, PlannedUnit, make_plan
 from semstab.errors import ConfigError, SemstabError, one_line
 from semstab.model.frames import Frame
 from semstab.model.labels import LabelSpace
-from semstab.model.records import Record, Result, UnitContent, voxels_of
+from semstab.model.measures import measures
+from semstab.model.records import Result, UnitContent
 from semstab.model.results import Unit, UnitSummary
 from semstab.model.voxels import VoxelTable
 from semstab.recording import timeline
-from semstab.recording.group import GroupLog, SceneLog, final
-from semstab.recording.layout import blueprint
+from semstab.recording.camera import COARSE_SIDE, SceneLog, over_camera, stride_of
+from semstab.recording.drift import DriftLog
+from semstab.recording.layout import blueprint, drawn, is_pointwise
 from semstab.recording.target import DEFAULT_URL, Target, is_whole
 from semstab.recording.timeline import Background, Clock, path
-from semstab.recording.voxel_maps import chunks_of, thinned_map
+from semstab.recording.voxel_maps import VoxelLogger, agreement_report, load_map, log_difference
 from semstab.settings import load_config
 from semstab.task import Task, read
 
@@ -45,23 +47,109 @@ BYTES_A_VOXEL = 120
 """Memory that the recording's own map takes for a voxel, besides 8 bytes for each class."""
 
 
+class GroupLog:
+    """What is recorded of one backbone on a scene.
+
+    live      a map that is being fused and can be followed; without it the recording fuses one of its own
+    followed  whether a map is followed at all
+    """
+
+    def __init__(
+        self, task: Task, voxel_size: float, origin: Int64, live: GrowingMap | None = None, *, followed: bool = True
+    ) -> None:
+        self.task, self.origin = task, origin
+        self._scene, self._classes = task.scene.name, task.mapping.target
+        self._size = voxel_size
+        self.drift = DriftLog(voxel_size, len(self._classes), live) if followed else None
+        self._maps: dict[str, VoxelLogger] = {}
+        self._tables: dict[str, VoxelTable] = {}  # by backend, as they are finished
+        self.last: tuple[int, float | None] = (task.indices[-1], None)
+        """Number and timestamp of the last frame."""
+
+    def log(self, stream: rr.RecordingStream, frame: Frame, background: Background) -> None:
+        """Log the labels of a frame that all units fused, what it did to the map, and the map that grows."""
+        self.last = frame.index, frame.timestamp
+        changes, jobs = None, list[Callable[[], None]]()
+        if self.drift is not None:
+            changes = self.drift.follow(frame)
+            if is_pointwise(drawn(self.task)):
+                jobs = self._map(drawn(self.task)).update(stream, self.drift.map)
+
+        def job() -> None:
+            stride, coarse = stride_of(frame.shape), stride_of(frame.shape, COARSE_SIDE)
+            pictures: dict[str, tuple[npt.NDArray[Any], int]] = {
+                "labels": (np.ascontiguousarray(frame.predicted[::stride, ::stride]), stride)
+            }
+            if changes is not None:
+                pictures |= {name: (picture, coarse) for name, picture in changes.pictures(coarse).items()}
+            for name, (picture, every) in pictures.items():
+                image = rr.SegmentationImage(picture, draw_order=-10)
+                stream.log(path(self._scene, "camera", self.task.backbone, name), image, over_camera(every))
+            for log_chunk in jobs:
+                log_chunk()
+
+        background.submit(frame.index, frame.timestamp, job)
+
+    def log_unit(
+        self, stream: rr.RecordingStream, summary: UnitSummary, table: VoxelTable, tolerance: float, factor: int = 1
+    ) -> None:
+        """Log a unit's final voxels, their differences from the drawn unit, its numbers, the agreement of its frames.
+
+        factor  of a table that is thinned already: it is not compared
+        """
+        unit, first = summary.unit, drawn(self.task)
+        if factor == 1:
+            self._tables[unit.backend] = table
+        if first in self._tables and factor == 1:
+            for other in self._tables if unit.backend == first else [unit.backend]:
+                if other != first:
+                    self._log_difference(stream, first, other, tolerance)
+        note = self._map(unit.backend).finish(stream, table, factor)
+        means = (f"{m.symbol} {summary.table[m]:.{m.digits[0]}f} {m.unit}".rstrip() for m in measures())
+        text = (
+            f"{unit.backbone}, {unit.backend}: {summary.table.voxels:,} voxels, mean OP {summary.table.mean_op:.2f},"
+            f" {', '.join(means)} (K = {summary.table.K}){note}"
+        )
+        stream.log(path(unit.scene, "log"), rr.TextLog(text))
+        if summary.statistics is not None:
+            document = rr.TextDocument(agreement_report(summary.statistics), media_type=rr.MediaType.MARKDOWN)
+            stream.log(path(unit.scene, "agreement", unit.backbone), document, static=True)
+
+    def log_flips(self, stream: rr.RecordingStream, clock: Clock) -> None:
+        """Log the voxels that drifted most, and the frames that contributed most."""
+        if self.drift is not None:
+            self.drift.log(stream, self._scene, self.task.backbone, self._classes, self.origin * self._size, clock)
+
+    def _log_difference(self, stream: rr.RecordingStream, first: str, second: str, tolerance: float) -> None:
+        backbone, pair = self.task.backbone, f"{first} and {second}"
+        tables = {name: self._tables[name] for name in (first, second)}
+        text = log_difference(stream, path(self._scene, "difference", backbone, pair), tables, self.origin, tolerance)
+        stream.log(path(self._scene, "log"), rr.TextLog(f"{backbone}: {text}"))
+        report = rr.TextDocument(f"{text}.", media_type=rr.MediaType.MARKDOWN)
+        stream.log(path(self._scene, "difference_report", backbone, pair), report, static=True)
+
+    def _map(self, backend: str) -> VoxelLogger:
+        if backend not in self._maps:
+            entity = path(self._scene, "map", self.task.backbone, backend)
+            self._maps[backend] = VoxelLogger(entity, self._classes, self.origin, len(self.task.indices))
+        return self._maps[backend]
+
+
 class Recording(Observer):
     """Writes one recording while the run is fused; a killed run leaves a recording up to a moment before.
 
     target  a file, or a `Target`: a file and a viewer
-    run     the run folder, which has series and voxels of the units that were not fused whole in this process
 
     The file is opened at the first fused frame: a start that finds every unit finished leaves an earlier recording
-    alone, unless a kill cut it. Call `close` where a run does not come to its end. Raises ConfigError where the file
-    cannot be written.
+    alone, unless a kill cut it. Series and voxels of units that were not fused whole in this process come from the
+    run's folder. Call `close` where a run does not come to its end. Raises ConfigError where the file cannot be
+    written.
     """
 
-    def __init__(self, target: str | Path | Target, run: Path | None = None) -> None:
+    def __init__(self, target: str | Path | Target) -> None:
         self.target = target if isinstance(target, Target) else Target(Path(target))
-        self._run = run
         self._plan: Plan
         self._scenes: dict[str, SceneLog] = {}
-        self._tasks: dict[tuple[str, str], Task] = {}
         self._stream: rr.RecordingStream | None = None
         self._background: Background | None = None
         self._clock = Clock()
@@ -74,8 +162,8 @@ class Recording(Observer):
     def run_started(self, plan: Plan, finished: Mapping[str, UnitContent]) -> None:
         """Keep the plan: layout, names and colours follow from it."""
         self._plan = plan
-        self._tasks = {(task.scene.name, task.backbone): task for task in plan.tasks}
-        self._scenes = SceneLog.of_plan(plan, live=self.target.live)
+        for name in dict.fromkeys(task.scene.name for task in plan.tasks):
+            self._scenes[name] = SceneLog([task for task in plan.tasks if task.scene.name == name])
 
     def group_started(self, task: Task, config: Config, backends: Mapping[Unit, FusionBackend]) -> None:
         """Follow the first map that can be followed."""
@@ -85,18 +173,13 @@ class Recording(Observer):
 
     def frame_fused(self, task: Task, frame: Frame, rows: Mapping[Unit, FrameRow]) -> None:
         """Log a row of each time series, the camera, and the map."""
-        (stream, background), scene = self._opened(), self._scenes[task.scene.name]
+        stream, background = self._opened()
         self._clock.set(stream, frame.index, frame.timestamp)
-        group = self._begun(task, frame.T_wc[:3, 3])
+        group = self._group or self._begin(task, frame.T_wc[:3, 3])
         for unit, row in rows.items():
-            values = timeline.values(row.cells())
-            timeline.log_row(stream, unit, group.task, values)
-            group.span(values)
-        scene.camera.log(stream, frame, background)
+            timeline.log_row(stream, unit, group.task, row.cells())
+        self._scenes[task.scene.name].log(stream, frame, background)
         group.log(stream, frame, background)
-        if chunks_of(group.grown) > scene.chunks:
-            show = functools.partial(self._show_chunks, stream, scene, group.grown)
-            background.submit(frame.index, frame.timestamp, show)
 
     def unit_finished(
         self, planned: PlannedUnit, content: UnitContent | None, table: VoxelTable | None, error: str | None
@@ -118,26 +201,37 @@ class Recording(Observer):
         self._end_group()
         if self._stream is None and is_whole(self.target.file):
             return
-        self._opened()
-        for task in self._plan.tasks:
-            self._log_finished(task, [each for each in _of(result, task) if each.unit not in self._logged])
+        self.log_finished(result)
         if self.target.viewer != "serve":
             self.close()
 
-    def replay(self, result: Result) -> None:
-        """Record all units of a finished run: the frames are read again where the dataset is there."""
+    def log_finished(self, result: Result, *, pictures: bool = False) -> None:
+        """Log what the run's folder has of the units that are not logged yet; with pictures read frames again."""
+        stream, background = self._opened()
         for task in self._plan.tasks:
-            records = _of(result, task)
+            scene, backbone = task.scene.name, task.backbone
+            records = [
+                each
+                for sweep in (BASE, BACKENDS)
+                for each in result.select(sweep, scene=scene, backbone=backbone)
+                if each.unit not in self._logged
+            ]
             if not records:
                 continue
-            self._end_group()
             try:
-                if not isinstance(task.scene, _ClosedScene):
+                if pictures and not isinstance(task.scene, _ClosedScene):
                     self._replay_frames(task, records[0].summary)
             except (SemstabError, OSError) as error:
-                logger.warning("%s, %s: recorded without pictures (%s)", task.scene.name, task.backbone, error)
-            self._log_finished(task, records)
-        self.run_finished(result)
+                logger.warning("%s, %s: recorded without pictures (%s)", scene, backbone, error)
+            background.drain()
+            self._clock.set(stream, task.indices[-1])
+            group = self._group or self._begin(task, followed=False)
+            for record in records:
+                if record.series is not None:
+                    timeline.log_file(stream, record.unit, task, record.series, self._clock)
+                factor, table = load_map(record, group.origin)
+                self._log_unit(group, record.summary, table, factor)
+            self._end_group()
 
     def serve(self) -> None:
         """Wait for viewers until the user interrupts, where the recording is served; else return at once."""
@@ -159,9 +253,7 @@ class Recording(Observer):
         try:
             if self._background is not None:
                 self._background.close()
-            for name, scene in self._scenes.items():
-                if scene.is_open and scene.camera.unread is not None:
-                    stream.log(path(name, "log"), rr.TextLog(f"without colour: {scene.camera.unread}"))
+            self._send_layout(stream)
         finally:
             try:
                 stream.flush()
@@ -184,14 +276,16 @@ class Recording(Observer):
             self._send_layout(self._stream)
         return self._stream, self._background
 
-    def _begun(self, task: Task, position: Float64 | None = None, *, followed: bool = True) -> GroupLog:
-        """The log of the backbone on a scene that is being fused."""
+    def _begin(self, task: Task, position: Float64 | None = None, *, followed: bool = True) -> GroupLog:
+        """Begin the log of a backbone on a scene, with all backends of the plan."""
         stream, _ = self._opened()
-        if self._group is None:
-            own, config = self._tasks[task.scene.name, task.backbone], self._plan.config
-            origin = self._scenes[task.scene.name].origin(stream, own, position, config.voxel_size)
-            self._group = GroupLog(own, config.voxel_size, origin, self._live, followed=followed)
-            self._live = None
+        scene, voxel_size = self._scenes[task.scene.name], self._plan.config.voxel_size
+        if position is None:
+            position = task.scene.T_wc(task.indices[0])[:3, 3]
+        origin = scene.begin(stream, position, voxel_size)
+        own = next(each for each in self._plan.tasks if (each.scene.name, each.backbone) == (scene.name, task.backbone))
+        self._group = GroupLog(own, voxel_size, origin, self._live, followed=followed)
+        self._live = None
         return self._group
 
     def _replay_frames(self, task: Task, summary: UnitSummary) -> None:
@@ -205,74 +299,40 @@ class Recording(Observer):
         with contextlib.closing(frames):
             for each in frames:
                 if self._group is None:
-                    self._begun(task, each.item.T_wc[:3, 3], followed=fits)
+                    self._begin(task, each.item.T_wc[:3, 3], followed=fits)
                 self.frame_fused(task, each.item, {})
         if not fits:
             text = f"{task.backbone}: drift of frames is left out, the map would not fit into memory a second time"
             self._opened()[0].log(path(scene, "log"), rr.TextLog(text))
 
-    def _log_finished(self, task: Task, records: Sequence[Record]) -> None:
-        """Log the series and the voxels of finished units from the run folder."""
-        if not records:
-            return
-        stream, background = self._opened()
-        background.drain()
-        if self._run is None:
-            self._clock.set(stream, task.indices[-1])
-            for record in records:
-                text = f"{final(record.summary)}; finished by an earlier start, series and voxels are not recorded"
-                stream.log(path(task.scene.name, "log"), rr.TextLog(text))
-            return
-        own = self._tasks[task.scene.name, task.backbone]
-        group = self._group or self._begun(own)
-        for record in records:
-            unit = record.unit
-            for values in timeline.send_rows(stream, unit, own, self._run / "frames" / f"{unit.slug}.csv", self._clock):
-                group.span(values)
-            factor, table = thinned_map(voxels_of(self._run, unit), group.origin)
-            self._log_unit(group, record.summary, table, factor)
-        self._end_group()
-
     def _log_unit(self, group: GroupLog, summary: UnitSummary, table: VoxelTable, factor: int = 1) -> None:
         stream, background = self._opened()
         self._logged.add(summary.unit)
         tolerance = self._plan.config.tolerance
-        background.submit(*group.last, functools.partial(group.log_unit, stream, summary, table, tolerance, factor))
+
+        def job() -> None:
+            group.log_unit(stream, summary, table, tolerance, factor)
+            self._scenes[summary.unit.scene].see(stream, group.task, table)
+            if self._sent == 1:  # later ones wait for the end: each has all scenes
+                self._send_layout(stream)
+
+        background.submit(*group.last, job)
 
     def _end_group(self) -> None:
-        """Log the flips of the group that is fused, and the layout with its maps."""
+        """Log the flips of the group that is fused."""
         group, self._group, self._live, self._unfinished = self._group, None, None, set()
         if group is None:
             return
         stream, background = self._opened()
-        background.submit(*group.last, functools.partial(self._lay_out, stream, group))
-        background.submit(*group.last, functools.partial(group.log_flips, stream, self._clock))
+        background.submit(*group.last, lambda: group.log_flips(stream, self._clock))
         background.drain()
-
-    def _lay_out(self, stream: rr.RecordingStream, group: GroupLog) -> None:
-        """Send the layout again where there is more to it now."""
-        scene = self._scenes[group.task.scene.name]
-        if group.table is not None and scene.see(stream, group, group.table):
-            scene.outgrown(group.voxels)
-            self._send_layout(stream)
-        else:
-            self._show_chunks(stream, scene, group.voxels)
-
-    def _show_chunks(self, stream: rr.RecordingStream, scene: SceneLog, voxels: int) -> None:
-        if scene.outgrown(voxels):
-            self._send_layout(stream)
 
     def _send_layout(self, stream: rr.RecordingStream) -> None:
         """Send the layout; a viewer that follows the run stays at the one that it got first."""
-        layout = blueprint(self._plan, {name: scene.shown for name, scene in self._scenes.items()})
+        legends = {name: scene.legend for name, scene in self._scenes.items()}
+        layout = blueprint(self._plan, legends, {name: scene.bounds for name, scene in self._scenes.items()})
         stream.send_blueprint(layout, make_default=True, make_active=self._sent == 0 or not self.target.live)
         self._sent += 1
-
-
-def _of(result: Result, task: Task) -> list[Record]:
-    """The records of a task's units."""
-    base = (*result.select(BASE), *result.select(BACKENDS))
-    return [each for each in base if (each.unit.scene, each.unit.backbone) == (task.scene.name, task.backbone)]
 
 
 # The recording of a finished run, from its folder.
@@ -294,10 +354,10 @@ def lacks_pictures(run: Path, file: Path) -> bool:
 def record_finished(run: Path, file: Path) -> None:
     """Make the recording of a finished run from its folder; pictures need the dataset that config.yaml names."""
     result, config = load_result(run), load_config(run / "config.yaml")
-    recording = Recording(file, run)
+    recording = Recording(file)
     recording.run_started(_plan_of(run, config, result), {})
     with contextlib.closing(recording):
-        recording.replay(result)
+        recording.log_finished(result, pictures=True)
 
 
 @dataclass(frozen=True)
@@ -308,9 +368,13 @@ class _ClosedScene:
     backbones: tuple[str, ...]
     up: Float64 | None
 
+    def T_wc(self, index: int) -> Float64:
+        """Return the world's origin: poses are not in the folder."""
+        return np.eye(4)
+
 
 def _plan_of(run: Path, config: Config, result: Result) -> Plan:
-    """The plan of the run; without its dataset that of its finished units."""
+    """Return the plan of the run; without its dataset that of its finished units."""
     try:
         return make_plan(config)
     except SemstabError as error:
@@ -319,12 +383,13 @@ def _plan_of(run: Path, config: Config, result: Result) -> Plan:
     for record in (*result.select(), *result.select(BACKENDS)):
         unit, up = record.unit, result.up.get(record.unit.scene)
         scene = _ClosedScene(unit.scene, result.backbones, None if up is None else np.array(up))
-        classes = next(VoxelTable.iter_tiles(voxels_of(run, unit))).classes
+        classes = next(record.tiles()).classes
         space = LabelSpace(record.summary.taxonomy, classes)
         if config.taxonomy is not None:
             with contextlib.suppress(SemstabError):
                 space = LabelSpace.load(config.taxonomy)
-        frames = timeline.frames_of(run / "frames" / f"{unit.slug}.csv")
+        assert record.series is not None
+        frames = [frame for frame, *_ in timeline.read_rows(record.series)]
         task = Task(cast(Scene, scene), unit.backbone, frames, space.mapping_to(space), (unit.backend,))
         units.append(PlannedUnit(record.variation, config, task, record.key, image_space=False, kept=True))
     return Plan(config, {}, tuple(units), ())

@@ -7,7 +7,6 @@ import os
 import re
 import shutil
 import socket
-import ssl
 import subprocess
 import sys
 import time
@@ -32,7 +31,7 @@ ANSWER_SECONDS, SPAWN_SECONDS = 5.0, 30.0
 
 HTTP2_SETTINGS = b"\x04"
 HTTP2_PREFACE = b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n" + bytes(3) + HTTP2_SETTINGS + bytes(5)
-"""What a client begins with, an empty frame of settings included; a server answers with such a frame (RFC 9113)."""
+"""A client's first bytes, an empty frame of settings included; a server answers with such a frame (RFC 9113)."""
 
 
 @dataclass(frozen=True)
@@ -44,7 +43,7 @@ class Target:
 
     @classmethod
     def parse(cls, text: str | None, default: Path) -> Target:
-        """What `--rerun` says; `default` is the file where it names none. Raises ConfigError for anything else."""
+        """Read `--rerun`; `default` is the file where it names none. Raises ConfigError for anything else."""
         if text is None:
             return cls(default)
         if text in ("spawn", "serve"):
@@ -65,7 +64,7 @@ class Target:
         return self.viewer is not None
 
     def open(self) -> rr.RecordingStream:
-        """A stream into it. Raises ConfigError where the file cannot be written, or the viewer is not there."""
+        """Open a stream into it. Raises ConfigError where the file cannot be written, or the viewer is not there."""
         stream = rr.RecordingStream(APPLICATION)
         try:
             self.file.parent.mkdir(parents=True, exist_ok=True)
@@ -81,18 +80,13 @@ class Target:
         stream.set_log_time_enabled(False)
         return stream
 
-    @property
-    def viewer_url(self) -> str | None:
-        """Where the viewer listens, or what serves it does; None where there is none."""
-        return DEFAULT_URL if self.viewer in ("spawn", "serve") else self.viewer
-
     def _viewer(self) -> rr.GrpcSink | rr.GrpcServerSink:
         if self.viewer == "serve":
             address = _address(DEFAULT_URL)
             if not _is_free(address):
                 raise ConfigError(f"--rerun serve: port {address[1]} is taken; end what listens there, or use connect")
             return rr.GrpcServerSink(*address)
-        url = str(self.viewer_url)
+        url = DEFAULT_URL if self.viewer == "spawn" else str(self.viewer)
         if self.viewer == "spawn" and _is_free(_address(url)):
             _spawn(url)
         if (reason := _why_no_viewer(url)) is not None:
@@ -101,7 +95,7 @@ class Target:
 
 
 def is_whole(file: Path) -> bool:
-    """Whether a recording was closed: one that was cut by a kill, or by a full disk, has no footer."""
+    """Return whether a recording was closed: one that was cut by a kill, or by a full disk, has no footer."""
     try:
         with open_file(file) as recording:
             recording.seek(-min(FOOTER_BYTES, recording.seek(0, os.SEEK_END)), os.SEEK_END)
@@ -110,18 +104,16 @@ def is_whole(file: Path) -> bool:
         return False
 
 
-def rerun_program() -> str:
-    """The program that came with the SDK. Raises ConfigError where it is missing."""
-    beside = Path(sys.executable).with_name("rerun")
-    found = str(beside) if beside.exists() else shutil.which("rerun")
-    if found is None:
-        raise ConfigError("the rerun viewer is not installed; pip install rerun-sdk, or record into a file")
-    return found
-
-
 def viewer_command() -> list[str]:
-    """What starts the viewer, for this machine only. Raises ConfigError where it is missing."""
-    return [rerun_program(), "--bind", "127.0.0.1"]
+    """Return the command of the viewer that came with the SDK, for this machine only.
+
+    Raises ConfigError where it is missing.
+    """
+    own = Path(sys.executable).with_name("rerun")
+    program = str(own) if own.exists() else shutil.which("rerun")
+    if program is None:
+        raise ConfigError("the rerun viewer is not installed; pip install rerun-sdk, or record into a file")
+    return [program, "--bind", "127.0.0.1"]
 
 
 def _spawn(url: str) -> None:
@@ -153,21 +145,13 @@ def _is_free(address: tuple[str, int]) -> bool:
 
 
 def _why_no_viewer(url: str) -> str | None:
-    """None where a gRPC server answers: with less the SDK would wait for one at the end of the run."""
+    """Return None where a gRPC server answers: with less the SDK would wait for one at the end of the run."""
     try:
-        host, port = _address(url)
-        plain = socket.create_connection((host, port), timeout=ANSWER_SECONDS)
-        with plain, plain if url.startswith("rerun+http:") else _encrypted(plain, host) as connection:
+        with socket.create_connection(_address(url), timeout=ANSWER_SECONDS) as connection:
+            if not url.startswith("rerun+http:"):
+                return None  # it is encrypted
             connection.sendall(HTTP2_PREFACE)
             answer = connection.recv(9)
     except (OSError, ValueError) as error:
         return str(error)
     return None if answer[3:4] == HTTP2_SETTINGS else "something else does"
-
-
-def _encrypted(connection: socket.socket, host: str) -> ssl.SSLSocket:
-    """Only to ask who is there: the SDK checks the certificate."""
-    context = ssl.create_default_context()
-    context.check_hostname, context.verify_mode = False, ssl.CERT_NONE
-    context.set_alpn_protocols(["h2"])
-    return context.wrap_socket(connection, server_hostname=host)

@@ -9,7 +9,6 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import rerun as rr
 
 from semstab.engine.units import Plan
@@ -24,7 +23,7 @@ last one they are no seconds, and more nanoseconds than 64 bits hold: frames are
 
 
 def path(*parts: str) -> str:
-    """An entity's path; what a part may not hold is escaped."""
+    """Return an entity's path, with what a part may not hold escaped."""
     return "/" + rr.new_entity_path(list(parts)).lstrip("/")
 
 
@@ -35,7 +34,7 @@ class Clock:
         self._dated: bool | None = None  # a timeline has one type: the first timestamp decides
 
     def set(self, stream: rr.RecordingStream, frame: int, timestamp: float | None = None) -> None:
-        """What is logged from now on belongs to that frame."""
+        """Log at that frame from now on."""
         stream.reset_time()
         stream.set_time("frame", sequence=frame)
         if timestamp is None or not abs(timestamp) <= LAST_DATE:
@@ -46,17 +45,6 @@ class Clock:
             stream.set_time("time", timestamp=timestamp)
         else:
             stream.set_time("time", duration=timestamp)
-
-    def columns(self, frames: list[int], timestamps: list[float | None]) -> list[rr.TimeColumn]:
-        """The times of a whole series; without timestamps where one is missing."""
-        columns = [rr.TimeColumn("frame", sequence=frames)]
-        known = [stamp for stamp in timestamps if stamp is not None and abs(stamp) <= LAST_DATE]
-        if not known or len(known) < len(frames):
-            return columns
-        if self._dated is None:
-            self._dated = known[0] >= FIRST_DATE
-        stamps = rr.TimeColumn("time", timestamp=known) if self._dated else rr.TimeColumn("time", duration=known)
-        return [*columns, stamps]
 
 
 MOST_PENDING = 4
@@ -74,33 +62,31 @@ class Background:
 
     def submit(self, frame: int, timestamp: float | None, job: Callable[[], None]) -> None:
         """Leave a job to the thread, and wait while too many are pending; raises what an earlier job raised."""
-        self._wait(MOST_PENDING)
-        self._pending.append(self._thread.submit(self._do, frame, timestamp, job))
 
-    def drain(self) -> None:
-        """Wait until all jobs are done; raises what one of them raised."""
-        self._wait(0)
+        def at_its_time() -> None:
+            self._clock.set(self._stream, frame, timestamp)  # a stream has a time for each thread
+            job()
+
+        self.drain(MOST_PENDING)
+        self._pending.append(self._thread.submit(at_its_time))
+
+    def drain(self, pending: int = 0) -> None:
+        """Wait until no more than so many jobs are pending; raises what one of them raised."""
+        while len(self._pending) > pending:
+            self._pending.popleft().result()
 
     def close(self) -> None:
         """Do what is pending, and end the thread."""
         self._thread.shutdown()
         self.drain()
 
-    def _do(self, frame: int, timestamp: float | None, job: Callable[[], None]) -> None:
-        self._clock.set(self._stream, frame, timestamp)  # a stream has a time for each thread
-        job()
 
-    def _wait(self, pending: int) -> None:
-        while len(self._pending) > pending:
-            self._pending.popleft().result()
-
-
-# Time series: the columns of RUN/frames/*.csv, and two that follow from them.
+# Time series: columns of RUN/frames/*.csv, and one that follows from two of them.
 
 SERIES = {
     "drift": "Mean drift of updates (bits)",
     "flicker_percent": "Pixel flicker (%)",
-    "compensated_flicker": "Flicker (%)",
+    "compensated_flicker_percent": "Flicker (%)",
     "map_vss": f"Mean {VSS.word} so far (0 to {VSS.largest:g})",
     "map_entropy": f"Mean {ENTROPY.word} so far (0 to {ENTROPY.largest:g})",
     "map_recurrent": f"Share OP >= {RECURRENT} so far (0 to 1)",
@@ -112,11 +98,11 @@ SERIES = {
     "decode_ms": "Decoding, in a worker (ms)",
     "wait_ms": "Waiting for a frame (ms)",
 }
-"""Time series by name, and the titles of their plots. All but updated_voxels (voxels - new_voxels) and
-compensated_flicker are columns of the CSV."""
+"""Time series by name, and the titles of their plots. All but updated_voxels (voxels - new_voxels) are columns of the
+CSV."""
 
-OF_THE_BACKBONE = ("flicker_percent", "compensated_flicker", "decode_ms", "wait_ms")
-"""Series that are the same for all backends."""
+OF_THE_BACKBONE = ("flicker_percent", "compensated_flicker_percent", "decode_ms", "wait_ms")
+"""Series that are the same for all backends; they are logged with the first one."""
 
 # Okabe and Ito's colours without black: distinct with any colour vision, and on the viewer's dark ground.
 LINE_COLORS = (
@@ -124,59 +110,45 @@ LINE_COLORS = (
 )  # fmt: skip
 
 
-def values(cells: Mapping[str, Any]) -> dict[str, float]:
-    """The series' values in a row of the CSV, without what is undefined."""
-    row = {name: float(cells[name]) for name in SERIES if cells.get(name) not in (None, "")}
-    return row | {"updated_voxels": float(cells["voxels"]) - float(cells["new_voxels"])}
-
-
 def entity(name: str, unit: Unit) -> str:
-    """The entity of a series."""
+    """Return the entity of a series."""
     backend = () if name in OF_THE_BACKBONE else (unit.backend,)
     return path(unit.scene, "series", name, unit.backbone, *backend)
 
 
 def columns(unit: Unit, task: Task) -> list[str]:
-    """The unit's series: what belongs to the backbone goes with its first backend."""
+    """Return the names of the unit's series."""
     return [name for name in SERIES if name not in OF_THE_BACKBONE or unit.backend == task.backends[0]]
 
 
-def log_row(stream: rr.RecordingStream, unit: Unit, task: Task, row: Mapping[str, float]) -> None:
-    """Log one frame's values at the stream's time."""
+def log_row(stream: rr.RecordingStream, unit: Unit, task: Task, cells: Mapping[str, Any]) -> None:
+    """Log the defined values of a row of the CSV at the stream's time."""
+    row = {**cells, "updated_voxels": float(cells["voxels"]) - float(cells["new_voxels"])}
     for name in columns(unit, task):
-        if name in row:
-            stream.log(entity(name, unit), rr.Scalars(row[name]))
+        if row.get(name) not in (None, ""):
+            stream.log(entity(name, unit), rr.Scalars(float(row[name])))
 
 
-def frames_of(file: Path) -> list[int]:
-    """Return the numbers of the frames in a CSV of time series. Raises DataError where it is damaged."""
-    return [int(row["frame"]) for row in _rows(file)]
-
-
-def send_rows(stream: rr.RecordingStream, unit: Unit, task: Task, file: Path, clock: Clock) -> list[dict[str, float]]:
-    """Log a whole time series from its CSV; return the values of each frame. Raises DataError where it is damaged."""
-    rows = _rows(file)
-    try:
-        frames = np.array([int(row["frame"]) for row in rows], np.int64)
-        stamps = [float(row["timestamp"]) if row["timestamp"] else None for row in rows]
-        cells = [values(row) for row in rows]
-    except (LookupError, TypeError, ArithmeticError, ValueError) as error:
-        raise _damaged(file, error) from error
-    for name in columns(unit, task):
-        at = [k for k, row in enumerate(cells) if name in row]
-        if at:
-            times = clock.columns(frames[at].tolist(), [stamps[k] for k in at])
-            scalars = np.array([cells[k][name] for k in at])
-            stream.send_columns(entity(name, unit), times, rr.Scalars.columns(scalars=scalars))
-    return cells
-
-
-def _rows(file: Path) -> list[dict[str, str]]:
+def read_rows(file: Path) -> list[tuple[int, float | None, dict[str, str]]]:
+    """Return frame, timestamp and cells of each row of a time series. Raises DataError where it is damaged."""
     try:
         with file.open(encoding="utf-8", newline="") as lines:
-            return list(csv.DictReader(lines))
-    except (OSError, ValueError, csv.Error) as error:
+            return [
+                (int(row["frame"]), float(row["timestamp"]) if row["timestamp"] else None, row)
+                for row in csv.DictReader(lines)
+            ]
+    except (OSError, LookupError, TypeError, ValueError, csv.Error) as error:
         raise _damaged(file, error) from error
+
+
+def log_file(stream: rr.RecordingStream, unit: Unit, task: Task, file: Path, clock: Clock) -> None:
+    """Log a unit's time series from its CSV. Raises DataError where it is damaged."""
+    for frame, timestamp, cells in read_rows(file):
+        clock.set(stream, frame, timestamp)
+        try:
+            log_row(stream, unit, task, cells)
+        except (LookupError, TypeError, ValueError) as error:
+            raise _damaged(file, error) from error
 
 
 def _damaged(file: Path, error: Exception) -> DataError:
@@ -184,7 +156,7 @@ def _damaged(file: Path, error: Exception) -> DataError:
 
 
 def log_styles(stream: rr.RecordingStream, plan: Plan) -> None:
-    """Names, colours and widths of all lines."""
+    """Log names, colours and widths of all lines."""
     units = list(dict.fromkeys((unit.backbone, unit.backend) for task in plan.tasks for unit in task.units))
     for task in plan.tasks:
         for unit in task.units:

@@ -7,10 +7,9 @@ those that got no new voxels without their indices.
 
 from __future__ import annotations
 
-import math
+import functools
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -19,21 +18,22 @@ import rerun as rr
 from rerun.blueprint.encodings import ComponentSourceKind, VisualizerComponentMapping
 
 from semstab.backends import GrowingMap
-from semstab.core.types import Float32, Float64, Int32, Int64, UInt32
-from semstab.metrics import CATEGORY_COLORS, vss
+from semstab.core.types import Float64, Int32, Int64, UInt32
+from semstab.metrics import CATEGORY_COLORS, dominant, vss
 from semstab.metrics.agreement import shared_rows
 from semstab.metrics.summary import categorise
+from semstab.model.evidence import Evidence
 from semstab.model.labels import LabelSpace
-from semstab.model.measures import ENTROPY, SBD, VSS, Measure, mean_drift, measures
+from semstab.model.measures import Voxels, bits, measures, sbd
+from semstab.model.records import Record
 from semstab.model.results import RECURRENT
 from semstab.model.statistics import LagBin, MapStatistics
 from semstab.model.voxels import VoxelTable
-from semstab.recording.kernels import read_off
 
 
 @dataclass(frozen=True)
 class ColorMode:
-    """What a map is coloured by; ranges are fixed, so that a colour means the same in every recording.
+    """How a map is coloured; ranges are fixed, so that a colour means the same in every recording.
 
     tab    its name where there is little room; `title` is that of its views
     range  of the values that the colour map spans; None where voxels have a colour of their own
@@ -44,42 +44,28 @@ class ColorMode:
     colormap: rr.components.Colormap | None = None
     range: tuple[float, float] | None = None
 
-    @classmethod
-    def of(cls, measure: Measure) -> ColorMode:
-        """Of a measure: 'SBD (0 to 0.31 bits; black: seen once)'."""
-        low, high = measure.range
-        ends = f"{low:.2g}{' and less' if low > 0 else ''} to {high:.2g}{' and more' if high < measure.largest else ''}"
-        once = "; black: seen once" if measure.lowest_op == 2 else ""
-        once = f"; black: OP < {measure.lowest_op}" if measure.lowest_op > 2 else once
-        title = f"{measure.title} ({f'{ends} {measure.unit}'.strip()}{once})"
-        colors = rr.components.Colormap
-        return cls(measure.title, title, colors.Viridis if measure.better == "higher" else colors.Plasma, measure.range)
-
 
 def color_modes() -> dict[str, ColorMode]:
-    """What the maps can be coloured by."""
+    """Return the modes of the maps by name."""
+    colors, modes = rr.components.Colormap, {"class": ColorMode("Class", "dominant class")}
+    for measure in measures():  # 'SBD (0 to 0.31 bits; black: OP < 2)'
+        low, high = measure.range
+        ends = f"{low:.2g}{' and less' if low > 0 else ''} to {high:.2g}{' and more' if high < measure.largest else ''}"
+        undefined = f"; black: OP < {measure.lowest_op}" if measure.lowest_op > 1 else ""
+        title = f"{measure.title} ({f'{ends} {measure.unit}'.strip()}{undefined})"
+        colormap = colors.Viridis if measure.better == "higher" else colors.Plasma
+        modes[measure.key] = ColorMode(measure.title, title, colormap, measure.range)
     category = f"category (blue stable, orange uncertain, yellow drifting, grey OP < {RECURRENT})"
-    return {
-        "class": ColorMode("Class", "dominant class"),
-        **{measure.key: ColorMode.of(measure) for measure in measures()},
-        "op": ColorMode("OP", "OP (1 to 10 and more)", rr.components.Colormap.Viridis, (1.0, 10.0)),
-        "category": ColorMode("Category", category),
-    }
-
-
-@dataclass(frozen=True, eq=False)
-class Columns:
-    """What the measures of n voxels are computed from, as `VoxelTable` has it."""
-
-    op: Int32
-    evidence: Float64
-    drift_sum: Float64
+    modes["op"] = ColorMode("OP", "OP (1 to 10 and more)", colors.Viridis, (1.0, 10.0))
+    return modes | {"category": ColorMode("Category", category)}
 
 
 MAX_VOXELS = 2_000_000
-"""VoxelBatch of one map; at its end a larger one is thinned."""
+"""Voxels of one map; a larger one is thinned at its end."""
 
-CHUNKS = 32
+CHUNKS = 10
+"""Parts of a map; a layout has an entry for each of them in each view, which takes kilobytes."""
+
 BUDGET = 2_000_000
 """Voxels that are logged of one map while it grows; those at its end come on top, at most MAX_VOXELS."""
 
@@ -91,86 +77,46 @@ NEW = 10
 
 
 def edges() -> Int64:
-    """(CHUNKS + 1,) first voxel of each chunk: small maps have several chunks, large ones not too many."""
+    """Return the first voxel of each chunk (CHUNKS + 1,): small maps have several chunks, large ones not too many."""
     return np.round(MAX_VOXELS * (np.arange(CHUNKS + 1) / CHUNKS) ** 2).astype(np.int64)
 
 
-def chunks_of(voxels: int) -> int:
-    """In how many chunks a map of that size is drawn."""
-    return int(np.searchsorted(edges(), min(voxels, MAX_VOXELS)))
-
-
 def chunk(entity: str, number: int) -> str:
-    """The entity of a chunk, where `entity` is the map's."""
+    """Return the entity of a chunk of a map."""
     return f"{entity}/{number:02d}"
 
 
 def packed(colors: npt.ArrayLike) -> UInt32:
-    """RGB (n, 3) as the viewer's 0xRRGGBBAA (n,)."""
+    """Return RGB (n, 3) as the viewer's 0xRRGGBBAA (n,)."""
     r, g, b = np.asarray(colors, dtype=np.uint32).T
     rgba: UInt32 = (r << 24) | (g << 16) | (b << 8) | 0xFF
     return rgba
 
 
-@dataclass(frozen=True, eq=False)
-class VoxelBatch:
-    """n voxels as they are drawn.
+def components(index: Int64 | None, size: float, classes: LabelSpace, voxels: Voxels) -> list[Any]:
+    """Return a grid that shows the dominant class, with all else that it can show; see `visualizer`.
 
-    index   (n, 3) int32 relative to the map's origin: small, so that the viewer's float32 keeps them exact
-    size    edge of a voxel, metres
-    colors  (n,) uint32 by dominant class and by category, 'class' and 'category'
-    values  (n,) float32 of each measure and of OP
+    index   (n, 3) relative to the map's origin: small, so that the viewer's float32 keeps it exact; None where only
+            colours and values changed
+    voxels  measured, so that each is computed in one pass
     """
-
-    index: Int32
-    size: float
-    colors: dict[str, UInt32]
-    values: dict[str, Float32]
-
-    @classmethod
-    def of(
-        cls,
-        index: Int32,
-        size: float,
-        classes: LabelSpace,
-        evidence: Float64,
-        op: Int32,
-        drift_sum: Float64,
-    ) -> VoxelBatch:
-        """From the voxels' columns, as `VoxelTable` has them."""
-        n, K = evidence.shape
-        label, stability, bits = np.empty(n, dtype=np.uint16), np.empty(n), np.empty(n)
-        read_off(evidence, label, stability, bits)
-        sbd = mean_drift(drift_sum, op)
-        read = {VSS: stability, SBD: sbd, ENTROPY: bits / math.log2(K)}  # in one pass over the evidence
-        voxels = Columns(op, evidence, drift_sum)
-        values: dict[str, npt.NDArray[Any]] = {m.key: read[m] if m in read else m.of(voxels) for m in measures()}
-        values["op"] = op
-        colors = {
-            "class": packed(classes.colors)[label],
-            "category": packed(CATEGORY_COLORS)[categorise(op, sbd, bits)],
-        }
-        return cls(index, size, colors, {name: value.astype(np.float32) for name, value in values.items()})
-
-    def components(self, *, whole: bool) -> list[Any]:
-        """A grid that shows the dominant class, and beside it what else it can show; see `visualizer`.
-
-        Where not `whole`, only colours and values, as the rest was logged before.
-        """
-        places: dict[str, Any] = {"voxel_indices": self.index, "voxel_size": [self.size] * 3} if whole else {}
-        category = rr.components.ColorBatch(self.colors["category"])
-        return [
-            rr.VoxelGridMap.from_fields(**places, colors=self.colors["class"]),
-            rr.DynamicArchetype("category", components={"colors": category}),
-            *(
-                rr.DynamicArchetype(name, components={"values": rr.components.VoxelValueBatch(values)})
-                for name, values in self.values.items()
-            ),
-        ]
+    where: dict[str, Any] = {}
+    if index is not None:
+        where = {"voxel_indices": index.astype(np.int32), "voxel_size": [size] * 3}
+    category = packed(CATEGORY_COLORS)[categorise(voxels.op, sbd(voxels), bits(voxels))]
+    values: dict[str, npt.NDArray[Any]] = {measure.key: measure.of(voxels) for measure in measures()}
+    return [
+        rr.VoxelGridMap.from_fields(**where, colors=packed(classes.colors)[dominant(voxels)]),
+        rr.DynamicArchetype("category", components={"colors": rr.components.ColorBatch(category)}),
+        *(
+            rr.DynamicArchetype(name, components={"values": rr.components.VoxelValueBatch(each.astype(np.float32))})
+            for name, each in {**values, "op": voxels.op}.items()
+        ),
+    ]
 
 
 def visualizer(name: str) -> rr.blueprint.Visualizer:
-    """What makes a view show a measure, or the category, of a grid that has them all; of itself it shows the class.
+    """Make a view show a measure, or the category, of a grid that has them all; otherwise it shows the class.
 
     The view's `defaults` say how values are coloured.
     """
@@ -186,126 +132,107 @@ def visualizer(name: str) -> rr.blueprint.Visualizer:
 
 
 def defaults(name: str) -> list[rr.VoxelGridMap]:
-    """How a view colours the values of a measure."""
+    """Return how a view colours the values of a measure."""
     mode = color_modes()[name]
     return [] if mode.range is None else [rr.VoxelGridMap.from_fields(colormap=mode.colormap, value_range=mode.range)]
 
 
-def thinned(index: Int64) -> tuple[int, Int64]:
-    """Blocks of factor^3 voxels, few enough to draw: the factor, and the row of one voxel in each, ascending."""
-    factor, blocks, rows = 1, index, np.arange(len(index))
-    while len(blocks) > MAX_VOXELS:
-        factor, blocks = factor * 2, blocks // 2
-        x, y, z = (blocks - blocks.min(axis=0)).T
-        _, first = np.unique((x << 42) ^ (y << 21) ^ z, return_index=True)
-        blocks, rows = blocks[first], rows[first]
-    return factor, np.sort(rows) if factor > 1 else rows
+def thinned(index: Int64, factor: int = 1) -> tuple[int, Int64]:
+    """Return the edge of blocks of voxels, few enough to draw, and the row of one voxel in each, ascending.
 
-
-def thinned_map(path: Path, origin: Int64) -> tuple[int, VoxelTable]:
-    """Return a map from its file, or few enough voxels of one in tiles: the factor, and a voxel of each factor^3 block.
-
-    Tiles are read one after the other. Blocks are aligned with the origin.
+    index   (n, 3) relative to the map's origin, with which blocks are aligned
+    factor  the least edge, a power of 2
     """
-    if path.is_file():
-        return 1, VoxelTable.load(path)
+    rows = np.arange(len(index))
+    while factor > 1 or len(rows) > MAX_VOXELS:
+        x, y, z = (index // factor - index.min(axis=0) // factor).T
+        rows = np.sort(np.unique((x << 42) ^ (y << 21) ^ z, return_index=True)[1])
+        if len(rows) <= MAX_VOXELS:
+            break
+        factor *= 2
+    return factor, rows
+
+
+def load_map(record: Record, origin: Int64) -> tuple[int, VoxelTable]:
+    """Return a unit's map, or of one in tiles, read one by one, few enough voxels: the edge of blocks, as `thinned`."""
+    if not record.in_tiles:
+        return 1, record.table()
     factor, parts = 1, list[VoxelTable]()
-    for tile in VoxelTable.iter_tiles(path):
-        parts.append(tile)
-        while factor > 1 or sum(map(len, parts)) > MAX_VOXELS:
-            joined = VoxelTable.joined(parts)
-            factor *= 1 if sum(map(len, parts)) <= MAX_VOXELS else 2
-            _, first = np.unique((joined.index - origin) // factor, axis=0, return_index=True)
-            parts = [joined.rows(np.sort(first))]
-            if len(first) <= MAX_VOXELS:
-                break
-    return factor, VoxelTable.joined(parts)
+    for tile in record.tiles():
+        joined = VoxelTable.joined([*parts, tile])
+        factor, rows = thinned(joined.index - origin, factor)
+        parts = [joined.rows(rows) if len(rows) < len(joined) else joined]
+    return factor, parts[0]
 
 
 class VoxelLogger:
-    """Logs what changes in a map, within the budget: of `frames` frames each one may log its share, and what is saved.
+    """Logs the changes of a map within the budget: each of `frames` frames may log its share, and what is saved.
 
     Where there is more to log, chunks come first in which the most voxels are new or were observed again since they
     were logged.
     """
 
     def __init__(self, entity: str, classes: LabelSpace, origin: Int64, frames: int) -> None:
-        self.entity = entity
-        self.logged = 0
-        """Voxels logged so far."""
-        self._classes = classes
-        self._origin = origin
+        self._entity, self._classes, self._origin = entity, classes, origin
         self._edges = edges()
         self._chunk_of = np.repeat(np.arange(CHUNKS, dtype=np.uint8), np.diff(self._edges))
         self._share = min(BUDGET / frames, MOST_A_FRAME)
-        self.allowed = 0.0
-        """How many of them the frames so far pay for."""
+        self._allowed = 0.0  # voxels that the frames so far pay for and that are not logged
         self._changed = np.zeros(CHUNKS, dtype=np.int64)  # observations in each chunk since it was logged
         self._drawn = np.zeros(CHUNKS, dtype=np.int64)  # voxels that each chunk was logged with
 
     def update(self, stream: rr.RecordingStream, fused: GrowingMap) -> list[Callable[[], None]]:
-        """A frame went into the map: what logs as much of it as the budget allows, whatever becomes of the map."""
+        """Return jobs that log the last frame's changes as far as the budget allows, whatever becomes of the map."""
         rows = fused.changes.row
         self._changed += np.bincount(self._chunk_of[rows[rows < MAX_VOXELS]], minlength=CHUNKS)
-        self.allowed += self._share
+        self._allowed += self._share
         sizes = np.diff(np.minimum(self._edges, len(fused)))
-        urgent = (self._changed + NEW * (sizes - self._drawn)) / np.maximum(sizes, 1)
+        urgency = (self._changed + NEW * (sizes - self._drawn)) / np.maximum(sizes, 1)
         jobs: list[Callable[[], None]] = []
-        for c in np.argsort(-urgent, kind="stable"):
-            if self._changed[c] == 0 or self.logged + sizes[c] > self.allowed:
+        for c in np.argsort(-urgency, kind="stable"):
+            if self._changed[c] == 0 or sizes[c] > self._allowed:
                 break
-            jobs.append(self._job(stream, fused, int(c), int(sizes[c])))
+            self._allowed -= sizes[c]
+            at = np.arange(self._edges[c], self._edges[c] + sizes[c])
+            index = fused.index_of(at) - self._origin if self._drawn[c] != sizes[c] else None
+            values = fused.column("op", at), fused.evidence_of(at), fused.column("drift_sum", at)
+            jobs.append(functools.partial(self._log, stream, int(c), index, fused.voxel_size, *values))
+            self._changed[c], self._drawn[c] = 0, sizes[c]
         return jobs
 
-    def finish(self, stream: rr.RecordingStream, table: VoxelTable, factor: int = 1) -> str:
-        """Log the final map in place of what is there; says how it was thinned, where it is too large.
+    def _log(
+        self, stream: rr.RecordingStream, c: int, index: Int64 | None, size: float,
+        op: Int32, evidence: Float64 | Evidence, drift_sum: Float64,
+    ) -> None:  # fmt: skip
+        voxels = Voxels(op, Evidence.of(evidence).measured(), drift_sum)
+        stream.log(chunk(self._entity, c), *components(index, size, self._classes, voxels))
 
-        factor  of a table that is thinned already
+    def finish(self, stream: rr.RecordingStream, table: VoxelTable, factor: int = 1) -> str:
+        """Log the final map in place of the growing one; return how it was thinned, where it is too large.
+
+        factor  edge of the blocks of a table that is thinned already
         """
         index = table.index - self._origin
         factor, rows = thinned(index) if factor == 1 else (factor, np.arange(len(index)))
         for c, part in enumerate(np.split(rows, self._edges[1:-1])):
             if len(part):
                 at = np.s_[part[0] : part[-1] + 1] if factor == 1 else part  # what is not thinned is not copied
-                batch = VoxelBatch.of(
-                    (index[at] // factor).astype(np.int32), table.voxel_size * factor, self._classes,
-                    table.evidence[at], table.op[at], table.drift_sum[at],
-                )  # fmt: skip
-                stream.log(chunk(self.entity, c), *batch.components(whole=True))
-                self._note(c, len(part))
+                values = table.op[at], table.evidence.take(at), table.drift_sum[at]
+                self._log(stream, c, index[at] // factor, table.voxel_size * factor, *values)
             elif self._drawn[c]:
-                stream.log(chunk(self.entity, c), rr.Clear(recursive=False))
+                stream.log(chunk(self._entity, c), rr.Clear(recursive=False))
         thin = f"; drawn: one voxel of each block of {factor}x{factor}x{factor}, as large as the block"
         return thin if factor > 1 else ""
-
-    def _job(self, stream: rr.RecordingStream, fused: GrowingMap, c: int, size: int) -> Callable[[], None]:
-        """What logs a chunk as it is now."""
-        stretch = np.s_[self._edges[c] : self._edges[c] + size]
-        rows = np.arange(stretch.start, stretch.stop)
-        index, evidence = fused.index_of(rows), fused.evidence_of(rows)
-        op, drift_sum = (fused.column(name, stretch) for name in ("op", "drift_sum"))
-        whole = self._drawn[c] != size
-        self._note(c, size)
-
-        def job() -> None:
-            at = (index - self._origin).astype(np.int32)
-            batch = VoxelBatch.of(at, fused.voxel_size, self._classes, evidence, op, drift_sum)
-            stream.log(chunk(self.entity, c), *batch.components(whole=whole))
-
-        return job
-
-    def _note(self, c: int, size: int) -> None:
-        self.logged += size
-        self._changed[c], self._drawn[c] = 0, size
 
 
 # Voxels where the maps of two backends differ.
 
-ONLY_FIRST, ONLY_SECOND = (230, 159, 0), (86, 180, 233)
-VSS_RANGE = (0.0, 0.5)
-
-DIFFERENCE = {"only_first": "in the first only", "only_second": "in the second only", "changed": "|VSS difference|"}
-"""The parts of a difference, and what they are called."""
+DIFFERENCE: dict[str, dict[str, Any]] = {
+    "only_first": {"colors": (230, 159, 0)},
+    "only_second": {"colors": (86, 180, 233)},
+    "changed": {"colormap": rr.components.Colormap.Inferno, "value_range": (0.0, 0.5)},
+}
+"""The parts of a difference: voxels in one of the maps only, and |VSS difference| of the others."""
 
 
 def log_difference(
@@ -330,18 +257,13 @@ def log_difference(
         "only_second": np.delete(second.index, in_second, axis=0),
         "changed": first.index[in_first[differs]],
     }
-    styles: dict[str, dict[str, Any]] = {
-        "only_first": {"colors": ONLY_FIRST},
-        "only_second": {"colors": ONLY_SECOND},
-        "changed": {"colormap": rr.components.Colormap.Inferno, "value_range": VSS_RANGE},
-    }
-    for part in DIFFERENCE:
+    for part, style in DIFFERENCE.items():
         index = parts[part] - origin
         factor, rows = thinned(index)
         values: dict[str, Any] = {"values": change[differs][rows].astype(np.float32)} if part == "changed" else {}
         cells = (index[rows] // factor).astype(np.int32)
         size = [first.voxel_size * factor] * 3
-        stream.log(f"{entity}/{part}", rr.VoxelGridMap(cells, size, **values, **styles[part]), static=True)
+        stream.log(f"{entity}/{part}", rr.VoxelGridMap(cells, size, **values, **style), static=True)
     one, other = tables
     return (
         f"{len(parts['only_first']):,} voxels in {one} only, {len(parts['only_second']):,} in {other} only; of"
