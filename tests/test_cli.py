@@ -60,6 +60,7 @@ def test_a_run_on_a_folder(wall, tmp_path) -> None:
         "tables/persistence.md", "tables/verdicts.tex", "figures/persistence.png",
     ):  # fmt: skip
         assert (tmp_path / "run" / name).exists()
+    assert cv2.imread(str(tmp_path / "run/figures/persistence.png")).shape[1] in (3.4 * 300, 7 * 300)
     assert 'id="table-scenes"' in (tmp_path / "run/report.html").read_text()
     runs = json.loads((tmp_path / "run" / "summary.json").read_text())["runs"]
     assert {(run["backbone"], run["backend"]) for run in runs} == {("a", "open3d"), ("b", "open3d")}

@@ -127,17 +127,17 @@ def two_backbones(rng, gap, side=32, F=4):
 
 
 def test_paired_differences_cover_and_their_test_keeps_its_level():
-    """Two backbones of the same quality, 30 times: the interval holds 0, and the test says so, 28 times."""
+    """Two backbones of the same quality, 15 times: the interval holds 0, and the test says so, 14 times."""
     rng = np.random.default_rng(1)
     held, rejected = 0, 0
-    for _ in range(30):
+    for _ in range(15):
         tables = two_backbones(rng, 0.0)
         result = paired(tables)
         by_measure = {row.measure: row for row in result.differences}
         held += by_measure["psa"].difference.low <= 0 <= by_measure["psa"].difference.high
         rejected += by_measure["alpha_between"].p_value <= 0.05
-    assert held >= 25
-    assert rejected <= 5
+    assert held >= 12
+    assert rejected <= 3
 
 
 def test_a_worse_backbone_is_found_by_difference_test_and_rank():

@@ -194,7 +194,7 @@ def test_places_and_frames_are_paired_where_both_maps_have_them():
     ("flight", "scope"),
     [
         (Flight(side=64, reach=2.0), THESE_FRAMES),
-        (Flight(24, 1.5, 1.0, 60, 60, "bad"), THIS_SCENE),
+        (Flight(24, 1.5, 1.0, 40, 40, "bad"), THIS_SCENE),
         (Flight(24, 1.5, 1.0, 40, 5, "regimes"), THIS_SCENE),
         (Flight(32, 2.0, 1.0, 40, 5, "lasting"), OTHER_SCENES),
     ],

@@ -19,7 +19,7 @@ from semstab.errors import ConfigError
 from semstab.model.results import Unit, slug
 
 HORRORS = (
-    "a b", "a-b", "x", "x__y", "_x", "-rf", "[/bold]", "$x^{", "=1+1", "<b>&amp;", "ä" * 100, "new\nline", "\u202e",
+    "a b", "a-b", "x", "x__y", "-rf", "[/bold]", "$x^{", "<b>&amp;", "ä" * 100, "new\nline", "\u202e",
 )  # fmt: skip
 """Every one of them can be the name of a folder."""
 
@@ -55,7 +55,7 @@ def test_what_would_share_a_file_is_refused_before_fusion(tmp_path) -> None:
 
 def test_every_hostile_name_gets_results_of_its_own(tmp_path) -> None:
     """Scenes and label sources: as many files as there are, all within OUT, and a second start finds them again."""
-    tiny_scene.write(tmp_path / "scenes" / "plain", backbones=("z", "y__z"), frames=2)
+    tiny_scene.write(tmp_path / "scenes" / "plain", backbones=("z", "y__z"), frames=1)
     for name in HORRORS:
         shutil.copytree(tmp_path / "scenes" / "plain", tmp_path / "scenes" / name)
     config = configure(tmp_path / "scenes", backbones=["z", "y__z"], check=None, voxel_size=1.0)
