@@ -56,11 +56,7 @@ def _of_lists(a: list[Any], b: list[Any], path: str, tolerance: float, added: bo
     names = [_name(item) for item in a]
     if a and None not in names and len(set(names)) == len(names):
         yield from _of_objects(
-            {f"[{_name(item)}]": item for item in a},
-            {f"[{_name(item)}]": item for item in b},
-            path,
-            tolerance,
-            added,
+            {f"[{_name(item)}]": item for item in a}, {f"[{_name(item)}]": item for item in b}, path, tolerance, added
         )
         return
     if len(a) != len(b) and not (added and len(a) < len(b)):

@@ -41,14 +41,11 @@ def write_scene(folder: Path, names=("frame1", "frame2", "frame10")) -> Path:
 def frame(k: int, source: str) -> Frame:
     rng = np.random.default_rng(k)
     return Frame(
-        index=k,
-        depth=(rng.integers(500, 9000, (H, W)) / 1000).astype(np.float32),
-        intrinsics=Intrinsics(10, 11, 3.5, 2.5),
-        T_wc=pose(k),
-        color=rng.integers(0, 255, (H, W, 3)).astype(np.uint8),
+        index=k, depth=(rng.integers(500, 9000, (H, W)) / 1000).astype(np.float32),
+        intrinsics=Intrinsics(10, 11, 3.5, 2.5), T_wc=pose(k), color=rng.integers(0, 255, (H, W, 3)).astype(np.uint8),
         labels=None if source == "net-scores" else np.full((H, W), (k + (source == "gt")) % K, np.uint8),
         scores=rng.dirichlet(np.ones(K), (H, W)).astype(np.float16) if source == "net-scores" else None,
-    )
+    )  # fmt: skip
 
 
 def say(folder: Path, **settings) -> None:

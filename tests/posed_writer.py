@@ -12,13 +12,9 @@ from semstab.model.frames import Frame
 
 
 def write_posed(
-    folder: Path,
-    names: Sequence[str],
-    sources: Mapping[str, Iterable[Frame]],
-    *,
-    scale: float | None = 1000.0,
+    folder: Path, names: Sequence[str], sources: Mapping[str, Iterable[Frame]], *, scale: float | None = 1000.0,
     **settings: object,
-) -> Path:
+) -> Path:  # fmt: skip
     """Depth, poses and colour of the first source's frames, and the labels or scores of every source.
 
     `scale` is that of 16-bit depth, None for floats; `settings` are those of scene.yaml; a source without a name has no

@@ -222,14 +222,11 @@ def test_scenes_and_backbones(small: City) -> None:
 def test_digest_tells_contents_apart_without_rendering() -> None:
     scene = city().scene("scene0")
     digests = {
-        scene.digest([0, 1], "sim-steady"),
-        scene.digest([0, 2], "sim-steady"),
-        scene.digest([0, 1], "sim-flicker"),
-        scene.digest([0, 1], GROUND_TRUTH),
-        city(seed=1).scene("scene0").digest([0, 1], "sim-steady"),
+        scene.digest([0, 1], "sim-steady"), scene.digest([0, 2], "sim-steady"), scene.digest([0, 1], "sim-flicker"),
+        scene.digest([0, 1], GROUND_TRUTH), city(seed=1).scene("scene0").digest([0, 1], "sim-steady"),
         city().scene("scene1").digest([0, 1], "sim-steady"),
         city(backbones={"sim-steady": {"flicker": 0.5}}).scene("scene0").digest([0, 1], "sim-steady"),
-    }
+    }  # fmt: skip
     assert len(digests) == 7
     assert city(cache_megabytes=1).scene("scene0").digest([0, 1], "sim-steady") in digests
     assert "world" not in vars(scene)
@@ -245,18 +242,15 @@ def test_the_cache_is_bounded() -> None:
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"width": 4000}, "less than or equal to 3840"),
-        ({"frames": 0}, "greater than or equal to 1"),
-        ({"origin": [float("nan"), 0, 0]}, "finite"),
-        ({"wdith": 10}, "Extra inputs"),
+        ({"width": 4000}, "less than or equal to 3840"), ({"frames": 0}, "greater than or equal to 1"),
+        ({"origin": [float("nan"), 0, 0]}, "finite"), ({"wdith": 10}, "Extra inputs"),
         ({"backbones": {"mine": {"place": 1.5}}}, "less than or equal to 1"),
-        ({"backbones": {"gt": {}}}, "cannot name a backbone"),
-        ({"backbones": {"a/b": {}}}, "cannot name a backbone"),
+        ({"backbones": {"gt": {}}}, "cannot name a backbone"), ({"backbones": {"a/b": {}}}, "cannot name a backbone"),
         ({"backbones": {"mine": {"difficulty": {"lorry": 2}}}}, "class 'lorry' is not known"),
         ({"backbones": {"mine": {"confusion": {"road": {"road": 1}}}}}, "mistaken for itself"),
         ({"backbones": {"mine": {"confusion": {"road": {"tree": 0}}}}}, "sum to more than 0"),
     ],
-)
+)  # fmt: skip
 def test_bad_options(options: dict[str, Any], message: str) -> None:
     with pytest.raises(ValidationError, match=message):
         open_dataset("city", options)

@@ -89,16 +89,13 @@ def test_a_lost_pose_is_left_out_and_said_and_the_default_folder_is_new(wall, tm
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ("--data nowhere", "nowhere: there is no such folder"),
-        ("--data empty", "empty"),
+        ("--data nowhere", "nowhere: there is no such folder"), ("--data empty", "empty"),
         ("--config nowhere.yaml", "nowhere.yaml: cannot be read"),
         ("--config bad.yaml", "unknown setting 'voxel_sise'; did you mean 'voxel_size'?"),
         ("--data wall --voxel-size 0", "voxel_size: input should be greater than"),
         ("--data wall --backend opn3d", "did you mean 'open3d'?"),
-        ("--data wall --backbone c", "no backbone 'c'; there is a, b, gt"),
-        ("--data wall --frames 3", "--frames 3"),
-        ("--data wall --set x", "write KEY=VALUE"),
-        ("--data wall --device CUDA:7", "CUDA"),
+        ("--data wall --backbone c", "no backbone 'c'; there is a, b, gt"), ("--data wall --frames 3", "--frames 3"),
+        ("--data wall --set x", "write KEY=VALUE"), ("--data wall --device CUDA:7", "CUDA"),
         ("--data wall --backend numpy --device CPU:0", "none of numpy runs on a device"),
         ("--data wall --seed 1", "unknown setting 'seed'"),
         ("--data wall --out wall", "is not empty and holds no run"),
@@ -113,7 +110,7 @@ def test_a_lost_pose_is_left_out_and_said_and_the_default_folder_is_new(wall, tm
         ("study tiny.yaml --jobs 2 --scheduler tcp://x:1", "--jobs and --scheduler: the scheduler's workers do"),
         ("study tiny.yaml --out wall", "is not empty and holds no run or study; choose another folder"),
     ],
-)
+)  # fmt: skip
 def test_bad_input_is_one_line_and_exit_2(wall, tmp_path, arguments, message) -> None:
     (tmp_path / "empty").mkdir()
     (tmp_path / "bad.yaml").write_text("voxel_sise: 1\n")
@@ -143,6 +140,7 @@ def image(path: str, *shape_and_value: int, dtype: type = np.uint16):
         (image("labels/a/0001.png", 6, 8, 77, dtype=np.uint8), "labels/a/0001.png: label id 77"),
         (lambda wall: (wall / "labels/a/0001.png").unlink(), "labels/a/0001"),
         (image("depth", 6, 8, 0), "wall, a: no pixel of 3 frames is valid"),
+        (image("labels/a", 6, 8, 255, dtype=np.uint8), "depth in 100% of the pixels, a label in 0%"),
         (lambda wall: (wall / "intrinsics.txt").unlink(), "intrinsics.txt"),
     ],
 )  # fmt: skip

@@ -76,11 +76,9 @@ def test_an_earlier_layout_is_said(run, tmp_path):
     settings = tmp_path / "old/config.yaml"
     settings.write_text(settings.read_text().replace("layout 4", "layout 2"))
     fails(
-        DataError,
-        re.escape("holds results of an earlier version of semstab; run it again"),
-        open_run,
+        DataError, re.escape("holds results of an earlier version of semstab; run it again"), open_run,
         f"{tmp_path}/old:a",
-    )
+    )  # fmt: skip
 
 
 def test_runs_of_other_scenes_and_classes_are_refused(run):
@@ -90,11 +88,9 @@ def test_runs_of_other_scenes_and_classes_are_refused(run):
     entry = dataclasses.replace(one.scenes["wall"])
     entry.__dict__["sums"] = dataclasses.replace(entry.sums, classes=("floor", *entry.classes[1:]))
     fails(
-        DataError,
-        re.escape(f"class 0 is {entry.read_sums().classes[0]} and floor"),
-        shared_scenes,
+        DataError, re.escape(f"class 0 is {entry.read_sums().classes[0]} and floor"), shared_scenes,
         [one, dataclasses.replace(one, scenes={"wall": entry})],
-    )
+    )  # fmt: skip
 
 
 def test_a_small_summary_holds_all_but_voxels(run, tmp_path):
@@ -107,11 +103,9 @@ def test_a_small_summary_holds_all_but_voxels(run, tmp_path):
     assert (back.up, back.flicker) == (own.up, own.flicker)
     assert all(value(back.sums, key) == value(own.sums, key) for key in ("psa", "alpha_between", "reached", "vss"))
     fails(
-        DataError,
-        re.escape(f"{file}: is a small summary, without the voxels that mIoU needs"),
-        back.with_voxels,
+        DataError, re.escape(f"{file}: is a small summary, without the voxels that mIoU needs"), back.with_voxels,
         "mIoU",
-    )
+    )  # fmt: skip
 
 
 def test_a_small_summary_becomes_coarser_until_it_fits(run, tmp_path):
@@ -145,17 +139,13 @@ def test_a_damaged_small_summary_is_one_line(run, tmp_path):
 @pytest.mark.parametrize(
     ("field", "number", "line"),
     [
-        ("edge", 0.3, "sums of wall are damaged"),
-        ("edge", 2.0**63, "sums of wall are damaged"),
-        ("step", 2**31, "sums of wall are damaged"),
-        ("step", 3, "sums of wall are damaged"),
-        ("evidence_0", 1e300, "sums of wall are damaged"),
-        ("evidence_0", float("inf"), "sums of wall are damaged"),
-        ("ix", 2**40, "sums of wall are damaged"),
-        ("flicker", 1e308, "percentages of flicker, or the frames"),
+        ("edge", 0.3, "sums of wall are damaged"), ("edge", 2.0**63, "sums of wall are damaged"),
+        ("step", 2**31, "sums of wall are damaged"), ("step", 3, "sums of wall are damaged"),
+        ("evidence_0", 1e300, "sums of wall are damaged"), ("evidence_0", float("inf"), "sums of wall are damaged"),
+        ("ix", 2**40, "sums of wall are damaged"), ("flicker", 1e308, "percentages of flicker, or the frames"),
         ("frames", 2**31, "percentages of flicker, or the frames"),
     ],
-)
+)  # fmt: skip
 def test_numbers_that_no_map_has_are_refused_before_they_overflow(run, tmp_path, field, number, line):
     file = tmp_path / "kept.semstab"
     save_summary(open_run(f"{run}:a"), file)

@@ -23,7 +23,7 @@ from semstab.report.findings import (
     findings,
     less_association,
     more_disagreement,
-)
+)  # fmt: skip
 from semstab.statistics import describe as describe_map
 
 SURE, SPLIT, CALM = [1, 0, 0], [3, 1, 0], [3.6, 0.4, 0]

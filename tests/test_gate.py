@@ -41,19 +41,14 @@ from semstab.statistics.intervals import difference
         ("Accuracy drop<1%", "accuracy", "drop", True, 0.01, None, None),
         ("class human: recall > 0.6", "recall", None, False, 0.6, "human", None),
         (
-            "scene street 1: class traffic light: IoU drop <= .05",
-            "iou",
-            "drop",
-            True,
-            0.05,
-            "traffic light",
+            "scene street 1: class traffic light: IoU drop <= .05", "iou", "drop", True, 0.05, "traffic light",
             "street 1",
         ),
         ("flicker rise < 0.5%", "flicker", "rise", True, 0.5, None, None),
         ("stable-and-wrong rise < 1e-2", "wrong of stable", "rise", True, 0.01, None, None),
         ("alpha between drop < -0.01", "alpha between", "drop", True, -0.01, None, None),
     ],
-)
+)  # fmt: skip
 def test_a_rule_is_read(text, key, change, below, limit, class_name, scene):
     rule = parse(text)
     found = (rule.measure.name, rule.change, rule.below, rule.limit, rule.class_name, rule.scene)

@@ -437,11 +437,7 @@ def test_parts_of_other_tiles_are_not_taken_for_those_of_these(wall, both, tmp_p
 def test_a_unit_in_tiles_takes_the_place_of_a_whole_one_and_back(wall, tmp_path) -> None:
     """No file of the other form stays."""
     voxels = tmp_path / "run" / "voxels"
-    for size, there in (
-        (None, "wall__a__numba.parquet"),
-        (8, "wall__a__numba"),
-        (None, "wall__a__numba.parquet"),
-    ):
+    for size, there in ((None, "wall__a__numba.parquet"), (8, "wall__a__numba"), (None, "wall__a__numba.parquet")):
         (tmp_path / "run" / "units").mkdir(parents=True, exist_ok=True)
         for unit in (tmp_path / "run" / "units").iterdir():
             unit.unlink()

@@ -35,7 +35,7 @@ from semstab.report.figures.distributions import (
     informative,
     op_position,
     together,
-)
+)  # fmt: skip
 from semstab.report.figures.maps import Overview, draw_overview, draw_stability, scale_length
 from semstab.report.figures.statistics import draw_agreement
 from semstab.report.figures.style import COLUMN, DPI, PAGE, legend_columns
@@ -321,22 +321,11 @@ def test_every_figure_is_written(drawn):
     result, folder, paths = drawn
     names = [figure.name for figure in figures(result, folder)]
     assert names == [
-        "overview__often__calm",
-        "ecdf__calm",
-        "persistence",
-        "stability_map__often__calm",
-        "stability_map__rarely__calm",
-        "sensitivity_voxel_size",
-        "sensitivity_depth_noise",
-        "sensitivity_frame_count",
-        "temporal_agreement",
-        "correlogram__often",
-        "correlogram__rarely",
-        "drift",
-        "sensitivity_agreement_voxel_size",
-        "sensitivity_agreement_depth_noise",
-        "sensitivity_agreement_frame_count",
-    ]
+        "overview__often__calm", "ecdf__calm", "persistence", "stability_map__often__calm",
+        "stability_map__rarely__calm", "sensitivity_voxel_size", "sensitivity_depth_noise", "sensitivity_frame_count",
+        "temporal_agreement", "correlogram__often", "correlogram__rarely", "drift",
+        "sensitivity_agreement_voxel_size", "sensitivity_agreement_depth_noise", "sensitivity_agreement_frame_count",
+    ]  # fmt: skip
     assert set(paths) == {folder / "figures" / f"{name}.{suffix}" for name in names for suffix in ("png", "svg")}
 
 

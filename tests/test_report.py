@@ -185,10 +185,7 @@ def test_figures_are_taken_from_the_folder_and_made_small(walls):
         kind, _, data = by_alt[figure.alt]["src"].partition(";base64,")
         content = base64.b64decode(data)
         assert kind == "data:image/png"
-        with (
-            Image.open(io.BytesIO(content)) as image,
-            Image.open(folder / "figures" / f"{figure.name}.png") as full,
-        ):
+        with Image.open(io.BytesIO(content)) as image, Image.open(folder / "figures" / f"{figure.name}.png") as full:
             assert image.width == round(full.width * 2 / 3)
 
 
@@ -274,10 +271,7 @@ def test_flicker_is_read_beside_its_compensated_share():
 
 
 def test_the_scene_that_looks_steadiest_may_be_the_one_seen_least():
-    scenes = [
-        record(voxels((10, 4, SPLIT)), scene="looked at"),
-        record(voxels((10, 1, SURE)), scene="passed by"),
-    ]
+    scenes = [record(voxels((10, 4, SPLIT)), scene="looked at"), record(voxels((10, 1, SURE)), scene="passed by")]
     expected = "m looks steadiest in passed by (VSS 1.000), which is also the scene seen least: 1.00 frames a voxel."
     assert expected in read(study(*scenes))
     assert expected not in read(study(record(voxels((10, 4, SURE)), scene="looked at"), scenes[1]))

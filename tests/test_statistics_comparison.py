@@ -211,10 +211,8 @@ def test_pairs_of_all_scenes_are_corrected_together_where_something_may_be_claim
         row.p_holm for scene in together for row in scene.paired.differences if row.measure == found.paired.primary
     ]
     assert corrected == [
-        pytest.approx(min(1, 2 * p)),
-        pytest.approx(math.nan, nan_ok=True),
-        pytest.approx(min(1, 2 * p)),
-    ]
+        pytest.approx(min(1, 2 * p)), pytest.approx(math.nan, nan_ok=True), pytest.approx(min(1, 2 * p)),
+    ]  # fmt: skip
 
 
 def test_what_describes_says_what_its_interval_answers():

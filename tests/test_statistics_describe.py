@@ -24,7 +24,7 @@ from semstab.model.statistics import (
     HeadlineStatistics,
     Interval,
     MapStatistics,
-)
+)  # fmt: skip
 from semstab.model.voxels import VoxelTable
 from semstab.statistics import (
     MapSample,
@@ -34,7 +34,7 @@ from semstab.statistics import (
     expected_sbd,
     krippendorff_alpha,
     verdict,
-)
+)  # fmt: skip
 from semstab.statistics.agreement import PSA
 from semstab.statistics.intervals import probability_above
 from semstab.statistics.verdict import LIMITS, level_probabilities

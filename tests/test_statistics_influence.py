@@ -38,17 +38,12 @@ def test_the_sums_give_every_number_back(soft_evidence):
     stable = np.where(often, stability_posterior(table), 0.0)
     excess, known = sbd(table) - expected_sbd(table), correctness(table.evidence[again], truth[again])
     expected = {
-        "psa": psa(table)[again].mean(),
-        "alpha": krippendorff_alpha(table),
-        "vss": vss(table)[often].mean(),
-        "entropy": entropy(table)[again].mean(),
-        "accuracy": right[again].mean(),
+        "psa": psa(table)[again].mean(), "alpha": krippendorff_alpha(table), "vss": vss(table)[often].mean(),
+        "entropy": entropy(table)[again].mean(), "accuracy": right[again].mean(),
         "look_accuracy": log.evidence[again[log.voxel], truth[log.voxel[again[log.voxel]]]].mean(),
-        "wrong_of_stable": (stable * ~right).sum() / stable.sum(),
-        "miou": known.miou,
-        "ece": known.ece,
+        "wrong_of_stable": (stable * ~right).sum() / stable.sum(), "miou": known.miou, "ece": known.ece,
         "sbd_excess": np.nan if soft_evidence else np.nanmean(excess[again]),
-    }
+    }  # fmt: skip
     for given in (log, None):
         sums = cluster_sums_of(table, given, truth, sbd_excess=excess)
         assert {key: value(sums, key) for key in expected} == pytest.approx(expected, abs=1e-12, nan_ok=True)

@@ -26,7 +26,7 @@ from semstab.statistics.intervals import (
     spec_of,
     standard_error,
     unpaired,
-)
+)  # fmt: skip
 
 
 def sums_from(labels, side, voxel_size=0.125):
@@ -193,12 +193,10 @@ def test_places_and_frames_are_paired_where_both_maps_have_them():
 @pytest.mark.parametrize(
     ("flight", "scope"),
     [
-        (Flight(side=64, reach=2.0), THESE_FRAMES),
-        (Flight(24, 1.5, 1.0, 40, 40, "bad"), THIS_SCENE),
-        (Flight(24, 1.5, 1.0, 40, 5, "regimes"), THIS_SCENE),
-        (Flight(32, 2.0, 1.0, 40, 5, "lasting"), OTHER_SCENES),
+        (Flight(side=64, reach=2.0), THESE_FRAMES), (Flight(24, 1.5, 1.0, 40, 40, "bad"), THIS_SCENE),
+        (Flight(24, 1.5, 1.0, 40, 5, "regimes"), THIS_SCENE), (Flight(32, 2.0, 1.0, 40, 5, "lasting"), OTHER_SCENES),
     ],
-)
+)  # fmt: skip
 def test_intervals_hold_their_target(flight, scope):
     """So many of few intervals hold it that their level may be 95 %: 3 standard errors below."""
     (row,) = trials(flight, 30, 0, scope, ("alpha",))

@@ -64,29 +64,11 @@ def test_the_walls_tables_are_as_in_the_golden_file(walls, suffix):
 
 def test_a_study_of_everything_has_every_table(walls):
     assert [table.name for table in tables(walls)] == [
-        "glance",
-        "verdicts",
-        "flicker",
-        "flicker_by_scene",
-        "scenes",
-        "persistence",
-        "classes",
-        "temporal_agreement",
-        "correlogram",
-        "class_agreement",
-        "drift",
-        "uncertainty",
-        "cross_backbone",
-        "sensitivity_voxel_size",
-        "sensitivity_agreement_voxel_size",
-        "sensitivity_depth_noise",
-        "sensitivity_agreement_depth_noise",
-        "sensitivity_frame_count",
-        "sensitivity_agreement_frame_count",
-        "voxel_sizes",
-        "fusion",
-        "agreement",
-    ]
+        "glance", "verdicts", "flicker", "flicker_by_scene", "scenes", "persistence", "classes", "temporal_agreement",
+        "correlogram", "class_agreement", "drift", "uncertainty", "cross_backbone", "sensitivity_voxel_size",
+        "sensitivity_agreement_voxel_size", "sensitivity_depth_noise", "sensitivity_agreement_depth_noise",
+        "sensitivity_frame_count", "sensitivity_agreement_frame_count", "voxel_sizes", "fusion", "agreement",
+    ]  # fmt: skip
 
 
 def test_a_study_of_nothing_has_no_table():
@@ -119,12 +101,9 @@ def voxels_of(walls, backbone):
 def test_the_strata_pool_the_voxels_of_all_scenes(walls, backbone):
     seen, *measures = voxels_of(walls, backbone)
     inside = {
-        "OP=1": seen == 1,
-        "OP=2": seen == 2,
-        "3<=OP<=5": (seen >= 3) & (seen <= 5),
-        "OP>5": seen > 5,
+        "OP=1": seen == 1, "OP=2": seen == 2, "3<=OP<=5": (seen >= 3) & (seen <= 5), "OP>5": seen > 5,
         "OP>=3": seen >= 3,
-    }
+    }  # fmt: skip
     rows = [row for row in rows_of(walls, "persistence") if row["backbone"] == backbone]
     assert [row["persistence"] for row in rows] == list(inside)
     for row in rows:
@@ -227,10 +206,8 @@ def test_a_sweep_has_mean_and_spread_over_its_repeats():
     calm, disturbed = rows_of(study(base, noisy(0, 0, 0.0), *map(noisy, counts, range(3))), "sensitivity_depth_noise")
     shares = [100 * ENOUGH / (ENOUGH + once) for once in counts]
     assert disturbed["recurrent_percent"] == {
-        "mean": pytest.approx(statistics.mean(shares)),
-        "sd": pytest.approx(statistics.stdev(shares)),
-        "repeats": 3,
-    }
+        "mean": pytest.approx(statistics.mean(shares)), "sd": pytest.approx(statistics.stdev(shares)), "repeats": 3,
+    }  # fmt: skip
     assert (calm["value"], calm["recurrent_percent"], calm["vss"]) == ("0", 100, 0.75)
     assert disturbed["recurrent_vss"]["sd"] == 0
 
@@ -305,24 +282,18 @@ def test_the_agreement_says_who_agrees(walls):
 @pytest.mark.parametrize(
     ("column", "cell", "text"),
     [
-        (Column("", "", 0), 705902, "705,902"),
-        (Column("", "", 3), 0.95749, "0.957"),
-        (Column("", "", 4), math.nan, "--"),
-        (Column("", "", 3), -0.0001, "0.000"),
-        (Column("", "", 3, signed=True), 0.0021, "+0.002"),
-        (Column("", "", 3, signed=True), -0.0021, "-0.002"),
-        (Column("", "", 3, signed=True), 0.0001, "0.000"),
-        (Column("", "", 0, scientific=True), 2.2e-16, "2e-16"),
-        (Column("", "", 0, scientific=True), 0.0, "0"),
-        (Column("", "", 2), Spread(9.81, 0.123, 3), "9.81 ± 0.12"),
-        (Column("", "", 2), Spread(9.81, math.nan, 1), "9.81"),
-        (Column("", ""), "road", "road"),
+        (Column("", "", 0), 705902, "705,902"), (Column("", "", 3), 0.95749, "0.957"),
+        (Column("", "", 4), math.nan, "--"), (Column("", "", 3), -0.0001, "0.000"),
+        (Column("", "", 3, signed=True), 0.0021, "+0.002"), (Column("", "", 3, signed=True), -0.0021, "-0.002"),
+        (Column("", "", 3, signed=True), 0.0001, "0.000"), (Column("", "", 0, scientific=True), 2.2e-16, "2e-16"),
+        (Column("", "", 0, scientific=True), 0.0, "0"), (Column("", "", 2), Spread(9.81, 0.123, 3), "9.81 ± 0.12"),
+        (Column("", "", 2), Spread(9.81, math.nan, 1), "9.81"), (Column("", ""), "road", "road"),
         (Column("", "", 2), Estimate(0.481, 0.326, 0.61), "0.48 (0.33, 0.61)"),
         (Column("", "", 2, signed=True), Estimate(0.02, -0.01, 0.05), "+0.02 (-0.01, +0.05)"),
         (Column("", "", 2), Estimate(0.481, math.nan, math.nan), "0.48"),
         (Column("", "", 2), Estimate(math.nan, math.nan, math.nan), "--"),
     ],
-)
+)  # fmt: skip
 def test_a_cell_in_print(column, cell, text):
     assert column.text(cell) == text
 

@@ -101,13 +101,10 @@ def predicted_again(file: Path) -> None:
 @pytest.mark.parametrize(
     ("pattern", "read"),
     [
-        ("run/summary.json", read_again),
-        ("run/manifest.json", read_again),
-        ("run/units/*.json", read_unit),
-        ("converted/wall/conversion.json", converted_again),
-        ("labels/net/predictions.json", predicted_again),
+        ("run/summary.json", read_again), ("run/manifest.json", read_again), ("run/units/*.json", read_unit),
+        ("converted/wall/conversion.json", converted_again), ("labels/net/predictions.json", predicted_again),
     ],
-)
+)  # fmt: skip
 def test_a_damaged_file_is_one_line_or_still_whole(folder, pattern, read: Callable[[Path], None]) -> None:
     rng, refused = random.Random(pattern), list[str]()
     file = min(folder.glob(pattern))
