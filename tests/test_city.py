@@ -70,9 +70,6 @@ def simulated(scene: CityScene, seen: View, **model: Any) -> np.ndarray:
     return Simulation(SimulatedBackbone(**model), 0, "test", scene.name).labels(seen)
 
 
-# The world and its images
-
-
 def test_same_seed_same_frames(small: City) -> None:
     again, other = city(), city(seed=1)
     a, b, c = (d.scene("scene0").frame(1, "sim-flicker") for d in (small, again, other))
@@ -204,9 +201,6 @@ def test_a_surface_without_triangles_is_never_hit() -> None:
     assert not nothing.blocks(np.zeros((2, 3)), np.ones(3)).any()
 
 
-# The protocol
-
-
 def test_scenes_and_backbones(small: City) -> None:
     assert small.scenes == ("scene0", "scene1", "scene2", "scene3", "scene4")
     scene = small.scene("scene2")
@@ -263,9 +257,6 @@ def test_unknown_names(small: City) -> None:
         small.scene("scene0").frame(0, "sim-stedy")
     with pytest.raises(DataError, match="there is no frame 3"):
         small.scene("scene0").frame(3, GROUND_TRUTH)
-
-
-# The error model
 
 
 def test_no_rates_no_errors(small: City) -> None:

@@ -57,9 +57,6 @@ def walls(tmp_path_factory):
     return wall_study(tmp_path_factory.getbasetemp())[0]
 
 
-# --- Recurrent voxels disagree more than the aggregate says -----------------------------------------------------------
-
-
 def test_recurrent_voxels_that_disagree_more():
     outcome = more_disagreement(pooled([record(voxels(*seen(3 * N, N, SPLIT)))]))
     assert outcome.verdict is Answer.SHOWN
@@ -126,9 +123,6 @@ def test_the_first_finding_against_the_voxels_themselves(walls):
     assert [row.backbone for row in finding.evidence] == list(BACKBONES)
 
 
-# --- Mean SBD falls with OP -------------------------------------------------------------------------------------------
-
-
 def drifting(*sbd_by_op):
     return pooled([record(voxels(*((n, op, SURE, sbd) for n, op, sbd in sbd_by_op)))])
 
@@ -163,9 +157,6 @@ def test_a_small_stratum_does_not_count():
 
 def test_one_stratum_has_no_trend():
     assert falling_drift(drifting((9 * N, 1, 0.0), (N, 2, 0.05))).verdict is Answer.UNTESTED
-
-
-# --- Finer voxels and noise -------------------------------------------------------------------------------------------
 
 
 def test_noise_that_lowers_recurrence_and_raises_vss():
@@ -210,9 +201,6 @@ def test_recurrence_that_was_never_there_cannot_fall():
     assert less_association(describe("depth_noise"), found).verdict is Answer.UNTESTED
 
 
-# --- Denser sampling --------------------------------------------------------------------------------------------------
-
-
 def sampled(fewer, more):
     return denser_sampling(describe("frame_count"), [level(20, *fewer), level(80, *more)])
 
@@ -250,9 +238,6 @@ def test_vss_that_does_not_fall():
 
 def test_levels_without_recurrent_voxels_do_not_count():
     assert sampled(seen(9 * N, 10, SPLIT), seen(N, N, SPLIT)).verdict is Answer.UNTESTED
-
-
-# --- Together ---------------------------------------------------------------------------------------------------------
 
 
 def test_what_only_pooling_makes_is_not_shown():

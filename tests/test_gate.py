@@ -30,8 +30,6 @@ from semstab.statistics.accumulate import cluster_sums_of
 from semstab.statistics.cluster_sums import value
 from semstab.statistics.intervals import difference
 
-# --- Rules ------------------------------------------------------------------------------------------------------------
-
 
 @pytest.mark.parametrize(
     ("text", "key", "change", "below", "limit", "class_name", "scene"),
@@ -104,9 +102,6 @@ def test_settings_come_from_a_file_and_the_command(tmp_path):
         fails(ConfigError, f"gate.yaml: .*{line}", gate_config, file)
 
 
-# --- Judging ----------------------------------------------------------------------------------------------------------
-
-
 def models(frames=20, side=16, seed=0):
     """Two classes on a floor; the log of a model that errs in one look of ten, and the true classes."""
     rng = np.random.default_rng(seed)
@@ -176,9 +171,6 @@ def test_simulated_pairs_without_a_difference_seldom_fail_and_a_loss_of_the_marg
     assert 0.03 < margin < 0.12
     assert fails_ <= 0.12
     assert passes <= 0.16
-
-
-# --- The command ------------------------------------------------------------------------------------------------------
 
 
 def cli(*words):

@@ -109,9 +109,6 @@ def test_a_backend_that_looks_pixels_up_cannot_be_restricted() -> None:
         fused("numba", [], "all")
 
 
-# --- Runs -------------------------------------------------------------------------------------------------------------
-
-
 class Counting(InProcess):
     """In this process; remembers the tiles that were finished, and is interrupted after some."""
 
@@ -474,9 +471,6 @@ def test_tiles_of_two_maps_are_no_table(both, tmp_path) -> None:
 def test_what_cannot_be_tiled_is_refused_in_one_line(settings, message, wall) -> None:
     with pytest.raises(ConfigError, match=message):
         semstab.engine.run(configure(wall, **{"backends": ["numba"], "check": None, **settings}))
-
-
-# --- Which frames see which tiles -------------------------------------------------------------------------------------
 
 
 @hypothesis_settings(max_examples=20, deadline=None)

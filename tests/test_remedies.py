@@ -33,9 +33,6 @@ def said(found):
     return " ".join(advice(found))
 
 
-# --- Which one --------------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("truth", [True, False])
 def test_the_steadiest_is_not_the_best(truth):
     frozen = remedy("ema:0.98", flicker=0.001, worth=0.4, alpha=0.99)
@@ -84,9 +81,6 @@ def test_the_front_is_what_none_beats():
 
 def test_chains_are_written_as_they_are_typed():
     assert "Use --filter ema:0.6 --filter guided:8 over net" in said(study(remedy("ema:0.6+guided:8", 0.1, 0.9)))
-
-
-# --- From the command line --------------------------------------------------------------------------------------------
 
 
 @pytest.fixture(scope="module")

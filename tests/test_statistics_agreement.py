@@ -27,9 +27,6 @@ def by_pairs(evidence):
     return np.mean([s @ u for s, u in itertools.permutations(evidence, 2)])
 
 
-# --- PSA --------------------------------------------------------------------------------------------------------------
-
-
 def test_psa_by_hand():
     table = log_of([[0, 0, 1, -1], [0, 1, -1, -1], [2, 2, 2, 2], [1, -1, -1, -1]]).table()
     np.testing.assert_allclose(psa(table), [1 / 3, 0, 1, np.nan])
@@ -60,9 +57,6 @@ def test_psa_has_the_same_expectation_for_every_number_of_frames_and_vss_has_not
         assert agreement.mean() == pytest.approx((pi**2).sum(), abs=4 * agreement.std() / math.sqrt(len(table)))
         mean_vss.append(vss(table).mean())
     assert all(fewer > more + 0.01 for fewer, more in itertools.pairwise(mean_vss))
-
-
-# --- Kappa and alpha --------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("T", [2, 3, 9])
@@ -152,9 +146,6 @@ def test_classes_of_one_hot_evidence_need_no_events_and_those_of_other_evidence_
     mixed = log_of_evidence(soft(np.random.default_rng(9), 5, 3))
     assert all(math.isnan(row.alpha) for row in class_agreement(mixed.table()))
     assert not any(math.isnan(row.alpha) for row in class_agreement(mixed.table(), mixed))
-
-
-# --- Entropy ----------------------------------------------------------------------------------------------------------
 
 
 def test_entropy_is_within_frames_or_between_them():

@@ -37,9 +37,6 @@ def often(rng, F, low):
     return np.arange(F) < rng.integers(low, F + 1, size=(SIDE * SIDE, 1))
 
 
-# --- The same voxels --------------------------------------------------------------------------------------------------
-
-
 def table_of(voxels, op=2):
     return log_of(np.zeros((len(voxels), op), dtype=int), index=np.array(voxels)).table()
 
@@ -66,9 +63,6 @@ def test_coverage_by_hand():
     assert (first.voxels, first.observations, first.mean_op, first.repeated, first.recurrent) == (3, 6, 2, 2, 1)
     assert (first.common_share, first.alone) == (pytest.approx(1 / 3), 2)
     assert (second.common_share, second.alone) == (1 / 2, 1)
-
-
-# --- Standardisation --------------------------------------------------------------------------------------------------
 
 
 def test_standardised_values_of_one_model_seen_more_or_less_often_are_the_same():
@@ -110,9 +104,6 @@ def test_a_stratum_that_one_map_lacks_counts_for_none():
 def test_edges_that_do_not_ascend_are_refused():
     with pytest.raises(ConfigError, match="must ascend from 2"):
         standardised({"a": table_of([(0, 0, 0)])}, PSA, edges=(1, 5))
-
-
-# --- Paired comparison ------------------------------------------------------------------------------------------------
 
 
 def two_backbones(rng, gap, side=32, F=4):
@@ -196,9 +187,6 @@ def test_maps_without_a_common_voxel_leave_everything_undefined():
     assert math.isnan(result.values["psa"]["a"].value)
     assert all(math.isnan(row.p_value) for row in result.differences)
     assert all(math.isnan(rank.best) for ranking in result.rankings for rank in ranking.ranks)
-
-
-# --- Tests ------------------------------------------------------------------------------------------------------------
 
 
 def test_pairs_of_all_scenes_are_corrected_together_where_something_may_be_claimed():

@@ -22,9 +22,6 @@ def random_beliefs(n=400, K=4, seed=0):
     return rng.dirichlet(np.full(K, 0.5), size=n), rng.integers(0, K - 1, size=n)
 
 
-# --- Truth ------------------------------------------------------------------------------------------------------------
-
-
 def test_the_truth_of_a_voxel_is_what_most_of_its_ground_truth_says():
     table = log_of([[0], [0], [0], [0]]).table()
     index = np.array([[0, 0, 0], [0, 0, 1], [0, 0, 2], [0, 9, 9]])
@@ -37,9 +34,6 @@ def test_the_truth_of_a_voxel_is_what_most_of_its_ground_truth_says():
 def test_truth_of_other_voxels_is_refused():
     with pytest.raises(DataError, match="of 3 classes"):
         join_truth(log_of([[0]]).table(), log_of([[0]], K=4).table())
-
-
-# --- Measures ---------------------------------------------------------------------------------------------------------
 
 
 def test_accuracy_and_miou_are_those_of_scikit_learn():
@@ -101,9 +95,6 @@ def test_strata_hold_the_voxels_of_their_op():
     assert rows["3<=OP<=5"] == (2, 0.5)
     assert rows["OP>5"][0] == 0
     assert math.isnan(rows["OP>5"][1])
-
-
-# --- Quadrants --------------------------------------------------------------------------------------------------------
 
 
 def test_quadrants_by_hand():

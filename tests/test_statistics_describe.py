@@ -63,9 +63,6 @@ def described():
     return analyse(MapSample.draw(events.table(), events, ground_truth()), name="sim")
 
 
-# --- One map ----------------------------------------------------------------------------------------------------------
-
-
 def test_a_description_is_content_for_json_and_undefined_numbers_are_null(described, tmp_path):
     write_json(tmp_path / "statistics.json", described.summary)
     content = read_json(tmp_path / "statistics.json")
@@ -146,9 +143,6 @@ def test_events_of_another_map_are_refused():
         describe(log_of([[0, 1]]).table(), log_of([[0, -1]]))
 
 
-# --- Several maps -----------------------------------------------------------------------------------------------------
-
-
 def test_backbones_beside_each_other():
     logs = {"steady": backbone(0.1, 5), "flickering": backbone(0.4, 6), "stuck": backbone(0.1, 7, place=0.3)}
     tables = {name: log.table() for name, log in logs.items()}
@@ -169,9 +163,6 @@ def test_backbones_beside_each_other():
 def test_one_backbone_cannot_be_compared():
     with pytest.raises(ConfigError, match="give two or more"):
         compare_backbones({"a": ground_truth()})
-
-
-# --- The verdict ------------------------------------------------------------------------------------------------------
 
 
 def between(low, high):

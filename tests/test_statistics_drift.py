@@ -55,9 +55,6 @@ def small(events, **settings):
     return voxel_drift(events.table(), events, **settings)
 
 
-# --- The null ---------------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("T", [2, 3, 4, 5])
 def test_few_observations_are_compared_with_all_orders_exactly(T):
     rng = np.random.default_rng(T)
@@ -134,9 +131,6 @@ def test_in_every_stratum_the_mean_sbd_of_noise_is_what_random_order_gives():
     assert all(fewer > 1.5 * more for fewer, more in itertools.pairwise(means))
 
 
-# --- Tests of voxels --------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("T", [5, 9])
 def test_p_values_keep_their_level_under_noise(T):
     rng = np.random.default_rng(T)
@@ -204,9 +198,6 @@ def test_settings_that_make_no_sense_are_refused():
     events = log_of([[0, 1]])
     with pytest.raises(ConfigError, match="draws = 0, most = 5"):
         voxel_drift(events.table(), events, draws=0, most=5)
-
-
-# --- Tests of the scene -----------------------------------------------------------------------------------------------
 
 
 def scene(labels, K=2, frame_orders=99):
@@ -303,9 +294,6 @@ def test_frames_need_not_be_numbered_from_zero_nor_come_in_order():
     assert a.trend_p == pytest.approx(b.trend_p, abs=0.15)
 
 
-# --- Flips ------------------------------------------------------------------------------------------------------------
-
-
 def test_flips_by_hand():
     events = log_of([[0, 0, 1, 1, -1, 1], [0, 1, 0, -1, -1, -1], [2, -1, -1, -1, -1, -1], [1, 1, -1, -1, -1, -1]])
     changes = flips(events)
@@ -326,9 +314,6 @@ def test_noise_flips_as_often_as_random_order_does_and_lasting_labels_less():
     assert excess.mean() == pytest.approx(0, abs=4 * excess.std() / math.sqrt(5000))
     lasting = flips(log_of(np.sort(rng.integers(0, 3, size=(500, 6)), axis=1)))
     assert (lasting.rate - lasting.null).mean() < -0.2
-
-
-# --- Many tests at once -----------------------------------------------------------------------------------------------
 
 
 def test_benjamini_hochberg_is_that_of_scipy_and_leaves_out_what_was_not_tested():

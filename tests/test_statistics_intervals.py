@@ -41,9 +41,6 @@ def simulated(seed=0, **settings):
     return sums_of(fly(flight, over, rng), over)
 
 
-# --- Ends -------------------------------------------------------------------------------------------------------------
-
-
 def test_independent_places_have_the_interval_of_the_t_test():
     """256 cells of 4 voxels: the mean of PSA has the interval of the mean of the cells' means."""
     rng = np.random.default_rng(0)
@@ -94,9 +91,6 @@ def test_places_that_err_alike_count_as_few():
 def test_a_map_in_one_cube_has_no_interval():
     only = estimate(sums_from(np.zeros((4, 3), dtype=int), 2, 0.5), "alpha", scope=THESE_FRAMES)
     assert math.isnan(only.low)
-
-
-# --- Frames -----------------------------------------------------------------------------------------------------------
 
 
 def test_bad_frames_widen_the_interval_of_another_flight():
@@ -158,9 +152,6 @@ def test_numbers_asked_together_have_the_intervals_that_each_has_alone():
         assert found.undecided == alone.undecided
 
 
-# --- Differences ------------------------------------------------------------------------------------------------------
-
-
 def test_a_map_does_not_differ_from_itself_and_a_worse_one_does():
     sums = simulated(frames=64, looks=64, side=32)
     same = difference(sums, sums, "psa")
@@ -187,9 +178,6 @@ def test_places_and_frames_are_paired_where_both_maps_have_them():
     assert unpaired.high - unpaired.low > 0.8 * max(one.high - one.low for one in both)  # reaches differ
 
 
-# --- Coverage, a small part of simulations -----------------------------------------------------------------------
-
-
 @pytest.mark.parametrize(
     ("flight", "scope"),
     [
@@ -201,9 +189,6 @@ def test_intervals_hold_their_target(flight, scope):
     """So many of few intervals hold it that their level may be 95 %: 3 standard errors below."""
     (row,) = trials(flight, 30, 0, scope, ("alpha",))
     assert row.covered() >= 0.95 - 3 * math.sqrt(0.95 * 0.05 / len(row.intervals))
-
-
-# --- Of several numbers -----------------------------------------------------------------------------------------------
 
 
 def around(value, error, degrees=30.0, **more):

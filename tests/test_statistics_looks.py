@@ -35,9 +35,6 @@ from semstab.statistics.loops.observations import hash_row
 DATA = Path(os.environ.get("SEMSTAB_DATA", Path(__file__).parents[2] / "shared/data"))
 
 
-# --- Alpha between frames ---------------------------------------------------------------------------------------------
-
-
 def test_alpha_between_frames_of_labels_is_krippendorffs():
     table = log_of(np.random.default_rng(0).integers(-1, 3, size=(80, 5))).table()
     assert alpha_between(table) == pytest.approx(krippendorff_alpha(table))
@@ -84,9 +81,6 @@ def test_weights_that_are_fixed_make_flights_comparable_that_linger_elsewhere():
     easy, hard = by_flight[1], by_flight[0]
     assert easy.alpha_between.value - hard.alpha_between.value > 0.2
     assert easy.voxel_weighted.value == pytest.approx(hard.voxel_weighted.value, abs=0.03)
-
-
-# --- The sample -------------------------------------------------------------------------------------------------------
 
 
 def sampled(frames, voxel_size=0.4, budget=1 << 19):
@@ -177,8 +171,6 @@ def test_no_frames_leave_an_empty_sample():
     sample = sampled([])
     assert (len(sample.seen), len(sample.views)) == (0, 0)
 
-
-# --- The ceiling ------------------------------------------------------------------------------------------------------
 
 SIZES = (0.15, 0.3, 0.6)
 

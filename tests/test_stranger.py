@@ -50,9 +50,6 @@ def test_frames_in_which_nothing_is_seen_are_counted(tmp_path) -> None:
     assert "a: 1 of 3 frames hold no pixel with both depth and a label" in printed(result)
 
 
-# --- The check against the reference ----------------------------------------------------------------------------------
-
-
 def test_own_data_is_checked_on_a_sample_of_the_voxels(tmp_path) -> None:
     folder = tiny_scene.write(tmp_path / "scene", frames=12)
     config = configure(folder, backends=["numba"], check="sample", voxel_size=0.05)
@@ -92,9 +89,6 @@ def test_the_sample_is_part_of_the_reference() -> None:
     assert_same_map(sample.table(), drawn, 0)
 
 
-# --- Backends that differ by design -----------------------------------------------------------------------------------
-
-
 def test_a_compared_backend_has_a_line_and_a_table_of_how_it_differs(scene, tmp_path) -> None:
     config = configure(scene, backends=["numba", "open3d-projective"], check=None, backbones=["a"], voxel_size=0.25)
     result = semstab.run(config, out=tmp_path / "run", report=False)
@@ -108,9 +102,6 @@ def test_a_compared_backend_has_a_line_and_a_table_of_how_it_differs(scene, tmp_
     assert {table.name for table in tables(result)} >= {"fusion", "fusion_compared"}
     assert "agreement" not in {table.name for table in tables(result)}
     assert any(sentence.startswith("open3d-projective, which") for sentence in reading(result, ()))
-
-
-# --- The voxel size ---------------------------------------------------------------------------------------------------
 
 
 @pytest.fixture(scope="module")
@@ -149,9 +140,6 @@ def test_a_given_voxel_size_is_told_where_it_lies(wide) -> None:
     assert "'background' covers" in printed(result)
 
 
-# --- Strata -----------------------------------------------------------------------------------------------------------
-
-
 def test_a_crowded_last_stratum_is_split_by_its_op() -> None:
     rng = np.random.default_rng(0)
     op = np.concatenate([np.ones(10, int), rng.integers(6, 120, 990)])
@@ -186,9 +174,6 @@ def simulated(op, rng) -> Events:
         ix=np.arange(len(op), dtype=np.int32), iy=zeros, iz=zeros, voxel=rows, frame=frame, evidence=evidence,
         pixels=ones, voxel_size=0.1,
     )  # fmt: skip
-
-
-# --- What cannot be meant ---------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("name", ["numpy", "numba", "open3d", "open3d-projective", "torch"])
