@@ -57,15 +57,18 @@ def walls(tmp_path_factory):
     return wall_study(tmp_path_factory.getbasetemp())[0]
 
 
-def test_recurrent_voxels_that_disagree_more():
+def test_recurrent_voxels_that_disagree_more_as_much_and_too_few():
     outcome = more_disagreement(pooled([record(voxels(*seen(3 * N, N, SPLIT)))]))
-    assert outcome.verdict is Answer.SHOWN
-    assert (
-        outcome.numbers
-        == "VSS 0.7500 for OP>=3 against 0.9375 over all voxels: 25.0% of the evidence disagrees, not 6.2%. From OP=2"
+    assert (outcome.verdict, outcome.why) == (Answer.SHOWN, "")
+    assert outcome.numbers == (
+        "VSS 0.7500 for OP>=3 against 0.9375 over all voxels: 25.0% of the evidence disagrees, not 6.2%. From OP=2"
         " to OP>=3 PSA falls by 0.1000 (0.0500 to 0.1500)."
     )
-    assert outcome.why == ""
+    outcome = more_disagreement(pooled([record(voxels((N, 1, SPLIT), (N, 4, SPLIT)))]))
+    assert outcome.verdict is Answer.NOT_SHOWN
+    assert "agree as well" in outcome.why
+    outcome = more_disagreement(pooled([record(voxels(*seen(3 * N, N - 1, SPLIT)))]))
+    assert (outcome.verdict, outcome.why) == (Answer.UNTESTED, "999 voxels have OP>=3; 1,000 are needed.")
 
 
 def test_a_coin_shows_no_disagreement_nor_drift():
@@ -90,25 +93,10 @@ def test_a_tossed_coin_is_told_from_findings():
     assert found.drift_below_null.low <= 0 <= found.drift_below_null.high
 
 
-def test_recurrent_voxels_that_agree_as_well_as_all():
-    outcome = more_disagreement(pooled([record(voxels((N, 1, SPLIT), (N, 4, SPLIT)))]))
-    assert outcome.verdict is Answer.NOT_SHOWN
-    assert "agree as well" in outcome.why
-
-
-def test_too_few_recurrent_voxels_say_nothing():
-    outcome = more_disagreement(pooled([record(voxels(*seen(3 * N, N - 1, SPLIT)))]))
-    assert outcome.verdict is Answer.UNTESTED
-    assert outcome.why == "999 voxels have OP>=3; 1,000 are needed."
-
-
 @pytest.mark.parametrize(("gap", "verdict"), [(1.2, Answer.SHOWN), (0.8, Answer.NOT_SHOWN)])
 def test_a_difference_counts_from_the_last_printed_decimal_on(gap, verdict):
-    evidence = [
-        1 - 2 * gap * VISIBLE_VSS,
-        2 * gap * VISIBLE_VSS,
-        0,
-    ]  # half of the voxels: the aggregate lies in the middle
+    """Half of the voxels recur: the aggregate lies in the middle."""
+    evidence = [1 - 2 * gap * VISIBLE_VSS, 2 * gap * VISIBLE_VSS, 0]
     assert more_disagreement(pooled([record(voxels(*seen(N, N, evidence)))])).verdict is verdict
 
 
@@ -127,13 +115,17 @@ def drifting(*sbd_by_op):
     return pooled([record(voxels(*((n, op, SURE, sbd) for n, op, sbd in sbd_by_op)))])
 
 
-def test_sbd_that_falls_from_stratum_to_stratum():
+def test_sbd_that_falls_from_stratum_to_stratum_or_rises_once():
     outcome = falling_drift(drifting((N, 1, 0.0), (N, 2, 0.08), (N, 4, 0.05), (N, 9, 0.02)))
     assert outcome.verdict is Answer.SHOWN
     assert outcome.numbers == (
         "SBD 0.0800 at OP=2, 0.0500 at 3<=OP<=5, 0.0200 at OP>5; lower by 0.0100 (0.0050 to 0.0150) than in random"
         " order for OP>=3."
     )
+    outcome = falling_drift(drifting((N, 2, 0.05), (N, 4, 0.06), (N, 9, 0.02)))
+    assert (outcome.verdict, outcome.why) == (Answer.NOT_SHOWN, "No fall from OP=2 to 3<=OP<=5.")
+    assert falling_drift(drifting((N, 2, 0.05), (N - 1, 4, 0.06), (N, 9, 0.02))).verdict is Answer.SHOWN  # too small
+    assert falling_drift(drifting((9 * N, 1, 0.0), (N, 2, 0.05))).verdict is Answer.UNTESTED  # one stratum
 
 
 def test_numbers_below_zero_are_said_the_other_way_round():
@@ -145,40 +137,20 @@ def test_numbers_below_zero_are_said_the_other_way_round():
     assert "; neither lower nor higher (0.0000 to 0.0001) than in random order" in falling_drift(nothing).numbers
 
 
-def test_sbd_that_rises_once_does_not_fall():
-    outcome = falling_drift(drifting((N, 2, 0.05), (N, 4, 0.06), (N, 9, 0.02)))
-    assert outcome.verdict is Answer.NOT_SHOWN
-    assert outcome.why == "No fall from OP=2 to 3<=OP<=5."
-
-
-def test_a_small_stratum_does_not_count():
-    assert falling_drift(drifting((N, 2, 0.05), (N - 1, 4, 0.06), (N, 9, 0.02))).verdict is Answer.SHOWN
-
-
-def test_one_stratum_has_no_trend():
-    assert falling_drift(drifting((9 * N, 1, 0.0), (N, 2, 0.05))).verdict is Answer.UNTESTED
-
-
-def test_noise_that_lowers_recurrence_and_raises_vss():
+def test_noise_and_finer_voxels_that_lower_recurrence_and_raise_vss():
+    """Where the same places agree as before at each OP, of a coin as well there would be fewer that were seen often."""
     found = [level(0.0, *seen(N, N, SPLIT)), level(0.01, *seen(3 * N, N, CALM))]
     outcome = less_association(describe("depth_noise"), found)
     assert outcome.verdict is Answer.SHOWN
     assert outcome.numbers == "0 → 1 % of depth: VSS 0.8750 → 0.9750; OP>=3 50.00 → 25.00%."
-
-
-def test_what_fewer_looks_alone_make_of_vss_is_not_shown():
-    """The same places agree as before at each OP: of a coin as well there would be fewer that were seen often."""
-    found = [level(0.0, *seen(N, N, SPLIT)), level(0.01, *seen(3 * N, N, SPLIT))]
-    outcome = less_association(describe("depth_noise"), found)
-    assert outcome.verdict is Answer.NOT_SHOWN
-    assert outcome.why == "At 1 % of depth a coin would show it: VSS rises no more than fewer observations make it."
-
-
-def test_finer_voxels_are_compared_with_the_coarsest():
     found = [level(0.1, *seen(3 * N, N, CALM)), level(0.4, *seen(N, N, SPLIT))]
     outcome = less_association(describe("voxel_size"), found)
     assert outcome.verdict is Answer.SHOWN
     assert outcome.numbers.startswith("0.4 → 0.1 m: VSS 0.8750 → 0.9750")
+    found = [level(0.0, *seen(N, N, SPLIT)), level(0.01, *seen(3 * N, N, SPLIT))]
+    outcome = less_association(describe("depth_noise"), found)
+    assert outcome.verdict is Answer.NOT_SHOWN
+    assert outcome.why == "At 1 % of depth a coin would show it: VSS rises no more than fewer observations make it."
 
 
 def test_every_level_has_to_follow():
@@ -190,14 +162,15 @@ def test_every_level_has_to_follow():
     assert "1.0 pixels" in outcome.why
 
 
-def test_noise_needs_an_undisturbed_level():
-    found = [level(0.1, *seen(N, N, SPLIT)), level(0.2, *seen(3 * N, N, SPLIT))]
-    assert less_association(describe("depth_noise"), found).verdict is Answer.UNTESTED
-    assert less_association(describe("depth_noise"), found[:1]).verdict is Answer.UNTESTED
-
-
-def test_recurrence_that_was_never_there_cannot_fall():
-    found = [level(0.0, *seen(N, N - 1, SPLIT)), level(0.1, *seen(3 * N, 1, SPLIT))]
+@pytest.mark.parametrize(
+    "found",
+    [
+        [level(0.1, *seen(N, N, SPLIT)), level(0.2, *seen(3 * N, N, SPLIT))],  # no undisturbed level
+        [level(0.1, *seen(N, N, SPLIT))],
+        [level(0.0, *seen(N, N - 1, SPLIT)), level(0.1, *seen(3 * N, 1, SPLIT))],  # recurrence was never there
+    ],
+)
+def test_noise_without_a_level_to_compare_with_is_untested(found):
     assert less_association(describe("depth_noise"), found).verdict is Answer.UNTESTED
 
 
@@ -213,10 +186,19 @@ def test_denser_sampling_that_uncovers_what_was_there():
     )
 
 
-def test_what_more_looks_alone_make_of_vss_is_not_shown():
-    outcome = sampled(seen(9 * N, N, SPLIT), seen(N, N, SPLIT))
-    assert outcome.verdict is Answer.NOT_SHOWN
-    assert outcome.why == "A coin would show it: VSS falls no more than more observations make it."
+@pytest.mark.parametrize(
+    ("fewer", "more", "verdict", "why"),
+    [
+        (seen(9 * N, N, SPLIT), seen(N, N, SPLIT), Answer.NOT_SHOWN,
+         "A coin would show it: VSS falls no more than more observations make it."),
+        (seen(N, N, SPLIT), seen(9 * N, N, SPLIT), Answer.NOT_SHOWN, "VSS over all voxels does not fall."),
+        (seen(9 * N, 10, SPLIT), seen(N, N, SPLIT), Answer.UNTESTED, None),
+    ],
+)  # fmt: skip
+def test_denser_sampling_that_shows_nothing(fewer, more, verdict, why):
+    outcome = sampled(fewer, more)
+    assert outcome.verdict is verdict
+    assert why in (None, outcome.why)
 
 
 @pytest.mark.parametrize(("share", "verdict"), [(0.9, Answer.SHOWN), (1.1, Answer.NOT_SHOWN)])
@@ -229,15 +211,6 @@ def test_recurrent_vss_may_move_by_half_as_much(share, verdict):
     fall = 0.25 * 0.3 + move * 0.8
     assert (move <= HARDLY * fall) == (verdict is Answer.SHOWN)
     assert outcome.verdict is verdict
-
-
-def test_vss_that_does_not_fall():
-    outcome = sampled(seen(N, N, SPLIT), seen(9 * N, N, SPLIT))
-    assert (outcome.verdict, outcome.why) == (Answer.NOT_SHOWN, "VSS over all voxels does not fall.")
-
-
-def test_levels_without_recurrent_voxels_do_not_count():
-    assert sampled(seen(9 * N, 10, SPLIT), seen(N, N, SPLIT)).verdict is Answer.UNTESTED
 
 
 def test_what_only_pooling_makes_is_not_shown():

@@ -49,10 +49,12 @@ def test_shared_rows_are_the_voxels_that_all_maps_hold():
     assert [rows.tolist() for rows in shared_rows(a, table_of([(1, 1, 1)]))] == [[], []]
 
 
-def test_maps_of_different_voxels_are_refused():
+def test_maps_of_different_voxels_and_edges_that_do_not_ascend_are_refused():
     a = table_of([(0, 0, 0)])
     with pytest.raises(DataError, match="fuse both alike"):
         shared_rows(a, dataclasses.replace(a, voxel_size=0.4))
+    with pytest.raises(ConfigError, match="must ascend from 2"):
+        standardised({"a": a}, PSA, edges=(1, 5))
 
 
 def test_coverage_by_hand():
@@ -89,21 +91,12 @@ def test_standardised_value_by_hand():
     values = standardised({"a": a, "b": b}, PSA)
     assert values["a"].value == pytest.approx(2 / 3 * 1 / 2 + 1 / 3)
     assert values["b"].value == pytest.approx(2 / 3 + 1 / 3 * 1 / 2)
-
-
-def test_a_stratum_that_one_map_lacks_counts_for_none():
-    index = np.stack([np.zeros(2), np.zeros(2), np.arange(2)], axis=1)
-    a = log_of([[0, 0, -1, -1], [0, 0, 0, 1]], index=index).table()
-    b = log_of([[0, 1, -1, -1], [0, 1, -1, -1]], index=index).table()
+    a = log_of([[0, 0, -1, -1], [0, 0, 0, 1]], index=index[:2]).table()
+    b = log_of([[0, 1, -1, -1], [0, 1, -1, -1]], index=index[:2]).table()  # lacks a stratum, which counts for none
     assert common_weights(stratum_counts({"a": a, "b": b})).tolist() == [1.0] + [0.0] * len(EDGES)
     assert standardised({"a": a, "b": b}, PSA)["a"].value == 1
     never = log_of([[0, -1]], index=index[:1]).table()
     assert math.isnan(standardised({"a": a, "b": never}, PSA)["a"].value)
-
-
-def test_edges_that_do_not_ascend_are_refused():
-    with pytest.raises(ConfigError, match="must ascend from 2"):
-        standardised({"a": table_of([(0, 0, 0)])}, PSA, edges=(1, 5))
 
 
 def two_backbones(rng, gap, side=32, F=4):

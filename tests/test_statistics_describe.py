@@ -123,10 +123,11 @@ def test_the_same_seed_gives_the_same_description():
 def test_a_table_alone_is_described_as_far_as_it_goes():
     events = backbone(0.2, 0)
     alone, logged = describe(events.table()), describe(events.table(), events)
-    assert alone.fusion_rules is alone.correctness is alone.geometry is None
-    assert alone.drift.tests is None
+    assert alone.fusion_rules is alone.correctness is alone.geometry is alone.drift.tests is None
     assert alone.drift.null == logged.drift.null
     assert to_json(alone.agreement) == to_json(logged.agreement)
+    assert "for these frames alone (no log)" in alone.verdict.line
+    assert "for this scene flown again, from 8 frames" in logged.verdict.line
 
 
 @pytest.mark.parametrize("labels", [np.zeros((0, 2), dtype=int), [[0, -1]], [[0, 0], [0, 0]]])
@@ -138,9 +139,11 @@ def test_maps_that_say_nothing_are_described_too(labels):
     assert "no verdict" in summary.verdict.line
 
 
-def test_events_of_another_map_are_refused():
+def test_events_of_another_map_and_one_backbone_are_refused():
     with pytest.raises(DataError, match="take both from one backend"):
         describe(log_of([[0, 1]]).table(), log_of([[0, -1]]))
+    with pytest.raises(ConfigError, match="give two or more"):
+        compare_backbones({"a": ground_truth()})
 
 
 def test_backbones_beside_each_other():
@@ -158,11 +161,6 @@ def test_backbones_beside_each_other():
     assert rules.values["averaging"]["stuck"].accuracy < 0.8
     assert rules.order_changes.keys() == rules.orders.keys()
     assert compare_backbones(tables).fusion_rules is None
-
-
-def test_one_backbone_cannot_be_compared():
-    with pytest.raises(ConfigError, match="give two or more"):
-        compare_backbones({"a": ground_truth()})
 
 
 def between(low, high):
@@ -195,20 +193,15 @@ def test_the_most_probable_level_is_the_verdict(low, high, level):
     assert judged(low, high).level == level
 
 
-def test_agreement_below_zero_is_no_share_of_anything():
+def test_agreement_below_zero_stable_errors_and_few_places_are_said():
     line = judged(-0.2, -0.1, ceiling=0.9, classes=(of_class("tree", -0.2, -0.1),)).line
     assert "alpha between frames -0.15, no better than chance, is -15%" in line
     assert "probably unstable: tree (100%)" in line
     assert "chance" not in judged(0.1, 0.2, ceiling=0.9).line
-
-
-def test_what_is_stably_wrong_is_not_called_stable():
-    assert judged(0.9, 0.95, Interval(0.2, 0.1, 0.3)).level == "misleading"
+    wrong = judged(0.9, 0.95, Interval(0.2, 0.1, 0.3))
+    assert wrong.level == "misleading"
+    assert "20% of the stable locations are wrong (10% to 30%)" in wrong.line
     assert judged(0.9, 0.95, Interval(0.06, 0.04, 0.1)).level == "stable"
-    assert "20% of the stable locations are wrong (10% to 30%)" in judged(0.9, 0.95, Interval(0.2, 0.1, 0.3)).line
-
-
-def test_there_is_no_verdict_from_few_places():
     assert judged(0.9, 0.95, voxels=99).level == judged(0.9, 0.95, blocks=15).level == "no verdict"
     assert "more overlap between frames" in judged(0.9, 0.95, voxels=99).line
     assert "one class" in judged(math.nan, math.nan).line
@@ -222,12 +215,6 @@ def test_the_line_says_what_to_do_and_why():
     )
 
 
-def test_few_frames_and_a_missing_log_are_named():
-    events = backbone(0.1, 3)
-    assert "for this scene flown again, from 8 frames" in describe(events.table(), events).verdict.line
-    assert "for these frames alone (no log)" in describe(events.table()).verdict.line
-
-
 def test_probabilities_of_the_levels_sum_to_one_and_follow_the_interval():
     for low, high in ((0.5, 0.6), (0.7, 0.9), (0.81, 0.9)):
         for scale in ("agreement", "plain"):
@@ -238,15 +225,12 @@ def test_probabilities_of_the_levels_sum_to_one_and_follow_the_interval():
     assert half["stable"] == pytest.approx(0.5)
 
 
-def test_agreement_is_judged_against_its_ceiling_and_the_line_says_which():
+def test_agreement_is_judged_against_its_ceiling_and_the_line_names_unstable_classes_the_most_probable_first():
     found = judged(0.82, 0.9, ceiling=0.7)
     assert found.level == "stable"
     assert "alpha between frames 0.86 is 86% (82% to 90%) of its ceiling, 0.70" in found.line
     assert judged(0.82, 0.9, ceiling=0.4).level == "too coarse"
     assert judged(0.1, 0.2, ceiling=0.4).level == "unstable"
-
-
-def test_classes_that_are_probably_unstable_are_named_the_most_probable_first():
     good, bad, worse = of_class("road", 0.9, 1.0), of_class("person", 0.3, 0.6), of_class("tree", -0.1, 0.1)
     rare, unknown = of_class("car", 0.1, 0.2, matters=False), of_class("sign", math.nan, math.nan)
     found = judged(0.9, 1.0, ceiling=0.9, classes=(good, bad, worse, rare, unknown))

@@ -74,21 +74,14 @@ def test_what_weighs_next_to_nothing_is_nowhere():
     assert places.estimate(1e-112 * columns, ratio_of).undecided == NO_PLACES
 
 
-def test_few_places_that_disagree_leave_a_wide_interval_below():
+def test_few_places_and_places_that_err_alike_leave_a_wide_interval_and_one_cube_none():
     labels = np.zeros((36 * 36, 3), dtype=int)
     labels[: 18 * 36] = 1
     labels[[5, 700, 1200], 0] ^= 1
     found = estimate(sums_from(labels, 36), "alpha", scope=THESE_FRAMES)
     assert 0.95 < found.low < found.value < found.high < 1
-
-
-def test_places_that_err_alike_count_as_few():
-    near = estimate(simulated(side=64, reach=6.0), "alpha", scope=THESE_FRAMES)
-    far = estimate(simulated(side=64, reach=0.5), "alpha", scope=THESE_FRAMES)
+    near, far = (estimate(simulated(side=64, reach=reach), "alpha", scope=THESE_FRAMES) for reach in (6.0, 0.5))
     assert near.high - near.low > 3 * (far.high - far.low)
-
-
-def test_a_map_in_one_cube_has_no_interval():
     only = estimate(sums_from(np.zeros((4, 3), dtype=int), 2, 0.5), "alpha", scope=THESE_FRAMES)
     assert math.isnan(only.low)
 
@@ -102,13 +95,10 @@ def test_bad_frames_widen_the_interval_of_another_flight():
     assert (here.scope, again.scope, elsewhere.scope, again.frames) == (THESE_FRAMES, THIS_SCENE, OTHER_SCENES, 64)
 
 
-def test_where_frames_are_alike_the_same_scene_gives_nearly_the_same_again():
+def test_the_interval_is_narrow_where_frames_are_alike_and_wide_where_their_quality_lasts():
     sums = simulated(frames=64, looks=64, side=32)
     here, again = estimate(sums, "alpha", scope=THESE_FRAMES), estimate(sums, "alpha")
     assert again.high - again.low < 0.2 * (here.high - here.low)
-
-
-def test_quality_that_lasts_widens_the_interval():
     alike, lasting = (simulated(6, frames=32, looks=32, quality=quality, side=24) for quality in ("alike", "lasting"))
     one, other = (estimate(sums, "alpha") for sums in (alike, lasting))
     assert other.high - other.low > 5 * (one.high - one.low)
@@ -125,10 +115,8 @@ def test_few_frames_and_no_frames_say_so():
 
 def test_every_number_has_an_interval_around_it():
     sums = simulated(frames=64, looks=6, quality="uneven")
-    for key, k in [(key, None) for key in ("psa", "vss", "entropy", "accuracy", "look_accuracy", "wrong_of_stable")] + [
-        ("alpha", 0),
-        ("accuracy", 1),
-    ]:
+    keys = ("psa", "vss", "entropy", "accuracy", "look_accuracy", "wrong_of_stable")
+    for key, k in [*((key, None) for key in keys), ("alpha", 0), ("accuracy", 1)]:
         found = estimate(sums, key, k)
         assert found.low < found.value < found.high, key
         assert found.value == value(sums, key, k)
@@ -196,7 +184,7 @@ def around(value, error, degrees=30.0, **more):
     return Interval(value, value - half, value + half, degrees=degrees, **more)
 
 
-def test_a_mean_over_scenes_errs_less_than_each():
+def test_a_mean_over_scenes_errs_less_than_each_and_answers_the_lesser_question():
     scenes = [around(0.3, 0.1), around(-0.1, 0.1), around(0.1, 0.1), around(0.1, 0.1)]
     found = mean_of(scenes)
     assert found.value == pytest.approx(0.1)
@@ -204,9 +192,6 @@ def test_a_mean_over_scenes_errs_less_than_each():
     assert found.degrees == pytest.approx(120)
     assert found.p_value == pytest.approx(2 * stats.t.sf(0.1 / 0.05, 120))
     assert mean_of(scenes[:1]) is scenes[0]
-
-
-def test_a_mean_says_what_is_undecided_in_a_scene_and_answers_the_lesser_question():
     found = mean_of([around(0.0, 1.0, scope=THIS_SCENE), around(0.0, 1.0, scope=THESE_FRAMES, undecided="too few")])
     assert (found.scope, found.undecided) == (THESE_FRAMES, "too few")
 
