@@ -86,31 +86,27 @@ def test_a_lost_pose_is_left_out_and_said_and_the_default_folder_is_new(wall, tm
     assert (folder / "summary.json").exists()
 
 
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        ("--data nowhere", "nowhere: there is no such folder"), ("--data empty", "empty"),
-        ("--config nowhere.yaml", "nowhere.yaml: cannot be read"),
-        ("--config bad.yaml", "unknown setting 'voxel_sise'; did you mean 'voxel_size'?"),
-        ("--data wall --voxel-size 0", "voxel_size: input should be greater than"),
-        ("--data wall --backend opn3d", "did you mean 'open3d'?"),
-        ("--data wall --backbone c", "no backbone 'c'; there is a, b, gt"), ("--data wall --frames 3", "--frames 3"),
-        ("--data wall --set x", "write KEY=VALUE"), ("--data wall --device CUDA:7", "CUDA"),
-        ("--data wall --backend numpy --device CPU:0", "none of numpy runs on a device"),
-        ("--data wall --seed 1", "unknown setting 'seed'"),
-        ("--data wall --out wall", "is not empty and holds no run"),
-        ("--data wall --report maybe", "--report maybe: write on or off"),
-        ("--data wall --jobs 2 --rerun spawn", "a viewer follows a run in one process; leave out --jobs and"),
-        ("--data wall --jobs 2 --scheduler tcp://x:1", "--jobs and --scheduler: the scheduler's workers do the work"),
-        ("view wall", "holds no finished run"),
-        ("study citi", "study 'citi' is not known; did you mean 'city'?, or name a .yaml file"),
-        ("study nowhere.yaml", "nowhere.yaml: cannot be read"),
-        ("study tiny.yaml --only voxelsize", "study tiny: no part 'voxelsize'; did you mean 'voxel_size'?"),
-        ("study tiny.yaml --set sweeps.voxels=[1]", "unknown setting 'sweeps.voxels'; did you mean 'voxel_size'?"),
-        ("study tiny.yaml --jobs 2 --scheduler tcp://x:1", "--jobs and --scheduler: the scheduler's workers do"),
-        ("study tiny.yaml --out wall", "is not empty and holds no run or study; choose another folder"),
-    ],
-)  # fmt: skip
+@pytest.mark.parametrize(("arguments", "message"), [
+    ("--data nowhere", "nowhere: there is no such folder"), ("--data empty", "empty"),
+    ("--config nowhere.yaml", "nowhere.yaml: cannot be read"),
+    ("--config bad.yaml", "unknown setting 'voxel_sise'; did you mean 'voxel_size'?"),
+    ("--data wall --voxel-size 0", "voxel_size: input should be greater than"),
+    ("--data wall --backend opn3d", "did you mean 'open3d'?"),
+    ("--data wall --backbone c", "no backbone 'c'; there is a, b, gt"), ("--data wall --frames 3", "--frames 3"),
+    ("--data wall --set x", "write KEY=VALUE"), ("--data wall --device CUDA:7", "CUDA"),
+    ("--data wall --backend numpy --device CPU:0", "none of numpy runs on a device"),
+    ("--data wall --seed 1", "unknown setting 'seed'"), ("--data wall --out wall", "is not empty and holds no run"),
+    ("--data wall --report maybe", "--report maybe: write on or off"),
+    ("--data wall --jobs 2 --rerun spawn", "a viewer follows a run in one process; leave out --jobs and"),
+    ("--data wall --jobs 2 --scheduler tcp://x:1", "--jobs and --scheduler: the scheduler's workers do the work"),
+    ("view wall", "holds no finished run"),
+    ("study citi", "study 'citi' is not known; did you mean 'city'?, or name a .yaml file"),
+    ("study nowhere.yaml", "nowhere.yaml: cannot be read"),
+    ("study tiny.yaml --only voxelsize", "study tiny: no part 'voxelsize'; did you mean 'voxel_size'?"),
+    ("study tiny.yaml --set sweeps.voxels=[1]", "unknown setting 'sweeps.voxels'; did you mean 'voxel_size'?"),
+    ("study tiny.yaml --jobs 2 --scheduler tcp://x:1", "--jobs and --scheduler: the scheduler's workers do"),
+    ("study tiny.yaml --out wall", "is not empty and holds no run or study; choose another folder"),
+])  # fmt: skip
 def test_bad_input_is_one_line_and_exit_2(wall, tmp_path, arguments, message) -> None:
     (tmp_path / "empty").mkdir()
     (tmp_path / "bad.yaml").write_text("voxel_sise: 1\n")
@@ -130,20 +126,17 @@ def image(path: str, *shape_and_value: int, dtype: type = np.uint16):
     return write
 
 
-@pytest.mark.parametrize(
-    ("damage", "message"),
-    [
-        (image("depth/0001.png", 3, 4, 2000), "labels are 8x6 but depth is 4x3"),
-        (lambda wall: np.savetxt(wall / "pose/0001.txt", np.diag([2.0, 2, 2, 1])),
-         "pose/0001.txt: the rotation is not orthonormal"),
-        (lambda wall: os.truncate(wall / "depth/0001.png", 40), "depth/0001.png"),
-        (image("labels/a/0001.png", 6, 8, 77, dtype=np.uint8), "labels/a/0001.png: label id 77"),
-        (lambda wall: (wall / "labels/a/0001.png").unlink(), "labels/a/0001"),
-        (image("depth", 6, 8, 0), "wall, a: no pixel of 3 frames is valid"),
-        (image("labels/a", 6, 8, 255, dtype=np.uint8), "depth in 100% of the pixels, a label in 0%"),
-        (lambda wall: (wall / "intrinsics.txt").unlink(), "intrinsics.txt"),
-    ],
-)  # fmt: skip
+@pytest.mark.parametrize(("damage", "message"), [
+    (image("depth/0001.png", 3, 4, 2000), "labels are 8x6 but depth is 4x3"),
+    (lambda wall: np.savetxt(wall / "pose/0001.txt", np.diag([2.0, 2, 2, 1])),
+     "pose/0001.txt: the rotation is not orthonormal"),
+    (lambda wall: os.truncate(wall / "depth/0001.png", 40), "depth/0001.png"),
+    (image("labels/a/0001.png", 6, 8, 77, dtype=np.uint8), "labels/a/0001.png: label id 77"),
+    (lambda wall: (wall / "labels/a/0001.png").unlink(), "labels/a/0001"),
+    (image("depth", 6, 8, 0), "wall, a: no pixel of 3 frames is valid"),
+    (image("labels/a", 6, 8, 255, dtype=np.uint8), "depth in 100% of the pixels, a label in 0%"),
+    (lambda wall: (wall / "intrinsics.txt").unlink(), "intrinsics.txt"),
+])  # fmt: skip
 def test_damaged_data_is_one_line_that_names_the_file(wall, tmp_path, damage, message) -> None:
     damage(wall)
     result = bench("--data", wall, "--backend", "numpy", "--rerun", "off", "--out", "run", cwd=tmp_path, code=2)

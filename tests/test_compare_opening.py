@@ -32,7 +32,7 @@ def run(tmp_path_factory):
     return base / "run"
 
 
-def test_a_label_source_is_selected_behind_a_colon(run):
+def test_a_label_source_is_selected_behind_a_colon_and_names_are_the_shortest(run, tmp_path):
     found = open_run(f"{run}:b")
     assert (found.backbone, list(found.scenes), found.source) == ("b", ["wall"], run)
     entry = found.scenes["wall"]
@@ -40,9 +40,6 @@ def test_a_label_source_is_selected_behind_a_colon(run):
     assert value(entry.sums, "psa") == pytest.approx(entry.summary.statistics.agreement.psa.value)
     assert list(entry.flicker) == [1, 2, 3, 4, 5]
     assert np.mean(list(entry.flicker.values())) == pytest.approx(entry.image_space.compensated_flicker_percent)
-
-
-def test_names_are_the_shortest_that_tell_apart(run, tmp_path):
     shutil.copytree(run, tmp_path / "new")
     names = [each.name for each in open_runs([f"{run}:a", f"{run}:b"])]
     assert names == ["a", "b"]
@@ -50,28 +47,20 @@ def test_names_are_the_shortest_that_tell_apart(run, tmp_path):
     three = open_runs([f"{run}:a", f"{tmp_path}/new:a", f"{run}:b"])
     assert [each.name for each in three] == ["run:a", "new:a", "run:b"]
     assert [each.name for each in open_runs([f"{run}:a", f"{run}:a"])] == ["a", "a (2)"]
-
-
-def test_a_path_with_a_colon_is_a_path(run, tmp_path):
     shutil.copytree(run, tmp_path / "a:b")
     assert open_run(f"{tmp_path}/a:b:a").source == tmp_path / "a:b"
 
 
-@pytest.mark.parametrize(
-    ("named", "line"),
-    [
-        ("{run}", "holds several label sources (a, b); name one: {run}:a"),
-        ("{run}:q", "no backbone 'q'; known: a, b"),
-        ("{run}/nothing", "there is no such folder"),
-        ("{run}/units", "summary.json: cannot be read"),
-        ("{run}/config.yaml", "neither a run's folder nor a small summary"),
-    ],
-)
+@pytest.mark.parametrize(("named", "line"), [
+    ("{run}", "holds several label sources (a, b); name one: {run}:a"), ("{run}:q", "no backbone 'q'; known: a, b"),
+    ("{run}/nothing", "there is no such folder"), ("{run}/units", "summary.json: cannot be read"),
+    ("{run}/config.yaml", "neither a run's folder nor a small summary"),
+])  # fmt: skip
 def test_what_cannot_be_opened_is_one_line(run, named, line):
     fails((ConfigError, DataError), re.escape(line.format(run=run)), open_run, named.format(run=run))
 
 
-def test_an_earlier_layout_is_said(run, tmp_path):
+def test_an_earlier_layout_and_runs_of_other_scenes_and_classes_are_refused(run, tmp_path):
     shutil.copytree(run, tmp_path / "old")
     settings = tmp_path / "old/config.yaml"
     settings.write_text(settings.read_text().replace("layout 4", "layout 2"))
@@ -79,9 +68,6 @@ def test_an_earlier_layout_is_said(run, tmp_path):
         DataError, re.escape("holds results of an earlier version of semstab; run it again"), open_run,
         f"{tmp_path}/old:a",
     )  # fmt: skip
-
-
-def test_runs_of_other_scenes_and_classes_are_refused(run):
     one = open_run(f"{run}:a")
     other = dataclasses.replace(one, scenes={"street": one.scenes["wall"]})
     fails(DataError, re.escape("have no scene in common (wall; street)"), shared_scenes, [one, other])
@@ -136,16 +122,13 @@ def test_a_damaged_small_summary_is_one_line(run, tmp_path):
     fails(DataError, re.escape(f"{file}: unpacks to more than 100 MB"), open_run, file)
 
 
-@pytest.mark.parametrize(
-    ("field", "number", "line"),
-    [
-        ("edge", 0.3, "sums of wall are damaged"), ("edge", 2.0**63, "sums of wall are damaged"),
-        ("step", 2**31, "sums of wall are damaged"), ("step", 3, "sums of wall are damaged"),
-        ("evidence_0", 1e300, "sums of wall are damaged"), ("evidence_0", float("inf"), "sums of wall are damaged"),
-        ("ix", 2**40, "sums of wall are damaged"), ("flicker", 1e308, "percentages of flicker, or the frames"),
-        ("frames", 2**31, "percentages of flicker, or the frames"),
-    ],
-)  # fmt: skip
+@pytest.mark.parametrize(("field", "number", "line"), [
+    ("edge", 0.3, "sums of wall are damaged"), ("edge", 2.0**63, "sums of wall are damaged"),
+    ("step", 2**31, "sums of wall are damaged"), ("step", 3, "sums of wall are damaged"),
+    ("evidence_0", 1e300, "sums of wall are damaged"), ("evidence_0", float("inf"), "sums of wall are damaged"),
+    ("ix", 2**40, "sums of wall are damaged"), ("flicker", 1e308, "percentages of flicker, or the frames"),
+    ("frames", 2**31, "percentages of flicker, or the frames"),
+])  # fmt: skip
 def test_numbers_that_no_map_has_are_refused_before_they_overflow(run, tmp_path, field, number, line):
     file = tmp_path / "kept.semstab"
     save_summary(open_run(f"{run}:a"), file)

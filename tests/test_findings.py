@@ -162,14 +162,11 @@ def test_every_level_has_to_follow():
     assert "1.0 pixels" in outcome.why
 
 
-@pytest.mark.parametrize(
-    "found",
-    [
-        [level(0.1, *seen(N, N, SPLIT)), level(0.2, *seen(3 * N, N, SPLIT))],  # no undisturbed level
-        [level(0.1, *seen(N, N, SPLIT))],
-        [level(0.0, *seen(N, N - 1, SPLIT)), level(0.1, *seen(3 * N, 1, SPLIT))],  # recurrence was never there
-    ],
-)
+@pytest.mark.parametrize("found", [
+    [level(0.1, *seen(N, N, SPLIT)), level(0.2, *seen(3 * N, N, SPLIT))],  # no undisturbed level
+    [level(0.1, *seen(N, N, SPLIT))],
+    [level(0.0, *seen(N, N - 1, SPLIT)), level(0.1, *seen(3 * N, 1, SPLIT))],  # recurrence was never there
+])  # fmt: skip
 def test_noise_without_a_level_to_compare_with_is_untested(found):
     assert less_association(describe("depth_noise"), found).verdict is Answer.UNTESTED
 
@@ -186,15 +183,12 @@ def test_denser_sampling_that_uncovers_what_was_there():
     )
 
 
-@pytest.mark.parametrize(
-    ("fewer", "more", "verdict", "why"),
-    [
-        (seen(9 * N, N, SPLIT), seen(N, N, SPLIT), Answer.NOT_SHOWN,
-         "A coin would show it: VSS falls no more than more observations make it."),
-        (seen(N, N, SPLIT), seen(9 * N, N, SPLIT), Answer.NOT_SHOWN, "VSS over all voxels does not fall."),
-        (seen(9 * N, 10, SPLIT), seen(N, N, SPLIT), Answer.UNTESTED, None),
-    ],
-)  # fmt: skip
+@pytest.mark.parametrize(("fewer", "more", "verdict", "why"), [
+    (seen(9 * N, N, SPLIT), seen(N, N, SPLIT), Answer.NOT_SHOWN,
+     "A coin would show it: VSS falls no more than more observations make it."),
+    (seen(N, N, SPLIT), seen(9 * N, N, SPLIT), Answer.NOT_SHOWN, "VSS over all voxels does not fall."),
+    (seen(9 * N, 10, SPLIT), seen(N, N, SPLIT), Answer.UNTESTED, None),
+])  # fmt: skip
 def test_denser_sampling_that_shows_nothing(fewer, more, verdict, why):
     outcome = sampled(fewer, more)
     assert outcome.verdict is verdict

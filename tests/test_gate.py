@@ -31,61 +31,51 @@ from semstab.statistics.cluster_sums import value
 from semstab.statistics.intervals import difference
 
 
-@pytest.mark.parametrize(
-    ("text", "key", "change", "below", "limit", "class_name", "scene"),
-    [
-        ("alpha drop < 0.02", "alpha", "drop", True, 0.02, None, None),
-        ("alpha > 0.8", "alpha", None, False, 0.8, None, None),
-        ("Accuracy drop<1%", "accuracy", "drop", True, 0.01, None, None),
-        ("class human: recall > 0.6", "recall", None, False, 0.6, "human", None),
-        (
-            "scene street 1: class traffic light: IoU drop <= .05", "iou", "drop", True, 0.05, "traffic light",
-            "street 1",
-        ),
-        ("flicker rise < 0.5%", "flicker", "rise", True, 0.5, None, None),
-        ("stable-and-wrong rise < 1e-2", "wrong of stable", "rise", True, 0.01, None, None),
-        ("alpha between drop < -0.01", "alpha between", "drop", True, -0.01, None, None),
-    ],
-)  # fmt: skip
+@pytest.mark.parametrize(("text", "key", "change", "below", "limit", "class_name", "scene"), [
+    ("alpha drop < 0.02", "alpha", "drop", True, 0.02, None, None),
+    ("alpha > 0.8", "alpha", None, False, 0.8, None, None),
+    ("Accuracy drop<1%", "accuracy", "drop", True, 0.01, None, None),
+    ("class human: recall > 0.6", "recall", None, False, 0.6, "human", None),
+    (
+        "scene street 1: class traffic light: IoU drop <= .05", "iou", "drop", True, 0.05, "traffic light",
+        "street 1",
+    ),
+    ("flicker rise < 0.5%", "flicker", "rise", True, 0.5, None, None),
+    ("stable-and-wrong rise < 1e-2", "wrong of stable", "rise", True, 0.01, None, None),
+    ("alpha between drop < -0.01", "alpha between", "drop", True, -0.01, None, None),
+])  # fmt: skip
 def test_a_rule_is_read(text, key, change, below, limit, class_name, scene):
     rule = parse(text)
     found = (rule.measure.name, rule.change, rule.below, rule.limit, rule.class_name, rule.scene)
     assert found == (key, change, below, pytest.approx(limit), class_name, scene)
 
 
-@pytest.mark.parametrize(
-    ("text", "line"),
-    [
-        ("alpha", "write [scene NAME:] [class NAME|*:] MEASURE [drop|rise] <|> NUMBER[%]"),
-        ("alpha drop 0.02", "not understood"),
-        ("alpha < 1e999", "too large"),
-        ("alhpa drop < 0.02", "no measure 'alhpa'; did you mean 'alpha'?"),
-        ("recall > 0.6", "recall is of a class; write 'class NAME: recall > 0.6'"),
-        ("class car: ece < 0.1", "ece is of all classes; leave 'class car:' out"),
-        ("coverage > 0.9", "coverage is relative to a baseline"),
-    ],
-)
+@pytest.mark.parametrize(("text", "line"), [
+    ("alpha", "write [scene NAME:] [class NAME|*:] MEASURE [drop|rise] <|> NUMBER[%]"),
+    ("alpha drop 0.02", "not understood"), ("alpha < 1e999", "too large"),
+    ("alhpa drop < 0.02", "no measure 'alhpa'; did you mean 'alpha'?"),
+    ("recall > 0.6", "recall is of a class; write 'class NAME: recall > 0.6'"),
+    ("class car: ece < 0.1", "ece is of all classes; leave 'class car:' out"),
+    ("coverage > 0.9", "coverage is relative to a baseline"),
+])  # fmt: skip
 def test_a_rule_that_is_none_is_said_in_one_line(text, line):
     fails(ConfigError, re.escape(line), parse, text)
 
 
-@pytest.mark.parametrize(
-    ("text", "low", "high", "expected"),
-    [
-        ("alpha drop < 0.02", -0.01, 0.019, "passes"),
-        ("alpha drop < 0.02", 0.005, 0.015, "passes"),  # a loss is shown, and that it is small
-        ("alpha drop < 0.02", 0.005, 0.03, "fails"),
-        ("alpha drop < 0.02", -0.005, 0.03, "undecided"),
-        ("alpha drop < -0.02", -0.03, -0.01, "undecided"),  # a gain of 0.02 is asked for
-        ("alpha drop < -0.02", -0.01, 0.01, "fails"),
-        ("alpha rise < 0.02", 0.005, 0.03, "undecided"),  # no loss
-        ("ece rise < 0.02", 0.005, 0.03, "fails"),
-        ("alpha > 0.8", 0.81, 0.9, "passes"),
-        ("alpha > 0.8", 0.7, 0.79, "fails"),
-        ("alpha > 0.8", 0.7, 0.9, "undecided"),
-        ("alpha > 0.8", math.nan, 0.9, "undecided"),
-    ],
-)
+@pytest.mark.parametrize(("text", "low", "high", "expected"), [
+    ("alpha drop < 0.02", -0.01, 0.019, "passes"),
+    ("alpha drop < 0.02", 0.005, 0.015, "passes"),  # a loss is shown, and that it is small
+    ("alpha drop < 0.02", 0.005, 0.03, "fails"),
+    ("alpha drop < 0.02", -0.005, 0.03, "undecided"),
+    ("alpha drop < -0.02", -0.03, -0.01, "undecided"),  # a gain of 0.02 is asked for
+    ("alpha drop < -0.02", -0.01, 0.01, "fails"),
+    ("alpha rise < 0.02", 0.005, 0.03, "undecided"),  # no loss
+    ("ece rise < 0.02", 0.005, 0.03, "fails"),
+    ("alpha > 0.8", 0.81, 0.9, "passes"),
+    ("alpha > 0.8", 0.7, 0.79, "fails"),
+    ("alpha > 0.8", 0.7, 0.9, "undecided"),
+    ("alpha > 0.8", math.nan, 0.9, "undecided"),
+])  # fmt: skip
 def test_what_an_interval_says_of_a_rule(text, low, high, expected):
     found = Interval((low + high) / 2, low, high)
     assert judging.verdict(parse(text), found) == expected
@@ -147,15 +137,12 @@ def test_a_rule_of_each_class_shares_the_level(run):
     assert closer.found.low == pytest.approx(each[0].found.low)
 
 
-def test_a_class_that_is_nowhere_has_no_value():
+def test_a_class_that_is_nowhere_has_no_value_and_ends_are_one_sided():
     labels, truth = models()
     log = log_of(labels, K=3, index=grid(16))
     found = judging.bounded(parse("class c: recall > 0.5"), cluster_sums_of(log.table(), log, truth), k=2)
     assert math.isnan(found.value)
     assert judging.verdict(parse("class c: recall > 0.5"), found) == "undecided"
-
-
-def test_ends_are_one_sided_and_of_the_sums_differences():
     (labels, truth), (other, _) = models(), models(seed=1)
     new, base = sums(labels, truth), sums(other, truth)
     for key in ("alpha", "look_accuracy"):
@@ -208,21 +195,18 @@ def test_the_command_says_what_came_of_each_rule(run, tmp_path):
     assert [row["verdict"] for row in content["rules"]] == ["passes", "passes", "fails"]
 
 
-@pytest.mark.parametrize(
-    ("arguments", "line"),
-    [
-        (["--rule", "alpha drop < 0.02"], "a drop is from a baseline; give --against RUN"),
-        (["--rule", "class q: alpha > 0.1"], "no class 'q'"),
-        (["--rule", "scene q: alpha > 0.1"], "no scene 'q'; known: wall"),
-        (["--rule", "flicker < 99", "--scope", "other-scenes"], "flicker is known by frame alone"),
-        (["--rule", "alpha > 0.1", "--scope", "some"], "scope"),
-        (["--rule", "class door: recall > 0.1"], "has no recall of wall; run it with --statistics"),
-        (["--rule", "accuracy > 0.1"], "has no accuracy of wall; run it with --statistics"),
-        (["--rule", "sbd excess < 0.1", "--out", "x.txt"], "format '.txt' is not known"),
-        (["--rule", "alpha > 0.1", "--undecided", "maybe"], "undecided"),
-        (["--rule", "alpha > 0.1", "--against", "nowhere"], "there is no such folder"),
-    ],
-)
+@pytest.mark.parametrize(("arguments", "line"), [
+    (["--rule", "alpha drop < 0.02"], "a drop is from a baseline; give --against RUN"),
+    (["--rule", "class q: alpha > 0.1"], "no class 'q'"),
+    (["--rule", "scene q: alpha > 0.1"], "no scene 'q'; known: wall"),
+    (["--rule", "flicker < 99", "--scope", "other-scenes"], "flicker is known by frame alone"),
+    (["--rule", "alpha > 0.1", "--scope", "some"], "scope"),
+    (["--rule", "class door: recall > 0.1"], "has no recall of wall; run it with --statistics"),
+    (["--rule", "accuracy > 0.1"], "has no accuracy of wall; run it with --statistics"),
+    (["--rule", "sbd excess < 0.1", "--out", "x.txt"], "format '.txt' is not known"),
+    (["--rule", "alpha > 0.1", "--undecided", "maybe"], "undecided"),
+    (["--rule", "alpha > 0.1", "--against", "nowhere"], "there is no such folder"),
+])  # fmt: skip
 def test_bad_input_is_one_line_and_exit_code_2(run, arguments, line):
     done = cli("gate", f"{run}:a", *arguments)
     assert done.exit_code == 2

@@ -68,14 +68,11 @@ def test_ground_truth_of_a_static_wall_is_perfectly_stable(root) -> None:
     assert run.flicker_percent == pytest.approx(25.0)
 
 
-def test_observers_see_everything_in_order(root) -> None:
+def test_observers_see_everything_and_every_backbone_goes_through_every_backend(root) -> None:
     watching = Watching()
     semstab.engine.run(configure(root, backbones=["a"]), observers=[watching])
     unit = "wall__a__numpy"
     assert watching.seen == ["start 1", f"{unit} 0", f"{unit} 1", f"{unit} 2", f"{unit} done 60", "finished"]
-
-
-def test_every_backbone_goes_through_every_backend_and_they_agree(root) -> None:
     result = semstab.engine.run(configure(root, backends=["open3d"]))
     assert [run.unit.slug for run in result.runs] == [
         "wall__a__open3d", "wall__a__numpy", "wall__b__open3d", "wall__b__numpy"
@@ -164,15 +161,12 @@ def test_a_folder_of_an_earlier_version_is_refused_and_not_touched(root, tmp_pat
     assert (out / name).read_text() == text
 
 
-def test_a_folder_that_a_killed_start_only_began_is_taken_over(root, tmp_path) -> None:
+def test_a_folder_that_a_killed_start_began_or_whose_unit_is_damaged_is_taken_over(root, tmp_path, caplog) -> None:
     out = tmp_path / "run"
     (out / "units").mkdir(parents=True)
     (out / ".semstab-ab12cd34.yaml").write_text("half")
     semstab.engine.run(configure(root, backbones=["a"]), out=out)
     assert not list(out.rglob(".*"))
-
-
-def test_a_damaged_unit_file_is_computed_again_and_told(root, tmp_path, caplog) -> None:
     out, config = tmp_path / "run", configure(root)
     whole = semstab.engine.run(config, out=out)
     unit, *_ = sorted((out / "units").iterdir())
@@ -215,34 +209,28 @@ def test_disagreement_is_reported_after_everything_is_written(root, tmp_path, mo
     assert json.loads((tmp_path / "run" / "summary.json").read_text())["agreement"][0]["agrees"] is False
 
 
-@pytest.mark.parametrize(
-    ("settings", "message"),
-    [
-        ({"backbones": ["c"]}, "wall: no backbone 'c'; there is a, b, gt"),
-        ({"scenes": ["wal"]}, "posed_folder: no scene 'wal'; did you mean 'wall'"),
-        ({"frames": {"start": 9}}, "wall: the selection of frames leaves none of its 3"),
-        ({"backends": ["open4d"]}, "backend 'open4d' is not known; did you mean 'open3d'"),
-        ({"backends": [{"name": "open3d", "options": {"block": 8}}]}, "has no option 'block'; it takes device, bl"),
-        (
-            {"backends": [{"name": "open3d", "options": {"device": "GPU"}}]},
-            "device 'GPU' is not one; use CPU:0 or CUDA:0",
-        ),
-        ({"taxonomy": "uavid7"}, "no class takes 'wall, door, window' of "),
-        ({"taxonomy": "uavid9"}, "taxonomy 'uavid9' is not known; did you mean 'uavid"),
-    ],
-)
+@pytest.mark.parametrize(("settings", "message"), [
+    ({"backbones": ["c"]}, "wall: no backbone 'c'; there is a, b, gt"),
+    ({"scenes": ["wal"]}, "posed_folder: no scene 'wal'; did you mean 'wall'"),
+    ({"frames": {"start": 9}}, "wall: the selection of frames leaves none of its 3"),
+    ({"backends": ["open4d"]}, "backend 'open4d' is not known; did you mean 'open3d'"),
+    ({"backends": [{"name": "open3d", "options": {"block": 8}}]}, "has no option 'block'; it takes device, bl"),
+    (
+        {"backends": [{"name": "open3d", "options": {"device": "GPU"}}]},
+        "device 'GPU' is not one; use CPU:0 or CUDA:0",
+    ),
+    ({"taxonomy": "uavid7"}, "no class takes 'wall, door, window' of "),
+    ({"taxonomy": "uavid9"}, "taxonomy 'uavid9' is not known; did you mean 'uavid"),
+])  # fmt: skip
 def test_a_selection_that_does_not_fit_is_refused_before_anything_is_read(root, settings, message) -> None:
     with pytest.raises((ConfigError, DataError), match=message):
         semstab.engine.run(configure(root, **settings))
 
 
-def test_pixel_stride_keeps_every_nth_pixel_at_its_place(root) -> None:
+def test_pixel_stride_keeps_every_nth_pixel_and_a_taxonomy_file_merges_classes(root, tmp_path) -> None:
     (run,) = semstab.engine.run(configure(root, backbones=["gt"], pixel_stride=2)).runs
     assert run.table.points == 3 * 4 * 3
     assert run.table[VSS] == 1.0
-
-
-def test_a_taxonomy_file_merges_classes(root, tmp_path) -> None:
     path = tmp_path / "two.yaml"
     path.write_text(yaml.safe_dump({"classes": ["wall", {"name": "opening", "members": ["door", "window"]}]}))
     (run,) = semstab.engine.run(configure(root, backbones=["gt"], taxonomy=str(path))).runs

@@ -62,13 +62,15 @@ def at(index, r=1.0, **columns):
     return VoxelTable(*index[order].T, **given, **rest, voxel_size=r, classes=("a", "b", "c"))
 
 
-def test_the_bins_of_op_are_single_values_and_then_widen():
+def test_the_bins_of_op_widen_and_a_long_legend_takes_more_lines():
     assert OP_BOUNDS[:9].tolist() == list(range(1, 10))
     steps = np.diff(OP_BOUNDS[8:].astype(float))
     assert (steps >= 1).all()
     assert (steps <= 0.25 * OP_BOUNDS[8:-1] + 0.5).all()
     assert OP_BOUNDS[-1] >= 2**31
     assert op_position()[:8] == pytest.approx(range(1, 9))
+    names = [f"a backbone with a long name {k}" for k in range(8)]
+    assert legend_columns(names, PAGE) < legend_columns(["a", "b", "c", "d", "e", "f", "g", "h"], PAGE) == 8
 
 
 @checks
@@ -172,16 +174,13 @@ def test_a_tilted_floor_has_no_holes(up):
     assert (inside != EMPTY).all()
 
 
-def test_a_large_map_has_cells_of_several_voxels(monkeypatch):
+def test_large_maps_have_large_cells_and_lone_voxels_far_away_are_cut_off(monkeypatch):
     monkeypatch.setattr(topdown, "LARGEST", 10)
     table = at([(x, 0, x % 7) for x in range(40)])
     image, cell = top_down(table, (0, 0, 1))
     assert cell == 4.0
     assert image.shape == (1, 10)
     assert [table.iz[row] for row in image[0][:3]] == [3, 6, 4]
-
-
-def test_lone_voxels_far_away_are_cut_off():
     plate = [(x, y, 0) for x in range(40) for y in range(40)]
     image, _ = top_down(at([*plate, (10_000, 0, 0), (0, -10_000, 0)]), (0, 0, 1))
     assert image.shape == (40, 40)
@@ -252,11 +251,6 @@ def test_a_small_difference_looks_small_and_no_bar_is_cut(walls):
     assert change.get_ylim()[0] <= 0
 
 
-def test_a_long_legend_takes_more_lines():
-    names = [f"a backbone with a long name {k}" for k in range(8)]
-    assert legend_columns(names, PAGE) < legend_columns(["a", "b", "c", "d", "e", "f", "g", "h"], PAGE) == 8
-
-
 def test_recurrent_values_of_few_voxels_are_not_drawn():
     few = record(voxels((ENOUGH - 1, 3, SPLIT)), "frame_count", 5)
     many = record(voxels((ENOUGH, 3, SPLIT)), "frame_count", 10)
@@ -265,7 +259,7 @@ def test_recurrent_values_of_few_voxels_are_not_drawn():
     assert (list(every.lines[0].get_xdata()), list(recurrent.lines[0].get_xdata())) == ([0, 1], [1])
 
 
-def test_curves_against_op_have_the_means_of_the_voxels():
+def test_curves_and_ecdfs_have_the_means_of_the_voxels():
     found = histograms(voxels((ENOUGH, 1, SURE), (ENOUGH, 2, SPLIT, 0.2), (5, 4, [1, 1, 0], 0.1)))
     stability, drift, *_, counts = draw_persistence({"m": found}).axes
     mean, few = stability.get_lines()
@@ -274,9 +268,6 @@ def test_curves_against_op_have_the_means_of_the_voxels():
     assert few.get_xdata().tolist() == pytest.approx([4])
     assert drift.get_lines()[0].get_ydata().tolist() == pytest.approx([math.nan, 0.2, 0.1], nan_ok=True)
     assert [tick for tick in counts.get_xticks() if tick <= 4] == [1, 2, 3, 4]
-
-
-def test_an_ecdf_has_a_curve_a_scene_and_one_of_the_recurrent_voxels():
     scenes = {name: histograms(voxels((n, 3, SPLIT, 0.1), (5, 1, SURE))) for name, n in (("x", 5), ("y", 15))}
     disagreement, *_ = draw_ecdf(scenes, informative(scenes.values())).axes
     at_zero = [line.get_ydata()[0] for line in disagreement.get_lines()]

@@ -66,7 +66,7 @@ def test_kappa_is_that_of_statsmodels(T):
     assert fleiss_kappa(table) == pytest.approx(statsmodels_kappa(table.evidence))
 
 
-def test_kappa_of_a_class_is_that_of_the_class_against_the_rest():
+def test_kappa_and_alpha_of_a_class_are_those_of_the_class_against_the_rest():
     labels = np.random.default_rng(3).choice(3, size=(80, 5), p=[0.6, 0.3, 0.1])
     events = log_of(labels)
     rows = class_agreement(events.table(), events)
@@ -74,6 +74,12 @@ def test_kappa_of_a_class_is_that_of_the_class_against_the_rest():
     for k, row in enumerate(rows):
         assert row.kappa == pytest.approx(statsmodels_kappa(np.stack([counts[:, k], 5 - counts[:, k]], axis=1)))
         assert row.observations == counts[:, k].sum()
+    labels = np.random.default_rng(4).integers(-1, 3, size=(80, 5))
+    labels = labels[(labels >= 0).any(axis=1)]
+    events = log_of(labels)
+    for k, row in enumerate(class_agreement(events.table(), events)):
+        data = np.where(labels >= 0, labels == k, np.nan).T
+        assert row.alpha == pytest.approx(krippendorff.alpha(data, level_of_measurement="nominal"))
 
 
 @checks
@@ -87,15 +93,6 @@ def test_alpha_is_that_of_krippendorff_with_observations_missing(labels):
     else:
         data = np.where(labels >= 0, labels, np.nan).T
         assert krippendorff_alpha(table) == pytest.approx(krippendorff.alpha(data, level_of_measurement="nominal"))
-
-
-def test_alpha_of_a_class_is_that_of_the_class_against_the_rest():
-    labels = np.random.default_rng(4).integers(-1, 3, size=(80, 5))
-    labels = labels[(labels >= 0).any(axis=1)]
-    events = log_of(labels)
-    for k, row in enumerate(class_agreement(events.table(), events)):
-        data = np.where(labels >= 0, labels == k, np.nan).T
-        assert row.alpha == pytest.approx(krippendorff.alpha(data, level_of_measurement="nominal"))
 
 
 def test_kappa_and_alpha_of_soft_evidence_are_their_definitions():
@@ -148,15 +145,12 @@ def test_classes_of_one_hot_evidence_need_no_events_and_those_of_other_evidence_
     assert not any(math.isnan(row.alpha) for row in class_agreement(mixed.table(), mixed))
 
 
-def test_entropy_is_within_frames_or_between_them():
+def test_entropy_is_within_frames_or_between_them_as_the_generalised_jensen_shannon_divergence():
     """Unanimous frames of (1/2, 1/2): all within. One-hot frames that disagree: all between."""
     evidence = [[[0.5, 0.5], [0.5, 0.5]], [[1, 0], [0, 1]], [[1, 0], [1, 0]]]
     parts = decompose(log_of_evidence(evidence).table())
     np.testing.assert_allclose(parts.within, [1, 0, 0], atol=1e-12)
     np.testing.assert_allclose(parts.between, [0, 1, 0], atol=1e-12)
-
-
-def test_between_frame_entropy_is_the_generalised_jensen_shannon_divergence():
     evidence = soft(np.random.default_rng(10), 25, 6, K=4)
     parts = decompose(log_of_evidence(evidence).table())
     mean = evidence.mean(axis=1, keepdims=True)

@@ -47,9 +47,6 @@ def test_labels_are_those_of_the_voxels_that_the_pixels_see():
     (frame,) = rendered([sight_line(5, [(0.2, 1), (0.4, 1), (0.7, 1), (9.0, 1), (0.0, 1)])], world)
     assert frame.index == 5
     assert frame.labels.tolist() == [[0, 2, 1, 255, 255]]
-
-
-def test_scores_give_way_to_labels_and_many_classes_take_16_bits():
     world = fused([sight_line(0, [(0.1, 0)])])
     (frame,) = rendered([sight_line(0, [(0.1, (0.2, 0.8, 0.0))], dtype=np.float32)], world)
     assert (frame.scores, frame.labels.tolist()) == (None, [[0]])
@@ -105,7 +102,7 @@ def test_frames_are_taken_one_at_a_time():
     assert alive == [0]
 
 
-def test_voxels_in_one_map_only_or_seen_once_do_not_count():
+def test_voxels_in_one_map_only_or_seen_once_do_not_count_and_views_that_do_not_fit_are_refused():
     model = fused([sight_line(t, [(0.1, t), (0.4, 0)]) for t in range(2)])
     limit = fused([sight_line(0, [(0.1, 0), (0.4, 0)]), sight_line(1, [(0.1, 0)])])
     found = losses(model, limit)
@@ -113,9 +110,6 @@ def test_voxels_in_one_map_only_or_seen_once_do_not_count():
     nothing = losses(model, fused([sight_line(0, [(9.0, 0)])]))
     assert nothing.voxels == 0
     assert math.isnan(nothing.share.value)
-
-
-def test_views_that_do_not_fit_are_refused():
     world = fused(flight())
     with pytest.raises(DataError, match="frame 1: needs a view of its size to see labels from; there is none"):
         list(rendered(flight(), world, views=list(flight())[:1]))

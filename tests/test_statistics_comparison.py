@@ -47,9 +47,6 @@ def test_shared_rows_are_the_voxels_that_all_maps_hold():
     c = table_of([(-9, 9, 9), (0, 0, 1), (0, 0, 2), (7, 7, 7)])
     assert [rows.tolist() for rows in shared_rows(a, b, c)] == [[1, 3], [0, 2], [1, 3]]
     assert [rows.tolist() for rows in shared_rows(a, table_of([(1, 1, 1)]))] == [[], []]
-
-
-def test_maps_of_different_voxels_and_edges_that_do_not_ascend_are_refused():
     a = table_of([(0, 0, 0)])
     with pytest.raises(DataError, match="fuse both alike"):
         shared_rows(a, dataclasses.replace(a, voxel_size=0.4))
@@ -159,6 +156,12 @@ def test_only_voxels_that_all_saw_twice_are_compared():
     assert result.voxels == 2
     assert result.values["psa"]["a"].value == pytest.approx(psa(a)[:2].mean())
     assert result.values["psa"]["b"].value == 0
+    tables = {"a": table_of([(0, 0, 0)]), "b": table_of([(9, 9, 9)])}
+    result = paired(tables)
+    assert result.voxels == result.blocks == 0
+    assert math.isnan(result.values["psa"]["a"].value)
+    assert all(math.isnan(row.p_value) for row in result.differences)
+    assert all(math.isnan(rank.best) for ranking in result.rankings for rank in ranking.ranks)
 
 
 def test_ranks_are_uncertain_where_backbones_are_alike_and_certain_where_not():
@@ -171,15 +174,6 @@ def test_ranks_are_uncertain_where_backbones_are_alike_and_certain_where_not():
     assert ranks["a"].best + ranks["b"].best == pytest.approx(1, abs=0.01)
     assert {ranks["a"].low, ranks["b"].low} == {1}
     assert {ranks["a"].high, ranks["b"].high} == {2}
-
-
-def test_maps_without_a_common_voxel_leave_everything_undefined():
-    tables = {"a": table_of([(0, 0, 0)]), "b": table_of([(9, 9, 9)])}
-    result = paired(tables)
-    assert result.voxels == result.blocks == 0
-    assert math.isnan(result.values["psa"]["a"].value)
-    assert all(math.isnan(row.p_value) for row in result.differences)
-    assert all(math.isnan(rank.best) for ranking in result.rankings for rank in ranking.ranks)
 
 
 def test_pairs_of_all_scenes_are_corrected_together_where_something_may_be_claimed():

@@ -29,9 +29,6 @@ def test_the_truth_of_a_voxel_is_what_most_of_its_ground_truth_says():
     joined = join_truth(table, truth)
     assert joined.label.tolist() == [1, 2, -1, -1]
     assert joined.known.tolist() == [True, True, False, False]
-
-
-def test_truth_of_other_voxels_is_refused():
     with pytest.raises(DataError, match="of 3 classes"):
         join_truth(log_of([[0]]).table(), log_of([[0]], K=4).table())
 
@@ -44,18 +41,12 @@ def test_accuracy_and_miou_are_those_of_scikit_learn():
     assert found.miou == pytest.approx(jaccard_score(label, predicted, average="macro"))
 
 
-def test_classes_that_are_neither_true_nor_predicted_do_not_count():
+def test_miou_brier_score_and_calibration_error_by_hand():
     belief = np.array([[0.9, 0.1, 0.0], [0.8, 0.2, 0.0]])
     assert correctness(belief, np.array([0, 1])).miou == pytest.approx((1 / 2 + 0) / 2)
-
-
-def test_brier_score_by_hand():
     belief = np.array([[0.5, 0.5], [1.0, 0.0], [0.0, 1.0]])
     assert correctness(belief, np.array([0, 0, 0])).brier == pytest.approx((0.5 + 0 + 2) / 3)
-
-
-def test_calibration_error_by_hand():
-    """Ten voxels of confidence 0.9, six right; ten of 0.5 and all right: (0.3 + 0.5) / 2."""
+    # Ten voxels of confidence 0.9, six right; ten of 0.5 and all right: (0.3 + 0.5) / 2
     belief = np.array([[0.9, 0.1]] * 10 + [[0.5, 0.5]] * 10)
     label = np.array([0] * 6 + [1] * 4 + [0] * 10)
     assert correctness(belief, label).ece == pytest.approx(0.4)
@@ -74,9 +65,6 @@ def test_a_calibrated_model_has_hardly_any_calibration_error():
     found = correctness(belief, label)
     assert found.ece < 0.01
     assert found.brier == pytest.approx((1 - (belief**2).sum(axis=1)).mean(), abs=0.01)
-
-
-def test_every_voxel_is_in_one_bin():
     belief, label = random_beliefs(seed=2)
     belief[:3] = np.eye(4)[:3]
     assert sum(row.voxels for row in reliability(belief, label)) == len(belief)
@@ -110,12 +98,14 @@ def test_quadrants_by_hand():
     assert [share.value for share in shares] == pytest.approx([0.25, 0.25, 0.25, 0.25], abs=0.01)
     assert found.wrong_of_stable.value == pytest.approx(0.5, abs=0.01)
     assert stable_wrong(table, truth).tolist() == [False, True, False, False, False, False]
-
-
-def test_one_of_ten_frames_may_disagree_at_a_stable_voxel():
     table = log_of([[0] * 90 + [1] * 10, [0] * 80 + [1] * 20]).table()
     truth = join_truth(table, log_of([[1], [1]]).table())
     assert stable_wrong(table, truth).tolist() == [True, False]
+    table = log_of([[0, 0]]).table()
+    found = quadrants(table, join_truth(table, table), Cubes.of(table, where=table.op > 0))
+    assert found.voxels == 0
+    assert math.isnan(found.stable_wrong.value)
+    assert math.isnan(correctness(np.zeros((0, 3)), np.zeros(0, dtype=int)).accuracy)
 
 
 @pytest.mark.parametrize("q", [0.8, 0.95])
@@ -151,14 +141,6 @@ def test_a_model_that_errs_the_same_way_in_every_view_is_stable_and_wrong():
     found = quadrants(table, truth, Cubes.of(table, where=table.op > 0))
     assert found.wrong_of_stable.low <= place.mean() <= found.wrong_of_stable.high
     assert stable_wrong(table, truth)[~place[:, 0]].mean() < 0.01
-
-
-def test_without_a_voxel_that_counts_quadrants_are_undefined():
-    table = log_of([[0, 0]]).table()
-    found = quadrants(table, join_truth(table, table), Cubes.of(table, where=table.op > 0))
-    assert found.voxels == 0
-    assert math.isnan(found.stable_wrong.value)
-    assert math.isnan(correctness(np.zeros((0, 3)), np.zeros(0, dtype=int)).accuracy)
 
 
 def test_the_belief_is_the_normalised_evidence():

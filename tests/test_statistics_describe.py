@@ -182,13 +182,10 @@ def of_class(name, low, high, *, matters=True):
     )
 
 
-@pytest.mark.parametrize(
-    ("low", "high", "level"),
-    [
-        (0.81, 0.9, "stable"), (0.79, 0.9, "stable"), (0.67, 0.7, "usable"), (0.6, 0.9, "usable"),
-        (0.6, 0.98, "undecided"), (0.3, 0.66, "unstable"), (math.nan, math.nan, "no verdict"),
-    ],
-)  # fmt: skip
+@pytest.mark.parametrize(("low", "high", "level"), [
+    (0.81, 0.9, "stable"), (0.79, 0.9, "stable"), (0.67, 0.7, "usable"), (0.6, 0.9, "usable"),
+    (0.6, 0.98, "undecided"), (0.3, 0.66, "unstable"), (math.nan, math.nan, "no verdict"),
+])  # fmt: skip
 def test_the_most_probable_level_is_the_verdict(low, high, level):
     assert judged(low, high).level == level
 
@@ -207,15 +204,7 @@ def test_agreement_below_zero_stable_errors_and_few_places_are_said():
     assert "one class" in judged(math.nan, math.nan).line
 
 
-def test_the_line_says_what_to_do_and_why():
-    assert judged(0.5, 0.6).line == (
-        "net: unstable (100%), do not act on its labels: two frames agree at 55% of the locations (50% to 60%),"
-        " alpha between frames 0.55 (0.50 to 0.60), its ceiling not known; 5000 locations seen twice or more, 50% of"
-        " the map; for this scene flown again, from 60 frames"
-    )
-
-
-def test_probabilities_of_the_levels_sum_to_one_and_follow_the_interval():
+def test_probabilities_of_the_levels_sum_to_one_and_the_line_says_what_to_do_and_why():
     for low, high in ((0.5, 0.6), (0.7, 0.9), (0.81, 0.9)):
         for scale in ("agreement", "plain"):
             levels = level_probabilities(between(low, high), scale)
@@ -223,6 +212,11 @@ def test_probabilities_of_the_levels_sum_to_one_and_follow_the_interval():
             assert min(levels.values()) >= 0
     half = level_probabilities(between(0.7, 0.9), "plain")
     assert half["stable"] == pytest.approx(0.5)
+    assert judged(0.5, 0.6).line == (
+        "net: unstable (100%), do not act on its labels: two frames agree at 55% of the locations (50% to 60%),"
+        " alpha between frames 0.55 (0.50 to 0.60), its ceiling not known; 5000 locations seen twice or more, 50% of"
+        " the map; for this scene flown again, from 60 frames"
+    )
 
 
 def test_agreement_is_judged_against_its_ceiling_and_the_line_names_unstable_classes_the_most_probable_first():

@@ -250,17 +250,14 @@ def test_stretches_are_the_means_of_their_observations():
     np.testing.assert_allclose(found.evidence, [mean for _, _, mean in expected])
 
 
-def test_the_statistics_of_the_scene_are_means_over_its_voxels():
+def test_the_statistics_of_the_scene_are_means_over_its_voxels_whatever_the_numbers_of_frames():
     rng = np.random.default_rng(12)
     events = log_of(rng.integers(-1, 2, size=(60, 7)).clip(min=[0] + [-1] * 6))
     table, drift = events.table(), small(events)
     found = scene_drift(table, events, drift, frame_orders=9)
     assert found.sbd == pytest.approx(np.nanmean(sbd(table)))
     assert found.null == pytest.approx(np.nanmean(drift.null))
-
-
-def test_frames_need_not_be_numbered_from_zero_nor_come_in_order():
-    """The observed order is the order of integration; the null does not depend on the frames' numbers."""
+    # The observed order is the order of integration; the null does not depend on the frames' numbers
     plain = log_of(np.random.default_rng(0).integers(0, 2, size=(400, 36)))
     other = Events(
         plain.ix, plain.iy, plain.iz, plain.voxel, 1000 - plain.frame, plain.evidence, plain.pixels, plain.voxel_size

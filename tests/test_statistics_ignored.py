@@ -128,7 +128,7 @@ def test_looks_come_back_from_their_file(tmp_path):
         CellObservations.load(tmp_path / "other.parquet")
 
 
-def test_samples_of_other_voxels_are_refused_and_less_dense_ones_are_met():
+def test_samples_of_other_voxels_are_refused_and_less_dense_ones_or_others_meet():
     looks = sampler_of(flight(4), 0.4).looks()
     with pytest.raises(DataError, match="fuse both alike"):
         common_observations([looks, sampler_of(flight(4), 0.2).looks()])
@@ -137,9 +137,6 @@ def test_samples_of_other_voxels_are_refused_and_less_dense_ones_are_met():
     both = common_observations([looks, thinned])
     assert both.missing == (0, 0)
     assert len(both.logs[0]) == len(both.logs[1]) == len(thinned.observations())
-
-
-def test_samples_that_began_elsewhere_meet_on_the_same_cells():
     frames = list(flight(6, flicker=0.2, step=0.5))
     looks, back = sampler_of(frames, 0.1).looks(), sampler_of(frames[::-1], 0.1).looks()
     assert looks.low != back.low

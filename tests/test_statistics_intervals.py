@@ -55,7 +55,7 @@ def test_independent_places_have_the_interval_of_the_t_test():
     assert found.decided
 
 
-def test_no_error_seen_is_not_no_error():
+def test_no_error_seen_is_not_no_error_and_next_to_nothing_is_nowhere():
     """100 places in two frames that agree, of two classes: some disagreement may have been missed."""
     labels = np.tile((np.arange(100) % 10 < 5)[:, None], (1, 2)).astype(int)
     sums = sums_from(labels, 10)
@@ -63,10 +63,7 @@ def test_no_error_seen_is_not_no_error():
     assert alpha.value == alpha.high == psa.high == 1
     assert psa.low == pytest.approx(0.025 ** (1 / 100))
     assert alpha.low == pytest.approx(1 - (1 - psa.low) / 0.5, abs=0.01)
-
-
-def test_what_weighs_next_to_nothing_is_nowhere():
-    """Of 150 classes so few voxels may be stable that the square of their number is none any more."""
+    # Of 150 classes so few voxels may be stable that the square of their number is none any more
     rng = np.random.default_rng(0)
     places = Cubes.of(log_of(np.zeros((32 * 32, 3), dtype=int), K=2, index=grid(32), voxel_size=0.125).table())
     columns = np.stack([rng.random(32 * 32) < 0.3, np.ones(32 * 32)], axis=1)
@@ -166,13 +163,10 @@ def test_places_and_frames_are_paired_where_both_maps_have_them():
     assert unpaired.high - unpaired.low > 0.8 * max(one.high - one.low for one in both)  # reaches differ
 
 
-@pytest.mark.parametrize(
-    ("flight", "scope"),
-    [
-        (Flight(side=64, reach=2.0), THESE_FRAMES), (Flight(24, 1.5, 1.0, 40, 40, "bad"), THIS_SCENE),
-        (Flight(24, 1.5, 1.0, 40, 5, "regimes"), THIS_SCENE), (Flight(32, 2.0, 1.0, 40, 5, "lasting"), OTHER_SCENES),
-    ],
-)  # fmt: skip
+@pytest.mark.parametrize(("flight", "scope"), [
+    (Flight(side=64, reach=2.0), THESE_FRAMES), (Flight(24, 1.5, 1.0, 40, 40, "bad"), THIS_SCENE),
+    (Flight(24, 1.5, 1.0, 40, 5, "regimes"), THIS_SCENE), (Flight(32, 2.0, 1.0, 40, 5, "lasting"), OTHER_SCENES),
+])  # fmt: skip
 def test_intervals_hold_their_target(flight, scope):
     """So many of few intervals hold it that their level may be 95 %: 3 standard errors below."""
     (row,) = trials(flight, 30, 0, scope, ("alpha",))

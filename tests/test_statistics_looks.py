@@ -126,15 +126,12 @@ def test_what_is_drawn_is_its_definition():
     assert max(looks.drawn) < looks.share < 2**32
 
 
-@pytest.mark.parametrize(
-    ("along", "shape"),
-    [
-        ([(1, 0, 0)], (60000,)), ([(3, -2, 1)], (60000,)), ([(1, 0, 0), (0, 1, 0)], (250, 240)),
-        ([(0, 1, 0), (0, 0, 1)], (250, 240)), ([(1, 1, 0), (0, 1, -1)], (250, 240)),
-        ([(2, 0, 1), (1, -2, 0)], (250, 240)), ([(256, 0, 0), (0, 256, 0)], (250, 240)),
-        ([(1, 0, 0), (0, 1, 0), (0, 0, 1)], (40, 40, 38)),
-    ],
-)  # fmt: skip
+@pytest.mark.parametrize(("along", "shape"), [
+    ([(1, 0, 0)], (60000,)), ([(3, -2, 1)], (60000,)), ([(1, 0, 0), (0, 1, 0)], (250, 240)),
+    ([(0, 1, 0), (0, 0, 1)], (250, 240)), ([(1, 1, 0), (0, 1, -1)], (250, 240)),
+    ([(2, 0, 1), (1, -2, 0)], (250, 240)), ([(256, 0, 0), (0, 256, 0)], (250, 240)),
+    ([(1, 0, 0), (0, 1, 0), (0, 0, 1)], (40, 40, 38)),
+])  # fmt: skip
 def test_lines_planes_and_blocks_of_voxels_are_sampled_evenly(along, shape):
     """About the origin and far from it: the share below a threshold, of all and of stretches, is as if at random."""
     steps = np.stack(np.meshgrid(*(np.arange(n) - n // 2 for n in shape), indexing="ij"), axis=-1).reshape(

@@ -89,7 +89,7 @@ def test_the_sample_is_part_of_the_reference() -> None:
     assert_same_map(sample.table(), drawn, 0)
 
 
-def test_a_compared_backend_has_a_line_and_a_table_of_how_it_differs(scene, tmp_path) -> None:
+def test_compared_backends_have_a_line(scene, tmp_path) -> None:
     config = configure(scene, backends=["numba", "open3d-projective"], check=None, backbones=["a"], voxel_size=0.25)
     result = semstab.run(config, out=tmp_path / "run", report=False)
     (row,) = result.compared

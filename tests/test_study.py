@@ -266,15 +266,12 @@ def test_stability_in_image_space_is_that_of_the_base_frames(root, tmp_path) -> 
     assert np.isnan(list(dataclasses.astuple(swept))).all()
 
 
-def test_ground_truth_is_consistent_wherever_it_stays_the_same(root, tmp_path) -> None:
+def test_ground_truth_is_consistent_and_frames_without_it_are_in_no_clip(root, tmp_path) -> None:
     config = configure(root, frames={}, backbones=["gt", "a"], sweeps={}, backends=["numpy"])
     gt, a = run_study(config, tmp_path / "out").select()
     assert np.isnan(gt.image_space.vc8)  # nothing to compare it with
     assert gt.image_space.compensated_flicker_percent == 0
     assert a.image_space.compensated_flicker_percent > 0
-
-
-def test_frames_without_ground_truth_are_in_no_clip(root, tmp_path) -> None:
     (root / "labels/gt/0005.png").unlink()
     config = configure(root, frames={}, backbones=["a"], sweeps={}, backends=["numpy"])
     (a,) = run_study(config, tmp_path / "out").select()
@@ -366,25 +363,21 @@ def test_a_scene_can_have_frames_of_its_own(tmp_path) -> None:
     assert [[*cell.task.indices] for cell in make_plan(listed).units][2:] == [[1, 5, 9]] * 2
 
 
-@pytest.mark.parametrize(
-    ("settings", "message"),
-    [
-        ({"scene_frames": {"hall": {}}}, "scene_frames: 'hall' is not among wall"),
-        ({"sweeps": {"voxel_size": {"values": [1], "scenes": ["x"]}}}, "voxel_size.scenes: 'x' is not among wall"),
-        ({"backends": ["numpy", {"name": "numba", "backbones": ["x"]}]}, "backends.backbones: 'x' is not among a, b"),
-        ({"sweeps": {"frame_count": [11]}}, "frame_count: wall has 10 frames over the extent of the base ones, not 11"),
-        ({"backends": [{"name": "numpy", "options": {"x": 1}}]}, "backend 'numpy' has no option 'x'"),
-        ({"shared_taxonomy": "uavid3"}, "no class takes 'wall, door, window'"),
-        ({"backbones": ["c"]}, "no backbone 'c'"),
-    ],
-)
+@pytest.mark.parametrize(("settings", "message"), [
+    ({"scene_frames": {"hall": {}}}, "scene_frames: 'hall' is not among wall"),
+    ({"sweeps": {"voxel_size": {"values": [1], "scenes": ["x"]}}}, "voxel_size.scenes: 'x' is not among wall"),
+    ({"backends": ["numpy", {"name": "numba", "backbones": ["x"]}]}, "backends.backbones: 'x' is not among a, b"),
+    ({"sweeps": {"frame_count": [11]}}, "frame_count: wall has 10 frames over the extent of the base ones, not 11"),
+    ({"backends": [{"name": "numpy", "options": {"x": 1}}]}, "backend 'numpy' has no option 'x'"),
+    ({"shared_taxonomy": "uavid3"}, "no class takes 'wall, door, window'"), ({"backbones": ["c"]}, "no backbone 'c'"),
+])  # fmt: skip
 def test_what_does_not_fit_together_is_refused_before_anything_is_read(root, tmp_path, settings, message) -> None:
     with pytest.raises((ConfigError, DataError), match=message):
         run_study(configure(root, **settings), tmp_path / "out")
     assert not (tmp_path / "out").exists()
 
 
-def test_a_worker_that_does_not_see_the_folder_sends_the_voxels_back(root, tmp_path) -> None:
+def test_a_worker_that_does_not_see_the_folder_sends_the_voxels_back_and_a_job_fails_as_a_whole(root, tmp_path) -> None:
     config = resolve(configure(root, sweeps={}, backends=["numpy"], backbones=["a"]))
     (cell,) = make_plan(config).units
     elsewhere = tmp_path / "elsewhere"
@@ -397,9 +390,6 @@ def test_a_worker_that_does_not_see_the_folder_sends_the_voxels_back(root, tmp_p
     result = run_study(config, tmp_path / "out", observers=[counting])
     assert counting.kept == 1
     assert summarise(result.select()[0].table()) == result.select()[0].summary.table
-
-
-def test_a_job_that_cannot_even_begin_fails_as_a_whole(root, tmp_path) -> None:
     config = resolve(configure(root, sweeps={"voxel_size": [0.5]}, backends=["numpy"], backbones=["a"]))
     start = Start("start", tmp_path)
     works = [dataclasses.replace(Work.of(cell, start), scene="hall") for cell in make_plan(config).units]
@@ -417,15 +407,12 @@ def names(job: tuple[Work, ...]) -> str:
     return "".join(work.identity for work in job)
 
 
-def test_jobs_are_halved_until_every_worker_has_one() -> None:
+def test_jobs_are_halved_until_every_worker_has_one_and_watched_works_stay_in_one() -> None:
     both = [*works("s", "123456"), *works("t", "78")]
     assert [names(job) for job in jobs_of(both, 2)] == ["123456", "78"]
     assert [names(job) for job in jobs_of(both, 4)] == ["1", "23", "456", "78"]
     assert [len(job) for job in jobs_of(both, 100)] == [1] * 8
     assert "".join(names(job) for job in jobs_of(both, 5)) == "12345678"
     assert jobs_of([], 3) == []
-
-
-def test_watched_works_stay_in_one_job() -> None:
-    """Observers see all backends of a frame together."""
+    # Observers see all backends of a frame together
     assert [names(job) for job in jobs_of(works("a", "123456", kept="15"), 9)] == ["15", "2", "3", "4", "6"]

@@ -140,9 +140,16 @@ def test_a_script_without_a_main_guard_is_told_so(root, tmp_path) -> None:
     assert "call it under if __name__ == '__main__'" in result.stderr
 
 
-def test_local_processes_are_at_least_one() -> None:
+def test_executors_that_cannot_be_used_say_why(monkeypatch) -> None:
     with pytest.raises(ConfigError, match="0 jobs: use 1 or more"):
         LocalProcesses(0)
+    pytest.importorskip("distributed", reason="needs the extra 'cluster'")
+    monkeypatch.setattr("semstab.engine.executors.CONNECT_SECONDS", 0.5)
+    with pytest.raises(ConfigError, match=r"tcp://127\.0\.0\.1:9: no Dask scheduler answers"):
+        DaskCluster("tcp://127.0.0.1:9")
+    monkeypatch.setitem(sys.modules, "distributed", None)
+    with pytest.raises(MissingDependencyError, match=r"pip install 'semstab\[cluster\]'"):
+        DaskCluster("tcp://127.0.0.1:9")
 
 
 @contextlib.contextmanager
@@ -197,16 +204,3 @@ def test_a_dask_cluster_gives_the_same_numbers_though_a_worker_is_killed(
     with pytest.raises(ConfigError, match="the scheduler went away; start it again"):
         list(finished)
     executor.close()
-
-
-def test_a_scheduler_that_does_not_answer_is_named(monkeypatch) -> None:
-    pytest.importorskip("distributed", reason="needs the extra 'cluster'")
-    monkeypatch.setattr("semstab.engine.executors.CONNECT_SECONDS", 0.5)
-    with pytest.raises(ConfigError, match=r"tcp://127\.0\.0\.1:9: no Dask scheduler answers"):
-        DaskCluster("tcp://127.0.0.1:9")
-
-
-def test_a_cluster_without_dask_says_what_to_install(monkeypatch) -> None:
-    monkeypatch.setitem(sys.modules, "distributed", None)
-    with pytest.raises(MissingDependencyError, match=r"pip install 'semstab\[cluster\]'"):
-        DaskCluster("tcp://127.0.0.1:9")

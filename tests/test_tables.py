@@ -154,7 +154,7 @@ def test_a_comparison_needs_one_taxonomy_and_two_backbones():
     assert {row["voxels"] for row in rows[::3]} == {7}
 
 
-def test_flicker_is_the_macro_mean_of_the_scenes():
+def test_flicker_is_the_macro_mean_of_the_scenes_and_regions_stand_in_its_tables_only():
     images = (ImageSpace(20.0, 8.0, 0.5, 0.9), ImageSpace(30.0, math.nan, 0.7, 0.8))
     found = study(*(record(voxels((1, 1, SURE)), scene=f"s{k}", image_space=image) for k, image in enumerate(images)))
     (row,) = rows_of(found, "flicker")
@@ -164,9 +164,6 @@ def test_flicker_is_the_macro_mean_of_the_scenes():
     assert row["vc8"] == pytest.approx(0.85)
     assert math.isnan(row["vc16"])
     assert [row["scene"] for row in rows_of(found, "flicker_by_scene")] == ["s0", "s1"]
-
-
-def test_regions_without_classes_stand_in_the_flicker_tables_only():
     found = study(
         record(voxels((1, 1, SURE)), image_space=ImageSpace(20.0, 8.0, 0.5)),
         regions=(RegionFlicker("s", "raw SAM", 21.64, 10.0, 0.5), RegionFlicker("t", "raw SAM", 23.0, math.nan, 0.7)),
@@ -195,13 +192,21 @@ def test_a_sweep_has_mean_and_spread_over_its_repeats():
     assert disturbed["recurrent_vss"]["sd"] == 0
 
 
-def test_levels_pool_the_scenes_that_have_all_of_them():
+def test_levels_and_sweeps_pool_scenes_in_a_fixed_order():
     base = [record(voxels((1, 1, SURE)), scene=scene) for scene in "xy"]
     whole = [noisy(5, 0, value, "x") for value in (0.0, 0.01)]
     found = study(*base, *whole, noisy(7, 0, 0.0, "y"))
     assert complete_scenes(found, "depth_noise", "m") == ("x",)
     assert [level.repeats[0].voxels for level in levels(found, "depth_noise", "m")] == [ENOUGH + 5] * 2
     assert "together (x);" in table_of(found, "sensitivity_depth_noise").caption
+    base = record(voxels((1, 1, SURE)))
+    named = [record(voxels((1, 1, SURE)), name, 1.0) for name in ("new_thing", "frame_count", "voxel_size")]
+    assert [sweep.name for sweep in swept(study(base, *named))] == ["voxel_size", "frame_count", "new_thing"]
+    assert describe("new_thing").header == "New thing"
+    small, large = record(voxels((1, 2, SPLIT, 0.2)), scene="x"), record(voxels((9, 1, SURE)), scene="y")
+    together = pooled([small, large])
+    assert (together.voxels, together.observations, together.mean_op) == (10, 11, 1.1)
+    assert (together.every[VSS], together.every[SBD], together.once) == pytest.approx((0.975, 0.2, 0.9))
 
 
 def test_rare_classes_and_few_recurrent_voxels_are_noted():
@@ -210,20 +215,6 @@ def test_rare_classes_and_few_recurrent_voxels_are_noted():
     counts = [record(voxels((n, 3, SURE)), "frame_count", value) for n, value in ((ENOUGH, 40), (ENOUGH - 1, 20))]
     rows = rows_of(study(record(voxels((1, 1, SURE))), *counts), "sensitivity_frame_count")
     assert [(row["value"], row["note"]) for row in rows] == [("20", "few"), ("40", "")]
-
-
-def test_sweeps_stand_in_a_fixed_order_and_new_ones_go_by_their_name():
-    base = record(voxels((1, 1, SURE)))
-    named = [record(voxels((1, 1, SURE)), name, 1.0) for name in ("new_thing", "frame_count", "voxel_size")]
-    assert [sweep.name for sweep in swept(study(base, *named))] == ["voxel_size", "frame_count", "new_thing"]
-    assert describe("new_thing").header == "New thing"
-
-
-def test_pooling_counts_a_scene_by_its_voxels():
-    small, large = record(voxels((1, 2, SPLIT, 0.2)), scene="x"), record(voxels((9, 1, SURE)), scene="y")
-    together = pooled([small, large])
-    assert (together.voxels, together.observations, together.mean_op) == (10, 11, 1.1)
-    assert (together.every[VSS], together.every[SBD], together.once) == pytest.approx((0.975, 0.2, 0.9))
 
 
 def test_other_backends_are_compared_with_the_base_one_on_the_scenes_that_all_fused():
@@ -247,21 +238,18 @@ def test_the_agreement_says_who_agrees(walls):
     assert [row["verdict"] for row in rows_of(odd, "agreement")] == ["disagree"]
 
 
-@pytest.mark.parametrize(
-    ("column", "cell", "text"),
-    [
-        (Column("", "", 0), 705902, "705,902"), (Column("", "", 3), 0.95749, "0.957"),
-        (Column("", "", 4), math.nan, "--"), (Column("", "", 3), -0.0001, "0.000"),
-        (Column("", "", 3, signed=True), 0.0021, "+0.002"), (Column("", "", 3, signed=True), -0.0021, "-0.002"),
-        (Column("", "", 3, signed=True), 0.0001, "0.000"), (Column("", "", 0, scientific=True), 2.2e-16, "2e-16"),
-        (Column("", "", 0, scientific=True), 0.0, "0"), (Column("", "", 2), Spread(9.81, 0.123, 3), "9.81 ± 0.12"),
-        (Column("", "", 2), Spread(9.81, math.nan, 1), "9.81"), (Column("", ""), "road", "road"),
-        (Column("", "", 2), Estimate(0.481, 0.326, 0.61), "0.48 (0.33, 0.61)"),
-        (Column("", "", 2, signed=True), Estimate(0.02, -0.01, 0.05), "+0.02 (-0.01, +0.05)"),
-        (Column("", "", 2), Estimate(0.481, math.nan, math.nan), "0.48"),
-        (Column("", "", 2), Estimate(math.nan, math.nan, math.nan), "--"),
-    ],
-)  # fmt: skip
+@pytest.mark.parametrize(("column", "cell", "text"), [
+    (Column("", "", 0), 705902, "705,902"), (Column("", "", 3), 0.95749, "0.957"),
+    (Column("", "", 4), math.nan, "--"), (Column("", "", 3), -0.0001, "0.000"),
+    (Column("", "", 3, signed=True), 0.0021, "+0.002"), (Column("", "", 3, signed=True), -0.0021, "-0.002"),
+    (Column("", "", 3, signed=True), 0.0001, "0.000"), (Column("", "", 0, scientific=True), 2.2e-16, "2e-16"),
+    (Column("", "", 0, scientific=True), 0.0, "0"), (Column("", "", 2), Spread(9.81, 0.123, 3), "9.81 ± 0.12"),
+    (Column("", "", 2), Spread(9.81, math.nan, 1), "9.81"), (Column("", ""), "road", "road"),
+    (Column("", "", 2), Estimate(0.481, 0.326, 0.61), "0.48 (0.33, 0.61)"),
+    (Column("", "", 2, signed=True), Estimate(0.02, -0.01, 0.05), "+0.02 (-0.01, +0.05)"),
+    (Column("", "", 2), Estimate(0.481, math.nan, math.nan), "0.48"),
+    (Column("", "", 2), Estimate(math.nan, math.nan, math.nan), "--"),
+])  # fmt: skip
 def test_a_cell_in_print(column, cell, text):
     assert column.text(cell) == text
 
