@@ -73,11 +73,21 @@ def rows(own: Against, of: str = "") -> dict[str, Contrast]:
     return {row.measure: row for row in (*own.contrasts, *own.by_class) if row.of == of}
 
 
-def test_a_run_and_itself_do_not_differ_anywhere(runs):
+def test_a_run_and_itself_do_not_differ_and_numbers_are_those_of_the_runs(runs, fault):
     (own,) = semstab.compare([runs / "old", f"{runs}/new:same"]).overall
     assert {row.difference.value for row in (*own.contrasts, *own.by_class)} == {0.0}
     assert {row.change for row in (*own.contrasts, *own.by_class)} == {""}
     assert all(row.difference.low == row.difference.high == 0 for row in own.contrasts)
+    record = semstab.load_result(runs / "old").record(backbone="net")
+    found = rows(fault.overall[0])
+    judged, right = record.statistics.headline, record.statistics.correctness
+    assert found["psa"].base == pytest.approx(judged.psa.value, abs=1e-9)
+    assert found["alpha"].base == pytest.approx(judged.alpha.value, abs=1e-9)
+    assert found["accuracy"].base == pytest.approx(judged.accuracy.value, abs=1e-9)
+    assert found["reached"].base == pytest.approx(record.statistics.ceiling_share.share.value, abs=1e-9)
+    assert found["compensated_flicker_percent"].base == pytest.approx(record.image_space.compensated_flicker_percent)
+    assert found["wrong_of_stable"].base == pytest.approx(right.quadrants.wrong_of_stable.value, abs=1e-9)
+    assert {"sbd_excess", "miou", "ece", "entropy", "sbd", "margin"} <= found.keys()
 
 
 def test_a_planted_fault_is_found_with_its_class_its_place_and_its_frames(fault):
@@ -93,19 +103,6 @@ def test_a_planted_fault_is_found_with_its_class_its_place_and_its_frames(fault)
     assert {each.frame for area in own.areas for each in area.frames} <= set(FAULTY)
     assert {FAULTY[0], FAULTY[1]} <= {each.frame for each in own.top_frames} <= set(FAULTY)
     assert own.worse > 10 * own.better
-
-
-def test_the_numbers_are_those_of_the_runs_where_all_looks_are_common(runs, fault):
-    record = semstab.load_result(runs / "old").record(backbone="net")
-    found = rows(fault.overall[0])
-    judged, right = record.statistics.headline, record.statistics.correctness
-    assert found["psa"].base == pytest.approx(judged.psa.value, abs=1e-9)
-    assert found["alpha"].base == pytest.approx(judged.alpha.value, abs=1e-9)
-    assert found["accuracy"].base == pytest.approx(judged.accuracy.value, abs=1e-9)
-    assert found["reached"].base == pytest.approx(record.statistics.ceiling_share.share.value, abs=1e-9)
-    assert found["compensated_flicker_percent"].base == pytest.approx(record.image_space.compensated_flicker_percent)
-    assert found["wrong_of_stable"].base == pytest.approx(right.quadrants.wrong_of_stable.value, abs=1e-9)
-    assert {"sbd_excess", "miou", "ece", "entropy", "sbd", "margin"} <= found.keys()
 
 
 def test_what_is_written_comes_back_and_every_file_is_there(runs, fault):

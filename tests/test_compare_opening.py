@@ -104,6 +104,11 @@ def test_a_small_summary_becomes_coarser_until_it_fits(run, tmp_path):
     assert coarse.edge > fine.edge
     assert value(coarse, "alpha") == pytest.approx(value(fine, "alpha"))
     fails(DataError, re.escape("keep fewer scenes"), save_summary, one, file, 100)
+    sums = open_run(f"{run}:a").scenes["wall"].sums
+    assert sums.cells > 8
+    wide = sums.coarsened(2.0**62, 2**30 if sums.step else 0)
+    assert wide.cells <= 8
+    assert value(wide, "alpha") == pytest.approx(value(sums, "alpha"))
 
 
 def test_a_damaged_small_summary_is_one_line(run, tmp_path):
@@ -158,11 +163,3 @@ def test_flicker_out_of_range_in_a_runs_series_is_refused(run, tmp_path):
     values[at] = "1e308"
     series.write_text("\n".join([*rows[:2], ",".join(values), *rows[3:]]))
     fails(DataError, "out of range", lambda: open_run(f"{tmp_path}/run:a").scenes["wall"].flicker)
-
-
-def test_cubes_and_groups_as_large_as_they_may_be(run):
-    sums = open_run(f"{run}:a").scenes["wall"].sums
-    assert sums.cells > 8
-    wide = sums.coarsened(2.0**62, 2**30 if sums.step else 0)
-    assert wide.cells <= 8
-    assert value(wide, "alpha") == pytest.approx(value(sums, "alpha"))

@@ -23,7 +23,7 @@ from semstab.report.findings import (
     findings,
     less_association,
     more_disagreement,
-)  # fmt: skip
+)
 from semstab.statistics import describe as describe_map
 
 SURE, SPLIT, CALM = [1, 0, 0], [3, 1, 0], [3.6, 0.4, 0]
@@ -100,7 +100,7 @@ def test_a_difference_counts_from_the_last_printed_decimal_on(gap, verdict):
     assert more_disagreement(pooled([record(voxels(*seen(N, N, evidence)))])).verdict is verdict
 
 
-def test_the_first_finding_against_the_voxels_themselves(walls):
+def test_the_findings_of_the_walls_against_their_voxels(walls):
     finding = findings(walls)[0]
     for row in finding.evidence:
         tables = [r.table() for r in walls.select(backbone=row.backbone)]
@@ -109,6 +109,12 @@ def test_the_first_finding_against_the_voxels_themselves(walls):
         assert ("as well as all" in row.outcome.why) == (every - recurrent < VISIBLE_VSS)
         assert f"VSS {recurrent:.4f} for OP>=3 against {every:.4f}" in row.outcome.numbers
     assert [row.backbone for row in finding.evidence] == list(BACKBONES)
+    # Errors anew in every frame: more looks, more disagreement; noise tears apart what meets. It is no finding
+    by_name = {finding.name: finding for finding in findings(walls)}
+    assert by_name["drift"].verdict is not Answer.SHOWN
+    assert any("coin" in row.outcome.why for row in by_name["disagreement"].evidence)
+    assert {row.condition for row in by_name["association"].evidence} == {"voxel size", "depth noise"}
+    assert all(row.outcome.numbers for row in by_name["sampling"].evidence)
 
 
 def drifting(*sbd_by_op):
@@ -207,7 +213,7 @@ def test_recurrent_vss_may_move_by_half_as_much(share, verdict):
     assert outcome.verdict is verdict
 
 
-def test_what_only_pooling_makes_is_not_shown():
+def test_a_finding_is_shown_where_every_backbone_and_not_only_pooling_shows_it():
     """In each scene the recurrent voxels agree better than the others; the scene that disagrees has more of them."""
     clear = record(voxels((9 * N, 1, [9, 1, 0]), (N, 4, SURE)), scene="clear")
     unclear = record(voxels((N, 1, [1, 1, 0]), (9 * N, 4, [3, 2, 0])), scene="unclear")
@@ -216,9 +222,6 @@ def test_what_only_pooling_makes_is_not_shown():
     assert more_disagreement(pooled([clear, unclear])).verdict is Answer.SHOWN
     assert (row.verdict, row.scenes) == (Answer.NOT_SHOWN, (0, 2))
     assert "by themselves only 0 of 2" in row.outcome.why
-
-
-def test_a_finding_is_shown_where_every_backbone_shows_it():
     agreeing = record(voxels((N, 1, SPLIT), (N, 4, SPLIT)), backbone="agreeing")
     disagreeing = record(voxels(*seen(N, N, SPLIT)), backbone="disagreeing")
     untested = record(voxels((N, 1, SPLIT)), backbone="unseen")
@@ -228,23 +231,11 @@ def test_a_finding_is_shown_where_every_backbone_shows_it():
     assert findings(study(untested))[0].verdict is Answer.UNTESTED
 
 
-def test_without_sweeps_two_findings_cannot_be_tested():
+def test_without_sweeps_two_findings_cannot_be_tested_and_repeats_are_averaged():
     found = findings(study(record(voxels(*seen(N, N, SPLIT)))))
     assert [finding.verdict for finding in found[2:]] == [Answer.UNTESTED] * 2
     assert all(row.outcome.why.startswith("The study varies n") for finding in found[2:] for row in finding.evidence)
-
-
-def test_repeats_are_averaged():
     base = [record(voxels(*seen(N, N, SPLIT)), "depth_noise", 0.0)]
     noisy = [record(voxels(*seen(n * N, N, SPLIT)), "depth_noise", 0.01, repeat) for repeat, n in enumerate((3, 1))]
     (row,) = findings(study(record(voxels(*seen(N, N, SPLIT))), *base, *noisy))[2].evidence
     assert "VSS 0.8750 → 0.9062; OP>=3 50.00 → 37.50%" in row.outcome.numbers
-
-
-def test_the_walls_show_no_more_than_a_coin(walls):
-    """Errors anew in every frame: more looks, more disagreement; noise tears apart what meets. It is no finding."""
-    by_name = {finding.name: finding for finding in findings(walls)}
-    assert by_name["drift"].verdict is not Answer.SHOWN
-    assert any("coin" in row.outcome.why for row in by_name["disagreement"].evidence)
-    assert {row.condition for row in by_name["association"].evidence} == {"voxel size", "depth noise"}
-    assert all(row.outcome.numbers for row in by_name["sampling"].evidence)

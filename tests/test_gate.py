@@ -128,13 +128,18 @@ def test_a_planted_fault_fails_itself_passes_and_three_frames_are_undecided():
     assert outcome(sums(labels[:, :3], truth), sums(labels[:, :3], truth)) == "passes"  # the very same
 
 
-def test_a_rule_of_each_class_shares_the_level(run):
+def test_a_rule_of_each_class_shares_the_level_and_voxel_sizes_must_be_the_same(run, tmp_path):
     rules = gate_config(rules=["class *: alpha > 0.1", "class wall: alpha > 0.1"], level=0.06)
     *each, alone = gate(f"{run}:a", None, rules).judgements
     assert [row.rule.text for row in each] == [f"class {name}: alpha > 0.1" for name in ("wall", "door", "window")]
     assert each[0].found.low < alone.found.low
     closer = gate(f"{run}:a", None, gate_config(rules=["class wall: alpha > 0.1"], level=0.02)).judgements[0]
     assert closer.found.low == pytest.approx(each[0].found.low)
+    data = run.parent / "wall"
+    semstab.run(configure(data, check=None, voxel_size=0.4, backbones=["a"]), out=tmp_path / "large", report=False)
+    fails(
+        DataError, "run it with --voxel-size", gate, tmp_path / "large", f"{run}:a", gate_config(rules=["psa drop < 1"])
+    )
 
 
 def test_a_class_that_is_nowhere_has_no_value_and_ends_are_one_sided():
@@ -252,11 +257,3 @@ def test_the_documented_workflow_is_yaml():
     assert any("semstab-bench gate" in str(yaml.safe_load(block)) for block in blocks)
     for rule in re.findall(r"--rule '([^']+)'", text):
         parse(rule)
-
-
-def test_runs_of_other_voxel_sizes_are_not_compared(run, tmp_path):
-    data = run.parent / "wall"
-    semstab.run(configure(data, check=None, voxel_size=0.4, backbones=["a"]), out=tmp_path / "large", report=False)
-    fails(
-        DataError, "run it with --voxel-size", gate, tmp_path / "large", f"{run}:a", gate_config(rules=["psa drop < 1"])
-    )

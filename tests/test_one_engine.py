@@ -9,7 +9,6 @@ import json
 import numpy as np
 import pytest
 import tiny_scene
-import tiny_study
 import yaml
 from command_line import bench
 from compare_summaries import differences
@@ -22,7 +21,7 @@ from semstab.engine import load_result, streams
 from semstab.engine.units import make_plan
 from semstab.metrics import compare, compensated_flicker
 from semstab.recording import Recording, Target, lacks_pictures, record_finished
-from semstab.settings import load_config, load_study
+from semstab.settings import load_config
 from semstab.task import read as read_frame
 
 TIMES = {"decode_ms", "wait_ms", "fuse_ms", "association_ms", "update_ms"}
@@ -119,13 +118,6 @@ def test_a_kept_unit_that_gained_a_measure_is_computed_again(root, tmp_path) -> 
             "units": 2, "kept": 0, "computed": 2, "failed": 0, "executor": "in this process"
         }  # fmt: skip
         assert result.runs[0].table[ones] == 1.0
-
-
-def test_a_study_file_says_what_it_is_a_run_of(tmp_path) -> None:
-    file = tmp_path / "mine.yaml"
-    file.write_text(yaml.safe_dump({"sweeps": {"pixel_stride": [2]}, "scenes": ["scene0"]}))
-    assert load_study(file).model_copy(update={"name": "run", "check": "numpy"}) == load_config(file)
-    assert tiny_study.configure(tmp_path).check is None
 
 
 def test_a_backend_of_ones_own_that_breaks_leaves_its_trace(root, tmp_path, monkeypatch) -> None:

@@ -92,9 +92,6 @@ def test_drift_is_a_random_walk_from_the_first_frame_on() -> None:
     np.testing.assert_allclose(steps.std(axis=0), 0.02, rtol=0.1)
     turns = [angle(turned(100, rotation_drift=0.02, seed=seed)) ** 2 for seed in range(300)]
     assert np.mean(turns) == pytest.approx(3 * 0.02**2 * 100, rel=0.15)
-
-
-def test_a_drifting_rotation_changes_by_single_steps() -> None:
     steps = [angle(turned(i, rotation_drift=0.1).T @ turned(i + 1, rotation_drift=0.1)) ** 2 for i in range(500)]
     assert np.mean(steps) == pytest.approx(3 * 0.1**2, rel=0.15)
 
@@ -169,16 +166,13 @@ def test_noise_is_of_the_pixel_and_none_changes_nothing(config) -> None:
     assert keys(perturbation=NOISE, seed=4) == keys(perturbation=NOISE, seed=4) != keys(perturbation=NOISE, seed=5)
 
 
-def test_a_run_takes_it_as_a_setting_and_keeps_it(config, tmp_path) -> None:
+def test_a_run_takes_it_as_a_setting_that_cannot_be_negative(config, tmp_path) -> None:
     plain = semstab.engine.run(config())
     noisy = semstab.engine.run(config(perturbation=NOISE, seed=3), out=tmp_path / "run")
     assert noisy.runs[0].table != plain.runs[0].table
     again = semstab.engine.run(load_config(tmp_path / "run" / "config.yaml"))
     assert [run.table for run in again.runs] == [run.table for run in noisy.runs]
     assert json.loads(json.dumps(config(perturbation=NOISE, seed=3).model_dump(mode="json")))["seed"] == 3
-
-
-def test_noise_cannot_be_negative(config) -> None:
     with pytest.raises(ConfigError, match=r"perturbation\.depth_noise: input should be greater than or equal to 0"):
         config(perturbation={"depth_noise": -0.1})
     with pytest.raises(ConfigError, match=r"unknown setting 'perturbation\.depth'; did you mean 'depth_noise'"):

@@ -35,7 +35,7 @@ from semstab.report.figures.distributions import (
     informative,
     op_position,
     together,
-)  # fmt: skip
+)
 from semstab.report.figures.maps import Overview, draw_overview, draw_stability, scale_length
 from semstab.report.figures.statistics import draw_agreement
 from semstab.report.figures.style import COLUMN, DPI, PAGE, legend_columns
@@ -251,15 +251,12 @@ def test_a_small_difference_looks_small_and_no_bar_is_cut(walls):
     assert change.get_ylim()[0] <= 0
 
 
-def test_recurrent_values_of_few_voxels_are_not_drawn():
+def test_curves_have_the_means_of_the_voxels_and_none_of_few_recurrent_ones():
     few = record(voxels((ENOUGH - 1, 3, SPLIT)), "frame_count", 5)
     many = record(voxels((ENOUGH, 3, SPLIT)), "frame_count", 10)
     found = {"m": levels(study(few, many), "frame_count", "m")}
     every, recurrent = draw_sweep(describe("frame_count"), found).axes[1].containers
     assert (list(every.lines[0].get_xdata()), list(recurrent.lines[0].get_xdata())) == ([0, 1], [1])
-
-
-def test_curves_and_ecdfs_have_the_means_of_the_voxels():
     found = histograms(voxels((ENOUGH, 1, SURE), (ENOUGH, 2, SPLIT, 0.2), (5, 4, [1, 1, 0], 0.1)))
     stability, drift, *_, counts = draw_persistence({"m": found}).axes
     mean, few = stability.get_lines()
@@ -279,7 +276,7 @@ def drawn(tmp_path_factory):
     return drawn_walls(tmp_path_factory.getbasetemp())
 
 
-def test_every_figure_is_written(drawn):
+def test_every_figure_is_written_in_the_same_bytes(drawn, tmp_path):
     result, folder, paths = drawn
     names = [figure.name for figure in figures(result, folder)]
     assert names == [
@@ -289,6 +286,10 @@ def test_every_figure_is_written(drawn):
         "sensitivity_agreement_voxel_size", "sensitivity_agreement_depth_noise", "sensitivity_agreement_frame_count",
     ]  # fmt: skip
     assert set(paths) == {folder / "figures" / f"{name}.{suffix}" for name in names for suffix in ("png", "svg")}
+    result, folder, _ = drawn
+    (figure,) = (f for f in figures(result, folder) if f.name == "stability_map__often__calm")
+    for path in figure.save(tmp_path):
+        assert path.read_bytes() == (folder / "figures" / path.name).read_bytes()
 
 
 def test_figures_have_texts_and_the_width_of_a_column_or_a_page_and_svg_files_no_date(drawn):
@@ -304,13 +305,6 @@ def test_figures_have_texts_and_the_width_of_a_column_or_a_page_and_svg_files_no
         assert figure.title
         assert figure.caption.endswith(".")
         assert len(figure.alt) > 40
-
-
-def test_the_same_study_gives_the_same_files(drawn, tmp_path):
-    result, folder, _ = drawn
-    (figure,) = (f for f in figures(result, folder) if f.name == "stability_map__often__calm")
-    for path in figure.save(tmp_path):
-        assert path.read_bytes() == (folder / "figures" / path.name).read_bytes()
 
 
 def test_without_an_up_axis_there_is_no_map_and_of_nothing_no_figure(drawn):
@@ -349,19 +343,8 @@ def test_colours_are_as_many_as_classes_and_each_is_unlike_the_others() -> None:
 def test_a_room_is_cut_open_beneath_its_ceiling_and_a_wall_is_seen_from_the_side() -> None:
     x, y = (index.ravel() for index in np.meshgrid(range(20), range(20)))
     floor, ceiling = np.stack([x, y, 0 * x], axis=1), np.stack([x, y, 0 * x + 15], axis=1)
-    room = FromAbove.of(table_at(np.concatenate([floor, ceiling])), (0, 0, 1))
+    room = FromAbove.of(at(np.concatenate([floor, ceiling]), r=0.1), (0, 0, 1))
     assert room.view.startswith("cut open at")
     assert (room.table.iz == 0).all()
-    assert FromAbove.of(table_at(floor), (0, 0, 1)).view == "from above"
-    assert FromAbove.of(table_at(np.stack([x, 0 * x, y], axis=1)), (0, 0, 1)).view == "from the side"
-
-
-def table_at(index) -> VoxelTable:
-    """Voxels of 0.1 m at these indices (n, 3), sorted."""
-    index = index[np.lexsort(index.T[::-1])].astype(np.int32)
-    n, ones = len(index), np.ones(len(index), dtype=np.int64)
-    return VoxelTable(
-        ix=index[:, 0], iy=index[:, 1], iz=index[:, 2], op=ones, evidence=np.tile([1.0, 0.0], (n, 1)),
-        drift_sum=np.zeros(n), pixels=ones, first_frame=0 * ones, last_frame=0 * ones, self_sum=np.ones(n),
-        frame_entropy_sum=np.zeros(n), voxel_size=0.1,
-    )  # fmt: skip
+    assert FromAbove.of(at(floor, r=0.1), (0, 0, 1)).view == "from above"
+    assert FromAbove.of(at(np.stack([x, 0 * x, y], axis=1), r=0.1), (0, 0, 1)).view == "from the side"

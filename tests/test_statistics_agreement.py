@@ -27,24 +27,21 @@ def by_pairs(evidence):
     return np.mean([s @ u for s, u in itertools.permutations(evidence, 2)])
 
 
-def test_psa_by_hand():
+def test_psa_by_hand_and_of_labels_drawn_from_soft_evidence():
     table = log_of([[0, 0, 1, -1], [0, 1, -1, -1], [2, 2, 2, 2], [1, -1, -1, -1]]).table()
     np.testing.assert_allclose(psa(table), [1 / 3, 0, 1, np.nan])
-
-
-@pytest.mark.parametrize("T", [2, 3, 7])
-def test_psa_is_the_mean_over_pairs_of_frames(T):
-    evidence = soft(np.random.default_rng(T), 20, T)
-    np.testing.assert_allclose(psa(log_of_evidence(evidence).table()), [by_pairs(e) for e in evidence])
-
-
-def test_soft_evidence_counts_by_the_agreement_of_labels_drawn_from_it():
     rng = np.random.default_rng(0)
     evidence = soft(rng, 1, 4)
     draws = (rng.random((40_000, 4, 1)) > np.cumsum(evidence, axis=2)[..., :-1]).sum(axis=2)
     sampled = psa(log_of(draws).table())
     (expected,) = psa(log_of_evidence(evidence).table())
     assert sampled.mean() == pytest.approx(expected, abs=4 * sampled.std() / math.sqrt(len(sampled)))
+
+
+@pytest.mark.parametrize("T", [2, 3, 7])
+def test_psa_is_the_mean_over_pairs_of_frames(T):
+    evidence = soft(np.random.default_rng(T), 20, T)
+    np.testing.assert_allclose(psa(log_of_evidence(evidence).table()), [by_pairs(e) for e in evidence])
 
 
 def test_psa_has_the_same_expectation_for_every_number_of_frames_and_vss_has_not():
@@ -111,7 +108,7 @@ def test_kappa_and_alpha_of_soft_evidence_are_their_definitions():
         assert row.alpha == pytest.approx(1 - (1 - agree) / (1 - by_pairs(both.reshape(-1, 2))))
 
 
-def test_alpha_is_zero_for_chance_and_one_for_agreement():
+def test_alpha_is_zero_for_chance_and_one_for_agreement_and_voxels_seen_once_count_nowhere():
     rng = np.random.default_rng(6)
     chance = log_of(rng.choice(3, size=(20_000, 4), p=[0.7, 0.2, 0.1])).table()
     assert krippendorff_alpha(chance) == pytest.approx(0, abs=0.02)
@@ -119,15 +116,17 @@ def test_alpha_is_zero_for_chance_and_one_for_agreement():
     unanimous = log_of(np.repeat(rng.integers(0, 3, size=(50, 1)), 4, axis=1)).table()
     assert krippendorff_alpha(unanimous) == pytest.approx(1)
     assert fleiss_kappa(unanimous) == pytest.approx(1)
-
-
-def test_voxels_seen_once_count_nowhere():
     labels = np.array([[0, 0, 1], [1, 1, 1], [2, 0, -1]])
     once = np.array([[2, -1, -1], [-1, 0, -1]])
     events, more = log_of(labels), log_of(np.concatenate([labels, once]))
     assert krippendorff_alpha(more.table()) == krippendorff_alpha(events.table())
     assert fleiss_kappa(more.table()) == fleiss_kappa(events.table())
     assert class_agreement(more.table(), more) == class_agreement(events.table(), events)
+    events = log_of(np.random.default_rng(8).integers(0, 3, size=(30, 4)))
+    assert class_agreement(events.table()) == class_agreement(events.table(), events)
+    mixed = log_of_evidence(soft(np.random.default_rng(9), 5, 3))
+    assert all(math.isnan(row.alpha) for row in class_agreement(mixed.table()))
+    assert not any(math.isnan(row.alpha) for row in class_agreement(mixed.table(), mixed))
 
 
 @pytest.mark.parametrize("labels", [[[0, -1]], [[1, 1], [1, 1]]])
@@ -135,14 +134,6 @@ def test_agreement_beyond_chance_is_undefined_where_there_is_no_pair_or_one_clas
     table = log_of(labels).table()
     assert math.isnan(fleiss_kappa(table))
     assert math.isnan(krippendorff_alpha(table))
-
-
-def test_classes_of_one_hot_evidence_need_no_events_and_those_of_other_evidence_do():
-    events = log_of(np.random.default_rng(8).integers(0, 3, size=(30, 4)))
-    assert class_agreement(events.table()) == class_agreement(events.table(), events)
-    mixed = log_of_evidence(soft(np.random.default_rng(9), 5, 3))
-    assert all(math.isnan(row.alpha) for row in class_agreement(mixed.table()))
-    assert not any(math.isnan(row.alpha) for row in class_agreement(mixed.table(), mixed))
 
 
 def test_entropy_is_within_frames_or_between_them_as_the_generalised_jensen_shannon_divergence():

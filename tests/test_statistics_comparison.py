@@ -54,7 +54,7 @@ def test_shared_rows_are_the_voxels_that_all_maps_hold():
         standardised({"a": a}, PSA, edges=(1, 5))
 
 
-def test_coverage_by_hand():
+def test_coverage_by_hand_and_holm_as_in_statsmodels():
     labels = [[0, 0, 0], [0, 0, -1], [0, -1, -1]]
     a = log_of(labels, index=np.array([(0, 0, 0), (0, 0, 1), (0, 0, 2)])).table()
     b = log_of(labels[:2], index=np.array([(0, 0, 1), (5, 0, 0)])).table()
@@ -62,6 +62,9 @@ def test_coverage_by_hand():
     assert (first.voxels, first.observations, first.mean_op, first.repeated, first.recurrent) == (3, 6, 2, 2, 1)
     assert (first.common_share, first.alone) == (pytest.approx(1 / 3), 2)
     assert (second.common_share, second.alone) == (1 / 2, 1)
+    p = [0.01, 0.2, 0.03, 0.5, 0.002]
+    assert holm(p) == pytest.approx(multipletests(p, method="holm")[1])
+    assert holm([math.nan, 0.02]) == [pytest.approx(math.nan, nan_ok=True), 0.02]
 
 
 def test_standardised_values_of_one_model_seen_more_or_less_often_are_the_same():
@@ -112,7 +115,7 @@ def test_paired_differences_cover_and_their_test_keeps_its_level():
     rng = np.random.default_rng(1)
     held, rejected = 0, 0
     for _ in range(15):
-        tables = two_backbones(rng, 0.0)
+        tables = two_backbones(rng, 0.0, side=24)
         result = paired(tables)
         by_measure = {row.measure: row for row in result.differences}
         held += by_measure["psa"].difference.low <= 0 <= by_measure["psa"].difference.high
@@ -133,6 +136,15 @@ def test_a_worse_backbone_is_found_by_difference_test_and_rank():
     for ranking in result.rankings:
         assert [rank.backbone for rank in ranking.ranks] == ["a", "b"]
         assert ranking.ranks[0].best > 0.95
+    rng = np.random.default_rng(3)
+    twins = two_backbones(rng, 0.0)
+    worst = two_backbones(rng, 0.4)["b"]
+    (by_psa,) = (r for r in paired({**twins, "worst": worst}).rankings if r.measure == "psa")
+    ranks = {rank.backbone: rank for rank in by_psa.ranks}
+    assert ranks["worst"].rank == ranks["worst"].low == 3
+    assert ranks["a"].best + ranks["b"].best == pytest.approx(1, abs=0.01)
+    assert {ranks["a"].low, ranks["b"].low} == {1}
+    assert {ranks["a"].high, ranks["b"].high} == {2}
 
 
 def test_backbones_are_compared_by_accuracy_where_there_is_a_truth():
@@ -164,18 +176,6 @@ def test_only_voxels_that_all_saw_twice_are_compared():
     assert all(math.isnan(rank.best) for ranking in result.rankings for rank in ranking.ranks)
 
 
-def test_ranks_are_uncertain_where_backbones_are_alike_and_certain_where_not():
-    rng = np.random.default_rng(3)
-    twins = two_backbones(rng, 0.0)
-    worst = two_backbones(rng, 0.4)["b"]
-    (by_psa,) = (r for r in paired({**twins, "worst": worst}).rankings if r.measure == "psa")
-    ranks = {rank.backbone: rank for rank in by_psa.ranks}
-    assert ranks["worst"].rank == ranks["worst"].low == 3
-    assert ranks["a"].best + ranks["b"].best == pytest.approx(1, abs=0.01)
-    assert {ranks["a"].low, ranks["b"].low} == {1}
-    assert {ranks["a"].high, ranks["b"].high} == {2}
-
-
 def test_pairs_of_all_scenes_are_corrected_together_where_something_may_be_claimed():
     found = compare_backbones(two_backbones(np.random.default_rng(4), 0.05, side=16))
     (p,) = (row.p_value for row in found.paired.differences if row.measure == found.paired.primary)
@@ -199,9 +199,3 @@ def test_what_describes_says_what_its_interval_answers():
     assert answers["psa"] == answers["alpha"] == answers["entropy"] == THIS_SCENE
     assert answers["sbd"] == answers["vss"] == THESE_FRAMES
     assert all(row.difference.low < 0 < row.difference.high for row in result.differences)
-
-
-def test_holm_is_that_of_statsmodels():
-    p = [0.01, 0.2, 0.03, 0.5, 0.002]
-    assert holm(p) == pytest.approx(multipletests(p, method="holm")[1])
-    assert holm([math.nan, 0.02]) == [pytest.approx(math.nan, nan_ok=True), 0.02]

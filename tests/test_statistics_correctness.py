@@ -33,12 +33,17 @@ def test_the_truth_of_a_voxel_is_what_most_of_its_ground_truth_says():
         join_truth(log_of([[0]]).table(), log_of([[0]], K=4).table())
 
 
-def test_accuracy_and_miou_are_those_of_scikit_learn():
+def test_accuracy_and_miou_are_those_of_scikit_learn_and_brier_of_the_normalised_evidence():
     belief, label = random_beliefs()
     found = correctness(belief, label)
     predicted = belief.argmax(axis=1)
     assert found.accuracy == pytest.approx(accuracy_score(label, predicted))
     assert found.miou == pytest.approx(jaccard_score(label, predicted, average="macro"))
+    events = log_of_evidence([[[0.2, 0.8], [0.6, 0.4], [0.7, 0.3]]])
+    table = events.table()
+    truth = join_truth(table, log_of_evidence([[[0.0, 1.0]]]).table())
+    (everything, *_) = by_stratum(Predictions.of(table.evidence, truth.label), table.op, truth.known, (1, 2, 5))
+    assert everything.brier == pytest.approx(2 * normalise(table.evidence)[0, 0] ** 2)
 
 
 def test_miou_brier_score_and_calibration_error_by_hand():
@@ -141,11 +146,3 @@ def test_a_model_that_errs_the_same_way_in_every_view_is_stable_and_wrong():
     found = quadrants(table, truth, Cubes.of(table, where=table.op > 0))
     assert found.wrong_of_stable.low <= place.mean() <= found.wrong_of_stable.high
     assert stable_wrong(table, truth)[~place[:, 0]].mean() < 0.01
-
-
-def test_the_belief_is_the_normalised_evidence():
-    events = log_of_evidence([[[0.2, 0.8], [0.6, 0.4], [0.7, 0.3]]])
-    table = events.table()
-    truth = join_truth(table, log_of_evidence([[[0.0, 1.0]]]).table())
-    (everything, *_) = by_stratum(Predictions.of(table.evidence, truth.label), table.op, truth.known, (1, 2, 5))
-    assert everything.brier == pytest.approx(2 * normalise(table.evidence)[0, 0] ** 2)

@@ -268,7 +268,7 @@ def test_the_statistics_of_the_scene_are_means_over_its_voxels_whatever_the_numb
     assert a.trend_p == pytest.approx(b.trend_p, abs=0.15)
 
 
-def test_flips_by_hand():
+def test_flips_by_hand_and_of_noise():
     events = log_of([[0, 0, 1, 1, -1, 1], [0, 1, 0, -1, -1, -1], [2, -1, -1, -1, -1, -1], [1, 1, -1, -1, -1, -1]])
     changes = flips(events)
     np.testing.assert_allclose(changes.rate, [1 / 4, 1, np.nan, 0])
@@ -276,9 +276,6 @@ def test_flips_by_hand():
     np.testing.assert_allclose(changes.since, [3, 0, np.nan, np.nan])
     soft_ones = log_of_evidence([[[0.6, 0.4], [0.9, 0.1], [0.5, 0.5], [0.4, 0.6]]])  # of the largest evidence
     assert flips(soft_ones).rate[0] == pytest.approx(1 / 3)
-
-
-def test_noise_flips_as_often_as_random_order_does_and_lasting_labels_less():
     rng = np.random.default_rng(13)
     noise = flips(log_of(rng.integers(0, 3, size=(5000, 6))))
     excess = noise.rate - noise.null

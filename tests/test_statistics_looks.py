@@ -80,7 +80,7 @@ def fused(frames, voxel_size):
     return backend
 
 
-def test_a_sample_of_all_voxels_is_the_log_where_every_cell_was_seen_twice():
+def test_a_sample_of_all_voxels_is_the_log_and_scores_are_sampled_as_labels_are():
     frames = list(flight(3, flicker=0.3))
     twice = [*frames, *(dataclasses.replace(frame, index=frame.index + 3) for frame in frames)]
     seen, log = sampled(twice).seen, fused(twice, 0.4).events()
@@ -88,9 +88,6 @@ def test_a_sample_of_all_voxels_is_the_log_where_every_cell_was_seen_twice():
     np.testing.assert_allclose(seen.evidence, log.evidence)
     np.testing.assert_array_equal(seen.frame, log.frame)
     np.testing.assert_array_equal(seen.pixels, log.pixels)
-
-
-def test_scores_are_sampled_as_labels_are():
     frames = list(flight(4, flicker=0.3))
     soft_ones = [dataclasses.replace(f, labels=None, scores=np.eye(K, dtype=np.float32)[f.labels]) for f in frames]
     by_labels, by_scores = sampled(frames), sampled(soft_ones)

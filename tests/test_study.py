@@ -105,34 +105,31 @@ def test_a_point_at_the_base_settings_is_the_base_unit(finished) -> None:
     assert {record.voxels_file for record in of_a if record.variation.sweep not in ("base", "backends")} == {None}
 
 
-def test_frames_are_decoded_once_for_all_units_of_a_backbone(root, tmp_path, monkeypatch) -> None:
-    decoded: list[tuple[int, str]] = []
+@pytest.fixture
+def decoded(monkeypatch) -> list[tuple[int, str]]:
+    """Frames and label sources as they are decoded."""
+    pairs: list[tuple[int, str]] = []
     frame = FileScene.frame
 
     def counted(self, index, backbone, *, color=True):
-        decoded.append((index, backbone))
+        pairs.append((index, backbone))
         return frame(self, index, backbone, color=color)
 
     monkeypatch.setattr(FileScene, "frame", counted)
+    return pairs
+
+
+def test_frames_are_decoded_once_for_all_units_of_a_backbone(root, tmp_path, decoded) -> None:
     run_study(configure(root), tmp_path / "out")
     predicted = [pair for pair in decoded if pair[1] != "gt"]
     # a's ten frames for the sweep of frame_count, b's five
     assert sorted(predicted) == sorted([(i, "a") for i in range(10)] + [(i, "b") for i in (0, 2, 4, 7, 9)])
-    # the truth beside the base frames, for video consistency
-    assert len(decoded) - len(predicted) == 2 * 5
+    assert len(decoded) - len(predicted) == 2 * 5  # the truth of the base frames, for video consistency
 
 
 def test_maps_that_exceed_the_memory_bound_are_put_off_and_the_numbers_are_the_same(
-    root, tmp_path, finished, monkeypatch
+    root, tmp_path, finished, decoded, monkeypatch
 ) -> None:
-    decoded: list[int] = []
-    frame = FileScene.frame
-
-    def counted(self, index, backbone, *, color=True):
-        decoded.append(index)
-        return frame(self, index, backbone, color=color)
-
-    monkeypatch.setattr(FileScene, "frame", counted)
     grown = itertools.count(step=1_000_000)
     monkeypatch.setattr("semstab.engine.passes.resident_bytes", lambda: next(grown))
     run_study(configure(root, memory_gb=0.0005), tmp_path / "tight")

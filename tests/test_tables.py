@@ -271,14 +271,6 @@ def test_csv_holds_the_numbers_of_the_json_rounded(walls):
                     assert abs(float(row[column.key]) - value) <= 0.5 * 10.0**-column.digits + 1e-12
 
 
-def test_an_interval_has_fields_of_its_own():
-    columns = (Column("x", "X", 2), Column("y", "Y", 1))
-    table = Table("t", "t", "t", columns, (Group("", ((Estimate(-0.5, -0.75, 0.25), 1.0), (0.5, 2.0))),), by="")
-    assert to_csv(table).splitlines() == ["x,x_low,x_high,y", "-0.50,-0.75,0.25,1.0", "0.50,,,2.0"]
-    assert to_json(table)["rows"][0]["x"] == {"value": -0.5, "low": -0.75, "high": 0.25}
-    assert r"$-$0.50 ($-$0.75, 0.25)" in to_latex(table)
-
-
 NASTY = r"a|b_c & 50% #1 {x} $y$ ~^ \z <b>*i* [l](u) `c` é ≥ ±"
 
 
@@ -287,10 +279,15 @@ def nasty_table() -> Table:
     return Table("nasty", NASTY, NASTY, columns, (Group(NASTY, ((NASTY, 0.5),)), Group("b", (("c", math.nan),))))
 
 
-def test_markdown_has_as_many_cells_in_every_row():
+def test_markdown_has_as_many_cells_in_every_row_and_an_interval_fields_of_its_own():
     lines = [line for line in to_markdown(nasty_table()).splitlines() if line.startswith("|")]
     assert {len(re.findall(r"(?<!\\)\|", line)) for line in lines} == {3}
     assert not re.search(r"<b>|(?<!\\)\*i|(?<!\\)\[l", "\n".join(lines[2:]))
+    columns = (Column("x", "X", 2), Column("y", "Y", 1))
+    table = Table("t", "t", "t", columns, (Group("", ((Estimate(-0.5, -0.75, 0.25), 1.0), (0.5, 2.0))),), by="")
+    assert to_csv(table).splitlines() == ["x,x_low,x_high,y", "-0.50,-0.75,0.25,1.0", "0.50,,,2.0"]
+    assert to_json(table)["rows"][0]["x"] == {"value": -0.5, "low": -0.75, "high": 0.25}
+    assert r"$-$0.50 ($-$0.75, 0.25)" in to_latex(table)
 
 
 @checks
