@@ -46,7 +46,9 @@ def _differences(a: Any, b: Any, path: str, tolerance: float) -> Iterator[str]:
 def _name(item: Any) -> str | None:
     if not isinstance(item, dict):
         return None
-    return " ".join(json.dumps(item[key], sort_keys=True).strip('"') for key in NAMED_BY if key in item) or None
+    values = [item[key] for key in NAMED_BY if key in item]
+    parts = [part for value in values for part in (value.values() if isinstance(value, dict) else [value])]
+    return " ".join(json.dumps(part).strip('"') for part in parts) or None
 
 
 def _same(a: Any, b: Any, tolerance: float) -> bool:

@@ -72,8 +72,7 @@ def test_the_limits_of_nested_groups_of_both_versions_bound_what_is_free(tmp_pat
     (root / "user/memory.max").write_text("max\n")
     assert group_bytes(proc, root) == 1205
     # In a container the path is that of the host, which is not there; the limit stands at the root
-    proc, root = tmp_path / "proc", tmp_path / "cgroup"
-    proc.mkdir()
+    root = tmp_path / "cgroup1"
     (proc / "cgroup").write_text("3:cpu,cpuacct:/docker/ab\n4:memory:/docker/ab\n")
     group(root / "memory", "5000", 1005, 100, 1)
     assert group_bytes(proc, root) == 4100
