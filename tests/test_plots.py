@@ -181,6 +181,7 @@ def test_large_maps_have_large_cells_and_lone_voxels_far_away_are_cut_off(monkey
     assert cell == 4.0
     assert image.shape == (1, 10)
     assert [table.iz[row] for row in image[0][:3]] == [3, 6, 4]
+    monkeypatch.undo()
     plate = [(x, y, 0) for x in range(40) for y in range(40)]
     image, _ = top_down(at([*plate, (10_000, 0, 0), (0, -10_000, 0)]), (0, 0, 1))
     assert image.shape == (40, 40)

@@ -134,7 +134,7 @@ def test_a_script_without_a_main_guard_is_told_so(root, tmp_path) -> None:
     (tmp_path / "script.py").write_text(
         "from semstab.config import Config\nfrom semstab.engine import LocalProcesses, run_study\n"
         f"config = Config.build({tiny_study.content(root)!r})\n"
-        "run_study(config, 'out', executor=LocalProcesses(2))\n"
+        "run_study(config, 'out', executor=LocalProcesses(1))\n"
     )
     result = subprocess.run([sys.executable, "script.py"], cwd=tmp_path, capture_output=True, text=True, check=False)
     assert "call it under if __name__ == '__main__'" in result.stderr
