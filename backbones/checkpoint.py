@@ -20,7 +20,7 @@ from transformers import AutoImageProcessor, SegformerImageProcessorPil
 
 from semstab.config import Settings
 from semstab.core.files import read_json
-from semstab.errors import ConfigError, DataError, one_line
+from semstab.errors import ConfigError, DataError, summarize_error
 
 if not transformers.is_torch_available():  # else its classes are stand-ins that fail when they are used
     raise ImportError(f"transformers {transformers.__version__} does not work with torch {torch.__version__}")
@@ -208,7 +208,7 @@ def _download(options: ModelOptions) -> Path:
 
 def _first_sentence(error: Exception) -> str:
     """Without the paragraphs of advice that libraries append."""
-    return re.split(r"(?<=[.:;]) |\n", one_line(error), maxsplit=1)[0].rstrip(".:;")
+    return re.split(r"(?<=[.:;]) |\n", summarize_error(error), maxsplit=1)[0].rstrip(".:;")
 
 
 @contextlib.contextmanager

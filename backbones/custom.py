@@ -24,7 +24,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from semstab.backbones import Backbone, Image, Labels, Prediction, content_digest, narrowed
 from semstab.backbones.border import Wrapped
 from semstab.backbones.names import class_names
-from semstab.errors import ConfigError, DataError, MissingDependencyError, one_line
+from semstab.errors import ConfigError, DataError, MissingDependencyError, summarize_error
 from semstab.model.frames import Frame
 from semstab.model.labels import IGNORE_8BIT, IGNORE_16BIT, LabelSpace
 
@@ -109,13 +109,15 @@ def guarded(text: str, do: Callable[[], T]) -> T:
         raise
     except ImportError as error:
         package = f"; install {error.name.partition('.')[0]}" if error.name else ""
-        raise MissingDependencyError(f"{text}: it imports what is not there ({one_line(error)}){package}") from error
+        raise MissingDependencyError(
+            f"{text}: it imports what is not there ({summarize_error(error)}){package}"
+        ) from error
     except (Exception, SystemExit) as error:
         last = traceback.extract_tb(error.__traceback__)[-1]
         at = f"{Path(last.filename).name}:{last.lineno}"
         if isinstance(error, SyntaxError):
             at = f"{Path(error.filename or '').name}:{error.lineno}"
-        raise DataError(f"{text}: {type(error).__name__} at {at}: {one_line(error)}") from error
+        raise DataError(f"{text}: {type(error).__name__} at {at}: {summarize_error(error)}") from error
 
 
 def _of_file(path: Path) -> ModuleType:

@@ -16,7 +16,7 @@ from transformers.models.auto.modeling_auto import MODEL_FOR_SEMANTIC_SEGMENTATI
 from semstab.backbones import Image
 from semstab.backbones.checkpoint import Checkpoint, ModelOptions, SegmenterOptions, bilinear, load_processor
 from semstab.core.files import atomic_path, cache_folder, content_key
-from semstab.errors import ConfigError, DataError, MissingDependencyError, one_line
+from semstab.errors import ConfigError, DataError, MissingDependencyError, summarize_error
 
 logger = logging.getLogger("semstab")
 
@@ -65,7 +65,8 @@ class SemanticHead:
             if "out of memory" in str(error):
                 raise
             raise ConfigError(
-                f"image_size: a '{self._kind}' model cannot see {height}x{width} ({one_line(error)}); give the size"
+                f"image_size: a '{self._kind}' model cannot see {height}x{width} ({summarize_error(error)});"
+                f" give the size"
                 " that it was made for"
             ) from error
 
@@ -262,7 +263,7 @@ class OnnxEngine:
             import onnxruntime
             import onnxscript  # noqa: F401  torch's exporter needs it
         except ImportError as error:
-            raise MissingDependencyError(f"engine onnx cannot be used ({one_line(error)}); {INSTALL}") from error
+            raise MissingDependencyError(f"engine onnx cannot be used ({summarize_error(error)}); {INSTALL}") from error
         self._settings = onnxruntime.SessionOptions()
         self._settings.log_severity_level = 3
         if options.threads is not None:
@@ -321,7 +322,7 @@ def _export(model: torch.nn.Module, example: torch.Tensor) -> bytes:
         assert program is not None
         content: bytes = program.model_proto.SerializeToString()
     except Exception as error:  # the exporter's own; and what protobuf says of more than 2 GB
-        raise DataError(f"the model cannot be exported to ONNX ({one_line(error)}); use engine torch") from error
+        raise DataError(f"the model cannot be exported to ONNX ({summarize_error(error)}); use engine torch") from error
     finally:
         notes.setLevel(level)
     return content

@@ -18,7 +18,7 @@ from semstab.backbones import Backbone, Image, Prediction, Streamed
 from semstab.backbones.border import Wrapped
 from semstab.core.files import MAX_YAML_BYTES, parse_yaml, read_limited
 from semstab.core.types import Float32, Mask
-from semstab.errors import ConfigError, one_line
+from semstab.errors import ConfigError, summarize_error
 from semstab.model.frames import Frame
 from semstab.model.labels import LEFT_OUT, LabelMapping, LabelSpace, ignore_id, name_key
 
@@ -169,7 +169,7 @@ def class_names(classes: Sequence[str] | str) -> Sequence[str] | LabelSpace:
         try:
             text = read_limited(path, MAX_YAML_BYTES).decode("utf-8")
         except (OSError, ValueError) as error:
-            raise ConfigError(f"classes {classes}: cannot be read ({one_line(error)})") from error
+            raise ConfigError(f"classes {classes}: cannot be read ({summarize_error(error)})") from error
         names = [line.strip() for line in text.splitlines()]
     else:
         names = [name.strip() for name in classes.split(",")]

@@ -19,7 +19,7 @@ from semstab.backbones import Backbone, Image, Prediction, content_digest, narro
 from semstab.backbones.names import class_names
 from semstab.config import Settings
 from semstab.core.types import Float32, Int64
-from semstab.errors import ConfigError, DataError, MissingDependencyError, one_line
+from semstab.errors import ConfigError, DataError, MissingDependencyError, summarize_error
 from semstab.model.labels import IGNORE_8BIT, LabelSpace
 
 # What runs a network that lies in a file: ONNX Runtime, or torch for TorchScript and exported programs.
@@ -41,7 +41,7 @@ class OnnxFile:
             import onnxruntime
         except ImportError as error:
             raise MissingDependencyError(
-                f"{path}: needs ONNX Runtime ({one_line(error)}); pip install 'semstab[onnx]'"
+                f"{path}: needs ONNX Runtime ({summarize_error(error)}); pip install 'semstab[onnx]'"
             ) from error
         if device != "cpu":
             raise ConfigError(f"{path}: ONNX files run on the cpu, not on {device}; leave device out")
@@ -52,7 +52,9 @@ class OnnxFile:
         try:
             self._session = onnxruntime.InferenceSession(path, settings, providers=["CPUExecutionProvider"])
         except Exception as error:  # its errors derive from nothing but Exception
-            raise DataError(f"{path}: ONNX Runtime cannot load it ({one_line(error)}); is it an ONNX file?") from error
+            raise DataError(
+                f"{path}: ONNX Runtime cannot load it ({summarize_error(error)}); is it an ONNX file?"
+            ) from error
         (self._input,) = _only(path, [each.name for each in self._session.get_inputs()])
         about = self._session.get_inputs()[0]
         if about.type not in ONNX_TYPES:
@@ -75,7 +77,7 @@ class TorchFile:
             from semstab.backbones.checkpoint import checked_device
         except ImportError as error:
             raise MissingDependencyError(
-                f"{path}: needs torch ({one_line(error)}); pip install 'semstab[segformer]'"
+                f"{path}: needs torch ({summarize_error(error)}); pip install 'semstab[segformer]'"
             ) from error
         self._torch, self._device = torch, checked_device(device)
         if threads is not None:
@@ -90,7 +92,8 @@ class TorchFile:
         except Exception as error:
             raise DataError(
                 f"{path}: torch cannot load it as {'an exported program' if path.suffix == '.pt2' else 'TorchScript'}"
-                f" ({one_line(error)[:80]}); where it holds weights alone, name the code that loads them: FILE.py:CLASS"
+                f" ({summarize_error(error)[:80]}); where it holds weights alone, name the code that loads"
+                f" them: FILE.py:CLASS"
             ) from error
 
     def __call__(self, pixels: Array) -> list[Array]:
@@ -254,7 +257,8 @@ class NetworkFile(Backbone):
             outputs = self._network(pixels)
         except Exception as error:  # whatever the runtime has
             raise DataError(
-                f"{self._path}: cannot see an image of shape {pixels.shape} ({one_line(error)}); mend size, layout"
+                f"{self._path}: cannot see an image of shape {pixels.shape} ({summarize_error(error)});"
+                " mend size, layout"
             ) from error
         if self._options.output >= len(outputs):
             raise ConfigError(f"{self._path}: output: has {len(outputs)} outputs, counted from 0")

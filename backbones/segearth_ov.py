@@ -18,7 +18,7 @@ from semstab.backbones import Backbone, Image, Prediction, content_digest, narro
 from semstab.backbones.checkpoint import Checkpoint, ModelOptions, bilinear
 from semstab.config import Settings, read_yaml, validated
 from semstab.core.types import Float32
-from semstab.errors import ConfigError, DataError, one_line
+from semstab.errors import ConfigError, DataError, summarize_error
 from semstab.model.labels import LabelSpace
 
 # CLIP as a dense feature extractor: its last block lets each patch look at its like (Li et al. 2025, CVPR).
@@ -192,7 +192,8 @@ class SimFeatUp(nn.Module):
             module.load_state_dict({key.removeprefix(PREFIX): value for key, value in weights.items()})
         except Exception as error:  # torch.load raises whatever its unpickler does
             raise DataError(
-                f"{path}: no SimFeatUp weights for {channels} channels ({one_line(error)[:200]}); name the checkpoint"
+                f"{path}: no SimFeatUp weights for {channels} channels ({summarize_error(error)[:200]}); name"
+                f" the checkpoint"
                 " 'jbu_one' that was trained for this CLIP"
             ) from error
         return module.to(device, dtype).eval()

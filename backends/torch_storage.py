@@ -18,7 +18,7 @@ import torch
 from torch.utils.dlpack import from_dlpack
 
 from semstab.core.types import Float64
-from semstab.errors import DataError, one_line
+from semstab.errors import DataError, summarize_error
 from semstab.model.frames import Frame, Intrinsics
 from semstab.model.labels import IGNORE_8BIT, IGNORE_16BIT
 
@@ -189,7 +189,8 @@ class Storage:
         except RuntimeError as error:  # torch.OutOfMemoryError is one; on a CPU it is plain
             device = self.hash.keys.device
             raise DataError(
-                f"{where}: the device {device} has no room for {wanted:,} voxels ({one_line(error)}); use larger voxels"
+                f"{where}: the device {device} has no room for {wanted:,} voxels ({summarize_error(error)});"
+                f" use larger voxels"
             ) from error
 
     def _bytes_to_grow(self, voxels: int) -> int:

@@ -61,7 +61,7 @@ def sanitize(text: str) -> str:
     return line if whole else f"{line[:head]} ... {line[head + 5 - LONGEST_LINE :]}"
 
 
-def one_line(error: BaseException) -> str:
+def summarize_error(error: BaseException) -> str:
     """Return the message of another library's error, in bounds, without line breaks, colours, names of exceptions."""
     text = EXCEPTION_NAMES.sub("", " ".join(TERMINAL_CODES.sub("", str(error)).split())) or "no reason is given"
     return text if len(text) <= LONGEST else f"{text[:LONGEST]}..."

@@ -23,7 +23,7 @@ import numpy.typing as npt
 
 from semstab.config import nearest
 from semstab.core.files import read_limited, write_text
-from semstab.errors import ConfigError, DataError, one_line
+from semstab.errors import ConfigError, DataError, summarize_error
 from semstab.model.frames import Frame, Intrinsics
 from semstab.model.measures import measures
 from semstab.model.voxels import VoxelTable
@@ -64,7 +64,7 @@ def conform(command: str, only: Sequence[str] = (), tolerance: float = TOLERANCE
     try:
         words = shlex.split(command)
     except ValueError as error:
-        raise ConfigError(f"{command}: {one_line(error)}") from error
+        raise ConfigError(f"{command}: {summarize_error(error)}") from error
     if not words:
         raise ConfigError("name the program that fuses a case: semstab-bench conform 'PROGRAM OPTIONS'")
     for folder in folders:
@@ -91,7 +91,7 @@ def _ran(words: Sequence[str], folder: Path, out: Path) -> str:
     except subprocess.TimeoutExpired:
         return f"the program took longer than {SECONDS:g} s"
     except (OSError, ValueError) as error:
-        raise ConfigError(f"{words[0]}: cannot be started ({one_line(error)})") from error
+        raise ConfigError(f"{words[0]}: cannot be started ({summarize_error(error)})") from error
     if done.returncode:
         errors = done.stderr.decode(errors="replace").strip().splitlines()
         return f"the program ended with code {done.returncode}" + (f" ({errors[-1][:200]})" if errors else "")

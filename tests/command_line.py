@@ -1,4 +1,4 @@
-"""The command line: `bench` in this process, or as the installed `semstab-bench` in a process of its own."""
+"""The command line as a test calls it: in this process, or as the installed `semstab-bench` in one of its own."""
 
 from __future__ import annotations
 
@@ -9,13 +9,10 @@ import subprocess
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from types import SimpleNamespace
-from typing import Any
-from unittest import mock
 
 from typer.testing import CliRunner
 
-from semstab.cli import app
+from semstab.cli import _Once, app
 
 COMMAND = str(Path(sys.executable).with_name("semstab-bench"))
 
@@ -34,37 +31,35 @@ def command(words: Sequence[object], report: bool = False, recording: bool = Fal
 
 
 def bench(
-    *words: object,
-    cwd: Path,
-    code: int = 0,
-    columns: int = 160,
-    report: bool = False,
-    recording: bool = False,
-    apart: bool = False,
-    **more: str,
-) -> Any:
-    """Its stdout and stderr, in a terminal of so many columns; it ends with this code.
+    *words: object, cwd: Path, code: int = 0, columns: int = 160, report: bool = False, recording: bool = False,
+    process: bool = False, **more: str,
+) -> subprocess.CompletedProcess[str]:  # fmt: skip
+    """Return what a command in a terminal of so many columns prints; it ends with this code.
 
-    apart  in a process of its own; `more` is of its environment then
+    process   start the installed command: what it imports, its signals, plug-ins; the imports take seconds
+    more      of its environment
     """
-    line, variables = command(words, report, recording), environment(columns, **more)
-    if apart or more:
-        done: Any = subprocess.run(line, cwd=cwd, env=variables, capture_output=True, text=True, check=False)
+    line, known = command(words, report, recording), environment(columns, **more)
+    if process:
+        done = subprocess.run(line, cwd=cwd, env=known, capture_output=True, text=True, check=False)
     else:
-        logger, handler = logging.getLogger("semstab"), logging.lastResort
-        assert handler is not None
-        logger.addHandler(handler)  # as in a process without pytest's own handler
-        try:
-            with contextlib.chdir(cwd), mock.patch.dict(os.environ, variables), mock.patch.object(sys, "argv", line):
-                result = CliRunner().invoke(app, line[1:])
-        finally:
-            logger.removeHandler(handler)
-        if result.exception is not None and not isinstance(result.exception, SystemExit):
-            raise result.exception
-        done = SimpleNamespace(returncode=result.exit_code, stdout=result.stdout, stderr=result.stderr)
+        done = _in_this_process(line, cwd, known)
     assert done.returncode == code, done.stderr
     assert "Traceback" not in done.stderr
     return done
+
+
+def _in_this_process(line: list[str], cwd: Path, known: dict[str, str]) -> subprocess.CompletedProcess[str]:
+    """Call the command as `main` does: warnings go to standard error, each of them once."""
+    logger, handler = logging.getLogger("semstab"), logging._StderrHandler(logging.WARNING)  # as logging.lastResort
+    handler.addFilter(_Once())
+    logger.addHandler(handler)
+    try:
+        with contextlib.chdir(cwd):
+            done = CliRunner().invoke(app, line[1:], env=known, catch_exceptions=False)
+    finally:
+        logger.removeHandler(handler)
+    return subprocess.CompletedProcess(line, done.exit_code, done.stdout, done.stderr)
 
 
 def started(*words: object, cwd: Path, columns: int = 80) -> subprocess.Popen[str]:

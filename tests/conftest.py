@@ -9,11 +9,13 @@ import pytest
 
 import semstab
 from semstab.core.process import configure_process
+from semstab.report.figures import style
 
 pytest.register_assert_rewrite("semstab.testing")
 signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell lets what it starts in the background ignore Ctrl-C
 os.environ["SEMSTAB_CACHE"] = tempfile.mkdtemp(prefix="semstab-cache-")
 atexit.register(shutil.rmtree, os.environ["SEMSTAB_CACHE"], ignore_errors=True)
+style.DPI = 60  # of the 300 that an installed command writes (test_cli): half of a report's time
 configure_process()  # threads that spin would take the time of the other workers' tests
 
 

@@ -20,20 +20,10 @@ def voxels(*groups, r=0.2):
     zeros = np.zeros(total)
     ops = np.repeat(op, n)
     return VoxelTable(
-        zeros,
-        zeros,
-        np.arange(total),
-        op=ops,
-        evidence=np.repeat(np.array(evidence, dtype=float), n, axis=0),
-        drift_sum=np.repeat(drift, n) * (ops - 1),
-        pixels=ops,
-        first_frame=zeros,
-        last_frame=zeros,
-        self_sum=zeros,
-        frame_entropy_sum=zeros,
-        voxel_size=r,
-        classes=CLASSES,
-    )
+        zeros, zeros, np.arange(total), op=ops, evidence=np.repeat(np.array(evidence, dtype=float), n, axis=0),
+        drift_sum=np.repeat(drift, n) * (ops - 1), pixels=ops, first_frame=zeros, last_frame=zeros, self_sum=zeros,
+        frame_entropy_sum=zeros, voxel_size=r, classes=CLASSES,
+    )  # fmt: skip
 
 
 def record(table, sweep=BASE, value=None, repeat=0, scene="s", backbone="m", backend="numpy", **more):

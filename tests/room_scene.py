@@ -95,15 +95,9 @@ class Room(Scene):
     name = "room"
 
     def __init__(
-        self,
-        poses=None,
-        *,
-        told_pose=lambda T: T,
-        told_depth=lambda z: z,
-        camera: Intrinsics = CAMERA,
-        noise: float = 0.0,
-        soft: bool = False,
-    ) -> None:
+        self, poses=None, *, told_pose=lambda T: T, told_depth=lambda z: z, camera: Intrinsics = CAMERA,
+        noise: float = 0.0, soft: bool = False,
+    ) -> None:  # fmt: skip
         self.poses = walk() if poses is None else poses
         self.told_pose, self.told_depth, self.camera, self.noise, self.soft = told_pose, told_depth, camera, noise, soft
         self.backbones, self.ground_truth = ("net",), True
@@ -127,13 +121,9 @@ class Room(Scene):
         labels = np.where(wrong, (seen + 1) % len(CLASSES), seen).astype(np.uint8)
         scores = np.eye(len(CLASSES), dtype=np.float32)[labels] * 0.5 + 0.1 if self.soft else None
         return Frame(
-            index=index,
-            depth=self.told_depth(z).astype(np.float32),
-            intrinsics=self.camera,
-            T_wc=self.told_pose(self.poses[index]),
-            labels=None if self.soft else labels,
-            scores=scores,
-        )
+            index=index, depth=self.told_depth(z).astype(np.float32), intrinsics=self.camera,
+            T_wc=self.told_pose(self.poses[index]), labels=None if self.soft else labels, scores=scores,
+        )  # fmt: skip
 
 
 def write(folder: Path, room: Room | None = None, **settings) -> Path:

@@ -21,13 +21,9 @@ def log_of_evidence(evidence, seen=None, index=None, frames=None, voxel_size=0.2
     voxel, frame = np.nonzero(seen)
     index = np.stack([np.zeros(n), np.zeros(n), np.arange(n)], axis=1) if index is None else index
     return Events(
-        *np.asarray(index).T,
-        voxel=voxel,
-        frame=frame if frames is None else np.asarray(frames)[frame],
-        evidence=evidence[seen],
-        pixels=np.ones(len(voxel)),
-        voxel_size=voxel_size,
-    )
+        *np.asarray(index).T, voxel=voxel, frame=frame if frames is None else np.asarray(frames)[frame],
+        evidence=evidence[seen], pixels=np.ones(len(voxel)), voxel_size=voxel_size,
+    )  # fmt: skip
 
 
 def grid(side):

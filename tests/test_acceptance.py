@@ -70,7 +70,7 @@ def test_labels_that_err_together_count_as_few():
     assert low[0] > low[1]
 
 
-def test_a_file_keeps_it(commit, tmp_path):
+def test_a_file_keeps_it_and_another_kind_of_map_is_refused(commit, tmp_path):
     commit.save(file := tmp_path / "commit.yaml")
     again = semstab.AcceptanceThresholds.load(file)
     assert again == commit
@@ -82,9 +82,6 @@ def test_a_file_keeps_it(commit, tmp_path):
     ):
         file.write_text(bad)
         fails(ConfigError, f"commit.yaml: .*{line}", AcceptanceThresholds.load, file)
-
-
-def test_another_kind_of_map_is_refused(commit):
     table, truth = town(side=8, classes=("road", "car", "house"))
     fails(DataError, "with its taxonomy", commit.decide, table)
     large = VoxelTable(**{**vars(town(side=8)[0]), "voxel_size": 0.5})

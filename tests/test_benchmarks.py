@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import runpy
 import subprocess
 import sys
 from pathlib import Path
@@ -11,20 +12,33 @@ import pytest
 
 BENCHMARKS = Path(__file__).parents[1] / "benchmarks"
 SMALL = {
-    "bench_fusion.py": ["--sizes", "96x54", "--rounds", "1", "--conditions", "noise 0.3 %"],
-    "bench_scaling.py": ["--size", "96x54", "--voxels", "1000", "5000"],
-    "bench_casting.py": ["--size", "96x54", "--triangles", "200", "--rounds", "1"],
-    "bench_end_to_end.py": ["--size", "96x54", "--frames", "3", "--runs", "1", "--noise", "0", "--backend", "numpy",
-                            "--depth", "png"],
-    "bench_gpu.py": ["--device", "CPU:0", "--sizes", "96x54", "--classes", "3", "--voxels", "9000", "--rounds", "2",
-                     "--copied-megabytes", "1", "--cpu-backends", "numba"],
+    "fusion": ("96x54", "--sizes 96x54 --rounds 1 --conditions", "noise 0.3 %"),
+    "scaling": ("96x54", "--size 96x54 --voxels 1000 5000"),
+    "casting": ("96x54", "--size 96x54 --triangles 200 --rounds 1"),
+    "end_to_end": ("96x54", "--size 96x54 --frames 3 --runs 1 --noise 0 --backend numpy --depth png"),
+    "gpu": ("96x54", "--device CPU:0 --sizes 96x54 --classes 3 --voxels 9000 --rounds 2 --copied-megabytes 1 "
+            "--cpu-backends numba"),
+    "statistics": ("all statistics", "--frames 4 --size 64x48 --voxel-size 0.2"),
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("script", SMALL)
-def test_a_benchmark_prints_its_table_and_writes_it(script, tmp_path) -> None:
-    command = [sys.executable, str(BENCHMARKS / script), *SMALL[script], "--json", str(tmp_path / "figures.json")]
-    result = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
-    assert result.returncode == 0, result.stderr
-    assert "96x54" in result.stdout
-    assert json.loads((tmp_path / "figures.json").read_text())
+@pytest.mark.parametrize("name", SMALL)
+def test_a_benchmark_prints_its_table_and_writes_it(name, tmp_path, capsys, monkeypatch) -> None:
+    text, words, *more = SMALL[name]
+    script, file = BENCHMARKS / f"bench_{name}.py", tmp_path / "figures.json"
+    monkeypatch.syspath_prepend(str(BENCHMARKS))
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "argv", [str(script), *words.split(), *more, "--json", str(file)])
+    runpy.run_path(str(script), run_name="__main__")
+    assert text in capsys.readouterr().out
+    assert json.loads(file.read_text())
+
+
+def test_the_benchmark_of_whole_runs_prints_its_tables() -> None:
+    """In a process of its own, as it sets the threads of numba, which can be done but once."""
+    words = ["--frames", "3", "--size", "32x24", "--voxel-size", "0.4", "--runs", "1"]
+    command = [sys.executable, str(BENCHMARKS / "bench_run.py"), *words]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert "as it is" in done.stdout
+    assert "with --statistics" in done.stdout

@@ -70,10 +70,7 @@ def simulated(scene: CityScene, seen: View, **model: Any) -> np.ndarray:
     return Simulation(SimulatedBackbone(**model), 0, "test", scene.name).labels(seen)
 
 
-# The world and its images
-
-
-def test_same_seed_same_frames(small: City) -> None:
+def test_frames_depend_on_the_seed_and_not_on_the_order_of_calls(small) -> None:
     again, other = city(), city(seed=1)
     a, b, c = (d.scene("scene0").frame(1, "sim-flicker") for d in (small, again, other))
     assert np.array_equal(a.depth, b.depth)
@@ -82,9 +79,6 @@ def test_same_seed_same_frames(small: City) -> None:
     assert np.array_equal(a.T_wc, b.T_wc)
     assert (a.depth != c.depth).mean() > 0.5
     assert a.where("labels") == "city/scene0/frame 1, labels"
-
-
-def test_frames_do_not_depend_on_the_order_of_calls(small: City) -> None:
     backwards = city(cache_megabytes=0).scene("scene1")
     forwards = small.scene("scene1")
     expected = [forwards.frame(i, "sim-soft").scores for i in range(3)]
@@ -154,7 +148,7 @@ def test_overlap_and_classes_are_as_in_the_paper(name: str, low: float, high: fl
     assert all(30 < np.median(f.depth) < 80 for f in frames)
 
 
-def test_moving_cars_move_and_buildings_do_not() -> None:
+def test_moving_cars_move_and_a_surface_without_triangles_is_never_hit() -> None:
     traffic = full("scene0").world.traffic
     camera = np.zeros(3)
     before, after = traffic.at(1.0, camera), traffic.at(2.0, camera)
@@ -164,16 +158,18 @@ def test_moving_cars_move_and_buildings_do_not() -> None:
     s1, t1, _ = traffic.cars.plan_points(2.0)
     step = np.hypot(s1 - s0, t1 - t0)
     assert 6 <= np.median(step) <= 13
+    nothing = Caster(Surface.of_class(np.empty((0, 3)), np.empty((0, 3), dtype=np.int64), 0, (0.0, 0.0, 0.0)))
+    face, parameter = nothing.first(np.zeros(3), np.ones((2, 3)))
+    assert (face == -1).all()
+    assert np.isinf(parameter).all()
+    assert not nothing.blocks(np.zeros((2, 3)), np.ones(3)).any()
 
 
-def test_more_frames_sample_the_same_flight() -> None:
+def test_more_frames_sample_the_same_flight_and_a_utm_origin_shifts_the_voxels(small) -> None:
     few, many = (city(frames=n).scene("scene0") for n in (3, 5))
     assert np.array_equal(few.frame(1, GROUND_TRUTH).T_wc, many.frame(2, GROUND_TRUTH).T_wc)
     assert few.frame(2, GROUND_TRUTH).timestamp == many.frame(4, GROUND_TRUTH).timestamp
     assert city(frames=1).scene("scene0").frame(0, GROUND_TRUTH).timestamp == 0.0
-
-
-def test_utm_origin_shifts_the_voxels(small: City) -> None:
     origin = (480_000.0, 5_400_000.0, 120.0)  # whole numbers of voxels and of the backbone's cells
     near, far = small.scene("scene0"), city(origin=origin).scene("scene0")
     a, b = near.frame(1, "sim-flicker"), far.frame(1, "sim-flicker")
@@ -184,7 +180,7 @@ def test_utm_origin_shifts_the_voxels(small: City) -> None:
     assert (a.labels != b.labels).mean() < 1e-3
 
 
-def test_a_large_frame_is_cast_in_bounded_memory() -> None:
+def test_memory_of_large_frames_and_of_the_cache_is_bounded() -> None:
     """12 bytes a pixel stay; what is needed on the way does not grow with the image (a 4K frame peaks at 180 MB)."""
     scene = city(width=960, height=540).scene("scene0")
     scene.still = full("scene0").still
@@ -194,20 +190,13 @@ def test_a_large_frame_is_cast_in_bounded_memory() -> None:
     tracemalloc.stop()
     assert frame.shape == (540, 960)
     assert peak < 120e6
+    scene = city(width=320, height=180, cache_megabytes=1).scene("scene0")
+    for index in range(3):
+        scene.frame(index, GROUND_TRUTH)
+    assert 0 < sum(r.nbytes for r in scene.rendered.values()) <= 1_000_000
 
 
-def test_a_surface_without_triangles_is_never_hit() -> None:
-    nothing = Caster(Surface.of_class(np.empty((0, 3)), np.empty((0, 3), dtype=np.int64), 0, (0.0, 0.0, 0.0)))
-    face, parameter = nothing.first(np.zeros(3), np.ones((2, 3)))
-    assert (face == -1).all()
-    assert np.isinf(parameter).all()
-    assert not nothing.blocks(np.zeros((2, 3)), np.ones(3)).any()
-
-
-# The protocol
-
-
-def test_scenes_and_backbones(small: City) -> None:
+def test_scenes_and_backbones_and_unknown_names(small) -> None:
     assert small.scenes == ("scene0", "scene1", "scene2", "scene3", "scene4")
     scene = small.scene("scene2")
     assert scene.backbones == ("sim-steady", "sim-flicker", "sim-soft")
@@ -217,68 +206,43 @@ def test_scenes_and_backbones(small: City) -> None:
     assert len(scene) == 3
     assert scene.label_space("sim-soft").classes[2] == "road"
     assert small.scene("scene2") is scene
-
-
-def test_digest_tells_contents_apart_without_rendering() -> None:
-    scene = city().scene("scene0")
-    digests = {
-        scene.digest([0, 1], "sim-steady"),
-        scene.digest([0, 2], "sim-steady"),
-        scene.digest([0, 1], "sim-flicker"),
-        scene.digest([0, 1], GROUND_TRUTH),
-        city(seed=1).scene("scene0").digest([0, 1], "sim-steady"),
-        city().scene("scene1").digest([0, 1], "sim-steady"),
-        city(backbones={"sim-steady": {"flicker": 0.5}}).scene("scene0").digest([0, 1], "sim-steady"),
-    }
-    assert len(digests) == 7
-    assert city(cache_megabytes=1).scene("scene0").digest([0, 1], "sim-steady") in digests
-    assert "world" not in vars(scene)
-
-
-def test_the_cache_is_bounded() -> None:
-    scene = city(width=320, height=180, cache_megabytes=1).scene("scene0")
-    for index in range(3):
-        scene.frame(index, GROUND_TRUTH)
-    assert 0 < sum(r.nbytes for r in scene.rendered.values()) <= 1_000_000
-
-
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"width": 4000}, "less than or equal to 3840"),
-        ({"frames": 0}, "greater than or equal to 1"),
-        ({"origin": [float("nan"), 0, 0]}, "finite"),
-        ({"wdith": 10}, "Extra inputs"),
-        ({"backbones": {"mine": {"place": 1.5}}}, "less than or equal to 1"),
-        ({"backbones": {"gt": {}}}, "cannot name a backbone"),
-        ({"backbones": {"a/b": {}}}, "cannot name a backbone"),
-        ({"backbones": {"mine": {"difficulty": {"lorry": 2}}}}, "class 'lorry' is not known"),
-        ({"backbones": {"mine": {"confusion": {"road": {"road": 1}}}}}, "mistaken for itself"),
-        ({"backbones": {"mine": {"confusion": {"road": {"tree": 0}}}}}, "sum to more than 0"),
-    ],
-)
-def test_bad_options(options: dict[str, Any], message: str) -> None:
-    with pytest.raises(ValidationError, match=message):
-        open_dataset("city", options)
-
-
-def test_unknown_names(small: City) -> None:
     with pytest.raises(DataError, match="did you mean 'scene1'"):
         small.scene("scen1")
     with pytest.raises(ConfigError, match="did you mean 'sim-steady'"):
         small.scene("scene0").frame(0, "sim-stedy")
     with pytest.raises(DataError, match="there is no frame 3"):
         small.scene("scene0").frame(3, GROUND_TRUTH)
-
-
-# The error model
-
-
-def test_no_rates_no_errors(small: City) -> None:
     scene = city(backbones={"perfect": {}}).scene("scene0")
     for index in range(3):
         truth = small.scene("scene0").frame(index, GROUND_TRUTH).labels
         assert np.array_equal(scene.frame(index, "perfect").labels, truth)
+
+
+def test_digest_tells_contents_apart_without_rendering() -> None:
+    scene = city().scene("scene0")
+    digests = {
+        scene.digest([0, 1], "sim-steady"), scene.digest([0, 2], "sim-steady"), scene.digest([0, 1], "sim-flicker"),
+        scene.digest([0, 1], GROUND_TRUTH), city(seed=1).scene("scene0").digest([0, 1], "sim-steady"),
+        city().scene("scene1").digest([0, 1], "sim-steady"),
+        city(backbones={"sim-steady": {"flicker": 0.5}}).scene("scene0").digest([0, 1], "sim-steady"),
+    }  # fmt: skip
+    assert len(digests) == 7
+    assert city(cache_megabytes=1).scene("scene0").digest([0, 1], "sim-steady") in digests
+    assert "world" not in vars(scene)
+
+
+@pytest.mark.parametrize(("options", "message"), [
+    ({"width": 4000}, "less than or equal to 3840"), ({"frames": 0}, "greater than or equal to 1"),
+    ({"origin": [float("nan"), 0, 0]}, "finite"), ({"wdith": 10}, "Extra inputs"),
+    ({"backbones": {"mine": {"place": 1.5}}}, "less than or equal to 1"),
+    ({"backbones": {"gt": {}}}, "cannot name a backbone"), ({"backbones": {"a/b": {}}}, "cannot name a backbone"),
+    ({"backbones": {"mine": {"difficulty": {"lorry": 2}}}}, "class 'lorry' is not known"),
+    ({"backbones": {"mine": {"confusion": {"road": {"road": 1}}}}}, "mistaken for itself"),
+    ({"backbones": {"mine": {"confusion": {"road": {"tree": 0}}}}}, "sum to more than 0"),
+])  # fmt: skip
+def test_bad_options(options: dict[str, Any], message: str) -> None:
+    with pytest.raises(ValidationError, match=message):
+        open_dataset("city", options)
 
 
 def test_flicker_follows_its_theory() -> None:
@@ -356,7 +320,7 @@ def test_view_errors_repeat_with_the_view_and_change_with_it() -> None:
     assert kept < 0.8
 
 
-def test_border_errors_stay_at_borders_and_wobble() -> None:
+def test_border_errors_stay_at_borders_and_difficulty_scales_rates() -> None:
     scene = full("scene0")
     view = view_of(scene, 2)
     labels = simulated(scene, view, border=2.0)
@@ -368,9 +332,6 @@ def test_border_errors_stay_at_borders_and_wobble() -> None:
     assert (windows[wrong] == labels[wrong][:, None, None]).any(axis=(1, 2)).all(), "within 2 pixels of their class"
     assert (labels != simulated(scene, view_of(scene, 2, as_frame=3), border=2.0)).any()
     assert np.array_equal(simulated(scene, view, border=0.0), truth)
-
-
-def test_difficulty_scales_the_rates() -> None:
     scene = full("scene0")
     view = view_of(scene, 2)
     wrong = (

@@ -1,4 +1,4 @@
-"""The real command line, in a process of its own: exit codes, one-line errors, what it prints and leaves behind."""
+"""The command line: exit codes, one-line errors, what it prints and leaves behind."""
 
 from __future__ import annotations
 
@@ -22,16 +22,10 @@ def wall(tmp_path):
     return tiny_scene.write(tmp_path / "wall")
 
 
-def test_help_shows_the_options_and_the_commands(tmp_path) -> None:
-    result = bench("--help", cwd=tmp_path)
-    for word in ("--backend", "--voxel-size", "--rerun", "list", "view"):
-        assert word in result.stdout
-
-
-def test_flags_take_no_value(tmp_path) -> None:
-    assert not [
-        command for command in ("", "relabel") if "<bool>" in bench(*command.split(), "--help", cwd=tmp_path).stdout
-    ]
+def test_help_shows_the_options_and_the_commands_and_flags_take_no_value(tmp_path) -> None:
+    text = bench("--help", cwd=tmp_path).stdout
+    assert {"--backend", "--voxel-size", "--rerun", "list", "view"} <= set(text.split())
+    assert "<bool>" not in text + bench("relabel", "--help", cwd=tmp_path).stdout
 
 
 def test_help_imports_nothing_heavy(tmp_path) -> None:
@@ -47,37 +41,35 @@ def test_help_imports_nothing_heavy(tmp_path) -> None:
 
 
 def test_list_names_what_there_is(tmp_path) -> None:
-    result = bench("list", cwd=tmp_path, columns=200, apart=True)
-    for word in ("open3d", "numpy", "city", "posed_folder", "uavid7", "ready"):
-        assert word in result.stdout
-    studies = [line.split() for line in result.stdout.splitlines() if line.split()[:1] == ["study"]]
+    text = bench("list", cwd=tmp_path, columns=200).stdout
+    assert {"open3d", "numpy", "city", "posed_folder", "uavid7", "ready"} <= set(text.split())
+    studies = [line.split() for line in text.splitlines() if line.split()[:1] == ["study"]]
     assert [row[2] for row in studies] == ["city", "remedies", "uavid3d"]
 
 
 def test_a_run_on_a_folder(wall, tmp_path) -> None:
-    result = bench(
-        "--backend", "open3d", "--data", wall, "--voxel-size", "0.25", "--out", "run", cwd=tmp_path, recording=True
-    )
-    for word in (
-        "wall",
-        "no verdict",
-        "checked open3d against numpy on",
-        "semstab-bench view run",
-        "semstab-bench show run",
-    ):
-        assert word in result.stdout
-    for name in ("config.yaml", "manifest.json", "summary.json", "recording.rrd", "voxels/wall__a__open3d.parquet"):
+    arguments = ("--backend", "open3d", "--data", wall, "--backbone", "a", "--voxel-size", "0.25", "--out", "run")
+    text = bench(*arguments, cwd=tmp_path, report=True, recording=True, process=True).stdout
+    for words in (
+        "wall", "no verdict", "checked open3d against numpy on", "semstab-bench view run", "semstab-bench show run",
+        "report  run/report.html",
+    ):  # fmt: skip
+        assert words in text
+    for name in (
+        "config.yaml", "manifest.json", "recording.rrd", "voxels/wall__a__open3d.parquet", "tables/scenes.csv",
+        "tables/persistence.md", "tables/verdicts.tex", "figures/persistence.png",
+    ):  # fmt: skip
         assert (tmp_path / "run" / name).exists()
+    assert cv2.imread(str(tmp_path / "run/figures/persistence.png")).shape[1] in (3.4 * 300, 7 * 300)
+    assert 'id="table-scenes"' in (tmp_path / "run/report.html").read_text()
     runs = json.loads((tmp_path / "run" / "summary.json").read_text())["runs"]
-    assert {(run["backbone"], run["backend"]) for run in runs} == {("a", "open3d"), ("b", "open3d")}
+    assert {(run["backbone"], run["backend"]) for run in runs} == {("a", "open3d")}
 
 
 def test_options_reach_the_run(wall, tmp_path) -> None:
     arguments = ("--backend", "numpy", "--check", "none", "--backbone", "gt", "--frames", ":2", "--pixel-stride", "2")
-    more = (
-        "--set", "strata=[1, 4]", "--set", "voxel_size=0.25", "--rerun", "off", "--out", "run", "--quiet", "--events",
-    )  # fmt: skip
-    result = bench("run", *arguments, *more, "--data", wall, cwd=tmp_path)
+    more = ("--set", "strata=[1, 4]", "--set", "voxel_size=0.25", "--rerun", "off", "--quiet", "--events")
+    result = bench("run", *arguments, *more, "--data", wall, "--out", "run", cwd=tmp_path)
     assert (result.stdout, result.stderr) == ("", "")
     (run,) = json.loads((tmp_path / "run" / "summary.json").read_text())["runs"]
     assert (run["frames"], run["points"], run["backbone"]) == (2, 24, "gt")
@@ -86,59 +78,68 @@ def test_options_reach_the_run(wall, tmp_path) -> None:
     assert (tmp_path / "run" / "events" / "wall__gt__numpy.parquet").exists()
 
 
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (("--data", "nowhere"), "nowhere: there is no such folder"),
-        (("--data", "empty"), "empty"),
-        (("--config", "nowhere.yaml"), "nowhere.yaml: cannot be read"),
-        (("--config", "bad.yaml"), "unknown setting 'voxel_sise'; did you mean 'voxel_size'?"),
-        (("--data", "wall", "--voxel-size", "0"), "voxel_size: input should be greater than"),
-        (("--data", "wall", "--backend", "opn3d"), "did you mean 'open3d'?"),
-        (("--data", "wall", "--backbone", "c"), "no backbone 'c'; known: a, b, gt"),
-        (("--data", "wall", "--frames", "3"), "--frames 3"),
-        (("--data", "wall", "--set", "x"), "write KEY=VALUE"),
-        (("--data", "wall", "--device", "CUDA:7"), "CUDA"),
-        (("--data", "wall", "--backend", "numpy", "--device", "CPU:0"), "none of numpy runs on a device"),
-        (("--data", "wall", "--seed", "1"), "unknown setting 'seed'"),
-        (("--data", "wall", "--out", "wall"), "is not empty and holds no run"),
-        (("view", "wall"), "holds no finished run"),
-    ],
-)
+def test_a_lost_pose_is_left_out_and_said_and_the_default_folder_is_new(wall, tmp_path) -> None:
+    np.savetxt(wall / "pose/0001.txt", np.full((4, 4), np.nan))
+    result = bench("--data", wall, "--backend", "numpy", "--rerun", "off", cwd=tmp_path)
+    assert result.stderr.count("wall: 1 of 3 selected frames have no pose (tracking was lost) and are left out: 1") == 1
+    (folder,) = (tmp_path / "runs").iterdir()
+    assert (folder / "summary.json").exists()
+
+
+@pytest.mark.parametrize(("arguments", "message"), [
+    ("--data nowhere", "nowhere: there is no such folder"), ("--data empty", "empty"),
+    ("--config nowhere.yaml", "nowhere.yaml: cannot be read"),
+    ("--config bad.yaml", "unknown setting 'voxel_sise'; did you mean 'voxel_size'?"),
+    ("--data wall --voxel-size 0", "voxel_size: input should be greater than"),
+    ("--data wall --backend opn3d", "did you mean 'open3d'?"),
+    ("--data wall --backbone c", "no backbone 'c'; known: a, b, gt"), ("--data wall --frames 3", "--frames 3"),
+    ("--data wall --set x", "write KEY=VALUE"), ("--data wall --device CUDA:7", "CUDA"),
+    ("--data wall --backend numpy --device CPU:0", "none of numpy runs on a device"),
+    ("--data wall --seed 1", "unknown setting 'seed'"), ("--data wall --out wall", "is not empty and holds no run"),
+    ("--data wall --report maybe", "--report maybe: write on or off"),
+    ("--data wall --jobs 2 --rerun spawn", "a viewer follows a run in one process; leave out --jobs and"),
+    ("--data wall --jobs 2 --scheduler tcp://x:1", "--jobs and --scheduler: the scheduler's workers do the work"),
+    ("view wall", "holds no finished run"),
+    ("study citi", "study 'citi' is not known; did you mean 'city'?, or name a .yaml file"),
+    ("study nowhere.yaml", "nowhere.yaml: cannot be read"),
+    ("study tiny.yaml --only voxelsize", "study tiny: no part 'voxelsize'; did you mean 'voxel_size'?"),
+    ("study tiny.yaml --set sweeps.voxels=[1]", "unknown setting 'sweeps.voxels'; did you mean 'voxel_size'?"),
+    ("study tiny.yaml --jobs 2 --scheduler tcp://x:1", "--jobs and --scheduler: the scheduler's workers do"),
+    ("study tiny.yaml --out wall", "is not empty and holds no run or study; choose another folder"),
+])  # fmt: skip
 def test_bad_input_is_one_line_and_exit_2(wall, tmp_path, arguments, message) -> None:
     (tmp_path / "empty").mkdir()
     (tmp_path / "bad.yaml").write_text("voxel_sise: 1\n")
-    assert message in error_of(*arguments, cwd=tmp_path)
+    dataset = "dataset: {name: posed_folder, options: {root: wall}}"
+    (tmp_path / "tiny.yaml").write_text(f"name: tiny\n{dataset}\nsweeps: {{voxel_size: [0.5]}}\n")
+    assert message in error_of(*arguments.split(), cwd=tmp_path)
 
 
-def test_a_lost_pose_is_left_out_and_said(wall, tmp_path) -> None:
-    np.savetxt(wall / "pose/0001.txt", np.full((4, 4), np.nan))
-    result = bench("--data", wall, "--backend", "numpy", "--out", "run", cwd=tmp_path, apart=True)
-    assert result.stderr.count("wall: 1 of 3 selected frames have no pose (tracking was lost) and are left out: 1") == 1
+def image(path: str, *shape_and_value: int, dtype: type = np.uint16):
+    """Return what writes an image of one value over a file, or over all of a folder."""
+    *shape, value = shape_and_value
+
+    def write(wall: Path) -> None:
+        for file in sorted((wall / path).iterdir()) if (wall / path).is_dir() else [wall / path]:
+            cv2.imwrite(str(file), np.full(shape, value, dtype))
+
+    return write
 
 
-def png(path: Path, shape: tuple[int, int], value: int, dtype: type = np.uint16) -> None:
-    cv2.imwrite(str(path), np.full(shape, value, dtype))
-
-
-@pytest.mark.parametrize(
-    ("damage", "message"),
-    [
-        (lambda wall: png(wall / "depth/0001.png", (3, 4), 2000), "labels are 8x6 but depth is 4x3"),
-        (
-            lambda wall: np.savetxt(wall / "pose/0001.txt", np.diag([2.0, 2, 2, 1])),
-            "0001.txt: the rotation is not",
-        ),
-        (lambda wall: os.truncate(wall / "depth/0001.png", 40), "depth/0001.png"),
-        (lambda wall: png(wall / "labels/a/0001.png", (6, 8), 77, np.uint8), "labels/a/0001.png: label id 77"),
-        (lambda wall: (wall / "labels/a/0001.png").unlink(), "labels/a/0001"),
-        (lambda wall: [png(path, (6, 8), 0) for path in (wall / "depth").iterdir()], "no pixel of 3 frames is valid"),
-        (lambda wall: (wall / "intrinsics.txt").unlink(), "intrinsics.txt"),
-    ],
-)
+@pytest.mark.parametrize(("damage", "message"), [
+    (image("depth/0001.png", 3, 4, 2000), "labels are 8x6 but depth is 4x3"),
+    (lambda wall: np.savetxt(wall / "pose/0001.txt", np.diag([2.0, 2, 2, 1])),
+     "pose/0001.txt: the rotation is not orthonormal"),
+    (lambda wall: os.truncate(wall / "depth/0001.png", 40), "depth/0001.png"),
+    (image("labels/a/0001.png", 6, 8, 77, dtype=np.uint8), "labels/a/0001.png: label id 77"),
+    (lambda wall: (wall / "labels/a/0001.png").unlink(), "labels/a/0001"),
+    (image("depth", 6, 8, 0), "wall, a: no pixel of 3 frames is valid"),
+    (image("labels/a", 6, 8, 255, dtype=np.uint8), "depth in 100% of the pixels, a label in 0%"),
+    (lambda wall: (wall / "intrinsics.txt").unlink(), "intrinsics.txt"),
+])  # fmt: skip
 def test_damaged_data_is_one_line_that_names_the_file(wall, tmp_path, damage, message) -> None:
     damage(wall)
-    result = bench("--data", wall, "--backend", "numpy", "--out", "run", cwd=tmp_path, code=2)
+    result = bench("--data", wall, "--backend", "numpy", "--rerun", "off", "--out", "run", cwd=tmp_path, code=2)
     lines = [line for line in result.stderr.splitlines() if line.strip()]
     assert all(line.startswith("error: ") for line in lines)  # one for each backbone that it concerns
     assert message in lines[0]
@@ -147,9 +148,9 @@ def test_damaged_data_is_one_line_that_names_the_file(wall, tmp_path, damage, me
 
 def test_disagreement_is_exit_3_after_everything_is_written(wall, tmp_path) -> None:
     """A plug-in's backend that counts every observation twice is found out by the reference."""
-    package = tmp_path / "plugin" / "twice.py"
-    package.parent.mkdir()
-    package.write_text(
+    plugin = tmp_path / "plugin"
+    (plugin / "twice-1.0.dist-info").mkdir(parents=True)
+    (plugin / "twice.py").write_text(
         "import dataclasses\n"
         "from semstab.backends.numpy_reference import NumpyReference\n"
         "class Twice(NumpyReference):\n"
@@ -157,20 +158,18 @@ def test_disagreement_is_exit_3_after_everything_is_written(wall, tmp_path) -> N
         "        table = super().table()\n"
         "        return dataclasses.replace(table, op=table.op * 2)\n"
     )
-    metadata = tmp_path / "plugin" / "twice-1.0.dist-info"
-    metadata.mkdir()
-    (metadata / "METADATA").write_text("Metadata-Version: 2.1\nName: twice\nVersion: 1.0\n")
-    (metadata / "entry_points.txt").write_text("[semstab.backends]\ntwice = twice:Twice\n")
-    arguments = ["--data", "wall", "--backend", "twice", "--rerun", "off", "--out", "run"]
-    paths = os.pathsep.join([str(package.parent), *filter(None, [os.environ.get("PYTHONPATH")])])
-    result = bench(*arguments, cwd=tmp_path, code=3, PYTHONPATH=paths)
+    (plugin / "twice-1.0.dist-info/METADATA").write_text("Metadata-Version: 2.1\nName: twice\nVersion: 1.0\n")
+    (plugin / "twice-1.0.dist-info/entry_points.txt").write_text("[semstab.backends]\ntwice = twice:Twice\n")
+    paths = os.pathsep.join([str(plugin), *filter(None, [os.environ.get("PYTHONPATH")])])
+    words = ("--data", "wall", "--backend", "twice", "--rerun", "off", "--out", "run")
+    result = bench(*words, cwd=tmp_path, code=3, process=True, PYTHONPATH=paths)
     assert "DISAGREE" in result.stdout
     assert "error: the backends disagree" in result.stderr
     assert json.loads((tmp_path / "run" / "summary.json").read_text())["agreement"][0]["agrees"] is False
 
 
 def test_ctrl_c_is_exit_130_and_the_same_command_goes_on(tmp_path) -> None:
-    wall = tiny_scene.write(tmp_path / "wall", backbones=("a", "b"), frames=400)
+    wall = tiny_scene.write(tmp_path / "wall", backbones=("a", "b"), frames=200)
     arguments = ("--data", wall, "--backend", "numpy", "--voxel-size", "0.05", "--rerun", "off", "--out", "run")
     process = started(*arguments, cwd=tmp_path)
     units = tmp_path / "run" / "units"

@@ -73,11 +73,21 @@ def rows(own: Against, of: str = "") -> dict[str, Contrast]:
     return {row.measure: row for row in (*own.contrasts, *own.by_class) if row.of == of}
 
 
-def test_a_run_and_itself_do_not_differ_anywhere(runs):
+def test_a_run_and_itself_do_not_differ_and_numbers_are_those_of_the_runs(runs, fault):
     (own,) = semstab.compare([runs / "old", f"{runs}/new:same"]).overall
     assert {row.difference.value for row in (*own.contrasts, *own.by_class)} == {0.0}
     assert {row.change for row in (*own.contrasts, *own.by_class)} == {""}
     assert all(row.difference.low == row.difference.high == 0 for row in own.contrasts)
+    record = semstab.load_result(runs / "old").record(backbone="net")
+    found = rows(fault.overall[0])
+    judged, right = record.statistics.headline, record.statistics.correctness
+    assert found["psa"].base == pytest.approx(judged.psa.value, abs=1e-9)
+    assert found["alpha"].base == pytest.approx(judged.alpha.value, abs=1e-9)
+    assert found["accuracy"].base == pytest.approx(judged.accuracy.value, abs=1e-9)
+    assert found["reached"].base == pytest.approx(record.statistics.ceiling_share.share.value, abs=1e-9)
+    assert found["compensated_flicker_percent"].base == pytest.approx(record.image_space.compensated_flicker_percent)
+    assert found["wrong_of_stable"].base == pytest.approx(right.quadrants.wrong_of_stable.value, abs=1e-9)
+    assert {"sbd_excess", "miou", "ece", "entropy", "sbd", "margin"} <= found.keys()
 
 
 def test_a_planted_fault_is_found_with_its_class_its_place_and_its_frames(fault):
@@ -93,19 +103,6 @@ def test_a_planted_fault_is_found_with_its_class_its_place_and_its_frames(fault)
     assert {each.frame for area in own.areas for each in area.frames} <= set(FAULTY)
     assert {FAULTY[0], FAULTY[1]} <= {each.frame for each in own.top_frames} <= set(FAULTY)
     assert own.worse > 10 * own.better
-
-
-def test_the_numbers_are_those_of_the_runs_where_all_looks_are_common(runs, fault):
-    record = semstab.load_result(runs / "old").record(backbone="net")
-    found = rows(fault.overall[0])
-    judged, right = record.statistics.headline, record.statistics.correctness
-    assert found["psa"].base == pytest.approx(judged.psa.value, abs=1e-9)
-    assert found["alpha"].base == pytest.approx(judged.alpha.value, abs=1e-9)
-    assert found["accuracy"].base == pytest.approx(judged.accuracy.value, abs=1e-9)
-    assert found["reached"].base == pytest.approx(record.statistics.ceiling_share.share.value, abs=1e-9)
-    assert found["compensated_flicker_percent"].base == pytest.approx(record.image_space.compensated_flicker_percent)
-    assert found["wrong_of_stable"].base == pytest.approx(right.quadrants.wrong_of_stable.value, abs=1e-9)
-    assert {"sbd_excess", "miou", "ece", "entropy", "sbd", "margin"} <= found.keys()
 
 
 def test_what_is_written_comes_back_and_every_file_is_there(runs, fault):
@@ -141,15 +138,12 @@ def test_the_columns_go_along_in_an_export(runs, fault, tmp_path):
         semstab.export(runs / "coarse", tmp_path / "map.csv", measures=["change"], beside=file)
 
 
-def test_of_other_voxel_sizes_only_what_does_not_depend_on_them_is_compared(runs):
+def test_runs_of_other_voxel_sizes_and_frames_of_reference_are_hardly_compared(runs):
     (scene,) = semstab.compare([runs / "old", runs / "coarse"]).scenes
     assert scene.basis == "cubes"
     assert set(rows(scene.against[0])) == {"reached", "compensated_flicker_percent", "accuracy", "miou"}
     assert not scene.against[0].areas
     assert "voxels of 0.125 m and 0.25 m" in scene.notes[0]
-
-
-def test_of_other_frames_of_reference_nothing_is_paired(runs):
     entries = [each.scenes["wall"] for each in open_runs([runs / "old", f"{runs}/new:net"])]
     here = Georeference("PROJCRS", (0.0, 0.0, 0.0))
     moved = dataclasses.replace(here, offset=(100.0, 0.0, 0.0))
@@ -166,13 +160,10 @@ def contrast(value: float, error: float, measure: str = "psa") -> Contrast:
     return Contrast(measure, "", 0.5, 0.5 + value, interval, math.nan, "")
 
 
-def test_over_scenes_each_counts_once():
+def test_contrasts_of_scenes_are_averaged_and_corrected_together():
     (mean,) = over_scenes([[contrast(0.1, 0.1)], [contrast(0.3, 0.1)]])
     assert (mean.base, mean.other, mean.difference.value) == pytest.approx((0.5, 0.7, 0.2))
     assert mean.difference.high == pytest.approx(0.2 + 0.2 / math.sqrt(2))
-
-
-def test_what_is_claimed_is_corrected_for_all_that_is_compared_together():
     ((one, two, three),) = corrected(
         [[contrast(-0.3, 0.1), contrast(0.3, 0.1, "sbd_excess"), contrast(0.2, 0.1, "vss")]]
     )
@@ -193,15 +184,12 @@ def test_a_terminal_of_80_columns_and_markdown_hold_it(fault):
     assert "| Measure | old | The run |" in page
 
 
-def test_the_command_writes_a_folder_and_refuses_bad_input_in_one_line(runs, tmp_path):
+def test_bad_input_is_one_line_and_the_command_writes_markdown(runs, tmp_path):
     done = bench("compare", runs / "old", runs / "old", "--markdown", cwd=tmp_path, columns=80)
     assert done.stdout.startswith("## net (2) against net\n")
     done = bench("compare", runs / "old", runs / "new", cwd=tmp_path, code=2)
     assert done.stderr.count("\n") == 1
     assert "holds several label sources (net, same); name one" in done.stderr
-
-
-def test_bad_input_is_one_line(runs, tmp_path):
     with pytest.raises(ConfigError, match="name two runs or more"):
         semstab.compare([runs / "old"])
     broken = shutil.copytree(runs / "old", tmp_path / "broken")

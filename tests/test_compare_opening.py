@@ -32,7 +32,7 @@ def run(tmp_path_factory):
     return base / "run"
 
 
-def test_a_label_source_is_selected_behind_a_colon(run):
+def test_a_label_source_is_selected_behind_a_colon_and_names_are_the_shortest(run, tmp_path):
     found = open_run(f"{run}:b")
     assert (found.backbone, list(found.scenes), found.source) == ("b", ["wall"], run)
     entry = found.scenes["wall"]
@@ -40,9 +40,6 @@ def test_a_label_source_is_selected_behind_a_colon(run):
     assert value(entry.sums, "psa") == pytest.approx(entry.summary.statistics.agreement.psa.value)
     assert list(entry.flicker) == [1, 2, 3, 4, 5]
     assert np.mean(list(entry.flicker.values())) == pytest.approx(entry.image_space.compensated_flicker_percent)
-
-
-def test_names_are_the_shortest_that_tell_apart(run, tmp_path):
     shutil.copytree(run, tmp_path / "new")
     names = [each.name for each in open_runs([f"{run}:a", f"{run}:b"])]
     assert names == ["a", "b"]
@@ -50,51 +47,36 @@ def test_names_are_the_shortest_that_tell_apart(run, tmp_path):
     three = open_runs([f"{run}:a", f"{tmp_path}/new:a", f"{run}:b"])
     assert [each.name for each in three] == ["run:a", "new:a", "run:b"]
     assert [each.name for each in open_runs([f"{run}:a", f"{run}:a"])] == ["a", "a (2)"]
-
-
-def test_a_path_with_a_colon_is_a_path(run, tmp_path):
     shutil.copytree(run, tmp_path / "a:b")
     assert open_run(f"{tmp_path}/a:b:a").source == tmp_path / "a:b"
 
 
-@pytest.mark.parametrize(
-    ("named", "line"),
-    [
-        ("{run}", "holds several label sources (a, b); name one: {run}:a"),
-        ("{run}:q", "no backbone 'q'; known: a, b"),
-        ("{run}/nothing", "there is no such folder"),
-        ("{run}/units", "summary.json: cannot be read"),
-        ("{run}/config.yaml", "neither a run's folder nor a small summary"),
-    ],
-)
+@pytest.mark.parametrize(("named", "line"), [
+    ("{run}", "holds several label sources (a, b); name one: {run}:a"), ("{run}:q", "no backbone 'q'; known: a, b"),
+    ("{run}/nothing", "there is no such folder"), ("{run}/units", "summary.json: cannot be read"),
+    ("{run}/config.yaml", "neither a run's folder nor a small summary"),
+])  # fmt: skip
 def test_what_cannot_be_opened_is_one_line(run, named, line):
     fails((ConfigError, DataError), re.escape(line.format(run=run)), open_run, named.format(run=run))
 
 
-def test_an_earlier_layout_is_said(run, tmp_path):
+def test_an_earlier_layout_and_runs_of_other_scenes_and_classes_are_refused(run, tmp_path):
     shutil.copytree(run, tmp_path / "old")
     settings = tmp_path / "old/config.yaml"
     settings.write_text(settings.read_text().replace("layout 4", "layout 2"))
     fails(
-        DataError,
-        re.escape("holds results of an earlier version of semstab; run it again"),
-        open_run,
+        DataError, re.escape("holds results of an earlier version of semstab; run it again"), open_run,
         f"{tmp_path}/old:a",
-    )
-
-
-def test_runs_of_other_scenes_and_classes_are_refused(run):
+    )  # fmt: skip
     one = open_run(f"{run}:a")
     other = dataclasses.replace(one, scenes={"street": one.scenes["wall"]})
     fails(DataError, re.escape("have no scene in common (wall; street)"), shared_scenes, [one, other])
     entry = dataclasses.replace(one.scenes["wall"])
     entry.__dict__["sums"] = dataclasses.replace(entry.sums, classes=("floor", *entry.classes[1:]))
     fails(
-        DataError,
-        re.escape(f"class 0 is {one.scenes['wall'].classes[0]} and floor"),
-        shared_scenes,
+        DataError, re.escape(f"class 0 is {one.scenes['wall'].classes[0]} and floor"), shared_scenes,
         [one, dataclasses.replace(one, scenes={"wall": entry})],
-    )
+    )  # fmt: skip
 
 
 def test_a_small_summary_holds_all_but_voxels(run, tmp_path):
@@ -107,11 +89,9 @@ def test_a_small_summary_holds_all_but_voxels(run, tmp_path):
     assert (back.up, back.flicker) == (own.up, own.flicker)
     assert all(value(back.sums, key) == value(own.sums, key) for key in ("psa", "alpha_between", "reached", "vss"))
     fails(
-        DataError,
-        re.escape(f"{file}: is a small summary, without the voxels that mIoU needs"),
-        back.with_voxels,
+        DataError, re.escape(f"{file}: is a small summary, without the voxels that mIoU needs"), back.with_voxels,
         "mIoU",
-    )
+    )  # fmt: skip
 
 
 def test_a_small_summary_becomes_coarser_until_it_fits(run, tmp_path):
@@ -124,6 +104,11 @@ def test_a_small_summary_becomes_coarser_until_it_fits(run, tmp_path):
     assert coarse.edge > fine.edge
     assert value(coarse, "alpha") == pytest.approx(value(fine, "alpha"))
     fails(DataError, re.escape("keep fewer scenes"), save_summary, one, file, 100)
+    sums = open_run(f"{run}:a").scenes["wall"].sums
+    assert sums.cells > 8
+    wide = sums.coarsened(2.0**62, 2**30 if sums.step else 0)
+    assert wide.cells <= 8
+    assert value(wide, "alpha") == pytest.approx(value(sums, "alpha"))
 
 
 def test_a_damaged_small_summary_is_one_line(run, tmp_path):
@@ -142,20 +127,13 @@ def test_a_damaged_small_summary_is_one_line(run, tmp_path):
     fails(DataError, re.escape(f"{file}: unpacks to more than 100 MB"), open_run, file)
 
 
-@pytest.mark.parametrize(
-    ("field", "number", "line"),
-    [
-        ("edge", 0.3, "sums of wall are damaged"),
-        ("edge", 2.0**63, "sums of wall are damaged"),
-        ("step", 2**31, "sums of wall are damaged"),
-        ("step", 3, "sums of wall are damaged"),
-        ("evidence_0", 1e300, "sums of wall are damaged"),
-        ("evidence_0", float("inf"), "sums of wall are damaged"),
-        ("ix", 2**40, "sums of wall are damaged"),
-        ("flicker", 1e308, "percentages of flicker, or the frames"),
-        ("frames", 2**31, "percentages of flicker, or the frames"),
-    ],
-)
+@pytest.mark.parametrize(("field", "number", "line"), [
+    ("edge", 0.3, "sums of wall are damaged"), ("edge", 2.0**63, "sums of wall are damaged"),
+    ("step", 2**31, "sums of wall are damaged"), ("step", 3, "sums of wall are damaged"),
+    ("evidence_0", 1e300, "sums of wall are damaged"), ("evidence_0", float("inf"), "sums of wall are damaged"),
+    ("ix", 2**40, "sums of wall are damaged"), ("flicker", 1e308, "percentages of flicker, or the frames"),
+    ("frames", 2**31, "percentages of flicker, or the frames"),
+])  # fmt: skip
 def test_numbers_that_no_map_has_are_refused_before_they_overflow(run, tmp_path, field, number, line):
     file = tmp_path / "kept.semstab"
     save_summary(open_run(f"{run}:a"), file)
@@ -185,11 +163,3 @@ def test_flicker_out_of_range_in_a_runs_series_is_refused(run, tmp_path):
     values[at] = "1e308"
     series.write_text("\n".join([*rows[:2], ",".join(values), *rows[3:]]))
     fails(DataError, "out of range", lambda: open_run(f"{tmp_path}/run:a").scenes["wall"].flicker)
-
-
-def test_cubes_and_groups_as_large_as_they_may_be(run):
-    sums = open_run(f"{run}:a").scenes["wall"].sums
-    assert sums.cells > 8
-    wide = sums.coarsened(2.0**62, 2**30 if sums.step else 0)
-    assert wide.cells <= 8
-    assert value(wide, "alpha") == pytest.approx(value(sums, "alpha"))

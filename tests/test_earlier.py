@@ -52,7 +52,7 @@ def old_run(tmp_path):
     return out, result
 
 
-def test_a_run_of_version_0_3_is_read_with_a_warning(old_run, caplog):
+def test_a_run_of_version_0_3_is_read_with_a_warning_and_an_older_one_refused(old_run, caplog):
     out, result = old_run
     (old,), (new,) = semstab.load_result(out).records, result.records
     assert "written by version 0.3" in caplog.text
@@ -62,9 +62,6 @@ def test_a_run_of_version_0_3_is_read_with_a_warning(old_run, caplog):
     assert one.verdict.level == other.verdict.level
     assert math.isnan(one.verdict.probability)
     assert one.agreement.voxel_weighted.locations == other.agreement.voxel_weighted.locations
-
-
-def test_an_older_run_is_refused(old_run):
     out, _ = old_run
     settings = out / "config.yaml"
     settings.write_text(settings.read_text().replace("folder layout 3", "folder layout 2"))

@@ -57,18 +57,18 @@ def walls(tmp_path_factory):
     return wall_study(tmp_path_factory.getbasetemp())[0]
 
 
-# --- Recurrent voxels disagree more than the aggregate says -----------------------------------------------------------
-
-
-def test_recurrent_voxels_that_disagree_more():
+def test_recurrent_voxels_that_disagree_more_as_much_and_too_few():
     outcome = more_disagreement(pooled([record(voxels(*seen(3 * N, N, SPLIT)))]))
-    assert outcome.verdict is Answer.SHOWN
-    assert (
-        outcome.numbers
-        == "VSS 0.7500 for OP>=3 against 0.9375 over all voxels: 25.0% of the evidence disagrees, not 6.2%. From OP=2"
+    assert (outcome.verdict, outcome.why) == (Answer.SHOWN, "")
+    assert outcome.numbers == (
+        "VSS 0.7500 for OP>=3 against 0.9375 over all voxels: 25.0% of the evidence disagrees, not 6.2%. From OP=2"
         " to OP>=3 PSA falls by 0.1000 (0.0500 to 0.1500)."
     )
-    assert outcome.why == ""
+    outcome = more_disagreement(pooled([record(voxels((N, 1, SPLIT), (N, 4, SPLIT)))]))
+    assert outcome.verdict is Answer.NOT_SHOWN
+    assert "agree as well" in outcome.why
+    outcome = more_disagreement(pooled([record(voxels(*seen(3 * N, N - 1, SPLIT)))]))
+    assert (outcome.verdict, outcome.why) == (Answer.UNTESTED, "999 voxels have OP>=3; 1,000 are needed.")
 
 
 def test_a_coin_shows_no_disagreement_nor_drift():
@@ -93,29 +93,14 @@ def test_a_tossed_coin_is_told_from_findings():
     assert found.drift_below_null.low <= 0 <= found.drift_below_null.high
 
 
-def test_recurrent_voxels_that_agree_as_well_as_all():
-    outcome = more_disagreement(pooled([record(voxels((N, 1, SPLIT), (N, 4, SPLIT)))]))
-    assert outcome.verdict is Answer.NOT_SHOWN
-    assert "agree as well" in outcome.why
-
-
-def test_too_few_recurrent_voxels_say_nothing():
-    outcome = more_disagreement(pooled([record(voxels(*seen(3 * N, N - 1, SPLIT)))]))
-    assert outcome.verdict is Answer.UNTESTED
-    assert outcome.why == "999 voxels have OP>=3; 1,000 are needed."
-
-
 @pytest.mark.parametrize(("gap", "verdict"), [(1.2, Answer.SHOWN), (0.8, Answer.NOT_SHOWN)])
 def test_a_difference_counts_from_the_last_printed_decimal_on(gap, verdict):
-    evidence = [
-        1 - 2 * gap * VISIBLE_VSS,
-        2 * gap * VISIBLE_VSS,
-        0,
-    ]  # half of the voxels: the aggregate lies in the middle
+    """Half of the voxels recur: the aggregate lies in the middle."""
+    evidence = [1 - 2 * gap * VISIBLE_VSS, 2 * gap * VISIBLE_VSS, 0]
     assert more_disagreement(pooled([record(voxels(*seen(N, N, evidence)))])).verdict is verdict
 
 
-def test_the_first_finding_against_the_voxels_themselves(walls):
+def test_the_findings_of_the_walls_against_their_voxels(walls):
     finding = findings(walls)[0]
     for row in finding.evidence:
         tables = [r.table() for r in walls.select(backbone=row.backbone)]
@@ -124,22 +109,29 @@ def test_the_first_finding_against_the_voxels_themselves(walls):
         assert ("as well as all" in row.outcome.why) == (every - recurrent < VISIBLE_VSS)
         assert f"VSS {recurrent:.4f} for OP>=3 against {every:.4f}" in row.outcome.numbers
     assert [row.backbone for row in finding.evidence] == list(BACKBONES)
-
-
-# --- Mean SBD falls with OP -------------------------------------------------------------------------------------------
+    # Errors anew in every frame: more looks, more disagreement; noise tears apart what meets. It is no finding
+    by_name = {finding.name: finding for finding in findings(walls)}
+    assert by_name["drift"].verdict is not Answer.SHOWN
+    assert any("coin" in row.outcome.why for row in by_name["disagreement"].evidence)
+    assert {row.condition for row in by_name["association"].evidence} == {"voxel size", "depth noise"}
+    assert all(row.outcome.numbers for row in by_name["sampling"].evidence)
 
 
 def drifting(*sbd_by_op):
     return pooled([record(voxels(*((n, op, SURE, sbd) for n, op, sbd in sbd_by_op)))])
 
 
-def test_sbd_that_falls_from_stratum_to_stratum():
+def test_sbd_that_falls_from_stratum_to_stratum_or_rises_once():
     outcome = falling_drift(drifting((N, 1, 0.0), (N, 2, 0.08), (N, 4, 0.05), (N, 9, 0.02)))
     assert outcome.verdict is Answer.SHOWN
     assert outcome.numbers == (
         "SBD 0.0800 at OP=2, 0.0500 at 3<=OP<=5, 0.0200 at OP>5; lower by 0.0100 (0.0050 to 0.0150) than in random"
         " order for OP>=3."
     )
+    outcome = falling_drift(drifting((N, 2, 0.05), (N, 4, 0.06), (N, 9, 0.02)))
+    assert (outcome.verdict, outcome.why) == (Answer.NOT_SHOWN, "No fall from OP=2 to 3<=OP<=5.")
+    assert falling_drift(drifting((N, 2, 0.05), (N - 1, 4, 0.06), (N, 9, 0.02))).verdict is Answer.SHOWN  # too small
+    assert falling_drift(drifting((9 * N, 1, 0.0), (N, 2, 0.05))).verdict is Answer.UNTESTED  # one stratum
 
 
 def test_numbers_below_zero_are_said_the_other_way_round():
@@ -151,43 +143,20 @@ def test_numbers_below_zero_are_said_the_other_way_round():
     assert "; neither lower nor higher (0.0000 to 0.0001) than in random order" in falling_drift(nothing).numbers
 
 
-def test_sbd_that_rises_once_does_not_fall():
-    outcome = falling_drift(drifting((N, 2, 0.05), (N, 4, 0.06), (N, 9, 0.02)))
-    assert outcome.verdict is Answer.NOT_SHOWN
-    assert outcome.why == "No fall from OP=2 to 3<=OP<=5."
-
-
-def test_a_small_stratum_does_not_count():
-    assert falling_drift(drifting((N, 2, 0.05), (N - 1, 4, 0.06), (N, 9, 0.02))).verdict is Answer.SHOWN
-
-
-def test_one_stratum_has_no_trend():
-    assert falling_drift(drifting((9 * N, 1, 0.0), (N, 2, 0.05))).verdict is Answer.UNTESTED
-
-
-# --- Finer voxels and noise -------------------------------------------------------------------------------------------
-
-
-def test_noise_that_lowers_recurrence_and_raises_vss():
+def test_noise_and_finer_voxels_that_lower_recurrence_and_raise_vss():
+    """Where the same places agree as before at each OP, of a coin as well there would be fewer that were seen often."""
     found = [level(0.0, *seen(N, N, SPLIT)), level(0.01, *seen(3 * N, N, CALM))]
     outcome = less_association(describe("depth_noise"), found)
     assert outcome.verdict is Answer.SHOWN
     assert outcome.numbers == "0 → 1 % of depth: VSS 0.8750 → 0.9750; OP>=3 50.00 → 25.00%."
-
-
-def test_what_fewer_looks_alone_make_of_vss_is_not_shown():
-    """The same places agree as before at each OP: of a coin as well there would be fewer that were seen often."""
-    found = [level(0.0, *seen(N, N, SPLIT)), level(0.01, *seen(3 * N, N, SPLIT))]
-    outcome = less_association(describe("depth_noise"), found)
-    assert outcome.verdict is Answer.NOT_SHOWN
-    assert outcome.why == "At 1 % of depth a coin would show it: VSS rises no more than fewer observations make it."
-
-
-def test_finer_voxels_are_compared_with_the_coarsest():
     found = [level(0.1, *seen(3 * N, N, CALM)), level(0.4, *seen(N, N, SPLIT))]
     outcome = less_association(describe("voxel_size"), found)
     assert outcome.verdict is Answer.SHOWN
     assert outcome.numbers.startswith("0.4 → 0.1 m: VSS 0.8750 → 0.9750")
+    found = [level(0.0, *seen(N, N, SPLIT)), level(0.01, *seen(3 * N, N, SPLIT))]
+    outcome = less_association(describe("depth_noise"), found)
+    assert outcome.verdict is Answer.NOT_SHOWN
+    assert outcome.why == "At 1 % of depth a coin would show it: VSS rises no more than fewer observations make it."
 
 
 def test_every_level_has_to_follow():
@@ -199,18 +168,13 @@ def test_every_level_has_to_follow():
     assert "1.0 pixels" in outcome.why
 
 
-def test_noise_needs_an_undisturbed_level():
-    found = [level(0.1, *seen(N, N, SPLIT)), level(0.2, *seen(3 * N, N, SPLIT))]
+@pytest.mark.parametrize("found", [
+    [level(0.1, *seen(N, N, SPLIT)), level(0.2, *seen(3 * N, N, SPLIT))],  # no undisturbed level
+    [level(0.1, *seen(N, N, SPLIT))],
+    [level(0.0, *seen(N, N - 1, SPLIT)), level(0.1, *seen(3 * N, 1, SPLIT))],  # recurrence was never there
+])  # fmt: skip
+def test_noise_without_a_level_to_compare_with_is_untested(found):
     assert less_association(describe("depth_noise"), found).verdict is Answer.UNTESTED
-    assert less_association(describe("depth_noise"), found[:1]).verdict is Answer.UNTESTED
-
-
-def test_recurrence_that_was_never_there_cannot_fall():
-    found = [level(0.0, *seen(N, N - 1, SPLIT)), level(0.1, *seen(3 * N, 1, SPLIT))]
-    assert less_association(describe("depth_noise"), found).verdict is Answer.UNTESTED
-
-
-# --- Denser sampling --------------------------------------------------------------------------------------------------
 
 
 def sampled(fewer, more):
@@ -225,10 +189,16 @@ def test_denser_sampling_that_uncovers_what_was_there():
     )
 
 
-def test_what_more_looks_alone_make_of_vss_is_not_shown():
-    outcome = sampled(seen(9 * N, N, SPLIT), seen(N, N, SPLIT))
-    assert outcome.verdict is Answer.NOT_SHOWN
-    assert outcome.why == "A coin would show it: VSS falls no more than more observations make it."
+@pytest.mark.parametrize(("fewer", "more", "verdict", "why"), [
+    (seen(9 * N, N, SPLIT), seen(N, N, SPLIT), Answer.NOT_SHOWN,
+     "A coin would show it: VSS falls no more than more observations make it."),
+    (seen(N, N, SPLIT), seen(9 * N, N, SPLIT), Answer.NOT_SHOWN, "VSS over all voxels does not fall."),
+    (seen(9 * N, 10, SPLIT), seen(N, N, SPLIT), Answer.UNTESTED, None),
+])  # fmt: skip
+def test_denser_sampling_that_shows_nothing(fewer, more, verdict, why):
+    outcome = sampled(fewer, more)
+    assert outcome.verdict is verdict
+    assert why in (None, outcome.why)
 
 
 @pytest.mark.parametrize(("share", "verdict"), [(0.9, Answer.SHOWN), (1.1, Answer.NOT_SHOWN)])
@@ -243,19 +213,7 @@ def test_recurrent_vss_may_move_by_half_as_much(share, verdict):
     assert outcome.verdict is verdict
 
 
-def test_vss_that_does_not_fall():
-    outcome = sampled(seen(N, N, SPLIT), seen(9 * N, N, SPLIT))
-    assert (outcome.verdict, outcome.why) == (Answer.NOT_SHOWN, "VSS over all voxels does not fall.")
-
-
-def test_levels_without_recurrent_voxels_do_not_count():
-    assert sampled(seen(9 * N, 10, SPLIT), seen(N, N, SPLIT)).verdict is Answer.UNTESTED
-
-
-# --- Together ---------------------------------------------------------------------------------------------------------
-
-
-def test_what_only_pooling_makes_is_not_shown():
+def test_a_finding_is_shown_where_every_backbone_and_not_only_pooling_shows_it():
     """In each scene the recurrent voxels agree better than the others; the scene that disagrees has more of them."""
     clear = record(voxels((9 * N, 1, [9, 1, 0]), (N, 4, SURE)), scene="clear")
     unclear = record(voxels((N, 1, [1, 1, 0]), (9 * N, 4, [3, 2, 0])), scene="unclear")
@@ -264,9 +222,6 @@ def test_what_only_pooling_makes_is_not_shown():
     assert more_disagreement(pooled([clear, unclear])).verdict is Answer.SHOWN
     assert (row.verdict, row.scenes) == (Answer.NOT_SHOWN, (0, 2))
     assert "by themselves only 0 of 2" in row.outcome.why
-
-
-def test_a_finding_is_shown_where_every_backbone_shows_it():
     agreeing = record(voxels((N, 1, SPLIT), (N, 4, SPLIT)), backbone="agreeing")
     disagreeing = record(voxels(*seen(N, N, SPLIT)), backbone="disagreeing")
     untested = record(voxels((N, 1, SPLIT)), backbone="unseen")
@@ -276,23 +231,11 @@ def test_a_finding_is_shown_where_every_backbone_shows_it():
     assert findings(study(untested))[0].verdict is Answer.UNTESTED
 
 
-def test_without_sweeps_two_findings_cannot_be_tested():
+def test_without_sweeps_two_findings_cannot_be_tested_and_repeats_are_averaged():
     found = findings(study(record(voxels(*seen(N, N, SPLIT)))))
     assert [finding.verdict for finding in found[2:]] == [Answer.UNTESTED] * 2
     assert all(row.outcome.why.startswith("The study varies n") for finding in found[2:] for row in finding.evidence)
-
-
-def test_repeats_are_averaged():
     base = [record(voxels(*seen(N, N, SPLIT)), "depth_noise", 0.0)]
     noisy = [record(voxels(*seen(n * N, N, SPLIT)), "depth_noise", 0.01, repeat) for repeat, n in enumerate((3, 1))]
     (row,) = findings(study(record(voxels(*seen(N, N, SPLIT))), *base, *noisy))[2].evidence
     assert "VSS 0.8750 → 0.9062; OP>=3 50.00 → 37.50%" in row.outcome.numbers
-
-
-def test_the_walls_show_no_more_than_a_coin(walls):
-    """Errors anew in every frame: more looks, more disagreement; noise tears apart what meets. It is no finding."""
-    by_name = {finding.name: finding for finding in findings(walls)}
-    assert by_name["drift"].verdict is not Answer.SHOWN
-    assert any("coin" in row.outcome.why for row in by_name["disagreement"].evidence)
-    assert {row.condition for row in by_name["association"].evidence} == {"voxel size", "depth noise"}
-    assert all(row.outcome.numbers for row in by_name["sampling"].evidence)

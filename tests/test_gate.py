@@ -30,69 +30,52 @@ from semstab.statistics.accumulate import cluster_sums_of
 from semstab.statistics.cluster_sums import value
 from semstab.statistics.intervals import difference
 
-# --- Rules ------------------------------------------------------------------------------------------------------------
 
-
-@pytest.mark.parametrize(
-    ("text", "key", "change", "below", "limit", "class_name", "scene"),
-    [
-        ("alpha drop < 0.02", "alpha", "drop", True, 0.02, None, None),
-        ("alpha > 0.8", "alpha", None, False, 0.8, None, None),
-        ("Accuracy drop<1%", "accuracy", "drop", True, 0.01, None, None),
-        ("class human: recall > 0.6", "recall", None, False, 0.6, "human", None),
-        (
-            "scene street 1: class traffic light: IoU drop <= .05",
-            "iou",
-            "drop",
-            True,
-            0.05,
-            "traffic light",
-            "street 1",
-        ),
-        ("flicker rise < 0.5%", "flicker", "rise", True, 0.5, None, None),
-        ("stable-and-wrong rise < 1e-2", "wrong of stable", "rise", True, 0.01, None, None),
-        ("alpha between drop < -0.01", "alpha between", "drop", True, -0.01, None, None),
-    ],
-)
+@pytest.mark.parametrize(("text", "key", "change", "below", "limit", "class_name", "scene"), [
+    ("alpha drop < 0.02", "alpha", "drop", True, 0.02, None, None),
+    ("alpha > 0.8", "alpha", None, False, 0.8, None, None),
+    ("Accuracy drop<1%", "accuracy", "drop", True, 0.01, None, None),
+    ("class human: recall > 0.6", "recall", None, False, 0.6, "human", None),
+    (
+        "scene street 1: class traffic light: IoU drop <= .05", "iou", "drop", True, 0.05, "traffic light",
+        "street 1",
+    ),
+    ("flicker rise < 0.5%", "flicker", "rise", True, 0.5, None, None),
+    ("stable-and-wrong rise < 1e-2", "wrong of stable", "rise", True, 0.01, None, None),
+    ("alpha between drop < -0.01", "alpha between", "drop", True, -0.01, None, None),
+])  # fmt: skip
 def test_a_rule_is_read(text, key, change, below, limit, class_name, scene):
     rule = parse(text)
     found = (rule.measure.name, rule.change, rule.below, rule.limit, rule.class_name, rule.scene)
     assert found == (key, change, below, pytest.approx(limit), class_name, scene)
 
 
-@pytest.mark.parametrize(
-    ("text", "line"),
-    [
-        ("alpha", "write [scene NAME:] [class NAME|*:] MEASURE [drop|rise] <|> NUMBER[%]"),
-        ("alpha drop 0.02", "not understood"),
-        ("alpha < 1e999", "too large"),
-        ("alhpa drop < 0.02", "no measure 'alhpa'; did you mean 'alpha'?"),
-        ("recall > 0.6", "recall is of a class; write 'class NAME: recall > 0.6'"),
-        ("class car: ece < 0.1", "ece is of all classes; leave 'class car:' out"),
-        ("coverage > 0.9", "coverage is relative to a baseline"),
-    ],
-)
+@pytest.mark.parametrize(("text", "line"), [
+    ("alpha", "write [scene NAME:] [class NAME|*:] MEASURE [drop|rise] <|> NUMBER[%]"),
+    ("alpha drop 0.02", "not understood"), ("alpha < 1e999", "too large"),
+    ("alhpa drop < 0.02", "no measure 'alhpa'; did you mean 'alpha'?"),
+    ("recall > 0.6", "recall is of a class; write 'class NAME: recall > 0.6'"),
+    ("class car: ece < 0.1", "ece is of all classes; leave 'class car:' out"),
+    ("coverage > 0.9", "coverage is relative to a baseline"),
+])  # fmt: skip
 def test_a_rule_that_is_none_is_said_in_one_line(text, line):
     fails(ConfigError, re.escape(line), parse, text)
 
 
-@pytest.mark.parametrize(
-    ("text", "low", "high", "expected"),
-    [
-        ("alpha drop < 0.02", -0.01, 0.019, "passes"),
-        ("alpha drop < 0.02", 0.005, 0.015, "passes"),  # a loss is shown, and that it is small
-        ("alpha drop < 0.02", 0.005, 0.03, "fails"),
-        ("alpha drop < 0.02", -0.005, 0.03, "undecided"),
-        ("alpha drop < -0.02", -0.03, -0.01, "undecided"),  # a gain of 0.02 is asked for
-        ("alpha drop < -0.02", -0.01, 0.01, "fails"),
-        ("alpha rise < 0.02", 0.005, 0.03, "undecided"),  # no loss
-        ("ece rise < 0.02", 0.005, 0.03, "fails"),
-        ("alpha > 0.8", 0.81, 0.9, "passes"),
-        ("alpha > 0.8", 0.7, 0.79, "fails"),
-        ("alpha > 0.8", 0.7, 0.9, "undecided"),
-        ("alpha > 0.8", math.nan, 0.9, "undecided"),
-    ],
-)
+@pytest.mark.parametrize(("text", "low", "high", "expected"), [
+    ("alpha drop < 0.02", -0.01, 0.019, "passes"),
+    ("alpha drop < 0.02", 0.005, 0.015, "passes"),  # a loss is shown, and that it is small
+    ("alpha drop < 0.02", 0.005, 0.03, "fails"),
+    ("alpha drop < 0.02", -0.005, 0.03, "undecided"),
+    ("alpha drop < -0.02", -0.03, -0.01, "undecided"),  # a gain of 0.02 is asked for
+    ("alpha drop < -0.02", -0.01, 0.01, "fails"),
+    ("alpha rise < 0.02", 0.005, 0.03, "undecided"),  # no loss
+    ("ece rise < 0.02", 0.005, 0.03, "fails"),
+    ("alpha > 0.8", 0.81, 0.9, "passes"),
+    ("alpha > 0.8", 0.7, 0.79, "fails"),
+    ("alpha > 0.8", 0.7, 0.9, "undecided"),
+    ("alpha > 0.8", math.nan, 0.9, "undecided"),
+])  # fmt: skip
 def test_what_an_interval_says_of_a_rule(text, low, high, expected):
     found = Interval((low + high) / 2, low, high)
     assert judging.verdict(parse(text), found) == expected
@@ -107,9 +90,6 @@ def test_settings_come_from_a_file_and_the_command(tmp_path):
     for content, line in (("rulez: []", "did you mean 'rules'"), ("level: 0.7", "level"), ("- a", "expected settings")):
         file.write_text(content)
         fails(ConfigError, f"gate.yaml: .*{line}", gate_config, file)
-
-
-# --- Judging ----------------------------------------------------------------------------------------------------------
 
 
 def models(frames=20, side=16, seed=0):
@@ -148,24 +128,26 @@ def test_a_planted_fault_fails_itself_passes_and_three_frames_are_undecided():
     assert outcome(sums(labels[:, :3], truth), sums(labels[:, :3], truth)) == "passes"  # the very same
 
 
-def test_a_rule_of_each_class_shares_the_level(run):
+def test_a_rule_of_each_class_shares_the_level_and_voxel_sizes_must_be_the_same(run, tmp_path):
     rules = gate_config(rules=["class *: alpha > 0.1", "class wall: alpha > 0.1"], level=0.06)
     *each, alone = gate(f"{run}:a", None, rules).judgements
     assert [row.rule.text for row in each] == [f"class {name}: alpha > 0.1" for name in ("wall", "door", "window")]
     assert each[0].found.low < alone.found.low
     closer = gate(f"{run}:a", None, gate_config(rules=["class wall: alpha > 0.1"], level=0.02)).judgements[0]
     assert closer.found.low == pytest.approx(each[0].found.low)
+    data = run.parent / "wall"
+    semstab.run(configure(data, check=None, voxel_size=0.4, backbones=["a"]), out=tmp_path / "large", report=False)
+    fails(
+        DataError, "run it with --voxel-size", gate, tmp_path / "large", f"{run}:a", gate_config(rules=["psa drop < 1"])
+    )
 
 
-def test_a_class_that_is_nowhere_has_no_value():
+def test_a_class_that_is_nowhere_has_no_value_and_ends_are_one_sided():
     labels, truth = models()
     log = log_of(labels, K=3, index=grid(16))
     found = judging.bounded(parse("class c: recall > 0.5"), cluster_sums_of(log.table(), log, truth), k=2)
     assert math.isnan(found.value)
     assert judging.verdict(parse("class c: recall > 0.5"), found) == "undecided"
-
-
-def test_ends_are_one_sided_and_of_the_sums_differences():
     (labels, truth), (other, _) = models(), models(seed=1)
     new, base = sums(labels, truth), sums(other, truth)
     for key in ("alpha", "look_accuracy"):
@@ -181,9 +163,6 @@ def test_simulated_pairs_without_a_difference_seldom_fail_and_a_loss_of_the_marg
     assert 0.03 < margin < 0.12
     assert fails_ <= 0.12
     assert passes <= 0.16
-
-
-# --- The command ------------------------------------------------------------------------------------------------------
 
 
 def cli(*words):
@@ -221,21 +200,18 @@ def test_the_command_says_what_came_of_each_rule(run, tmp_path):
     assert [row["verdict"] for row in content["rules"]] == ["passes", "passes", "fails"]
 
 
-@pytest.mark.parametrize(
-    ("arguments", "line"),
-    [
-        (["--rule", "alpha drop < 0.02"], "a drop is from a baseline; give --against RUN"),
-        (["--rule", "class q: alpha > 0.1"], "no class 'q'"),
-        (["--rule", "scene q: alpha > 0.1"], "no scene 'q'; known: wall"),
-        (["--rule", "flicker < 99", "--scope", "other-scenes"], "flicker is known by frame alone"),
-        (["--rule", "alpha > 0.1", "--scope", "some"], "scope"),
-        (["--rule", "class door: recall > 0.1"], "has no recall of wall; run it with --statistics"),
-        (["--rule", "accuracy > 0.1"], "has no accuracy of wall; run it with --statistics"),
-        (["--rule", "sbd excess < 0.1", "--out", "x.txt"], "format '.txt' is not known"),
-        (["--rule", "alpha > 0.1", "--undecided", "maybe"], "undecided"),
-        (["--rule", "alpha > 0.1", "--against", "nowhere"], "there is no such folder"),
-    ],
-)
+@pytest.mark.parametrize(("arguments", "line"), [
+    (["--rule", "alpha drop < 0.02"], "a drop is from a baseline; give --against RUN"),
+    (["--rule", "class q: alpha > 0.1"], "no class 'q'"),
+    (["--rule", "scene q: alpha > 0.1"], "no scene 'q'; known: wall"),
+    (["--rule", "flicker < 99", "--scope", "other-scenes"], "flicker is known by frame alone"),
+    (["--rule", "alpha > 0.1", "--scope", "some"], "scope"),
+    (["--rule", "class door: recall > 0.1"], "has no recall of wall; run it with --statistics"),
+    (["--rule", "accuracy > 0.1"], "has no accuracy of wall; run it with --statistics"),
+    (["--rule", "sbd excess < 0.1", "--out", "x.txt"], "format '.txt' is not known"),
+    (["--rule", "alpha > 0.1", "--undecided", "maybe"], "undecided"),
+    (["--rule", "alpha > 0.1", "--against", "nowhere"], "there is no such folder"),
+])  # fmt: skip
 def test_bad_input_is_one_line_and_exit_code_2(run, arguments, line):
     done = cli("gate", f"{run}:a", *arguments)
     assert done.exit_code == 2
@@ -281,11 +257,3 @@ def test_the_documented_workflow_is_yaml():
     assert any("semstab-bench gate" in str(yaml.safe_load(block)) for block in blocks)
     for rule in re.findall(r"--rule '([^']+)'", text):
         parse(rule)
-
-
-def test_runs_of_other_voxel_sizes_are_not_compared(run, tmp_path):
-    data = run.parent / "wall"
-    semstab.run(configure(data, check=None, voxel_size=0.4, backbones=["a"]), out=tmp_path / "large", report=False)
-    fails(
-        DataError, "run it with --voxel-size", gate, tmp_path / "large", f"{run}:a", gate_config(rules=["psa drop < 1"])
-    )

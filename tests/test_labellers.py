@@ -16,16 +16,14 @@ NAMES = [f"trick-{name}" for name in LABELLERS]
 @pytest.fixture(scope="module")
 def result(tmp_path_factory):
     """The labellers over a small city, without ground truth."""
-    options = {"frames": 10, "width": 192, "height": 108}
-    config = semstab.load_config(
-        overrides={
-            "dataset": {"name": "city", "options": options}, "scenes": ["scene0"], "check": None,
-            "backbones": ["sim-steady", *NAMES], "voxel_size": 0.4,
-        }
-    )  # fmt: skip
-    out = tmp_path_factory.mktemp("labellers") / "run"
-    semstab.run(config, out=out, report=False)
-    return semstab.load_result(out)
+    return labelled(tmp_path_factory.mktemp("labellers"), ["sim-steady", *NAMES])
+
+
+def labelled(folder, backbones, **settings):
+    city = {"name": "city", "options": {"frames": 10, "width": 192, "height": 108}}
+    fixed = {"dataset": city, "scenes": ["scene0"], "check": None, "voxel_size": 0.4, "backends": ["numba"]}
+    semstab.run(semstab.load_config(overrides={**fixed, "backbones": backbones, **settings}), out=folder, report=False)
+    return semstab.load_result(folder)
 
 
 def of(result, name):
@@ -59,15 +57,8 @@ def test_the_limits_of_a_verdict_are_settings(result, tmp_path):
     assert VerdictSettings().model_dump() == {
         "stable": 0.8, "usable": pytest.approx(2 / 3), "labelled": 0.9, "class_locations": 100.0,
     }  # fmt: skip
-    asked = {"stable": 0.99, "class_locations": 1e9}
-    config = semstab.load_config(
-        overrides={
-            "dataset": {"name": "city", "options": {"frames": 10, "width": 192, "height": 108}}, "scenes": ["scene0"],
-            "check": None, "backbones": ["sim-steady"], "voxel_size": 0.4, "verdict": asked,
-        }
-    )  # fmt: skip
-    semstab.run(config, out=tmp_path / "run", report=False)
-    found = of(semstab.load_result(tmp_path / "run"), "sim-steady")
+    verdict = {"stable": 0.99, "class_locations": 1e9}
+    found = of(labelled(tmp_path / "run", ["sim-steady"], verdict=verdict), "sim-steady")
     assert found.verdict.level == "usable"
     assert np.isfinite(of(result, "sim-steady").ceiling_share.judged_classes[0].unstable)
     assert not found.ceiling_share.judged_classes

@@ -25,12 +25,15 @@ def run(tmp_path_factory):
     return semstab.load(folder / "run")
 
 
-def test_the_summary_has_a_row_a_unit(run):
+def test_the_summary_has_a_row_a_unit_and_a_unit_series_and_events(run):
     assert list(run.summary["backbone"]) == ["a", "b"]
     for (_, row), summary in zip(run.summary.iterrows(), run.result.runs, strict=True):
         assert row["vss"] == summary.table.means.value["vss"]
         assert row["recurrent_entropy"] == summary.table.recurrent.means.value["entropy"]
         assert row["voxels"] == summary.table.voxels
+    assert list(run.series(backbone="b")["frame"]) == [0, 1, 2]
+    assert len(run.events(backbone="b")) == run.table(backbone="b").op.sum()
+    fails(ConfigError, "2 units fit", run.table)
 
 
 def test_a_table_has_every_voxel_and_its_classes_by_name(run):
@@ -46,12 +49,6 @@ def test_a_table_has_every_voxel_and_its_classes_by_name(run):
     assert "evidence_0" in dataclasses.replace(table, classes=()).to_arrow().column_names
 
 
-def test_series_and_events_of_a_unit(run):
-    assert list(run.series(backbone="b")["frame"]) == [0, 1, 2]
-    assert len(run.events(backbone="b")) == run.table(backbone="b").op.sum()
-    fails(ConfigError, "2 units fit", run.table)
-
-
 def test_what_a_notebook_shows(run):
     shown = run._repr_html_()
     assert "<td>scene</td><td>a</td><td>numpy</td>" in shown
@@ -60,9 +57,6 @@ def test_what_a_notebook_shows(run):
     table = run.table(backbone="a")
     assert f"{len(table)} voxels of 0.25 m, 3 classes" in table._repr_html_()
     assert f"<td>all</td><td>{len(table)}</td><td>{vss(table).mean():.3f}</td>" in table._repr_html_()
-
-
-def test_names_are_shown_as_they_are():
     shown = study(record(voxels((1, 1, [1, 0, 0])), scene="<b>&"))._repr_html_()
     assert "&lt;b&gt;&amp;" in shown
     assert "<td>-</td>" in shown  # SBD of a voxel seen once

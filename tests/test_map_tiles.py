@@ -94,22 +94,16 @@ def test_soft_scores_are_rounded_as_in_the_whole_map(name) -> None:
     assert_same_bits(part.table(), whole.rows(tile.holds(whole.index.T)))
 
 
-def test_a_frame_that_reaches_far_is_restricted_too() -> None:
+def test_a_backend_is_restricted_far_away_and_not_where_it_looks_pixels_up() -> None:
     """Beyond 2^15 voxels from the camera pixels become voxels by another loop."""
     far = [sight_line(t, [(0.5, 1), (20000.5, 2), (20001.5, 0)], along="x") for t in range(2)]
     whole, part = fused("numba", far), fused("numba", far, Extent((50000, 0), (50003, 4)))
     assert 0 < len(part) < len(whole)
     assert_same_bits(part, whole.rows(Extent((50000, 0), (50003, 4)).holds(whole.index.T)))
-
-
-def test_a_backend_that_looks_pixels_up_cannot_be_restricted() -> None:
     with pytest.raises(ConfigError, match="open3d-projective' does not associate pixel by pixel"):
         fused("open3d-projective", [], Extent((0, 0), (1, 1)))
     with pytest.raises(ConfigError, match="'numba' has no option 'within'"):
         fused("numba", [], "all")
-
-
-# --- Runs -------------------------------------------------------------------------------------------------------------
 
 
 class Counting(InProcess):
@@ -437,11 +431,7 @@ def test_parts_of_other_tiles_are_not_taken_for_those_of_these(wall, both, tmp_p
 def test_a_unit_in_tiles_takes_the_place_of_a_whole_one_and_back(wall, tmp_path) -> None:
     """No file of the other form stays."""
     voxels = tmp_path / "run" / "voxels"
-    for size, there in (
-        (None, "wall__a__numba.parquet"),
-        (8, "wall__a__numba"),
-        (None, "wall__a__numba.parquet"),
-    ):
+    for size, there in ((None, "wall__a__numba.parquet"), (8, "wall__a__numba"), (None, "wall__a__numba.parquet")):
         (tmp_path / "run" / "units").mkdir(parents=True, exist_ok=True)
         for unit in (tmp_path / "run" / "units").iterdir():
             unit.unlink()
@@ -468,19 +458,13 @@ def test_tiles_of_two_maps_are_no_table(both, tmp_path) -> None:
         VoxelTable.load(tmp_path)
 
 
-@pytest.mark.parametrize(
-    ("settings", "message"),
-    [
-        ({"tile_size": 12}, r"tile_size: use a power of 2 from 8, or off"),
-        ({"tile_size": 8, "backends": ["open3d-projective"]}, r"tile_size = 8: backend 'open3d-projective' cannot"),
-    ],
-)
+@pytest.mark.parametrize(("settings", "message"), [
+    ({"tile_size": 12}, r"tile_size: use a power of 2 from 8, or off"),
+    ({"tile_size": 8, "backends": ["open3d-projective"]}, r"tile_size = 8: backend 'open3d-projective' cannot"),
+])  # fmt: skip
 def test_what_cannot_be_tiled_is_refused_in_one_line(settings, message, wall) -> None:
     with pytest.raises(ConfigError, match=message):
         semstab.engine.run(configure(wall, **{"backends": ["numba"], "check": None, **settings}))
-
-
-# --- Which frames see which tiles -------------------------------------------------------------------------------------
 
 
 @hypothesis_settings(max_examples=20, deadline=None)
@@ -500,7 +484,7 @@ def test_no_pixel_falls_into_a_tile_that_its_frustum_does_not_meet(seed, size, v
     assert {tuple(own) for own in (backend.table().index[:, :2] // size).tolist()} <= met
 
 
-def test_a_frustum_meets_few_tiles_that_no_pixel_falls_into() -> None:
+def test_a_frustum_meets_few_tiles_and_too_many_are_told_with_the_file() -> None:
     """Straight down from 60 voxels above, onto ground 40 by 30 voxels wide; not the box around an oblique view."""
     down = np.array([[1.0, 0, 0, 4], [0, -1, 0, 4], [0, 0, -1, 60], [0, 0, 0, 1]])
     depth, labels = np.full((30, 40), 60.0, np.float32), np.zeros((30, 40), np.uint8)
@@ -511,9 +495,6 @@ def test_a_frustum_meets_few_tiles_that_no_pixel_falls_into() -> None:
     far = dataclasses.replace(frame, T_wc=turned, depth=depth + np.linspace(0, 400, 30, dtype=np.float32)[:, None])
     met = tiles_met(far, 1.0, 8)
     assert len(met) < 0.6 * np.prod(np.ptp(met, axis=0) + 1)
-
-
-def test_depth_that_meets_too_many_tiles_is_told_with_its_file() -> None:
     depth = np.full((4, 4), 1e6, np.float32)
     frame = Frame(0, depth, Intrinsics(2, 2, 2, 2), np.eye(4), labels=np.zeros((4, 4), np.uint8))
     with pytest.raises(DataError, match=r"frame 0, depth: up to 1e\+06 m deep, it sees .* tiles of 0.8 m"):

@@ -9,7 +9,6 @@ import json
 import numpy as np
 import pytest
 import tiny_scene
-import tiny_study
 import yaml
 from command_line import bench
 from compare_summaries import differences
@@ -18,11 +17,11 @@ from test_recording import read
 
 import semstab
 from semstab.config import BACKENDS
-from semstab.engine import LocalProcesses, load_result, streams
+from semstab.engine import load_result, streams
 from semstab.engine.units import make_plan
 from semstab.metrics import compare, compensated_flicker
 from semstab.recording import Recording, Target, lacks_pictures, record_finished
-from semstab.settings import load_config, load_study
+from semstab.settings import load_config
 from semstab.task import read as read_frame
 
 TIMES = {"decode_ms", "wait_ms", "fuse_ms", "association_ms", "update_ms"}
@@ -59,47 +58,30 @@ def same(one, other):
 
 
 def test_a_run_equals_the_study_without_sweeps_voxel_for_voxel(root, tmp_path) -> None:
-    content = settings(root, statistics=True)
     file = tmp_path / "wall.yaml"
-    file.write_text(yaml.safe_dump(content))
+    file.write_text(yaml.safe_dump(settings(root, statistics=True)))
     bench("--config", file, "--rerun", "off", "--out", "run", "-q", cwd=tmp_path)
     bench("study", file, "--out", "study", "-q", cwd=tmp_path)
     same(tmp_path / "run", tmp_path / "study")
-
-
-def test_every_folder_has_tables_figures_and_a_report_unless_told_otherwise(root, tmp_path) -> None:
-    data = ("--data", root, "--voxel-size", "0.25", "--check", "none", "--rerun", "off")
-    out = bench(*data, "--out", "run", cwd=tmp_path, report=True).stdout
-    run = tmp_path / "run"
-    assert "report  run/report.html" in out
-    assert {"scenes.csv", "persistence.md", "verdicts.tex"} <= {file.name for file in (run / "tables").iterdir()}
-    assert {"persistence.png"} <= {file.name for file in (run / "figures").iterdir()}
-    assert 'id="table-scenes"' in (run / "report.html").read_text()
-    out = bench(*data, "--out", "bare", "--report", "off", cwd=tmp_path).stdout
-    assert "report" not in out
-    assert {path.name for path in (tmp_path / "bare").iterdir()} == {
-        "config.yaml", "manifest.json", "summary.json", "units", "voxels", "frames", "influence", "looks", "overview"
+    assert {path.name for path in (tmp_path / "run").iterdir()} == {
+        "config.yaml", "manifest.json", "summary.json", "units", "voxels", "frames", "influence", "looks", "overview",
+        "truth",
     }  # fmt: skip
-    refused = bench(*data, "--report", "maybe", cwd=tmp_path, code=2)
-    assert refused.stderr == "error: --report maybe: write on or off\n"
 
 
 def test_a_run_in_several_processes_is_the_same_run(root, tmp_path) -> None:
-    config = load_config(overrides=settings(root))
-    semstab.engine.run(config, out=tmp_path / "one")
-    result = semstab.engine.run(config, out=tmp_path / "two", executor=LocalProcesses(2))
-    assert result.manifest["units"]["executor"] == "2 local processes"
-    same(tmp_path / "one", tmp_path / "two")
-
-
-def test_the_command_takes_jobs_and_says_what_does_not_go_together(root, tmp_path) -> None:
-    data = ("--data", root, "--voxel-size", "0.25", "--check", "none", "--report", "off")
-    bench(*data, "--jobs", "2", "--out", "run", "-q", cwd=tmp_path, recording=True)
-    assert (tmp_path / "run/recording.rrd").exists()
-    refused = bench(*data, "--jobs", "2", "--rerun", "spawn", "--out", "live", cwd=tmp_path, code=2)
-    assert "a viewer follows a run in one process; leave out --jobs and --scheduler" in refused.stderr
-    refused = bench(*data, "--jobs", "2", "--scheduler", "tcp://x:1", cwd=tmp_path, code=2)
-    assert "--jobs and --scheduler: the scheduler's workers do the work" in refused.stderr
+    """Its recording has the same series and maps; the images are added from the finished folder."""
+    one, two = tmp_path / "one", tmp_path / "two"
+    recording = Recording(Target(one / "recording.rrd"))
+    semstab.engine.run(load_config(overrides=settings(root)), out=one, observers=[recording])
+    file = tmp_path / "wall.yaml"
+    file.write_text(yaml.safe_dump(settings(root)))
+    bench("--config", file, "--jobs", "2", "--out", "two", "-q", cwd=tmp_path, recording=True)
+    assert load_result(two).manifest["units"]["executor"] == "2 local processes"
+    same(one, two)
+    assert [lacks_pictures(out, out / "recording.rrd") for out in (one, two)] == [False, True]
+    record_finished(two, two / "recording.rrd")
+    assert set(read(one / "recording.rrd")) == set(read(two / "recording.rrd"))
 
 
 def test_a_study_writes_frame_series_and_where_asked_a_recording_of_its_base_units(root, tmp_path) -> None:
@@ -121,21 +103,6 @@ def test_a_study_writes_frame_series_and_where_asked_a_recording_of_its_base_uni
     assert [record.unit.backend for record in result.select(BACKENDS)] == ["numpy", "numpy"]
 
 
-def test_a_recording_of_several_processes_has_the_series_and_maps_of_the_folder(root, tmp_path) -> None:
-    config = load_config(overrides=settings(root))
-    found = []
-    for name, executor in (("one", None), ("two", LocalProcesses(2))):
-        out = tmp_path / name
-        recording = Recording(Target(out / "recording.rrd"))
-        semstab.engine.run(config, out=out, executor=executor, observers=[recording])
-        assert lacks_pictures(out, out / "recording.rrd") == (name == "two")
-        if name == "two":
-            record_finished(out, out / "recording.rrd")
-        found.append(set(read(out / "recording.rrd")))
-    one, two = found
-    assert one == two
-
-
 def test_a_kept_unit_that_gained_a_measure_is_computed_again(root, tmp_path) -> None:
     """What a unit has is part of its key."""
     from semstab.model.measures import Measure, registered
@@ -149,13 +116,6 @@ def test_a_kept_unit_that_gained_a_measure_is_computed_again(root, tmp_path) -> 
             "units": 2, "kept": 0, "computed": 2, "failed": 0, "executor": "in this process"
         }  # fmt: skip
         assert result.runs[0].table[ones] == 1.0
-
-
-def test_a_study_file_says_what_it_is_a_run_of(tmp_path) -> None:
-    file = tmp_path / "mine.yaml"
-    file.write_text(yaml.safe_dump({"sweeps": {"pixel_stride": [2]}, "scenes": ["scene0"]}))
-    assert load_study(file).model_copy(update={"name": "run", "check": "numpy"}) == load_config(file)
-    assert tiny_study.configure(tmp_path).check is None
 
 
 def test_a_backend_of_ones_own_that_breaks_leaves_its_trace(root, tmp_path, monkeypatch) -> None:

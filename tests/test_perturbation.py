@@ -75,6 +75,9 @@ def test_rotation_noise_turns_the_camera_about_itself() -> None:
     np.testing.assert_array_equal(far.T_wc[:3, 3], frame().T_wc[:3, 3])  # though the world's origin is 5000 km away
     assert 0 < angle(turned(3, rotation_noise=1.0)) < 10
     np.testing.assert_array_equal(far.depth, frame().depth)
+    noise = {name: 0.1 for name in Perturbation.model_fields if name != "seed"}
+    T = disturbed(50, **noise).T_wc
+    np.testing.assert_allclose(T[:3, :3].T @ T[:3, :3], np.eye(3), atol=1e-12)
 
 
 def test_drift_is_a_random_walk_from_the_first_frame_on() -> None:
@@ -89,17 +92,8 @@ def test_drift_is_a_random_walk_from_the_first_frame_on() -> None:
     np.testing.assert_allclose(steps.std(axis=0), 0.02, rtol=0.1)
     turns = [angle(turned(100, rotation_drift=0.02, seed=seed)) ** 2 for seed in range(300)]
     assert np.mean(turns) == pytest.approx(3 * 0.02**2 * 100, rel=0.15)
-
-
-def test_a_drifting_rotation_changes_by_single_steps() -> None:
     steps = [angle(turned(i, rotation_drift=0.1).T @ turned(i + 1, rotation_drift=0.1)) ** 2 for i in range(500)]
     assert np.mean(steps) == pytest.approx(3 * 0.1**2, rel=0.15)
-
-
-def test_all_noise_together_is_still_a_frame() -> None:
-    noise = {name: 0.1 for name in Perturbation.model_fields if name != "seed"}
-    T = disturbed(50, **noise).T_wc
-    np.testing.assert_allclose(T[:3, :3].T @ T[:3, :3], np.eye(3), atol=1e-12)
 
 
 @pytest.mark.parametrize("noise", ["depth_noise", "translation_noise", "rotation_noise", "translation_drift"])
@@ -115,18 +109,6 @@ def test_the_strength_scales_the_same_random_numbers(noise) -> None:
         np.testing.assert_allclose(two.T_wc - base, 2 * (one.T_wc - base), atol=1e-8)
 
 
-def test_one_kind_of_noise_leaves_the_random_numbers_of_the_others_alone() -> None:
-    alone, together = disturbed(2, depth_noise=0.01), disturbed(2, depth_noise=0.01, translation_drift=0.1)
-    np.testing.assert_array_equal(alone.depth, together.depth)
-
-
-def test_seed_scene_and_frame_choose_the_noise() -> None:
-    first = disturbed(1, depth_noise=0.01).depth
-    np.testing.assert_array_equal(first, disturbed(1, depth_noise=0.01).depth)
-    for other in ({"seed": 1}, {"scene": "t"}, {"index": 2}):
-        assert (disturbed(**{"index": 1, "depth_noise": 0.01, **other}).depth != first).mean() > 0.9
-
-
 @pytest.mark.parametrize("value", [0.0, -1.0, np.nan, np.inf, -np.inf])
 def test_invalid_depth_stays_invalid(value) -> None:
     """Also where noise this large would turn the sign of a negative depth."""
@@ -135,10 +117,16 @@ def test_invalid_depth_stays_invalid(value) -> None:
     assert not noisy.valid.any()
 
 
-def test_depth_that_falls_below_zero_is_invalid() -> None:
+def test_noise_of_a_frame_is_drawn_anew_and_depth_below_zero_is_invalid() -> None:
     noisy = disturbed(depth_noise=1.0)  # one number in six lies below -1
     assert (noisy.depth <= 0).mean() == pytest.approx(0.1587, abs=0.02)
     np.testing.assert_array_equal(noisy.valid, noisy.depth > 0)
+    alone, together = disturbed(2, depth_noise=0.01), disturbed(2, depth_noise=0.01, translation_drift=0.1)
+    np.testing.assert_array_equal(alone.depth, together.depth)
+    first = disturbed(1, depth_noise=0.01).depth
+    np.testing.assert_array_equal(first, disturbed(1, depth_noise=0.01).depth)
+    for other in ({"seed": 1}, {"scene": "t"}, {"index": 2}):
+        assert (disturbed(**{"index": 1, "depth_noise": 0.01, **other}).depth != first).mean() > 0.9
 
 
 @pytest.fixture
@@ -160,12 +148,9 @@ def test_every_backbone_and_any_order_sees_the_same_geometry(config) -> None:
         np.testing.assert_array_equal(there.T_wc, back.T_wc)
 
 
-def test_a_pixel_has_the_same_noise_at_any_stride(config) -> None:
+def test_noise_is_of_the_pixel_and_none_changes_nothing(config) -> None:
     task = make_plan(config(perturbation=NOISE, seed=3)).tasks[0]
     np.testing.assert_array_equal(read(task, 1, 2).depth, read(task, 1).depth[::2, ::2])
-
-
-def test_no_noise_changes_nothing(config) -> None:
     plain, zero = config(), config(perturbation={"depth_noise": 0}, seed=9)
     assert zero.model_copy(update={"seed": 0}) == plain
     assert zero.perturbation is None
@@ -174,8 +159,6 @@ def test_no_noise_changes_nothing(config) -> None:
     np.testing.assert_array_equal(read(task, 1).depth, original.depth)
     np.testing.assert_array_equal(read(task, 1).T_wc, original.T_wc)
 
-
-def test_the_seed_counts_where_there_is_noise(config) -> None:
     def keys(**settings):
         return [each.identity for each in make_plan(config(**settings)).units]
 
@@ -183,16 +166,13 @@ def test_the_seed_counts_where_there_is_noise(config) -> None:
     assert keys(perturbation=NOISE, seed=4) == keys(perturbation=NOISE, seed=4) != keys(perturbation=NOISE, seed=5)
 
 
-def test_a_run_takes_it_as_a_setting_and_keeps_it(config, tmp_path) -> None:
+def test_a_run_takes_it_as_a_setting_that_cannot_be_negative(config, tmp_path) -> None:
     plain = semstab.engine.run(config())
     noisy = semstab.engine.run(config(perturbation=NOISE, seed=3), out=tmp_path / "run")
     assert noisy.runs[0].table != plain.runs[0].table
     again = semstab.engine.run(load_config(tmp_path / "run" / "config.yaml"))
     assert [run.table for run in again.runs] == [run.table for run in noisy.runs]
     assert json.loads(json.dumps(config(perturbation=NOISE, seed=3).model_dump(mode="json")))["seed"] == 3
-
-
-def test_noise_cannot_be_negative(config) -> None:
     with pytest.raises(ConfigError, match=r"perturbation\.depth_noise: input should be greater than or equal to 0"):
         config(perturbation={"depth_noise": -0.1})
     with pytest.raises(ConfigError, match=r"unknown setting 'perturbation\.depth'; did you mean 'depth_noise'"):

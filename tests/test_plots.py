@@ -62,16 +62,15 @@ def at(index, r=1.0, **columns):
     return VoxelTable(*index[order].T, **given, **rest, voxel_size=r, classes=("a", "b", "c"))
 
 
-# --- Histograms -------------------------------------------------------------------------------------------------------
-
-
-def test_the_bins_of_op_are_single_values_and_then_widen():
+def test_the_bins_of_op_widen_and_a_long_legend_takes_more_lines():
     assert OP_BOUNDS[:9].tolist() == list(range(1, 10))
     steps = np.diff(OP_BOUNDS[8:].astype(float))
     assert (steps >= 1).all()
     assert (steps <= 0.25 * OP_BOUNDS[8:-1] + 0.5).all()
     assert OP_BOUNDS[-1] >= 2**31
     assert op_position()[:8] == pytest.approx(range(1, 9))
+    names = [f"a backbone with a long name {k}" for k in range(8)]
+    assert legend_columns(names, PAGE) < legend_columns(["a", "b", "c", "d", "e", "f", "g", "h"], PAGE) == 8
 
 
 @checks
@@ -102,38 +101,28 @@ def fused(sequence):
 
 @checks
 @given(SEQUENCES)
-def test_no_voxel_drifts_further_than_the_scale_of_the_maps(sequence):
+def test_no_voxel_drifts_further_than_the_scale_of_the_maps_which_two_contradicting_frames_reach(sequence):
     drift = sbd(fused(sequence))
     assert (drift[~np.isnan(drift)] <= SBD_MAX + 1e-12).all()
-
-
-def test_the_largest_drift_is_that_of_two_frames_that_contradict_each_other():
-    half = -(0.75 * math.log2(0.75) + 0.25 * math.log2(0.25)) - 0.5
-    assert pytest.approx(half) == SBD_MAX
+    assert pytest.approx(-(0.75 * math.log2(0.75) + 0.25 * math.log2(0.25)) - 0.5) == SBD_MAX
 
 
 def test_histograms_add_up():
-    parts = voxels((5, 1, SURE), (3, 9, SPLIT, 0.1)), voxels((2, 4, SPLIT, 0.2), (7, 2, SURE))
-    whole = voxels((5, 1, SURE), (3, 9, SPLIT, 0.1), (2, 4, SPLIT, 0.2), (7, 2, SURE))
-    added, direct = together(map(histograms, parts)), histograms(whole)
+    groups = (5, 1, SURE), (3, 9, SPLIT, 0.1), (2, 4, SPLIT, 0.2), (7, 2, SURE)
+    added = together(map(histograms, (voxels(*groups[:2]), voxels(*groups[2:]))))
+    direct = histograms(voxels(*groups))
     assert set(added) == {measure.key for measure in measures()}
     for key, found in added.items():
         assert np.array_equal(found.counts, direct[key].counts)
         assert found.sums == pytest.approx(direct[key].sums)
 
 
-def test_the_ecdf_of_recurrent_voxels_leaves_the_others_out():
+def test_ecdfs_leave_the_others_out_and_end_where_nearly_all_voxels_are():
     measure = histograms(voxels((6, 1, SURE), (3, 3, SURE), (1, 3, SPLIT)))["vss"]
     assert (measure.ecdf()[0], measure.ecdf(3)[0], measure.ecdf(3)[BINS // 4]) == (0.9, 0.75, 1.0)
-
-
-def test_the_axes_of_the_ecdfs_end_where_nearly_all_voxels_are():
     ends = informative([histograms(voxels((99, 2, SURE, 0.1), (1, 2, [1, 1, 0], 0.3)))])
     assert ends["vss"] == 0.06
     assert ends["sbd"] == pytest.approx(0.1, abs=SBD_MAX / BINS)
-
-
-# --- From above -------------------------------------------------------------------------------------------------------
 
 
 @checks
@@ -185,16 +174,14 @@ def test_a_tilted_floor_has_no_holes(up):
     assert (inside != EMPTY).all()
 
 
-def test_a_large_map_has_cells_of_several_voxels(monkeypatch):
+def test_large_maps_have_large_cells_and_lone_voxels_far_away_are_cut_off(monkeypatch):
     monkeypatch.setattr(topdown, "LARGEST", 10)
     table = at([(x, 0, x % 7) for x in range(40)])
     image, cell = top_down(table, (0, 0, 1))
     assert cell == 4.0
     assert image.shape == (1, 10)
     assert [table.iz[row] for row in image[0][:3]] == [3, 6, 4]
-
-
-def test_lone_voxels_far_away_are_cut_off():
+    monkeypatch.undo()
     plate = [(x, y, 0) for x in range(40) for y in range(40)]
     image, _ = top_down(at([*plate, (10_000, 0, 0), (0, -10_000, 0)]), (0, 0, 1))
     assert image.shape == (40, 40)
@@ -205,44 +192,31 @@ def test_a_scale_bar_has_a_round_length(width, length):
     assert scale_length(width) == pytest.approx(length)
 
 
-# --- What is drawn ----------------------------------------------------------------------------------------------------
-
-
 def pixels(axes):
     (image,) = axes.get_images()
     return image.get_array()
 
 
-def test_a_map_has_the_colours_of_its_categories():
+def test_a_map_has_the_colours_of_its_categories_and_nothing_is_white():
     columns = {"op": [1, 4, 4], "evidence": [SURE, [2, 2, 0], [4, 0, 0]], "drift_sum": [0, 0.6, 0]}
     table = at([(0, 0, 0), (1, 0, 0), (2, 0, 0)], **columns)
     kind, drift, doubt, *_ = draw_stability(FromAbove.of(table, (0, 0, 1))).axes
     assert pixels(kind)[0].tolist() == [list(CATEGORY_COLORS[k]) for k in categories(table)]
-    grey = [204, 204, 204]
-    assert pixels(drift)[0, 0, :3].tolist() == grey
-    assert pixels(doubt)[0, 0, :3].tolist() == grey
-    assert pixels(drift)[0, 2, :3].tolist() != pixels(drift)[0, 1, :3].tolist() != grey
-
-
-def test_nothing_is_white():
-    table = at([(0, 0, 0), (2, 0, 0)], op=[3, 3])
-    for axes in draw_stability(FromAbove.of(table, (0, 0, 1))).axes[: 1 + sum(measure.panel for measure in measures())]:
+    assert pixels(drift)[0, 0, :3].tolist() == pixels(doubt)[0, 0, :3].tolist() == [204, 204, 204]
+    assert pixels(drift)[0, 2, :3].tolist() != pixels(drift)[0, 1, :3].tolist() != [204, 204, 204]
+    apart = at([(0, 0, 0), (2, 0, 0)], op=[3, 3])
+    for axes in draw_stability(FromAbove.of(apart, (0, 0, 1))).axes[: 1 + sum(measure.panel for measure in measures())]:
         assert pixels(axes)[0, 1, :3].tolist() == [255, 255, 255]
 
 
 def test_the_overview_is_in_one_palette():
-    table = at([(0, 0, 0), (1, 0, 0)], evidence=[[0, 1, 0], [0, 0, 1]])
+    seen = FromAbove.of(at([(0, 0, 0), (1, 0, 0)], evidence=[[0, 1, 0], [0, 0, 1]]), (0, 0, 1))
     overview = Overview(7, np.array([[0, 1], [2, 255]]), np.zeros((2, 2, 3), np.uint8), PALETTE)
-    image, prediction, fused_map = draw_overview(FromAbove.of(table, (0, 0, 1)), overview).axes
+    image, prediction, fused_map = draw_overview(seen, overview).axes
     assert [axes.get_title(loc="left")[:3] for axes in (image, prediction, fused_map)] == ["(a)", "(b)", "(c)"]
-    white = [255, 255, 255]
-    assert pixels(prediction).tolist() == [[[200, 0, 0], [0, 200, 0]], [[0, 0, 200], white]]
-    assert pixels(fused_map)[0].tolist() == [PALETTE[k].tolist() for k in dominant(table)]
-
-
-def test_without_an_image_the_overview_has_two_panels():
-    overview = Overview(0, np.zeros((2, 2), int), None, PALETTE)
-    assert len(draw_overview(FromAbove.of(at([(0, 0, 0)]), (0, 0, 1)), overview).axes) == 2
+    assert pixels(prediction).tolist() == [[[200, 0, 0], [0, 200, 0]], [[0, 0, 200], [255, 255, 255]]]
+    assert pixels(fused_map)[0].tolist() == [PALETTE[k].tolist() for k in dominant(seen.table)]
+    assert len(draw_overview(seen, dataclasses.replace(overview, color=None)).axes) == 2
 
 
 def test_a_sweep_shows_all_voxels_and_recurrent_ones(walls):
@@ -278,20 +252,12 @@ def test_a_small_difference_looks_small_and_no_bar_is_cut(walls):
     assert change.get_ylim()[0] <= 0
 
 
-def test_a_long_legend_takes_more_lines():
-    names = [f"a backbone with a long name {k}" for k in range(8)]
-    assert legend_columns(names, PAGE) < legend_columns(["a", "b", "c", "d", "e", "f", "g", "h"], PAGE) == 8
-
-
-def test_recurrent_values_of_few_voxels_are_not_drawn():
+def test_curves_have_the_means_of_the_voxels_and_none_of_few_recurrent_ones():
     few = record(voxels((ENOUGH - 1, 3, SPLIT)), "frame_count", 5)
     many = record(voxels((ENOUGH, 3, SPLIT)), "frame_count", 10)
     found = {"m": levels(study(few, many), "frame_count", "m")}
     every, recurrent = draw_sweep(describe("frame_count"), found).axes[1].containers
     assert (list(every.lines[0].get_xdata()), list(recurrent.lines[0].get_xdata())) == ([0, 1], [1])
-
-
-def test_curves_against_op_have_the_means_of_the_voxels():
     found = histograms(voxels((ENOUGH, 1, SURE), (ENOUGH, 2, SPLIT, 0.2), (5, 4, [1, 1, 0], 0.1)))
     stability, drift, *_, counts = draw_persistence({"m": found}).axes
     mean, few = stability.get_lines()
@@ -300,16 +266,10 @@ def test_curves_against_op_have_the_means_of_the_voxels():
     assert few.get_xdata().tolist() == pytest.approx([4])
     assert drift.get_lines()[0].get_ydata().tolist() == pytest.approx([math.nan, 0.2, 0.1], nan_ok=True)
     assert [tick for tick in counts.get_xticks() if tick <= 4] == [1, 2, 3, 4]
-
-
-def test_an_ecdf_has_a_curve_a_scene_and_one_of_the_recurrent_voxels():
     scenes = {name: histograms(voxels((n, 3, SPLIT, 0.1), (5, 1, SURE))) for name, n in (("x", 5), ("y", 15))}
     disagreement, *_ = draw_ecdf(scenes, informative(scenes.values())).axes
     at_zero = [line.get_ydata()[0] for line in disagreement.get_lines()]
     assert at_zero == pytest.approx([0.5, 0.25, 0.0])
-
-
-# --- Files ------------------------------------------------------------------------------------------------------------
 
 
 @pytest.fixture(scope="module")
@@ -317,95 +277,60 @@ def drawn(tmp_path_factory):
     return drawn_walls(tmp_path_factory.getbasetemp())
 
 
-def test_every_figure_is_written(drawn):
+def test_every_figure_is_written_in_the_same_bytes(drawn, tmp_path):
     result, folder, paths = drawn
     names = [figure.name for figure in figures(result, folder)]
     assert names == [
-        "overview__often__calm",
-        "ecdf__calm",
-        "persistence",
-        "stability_map__often__calm",
-        "stability_map__rarely__calm",
-        "sensitivity_voxel_size",
-        "sensitivity_depth_noise",
-        "sensitivity_frame_count",
-        "temporal_agreement",
-        "correlogram__often",
-        "correlogram__rarely",
-        "drift",
-        "sensitivity_agreement_voxel_size",
-        "sensitivity_agreement_depth_noise",
-        "sensitivity_agreement_frame_count",
-    ]
+        "overview__often__calm", "ecdf__calm", "persistence", "stability_map__often__calm",
+        "stability_map__rarely__calm", "sensitivity_voxel_size", "sensitivity_depth_noise", "sensitivity_frame_count",
+        "temporal_agreement", "correlogram__often", "correlogram__rarely", "drift",
+        "sensitivity_agreement_voxel_size", "sensitivity_agreement_depth_noise", "sensitivity_agreement_frame_count",
+    ]  # fmt: skip
     assert set(paths) == {folder / "figures" / f"{name}.{suffix}" for name in names for suffix in ("png", "svg")}
-
-
-def test_figures_have_the_width_of_a_column_or_a_page(drawn):
-    for path in drawn[2]:
-        if path.suffix == ".png":
-            with Image.open(path) as image:
-                assert image.width in (round(COLUMN * DPI), round(PAGE * DPI))
-                assert image.height <= 8 * DPI
-
-
-def test_svg_files_are_whole_and_without_a_date(drawn):
-    for path in drawn[2]:
-        if path.suffix == ".svg":
-            assert ET.parse(path).getroot().tag.endswith("svg")
-            assert "date" not in path.read_text(encoding="utf-8")
-
-
-def test_the_same_study_gives_the_same_files(drawn, tmp_path):
     result, folder, _ = drawn
     (figure,) = (f for f in figures(result, folder) if f.name == "stability_map__often__calm")
     for path in figure.save(tmp_path):
         assert path.read_bytes() == (folder / "figures" / path.name).read_bytes()
 
 
-def test_titles_and_texts_are_there_for_every_figure(drawn):
-    result, folder, _ = drawn
-    for figure in figures(result, folder):
+def test_figures_have_texts_and_the_width_of_a_column_or_a_page_and_svg_files_no_date(drawn):
+    for path in drawn[2]:
+        if path.suffix == ".png":
+            with Image.open(path) as image:
+                assert image.width in (round(COLUMN * DPI), round(PAGE * DPI))
+                assert image.height <= 8 * DPI
+        else:
+            assert ET.parse(path).getroot().tag.endswith("svg")
+            assert "date" not in path.read_text(encoding="utf-8")
+    for figure in figures(*drawn[:2]):
         assert figure.title
         assert figure.caption.endswith(".")
         assert len(figure.alt) > 40
 
 
-def test_without_an_up_axis_there_is_no_map(drawn):
+def test_without_an_up_axis_there_is_no_map_and_of_nothing_no_figure(drawn):
     result, folder, _ = drawn
-    level = dataclasses.replace(result, up={"often": (0.0, -1.0, 0.0)})
-    names = [figure.name for figure in figures(level, folder)]
+    names = [figure.name for figure in figures(dataclasses.replace(result, up={"often": (0.0, -1.0, 0.0)}), folder)]
     assert "stability_map__often__calm" in names
     assert "stability_map__rarely__calm" not in names
+    assert figures(study(), folder) == []
 
 
-def test_a_study_of_nothing_has_no_figure(tmp_path):
-    assert figures(study(), tmp_path) == []
-
-
-@pytest.mark.parametrize("content", [b"", b"not an archive", b"PK\x03\x04broken"])
-def test_a_damaged_frame_file_is_said_in_one_line(tmp_path, content):
-    path = tmp_path / "s__m.npz"
-    path.write_bytes(content)
-    with pytest.raises(DataError, match=r"s__m\.npz: not a saved frame") as caught:
-        Overview.load(path)
-    assert "\n" not in str(caught.value)
-
-
-def test_a_frame_file_without_palette_or_with_objects_is_refused(tmp_path):
+def test_a_damaged_frame_file_is_one_line(tmp_path):
     np.savez(tmp_path / "a.npz", frame=0, labels=np.zeros((2, 2)))
     np.savez(tmp_path / "b.npz", frame=0, labels=np.array([{}], dtype=object), palette=PALETTE)
-    for name in "ab":
-        with pytest.raises(DataError, match="not a saved frame"):
-            Overview.load(tmp_path / f"{name}.npz")
+    for k, content in enumerate((b"", b"not an archive", b"PK\x03\x04broken")):
+        (tmp_path / f"{k}.npz").write_bytes(content)
+    for path in tmp_path.iterdir():
+        with pytest.raises(DataError, match=rf"{path.name}: not a saved frame") as caught:
+            Overview.load(path)
+        assert "\n" not in str(caught.value)
 
 
 def test_matplotlib_is_imported_only_when_something_is_drawn():
     heavy = "{'matplotlib', 'jinja2', 'PIL'}"
     code = f"import sys, semstab.report.figures, semstab.report; assert not {heavy} & set(sys.modules)"
     subprocess.run([sys.executable, "-c", code], check=True)
-
-
-# --- What is shown ----------------------------------------------------------------------------------------------------
 
 
 def test_colours_are_as_many_as_classes_and_each_is_unlike_the_others() -> None:
@@ -419,19 +344,8 @@ def test_colours_are_as_many_as_classes_and_each_is_unlike_the_others() -> None:
 def test_a_room_is_cut_open_beneath_its_ceiling_and_a_wall_is_seen_from_the_side() -> None:
     x, y = (index.ravel() for index in np.meshgrid(range(20), range(20)))
     floor, ceiling = np.stack([x, y, 0 * x], axis=1), np.stack([x, y, 0 * x + 15], axis=1)
-    room = FromAbove.of(table_at(np.concatenate([floor, ceiling])), (0, 0, 1))
+    room = FromAbove.of(at(np.concatenate([floor, ceiling]), r=0.1), (0, 0, 1))
     assert room.view.startswith("cut open at")
     assert (room.table.iz == 0).all()
-    assert FromAbove.of(table_at(floor), (0, 0, 1)).view == "from above"
-    assert FromAbove.of(table_at(np.stack([x, 0 * x, y], axis=1)), (0, 0, 1)).view == "from the side"
-
-
-def table_at(index) -> VoxelTable:
-    """Voxels of 0.1 m at these indices (n, 3), sorted."""
-    index = index[np.lexsort(index.T[::-1])].astype(np.int32)
-    n, ones = len(index), np.ones(len(index), dtype=np.int64)
-    return VoxelTable(
-        ix=index[:, 0], iy=index[:, 1], iz=index[:, 2], op=ones, evidence=np.tile([1.0, 0.0], (n, 1)),
-        drift_sum=np.zeros(n), pixels=ones, first_frame=0 * ones, last_frame=0 * ones, self_sum=np.ones(n),
-        frame_entropy_sum=np.zeros(n), voxel_size=0.1,
-    )  # fmt: skip
+    assert FromAbove.of(at(floor, r=0.1), (0, 0, 1)).view == "from above"
+    assert FromAbove.of(at(np.stack([x, 0 * x, y], axis=1), r=0.1), (0, 0, 1)).view == "from the side"

@@ -524,7 +524,7 @@ def test_a_study_measures_regions_by_name(scene):
     predict(scene, Tiles(), name="tiles")
     predict(scene, Shifting(), name="thirds")
     grid = make_plan(configure(scene, region_maps=["tiles"]))
-    assert [cell.backbone for cell in grid.regions] == ["tiles"]
+    assert [cell.unit.backbone for cell in grid.regions] == ["tiles"]
     assert {cell.unit.backbone for cell in grid.units} == {"thirds"}
 
 

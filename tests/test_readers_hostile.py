@@ -18,7 +18,7 @@ from semstab.datasets.formats.disk import read_table, records
 from semstab.datasets.scannet import read_class_table
 from semstab.datasets.scene import select_frames
 from semstab.datasets.transforms_json import read_transforms
-from semstab.errors import ConfigError, DataError, SemstabError, one_line
+from semstab.errors import ConfigError, DataError, SemstabError, summarize_error
 from semstab.predict.folder import PredictionFolder
 
 
@@ -192,7 +192,7 @@ def test_messages_are_short_whatever_the_file_holds(tmp_path):
         with pytest.raises((ConfigError, DataError)) as caught:
             opened_folder(folder).frame(0, "net")
         assert len(str(caught.value)) < 400 + len(str(folder))
-    assert len(one_line(ValueError("v" * 9999))) < 250
+    assert len(summarize_error(ValueError("v" * 9999))) < 250
 
 
 def test_predictions_stay_in_their_folder(tmp_path):

@@ -150,7 +150,7 @@ def test_a_run_reads_what_was_relabelled(fused, tmp_path):
     fails(ConfigError, other, relabel, fused / "run", tmp_path, belief=Belief(min_op=2))
 
 
-def test_what_cannot_be_relabelled(fused, tmp_path):
+def test_what_cannot_be_relabelled_is_refused(fused, tmp_path):
     fails(ConfigError, "no category 'stabel'; did you mean 'stable'", Belief, categories=("stabel",))
     fails(ConfigError, "min_psa = 2", Belief, min_psa=2)
     taken = tmp_path / "labels/a-fused"
@@ -161,10 +161,7 @@ def test_what_cannot_be_relabelled(fused, tmp_path):
     manifest = tmp_path / "run/manifest.json"
     manifest.write_text(manifest.read_text().replace('"scene/a": "', '"scene/a": "other'))
     fails(DataError, "is not what was fused; run it again", relabel, tmp_path / "run", tmp_path / "out")
-
-
-def test_maps_that_would_be_read_with_another_camera_are_refused(tmp_path):
-    """ScanNet's colour camera sees more than its depth camera, and label maps are the colour image's."""
+    # ScanNet's colour camera sees more than its depth camera, and label maps are the colour image's
     labels, color = np.arange(48, dtype=np.uint8).reshape(6, 8) % 3, np.zeros((6, 8, 3), np.uint8)
     frames = [dataclasses.replace(tiny_scene.frame(i, labels), color=color) for i in range(2)]
     names = write_scannet(tmp_path / "scene", frames)

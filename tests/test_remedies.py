@@ -33,9 +33,6 @@ def said(found):
     return " ".join(advice(found))
 
 
-# --- Which one --------------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("truth", [True, False])
 def test_the_steadiest_is_not_the_best(truth):
     frozen = remedy("ema:0.98", flicker=0.001, worth=0.4, alpha=0.99)
@@ -48,10 +45,22 @@ def test_the_steadiest_is_not_the_best(truth):
     assert ("There is no ground truth: whether labels are right" in said(found)) is not truth
 
 
-def test_alpha_alone_chooses_nothing():
+def test_the_best_is_the_steadier_one_of_those_alike_and_alpha_alone_chooses_nothing():
     found = study(remedy("ema:0.9", worth=0.79, alpha=0.99, flicker=0.01))
     assert found.best is None
     assert said(found).startswith("Use none of these filters over net: none steadies it without a loss of accuracy")
+    found = study(remedy("ema:0.98", flicker=0.3, worth=0.4, plain=0.001, stable_wrong=0.4, lag=4.5))
+    assert found.best is None
+    assert (
+        "Steadier and worse: ema:0.98. ema:0.98 has 0.1 % flicker at the same pixel (20.0 % without), but 40 %"
+        in said(found)
+    )
+    assert "it follows changes 4.5 frames late" in said(found)
+    rows = remedy("vote:3", 0.1, 0.9), remedy("vote:5", 0.05, 0.899), remedy("vote:9", 0.01, 0.88)
+    assert study(*rows).best.filters == "vote:5"
+    rows = remedy("a:1", 0.1, 0.9), remedy("b:1", 0.15, 0.85), remedy("c:1", 0.05, 0.5), remedy("d:1", 0.3, 0.95)
+    assert [row.filters for row in study(*rows).front] == ["c:1", "a:1", "d:1"]
+    assert "Use --filter ema:0.6 --filter guided:8 over net" in said(study(remedy("ema:0.6+guided:8", 0.1, 0.9)))
 
 
 @pytest.mark.parametrize(
@@ -60,33 +69,6 @@ def test_alpha_alone_chooses_nothing():
 def test_what_a_filter_must_not_cost(loss):
     found = study(dataclasses.replace(remedy("vote:9", flicker=0.05, worth=0.9), **loss))
     assert found.best is None
-
-
-def test_what_is_steady_at_the_pixel_alone_is_told():
-    found = study(remedy("ema:0.98", flicker=0.3, worth=0.4, plain=0.001, stable_wrong=0.4, lag=4.5))
-    assert found.best is None
-    assert (
-        "Steadier and worse: ema:0.98. ema:0.98 has 0.1 % flicker at the same pixel (20.0 % without), but 40 %"
-        in said(found)
-    )
-    assert "it follows changes 4.5 frames late" in said(found)
-
-
-def test_among_those_alike_the_steadier_one():
-    rows = remedy("vote:3", 0.1, 0.9), remedy("vote:5", 0.05, 0.899), remedy("vote:9", 0.01, 0.88)
-    assert study(*rows).best.filters == "vote:5"
-
-
-def test_the_front_is_what_none_beats():
-    rows = remedy("a:1", 0.1, 0.9), remedy("b:1", 0.15, 0.85), remedy("c:1", 0.05, 0.5), remedy("d:1", 0.3, 0.95)
-    assert [row.filters for row in study(*rows).front] == ["c:1", "a:1", "d:1"]
-
-
-def test_chains_are_written_as_they_are_typed():
-    assert "Use --filter ema:0.6 --filter guided:8 over net" in said(study(remedy("ema:0.6+guided:8", 0.1, 0.9)))
-
-
-# --- From the command line --------------------------------------------------------------------------------------------
 
 
 @pytest.fixture(scope="module")
@@ -110,15 +92,12 @@ def done(tmp_path_factory):
     return folder, result.output
 
 
-def test_the_terminal_says_what_to_use_in_80_columns(done):
+def test_the_folder_and_the_terminal_hold_what_to_use(done):
     _, text = done
     assert "threshold:0.6: left out, for net gives labels without scores" in text
     assert "Use --filter vote-warped:5 over net: flicker falls from" in " ".join(text.split())
     table = text[text.index("Use --filter") :]
     assert "vote-warped:5" in table
-
-
-def test_the_folder_holds_table_figure_and_sentence(done):
     folder, _ = done
     rows = json.loads((folder / "out/tables/remedies.json").read_text())
     assert (folder / "out/figures/remedies__net.png").stat().st_size > 10_000
@@ -143,14 +122,11 @@ def test_a_second_start_computes_nothing(done):
     assert (units["kept"], units["computed"]) == (4, 0)
 
 
-@pytest.mark.parametrize(
-    ("words", "said"),
-    [
-        (("--backbone", "nut"), "there are no labels 'nut' for filters to take; there is net"),
-        (("--backbone", "net", "--filter", "ema:0.6+smooth"), "filter 'smooth' is not known"),
-        (("--predict", "nothing"), "backbone 'nothing' is not known"),
-    ],
-)
+@pytest.mark.parametrize(("words", "said"), [
+    (("--backbone", "nut"), "there are no labels 'nut' for filters to take; there is net"),
+    (("--backbone", "net", "--filter", "ema:0.6+smooth"), "filter 'smooth' is not known"),
+    (("--predict", "nothing"), "backbone 'nothing' is not known"),
+])  # fmt: skip
 def test_bad_input_is_one_line(done, words, said):
     folder, _ = done
     command = ["remedies", "--data", folder / "flight", *words, "--voxel-size", "0.1", "--out", folder / "bad"]

@@ -76,30 +76,21 @@ def plain(text):
     return re.sub(r"\s+", " ", text.replace("<=", "≤").replace(">=", "≥"))
 
 
-# --- The page ---------------------------------------------------------------------------------------------------------
-
-
-def test_the_page_needs_no_other_file_no_script_and_no_network(walls):
+def test_the_page_needs_no_other_file_no_script_and_no_network_and_links_lead_somewhere(walls):
     page = walls[2]
-    assert not page.all("script")
-    assert not page.all("iframe")
+    assert not page.all("script") + page.all("iframe")
     sources = [attributes["src"] for attributes in page.all("img")]
-    links = [attributes["href"] for tag in ("a", "link") for attributes in page.all(tag)]
     assert sources
     assert all(source.startswith("data:image/") for source in sources)
-    assert all(link.startswith("#") or link == "data:," for link in links)
+    ids = [attributes["id"] for _, attributes in page.elements if "id" in attributes]
+    assert len(ids) == len(set(ids))
+    links = {attributes["href"] for tag in ("a", "link") for attributes in page.all(tag)} - {"data:,"}
+    assert links <= {f"#{name}" for name in ids}
     assert "url(" not in (walls[1] / "report.html").read_text()
     assert not any(key.startswith("on") for _, attributes in page.elements for key in attributes)
 
 
-def test_every_link_leads_somewhere_and_every_id_is_one(walls):
-    page = walls[2]
-    ids = [attributes["id"] for _, attributes in page.elements if "id" in attributes]
-    assert len(ids) == len(set(ids))
-    assert {a["href"][1:] for a in page.all("a")} <= set(ids)
-
-
-def test_the_page_can_be_heard(walls):
+def test_the_page_can_be_heard_and_every_table_scrolls_in_a_region_of_its_own(walls):
     page = walls[2]
     assert page.all("html")[0]["lang"] == "en"
     assert all(len(attributes["alt"]) > 40 for attributes in page.all("img"))
@@ -107,22 +98,26 @@ def test_the_page_can_be_heard(walls):
     regions = [attributes for _, attributes in page.elements if "scroll" in (attributes.get("class") or "")]
     assert all(attributes["tabindex"] == "0" and attributes["aria-label"] for attributes in regions)
     assert [tag for tag, _ in page.elements if re.fullmatch(r"h\d", tag)][:2] == ["h1", "h2"]
-
-
-def test_every_table_scrolls_in_a_region_of_its_own(walls):
-    elements = walls[2].elements
-    before = [elements[i - 1][1].get("class") for i, (tag, _) in enumerate(elements) if tag == "table"]
+    before = [page.elements[i - 1][1].get("class") for i, (tag, _) in enumerate(page.elements) if tag == "table"]
     assert set(before) == {"scroll"}
 
 
-def test_the_page_counts_units_as_the_manifest_does(walls, tmp_path_factory):
-    """It counts those of one of the two backbones here."""
+def test_the_page_says_units_findings_failures_and_where_the_numbers_come_from(walls, tmp_path_factory):
+    result, text = walls[0], plain(walls[2].text)
     _, folder = wall_study(tmp_path_factory.getbasetemp())
     units = json.loads((folder / "manifest.json").read_text())["units"]["units"]
-    assert f"{units // 2} units" in plain(walls[2].text)
+    assert f"{units // 2} units" in text  # those of one of the two backbones
+    for finding in findings(result):
+        said = [plain(line) for row in finding.evidence for line in (row.outcome.numbers, row.outcome.why)]
+        assert all(line in text for line in (finding.claim, *said))
+    for line in ("1 failed", 'out of memory <script>alert("x")</script>', "voxel size 0.001, repeat 0"):
+        assert line in text
+    assert result.manifest["python"] in text
+    assert not re.search(r"\bnan\b|\bNone\b|\binf\b", walls[2].text)
+    assert "\N{EN DASH}" in text
 
 
-def test_every_table_and_figure_stands_on_the_page(walls):
+def test_every_table_and_figure_stands_on_the_page_with_all_cells(walls):
     result, folder, page = walls
     text = plain(page.text)
     ids = {attributes.get("id") for _, attributes in page.elements}
@@ -140,9 +135,6 @@ def test_every_table_and_figure_stands_on_the_page(walls):
     assert {f"figure-{figure.name}" for figure in drawn} <= ids
     for caption, times in Counter(plain(item.caption) for item in (*tables(result), *drawn)).items():
         assert text.count(caption) >= times
-
-
-def test_rows_have_as_many_cells_as_the_table_has_columns(walls):
     text = (walls[1] / "report.html").read_text()
     for table in re.findall(r"<table>.*?</table>", text, re.DOTALL):
         rows = re.findall(r"<tr.*?</tr>", table, re.DOTALL)
@@ -156,54 +148,34 @@ def test_rows_have_as_many_cells_as_the_table_has_columns(walls):
         assert len(set(widths)) == 1, table[:300]
 
 
-def test_every_finding_is_stated_with_its_numbers(walls):
-    text = plain(walls[2].text)
-    for finding in findings(walls[0]):
-        assert finding.claim in text
-        for row in finding.evidence:
-            assert plain(row.outcome.numbers) in text
-            assert plain(row.outcome.why) in text
-
-
-def test_failures_and_where_the_numbers_come_from_are_said(walls):
-    text = plain(walls[2].text)
-    assert "1 failed" in text
-    assert 'out of memory <script>alert("x")</script>' in text
-    assert "voxel size 0.001, repeat 0" in text
-    assert walls[0].manifest["python"] in text
-
-
-def test_undefined_numbers_are_dashes(walls):
-    assert not re.search(r"\bnan\b|\bNone\b|\binf\b", walls[2].text)
-    assert "\N{EN DASH}" in walls[2].text
-
-
-def test_figures_are_taken_from_the_folder_and_made_small(walls):
+def test_figures_are_made_small_maps_closed_and_the_page_is_the_same_again(walls, tmp_path):
     result, folder, page = walls
     by_alt = {attributes["alt"]: attributes for attributes in page.all("img")}
     for figure in figures(result, folder):
         kind, _, data = by_alt[figure.alt]["src"].partition(";base64,")
         content = base64.b64decode(data)
         assert kind == "data:image/png"
-        with (
-            Image.open(io.BytesIO(content)) as image,
-            Image.open(folder / "figures" / f"{figure.name}.png") as full,
-        ):
+        with Image.open(io.BytesIO(content)) as image, Image.open(folder / "figures" / f"{figure.name}.png") as full:
             assert image.width == round(full.width * 2 / 3)
-
-
-def test_figures_that_are_missing_are_drawn(tmp_path):
-    result = study(record(voxels((5, 2, SURE))), record(voxels((5, 2, SURE)), "frame_count", 5))
-    page = page_of(result, tmp_path)
-    assert len(page.all("img")) == 1
-    assert (tmp_path / "figures" / "sensitivity_frame_count.png").exists()
-
-
-def test_of_the_maps_one_a_backbone_is_open(walls):
     text = (walls[1] / "report.html").read_text()
     maps = text[text.index('<section id="maps"') :]
     assert maps.index("figure-stability_map__often__calm") < maps.index("<details>")
     assert maps.index("<details>") < maps.index("figure-stability_map__rarely__calm")
+    result, folder, _ = walls
+    before = (folder / "report.html").read_bytes()
+    write_report(result, folder)
+    assert (folder / "report.html").read_bytes() == before
+
+
+def test_missing_figures_are_drawn_and_a_study_in_which_everything_failed_has_a_report(tmp_path):
+    result = study(record(voxels((5, 2, SURE))), record(voxels((5, 2, SURE)), "frame_count", 5))
+    page = page_of(result, tmp_path)
+    assert len(page.all("img")) == 1
+    assert (tmp_path / "figures" / "sensitivity_frame_count.png").exists()
+    failure = Failure(Unit("s", "m", "numpy"), Variation(BASE), "no depth")
+    page = page_of(study(failures=(failure,)), tmp_path)
+    assert "there is nothing to say yet" in page.text
+    assert "no depth" in page.text
 
 
 def test_names_are_shown_as_they_are_whatever_they_are(tmp_path):
@@ -213,23 +185,6 @@ def test_names_are_shown_as_they_are_whatever_they_are(tmp_path):
     assert not page.all("script")
     assert page.text.count(EVIL) >= 6
     assert CLASSES[2] == "window & <sill>"
-
-
-def test_a_study_in_which_everything_failed_has_a_report(tmp_path):
-    failure = Failure(Unit("s", "m", "numpy"), Variation(BASE), "no depth")
-    page = page_of(study(failures=(failure,)), tmp_path)
-    assert "there is nothing to say yet" in page.text
-    assert "no depth" in page.text
-
-
-def test_the_same_study_gives_the_same_page(walls, tmp_path):
-    result, folder, _ = walls
-    before = (folder / "report.html").read_bytes()
-    write_report(result, folder)
-    assert (folder / "report.html").read_bytes() == before
-
-
-# --- The plain-language reading ---------------------------------------------------------------------------------------
 
 
 def read(result):
@@ -245,39 +200,31 @@ def test_the_reading_says_what_was_seen_once_and_what_recurs():
     )
 
 
-def test_too_few_recurrent_voxels_are_not_read_from():
+def test_few_voxels_have_no_sentence_and_flicker_has_one_with_its_compensated_share():
     sentences = read(study(record(voxels((90, 1, SURE), (10, 4, SPLIT)))))
     assert "m has 10 voxels with three looks or more: too few to judge it by." in sentences
+    few = study(record(voxels((5, 1, SURE), (3 * ENOUGH, 4, SPLIT)), backbone="net"))
+    assert not any("seen once" in sentence for sentence in read(few))
+    sentences = read(study(record(voxels((5, 1, SURE)), backbone="net", image_space=ImageSpace(65.2, 12.4))))
+    assert any(sentence.endswith("(in brackets pixel flicker, with it): net 12% (65%).") for sentence in sentences)
 
 
 def backbone(name, once, recurrent, sweep=BASE):
     return record(voxels((ENOUGH, 1, once), (ENOUGH, 4, recurrent)), sweep, backbone=name)
 
 
-def test_the_order_of_the_backbones_may_change_where_voxels_recur():
+def test_the_order_of_the_backbones_may_change_where_voxels_recur_and_the_shared_taxonomy_decides():
     found = study(backbone("x", [1, 0, 0], [6, 4, 0]), backbone("y", [6, 4, 0], [8, 2, 0]))
     assert "In one taxonomy (abc) the order by VSS is x > y over all voxels, but y > x for OP>=3." in read(found)
-    same = study(backbone("x", SURE, SURE), backbone("y", SURE, SPLIT))
-    assert "In one taxonomy (abc) the order by VSS is x > y, over all voxels and for OP>=3 alike." in read(same)
-
-
-def test_the_shared_taxonomy_decides_the_order():
-    base = [backbone("x", SURE, SURE), backbone("y", SURE, SPLIT)]
+    same = [backbone("x", SURE, SURE), backbone("y", SURE, SPLIT)]
+    line = "In one taxonomy (abc) the order by VSS is x > y, over all voxels and for OP>=3 alike."
+    assert line in read(study(*same))
     shared = [backbone("x", SURE, SPLIT, SHARED), backbone("y", SURE, SURE, SHARED)]
-    assert any("the order by VSS is y > x" in sentence for sentence in read(study(*base, *shared)))
-
-
-def test_flicker_is_read_beside_its_compensated_share():
-    image = ImageSpace(65.2, 12.4)
-    sentences = read(study(record(voxels((5, 1, SURE)), backbone="net", image_space=image)))
-    assert any(sentence.endswith("(in brackets pixel flicker, with it): net 12% (65%).") for sentence in sentences)
+    assert any("the order by VSS is y > x" in sentence for sentence in read(study(*same, *shared)))
 
 
 def test_the_scene_that_looks_steadiest_may_be_the_one_seen_least():
-    scenes = [
-        record(voxels((10, 4, SPLIT)), scene="looked at"),
-        record(voxels((10, 1, SURE)), scene="passed by"),
-    ]
+    scenes = [record(voxels((10, 4, SPLIT)), scene="looked at"), record(voxels((10, 1, SURE)), scene="passed by")]
     expected = "m looks steadiest in passed by (VSS 1.000), which is also the scene seen least: 1.00 frames a voxel."
     assert expected in read(study(*scenes))
     assert expected not in read(study(record(voxels((10, 4, SURE)), scene="looked at"), scenes[1]))
@@ -285,11 +232,6 @@ def test_the_scene_that_looks_steadiest_may_be_the_one_seen_least():
 
 def agreement(name, agrees):
     return Agreement("s", "m", ("numpy", name), (1, 1), (0, 0), {}, agrees)
-
-
-def test_hardly_any_voxels_seen_once_need_no_sentence():
-    few = study(record(voxels((5, 1, SURE), (3 * ENOUGH, 4, SPLIT)), backbone="net"))
-    assert not any("seen once" in sentence for sentence in read(few))
 
 
 def test_the_reading_says_which_implementations_agree():
@@ -304,19 +246,12 @@ def test_the_reading_says_which_implementations_agree():
     assert "numba leaves the same maps as numpy, as far as one voxel in 16 tells." in reading(drawn, ())
 
 
-def test_the_reading_says_what_became_of_each_finding(walls):
-    (sentence,) = (s for s in reading(walls[0], findings(walls[0])) if s.startswith("The paper's findings here:"))
-    assert (
-        "recurrent voxels disagree more than the aggregate says (not shown); mean SBD falls with OP (not shown);"
-        in sentence
-    )
-
-
-def test_the_reading_of_the_walls_says_their_numbers(walls):
-    voxels_seen = pooled(walls[0].select())
+def test_the_reading_of_the_walls_says_their_numbers_and_findings(walls):
+    (sentence,) = (s for s in read(walls[0]) if s.startswith("The paper's findings here:"))
+    for line in ("recurrent voxels disagree more than the aggregate says", "mean SBD falls with OP"):
+        assert f"{line} (not shown);" in sentence
     said = reading(walls[0], ())
     assert said[:1] == verdicts(walls[0])
     assert said[0].startswith("Verdict on ")
-    assert any(line.startswith(f"{voxels_seen.once:.0%} of the voxels were seen once") for line in said)
-    assert set(walls[0].scenes) == set(STEPS)
-    assert walls[0].backbones == tuple(BACKBONES)[:1]
+    assert any(line.startswith(f"{pooled(walls[0].select()).once:.0%} of the voxels were seen once") for line in said)
+    assert (set(walls[0].scenes), walls[0].backbones) == (set(STEPS), tuple(BACKBONES)[:1])

@@ -17,8 +17,7 @@ from semstab.model.results import FrameReport
 
 counts, numbers = st.integers(0, 2**53), st.floats()
 reports = st.builds(
-    FrameReport,
-    **{field.name: counts if field.type == "int" else numbers for field in dataclasses.fields(FrameReport)},
+    FrameReport, **{field.name: counts if field.type == "int" else numbers for field in dataclasses.fields(FrameReport)}
 )
 rows = st.builds(FrameRow, reports, st.none() | st.floats(allow_nan=False), *[numbers] * 6, counts, numbers, numbers)
 

@@ -27,27 +27,21 @@ def by_pairs(evidence):
     return np.mean([s @ u for s, u in itertools.permutations(evidence, 2)])
 
 
-# --- PSA --------------------------------------------------------------------------------------------------------------
-
-
-def test_psa_by_hand():
+def test_psa_by_hand_and_of_labels_drawn_from_soft_evidence():
     table = log_of([[0, 0, 1, -1], [0, 1, -1, -1], [2, 2, 2, 2], [1, -1, -1, -1]]).table()
     np.testing.assert_allclose(psa(table), [1 / 3, 0, 1, np.nan])
-
-
-@pytest.mark.parametrize("T", [2, 3, 7])
-def test_psa_is_the_mean_over_pairs_of_frames(T):
-    evidence = soft(np.random.default_rng(T), 20, T)
-    np.testing.assert_allclose(psa(log_of_evidence(evidence).table()), [by_pairs(e) for e in evidence])
-
-
-def test_soft_evidence_counts_by_the_agreement_of_labels_drawn_from_it():
     rng = np.random.default_rng(0)
     evidence = soft(rng, 1, 4)
     draws = (rng.random((40_000, 4, 1)) > np.cumsum(evidence, axis=2)[..., :-1]).sum(axis=2)
     sampled = psa(log_of(draws).table())
     (expected,) = psa(log_of_evidence(evidence).table())
     assert sampled.mean() == pytest.approx(expected, abs=4 * sampled.std() / math.sqrt(len(sampled)))
+
+
+@pytest.mark.parametrize("T", [2, 3, 7])
+def test_psa_is_the_mean_over_pairs_of_frames(T):
+    evidence = soft(np.random.default_rng(T), 20, T)
+    np.testing.assert_allclose(psa(log_of_evidence(evidence).table()), [by_pairs(e) for e in evidence])
 
 
 def test_psa_has_the_same_expectation_for_every_number_of_frames_and_vss_has_not():
@@ -62,9 +56,6 @@ def test_psa_has_the_same_expectation_for_every_number_of_frames_and_vss_has_not
     assert all(fewer > more + 0.01 for fewer, more in itertools.pairwise(mean_vss))
 
 
-# --- Kappa and alpha --------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("T", [2, 3, 9])
 def test_kappa_is_that_of_statsmodels(T):
     labels = np.random.default_rng(T).choice(4, size=(60, T), p=[0.5, 0.3, 0.15, 0.05])
@@ -72,7 +63,7 @@ def test_kappa_is_that_of_statsmodels(T):
     assert fleiss_kappa(table) == pytest.approx(statsmodels_kappa(table.evidence))
 
 
-def test_kappa_of_a_class_is_that_of_the_class_against_the_rest():
+def test_kappa_and_alpha_of_a_class_are_those_of_the_class_against_the_rest():
     labels = np.random.default_rng(3).choice(3, size=(80, 5), p=[0.6, 0.3, 0.1])
     events = log_of(labels)
     rows = class_agreement(events.table(), events)
@@ -80,6 +71,12 @@ def test_kappa_of_a_class_is_that_of_the_class_against_the_rest():
     for k, row in enumerate(rows):
         assert row.kappa == pytest.approx(statsmodels_kappa(np.stack([counts[:, k], 5 - counts[:, k]], axis=1)))
         assert row.observations == counts[:, k].sum()
+    labels = np.random.default_rng(4).integers(-1, 3, size=(80, 5))
+    labels = labels[(labels >= 0).any(axis=1)]
+    events = log_of(labels)
+    for k, row in enumerate(class_agreement(events.table(), events)):
+        data = np.where(labels >= 0, labels == k, np.nan).T
+        assert row.alpha == pytest.approx(krippendorff.alpha(data, level_of_measurement="nominal"))
 
 
 @checks
@@ -93,15 +90,6 @@ def test_alpha_is_that_of_krippendorff_with_observations_missing(labels):
     else:
         data = np.where(labels >= 0, labels, np.nan).T
         assert krippendorff_alpha(table) == pytest.approx(krippendorff.alpha(data, level_of_measurement="nominal"))
-
-
-def test_alpha_of_a_class_is_that_of_the_class_against_the_rest():
-    labels = np.random.default_rng(4).integers(-1, 3, size=(80, 5))
-    labels = labels[(labels >= 0).any(axis=1)]
-    events = log_of(labels)
-    for k, row in enumerate(class_agreement(events.table(), events)):
-        data = np.where(labels >= 0, labels == k, np.nan).T
-        assert row.alpha == pytest.approx(krippendorff.alpha(data, level_of_measurement="nominal"))
 
 
 def test_kappa_and_alpha_of_soft_evidence_are_their_definitions():
@@ -120,7 +108,7 @@ def test_kappa_and_alpha_of_soft_evidence_are_their_definitions():
         assert row.alpha == pytest.approx(1 - (1 - agree) / (1 - by_pairs(both.reshape(-1, 2))))
 
 
-def test_alpha_is_zero_for_chance_and_one_for_agreement():
+def test_alpha_is_zero_for_chance_and_one_for_agreement_and_voxels_seen_once_count_nowhere():
     rng = np.random.default_rng(6)
     chance = log_of(rng.choice(3, size=(20_000, 4), p=[0.7, 0.2, 0.1])).table()
     assert krippendorff_alpha(chance) == pytest.approx(0, abs=0.02)
@@ -128,15 +116,17 @@ def test_alpha_is_zero_for_chance_and_one_for_agreement():
     unanimous = log_of(np.repeat(rng.integers(0, 3, size=(50, 1)), 4, axis=1)).table()
     assert krippendorff_alpha(unanimous) == pytest.approx(1)
     assert fleiss_kappa(unanimous) == pytest.approx(1)
-
-
-def test_voxels_seen_once_count_nowhere():
     labels = np.array([[0, 0, 1], [1, 1, 1], [2, 0, -1]])
     once = np.array([[2, -1, -1], [-1, 0, -1]])
     events, more = log_of(labels), log_of(np.concatenate([labels, once]))
     assert krippendorff_alpha(more.table()) == krippendorff_alpha(events.table())
     assert fleiss_kappa(more.table()) == fleiss_kappa(events.table())
     assert class_agreement(more.table(), more) == class_agreement(events.table(), events)
+    events = log_of(np.random.default_rng(8).integers(0, 3, size=(30, 4)))
+    assert class_agreement(events.table()) == class_agreement(events.table(), events)
+    mixed = log_of_evidence(soft(np.random.default_rng(9), 5, 3))
+    assert all(math.isnan(row.alpha) for row in class_agreement(mixed.table()))
+    assert not any(math.isnan(row.alpha) for row in class_agreement(mixed.table(), mixed))
 
 
 @pytest.mark.parametrize("labels", [[[0, -1]], [[1, 1], [1, 1]]])
@@ -146,26 +136,12 @@ def test_agreement_beyond_chance_is_undefined_where_there_is_no_pair_or_one_clas
     assert math.isnan(krippendorff_alpha(table))
 
 
-def test_classes_of_one_hot_evidence_need_no_events_and_those_of_other_evidence_do():
-    events = log_of(np.random.default_rng(8).integers(0, 3, size=(30, 4)))
-    assert class_agreement(events.table()) == class_agreement(events.table(), events)
-    mixed = log_of_evidence(soft(np.random.default_rng(9), 5, 3))
-    assert all(math.isnan(row.alpha) for row in class_agreement(mixed.table()))
-    assert not any(math.isnan(row.alpha) for row in class_agreement(mixed.table(), mixed))
-
-
-# --- Entropy ----------------------------------------------------------------------------------------------------------
-
-
-def test_entropy_is_within_frames_or_between_them():
+def test_entropy_is_within_frames_or_between_them_as_the_generalised_jensen_shannon_divergence():
     """Unanimous frames of (1/2, 1/2): all within. One-hot frames that disagree: all between."""
     evidence = [[[0.5, 0.5], [0.5, 0.5]], [[1, 0], [0, 1]], [[1, 0], [1, 0]]]
     parts = decompose(log_of_evidence(evidence).table())
     np.testing.assert_allclose(parts.within, [1, 0, 0], atol=1e-12)
     np.testing.assert_allclose(parts.between, [0, 1, 0], atol=1e-12)
-
-
-def test_between_frame_entropy_is_the_generalised_jensen_shannon_divergence():
     evidence = soft(np.random.default_rng(10), 25, 6, K=4)
     parts = decompose(log_of_evidence(evidence).table())
     mean = evidence.mean(axis=1, keepdims=True)

@@ -47,9 +47,6 @@ def test_labels_are_those_of_the_voxels_that_the_pixels_see():
     (frame,) = rendered([sight_line(5, [(0.2, 1), (0.4, 1), (0.7, 1), (9.0, 1), (0.0, 1)])], world)
     assert frame.index == 5
     assert frame.labels.tolist() == [[0, 2, 1, 255, 255]]
-
-
-def test_scores_give_way_to_labels_and_many_classes_take_16_bits():
     world = fused([sight_line(0, [(0.1, 0)])])
     (frame,) = rendered([sight_line(0, [(0.1, (0.2, 0.8, 0.0))], dtype=np.float32)], world)
     assert (frame.scores, frame.labels.tolist()) == (None, [[0]])
@@ -59,36 +56,27 @@ def test_scores_give_way_to_labels_and_many_classes_take_16_bits():
     assert wide.labels.tolist() == [[299, 65535]]
 
 
-def test_a_map_seen_through_its_own_voxels_loses_nothing():
-    model = fused(flight(flicker=0.3, depth_noise=0.02))
-    limit = ceiling(flight(flicker=0.3, depth_noise=0.02), make(), world=model)
-    assert np.nanmin(psa(limit)) == 1
-    assert losses(model, limit).geometry.value == 0
-
-
-def test_flicker_without_noise_is_all_the_models():
+def test_losses_are_of_the_model_or_of_geometry():
     """Geometry loses what it loses of the true labels too: voxels that hold two stripes."""
     frames, truth = list(flight(flicker=0.3)), list(flight())
     found = losses(fused(frames), ceiling(frames, make(), world=fused(truth, SIZE / 8)))
     assert found.geometry.value == pytest.approx(1 - np.nanmean(psa(fused(truth))), abs=0.01)
     assert found.model.low > 0.3
-
-
-def test_depth_noise_without_errors_is_all_geometry():
-    """Pixels see the floor as it is, and are fused where the noise puts them."""
+    # Pixels see the floor as it is, and are fused where the noise puts them
     noisy = list(flight(depth_noise=0.05))
     limit = ceiling(noisy, make(), world=fused(flight(), SIZE / 8), views=flight())
     found = losses(fused(noisy), limit)
     assert found.total.value > 0.05
     assert found.share.value == pytest.approx(1, abs=0.1)
-
-
-def test_the_ground_truth_in_the_frames_is_a_ceiling_too():
     noisy, wrong = list(flight(depth_noise=0.05)), list(flight(flicker=0.2, depth_noise=0.05))
     labelled = [dataclasses.replace(frame, depth=other.depth) for frame, other in zip(wrong, noisy, strict=True)]
     found = losses(fused(labelled), ceiling(noisy, make()))
     assert found.model.low > 0
     assert found.total.value == pytest.approx(found.geometry.value + found.model.value)
+    model = fused(flight(flicker=0.3, depth_noise=0.02))
+    limit = ceiling(flight(flicker=0.3, depth_noise=0.02), make(), world=model)
+    assert np.nanmin(psa(limit)) == 1
+    assert losses(model, limit).geometry.value == 0
 
 
 def test_frames_are_taken_one_at_a_time():
@@ -105,7 +93,7 @@ def test_frames_are_taken_one_at_a_time():
     assert alive == [0]
 
 
-def test_voxels_in_one_map_only_or_seen_once_do_not_count():
+def test_voxels_in_one_map_only_or_seen_once_do_not_count_and_views_that_do_not_fit_are_refused():
     model = fused([sight_line(t, [(0.1, t), (0.4, 0)]) for t in range(2)])
     limit = fused([sight_line(0, [(0.1, 0), (0.4, 0)]), sight_line(1, [(0.1, 0)])])
     found = losses(model, limit)
@@ -113,9 +101,6 @@ def test_voxels_in_one_map_only_or_seen_once_do_not_count():
     nothing = losses(model, fused([sight_line(0, [(9.0, 0)])]))
     assert nothing.voxels == 0
     assert math.isnan(nothing.share.value)
-
-
-def test_views_that_do_not_fit_are_refused():
     world = fused(flight())
     with pytest.raises(DataError, match="frame 1: needs a view of its size to see labels from; there is none"):
         list(rendered(flight(), world, views=list(flight())[:1]))

@@ -37,9 +37,6 @@ def often(rng, F, low):
     return np.arange(F) < rng.integers(low, F + 1, size=(SIDE * SIDE, 1))
 
 
-# --- The same voxels --------------------------------------------------------------------------------------------------
-
-
 def table_of(voxels, op=2):
     return log_of(np.zeros((len(voxels), op), dtype=int), index=np.array(voxels)).table()
 
@@ -50,15 +47,14 @@ def test_shared_rows_are_the_voxels_that_all_maps_hold():
     c = table_of([(-9, 9, 9), (0, 0, 1), (0, 0, 2), (7, 7, 7)])
     assert [rows.tolist() for rows in shared_rows(a, b, c)] == [[1, 3], [0, 2], [1, 3]]
     assert [rows.tolist() for rows in shared_rows(a, table_of([(1, 1, 1)]))] == [[], []]
-
-
-def test_maps_of_different_voxels_are_refused():
     a = table_of([(0, 0, 0)])
     with pytest.raises(DataError, match="fuse both alike"):
         shared_rows(a, dataclasses.replace(a, voxel_size=0.4))
+    with pytest.raises(ConfigError, match="must ascend from 2"):
+        standardised({"a": a}, PSA, edges=(1, 5))
 
 
-def test_coverage_by_hand():
+def test_coverage_by_hand_and_holm_as_in_statsmodels():
     labels = [[0, 0, 0], [0, 0, -1], [0, -1, -1]]
     a = log_of(labels, index=np.array([(0, 0, 0), (0, 0, 1), (0, 0, 2)])).table()
     b = log_of(labels[:2], index=np.array([(0, 0, 1), (5, 0, 0)])).table()
@@ -66,9 +62,9 @@ def test_coverage_by_hand():
     assert (first.voxels, first.observations, first.mean_op, first.repeated, first.recurrent) == (3, 6, 2, 2, 1)
     assert (first.common_share, first.alone) == (pytest.approx(1 / 3), 2)
     assert (second.common_share, second.alone) == (1 / 2, 1)
-
-
-# --- Standardisation --------------------------------------------------------------------------------------------------
+    p = [0.01, 0.2, 0.03, 0.5, 0.002]
+    assert holm(p) == pytest.approx(multipletests(p, method="holm")[1])
+    assert holm([math.nan, 0.02]) == [pytest.approx(math.nan, nan_ok=True), 0.02]
 
 
 def test_standardised_values_of_one_model_seen_more_or_less_often_are_the_same():
@@ -95,24 +91,12 @@ def test_standardised_value_by_hand():
     values = standardised({"a": a, "b": b}, PSA)
     assert values["a"].value == pytest.approx(2 / 3 * 1 / 2 + 1 / 3)
     assert values["b"].value == pytest.approx(2 / 3 + 1 / 3 * 1 / 2)
-
-
-def test_a_stratum_that_one_map_lacks_counts_for_none():
-    index = np.stack([np.zeros(2), np.zeros(2), np.arange(2)], axis=1)
-    a = log_of([[0, 0, -1, -1], [0, 0, 0, 1]], index=index).table()
-    b = log_of([[0, 1, -1, -1], [0, 1, -1, -1]], index=index).table()
+    a = log_of([[0, 0, -1, -1], [0, 0, 0, 1]], index=index[:2]).table()
+    b = log_of([[0, 1, -1, -1], [0, 1, -1, -1]], index=index[:2]).table()  # lacks a stratum, which counts for none
     assert common_weights(stratum_counts({"a": a, "b": b})).tolist() == [1.0] + [0.0] * len(EDGES)
     assert standardised({"a": a, "b": b}, PSA)["a"].value == 1
     never = log_of([[0, -1]], index=index[:1]).table()
     assert math.isnan(standardised({"a": a, "b": never}, PSA)["a"].value)
-
-
-def test_edges_that_do_not_ascend_are_refused():
-    with pytest.raises(ConfigError, match="must ascend from 2"):
-        standardised({"a": table_of([(0, 0, 0)])}, PSA, edges=(1, 5))
-
-
-# --- Paired comparison ------------------------------------------------------------------------------------------------
 
 
 def two_backbones(rng, gap, side=32, F=4):
@@ -127,17 +111,17 @@ def two_backbones(rng, gap, side=32, F=4):
 
 
 def test_paired_differences_cover_and_their_test_keeps_its_level():
-    """Two backbones of the same quality, 30 times: the interval holds 0, and the test says so, 28 times."""
+    """Two backbones of the same quality, 15 times: the interval holds 0, and the test says so, 14 times."""
     rng = np.random.default_rng(1)
     held, rejected = 0, 0
-    for _ in range(30):
-        tables = two_backbones(rng, 0.0)
+    for _ in range(15):
+        tables = two_backbones(rng, 0.0, side=24)
         result = paired(tables)
         by_measure = {row.measure: row for row in result.differences}
         held += by_measure["psa"].difference.low <= 0 <= by_measure["psa"].difference.high
         rejected += by_measure["alpha_between"].p_value <= 0.05
-    assert held >= 25
-    assert rejected <= 5
+    assert held >= 12
+    assert rejected <= 3
 
 
 def test_a_worse_backbone_is_found_by_difference_test_and_rank():
@@ -152,6 +136,15 @@ def test_a_worse_backbone_is_found_by_difference_test_and_rank():
     for ranking in result.rankings:
         assert [rank.backbone for rank in ranking.ranks] == ["a", "b"]
         assert ranking.ranks[0].best > 0.95
+    rng = np.random.default_rng(3)
+    twins = two_backbones(rng, 0.0)
+    worst = two_backbones(rng, 0.4)["b"]
+    (by_psa,) = (r for r in paired({**twins, "worst": worst}).rankings if r.measure == "psa")
+    ranks = {rank.backbone: rank for rank in by_psa.ranks}
+    assert ranks["worst"].rank == ranks["worst"].low == 3
+    assert ranks["a"].best + ranks["b"].best == pytest.approx(1, abs=0.01)
+    assert {ranks["a"].low, ranks["b"].low} == {1}
+    assert {ranks["a"].high, ranks["b"].high} == {2}
 
 
 def test_backbones_are_compared_by_accuracy_where_there_is_a_truth():
@@ -175,30 +168,12 @@ def test_only_voxels_that_all_saw_twice_are_compared():
     assert result.voxels == 2
     assert result.values["psa"]["a"].value == pytest.approx(psa(a)[:2].mean())
     assert result.values["psa"]["b"].value == 0
-
-
-def test_ranks_are_uncertain_where_backbones_are_alike_and_certain_where_not():
-    rng = np.random.default_rng(3)
-    twins = two_backbones(rng, 0.0)
-    worst = two_backbones(rng, 0.4)["b"]
-    (by_psa,) = (r for r in paired({**twins, "worst": worst}).rankings if r.measure == "psa")
-    ranks = {rank.backbone: rank for rank in by_psa.ranks}
-    assert ranks["worst"].rank == ranks["worst"].low == 3
-    assert ranks["a"].best + ranks["b"].best == pytest.approx(1, abs=0.01)
-    assert {ranks["a"].low, ranks["b"].low} == {1}
-    assert {ranks["a"].high, ranks["b"].high} == {2}
-
-
-def test_maps_without_a_common_voxel_leave_everything_undefined():
     tables = {"a": table_of([(0, 0, 0)]), "b": table_of([(9, 9, 9)])}
     result = paired(tables)
     assert result.voxels == result.blocks == 0
     assert math.isnan(result.values["psa"]["a"].value)
     assert all(math.isnan(row.p_value) for row in result.differences)
     assert all(math.isnan(rank.best) for ranking in result.rankings for rank in ranking.ranks)
-
-
-# --- Tests ------------------------------------------------------------------------------------------------------------
 
 
 def test_pairs_of_all_scenes_are_corrected_together_where_something_may_be_claimed():
@@ -211,10 +186,8 @@ def test_pairs_of_all_scenes_are_corrected_together_where_something_may_be_claim
         row.p_holm for scene in together for row in scene.paired.differences if row.measure == found.paired.primary
     ]
     assert corrected == [
-        pytest.approx(min(1, 2 * p)),
-        pytest.approx(math.nan, nan_ok=True),
-        pytest.approx(min(1, 2 * p)),
-    ]
+        pytest.approx(min(1, 2 * p)), pytest.approx(math.nan, nan_ok=True), pytest.approx(min(1, 2 * p)),
+    ]  # fmt: skip
 
 
 def test_what_describes_says_what_its_interval_answers():
@@ -226,9 +199,3 @@ def test_what_describes_says_what_its_interval_answers():
     assert answers["psa"] == answers["alpha"] == answers["entropy"] == THIS_SCENE
     assert answers["sbd"] == answers["vss"] == THESE_FRAMES
     assert all(row.difference.low < 0 < row.difference.high for row in result.differences)
-
-
-def test_holm_is_that_of_statsmodels():
-    p = [0.01, 0.2, 0.03, 0.5, 0.002]
-    assert holm(p) == pytest.approx(multipletests(p, method="holm")[1])
-    assert holm([math.nan, 0.02]) == [pytest.approx(math.nan, nan_ok=True), 0.02]

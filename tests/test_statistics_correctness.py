@@ -22,9 +22,6 @@ def random_beliefs(n=400, K=4, seed=0):
     return rng.dirichlet(np.full(K, 0.5), size=n), rng.integers(0, K - 1, size=n)
 
 
-# --- Truth ------------------------------------------------------------------------------------------------------------
-
-
 def test_the_truth_of_a_voxel_is_what_most_of_its_ground_truth_says():
     table = log_of([[0], [0], [0], [0]]).table()
     index = np.array([[0, 0, 0], [0, 0, 1], [0, 0, 2], [0, 9, 9]])
@@ -32,36 +29,29 @@ def test_the_truth_of_a_voxel_is_what_most_of_its_ground_truth_says():
     joined = join_truth(table, truth)
     assert joined.label.tolist() == [1, 2, -1, -1]
     assert joined.known.tolist() == [True, True, False, False]
-
-
-def test_truth_of_other_voxels_is_refused():
     with pytest.raises(DataError, match="of 3 classes"):
         join_truth(log_of([[0]]).table(), log_of([[0]], K=4).table())
 
 
-# --- Measures ---------------------------------------------------------------------------------------------------------
-
-
-def test_accuracy_and_miou_are_those_of_scikit_learn():
+def test_accuracy_and_miou_are_those_of_scikit_learn_and_brier_of_the_normalised_evidence():
     belief, label = random_beliefs()
     found = correctness(belief, label)
     predicted = belief.argmax(axis=1)
     assert found.accuracy == pytest.approx(accuracy_score(label, predicted))
     assert found.miou == pytest.approx(jaccard_score(label, predicted, average="macro"))
+    events = log_of_evidence([[[0.2, 0.8], [0.6, 0.4], [0.7, 0.3]]])
+    table = events.table()
+    truth = join_truth(table, log_of_evidence([[[0.0, 1.0]]]).table())
+    (everything, *_) = by_stratum(Predictions.of(table.evidence, truth.label), table.op, truth.known, (1, 2, 5))
+    assert everything.brier == pytest.approx(2 * normalise(table.evidence)[0, 0] ** 2)
 
 
-def test_classes_that_are_neither_true_nor_predicted_do_not_count():
+def test_miou_brier_score_and_calibration_error_by_hand():
     belief = np.array([[0.9, 0.1, 0.0], [0.8, 0.2, 0.0]])
     assert correctness(belief, np.array([0, 1])).miou == pytest.approx((1 / 2 + 0) / 2)
-
-
-def test_brier_score_by_hand():
     belief = np.array([[0.5, 0.5], [1.0, 0.0], [0.0, 1.0]])
     assert correctness(belief, np.array([0, 0, 0])).brier == pytest.approx((0.5 + 0 + 2) / 3)
-
-
-def test_calibration_error_by_hand():
-    """Ten voxels of confidence 0.9, six right; ten of 0.5 and all right: (0.3 + 0.5) / 2."""
+    # Ten voxels of confidence 0.9, six right; ten of 0.5 and all right: (0.3 + 0.5) / 2
     belief = np.array([[0.9, 0.1]] * 10 + [[0.5, 0.5]] * 10)
     label = np.array([0] * 6 + [1] * 4 + [0] * 10)
     assert correctness(belief, label).ece == pytest.approx(0.4)
@@ -80,9 +70,6 @@ def test_a_calibrated_model_has_hardly_any_calibration_error():
     found = correctness(belief, label)
     assert found.ece < 0.01
     assert found.brier == pytest.approx((1 - (belief**2).sum(axis=1)).mean(), abs=0.01)
-
-
-def test_every_voxel_is_in_one_bin():
     belief, label = random_beliefs(seed=2)
     belief[:3] = np.eye(4)[:3]
     assert sum(row.voxels for row in reliability(belief, label)) == len(belief)
@@ -103,9 +90,6 @@ def test_strata_hold_the_voxels_of_their_op():
     assert math.isnan(rows["OP>5"][1])
 
 
-# --- Quadrants --------------------------------------------------------------------------------------------------------
-
-
 def test_quadrants_by_hand():
     """Of five voxels one is seen twice only, and one has no truth; seen so often, places are what they look like."""
     labels = np.full((6, 40), -1)
@@ -119,12 +103,14 @@ def test_quadrants_by_hand():
     assert [share.value for share in shares] == pytest.approx([0.25, 0.25, 0.25, 0.25], abs=0.01)
     assert found.wrong_of_stable.value == pytest.approx(0.5, abs=0.01)
     assert stable_wrong(table, truth).tolist() == [False, True, False, False, False, False]
-
-
-def test_one_of_ten_frames_may_disagree_at_a_stable_voxel():
     table = log_of([[0] * 90 + [1] * 10, [0] * 80 + [1] * 20]).table()
     truth = join_truth(table, log_of([[1], [1]]).table())
     assert stable_wrong(table, truth).tolist() == [True, False]
+    table = log_of([[0, 0]]).table()
+    found = quadrants(table, join_truth(table, table), Cubes.of(table, where=table.op > 0))
+    assert found.voxels == 0
+    assert math.isnan(found.stable_wrong.value)
+    assert math.isnan(correctness(np.zeros((0, 3)), np.zeros(0, dtype=int)).accuracy)
 
 
 @pytest.mark.parametrize("q", [0.8, 0.95])
@@ -160,19 +146,3 @@ def test_a_model_that_errs_the_same_way_in_every_view_is_stable_and_wrong():
     found = quadrants(table, truth, Cubes.of(table, where=table.op > 0))
     assert found.wrong_of_stable.low <= place.mean() <= found.wrong_of_stable.high
     assert stable_wrong(table, truth)[~place[:, 0]].mean() < 0.01
-
-
-def test_without_a_voxel_that_counts_quadrants_are_undefined():
-    table = log_of([[0, 0]]).table()
-    found = quadrants(table, join_truth(table, table), Cubes.of(table, where=table.op > 0))
-    assert found.voxels == 0
-    assert math.isnan(found.stable_wrong.value)
-    assert math.isnan(correctness(np.zeros((0, 3)), np.zeros(0, dtype=int)).accuracy)
-
-
-def test_the_belief_is_the_normalised_evidence():
-    events = log_of_evidence([[[0.2, 0.8], [0.6, 0.4], [0.7, 0.3]]])
-    table = events.table()
-    truth = join_truth(table, log_of_evidence([[[0.0, 1.0]]]).table())
-    (everything, *_) = by_stratum(Predictions.of(table.evidence, truth.label), table.op, truth.known, (1, 2, 5))
-    assert everything.brier == pytest.approx(2 * normalise(table.evidence)[0, 0] ** 2)

@@ -35,11 +35,17 @@ def tied_to_the_view(rng, frames=8, lasts=2):
     return np.where(rng.random((SIDE**2, 1)) < 0.5, drawn, own)
 
 
-def test_alpha_of_two_frames_is_krippendorffs():
+def test_alpha_of_two_frames_is_krippendorffs_and_distances_are_those_of_the_cameras():
     labels = np.random.default_rng(0).choice(3, size=(SIDE**2, 2), p=[0.6, 0.3, 0.1])
     (row,) = correlogram(sample_of(labels, flown(1.0, 2))).time
     assert (row.mean, row.pairs) == (1, SIDE**2)
     assert row.alpha.value == pytest.approx(krippendorff_alpha(log_of(labels).table()))
+    found = correlogram(sample_of(np.zeros((SIDE**2, 2), int), [(2, 2, 10), (2, 7, 20)]))
+    (baseline,), (ratio,) = found.baseline, found.range
+    assert baseline.mean == pytest.approx(math.hypot(5, 10))
+    assert ratio.mean == pytest.approx(2, abs=0.15)
+    assert 300 < sum(row.pairs for row in found.angle) <= SIDE**2
+    assert math.isnan(found.time[0].alpha.value)  # one class: chance alone always agrees
 
 
 def test_errors_that_last_show_as_agreement_that_falls_with_distance():
@@ -51,15 +57,6 @@ def test_errors_that_last_show_as_agreement_that_falls_with_distance():
     assert alphas[16].low < 0.5 < alphas[16].high
     angles = [row.alpha.value for row in found.angle]
     assert angles[0] > angles[-1] + 0.2
-
-
-def test_distances_are_those_of_the_cameras():
-    found = correlogram(sample_of(np.zeros((SIDE**2, 2), int), [(2, 2, 10), (2, 7, 20)]))
-    (baseline,), (ratio,) = found.baseline, found.range
-    assert baseline.mean == pytest.approx(math.hypot(5, 10))
-    assert ratio.mean == pytest.approx(2, abs=0.15)
-    assert 300 < sum(row.pairs for row in found.angle) <= SIDE**2
-    assert math.isnan(found.time[0].alpha.value)  # one class: chance alone always agrees
 
 
 def errs_by_view(rng, centres, sector=20.0):

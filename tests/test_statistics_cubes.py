@@ -13,11 +13,14 @@ from semstab.statistics.cluster_sums import cubes_of
 from semstab.statistics.variance import gradient_of
 
 
-def test_slopes_are_exact():
+def test_slopes_are_exact_and_columns_leave_out_voxels_seen_once():
     """Of a mean s / n: 1 / n and -s / n^2, to the last digits; NaN where it is not defined."""
     sums = np.array([0.3e6, 1e6])
     np.testing.assert_allclose(gradient_of(ratio_of, sums), [1e-6, -0.3e-6], rtol=1e-15)
     assert np.isnan(gradient_of(alpha_of, np.array([0.5, 1.0, 0.7, 0.5, 0.5]))).any()
+    table = log_of([[0, 1, 0], [1, -1, -1]]).table()
+    assert not psa_columns(table)[1].any()
+    assert not alpha_columns(table)[1].any()
 
 
 def test_keys_are_one_to_one_and_ascend_with_the_index():
@@ -26,17 +29,8 @@ def test_keys_are_one_to_one_and_ascend_with_the_index():
     a, b = voxel_keys(index, index[::7])
     assert (np.diff(a) > 0).all()
     assert np.array_equal(a[::7], b)
-
-
-def test_maps_that_span_too_much_are_refused():
     with pytest.raises(DataError, match="larger voxels"):
         voxel_keys(np.array([[-(2**31), -(2**31), -(2**31)], [2**31 - 1] * 3]))
-
-
-def test_columns_leave_out_voxels_seen_once():
-    table = log_of([[0, 1, 0], [1, -1, -1]]).table()
-    assert not psa_columns(table)[1].any()
-    assert not alpha_columns(table)[1].any()
 
 
 @pytest.mark.parametrize("spread", [3, 40, 100_000])

@@ -63,16 +63,17 @@ def described():
     return analyse(MapSample.draw(events.table(), events, ground_truth()), name="sim")
 
 
-# --- One map ----------------------------------------------------------------------------------------------------------
-
-
-def test_a_description_is_content_for_json_and_undefined_numbers_are_null(described, tmp_path):
+def test_a_description_is_content_for_json_and_every_voxel_has_a_value(described, tmp_path):
     write_json(tmp_path / "statistics.json", described.summary)
     content = read_json(tmp_path / "statistics.json")
     assert content["agreement"]["alpha"]["value"] == described.summary.agreement.alpha.value
     assert content["strata"][0]["psa"] is None
     assert math.isnan(described.summary.strata[0].psa)
     assert to_json(from_json(MapStatistics, content, "statistics.json")) == content
+    columns = described.columns(backbone(0.2, 0, place=0.2).table())
+    assert {len(values) for values in columns.values()} == {SIDE**2}
+    assert {"psa", "sbd_excess", "trend_q", "entropy_within", "entropy_between", "stable_wrong"} <= set(columns)
+    assert 0 <= np.nanmin(columns["stable"]) < np.nanmax(columns["stable"]) <= 1
 
 
 @pytest.mark.parametrize("soft", [False, True])
@@ -108,13 +109,6 @@ def test_a_description_holds_what_the_functions_say(described):
     assert [row.rule for row in summary.fusion_rules] == ["averaging", "majority", "product", "geometric"]
 
 
-def test_every_column_has_a_value_for_every_voxel(described):
-    columns = described.columns(backbone(0.2, 0, place=0.2).table())
-    assert {len(values) for values in columns.values()} == {SIDE**2}
-    assert {"psa", "sbd_excess", "trend_q", "entropy_within", "entropy_between", "stable_wrong"} <= set(columns)
-    assert 0 <= np.nanmin(columns["stable"]) < np.nanmax(columns["stable"]) <= 1
-
-
 def test_the_same_seed_gives_the_same_description():
     events = backbone(0.2, 3)
     a, b, other = (describe(events.table(), events, seed=seed) for seed in (4, 4, 5))
@@ -126,10 +120,11 @@ def test_the_same_seed_gives_the_same_description():
 def test_a_table_alone_is_described_as_far_as_it_goes():
     events = backbone(0.2, 0)
     alone, logged = describe(events.table()), describe(events.table(), events)
-    assert alone.fusion_rules is alone.correctness is alone.geometry is None
-    assert alone.drift.tests is None
+    assert alone.fusion_rules is alone.correctness is alone.geometry is alone.drift.tests is None
     assert alone.drift.null == logged.drift.null
     assert to_json(alone.agreement) == to_json(logged.agreement)
+    assert "for these frames alone (no log)" in alone.verdict.line
+    assert "for this scene flown again, from 8 frames" in logged.verdict.line
 
 
 @pytest.mark.parametrize("labels", [np.zeros((0, 2), dtype=int), [[0, -1]], [[0, 0], [0, 0]]])
@@ -141,12 +136,11 @@ def test_maps_that_say_nothing_are_described_too(labels):
     assert "no verdict" in summary.verdict.line
 
 
-def test_events_of_another_map_are_refused():
+def test_events_of_another_map_and_one_backbone_are_refused():
     with pytest.raises(DataError, match="take both from one backend"):
         describe(log_of([[0, 1]]).table(), log_of([[0, -1]]))
-
-
-# --- Several maps -----------------------------------------------------------------------------------------------------
+    with pytest.raises(ConfigError, match="give two or more"):
+        compare_backbones({"a": ground_truth()})
 
 
 def test_backbones_beside_each_other():
@@ -164,14 +158,6 @@ def test_backbones_beside_each_other():
     assert rules.values["averaging"]["stuck"].accuracy < 0.8
     assert rules.order_changes.keys() == rules.orders.keys()
     assert compare_backbones(tables).fusion_rules is None
-
-
-def test_one_backbone_cannot_be_compared():
-    with pytest.raises(ConfigError, match="give two or more"):
-        compare_backbones({"a": ground_truth()})
-
-
-# --- The verdict ------------------------------------------------------------------------------------------------------
 
 
 def between(low, high):
@@ -193,51 +179,29 @@ def of_class(name, low, high, *, matters=True):
     )
 
 
-@pytest.mark.parametrize(
-    ("low", "high", "level"),
-    [
-        (0.81, 0.9, "stable"), (0.79, 0.9, "stable"), (0.67, 0.7, "usable"), (0.6, 0.9, "usable"),
-        (0.6, 0.98, "undecided"), (0.3, 0.66, "unstable"), (math.nan, math.nan, "no verdict"),
-    ],
-)  # fmt: skip
+@pytest.mark.parametrize(("low", "high", "level"), [
+    (0.81, 0.9, "stable"), (0.79, 0.9, "stable"), (0.67, 0.7, "usable"), (0.6, 0.9, "usable"),
+    (0.6, 0.98, "undecided"), (0.3, 0.66, "unstable"), (math.nan, math.nan, "no verdict"),
+])  # fmt: skip
 def test_the_most_probable_level_is_the_verdict(low, high, level):
     assert judged(low, high).level == level
 
 
-def test_agreement_below_zero_is_no_share_of_anything():
+def test_agreement_below_zero_stable_errors_and_few_places_are_said():
     line = judged(-0.2, -0.1, ceiling=0.9, classes=(of_class("tree", -0.2, -0.1),)).line
     assert "alpha between frames -0.15, no better than chance, is -15%" in line
     assert "probably unstable: tree (100%)" in line
     assert "chance" not in judged(0.1, 0.2, ceiling=0.9).line
-
-
-def test_what_is_stably_wrong_is_not_called_stable():
-    assert judged(0.9, 0.95, Interval(0.2, 0.1, 0.3)).level == "misleading"
+    wrong = judged(0.9, 0.95, Interval(0.2, 0.1, 0.3))
+    assert wrong.level == "misleading"
+    assert "20% of the stable locations are wrong (10% to 30%)" in wrong.line
     assert judged(0.9, 0.95, Interval(0.06, 0.04, 0.1)).level == "stable"
-    assert "20% of the stable locations are wrong (10% to 30%)" in judged(0.9, 0.95, Interval(0.2, 0.1, 0.3)).line
-
-
-def test_there_is_no_verdict_from_few_places():
     assert judged(0.9, 0.95, voxels=99).level == judged(0.9, 0.95, blocks=15).level == "no verdict"
     assert "more overlap between frames" in judged(0.9, 0.95, voxels=99).line
     assert "one class" in judged(math.nan, math.nan).line
 
 
-def test_the_line_says_what_to_do_and_why():
-    assert judged(0.5, 0.6).line == (
-        "net: unstable (100%), do not act on its labels: two frames agree at 55% of the locations (50% to 60%),"
-        " alpha between frames 0.55 (0.50 to 0.60), its ceiling not known; 5000 locations seen twice or more, 50% of"
-        " the map; for this scene flown again, from 60 frames"
-    )
-
-
-def test_few_frames_and_a_missing_log_are_named():
-    events = backbone(0.1, 3)
-    assert "for this scene flown again, from 8 frames" in describe(events.table(), events).verdict.line
-    assert "for these frames alone (no log)" in describe(events.table()).verdict.line
-
-
-def test_probabilities_of_the_levels_sum_to_one_and_follow_the_interval():
+def test_probabilities_of_the_levels_sum_to_one_and_the_line_says_what_to_do_and_why():
     for low, high in ((0.5, 0.6), (0.7, 0.9), (0.81, 0.9)):
         for scale in ("agreement", "plain"):
             levels = level_probabilities(between(low, high), scale)
@@ -245,17 +209,19 @@ def test_probabilities_of_the_levels_sum_to_one_and_follow_the_interval():
             assert min(levels.values()) >= 0
     half = level_probabilities(between(0.7, 0.9), "plain")
     assert half["stable"] == pytest.approx(0.5)
+    assert judged(0.5, 0.6).line == (
+        "net: unstable (100%), do not act on its labels: two frames agree at 55% of the locations (50% to 60%),"
+        " alpha between frames 0.55 (0.50 to 0.60), its ceiling not known; 5000 locations seen twice or more, 50% of"
+        " the map; for this scene flown again, from 60 frames"
+    )
 
 
-def test_agreement_is_judged_against_its_ceiling_and_the_line_says_which():
+def test_agreement_is_judged_against_its_ceiling_and_the_line_names_unstable_classes_the_most_probable_first():
     found = judged(0.82, 0.9, ceiling=0.7)
     assert found.level == "stable"
     assert "alpha between frames 0.86 is 86% (82% to 90%) of its ceiling, 0.70" in found.line
     assert judged(0.82, 0.9, ceiling=0.4).level == "too coarse"
     assert judged(0.1, 0.2, ceiling=0.4).level == "unstable"
-
-
-def test_classes_that_are_probably_unstable_are_named_the_most_probable_first():
     good, bad, worse = of_class("road", 0.9, 1.0), of_class("person", 0.3, 0.6), of_class("tree", -0.1, 0.1)
     rare, unknown = of_class("car", 0.1, 0.2, matters=False), of_class("sign", math.nan, math.nan)
     found = judged(0.9, 1.0, ceiling=0.9, classes=(good, bad, worse, rare, unknown))

@@ -56,9 +56,6 @@ def small(events, **settings):
     return voxel_drift(events.table(), events, **settings)
 
 
-# --- The null ---------------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("T", [2, 3, 4, 5])
 def test_few_observations_are_compared_with_all_orders_exactly(T):
     rng = np.random.default_rng(T)
@@ -97,29 +94,17 @@ def test_the_null_of_one_hot_observations_is_known_from_their_counts(labels):
     np.testing.assert_allclose(small(log_of_evidence(evidence[None])).null, [expected])
 
 
-def test_the_null_from_counts_is_what_random_orders_give_on_average():
-    rng = np.random.default_rng(1)
-    labels = np.repeat([[0] * 25 + [1] * 10 + [2] * 5], 4000, axis=0)
-    table = log_of(shuffled(rng, labels)).table()
-    drawn = sbd(table)
-    assert drawn.mean() == pytest.approx(expected_sbd(table)[0], abs=4 * drawn.std() / math.sqrt(len(drawn)))
-
-
 def test_the_null_is_undefined_where_a_frame_disagrees_with_itself_and_zero_where_all_agree():
+    """Beyond 256 observations the table of drifts ends, and drawn orders take over."""
     events = log_of_evidence([[[1, 0], [0.5, 0.5]], [[1, 0], [1, 0]], [[1, 0], [0, 1]]])
     np.testing.assert_allclose(expected_sbd(events.table()), [np.nan, 0, 0.311278], atol=1e-6)
     drift = small(events)
     assert drift.null[1] == drift.excess[1] == 0
     assert math.isnan(drift.p_value[1])
     assert math.isnan(small(log_of([[0, -1]])).null[0])
-
-
-def test_very_many_observations():
-    """Beyond 256 the table of drifts ends, and drawn orders take over."""
-    rng = np.random.default_rng(2)
-    events = log_of(rng.integers(0, 2, size=(3, 300)))
-    assert np.isnan(expected_sbd(events.table())).all()
-    drift = small(events, draws=100)
+    many = log_of(np.random.default_rng(2).integers(0, 2, size=(3, 300)))
+    assert np.isnan(expected_sbd(many.table())).all()
+    drift = small(many, draws=100)
     assert (np.abs(drift.excess) < 0.5 * drift.null).all()
 
 
@@ -133,9 +118,6 @@ def test_in_every_stratum_the_mean_sbd_of_noise_is_what_random_order_gives():
         assert excess.mean() == pytest.approx(0, abs=4 * excess.std() / math.sqrt(len(table)) + 1e-12)
         means.append(sbd(table).mean())
     assert all(fewer > 1.5 * more for fewer, more in itertools.pairwise(means))
-
-
-# --- Tests of voxels --------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("T", [5, 9])
@@ -191,21 +173,14 @@ def test_the_same_seed_gives_the_same_numbers_for_any_number_of_threads():
     assert a == b
 
 
-def test_an_empty_log_and_one_without_disagreement():
+def test_an_empty_log_one_without_disagreement_and_settings_that_make_no_sense():
     for labels in (np.zeros((0, 3), dtype=int), [[1, 1, 1]]):
         events = log_of(labels)
         assert math.isnan(order_test(events.table(), events).p_value)
         assert not len(trend_columns(events.table(), small(events))[0])
         assert len(flips(events).rate) == len(labels)
-
-
-def test_settings_that_make_no_sense_are_refused():
-    events = log_of([[0, 1]])
     with pytest.raises(ConfigError, match="draws = 0, most = 5"):
-        voxel_drift(events.table(), events, draws=0, most=5)
-
-
-# --- Tests of the scene -----------------------------------------------------------------------------------------------
+        small(log_of([[0, 1]]), draws=0, most=5)
 
 
 def scene(labels, K=2, frame_orders=99):
@@ -223,14 +198,14 @@ def drift_of(events, frame_orders=99):
 def test_the_scene_test_keeps_its_level_when_voxels_err_together():
     """40 voxels with one and the same labels are one voxel, not 40."""
     rng = np.random.default_rng(10)
-    p_values = [scene(np.repeat(rng.integers(0, 2, size=(1, 40)), 40, axis=0)) for _ in range(60)]
-    slack = 3 * math.sqrt(0.05 * 0.95 / 60)
+    p_values = [scene(np.repeat(rng.integers(0, 2, size=(1, 40)), 40, axis=0)) for _ in range(30)]
+    slack = 3 * math.sqrt(0.05 * 0.95 / 30)
     assert np.mean([s.p_value <= 0.05 for s in p_values]) <= 0.05 + slack
     assert np.mean([s.trend_p <= 0.05 for s in p_values]) <= 0.05 + slack
 
 
 def test_the_scene_test_finds_a_common_drift():
-    """Small beside what single frames err: neighbouring frames have hardly more in common than others."""
+    """Where it is small; a belief that moves all the time cannot be told from errors that last."""
     rng = np.random.default_rng(11)
     labels = (rng.random((600, 40)) < np.linspace(0.35, 0.65, 40)).astype(int)
     seen = rng.random(labels.shape) < 0.6
@@ -240,14 +215,9 @@ def test_the_scene_test_finds_a_common_drift():
     assert moving.trend_p == 0.01
     assert moving.trend > moving.trend_null + 0.02
     assert noise.trend_p > 0.05
-
-
-def test_a_belief_that_moves_all_the_time_cannot_be_told_from_errors_that_last():
-    rng = np.random.default_rng(11)
     moving = scene(drifting(rng, 200, 40))
     assert moving.trend > moving.trend_null + 0.1
-    assert math.isnan(moving.trend_p)
-    assert math.isnan(scene(drifting(rng, 200, 12)).trend_p)
+    assert np.isnan([moving.trend_p, scene(drifting(rng, 200, 12)).trend_p]).all()
 
 
 def flown(quality, frames, looks, seed):
@@ -295,32 +265,20 @@ def test_frames_need_not_be_numbered_from_zero_nor_come_in_order():
     assert a.trend_p == pytest.approx(b.trend_p, abs=0.15)
 
 
-# --- Flips ------------------------------------------------------------------------------------------------------------
-
-
-def test_flips_by_hand():
+def test_flips_by_hand_and_of_noise():
     events = log_of([[0, 0, 1, 1, -1, 1], [0, 1, 0, -1, -1, -1], [2, -1, -1, -1, -1, -1], [1, 1, -1, -1, -1, -1]])
     changes = flips(events)
     np.testing.assert_allclose(changes.rate, [1 / 4, 1, np.nan, 0])
     np.testing.assert_allclose(changes.null, [3 * 2 / 10, 2 / 3, np.nan, 0])
     np.testing.assert_allclose(changes.since, [3, 0, np.nan, np.nan])
-
-
-def test_a_flip_is_a_change_of_the_largest_evidence():
-    events = log_of_evidence([[[0.6, 0.4], [0.9, 0.1], [0.5, 0.5], [0.4, 0.6]]])
-    assert flips(events).rate[0] == pytest.approx(1 / 3)
-
-
-def test_noise_flips_as_often_as_random_order_does_and_lasting_labels_less():
+    soft_ones = log_of_evidence([[[0.6, 0.4], [0.9, 0.1], [0.5, 0.5], [0.4, 0.6]]])  # of the largest evidence
+    assert flips(soft_ones).rate[0] == pytest.approx(1 / 3)
     rng = np.random.default_rng(13)
     noise = flips(log_of(rng.integers(0, 3, size=(5000, 6))))
     excess = noise.rate - noise.null
     assert excess.mean() == pytest.approx(0, abs=4 * excess.std() / math.sqrt(5000))
     lasting = flips(log_of(np.sort(rng.integers(0, 3, size=(500, 6)), axis=1)))
     assert (lasting.rate - lasting.null).mean() < -0.2
-
-
-# --- Many tests at once -----------------------------------------------------------------------------------------------
 
 
 def test_benjamini_hochberg_is_that_of_scipy_and_leaves_out_what_was_not_tested():

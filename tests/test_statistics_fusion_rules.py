@@ -40,36 +40,24 @@ def test_each_rule_is_its_formula(rule):
         assert sbd(fused)[i] == pytest.approx(js_divergence(beliefs[1:], beliefs[:-1]).mean())
 
 
-def test_averaging_is_what_the_metrics_say():
+def test_averaging_is_what_the_metrics_say_and_the_two_products_decide_alike():
     events = log_of_evidence(soft(np.random.default_rng(1), 20, 4))
     fused, table = fuse(events, "averaging"), events.table()
     np.testing.assert_allclose(vss(fused), vss(table))
     np.testing.assert_allclose(sbd(fused), sbd(table))
     np.testing.assert_allclose(entropy(fused), entropy(table))
-
-
-def test_the_two_products_decide_alike_and_differ_in_how_sure_they_are():
     events = log_of_evidence(soft(np.random.default_rng(2), 200, 6))
     product, geometric = fuse(events, "product"), fuse(events, "geometric")
     assert np.array_equal(labels(product.belief), labels(geometric.belief))
     assert (vss(product) >= vss(geometric) - 1e-12).all()
 
 
-def test_one_frame_cannot_veto_a_class_for_ever():
+def test_beliefs_neither_veto_nor_underflow_and_ties_go_to_the_lowest():
     fused = fuse(log_of_evidence([[[0.0, 1.0]] + [[0.9, 0.1]] * 9]), "product")
     assert fused.belief[0, 0] > 0.99
-
-
-def test_a_thousand_observations_do_not_underflow():
     fused = fuse(log_of([[0, 1] * 500]), "product")
     np.testing.assert_allclose(fused.belief, [[0.5, 0.5, 0]], atol=1e-9)
-
-
-def test_classes_that_tie_but_for_rounding_go_to_the_lowest():
     assert labels(np.array([[0.5 - 1e-16, 0.5, 0], [0.1, 0.3, 0.6]])).tolist() == [0, 2]
-
-
-def test_a_voxel_seen_once_has_no_drift_and_an_empty_log_no_voxel():
     assert np.isnan(sbd(fuse(log_of([[1, -1]]), "majority"))[0])
     assert fuse(log_of(np.zeros((0, 2), dtype=int)), "geometric").belief.shape == (0, 3)
 

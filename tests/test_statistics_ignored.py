@@ -92,15 +92,12 @@ def test_labels_and_scores_are_compared_by_what_they_decide():
     assert found.standardised.values == {}
 
 
-def test_bounds_of_agreement_by_hand():
+def test_bounds_of_agreement_by_hand_and_thin_strata():
     """One place, three looks: class 0, class 0, left out. Of three pairs one agrees, of two nothing is known."""
     looks = np.zeros((1, 3, 3))
     looks[0, [0, 1, 2], [0, 0, 2]] = 1
     assert psa_bounds(log_of_evidence(looks)) == (pytest.approx(1 / 3), pytest.approx(1))
     assert all(map(math.isnan, psa_bounds(log_of_evidence(looks[:, :1]))))
-
-
-def test_strata_of_op_that_hardly_overlap_are_said():
     seen = {"rarely": 2, "often": 8}
     tables = {
         name: log_of_evidence(np.tile(np.eye(3)[0], (400, op, 1)), index=grid(20)).table() for name, op in seen.items()
@@ -112,9 +109,16 @@ def test_strata_of_op_that_hardly_overlap_are_said():
     assert found.standardised.thin == 1
     same = {"a": tables["often"], "b": tables["often"]}
     assert thin_share(stratum_counts(same), np.array([0, 0, 0, 0, 0, 1.0, 0, 0, 0, 0, 0])) == 0
+    apart = [dataclasses.replace(f, index=f.index + 10) for f in flight(4)]
+    found = compared(a=list(flight(4)), b=apart)
+    assert isinstance(found.observations, ComparedObservations)
+    assert (found.observations.voxels, found.paired.voxels) == (0, 0)
+    assert psa(compared(a=list(flight(2)), b=list(flight(2))) and log_of_evidence(np.eye(3)[None]).table()).shape == (
+        1,
+    )
 
 
-def test_looks_come_back_from_their_file(tmp_path):
+def test_looks_come_back_from_their_file_and_stay_when_more_frames_come(tmp_path):
     looks = sampler_of(flight(4, flicker=0.2), 0.4).looks(("a", "b", "c"))
     looks.save(tmp_path / "looks.parquet")
     back = CellObservations.load(tmp_path / "looks.parquet")
@@ -126,33 +130,6 @@ def test_looks_come_back_from_their_file(tmp_path):
     (tmp_path / "other.parquet").write_bytes(b"no")
     with pytest.raises(DataError, match="not a file of sampled looks"):
         CellObservations.load(tmp_path / "other.parquet")
-
-
-def test_samples_of_other_voxels_are_refused_and_less_dense_ones_are_met():
-    looks = sampler_of(flight(4), 0.4).looks()
-    with pytest.raises(DataError, match="fuse both alike"):
-        common_observations([looks, sampler_of(flight(4), 0.2).looks()])
-    thinned = sampler_of(flight(4), 0.4, budget=1500).looks()
-    assert thinned.share < looks.share
-    both = common_observations([looks, thinned])
-    assert both.missing == (0, 0)
-    assert len(both.logs[0]) == len(both.logs[1]) == len(thinned.observations())
-
-
-def test_samples_that_began_elsewhere_meet_on_the_same_cells():
-    frames = list(flight(6, flicker=0.2, step=0.5))
-    looks, back = sampler_of(frames, 0.1).looks(), sampler_of(frames[::-1], 0.1).looks()
-    assert looks.low != back.low
-    both = common_observations([looks, back])
-    assert both.missing == (0, 0)
-    np.testing.assert_array_equal(both.logs[0].evidence, both.logs[1].evidence)
-    np.testing.assert_array_equal(both.logs[0].evidence, looks.observations().evidence)
-    far = dataclasses.replace(back, low=(back.low[0], back.low[1] - (1 << 19), back.low[2]))
-    with pytest.raises(DataError, match="larger voxels"):
-        common_observations([looks, far])
-
-
-def test_looks_stay_as_they_were_when_more_frames_come():
     frames = list(flight(6, flicker=0.2))
     sampler = sampler_of(frames[:3], 0.1, budget=6000)
     before, share = sampler.looks(), sampler.looks().share
@@ -164,11 +141,22 @@ def test_looks_stay_as_they_were_when_more_frames_come():
     np.testing.assert_array_equal(before.sample().seen.evidence, seen.evidence)
 
 
-def test_nothing_in_common_leaves_everything_undefined():
-    apart = [dataclasses.replace(f, index=f.index + 10) for f in flight(4)]
-    found = compared(a=list(flight(4)), b=apart)
-    assert isinstance(found.observations, ComparedObservations)
-    assert (found.observations.voxels, found.paired.voxels) == (0, 0)
-    assert psa(compared(a=list(flight(2)), b=list(flight(2))) and log_of_evidence(np.eye(3)[None]).table()).shape == (
-        1,
-    )
+def test_samples_of_other_voxels_are_refused_and_less_dense_ones_or_others_meet():
+    looks = sampler_of(flight(4), 0.4).looks()
+    with pytest.raises(DataError, match="fuse both alike"):
+        common_observations([looks, sampler_of(flight(4), 0.2).looks()])
+    thinned = sampler_of(flight(4), 0.4, budget=1500).looks()
+    assert thinned.share < looks.share
+    both = common_observations([looks, thinned])
+    assert both.missing == (0, 0)
+    assert len(both.logs[0]) == len(both.logs[1]) == len(thinned.observations())
+    frames = list(flight(6, flicker=0.2, step=0.5))
+    looks, back = sampler_of(frames, 0.1).looks(), sampler_of(frames[::-1], 0.1).looks()
+    assert looks.low != back.low
+    both = common_observations([looks, back])
+    assert both.missing == (0, 0)
+    np.testing.assert_array_equal(both.logs[0].evidence, both.logs[1].evidence)
+    np.testing.assert_array_equal(both.logs[0].evidence, looks.observations().evidence)
+    far = dataclasses.replace(back, low=(back.low[0], back.low[1] - (1 << 19), back.low[2]))
+    with pytest.raises(DataError, match="larger voxels"):
+        common_observations([looks, far])

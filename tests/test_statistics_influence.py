@@ -38,17 +38,12 @@ def test_the_sums_give_every_number_back(soft_evidence):
     stable = np.where(often, stability_posterior(table), 0.0)
     excess, known = sbd(table) - expected_sbd(table), correctness(table.evidence[again], truth[again])
     expected = {
-        "psa": psa(table)[again].mean(),
-        "alpha": krippendorff_alpha(table),
-        "vss": vss(table)[often].mean(),
-        "entropy": entropy(table)[again].mean(),
-        "accuracy": right[again].mean(),
+        "psa": psa(table)[again].mean(), "alpha": krippendorff_alpha(table), "vss": vss(table)[often].mean(),
+        "entropy": entropy(table)[again].mean(), "accuracy": right[again].mean(),
         "look_accuracy": log.evidence[again[log.voxel], truth[log.voxel[again[log.voxel]]]].mean(),
-        "wrong_of_stable": (stable * ~right).sum() / stable.sum(),
-        "miou": known.miou,
-        "ece": known.ece,
+        "wrong_of_stable": (stable * ~right).sum() / stable.sum(), "miou": known.miou, "ece": known.ece,
         "sbd_excess": np.nan if soft_evidence else np.nanmean(excess[again]),
-    }
+    }  # fmt: skip
     for given in (log, None):
         sums = cluster_sums_of(table, given, truth, sbd_excess=excess)
         assert {key: value(sums, key) for key in expected} == pytest.approx(expected, abs=1e-12, nan_ok=True)
@@ -115,14 +110,11 @@ def test_a_series_over_frames_and_how_much_of_a_map_is_covered():
     assert difference_over_frames({f: v + 1 for f, v in series.items()}, series).value == pytest.approx(1)
 
 
-def test_a_map_of_which_nothing_was_seen_twice_has_no_numbers():
+def test_a_map_of_which_nothing_was_seen_twice_has_no_numbers_and_a_large_one_few_cubes():
     table = (log := log_of(np.zeros((9, 1), dtype=int), index=grid(3))).table()
     for given in (log, None):
         sums = cluster_sums_of(table, given, np.zeros(9, dtype=np.int64), sbd_excess=np.full(9, np.nan))
         assert np.isnan([value(sums, key) for key in ("alpha", "miou", "ece", "sbd_excess")]).all()
-
-
-def test_at_most_so_many_cubes_and_groups_of_frames():
     labels = np.zeros((40 * 40, 150), dtype=int)
     log = log_of(labels, index=grid(40))
     sums = cluster_sums_of(log.table(), log)

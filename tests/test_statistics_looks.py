@@ -27,7 +27,7 @@ from semstab.statistics import (
     disagreement,
     krippendorff_alpha,
     psa,
-)
+)  # fmt: skip
 from semstab.statistics.accumulate import cluster_sums_of
 from semstab.statistics.cluster_sums import value
 from semstab.statistics.loops.observations import hash_row
@@ -35,32 +35,15 @@ from semstab.statistics.loops.observations import hash_row
 DATA = Path(os.environ.get("SEMSTAB_DATA", Path(__file__).parents[2] / "shared/data"))
 
 
-# --- Alpha between frames ---------------------------------------------------------------------------------------------
-
-
-def test_alpha_between_frames_of_labels_is_krippendorffs():
-    table = log_of(np.random.default_rng(0).integers(-1, 3, size=(80, 5))).table()
-    assert alpha_between(table) == pytest.approx(krippendorff_alpha(table))
-
-
-def test_alpha_between_frames_is_its_definition():
+def test_alpha_between_frames_is_its_definition_and_of_labels_krippendorffs():
+    labels = log_of(np.random.default_rng(0).integers(-1, 3, size=(80, 5))).table()
+    assert alpha_between(labels) == pytest.approx(krippendorff_alpha(labels))
     evidence = soft(np.random.default_rng(1), 12, 4)
     apart = ((evidence[:, :, None] - evidence[:, None]) ** 2).sum(axis=3) / 2
-    all_of_them = evidence.reshape(-1, 3)
-    expected = ((all_of_them[:, None] - all_of_them[None]) ** 2).sum(axis=2) / 2
-    n = len(all_of_them)
+    every = evidence.reshape(-1, 3)
+    expected = ((every[:, None] - every[None]) ** 2).sum() / 2 / (len(every) * (len(every) - 1))
     found = alpha_between(log_of_evidence(evidence).table())
-    assert found == pytest.approx(1 - apart.sum() / (12 * 4 * 3) / (expected.sum() / (n * (n - 1))))
-
-
-def test_frames_that_see_the_same_mixture_agree():
-    same = np.repeat(soft(np.random.default_rng(2), 30, 1), 5, axis=1)
-    table = log_of_evidence(same).table()
-    assert alpha_between(table) == pytest.approx(1)
-    assert krippendorff_alpha(table) < 0.5
-    within, between = disagreement(table)
-    np.testing.assert_allclose(within, 1 - psa(table))
-    assert between.max() < 1e-12
+    assert found == pytest.approx(1 - apart.sum() / (12 * 4 * 3) / expected)
 
 
 def test_disagreement_is_within_a_frame_and_between_frames_whatever_the_number_of_frames():
@@ -86,9 +69,6 @@ def test_weights_that_are_fixed_make_flights_comparable_that_linger_elsewhere():
     assert easy.voxel_weighted.value == pytest.approx(hard.voxel_weighted.value, abs=0.03)
 
 
-# --- The sample -------------------------------------------------------------------------------------------------------
-
-
 def sampled(frames, voxel_size=0.4, budget=1 << 19):
     return sampler_of(frames, voxel_size, budget).sample()
 
@@ -100,7 +80,7 @@ def fused(frames, voxel_size):
     return backend
 
 
-def test_a_sample_of_all_voxels_is_the_log_where_every_cell_was_seen_twice():
+def test_a_sample_of_all_voxels_is_the_log_and_scores_are_sampled_as_labels_are():
     frames = list(flight(3, flicker=0.3))
     twice = [*frames, *(dataclasses.replace(frame, index=frame.index + 3) for frame in frames)]
     seen, log = sampled(twice).seen, fused(twice, 0.4).events()
@@ -108,9 +88,6 @@ def test_a_sample_of_all_voxels_is_the_log_where_every_cell_was_seen_twice():
     np.testing.assert_allclose(seen.evidence, log.evidence)
     np.testing.assert_array_equal(seen.frame, log.frame)
     np.testing.assert_array_equal(seen.pixels, log.pixels)
-
-
-def test_scores_are_sampled_as_labels_are():
     frames = list(flight(4, flicker=0.3))
     soft_ones = [dataclasses.replace(f, labels=None, scores=np.eye(K, dtype=np.float32)[f.labels]) for f in frames]
     by_labels, by_scores = sampled(frames), sampled(soft_ones)
@@ -146,19 +123,12 @@ def test_what_is_drawn_is_its_definition():
     assert max(looks.drawn) < looks.share < 2**32
 
 
-@pytest.mark.parametrize(
-    ("along", "shape"),
-    [
-        ([(1, 0, 0)], (60000,)),
-        ([(3, -2, 1)], (60000,)),
-        ([(1, 0, 0), (0, 1, 0)], (250, 240)),
-        ([(0, 1, 0), (0, 0, 1)], (250, 240)),
-        ([(1, 1, 0), (0, 1, -1)], (250, 240)),
-        ([(2, 0, 1), (1, -2, 0)], (250, 240)),
-        ([(256, 0, 0), (0, 256, 0)], (250, 240)),
-        ([(1, 0, 0), (0, 1, 0), (0, 0, 1)], (40, 40, 38)),
-    ],
-)
+@pytest.mark.parametrize(("along", "shape"), [
+    ([(1, 0, 0)], (60000,)), ([(3, -2, 1)], (60000,)), ([(1, 0, 0), (0, 1, 0)], (250, 240)),
+    ([(0, 1, 0), (0, 0, 1)], (250, 240)), ([(1, 1, 0), (0, 1, -1)], (250, 240)),
+    ([(2, 0, 1), (1, -2, 0)], (250, 240)), ([(256, 0, 0), (0, 256, 0)], (250, 240)),
+    ([(1, 0, 0), (0, 1, 0), (0, 0, 1)], (40, 40, 38)),
+])  # fmt: skip
 def test_lines_planes_and_blocks_of_voxels_are_sampled_evenly(along, shape):
     """About the origin and far from it: the share below a threshold, of all and of stretches, is as if at random."""
     steps = np.stack(np.meshgrid(*(np.arange(n) - n // 2 for n in shape), indexing="ij"), axis=-1).reshape(
@@ -177,12 +147,14 @@ def test_lines_planes_and_blocks_of_voxels_are_sampled_evenly(along, shape):
             assert abs((below[1:] & below[:-1]).sum() - n * p * p) < 5 * math.sqrt(n) * p
 
 
-def test_no_frames_leave_an_empty_sample():
-    sample = sampled([])
-    assert (len(sample.seen), len(sample.views)) == (0, 0)
+def test_views_are_found_by_the_index_of_their_frame_whatever_their_order():
+    assert (len(sampled([]).seen), len(sampled([]).views)) == (0, 0)
+    views = Views(np.array([7, 2, 5]), np.arange(9.0).reshape(3, 3), np.array([0.5, math.nan, 1.0]))
+    assert views.rank(np.array([5, 7, 7, 2])).tolist() == [2, 0, 0, 1]
+    np.testing.assert_array_equal(Views.of(views.rows().tolist()).rows(), views.rows())
+    with pytest.raises(ValueError, match="without an index"):
+        Views.of([[math.nan, 0, 0, 0, 0]])
 
-
-# --- The ceiling ------------------------------------------------------------------------------------------------------
 
 SIZES = (0.15, 0.3, 0.6)
 
@@ -315,11 +287,3 @@ def shelf():
         pytest.skip(f"no {DATA / 'apc_shelf'}; set SEMSTAB_DATA to the folder that holds apc_shelf/")
     scene = open_dataset("posed_folder", {"root": DATA / "apc_shelf"}).scene("apc_shelf")
     return [scene.frame(index, "gt") for index in range(15)]
-
-
-def test_views_are_found_by_the_index_of_their_frame_whatever_their_order():
-    views = Views(np.array([7, 2, 5]), np.arange(9.0).reshape(3, 3), np.array([0.5, math.nan, 1.0]))
-    assert views.rank(np.array([5, 7, 7, 2])).tolist() == [2, 0, 0, 1]
-    np.testing.assert_array_equal(Views.of(views.rows().tolist()).rows(), views.rows())
-    with pytest.raises(ValueError, match="without an index"):
-        Views.of([[math.nan, 0, 0, 0, 0]])

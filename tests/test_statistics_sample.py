@@ -65,13 +65,10 @@ def test_means_are_of_all_voxels_and_columns_that_need_the_log_of_the_drawn_ones
     assert np.count_nonzero(few["true_label"] >= 0) == MOST
 
 
-def test_a_small_map_is_its_own_sample(log) -> None:
+def test_a_small_map_is_its_own_sample_and_a_damaged_file_is_refused(log, tmp_path) -> None:
     sample = MapSample.draw(log.table(), log)
     assert len(sample.table) == SIDE**2
     assert to_json(analyse(sample).summary) == to_json(describe(log.table(), log))
-
-
-def test_a_damaged_file_is_refused(tmp_path) -> None:
     (tmp_path / "part.npz").write_bytes(b"no arrays")
     with pytest.raises(DataError, match=r"part\.npz: not a sample of a map"):
         MapSample.load(tmp_path / "part.npz")

@@ -11,6 +11,7 @@ import tiny_scene
 from posed_config import configure, dataset_of
 from posed_writer import write_posed
 from rich.console import Console
+from simulated_events import log_of
 
 import semstab
 from semstab.backends.numba_hash import NumbaHash
@@ -20,7 +21,6 @@ from semstab.config import read_yaml
 from semstab.errors import DataError
 from semstab.metrics import split_last, summarise
 from semstab.metrics.agreement import rows_of
-from semstab.model.events import Events
 from semstab.model.frames import Frame, Intrinsics
 from semstab.report.narrative import reading
 from semstab.report.tables import tables
@@ -48,9 +48,6 @@ def test_frames_in_which_nothing_is_seen_are_counted(tmp_path) -> None:
     result = semstab.run(configure(folder))
     assert result.select()[0].summary.frames_empty == 1
     assert "a: 1 of 3 frames hold no pixel with both depth and a label" in printed(result)
-
-
-# --- The check against the reference ----------------------------------------------------------------------------------
 
 
 def test_own_data_is_checked_on_a_sample_of_the_voxels(tmp_path) -> None:
@@ -92,10 +89,7 @@ def test_the_sample_is_part_of_the_reference() -> None:
     assert_same_map(sample.table(), drawn, 0)
 
 
-# --- Backends that differ by design -----------------------------------------------------------------------------------
-
-
-def test_a_compared_backend_has_a_line_and_a_table_of_how_it_differs(scene, tmp_path) -> None:
+def test_compared_backends_have_a_line(scene, tmp_path) -> None:
     config = configure(scene, backends=["numba", "open3d-projective"], check=None, backbones=["a"], voxel_size=0.25)
     result = semstab.run(config, out=tmp_path / "run", report=False)
     (row,) = result.compared
@@ -108,9 +102,6 @@ def test_a_compared_backend_has_a_line_and_a_table_of_how_it_differs(scene, tmp_
     assert {table.name for table in tables(result)} >= {"fusion", "fusion_compared"}
     assert "agreement" not in {table.name for table in tables(result)}
     assert any(sentence.startswith("open3d-projective, which") for sentence in reading(result, ()))
-
-
-# --- The voxel size ---------------------------------------------------------------------------------------------------
 
 
 @pytest.fixture(scope="module")
@@ -149,46 +140,22 @@ def test_a_given_voxel_size_is_told_where_it_lies(wide) -> None:
     assert "'background' covers" in printed(result)
 
 
-# --- Strata -----------------------------------------------------------------------------------------------------------
-
-
 def test_a_crowded_last_stratum_is_split_by_its_op() -> None:
     rng = np.random.default_rng(0)
-    op = np.concatenate([np.ones(10, int), rng.integers(6, 120, 990)])
-    events = simulated(op, rng)
-    table = summarise(events.table())
+
+    def summary(op):
+        labels = rng.integers(0, 3, (len(op), max(op)))
+        return summarise(log_of(np.where(np.arange(max(op)) < op[:, None], labels, -1)).table())
+
+    table = summary(np.concatenate([np.ones(10, int), rng.integers(6, 120, 990)]))
     parts = split_last([table])
     assert [row.name for row in table.strata] == ["OP=1", "OP=2", "3<=OP<=5", "OP>5"]
     assert 2 <= len(parts) <= 3
     assert sum(part.voxels for part in parts) == table.strata[-1].voxels
     assert parts[0].name.startswith("6<=OP<=")
     assert all(part.voxels > 150 for part in parts)
-    several = split_last([table, table])
-    assert [part.voxels for part in several] == [2 * part.voxels for part in parts]
-    few = summarise(simulated(np.repeat([1, 2, 7], [50, 30, 20]), rng).table())
-    assert split_last([few]) == []
-
-
-def test_what_was_hardly_ever_seen_once_needs_no_remark(scene) -> None:
-    said = "were seen once and look stable for that reason"
-    assert said in printed(semstab.run(configure(scene, backbones=["a"], frames={"stop": 1})))
-    assert said not in printed(semstab.run(configure(scene, backbones=["a"], voxel_size=4.0)))
-
-
-def simulated(op, rng) -> Events:
-    """One-hot events of voxels that are seen that often."""
-    rows, n = np.repeat(np.arange(len(op)), op), int(op.sum())
-    zeros = np.zeros(len(op), np.int32)
-    frame = np.concatenate([np.arange(count) for count in op]).astype(np.int32)
-    evidence = np.eye(3)[rng.integers(0, 3, n)]
-    ones = np.ones(n, np.int64)
-    return Events(
-        ix=np.arange(len(op), dtype=np.int32), iy=zeros, iz=zeros, voxel=rows, frame=frame, evidence=evidence,
-        pixels=ones, voxel_size=0.1,
-    )  # fmt: skip
-
-
-# --- What cannot be meant ---------------------------------------------------------------------------------------------
+    assert [part.voxels for part in split_last([table, table])] == [2 * part.voxels for part in parts]
+    assert split_last([summary(np.repeat([1, 2, 7], [50, 30, 20]))]) == []
 
 
 @pytest.mark.parametrize("name", ["numpy", "numba", "open3d", "open3d-projective", "torch"])

@@ -81,12 +81,9 @@ def test_a_source_of_regions_that_fails_is_a_failure(root, tmp_path) -> None:
     assert len(result.records) == 1
 
 
-def test_one_frame_has_no_flicker(root, tmp_path) -> None:
+def test_one_frame_has_no_flicker_and_a_source_that_is_not_there_is_refused(root, tmp_path) -> None:
     config = configure(root, frames={"count": 1}, region_maps=["regions"], sweeps={}, backends=["numpy"])
     (found,) = run_study(config, tmp_path / "out").regions
     assert math.isnan(found.flicker_percent)
-
-
-def test_a_source_that_is_not_there_is_refused(root, tmp_path) -> None:
     with pytest.raises(ConfigError, match="wall: no region map 'region'; did you mean 'regions'"):
         run_study(configure(root, frames={}, region_maps=["region"], sweeps={}, backends=["numpy"]), tmp_path / "out")

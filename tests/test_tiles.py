@@ -26,16 +26,13 @@ def noisy_frame(rng: np.random.Generator, index: int, shape: tuple[int, int], fa
     return semstab.Frame(index=index, depth=depth, labels=labels.astype(dtype), intrinsics=camera, T_wc=T_wc)
 
 
-@pytest.mark.parametrize(
-    ("shape", "far", "voxel_size", "K"),
-    [
-        ((37, 300), 5.0, 0.1, 3),
-        ((16, 64), 50.0, 0.05, 150),
-        ((17, 129), 3.0, 0.5, 7),
-        ((1, 1), 3.0, 0.5, 7),
-        ((33, 70), 4200.0, 0.1, 7),  # beyond 2^15 voxels from the camera: by the other path
-    ],
-)
+@pytest.mark.parametrize(("shape", "far", "voxel_size", "K"), [
+    ((37, 300), 5.0, 0.1, 3),
+    ((16, 64), 50.0, 0.05, 150),
+    ((17, 129), 3.0, 0.5, 7),
+    ((1, 1), 3.0, 0.5, 7),
+    ((33, 70), 4200.0, 0.1, 7),  # beyond 2^15 voxels from the camera: by the other path
+])  # fmt: skip
 def test_the_counts_are_those_of_the_reference(shape, far, voxel_size, K) -> None:
     rng = np.random.default_rng(5)
     made = {

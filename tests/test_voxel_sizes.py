@@ -66,12 +66,9 @@ def test_alpha_at_each_size_is_that_of_a_map_of_its_own(kind):
     assert [size.alpha for size in found] == pytest.approx([alpha_of(frames, size.voxel_size) for size in found])
 
 
-def test_a_scene_larger_than_a_map_has_none():
+def test_a_scene_larger_than_a_map_and_frames_without_a_pixel_have_none():
     near, far = flight(2)
     far = dataclasses.replace(far, depth=np.full(far.shape, 3e5, np.float32))
     assert alphas([near, far], 0.17) == ()
-
-
-def test_frames_without_a_pixel_have_no_alpha():
     frames = [dataclasses.replace(frame, depth=np.zeros_like(frame.depth)) for frame in flight(2)]
     assert [math.isnan(size.alpha) for size in alphas(frames, 0.17)] == [True] * 3

@@ -17,11 +17,9 @@ FRAMES = 10
 TIMES = ("fuse_ms_per_frame", "stages_ms")
 
 SWEEPS = {
-    "voxel_size": [0.25, 0.5],
-    "depth_noise": {"values": [0, 0.05], "repeats": 2},
-    "frame_count": {"values": [5, 10], "backbones": ["a"]},
-    "pixel_stride": [1, 2],
-}
+    "voxel_size": [0.25, 0.5], "depth_noise": {"values": [0, 0.05], "repeats": 2},
+    "frame_count": {"values": [5, 10], "backbones": ["a"]}, "pixel_stride": [1, 2],
+}  # fmt: skip
 
 
 def write(root: Path, **scene: Any) -> Path:
@@ -32,15 +30,9 @@ def write(root: Path, **scene: Any) -> Path:
 def content(root: Path, **settings: Any) -> dict[str, Any]:
     """Settings of a study of the scene, or the scenes, in a folder."""
     return {
-        "name": "tiny",
-        "dataset": dataset_of(root),
-        "voxel_size": 0.25,
-        "frames": {"spacing": "even", "count": 5},
-        "sweeps": SWEEPS,
-        "backends": ["numpy", "numba"],
-        "check": None,
-        **settings,
-    }
+        "name": "tiny", "dataset": dataset_of(root), "voxel_size": 0.25, "frames": {"spacing": "even", "count": 5},
+        "sweeps": SWEEPS, "backends": ["numpy", "numba"], "check": None, **settings,
+    }  # fmt: skip
 
 
 def configure(root: Path, **settings: Any) -> Config:

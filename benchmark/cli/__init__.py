@@ -19,7 +19,7 @@ from semstab.cli.finished import calibrate, compare, conform, export, gate, list
 from semstab.cli.options import say
 from semstab.cli.running import check, convert, predict, remedies, run, show, study, view
 from semstab.core.process import configure_process
-from semstab.errors import OUT_OF_MEMORY, SemstabError, one_line
+from semstab.errors import OUT_OF_MEMORY, SemstabError, summarize_error
 
 # Ctrl-C, which may come in the midst of anything: an import, a callback from compiled code.
 
@@ -126,7 +126,7 @@ class Group(TyperGroup):
             say(f"error: {error.filename or 'input or output'}: {error.strerror or error}")
             raise typer.Exit(2) from error
         except ImportError as error:
-            what = f"{error.name or 'a package'} cannot be loaded ({one_line(error)})"
+            what = f"{error.name or 'a package'} cannot be loaded ({summarize_error(error)})"
             say(f"error: {what}; install semstab again, or give the process more memory (ulimit -v)")
             raise typer.Exit(2) from error
         except MemoryError as error:

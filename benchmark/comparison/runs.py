@@ -26,7 +26,7 @@ from semstab.core.files import atomic_path, parse_json, read_limited
 from semstab.core.json_form import from_json, to_json
 from semstab.datasets import GROUND_TRUTH
 from semstab.engine.folder import load_result
-from semstab.errors import ConfigError, DataError, one_line
+from semstab.errors import ConfigError, DataError, summarize_error
 from semstab.model import earlier
 from semstab.model.contrast import FrameShare
 from semstab.model.georeference import Georeference
@@ -230,7 +230,7 @@ def _flicker(file: Path | None) -> Flicker:
         if not _valid(flicker, flicker.values()):
             raise ValueError("a percentage of flicker, or a frame's index, is out of range")
     except (OSError, ValueError, KeyError, TypeError, csv.Error) as error:
-        raise DataError(f"{file}: cannot be read ({one_line(error)}); run it again") from error
+        raise DataError(f"{file}: cannot be read ({summarize_error(error)}); run it again") from error
     return flicker
 
 
@@ -304,7 +304,7 @@ def load_summary(path: str | Path) -> tuple[str, dict[str, Entry]]:
     except (OSError, zipfile.BadZipFile, zlib.error, LookupError, ValueError, RuntimeError, EOFError) as error:
         if isinstance(error, DataError) and str(path) in str(error):
             raise
-        raise DataError(f"{path}: neither a run's folder nor a small summary ({one_line(error)})") from error
+        raise DataError(f"{path}: neither a run's folder nor a small summary ({summarize_error(error)})") from error
     scenes = {}
     with tempfile.TemporaryDirectory() as folder:
         part = Path(folder) / "sums.parquet"

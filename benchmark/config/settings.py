@@ -15,7 +15,7 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationEr
 
 from semstab.core.files import MAX_YAML_BYTES, parse_yaml, read_limited
 from semstab.core.types import THIS_SCENE, Scope
-from semstab.errors import ConfigError, nearest, one_line
+from semstab.errors import ConfigError, nearest, summarize_error
 
 Model = TypeVar("Model", bound=BaseModel)
 V = TypeVar("V")
@@ -71,7 +71,7 @@ def validated(model: type[Model], content: Any, where: str = "") -> Model:
     except ValidationError as error:
         raise ConfigError(f"{where}{explain(error, model)}") from error
     except (UnicodeEncodeError, TypeError) as error:  # YAML's "\\ud800" is half a character, names may be numbers
-        raise ConfigError(f"{where}a name or a text is no text ({one_line(error)})") from error
+        raise ConfigError(f"{where}a name or a text is no text ({summarize_error(error)})") from error
 
 
 def explain(error: ValidationError, model: type[BaseModel]) -> str:

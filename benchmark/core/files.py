@@ -22,7 +22,7 @@ import yaml
 
 from semstab.core.json_form import to_json
 from semstab.core.types import UInt8
-from semstab.errors import ConfigError, DataError, one_line
+from semstab.errors import ConfigError, DataError, summarize_error
 
 TEMPORARY = ".semstab-"
 """How names of files begin that are not whole yet."""
@@ -157,7 +157,7 @@ def read_json(path: str | Path) -> Any:
     except OSError as error:
         raise DataError(f"{path}: cannot be read ({error.strerror})") from error
     except ValueError as error:
-        raise DataError(f"{path}: not valid JSON ({one_line(error)})") from error
+        raise DataError(f"{path}: not valid JSON ({summarize_error(error)})") from error
 
 
 def read_limited(path: str | Path, limit: int) -> bytes:
@@ -189,7 +189,7 @@ def parse_yaml(text: str, where: str) -> Any:
         return yaml.SafeLoader(text).get_single_data()
     except (yaml.YAMLError, ValueError, LookupError, AttributeError, TypeError, RecursionError) as error:
         # PyYAML lets other errors than its own escape, for example for the date 2020-13-45
-        raise ConfigError(f"{where}: not valid YAML ({one_line(error)})") from error
+        raise ConfigError(f"{where}: not valid YAML ({summarize_error(error)})") from error
 
 
 # Arrays for a later start: read as they were written, or not at all.

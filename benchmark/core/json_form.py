@@ -14,7 +14,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path, PurePath
 from typing import TYPE_CHECKING, Any, TypeVar, cast
 
-from semstab.errors import DataError, one_line
+from semstab.errors import DataError, summarize_error
 
 if TYPE_CHECKING:
     from pydantic_core import ErrorDetails, SchemaValidator
@@ -141,4 +141,4 @@ def _line(problem: ErrorDetails) -> str:
         message = "is missing"
     elif problem["type"] != "value_error":
         message += f", is {reprlib.repr(problem['input'])}"
-    return one_line(Exception(f"{path[:LONGEST] or 'content'}: {message[:LONGEST]}"))
+    return summarize_error(Exception(f"{path[:LONGEST] or 'content'}: {message[:LONGEST]}"))

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from importlib.metadata import entry_points
 from typing import Any
 
-from semstab.errors import ConfigError, MissingDependencyError, nearest, one_line
+from semstab.errors import ConfigError, MissingDependencyError, nearest, summarize_error
 
 
 @dataclass(frozen=True)
@@ -63,4 +63,6 @@ class Registry:
             return getattr(importlib.import_module(module), attribute)
         except Exception as error:  # RuntimeError: torchvision of another torch; OSError: a shared library is missing
             hint = entry.install or "install what it needs"
-            raise MissingDependencyError(f"{self.kind} '{name}' cannot be used ({one_line(error)}); {hint}") from error
+            raise MissingDependencyError(
+                f"{self.kind} '{name}' cannot be used ({summarize_error(error)}); {hint}"
+            ) from error

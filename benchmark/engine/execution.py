@@ -86,7 +86,10 @@ def _execute(
     require_file_names(out, (each.unit for each in plan.units))
     folder = Folder(out, config)
     try:
-        units = _Execution(plan, folder, executor, observers).units
+        execution = _Execution(plan, folder, executor, observers)
+        with folder.started(config) as start, share_open_scenes(start.name, plan.scenes):
+            execution.compute(start)
+        units = execution.units
         units.advice = advice or advice_of(plan, units.contents)
         result = result_of(plan, folder, units)
         units.watch.seconds["all"] = time.perf_counter() - started
@@ -108,23 +111,22 @@ class _Execution:
     """The units that an earlier start finished, and all others, kept as they finish."""
 
     def __init__(self, plan: Plan, folder: Folder, executor: Executor, observers: Observers) -> None:
-        self.units, self._folder, self._executor, self._observers = UnitResults(), folder, executor, observers
-        planned, units = plan.distinct(), self.units
+        self._plan, self._folder, self._executor, self._observers = plan, folder, executor, observers
+        self.units = units = UnitResults()
         with units.watch("digest"):
-            there = ((key, folder.finished(each)) for key, each in planned.items())
+            there = ((key, folder.finished(each)) for key, each in plan.distinct().items())
             units.contents = {key: content for key, content in there if content is not None}
         units.finished_before, finished = len(units.contents), dict(units.contents)
         observers.tell(lambda observer: observer.run_started(plan, finished))
-        missing = [each for identity, each in planned.items() if identity not in finished]
+        self._missing = [each for identity, each in plan.distinct().items() if identity not in finished]
         if plan.config.check_geometry:
             with units.watch("check"):
-                self._check_geometry(plan.config, missing)
-        with folder.started(plan.config) as start, share_open_scenes(start.name, plan.scenes):
-            self._compute(planned, *self._begin(plan.config, missing, start))
+                self._check_geometry(plan.config, self._missing)
 
-    def _compute(
-        self, planned: Mapping[str, PlannedUnit], whole: Sequence[Work], tiled: Mapping[str, TiledUnit]
-    ) -> None:
+    def compute(self, start: Start) -> None:
+        """Compute the units that are missing, each kept as it finishes."""
+        planned = {each.identity: each for each in self._missing}
+        whole, tiled = self._begin(start)
         queue = deque(jobs_of(whole, self._executor.width))
         ended = [outcome for unit in tiled.values() if (outcome := unit.ended()) is not None]
 
@@ -143,17 +145,15 @@ class _Execution:
                 if own is not None:
                     self._keep(planned[own.identity], own, in_tiles=unit is not None)
 
-    def _begin(
-        self, config: Config, missing: Sequence[PlannedUnit], start: Start
-    ) -> tuple[list[Work], dict[str, TiledUnit]]:
+    def _begin(self, start: Start) -> tuple[list[Work], dict[str, TiledUnit]]:
         """Works of the units that are fused whole, and the units in tiles; those that cannot be fused fail."""
         with self.units.watch("sizing"):
-            sizing = planned_sizes(config, missing, self._executor.width)
+            sizing = planned_sizes(self._plan.config, self._missing, self._executor.width)
             trim_malloc()
         for line in sizing.lines:
             logger.warning("%s", line)
         whole, tiled = list[Work](), dict[str, TiledUnit]()
-        for each in missing:
+        for each in self._missing:
             if (error := sizing.refused.get(each.identity)) is not None:
                 self._keep(each, Outcome(each.identity, error=error, cause=ConfigError(error)))
             elif (size := sizing.tile_sizes.get(each.identity)) is not None:

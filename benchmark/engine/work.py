@@ -10,7 +10,7 @@ from pathlib import Path
 from semstab.config import Config, FrameSelection, as_range
 from semstab.core.files import TEMPORARY
 from semstab.engine.units import PlannedUnit
-from semstab.errors import OUT_OF_MEMORY, OutgrownError, SemstabError, one_line
+from semstab.errors import OUT_OF_MEMORY, OutgrownError, SemstabError, summarize_error
 from semstab.model.records import UnitContent
 from semstab.model.voxels import Extent, VoxelTable
 
@@ -180,7 +180,7 @@ def failed(works: Iterable[Work], error: str | Exception) -> list[Outcome]:
 
 
 def _one_line(error: Exception) -> str:
-    return OUT_OF_MEMORY if isinstance(error, MemoryError) else f"{type(error).__name__}: {one_line(error)}"
+    return OUT_OF_MEMORY if isinstance(error, MemoryError) else f"{type(error).__name__}: {summarize_error(error)}"
 
 
 def jobs_of(works: Iterable[Work], width: int) -> list[Job]:

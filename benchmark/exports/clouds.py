@@ -16,7 +16,7 @@ import numpy.typing as npt
 from semstab.config import nearest, read_yaml
 from semstab.core.files import atomic_path
 from semstab.core.types import UInt8
-from semstab.errors import ConfigError, DataError, MissingDependencyError, one_line
+from semstab.errors import ConfigError, DataError, MissingDependencyError, summarize_error
 from semstab.exports.voxels import Voxels, crs_name
 from semstab.model.georeference import INSTALL
 from semstab.model.labels import name_key
@@ -60,7 +60,9 @@ class Header:
         except DataError:
             raise
         except (LookupError, ValueError) as error:  # a word that is missing, no number, a name that is there twice
-            raise DataError(f"{path}: its header cannot be read ({one_line(error)}); save the cloud anew") from error
+            raise DataError(
+                f"{path}: its header cannot be read ({summarize_error(error)}); save the cloud anew"
+            ) from error
 
     @classmethod
     def _parsed(cls, lines: list[str], size: int, path: Path) -> Header:

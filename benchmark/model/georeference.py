@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from semstab.errors import ConfigError, MissingDependencyError, one_line
+from semstab.errors import ConfigError, MissingDependencyError, summarize_error
 
 INSTALL = 'pip install "semstab[geo]"'
 """What a message says where a package of the extra `geo` is not installed."""
@@ -42,7 +42,9 @@ def wkt(crs: str, where: str) -> str:
         known = CRS.from_user_input(crs)
     except (CRSError, RecursionError) as error:  # a text of braces is read as JSON
         hint = "write it as EPSG:32615, a PROJ string or WKT"
-        raise ConfigError(f"{where}: {crs[:80]!r} is no reference system ({one_line(error)[:80]}); {hint}") from error
+        raise ConfigError(
+            f"{where}: {crs[:80]!r} is no reference system ({summarize_error(error)[:80]}); {hint}"
+        ) from error
     units = {axis.unit_name for axis in known.axis_info[:2]}
     if not known.is_projected or units != {"metre"}:
         raise ConfigError(

@@ -15,7 +15,7 @@ import numpy.typing as npt
 
 from semstab.core.arrays import column, values_of
 from semstab.core.files import atomic_path, parse_json
-from semstab.errors import DataError, one_line
+from semstab.errors import DataError, summarize_error
 from semstab.model.evidence import Evidence
 
 if TYPE_CHECKING:
@@ -155,7 +155,7 @@ def reading(path: str | Path) -> Iterator[None]:
     try:
         yield
     except (OSError, LookupError, TypeError, ValueError, OverflowError, pa.ArrowException) as error:
-        raise DataError(f"{path}: not a semstab table ({one_line(error)})") from error
+        raise DataError(f"{path}: not a semstab table ({summarize_error(error)})") from error
 
 
 def read(path: str | Path, names: Iterable[str]) -> dict[str, Any]:

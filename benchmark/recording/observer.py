@@ -24,7 +24,7 @@ from semstab.engine.folder import load_result
 from semstab.engine.observer import Observer
 from semstab.engine.series import FrameRow
 from semstab.engine.units import Plan, PlannedUnit, make_plan
-from semstab.errors import ConfigError, SemstabError, one_line
+from semstab.errors import ConfigError, SemstabError, summarize_error
 from semstab.model.frames import Frame
 from semstab.model.labels import LabelSpace
 from semstab.model.measures import measures
@@ -260,7 +260,8 @@ class Recording(Observer):
             except RuntimeError as error:
                 reason = "did the viewer go away?" if self.target.live else "is the disk full?"
                 raise ConfigError(
-                    f"{self.target.file}: the recording is not whole ({one_line(error)}; {reason}); all else is kept,"
+                    f"{self.target.file}: the recording is not whole ({summarize_error(error)}; {reason}); all"
+                    f" else is kept,"
                     " and the same command makes it again"
                 ) from error
             finally:

@@ -12,7 +12,7 @@ from typing import Any
 import rerun as rr
 
 from semstab.engine.units import Plan
-from semstab.errors import DataError, one_line
+from semstab.errors import DataError, summarize_error
 from semstab.model.measures import ENTROPY, VSS
 from semstab.model.results import RECURRENT, Unit
 from semstab.task import Task
@@ -152,7 +152,7 @@ def log_file(stream: rr.RecordingStream, unit: Unit, task: Task, file: Path, clo
 
 
 def _damaged(file: Path, error: Exception) -> DataError:
-    return DataError(f"{file}: not a time series of a run ({one_line(error)}); delete the run folder's units/")
+    return DataError(f"{file}: not a time series of a run ({summarize_error(error)}); delete the run folder's units/")
 
 
 def log_styles(stream: rr.RecordingStream, plan: Plan) -> None:

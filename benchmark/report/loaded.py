@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from semstab.engine.folder import load_result
-from semstab.errors import ConfigError, DataError, one_line
+from semstab.errors import ConfigError, DataError, summarize_error
 from semstab.model import voxels
 from semstab.model.events import Events
 from semstab.model.records import Result
@@ -75,5 +75,5 @@ def read_series(file: Path) -> pd.DataFrame:
         LookupError,
         pa.ArrowException,
     ) as error:  # LookupError: a name that is there twice
-        raise DataError(f"{file}: cannot be read ({one_line(error)})") from error
+        raise DataError(f"{file}: cannot be read ({summarize_error(error)})") from error
     return voxels.to_pandas(columns)

@@ -22,7 +22,7 @@ from semstab.core import arrays as arrow
 from semstab.core.files import atomic_path, parse_json
 from semstab.core.json_form import from_json
 from semstab.core.types import Float64, Int32, Int64, Mask
-from semstab.errors import DataError, one_line
+from semstab.errors import DataError, summarize_error
 from semstab.statistics.agreement import ONE_HOT, alpha_of, between_of, class_of, ratio_of
 
 # --- Columns ----------------------------------------------------------------------------------------------------------
@@ -308,7 +308,7 @@ class ClusterSums:
             if seen is not None and (same_cells is None or not np.array_equal(seen.frame, same_cells.frame)):
                 raise DataError("the sums of the sample, and of its cells, are of other rows")
         except (OSError, LookupError, TypeError, ValueError, OverflowError, pa.ArrowException) as error:
-            raise DataError(f"{path}: not a file of influence sums ({one_line(error)})") from error
+            raise DataError(f"{path}: not a file of influence sums ({summarize_error(error)})") from error
         assert whole is not None
         return dataclasses.replace(whole, seen=seen, same_cells=same_cells)
 

@@ -18,7 +18,7 @@ import numpy.typing as npt
 from semstab.core import arrays
 from semstab.core.files import atomic_path, parse_json
 from semstab.core.types import Float64, Int32, Int64, Mask, UInt16, UInt32
-from semstab.errors import DataError, one_line
+from semstab.errors import DataError, summarize_error
 from semstab.model.events import Events
 from semstab.model.evidence import Evidence
 from semstab.model.measures import dominant, mean
@@ -291,4 +291,4 @@ class CellObservations:
             key, low = keys_of(np.stack([x, y, z], axis=1).astype(np.int64))
             return cls(key, view, label, weight, drawn, low, views, **about)
         except (OSError, LookupError, TypeError, ValueError, OverflowError, pa.ArrowException) as error:
-            raise DataError(f"{path}: not a file of sampled looks ({one_line(error)})") from error
+            raise DataError(f"{path}: not a file of sampled looks ({summarize_error(error)})") from error

@@ -20,7 +20,7 @@ import numpy as np
 from semstab.core.files import atomic_path
 from semstab.core.types import Float32, Float64, Int32
 from semstab.datasets.formats.disk import file_digest
-from semstab.errors import ConfigError, DataError, MissingDependencyError, SemstabError, one_line
+from semstab.errors import ConfigError, DataError, MissingDependencyError, SemstabError, summarize_error
 from semstab.model.frames import Intrinsics
 from semstab.model.georeference import INSTALL, Georeference
 
@@ -132,9 +132,9 @@ def read_triangles(path: Path, cell: float | None, georeference: Georeference | 
     except (DataError, ConfigError):
         raise
     except ImportError as error:
-        raise MissingDependencyError(f"{path}: cannot be read ({one_line(error)}); {INSTALL}") from error
+        raise MissingDependencyError(f"{path}: cannot be read ({summarize_error(error)}); {INSTALL}") from error
     except Exception as error:
-        raise DataError(f"{path}: cannot be read as a surface ({one_line(error)})") from error
+        raise DataError(f"{path}: cannot be read as a surface ({summarize_error(error)})") from error
     if not len(triangles.faces):
         raise DataError(f"{path}: holds no triangle that can be seen ({triangles.what})")
     return triangles
@@ -236,7 +236,7 @@ def open_las(path: Path) -> Iterator[Any]:
     except BaseException as error:
         if not isinstance(error, Exception) and type(error).__module__ != "pyo3_runtime":  # lazrs panics with its own
             raise
-        raise DataError(f"{path}: cannot be read ({one_line(error)})") from error
+        raise DataError(f"{path}: cannot be read ({summarize_error(error)})") from error
 
 
 def points_at_once(header: Any) -> int:

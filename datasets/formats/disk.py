@@ -20,7 +20,7 @@ import numpy.typing as npt
 from semstab.core.files import open_file, parse_json, read_limited
 from semstab.core.types import Float64
 from semstab.datasets.geometry.cameras import Poses
-from semstab.errors import DataError, one_line
+from semstab.errors import DataError, summarize_error
 from semstab.model.frames import Intrinsics
 
 AGAIN = "copy or export it again"
@@ -157,7 +157,7 @@ def _decode_npz(path: Path, data: bytes, key: str) -> npt.NDArray[Any]:
     except DataError:
         raise
     except Exception as error:
-        raise DataError(f"{path}: not a whole .npz archive ({one_line(error)}); {AGAIN}") from error
+        raise DataError(f"{path}: not a whole .npz archive ({summarize_error(error)}); {AGAIN}") from error
     return _decode_npy(f"{path} ({reprlib.repr(name)})", content)
 
 
@@ -180,7 +180,7 @@ def read_content(path: Path, limit: int) -> Any:
     try:
         return parse_json(data)
     except ValueError as error:
-        raise DataError(f"{path}: not valid JSON ({one_line(error)[:120]})") from error
+        raise DataError(f"{path}: not valid JSON ({summarize_error(error)[:120]})") from error
 
 
 def pixels(content: Mapping[str, Any], key: str, where: str) -> int:
@@ -253,7 +253,7 @@ def _numbers(path: Path) -> list[float]:
     try:
         return [float(word) for word in words]
     except ValueError as error:
-        raise DataError(f"{path}: expected numbers ({one_line(error)}); write the matrix as text") from error
+        raise DataError(f"{path}: expected numbers ({summarize_error(error)}); write the matrix as text") from error
 
 
 # Text files with one record a line (trajectories, lists of images): all of it, or one DataError with the line.

@@ -24,7 +24,7 @@ import numpy.typing as npt
 from semstab.core.types import Float32, Mask, UInt8, UInt16, UInt32
 from semstab.datasets.formats.disk import AGAIN, decode_array, read_bytes
 from semstab.datasets.geometry.lenses import Labels
-from semstab.errors import ConfigError, DataError, one_line
+from semstab.errors import ConfigError, DataError, summarize_error
 from semstab.model.labels import IGNORE_8BIT, IGNORE_16BIT, LabelSpace
 
 if TYPE_CHECKING:
@@ -265,7 +265,7 @@ def _one_line(path: Path, what: str) -> Iterator[None]:
     except DataError:
         raise
     except Exception as error:
-        raise DataError(f"{path}: not a whole {what} image ({one_line(error)}); {AGAIN}") from error
+        raise DataError(f"{path}: not a whole {what} image ({summarize_error(error)}); {AGAIN}") from error
 
 
 def _decode_jpeg(path: Path, data: bytes) -> UInt8:
@@ -358,7 +358,7 @@ def _imdecode(path: Path, data: bytes, mode: str) -> npt.NDArray[Any]:
     try:
         image: npt.NDArray[Any] | None = cv2.imdecode(np.frombuffer(data, np.uint8), getattr(cv2, mode))
     except cv2.error as error:
-        raise DataError(f"{path}: the image cannot be decoded ({one_line(error)}); {AGAIN}") from error
+        raise DataError(f"{path}: the image cannot be decoded ({summarize_error(error)}); {AGAIN}") from error
     if image is None:
         raise DataError(f"{path}: the image is damaged; {AGAIN}")
     return image

@@ -4,8 +4,7 @@
 
 Each is then started again as it was, and has to leave what one without a kill leaves. Where several are at work on the
 machine, a kill may come after the end: those are counted apart. Beside these, a fifth as many are started twice at
-once: one of the two is refused in one line, or both end well. And each kind is stopped while it has its folder: a
-second start is refused.
+once: one of the two is refused in one line, or both end well.
 """
 
 from __future__ import annotations
@@ -85,28 +84,6 @@ def beside(words: Words, logs: tuple[Path, Path], seconds: float) -> str | None:
     return None
 
 
-def locked(child: int, out: Path) -> bool:
-    """Whether that process has the lock of a folder, or of one in it."""
-    inodes = {path.stat().st_ino for path in (out, *out.glob("**/"))} if out.exists() else set()
-    locks = (line.split() for line in Path("/proc/locks").read_text().splitlines())
-    return any(int(words[-4]) == child and int(words[-3].split(":")[-1]) in inodes for words in locks)
-
-
-def held(words: Words, logs: tuple[Path, Path], out: Path) -> str | None:
-    """Start it, stop it while it has its folder, and start it again; what is wrong with how that is refused."""
-    first = in_a_child(words, logs[0])
-    deadline = time.monotonic() + 60
-    while not locked(first, out) and time.monotonic() < deadline:
-        time.sleep(0.0002)
-    os.kill(first, signal.SIGSTOP)
-    code = os.waitstatus_to_exitcode(os.waitpid(in_a_child(words, logs[1]), 0)[1])
-    os.kill(first, signal.SIGCONT)
-    ended = os.waitstatus_to_exitcode(os.waitpid(first, 0)[1])
-    said = logs[1].read_text()
-    one = code == 2 and said.startswith("error: ") and "another process works on it" in said and said.count("\n") == 1
-    return None if one and ended == 0 else f"first {ended}, second {code}: {said}"
-
-
 def of_run(out: Path) -> Any:
     """What a run or a study leaves: the summary without times, its files, and whether the recording is whole."""
     found = json.loads((out / "summary.json").read_text())
@@ -177,12 +154,6 @@ def main(count: int, seed: int) -> None:
                 told[f"{kind}, {'birth' if birth else 'later'}{'' if at_work else ', had ended'}"] += 1
                 if left(out) != whole[kind]:
                     wrong.append(f"{kind} {k}: differs, killed at {moment:.3f} s{' of its birth' if birth else ''}")
-            for kind, (words, left) in made.items():
-                out = base / f"held {kind}"
-                fault = held(words(out), (base / "log", base / "log2"), out)
-                told[f"{kind}, a second start refused"] += 1
-                if fault or left(out) != whole[kind]:
-                    wrong.append(f"{kind}, a second start: {fault or 'differs'}")
             for k in range(count // 5):
                 kind = list(made)[k % len(made)]
                 (words, left), out = made[kind], base / f"twice {kind}{k}"

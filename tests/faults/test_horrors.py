@@ -71,7 +71,7 @@ def test_a_horror_is_one_line(wall, tmp_path, monkeypatch, words) -> None:
     assert line.isprintable()
 
 
-def test_a_message_keeps_its_beginning_and_its_end() -> None:
+def test_a_message_keeps_its_ends_and_a_dollar_begins_no_formula_in_a_figure(tmp_path) -> None:
     assert sanitize("ä 'b'") == "ä 'b'"
     assert sanitize("a\nb\udcff\x00") == r"a\nb\udcff\x00"
     for text in ("x: " + LONG + "; mend it", "x: " + "\n" * 500 + "; mend it", "x: " + "9" * 450 + "; mend it"):
@@ -79,6 +79,16 @@ def test_a_message_keeps_its_beginning_and_its_end() -> None:
         assert line.startswith("x: ")
         assert line.endswith("; mend it")
         assert len(line) == LONGEST_LINE
+
+    def draw():
+        drawn = canvas(2, 2)
+        axes = drawn.add_subplot(title="$x^{ $", xscale="log")
+        axes.bar(["$a_{", "b$"], [1, 2], label="$y$")
+        axes.legend()
+        return drawn
+
+    for path in Figure("figure", "title", "caption", "alt", draw).save(tmp_path):
+        assert path.stat().st_size > 1000
 
 
 @pytest.mark.parametrize("name", [b"\xff", b"a\nb"])
@@ -107,15 +117,3 @@ def test_names_that_no_terminal_and_no_format_likes_are_reported_whole(tmp_path)
     cells = [to_csv(table) for table in tables(load_result(tmp_path / "run"))]
     assert any(",'=wall," in text for text in cells)
     assert not [line for text in cells for line in text.splitlines() if line.startswith("=")]
-
-
-def test_a_dollar_in_a_name_begins_no_formula_in_a_figure(tmp_path) -> None:
-    def draw():
-        drawn = canvas(2, 2)
-        axes = drawn.add_subplot(title="$x^{ $", xscale="log")
-        axes.bar(["$a_{", "b$"], [1, 2], label="$y$")
-        axes.legend()
-        return drawn
-
-    for path in Figure("figure", "title", "caption", "alt", draw).save(tmp_path):
-        assert path.stat().st_size > 1000

@@ -19,7 +19,7 @@ from semstab.errors import ConfigError
 from semstab.model.results import Unit, slug
 
 HORRORS = (
-    "a b", "a-b", "x", "x__y", "_x", "-rf", "[/bold]", "$x^{", "=1+1", "<b>&amp;", "ä" * 100, "new\nline", "\u202e",
+    "a b", "a-b", "x", "x__y", "-rf", "[/bold]", "$x^{", "<b>&amp;", "ä" * 100, "new\nline", "\u202e",
 )  # fmt: skip
 """Every one of them can be the name of a folder."""
 
@@ -40,22 +40,19 @@ def test_a_file_name_is_short_plain_and_visible(name) -> None:
     assert path[0] not in "."
 
 
-def test_usual_names_stay_as_they_are() -> None:
-    assert slug("scene-1", "segformer.b5_ade", "Gebäude") == "scene-1__segformer.b5_ade__Gebäude"
-
-
-def test_what_would_share_a_file_is_refused_before_fusion(tmp_path) -> None:
+def test_names_that_share_a_file_are_refused_and_usual_ones_stay(tmp_path) -> None:
     """Two names with one digest of five bytes."""
     one, other = Unit("a#>@$ b", "a", "numpy"), Unit("a#>@:+b", "a", "numpy")
     assert one.slug == other.slug
     with pytest.raises(ConfigError, match="would be written to one file"):
         require_file_names(tmp_path / "out", [one, other])
     require_file_names(tmp_path / "out", [one, one])
+    assert slug("scene-1", "segformer.b5_ade", "Gebäude") == "scene-1__segformer.b5_ade__Gebäude"
 
 
 def test_every_hostile_name_gets_results_of_its_own(tmp_path) -> None:
     """Scenes and label sources: as many files as there are, all within OUT, and a second start finds them again."""
-    tiny_scene.write(tmp_path / "scenes" / "plain", backbones=("z", "y__z"), frames=2)
+    tiny_scene.write(tmp_path / "scenes" / "plain", backbones=("z", "y__z"), frames=1)
     for name in HORRORS:
         shutil.copytree(tmp_path / "scenes" / "plain", tmp_path / "scenes" / name)
     config = configure(tmp_path / "scenes", backbones=["z", "y__z"], check=None, voxel_size=1.0)

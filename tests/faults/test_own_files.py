@@ -98,16 +98,10 @@ def predicted_again(file: Path) -> None:
     predicted(file.parents[2]).close()
 
 
-@pytest.mark.parametrize(
-    ("pattern", "read"),
-    [
-        ("run/summary.json", read_again),
-        ("run/manifest.json", read_again),
-        ("run/units/*.json", read_unit),
-        ("converted/wall/conversion.json", converted_again),
-        ("labels/net/predictions.json", predicted_again),
-    ],
-)
+@pytest.mark.parametrize(("pattern", "read"), [
+    ("run/summary.json", read_again), ("run/manifest.json", read_again), ("run/units/*.json", read_unit),
+    ("converted/wall/conversion.json", converted_again), ("labels/net/predictions.json", predicted_again),
+])  # fmt: skip
 def test_a_damaged_file_is_one_line_or_still_whole(folder, pattern, read: Callable[[Path], None]) -> None:
     rng, refused = random.Random(pattern), list[str]()
     file = min(folder.glob(pattern))
@@ -125,14 +119,10 @@ def test_a_damaged_file_is_one_line_or_still_whole(folder, pattern, read: Callab
     assert len(refused) > DAMAGES / 10
 
 
-@pytest.mark.parametrize(
-    ("place", "value", "said"),
-    [
-        (("strata",), [], "has no strata"),
-        (("classes",), [], "has no classes"),
-        (("statistics", "verdict", "level"), "fine", "level"),
-    ],
-)
+@pytest.mark.parametrize(("place", "value", "said"), [
+    (("strata",), [], "has no strata"), (("classes",), [], "has no classes"),
+    (("statistics", "verdict", "level"), "fine", "level"),
+])  # fmt: skip
 def test_a_summary_that_lacks_what_its_tables_are_made_of_is_refused(folder, place, value, said) -> None:
     file = folder / "run" / "summary.json"
     whole = file.read_text()

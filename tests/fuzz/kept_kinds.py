@@ -31,7 +31,7 @@ from semstab.predict.filters import parse
 from semstab.predict.predictor import Kept
 from semstab.recording import Recording
 from semstab.recording.target import is_whole
-from semstab.recording.timeline import Clock, send_rows
+from semstab.recording.timeline import Clock, log_file
 from semstab.settings import load_config, resolve
 
 
@@ -61,7 +61,7 @@ def of_kept(folder: Path) -> Iterator[Kind]:
     yield Kind("recording.rrd", (tiled / "recording.rrd",), is_whole)
     series = min(tiled.glob("frames/*.csv"))
     stream = rr.RecordingStream("fuzz")
-    yield Kind("series of a recording", (series,), lambda file: send_rows(stream, task.units[0], task, file, Clock()))
+    yield Kind("series of a recording", (series,), lambda file: log_file(stream, task.units[0], task, file, Clock()))
     yield from of_text(folder)
 
 

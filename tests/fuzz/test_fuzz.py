@@ -22,7 +22,7 @@ from semstab.datasets import open_dataset
 from semstab.datasets.files.surfaces import Surface, open_las
 from semstab.datasets.formats.disk import natural
 from semstab.engine.tiles import TileResult
-from semstab.errors import ConfigError, DataError, one_line
+from semstab.errors import ConfigError, DataError, summarize_error
 from semstab.exports.clouds import Header
 from semstab.model.georeference import wkt
 from semstab.model.voxels import VoxelTable
@@ -194,8 +194,8 @@ def test_a_series_whose_columns_have_no_names_is_refused(tmp_path, text) -> None
 
 
 def test_no_exceptions_name_is_told() -> None:
-    assert one_line(OSError("Couldn't read: TProtocolException: Invalid data")) == "Couldn't read: Invalid data"
-    assert "Error" not in one_line(EOFError())
+    assert summarize_error(OSError("Couldn't read: TProtocolException: Invalid data")) == "Couldn't read: Invalid data"
+    assert "Error" not in summarize_error(EOFError())
 
 
 def test_json_nested_too_deeply_is_refused_wherever_it_stands(tmp_path) -> None:

@@ -17,7 +17,7 @@ import numpy.typing as npt
 
 from semstab.core.types import Float64, Int64, UInt8
 from semstab.datasets.formats.disk import decode_array, read_bytes
-from semstab.errors import DataError, one_line
+from semstab.errors import DataError, summarize_error
 from semstab.metrics import CATEGORIES, CATEGORY_COLORS, categories
 from semstab.metrics.agreement import voxel_keys
 from semstab.model import parquet
@@ -143,7 +143,7 @@ class Overview:
             return cls(int(frame), labels, color, palette)
         except (ValueError, TypeError) as error:
             raise DataError(
-                f"{path}: not a saved frame ({one_line(error)}); delete it, and it is made again"
+                f"{path}: not a saved frame ({summarize_error(error)}); delete it, and it is made again"
             ) from error
 
 
