@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import logging
 import runpy
 import subprocess
 import sys
@@ -28,6 +29,7 @@ def test_a_benchmark_prints_its_table_and_writes_it(name, tmp_path, capsys, monk
     script, file = BENCHMARKS / f"bench_{name}.py", tmp_path / "figures.json"
     monkeypatch.syspath_prepend(str(BENCHMARKS))
     monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(logging.getLogger("semstab"), "setLevel", lambda level: None)  # it would stay for other tests
     monkeypatch.setattr(sys, "argv", [str(script), *words.split(), *more, "--json", str(file)])
     runpy.run_path(str(script), run_name="__main__")
     assert text in capsys.readouterr().out
