@@ -40,6 +40,7 @@ libraries=$(PATH="$PATH:/sbin:/usr/sbin" ldconfig -p)
 for library in "${!package_of[@]}"; do
     [[ $libraries == *"$library "* ]] || missing+=("${package_of[$library]}")
 done
+[ "${1:-}" != dev ] || command -v chromium >/dev/null || missing+=(chromium)  # the report is tested in a browser
 [ "$(uname -s)" != Linux ] || [ ${#missing[@]} -eq 0 ] || install_packages "${missing[@]}"
 
 if ! .venv/bin/python -c '' 2>/dev/null; then

@@ -16,6 +16,8 @@ import pytest
 import tiny_scene
 from command_line import bench, error_of, started
 
+from semstab.report.figures import style
+
 
 @pytest.fixture
 def wall(tmp_path):
@@ -57,10 +59,11 @@ def test_a_run_on_a_folder(wall, tmp_path) -> None:
         assert words in text
     for name in (
         "config.yaml", "manifest.json", "recording.rrd", "voxels/wall__a__open3d.parquet", "tables/scenes.csv",
-        "tables/persistence.md", "tables/verdicts.tex", "figures/persistence.png",
+        "tables/persistence.md", "tables/verdicts.tex",
     ):  # fmt: skip
         assert (tmp_path / "run" / name).exists()
-    assert cv2.imread(str(tmp_path / "run/figures/persistence.png")).shape[1] in (3.4 * 300, 7 * 300)
+    assert "figures/persistence.svg" in bench("show", "run", "--figures", "svg", cwd=tmp_path).stdout
+    assert cv2.imread(str(tmp_path / "run/figures/persistence.png")).shape[1] in (3.4 * style.DPI, 7 * style.DPI)
     assert 'id="table-scenes"' in (tmp_path / "run/report.html").read_text()
     runs = json.loads((tmp_path / "run" / "summary.json").read_text())["runs"]
     assert {(run["backbone"], run["backend"]) for run in runs} == {("a", "open3d")}

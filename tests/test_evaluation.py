@@ -6,7 +6,6 @@ import dataclasses
 import json
 from pathlib import Path
 
-import cv2
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
@@ -21,18 +20,12 @@ from semstab.core.json_form import to_json
 from semstab.engine import Observer, load_result, run_study
 from semstab.engine.memory import map_bytes
 from semstab.errors import ConfigError
-from semstab.metrics import sbd
 from semstab.model.events import Events
 from semstab.model.voxels import VoxelTable
-from semstab.report import TOPICS, write_report
-from semstab.report.figures import figures
-from semstab.report.figures.maps import right_or_wrong
-from semstab.report.figures.statistics import DriftByOP, draw_intervals, draw_reliability
 from semstab.report.tables import tables
 from semstab.report.tables.table import to_json as table_content
 from semstab.report.terminal import print_summary
-from semstab.statistics import CellObservations, Estimate, MapSample, ObservationSample, Reliability, analyse, describe
-from semstab.statistics.agreement import stability_posterior
+from semstab.statistics import CellObservations, MapSample, ObservationSample, analyse, describe
 from semstab.statistics.correctness import ACCURACY
 
 BACKBONES = ("a", "b", "gt")
@@ -248,26 +241,6 @@ def test_agreement_stands_beside_the_sweep(studied) -> None:
     assert rows[1]["alpha"]["sd"] == pytest.approx(np.std(alphas, ddof=1))
 
 
-DRAWN = ("temporal_agreement", "drift", "correctness", "comparison", "sensitivity_agreement_depth_noise",
-         "uncertainty_map__wall__a")  # fmt: skip
-
-
-def test_every_figure_of_the_statistics_can_be_drawn(studied, tmp_path) -> None:
-    found, folder = studied
-    drawn = {figure.name: figure for figure in figures(found, folder)}
-    for name in DRAWN:
-        png, svg = drawn[name].save(tmp_path, svg=True)
-        assert cv2.imread(str(png)).std() > 1
-        assert svg.stat().st_size > 1000
-
-
-def test_every_table_and_figure_has_one_place_in_the_report(studied) -> None:
-    found, folder = studied
-    for item in (*tables(found), *figures(found, folder)):
-        assert [topic.id for topic in TOPICS if item.name.startswith(topic.prefixes)], item.name
-        assert len([topic.id for topic in TOPICS if item.name.startswith(topic.prefixes)]) == 1, item.name
-
-
 def test_columns_without_a_number_are_left_out() -> None:
     table = voxels((5, 1, [1, 0, 0]), (5, 2, [1, 1, 0]))
     plain = record(table)
@@ -289,55 +262,3 @@ def test_the_mean_of_several_scenes_counts_each_once() -> None:
     entropies = [record.statistics.uncertainty.entropy.value for record in judged]
     assert total["scene"] == "Mean"
     assert total["entropy"] == pytest.approx(np.mean(entropies))
-
-
-def test_the_reading_says_the_verdicts(tmp_path) -> None:
-    table = voxels((5, 2, [1, 1, 0]))
-    records = [record(table, scene=scene) for scene in "xy"]
-    judged = [
-        dataclasses.replace(r, summary=dataclasses.replace(r.summary, statistics=(describe(table, name="m"))))
-        for r in records
-    ]
-    (path,) = write_report(study(*judged), tmp_path)
-    assert "Verdict on m: no verdict in 2 scenes." in path.read_text()
-
-
-# --- What figures are drawn from --------------------------------------------------------------------------------------
-
-
-def test_drift_by_op_is_the_mean_of_the_voxels_whose_null_is_known() -> None:
-    table = voxels((3, 2, [1, 1, 0], 0.3), (2, 2, [2, 0, 0]), (4, 5, [3, 2, 0], 0.1))
-    null = np.array([0.25, np.nan, 0.35, 0.0, 0.0, 0.2, 0.2, 0.2, np.nan])
-    one = DriftByOP.of(table, null)
-    found = one + one
-    assert found.voxels[[1, 4]].tolist() == [8, 6]
-    assert found.sbd[1] / found.voxels[1] == pytest.approx(np.mean(sbd(table)[[0, 2, 3, 4]]))
-    assert found.null[4] / found.voxels[4] == pytest.approx(0.2)
-
-
-def test_what_is_right_and_stable_by_voxel() -> None:
-    """Five observations of two classes: 5 to 0 is stable, 3 to 2 is not; OP = 2 does not count."""
-    table = voxels((1, 5, [5, 0, 0]), (1, 5, [3, 2, 0]), (1, 5, [5, 0, 0]), (1, 5, [3, 2, 0]), (1, 2, [2, 0, 0]))
-    one_hot = dataclasses.replace(table, self_sum=table.op.astype(float))
-    assert right_or_wrong(one_hot, np.array([0, 0, 1, 1, 1]), stability_posterior(one_hot)).tolist() == [1, 2, 4, 3, 0]
-    assert right_or_wrong(one_hot, np.full(5, -1), stability_posterior(one_hot)).tolist() == [0] * 5
-
-
-def test_reliability_pools_the_bins_of_several_scenes() -> None:
-    bins = [
-        Reliability(0.8, 0.9, 10, confidence=0.85, accuracy=0.5),
-        Reliability(0.8, 0.9, 30, confidence=0.81, accuracy=0.7),
-        Reliability(0.9, 1.0, 0, confidence=np.nan, accuracy=np.nan),
-    ]
-    upper = draw_reliability({"net": bins}).axes[0]
-    points = [line.get_xydata().tolist() for line in upper.lines if len(line.get_xydata()) == 1]
-    assert [pytest.approx([0.82, 0.65])] in points
-
-
-def test_intervals_stand_where_their_estimates_say() -> None:
-    rows = {"x": {"net": Estimate(0.5, 0.4, 0.7), "other": Estimate(0.6, np.nan, np.nan)}}
-    (axes,) = draw_intervals({"PSA": rows}, {"PSA": (0.0,)}).axes
-    segments = [[x for x, _ in bar.get_segments()[0]] for bar in axes.collections]
-    assert segments[0] == pytest.approx([0.4, 0.7])
-    assert segments[1] == pytest.approx([0.6, 0.6])
-    assert axes.lines[0].get_xdata()[0] == 0.0

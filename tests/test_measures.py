@@ -23,8 +23,7 @@ from semstab.recording import Recording, color_modes
 from semstab.recording.voxel_maps import defaults
 from semstab.report.averages import describe, levels
 from semstab.report.figures.distributions import draw_ecdf, draw_persistence, draw_sweep, histograms, informative
-from semstab.report.figures.judgement import statistics_figures
-from semstab.report.figures.maps import Views, draw_stability
+from semstab.report.figures.maps import draw_stability
 from semstab.report.figures.topdown import FromAbove
 from semstab.report.tables import tables
 from semstab.report.tables.table import to_csv
@@ -125,7 +124,6 @@ def test_figures_show_it(study) -> None:
         draw_persistence(found),
         draw_sweep(describe("voxel_size"), swept),
         draw_stability(FromAbove.of(table, (0, -1, 0))),
-        next(figure for figure in statistics_figures(result, [], Views()) if figure.name == "comparison").draw(),
     )
     for figure in panels:
         assert any("rival" in title.lower() for title in titles(figure)), titles(figure)

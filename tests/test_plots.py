@@ -26,7 +26,6 @@ from semstab.report.averages import ENOUGH, describe, levels
 from semstab.report.figures import figures, topdown
 from semstab.report.figures.distributions import (
     BINS,
-    LEAST_SPAN,
     OP_BOUNDS,
     draw_ecdf,
     draw_persistence,
@@ -37,7 +36,6 @@ from semstab.report.figures.distributions import (
     together,
 )
 from semstab.report.figures.maps import Overview, draw_overview, draw_stability, scale_length
-from semstab.report.figures.statistics import draw_agreement
 from semstab.report.figures.style import COLUMN, DPI, PAGE, legend_columns
 from semstab.report.figures.topdown import EMPTY, FromAbove, level_axes, top_down
 from semstab.testing import SEQUENCES, as_frames, checks
@@ -234,24 +232,6 @@ def test_a_sweep_shows_all_voxels_and_recurrent_ones(walls):
     assert shares == pytest.approx([100 * level.mean(lambda p: p.recurrent.share) for level in found["calm"]])
 
 
-def test_a_small_difference_looks_small_and_no_bar_is_cut(walls):
-    found = {name: levels(walls, "depth_noise", name) for name in BACKBONES}
-    vss_axes, psa, alpha, drift = draw_agreement(describe("depth_noise"), found).axes
-    for axes, take in ((psa, lambda p: p.psa), (alpha, lambda p: p.alpha), (drift, lambda p: p.drift)):
-        low, high = axes.get_ylim()
-        expected = [level.interval(take) for rows in found.values() for level in rows]
-        assert all(low < e.low <= e.value <= e.high < high for e in expected)
-        drawn = [segment[:, 1] for c in axes.containers if c.has_yerr for segment in c.lines[2][0].get_segments()]
-        wide = [(e.low, e.high) for e in expected if e.low < e.high]
-        assert wide
-        assert all(any(bar == pytest.approx(ends) for bar in drawn) for ends in wide)
-    assert min(np.ptp(axes.get_ylim()) for axes in (vss_axes, psa, alpha)) >= LEAST_SPAN - 1e-9
-    share, stability, change, *_ = draw_sweep(describe("depth_noise"), found).axes
-    assert np.ptp(stability.get_ylim()) >= LEAST_SPAN - 1e-9
-    assert share.get_ylim()[0] < 0 < share.get_ylim()[1]
-    assert change.get_ylim()[0] <= 0
-
-
 def test_curves_have_the_means_of_the_voxels_and_none_of_few_recurrent_ones():
     few = record(voxels((ENOUGH - 1, 3, SPLIT)), "frame_count", 5)
     many = record(voxels((ENOUGH, 3, SPLIT)), "frame_count", 10)
@@ -283,8 +263,6 @@ def test_every_figure_is_written_in_the_same_bytes(drawn, tmp_path):
     assert names == [
         "overview__often__calm", "ecdf__calm", "persistence", "stability_map__often__calm",
         "stability_map__rarely__calm", "sensitivity_voxel_size", "sensitivity_depth_noise", "sensitivity_frame_count",
-        "temporal_agreement", "correlogram__often", "correlogram__rarely", "drift",
-        "sensitivity_agreement_voxel_size", "sensitivity_agreement_depth_noise", "sensitivity_agreement_frame_count",
     ]  # fmt: skip
     assert set(paths) == {folder / "figures" / f"{name}.{suffix}" for name in names for suffix in ("png", "svg")}
     result, folder, _ = drawn

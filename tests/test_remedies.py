@@ -100,9 +100,7 @@ def test_the_folder_and_the_terminal_hold_what_to_use(done):
     assert "vote-warped:5" in table
     folder, _ = done
     rows = json.loads((folder / "out/tables/remedies.json").read_text())
-    assert (folder / "out/figures/remedies__net.png").stat().st_size > 10_000
     page = (folder / "out/report.html").read_text()
-    assert "What would steady it?" in page
     assert "Use --filter vote-warped:5 over net" in page
     (found,) = remedies(load_result(folder / "out"))
     assert [row.filters for row in found.filtered] == ["ema:0.98", "vote-warped:5", "vote:3+threshold:0.5"]

@@ -10,7 +10,6 @@ from simulated_events import grid, log_of
 
 from semstab.core.types import THESE_FRAMES, THIS_SCENE
 from semstab.recording.voxel_maps import agreement_report
-from semstab.report.figures.statistics import draw_correlogram
 from semstab.statistics import ObservationSample, Views, correlogram, describe, krippendorff_alpha
 
 SIDE = 20
@@ -89,8 +88,6 @@ def test_frames_of_one_look_have_no_correlogram_and_all_outputs_take_it():
     summary = describe(log_of(once).table(), observations=sample_of(once, flown(1.0, 2)))
     assert "no verdict" in agreement_report(summary)
     labels = tied_to_the_view(np.random.default_rng(3))
-    many = correlogram(sample_of(labels, flown(1.0)))
-    assert len(draw_correlogram({"net": many}).axes) == 4
     report = agreement_report(describe(log_of(labels).table(), observations=sample_of(labels, flown(1.0))))
     assert report.count("| for |") == 4
 

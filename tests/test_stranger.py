@@ -22,7 +22,7 @@ from semstab.errors import DataError
 from semstab.metrics import split_last, summarise
 from semstab.metrics.agreement import rows_of
 from semstab.model.frames import Frame, Intrinsics
-from semstab.report.narrative import reading
+from semstab.report.narrative import notes
 from semstab.report.tables import tables
 from semstab.report.terminal import print_summary
 from semstab.settings import load_config, resolve
@@ -101,7 +101,7 @@ def test_compared_backends_have_a_line(scene, tmp_path) -> None:
     assert "open3d-projective differs from numba by design" in told
     assert {table.name for table in tables(result)} >= {"fusion", "fusion_compared"}
     assert "agreement" not in {table.name for table in tables(result)}
-    assert any(sentence.startswith("open3d-projective, which") for sentence in reading(result, ()))
+    assert any(sentence.startswith("open3d-projective, which") for sentence in notes(result))
 
 
 @pytest.fixture(scope="module")

@@ -67,8 +67,8 @@ def test_a_study_interrupted_and_killed_at_random_moments_ends_with_the_same_sum
 def test_what_it_prints_fits_into_80_columns(file, tmp_path) -> None:
     arguments = (file, "--set", "backends=[numpy, numba]", "--set", "backbones=[a]", "--only", "backends")
     out, _ = study(*arguments, "--set", "statistics=true", cwd=tmp_path, report=True)
-    files = ("report.html", "manifest.json", "config.yaml", "tables/scenes.csv", "figures/persistence.png")
-    for name in (*files, "tables/quadrants.csv", "tables/verdicts.tex", "figures/correctness.png"):
+    files = ("report.html", "manifest.json", "config.yaml", "tables/scenes.csv")
+    for name in (*files, "tables/quadrants.csv", "tables/verdicts.tex"):
         assert (tmp_path / "studies/tiny" / name).exists()
     assert max(len(line) for line in out.splitlines()) <= 80
     assert "checked numpy against numba" in out
@@ -76,7 +76,7 @@ def test_what_it_prints_fits_into_80_columns(file, tmp_path) -> None:
     assert "report  studies/tiny/report.html" in out
     assert len(out.splitlines()) <= 24
     page = (tmp_path / "studies/tiny/report.html").read_text()
-    assert {"table-quadrants", "table-verdicts", "figure-correctness"} <= set(re.findall(r'id="([^"]+)"', page))
+    assert {"table-quadrants", "table-verdicts", "table-correctness"} <= set(re.findall(r'id="([^"]+)"', page))
     runs = json.loads((tmp_path / "studies/tiny/summary.json").read_text())["runs"]
     (base,) = (run for run in runs if run["variation"]["sweep"] == "base")
     assert base["statistics"]["correctness"]["quadrants"]["voxels"] > 0

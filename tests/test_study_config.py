@@ -63,7 +63,7 @@ def test_every_setting_is_in_the_key_of_a_unit_or_has_a_reason_not_to_be() -> No
     selects = {"dataset", "scenes", "backbones", "region_maps", "backends", "taxonomy", "frames", "scene_frames"}
     plans = {"name", "description", "check", "tolerance", "shared_taxonomy", "sweeps", "seed", "events"}
     plans |= {"frame_quality"}  # with the label source that it compares with
-    elsewhere = {"check_geometry", "threads", "memory_gb", "tile_size", "svg"}
+    elsewhere = {"check_geometry", "threads", "memory_gb", "tile_size"}
     assert set(Config.model_fields) == selects | plans | elsewhere | set(IN_KEYS)
 
 

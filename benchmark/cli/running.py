@@ -6,6 +6,7 @@ import gc
 import re
 import sys
 import time
+from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -368,10 +369,18 @@ def convert(
             print_converted(converted, console)
 
 
+class FigureFormat(StrEnum):
+    """In which figures are written."""
+
+    png = "png"
+    svg = "svg"
+
+
 def show(
     run: Annotated[Path, typer.Argument(metavar="RUN", help="Folder of a finished run.")],
     what: Annotated[list[str] | None, typer.Argument(
         metavar="[TABLE]...", help="Tables to print, by the beginning of their names.")] = None,
+    figures: Annotated[FigureFormat | None, typer.Option(help="Draw the figures for a paper into RUN/figures.")] = None,
 ) -> None:  # fmt: skip
     """Print the answer of a finished run again, or its tables, without computing."""
     from rich.console import Console
@@ -383,11 +392,14 @@ def show(
 
     result = load_result(run)
     there = {table.name: table for table in tables(result)}
-    if not what:
+    if figures is not None:
+        from semstab.report.figures import write_figures
+
+        print_lines(map(str, write_figures(result, run, svg=figures is FigureFormat.svg)))
+    elif not what:
         print_summary(result, Console(), out=run)
         print_lines([f"  tables  {', '.join(there)}"])
-        return
-    for name in what:
+    for name in what or ():
         matching = [table for key, table in there.items() if key.startswith(name)]
         if not matching:
             raise ConfigError(f"{run}: no table '{name}'; there are {', '.join(there)}")

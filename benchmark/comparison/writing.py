@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from semstab.comparison.differences import ComparisonData, Progress, find
 from semstab.comparison.locations import Changes
-from semstab.comparison.tables import ALL_SCENES, HEADLINES, IN_CLASSES, IOU, by_key, heading, scopes, sentences, tables
+from semstab.comparison.tables import HEADLINES, IN_CLASSES, IOU, by_key, heading, scopes, sentences, tables
 from semstab.config.settings import ScopeOption, validated
 from semstab.core.files import keep_only, read_json, write_json, write_text
 from semstab.core.json_form import from_json
@@ -19,71 +19,49 @@ from semstab.model import parquet
 from semstab.model.contrast import Against, RunComparison, SceneComparison
 from semstab.model.results import slug
 from semstab.model.statistics import Estimate
-from semstab.report import blocks, filled
+from semstab.report.charts import SERIES, dot_chart
 from semstab.report.figures.maps import Panel, draw_changes
-from semstab.report.figures.statistics import draw_intervals
 from semstab.report.figures.style import Figure
+from semstab.report.html import blocks, filled
 from semstab.report.tables import save_tables
 from semstab.report.tables.table import Table, relations, to_markdown
 from semstab.statistics.agreement import PSA
 from semstab.statistics.correctness import MIOU
-from semstab.statistics.intervals import LEAST_FRAMES
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure as Canvas
 
 
-# The figures of a comparison: differences with their intervals, by scene and by class, and where they lie.
+# The charts and maps of a comparison: differences with their intervals, by scene and by class, and where they lie.
 
-Panels = dict[str, dict[str, dict[str, Estimate]]]
-"""By measure, by scene or class, by run."""
+Panels = dict[str, dict[str, list[tuple[int, str, Estimate]]]]
+"""By measure, by scene or class: the colour of each run, its name, and its difference from the base."""
 
 MOST_NUMBERS = 9
 """Places that have their number in a map."""
 
 
-def figures(comparison: ComparisonData) -> list[Figure]:
-    """All that there is something for."""
-    return [*_forest(comparison.result), *_forest_by_class(comparison.result), *_maps(comparison)]
-
-
-def _forest(comparison: RunComparison) -> Iterator[Figure]:
-    shown, panels = by_key(HEADLINES), Panels()
-    for scope, own in scopes(comparison):
-        for row in own.contrasts:
+def charts(comparison: RunComparison) -> dict[str, list[dict[str, str]]]:
+    """Return charts of the differences with their intervals, by the name of the table that they stand beneath."""
+    colors = {own.name: k for k, own in enumerate(comparison.runs[1:])}
+    shown, panels, by_class = by_key(HEADLINES), Panels(), Panels()
+    for scope, against in scopes(comparison):
+        for row in against.contrasts:
             if row.measure in shown:
-                panels.setdefault(shown[row.measure].title, {}).setdefault(scope, {})[own.other] = row.difference
-    yield Figure(
-        "comparison",
-        "Differences",
-        f"Each run less {comparison.base}, with intervals at 95%: for this scene flown again where there are"
-        f" {LEAST_FRAMES}"
-        " frames, else for these frames. An interval that holds 0 decides nothing.",
-        f"One panel a measure with the difference of each run from {comparison.base} and its interval, beside 0.",
-        lambda: draw_intervals(panels, dict.fromkeys(panels, (0.0,))),
-    )
-
-
-def _forest_by_class(comparison: RunComparison) -> Iterator[Figure]:
-    """Over all scenes where there are several."""
-    overall = comparison.overall
-    panels = Panels()
+                dot = (colors[against.other], against.other, row.difference)
+                panels.setdefault(shown[row.measure].title, {}).setdefault(scope, []).append(dot)
     for quantity in (quantity for quantity in IN_CLASSES if quantity is not PSA):
-        for own in overall:
+        for own in comparison.overall if any(own.by_class for own in comparison.overall) else ():
             for row in (*own.contrasts, *own.by_class):
                 if row.measure == (MIOU.key if quantity is IOU and not row.of else quantity.key):
-                    classes = panels.setdefault(quantity.title, {})
-                    classes.setdefault(row.of or "all classes", {})[own.other] = row.difference
-    if any(own.by_class for own in overall):
-        where = f", macro means over {ALL_SCENES}" if len(comparison.scenes) > 1 else ""
-        yield Figure(
-            "comparison_classes",
-            "Differences by class",
-            f"Each run less {comparison.base}{where}, with intervals at 95%. Agreement is that of the class against all"
-            " others; of all classes recall is accuracy, and IoU its mean. Classes with few locations are left out.",
-            f"One panel a measure with the difference of each run from {comparison.base} in each class, beside 0.",
-            lambda: draw_intervals(panels, dict.fromkeys(panels, (0.0,))),
-        )
+                    dots = by_class.setdefault(quantity.title, {}).setdefault(row.of or "all classes", [])
+                    dots.append((colors[own.other], own.other, row.difference))
+    less = f"less {comparison.base}"
+    return {
+        name: [{"title": title, "chart": dot_chart(rows, f"{title} {less}", (0.0,))} for title, rows in own.items()]
+        for name, own in (("comparison", panels), ("comparison_classes", by_class))
+        if own
+    }
 
 
 def _changed(comparison: ComparisonData) -> Iterator[tuple[SceneComparison, Against, Changes]]:
@@ -94,7 +72,8 @@ def _changed(comparison: ComparisonData) -> Iterator[tuple[SceneComparison, Agai
                 yield scene, own, changes
 
 
-def _maps(comparison: ComparisonData) -> Iterator[Figure]:
+def maps(comparison: ComparisonData) -> Iterator[Figure]:
+    """Yield a map of each scene and run of which is known what changed where."""
     for scene, own, changes in _changed(comparison):
         if scene.scene in comparison.up:
             yield Figure(
@@ -158,7 +137,7 @@ def load_comparison(folder: str | Path) -> RunComparison:
 
 def write(comparison: ComparisonData, out: str | Path) -> None:
     """Write the folder; of an earlier comparison nothing is left in it."""
-    folder, made, drawn = Path(out), tables(comparison.result), figures(comparison)
+    folder, made, drawn = Path(out), tables(comparison.result), list(maps(comparison))
     _require_own(folder)
     write_json(folder / CONTENT, comparison.result)
     write_text(folder / PAGE, markdown(comparison.result, made))
@@ -189,7 +168,8 @@ def page(comparison: RunComparison, made: Sequence[Table], drawn: Sequence[Figur
         runs=comparison.runs,
         scenes=[scene.scene for scene in comparison.scenes],
         reading=[relations(text) for text in sentences(comparison)],
-        topics=list(_topics(shown, drawn, folder)),
+        models=[(own.name, f"c{k % SERIES}") for k, own in enumerate(comparison.runs[1:])],
+        topics=list(_topics(shown, drawn, charts(comparison), folder)),
     )
 
 
@@ -203,12 +183,15 @@ TOPICS = (
 )
 
 
-def _topics(made: Sequence[Table], drawn: Sequence[Figure], folder: Path) -> Iterator[dict[str, Any]]:
+def _topics(
+    made: Sequence[Table], drawn: Sequence[Figure], made_charts: Mapping[str, list[dict[str, str]]], folder: Path
+) -> Iterator[dict[str, Any]]:
     for key, title, names in TOPICS:
         own = [table for table in made if table.name in names]
         shown = [figure for figure in drawn if figure.name.partition("__")[0] in names]
         if own or shown:
-            yield {"id": key, "title": title, "blocks": list(blocks(own, shown, folder))}
+            dots = [chart for name in names for chart in made_charts.get(name, ())]
+            yield {"id": key, "title": title, "charts": dots, "blocks": list(blocks(own, shown, folder))}
 
 
 def _write_columns(comparison: ComparisonData, folder: Path) -> None:

@@ -141,7 +141,6 @@ class Config(Settings):
     tile_size: int | Literal["off"] | None = Field(
         None, exclude=True, description="edge of tiles, voxels, a power of 2; by default only where a map needs them"
     )
-    svg: bool = Field(False, exclude=True, description="also write figures as SVG, for print")
     check_geometry: bool = Field(True, exclude=True, description="refuse data whose depth and poses contradict")
 
     if not TYPE_CHECKING:

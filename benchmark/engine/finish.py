@@ -265,7 +265,7 @@ def _savers(
     """
     work, config, unit, tile, savers = live.work, live.work.config, live.unit, live.work.tile, Savers()
     if work.image_space and stream.overview:
-        savers[f"{OVERVIEW}/{slug(unit.scene, unit.backbone)}.npz"] = partial(_save_overview, stream.overview)
+        savers[f"{OVERVIEW}/{slug(unit.scene, unit.backbone)}.npz"] = partial(_save_overview, stream)
     if tile is not None and observations is not None:
         savers[f"{tile.folder}/{tile.size}_{OBSERVATIONS}"] = observations.save
     if tile is None and work.kept:
@@ -297,9 +297,12 @@ def _savers(
     return savers
 
 
-def _save_overview(overview: Mapping[str, Any], path: Path) -> None:
+def _save_overview(stream: Stream, path: Path) -> None:
+    """Save a frame of the sequence, and those with the most flicker."""
+    meter, color = stream.image_space, "color" in stream.overview
+    worst = {} if meter is None else meter.worst(stream.task, color=color)
     with atomic_path(path) as temporary:
-        np.savez_compressed(temporary, **overview)
+        np.savez_compressed(temporary, **stream.overview, **worst)
 
 
 def written(start: Start, savers: Savers) -> tuple[dict[str, str], dict[str, bytes]]:

@@ -20,14 +20,21 @@ from semstab.config import Config
 from semstab.core.arrays import Rows
 from semstab.core.prefetch import Fetched
 from semstab.core.process import Stopwatch
-from semstab.core.types import Float64, Int32, UInt8, UInt16
+from semstab.core.types import Float64, Int32, Mask, UInt8, UInt16
 from semstab.datasets import Scene
 from semstab.engine.observer import Observers
 from semstab.engine.series import FrameRow, Series
 from semstab.engine.tiles import tiles_met
 from semstab.engine.work import Work
 from semstab.errors import DataError
-from semstab.metrics import FrameQualityMeter, SelfConsistency, VideoConsistency, compensated_flicker, flicker_percent
+from semstab.metrics import (
+    FrameQualityMeter,
+    SelfConsistency,
+    VideoConsistency,
+    changed_pixels,
+    compensated_flicker,
+    flicker_percent,
+)
 from semstab.model.frames import Frame
 from semstab.model.measures import mean
 from semstab.model.records import ImageSpace
@@ -319,6 +326,9 @@ EDGES_EVERY = 8
 SIDE = 640
 """Pixels of the longer side from which on every n-th pixel of each axis is measured, so that fusion does not wait."""
 
+WORST, THUMBNAIL = 3, 320
+"""So many frames with the most flicker are kept for the report, with at most so many pixels on the longer side."""
+
 
 def edge_recall(frame: Frame) -> float:
     """Return which part of the edges of depth has a border of labels within two pixels; NaN without edges."""
@@ -337,6 +347,7 @@ class ImageSpaceMeter:
         self._previous: Frame | None = None
         self._by_truth = [VideoConsistency(n) for n in CLIPS]
         self._by_itself = [SelfConsistency(n) for n in CLIPS]
+        self._worst: list[tuple[float, int, npt.NDArray[Any], Mask]] = []
 
     def add(self, frame: Frame, truth: Frame | None) -> float:
         """Add the next frame, with its truth in the same label space where there is any; its compensated flicker."""
@@ -353,12 +364,35 @@ class ImageSpaceMeter:
         ]
         recall = math.nan if len(self.rows) % EDGES_EVERY else edge_recall(sample)
         self.rows.append((flicker, share, *by_truth, *by_itself, recall))
+        if self._previous is not None and flicker > (self._worst[-1][0] if len(self._worst) == WORST else 0.0):
+            some = _thumbnail(sample.shape)
+            labels, changed = sample.predicted[some].copy(), changed_pixels(self._previous, sample)[some].copy()
+            same = [one for one in self._worst if one[3].shape == changed.shape]
+            worst = sorted([*same, (flicker, sample.index, labels, changed)], key=lambda one: -one[0])
+            self._worst = worst[:WORST]
         self._previous = frame
         return flicker
+
+    def worst(self, task: Task, *, color: bool) -> dict[str, Any]:
+        """Return the frames with the most flicker as arrays (n, h, w): labels, changed pixels, colour on request."""
+        if not self._worst:
+            return {}
+        flicker, frames, labels, changed = zip(*self._worst, strict=True)
+        arrays = {"worst_frames": np.array(frames), "worst_flicker": np.array(flicker)}
+        arrays |= {"worst_labels": np.stack(labels), "worst_changed": np.stack(changed)}
+        images = [task.scene.frame(index, task.backbone, color=True).color for index in frames] if color else []
+        known = [image[_thumbnail(image.shape)] for image in images if image is not None]
+        return arrays | ({"worst_color": np.stack(known)} if known and len(known) == len(frames) else {})
 
     def result(self, flicker_percent: float) -> ImageSpace:
         """Means over the frames so far, beside the flicker of the unit's summary."""
         return ImageSpace(flicker_percent, **{name: mean(self.rows.column(k)) for k, name in enumerate(COLUMNS)})
+
+
+def _thumbnail(shape: tuple[int, ...]) -> tuple[slice, slice]:
+    """Return every n-th pixel of both axes, so that at most THUMBNAIL are left of the longer one."""
+    every = slice(None, None, -(-max(shape[:2]) // THUMBNAIL))
+    return every, every
 
 
 # --- A few frames at other voxel sizes --------------------------------------------------------------------------------

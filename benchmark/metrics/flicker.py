@@ -69,6 +69,15 @@ def compensated_flicker(
     )
 
 
+def changed_pixels(previous: Frame, current: Frame, *, depth_tolerance: float = DEPTH_TOLERANCE) -> Mask:
+    """Return the co-visible pixels (H, W) whose label changed since the previous frame; see `compensated_flicker`."""
+    seen = correspond(current, previous, depth_tolerance=depth_tolerance).pixel.reshape(current.shape)
+    at = np.maximum(seen, 0)
+    covisible: Mask = (seen >= 0) & current.valid & previous.valid.ravel()[at]
+    changed: Mask = covisible & (previous.predicted.ravel()[at] != current.predicted)
+    return changed
+
+
 # Video consistency: how many pixels keep their label over clips of n frames (Miao et al. 2021, CVPR, VSPW).
 
 Labels = npt.NDArray[np.integer[Any]]

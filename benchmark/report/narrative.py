@@ -1,9 +1,8 @@
-"""What a study found, in sentences; one that has no numbers to stand on is left out."""
+"""Warnings and remarks on a result, in sentences; one that has no numbers to stand on is left out."""
 
 from __future__ import annotations
 
 import math
-from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 
 from semstab.datasets import GROUND_TRUTH
@@ -11,13 +10,13 @@ from semstab.metrics import macro_mean
 from semstab.model.measures import VSS
 from semstab.model.records import Record, Result
 from semstab.model.results import UnitSummary, VoxelAdvice
-from semstab.report.averages import ENOUGH, Pooled, by_backbone, pooled
-from semstab.report.findings import Answer, Finding
+from semstab.report.averages import ENOUGH, by_backbone, pooled
 from semstab.report.tables.stability import comparable
+from semstab.statistics.agreement import ALPHA
 from semstab.statistics.verdict import LIMITS
 
-HARDLY_ANY, MOSTLY_ONCE = 0.1, 0.5
-"""Shares of voxels seen once: below the first they need no sentence, from the second on they need a warning."""
+MOSTLY_ONCE = 0.5
+"""The share of voxels seen once from which on a warning says so."""
 
 LEAST_RECALL = 0.25
 """Share of the edges of depth with a border of labels below which labels that agree are said to be coarse."""
@@ -125,58 +124,27 @@ def mixed(runs: Sequence[UnitSummary]) -> bool:
     return len({run.reduced is None for run in runs}) > 1
 
 
-def reading(result: Result, found: Sequence[Finding]) -> list[str]:
-    """The summary of a study for somebody who will not read its tables."""
+def notes(result: Result) -> Iterator[str]:
+    """The facts about several models, scenes or backends that no table says."""
     records = result.select()
-    if not records:
-        return ["No unit at the study's own settings was finished: there is nothing to say yet."]
-    means = {name: pooled(rows) for name, rows in by_backbone(records).items()}
-    return [
-        *verdicts(result),
-        *(f"{text}." for text in warnings(result)),
-        *_once(pooled(records)),
-        *(sentence for name, voxels in means.items() for sentence in _recurrent(name, voxels)),
-        *_ranking(result),
-        *_flicker(records),
-        *_least_seen(records),
-        *_findings(found),
-        *_implementations(result),
-    ]
+    yield from _ranking(result)
+    yield from _least_seen(records)
+    yield from _implementations(result)
 
 
-def verdicts(result: Result) -> list[str]:
-    """On each backbone."""
-    return [sentence for rows in by_backbone(result.select()).values() for sentence in _verdict(rows)]
-
-
-def _once(voxels: Pooled) -> Iterator[str]:
-    if HARDLY_ANY <= voxels.once < MOSTLY_ONCE:
-        yield (
-            f"{voxels.once:.0%} of the voxels were seen once. They look stable because no second look could contradict"
-            " them: read every measure where voxels recur (OP>=3)."
-        )
-
-
-def _recurrent(backbone: str, voxels: Pooled) -> Iterator[str]:
-    if voxels.recurrent.voxels >= ENOUGH:
-        yield (
-            f"Where {backbone} had three looks or more ({voxels.recurrent.share:.0%} of its voxels),"
-            f" {1 - voxels.recurrent[VSS]:.1%} of the evidence goes against the voxel's own class; over all voxels it"
-            f" seems to be {1 - voxels.every[VSS]:.1%}."
-        )
-    else:
-        yield f"{backbone} has {voxels.recurrent.voxels:,} voxels with three looks or more: too few to judge it by."
-
-
-def _verdict(records: Sequence[Record]) -> Iterator[str]:
-    """The verdict on a backbone; of several scenes, in how many each level was reached."""
-    judged = [record.statistics.verdict for record in records if record.statistics is not None]
-    if len(judged) == 1:
-        yield f"{judged[0].line}."
-    elif judged:
-        levels = Counter(verdict.level for verdict in judged)
-        parts = (f"{level} in {n} scene{'' if n == 1 else 's'}" for level, n in levels.items())
-        yield f"Verdict on {records[0].unit.backbone}: {', '.join(parts)}."
+def differences(result: Result) -> Iterator[str]:
+    """How far alpha differs from the first model's on the locations that all saw, where that was compared."""
+    for comparison in result.comparisons:
+        first = comparison.backbones[0]
+        for row in comparison.paired.differences:
+            if row.measure == ALPHA.key and first in (row.a, row.b) and not math.isnan(row.difference.value):
+                sign = 1.0 if row.b == first else -1.0
+                other = row.a if row.b == first else row.b
+                value = sign * row.difference.value
+                low, high = sorted((sign * row.difference.low, sign * row.difference.high))
+                clear = "" if low > 0 or high < 0 else ": not told apart"
+                place = f"{comparison.scene}: " if len(result.scenes) > 1 else ""
+                yield f"{place}{other} less {first}: alpha {value:+.2f} ({low:+.2f} to {high:+.2f}){clear}"
 
 
 def _ranking(result: Result) -> Iterator[str]:
@@ -200,22 +168,8 @@ def _order(values: Mapping[str, float]) -> str:
     return " > ".join(sorted(values, key=lambda name: -values[name]))
 
 
-def _flicker(records: Sequence[Record]) -> Iterator[str]:
-    parts = []
-    for backbone, rows in by_backbone(records).items():
-        plain = macro_mean([row.image_space.flicker_percent for row in rows])
-        compensated = macro_mean([row.image_space.compensated_flicker_percent for row in rows])
-        if not math.isnan(compensated):
-            parts.append(f"{backbone} {compensated:.0f}% ({plain:.0f}%)")
-    if parts:
-        yield (
-            "Flicker, the share of the pixels whose label changes from one sampled frame to the next with the camera's"
-            f" motion removed (in brackets pixel flicker, with it): {', '.join(parts)}."
-        )
-
-
 def _least_seen(records: Sequence[Record]) -> Iterator[str]:
-    """The paradox between scenes: the one that looks steadiest may be the one that was hardly looked at."""
+    """The paradox between scenes: the one that seems most stable may be the one seen least."""
     for backbone, rows in by_backbone(records).items():
         tables = {row.unit.scene: row.summary.table for row in rows if row.summary.table.voxels}
         if len(tables) < 2:
@@ -223,16 +177,9 @@ def _least_seen(records: Sequence[Record]) -> Iterator[str]:
         steadiest = max(tables, key=lambda name: tables[name][VSS])
         if steadiest == min(tables, key=lambda name: tables[name].mean_op):
             yield (
-                f"{backbone} looks steadiest in {steadiest} (VSS {tables[steadiest][VSS]:.3f}), which is also the scene"
-                f" seen least: {tables[steadiest].mean_op:.2f} frames a voxel."
+                f"{backbone} is most stable in {steadiest} (VSS {tables[steadiest][VSS]:.3f}), which is also the scene"
+                f" seen least often: {tables[steadiest].mean_op:.2f} frames a voxel."
             )
-
-
-def _findings(found: Sequence[Finding]) -> Iterator[str]:
-    tested = [row for row in found if row.verdict is not Answer.UNTESTED]
-    parts = (f"{row.claim[0].lower()}{row.claim[1:].rstrip('.')} ({row.said})" for row in tested)
-    if tested:
-        yield f"The paper's findings here: {'; '.join(parts)}."
 
 
 def _implementations(result: Result) -> Iterator[str]:
@@ -244,8 +191,8 @@ def _implementations(result: Result) -> Iterator[str]:
     if same := [name for name, agrees in rows.items() if all(agrees)]:
         drawn = max(row.one_in for row in result.agreement if row.backends[1] in same)
         sample = f", as far as one voxel in {drawn} tells" if drawn > 1 else ""
-        leave = "leaves" if len(same) == 1 else "leave"
-        yield f"{' and '.join(same)} {leave} the same maps as {result.backend}{sample}."
+        make = "makes" if len(same) == 1 else "make"
+        yield f"{' and '.join(same)} {make} the same maps as {result.backend}{sample}."
     for name, agrees in rows.items():
         if not all(agrees):
             yield f"{name} and {result.backend} disagree in {agrees.count(False)} of {len(agrees)} comparisons."

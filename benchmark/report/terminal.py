@@ -20,11 +20,10 @@ from semstab.model.measures import measures
 from semstab.model.records import Failure, Record, Result, UnitContent
 from semstab.model.results import Agreement, UnitSummary
 from semstab.model.statistics import Estimate, StabilityVerdict
-from semstab.report.narrative import warnings
+from semstab.report.narrative import differences, warnings
 from semstab.report.remedies import advice, remedies
 from semstab.report.tables import tables
 from semstab.report.tables.table import to_terminal
-from semstab.statistics.agreement import ALPHA
 from semstab.statistics.verdict import LIMITS
 from semstab.task import Task
 
@@ -172,7 +171,7 @@ def _several(result: Result, records: Sequence[Record]) -> Iterator[str]:
     listed = ", ".join(result.scenes[:3]) + (", ..." if len(result.scenes) > 3 else "")
     yield _head(listed, result, [record.summary for record in records])
     yield ""
-    known = any(not math.isnan(_miou(record)) for record in records)
+    known = any(not math.isnan(miou(record)) for record in records)
     columns = len(COLUMNS) if known else len(COLUMNS) - 1
     yield _laid_out(COLUMNS[:columns])
     yield _laid_out(UNITS[:columns])
@@ -181,7 +180,7 @@ def _several(result: Result, records: Sequence[Record]) -> Iterator[str]:
         if len(result.scenes) > 1 and own:
             yield f"  {scene}"
         yield from (_laid_out(_cells(record)[:columns]) for record in own)
-    yield from _differences(result)
+    yield from (f"  {text}" for text in differences(result))
     yield from _classes(records)
     yield ""
 
@@ -203,30 +202,15 @@ def _cells(record: Record) -> list[str]:
         alpha = f"{_number(between.value, 2)}{ends}"
     vss, sbd = (run.table.recurrent[m] for m in measures()[:2])
     flicker = record.image_space.compensated_flicker_percent
-    numbers = ((agree, 0), (flicker, 1), (vss, 3), (sbd, 4), (100 * _miou(record), 1))
+    numbers = ((agree, 0), (flicker, 1), (vss, 3), (sbd, 4), (100 * miou(record), 1))
     return [run.unit.backbone, level, alpha, *(_number(value, digits) for value, digits in numbers)]
 
 
-def _miou(record: Record) -> float:
+def miou(record: Record) -> float:
     """Of the fused labels seen twice or more; NaN without ground truth."""
     found = record.summary.statistics
     rows = [] if found is None or found.correctness is None else found.correctness.strata
     return rows[0].miou if rows else math.nan
-
-
-def _differences(result: Result) -> Iterator[str]:
-    """How far alpha differs from the first model's on the locations that all saw, where that was compared."""
-    for comparison in result.comparisons:
-        first = comparison.backbones[0]
-        for row in comparison.paired.differences:
-            if row.measure == ALPHA.key and first in (row.a, row.b) and not math.isnan(row.difference.value):
-                sign = 1.0 if row.b == first else -1.0
-                other = row.a if row.b == first else row.b
-                value = sign * row.difference.value
-                low, high = sorted((sign * row.difference.low, sign * row.difference.high))
-                clear = "" if low > 0 or high < 0 else ": not told apart"
-                place = f"{comparison.scene}: " if len(result.scenes) > 1 else ""
-                yield f"  {place}{other} less {first}: alpha {value:+.2f} ({low:+.2f} to {high:+.2f}){clear}"
 
 
 def _number(value: float, digits: int) -> str:

@@ -1,4 +1,4 @@
-"""The study's figures, PNG and SVG, at the widths of a paper's column and page; matplotlib is imported when used."""
+"""Figures for a paper, PNG or SVG, at the widths of its column and page: `semstab-bench show RUN --figures png`."""
 
 from __future__ import annotations
 
@@ -21,11 +21,9 @@ from semstab.report.figures.distributions import (
     informative,
     together,
 )
-from semstab.report.figures.judgement import statistics_figures
 from semstab.report.figures.maps import Overview, Views, draw_overview, draw_stability
-from semstab.report.figures.remedies import remedy_figure
 from semstab.report.figures.style import Figure
-from semstab.report.remedies import of_interest, remedies
+from semstab.report.remedies import of_interest
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure as Canvas
@@ -35,9 +33,9 @@ __all__ = ["Figure", "Views", "figures", "write_figures"]
 
 
 def write_figures(result: Result, folder: str | Path, *, svg: bool = False) -> list[Path]:
-    """Write FOLDER/figures/NAME.png, and .svg on request, for every figure that the study has records for.
+    """Write FOLDER/figures/NAME.png, and .svg on request, for every figure that the result has records for.
 
-    Other figures there are removed. Returns the paths.
+    Figures that are there already are removed. Returns the paths.
     """
     target = Path(folder) / "figures"
     drawn = sorted(figures(result, folder), key=lambda figure: figure.unit)  # those of a unit read its voxels once
@@ -48,16 +46,13 @@ def write_figures(result: Result, folder: str | Path, *, svg: bool = False) -> l
 
 def figures(result: Result, folder: str | Path) -> list[Figure]:
     """Every figure in the paper's order, drawn only when it is saved; saved frames are taken from the study folder."""
-    views, found = Views(), remedies(result)
-    result = of_interest(result)
+    views, result = Views(), of_interest(result)
     kept = [record for record in result.select() if record.voxels_file is not None]
     return [
-        *(remedy_figure(each, slug("remedies", each.model)) for each in found),
         *_overviews(result, kept, views, Path(folder) / OVERVIEW),
         *_distributions(kept, views),
         *_maps(result, kept, views),
         *_sweeps(result),
-        *statistics_figures(result, kept, views),
     ]
 
 
@@ -94,7 +89,7 @@ def _distributions(kept: list[Record], views: Views) -> Iterator[Figure]:
     def of_all() -> dict[str, dict[str, Histograms]]:
         """By backbone and scene."""
         return {
-            backbone: {record.unit.scene: views.sums(record).measures for record in records}
+            backbone: {record.unit.scene: views.sums(record) for record in records}
             for backbone, records in by_backbone(kept).items()
         }
 

@@ -5,32 +5,24 @@ from __future__ import annotations
 import io
 import math
 import zipfile
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import reduce
-from operator import add
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
 
-from semstab.core.types import Float64, Int64, UInt8
+from semstab.core.types import Float64, Int64, Mask, UInt8
 from semstab.datasets.formats.disk import decode_array, read_bytes
 from semstab.errors import DataError, summarize_error
 from semstab.metrics import CATEGORIES, CATEGORY_COLORS, categories
-from semstab.metrics.agreement import voxel_keys
-from semstab.model import parquet
 from semstab.model.measures import dominant, measures
 from semstab.model.records import Record, Tables
-from semstab.model.results import RECURRENT
 from semstab.model.voxels import VoxelTable
 from semstab.report.figures.distributions import Histograms, histograms, together
-from semstab.report.figures.statistics import DriftByOP
 from semstab.report.figures.style import COLORS, COLUMN, FAINT, INK, LETTERS, PAGE, canvas, mark_panel
 from semstab.report.figures.topdown import EMPTY, MOST, OUTLIERS, FromAbove, best_view, level_axes, top_down, topmost
-from semstab.statistics import decompose, expected_sbd
-from semstab.statistics.agreement import LIKELY
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -45,15 +37,6 @@ Colors = Sequence[tuple[int, int, int]]
 BLANK = (255, 255, 255)
 UNDEFINED = "#cccccc"
 COLORMAP = "YlOrRd"
-RIGHT_COLORS = (
-    ("OP < 3, or no truth", (204, 204, 204)),
-    ("stable, right", (86, 180, 233)),
-    ("unstable, right", (0, 114, 178)),
-    ("unstable, wrong", (240, 228, 66)),
-    ("stable, wrong", (213, 94, 0)),
-)
-"""What is known of a voxel, in Okabe and Ito's colours."""
-
 LEGEND_LINE, LEGEND_KEY, LEGEND_LETTER = 0.15, 0.5, 0.066
 """Inches of a legend: height of a line; width of a key with its margins, and of a letter."""
 
@@ -79,39 +62,22 @@ def draw_stability(above: FromAbove) -> Figure:
     return figure
 
 
-def draw_uncertainty(above: FromAbove, wrong: npt.NDArray[np.integer[Any]] | None) -> Figure:
-    """Entropy within and between frames of the topmost voxels and, where truth tells, which are stable and wrong.
+@dataclass(frozen=True, eq=False)
+class WorstFrames:
+    """The frames of a sequence with the most flicker, the worst first, as small images.
 
-    `wrong` (n,) is a row of RIGHT_COLORS: what is known of each voxel that is seen.
+    frames   (n,) their indices
+    flicker  (n,) percent, camera motion removed
+    labels   (n, h, w) rows 0..K-1, and above where a pixel has none
+    changed  (n, h, w) pixels whose label differs from that of the frame before
+    color    (n, h, w, 3); None where the dataset has no images
     """
-    table, rows = above.table, above.rows
-    figure, panels = map_panels(rows, 2 if wrong is None else 3)
-    parts, again = decompose(table), table.op > 1
-    most = math.log(2) / math.log(table.K)
-    for axes, values in zip(panels, (parts.within, parts.between), strict=False):
-        _draw_measure(figure, axes, rows, np.where(again, values, np.nan), (0.0, most))
-    if wrong is not None:
-        panels[2].imshow(_painted(rows, wrong, [shade for _, shade in RIGHT_COLORS]), interpolation_stage="rgba")
-        entries = [(name, tuple(channel / 255 for channel in shade)) for name, shade in RIGHT_COLORS]
-        columns = len(entries) if figure.get_figwidth() > COLUMN else 2
-        figure.legend(handles=_handles(entries), loc="outside lower center", ncols=columns)
-    titles = ("entropy within frames", "entropy between frames", "right and wrong")
-    for axes, letter, title in zip(panels, "abc", titles, strict=False):
-        mark_panel(axes, letter, title)
-        framed(axes)
-        scale_bar(axes, rows.shape[1], above.cell)
-    return figure
 
-
-def right_or_wrong(table: VoxelTable, truth: Int64, likely: Float64) -> Int64:
-    """What is known of each voxel (n,), a row of RIGHT_COLORS.
-
-    By its true class (n,), -1 where that is not known, and how likely it is stable (n,), NaN likewise.
-    """
-    stable = np.nan_to_num(likely) >= LIKELY
-    right = dominant(table) == truth
-    known = (truth >= 0) & (table.op >= RECURRENT)
-    return np.where(known, np.where(right, np.where(stable, 1, 2), np.where(stable, 4, 3)), 0)
+    frames: Int64
+    flicker: Float64
+    labels: npt.NDArray[np.integer[Any]]
+    changed: Mask
+    color: Image | None
 
 
 @dataclass(frozen=True, eq=False)
@@ -122,12 +88,14 @@ class Overview:
     labels     (H, W) predicted rows 0..K-1; K and above: ignored
     color      (H, W, 3) the image; None where the dataset has none
     palette    (K, 3) RGB of the classes
+    worst      the frames with the most flicker; None where no pixel changed
     """
 
     frame: int
     labels: npt.NDArray[np.integer[Any]]
     color: Image | None
     palette: Image
+    worst: WorstFrames | None = None
 
     @classmethod
     def load(cls, path: Path) -> Overview:
@@ -137,11 +105,17 @@ class Overview:
         """
         try:
             data = read_bytes(path)
-            frame, labels, palette = (decode_array(path, data, key) for key in ("frame", "labels", "palette"))
             with zipfile.ZipFile(io.BytesIO(data)) as archive:
-                color = decode_array(path, data, "color") if "color.npy" in archive.namelist() else None
-            return cls(int(frame), labels, color, palette)
-        except (ValueError, TypeError) as error:
+                found = {name: decode_array(path, data, name[:-4]) for name in archive.namelist()}
+            own = {name.removesuffix(".npy"): value for name, value in found.items()}
+            worst: list[Any] = [
+                own.get(f"worst_{name}") for name in ("frames", "flicker", "labels", "changed", "color")
+            ]
+            return cls(
+                int(own["frame"]), own["labels"], own.get("color"), own["palette"],
+                None if worst[0] is None else WorstFrames(*worst),
+            )  # fmt: skip
+        except (ValueError, TypeError, KeyError, zipfile.BadZipFile) as error:
             raise DataError(
                 f"{path}: not a saved frame ({summarize_error(error)}); delete it, and it is made again"
             ) from error
@@ -286,44 +260,21 @@ def _handles(entries: Sequence[tuple[str, Any]]) -> list[Any]:
 # What figures show of units' voxels, each table read once; the figures of a unit are drawn one after the other.
 
 
-@dataclass(frozen=True, eq=False)
-class Sums:
-    """A unit's voxels by OP: each measure, and SBD beside random order."""
-
-    measures: Histograms
-    drift: DriftByOP
-
-    @classmethod
-    def of(cls, table: VoxelTable, null: Float64) -> Sums:
-        """Of a map, and the SBD (n,) expected of its voxels in random order."""
-        return cls(histograms(table), DriftByOP.of(table, null))
-
-    def __add__(self, other: Sums) -> Sums:
-        return Sums(together([self.measures, other.measures]), self.drift + other.drift)
-
-
 class Views:
     """The sums of every unit that was asked for, and the view from above of the last one."""
 
     def __init__(self) -> None:
         self._tables = Tables()
-        self._sums: dict[str, Sums] = {}
+        self._sums: dict[str, Histograms] = {}
         self._last: tuple[str, FromAbove] | None = None
 
-    def sums(self, record: Record) -> Sums:
-        """The unit's voxels by OP."""
+    def sums(self, record: Record) -> Histograms:
+        """Return the measures of the unit's voxels, by OP."""
         slug = record.unit.slug
         if slug not in self._sums:
-            self._sums[slug] = reduce(add, self._parts(record))
+            tables = record.tiles() if record.in_tiles else [self._tables.of(record)]
+            self._sums[slug] = together([histograms(table) for table in tables])
         return self._sums[slug]
-
-    def _parts(self, record: Record) -> Iterator[Sums]:
-        """Of the unit, or of each of its tiles."""
-        assert record.voxels_file is not None
-        for file in parquet.files_of(record.voxels_file):
-            table = VoxelTable.load(file) if record.in_tiles else self._tables.of(record)
-            null = _column(file, "sbd_null")
-            yield Sums.of(table, expected_sbd(table) if null is None else null)
 
     def above(self, record: Record, up: npt.ArrayLike) -> FromAbove:
         """The unit's voxels that are seen from above."""
@@ -333,27 +284,6 @@ class Views:
             table = topmost(record.tiles(), up) if large else self._tables.of(record)
             self._last = slug, FromAbove.of(table, up)
         return self._last[1]
-
-
-def kept_of(record: Record, table: VoxelTable, names: Sequence[str]) -> list[npt.NDArray[Any]] | None:
-    """Columns (n,) that were written beside the voxels, of these of them, tile by tile; None where they were not."""
-    if record.voxels_file is None or not {*names} <= {*parquet.names_in(record.voxels_file)}:
-        return None
-    found: list[npt.NDArray[Any]] | None = None
-    for file in parquet.files_of(record.voxels_file):
-        own = VoxelTable.columns(file, ("ix", "iy", "iz", *names))
-        wanted, there = voxel_keys(table.index, np.stack([own[axis] for axis in ("ix", "iy", "iz")], axis=1))
-        at = np.minimum(np.searchsorted(there, wanted), len(there) - 1)
-        met = there[at] == wanted
-        if found is None:
-            found = [np.zeros(len(table), own[name].dtype) for name in names]
-        for values, name in zip(found, names, strict=True):
-            values[met] = own[name][at[met]]
-    return found
-
-
-def _column(file: Path, name: str) -> npt.NDArray[Any] | None:
-    return VoxelTable.columns(file, [name])[name] if name in parquet.names_in(file) else None
 
 
 # Where two maps differ, seen from above or from the side.

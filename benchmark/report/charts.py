@@ -1,0 +1,175 @@
+"""Charts of the page as inline SVG: lines with intervals, and dots with intervals; drawn in a millisecond each."""
+
+from __future__ import annotations
+
+import html
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from semstab.model.statistics import Estimate
+
+WIDTH, HEIGHT = 520, 230
+LEFT, RIGHT, TOP, BOTTOM = 68, 12, 12, 42
+ROW = 24
+"""Units of the drawing, as many as pixels at its own size: of a chart, of its margins, of a row of dots."""
+
+POINTS = 400
+"""A longer line is drawn by the means of so many equal parts."""
+
+SERIES = 8
+"""Colours of the style sheet, c0 to c7."""
+
+
+@dataclass(frozen=True)
+class Line:
+    """A line of a chart by its name; NaN breaks it. `ends` has an interval (low, high) a point."""
+
+    name: str
+    x: Sequence[float]
+    y: Sequence[float]
+    ends: Sequence[tuple[float, float]] = ()
+    color: int = 0
+    dashed: bool = False
+
+
+@dataclass(frozen=True)
+class Scale:
+    """From values between two ends to units of the drawing."""
+
+    low: float
+    high: float
+    first: float
+    last: float
+
+    @classmethod
+    def over(cls, values: Sequence[float], first: float, last: float, *, zero: bool = False) -> Scale:
+        """Over the finite values, from 0 on where `zero` says so."""
+        known = [value for value in values if math.isfinite(value)] or [0.0, 1.0]
+        low, high = min(0.0, *known) if zero else min(known), max(known)
+        apart = high - low > 1e-9 * max(abs(low), abs(high), 1e-9)
+        return cls(low, high if apart else low + max(abs(low), 1e-3), first, last)
+
+    def __call__(self, value: float) -> float:
+        """Return where the value lies."""
+        return self.first + (value - self.low) / (self.high - self.low) * (self.last - self.first)
+
+    def ticks(self, most: int = 5) -> list[float]:
+        """Round values between the ends: 1, 2 or 5 times a power of ten apart."""
+        rough = (self.high - self.low) / most
+        power = 10.0 ** math.floor(math.log10(rough))
+        step = next(factor * power for factor in (1, 2, 5, 10) if factor * power >= 0.999 * rough)
+        first, last = math.ceil(self.low / step - 1e-9), math.floor(self.high / step + 1e-9)
+        return [k * step for k in range(first, last + 1)]
+
+
+def line_chart(
+    lines: Sequence[Line], x_label: str, y_label: str, *, names: Sequence[str] = (), zero: bool = True
+) -> str:
+    """Return a chart of lines over x; `names` of its ticks where x counts things that have names."""
+    shown = [thinned(line) for line in lines]
+    xs = [x for line in shown for x in line.x]
+    ys = [y for line in shown for y in (*line.y, *(end for pair in line.ends for end in pair))]
+    x, y = Scale.over(xs, LEFT + 8, WIDTH - RIGHT - 8), Scale.over(ys, HEIGHT - BOTTOM, TOP + 4, zero=zero)
+    x_ticks = {float(k): name for k, name in enumerate(names)} or {tick: number(tick) for tick in x.ticks(8)}
+    parts = [*_frame(x, y, x_ticks, {tick: number(tick) for tick in y.ticks()}, x_label, y_label)]
+    for line in shown:
+        parts += _line(line, x, y)
+    return _svg(parts, HEIGHT, f"{y_label} by {x_label}")
+
+
+def dot_chart(rows: Mapping[str, Sequence[tuple[int, str, Estimate]]], x_label: str, guides: Sequence[float]) -> str:
+    """Return a chart of rows of dots with their intervals, (colour, name, estimate) each; lines at the guides."""
+    values = [v for row in rows.values() for _, _, e in row for v in (e.value, e.low, e.high)]
+    left = LEFT + 6 * min(16, max(map(len, rows)))
+    most = max(len(row) for row in rows.values())
+    step = ROW if most == 1 else 10 * most + 8
+    height = TOP + step * len(rows) + BOTTOM
+    x = Scale.over([*values, *guides], left, WIDTH - RIGHT - 6)
+    y = Scale(0, len(rows), TOP, height - BOTTOM)
+    names = {k + 0.5: name if len(name) <= 22 else f"{name[:19]}..." for k, name in enumerate(rows)}
+    parts = [*_frame(x, y, {tick: number(tick) for tick in x.ticks()}, names, x_label, "", left=left, height=height)]
+    parts += [f'<path class="guide" d="M{x(g):.1f} {TOP}V{height - BOTTOM}"/>' for g in guides]
+    for k, row in enumerate(rows.values()):
+        for j, (color, name, estimate) in enumerate(row):
+            if math.isfinite(estimate.value):
+                at = y(k + 0.5) + 10 * (j - (len(row) - 1) / 2)
+                parts += _dot(x, at, estimate, color, name)
+    return _svg(parts, height, x_label)
+
+
+def thinned(line: Line) -> Line:
+    """Return the line, of more than POINTS points the means of parts of it."""
+    if len(line.x) <= POINTS:
+        return line
+    with np.errstate(invalid="ignore"):
+        parts = [np.array_split(np.asarray(values, dtype=np.float64), POINTS) for values in (line.x, line.y)]
+        x, y = ([float(np.nanmean(p)) if np.isfinite(p).any() else math.nan for p in own] for own in parts)
+    return Line(line.name, x, y, (), line.color, line.dashed)
+
+
+def number(value: float) -> str:
+    """Return a value as a tick has it: '0.05', '1,200'."""
+    return f"{value + 0.0:,.6g}".replace("-", "\N{MINUS SIGN}")
+
+
+def _line(line: Line, x: Scale, y: Scale) -> Iterator[str]:
+    color = f"c{line.color % SERIES}"
+    points = list(zip(line.x, line.y, strict=True))
+    pen, steps = "M", []
+    for px, py in points:
+        if math.isfinite(py):
+            steps.append(f"{pen}{x(px):.1f} {y(py):.1f}")
+        pen = "L" if math.isfinite(py) else "M"
+    yield f'<path class="line {color}{" dashed" if line.dashed else ""}" d="{"".join(steps)}"/>'
+    for k, (px, py) in enumerate(points if len(points) <= 40 else ()):
+        if math.isfinite(py):
+            ends = line.ends[k] if line.ends else (math.nan, math.nan)
+            if all(map(math.isfinite, ends)):
+                yield f'<path class="line {color}" d="M{x(px):.1f} {y(ends[0]):.1f}V{y(ends[1]):.1f}"/>'
+            yield _circle(x(px), y(py), color, f"{line.name}: {_said(Estimate(py, *ends))}")
+
+
+def _dot(x: Scale, at: float, estimate: Estimate, color: int, name: str) -> Iterator[str]:
+    shade = f"c{color % SERIES}"
+    if math.isfinite(estimate.low) and math.isfinite(estimate.high):
+        yield f'<path class="line {shade}" d="M{x(estimate.low):.1f} {at:.1f}H{x(estimate.high):.1f}"/>'
+    yield _circle(x(estimate.value), at, shade, f"{name}: {_said(estimate)}")
+
+
+def _said(estimate: Estimate) -> str:
+    ends = f" ({estimate.low:.3g} to {estimate.high:.3g})" if math.isfinite(estimate.low) else ""
+    return f"{estimate.value:.3g}{ends}"
+
+
+def _circle(x: float, y: float, color: str, title: str) -> str:
+    return f'<circle class="dot {color}" cx="{x:.1f}" cy="{y:.1f}" r="3.4"><title>{html.escape(title)}</title></circle>'
+
+
+def _frame(
+    x: Scale, y: Scale, x_ticks: Mapping[float, str], y_ticks: Mapping[float, str], x_label: str, y_label: str,
+    *, left: float = LEFT, height: float = HEIGHT,
+) -> Iterator[str]:  # fmt: skip
+    """Grid, ticks and labels of both axes."""
+    bottom = height - BOTTOM
+    for value, text in y_ticks.items():
+        if y_label:
+            yield f'<path class="grid" d="M{left} {y(value):.1f}H{WIDTH - RIGHT}"/>'
+        yield f'<text x="{left - 7:.0f}" y="{y(value) + 4:.1f}" text-anchor="end">{html.escape(text)}</text>'
+    for value, text in x_ticks.items():
+        if not y_label:
+            yield f'<path class="grid" d="M{x(value):.1f} {TOP}V{bottom}"/>'
+        yield f'<text x="{x(value):.1f}" y="{bottom + 16}" text-anchor="middle">{html.escape(text)}</text>'
+    yield f'<path class="axis" d="M{left} {bottom}H{WIDTH - RIGHT}"/>'
+    middle = (left + WIDTH - RIGHT) / 2
+    yield f'<text class="label" x="{middle:.0f}" y="{height - 6}" text-anchor="middle">{html.escape(x_label)}</text>'
+    if y_label:
+        turned = f'transform="rotate(-90)" x="{-(TOP + bottom) / 2:.0f}" y="13"'
+        yield f'<text class="label" {turned} text-anchor="middle">{html.escape(y_label)}</text>'
+
+
+def _svg(parts: Sequence[str], height: float, label: str) -> str:
+    box = f'viewBox="0 0 {WIDTH} {height:.0f}" width="{WIDTH}" height="{height:.0f}"'
+    return f'<svg class="chart" {box} role="img" aria-label="{html.escape(label)}">{"".join(parts)}</svg>'

@@ -1,0 +1,131 @@
+"""Parts of a page that needs no other file: its style, its tables, its images."""
+
+from __future__ import annotations
+
+import base64
+import io
+import itertools
+import re
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from semstab.core.types import UInt8
+from semstab.report.figures.style import COLUMN, DPI, Figure
+from semstab.report.tables.table import ARROWS, Table, relations, sections
+
+SCREEN_DPI = 200
+"""Figures are embedded with that many pixels an inch and in 256 colours: a quarter of the file's size."""
+
+CSS_INCH = 122
+"""Pixels of the page an inch of a figure: its smallest type then is as large as the text of the tables."""
+
+ABSENT = "absent"
+"""A table's note of a class that covers no voxel: the page names such classes in a line."""
+
+
+def filled(template: str, **content: Any) -> str:
+    """Return a page, from its template; `style` and `script` are there already."""
+    from jinja2 import Environment, FileSystemLoader, StrictUndefined
+
+    here = Path(__file__).parent
+    environment = Environment(
+        loader=FileSystemLoader(here), autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
+    )
+    style, script = ((here / name).read_text(encoding="utf-8") for name in ("style.css", "page.js"))
+    page: str = environment.get_template(template).render(style=style, script=script, **content)
+    return page
+
+
+def blocks(own: Sequence[Table], shown: Sequence[Figure], folder: Path) -> Iterator[dict[str, Any]]:
+    """Yield tables, each with the figure of its name beneath it, then the other figures."""
+    figures = {figure.name: figure for figure in shown}
+    ordered: list[Table | Figure] = []
+    for table in own:
+        ordered += [table, *([figures.pop(table.name)] if table.name in figures else [])]
+    for item in (*ordered, *figures.values()):
+        if isinstance(item, Table):
+            yield {"kind": "table", "content": table_block(item)}
+        else:
+            yield {"kind": "figure", "content": figure_block(item, folder)}
+
+
+def table_block(table: Table) -> dict[str, Any]:
+    """Return a table as the page shows it."""
+    headers = [f"{column.header} {ARROWS[column.better]}".strip() for column in table.columns]
+    absent = [*dict.fromkeys(row[0] for _, rows in sections(table) for row in rows if row[-1] == ABSENT)]
+    left_out = f" Absent: {', '.join(absent)}." if absent else ""
+    over = [relations(column.over) for column in table.columns]
+    return {
+        "name": table.name,
+        "title": relations(table.title),
+        "caption": relations(table.caption + left_out),
+        "headers": [relations(header) for header in headers],
+        "over": [(name, len(list(run))) for name, run in itertools.groupby(over)] if any(over) else [],
+        "numeric": [column.digits is not None for column in table.columns],
+        "sections": [
+            (relations(name), [[_cell(cell) for cell in row] for row in rows if row[-1] != ABSENT])
+            for name, rows in sections(table)
+        ],
+    }
+
+
+def _cell(text: str) -> str:
+    """A cell as typography has it: minus signs, a dash for what is undefined."""
+    if text == "--":
+        return "\N{EN DASH}"
+    is_number = text[-1:].isdigit() or re.fullmatch(r"[-+]?[\d.,]+ \([-+\d., ]+\)", text)
+    return relations(re.sub(r"(^|(?<=\()|(?<=, )|(?<=e))-(?=\d)", "\N{MINUS SIGN}", text) if is_number else text)
+
+
+def figure_block(figure: Figure, folder: Path) -> dict[str, Any]:
+    """Return a figure as the page holds it; it is drawn where FOLDER/figures lacks it."""
+    from PIL import Image
+
+    png = folder / "figures" / f"{figure.name}.png"
+    if not png.exists():
+        figure.save(png.parent)
+    with Image.open(png) as image:
+        width, height = (edge / DPI for edge in image.size)
+        size = [round(edge * SCREEN_DPI / DPI) for edge in image.size]
+        small = image.convert("RGB").resize((size[0], size[1]), Image.Resampling.LANCZOS)
+    data = io.BytesIO()
+    # the octree keeps colours of small areas, which the median cut merges, and takes a fortieth of its time
+    small.quantize(256, Image.Quantize.FASTOCTREE, dither=Image.Dither.NONE).save(data, "PNG")
+    return {
+        "name": figure.name,
+        "title": figure.title,
+        "caption": relations(figure.caption),
+        "alt": figure.alt,
+        "source": _url(data.getvalue(), "png"),
+        "width": round(width * CSS_INCH),
+        "height": round(height * CSS_INCH),
+        "narrow": width <= COLUMN * 1.01,
+    }
+
+
+def png(image: UInt8, palette: UInt8 | None = None) -> str:
+    """Return an image (H, W, 3), or indices (H, W) into a palette (n, 3), as the address of a PNG without loss."""
+    from PIL import Image
+
+    data, made = io.BytesIO(), Image.fromarray(np.ascontiguousarray(image))
+    if palette is not None:
+        made = made.convert("P")
+        made.putpalette(np.ascontiguousarray(palette[:256]).tobytes())
+    made.save(data, "PNG", optimize=palette is not None)
+    return _url(data.getvalue(), "png")
+
+
+def jpeg(image: UInt8) -> str:
+    """Return an image (H, W, 3) as the address of a JPEG."""
+    from PIL import Image
+
+    data = io.BytesIO()
+    Image.fromarray(np.ascontiguousarray(image)).save(data, "JPEG", quality=80)
+    return _url(data.getvalue(), "jpeg")
+
+
+def _url(data: bytes, kind: str) -> str:
+    return f"data:image/{kind};base64,{base64.b64encode(data).decode()}"

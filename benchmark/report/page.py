@@ -1,0 +1,402 @@
+"""report.html: the answer of a run or a study first, then where, when and in which classes; all else is folded."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from semstab.core.types import Int64, UInt8
+from semstab.metrics import CATEGORIES, CATEGORY_COLORS, categories, macro_mean
+from semstab.model.measures import SBD, VSS, dominant
+from semstab.model.records import OVERVIEW, Failure, Record, Result
+from semstab.model.results import slug
+from semstab.model.statistics import Estimate, MapStatistics
+from semstab.report.averages import by_backbone, describe, levels, over_recurrent, pooled, swept
+from semstab.report.charts import SERIES, Line, dot_chart, line_chart
+from semstab.report.figures.maps import Overview, Views
+from semstab.report.figures.topdown import EMPTY
+from semstab.report.findings import Answer, Finding, findings
+from semstab.report.html import filled, jpeg, png, table_block
+from semstab.report.loaded import read_series
+from semstab.report.narrative import differences, notes, warnings
+from semstab.report.remedies import advice, of_interest, remedies
+from semstab.report.tables import tables
+from semstab.report.tables.table import relations
+from semstab.report.terminal import class_alphas, miou
+from semstab.statistics.verdict import LIMITS
+
+MOST_NAMED = 3
+"""Scenes that are named in the title."""
+
+CELLS, BYTES, ALL_BYTES = 1_200_000, 1_000_000, 12_000_000
+"""Cells of a map in the page, and letters of its images: of one map, and of all; beyond, every n-th cell is left."""
+
+SBD_END = 0.25
+"""SBD, bits, that the largest code of a map's image stands for."""
+
+UNKNOWN = 255
+"""Code of a value that is not defined; as a category, of a cell without a voxel."""
+
+KINDS = {"stable": "good", "usable": "part", "undecided": "open", "no verdict": "open"}
+"""Styles of verdicts; the others are bad news."""
+
+
+def render(result: Result, folder: Path) -> str:
+    """Return the page of the result whose files lie in the folder."""
+    everything, result = result, of_interest(result)
+    tested = findings(result)
+    shown, views = list(_scenes(result, folder)), [table_block(table) for table in tables(everything)]
+    return filled(
+        "report.html.j2",
+        kind="Study of temporal semantic stability" if result.sweeps() else "Temporal semantic stability",
+        title=_title(result),
+        subtitle=_subtitle(result),
+        models=_legend(result.backbones),
+        cards=[_card(name, records) for name, records in by_backbone(result.select()).items()],
+        advice=[sentence for each in remedies(everything) for sentence in advice(each)],
+        warnings=[relations(text) for text in warnings(result)],
+        notes=[relations(text) for text in (*differences(result), *notes(result))],
+        scenes=shown,
+        maps=_script([unit for scene in shown for unit in scene["maps"]]),
+        layers=_script({"categories": CATEGORIES, "colors": CATEGORY_COLORS, "sbd": SBD_END}),
+        charts_all=[*_by_op(result), *_sweeps(result)],
+        tables=views,
+        findings=[_finding(row) for row in tested if row.verdict is not Answer.UNTESTED],
+        untested=[_finding(row) for row in tested if row.verdict is Answer.UNTESTED],
+        failures=[_failure(row) for row in result.failures],
+        facts=list(_facts(result.manifest)),
+        manifest=json.dumps(result.manifest, indent=2, default=str),
+    )
+
+
+def _script(content: Any) -> str:
+    """JSON that may stand in a script element."""
+    return json.dumps(content).replace("<", "\\u003c")
+
+
+def _legend(names: Sequence[str]) -> list[tuple[str, str]]:
+    """The names with the styles of their colours."""
+    return [(name, f"c{k % SERIES}") for k, name in enumerate(names)]
+
+
+# --- Cards ------------------------------------------------------------------------------------------------------------
+
+
+def _card(model: str, records: Sequence[Record]) -> dict[str, Any]:
+    """A model: the verdict on it in each scene, and the numbers that it rests on."""
+    judged = [record.statistics for record in records if record.statistics is not None]
+    one = judged[0] if len(judged) == 1 else None
+    return {
+        "model": model,
+        "scenes": [_scene_verdict(record) for record in records[:12]],
+        "more": max(0, len(records) - 12),
+        "reasons": relations(one.verdict.line.partition(": ")[2]) if one is not None else "",
+        "numbers": [(name, value, note) for name, value, note in _numbers(records, judged, one) if value],
+    }
+
+
+def _scene_verdict(record: Record) -> dict[str, str]:
+    found = record.statistics
+    if found is None:
+        return {"scene": record.unit.scene, "level": "not judged", "kind": "open", "probability": ""}
+    level, probability = found.verdict.level, found.verdict.probability
+    said = "" if math.isnan(probability) else f"{100 * probability:.0f} %"
+    return {"scene": record.unit.scene, "level": level, "kind": KINDS.get(level, "bad"), "probability": said}
+
+
+def _numbers(
+    records: Sequence[Record], judged: Sequence[MapStatistics], one: MapStatistics | None
+) -> Iterator[tuple[str, str, str]]:
+    """Rows of a card: name, value, and its interval or unit; macro means over several scenes."""
+
+    def mean(values: Sequence[float], form: str, scale: float = 1.0) -> str:
+        value = macro_mean(values)
+        return "" if math.isnan(value) else form.format(scale * value)
+
+    def interval(estimate: Estimate | None, scale: float = 1.0) -> str:
+        if estimate is None or math.isnan(estimate.low):
+            return ""
+        digits = 2 if scale == 1.0 else 0
+        return f"95 % CI {scale * estimate.low:.{digits}f} to {scale * estimate.high:.{digits}f}"
+
+    shares = [found.ceiling_share for found in judged if found.ceiling_share is not None]
+    head = None if one is None else one.headline
+    own = shares[0].share if one is not None and shares else None
+    yield (
+        "alpha between frames",
+        mean([f.headline.alpha_between.value for f in judged], "{:.2f}"),
+        interval(None if head is None else head.alpha_between),
+    )
+    yield "share of its ceiling", mean([s.share.value for s in shares], "{:.0f} %", 100), interval(own, 100)
+    psa = [found.headline.psa.value for found in judged]
+    yield "two frames agree", mean(psa, "{:.0f} %", 100), "of the locations"
+    flicker = [record.image_space.compensated_flicker_percent for record in records]
+    yield "flicker", mean(flicker, "{:.1f} %"), "of the pixels a frame, camera motion removed"
+    together = pooled(records)
+    yield "seen 3 times or more", f"{100 * together.recurrent.share:.0f} %", f"of {together.voxels:,} voxels"
+    yield "VSS", mean([together.recurrent[VSS]], "{:.3f}"), "OP ≥ 3"
+    yield "SBD", mean([together.recurrent[SBD]], "{:.4f}"), "bits, OP ≥ 3"
+    yield "mIoU", mean([miou(record) for record in records], "{:.1f} %", 100), "of the fused labels"
+    wrong = [found.headline.wrong_of_stable.value for found in judged]
+    yield "stable and wrong", mean(wrong, "{:.1f} %", 100), "of the stable locations"
+
+
+# --- A scene: the map, the time line, the classes ---------------------------------------------------------------------
+
+
+def _scenes(result: Result, folder: Path) -> Iterator[dict[str, Any]]:
+    views = Views()
+    own = [record for record in result.select() if record.voxels_file is not None]
+    share = min(BYTES, ALL_BYTES // max(1, len(own)))
+    for scene in result.scenes:
+        records = result.select(scene=scene)
+        overviews = {}
+        for record in records:
+            path = folder / OVERVIEW / f"{slug(scene, record.unit.backbone)}.npz"
+            if path.exists():
+                overviews[record.unit.backbone] = Overview.load(path)
+        up, colors = result.up.get(scene), {name: k for k, name in enumerate(result.backbones)}
+        drawn = [] if up is None else [record for record in records if record.voxels_file is not None]
+        yield {
+            "name": scene,
+            "maps": [_map(record, up, views, overviews.get(record.unit.backbone), share) for record in drawn],
+            "unknown_up": up is None,
+            "models": _legend(result.backbones) if len(result.backbones) > 1 else [],
+            "timeline": list(_timeline(records, colors)),
+            "worst": [row for record in records for row in _worst(record, overviews.get(record.unit.backbone))],
+            "classes": _classes(records, colors),
+            "distance": list(_distance(records, colors)),
+        }
+
+
+def _map(record: Record, up: Any, views: Views, overview: Overview | None, most: int) -> dict[str, Any]:
+    """The map as the page's script paints it: images of numbers, and of the stability where there is no script."""
+    above = views.above(record, up)
+    step = max(1, math.ceil(math.sqrt(above.rows.size / CELLS)))
+    table, names = above.table, above.table.classes or tuple(map(str, range(above.table.K)))
+    with np.errstate(invalid="ignore"):
+        drift = np.nan_to_num(np.minimum(SBD.of(table) / SBD_END, 1) * (UNKNOWN - 1), nan=UNKNOWN)
+    label, category = dominant(table), categories(table)
+    first = np.stack([label & 255, label >> 8, category], axis=1).astype(np.uint8)
+    second = np.stack([np.rint(VSS.of(table) * 255), np.minimum(table.op, 255), np.rint(drift)], axis=1)
+    while True:
+        rows = above.rows[::step, ::step]
+        images = [_spread(rows, first), _spread(rows, second.astype(np.uint8))]
+        encoded = [png(image) for image in images]
+        if sum(map(len, encoded)) <= most or rows.size < 10_000:
+            break
+        step += 1
+    kinds = np.where(rows == EMPTY, len(CATEGORIES), category[rows]).astype(np.uint8)
+    palette = np.array([(k * 67 % 256, k * 131 % 256, k * 29 % 256) for k in range(table.K)], dtype=np.uint8)
+    palette = palette if overview is None else overview.palette
+    cell = step * above.cell
+    return {
+        "model": record.unit.backbone,
+        "scene": record.unit.scene,
+        "size": [rows.shape[1], rows.shape[0]],
+        "text": f"{rows.shape[1] * cell:.3g} m by {rows.shape[0] * cell:.3g} m, seen {above.view}",
+        "cell": cell,
+        "names": names,
+        "palette": palette.tolist(),
+        "numbers": encoded,
+        "plain": png(kinds, np.array([*CATEGORY_COLORS, (255, 255, 255)], dtype=np.uint8)),
+        "image": "" if overview is None or overview.color is None else jpeg(_reduced(overview.color, 960)),
+        "frame": "" if overview is None else f"frame {overview.frame}",
+    }
+
+
+def _spread(rows: Any, values: UInt8) -> UInt8:
+    """The values (n, 3) of each cell's voxel (H, W, 3); (0, 0, UNKNOWN) where there is none."""
+    image = values[rows]
+    image[rows == EMPTY] = (0, 0, UNKNOWN)
+    return image  # type: ignore[no-any-return]
+
+
+def _reduced(image: UInt8, most: int) -> UInt8:
+    step = -(-max(image.shape[:2]) // most)
+    return image[::step, ::step]
+
+
+def _timeline(records: Sequence[Record], colors: Mapping[str, int]) -> Iterator[dict[str, str]]:
+    """Flicker and drift by frame."""
+    series = {r.unit.backbone: read_series(r.series) for r in records if r.series is not None and r.series.exists()}
+    for column, title, unit in (
+        ("compensated_flicker_percent", "Flicker", "flicker, % of the pixels"),
+        ("drift", "Drift", "drift, bits a voxel"),
+    ):
+        lines = [
+            Line(name, own["frame"].tolist(), own[column].astype(float).tolist(), color=colors[name])
+            for name, own in series.items()
+        ]
+        if any(np.isfinite(line.y).any() for line in lines):
+            yield {"title": title, "chart": line_chart(lines, "frame", unit)}
+
+
+def _worst(record: Record, overview: Overview | None) -> Iterator[dict[str, Any]]:
+    """The frames with the most flicker as small images: the picture, its labels, and which of them changed."""
+    if overview is None or overview.worst is None:
+        return
+    worst, K = overview.worst, len(overview.palette)
+    palette = np.vstack([overview.palette, np.full((1, 3), 128, np.uint8)])
+    faded = np.tile(160 + 0.35 * palette.mean(axis=1, keepdims=True), 3).astype(np.uint8)
+    changed = np.vstack([faded, np.array([[213, 94, 0]], np.uint8)])
+    for k, (frame, flicker) in enumerate(zip(worst.frames, worst.flicker, strict=True)):
+        labels = np.minimum(worst.labels[k].astype(np.int64), K)
+        pictures = [] if worst.color is None else [("image", jpeg(worst.color[k]))]
+        pictures.append(("labels", _indexed(labels, palette)))
+        pictures.append(("changed", _indexed(np.where(worst.changed[k], K + 1, labels), changed)))
+        yield {"title": f"{record.unit.backbone}, frame {frame}: {flicker:.1f} % flicker", "pictures": pictures}
+
+
+def _indexed(index: Int64, palette: UInt8) -> str:
+    """A PNG of indices (H, W) into colours."""
+    return png(index.astype(np.uint8), palette) if len(palette) <= 256 else png(palette[index])
+
+
+def _classes(records: Sequence[Record], colors: Mapping[str, int]) -> str:
+    """Each class with its share of the ceiling, or its alpha where no ceiling is known."""
+    rows: dict[str, list[tuple[int, str, Estimate]]] = {}
+    shares = [r.statistics.ceiling_share for r in records if r.statistics is not None]
+    known = all(shares) and bool(shares)
+    for record in records:
+        found, name = record.statistics, record.unit.backbone
+        if known and found is not None and found.ceiling_share is not None:
+            for own in found.ceiling_share.classes:
+                if own.counts_for_verdict:
+                    rows.setdefault(own.name, []).append((colors[name], name, own.share))
+        else:
+            for label, alpha in class_alphas([record]).items():
+                rows.setdefault(label, []).append((colors[name], name, Estimate(alpha, math.nan, math.nan)))
+    if not rows:
+        return ""
+    ordered = dict(sorted(rows.items(), key=lambda item: min(e.value for _, _, e in item[1])))
+    guides = (LIMITS.usable, LIMITS.stable)
+    return dot_chart(ordered, "alpha, share of its ceiling" if known else "alpha of the class", guides)
+
+
+def _distance(records: Sequence[Record], colors: Mapping[str, int]) -> Iterator[dict[str, str]]:
+    """Agreement by how far apart two observations are."""
+    for axis, title, unit in (
+        ("time", "In time", "frames apart"),
+        ("angle", "In angle", "degrees between the views"),
+        ("baseline", "In space", "metres between the cameras"),
+    ):
+        lines = []
+        for record in records:
+            found = record.statistics and record.statistics.correlogram
+            bins = getattr(found, axis) if found else ()
+            if bins:
+                name, alphas = record.unit.backbone, [own.alpha for own in bins]
+                ends = [(alpha.low, alpha.high) for alpha in alphas]
+                lines.append(
+                    Line(name, [own.mean for own in bins], [alpha.value for alpha in alphas], ends, colors[name])
+                )
+        if lines:
+            yield {"title": title, "chart": line_chart(lines, unit, "alpha between frames", zero=True)}
+
+
+# --- All scenes together ----------------------------------------------------------------------------------------------
+
+
+def _by_op(result: Result) -> Iterator[dict[str, str]]:
+    """The measures by observation persistence."""
+    together = {name: pooled(records) for name, records in by_backbone(result.select()).items()}
+    for measure in (VSS, SBD):
+        lines, names = [], list[str]()
+        for k, (model, own) in enumerate(together.items()):
+            strata = [*own.strata[:-1], *(own.well_seen or own.strata[-1:])]
+            names = names or [
+                row.name.replace("<=OP<=", " to ").replace("OP=", "").replace("OP>", "> ") for row in strata
+            ]
+            lines.append(Line(model, [*range(len(strata))], [row[measure] for row in strata], color=k))
+        unit = f"{measure.title}, {measure.unit}" if measure.unit else measure.title
+        if lines:
+            chart = line_chart(lines, "OP, frames that saw the voxel", unit, names=names, zero=measure is SBD)
+            yield {"title": f"{measure.title} by observation persistence", "chart": chart}
+
+
+def _sweeps(result: Result) -> Iterator[dict[str, str]]:
+    for sweep in swept(result):
+        for title, take in (("alpha", lambda p: p.alpha.value), ("VSS, OP ≥ 3", over_recurrent(VSS))):
+            lines = []
+            for k, model in enumerate(result.backbones):
+                if own := levels(result, sweep.name, model):
+                    spread = [level.spread(take) for level in own]
+                    ends = [(s.mean - s.sd, s.mean + s.sd) for s in spread]
+                    xs = [level.value * sweep.scale for level in own]
+                    lines.append(Line(model, xs, [s.mean for s in spread], ends, k))
+            if any(np.isfinite(line.y).any() for line in lines):
+                label = f"{sweep.title}, {sweep.unit}" if sweep.unit else sweep.title
+                yield {"title": f"{title} by {sweep.title}", "chart": line_chart(lines, label, title, zero=False)}
+
+
+def _finding(finding: Finding) -> dict[str, Any]:
+    return {
+        "claim": finding.claim,
+        "rule": relations(finding.rule),
+        "caveat": relations(finding.caveat),
+        "verdict": finding.said,
+        "kind": finding.verdict.name.lower() if finding.said == finding.verdict.value else "part",
+        "evidence": [
+            {
+                "what": ", ".join(filter(None, (row.backbone, row.condition))),
+                "verdict": row.verdict.value,
+                "kind": row.verdict.name.lower(),
+                "numbers": relations(row.outcome.numbers),
+                "why": relations(row.outcome.why),
+                "scenes": f"{row.scenes[0]} of {row.scenes[1]} scenes" if row.scenes[1] > 1 else "",
+            }
+            for row in finding.evidence
+        ],
+    }
+
+
+def _title(result: Result) -> str:
+    """The name of a study; of a run, which has none, its scenes."""
+    if result.sweeps():
+        return result.name
+    scenes = result.scenes
+    return ", ".join(scenes) if len(scenes) <= MOST_NAMED else f"{len(scenes)} scenes"
+
+
+def _subtitle(result: Result) -> str:
+    units = {record.key for record in result.records}  # a sweep shares some with the base, as the manifest counts them
+    counts = [(len(result.scenes), "scene"), (len(result.backbones), "model"), (len(units), "unit")]
+    parts = [f"{n:,} {name}{'' if n == 1 else 's'}" for n, name in counts]
+    if records := result.select():
+        run = records[0].summary
+        parts += [f"{run.frames} frames", f"{run.table.K} classes", f"voxels of {run.table.voxel_size:g} m"]
+    return " · ".join([*parts, f"fused by {result.backend}"])
+
+
+def _failure(failure: Failure) -> dict[str, str]:
+    unit, variation = failure.unit, failure.variation
+    value = "" if variation.value is None else f" {describe(variation.sweep).text(variation.value)}"
+    return {
+        "unit": f"{unit.scene}, {unit.backbone}, {unit.backend}",
+        "variation": f"{describe(variation.sweep).title}{value}, repeat {variation.repeat}",
+        "message": failure.message,
+    }
+
+
+def _facts(manifest: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
+    """The manifest's short entries, by name."""
+    for key, value in manifest.items():
+        if isinstance(value, Mapping):
+            short = len(value) <= 12 and not any(isinstance(item, Mapping | list) for item in value.values())
+            text = ", ".join(f"{name} {_short(item)}" for name, item in value.items()) if short else ""
+        elif isinstance(value, Sequence) and not isinstance(value, str):
+            text = " ".join(str(item) for item in value)
+        else:
+            text = "" if value is None else _short(value)
+        if text:
+            yield key.replace("_", " "), text
+
+
+def _short(value: Any) -> str:
+    return f"{value:,.1f}" if isinstance(value, float) else f"{value:,}" if isinstance(value, int) else str(value)
