@@ -5,6 +5,7 @@ from __future__ import annotations
 import gc
 import re
 import sys
+import textwrap
 import time
 from enum import StrEnum
 from pathlib import Path
@@ -398,7 +399,8 @@ def show(
         print_lines(map(str, write_figures(result, run, svg=figures is FigureFormat.svg)))
     elif not what:
         print_summary(result, Console(), out=run)
-        print_lines([f"  tables  {', '.join(there)}"])
+        listed = f"tables  {', '.join(there)}"
+        print_lines(textwrap.wrap(listed, 80, initial_indent="  ", subsequent_indent=" " * 10))
     for name in what or ():
         matching = [table for key, table in there.items() if key.startswith(name)]
         if not matching:

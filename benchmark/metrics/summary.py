@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -23,6 +23,17 @@ STRATA = (1, 2, 5)
 
 STEPS = tuple(m * 10**e for e in range(6) for m in (1, 2, 5))
 """Upper edges of OP that divide the last stratum."""
+
+LOW_PERSISTENCE, DRIFTING, UNCERTAIN, STABLE = range(4)
+
+CATEGORIES = ("low persistence", "drifting", "uncertain", "stable")
+"""Names by id, in the order in which they are decided."""
+
+CATEGORY_COLORS = ((153, 153, 153), (240, 228, 66), (213, 94, 0), (0, 114, 178))
+"""RGB by id: grey, and yellow, vermillion and blue of the colour-blind safe palette by Okabe and Ito (2008)."""
+
+MOST_CONFUSED = 1024
+"""Classes of a taxonomy of which is summed up which are taken for which."""
 
 CROWDED, PARTS = 0.5, 3
 """A last stratum that holds more than this share of the voxels is split into so many about equal parts."""
@@ -44,6 +55,9 @@ class TableSums:
     total    (3,) points, observations, voxels
     stratum, kind, recurrence, step  sums of every measure by stratum, by dominant class, of the voxels below OP 3 and
              the recurrent ones, and by finer strata beyond the last edge: see `_by_group`
+    category voxels in each of CATEGORIES
+    confusion  (K, K) evidence for a class (column) in the voxels that another one dominates (row); (0, 0) beyond
+             MOST_CONFUSED classes
     """
 
     total: Float64
@@ -51,6 +65,8 @@ class TableSums:
     kind: Float64
     recurrence: Float64
     step: Float64
+    category: Float64
+    confusion: Float64
 
     @classmethod
     def of(cls, table: VoxelTable, edges: Sequence[int] = STRATA) -> TableSums:
@@ -59,6 +75,8 @@ class TableSums:
         groups = (len(edges) + 1, table.K, 2, len(steps) + 1)
         sums = [np.zeros((1 + 3 * len(measures()), n)) for n in groups]
         finest, observations = sorted({*edges, RECURRENT - 1, *steps}), 0.0
+        category, K = np.zeros(len(CATEGORIES)), table.K if table.K <= MOST_CONFUSED else 0
+        confusion = np.zeros((K, K))
         by_op = np.zeros((1 + 3 * len(measures()), len(finest) + 1))
         for some in stretches(len(table)):
             rows = Voxels(table.op[some], table.evidence.take(some).measured(), table.drift_sum[some])
@@ -66,10 +84,15 @@ class TableSums:
             sums[1] += _by_group(values, rows.op, dominant(rows), table.K)
             by_op += _by_group(values, rows.op, groups_of(rows.op, finest), by_op.shape[1])
             observations += float(rows.op.sum(dtype=np.int64))
+            category += np.bincount(categorise(rows.op, sbd(rows), bits(rows)), minlength=len(CATEGORIES))
+            if K:
+                start, label, weight = rows.evidence.entries
+                pair = np.repeat(dominant(rows), np.diff(start)) * K + label
+                confusion += np.bincount(pair, weights=weight, minlength=K * K).reshape(K, K)
         for own, bounds in ((sums[0], edges), (sums[2], [RECURRENT - 1]), (sums[3], steps)):
             np.add.at(own.T, np.searchsorted(bounds, [*finest, np.iinfo(np.int32).max]), by_op.T)
         total = [table.pixels.sum(), observations, by_op[0].sum()]
-        return cls(np.array(total, dtype=np.float64), *sums)
+        return cls(np.array(total, dtype=np.float64), sums[0], sums[1], sums[2], sums[3], category, confusion)
 
     def arrays(self) -> dict[str, Float64]:
         """All of it by name, as `read` takes it."""
@@ -109,7 +132,15 @@ class TableSums:
                 for g, (name, _, _) in enumerate(strata(_steps(edges)))
                 if g and self.step[0, g]
             ),
+            categories={name: float(n) / voxels for name, n in zip(CATEGORIES, self.category, strict=True) if voxels},
+            confused_with=dict(self._confused(names)),
         )
+
+    def _confused(self, names: Sequence[str]) -> Iterator[tuple[str, str]]:
+        others = self.confusion * (1 - np.eye(len(self.confusion)))
+        for name, row in zip(names, others, strict=False):
+            if row.max() > 0:
+                yield name, names[int(row.argmax())]
 
 
 def _steps(edges: Sequence[int]) -> list[int]:
@@ -204,14 +235,6 @@ def _weighted(values: Sequence[float], weights: Sequence[int]) -> float:
 
 
 # Categories of voxels: low persistence, drifting, uncertain or stable (paper, Qualitative Analysis).
-
-LOW_PERSISTENCE, DRIFTING, UNCERTAIN, STABLE = range(4)
-
-CATEGORIES = ("low persistence", "drifting", "uncertain", "stable")
-"""Names by id, in the order in which they are decided."""
-
-CATEGORY_COLORS = ((153, 153, 153), (240, 228, 66), (213, 94, 0), (0, 114, 178))
-"""RGB by id: grey, and yellow, vermillion and blue of the colour-blind safe palette by Okabe and Ito (2008)."""
 
 
 @dataclass(frozen=True)

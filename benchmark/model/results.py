@@ -127,7 +127,8 @@ class TableSummary:
     """What a voxel table says as a whole: one row of the paper's scene table, its strata and its classes.
 
     `summary[VSS]` is the mean of a measure over all voxels where it is defined. `well_seen` is the last stratum in
-    finer steps of OP.
+    finer steps of OP. `categories` has the share of the voxels in each stability category, `confused_with` for each
+    dominant class the one that most of the other evidence in its voxels is for.
     """
 
     K: int
@@ -141,6 +142,8 @@ class TableSummary:
     recurrent: Means
     classes: tuple[Means, ...]
     well_seen: tuple[Means, ...] = ()
+    categories: Mapping[str, float] = field(default_factory=dict)
+    confused_with: Mapping[str, str] = field(default_factory=dict)
 
     def __getitem__(self, measure: Measure) -> float:
         return self.means[measure]

@@ -90,7 +90,7 @@ def dot_chart(rows: Mapping[str, Sequence[tuple[int, str, Estimate]]], x_label: 
     x = Scale.over([*values, *guides], left, WIDTH - RIGHT - 6)
     y = Scale(0, len(rows), TOP, height - BOTTOM)
     names = {k + 0.5: name if len(name) <= 22 else f"{name[:19]}..." for k, name in enumerate(rows)}
-    parts = [*_frame(x, y, {tick: number(tick) for tick in x.ticks()}, names, x_label, "", left=left, height=height)]
+    parts = [*_frame(x, y, {tick: number(tick) for tick in x.ticks(7)}, names, x_label, "", left=left, height=height)]
     parts += [f'<path class="guide" d="M{x(g):.1f} {TOP}V{height - BOTTOM}"/>' for g in guides]
     for k, row in enumerate(rows.values()):
         for j, (color, name, estimate) in enumerate(row):

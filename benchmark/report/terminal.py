@@ -15,7 +15,7 @@ from semstab.check import Verdict
 from semstab.config import BASE
 from semstab.engine.observer import Observer
 from semstab.engine.units import Plan
-from semstab.metrics import macro_mean
+from semstab.metrics import CATEGORIES, macro_mean
 from semstab.model.measures import measures
 from semstab.model.records import Failure, Record, Result, UnitContent
 from semstab.model.results import Agreement, UnitSummary
@@ -72,8 +72,10 @@ def _one(result: Result, record: Record) -> Iterator[str]:
     yield ""
     if found is not None:
         yield from _verdict(run)
-    recurrent = run.table.recurrent
-    yield f"  of the map   {_percent(recurrent.share)} seen 3 times or more, {_percent(1 - recurrent.share)} fewer"
+    recurrent, shares = run.table.recurrent, run.table.categories
+    if shares:
+        low, drifting, contested, stable = (_percent(shares[name]) for name in CATEGORIES)
+        yield f"  map  {stable} stable  {contested} contested  {drifting} drifting  {low} seen less than 3 times"
     yield from _flicker(record)
     yield from _classes([record])
     if run.worst_frames:
@@ -132,7 +134,7 @@ def _probability(verdict: StabilityVerdict) -> str:
 def _flicker(record: Record) -> Iterator[str]:
     compensated = record.image_space.compensated_flicker_percent
     if not math.isnan(compensated):
-        yield f"  flicker      {compensated:.1f} % of pixels change class per frame (camera motion removed)"
+        yield f"  flicker  {compensated:.1f} % of the pixels change class per frame (camera motion removed)"
 
 
 def _interval(found: Estimate, scale: float = 1.0) -> str:
@@ -228,13 +230,14 @@ def _classes(records: Sequence[Record]) -> Iterator[str]:
     for name in names:
         alphas = class_alphas([record for record in records if record.unit.backbone == name])
         shares = _class_shares([record for record in records if record.unit.backbone == name])
+        others = {k: v for r in records if r.unit.backbone == name for k, v in r.summary.table.confused_with.items()}
         common = [key for key, (voxels, _) in shares.items() if voxels >= RARE and key in alphas]
         for key in sorted(common, key=alphas.__getitem__)[:most]:
-            label = key if alone else f"{name}: {key}"
-            lines.append(f"    {label[:30]:<30}{alphas[key]:>6.2f}{100 * shares[key][1]:>9.0f} %")
+            label, taken = key if alone else f"{name}: {key}", others.get(key, "")
+            lines.append(f"    {label[:26]:<26}{alphas[key]:>6.2f}   {taken[:24]:<24}{100 * shares[key][1]:>9.0f} %")
     if lines:
         yield ""
-        yield f"  {'least stable classes':<32}{'alpha':>6}{'of the map':>12}"
+        yield f"  {'least stable classes':<28}{'alpha':>6}   {'confused with':<24}{'of the map':>11}"
         yield from lines
 
 
@@ -242,8 +245,11 @@ def class_alphas(records: Sequence[Record]) -> dict[str, float]:
     """Krippendorff's alpha of each class, the macro mean over scenes, where it is known."""
     found: dict[str, list[float]] = {}
     for statistics in (record.statistics for record in records if record.statistics is not None):
+        share = statistics.ceiling_share
+        between = {} if share is None else {row.name: row.alpha for row in share.classes}
         for row in statistics.agreement.classes:
-            found.setdefault(row.name, []).append(row.alpha)
+            alpha = between.get(row.name, math.nan) if math.isnan(row.alpha) else row.alpha
+            found.setdefault(row.name, []).append(alpha)
     means = {name: macro_mean(values) for name, values in found.items()}
     return {name: alpha for name, alpha in means.items() if not math.isnan(alpha)}
 
