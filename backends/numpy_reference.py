@@ -17,7 +17,6 @@ from semstab.backends.shared.association import (
     check_settings,
     falling_into,
     observe,
-    pixels_held,
 )
 from semstab.backends.shared.observations import Change, MapTotal
 from semstab.core.types import Int32, Int64, Mask
@@ -27,8 +26,8 @@ from semstab.model.frames import Frame
 from semstab.model.results import FrameReport
 from semstab.model.voxels import Extent, VoxelTable, index_columns
 
-ONE_IN = 16
-"""Of so many voxels the sample holds one."""
+ONE_IN, MOST = 16, 10_000
+"""Of so many voxels the sample holds one; of twice as many, and so on, where the map has more than the sample may."""
 
 ODD = np.array([-0x61C8864680B583EB, -0x3D4D51C2D82B14B1, 0x165667B19E3779F9])
 """Of each axis, to mix an index's bits (odd numbers of Steele and Vigna's splitmix and of xxHash)."""
@@ -69,7 +68,7 @@ class NumpyReference:
         started = time.perf_counter()
         check_depth(frame)
         check_frame(frame, self.num_classes)
-        seen = observe(frame, self.voxel_size, self.num_classes, self._pixels(frame))
+        seen = self._observe(frame)
         rows = self._rows(seen)
         before = self._evidence[rows]
         after = before + seen.s_bar
@@ -104,10 +103,11 @@ class NumpyReference:
             voxel_size=self.voxel_size,
         )
 
-    def _pixels(self, frame: Frame) -> Mask:
-        """Those of the frame that are observed: the valid ones that fall into the extent."""
+    def _observe(self, frame: Frame) -> Observations:
+        """What the valid pixels observe that fall into the extent."""
         valid = frame.valid
-        return valid if self.within is None else valid & falling_into(self.within, frame, self.voxel_size)
+        pixels = valid if self.within is None else valid & falling_into(self.within, frame, self.voxel_size)
+        return observe(frame, self.voxel_size, self.num_classes, pixels)
 
     def _rows(self, seen: Observations) -> Int64:
         """The rows of the frame's voxels, new ones added."""
@@ -121,20 +121,45 @@ class NumpyReference:
 
 
 class NumpySample(NumpyReference):
-    """The reference on one in `ONE_IN` of the voxels, drawn at random by their index, through all frames."""
+    """The reference on one in `one_in` of the voxels, drawn at random by their index, through all frames.
 
-    def _pixels(self, frame: Frame) -> Mask:
-        return pixels_held(frame, frame.valid, self.voxel_size, self._holds)
+    Each sample holds those of the next thinner one, so that it can become thinner while the map grows: a defect in a
+    share p of the voxels is found with probability 1 - (1 - p)^n, and n = MOST voxels find 0.05 % of them in 99 of 100.
+    """
 
-    def _holds(self, index: Int64) -> Mask:
-        drawn = in_sample(index)
-        return drawn if self.within is None else drawn & self.within.holds(index)
+    def __init__(self, voxel_size: float, num_classes: int, within: Extent | None = None) -> None:
+        super().__init__(voxel_size, num_classes, within)
+        self.one_in, self._left = ONE_IN, 0
+
+    def integrate(self, frame: Frame) -> FrameReport:
+        """Append the frame's observations of the sample; make the sample thinner where it has become too large."""
+        report = super().integrate(frame)
+        while len(self._row) - self._left > MOST:
+            self.one_in *= 2
+            index = np.frombuffer(b"".join(self._row), dtype=np.int64).reshape(-1, 3)
+            self._left = int(np.count_nonzero(~in_sample(index.T, self.one_in)))
+        return report
+
+    def table(self) -> VoxelTable:
+        """The map of the sample so far."""
+        table = super().table()
+        return table.rows(in_sample(table.index.T, self.one_in))
+
+    def _observe(self, frame: Frame) -> Observations:
+        from semstab.backends.shared.pixel_keys import drawn_pixels
+
+        K, pose = frame.intrinsics, np.ascontiguousarray(frame.T_wc)
+        near = drawn_pixels(frame.depth, frame.valid, (K.fx, K.fy, K.cx, K.cy), pose, self.voxel_size, ODD, self.one_in)
+        seen = observe(frame, self.voxel_size, self.num_classes, near)
+        held = in_sample(seen.index.T, self.one_in)
+        held = held if self.within is None else held & self.within.holds(seen.index.T)
+        return Observations(seen.index[held], seen.s_bar[held], seen.pixels[held])
 
 
-def in_sample(index: npt.NDArray[np.integer]) -> Mask:
-    """Which voxels of that index (3, n) are in the sample."""
+def in_sample(index: npt.NDArray[np.integer], one_in: int = ONE_IN) -> Mask:
+    """Which voxels of that index (3, n) are in the sample of one in so many, a power of 2."""
     mixed = np.zeros(index.shape[1], np.int64)
     for axis, odd in zip(index, ODD, strict=True):
         mixed += axis * odd
-    drawn: Mask = (mixed >> 40) & (ONE_IN - 1) == 0
+    drawn: Mask = (mixed >> 40) & (one_in - 1) == 0
     return drawn

@@ -15,18 +15,15 @@ from simulated_events import log_of
 
 import semstab
 from semstab.backends.numba_hash import NumbaHash
-from semstab.backends.numpy_reference import NumpyReference, NumpySample, in_sample
 from semstab.check import check
 from semstab.config import read_yaml
 from semstab.errors import DataError
 from semstab.metrics import split_last, summarise
-from semstab.metrics.agreement import rows_of
 from semstab.model.frames import Frame, Intrinsics
 from semstab.report.narrative import notes
 from semstab.report.tables import tables
 from semstab.report.terminal import print_summary
 from semstab.settings import load_config, resolve
-from semstab.testing.builders import assert_same_map, random_frames
 
 
 def printed(result) -> str:
@@ -76,17 +73,6 @@ def test_the_sample_finds_a_backend_that_is_wrong(tmp_path, monkeypatch) -> None
     result = semstab.run(configure(folder, backends=["numba"], check="sample", voxel_size=0.05))
     assert not result.agrees
     assert "DISAGREE" in printed(result)
-
-
-def test_the_sample_is_part_of_the_reference() -> None:
-    frames, K = random_frames(1), 4
-    whole, sample = NumpyReference(0.2, K), NumpySample(0.2, K)
-    for frame in frames:
-        whole.integrate(frame)
-        sample.integrate(frame)
-    drawn = rows_of(whole.table(), in_sample(whole.table().index.T))
-    assert 0 < len(drawn) < len(whole.table()) / 4
-    assert_same_map(sample.table(), drawn, 0)
 
 
 def test_compared_backends_have_a_line(scene, tmp_path) -> None:

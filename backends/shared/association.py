@@ -137,11 +137,9 @@ def _points(frame: Frame, pixels: Mask) -> Iterator[Float64]:
     across, down = (np.arange(W) - K.cx) / K.fx, (np.arange(H) - K.cy) / K.fy
     step = max(1, FEW // W)
     for rows in (slice(first, first + step) for first in range(0, H, step)):
-        wanted = pixels[rows]
-        d = frame.depth[rows].astype(np.float64)
-        with np.errstate(invalid="ignore", over="ignore"):
-            x, y = (across * d)[wanted], (down[rows, None] * d)[wanted]
-        z = d[wanted]
+        row, column = np.nonzero(pixels[rows])
+        z = frame.depth[rows][row, column].astype(np.float64)
+        x, y = across[column] * z, down[rows][row] * z
         yield np.stack([((R[i, 0] * x + R[i, 1] * y) + R[i, 2] * z) + t[i] for i in range(3)])
 
 

@@ -16,6 +16,9 @@ from semstab.core.types import Float64
 
 Floats = npt.NDArray[np.floating]
 
+FACE = 2.0**30
+"""Index from which on rounding may move a point across a face by more than the margin of one millionth."""
+
 
 @serial
 def in_voxels(r0, r1, r2, t, x, y, z, size):
@@ -51,6 +54,30 @@ def exact_keys_of_row(depth, labels, ray_x, ray_y, T, size, ox, oy, oz, ignore, 
         k = np.int64(np.int32(c if good else 0.0)) + HALF
         out[u] = ((i << 42) | (j << 21) | k) if good else -1
     return lost
+
+
+@serial
+def drawn_pixels(depth, wanted, camera, T, size, odd, one_in):
+    """Which of the wanted pixels (H, W) may fall into a voxel of the sample: all that do, and those close to a face.
+
+    A filter for the numpy reference, which decides on the pixels that are left by itself.
+    """
+    fx, fy, cx, cy = camera
+    out = np.zeros(depth.shape, dtype=np.bool_)
+    for v in range(depth.shape[0]):
+        ray_y = (v - cy) / fy
+        for u in range(depth.shape[1]):
+            if not wanted[v, u]:
+                continue
+            d = np.float64(depth[v, u])
+            x, y, mixed, near = (u - cx) / fx * d, ray_y * d, np.int64(0), False
+            for axis in range(3):
+                q = in_voxels(T[axis, 0], T[axis, 1], T[axis, 2], T[axis, 3], x, y, d, size)
+                low = np.floor(q)
+                near |= not (1e-6 < q - low < 1 - 1e-6 and abs(q) < FACE)
+                mixed += np.int64(low) * odd[axis] if abs(q) < FACE else 0
+            out[v, u] = near or ((mixed >> 40) & (one_in - 1)) == 0
+    return out
 
 
 def columns_of(within, origin):

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from semstab.backends.numpy_reference import ONE_IN, NumpySample, in_sample
+from semstab.backends.numpy_reference import NumpySample, in_sample
 from semstab.config import Config
 from semstab.core.files import atomic_path
 from semstab.core.process import Stopwatch, trim_malloc
@@ -168,10 +168,10 @@ def no_voxels(task: Task, config: Config) -> DataError:
 
 def _checked(live: LiveMap, table: VoxelTable, reference: NumpySample) -> Agreement:
     """How far the map agrees with the reference on the voxels of the sample."""
-    expected = dataclasses.replace(reference.table(), classes=table.classes)
-    drawn = rows_of(table, in_sample(table.index.T))
+    expected, one_in = dataclasses.replace(reference.table(), classes=table.classes), reference.one_in
+    drawn = rows_of(table, in_sample(table.index.T, one_in))
     units = (live.unit, dataclasses.replace(live.unit, backend="numpy"))
-    return dataclasses.replace(compare(drawn, expected, units, tolerance=live.work.config.tolerance), one_in=ONE_IN)
+    return dataclasses.replace(compare(drawn, expected, units, tolerance=live.work.config.tolerance), one_in=one_in)
 
 
 def unit_content(

@@ -2,33 +2,71 @@
 
 from __future__ import annotations
 
+import hashlib
+from collections.abc import Mapping
+from importlib.metadata import version
 from pathlib import Path
+from types import MappingProxyType
+from typing import TYPE_CHECKING
 
 from semstab.core.files import write_text
 from semstab.engine.observer import Observer
-from semstab.model.records import Result
+from semstab.model.records import Result, UnitContent
 from semstab.report.tables import write_tables
+
+if TYPE_CHECKING:
+    from semstab.engine.units import PlannedUnit
+    from semstab.model.voxels import VoxelTable
+    from semstab.report.figures.topdown import FromAbove
 
 __all__ = ["Reporting", "write_report"]
 
 
 class Reporting(Observer):
-    """Writes tables and report.html into the folder when all has been computed."""
+    """Writes tables and report.html into the folder when all has been computed, unless they tell of the same result."""
 
     def __init__(self, folder: str | Path) -> None:
         self._folder = Path(folder)
+        self._above: dict[str, FromAbove] = {}
+
+    def unit_finished(
+        self, planned: PlannedUnit, content: UnitContent | None, table: VoxelTable | None, error: str | None
+    ) -> None:
+        """Take the voxels that are seen from above, while the table is in memory."""
+        if table is not None and content is not None and content.up is not None and planned.image_space:
+            from semstab.report.figures.topdown import FromAbove
+
+            self._above[planned.unit.slug] = FromAbove.of(table, content.up)
 
     def run_finished(self, result: Result) -> None:
         """Write them; nothing where every unit failed."""
+        report = self._folder / "report.html"
+        if report.exists() and (self._folder / "tables").exists() and not result.manifest["units"]["computed"]:
+            with report.open(encoding="utf-8", errors="replace") as page:
+                if digest_of(self._folder) in page.read(HEAD):
+                    return
         if result.select():
             write_tables(result, self._folder)
-            write_report(result, self._folder)
+            write_report(result, self._folder, self._above)
 
 
-def write_report(result: Result, folder: str | Path) -> Path:
-    """Write FOLDER/report.html, from the result and the files that its run left in the folder; return its path."""
+HEAD = 1000
+"""Letters of the page among which its digest stands."""
+
+
+def digest_of(folder: Path) -> str:
+    """Return the digest of the version and the summary that a page is made from."""
+    summary = folder / "summary.json"
+    return hashlib.sha256(version("semstab").encode() + (summary.read_bytes() if summary.exists() else b"")).hexdigest()
+
+
+def write_report(result: Result, folder: str | Path, above: Mapping[str, FromAbove] = MappingProxyType({})) -> Path:
+    """Write FOLDER/report.html, from the result and the files that its run left in the folder; return its path.
+
+    above  of units, by their slugs, the voxels that are seen from above; those of the others are read
+    """
     from semstab.report.page import render
 
     path = Path(folder) / "report.html"
-    write_text(path, render(result, Path(folder)))
+    write_text(path, render(result, Path(folder), digest_of(Path(folder)), above))
     return path

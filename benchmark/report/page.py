@@ -6,6 +6,7 @@ import json
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -19,7 +20,7 @@ from semstab.model.statistics import Estimate, MapStatistics
 from semstab.report.averages import by_backbone, describe, levels, over_recurrent, pooled, swept
 from semstab.report.charts import SERIES, Line, dot_chart, line_chart
 from semstab.report.figures.maps import Overview, Views
-from semstab.report.figures.topdown import EMPTY
+from semstab.report.figures.topdown import EMPTY, FromAbove
 from semstab.report.findings import Answer, Finding, findings
 from semstab.report.html import filled, jpeg, png, table_block
 from semstab.report.loaded import read_series
@@ -46,14 +47,20 @@ KINDS = {"stable": "good", "usable": "part", "undecided": "open", "no verdict": 
 """Styles of verdicts; the others are bad news."""
 
 
-def render(result: Result, folder: Path) -> str:
-    """Return the page of the result whose files lie in the folder."""
+def render(
+    result: Result, folder: Path, digest: str = "", above: Mapping[str, FromAbove] = MappingProxyType({})
+) -> str:
+    """Return the page of the result whose files lie in the folder, with the digest of what it is made from.
+
+    above  of units, by their slugs, the voxels that are seen from above; those of the others are read
+    """
     everything, result = result, of_interest(result)
     tested = findings(result)
-    shown, views = list(_scenes(result, folder)), [table_block(table) for table in tables(everything)]
+    shown, views = list(_scenes(result, folder, above)), [table_block(table) for table in tables(everything)]
     return filled(
         "report.html.j2",
         kind="Study of temporal semantic stability" if result.sweeps() else "Temporal semantic stability",
+        digest=digest,
         title=_title(result),
         subtitle=_subtitle(result),
         models=_legend(result.backbones),
@@ -149,7 +156,7 @@ def _numbers(
 # --- A scene: the map, the time line, the classes ---------------------------------------------------------------------
 
 
-def _scenes(result: Result, folder: Path) -> Iterator[dict[str, Any]]:
+def _scenes(result: Result, folder: Path, above: Mapping[str, FromAbove]) -> Iterator[dict[str, Any]]:
     views = Views()
     own = [record for record in result.select() if record.voxels_file is not None]
     share = min(BYTES, ALL_BYTES // max(1, len(own)))
@@ -164,7 +171,15 @@ def _scenes(result: Result, folder: Path) -> Iterator[dict[str, Any]]:
         drawn = [] if up is None else [record for record in records if record.voxels_file is not None]
         yield {
             "name": scene,
-            "maps": [_map(record, up, views, overviews.get(record.unit.backbone), share) for record in drawn],
+            "maps": [
+                _map(
+                    record,
+                    above.get(record.unit.slug) or views.above(record, result.up[scene]),
+                    overviews.get(record.unit.backbone),
+                    share,
+                )
+                for record in drawn
+            ],
             "unknown_up": up is None,
             "models": _legend(result.backbones) if len(result.backbones) > 1 else [],
             "timeline": list(_timeline(records, colors)),
@@ -174,9 +189,8 @@ def _scenes(result: Result, folder: Path) -> Iterator[dict[str, Any]]:
         }
 
 
-def _map(record: Record, up: Any, views: Views, overview: Overview | None, most: int) -> dict[str, Any]:
+def _map(record: Record, above: FromAbove, overview: Overview | None, most: int) -> dict[str, Any]:
     """The map as the page's script paints it: images of numbers, and of the stability where there is no script."""
-    above = views.above(record, up)
     step = max(1, math.ceil(math.sqrt(above.rows.size / CELLS)))
     table, names = above.table, above.table.classes or tuple(map(str, range(above.table.K)))
     with np.errstate(invalid="ignore"):

@@ -1,0 +1,63 @@
+"""The reference on a sample of the voxels: the same numbers as the whole reference, however thin the sample becomes."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import semstab
+from semstab.backends import numpy_reference
+from semstab.backends.numpy_reference import NumpyReference, NumpySample, in_sample
+from semstab.model.voxels import Extent
+
+K = 5
+
+
+def frames(seed: int, count: int = 5, size: tuple[int, int] = (24, 32)) -> list[semstab.Frame]:
+    """Frames of a rough wall; a part of the pixels lies on faces of voxels."""
+    rng = np.random.default_rng(seed)
+    shape = size
+    made = []
+    for index in range(count):
+        depth = rng.uniform(0.5, 3, shape).round(int(rng.integers(1, 4))).astype(np.float32)
+        depth[rng.random(shape) < 0.1] = 0
+        pose = np.eye(4)
+        pose[:3, 3] = rng.integers(-2, 3, 3) * 0.25
+        camera = semstab.Intrinsics(16.0, 16.0, 16.0, 12.0)
+        labels = rng.integers(0, K, shape).astype(np.uint8)
+        made.append(semstab.Frame(index, depth, camera, pose, labels=labels))
+    return made
+
+
+@settings(max_examples=25, deadline=None)
+@given(st.integers(0, 2**31), st.sampled_from([0.01, 0.05, 0.25]), st.booleans())
+def test_the_sample_is_the_part_of_the_whole_reference_that_its_hash_draws(seed, voxel_size, part) -> None:
+    within = Extent((-100, -100), (5, 7)) if part else None
+    whole, sample = NumpyReference(voxel_size, K, within), NumpySample(voxel_size, K, within)
+    for frame in frames(seed):
+        whole.integrate(frame)
+        sample.integrate(frame)
+    expected = whole.table()
+    expected, found = expected.rows(in_sample(expected.index.T, sample.one_in)), sample.table()
+    np.testing.assert_array_equal(found.index, expected.index)
+    for name in ("op", "pixels", "drift_sum"):
+        np.testing.assert_array_equal(getattr(found, name), getattr(expected, name))
+    np.testing.assert_array_equal(found.evidence[:], expected.evidence[:])
+
+
+@pytest.mark.parametrize("most", [5, 40])
+def test_a_sample_that_becomes_too_large_is_made_thinner_and_stays_exact(most, monkeypatch) -> None:
+    monkeypatch.setattr(numpy_reference, "MOST", most)
+    whole, sample = NumpyReference(0.05, K), NumpySample(0.05, K)
+    for frame in frames(1, 12):
+        whole.integrate(frame)
+        sample.integrate(frame)
+    assert sample.one_in > numpy_reference.ONE_IN
+    found, expected = sample.table(), whole.table()
+    assert 0 < len(found) <= most
+    expected = expected.rows(in_sample(expected.index.T, sample.one_in))
+    np.testing.assert_array_equal(found.index, expected.index)
+    np.testing.assert_array_equal(found.evidence[:], expected.evidence[:])
+    np.testing.assert_array_equal(found.op, expected.op)
