@@ -129,26 +129,28 @@ class Open3DBlocks(FusionBackend):
             device=self.device,
         )
 
-    def _make_room(self, keys: Any) -> None:
-        """Grow where the blocks (n, 3) do not fit, by a copy into a new grid: Open3D's own rehash takes longer."""
+    def _add_blocks(self, blocks: npt.NDArray[np.int32]) -> None:
+        """Activate the new ones of the blocks (n, 3); where they do not fit, the map moves into a larger grid.
+
+        Open3D's own rehash takes longer, and it would begin one for keys that are there already as well.
+        """
         old = self.grid.hashmap()
-        _, present = old.find(keys)
-        needed = old.size() + int(np.count_nonzero(~present.cpu().numpy()))
-        if needed <= old.capacity():
-            return
-        grid = self._new_grid(needed + needed // 2)
-        if old.size():
-            _copy_blocks(self.grid, grid, tuple(self.attributes))
-        self.grid = grid
+        _, present = old.find(self._tensor(blocks))
+        new = blocks[~present.cpu().numpy()]
+        needed = old.size() + len(new)
+        if needed > old.capacity():
+            grid = self._new_grid(needed + needed // 2)
+            if old.size():
+                _copy_blocks(self.grid, grid, tuple(self.attributes))
+            self.grid = grid
+        if len(new):
+            self.grid.hashmap().activate(self._tensor(new))
 
     def _activate(self, index: Int64) -> Int64:
         """Rows of voxels (n, 3), at least one, in the attributes, their blocks activated; new ones start at 0."""
         blocks, block, place = blocks_of(index, self.block_resolution)
-        keys = self._tensor(blocks)
-        self._make_room(keys)
-        hashmap = self.grid.hashmap()
-        hashmap.activate(keys)  # gives indices of new blocks only
-        buffer, _ = hashmap.find(keys)
+        self._add_blocks(blocks)
+        buffer, _ = self.grid.hashmap().find(self._tensor(blocks))
         buffers: Int64 = buffer.cpu().numpy().astype(np.int64)
         return buffers[block] * self.block_resolution**3 + place
 
@@ -195,10 +197,14 @@ def _copy_blocks(old: VoxelBlockGrid, new: VoxelBlockGrid, attributes: tuple[str
     keys = old.hashmap().key_tensor()[source]
     new.hashmap().activate(keys)
     target = new.hashmap().find(keys)[0].to(o3c.int64)
+    if source.is_cpu:
+        source, target = source.numpy(), target.numpy()
     for name in attributes:
         values, room = (grid.attribute(name) for grid in (old, new))
         values, room = (tensor.reshape((tensor.shape[0], -1)) for tensor in (values, room))
-        for start in range(0, source.shape[0], COPIED_BLOCKS):
+        if values.is_cpu:  # numpy takes a tenth of the time of Open3D's indices
+            values, room = values.numpy(), room.numpy()
+        for start in range(0, len(source), COPIED_BLOCKS):
             part = slice(start, start + COPIED_BLOCKS)
             room[target[part]] = values[source[part]]
 
