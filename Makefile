@@ -1,13 +1,14 @@
 # A fresh Debian or Ubuntu machine needs no more than `make bench` and `make test`.
 BIN := .venv/bin
 
-.PHONY: help setup setup-dev bench test fuzz fuzz-short faults lint format clean
+.PHONY: help setup setup-dev bench test docs fuzz fuzz-short faults lint format clean
 
 help:
 	@echo 'make bench   set up, then fuse the built-in city with Open3D: semstab-bench --backend open3d'
 	@echo 'make test    set up, then lint, types and import contract beside a minute of damaged files, and the whole test suite'
 	@echo 'make fuzz    damage files of every kind for an hour (FUZZ_SECONDS=3600 FUZZ_SEED=1); fuzz-short: a minute'
 	@echo 'make faults  kill a hundred runs, studies, predictions and conversions, fill their disk, and see that nothing is lost'
+	@echo 'make docs    build the documentation into site/, warnings are errors'
 	@echo 'make setup   the set-up alone: system libraries, .venv, semstab; make setup-dev: and what the tests need'
 	@echo 'make format  let ruff format and mend the code'
 	@echo 'make clean   remove .venv and what tools left behind'
@@ -24,6 +25,9 @@ bench: setup
 test: setup-dev
 	$(MAKE) --no-print-directory -j2 --output-sync=target lint fuzz-short
 	$(BIN)/pytest -n auto --maxprocesses 4 --dist loadfile
+
+docs: setup-dev
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --quiet
 
 FUZZ_SECONDS := 3600
 FUZZ_SEED := 1
@@ -50,4 +54,4 @@ format: setup-dev
 	$(BIN)/ruff format .
 
 clean:
-	rm -rf .venv build dist *.egg-info .mypy_cache .ruff_cache .pytest_cache .import_linter_cache .hypothesis
+	rm -rf .venv build dist site *.egg-info .mypy_cache .ruff_cache .pytest_cache .import_linter_cache .hypothesis

@@ -161,7 +161,7 @@ def map_panels(rows: Int64, n: int) -> tuple[Figure, Sequence[Axes]]:
     height, width = rows.shape
     if width >= WIDE * height:
         figure = canvas(COLUMN, n * (max(0.3, COLUMN * height / width) + 0.5))
-        return figure, figure.subplots(n, 1)
+        return figure, list(figure.subplots(n, 1, squeeze=False)[:, 0])
     columns = min(n, 3)
     lines = math.ceil(n / columns)
     figure = canvas(PAGE, min(8.0, lines * (PAGE / columns * height / width + 0.65)))
