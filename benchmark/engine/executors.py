@@ -99,7 +99,8 @@ class LocalProcesses(Executor):
                 return waiting.pop(0)
             if (job := next_job()) is None:
                 return None
-            begun.append(self._with_a_share(job))
+            threads = max(1, (job[0].start.threads or default_threads()) // self.width)
+            begun.append(_with_start(job, threads=threads, width=self.width))
             return begun[-1]
 
         if (first := take()) is None:
@@ -119,12 +120,6 @@ class LocalProcesses(Executor):
         finally:
             alive.close()  # ends processes that are still at work: after an interruption, or where one of them died
             pool.shutdown(wait=False, cancel_futures=True)
-
-    def _with_a_share(self, job: Job) -> Job:
-        start = job[0].start
-        threads = max(1, (start.threads or default_threads()) // self.width)
-        own = dataclasses.replace(start, threads=threads, width=self.width)
-        return tuple(dataclasses.replace(work, start=own) for work in job)
 
 
 def _ended(
@@ -151,6 +146,11 @@ def _ended(
     finally:
         for future in jobs:
             future.cancel()
+
+
+def _with_start(job: Job, **changes: int) -> Job:
+    start = dataclasses.replace(job[0].start, **changes)
+    return tuple(dataclasses.replace(work, start=start) for work in job)
 
 
 def _run_all(job: Job) -> tuple[Outcome, ...]:
@@ -264,8 +264,7 @@ def _run_settled(job: Job) -> tuple[Outcome, ...]:
     configure_process()
     with contextlib.suppress(ValueError):  # called outside of a worker
         _use_threads(_distributed().get_worker().state.nthreads)
-    start = dataclasses.replace(job[0].start, threads=job[0].start.threads or 0)
-    return _run_all(tuple(dataclasses.replace(work, start=start) for work in job))
+    return _run_all(_with_start(job, threads=job[0].start.threads or 0))
 
 
 def _distributed() -> Any:
