@@ -148,7 +148,7 @@ def _ended(
             future.cancel()
 
 
-def _with_start(job: Job, **changes: int) -> Job:
+def _with_start(job: Job, **changes: Any) -> Job:
     start = dataclasses.replace(job[0].start, **changes)
     return tuple(dataclasses.replace(work, start=start) for work in job)
 

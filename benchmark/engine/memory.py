@@ -154,7 +154,7 @@ def _plan_sizes(config: Config, group: Sequence[PlannedUnit], width: int, sizing
         there = f"{free / GB:.2g} GB " + ("are free for it" if config.memory_gb is None else "is memory_gb")
         line = (
             f"{takes}, and {there}; use larger voxels (voxel_size), fewer frames (frames), a larger pixel_stride"
-            f"{', no statistics' if settings.statistics else ''}; or set memory_gb to try all the same ({why})"
+            f"{_without(group, settings)}; or set memory_gb to try all the same ({why})"
         )
         sizing.refused |= {each.identity: line for each in group}
         return
@@ -179,6 +179,13 @@ def _bytes_of(planned: PlannedUnit, voxels: float, observations: float, *, soft:
     config, K = planned.config, len(planned.task.mapping.target)
     logged = config.statistics or config.events
     return map_bytes(planned.unit.backend, K, voxels, observations, soft=soft, logged=logged, sampled=planned.sampled)
+
+
+def _without(group: Sequence[PlannedUnit], settings: Config) -> str:
+    backends = [each.unit.backend for each in group]
+    keep_all = [name for name in backends if expected_bytes(name, 1, 2, 2) > expected_bytes(name, 1, 1, 2)]
+    without = f", no backend that keeps every observation ({', '.join(keep_all)})" if keep_all else ""
+    return without + (", no statistics" if settings.statistics else "")
 
 
 class MapSize(NamedTuple):

@@ -160,8 +160,9 @@ def assembled(
     files = {name: digest for name, digest in files.items() if not name.startswith(tasks[0].folder)}
     if planned.kept:
         savers = unit_savers(task, rows, observations, analysis)
-        for each in tasks if config.statistics and analysis is not None else ():
-            savers |= _with_columns(each, unit.slug, analysis, folder)
+        if config.statistics and analysis is not None:
+            for each in tasks:
+                savers |= _with_columns(each, unit.slug, analysis, folder)
         files |= written(start, savers)[0]
     reduced = [tile.reduced for tile in tiles if len(tile.reduced)]
     checked = [tile.checked for tile in tiles if tile.checked is not None]
