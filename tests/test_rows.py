@@ -17,7 +17,7 @@ def test_rows_are_what_went_in(count) -> None:
     columns = [rows.column(k) for k in range(3)]
     rows.append([1.0, None, 3.0])
     np.testing.assert_array_equal(columns, expected.T)  # a column that was taken before does not change
-    assert list(rows)[:-1] == rows.table()[:-1].tolist() == expected.tolist()
+    assert [rows.row(k) for k in range(count)] == rows.table()[:-1].tolist() == expected.tolist()
     assert str(rows.row(-1)) == str(rows.row(count)) == "[1.0, nan, 3.0]"
     with pytest.raises(IndexError):
         rows.row(count + 1)

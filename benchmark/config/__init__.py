@@ -220,9 +220,9 @@ class Config(Settings):
 
     def fused_by(self) -> list[BackendConfig]:
         """Return the backends that fuse the base units: those named, and the one they are checked against."""
-        named = [backend.name for backend in self.backends]
-        extra = [BackendConfig(name=self.check)] if self.check not in (None, SAMPLE, *named) else []
-        return [*self.backends, *extra]
+        if self.check in (None, SAMPLE, *(backend.name for backend in self.backends)):
+            return [*self.backends]
+        return [*self.backends, BackendConfig(name=self.check)]
 
     def only(self, parts: Sequence[str]) -> Config:
         """Return the base units and these parts alone: sweeps, 'shared_taxonomy', 'backends'.

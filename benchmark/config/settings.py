@@ -36,11 +36,9 @@ def read_yaml(path: str | Path) -> dict[str, Any]:
     except UnicodeDecodeError as error:
         raise ConfigError(f"{path}: not a text file ({error.reason} at byte {error.start})") from error
     content = parse_yaml(text, str(path))
-    if content is None:
-        return {}
-    if not isinstance(content, dict):
+    if content is not None and not isinstance(content, dict):
         raise ConfigError(f"{path}: expected settings ('key: value' lines), found a {type(content).__name__}")
-    return content
+    return content or {}
 
 
 def merge(base: Mapping[str, Any], over: Mapping[str, Any]) -> dict[str, Any]:
@@ -79,20 +77,15 @@ def explain(error: ValidationError, model: type[BaseModel]) -> str:
     problem = error.errors()[0]
     name = ".".join(" ".join(str(part).split()) for part in problem["loc"])
     if problem["type"] == "extra_forbidden":
-        unknown = name.rpartition(".")[2]
-        known = sorted(_keys_at(model, problem["loc"][:-1]))
-        return f"unknown setting '{name}'; {nearest(unknown, known)}"
+        *groups, unknown = map(str, problem["loc"])
+        for group in groups:
+            field = model.model_fields.get(group)
+            model = next(_models_in(field.annotation), model) if field else model
+        return f"unknown setting '{name}'; {nearest(unknown, sorted(model.model_fields))}"
     message = problem["msg"].removeprefix("Value error, ")
     if not name:  # of the settings as a whole
         return message
     return f"{name}: {message[0].lower()}{message[1:]} (got {reprlib.repr(problem['input'])})"
-
-
-def _keys_at(model: type[BaseModel], path: tuple[int | str, ...]) -> Iterator[str]:
-    for part in path:
-        field = model.model_fields.get(str(part))
-        model = next(_models_in(field.annotation), model) if field else model
-    yield from model.model_fields
 
 
 def _models_in(annotation: Any) -> Iterator[type[BaseModel]]:
@@ -156,9 +149,7 @@ class Sweeps(Settings):
 
     def given(self) -> Iterator[tuple[str, Values[Any]]]:
         """Yield the sweeps that there are, by name."""
-        for name, part in self:
-            if part is not None:
-                yield name, part
+        return ((name, part) for name, part in self if part is not None)
 
 
 # Which frames of a sequence are fused.

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import types
 from array import array
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Mapping
 from typing import TYPE_CHECKING, Any, TypeVar, Union, cast, get_args, get_origin, get_type_hints
 
 import numpy as np
@@ -70,10 +70,6 @@ class Rows:
     def __len__(self) -> int:
         """Return the number of rows."""
         return len(self._numbers) // self.columns
-
-    def __iter__(self) -> Iterator[list[float]]:
-        """Yield each row in turn."""
-        return (self.row(k) for k in range(len(self)))
 
     def append(self, row: Iterable[float | None]) -> None:
         """Add a row, None as NaN."""

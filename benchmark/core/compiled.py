@@ -26,10 +26,10 @@ if sys.platform == "linux":  # the TBB that Open3D loads is too old for numba, w
 
 
 def compiled(**options: Any) -> Callable[[Any], Any]:
-    """Return a decorator that compiles a function at its first call, and keeps the code for later processes.
+    """Return a decorator that compiles a function at its first call, and stores the code for later processes.
 
-    numba keeps it in __pycache__ beside the source, or else below HOME. Where neither can be written it goes below the
-    temporary folder, and if that cannot be either each process compiles anew; numba alone would refuse the import.
+    It is stored in __pycache__ beside the source, below HOME, or below the temporary folder; else each process compiles
+    anew.
     """
 
     def decorate(function: Any) -> Any:
@@ -123,10 +123,9 @@ def is_kept(function: Any) -> bool:
 def _own_temporary_folder() -> str | None:
     """Return a folder that nobody else can write to, as code is loaded from it; None where there can be none."""
     folder = Path(tempfile.gettempdir()) / f"semstab-compiled-{os.getuid()}"
-    try:
+    with contextlib.suppress(OSError):
         folder.mkdir(mode=0o700, exist_ok=True)
         status = folder.lstat()
-    except OSError:
-        return None
-    own = stat.S_ISDIR(status.st_mode) and status.st_uid == os.getuid() and not status.st_mode & 0o022
-    return str(folder) if own else None
+        if stat.S_ISDIR(status.st_mode) and status.st_uid == os.getuid() and not status.st_mode & 0o022:
+            return str(folder)
+    return None

@@ -52,10 +52,7 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
 
 
 class FolderLock:
-    """A folder that one process owns until `release`, or until it dies. What a killed one left half-written is removed.
-
-    Raises ConfigError where another one has it.
-    """
+    """A folder that one process owns until `release`, or until it dies. Raises ConfigError where another one has it."""
 
     def __init__(self, path: Path) -> None:
         path.mkdir(parents=True, exist_ok=True)
@@ -107,12 +104,10 @@ def write_png(path: str | Path, image: npt.NDArray[Any]) -> None:
 def write_stack(
     path: Path, key: str, layers: Iterable[npt.NDArray[Any]], count: int, dtype: np.dtype[Any], compressed: bool
 ) -> None:
-    """An .npz file of one array, of `count` layers of one shape that come one after the other."""
+    """Write an .npz file of one array, of `count` layers of one shape that come one after the other."""
     method = zipfile.ZIP_DEFLATED if compressed else zipfile.ZIP_STORED
-    with (
-        zipfile.ZipFile(path, "w", method, compresslevel=1) as archive,
-        archive.open(f"{key}.npy", "w", force_zip64=True) as file,
-    ):
+    zipped = zipfile.ZipFile(path, "w", method, compresslevel=1)
+    with zipped as archive, archive.open(f"{key}.npy", "w", force_zip64=True) as file:
         for number, layer in enumerate(layers):
             if number == 0:
                 shape = (count, *layer.shape)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import threading
 import time
-from collections import OrderedDict, deque
+from collections import deque
 from collections.abc import Callable, Generator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
@@ -63,9 +63,7 @@ def prefetch(
     try:
         fill()
         while ahead:
-            started = time.perf_counter()
-            item, seconds = ahead.popleft().result()
-            waited = time.perf_counter() - started
+            (item, seconds), waited = _timed(lambda future: future.result(), ahead.popleft())
             room = max(1, min(threads + 1, limit // max(1, size(item))))
             fill()
             fetched = Fetched(item, seconds, waited)
@@ -76,7 +74,7 @@ def prefetch(
         pool.shutdown(wait=True, cancel_futures=True)
 
 
-def _timed(read: Callable[[int], T], index: int) -> tuple[T, float]:
+def _timed(read: Callable[[K], T], index: K) -> tuple[T, float]:
     started = time.perf_counter()
     return read(index), time.perf_counter() - started
 
@@ -86,13 +84,11 @@ class SizedCache(Generic[K, T]):
 
     def __init__(self, load: Callable[[K], T], size: Callable[[T], int], most: int) -> None:
         self._load, self._size, self._most = load, size, most
-        self._loaded, self._lock = OrderedDict[K, T](), threading.Lock()
+        self._loaded, self._lock = dict[K, T](), threading.Lock()
 
     def __getitem__(self, key: K) -> T:
         with self._lock:
-            if key not in self._loaded:
-                self._loaded[key] = self._load(key)
-            self._loaded.move_to_end(key)
+            value = self._loaded[key] = self._loaded.pop(key) if key in self._loaded else self._load(key)
             while len(self._loaded) > 1 and sum(map(self._size, self._loaded.values())) > self._most:
-                self._loaded.popitem(last=False)
-            return self._loaded[key]
+                del self._loaded[next(iter(self._loaded))]
+            return value

@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import math
 import os
+import resource
 import signal
 import sys
 import threading
 import time
 from collections import defaultdict
 from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -19,8 +20,6 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from multiprocessing.connection import Connection
 
-
-# The memory that a process has and can still take: of the machine, of its control groups, of its own limit.
 
 PROC, CGROUPS = Path("/proc/self"), Path("/sys/fs/cgroup")
 
@@ -33,11 +32,9 @@ def available_bytes() -> int:
     """Return the memory that this process can still take."""
     import psutil
 
-    free = [int(psutil.virtual_memory().available), *_group_limits(PROC, CGROUPS)]
-    try:
-        import resource
-    except ImportError:
-        return min(free)
+    free = [int(psutil.virtual_memory().available)]
+    if (group := group_bytes(PROC, CGROUPS)) is not None:
+        free.append(group)
     limit, _ = resource.getrlimit(resource.RLIMIT_AS)  # `ulimit -v` bounds the address space
     if limit != resource.RLIM_INFINITY:
         free.append(limit - int(psutil.Process().memory_info().vms))
@@ -52,49 +49,34 @@ def resident_bytes() -> int:
 
 
 def group_bytes(proc: Path, cgroups: Path) -> int | None:
-    """Return what the control groups of a process leave to it; None where none of them has a limit.
+    """Return what the control groups of a process leave to it, page cache included; None where none has a limit.
 
-    proc     as /proc/self: its file `cgroup` names the groups
+    proc     as /proc/self; lines of its file `cgroup` are such as '4:memory:/user' or, of version 2, '0::/user'
     cgroups  as /sys/fs/cgroup: version 2, or version 1 with a folder `memory`
     """
-    return min(_group_limits(proc, cgroups), default=None)
-
-
-def _group_limits(proc: Path, cgroups: Path) -> Iterator[int]:
-    """Yield what each group leaves, from the process's own up to the root: each bounds those below it.
-
-    Lines of `cgroup` are such as '4:memory:/user' or, of version 2, '0::/user'. Page cache is given back when memory
-    is short.
-    """
-    try:
+    left, lines = list[int](), list[str]()
+    with contextlib.suppress(OSError):
         lines = (proc / "cgroup").read_text().splitlines()
-    except OSError:
-        return
     for line in lines:
         _, controllers, path = (*line.split(":", 2), "", "")[:3]
         if controllers and "memory" not in controllers.split(","):
             continue
         root, (limit, used, cache) = (cgroups / "memory", V1_FILES) if controllers else (cgroups, V2_FILES)
-        own = root / path.lstrip("/")
-        for folder in (own, *own.parents):  # in a container, the path may be that of the host: then only the root is
-            if not folder.is_relative_to(root):
-                break
-            try:
-                most, taken = ((folder / name).read_text().strip() for name in (limit, used))
+        own = root / path.lstrip("/")  # in a container, the path may be that of the host: then only the root is there
+        for folder in (each for each in (own, *own.parents) if each.is_relative_to(root)):
+            with contextlib.suppress(OSError, ValueError):  # no limit, where it is 'max'
+                most, taken = (int((folder / name).read_text()) for name in (limit, used))
                 stat = dict(entry.split() for entry in (folder / "memory.stat").read_text().splitlines())
-                if most != "max":
-                    yield int(most) - int(taken) + sum(int(stat.get(name, 0)) for name in cache)
-            except (OSError, ValueError):
-                continue
+                left.append(most - taken + sum(int(stat.get(name, 0)) for name in cache))
+    return min(left, default=None)
 
 
 TRIM_THRESHOLD, MMAP_THRESHOLD, ARENA_MAX = -1, -3, -8
 """The parameters' numbers in glibc's malloc.h; see mallopt(3)."""
 
-LARGEST_IMAGE = 64 << 20
-"""Bytes up to which freed memory is used again: the depth of a 3840x2160 frame has 33 million."""
-KEPT = 1 << 30
-"""Bytes of freed memory that are kept."""
+LARGEST_IMAGE, RETAINED = 64 << 20, 1 << 30
+"""Bytes up to which freed memory is used again (the depth of a 3840x2160 frame has 33 million), and that are retained.
+"""
 
 
 def configure_process() -> None:
@@ -107,15 +89,12 @@ def configure_process() -> None:
     os.environ.setdefault("RUST_LOG", "off")
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     if hasattr(libc := _libc(), "gnu_get_libc_version"):
-        for parameter, value in ((MMAP_THRESHOLD, LARGEST_IMAGE), (TRIM_THRESHOLD, KEPT), (ARENA_MAX, 1)):
+        for parameter, value in ((MMAP_THRESHOLD, LARGEST_IMAGE), (TRIM_THRESHOLD, RETAINED), (ARENA_MAX, 1)):
             libc.mallopt(parameter, value)
 
 
 def trim_malloc(*, least: int = 0) -> None:
-    """Return freed memory to the system at once: what `configure_process` has kept for the next images (glibc).
-
-    least  bytes that the process must have: of a small one what comes next uses it again, and need not clear it
-    """
+    """Return freed memory to the system at once (glibc), where the process has `least` bytes."""
     if resident_bytes() >= least and hasattr(libc := _libc(), "malloc_trim"):
         libc.malloc_trim(0)
 
@@ -141,20 +120,16 @@ def follow_parent(listening: Connection) -> None:
     threading.Thread(target=end_with_parent, daemon=True).start()
 
 
-# Wall-clock seconds by stage.
-
-
 class Stopwatch:
     """Adds up wall-clock seconds by stage."""
 
     def __init__(self) -> None:
         self.seconds: defaultdict[str, float] = defaultdict(float)
 
-    @contextmanager
+    @contextlib.contextmanager
     def __call__(self, stage: str) -> Iterator[Lap]:
         """Time the block; the yielded lap has its own seconds once it is over."""
-        lap = Lap()
-        started = time.perf_counter()
+        lap, started = Lap(), time.perf_counter()
         try:
             yield lap
         finally:

@@ -41,8 +41,8 @@ def run(
 ) -> Result:
     """Fuse, measure and compare what the configuration selects; as `run_study`, but a failing unit is an error.
 
-    Without a folder `out` nothing is left on disk, and the result has summaries, but no voxels. Raises ConfigError or
-    DataError, or what a unit raised, once everything else has been written.
+    Without a folder `out` the result has summaries, but no voxels. Raises ConfigError or DataError, or the error of a
+    unit, once everything else has been written.
     """
     with contextlib.ExitStack() as stack:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory()) if out is None else out)
@@ -93,11 +93,7 @@ def _execute(
         units.advice = advice or advice_of(plan, units.contents)
         result = result_of(plan, folder, units)
         units.watch.seconds["all"] = time.perf_counter() - started
-        content = manifest(config, units.inputs(plan), units.watch.seconds, command)
-        content |= {"units": units.counts() | {"executor": executor.name}}
-        content |= {"geometry": {scene: verdict.summary() for scene, verdict in units.geometry.items()}}
-        content |= {"depth_from": {name: scene.depth_from for name, scene in plan.scenes.items() if scene.depth_from}}
-        result = dataclasses.replace(result, manifest=content)
+        result = dataclasses.replace(result, manifest=manifest(plan, units, executor.name, command))
         folder.save_result(result)
         observers.tell(lambda observer: observer.run_finished(result))
     finally:
@@ -141,7 +137,8 @@ class _Execution:
                     self.units.add_seconds(outcome)
                     with self.units.watch("assemble"):
                         own = unit.take(outcome)
-                    self._advance(unit.step(), unit.name)
+                    step, name = unit.step(), unit.name
+                    self._observers.tell(lambda observer: observer.advanced(step, name))  # noqa: B023
                 if own is not None:
                     self._keep(planned[own.identity], own, in_tiles=unit is not None)
 
@@ -162,9 +159,6 @@ class _Execution:
                 whole.append(Work.of(each, start))
         return whole, tiled
 
-    def _advance(self, frames: int, what: str) -> None:
-        self._observers.tell(lambda observer: observer.advanced(frames, what))
-
     def _keep(self, each: PlannedUnit, outcome: Outcome, *, in_tiles: bool = False) -> None:
         units, folder, content = self.units, self._folder, outcome.content
         if content is not None:
@@ -181,15 +175,12 @@ class _Execution:
         if not in_tiles:
             units.add_seconds(outcome)
             if self._executor.elsewhere or each.regions:
-                self._advance(each.frames, f"{each.unit.scene} · {each.unit.backbone}")
+                name = f"{each.unit.scene} · {each.unit.backbone}"
+                self._observers.tell(lambda observer: observer.advanced(each.frames, name))
         self._observers.tell(lambda observer: observer.unit_finished(each, content, outcome.table, outcome.error))
 
     def _check_geometry(self, config: Config, missing: Sequence[PlannedUnit]) -> None:
-        """Check the geometry of each scene with units to compute, and judge the voxel size.
-
-        A scene that cannot be read is left to its units to report. Raises DataError where depth and poses contradict
-        each other.
-        """
+        """Check the geometry and the voxel size of each scene of missing units; those report errors of reading."""
         tasks = {each.task.scene.name: each.task for each in reversed(missing) if not each.regions}
         verdicts: dict[str, Verdict] = {}
         for task in reversed(tasks.values()):

@@ -27,17 +27,13 @@ AWAY = OSError, RuntimeError, AttributeError
 
 LOST = "the scheduler went away; start it again, and the same command goes on from what is kept"
 
+Future = cf.Future[tuple[Outcome, ...]]
 NextJob = Callable[[], Job | None]
 """Gives the next job; None where there is none, until outcomes that were yielded call for more."""
 
 
 class Executor:
-    """Runs jobs.
-
-    name       for the manifest
-    width      how many jobs it runs at once
-    elsewhere  whether other processes do the work, so that observers here do not see it
-    """
+    """Runs jobs: so many at once (`width`), perhaps in other processes (`elsewhere`); `name` is for the manifest."""
 
     name: str
     width = 1
@@ -95,50 +91,66 @@ class LocalProcesses(Executor):
                     yield from failed(begun.pop(0), text)
 
     def _run(self, begun: list[Job], next_job: NextJob, width: int) -> Generator[Outcome, None, None]:
-        """Run the jobs that were begun before, then the next ones; begun stay those that are not finished.
+        """Run the jobs that were begun before, then the next ones; begun stay those that are not finished."""
+        waiting = [*begun]
 
-        Each is submitted before outcomes are yielded: no process waits for whoever takes them.
-        """
-        futures, waiting = dict[cf.Future[tuple[Outcome, ...]], Job](), [*begun]
+        def take() -> Job | None:
+            if waiting:
+                return waiting.pop(0)
+            if (job := next_job()) is None:
+                return None
+            threads = max(1, (job[0].start.threads or default_threads()) // self.width)
+            begun.append(_with_start(job, threads=threads, width=self.width))
+            return begun[-1]
 
-        def take() -> bool:
-            if not waiting and (job := next_job()) is not None:
-                begun.append(self._with_a_share(job))
-                waiting.append(begun[-1])
-            return bool(waiting)
-
-        def submit() -> None:
-            while len(futures) < width and take():
-                futures[pool.submit(_run_all, waiting[0])] = waiting[0]
-                del waiting[0]
-
-        if not take():
+        if (first := take()) is None:
             return
+        waiting.insert(0, first)
         context = multiprocessing.get_context("spawn")
         listening, alive = context.Pipe(duplex=False)
         share = max(1, cores() // self.width)
         pool = cf.ProcessPoolExecutor(width, context, initializer=_start_worker, initargs=(listening, share))
         try:
             _check_start(pool)
-            submit()
-            while futures:
-                done, _ = cf.wait(futures, return_when=cf.FIRST_COMPLETED)
-                for future in done:
-                    outcomes, job = future.result(), futures.pop(future)
-                    submit()  # raises where the processes died meanwhile: then this job is run once more
-                    begun[:] = [each for each in begun if each is not job]
-                    yield from outcomes
-                    submit()
+            for future, job in _ended(take, lambda job: pool.submit(_run_all, job), lambda: width):
+                outcomes = future.result()
+                begun[:] = [each for each in begun if each is not job]
+                yield from outcomes
             pool.shutdown()
         finally:
             alive.close()  # ends processes that are still at work: after an interruption, or where one of them died
             pool.shutdown(wait=False, cancel_futures=True)
 
-    def _with_a_share(self, job: Job) -> Job:
-        start = job[0].start
-        threads = max(1, (start.threads or default_threads()) // self.width)
-        own = dataclasses.replace(start, threads=threads, width=self.width)
-        return tuple(dataclasses.replace(work, start=own) for work in job)
+
+def _ended(
+    next_job: NextJob, submit: Callable[[Job], Future], width: Callable[[], int]
+) -> Generator[tuple[Future, Job], None, None]:
+    """Yield each job that ended, and its future; as many are submitted as can run at once.
+
+    The next ones are submitted before one is yielded: nobody waits for whoever takes its outcomes.
+    """
+    jobs = dict[Future, Job]()
+
+    def fill() -> None:
+        while len(jobs) < width() and (job := next_job()) is not None:
+            jobs[submit(job)] = job
+
+    fill()
+    try:
+        while jobs:
+            for future in cf.wait(jobs, return_when=cf.FIRST_COMPLETED).done:
+                job = jobs.pop(future)
+                fill()
+                yield future, job
+                fill()
+    finally:
+        for future in jobs:
+            future.cancel()
+
+
+def _with_start(job: Job, **changes: Any) -> Job:
+    start = dataclasses.replace(job[0].start, **changes)
+    return tuple(dataclasses.replace(work, start=start) for work in job)
 
 
 def _run_all(job: Job) -> tuple[Outcome, ...]:
@@ -193,42 +205,28 @@ class DaskCluster(Executor):
     def run(self, next_job: NextJob, observers: Observers) -> Generator[Outcome, None, None]:
         """Yield outcomes as jobs finish. The scheduler gives the job of a worker that died to another one.
 
-        There are never more at the scheduler than its workers have threads, so that whoever is free has the next one;
-        and that is sent before outcomes are yielded, so that nobody waits for it.
+        There are never more at the scheduler than its workers have threads, so that whoever is free has the next one.
         Raises ConfigError where the scheduler went away and jobs are left.
         """
-        futures, waiting = dict[Any, Job](), list[Job]()
-        finished = _distributed().as_completed(loop=self._client.loop)
-
-        def take() -> bool:
-            if not waiting and (job := next_job()) is not None:
-                waiting.append(job)
-            return bool(waiting)
-
-        def send() -> None:
-            free = self._threads() - len(futures)
-            while free > 0 and take():
-                job, free = waiting.pop(), free - 1
-                futures[future := self._client.submit(_run_settled, job, pure=False)] = job
-                finished.add(future)
-
-        if not take():
+        if (first := next_job()) is None:
             return
         self._require_same_version()
-        send()
-        try:
-            for future in finished:
-                job = futures.pop(future)
-                outcomes = _outcomes(future, job)
-                future.release()
-                send()
-                yield from outcomes
-                send()
-            if take():
-                raise ConfigError(LOST)
-        finally:
-            if futures:
-                self._client.cancel(list(futures))
+        waiting, pool = [first], self._client.get_executor(pure=False)
+
+        def take() -> Job | None:
+            return waiting.pop() if waiting else next_job()
+
+        for future, job in _ended(take, lambda job: pool.submit(_run_settled, job), self._threads):
+            if future.cancelled():
+                yield from failed(job, LOST)
+                continue
+            try:
+                outcomes = future.result()
+            except Exception as error:  # noqa: BLE001 - any error of a job on the cluster
+                outcomes = tuple(failed(job, error))
+            yield from outcomes
+        if take() is not None:
+            raise ConfigError(LOST)
 
     def _threads(self) -> int:
         """Threads of the workers that there are now; 0 where the scheduler does not answer."""
@@ -266,8 +264,7 @@ def _run_settled(job: Job) -> tuple[Outcome, ...]:
     configure_process()
     with contextlib.suppress(ValueError):  # called outside of a worker
         _use_threads(_distributed().get_worker().state.nthreads)
-    start = dataclasses.replace(job[0].start, threads=job[0].start.threads or 0)
-    return _run_all(tuple(dataclasses.replace(work, start=start) for work in job))
+    return _run_all(_with_start(job, threads=job[0].start.threads or 0))
 
 
 def _distributed() -> Any:
@@ -275,16 +272,6 @@ def _distributed() -> Any:
         return importlib.import_module("distributed")
     except ImportError as error:
         raise MissingDependencyError("a Dask cluster needs more packages: pip install 'semstab[cluster]'") from error
-
-
-def _outcomes(future: Any, job: Job) -> tuple[Outcome, ...]:
-    if future.cancelled():
-        return tuple(failed(job, LOST))
-    try:
-        outcomes: tuple[Outcome, ...] = future.result()
-    except Exception as error:  # noqa: BLE001 - whatever happened to it on the cluster
-        return tuple(failed(job, error))
-    return outcomes
 
 
 def cores() -> int:

@@ -5,10 +5,9 @@ from __future__ import annotations
 import dataclasses
 import tempfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -99,14 +98,8 @@ def finish(live: LiveMap, stream: Stream, watch: Stopwatch) -> Outcome:
     return Outcome(work.identity, content, files=returned, table=fused.table if work.watched else None)
 
 
-@dataclass(frozen=True, eq=False)
-class FusedMap:
-    """A map at its end, without the locations whose fused class is left out.
-
-    truth    the map of the ground truth, where that was fused
-    reduced  sums of the map of labels that soft scores were reduced to; empty where there are none
-    checked  how far it agrees with the reference on a sample of its voxels
-    """
+class FusedMap(NamedTuple):
+    """A map at its end, without the locations whose fused class is left out; reduced: `reduced_sums`, or empty."""
 
     table: VoxelTable
     events: Events | None
@@ -167,7 +160,6 @@ def no_voxels(task: Task, config: Config) -> DataError:
 
 
 def _checked(live: LiveMap, table: VoxelTable, reference: NumpySample) -> Agreement:
-    """How far the map agrees with the reference on the voxels of the sample."""
     expected, one_in = dataclasses.replace(reference.table(), classes=table.classes), reference.one_in
     drawn = rows_of(table, in_sample(table.index.T, one_in))
     units = (live.unit, dataclasses.replace(live.unit, backend="numpy"))
@@ -179,6 +171,7 @@ def unit_content(
 ) -> UnitContent:
     """Return the content of a unit from its time series, its result and the statistics of its map."""
     sums = TableSums.read(result.sums)
+    cut, most = rows.column("scores_left_out"), rows.column("most_scores_left_out")
     summary = UnitSummary(
         unit=task.units[0],
         taxonomy=task.mapping.target.name,
@@ -190,10 +183,10 @@ def unit_content(
         left_out=int(rows.column("left_out").sum()),
         frames_left_out=task.left_out,
         frames_empty=int(np.count_nonzero(rows.column("points") == 0)),
-        scores_left_out=_scores_left_out(rows),
+        scores_left_out=None if np.isnan(cut).all() else LeftOut(mean(cut), float(np.nanmax(most))),
         statistics=None if analysis is None else analysis.summary,
-        reduced=reduced_of(result.reduced) if len(result.reduced) else None,
-        worst_frames=tuple(_worst(rows, task.scene)),
+        reduced=_reduced(result.reduced) if len(result.reduced) else None,
+        worst_frames=_worst(rows, task.scene),
         sizes=result.sizes,
     )
     return UnitContent(task.digest, summary, files=result.files, checked=result.checked)
@@ -202,49 +195,37 @@ def unit_content(
 def in_image_space(content: UnitContent, task: Task, result: TileResult, points: VoxelTable | Float64) -> UnitContent:
     """Return the content with stability in image coordinates, the quality of single frames and the scene's up axis."""
     assert content.summary is not None
-    meter = ImageSpaceMeter(result.image)
-    return dataclasses.replace(
-        content,
-        image_space=meter.result(content.summary.flicker_percent),
-        up=up_axis(task.scene, points, result.poses),
-        quality=result.quality,
-    )
-
-
-def _scores_left_out(rows: Series) -> LeftOut | None:
-    """Over all frames that were cut to their largest scores; None where none was."""
-    left_out, most = rows.column("scores_left_out"), rows.column("most_scores_left_out")
-    return None if np.isnan(left_out).all() else LeftOut(mean(left_out), float(np.nanmax(most)))
+    image_space = ImageSpaceMeter(result.image).result(content.summary.flicker_percent)
+    up = up_axis(task.scene, points, result.poses)
+    return dataclasses.replace(content, image_space=image_space, up=up, quality=result.quality)
 
 
 def reduced_sums(table: VoxelTable) -> Float64:
-    """The sums over voxels from which `reduced_of` follows."""
+    """Return the sums over voxels of a map of labels that soft scores were reduced to."""
     values, recurrent = vss(table), table.op >= RECURRENT
     means = [values.sum(), len(values), values[recurrent].sum(), np.count_nonzero(recurrent)]
     return np.concatenate([means, alpha_sums(table)])
 
 
-def reduced_of(sums: Float64) -> ReducedScores:
-    """Soft scores reduced to labels, from the sums of their map."""
+def _reduced(sums: Float64) -> ReducedScores:
     return ReducedScores(float(ratio_of(sums[:2])), float(ratio_of(sums[2:4])), float(alpha_of(sums[4:])))
 
 
-def _worst(rows: Series, scene: Scene) -> list[FrameDrift]:
+def _worst(rows: Series, scene: Scene) -> tuple[FrameDrift, ...]:
     """The frames that moved the map most, of those that met as many known voxels as half of the frames do."""
     known, drift = rows.column("voxels") - rows.column("new_voxels"), rows.drift
     met = np.flatnonzero(known >= max(1, np.median(known) if len(known) else 0))
     worst = met[np.argsort(-drift[met], kind="stable")][:WORST]
     frames = rows.column("frame").astype(np.int64).tolist()
-    return [FrameDrift(frames[k], float(drift[k]), int(known[k]), scene.frame_name(frames[k])) for k in worst]
+    return tuple(FrameDrift(frames[k], float(drift[k]), int(known[k]), scene.frame_name(frames[k])) for k in worst)
 
 
 def up_axis(scene: Scene, points: VoxelTable | Float64, poses: Float64) -> tuple[float, float, float] | None:
-    """The scene's up axis, given or estimated; None where neither works."""
+    """Return the scene's up axis, given or estimated; None where neither works."""
     try:
-        up = estimate_up(points, poses) if scene.up is None else scene.up
+        x, y, z = (float(value) for value in (estimate_up(points, poses) if scene.up is None else scene.up))
     except DataError:
         return None
-    x, y, z = (float(value) for value in up)
     return x, y, z
 
 
@@ -269,11 +250,7 @@ def _savers(
     if tile is not None and observations is not None:
         savers[f"{tile.folder}/{tile.size}_{OBSERVATIONS}"] = observations.save
     if tile is None and work.kept:
-        savers[f"{FRAMES}/{unit.slug}.csv"] = partial(live.rows.save_csv, names=live.task.scene.frame_name)
-        if observations is not None:
-            savers[f"{LOOKS}/{unit.slug}.parquet"] = observations.save
-        if analysis is not None:
-            savers[f"{INFLUENCE}/{unit.slug}.parquet"] = analysis.sums.save
+        savers |= unit_savers(live.task, live.rows, observations, analysis)
     if fused is None or not len(fused.table):
         return savers
     if tile is not None and sample is not None:
@@ -294,6 +271,17 @@ def _savers(
         savers[path(EVENTS, waits=False)] = partial(fused.events.save, tile=own)
     if fused.truth is not None and (work.image_space if own is None else len(fused.truth)):
         savers[path(TRUTH, waits=not work.image_space)] = partial(fused.truth.save, tile=own)
+    return savers
+
+
+def unit_savers(task: Task, rows: Series, observations: CellObservations | None, analysis: Analysis | None) -> Savers:
+    """Return the files of a unit that do not depend on tiles: its time series, and what statistics rest on."""
+    slug = task.units[0].slug
+    savers: Savers = {f"{FRAMES}/{slug}.csv": partial(rows.save_csv, names=task.scene.frame_name)}
+    if observations is not None:
+        savers[f"{LOOKS}/{slug}.parquet"] = observations.save
+    if analysis is not None:
+        savers[f"{INFLUENCE}/{slug}.parquet"] = analysis.sums.save
     return savers
 
 

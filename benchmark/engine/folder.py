@@ -57,7 +57,7 @@ WRITTEN = (UNITS, VOXELS, TRUTH, EVENTS, LOOKS, FRAMES, INFLUENCE, OVERVIEW, TIL
 
 
 def require_file_names(out: Path, units: Iterable[Unit]) -> None:
-    """Raise ConfigError where two units' files would have one name, or one that the file system does not take."""
+    """Raise ConfigError where two units' files would share a name, or one is too long for the file system."""
     there = next(folder for folder in (out.absolute(), *out.absolute().parents) if folder.is_dir())
     longest = os.pathconf(there, "PC_NAME_MAX") - len(".parquet")
     named: dict[str, Unit] = {}
@@ -72,10 +72,9 @@ def require_file_names(out: Path, units: Iterable[Unit]) -> None:
 
 
 class Folder:
-    """OUT/: of one run or study, or of changed versions of it; what was computed with the same settings is kept.
+    """OUT/ of a run or study, with what was computed with the same settings; one process owns it until `close`.
 
-    One process owns it until `close`, or until it dies. Raises ConfigError where another one does, or where the folder
-    holds something else, or what an earlier version left.
+    Raises ConfigError where another process does, or where it holds something else, or results of an earlier version.
     """
 
     def __init__(self, path: str | Path, config: Config) -> None:
@@ -93,16 +92,13 @@ class Folder:
         self._lock.release()
 
     def finished(self, planned: PlannedUnit) -> UnitContent | None:
-        """What an earlier start left of a unit, if its input is the same and nothing that is wanted is missing.
-
-        The input is read to compare it only where there is such a unit at all.
-        """
+        """Return what an earlier start left of a unit, if its input is the same and nothing wanted is missing."""
         if not any(name.startswith(planned.identity) for name in self._files):
             return None
         try:
             file = self._files.get(unit_key(planned.identity, planned.task.digest))
         except DataError:
-            return None  # the input cannot be read: computing the unit will say so
+            return None  # the input cannot be read: computing the unit will report it
         try:
             content = None if file is None else from_json(UnitContent, read_json(file), file)
         except DataError:
@@ -121,7 +117,7 @@ class Folder:
             (self.path / TILES).rmdir()  # where nothing of other units is left
 
     def save_files(self, outcome: Outcome) -> None:
-        """Keep what a worker that does not see the folder sent; the last file says that the others are there."""
+        """Write what a worker that does not see the folder sent; the last file says that the others are there."""
         for name, file in outcome.files.items():
             with atomic_path(self.path / name) as temporary:
                 temporary.write_bytes(file)
@@ -138,7 +134,7 @@ class Folder:
                 (self.path / name / slug).rmdir()  # where it is empty
 
     def save_trace(self, outcome: Outcome) -> None:
-        """Keep where a unit's error was raised, for who mends it: failures.log of this start."""
+        """Add where a unit's error was raised to failures.log of this start."""
         if outcome.trace:
             with (self.path / FAILURES).open("a", encoding="utf-8") as log:
                 log.write(f"{outcome.error}\n{outcome.trace}\n")
@@ -264,14 +260,11 @@ def _contradiction(result: Result) -> str | None:
 
 def _with_files(records: Sequence[Record], change: Callable[[Path], Path]) -> tuple[Record, ...]:
     """The records with other paths of their files: in summary.json as they are called in the folder."""
-    return tuple(
-        dataclasses.replace(
-            record,
-            voxels_file=record.voxels_file and change(record.voxels_file),
-            truth_file=record.truth_file and change(record.truth_file),
-        )
-        for record in records
-    )
+
+    def files(record: Record) -> dict[str, Any]:
+        return {name: (path := getattr(record, name)) and change(path) for name in ("voxels_file", "truth_file")}
+
+    return tuple(dataclasses.replace(record, **files(record)) for record in records)
 
 
 def _claimed(path: Path) -> dict[str, Any] | None:
@@ -280,11 +273,10 @@ def _claimed(path: Path) -> dict[str, Any] | None:
         return None
     if not path.is_dir():
         raise ConfigError(f"{path}: is a file; name a folder")
-    settings = path / SETTINGS
     if _is_earlier(path):
         raise ConfigError(f"{path}: holds results of an earlier version of semstab; choose another folder")
-    if settings.exists():
-        return read_yaml(settings)
+    if (path / SETTINGS).exists():
+        return read_yaml(path / SETTINGS)
     entries = [*path.iterdir(), *path.glob(f"{UNITS}/*")]
     if any(entry.name != UNITS and not entry.name.startswith(TEMPORARY) for entry in entries):  # a birth's beginnings
         raise ConfigError(f"{path}: is not empty and holds no run or study; choose another folder")
@@ -292,22 +284,19 @@ def _claimed(path: Path) -> dict[str, Any] | None:
 
 
 def _is_earlier(folder: Path, layouts: Collection[str] = (LAYOUT,)) -> bool:
-    settings = folder / SETTINGS
-    if not settings.exists():
+    if (folder / "study.yaml").exists() or not (folder / SETTINGS).exists():
         return (folder / "study.yaml").exists()
-    with settings.open(encoding="utf-8", errors="replace") as lines:
-        return (folder / "study.yaml").exists() or lines.readline(200).rstrip("\n") not in layouts
+    with (folder / SETTINGS).open(encoding="utf-8", errors="replace") as lines:
+        return lines.readline(200).rstrip("\n") not in layouts
 
 
-def _first_change(old: Mapping[str, Any], new: Mapping[str, Any]) -> str | None:
-    there, here = dict(_flat(old)), dict(_flat(new))
-    changed = (name for name in there if name in here and there[name] != here[name])
-    return next((f"{name}: {there[name]} there, {here[name]} here" for name in changed), None)
-
-
-def _flat(settings: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
-    for key, value in settings.items():
-        if isinstance(value, dict) and key != "sweeps":
-            yield from _flat(value, f"{prefix}{key}.")
-        elif key not in ("name", "description", "scenes", "backbones", "backends", "sweeps"):
-            yield f"{prefix}{key}", value
+def _first_change(old: Mapping[str, Any], new: Mapping[str, Any], prefix: str = "") -> str | None:
+    left_out = {"name", "description", "scenes", "backbones", "backends", "sweeps"}
+    for key in (key for key in old if key in new and key not in left_out):
+        there, here = old[key], new[key]
+        if isinstance(there, dict) and isinstance(here, dict):
+            if change := _first_change(there, here, f"{prefix}{key}."):
+                return change
+        elif there != here:
+            return f"{prefix}{key}: {there} there, {here} here"
+    return None

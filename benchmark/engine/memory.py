@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -46,9 +46,8 @@ def map_bytes(
 ) -> float:
     """Return roughly the bytes that a map of K classes and its tables take.
 
-    soft     whether frames have scores, which are fused as labels as well
-    logged   whether every observation is kept, and the ground truth fused too
-    sampled  whether the reference follows a sample of its voxels
+    soft: of scores, which are fused as labels as well; logged: with every observation and the ground truth; sampled:
+    with the reference on a sample of its voxels.
     """
     n, seen = int(voxels), int(observations)
     total = expected_bytes(backend, n, seen, K, soft=soft) + (1 + logged) * table_bytes(n, K, soft=soft)
@@ -58,7 +57,7 @@ def map_bytes(
 
 
 def log_bytes(observations: int, num_classes: int, *, soft: bool) -> int:
-    """Return the bytes of a log: kept frame by frame, and sorted by voxel; of soft scores with most of the classes."""
+    """Return the bytes of a log, kept frame by frame and sorted by voxel."""
     return observations * (100 + (20 * num_classes if soft else 0))
 
 
@@ -101,10 +100,7 @@ SMALLEST, LARGEST = 8, 1 << 16
 
 @dataclass
 class Sizing:
-    """Units that would not fit into memory, by identity: the edge of their tiles, or why they cannot be fused.
-
-    lines  say so, one for each sequence in tiles
-    """
+    """Units that would not fit, by identity: the edge of their tiles, or why they cannot be fused; lines tell it."""
 
     tile_sizes: dict[str, int] = field(default_factory=dict)
     refused: dict[str, str] = field(default_factory=dict)
@@ -175,10 +171,8 @@ def available_for_maps(config: Config, width: int, taken: float) -> float:
 
     Where hardly anything is free, a quarter of it is for maps all the same.
     """
-    if config.memory_gb is not None:
-        return config.memory_gb * GB / width
     free = available_bytes() / width
-    return max(free - taken, free / 4)
+    return max(free - taken, free / 4) if config.memory_gb is None else config.memory_gb * GB / width
 
 
 def _bytes_of(planned: PlannedUnit, voxels: float, observations: float, *, soft: bool) -> float:
@@ -194,8 +188,7 @@ def _without(group: Sequence[PlannedUnit], settings: Config) -> str:
     return without + (", no statistics" if settings.statistics else "")
 
 
-@dataclass(frozen=True)
-class MapSize:
+class MapSize(NamedTuple):
     """The estimated size of a map: its voxels, observations, and voxels in a column of them."""
 
     voxels: float
@@ -220,16 +213,17 @@ def map_size(task: Task, settings: Config) -> MapSize:
     """Estimate the size of a map from a few pairs of successive frames, evenly spaced.
 
     If no location is seen again later, each frame adds as many voxels as the second one of a pair adds to the first.
-    Where frames far apart see the same voxels, there are fewer: as many as capture and recapture by every other one of
-    the sampled frames tells (Lincoln and Petersen).
+    Where frames far apart see the same voxels, there are fewer: capture and recapture by every other one of the sampled
+    frames (Lincoln and Petersen).
     """
-    after = dict(zip(task.indices, task.indices[1:], strict=False))
-    seen, new = list[Int64](), list[float]()
-    for index in (task.indices[k] for k in evenly(len(task.indices), FEW)):
-        seen.append(voxels_in(_geometry(task, settings, index), settings.voxel_size))
-        if index in after:
-            later = voxels_in(_geometry(task, settings, after[index]), settings.voxel_size)
-            new.append(_count([seen[-1], later]) - len(seen[-1]))
+
+    def seen_by(k: int) -> Int64:
+        return voxels_in(_geometry(task, settings, task.indices[k]), settings.voxel_size)
+
+    sampled = evenly(len(task.indices), FEW)
+    seen = [seen_by(k) for k in sampled]
+    pairs = [(own, seen_by(k + 1)) for k, own in zip(sampled, seen, strict=True) if k + 1 < len(task.indices)]
+    new = [_count(pair) - len(pair[0]) for pair in pairs]
     each = float(np.mean([len(own) for own in seen]))
     voxels = each + (len(task.indices) - 1) * (float(np.mean(new)) if new else 0.0)
     distinct = distinct_rows(np.concatenate(seen))[0]
@@ -262,11 +256,7 @@ AMPLE = 4
 
 
 class MemoryBudget:
-    """Watches the memory of a pass, frame by frame, in a time that does not grow with the maps.
-
-    memory_gb  that all maps and their tables may take; None: what is free
-    width      processes that share it
-    """
+    """Watches the memory of a pass: `memory_gb` or what is free, shared by `width` processes."""
 
     def __init__(self, memory_gb: float | None, width: int) -> None:
         self._limit = None if memory_gb is None else memory_gb * GB / width

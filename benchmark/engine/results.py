@@ -17,7 +17,7 @@ from semstab.config import BACKENDS, BASE, Config
 from semstab.core.process import Stopwatch
 from semstab.datasets import GROUND_TRUTH
 from semstab.engine.folder import Folder
-from semstab.engine.units import Plan, PlannedUnit, must_agree
+from semstab.engine.units import Plan, must_agree
 from semstab.engine.work import Outcome
 from semstab.metrics import compare
 from semstab.metrics.agreement import together
@@ -32,13 +32,7 @@ from semstab.statistics.model_comparison import Region, Regions, compare_regions
 
 @dataclass
 class UnitResults:
-    """The contents of the units by their identity, or why they failed.
-
-    finished_before  how many an earlier start finished
-    geometry  of the scenes of which something was computed
-    advice    where the voxel size lies in them
-    causes    exceptions that were raised in this process, by message
-    """
+    """Contents of the units by identity, or their errors; geometry and advice by scene; causes by message."""
 
     contents: dict[str, UnitContent] = field(default_factory=dict)
     finished_before: int = 0
@@ -53,46 +47,32 @@ class UnitResults:
         for stage, seconds in outcome.seconds.items():
             self.watch.seconds[stage] += seconds
 
-    def inputs(self, plan: Plan) -> dict[str, str]:
-        """The digest of the input of each base unit, and of each source of regions."""
-        return {
-            f"{each.unit.scene}/{each.unit.backbone}": self.contents[each.identity].input
-            for each in plan.every()
-            if each.variation.sweep in (BASE, REGIONS) and each.identity in self.contents
-        }
-
-    def counts(self) -> dict[str, Any]:
-        """Numbers of all units, of those finished by an earlier start, of those computed and of those that failed."""
-        failed = len(self.errors)
-        left = self.finished_before
-        computed = len(self.contents) - left
-        return {"units": len(self.contents) + failed, "kept": left, "computed": computed, "failed": failed}
-
 
 def result_of(plan: Plan, folder: Folder, units: UnitResults) -> Result:
     """The result of all units that there are: how they agree, and how backbones compare."""
-    contents, errors = units.contents, units.errors
+    contents, errors, config = units.contents, units.errors, plan.config
     records = tuple(folder.record(each, contents[each.identity]) for each in plan.units if each.identity in contents)
     tables = Tables(most=len({record.unit.backend for record in records}))
     with units.watch("agreement"):
-        own = [contents[each.identity].checked for each in plan.units if each.sampled and each.identity in contents]
-        agreement = (*filter(None, own), *_agreements(plan.config, records, tables, must=True))
-        compared = tuple(_agreements(plan.config, records, tables, must=False))
+        checks = [contents[each.identity].checked for each in plan.units if each.sampled and each.identity in contents]
+        agreement = (*filter(None, checks), *_agreements(config, records, tables, must=True))
+        compared = tuple(_agreements(config, records, tables, must=False))
     with units.watch("comparisons"):
-        scenes = tuple(_comparisons(plan.config, records, tables)) if plan.config.statistics else ()
-        comparisons = claimed_together(scenes)
+        comparisons = claimed_together(tuple(_comparisons(config, records, tables)) if config.statistics else ())
+    up: dict[str, tuple[float, float, float]] = {}  # of the first backbone whose base unit has it
+    for each in plan.units:
+        own = contents.get(each.identity)
+        if each.variation.sweep == BASE and own is not None and own.up is not None:
+            up.setdefault(each.unit.scene, own.up)
+    failed = [each for each in plan.every() if each.identity in errors]
     return Result(
-        name=plan.config.name,
-        backend=plan.config.backends[0].name,
+        name=config.name,
+        backend=config.backends[0].name,
         records=records,
-        failures=tuple(
-            Failure(each.unit, each.variation, errors[each.identity])
-            for each in plan.every()
-            if each.identity in errors
-        ),
+        failures=tuple(Failure(each.unit, each.variation, errors[each.identity]) for each in failed),
         agreement=agreement,
         comparisons=comparisons,
-        up=_up_axes(plan.units, contents),
+        up=up,
         georeference={name: known for name, scene in plan.scenes.items() if (known := scene.georeference) is not None},
         regions=tuple(
             content.regions for each in plan.regions if (content := contents.get(each.identity)) and content.regions
@@ -103,7 +83,7 @@ def result_of(plan: Plan, folder: Folder, units: UnitResults) -> Result:
 
 
 def advice_of(plan: Plan, contents: Mapping[str, UnitContent]) -> dict[str, VoxelAdvice]:
-    """Return where the voxel size lies in each scene, as was estimated when its base units were computed."""
+    """Return the voxel size's advice of each scene, from when its base units were computed."""
     return {
         each.unit.scene: content.advice
         for each in plan.units
@@ -129,7 +109,6 @@ def _agreements(config: Config, records: Sequence[Record], tables: Tables, *, mu
 
 
 def _alike(config: Config, a: Record, b: Record, tables: Tables) -> Agreement:
-    """How far two units agree, voxel by voxel; tile by tile where one is in tiles."""
     units = a.unit, b.unit
     maps = [Tiles.open(file, VoxelTable) for record in (a, b) if (file := record.voxels_file) is not None]
     if not (a.in_tiles or b.in_tiles):
@@ -144,18 +123,14 @@ def _comparisons(config: Config, records: Sequence[Record], tables: Tables) -> I
         there = [record for record in base if record.unit.scene == scene]
         if len(there) > 1:
             files = {record.unit.backbone: record.looks_file for record in there}
-            observations = {
-                name: CellObservations.load(file) for name, file in files.items() if file is not None and file.exists()
-            }
-            regions = _regions_of(there, config, tables)
-            if (
-                compared := _compared_maps(scene, regions, observations if len(observations) == len(there) else None)
-            ) is not None:
+            loaded = {name: CellObservations.load(file) for name, file in files.items() if file and file.exists()}
+            regions, observations = _regions_of(there, config, tables), loaded if len(loaded) == len(there) else None
+            if (compared := _compared_maps(scene, regions, observations)) is not None:
                 yield compared
 
 
 def _compared_maps(
-    scene: str, regions: Regions, looks: Mapping[str, CellObservations] | None
+    scene: str, regions: Regions, observations: Mapping[str, CellObservations] | None
 ) -> BackboneComparison | None:
     """The comparison of a scene's maps; None where there are not two or more of them in one label space.
 
@@ -166,8 +141,8 @@ def _compared_maps(
     if len(first.tables) < 2 or len(classes) > 1:
         return None
     if first.truth is not None and first.truth.classes not in classes:
-        return _compared_maps(scene, lambda: (dataclasses.replace(own, truth=None) for own in regions()), looks)
-    return compare_regions(regions, looks=looks, scene=scene)
+        return _compared_maps(scene, lambda: (dataclasses.replace(own, truth=None) for own in regions()), observations)
+    return compare_regions(regions, looks=observations, scene=scene)
 
 
 def _regions_of(there: Sequence[Record], config: Config, tables: Tables) -> Regions:
@@ -192,18 +167,6 @@ def _regions_of(there: Sequence[Record], config: Config, tables: Tables) -> Regi
     return regions
 
 
-def _up_axes(
-    units: Sequence[PlannedUnit], contents: Mapping[str, UnitContent]
-) -> dict[str, tuple[float, float, float]]:
-    """Each scene's up axis, as the base unit of its first backbone has it that knows one."""
-    axes: dict[str, tuple[float, float, float]] = {}
-    for each in units:
-        content = contents.get(each.identity)
-        if each.variation.sweep == BASE and content is not None and content.up is not None:
-            axes.setdefault(each.unit.scene, content.up)
-    return axes
-
-
 # manifest.json: where a run's numbers come from.
 
 SCHEMA = 1
@@ -212,11 +175,12 @@ SCHEMA = 1
 REPORTED_PACKAGES = ("numpy", "open3d", "opencv-python-headless", "pyarrow", "rerun-sdk", "trimesh")
 
 
-def manifest(
-    config: Config, inputs: Mapping[str, str], seconds: Mapping[str, float], command: Sequence[str]
-) -> dict[str, Any]:
-    """Return the content of manifest.json: versions, digests of the inputs, seconds by stage, peak memory."""
+def manifest(plan: Plan, units: UnitResults, executor: str, command: Sequence[str]) -> dict[str, Any]:
+    """Return the content of manifest.json: versions, digests of the inputs, seconds by stage, peak memory, counts."""
+    contents, before, failed = units.contents, units.finished_before, len(units.errors)
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss  # in kB on Linux, bytes on macOS
+    computed = [each for each in plan.every() if each.identity in contents]
+    counts = {"units": len(contents) + failed, "kept": before, "computed": len(contents) - before, "failed": failed}
     return {
         "schema": SCHEMA,
         "semstab": _version("semstab"),
@@ -224,10 +188,17 @@ def manifest(
         "platform": platform.platform(),
         "packages": {name: _version(name) for name in REPORTED_PACKAGES},
         "command": list(command),
-        "seed": config.dataset.options.get("seed"),
-        "inputs": dict(inputs),
-        "seconds": dict(seconds),
+        "seed": plan.config.dataset.options.get("seed"),
+        "inputs": {
+            f"{each.unit.scene}/{each.unit.backbone}": contents[each.identity].input
+            for each in computed
+            if each.variation.sweep in (BASE, REGIONS)
+        },
+        "seconds": dict(units.watch.seconds),
         "peak_memory_bytes": peak if sys.platform == "darwin" else 1024 * peak,
+        "units": counts | {"executor": executor},
+        "geometry": {scene: verdict.summary() for scene, verdict in units.geometry.items()},
+        "depth_from": {name: scene.depth_from for name, scene in plan.scenes.items() if scene.depth_from},
     }
 
 

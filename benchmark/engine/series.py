@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import dataclasses
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -28,12 +28,11 @@ FRAME_COLUMNS = (
 
 @dataclasses.dataclass(frozen=True)
 class FrameRow:
-    """One row of a unit's time series: the backend's report, what the frame itself tells, and seconds by stage.
+    """One row of a unit's time series: the backend's report, numbers of the frame itself, and seconds by stage.
 
     compensated_flicker_percent has the camera's motion removed (`ImageSpace`), NaN where that is not measured. left_out
-    counts the pixels that were left out of fusion because what they show moves; scores_left_out and
-    most_scores_left_out are the mean and the largest share of a pixel's scores that `top_k` left out. logging_seconds
-    is known once the observers have seen the row.
+    counts the pixels that were left out of fusion because they move; scores_left_out and most_scores_left_out are the
+    mean and the largest share of a pixel's scores that `top_k` left out.
     """
 
     report: FrameReport
@@ -60,21 +59,15 @@ class FrameRow:
         return {name: None if row[name] is None or row[name] != row[name] else row[name] for name in FRAME_COLUMNS}
 
 
-REPORT = ("frame", "points", "voxels", "new_voxels", "drift_sum", "seconds", "map_voxels", "map_vss", "map_entropy",
-          "map_recurrent", "association_seconds", "update_seconds")  # fmt: skip
-ROW = ("timestamp", "flicker_percent", "compensated_flicker_percent", "decode_seconds", "wait_seconds",
-       "flicker_seconds", "logging_seconds", "left_out", "scores_left_out", "most_scores_left_out")  # fmt: skip
-NUMBERS = (*REPORT, *ROW)
-"""What a row of numbers holds: fields of the report, then of the row; an undefined one is NaN."""
+REPORT, ROW = ([field.name for field in dataclasses.fields(cls)] for cls in (FrameReport, FrameRow))
+NUMBERS = (*REPORT, *ROW[1:])
+"""Columns of a row of numbers: fields of the report, then of the row; an undefined one is NaN."""
 
-INTEGERS = ("frame", "points", "voxels", "new_voxels", "map_voxels")
+INTEGERS = ("frame", "points", "voxels", "new_voxels", "map_voxels", "left_out")
 
 
 class Series:
-    """The rows of a time series, kept as numbers.
-
-    numbers  (F, C) the NUMBERS of the first ones
-    """
+    """The rows of a time series, stored as numbers; `numbers` (F, C) are the NUMBERS of the first ones."""
 
     def __init__(self, numbers: npt.ArrayLike = ()) -> None:
         self._rows = Rows(len(NUMBERS), numbers)
@@ -98,7 +91,8 @@ class Series:
 
     def append(self, row: FrameRow) -> None:
         """Add a frame."""
-        self._rows.append([*(getattr(row.report, name) for name in REPORT), *(getattr(row, name) for name in ROW)])
+        values = vars(row.report) | vars(row)
+        self._rows.append(values[name] for name in NUMBERS)
 
     def save_csv(self, path: Path, names: Callable[[int], str] = str) -> None:
         """Write FRAME_COLUMNS as text and the frames' names, with a header, atomically."""
@@ -112,17 +106,13 @@ class Series:
         return len(self._rows)
 
     def __iter__(self) -> Iterator[FrameRow]:
-        """Yield the rows in turn, each made when it is wanted."""
-        return map(_row, self._rows)
+        """Yield the rows in turn."""
+        return (self[k] for k in range(len(self)))
 
     def __getitem__(self, at: int) -> FrameRow:
         """Return a row."""
-        return _row(self._rows.row(at))
-
-
-def _row(numbers: Sequence[float]) -> FrameRow:
-    values: dict[str, Any] = dict(zip(NUMBERS, numbers, strict=True))
-    report = {name: int(values[name]) if name in INTEGERS else values[name] for name in REPORT}
-    row = {name: values[name] for name in ROW} | {"left_out": int(values["left_out"])}
-    row["timestamp"] = None if math.isnan(values["timestamp"]) else values["timestamp"]
-    return FrameRow(FrameReport(**report), **row)
+        values: dict[str, Any] = dict(zip(NUMBERS, self._rows.row(at), strict=True))
+        values |= {name: int(values[name]) for name in INTEGERS}
+        values["timestamp"] = None if math.isnan(values["timestamp"]) else values["timestamp"]
+        report = FrameReport(**{name: values.pop(name) for name in REPORT})
+        return FrameRow(report, **values)

@@ -59,14 +59,8 @@ OVERVIEW_WIDTH = 1280
 class LiveMap:
     """A work whose frames are being fused, and what goes with its map.
 
-    backend    None where nothing is fused
-    truth      takes the ground truth of the same frames
-    sampler    takes the sample of observations that statistics need
-    reference  follows a sample of its voxels, where it is checked so
-    sizes      some frames, to be fused at other voxel sizes
-    hard       of soft scores, a map of each pixel's likeliest class
-    frames     indices of those that go into it
-    tiles      (n, 3) each frame and a tile that it meets, where nothing is fused; origin the voxel of its first camera
+    backend  None where nothing is fused; truth fuses the ground truth, hard the likeliest class of soft scores
+    tiles    (n, 3) each frame and a tile that it meets, where nothing is fused; origin the voxel of its first camera
     """
 
     work: Work
@@ -176,10 +170,7 @@ _warm: set[tuple[str, str, int, bool]] = set()
 
 @dataclass(frozen=True, eq=False)
 class Decoded:
-    """A frame as its scene has it; or the error that came instead.
-
-    truth  its ground truth, where that is wanted; model  the model's frame before filters, where that is wanted
-    """
+    """A frame as its scene has it, its ground truth, the model's frame before filters; or the error of decoding it."""
 
     index: int
     frame: Frame | None = None
@@ -259,24 +250,20 @@ class Stream:
             self._poses.append(frame.T_wc[:3, 1:].ravel())
         self._previous = frame if self._sequential else None
         cut = frame.scores_left_out
-        seconds = compensated, now.fetched.seconds, now.fetched.waited, lap.seconds
-        of_frame: dict[str, Any] = {
-            "left_out": frame.left_out_pixels,
-            "scores_left_out": math.nan if cut is None else cut.mean,
-            "most_scores_left_out": math.nan if cut is None else cut.most,
-        }
-        return {live: FrameRow(own, frame.timestamp, flicker, *seconds, **of_frame) for live, own in reports.items()}
+        left_out = (frame.left_out_pixels, *((math.nan, math.nan) if cut is None else (cut.mean, cut.most)))
+        seconds = now.fetched.seconds, now.fetched.waited, lap.seconds, math.nan
+        numbers = frame.timestamp, flicker, compensated, *seconds, *left_out
+        return {live: FrameRow(report, *numbers) for live, report in reports.items()}
 
     def notify(self, now: Prepared, rows: Mapping[LiveMap, FrameRow]) -> None:
         """Show the frame to observers, and append each row to the series of its map."""
-        lap = None
+        seconds = math.nan
         if watched := {live.unit: row for live, row in rows.items() if live.work.watched}:
             with self._watch("observe") as lap:
                 self._observers.tell(lambda observer: observer.frame_fused(self.task, now.frame, watched))
+            seconds = lap.seconds / len(watched)
         for live, row in rows.items():
-            logged = lap is not None and live.work.watched
-            seconds = lap.seconds / len(watched) if logged and lap is not None else math.nan
-            live.rows.append(dataclasses.replace(row, logging_seconds=seconds))
+            live.rows.append(dataclasses.replace(row, logging_seconds=seconds) if live.work.watched else row)
             if live.work.tile is None:
                 unit = live.unit
                 what = f"{unit.scene} · {unit.backbone} · {unit.backend}"
@@ -305,7 +292,6 @@ def _as_set(frames: Iterable[int]) -> range | frozenset[int]:
 
 
 def _overview(task: Task, decoded: Frame) -> dict[str, Any]:
-    """Arrays of a frame that figures show, no wider than OVERVIEW_WIDTH."""
     frame = prepare(task, decoded, -(-decoded.shape[1] // OVERVIEW_WIDTH))
     palette = np.array(task.mapping.target.colors, dtype=np.uint8)
     arrays: dict[str, Any] = {"frame": frame.index, "labels": frame.predicted, "palette": palette}
@@ -414,19 +400,18 @@ class SizeSample:
     def add(self, frame: Frame) -> None:
         """Keep some pixels of the frame, if it is one of them."""
         if frame.index in self._indices:
-            H, W = frame.shape
-            some = frame.every(max(1, round(math.sqrt(H * W / SIZE_PIXELS))))
-            images = {name: getattr(some, name) for name in ("depth", "labels", "scores")}
-            own: dict[str, Any] = {
-                name: None if image is None else image.copy() for name, image in images.items()
-            }  # not the whole one
-            self._frames.append(dataclasses.replace(some, color=None, mask=None, left_out=None, **own))
+            some = frame.every(max(1, round(math.sqrt(math.prod(frame.shape) / SIZE_PIXELS))))
+            images = {
+                name: image.copy()
+                for name in ("depth", "labels", "scores")
+                if (image := getattr(some, name)) is not None
+            }
+            self._frames.append(dataclasses.replace(some, color=None, mask=None, left_out=None, **images))
 
     def alphas(self) -> tuple[SizeAlpha, ...]:
         """Krippendorff's alpha at each voxel size; none where the scene is larger than a map of the smallest."""
-        soft = any(frame.scores is not None for frame in self._frames)
         frames = self._frames
-        if soft:
+        if any(frame.scores is not None for frame in frames):
             frames = [frame if frame.labels is None else self._one_hot(frame, frame.labels) for frame in frames]
         try:
             return tuple(self._at(factor * self._voxel_size, frames) for factor in FACTORS) if frames else ()

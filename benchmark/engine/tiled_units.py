@@ -5,14 +5,22 @@ from __future__ import annotations
 import dataclasses
 import functools
 import operator
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
 
 from semstab.core.types import Float64
-from semstab.datasets.formats.disk import file_digest
-from semstab.engine.finish import analyse_sample, in_image_space, no_voxels, save_voxels, unit_content
+from semstab.engine.finish import (
+    Savers,
+    analyse_sample,
+    in_image_space,
+    no_voxels,
+    save_voxels,
+    unit_content,
+    unit_savers,
+    written,
+)
 from semstab.engine.folder import Folder, unit_key
 from semstab.engine.tiles import OBSERVATIONS, TileResult, joined_series
 from semstab.engine.units import PlannedUnit
@@ -21,7 +29,7 @@ from semstab.errors import SemstabError
 from semstab.metrics.agreement import together
 from semstab.metrics.summary import TableSums
 from semstab.model.parquet import tile_of
-from semstab.model.records import FRAMES, INFLUENCE, LOOKS, TRUTH, VOXELS, UnitContent
+from semstab.model.records import TRUTH, VOXELS, UnitContent
 from semstab.model.voxels import VoxelTable
 from semstab.statistics import Analysis, CellObservations, MapSample
 from semstab.statistics.sample import MOST_VOXELS
@@ -30,11 +38,14 @@ GUESS = 4
 """Tiles that a unit is expected to have, for the progress, until they are known."""
 
 UP_VOXELS = 1 << 20
-"""Of more voxels every n-th tells the up axis."""
+"""The up axis of more voxels is estimated from every n-th."""
+
+TileFrames = tuple[TileTask, list[int] | None]
+"""A tile and the frames that meet it; of the pass over all frames None."""
 
 
 class TiledUnit:
-    """A unit while its tiles are computed: first a pass over its frames, which tells which of them see which tile.
+    """A unit while its tiles are computed: first a pass over its frames, which gives the frames of each tile.
 
     The results of an earlier start are taken over where they are as they were.
     """
@@ -46,8 +57,8 @@ class TiledUnit:
         self._results: dict[str, TileResult] = {}
         self._samples: list[MapSample] = []
         self._bound: int | None = None
-        self._tiles: dict[str, tuple[TileTask, list[int] | None]] | None = None
-        self._waiting: list[tuple[TileTask, list[int] | None]] = [(self._frames, None)]
+        self._tiles: dict[str, TileFrames] | None = None
+        self._waiting: list[TileFrames] = [(self._frames, None)]
         self._advanced, self._failed = 0, False
         if self._take_over(self._frames):
             self._waiting = self._begin_tiles()
@@ -88,7 +99,7 @@ class TiledUnit:
         tiles = {task: self._results[name] for name, (task, _) in self._tiles.items()}
         sample = MapSample.merged(self._samples) if self._samples else None
         try:
-            content = assembled(self.planned, self._results[self._frames.name], tiles, sample, self._folder.path)
+            content = assembled(self.planned, self._results[self._frames.name], tiles, sample, self._work.start)
         except SemstabError as error:
             return failed([self._work], error)[0]
         return Outcome(self.planned.identity, content)
@@ -100,15 +111,14 @@ class TiledUnit:
         step, self._advanced = max(0, reached - self._advanced), max(reached, self._advanced)
         return step
 
-    def _begin_tiles(self) -> list[tuple[TileTask, list[int] | None]]:
+    def _begin_tiles(self) -> list[TileFrames]:
         """The tiles that are still to be computed; files of the unit that belong to none of them are removed."""
         frames = self._results[self._frames.name]
-        tasks: list[tuple[TileTask, list[int] | None]] = [
-            (dataclasses.replace(self._frames, place=place, origin=frames.origin), own)
-            for place, own in frames.tiles().items()
-        ]
-        self._tiles = {task.name: (task, own) for task, own in tasks}
-        waiting: list[tuple[TileTask, list[int] | None]] = [own for own in tasks if not self._take_over(own[0])]
+        self._tiles = {}
+        for place, own in frames.tiles().items():
+            task = dataclasses.replace(self._frames, place=place, origin=frames.origin)
+            self._tiles[task.name] = task, own
+        waiting = [own for own in self._tiles.values() if not self._take_over(own[0])]
         self._folder.clear(self.planned, {name for result in self._results.values() for name in result.files})
         return waiting
 
@@ -131,10 +141,10 @@ def assembled(
     frames: TileResult,
     results: Mapping[TileTask, TileResult],
     sample: MapSample | None,
-    folder: Path,
+    start: Start,
 ) -> UnitContent:
-    """The content of a unit, from the results of its frames and tiles. Raises DataError where no pixel was valid."""
-    tasks, tiles = [*results], [*results.values()]
+    """Return the content of a unit from its frames and tiles. Raises DataError where no pixel was valid."""
+    tasks, tiles, folder = [*results], [*results.values()], start.folder
     task, config, unit = planned.task, planned.config, planned.unit
     sums = functools.reduce(operator.add, (TableSums.read(tile.sums) for tile in tiles)) if tiles else None
     if sums is None or not sums.total[2]:
@@ -149,14 +159,11 @@ def assembled(
     files = {name: digest for each in (frames, *tiles) for name, digest in each.files.items()}
     files = {name: digest for name, digest in files.items() if not name.startswith(tasks[0].folder)}
     if planned.kept:
-        save_rows = functools.partial(rows.save_csv, names=task.scene.frame_name)
-        files |= _saved(folder, f"{FRAMES}/{unit.slug}.csv", save_rows)
-        if observations is not None:
-            files |= _saved(folder, f"{LOOKS}/{unit.slug}.parquet", observations.save)
-        if analysis is not None:
-            files |= _saved(folder, f"{INFLUENCE}/{unit.slug}.parquet", analysis.sums.save)
-            for each in tasks if config.statistics else ():
-                files |= _with_columns(each, unit.slug, analysis, folder)
+        savers = unit_savers(task, rows, observations, analysis)
+        if config.statistics and analysis is not None:
+            for each in tasks:
+                savers |= _with_columns(each, unit.slug, analysis, folder)
+        files |= written(start, savers)[0]
     reduced = [tile.reduced for tile in tiles if len(tile.reduced)]
     checked = [tile.checked for tile in tiles if tile.checked is not None]
     result = dataclasses.replace(
@@ -174,25 +181,18 @@ def assembled(
     return in_image_space(content, task, result, centers)
 
 
-def _with_columns(task: TileTask, slug: str, analysis: Analysis, folder: Path) -> dict[str, str]:
-    """Write the voxels of a tile once more, with the columns of the statistics; the digest of the file."""
+def _with_columns(task: TileTask, slug: str, analysis: Analysis, folder: Path) -> Savers:
+    """The file of a tile's voxels, once more with the columns of the statistics."""
     assert task.place is not None
     waiting = folder / task.folder / VOXELS / f"tile={task.place[0]}_{task.place[1]}.parquet"
-    if not waiting.exists():
-        return {}
-    table, truth = VoxelTable.load(waiting), None
-    for path in (folder / TRUTH / slug, folder / task.folder / TRUTH):
-        if (path / waiting.name).exists():
-            truth = VoxelTable.load(path / waiting.name)
-    columns, tile = analysis.columns(table, truth), tile_of(waiting)
-    return _saved(
-        folder, f"{VOXELS}/{slug}/{waiting.name}", functools.partial(save_voxels, table, columns=columns, tile=tile)
-    )
 
+    def save(path: Path) -> None:
+        truths = (folder / TRUTH / slug / waiting.name, folder / task.folder / TRUTH / waiting.name)
+        truth = next((VoxelTable.load(file) for file in truths if file.exists()), None)
+        table = VoxelTable.load(waiting)
+        save_voxels(table, path, analysis.columns(table, truth), tile_of(waiting))
 
-def _saved(folder: Path, name: str, save: Callable[[Path], None]) -> dict[str, str]:
-    save(folder / name)
-    return {name: file_digest(folder / name).hex()}
+    return {f"{VOXELS}/{slug}/{waiting.name}": save} if waiting.exists() else {}
 
 
 def _centers(files: Sequence[Path], voxel_size: float, step: int) -> Float64:

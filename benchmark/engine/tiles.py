@@ -21,8 +21,8 @@ from semstab.model.frames import Frame
 from semstab.model.records import FrameQuality
 from semstab.model.results import Agreement, SizeAlpha
 
-OBSERVATIONS, TRUE_OBSERVATIONS = "observations.parquet", "true_observations.parquet"
-"""Files of the sample of observations of all frames, and of their ground truth."""
+OBSERVATIONS = "observations.parquet"
+"""File of the sample of observations of all frames."""
 
 MOST_TILES = 1 << 16
 """Tiles that one frame may meet."""
@@ -45,7 +45,8 @@ def tiles_met(frame: Frame, voxel_size: float, size: int) -> Int32:
     x, y = (u - camera.cx) / camera.fx * d, (v - camera.cy) / camera.fy * d
     rays = np.stack([x, y, d], axis=-1, dtype=np.float64).reshape(-1, 3)
     corners = ((rays @ frame.T_wc[:3, :3].T + frame.T_wc[:3, 3]) / voxel_size)[:, :2]
-    low, high = (np.floor((edge + side) / size) for edge, side in _ranges(corners))
+    low = np.floor((corners.min(axis=0) - MARGIN) / size)
+    high = np.floor((corners.max(axis=0) + MARGIN) / size)
     if (count := float(np.prod(high - low + 1))) > MOST_TILES:
         raise DataError(
             f"{frame.where('depth')}: up to {depth.max():g} m deep, it sees {count:.0f} tiles of"
@@ -60,10 +61,6 @@ def tiles_met(frame: Frame, voxel_size: float, size: int) -> Int32:
     apart = (centre + reach < along.min(axis=0)) | (centre - reach > along.max(axis=0))
     met: Int32 = tiles[~apart.any(axis=1)].astype(np.int32)
     return met
-
-
-def _ranges(corners: Float64) -> tuple[tuple[Float64, float], tuple[Float64, float]]:
-    return (corners.min(axis=0), -MARGIN), (corners.max(axis=0), MARGIN)
 
 
 @dataclass(frozen=True, eq=False)

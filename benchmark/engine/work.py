@@ -23,12 +23,9 @@ FRAMES = "frames"
 
 @dataclass(frozen=True)
 class Start:
-    """What all works of one start of a run share.
+    """A start of a run: its name, the run's folder, the processes that share the machine (width).
 
-    name     by which a worker opens the dataset once, and knows the folder
-    folder   of the run or study
     threads  that decode frames ahead; 0: each when it is wanted, None: as many as the machine has for it
-    width    processes that share the machine's memory
     """
 
     name: str
@@ -74,8 +71,8 @@ class TileTask:
         """The voxels of the tile."""
         if self.place is None:
             return None
-        low = (self.place[0] * self.size, self.place[1] * self.size)
-        return Extent(low, (low[0] + self.size, low[1] + self.size), self.origin)
+        x, y = (corner * self.size for corner in self.place)
+        return Extent((x, y), (x + self.size, y + self.size), self.origin)
 
 
 @dataclass(frozen=True)
@@ -111,10 +108,8 @@ class Work:
 
     def in_tile(self, tile: TileTask, frames: Sequence[int] | None = None) -> Work:
         """The same of one tile and these frames alone."""
-        if frames is None:
-            return replace(self, tile=tile)
-        config = self.config.model_copy(update={"frames": FrameSelection.of(as_range(frames))})
-        return replace(self, config=config, tile=tile)
+        selection = {} if frames is None else {"frames": FrameSelection.of(as_range(frames))}
+        return replace(self, config=self.config.model_copy(update=selection), tile=tile)
 
     @property
     def fuses(self) -> bool:
@@ -143,7 +138,7 @@ Job = tuple[Work, ...]
 
 @dataclass(frozen=True)
 class Outcome:
-    """What became of a work: what its file holds, or the one line that says why there is none.
+    """The outcome of a work: the content of its file, or the one line that says why there is none.
 
     tile     name of the tile that was computed, or could not be
     files    further files by their path in the folder, where the worker does not see that folder
@@ -174,12 +169,14 @@ def failed(works: Iterable[Work], error: str | Exception) -> list[Outcome]:
         trace = "" if isinstance(error, SemstabError) else "".join(traceback.format_exception(error))
         if isinstance(error, (OutgrownError, MemoryError)):
             error = error.with_traceback(None)  # its frames would keep the map in memory
-        cause, error = error, str(error) if isinstance(error, SemstabError) else _one_line(error)
+        cause, error = error, _one_line(error)
     tiles = [(work.identity, None if work.tile is None else work.tile.name) for work in works]
     return [Outcome(own, tile=tile, error=error, cause=cause, trace=trace) for own, tile in tiles]
 
 
 def _one_line(error: Exception) -> str:
+    if isinstance(error, SemstabError):
+        return str(error)
     return OUT_OF_MEMORY if isinstance(error, MemoryError) else f"{type(error).__name__}: {summarize_error(error)}"
 
 
