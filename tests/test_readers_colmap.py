@@ -346,11 +346,7 @@ def test_what_the_guess_gets_wrong_is_said_by_options(tmp_path):
         ({"depth": "../{name}"}, ConfigError, "depth: .*leaves its folder"),
         ({"images": "images/x.png"}, ConfigError, r"images: .*needs \{name\}"),
         ({"model": "../.."}, DataError, r"the options of uavid3d: the path '../..' leaves"),
-        (
-            {"pose_format": "matrix", "pose": "nowhere/{name}.txt"},
-            DataError,
-            "no scene here.*options pose_format, pose",
-        ),
+        ({"pose_format": "matrix", "pose": "no/{name}.txt"}, DataError, "no scene here.*options pose_format, pose"),
         ({"pose_format": "transforms"}, DataError, "no scene here.*transforms.json"),
     ],
 )
@@ -450,6 +446,6 @@ def test_images_in_several_folders_have_names_with_folders(tmp_path):
         entries.append({"file_path": f"images\\cam{k}\\1.v2.png", "transform_matrix": T} | ds.camera_json(frame))
     (tmp_path / "transforms.json").write_text(json.dumps({"frames": entries}))
     scene = ds.opened(NERF, tmp_path, depth="depth/{name}.png")
-    found = [scene.frame(k, "net") for k in range(2)]
-    ds.assert_same_voxels(found, frames)
-    assert found[1].files["labels"] == f"{tmp_path}/labels/net/cam1/1.v2.png"
+    read = [scene.frame(k, "net") for k in range(2)]
+    ds.assert_same_voxels(read, frames)
+    assert read[1].files["labels"] == f"{tmp_path}/labels/net/cam1/1.v2.png"

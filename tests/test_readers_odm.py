@@ -193,13 +193,13 @@ def test_topocentric_cameras_lie_about_the_reference_of_opensfm(tmp_path) -> Non
     assert georeference.offset == (0, 0, 180)
     crs = "+proj=pipeline +step +proj=cart +ellps=WGS84 +step +proj=topocentric +ellps=WGS84"
     topocentric = Transformer.from_pipeline(f"{crs} +lat_0=46.84 +lon_0=-91.99 +h_0=180")
-    places = np.array([[0.0, 0, 0], [500, -300, 20], [-900, 900, 45]])
+    points = np.array([[0.0, 0, 0], [500, -300, 20], [-900, 900, 45]])
     longitude, latitude = Transformer.from_crs(CRS.from_wkt(georeference.crs), 4326, always_xy=True).transform(
-        places[:, 0], places[:, 1]
+        points[:, 0], points[:, 1]
     )
-    found = np.stack(topocentric.transform(longitude, latitude, places[:, 2] + 180), axis=1)
-    np.testing.assert_allclose(found, places, atol=0.15)  # of which 0.13 m are the Earth's curvature, up
-    np.testing.assert_allclose(found[:, :2], places[:, :2], atol=0.05)
+    back = np.stack(topocentric.transform(longitude, latitude, points[:, 2] + 180), axis=1)
+    np.testing.assert_allclose(back, points, atol=0.15)  # of which 0.13 m are the Earth's curvature, up
+    np.testing.assert_allclose(back[:, :2], points[:, :2], atol=0.05)
 
 
 def test_cameras_far_from_the_positions_of_the_project_are_pointed_out(tmp_path, caplog) -> None:
@@ -292,14 +292,13 @@ def test_models_predict_on_the_photograph_and_its_colour_is_shown_undistorted(tm
     frame = scene.frame(0, "net")
     inner = (slice(20, 40), slice(30, 60))
     assert np.abs(frame.color[inner].astype(int) - photograph[inner]).mean() > 20
-    live = scene.predicted(0, labels=cv2.imread(str(folder / f"labels/net/{NAMES[2]}.png"), -1))
+    ids = cv2.imread(str(folder / f"labels/net/{NAMES[2]}.png"), -1)
+    live = scene.predicted(0, labels=ids)
     np.testing.assert_array_equal(live.labels, frame.labels)
     assert "color" not in frame.files
     flat = opened(folder, labels_on="undistorted")
     np.testing.assert_array_equal(flat.image(0), frame.color)
-    np.testing.assert_array_equal(
-        flat.frame(0, "net").labels, cv2.imread(str(folder / f"labels/net/{NAMES[2]}.png"), -1)
-    )
+    np.testing.assert_array_equal(flat.frame(0, "net").labels, ids)
 
 
 def test_scores_of_distorted_photographs_are_mixed_with_any_number_of_classes(tmp_path) -> None:
@@ -310,9 +309,9 @@ def test_scores_of_distorted_photographs_are_mixed_with_any_number_of_classes(tm
         path.parent.mkdir(parents=True, exist_ok=True)
         np.save(path, scores.transpose(2, 0, 1))
     scene = opened(folder, classes=[f"c{k}" for k in range(9)])
-    found = scene.frame(0, "soft-scores").scores
-    assert found.shape == (*BIG[::-1], 9)
-    np.testing.assert_allclose(found.astype(float).sum(axis=2)[20:40, 30:60], 1, atol=5e-3)
+    mixed = scene.frame(0, "soft-scores").scores
+    assert mixed.shape == (*BIG[::-1], 9)
+    np.testing.assert_allclose(mixed.astype(float).sum(axis=2)[20:40, 30:60], 1, atol=5e-3)
 
 
 def test_what_a_lens_folds_over_has_no_label(tmp_path) -> None:
