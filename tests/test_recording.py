@@ -23,8 +23,8 @@ from semstab.backends.numba_hash import NumbaHash
 from semstab.config import Config
 from semstab.engine import Observer
 from semstab.engine.series import FrameRow
-from semstab.engine.units import Plan, PlannedUnit
-from semstab.errors import ConfigError
+from semstab.engine.units import Plan, PlannedUnit, make_plan
+from semstab.errors import ConfigError, DataError
 from semstab.model.frames import Frame, Intrinsics
 from semstab.model.labels import LabelSpace
 from semstab.model.measures import measures
@@ -43,7 +43,7 @@ from semstab.recording import (
     voxel_maps,
 )
 from semstab.recording.layout import Legend, SceneBounds, direction, fit
-from semstab.recording.timeline import OF_THE_BACKBONE, Clock
+from semstab.recording.timeline import OF_THE_BACKBONE, Clock, log_file
 from semstab.task import Task
 
 NANOSECONDS = 1_000_000_000
@@ -499,3 +499,11 @@ def test_a_map_that_is_too_large_is_thinned_and_says_so(tmp_path, monkeypatch) -
 def test_timestamps_of_any_unit_are_taken(stamp):
     """In other units than seconds, as some datasets have them, frames are shown by their number."""
     Clock().set(rr.RecordingStream("clock"), 3, stamp)
+
+
+@pytest.mark.parametrize("frame", ["x", str(10**30)])
+def test_a_damaged_series_is_one_line(run, tmp_path, frame) -> None:
+    task, file = make_plan(config_of(run.parent / "data/wall")).tasks[0], tmp_path / "series.csv"
+    file.write_text(f"frame,timestamp,drift\n{frame},,0.5\n")
+    with pytest.raises(DataError, match="not a time series of a run"):
+        log_file(rr.RecordingStream("damaged"), task.units[0], task, file, Clock())

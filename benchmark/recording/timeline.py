@@ -144,10 +144,10 @@ def read_rows(file: Path) -> list[tuple[int, float | None, dict[str, str]]]:
 def log_file(stream: rr.RecordingStream, unit: Unit, task: Task, file: Path, clock: Clock) -> None:
     """Log a unit's time series from its CSV. Raises DataError where it is damaged."""
     for frame, timestamp, cells in read_rows(file):
-        clock.set(stream, frame, timestamp)
         try:
+            clock.set(stream, frame, timestamp)
             log_row(stream, unit, task, cells)
-        except (LookupError, TypeError, ValueError) as error:
+        except (LookupError, TypeError, ValueError, OverflowError) as error:
             raise _damaged(file, error) from error
 
 
