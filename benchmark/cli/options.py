@@ -54,13 +54,18 @@ taxonomies, studies = _listed("model.labels", "shipped_taxonomies"), _listed("se
 scenes, label_sources = _beginning(lambda ctx: [*_opened(ctx).scenes, "all"]), _beginning(_label_sources)
 
 
+SETTINGS, LABELS, CHECKS, MACHINE = "Settings", "Labels", "Checks", "Machine"
+"""Panels of the help beneath that of the options which most people need."""
+
 # fmt: off
-ConfigFile = Annotated[Path | None, typer.Option("--config", "-c", help="YAML file with settings.")]
+ConfigFile = Annotated[Path | None, typer.Option("--config", "-c", help="YAML file with settings.",
+    rich_help_panel=SETTINGS)]
 DataFolder = Annotated[Path | None, typer.Option(help="Folder of scenes in posed_folder layout, or one scene.")]
 DatasetOptions = Annotated[list[str] | None, typer.Option(
-    "--option", metavar="KEY=VALUE", help="Option of the dataset, short for --set dataset.options.KEY=VALUE.")]
+    "--option", metavar="KEY=VALUE", help="Option of the dataset, short for --set dataset.options.KEY=VALUE.",
+    rich_help_panel=SETTINGS)]
 DatasetSettings = Annotated[list[str] | None, typer.Option(
-    "--set", metavar="KEY=VALUE", help="Any setting, e.g. dataset.options.depth_scale=5000.")]
+    "--set", metavar="KEY=VALUE", help="Any setting, e.g. dataset.options.depth_scale=5000.", rich_help_panel=SETTINGS)]
 DatasetName = Annotated[str | None, typer.Option(
     help="Dataset, as named by `semstab-bench list`.", show_default="posed_folder with --data, else city",
     autocompletion=datasets)]
@@ -73,30 +78,35 @@ Models = Annotated[list[str] | None, typer.Option(
     "--predict", metavar="NAME[,KEY=VALUE...]",
     help="Model that makes the labels, nothing on disk: a name of `list`, FILE.py:NAME; repeatable.")]
 Classes = Annotated[str | None, typer.Option(
-    metavar="A,B,C|FILE", help="Names of the model's classes by id, where it does not say them.")]
+    metavar="A,B,C|FILE", help="Names of the model's classes by id, where it does not say them.",
+    rich_help_panel=LABELS)]
 Filters = Annotated[list[str] | None, typer.Option(
     "--filter", metavar="NAME:NUMBER", autocompletion=filters,
-    help="Filter over the labels: ema:0.6, vote:5, ... (`list`); repeatable, in this order.")]
+    help="Filter over the labels: ema:0.6, vote:5, ... (`list`); repeatable, in this order.", rich_help_panel=LABELS)]
 VoxelSize = Annotated[float | None, typer.Option(
     help="Edge of a voxel, metres.", show_default="what `check` suggests; city: 0.2")]
 Frames = Annotated[str | None, typer.Option(
     metavar="START:STOP:STRIDE", help="Frames, as a Python slice.", show_default="all")]
 TrustGeometry = Annotated[bool, typer.Option(
-    "--no-geometry-check", help="Fuse also where depth and poses contradict each other.")]
+    "--no-geometry-check", help="Fuse also where depth and poses contradict each other.", rich_help_panel=CHECKS)]
 Rerun = Annotated[str | None, typer.Option(
     metavar="FILE|spawn|connect|URL|serve|off", show_default="OUT/recording.rrd; of a study off",
     help="Recording: a file, and a viewer to start, to connect to, or to serve.")]
-Report = Annotated[str, typer.Option(metavar="on|off", help="Write tables, figures and report.html.")]
+Report = Annotated[str, typer.Option(metavar="on|off", help="Write tables and report.html.",
+    rich_help_panel=SETTINGS)]
 Jobs = Annotated[int, typer.Option("--jobs", "-j", min=1, help="Local processes.")]
 Scheduler = Annotated[str | None, typer.Option(
-    metavar="URL", help="Dask scheduler to run on, e.g. tcp://HOST:PORT.", show_default="none")]
+    metavar="URL", help="Dask scheduler to run on, e.g. tcp://HOST:PORT.", show_default="none",
+    rich_help_panel=MACHINE)]
 TileSize = Annotated[str | None, typer.Option(
     metavar="N|off", show_default="where a map would not fit",
-    help="Fuse maps tile by tile, N voxels wide (a power of 2); off: refuse what does not fit in memory.")]
-Verbose = Annotated[bool, typer.Option("--verbose", "-v", help="Also print every table.")]
+    help="Fuse maps tile by tile, N voxels wide (a power of 2); off: refuse what does not fit in memory.",
+    rich_help_panel=MACHINE)]
+Verbose = Annotated[bool, typer.Option("--verbose", "-v", help="Also print every table.", rich_help_panel=SETTINGS)]
 ScopeOption = Annotated[str | None, typer.Option(
     "--scope", metavar="these-frames|this-scene|other-scenes", show_default="this-scene",
-    help="Population of intervals: these very frames, this scene flown again, or other scenes like it.")]
+    help="Population of intervals: these very frames, this scene flown again, or other scenes like it.",
+    rich_help_panel=SETTINGS)]
 Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Print nothing but errors.")]
 # fmt: on
 

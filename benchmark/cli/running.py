@@ -36,26 +36,30 @@ def run(
     backbone: opt.Backbones = None,
     taxonomy: Annotated[str | None, typer.Option(
         help="Taxonomy to fuse in: a name or a YAML file.", show_default="the dataset's; city: uavid7",
-        autocompletion=opt.taxonomies,
-    )] = None,
+        autocompletion=opt.taxonomies, rich_help_panel=opt.SETTINGS)] = None,
     voxel_size: opt.VoxelSize = None,
     pixel_stride: Annotated[int | None, typer.Option(
-        help="Use every n-th pixel of each axis.", show_default="1")] = None,
+        help="Use every n-th pixel of each axis.", show_default="1", rich_help_panel=opt.SETTINGS)] = None,
     top_k: Annotated[int | None, typer.Option(
-        "--top-k", help="Fuse the so many largest soft scores of each pixel.", show_default="all")] = None,
+        "--top-k", help="Fuse the so many largest soft scores of each pixel.", show_default="all",
+        rich_help_panel=opt.SETTINGS)] = None,
     frames: opt.Frames = None,
     device: Annotated[str | None, typer.Option(
-        help="CPU:0, or CUDA:0 for backends that take a device.", show_default="the backend's own")] = None,
+        help="CPU:0, or CUDA:0 for backends that take a device.", show_default="the backend's own",
+        rich_help_panel=opt.MACHINE)] = None,
     check: Annotated[str | None, typer.Option(
         metavar="sample|BACKEND|none", show_default="sample; of the built-in city numpy",
         help="Check voxel by voxel against the numpy reference on a random sample, or against a backend on all.",
-    )] = None,
-    seed: Annotated[int | None, typer.Option(help="Seed of a simulated dataset.", show_default="0")] = None,
+        rich_help_panel=opt.CHECKS)] = None,
+    seed: Annotated[int | None, typer.Option(help="Seed of a simulated dataset.", show_default="0",
+    rich_help_panel=opt.SETTINGS)] = None,
     settings: Annotated[list[str] | None, typer.Option(
-        "--set", metavar="KEY=VALUE", help="Any setting, e.g. dataset.options.width=640.")] = None,
+        "--set", metavar="KEY=VALUE", help="Any setting, e.g. dataset.options.width=640.",
+        rich_help_panel=opt.SETTINGS)] = None,
     options: opt.DatasetOptions = None,
     trust_geometry: opt.TrustGeometry = False,
-    events: Annotated[bool | None, typer.Option("--events", help="Also write the log of observations.")] = None,
+    events: Annotated[bool | None, typer.Option("--events", help="Also write the log of observations.",
+    rich_help_panel=opt.SETTINGS)] = None,
     statistics: Annotated[bool | None, typer.Option(
         "--statistics", help="Also test drift, judge by ground truth, compare backbones; takes longer.")] = None,
     scope: opt.ScopeOption = None,
