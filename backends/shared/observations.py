@@ -134,12 +134,13 @@ class Change:
         """
         known = op > 1
         before, after = np.asfortranarray(before), np.asfortranarray(after)  # sums over few classes run along n
-        p_after, p_before = normalise(after), normalise(before.T[:, known].T)
+        p_after, p_before, drift = normalise(after), normalise(before.T[:, known].T), np.zeros(len(op))
+        drift[known] = js_divergence(p_after.T[:, known].T, p_before)
         return cls(
             points=int(pixels.sum()),
             voxels=len(op),
             new=int(np.count_nonzero(~known)),
-            drift=float(js_divergence(p_after.T[:, known].T, p_before).sum()),
+            drift=float(drift.sum()),
             vss=float(p_after.max(axis=1).sum() - p_before.max(axis=1).sum()),
             entropy=float(entropy_bits(p_after).sum() - entropy_bits(p_before).sum()),
             recurrent=int(np.count_nonzero(op == RECURRENT)),
