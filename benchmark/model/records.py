@@ -177,12 +177,6 @@ class Record:
         return None if self.voxels_file is None else self.voxels_file.parents[1] / folder / f"{self.unit.slug}{suffix}"
 
 
-def voxels_of(folder: Path, unit: Unit) -> Path:
-    """Where a run's folder has the voxels of a unit: in a file, or in a folder of tiles."""
-    tiles = folder / VOXELS / unit.slug
-    return tiles if tiles.is_dir() else folder / VOXELS / f"{unit.slug}.parquet"
-
-
 class Tables:
     """Voxel tables of records, the last few of them at hand: those that belong together are asked for together."""
 

@@ -32,7 +32,7 @@ RARE = 100
 """Voxels below which a class is too rare to be called unstable."""
 
 MOST_CLASSES = {1: 5, 2: 3}
-"""How many of the least stable classes are listed by the number of models; 1 of more models."""
+"""How many of the least stable classes of a model are listed by the number of rows above; 1 beneath more rows."""
 
 MOST_WARNINGS = 3
 STAGE_NAMES = {"read": "reading", "reference": "check", "voxel sizes": "other voxel sizes", "write": "writing"}
@@ -225,7 +225,7 @@ def _number(value: float, digits: int) -> str:
 def _classes(records: Sequence[Record]) -> Iterator[str]:
     """The classes on which frames agree least, of those that cover enough of the map."""
     names = list(dict.fromkeys(record.unit.backbone for record in records))
-    most, alone = MOST_CLASSES.get(len(names), 1), len(names) == 1
+    most, alone = MOST_CLASSES.get(len(records), 1), len(names) == 1
     lines = []
     for name in names:
         alphas = class_alphas([record for record in records if record.unit.backbone == name])
