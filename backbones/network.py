@@ -230,6 +230,8 @@ class NetworkFile(Backbone):
             full = cv2.resize(small, shape[::-1], interpolation=cv2.INTER_NEAREST_EXACT)
             return Prediction(narrowed(np.asarray(full), K))
         maps = np.asarray(self._map(output, (K,)), dtype=np.float32)
+        if np.isnan(maps).any():
+            raise DataError(f"{self._path}: gave {gives} that are NaN; mend scale, mean, std or precision")
         labels = largest(maps, shape)
         if not scores:
             return Prediction(narrowed(labels, K))

@@ -186,3 +186,11 @@ def test_files_and_options_that_cannot_be_used(folder, net, monkeypatch, name, o
     with pytest.raises((ConfigError, DataError), match=message) as caught:
         create(name, **options).predict([IMAGE])
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("scores", [True, False])
+def test_logits_that_are_no_numbers_are_named(tmp_path, net, scores):
+    path = save_onnx(tmp_path / "logs.onnx", net, after=[helper.make_node("Log", ["logits"], ["logs"])], gives="logs")
+    model = create(str(path), classes=CLASSES, mean=MEAN, std=STD)
+    with pytest.raises(DataError, match=r"logs.onnx: gave logits that are NaN"):
+        model.predict([IMAGE], scores=scores)

@@ -153,6 +153,11 @@ def regions(proposals, min_area):
     return region_map(proposals.by_area(min_area), proposals.shape)
 
 
+def test_of_equal_masks_the_better_one_lies_below():
+    proposals = proposals_of([[0, 1, 1]], [[1, 1, 0]], scores=[0.9, 0.95])
+    assert regions(proposals, 1).tolist() == [[1, 2, 2]]
+
+
 def test_smaller_masks_are_painted_over_larger_ones():
     proposals = proposals_of([[0, 1, 1, 0]], [[1, 1, 1, 0]], [[0, 0, 1, 0]])
     assert regions(proposals, 1).tolist() == [[1, 2, 3, 0]]
