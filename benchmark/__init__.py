@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from semstab.model.frames import Frame, Intrinsics
     from semstab.model.labels import LabelSpace
     from semstab.model.voxels import VoxelTable
+    from semstab.online import FusedResult, TemporalStability, fuse
     from semstab.report.loaded import load
     from semstab.settings import load_config, load_study
     from semstab.statistics.acceptance import AcceptanceThresholds
@@ -26,10 +27,10 @@ if TYPE_CHECKING:
 __version__ = "0.4.0"
 
 __all__ = [
-    "AcceptanceThresholds", "Belief", "Config", "ConfigError", "DataError", "Events", "Frame", "GateConfig",
-    "Intrinsics", "LabelSpace", "MissingDependencyError", "SemstabError", "VoxelTable", "backbones", "backends",
-    "compare", "datasets", "engine", "export", "gate", "load", "load_config", "load_result", "load_study", "metrics",
-    "relabel", "run", "run_study", "statistics",
+    "AcceptanceThresholds", "Belief", "Config", "ConfigError", "DataError", "Events", "Frame", "FusedResult",
+    "GateConfig", "Intrinsics", "LabelSpace", "MissingDependencyError", "SemstabError", "TemporalStability",
+    "VoxelTable", "backbones", "backends", "compare", "datasets", "engine", "export", "fuse", "gate", "load",
+    "load_config", "load_result", "load_study", "metrics", "relabel", "run", "run_study", "statistics",
 ]  # fmt: skip
 
 _HOMES = {
@@ -37,7 +38,8 @@ _HOMES = {
     "ConfigError": "errors", "DataError": "errors", "Events": "model.events", "Frame": "model.frames",
     "GateConfig": "comparison.gate", "Intrinsics": "model.frames", "LabelSpace": "model.labels",
     "MissingDependencyError": "errors", "SemstabError": "errors", "VoxelTable": "model.voxels",
-    "compare": "comparison.writing", "export": "exports", "gate": "comparison.gate", "load": "report.loaded",
+    "FusedResult": "online", "TemporalStability": "online", "compare": "comparison.writing", "fuse": "online",
+    "export": "exports", "gate": "comparison.gate", "load": "report.loaded",
     "load_config": "settings", "load_result": "engine.folder", "load_study": "settings", "relabel": "exports.relabel",
     "run": "api", "run_study": "api",
 }  # fmt: skip

@@ -20,6 +20,7 @@ REGISTRY = Registry(
             "semstab.predict.live:PredictedDataset",
             "another dataset with labels that models make while it is fused: `run --predict`",
         ),
+        "frames": Entry("semstab.online.frames:Frames", "frames that a Python program gives to `semstab.fuse`"),
         "city": Entry(
             "semstab.datasets.city:City",
             "the built-in scene: a simulated UAV flight over a procedural city, with simulated backbones",

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -273,7 +274,7 @@ class ComparisonData:
 
 
 def find(
-    runs: Sequence[str | Path], progress: Progress = lambda what: None, scope: Scope = THIS_SCENE
+    runs: Sequence[str | os.PathLike[str]], progress: Progress = lambda what: None, scope: Scope = THIS_SCENE
 ) -> ComparisonData:
     """Compare runs with the first one for a scope; `progress` is told what is done.
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import os
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -369,7 +370,7 @@ class GateResult:
         return "undecided" if undecided else "passes"
 
 
-def gate(new: str | Path, against: str | Path | None, config: GateConfig) -> GateResult:
+def gate(new: str | os.PathLike[str], against: str | os.PathLike[str] | None, config: GateConfig) -> GateResult:
     """Judge a run, or 'FOLDER:BACKBONE', by rules; those on a drop or a rise need a baseline, a run or a small summary.
 
     Raises ConfigError and DataError, each with the rule or the folder, and what to do.

@@ -11,6 +11,7 @@ import functools
 import io
 import json
 import math
+import os
 import tempfile
 import zipfile
 import zlib
@@ -124,7 +125,7 @@ class RunHandle:
     scenes: Mapping[str, Entry]
 
 
-def open_runs(named: Sequence[str | Path]) -> tuple[RunHandle, ...]:
+def open_runs(named: Sequence[str | os.PathLike[str]]) -> tuple[RunHandle, ...]:
     """Open folders of runs or studies, 'FOLDER:BACKBONE', and small summaries, under the shortest distinct names.
 
     Raises ConfigError or DataError as `open_run` does.
@@ -139,12 +140,12 @@ def open_runs(named: Sequence[str | Path]) -> tuple[RunHandle, ...]:
     return tuple(replace(run, name=name) for run, name in zip(runs, names, strict=True))
 
 
-def open_run(named: str | Path) -> RunHandle:
+def open_run(named: str | os.PathLike[str]) -> RunHandle:
     """Open a run's only label source, or the one that 'FOLDER:BACKBONE' selects, at the base settings and backend.
 
     Raises ConfigError where there is no such folder or label source, or several; DataError where it is damaged.
     """
-    text = str(named)
+    text = os.fspath(named)
     start, _, wanted = text.rpartition(":")
     if Path(text).exists() or not start:
         start, wanted = text, ""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
@@ -107,7 +108,7 @@ KIND = "Changes"
 
 
 def compare(
-    runs: Sequence[str | Path],
+    runs: Sequence[str | os.PathLike[str]],
     out: str | Path | None = None,
     *,
     scope: str = THIS_SCENE,

@@ -82,7 +82,7 @@ class Frame:
     index       number in the sequence
     depth       (H, W) float32, metres along the optical axis (planar z); 0, negative, NaN and inf are invalid
     intrinsics  of the depth image; or its 3x3 camera matrix
-    T_wc        (4, 4) float64 camera-to-world, metres; camera axes x right, y down, z forward (OpenCV)
+    T_wc        (4, 4) or (3, 4) float64 camera-to-world, metres; camera axes x right, y down, z forward (OpenCV)
     labels      (H, W) uint8 or uint16 class ids, ignore id 255 or 65535; other integers become the smaller one; or
     scores      (H, W, K) float, non-negative; normalised per pixel where they are used
     color       (H, W, 3) uint8 RGB, optional
@@ -210,8 +210,10 @@ class Frame:
     def _checked_pose(self) -> Float64:
         where = self.where("pose")
         T = np.array(self.T_wc, dtype=np.float64)
+        if T.shape == (3, 4):
+            T = np.vstack([T, [0.0, 0.0, 0.0, 1.0]])
         if T.shape != (4, 4):
-            raise DataError(f"{where}: the pose must be a 4x4 matrix, got shape {T.shape}")
+            raise DataError(f"{where}: the pose must be a 4x4 or 3x4 matrix, got shape {T.shape}")
         if not np.isfinite(T).all():
             raise DataError(f"{where}: the pose is not finite (lost tracking?); leave this frame out")
         if np.abs(T[3] - [0, 0, 0, 1]).max() > RIGID_TOLERANCE:

@@ -1,0 +1,179 @@
+"""Posed label maps of a program, as frames, and as the dataset `frames` that a run reads."""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import pickle
+import shutil
+import tempfile
+import weakref
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any, ClassVar
+
+import numpy as np
+import numpy.typing as npt
+from pydantic import BaseModel
+
+from semstab.core.types import Float64
+from semstab.datasets.scene import GROUND_TRUTH, Dataset, Scene
+from semstab.errors import DataError
+from semstab.model.frames import Frame
+from semstab.model.labels import LabelSpace
+
+FIELDS = "labels", "scores", "depth", "intrinsics", "T_wc", "color", "mask", "timestamp", "truth"
+"""Of a posed label map that is given as a mapping; see `Frame`. truth (H, W) has the true labels."""
+
+
+def as_array(value: Any) -> npt.NDArray[Any]:
+    """Return an array of numpy, of a torch tensor on any device, or of nested lists."""
+    if hasattr(value, "detach"):
+        value = value.detach().cpu().numpy()
+    return np.asarray(value)
+
+
+def as_frame(given: Frame | Mapping[str, Any], index: int) -> tuple[Frame, Frame | None]:
+    """Return frame `index` of a sequence, and the same with its true labels where they are given.
+
+    Raises DataError where a field is missing, unknown, or not what `Frame` takes.
+    """
+    if isinstance(given, Frame):
+        return dataclasses.replace(given, index=index), None
+    fields = dict(given)
+    for name in fields:
+        if name not in FIELDS:
+            raise DataError(f"frame {index}: no field '{name}'; there are {', '.join(FIELDS)}")
+    for name in ("depth", "intrinsics", "T_wc"):
+        if name not in fields:
+            raise DataError(
+                f"frame {index}: '{name}' is missing; a posed label map has labels, depth, intrinsics, T_wc"
+            )
+    for name in fields.keys() - {"intrinsics", "timestamp"}:
+        fields[name] = None if fields[name] is None else as_array(fields[name])
+    if hasattr(fields["intrinsics"], "detach"):
+        fields["intrinsics"] = as_array(fields["intrinsics"])
+    truth = fields.pop("truth", None)
+    frame = Frame(index, **fields)
+    if truth is None:
+        return frame, None
+    return frame, Frame(index, frame.depth, frame.intrinsics, frame.T_wc, labels=truth, timestamp=frame.timestamp)
+
+
+class OwnFolder:
+    """A temporary folder that goes with the last reference to it, or with the process."""
+
+    def __init__(self) -> None:
+        self.path = Path(tempfile.mkdtemp(prefix="semstab-"))
+        weakref.finalize(self, shutil.rmtree, self.path, ignore_errors=True)
+
+
+class Sequence:
+    """Frames of a program on disk, in a temporary folder that goes with the last reference to them.
+
+    classes  how many the largest label, or the scores, ask for; timestamps (n,) seconds, where all frames have one
+    """
+
+    def __init__(self, frames: Iterable[Frame | Mapping[str, Any]]) -> None:
+        self._folder = OwnFolder()
+        self.count = self.classes = 0
+        self.has_truth, times, digest = True, list[float | None](), hashlib.blake2b(digest_size=16)
+        for given in frames:
+            frame, truth = as_frame(given, self.count)
+            with self._file(self.count).open("wb") as file:
+                pickle.dump((frame, truth), file, protocol=5)
+            for image in (frame.depth, frame.labels, frame.scores, frame.T_wc, None if truth is None else truth.labels):
+                digest.update(b"" if image is None else np.ascontiguousarray(image).data)
+            digest.update(repr((frame.intrinsics, frame.timestamp)).encode())
+            self.classes = max(self.classes, _classes(frame), 0 if truth is None else _classes(truth))
+            self.has_truth = self.has_truth and truth is not None
+            times.append(frame.timestamp)
+            self.count += 1
+        if not self.count:
+            raise DataError("there are no frames to fuse; give posed label maps: labels, depth, intrinsics, T_wc")
+        seconds = [time for time in times if time is not None]
+        ascending = len(seconds) == self.count and seconds == sorted(seconds)
+        self.timestamps: Float64 | None = np.array(seconds) if ascending else None
+        self.digest = digest.hexdigest()
+
+    def frame(self, index: int) -> tuple[Frame, Frame | None]:
+        """Return a frame, and the same with its true labels where they are given."""
+        with self._file(index).open("rb") as file:
+            frames: tuple[Frame, Frame | None] = pickle.load(file)
+        return frames
+
+    def _file(self, index: int) -> Path:
+        return self._folder.path / f"{index:06d}"
+
+
+def _classes(frame: Frame) -> int:
+    if frame.scores is not None:
+        return int(frame.scores.shape[2])
+    assert frame.labels is not None
+    return int(frame.labels.max(initial=0, where=frame.labels != frame.ignore_id)) + 1
+
+
+class FramesOptions(BaseModel):
+    """Which frames of this process: the token of a sequence, and how scene, model and classes are called."""
+
+    token: str
+    scene: str = "frames"
+    model: str = "model"
+    classes: tuple[str, ...] = ()
+
+
+class Frames(Dataset):
+    """One scene of the frames that `semstab.fuse` was given; only the process that has them can read them."""
+
+    Options: type[BaseModel] = FramesOptions
+    sequences: ClassVar[weakref.WeakValueDictionary[str, Sequence]] = weakref.WeakValueDictionary()
+
+    def __init__(self, options: FramesOptions) -> None:
+        self._options = options
+
+    @property
+    def scenes(self) -> tuple[str, ...]:
+        """Its one scene."""
+        return (self._options.scene,)
+
+    def scene(self, name: str) -> Scene:
+        """Open it. Raises DataError where the frames are gone."""
+        sequence = self.sequences.get(self._options.token)
+        if sequence is None:
+            raise DataError(f"{name}: a program gave these frames to semstab.fuse, and they are gone; fuse them again")
+        return FramesScene(sequence, self._options)
+
+
+class FramesScene(Scene):
+    """Frames of a program, with the labels of one model, and the truth where every frame has it."""
+
+    def __init__(self, sequence: Sequence, options: FramesOptions) -> None:
+        self._sequence = sequence
+        self.name, self.backbones, self.ground_truth = options.scene, (options.model,), sequence.has_truth
+        classes = options.classes or tuple(f"class {k}" for k in range(max(2, sequence.classes)))
+        if len(classes) < sequence.classes:
+            raise DataError(f"{self.name}: there are labels up to {sequence.classes - 1}, and {len(classes)} classes")
+        self._space = LabelSpace(options.scene, classes)
+
+    def __len__(self) -> int:
+        return self._sequence.count
+
+    def label_space(self, backbone: str) -> LabelSpace:
+        """The same of the model and of the truth."""
+        return self._space
+
+    def frame(self, index: int, backbone: str, *, color: bool = True) -> Frame:
+        """Return a frame with the model's labels, or with the true ones."""
+        frame, truth = self._sequence.frame(index)
+        return frame if backbone != GROUND_TRUTH or truth is None else truth
+
+    def digest(self, indices: list[int], backbone: str) -> str:
+        """Return a hash of all frames and of which of them are meant."""
+        return (
+            f"{self._sequence.digest}-{backbone}-{hashlib.blake2b(repr(indices).encode(), digest_size=8).hexdigest()}"
+        )
+
+    @property
+    def timestamps(self) -> Float64 | None:
+        """Seconds of each frame, where all have one and they ascend."""
+        return self._sequence.timestamps

@@ -1,0 +1,92 @@
+"""Fuse the frames that a program has: a `Result` with all that a run says, and nothing written unless asked."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import shutil
+import uuid
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any
+
+from semstab.engine import Observer
+from semstab.engine.execution import run
+from semstab.errors import ConfigError
+from semstab.model.frames import Frame
+from semstab.model.records import Result
+from semstab.online.frames import Frames, OwnFolder, Sequence
+from semstab.online.summary import Summary
+from semstab.report import Reporting, write_report
+from semstab.settings import as_config
+
+
+@dataclasses.dataclass(frozen=True)
+class FusedResult(Result):
+    """A result whose files lie in a temporary folder until `save`; `compare`, `gate` and `export` take it as a run."""
+
+    _folder: Any = None
+
+    @property
+    def summary(self) -> Summary:
+        """The numbers of the map in a row."""
+        record = self.record()
+        assert record.statistics is not None
+        flicker = record.image_space.compensated_flicker_percent
+        return Summary.of(record.summary.frames, record.summary.table, record.statistics, flicker)
+
+    def report(self, path: str | Path) -> Path:
+        """Write report.html, one file without a network; return its path."""
+        page = write_report(self, self.__fspath__())
+        return Path(shutil.copyfile(page, path))
+
+    def save(self, folder: str | Path) -> Path:
+        """Write the run's folder: summary, voxels, series, tables and report. Raises ConfigError where one is."""
+        if Path(folder).exists() and (not Path(folder).is_dir() or any(Path(folder).iterdir())):
+            raise ConfigError(f"{folder}: is not empty; choose another folder")
+        Reporting(self.__fspath__()).run_finished(self)
+        return Path(shutil.copytree(self.__fspath__(), folder, dirs_exist_ok=True))
+
+    def __fspath__(self) -> str:
+        """The folder of its files, which goes with the result."""
+        return str(self._folder.path)
+
+
+def fuse(
+    frames: Iterable[Frame | Mapping[str, Any]],
+    *,
+    voxel_size: float | None = None,
+    backend: str = "numba",
+    classes: Iterable[str] = (),
+    scene: str = "frames",
+    model: str = "model",
+    recording: str | Path | None = None,
+    observers: Iterable[Observer] = (),
+    **settings: Any,
+) -> FusedResult:
+    """Fuse posed label maps, and return all that a run says of them: measures, strata, ceiling, verdict, intervals.
+
+    frames      `Frame`s, or mappings with labels (H, W) or scores (H, W, K), depth (H, W) in metres, intrinsics (3, 3),
+                T_wc (4, 4) or (3, 4) camera to world; color, mask, timestamp and truth (H, W) where there are such.
+                NumPy or torch. A generator is read once; its frames wait on disk, in a temporary folder
+    voxel_size  metres; where not given, what `check` suggests for the data
+    classes     names, in the order of the labels
+    recording   a file for the rerun viewer
+    settings    further settings of `Config`: statistics=True, scope='these frames', events=True, ...
+
+    Raises DataError for a frame that cannot be fused, with its number, and ConfigError for a setting.
+    """
+    sequence, token = Sequence(frames), uuid.uuid4().hex
+    Frames.sequences[token] = sequence
+    options = {"token": token, "scene": scene, "model": model, "classes": tuple(classes)}
+    content = {"name": scene, "dataset": {"name": "frames", "options": options}, "backends": [backend], **settings}
+    config = as_config(content if voxel_size is None else {**content, "voxel_size": voxel_size})
+    folder = OwnFolder()
+    with contextlib.ExitStack() as stack:
+        watching = list(observers)
+        if recording is not None:
+            from semstab.recording import Recording, Target
+
+            watching.append(stack.enter_context(contextlib.closing(Recording(Target.parse(str(recording), Path())))))
+        result = run(config, out=folder.path, observers=watching)
+    return FusedResult(**{name: getattr(result, name) for name in vars(result)}, _folder=folder)

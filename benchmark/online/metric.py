@@ -1,0 +1,365 @@
+"""Temporal stability as a metric of a training loop: `update` with every batch, `compute` at the end of an epoch."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from semstab.backends import FusionBackend, create
+from semstab.backends.numpy_reference import ODD, in_sample
+from semstab.backends.shared.pixel_keys import drawn_pixels
+from semstab.core.types import Float64, Int64
+from semstab.errors import ConfigError, DataError
+from semstab.metrics import compensated_flicker, summarise
+from semstab.model.evidence import Evidence
+from semstab.model.frames import Frame, Intrinsics
+from semstab.model.labels import IGNORE_8BIT, IGNORE_16BIT
+from semstab.model.measures import SBD, VSS, mean
+from semstab.model.voxels import VoxelTable, index_columns
+from semstab.online.frames import as_array
+from semstab.online.summary import Summary
+from semstab.statistics import CellObservations, MapSample, Sampler, Views, analyse, krippendorff_alpha, psa
+from semstab.statistics.accumulate import cluster_sums_of
+from semstab.statistics.cluster_sums import value
+from semstab.statistics.sampler import BUDGET
+
+SIDE = 640
+"""Flicker is measured on every n-th pixel of frames with more pixels on a side, as in a run."""
+
+MOST_VOXELS = 2_000_000
+
+
+@dataclass(frozen=True)
+class State:
+    """What a process saw of a sequence; states of several processes are added.
+
+    updates  (n,) how often the belief of each voxel was moved by a further frame
+    cells    the sampled observations from which the ceiling follows; None where it is not wanted
+    one_in   of so many voxels the table holds one
+    """
+
+    frames: int
+    table: VoxelTable
+    updates: Int64
+    cells: CellObservations | None
+    flicker: tuple[float, int]
+    one_in: int
+
+    def __add__(self, other: State) -> State:
+        """Add what another process saw of the same sequence.
+
+        All is as if one process had seen all frames, but for SBD and flicker: they are means over the steps from frame
+        to frame that each process saw.
+        """
+        one_in = max(self.one_in, other.one_in)
+        a, b = (state._thinned(one_in) for state in (self, other))
+        table, updates = _added(a.table, b.table, a.updates, b.updates)
+        flicker = self.flicker[0] + other.flicker[0], self.flicker[1] + other.flicker[1]
+        cells = None if a.cells is None or b.cells is None else _joined(a.cells, b.cells)
+        return State(self.frames + other.frames, table, updates, cells, flicker, one_in)
+
+    def _thinned(self, one_in: int) -> State:
+        if one_in == self.one_in:
+            return self
+        rows = in_sample(self.table.index.T, one_in)
+        return dataclasses.replace(self, table=self.table.rows(rows), updates=self.updates[rows], one_in=one_in)
+
+    def scalars(self) -> dict[str, float]:
+        """Return the numbers of `Summary.NAMES`: what `summary` has too, without intervals."""
+        table = self._table()
+        whole, sample = summarise(table), MapSample.draw(table).table.measured()
+        share = math.nan
+        if self.cells is not None and len(self.cells):
+            seen = self.cells.sample()
+            share = value(cluster_sums_of(seen.seen.table(), sample=seen), "reached")
+        numbers = mean(psa(sample)), krippendorff_alpha(sample), share, self._flicker, whole.recurrent.share
+        return dict(zip(Summary.NAMES, map(float, (whole.recurrent[VSS], whole[SBD], *numbers)), strict=True))
+
+    def summary(self) -> Summary:
+        """Return what a run says of these frames."""
+        cells = None if self.cells is None else self.cells.sample()
+        analysis = analyse(MapSample.draw(self._table()), cells)
+        return Summary.of(self.frames, analysis.table, analysis.summary, self._flicker)
+
+    def _table(self) -> VoxelTable:
+        """The map; of a voxel that two processes saw, SBD is the mean over the steps that were taken."""
+        steps = self.table.op - 1
+        fewer = self.updates < steps
+        if not fewer.any():
+            return self.table
+        scale = np.where(fewer, steps / np.maximum(self.updates, 1), 1.0)
+        return dataclasses.replace(self.table, drift_sum=self.table.drift_sum * scale)
+
+    @property
+    def _flicker(self) -> float:
+        total, steps = self.flicker
+        return total / steps if steps else math.nan
+
+
+class _Map:
+    """A sequence while its frames come in; with more than `most` voxels it keeps a random half of them, and so on."""
+
+    def __init__(self, backend: FusionBackend, voxel_size: float, sampler: Sampler | None, most: int) -> None:
+        self._backend, self._voxel_size, self._sampler, self._most = backend, voxel_size, sampler, most
+        self._frames, self._one_in, self._left_out = 0, 1, 0
+        self._flicker, self._pairs = 0.0, 0
+        self._previous: Frame | None = None
+
+    def add(self, frame: Frame) -> None:
+        """Fuse the next frame."""
+        frame = dataclasses.replace(frame, index=self._frames)
+        if self._sampler is not None:
+            self._sampler.add(frame)
+        if self._previous is not None:
+            step = compensated_flicker(self._previous, frame.every(-(-max(frame.shape) // SIDE))).flicker_percent
+            if not math.isnan(step):
+                self._flicker, self._pairs = self._flicker + step, self._pairs + 1
+        self._previous = frame
+        report = self._backend.integrate(self._drawn(frame))
+        self._frames += 1
+        if report.map_voxels - self._left_out > self._most:
+            index = self._backend.table().index.T
+            while np.count_nonzero(in_sample(index, self._one_in)) > self._most:
+                self._one_in *= 2
+            self._left_out = int(np.count_nonzero(~in_sample(index, self._one_in)))
+
+    def _drawn(self, frame: Frame) -> Frame:
+        """The frame without depth where it shows voxels that are left out."""
+        if self._one_in == 1:
+            return frame
+        K, size = frame.intrinsics, self._voxel_size
+        pose, camera = np.ascontiguousarray(frame.T_wc), (K.fx, K.fy, K.cx, K.cy)
+        near = drawn_pixels(frame.depth, frame.valid, camera, pose, size, ODD, self._one_in)
+        return dataclasses.replace(frame, depth=np.where(near, frame.depth, np.float32(0)))
+
+    def state(self) -> State:
+        """Return all that is there so far."""
+        table = self._backend.table()
+        if self._one_in > 1:
+            table = table.rows(in_sample(table.index.T, self._one_in))
+        cells = None if self._sampler is None else self._sampler.looks()
+        flicker = self._flicker, self._pairs
+        return State(self._frames, table, table.op.astype(np.int64) - 1, cells, flicker, self._one_in)
+
+
+class TemporalStability:
+    """How stable predictions are at the same physical place, over the frames of one or more sequences.
+
+    num_classes   K
+    voxel_size    metres
+    ignore_index  the label of pixels without one
+    soft          fuse scores as they are; else the likeliest class of each pixel, as of label maps on disk
+    ceiling       also what part of the alpha is reached that geometry allows: a third of the time of an update
+    max_voxels    of a sequence; a larger map is sampled at random, and its memory stays bounded
+    backend       that fuses
+
+    Has the interface of torchmetrics, and is a `torchmetrics.Metric` where that is installed.
+
+    >>> import numpy as np
+    >>> metric = TemporalStability(num_classes=3, voxel_size=0.1)
+    >>> K, pose = [[50, 0, 32], [0, 50, 24], [0, 0, 1]], np.eye(4)
+    >>> depth, labels = np.ones((48, 64), np.float32), np.zeros((48, 64), int)
+    >>> labels[:, 32:] = 1
+    >>> for wrong in (0, 0, 12):
+    ...     predicted = labels.copy()
+    ...     predicted[:, :wrong] = 2
+    ...     metric.update(predicted, depth, K, pose)
+    >>> {name: round(float(value), 2) for name, value in metric.compute().items() if name in ("vss@3", "op3_share")}
+    {'vss@3': 0.93, 'op3_share': 1.0}
+    """
+
+    higher_is_better = True
+    """Of alpha, VSS, PSA and the share of the ceiling; SBD and flicker are better where they are low."""
+
+    def __init__(
+        self,
+        num_classes: int,
+        voxel_size: float = 0.1,
+        *,
+        ignore_index: int | None = IGNORE_8BIT,
+        soft: bool = False,
+        ceiling: bool = True,
+        max_voxels: int = MOST_VOXELS,
+        backend: str = "numba",
+    ) -> None:
+        if num_classes < 2:
+            raise ConfigError(f"num_classes = {num_classes}: stability needs at least 2 classes")
+        if max_voxels < 1:
+            raise ConfigError(f"max_voxels = {max_voxels}: use 1 or more")
+        create(backend, voxel_size=voxel_size, num_classes=num_classes)
+        self.num_classes, self.voxel_size, self.ignore_index, self.soft = num_classes, voxel_size, ignore_index, soft
+        self.ceiling, self.max_voxels, self.backend = ceiling, max_voxels, backend
+        self._maps: dict[str, _Map] = {}
+        self._merged: dict[str, State] = {}
+
+    def update(
+        self, predicted: Any, depth: Any, intrinsics: Any, T_wc: Any, sequence: str | int | Sequence[Any] = ""
+    ) -> None:
+        """Fuse one frame, or a batch of frames in the order of time.
+
+        predicted   labels (H, W), or logits or probabilities (K, H, W); of a batch (B, H, W) or (B, K, H, W)
+        depth       (H, W) or (B, H, W) float, metres along the optical axis
+        intrinsics  (3, 3) or (B, 3, 3) camera matrix, or `Intrinsics`
+        T_wc        (4, 4) or (3, 4), camera to world in metres; or (B, ...)
+        sequence    which sequence they belong to, one name or one a frame; sequences may alternate
+
+        Raises DataError, which names the frame of the batch, where shapes, labels or a pose cannot be; then no frame
+        of the batch was fused.
+        """
+        frames = self._frames(as_array(predicted), as_array(depth), intrinsics, as_array(T_wc))
+        names = [sequence] * len(frames) if isinstance(sequence, str | int) else [*sequence]
+        if len(names) != len(frames):
+            raise DataError(f"sequence: {len(names)} names for {len(frames)} frames; give one name, or one a frame")
+        for given, frame in zip(names, frames, strict=True):
+            name = str(given.item() if hasattr(given, "item") else given)
+            if name not in self._maps:
+                self._maps[name] = self._new_map()
+            self._maps[name].add(frame)
+
+    def compute(self) -> dict[str, float]:
+        """Return vss@3, sbd (bits), psa, alpha, ceiling_share, flicker (percent) and op3_share, means over sequences.
+
+        The same as a run says of these frames; NaN where undefined, as before the first update.
+        """
+        rows = [state.scalars() for state in self.states().values()]
+        return {name: mean(np.array([row[name] for row in rows], np.float64)) for name in Summary.NAMES}
+
+    def by_sequence(self) -> dict[str, Summary]:
+        """Return the numbers of each sequence, its verdict among them."""
+        return {name: state.summary() for name, state in self.states().items()}
+
+    def reset(self) -> None:
+        """Forget all frames."""
+        self._maps, self._merged = {}, {}
+
+    def states(self) -> dict[str, State]:
+        """Return what was seen of each sequence, to be sent to another process and merged there."""
+        return _sum(self._merged, {name: own.state() for name, own in self._maps.items()})
+
+    def merge_state(self, incoming_state: TemporalStability | Mapping[str, State]) -> None:
+        """Add what another metric, or its `states`, saw; a sequence may have been split between them."""
+        other = incoming_state.states() if isinstance(incoming_state, TemporalStability) else incoming_state
+        self._merged = _sum(self._merged, other)
+
+    def _new_map(self) -> _Map:
+        backend = create(self.backend, voxel_size=self.voxel_size, num_classes=self.num_classes)
+        sampler = Sampler(self.voxel_size, self.num_classes) if self.ceiling else None
+        return _Map(backend, self.voxel_size, sampler, self.max_voxels)
+
+    def _frames(
+        self, predicted: npt.NDArray[Any], depth: npt.NDArray[Any], intrinsics: Any, T_wc: Float64
+    ) -> list[Frame]:
+        """The frames of a batch, checked."""
+        if depth.ndim == 2:
+            predicted, depth, T_wc = predicted[None], depth[None], T_wc[None]
+        B = len(depth)
+        if depth.ndim != 3 or len(predicted) != B:
+            raise DataError(f"predicted {predicted.shape} and depth {depth.shape}: they are no batch of one size")
+        if not isinstance(intrinsics, Intrinsics | list | tuple):
+            intrinsics = as_array(intrinsics)
+        own = [*intrinsics] if np.ndim(intrinsics) == 3 or _are_cameras(intrinsics) else [intrinsics] * B
+        poses = [*T_wc] if T_wc.ndim == 3 else [T_wc] * B
+        if not len(own) == len(poses) == B:
+            raise DataError(f"{len(own)} intrinsics and {len(poses)} poses for {B} frames; give one, or one a frame")
+        return [self._frame(k, predicted[k], depth[k], own[k], poses[k]) for k in range(B)]
+
+    def _frame(self, k: int, predicted: npt.NDArray[Any], depth: npt.NDArray[Any], camera: Any, pose: Float64) -> Frame:
+        labels = scores = None
+        if predicted.ndim == 3:
+            if len(predicted) != self.num_classes:
+                raise DataError(f"frame {k}: logits of shape {predicted.shape}; give ({self.num_classes}, H, W)")
+            if self.soft:
+                scores = _probabilities(predicted)
+            else:
+                labels = predicted.argmax(axis=0)
+                labels[np.isnan(predicted).any(axis=0)] = IGNORE_16BIT
+        else:
+            labels = predicted
+            if not np.issubdtype(labels.dtype, np.integer):
+                raise DataError(f"frame {k}: labels are {labels.dtype}; give integers, or logits (K, H, W)")
+        if labels is not None:
+            labels = self._checked(k, labels)
+        frame = Frame(k, depth.astype(np.float32, copy=False), camera, pose, labels=labels, scores=scores)
+        none = (frame.predicted == frame.ignore_id) & (frame.depth > 0) & (frame.depth < np.inf)
+        return dataclasses.replace(frame, unlabelled=none) if none.any() else frame
+
+    def _checked(self, k: int, labels: npt.NDArray[Any]) -> npt.NDArray[Any]:
+        """Labels as uint8, or uint16 where there are more classes, with what is ignored under the highest id."""
+        dtype, none = (np.uint8, IGNORE_8BIT) if self.num_classes < IGNORE_8BIT else (np.uint16, IGNORE_16BIT)
+        known = (labels >= 0) & (labels < self.num_classes)
+        if not known.all():
+            ignored = labels == IGNORE_16BIT if self.ignore_index is None else labels == self.ignore_index
+            wrong = labels[~known & ~ignored & (labels != IGNORE_16BIT)]
+            if len(wrong):
+                raise DataError(f"frame {k}: label {int(wrong[0])} is not below num_classes = {self.num_classes}")
+        if self.ignore_index is not None:
+            known &= labels != self.ignore_index
+        return np.where(known, labels, none).astype(dtype)
+
+
+def _are_cameras(intrinsics: Any) -> bool:
+    return isinstance(intrinsics, list | tuple) and all(isinstance(one, Intrinsics) for one in intrinsics)
+
+
+def _probabilities(logits: npt.NDArray[Any]) -> npt.NDArray[Any]:
+    """(H, W, K) scores that sum to 1: as given, or by a softmax where some are no probabilities."""
+    values = np.moveaxis(logits, 0, -1).astype(np.float32, copy=False)
+    if values.min(initial=0) >= 0 and values.max(initial=1) <= 1:
+        return values
+    powers = np.exp(values - values.max(axis=-1, keepdims=True))
+    probabilities: npt.NDArray[Any] = powers / powers.sum(axis=-1, keepdims=True)
+    return probabilities
+
+
+def _sum(one: Mapping[str, State], other: Mapping[str, State]) -> dict[str, State]:
+    """The states of the sequences of both, those of one sequence added."""
+    both = dict(one)
+    for name, state in other.items():
+        both[name] = both[name] + state if name in both else state
+    return both
+
+
+def _added(a: VoxelTable, b: VoxelTable, updates_a: Int64, updates_b: Int64) -> tuple[VoxelTable, Int64]:
+    """The map of the frames of two maps, and how often its voxels were moved."""
+    index, of = np.unique(np.concatenate([a.index, b.index]), axis=0, return_inverse=True)
+    n, of = len(index), of.ravel()
+
+    def total(name: str) -> npt.NDArray[Any]:
+        sums = np.zeros(n, getattr(a, name).dtype)
+        np.add.at(sums, of, np.concatenate([getattr(a, name), getattr(b, name)]))
+        return sums
+
+    first, last = np.full(n, np.iinfo(np.int32).max, np.int32), np.zeros(n, np.int32)
+    np.minimum.at(first, of, np.concatenate([a.first_frame, b.first_frame]))
+    np.maximum.at(last, of, np.concatenate([a.last_frame, b.last_frame]))
+    updates = np.zeros(n, np.int64)
+    np.add.at(updates, of, np.concatenate([updates_a, updates_b]))
+    evidence = Evidence.joined([a.evidence, b.evidence])
+    voxel = np.repeat(of, np.diff(evidence.starts))
+    key, at = np.unique(voxel * a.K + evidence.label, return_inverse=True)
+    starts = np.searchsorted(key, np.arange(n + 1) * a.K)
+    weight = np.bincount(at.ravel(), evidence.weight, len(key)).astype(np.float64, copy=False)
+    summed = {name: total(name) for name in ("op", "drift_sum", "pixels", "self_sum", "frame_entropy_sum")}
+    return VoxelTable(
+        **index_columns(index), **summed, first_frame=first, last_frame=last, voxel_size=a.voxel_size,
+        evidence=Evidence(starts, (key % a.K).astype(np.uint16), weight, a.K), classes=a.classes,
+    ), updates  # fmt: skip
+
+
+def _joined(a: CellObservations, b: CellObservations) -> CellObservations:
+    """What both sampled, of the voxels that are in both samples; frames are numbered anew."""
+    share = min(a.share, b.share)
+    later = dataclasses.replace(b, view=b.view + np.int32(len(a.views)))
+    views = Views.joined([a.views, b.views])
+    views = dataclasses.replace(views, frame=np.arange(len(views)))
+    both = CellObservations.joined([each.only(each.drawn < share) for each in (a, later)])
+    while len(both) > BUDGET:
+        share //= 2
+        both = both.only(both.drawn < share)
+    return dataclasses.replace(both, views=views, share=share, soft=a.soft or b.soft)

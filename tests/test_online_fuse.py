@@ -1,0 +1,144 @@
+"""`semstab.fuse`: frames of a program in, all that a run says out, nothing written unless asked."""
+
+from __future__ import annotations
+
+import gc
+import tempfile
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+import semstab
+from semstab.core.json_form import to_json
+from semstab.datasets import GROUND_TRUTH, open_dataset
+from semstab.errors import ConfigError, DataError
+
+OPTIONS = {"width": 96, "height": 54, "frames": 10}
+SIZE = 1.0
+
+
+@pytest.fixture(scope="module")
+def city():
+    return open_dataset("city", OPTIONS).scene("scene0")
+
+
+@pytest.fixture(scope="module")
+def classes(city):
+    return city.label_space(city.backbones[0]).classes
+
+
+def frames_of(city, backbone, *, truth=False):
+    """The frames of a label source as a program has them: arrays, and poses of three rows."""
+    for i in range(len(city)):
+        frame = city.frame(i, backbone)
+        given = {"labels": frame.labels, "depth": frame.depth, "intrinsics": frame.intrinsics.matrix,
+                 "T_wc": frame.T_wc[:3], "color": frame.color}  # fmt: skip
+        yield given | ({"truth": city.frame(i, GROUND_TRUTH).labels} if truth else {})
+
+
+@pytest.fixture(scope="module")
+def steady(city, classes):
+    return semstab.fuse(frames_of(city, "sim-steady"), voxel_size=SIZE, classes=classes, model="steady")
+
+
+def test_a_generator_gives_what_a_run_gives(steady, city):
+    run = semstab.run({
+        "dataset": {"name": "city", "options": OPTIONS}, "scenes": ["scene0"], "backbones": ["sim-steady"],
+        "voxel_size": SIZE, "taxonomy": None, "exclude": {},
+    })  # fmt: skip
+    own, other = steady.record(), run.record()
+    assert own.summary.table == other.summary.table
+    for part in ("headline", "ceiling_share", "agreement"):
+        assert to_json(getattr(own.statistics, part)) == to_json(getattr(other.statistics, part))
+    assert own.statistics.verdict.level == other.statistics.verdict.level == steady.summary.verdict
+    assert steady.summary.alpha == other.statistics.agreement.alpha.value
+    assert steady.summary.psa == other.statistics.agreement.psa.value
+    assert steady.summary.flicker == own.image_space.compensated_flicker_percent > 0
+    assert steady.summary.frames == len(city)
+    assert len(steady.record().table()) == steady.summary.voxels
+
+
+def test_frames_and_tensors_and_scores_are_taken(city, classes, steady):
+    frames = [city.frame(i, "sim-steady") for i in range(len(city))]
+    tensors = [{key: torch.from_numpy(np.array(value)) if isinstance(value, np.ndarray) else value
+                for key, value in given.items()} for given in frames_of(city, "sim-steady")]  # fmt: skip
+    eye = np.eye(len(classes), dtype=np.float32)
+    soft = [{**given, "labels": None, "scores": eye[given["labels"]]} for given in frames_of(city, "sim-steady")]
+    for given in (frames, tensors, soft):
+        result = semstab.fuse(given, voxel_size=SIZE, classes=classes)
+        assert result.summary.vss3 == pytest.approx(steady.summary.vss3, abs=1e-12)
+        assert result.summary.alpha == pytest.approx(steady.summary.alpha, abs=1e-12)
+
+
+def test_truth_tells_what_is_right(city, classes):
+    result = semstab.fuse(
+        frames_of(city, "sim-flicker", truth=True), voxel_size=SIZE, classes=classes, statistics=True, backend="open3d"
+    )
+    correctness = result.record().statistics.correctness
+    assert correctness is not None
+    assert 0.3 < correctness.accuracy.value < 1
+    assert result.record().unit.backend == "open3d"
+
+
+def test_results_are_compared_gated_and_exported_as_runs_are(steady, city, classes, tmp_path):
+    other = semstab.fuse(frames_of(city, "sim-flicker"), voxel_size=SIZE, classes=classes, model="flicker")
+    comparison = semstab.compare([steady, other], tmp_path / "versus")
+    assert [own.name for own in comparison.runs] == ["steady", "flicker"]
+    assert (tmp_path / "versus/report.html").exists()
+    gate = semstab.GateConfig(rules=("alpha drop < 0.02",))
+    assert [each.verdict for each in semstab.gate(other, steady, gate).judgements] == ["fails"]
+    assert [each.verdict for each in semstab.gate(steady, steady, gate).judgements] == ["passes"]
+    semstab.export(steady, tmp_path / "map.ply")
+    assert (tmp_path / "map.ply").stat().st_size > 1000
+
+
+def test_nothing_is_written_unless_asked_and_then_all_of_it(city, classes, tmp_path, monkeypatch):
+    temporary = tmp_path / "temporary"
+    temporary.mkdir()
+    monkeypatch.setattr(tempfile, "tempdir", str(temporary))
+    monkeypatch.chdir(tmp_path)
+    result = semstab.fuse(
+        frames_of(city, "sim-steady"), voxel_size=SIZE, classes=classes, recording=tmp_path / "seen.rrd"
+    )
+    assert {path.name for path in tmp_path.iterdir()} == {"temporary", "seen.rrd"}
+    assert (tmp_path / "seen.rrd").stat().st_size > 10_000
+    result.report(tmp_path / "x.html")
+    assert "alpha" in (tmp_path / "x.html").read_text(encoding="utf-8")
+    folder = result.save(tmp_path / "run")
+    assert (folder / "report.html").exists()
+    assert to_json(semstab.load(folder).result.record().summary) == to_json(result.record().summary)
+    assert len(semstab.load(folder).table()) == result.summary.voxels
+    with pytest.raises(ConfigError, match=r"is not empty"):
+        result.save(folder)
+    assert "verdict" in result._repr_html_()
+    del result
+    gc.collect()
+    assert not [*temporary.iterdir()]
+
+
+def test_what_cannot_be_fused_is_one_line(city, classes):
+    (good, *_) = frames_of(city, "sim-steady")
+    for wrong, message in (
+        ({**good, "pose": np.eye(4)}, "frame 1: no field 'pose'"),
+        ({key: value for key, value in good.items() if key != "depth"}, "frame 1: 'depth' is missing"),
+        ({**good, "T_wc": np.eye(3)}, "frame 1, pose: the pose must be a 4x4 or 3x4 matrix"),
+        ({**good, "labels": good["labels"][:9]}, "frame 1, labels: labels are 96x9 but depth is 96x54"),
+    ):
+        with pytest.raises(DataError, match=message):
+            semstab.fuse([good, wrong], voxel_size=SIZE)
+    with pytest.raises(DataError, match="there are no frames"):
+        semstab.fuse([])
+    with pytest.raises(DataError, match="there are labels up to 7, and 3 classes"):
+        semstab.fuse(frames_of(city, "sim-steady"), voxel_size=SIZE, classes=classes[:3])
+    with pytest.raises(ConfigError, match="voxel_sizes"):
+        semstab.fuse([good], voxel_sizes=SIZE)
+
+
+def test_a_saved_run_says_that_its_frames_are_gone(steady, tmp_path):
+    folder = steady.save(Path(tmp_path) / "run")
+    config = semstab.load_config(folder / "config.yaml")
+    config.dataset.options["token"] = "of another process"
+    with pytest.raises(DataError, match=r"gave these frames to semstab\.fuse, and they are gone"):
+        semstab.run(config)
