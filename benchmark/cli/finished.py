@@ -142,7 +142,7 @@ Backend = Annotated[str | None, typer.Option("--backend", "-b", help="Whose map;
 def export(
     run: Run,
     to: Annotated[list[Path], typer.Option(
-        "--to", metavar="FILE", help=".ply .las .laz .tif .glb .parquet or .csv; repeatable.")],
+        "--to", metavar="FILE", help=".ply .las .laz .tif .glb .parquet .csv; or tasks, see --format; repeatable.")],
     scene: Scene = None,
     backbone: Backbone = None,
     backend: Backend = None,
@@ -159,6 +159,10 @@ def export(
         min=0, help="Metres from a point to the voxel that it may take; a voxel's edge.")] = None,
     join: Annotated[Path | None, typer.Option(
         metavar="FILE", help="Parquet with more columns of the voxels: OUT/columns of compare.")] = None,
+    task_format: Annotated[str | None, typer.Option(
+        "--format", metavar="coco|labelstudio|cvat|fiftyone",
+        help="Annotation tasks instead: places where frames disagree.")] = None,
+    most: Annotated[int, typer.Option("--most", "-n", min=1, help="Annotation tasks at most.")] = 50,
     quiet: Quiet = False,
 ) -> None:  # fmt: skip
     """The fused map as a point cloud, raster, mesh or table, with how far to trust each location."""
@@ -167,6 +171,7 @@ def export(
     for file in write(
         run, to, scene=scene, backbone=backbone, backend=backend, measures=measure, min_op=min_op,
         classes=classes or (), commit=thresholds, cell=cell, asprs=asprs, radius=radius, classify=classify, join=join,
+        task_format=task_format, most=most,
     ):  # fmt: skip
         print_lines([f"{file.path}: {file.content}", *(f"  {note}" for note in file.notes)], quiet=quiet)
 

@@ -10,11 +10,15 @@ from pathlib import Path
 from semstab.config import nearest
 from semstab.engine.folder import load_result
 from semstab.errors import ConfigError
-from semstab.exports import clouds, maps
+from semstab.exports import annotation_formats, clouds, maps
 from semstab.exports import join as joining
 from semstab.exports import voxels as tabular
+from semstab.exports.annotation import annotation_tasks
+from semstab.exports.annotation_formats import MOST, TaskFile, write_tasks
+from semstab.exports.relabel import task_of
 from semstab.exports.voxels import Chosen, Voxels, crs_name
 from semstab.statistics.acceptance import AcceptanceThresholds
+from semstab.task import Task
 
 __all__ = ["SUFFIXES", "Exported", "export"]
 
@@ -70,6 +74,8 @@ def export(
     join: str | Path | None = None,
     onto: str | Path | None = None,
     beside: str | Path | None = None,
+    task_format: str | None = None,
+    most: int = MOST,
 ) -> list[Exported]:
     """Write a unit of the run in a folder to files, in the format that each one's suffix names (`SUFFIXES`).
 
@@ -82,13 +88,17 @@ def export(
     classify  a cloud: write this cloud, classified; a point outside of all voxels takes the nearest one within
               `radius` metres, a voxel's edge where not given
     join      a Parquet file with further columns of the same voxels, such as `compare` writes
+    task_format  coco, labelstudio, cvat or fiftyone: write at most so many (`most`) annotation tasks for it, the places
+              where frames disagree, instead of the map
     onto, beside  names of `classify` and `join` in the version before
 
     Raises ConfigError, DataError, MissingDependencyError, each with the file.
     """
     files = [Path(file) for file in ([to] if isinstance(to, str | Path) else to)]
     for file in files:
-        if file.suffix.lower() not in SUFFIXES:
+        if task_format is not None:
+            annotation_formats.check(task_format, file)
+        elif file.suffix.lower() not in SUFFIXES:
             raise ConfigError(f"{file}: format '{file.suffix}' is not known; {nearest(file.suffix, SUFFIXES)}")
     result = load_result(run)
     record = result.record(scene=scene, backbone=backbone, backend=backend)
@@ -103,6 +113,11 @@ def export(
             join=None if join is None else Path(join),
         )  # fmt: skip
 
+    if task_format is not None:
+        task, _ = task_of(Path(run), record, result.manifest["inputs"])
+        tasks = annotation_tasks(chosen(("op",)), task, most)
+        named = task.mapping.target, task.scene.name, task.backbone
+        return [_tasks_written(TaskFile(tasks, *named, file), task_format, task) for file in files]
     if classify is not None:
         return [_classified(chosen(joining.MEASURES), Path(classify), file, radius, settings) for file in files]
     usual = {".tif": maps.RASTER_MEASURES}
@@ -114,6 +129,12 @@ def _written(chosen: Chosen, file: Path, settings: Settings) -> Exported:
     where = "coordinates of the scene, which has no georeference"
     where = where if some.georeference is None else crs_name(some.georeference)
     return Exported(file, f"{voxels:,} voxels, {where}", tuple(_notes(some, file.suffix.lower(), settings)))
+
+
+def _tasks_written(file: TaskFile, kind: str, task: Task) -> Exported:
+    notes, images = write_tasks(file, kind, task), len(file.by_image())
+    bits = sum(own.score for own in file.tasks)
+    return Exported(file.path, f"{len(file.tasks)} tasks in {images} images, {bits:,.0f} bits of entropy", notes)
 
 
 def _classified(chosen: Chosen, cloud: Path, file: Path, radius: float | None, settings: Settings) -> Exported:

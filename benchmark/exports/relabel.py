@@ -300,7 +300,7 @@ def relabel(
     """
     result = load_result(run)
     record = result.record(scene=scene, backbone=backbone, backend=backend)
-    task, pixel_stride = _task(Path(run), record, result.manifest["inputs"])
+    task, pixel_stride = task_of(Path(run), record, result.manifest["inputs"])
     chosen, name = belief or Belief(), name or f"{record.unit.backbone}-fused"
     settings = {"unit": record.key, "backend": record.unit.backend, **chosen.settings()}
     space = task.mapping.target
@@ -340,7 +340,7 @@ def relabel(
     return report
 
 
-def _task(run: Path, record: Record, fused: Mapping[str, str]) -> tuple[Task, int]:
+def task_of(run: Path, record: Record, fused: Mapping[str, str]) -> tuple[Task, int]:
     """Return the unit as it was fused, from inputs of these digests, and its pixel stride.
 
     Raises DataError where its data has changed since.

@@ -13,6 +13,7 @@ from semstab.core.json_form import INLINE
 from semstab.errors import ConfigError
 from semstab.model import voxels
 from semstab.model.contrast import BackboneComparison
+from semstab.model.display import as_figure
 from semstab.model.georeference import Georeference
 from semstab.model.measures import measures
 from semstab.model.results import Agreement, Unit, UnitSummary, VoxelAdvice
@@ -31,6 +32,10 @@ SCENE__BACKBONE.npz with the arrays frame (its index), labels (H, W) rows 0..K-1
 where the dataset has it, color (H, W, 3). Beside them sums by frame and cube of space, `InfluenceSums`."""
 
 REGIONS = "region_maps"
+
+MAPS = 6
+"""Maps that a notebook shows of a result."""
+
 """Not a sweep: the label sources that hold regions without classes."""
 
 
@@ -341,7 +346,7 @@ class Result:
         return {name: [row[name] for row in rows] for name in (rows[0] if rows else ())}
 
     def _repr_html_(self) -> str:
-        """The summary table and the verdicts, in a notebook."""
+        """The summary table, the verdicts and maps from above, in a notebook."""
         rows: list[list[voxels.Cell]] = []
         for run in self.runs:
             table, unit = run.table, run.unit
@@ -351,7 +356,14 @@ class Result:
             rows.append([unit.scene, unit.backbone, unit.backend, table.voxels, *seen, verdict])
         titles = [measure.title for measure in measures()]
         headers = ["scene", "backbone", "backend", "voxels", "mean OP", *titles, "OP>=3 %", "verdict"]
-        return voxels.as_html(self.name, headers, rows)
+        base = [record for record in self.select() if record.unit.backend == self.backend]
+        there = [record for record in base if record.voxels_file is not None and record.voxels_file.is_file()][:MAPS]
+        maps = [
+            as_figure(own.table().image(self.up.get(own.unit.scene)), f"{own.unit.scene}, {own.unit.backbone}")
+            for own in there
+        ]
+        legend = f"<div>{voxels.CAPTION}</div>" if maps else ""
+        return voxels.as_html(self.name, headers, rows) + "".join(maps) + legend
 
     @property
     def agrees(self) -> bool:

@@ -13,11 +13,12 @@ import numpy as np
 import numpy.typing as npt
 
 from semstab.core.process import available_bytes
-from semstab.core.types import Float64, Int32, Int64, Mask
+from semstab.core.types import Float64, Int32, Int64, Mask, UInt8
 from semstab.errors import DataError, MissingDependencyError
 from semstab.model import parquet
+from semstab.model.display import as_figure, from_above
 from semstab.model.evidence import Evidence
-from semstab.model.measures import MeasureMeans, dominant, measures
+from semstab.model.measures import MeasureMeans, dominant, measures, vss
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -27,6 +28,8 @@ if TYPE_CHECKING:
 # Columns as tables of Arrow and pandas, and the small tables that a notebook shows.
 
 Cell = str | int | float
+
+CAPTION = "VSS from above, dark 0 to yellow 1; grey: seen once"
 
 
 def to_arrow(columns: Mapping[str, Any]) -> pa.Table:
@@ -230,7 +233,12 @@ class VoxelTable:
             numbers = (number(means[measure], measure.digits[0]) for measure in measures())
             rows.append([name, int(np.count_nonzero(where)), *numbers])
         title = f"{len(self):,} voxels of {self.voxel_size:g} m, {self.K} classes"
-        return as_html(title, ["", "voxels", *(measure.title for measure in measures())], rows)
+        table = as_html(title, ["", "voxels", *(measure.title for measure in measures())], rows)
+        return table + (as_figure(self.image(), CAPTION) if len(self) else "")
+
+    def image(self, up: npt.ArrayLike | None = None) -> UInt8:
+        """Return VSS of the topmost voxels, (H, W, 3) RGB; see `semstab.model.display.from_above`."""
+        return from_above(self.index, np.where(self.op > 1, vss(self), np.nan), up)
 
     def save(
         self,

@@ -1,0 +1,242 @@
+"""Annotation tasks: the places of a map on which frames disagree, each with the view that shows it best."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+from scipy.ndimage import find_objects
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
+
+from semstab.backends.shared.association import back_project
+from semstab.core.prefetch import prefetch
+from semstab.core.types import Float64, Int64, Mask
+from semstab.errors import ConfigError, DataError
+from semstab.exports.join import NONE, VoxelLookup
+from semstab.exports.voxels import Chosen
+from semstab.metrics import CATEGORIES, categories
+from semstab.model.frames import Frame
+from semstab.model.measures import bits, dominant
+from semstab.model.voxels import VoxelTable
+from semstab.statistics import psa
+from semstab.task import Task
+
+MIN_PSA = 0.8
+"""Where fewer pairs of frames agree a place is annotated, as where belief drifts or is uncertain."""
+
+BLOCK = 16
+"""Largest edge of a place, voxels: what a person can judge at once."""
+
+NEIGHBOURS = 1.8
+"""Largest distance of neighbours' centres, voxels: those across an edge or a corner are neighbours, too."""
+
+SMALLEST = 1 / 5000
+"""Part of an image, 8 x 8 pixels of 640 x 480, that an outline encloses; what is smaller cannot be judged."""
+
+MORE = 8
+"""So many times the tasks wanted are looked for in the frames: no frame may show a place well."""
+
+
+@dataclass(frozen=True, eq=False)
+class AnnotationTask:
+    """A place to annotate, in the image that shows it best.
+
+    score    bits of entropy that its label removes from the map: the sum over the voxels that the outline shows
+    label    the fused class, and `other` the next one; names
+    voxels   of the place; `op`, how many frames saw them in the median
+    center   (3,) of the place, metres: global coordinates where the scene has a georeference
+    frame    number of the best view, `image` the name of its files
+    outline  polygons (n, 2) in pixels x, y of the image of `size` (width, height)
+    views    names of the other images that show it, the best first
+    """
+
+    score: float
+    label: str
+    other: str
+    voxels: int
+    op: float
+    center: tuple[float, ...]
+    frame: int
+    image: str
+    size: tuple[int, int]
+    outline: tuple[Float64, ...]
+    views: tuple[str, ...]
+
+
+def annotation_tasks(chosen: Chosen, task: Task, most: int) -> list[AnnotationTask]:
+    """Return at most so many tasks, the highest score first.
+
+    A place is a connected set of voxels that at least two frames saw, with the same two likeliest classes, on which
+    frames disagree. Its best view has the largest product of size in the image, how frontal and how sharp it is. A
+    place where all frames are wrong alike is not found.
+
+    chosen  the voxels that may be annotated
+    task    whose frames were fused
+
+    Raises ConfigError where frames disagree nowhere, or no frame shows it large enough; DataError where the frames have
+    no colour image.
+    """
+    places = _Places.of(chosen, MORE * most)
+    views = [view for fetched in prefetch(lambda i: _views(task, i, places), task.indices) for view in fetched.item]
+    by_place: dict[int, list[_View]] = {}
+    for view in views:
+        by_place.setdefault(view.place, []).append(view)
+    if not by_place:
+        raise ConfigError(
+            "no image shows a place where frames disagree as large as a person needs it; use larger voxels"
+        )
+    best = [_ranked(own) for own in by_place.values()]
+    best.sort(key=lambda own: -own[0].bits)
+    return [places.task(own, task) for own in best[:most]]
+
+
+@dataclass(frozen=True, eq=False)
+class _Places:
+    """The voxels that are annotated; (n,) the place of each, 0, 1, ..., its two classes, and its entropy in bits."""
+
+    table: VoxelTable
+    place: Int64
+    label: Int64
+    other: Int64
+    bits: Float64
+    names: tuple[str, ...]
+    offset: Float64
+
+    @classmethod
+    def of(cls, chosen: Chosen, most: int) -> _Places:
+        """At most so many places, those with the most entropy."""
+        parts = list(chosen)
+        first = parts[0]
+        table = VoxelTable.joined([part.table.rows(_disagreed(part.table)) for part in parts])
+        if not len(table):
+            raise ConfigError("the frames disagree nowhere; there is nothing to annotate")
+        label, entropy = dominant(table), bits(table)
+        rest = table.evidence[:]
+        rest[np.arange(len(table)), label] = -1
+        other = rest.argmax(axis=1)
+        place = _connected(table.index, np.stack([label, other], axis=1))
+        total = np.bincount(place, entropy)
+        rank = np.empty(len(total), np.int64)
+        rank[np.argsort(-total, kind="stable")] = np.arange(len(total))
+        rows = np.flatnonzero(rank[place] < most)
+        return cls(
+            table.rows(rows), rank[place[rows]], label[rows], other[rows], entropy[rows], first.classes, first.offset
+        )
+
+    def task(self, views: list[_View], task: Task) -> AnnotationTask:
+        """The task of a place from its views, the best first."""
+        best, names = views[0], task.scene.image_name
+        own = self.place == best.place
+        k = int(np.flatnonzero(own)[0])
+        center = self.table.centers[own].mean(axis=0) + self.offset
+        return AnnotationTask(
+            best.bits, self.names[self.label[k]], self.names[self.other[k]], int(own.sum()),
+            float(np.median(self.table.op[own])), tuple(center.tolist()), best.frame, names(best.frame), best.size,
+            best.outline, tuple(names(view.frame) for view in views[1:]),
+        )  # fmt: skip
+
+
+def _disagreed(table: VoxelTable) -> Int64:
+    """The rows of voxels on which frames disagree."""
+    category = np.array(CATEGORIES)[categories(table)]
+    wanted = np.isin(category, ("drifting", "uncertain")) | (np.nan_to_num(psa(table), nan=1.0) < MIN_PSA)
+    return np.flatnonzero(wanted & (table.op >= 2))
+
+
+def _connected(index: npt.NDArray[np.integer[Any]], classes: Int64) -> Int64:
+    """The connected set (n,) of each voxel (n, 3) with others of its classes (n, 2); large ones are cut into blocks."""
+    pairs, n = cKDTree(index).query_pairs(NEIGHBOURS, output_type="ndarray"), len(index)
+
+    def sets(alike: npt.NDArray[np.integer[Any]]) -> Int64:
+        a, b = pairs[(alike[pairs[:, 0]] == alike[pairs[:, 1]]).all(axis=1)].T
+        _, own = connected_components(coo_array((np.ones(len(a), np.bool_), (a, b)), shape=(n, n)), directed=False)
+        return np.asarray(own, np.int64)
+
+    whole = sets(classes)
+    corner = np.full((whole.max() + 1, 3), np.iinfo(index.dtype).max)
+    np.minimum.at(corner, whole, index)
+    return sets(np.column_stack([whole, (index - corner[whole]) // BLOCK]))
+
+
+# Places in the images.
+
+
+@dataclass(frozen=True, eq=False)
+class _View:
+    """A place in a frame.
+
+    bits     of the voxels that it shows
+    pixels   of the outline
+    area     of the surface across the line of sight, square metres: the more frontal, the larger
+    sharp    mean square of the image's second derivative in the outline
+    """
+
+    place: int
+    frame: int
+    size: tuple[int, int]
+    outline: tuple[Float64, ...]
+    bits: float
+    pixels: float
+    area: float
+    sharp: float
+
+
+def _ranked(views: list[_View]) -> list[_View]:
+    """The views of a place, the best first."""
+    area, sharp = (max(getattr(view, name) for view in views) for name in ("area", "sharp"))
+    return sorted(views, key=lambda view: -view.bits * view.pixels * (view.area / area) * (view.sharp / sharp))
+
+
+def _views(task: Task, index: int, places: _Places) -> list[_View]:
+    """The places that a frame shows."""
+    image = task.scene.color(index)
+    if image is None:
+        raise DataError(f"{task.scene.name}, {task.scene.image_name(index)}: the frame has no colour image to annotate")
+    frame = task.scene.view(index, image.shape[:2])
+    rows = np.full(frame.shape, NONE)
+    rows[frame.valid] = VoxelLookup(places.table).rows(back_project(frame).T)
+    place = np.where(rows == NONE, NONE, places.place[rows])
+    sharpness: Float64 = cv2.Laplacian(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), cv2.CV_64F).astype(np.float64) ** 2
+    boxes = enumerate(find_objects(place + 1))
+    found = [_view(frame, rows, place, k, box, places, sharpness) for k, box in boxes if box is not None]
+    return [view for view in found if view is not None]
+
+
+def _view(
+    frame: Frame, rows: Int64, place: Int64, k: int, box: tuple[slice, slice], places: _Places, sharpness: Float64
+) -> _View | None:
+    """Place k within a box of the image; None where the image shows too little of it."""
+    seen = place[box] == k
+    K, z = frame.intrinsics, frame.depth[box][seen].astype(np.float64)
+    outline, mask = outlined(seen, places.table.voxel_size * K.fx / float(np.median(z)), SMALLEST * rows.size)
+    if not outline:
+        return None
+    corner, (H, W) = np.array([box[1].start, box[0].start], np.float64), frame.shape
+    return _View(
+        k, frame.index, (W, H), tuple(polygon + corner for polygon in outline),
+        float(places.bits[np.unique(rows[box][seen])].sum()), float(mask.sum()), float((z**2).sum() / (K.fx * K.fy)),
+        float(sharpness[box][mask].mean()) + 1e-9,
+    )  # fmt: skip
+
+
+def outlined(seen: Mask, voxel: float, smallest: float) -> tuple[tuple[Float64, ...], Mask]:
+    """Return polygons around pixels (H, W), gaps up to the width of a voxel filled, and what they enclose.
+
+    voxel     its width, pixels
+    smallest  area of an outline, square pixels
+    """
+    width = int(np.clip(np.ceil(voxel), 3, 31)) | 1
+    kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (width, width))
+    closed = cv2.morphologyEx(np.pad(seen.astype(np.uint8), width), cv2.MORPH_CLOSE, kernel)
+    closed = np.ascontiguousarray(closed[width:-width, width:-width])
+    contours, _ = cv2.findContours(closed, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_SIMPLE)
+    kept = [cv2.approxPolyDP(c, 1.0, True) for c in contours if cv2.contourArea(c) >= max(4, smallest)]
+    kept = [c for c in kept if len(c) >= 3]
+    mask = np.zeros(seen.shape, np.uint8)
+    cv2.drawContours(mask, kept, -1, 1, cv2.FILLED)
+    return tuple(c[:, 0].astype(np.float64) for c in kept), mask.astype(np.bool_)

@@ -1,0 +1,229 @@
+"""Annotation tasks as files of COCO, Label Studio, CVAT and FiftyOne, with the images that they name beside them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree
+
+import cv2
+
+from semstab.config import nearest
+from semstab.core.files import atomic_path, write_json, write_text
+from semstab.errors import ConfigError
+from semstab.exports.annotation import AnnotationTask
+from semstab.model.labels import LabelSpace
+from semstab.task import Task
+
+MOST = 50
+"""Tasks where no number is given."""
+
+
+@dataclass(frozen=True, eq=False)
+class TaskFile:
+    """Tasks of a scene, the most urgent first, and the file that they go to.
+
+    space   the classes that are annotated
+    source  the label source, whose fused classes are proposed
+    """
+
+    tasks: Sequence[AnnotationTask]
+    space: LabelSpace
+    scene: str
+    source: str
+    path: Path
+
+    @property
+    def folder(self) -> Path:
+        """Where the images are: tasks_images beside tasks.json."""
+        return self.path.with_name(f"{self.path.stem}_images")
+
+    def image(self, task: AnnotationTask) -> str:
+        """The file of a task's image, relative to that of the tasks."""
+        return f"{self.folder.name}/{task.image.replace('/', '_')}.jpg"
+
+    def by_image(self) -> dict[str, list[tuple[int, AnnotationTask]]]:
+        """The tasks, numbered from 1, by the file of their image."""
+        found: dict[str, list[tuple[int, AnnotationTask]]] = {}
+        for rank, task in enumerate(self.tasks, start=1):
+            found.setdefault(self.image(task), []).append((rank, task))
+        return found
+
+    def beside(self, ending: str) -> Path:
+        """A further file: tasks_ENDING beside tasks.json."""
+        return self.path.with_name(f"{self.path.stem}_{ending}")
+
+
+def about(task: AnnotationTask) -> dict[str, Any]:
+    """What is known of a task's place."""
+    return {
+        "score": round(task.score, 3), "fused": task.label, "second": task.other, "voxels": task.voxels, "op": task.op,
+        "center": [round(x, 3) for x in task.center], "views": list(task.views),
+    }  # fmt: skip
+
+
+def coco(file: TaskFile) -> Iterator[str]:
+    """COCO's instances: polygons with a score; the order is that of the scores."""
+    numbers = {name: k for k, name in enumerate(file.by_image(), start=1)}
+    sizes = {file.image(task): task.size for task in file.tasks}
+    ids = {name: k for k, name in enumerate(file.space.classes, start=1)}
+    annotations: list[dict[str, Any]] = []
+    for rank, task in enumerate(file.tasks, start=1):
+        low = [min(float(p[:, k].min()) for p in task.outline) for k in range(2)]
+        high = [max(float(p[:, k].max()) for p in task.outline) for k in range(2)]
+        area = sum(float(cv2.contourArea(p.astype("float32"))) for p in task.outline)
+        own: dict[str, Any] = {
+            "id": rank, "image_id": numbers[file.image(task)], "category_id": ids[task.label], "iscrowd": 0,
+            "segmentation": [p.ravel().tolist() for p in task.outline], "area": area,
+            "bbox": [*low, high[0] - low[0], high[1] - low[1]],
+        }  # fmt: skip
+        annotations.append(own | about(task))
+    write_json(file.path, {
+        "info": {"description": f"{file.scene}, {file.source}: places where frames disagree, by semstab"},
+        "licenses": [],
+        "images": [
+            {"id": k, "file_name": name, "width": sizes[name][0], "height": sizes[name][1]}
+            for name, k in numbers.items()
+        ],
+        "categories": [{"id": k, "name": name, "supercategory": ""} for name, k in ids.items()],
+        "annotations": annotations,
+    })  # fmt: skip
+    yield f"images: {file.folder}"
+
+
+def label_studio(file: TaskFile) -> Iterator[str]:
+    """Label Studio's tasks with a predicted polygon, and the labelling set-up."""
+    rows = []
+    for rank, task in enumerate(file.tasks, start=1):
+        W, H = task.size
+        polygons = [
+            {
+                "id": f"{rank}.{k}", "type": "polygonlabels", "from_name": "label", "to_name": "image",
+                "original_width": W, "original_height": H, "image_rotation": 0,
+                "value": {
+                    "points": [[100 * x / W, 100 * y / H] for x, y in polygon.tolist()], "closed": True,
+                    "polygonlabels": [task.label],
+                },
+            }
+            for k, polygon in enumerate(task.outline, start=1)
+        ]  # fmt: skip
+        data = {"image": f"/data/local-files/?d={file.image(task)}", "title": f"{rank}: {task.label} or {task.other}?"}
+        predictions = [{"model_version": file.source, "result": polygons}]
+        rows.append({"data": {"rank": rank} | data | about(task), "predictions": predictions})
+    write_json(file.path, rows)
+    view = ElementTree.Element("View")
+    ElementTree.SubElement(view, "Header", value="$title")
+    ElementTree.SubElement(view, "Image", name="image", value="$image", zoom="true")
+    labels = ElementTree.SubElement(view, "PolygonLabels", name="label", toName="image")
+    for name, color in _colors(file.space):
+        ElementTree.SubElement(labels, "Label", value=name, background=color)
+    setup = file.beside("config.xml")
+    write_text(setup, _xml(view, declaration=False))
+    yield f"set-up of the project: {setup}; serve {file.folder} as local files"
+
+
+def cvat(file: TaskFile) -> Iterator[str]:
+    """CVAT for images 1.1, and the labels for the task's raw constructor."""
+    root = ElementTree.Element("annotations")
+    ElementTree.SubElement(root, "version").text = "1.1"
+    task_xml = ElementTree.SubElement(ElementTree.SubElement(root, "meta"), "task")
+    images = file.by_image()
+    for name, value in (("name", f"{file.scene}, {file.source}"), ("size", len(images)), ("mode", "annotation")):
+        ElementTree.SubElement(task_xml, name).text = str(value)
+    labels, raw = ElementTree.SubElement(task_xml, "labels"), []
+    own = ("task", "score", "second")
+    for name, color in _colors(file.space):
+        label = ElementTree.SubElement(labels, "label")
+        ElementTree.SubElement(label, "name").text = name
+        ElementTree.SubElement(label, "color").text = color
+        attributes = ElementTree.SubElement(label, "attributes")
+        for what in own:
+            attribute = ElementTree.SubElement(attributes, "attribute")
+            given = {"name": what, "mutable": "False", "input_type": "text", "default_value": "", "values": ""}
+            for key, text in given.items():
+                ElementTree.SubElement(attribute, key).text = text
+        raw.append({"name": name, "color": color, "attributes": [
+            {"name": what, "mutable": False, "input_type": "text", "values": [""]} for what in own]})  # fmt: skip
+    for k, (name, tasks) in enumerate(images.items()):
+        W, H = tasks[0][1].size
+        image = ElementTree.SubElement(root, "image", id=str(k), name=Path(name).name, width=str(W), height=str(H))
+        for rank, task in tasks:
+            for polygon in task.outline:
+                points = ";".join(f"{x:.2f},{y:.2f}" for x, y in polygon.tolist())
+                shape = ElementTree.SubElement(
+                    image, "polygon", label=task.label, source="semstab", occluded="0", points=points, z_order="0",
+                    group_id=str(rank),
+                )  # fmt: skip
+                for what, text in zip(own, (str(rank), f"{task.score:.3f}", task.other), strict=True):
+                    ElementTree.SubElement(shape, "attribute", name=what).text = text
+    write_text(file.path, _xml(root))
+    constructor = file.beside("labels.json")
+    write_json(constructor, raw)
+    yield f"labels of the task: {constructor} (Raw); images: {file.folder}; then upload as 'CVAT 1.1'"
+
+
+def fiftyone(file: TaskFile) -> Iterator[str]:
+    """FiftyOne's dataset as JSON: a sample an image, with polylines."""
+    fields, labels = "fiftyone.core.fields", "fiftyone.core.labels.Polylines"
+    samples = []
+    for name, tasks in file.by_image().items():
+        polylines = []
+        for rank, task in tasks:
+            W, H = task.size
+            points = [[[x / W, y / H] for x, y in polygon.tolist()] for polygon in task.outline]
+            polylines.append({"_cls": "Polyline", "label": task.label, "points": points, "closed": True, "filled": True,
+                              "attributes": {}, "tags": [], "task": rank, **about(task)})  # fmt: skip
+        samples.append({"filepath": name, "tags": [], "metadata": None, "_media_type": "image",
+                        "score": max(each["score"] for each in polylines),
+                        "places": {"_cls": "Polylines", "polylines": polylines}})  # fmt: skip
+    write_json(file.path, {
+        "name": f"semstab-{file.scene}-{file.source}",
+        "media_type": "image",
+        "sample_fields": {
+            "score": f"{fields}.FloatField",
+            "places": f"{fields}.EmbeddedDocumentField({labels})",
+        },
+        "info": {"scene": file.scene, "source": file.source},
+        "default_classes": list(file.space.classes),
+        "samples": samples,
+    })  # fmt: skip
+    yield f'open: fiftyone.Dataset.from_json("{file.path.name}", rel_dir=".")'
+
+
+FORMATS: Mapping[str, tuple[str, Callable[[TaskFile], Iterator[str]]]] = {
+    "coco": (".json", coco), "labelstudio": (".json", label_studio), "cvat": (".xml", cvat),
+    "fiftyone": (".json", fiftyone),
+}  # fmt: skip
+"""By name: the suffix of the file, and what writes it and yields how it is opened."""
+
+
+def check(kind: str, path: Path) -> None:
+    """Raise ConfigError where a format is not known, or the file's suffix is not its own."""
+    if kind not in FORMATS:
+        raise ConfigError(f"no format '{kind}'; {nearest(kind, [*FORMATS])}")
+    if path.suffix.lower() != FORMATS[kind][0]:
+        raise ConfigError(f"{path}: {kind} is a {FORMATS[kind][0]} file")
+
+
+def write_tasks(file: TaskFile, kind: str, task: Task) -> tuple[str, ...]:
+    """Write tasks of frames, and their images; return how they are opened."""
+    for one in {own.image: own for own in file.tasks}.values():
+        color = task.scene.color(one.frame)
+        assert color is not None
+        with atomic_path(file.path.parent / file.image(one)) as path:
+            cv2.imwrite(str(path), cv2.cvtColor(color, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, 95])
+    return tuple(FORMATS[kind][1](file))
+
+
+def _colors(space: LabelSpace) -> Iterator[tuple[str, str]]:
+    """Each class with its colour: '#ff0000'."""
+    yield from (
+        (name, "#{:02x}{:02x}{:02x}".format(*color)) for name, color in zip(space.classes, space.colors, strict=True)
+    )
+
+
+def _xml(root: ElementTree.Element, *, declaration: bool = True) -> str:
+    ElementTree.indent(root)
+    return ElementTree.tostring(root, encoding="unicode", xml_declaration=declaration) + "\n"

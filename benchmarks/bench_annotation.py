@@ -1,0 +1,132 @@
+"""True errors that the first tasks of `export --format` hold, beside as many regions chosen without a map.
+
+    python benchmarks/bench_annotation.py RUN --backbone fcn --scores fcn-scores     # a run of shared/data/apc_shelf
+
+The others are windows as large as the tasks, pixel by pixel the same budget: where the scores of a single image have
+the highest entropy (without windows that overlap in one image), at random, and at random on an edge between two
+classes. Wrong are pixels with depth whose label is not the truth: those in the regions, and those of all frames at the
+voxels that the regions show, which a label of the place mends; wrong voxels have such a pixel.
+"""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+import semstab
+from semstab.backends.shared.association import back_project
+from semstab.exports.annotation import annotation_tasks
+from semstab.exports.relabel import task_of
+from semstab.exports.voxels import Chosen
+from semstab.model.information import entropy_bits
+from semstab.task import read, truth_task
+
+NONE = -1
+
+
+class Images:
+    """The wrong pixels of each frame, its voxels, and the entropy of its scores."""
+
+    def __init__(self, task, scores, size):
+        truth = truth_task(task)
+        self.frames = list(task.indices)
+        self.wrong, self.key, self.entropy, self.edge, voxels = {}, {}, {}, {}, []
+        for i in self.frames:
+            frame, true, soft = read(task, i), read(truth, i), read(scores, i)
+            self.wrong[i] = true.valid & (frame.predicted != true.predicted) & (true.predicted != true.ignore_id)
+            self.key[i] = np.where(frame.valid, 0, NONE)
+            self.entropy[i] = entropy_bits(soft.scores)
+            edges = cv2.morphologyEx(frame.predicted.astype(np.uint8), cv2.MORPH_GRADIENT, np.ones((3, 3)))
+            self.edge[i] = np.argwhere((edges > 0) & frame.valid)
+            voxels.append(np.floor(back_project(frame).T / size).astype(np.int64))
+        _, key = np.unique(np.concatenate(voxels), axis=0, return_inverse=True)
+        for i, own in zip(self.frames, np.split(key.ravel(), np.cumsum([*map(len, voxels)])[:-1]), strict=True):
+            self.key[i][self.key[i] != NONE] = own
+        known = {i: self.key[i][self.wrong[i] & (self.key[i] != NONE)] for i in self.frames}
+        self.errors = np.bincount(np.concatenate([*known.values()]), minlength=int(key.max()) + 1)
+
+    def held(self, masks):
+        """Pixels of [(frame, mask), ...], wrong ones; voxels shown, wrong pixels of all frames there, wrong voxels."""
+        pixels = sum(int(mask.sum()) for _, mask in masks)
+        wrong = sum(int((mask & self.wrong[i]).sum()) for i, mask in masks)
+        shown = np.unique(np.concatenate([self.key[i][mask & (self.key[i] != NONE)] for i, mask in masks]))
+        return pixels, wrong, len(shown), int(self.errors[shown].sum()), int((self.errors[shown] > 0).sum())
+
+
+def window(shape, center, area):
+    """A square of that area inside an image."""
+    side = max(1, round(area**0.5))
+    low = [int(np.clip(c - side // 2, 0, max(0, n - side))) for c, n in zip(center, shape, strict=True)]
+    mask = np.zeros(shape, bool)
+    mask[low[0] : low[0] + side, low[1] : low[1] + side] = True
+    return mask
+
+
+def by_entropy(images, areas):
+    """Windows at the highest mean entropy, none over another one of the same image."""
+    free = {i: np.ones(e.shape, bool) for i, e in images.entropy.items()}
+    chosen = []
+    for area in areas:
+        side = max(1, round(area**0.5))
+        best = None
+        for i, entropy in images.entropy.items():
+            mean = cv2.boxFilter(np.where(free[i], entropy, -1.0).astype(np.float32), -1, (side, side))
+            at = np.unravel_index(mean.argmax(), mean.shape)
+            if best is None or mean[at] > best[0]:
+                best = mean[at], i, at
+        _, i, at = best
+        mask = window(free[i].shape, at, area)
+        free[i] &= ~mask
+        chosen.append((i, mask))
+    return chosen
+
+
+def at_random(images, areas, rng, *, edges):
+    """Windows around a random pixel, or a random pixel on an edge of labels."""
+    chosen = []
+    for area in areas:
+        i = images.frames[rng.integers(len(images.frames))]
+        shape = images.wrong[i].shape
+        rows = images.edge[i] if edges and len(images.edge[i]) else np.argwhere(images.key[i] != NONE)
+        chosen.append((i, window(shape, rows[rng.integers(len(rows))], area)))
+    return chosen
+
+
+def main():
+    """Print the table."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("run", type=Path)
+    parser.add_argument("--backbone", required=True)
+    parser.add_argument("--scores", required=True, help="label source with scores of the same model")
+    parser.add_argument("--most", type=int, default=50)
+    options = parser.parse_args()
+    result = semstab.load_result(options.run)
+    record, soft = (result.record(backbone=name) for name in (options.backbone, options.scores))
+    (task, _), (scores, _) = (task_of(options.run, own, result.manifest["inputs"]) for own in (record, soft))
+    tasks = annotation_tasks(Chosen(result, record, columns=("op",)), task, options.most)
+    images = Images(task, scores, Chosen(result, record, columns=("op",)).first.table.voxel_size)
+    masks = []
+    for one in tasks:
+        mask = np.zeros(one.size[::-1], np.uint8)
+        cv2.drawContours(mask, [p.astype(np.int32) for p in one.outline], -1, 1, cv2.FILLED)
+        masks.append((one.frame, mask.astype(bool)))
+    areas = [int(mask.sum()) for _, mask in masks]
+    rows = {
+        f"{len(tasks)} tasks": images.held(masks),
+        "entropy of single images": images.held(by_entropy(images, areas)),
+    }
+    for name, edges in (("random on an edge of labels", True), ("random", False)):
+        drawn = [images.held(at_random(images, areas, np.random.default_rng(s), edges=edges)) for s in range(20)]
+        rows[name] = tuple(float(np.mean(values)) for values in zip(*drawn, strict=True))
+    print(f"{'':28}{'pixels':>9}{'wrong':>9}{'share':>8}{'voxels':>9}{'wrong in all frames':>22}{'wrong voxels':>15}")
+    for name, (pixels, wrong, voxels, everywhere, places) in rows.items():
+        print(f"{name:28}{pixels:9,.0f}{wrong:9,.0f}{wrong / pixels:8.1%}{voxels:9,.0f}", end="")
+        print(f"{everywhere:22,.0f}{places:15,.0f}")
+    print(f"{'all':57}{len(images.errors):6,}{images.errors.sum():22,}{np.count_nonzero(images.errors):15,}")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,242 @@
+"""Annotation tasks: where frames disagree, in the view that shows it best, in files that annotation tools read."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import io
+import json
+from pathlib import Path
+from xml.etree import ElementTree
+
+import cv2
+import jsonschema
+import numpy as np
+import pytest
+from command_line import bench
+from posed_writer import write_posed
+from pycocotools.coco import COCO
+
+import semstab
+from semstab.datasets import open_dataset
+from semstab.errors import ConfigError, DataError
+from semstab.exports.annotation import outlined
+from semstab.exports.annotation_formats import FORMATS
+from semstab.model.frames import Frame, Intrinsics
+
+pytestmark = pytest.mark.filterwarnings("ignore:__array__ implementation:DeprecationWarning")
+
+W, H, SIZE = 192, 144, 0.1
+K = Intrinsics(160, 160, 95.5, 71.5)
+PATCHES = {1: (-0.8, -0.4, -0.4, 0.2), 2: (0.5, 0.7, -0.1, 0.1)}
+"""x and y of two patches of a floor, metres, by the class that is contested there: 4 x 6 and 2 x 2 voxels."""
+
+CAMERAS = [(0, 0, 3.0), (0.1, 0, 2.0), (0, 0.1, 3.0), (-0.1, 0, 3.0), (0, -0.1, 2.5), (0.1, 0.1, 3.5)]
+"""x, y, height of each frame; of the second and the fourth one the labels are wrong on the patches."""
+
+CLOSEST, SECOND = "frame1", "frame4"
+
+
+def frame(k: int, *, blurred: bool = False, color: bool = True) -> Frame:
+    """A view straight down; voxels lie between whole numbers, and the floor in their middle."""
+    x, y, z = CAMERAS[k]
+    T = np.diag([1.0, -1, -1, 1])
+    T[:3, 3] = x, y, z + SIZE / 2
+    v, u = np.mgrid[:H, :W]
+    X, Y = x + (u - K.cx) / K.fx * z, y - (v - K.cy) / K.fy * z
+    labels = np.zeros((H, W), np.uint8)
+    for label, (left, right, low, high) in PATCHES.items():
+        if k in (1, 3, 5)[: 3 if label == 1 else 2]:
+            labels[(left < X) & (right > X) & (low < Y) & (high > Y)] = label
+    grey = np.where((np.floor(X / 0.05) + np.floor(Y / 0.05)) % 2 > 0, 200, 60).astype(np.uint8)
+    if blurred:
+        grey = cv2.GaussianBlur(grey, (0, 0), 6)
+    image = np.repeat(grey[..., None], 3, axis=2) if color else None
+    return Frame(k, np.full((H, W), z, np.float32), K, T, labels=labels, color=image)
+
+
+def run_of(folder: Path, *, blurred: int | None = None, color: bool = True) -> Path:
+    frames = [frame(k, blurred=k == blurred, color=color) for k in range(len(CAMERAS))]
+    names = [f"frame{k}" for k in range(len(CAMERAS))]
+    scene = write_posed(folder / "floor", names, {"net": frames}, classes=["floor", "mat", "hole"], up_axis="z")
+    semstab.run({
+        "dataset": {"name": "posed_folder", "options": {"root": str(scene)}}, "voxel_size": SIZE, "taxonomy": None,
+        "check": None,
+    }, out=folder / "run")  # fmt: skip
+    return folder / "run"
+
+
+@pytest.fixture(scope="module")
+def floor(tmp_path_factory):
+    return run_of(tmp_path_factory.mktemp("floor"))
+
+
+def written(run: Path, folder: Path, kind: str, **options) -> Path:
+    path = folder / f"tasks{FORMATS[kind][0]}"
+    semstab.export(run, path, task_format=kind, **options)
+    return path
+
+
+def opened(path: Path) -> COCO:
+    with contextlib.redirect_stdout(io.StringIO()):
+        return COCO(str(path))
+
+
+def test_the_contested_place_is_found_and_outlined(floor, tmp_path):
+    coco = opened(written(floor, tmp_path, "coco"))
+    first, second = coco.dataset["annotations"]
+    assert (first["fused"], first["second"], second["second"]) == ("floor", "mat", "hole")
+    assert (first["voxels"], second["voxels"], first["op"]) == (24, 4, 6)
+    half, third = 1.0, -(2 * np.log2(1 / 3) + 4 * np.log2(2 / 3)) / 6
+    assert first["score"] == pytest.approx(24 * half)
+    assert second["score"] == pytest.approx(4 * third, abs=1e-3)
+    np.testing.assert_allclose(first["center"], [-0.6, -0.1, 0.05], atol=1e-3)
+    assert coco.imgs[first["image_id"]]["file_name"] == f"tasks_images/{CLOSEST}.jpg"
+    contested = frame(1).labels
+    for annotation, label in ((first, 1), (second, 2)):
+        mask, true = coco.annToMask(annotation) > 0, contested == label
+        assert (mask & true).sum() / (mask | true).sum() > 0.92  # to half a pixel
+        assert annotation["area"] == pytest.approx(true.sum(), rel=0.1)
+        low, size = np.array(annotation["bbox"][:2]), np.array(annotation["bbox"][2:])
+        rows, columns = np.nonzero(true)
+        np.testing.assert_allclose(
+            [*low, *(low + size)], [columns.min(), rows.min(), columns.max(), rows.max()], atol=2
+        )
+    image = cv2.imread(str(tmp_path / "tasks_images" / f"{CLOSEST}.jpg"))
+    assert np.abs(image.astype(int) - frame(1).color).mean() < 4
+
+
+def test_the_best_view_is_large_frontal_and_sharp(floor, tmp_path):
+    (first, *_) = json.loads(written(floor, tmp_path, "coco").read_text())["annotations"]
+    assert len(first["views"]) == 5
+    assert first["views"][0] == SECOND
+    blurred = run_of(tmp_path / "blurred", blurred=1)
+    coco = opened(written(blurred, tmp_path, "coco"))
+    assert coco.imgs[coco.anns[1]["image_id"]]["file_name"] == f"tasks_images/{SECOND}.jpg"
+
+
+def test_at_most_so_many_of_these_classes(floor, tmp_path):
+    assert len(json.loads(written(floor, tmp_path, "coco", most=1).read_text())["annotations"]) == 1
+    with pytest.raises(ConfigError, match="no voxel with OP >= 1 and class hole"):
+        written(floor, tmp_path, "coco", classes=["hole"])
+
+
+def test_where_frames_agree_there_is_nothing_to_annotate(tmp_path):
+    frames = [dataclasses.replace(frame(k), labels=np.zeros((H, W), np.uint8)) for k in range(3)]
+    scene = write_posed(tmp_path / "same", ["a", "b", "c"], {"net": frames}, classes=["floor", "mat"])
+    config = {"dataset": {"name": "posed_folder", "options": {"root": str(scene)}}, "voxel_size": SIZE, "check": None}
+    semstab.run(config, out=tmp_path / "run")
+    with pytest.raises(ConfigError, match="the frames disagree nowhere; there is nothing to annotate"):
+        written(tmp_path / "run", tmp_path, "coco")
+    assert not (tmp_path / "tasks.json").exists()
+
+
+def test_frames_without_images_are_one_line(tmp_path):
+    with pytest.raises(DataError, match="floor, frame0: the frame has no colour image to annotate"):
+        written(run_of(tmp_path, color=False), tmp_path, "coco")
+
+
+def test_the_command_says_what_it_wrote(floor, tmp_path):
+    def said(to: str, kind: str, code: int = 0) -> str:
+        done = bench("export", floor, "--to", to, "--format", kind, cwd=tmp_path, code=code)
+        return done.stderr if code else done.stdout
+
+    assert said("tasks.xml", "cvat").startswith("tasks.xml: 2 tasks in 1 images, 28 bits of entropy")
+    assert said("tasks.json", "cvat", code=2) == "error: tasks.json: cvat is a .xml file\n"
+    assert said("tasks.xml", "cvta", code=2) == "error: no format 'cvta'; did you mean 'cvat'?\n"
+
+
+LABEL_STUDIO = {
+    "type": "array", "minItems": 1, "items": {
+        "type": "object", "required": ["data", "predictions"], "properties": {
+            "data": {"type": "object", "required": ["image"], "properties": {
+                "image": {"type": "string", "pattern": "^/data/local-files/\\?d="}}},
+            "predictions": {"type": "array", "items": {
+                "type": "object", "required": ["model_version", "result"], "properties": {
+                    "result": {"type": "array", "minItems": 1, "items": {
+                        "type": "object",
+                        "required": ["id", "type", "from_name", "to_name", "original_width", "value"],
+                        "properties": {
+                            "id": {"type": "string"}, "type": {"const": "polygonlabels"},
+                            "image_rotation": {"const": 0},
+                            "value": {"type": "object", "required": ["points", "polygonlabels"], "properties": {
+                                "points": {"type": "array", "minItems": 3, "items": {
+                                    "type": "array", "minItems": 2, "maxItems": 2,
+                                    "items": {"type": "number", "minimum": 0, "maximum": 100}}},
+                                "polygonlabels": {"type": "array", "items": {"type": "string"}}}}}}}}}}}}}  # fmt: skip
+"""What Label Studio's importer asks of image tasks with predicted polygons (its guide, 'Import pre-annotations')."""
+
+
+def test_label_studio_has_tasks_and_a_set_up_that_fit(floor, tmp_path):
+    tasks = json.loads(written(floor, tmp_path, "labelstudio").read_text())
+    jsonschema.validate(tasks, LABEL_STUDIO)
+    view = ElementTree.parse(tmp_path / "tasks_config.xml").getroot()
+    control, image = view.find("PolygonLabels"), view.find("Image")
+    result = tasks[0]["predictions"][0]["result"][0]
+    assert (result["from_name"], result["to_name"]) == (control.get("name"), image.get("name"))
+    assert control.get("toName") == image.get("name")
+    assert image.get("value").lstrip("$") in tasks[0]["data"]
+    assert set(result["value"]["polygonlabels"]) <= {label.get("value") for label in control}
+    assert [task["data"]["rank"] for task in tasks] == [1, 2]
+    points = np.array(result["value"]["points"]) * [W, H] / 100
+    rows, columns = np.nonzero(frame(1).labels == 1)
+    np.testing.assert_allclose(points.mean(axis=0), [columns.mean(), rows.mean()], atol=2)
+    assert (tmp_path / tasks[0]["data"]["image"].partition("=")[2]).exists()
+
+
+def test_cvat_has_polygons_of_declared_labels(floor, tmp_path):
+    root = ElementTree.parse(written(floor, tmp_path, "cvat")).getroot()
+    labels = {label.find("name").text: label for label in root.iter("label")}
+    assert list(labels) == ["floor", "mat", "hole"]
+    (image,) = root.iter("image")
+    assert (image.get("name"), image.get("width"), image.get("height")) == (f"{CLOSEST}.jpg", str(W), str(H))
+    assert (tmp_path / "tasks_images" / image.get("name")).exists()
+    for polygon in image.iter("polygon"):
+        points = np.array([point.split(",") for point in polygon.get("points").split(";")], float)
+        assert ((points >= 0) & (points <= [W, H])).all()
+        declared = {each.find("name").text for each in labels[polygon.get("label")].iter("attribute")}
+        assert {attribute.get("name") for attribute in polygon} == declared
+    raw = json.loads((tmp_path / "tasks_labels.json").read_text())
+    assert [label["name"] for label in raw] == list(labels)
+    assert {attribute["name"] for attribute in raw[0]["attributes"]} == declared
+
+
+def test_fiftyone_has_a_dataset_of_polylines(floor, tmp_path):
+    dataset = json.loads(written(floor, tmp_path, "fiftyone").read_text())
+    (sample,) = dataset["samples"]
+    assert (tmp_path / sample["filepath"]).exists()
+    assert set(dataset["sample_fields"]) <= set(sample)
+    places = sample["places"]["polylines"]
+    assert [place["task"] for place in places] == [1, 2]
+    assert sample["score"] == places[0]["score"]
+    assert ((np.array(places[0]["points"][0]) >= 0) & (np.array(places[0]["points"][0]) <= 1)).all()
+
+
+def test_an_outline_fills_gaps_and_leaves_specks_out():
+    seen = np.zeros((60, 80), bool)
+    seen[10:40:2, 10:50] = True  # depth in every second row
+    seen[50:52, 70:72] = True
+    (outline,), mask = outlined(seen, voxel=8, smallest=20)  # pixels
+    assert mask[12:38, 12:48].all()
+    assert not mask[45:].any()
+    assert outline.min() >= 9
+
+
+def test_tasks_hold_more_errors_than_the_same_pixels_at_random(tmp_path):
+    """On the city: voxels whose class is not the truth, beneath the outlines and beneath random windows."""
+    config = {
+        "dataset": {"name": "city", "options": {"width": 128, "height": 72, "frames": 24}}, "scenes": ["scene0"],
+        "backbones": ["sim-flicker"], "voxel_size": 0.5, "taxonomy": None, "check": None,
+    }  # fmt: skip
+    semstab.run(config, out=tmp_path / "run")
+    coco = opened(written(tmp_path / "run", tmp_path, "coco", most=20))
+    scene, rng = open_dataset("city", config["dataset"]["options"]).scene("scene0"), np.random.default_rng(0)
+    names = {f"tasks_images/{scene.image_name(i)}.jpg": i for i in range(24)}
+    held, windows = [], []
+    for annotation in coco.dataset["annotations"]:
+        index = names[coco.imgs[annotation["image_id"]]["file_name"]]
+        true, said = (scene.frame(index, source).labels for source in ("gt", "sim-flicker"))
+        mask = coco.annToMask(annotation) > 0
+        held.append((true != said)[mask])
+        windows.append((true != said).ravel()[rng.choice(true.size, mask.sum())])
+    assert np.concatenate(held).mean() > 1.25 * np.concatenate(windows).mean()
