@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 from collections.abc import Iterator
 from typing import Any
@@ -16,6 +17,10 @@ def on_files(files: Any, config: Any, **_: Any) -> Any:
     """Add the generated pages."""
     from mkdocs.structure.files import File
 
+    for notebook in [file for file in files if file.src_uri.endswith(".ipynb")]:
+        files.remove(notebook)
+        page = notebook.src_uri.removesuffix(".ipynb") + ".md"
+        files.append(File.generated(config, page, content="\n\n".join(cells(notebook.content_string))))
     for path, lines in (("reference/cli.md", command_line()), ("reference/api.md", python_names())):
         files.append(File.generated(config, path, content="\n".join(lines)))
     return files
@@ -24,6 +29,19 @@ def on_files(files: Any, config: Any, **_: Any) -> Any:
 def on_page_markdown(markdown: str, **_: Any) -> str:
     """Take away links that lead out of the site."""
     return PARENT.sub("]", markdown)
+
+
+def cells(notebook: str) -> Iterator[str]:
+    """The cells of an executed notebook, with what they show."""
+    for cell in json.loads(notebook)["cells"]:
+        source = "".join(cell["source"])
+        yield source if cell["cell_type"] == "markdown" else f"```python\n{source}\n```"
+        for output in cell.get("outputs", ()):
+            shown = output.get("data", {})
+            if "text" in output:
+                yield f"```text\n{''.join(output['text'])}\n```"
+            elif "text/html" in shown or "text/markdown" in shown:
+                yield "".join(shown.get("text/html", shown.get("text/markdown")))
 
 
 def command_line() -> Iterator[str]:

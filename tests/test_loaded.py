@@ -57,6 +57,7 @@ def test_what_a_notebook_shows(run):
     table = run.table(backbone="a")
     assert f"{len(table)} voxels of 0.25 m, 3 classes" in table._repr_html_()
     assert f"<td>all</td><td>{len(table)}</td><td>{vss(table).mean():.3f}</td>" in table._repr_html_()
+    assert table.image().shape[2] == 3
     shown = study(record(voxels((1, 1, [1, 0, 0])), scene="<b>&"))._repr_html_()
     assert "&lt;b&gt;&amp;" in shown
     assert "<td>-</td>" in shown  # SBD of a voxel seen once

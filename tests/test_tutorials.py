@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import runpy
 import shlex
 import shutil
 from pathlib import Path
@@ -11,7 +12,8 @@ import pytest
 from command_line import bench
 from test_readers_odm import write_georeference, write_project
 
-TUTORIALS = Path(__file__).parents[1] / "docs/tutorials"
+DOCS = Path(__file__).parents[1] / "docs"
+TUTORIALS = DOCS / "tutorials"
 BLOCKS = re.compile(r"```(python|console)\n(.*?)```", re.DOTALL)
 
 
@@ -45,3 +47,55 @@ def test_every_block_of_a_tutorial_works_as_it_stands(name, prepare, left, tmp_p
             assert bench(*words, cwd=tmp_path, report=True, columns=80).stdout
     for file in left:
         assert (tmp_path / file).stat().st_size > 0
+
+
+def python_blocks(page: str) -> list[str]:
+    return [text for kind, text in BLOCKS.findall((DOCS / page).read_text(encoding="utf-8")) if kind == "python"]
+
+
+@pytest.mark.filterwarnings("ignore")  # of the trackers' own imports
+def test_the_recipes_for_trackers_log_scalars_report_and_map(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("WANDB_SILENT", "true")
+    monkeypatch.setenv("MLFLOW_ALLOW_FILE_STORE", "true")
+    blocks, names = python_blocks("trackers.md"), {}
+    assert all(len(text.strip().splitlines()) <= 10 for text in blocks[1:])
+    for text in blocks:
+        exec(compile(text, "trackers.md", "exec"), names)
+    scalars = names["result"].summary.scalars()
+
+    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+    logged = EventAccumulator(str(tmp_path / "tensorboard")).Reload()
+    assert {f"stability/{name}" for name in scalars} == set(logged.Tags()["scalars"])
+    assert logged.Scalars("stability/alpha")[0].value == pytest.approx(scalars["alpha"])
+    assert logged.Images("stability/map")[0].encoded_image_string.startswith(b"\x89PNG")
+
+    (offline,) = (tmp_path / "wandb").glob("offline-run-*")
+    (record,) = offline.glob("*.wandb")
+    content = record.read_bytes()
+    assert b"stability/alpha" in content
+    assert b"stability-report" in content
+    assert list(offline.rglob("*.png"))
+
+    import mlflow
+
+    (run,) = mlflow.search_runs(output_format="list", search_all_experiments=True)
+    assert run.data.metrics["stability/alpha"] == pytest.approx(scalars["alpha"])
+    artifacts = {file.path for file in mlflow.artifacts.list_artifacts(run_id=run.info.run_id)}
+    assert artifacts == {"report.html", "stability.png"}
+
+
+def test_training_with_the_metric_tells_stability_from_miou(tmp_path, monkeypatch):
+    """The page's blocks, and its example: alpha rises by much while mIoU stays."""
+    monkeypatch.chdir(tmp_path)
+    for text in python_blocks("training-loop.md"):
+        exec(compile(text, "training-loop.md", "exec"), {})
+    assert (tmp_path / "flicker.html").stat().st_size > 100_000
+    example = runpy.run_path(str(DOCS / "examples/training_loop.py"))
+    before, after = example["train"]()[example["EPOCHS"] // 2 - 1 :: example["EPOCHS"] // 2]
+    assert abs(after["miou"] - before["miou"]) < 0.06
+    assert before["miou"] > 0.3
+    assert after["alpha"] > before["alpha"] + 0.2
+    example["draw"]([before, after], tmp_path / "figure.png")
+    assert (tmp_path / "figure.png").stat().st_size > 1000

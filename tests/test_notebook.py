@@ -1,0 +1,55 @@
+"""The notebook of the documentation, run as it stands; a refreshed copy: `python tests/test_notebook.py`."""
+
+from __future__ import annotations
+
+import os
+import re
+import shutil
+import sys
+import tempfile
+from pathlib import Path
+
+import nbclient
+import nbformat
+import pytest
+
+NOTEBOOK = Path(__file__).parents[1] / "docs/tutorials/decision.ipynb"
+PICTURE = re.compile(r'src="data:image/png;base64,[^"]*"')
+
+
+def executed(folder: Path):
+    """The notebook, run in a folder; it uses the `semstab-bench` of this Python."""
+    os.environ["PATH"] = os.pathsep.join([str(Path(sys.executable).parent), os.environ["PATH"]])
+    os.environ["COLUMNS"] = "100"
+    notebook = nbformat.read(NOTEBOOK, nbformat.NO_CONVERT)
+    nbclient.NotebookClient(notebook, timeout=300, resources={"metadata": {"path": str(folder)}}).execute()
+    for cell in notebook.cells:
+        cell.metadata.pop("execution", None)
+    return notebook
+
+
+def shown(notebook) -> list[str]:
+    """What the cells show, without pictures."""
+    outputs = [output for cell in notebook.cells for output in cell.get("outputs", ())]
+    texts = [
+        output.get("text") or output["data"].get("text/html", output["data"].get("text/markdown")) for output in outputs
+    ]
+    return [PICTURE.sub("", text).strip() for text in texts]
+
+
+@pytest.mark.filterwarnings("ignore::DeprecationWarning:zmq", "ignore::RuntimeWarning:zmq")
+def test_the_notebook_says_what_it_says_in_the_documentation(tmp_path, monkeypatch):
+    monkeypatch.setenv("PATH", os.environ["PATH"])
+    monkeypatch.setenv("COLUMNS", "100")
+    kept = nbformat.read(NOTEBOOK, nbformat.NO_CONVERT)
+    assert len(kept.cells) <= 12
+    again = shown(executed(tmp_path))
+    assert again == shown(kept)
+    assert "the gate passes" in "".join(again)
+    assert "<table>" in again[0]
+
+
+if __name__ == "__main__":
+    where = Path(tempfile.mkdtemp())
+    nbformat.write(executed(where), NOTEBOOK)
+    shutil.rmtree(where)
