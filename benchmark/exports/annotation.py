@@ -214,7 +214,7 @@ def _view(
     seen = place[box] == k
     K, z = frame.intrinsics, frame.depth[box][seen].astype(np.float64)
     outline, mask = outlined(seen, places.table.voxel_size * K.fx / float(np.median(z)), SMALLEST * rows.size)
-    if not outline:
+    if not mask.any():
         return None
     corner, (H, W) = np.array([box[1].start, box[0].start], np.float64), frame.shape
     return _View(
@@ -233,10 +233,13 @@ def outlined(seen: Mask, voxel: float, smallest: float) -> tuple[tuple[Float64, 
     width = int(np.clip(np.ceil(voxel), 3, 31)) | 1
     kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (width, width))
     closed = cv2.morphologyEx(np.pad(seen.astype(np.uint8), width), cv2.MORPH_CLOSE, kernel)
-    closed = np.ascontiguousarray(closed[width:-width, width:-width])
-    contours, _ = cv2.findContours(closed, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_SIMPLE)
+    closed = np.pad(closed[width:-width, width:-width], (0, 1))
+    square = np.ones((2, 2), np.uint8)  # OpenCV's contours run through the centres of pixels: here, along their edges
+    edged = cv2.dilate(closed, square, anchor=(1, 1))
+    contours, _ = cv2.findContours(edged, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_SIMPLE)
     kept = [cv2.approxPolyDP(c, 1.0, True) for c in contours if cv2.contourArea(c) >= max(4, smallest)]
     kept = [c for c in kept if len(c) >= 3]
-    mask = np.zeros(seen.shape, np.uint8)
+    mask = np.zeros(closed.shape, np.uint8)
     cv2.drawContours(mask, kept, -1, 1, cv2.FILLED)
+    mask = cv2.erode(mask, square, anchor=(0, 0))[:-1, :-1]
     return tuple(c[:, 0].astype(np.float64) for c in kept), mask.astype(np.bool_)

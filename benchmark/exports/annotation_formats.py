@@ -113,12 +113,11 @@ def label_studio(file: TaskFile) -> Iterator[str]:
         predictions = [{"model_version": file.source, "result": polygons}]
         rows.append({"data": {"rank": rank} | data | about(task), "predictions": predictions})
     write_json(file.path, rows)
-    view = ElementTree.Element("View")
-    ElementTree.SubElement(view, "Header", value="$title")
-    ElementTree.SubElement(view, "Image", name="image", value="$image", zoom="true")
-    labels = ElementTree.SubElement(view, "PolygonLabels", name="label", toName="image")
-    for name, color in _colors(file.space):
-        ElementTree.SubElement(labels, "Label", value=name, background=color)
+    labels = (_node("Label", value=name, background=color) for name, color in _colors(file.space))
+    image = _node("Image", name="image", value="$image", zoom="true")
+    view = _node(
+        "View", _node("Header", value="$title"), image, _node("PolygonLabels", *labels, name="label", toName="image")
+    )
     setup = file.beside("config.xml")
     write_text(setup, _xml(view, declaration=False))
     yield f"set-up of the project: {setup}; serve {file.folder} as local files"
@@ -126,41 +125,34 @@ def label_studio(file: TaskFile) -> Iterator[str]:
 
 def cvat(file: TaskFile) -> Iterator[str]:
     """CVAT for images 1.1, and the labels for the task's raw constructor."""
-    root = ElementTree.Element("annotations")
-    ElementTree.SubElement(root, "version").text = "1.1"
-    task_xml = ElementTree.SubElement(ElementTree.SubElement(root, "meta"), "task")
-    images = file.by_image()
-    for name, value in (("name", f"{file.scene}, {file.source}"), ("size", len(images)), ("mode", "annotation")):
-        ElementTree.SubElement(task_xml, name).text = str(value)
-    labels, raw = ElementTree.SubElement(task_xml, "labels"), []
-    own = ("task", "score", "second")
-    for name, color in _colors(file.space):
-        label = ElementTree.SubElement(labels, "label")
-        ElementTree.SubElement(label, "name").text = name
-        ElementTree.SubElement(label, "color").text = color
-        attributes = ElementTree.SubElement(label, "attributes")
-        for what in own:
-            attribute = ElementTree.SubElement(attributes, "attribute")
-            given = {"name": what, "mutable": "False", "input_type": "text", "default_value": "", "values": ""}
-            for key, text in given.items():
-                ElementTree.SubElement(attribute, key).text = text
-        raw.append({"name": name, "color": color, "attributes": [
-            {"name": what, "mutable": False, "input_type": "text", "values": [""]} for what in own]})  # fmt: skip
+    images, colors, own = file.by_image(), list(_colors(file.space)), ("task", "score", "second")
+    text = ("mutable", "False"), ("input_type", "text"), ("default_value", ""), ("values", "")
+    attributes = [_node("attribute", _node("name", what), *(_node(*pair) for pair in text)) for what in own]
+    labels = [
+        _node("label", _node("name", name), _node("color", color), _node("attributes", *attributes))
+        for name, color in colors
+    ]
+    scene = _node("name", f"{file.scene}, {file.source}"), _node("size", str(len(images))), _node("mode", "annotation")
+    drawn = []
     for k, (name, tasks) in enumerate(images.items()):
         W, H = tasks[0][1].size
-        image = ElementTree.SubElement(root, "image", id=str(k), name=Path(name).name, width=str(W), height=str(H))
-        for rank, task in tasks:
-            for polygon in task.outline:
-                points = ";".join(f"{x:.2f},{y:.2f}" for x, y in polygon.tolist())
-                shape = ElementTree.SubElement(
-                    image, "polygon", label=task.label, source="semstab", occluded="0", points=points, z_order="0",
-                    group_id=str(rank),
-                )  # fmt: skip
-                for what, text in zip(own, (str(rank), f"{task.score:.3f}", task.other), strict=True):
-                    ElementTree.SubElement(shape, "attribute", name=what).text = text
-    write_text(file.path, _xml(root))
+        polygons = [
+            _node(
+                "polygon",
+                *(_node("attribute", value, name=what) for what, value in zip(own, values, strict=True)),
+                label=task.label, source="semstab", occluded="0", z_order="0", group_id=str(rank),
+                points=";".join(f"{x:.2f},{y:.2f}" for x, y in polygon.tolist()),
+            )
+            for rank, task in tasks
+            for values in [(str(rank), f"{task.score:.3f}", task.other)]
+            for polygon in task.outline
+        ]  # fmt: skip
+        drawn.append(_node("image", *polygons, id=str(k), name=Path(name).name, width=str(W), height=str(H)))
+    meta = _node("meta", _node("task", *scene, _node("labels", *labels)))
+    write_text(file.path, _xml(_node("annotations", _node("version", "1.1"), meta, *drawn)))
     constructor = file.beside("labels.json")
-    write_json(constructor, raw)
+    declared = [{"name": what, "mutable": False, "input_type": "text", "values": [""]} for what in own]
+    write_json(constructor, [{"name": name, "color": color, "attributes": declared} for name, color in colors])
     yield f"labels of the task: {constructor} (Raw); images: {file.folder}; then upload as 'CVAT 1.1'"
 
 
@@ -222,6 +214,14 @@ def _colors(space: LabelSpace) -> Iterator[tuple[str, str]]:
     yield from (
         (name, "#{:02x}{:02x}{:02x}".format(*color)) for name, color in zip(space.classes, space.colors, strict=True)
     )
+
+
+def _node(tag: str, *content: ElementTree.Element | str, **attributes: str) -> ElementTree.Element:
+    """An element with a text or others in it."""
+    node = ElementTree.Element(tag, attributes)
+    node.text = "".join(each for each in content if isinstance(each, str)) or None
+    node.extend(each for each in content if not isinstance(each, str))
+    return node
 
 
 def _xml(root: ElementTree.Element, *, declaration: bool = True) -> str:
