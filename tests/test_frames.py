@@ -35,7 +35,7 @@ REFUSED = {
     "depth is not an image": ("depth", {"depth": np.ones(6, np.float32)}, "shape (6,)"),
     "depth is empty": ("depth", {"depth": np.ones((0, 3), np.float32)}, "shape (0, 3)"),
     "depth is in whole numbers": ("depth", {"depth": np.ones((2, 3), np.uint16)}, "depth is uint16; convert"),
-    "pose is 3x4": ("pose", {"T_wc": np.eye(4)[:3]}, "shape (3, 4)"),
+    "pose is 3x3": ("pose", {"T_wc": np.eye(3)}, "shape (3, 3)"),
     "pose is not finite": ("pose", {"T_wc": pose(T03=math.nan)}, "not finite"),
     "pose is transposed": ("pose", {"T_wc": pose(T30=5.0)}, "transposed?"),
     "rotation mirrors": ("pose", {"T_wc": np.diag([1.0, 1, -1, 1])}, "mirrors (determinant -1)"),

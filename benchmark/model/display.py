@@ -5,7 +5,6 @@ from __future__ import annotations
 import base64
 import html
 
-import cv2
 import numpy as np
 import numpy.typing as npt
 
@@ -23,6 +22,8 @@ def from_above(index: Int32, vss: Float64, up: npt.ArrayLike | None = None) -> U
 
     up  direction out of the picture; the map's shortest side where not given
     """
+    import cv2
+
     height = int(np.argmin(np.ptp(index, axis=0))) if up is None else int(np.argmax(np.abs(np.asarray(up, float))))
     right, ahead = (axis for axis in range(3) if axis != height)
     rank = index[:, height] if up is None or np.asarray(up)[height] > 0 else -index[:, height]
@@ -40,6 +41,8 @@ def from_above(index: Int32, vss: Float64, up: npt.ArrayLike | None = None) -> U
 
 def as_figure(picture: UInt8, caption: str) -> str:
     """Return a picture with its caption as HTML."""
+    import cv2
+
     data = base64.b64encode(cv2.imencode(".png", picture[..., ::-1])[1].tobytes()).decode()
     return (
         f'<figure style="display: inline-block; margin: 1em 1em 0 0"><img src="data:image/png;base64,{data}">'
