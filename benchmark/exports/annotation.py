@@ -241,5 +241,5 @@ def outlined(seen: Mask, voxel: float, smallest: float) -> tuple[tuple[Float64, 
     kept = [c for c in kept if len(c) >= 3]
     mask = np.zeros(closed.shape, np.uint8)
     cv2.drawContours(mask, kept, -1, 1, cv2.FILLED)
-    mask = cv2.erode(mask, square, anchor=(0, 0))[:-1, :-1]
-    return tuple(c[:, 0].astype(np.float64) for c in kept), mask.astype(np.bool_)
+    inside = cv2.erode(mask, square, anchor=(0, 0))[:-1, :-1].astype(np.bool_)
+    return tuple(c[:, 0].astype(np.float64) for c in kept), inside
