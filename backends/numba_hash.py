@@ -31,7 +31,7 @@ from semstab.backends.numba_loops import (
 )
 from semstab.backends.shared.aggregator import Aggregator
 from semstab.backends.shared.association import check_depth, check_frame, check_settings
-from semstab.backends.shared.keys import PARTITIONS, index_of_keys
+from semstab.backends.shared.keys import PARTITIONS, columns_of_keys, index_of_keys
 from semstab.backends.shared.observations import Change, MapTotal, Observed, ObservedScores
 from semstab.backends.shared.score_loops import LANES
 from semstab.core.compiled import is_kept, settings
@@ -41,7 +41,7 @@ from semstab.model.events import Events
 from semstab.model.evidence import Evidence
 from semstab.model.frames import Frame, Intrinsics
 from semstab.model.results import FrameReport
-from semstab.model.voxels import Extent, VoxelTable, index_columns
+from semstab.model.voxels import Extent, VoxelTable
 
 # The log of observations that the numba backend keeps on request.
 
@@ -196,11 +196,11 @@ class NumbaHash:
     def table(self) -> VoxelTable:
         """The map so far."""
         order = self._order()
-        index = index_of_keys(self._records["key"][order], self.origin)
+        index = columns_of_keys(self._records["key"][order], self.origin)
         columns = ("op", "drift_sum", "pixels", "first_frame", "last_frame", "self_sum", "frame_entropy_sum")
         values: dict[str, Any] = {name: self._records[name][order] for name in columns}
         evidence = self._evidence_of(order)
-        return VoxelTable(**index_columns(index), **values, evidence=evidence, voxel_size=self.voxel_size)
+        return VoxelTable(**index, **values, evidence=evidence, voxel_size=self.voxel_size)
 
     def _evidence_of(self, rows: Int32) -> Evidence:
         starts = np.zeros(len(rows) + 1, dtype=np.int64)
@@ -237,8 +237,7 @@ class NumbaHash:
         if self._history is None:
             return None
         order = self._order()
-        index = index_of_keys(self._records["key"][order], self.origin)
-        return self._history.events(order, index_columns(index))
+        return self._history.events(order, columns_of_keys(self._records["key"][order], self.origin))
 
     def _make_slots(self, needed: int) -> None:
         size = self._slots.shape[1]

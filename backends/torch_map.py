@@ -15,7 +15,7 @@ import torch
 
 from semstab.backends import FusionBackend
 from semstab.backends.shared.association import INDEX_LIMIT, check_depth, check_settings
-from semstab.backends.shared.keys import HALF, index_of_keys, out_of_reach
+from semstab.backends.shared.keys import HALF, columns_of_keys, out_of_reach
 from semstab.backends.shared.observations import Change, MapTotal
 from semstab.backends.torch_operations import (
     LOST,
@@ -45,7 +45,7 @@ from semstab.errors import ConfigError, DataError
 from semstab.model.evidence import Evidence
 from semstab.model.frames import Frame, Intrinsics
 from semstab.model.results import FrameReport
-from semstab.model.voxels import VoxelTable, index_columns
+from semstab.model.voxels import VoxelTable
 
 
 def device_of(name: str | None) -> torch.device:
@@ -169,8 +169,8 @@ class TorchMaps:
         values["evidence"] = Evidence.read(
             len(rows), columns.num_classes, lambda some: _at_home(columns.values["evidence"], rows[some])
         )
-        index = index_of_keys(keys.numpy(), self._grid.origin if self._grid else (0, 0, 0))
-        return VoxelTable(**index_columns(index), **values, voxel_size=self.voxel_size)
+        index = columns_of_keys(keys.numpy(), self._grid.origin if self._grid else (0, 0, 0))
+        return VoxelTable(**index, **values, voxel_size=self.voxel_size)
 
     def _columns_of(self, name: str) -> Columns:
         if name not in self.storage.columns:

@@ -35,7 +35,6 @@ from semstab.datasets import open_dataset
 from semstab.metrics import flicker_percent, summarise
 from semstab.model.events import Events
 from semstab.model.voxels import VoxelTable
-from semstab.statistics.fusion_rules import fuse_all
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
 
@@ -152,7 +151,6 @@ def sections(table: VoxelTable, events: Events) -> dict[str, Callable[[], Any]]:
     return {
         "drift of each voxel": lambda: statistics.voxel_drift(table, events),
         "drift of the scene": lambda: statistics.drift.order_test(table, events),
-        "fusion rules": lambda: fuse_all(events, statistics.RULES, evidence=table.evidence),
         "flips": lambda: statistics.flips(events),
         "agreement by class": lambda: statistics.class_agreement(table, events),
     }

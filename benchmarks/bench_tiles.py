@@ -85,6 +85,8 @@ def same(whole: Path, tiles: Path) -> bool:
             print(f"{file.stem}: evidence differs")
             return False
     summaries = [json.loads((run / "summary.json").read_text()) for run in (whole, tiles)]
+    for summary in summaries:
+        del summary["agreement"]  # each tile has a sample of its own to check
     found = [line for line in differences(*summaries, tolerance=1e-12) if "voxels_file" not in line]
     print(*found, sep="\n", end="\n" if found else "")
     return not found

@@ -1,4 +1,4 @@
-"""Print the lines of product code by part of the package beside their budgets; exit with 1 where one is exceeded.
+"""Print lines of code by part, and words of documentation, beside their budgets; exit with 1 where one is exceeded.
 
     python scripts/budgets.py             # 1 if a budget is exceeded
     python scripts/budgets.py --report    # the table only
@@ -10,6 +10,7 @@ longest path to it, so that a new folder without a budget is an error, too.
 from __future__ import annotations
 
 import argparse
+import re
 import sys
 from collections import Counter
 from collections.abc import Iterator
@@ -51,10 +52,21 @@ BUDGETS: dict[str, tuple[int, tuple[str, ...]]] = {
 
 MOST_LINES, MOST_FILES, MOST_TEST_LINES = 44_000, 220, 24_000
 
+MOST_WORDS, MOST_README_WORDS = 20_000, 900
+"""Of the documentation with README, without code; and of README with its code."""
+
+NO_PROSE = re.compile(r"```.*?```|^    .*?$|\]\([^)]*\)", re.DOTALL | re.MULTILINE)
+
 
 def lines_of(path: Path) -> int:
     """The lines of a file."""
     return len(path.read_text(encoding="utf-8").splitlines())
+
+
+def words_by_hand() -> int:
+    """The words of the documentation and README outside of code and of links."""
+    pages = [ROOT / "README.md", *(ROOT / "docs").rglob("*.md")]
+    return sum(len(re.findall(r"[A-Za-z0-9][^\s|]*", NO_PROSE.sub(" ", page.read_text("utf-8")))) for page in pages)
 
 
 def python_files(*folders: str) -> Iterator[Path]:
@@ -92,6 +104,8 @@ def main(arguments: list[str] | None = None) -> int:
         ("all lines", lines.total(), MOST_LINES),
         ("all files", files.total(), MOST_FILES),
         ("test lines", test_lines, MOST_TEST_LINES),
+        ("words of docs", words_by_hand(), MOST_WORDS),
+        ("words of README", len((ROOT / "README.md").read_text("utf-8").split()), MOST_README_WORDS),
     ]
     width = max(len(name) for name, _, _ in rows)
     print(f"{'part':{width}}  {'files':>5}  {'now':>7}  {'budget':>7}  {'over':>6}")

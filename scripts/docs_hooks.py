@@ -2,15 +2,21 @@
 
 from __future__ import annotations
 
+import csv
 import json
 import re
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 import semstab
 
 PARENT = re.compile(r"\]\(\.\./[^)]*\)")
 """Links to files of the repository outside of docs/, which the site does not hold: their text alone is kept."""
+
+
+TABLE = re.compile(r"^\[([^\]]*)\]\((tables/[^)]*\.csv)\)$", re.MULTILINE)
+"""A line that is a link to a table alone, which the site shows in its place."""
 
 
 def on_files(files: Any, config: Any, **_: Any) -> Any:
@@ -26,9 +32,16 @@ def on_files(files: Any, config: Any, **_: Any) -> Any:
     return files
 
 
-def on_page_markdown(markdown: str, **_: Any) -> str:
-    """Take away links that lead out of the site."""
-    return PARENT.sub("]", markdown)
+def on_page_markdown(markdown: str, config: Any, **_: Any) -> str:
+    """Show tables, and take away links that lead out of the site."""
+
+    def table(link: re.Match[str]) -> str:
+        with (Path(config["docs_dir"]) / link[2]).open(newline="", encoding="utf-8") as file:
+            head, *rows = ([_cell(cell) for cell in row] for row in csv.reader(file))
+        lines = "\n".join(f"    | {' | '.join(row)} |" for row in (head, ["---"] * len(head), *rows))
+        return f'??? info "{link[1]}, {len(rows)} rows"\n\n{lines}'
+
+    return PARENT.sub("]", TABLE.sub(table, markdown))
 
 
 def cells(notebook: str) -> Iterator[str]:

@@ -242,11 +242,14 @@ def test_a_selection_that_does_not_fit_is_refused(folder):
 
 def test_the_tables_fit_80_columns_and_the_numbers_go_to_a_file(folder, tmp_path):
     file = tmp_path / "check.json"
-    result = bench("check", "--data", folder, "--json", file, "--voxel-size", 0.1)
+    result = bench("check", "--data", folder, "--json", file, "--voxel-size", 0.1, "--verbose")
     assert result.exit_code == 0, result.stderr
     assert max(map(len, result.stdout.splitlines())) <= 80
-    for word in ("as configured", "frames apart", "OP=1", "labels, % of the pixels", "voxel_size:", "room: sound"):
+    for word in ("as configured", "frames apart", "OP=1", "labels, % of the pixels", "--voxel-size", "SOUND"):
         assert word in result.stdout
+    plain = bench("check", "--data", folder, "--voxel-size", 0.1).stdout
+    assert "SOUND" in "".join(plain.splitlines()[:3])
+    assert len(plain.splitlines()) <= 24
     content = json.loads(file.read_text(), parse_constant=lambda text: pytest.fail(f"{text} in JSON"))
     (scene,) = content["scenes"]
     assert (content["schema"], scene["sound"], scene["problems"]) == (1, True, [])
@@ -263,7 +266,7 @@ def test_unsound_data_are_exit_2_with_one_line_that_says_what_mends_it(tmp_path)
     (line,) = result.stderr.strip().splitlines()
     assert line.startswith("error: room: depth reprojects with ")
     assert f"under camera_axes: opengl (set it in {folder}/scene.yaml)" in line
-    assert "room: unsound" in result.stdout
+    assert "UNSOUND" in result.stdout
     assert "same voxel" not in result.stdout  # nothing is said about voxels of a scene that is wrong
     assert bench("check", "--data", folder, "--set", "dataset.options.camera_axes=opengl").exit_code == 0
 
@@ -274,7 +277,7 @@ def test_every_scene_is_checked_and_every_problem_counted(tmp_path):
     Image.fromarray(np.full((72, 96), 77, np.uint8)).save(tmp_path / "scenes/b/labels/net/002.png")
     result = bench("check", "--data", tmp_path / "scenes")
     assert result.exit_code == 2
-    assert "a: sound" in result.stdout
+    assert "  SOUND" in result.stdout
     assert result.stderr.strip() == (
         "error: b: no pixel of the sampled frames has valid depth; check the files and depth_scale"
         " (and 1 more, see above)"

@@ -10,8 +10,7 @@ from semstab.metrics import dominant, entropy, vss
 from semstab.model.evidence import Evidence, row_chunks
 from semstab.model.measures import Rows, margin
 from semstab.model.voxels import VoxelTable
-from semstab.statistics import RULES, describe, fuse
-from semstab.statistics.fusion_rules import fuse_all
+from semstab.statistics import describe
 
 RNG = np.random.default_rng(0)
 DENSE = RNG.random((50, 6)) * (RNG.random((50, 6)) < 0.4)
@@ -58,34 +57,8 @@ def test_one_pass_over_the_entries_finds_the_measures_of_dense_rows():
     np.testing.assert_array_equal(vss(table.measured().rows(some)), vss(table)[some])
 
 
-def test_measures_of_a_belief_count_the_classes_that_were_not_seen():
-    labels = RNG.integers(0, 4, size=(200, 6))
-    for rule in ("majority", "product", "geometric"):
-        fused = fuse(log_of(labels, K=9), rule)
-        rows = Rows(fused.op, fused.belief, fused.drift_sum)
-        for formula in (vss, entropy, margin):
-            np.testing.assert_allclose(formula(fused), formula(rows), rtol=1e-13, atol=1e-15)
-        np.testing.assert_array_equal(dominant(fused), dominant(rows))
-
-
-def test_some_voxels_of_a_log_are_fused_as_they_are_in_all_of_it():
-    labels = np.where(RNG.random((300, 5)) < 0.2, 1, RNG.integers(0, 3, size=(300, 1)))
-    events = log_of(np.where(np.arange(5) < RNG.integers(1, 6, size=(300, 1)), labels, -1), K=4)
-    table = events.table()
-    again = np.flatnonzero(table.op >= 2)
-    known = fuse_all(events, RULES, evidence=table.evidence.take(again), rows=again)
-    for one, other in zip(known, fuse_all(events, RULES), strict=True):
-        np.testing.assert_array_equal(one.belief, other.belief[again])
-        np.testing.assert_array_equal(one.drift_sum, other.drift_sum[again])
-
-
-def test_hundreds_of_classes_have_statistics_and_every_fusion_rule():
-    """With 101 classes or more a floor of 0.01 left the products no room, and the statistics failed at their end."""
+def test_hundreds_of_classes_have_statistics():
     labels = RNG.integers(0, 300, size=(60, 4))
     labels[:, 1:][RNG.random((60, 3)) < 0.6] = 7
     events = log_of(labels, K=300)
-    assert [row.rule for row in describe(events.table(), events).fusion_rules] == [
-        "averaging", "majority", "product", "geometric",
-    ]  # fmt: skip
-    for rule in ("averaging", "majority", "product", "geometric"):
-        np.testing.assert_allclose(fuse(events, rule).belief.sum(axis=1), 1)
+    assert -1 < describe(events.table(), events).agreement.alpha.value < 1

@@ -249,11 +249,9 @@ def test_a_plan_says_how_many_frames_a_rule_needs(run):
     assert wide == pytest.approx(9 * (half / 0.1) ** 2, rel=1.5)
 
 
-def test_the_documented_workflow_is_yaml():
-    import yaml
-
+def test_the_documented_rules_are_rules():
     text = (Path(__file__).parents[1] / "docs/gate.md").read_text()
-    blocks = re.findall(r"```yaml\n(.*?)```", text, re.S)
-    assert any("semstab-bench gate" in str(yaml.safe_load(block)) for block in blocks)
-    for rule in re.findall(r"--rule '([^']+)'", text):
+    rules = re.findall(r"--rule '([^']+)'", text)
+    assert len(rules) > 5
+    for rule in rules:
         parse(rule)

@@ -198,11 +198,11 @@ def judged(wall, tmp_path_factory):
 
 
 def test_statistics_of_tiles_are_those_of_the_whole_map(judged) -> None:
-    """With log and ground truth: tests of drift, flips, fusion rules, quadrants; each column of each voxel."""
+    """With log and ground truth: tests of drift, flips, quadrants; each column of each voxel."""
     assert_same_run(*judged)
     whole, tiles = judged
     (statistics,) = (run["statistics"] for run in summary_of(tiles)["runs"])
-    assert all(statistics[name] is not None for name in ("geometry", "correctness", "fusion_rules", "flipping"))
+    assert all(statistics[name] is not None for name in ("geometry", "correctness", "flipping"))
     assert statistics["drift"]["tests"]["tested_voxels"] > 0
     one, other = (semstab.load(folder) for folder in (tiles, whole))
     names = parquet.read_schema(other.result.records[0].voxels_file).names
@@ -321,13 +321,12 @@ def test_backends_are_held_against_each_other_tile_by_tile(wall, tmp_path) -> No
 
 
 def test_backbones_are_compared_tile_by_tile(tmp_path) -> None:
-    """Coverage, means at a common OP, common looks, other rules of fusion: with logs and ground truth."""
+    """Coverage, means at a common OP, common looks: with logs and ground truth."""
     root, found = tiny_scene.write(tmp_path / "wall", frames=8), []
     for size in (None, 8):
         settings = {"check": None, "backends": ["numba"], "statistics": True, "events": True, "tile_size": size}
         semstab.engine.run(configure(root, **settings), out=tmp_path / str(size))
         found.append(summary_of(tmp_path / str(size))["comparisons"])
-    assert found[0][0]["fusion_rules"]["values"]
     assert differences(*found, tolerance=1e-12) == []
     assert_same_comparison(*(tmp_path / size for size in ("None", "8")))
 

@@ -140,7 +140,7 @@ def test_a_run_reads_what_was_relabelled(fused, tmp_path):
     done = bench("relabel", fused / "run", "--out", tmp_path, "--category", "stable", cwd=tmp_path)
     assert "a-fused: 4 frames" in done.stdout
     assert "accuracy 0." in done.stdout
-    assert "the stability of these maps says nothing" in done.stdout
+    assert "a verdict on these maps means nothing" in done.stdout
     assert LabelSpace.load(tmp_path / "labels/a-fused/label_space.yaml").classes == ("wall", "door", "window")
     found = dataset_of(fused / "scene", labels_root=tmp_path, labels="labels/{backbone}/{name}")
     again = semstab.run(configure(fused / "scene", dataset=found, check=None))

@@ -106,7 +106,6 @@ def test_a_description_holds_what_the_functions_say(described):
     parts_of_all = (found.stable_right, found.stable_wrong, found.unstable_right, found.unstable_wrong)
     assert sum(share.value for share in parts_of_all) == pytest.approx(1)
     assert summary.drift.tests.trending_voxels == 0
-    assert [row.rule for row in summary.fusion_rules] == ["averaging", "majority", "product", "geometric"]
 
 
 def test_the_same_seed_gives_the_same_description():
@@ -120,7 +119,7 @@ def test_the_same_seed_gives_the_same_description():
 def test_a_table_alone_is_described_as_far_as_it_goes():
     events = backbone(0.2, 0)
     alone, logged = describe(events.table()), describe(events.table(), events)
-    assert alone.fusion_rules is alone.correctness is alone.geometry is alone.drift.tests is None
+    assert alone.correctness is alone.geometry is alone.drift.tests is None
     assert alone.drift.null == logged.drift.null
     assert to_json(alone.agreement) == to_json(logged.agreement)
     assert "for these frames alone (no log)" in alone.verdict.line
@@ -153,11 +152,6 @@ def test_backbones_beside_each_other():
     assert by_alpha.ranks[-1].backbone == "flickering"
     assert len(content.paired.differences) == 3 * 8
     assert content.standardised.of(PSA, "steady").value > 0.8
-    rules = content.fusion_rules
-    assert rules.orders["accuracy"]["averaging"][0] == "steady"
-    assert rules.values["averaging"]["stuck"].accuracy < 0.8
-    assert rules.order_changes.keys() == rules.orders.keys()
-    assert compare_backbones(tables).fusion_rules is None
 
 
 def between(low, high):

@@ -239,7 +239,7 @@ def test_the_check_says_what_depth_is_cast_at(photographs, mesh) -> None:
     print_check(checked, console)
     said = " ".join(console.export_text().split())
     assert f"from rays cast at {mesh}".replace(" ", "") in said.replace(" ", "")
-    assert "field: sound: neighbouring images match" in said
+    assert "SOUND neighbouring images match" in said
     assert "reprojected into each other" not in said
 
 

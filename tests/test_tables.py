@@ -85,7 +85,6 @@ def test_drift_that_few_places_tell_of_is_not_shown(walls):
     assert "drift" in {table.name for table in tables(walls)}
     assert "drift" not in {table.name for table in tables(dataclasses.replace(walls, records=tuple(rows)))}
     assert math.isnan(pooled(rows).drift.value)
-    assert math.isnan(pooled(rows).drift_below_null.value)
 
 
 def voxels_of(walls, backbone):

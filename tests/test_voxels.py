@@ -17,18 +17,7 @@ from semstab.errors import DataError
 from semstab.metrics import entropy, vss
 from semstab.model.events import Events
 from semstab.model.voxels import VoxelTable
-from semstab.testing import (
-    EXACT,
-    HITS,
-    SEQUENCES,
-    SUMS,
-    as_frames,
-    assert_same_map,
-    checks,
-    random_frames,
-    sight_line,
-    voxels,
-)
+from semstab.testing import EXACT, SEQUENCES, SUMS, as_frames, assert_same_map, checks, sight_line, voxels
 
 
 def reference(frames, voxel_size=1.0, K=3):
@@ -133,25 +122,6 @@ def test_rows_of_the_log_are_grouped_by_voxel():
 def test_a_log_of_nothing_has_an_empty_table():
     events = reference([]).events()
     assert (len(events), len(events.table()), events.table().K) == (0, 0, 3)
-    assert len(events.coarsen(2)) == 0
-
-
-starts = st.tuples(*[st.integers(-9, 9)] * 3)
-
-
-@checks
-@given(st.lists(st.tuples(HITS, starts), min_size=1, max_size=5), st.sampled_from([2, 3, 4]))
-def test_a_coarser_log_is_that_of_larger_voxels(sequence, factor):
-    frames = [sight_line(t, hits, start=start) for t, (hits, start) in enumerate(sequence)]
-    coarse = reference(frames, voxel_size=0.25).events().coarsen(factor)
-    assert coarse.voxel_size == 0.25 * factor
-    assert_same_map(coarse.table(), reference(frames, voxel_size=0.25 * factor).table(), 1e-12)
-
-
-def test_a_coarser_log_of_random_frames_is_that_of_larger_voxels():
-    frames = random_frames(5)
-    coarse = reference(frames, voxel_size=0.25, K=4).events().coarsen(2).table()
-    assert_same_map(coarse, reference(frames, voxel_size=0.5, K=4).table(), 1e-12)
 
 
 # --- Files ------------------------------------------------------------------------------------------------------------

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import numpy.typing as npt
 
@@ -10,16 +12,24 @@ from semstab.core.compiled import serial
 from semstab.core.types import Int64
 from semstab.errors import DataError
 from semstab.model.frames import Frame
+from semstab.model.voxels import INDEX
 
 HALF = 1 << 20
 """A map reaches that many voxels to either side of its origin."""
 
 
+def columns_of_keys(keys: Int64, origin: npt.ArrayLike) -> dict[str, Any]:
+    """The columns ix, iy, iz (n,) of packed keys (n,), which sort like them."""
+    offset = np.asarray(origin) - HALF
+    return {
+        name: ((keys >> shift & 2 * HALF - 1) + start).astype(np.int32)
+        for name, shift, start in zip(INDEX, (42, 21, 0), offset.tolist(), strict=True)
+    }
+
+
 def index_of_keys(keys: Int64, origin: npt.ArrayLike) -> Int64:
-    """Voxel indices (n, 3) of packed keys (n,), which sort like (ix, iy, iz)."""
-    mask = 2 * HALF - 1
-    index: Int64 = np.stack([keys >> 42, (keys >> 21) & mask, keys & mask], axis=1) - HALF + np.asarray(origin)
-    return index
+    """Voxel indices (n, 3) of packed keys (n,)."""
+    return np.stack([*columns_of_keys(keys, origin).values()], axis=1, dtype=np.int64)
 
 
 def out_of_reach(frame: Frame, origin: npt.ArrayLike, voxel_size: float) -> DataError:

@@ -1,13 +1,15 @@
-"""A scene's check in the terminal: tables of 80 columns, then the verdict."""
+"""A scene's check in the terminal, in 80 columns: the verdict, one table, advice."""
 
 from __future__ import annotations
 
 import math
+import textwrap
 from collections.abc import Iterator, Sequence
 
 from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.markup import escape
+from rich.padding import Padding
 from rich.table import Table
 
 from semstab.check.coverage import FUSED_FRAMES
@@ -16,57 +18,61 @@ from semstab.check.scene_check import SceneCheck
 STATES = {"sound": "green", "unsound": "bold red", "unclear": "yellow"}
 NOTHING = "-"
 MOST_UNKNOWN = 4
+MOST_COLUMNS = 100
 
 
-def print_check(checked: SceneCheck, console: Console) -> None:
-    """What was found out about a scene; of an unsound one no more than what is wrong, and the labels."""
-    console.print(_heading(checked))
-    for title, table in _tables(checked):
-        console.print(title, style="bold")
-        console.print(table)
-    for line in _advice(checked):
-        console.print(line)
-    for remark in checked.remarks:
-        console.print(f"[yellow]look:[/] {escape(remark)}\n", highlight=False)
+def print_check(checked: SceneCheck, console: Console, *, verbose: bool = False) -> None:
+    """The verdict, then what explains it; verbose: every table."""
+
+    def say(text: str, indent: int, style: str = "") -> None:
+        lines = textwrap.wrap(text, min(console.width, MOST_COLUMNS), subsequent_indent=" " * indent)
+        console.print("\n".join(lines), style=style, highlight=False, markup=False, soft_wrap=True)
+
+    say(_heading(checked), 4, "bold")
     state = "unsound" if checked.problems else checked.verdict.state
-    console.print(f"[bold]{escape(checked.scene)}:[/] [{STATES[state]}]{state}[/]: {escape(_conclusion(checked))}\n")
+    console.print()
+    say(f"  {state.upper()}  {_conclusion(checked)}", 4, STATES[state])
+    for remark in checked.remarks:
+        say(f"  look: {remark}", 4, "yellow")
+    tables = _tables(checked)
+    wrong_labels = any(labels.problem for labels in checked.labels)
+    wanted = "labels" if wrong_labels else "overlap" if state == "sound" else "conventions"
+    for name in tables if verbose else [name for name in (wanted,) if name in tables]:
+        title, table = tables[name]
+        if verbose:
+            console.print(f"\n  {title}", highlight=False, markup=False)
+        console.print(Padding(table, (0, 0, 0, 2), expand=False))
+    for line in _advice(checked, verbose=verbose):
+        say(f"  {line}", 11)
+    if not verbose:
+        say("  more     -v: conventions, persistence, labels; --json FILE: all numbers", 11)
+    console.print()
 
 
 def _heading(checked: SceneCheck) -> str:
     depth, (width, height) = checked.depth, checked.size
-    text = (
-        f"[bold]{escape(checked.scene)}[/]: {checked.selected} of {checked.frames} frames of {width}x{height};"
-        f" depth in {depth.valid:.0%} of the pixels"
-    )
+    text = f"{checked.scene}    {checked.selected} of {checked.frames} frames {width}x{height}"
+    text += f", depth in {depth.valid:.0%} of the pixels"
     if depth.valid:
-        text += f", {depth.p5:.3g} to {depth.p95:.3g} m (5% to 95%)"
-    if checked.depth_from is not None:
-        text += f"; from {escape(checked.depth_from)}"
-    if checked.motion is None:
-        return text
-    (least, most), (from_, to) = checked.motion.shift, checked.motion.turn
-    return (
-        f"{text}; from frame to compared frame the camera moves {least:.1%} to {most:.0%} of the depth"
-        f" and turns {from_:.0f} to {to:.0f} degrees"
-    )
+        text += f", {depth.p5:.2g} to {depth.p95:.2g} m"
+    return text if checked.depth_from is None else f"{text}, from {checked.depth_from}"
 
 
-def _tables(checked: SceneCheck) -> Iterator[tuple[str, Table]]:
-    """Titles and tables."""
-    verdict = checked.verdict
-    if verdict.fits:
-        yield (
-            f"depth of {verdict.frames} frames reprojected into each other, {verdict.pairs} pairs",
-            _convention_table(checked),
-        )
+def _tables(checked: SceneCheck) -> dict[str, tuple[str, Table]]:
+    """Titles and tables by name."""
+    verdict, tables = checked.verdict, dict[str, tuple[str, Table]]()
     if checked.overlaps:
-        yield "what frames share, by their distance among the selected ones", _overlap_table(checked)
+        tables["overlap"] = "what frames share, by how far apart they are", _overlap_table(checked)
+    if verdict.fits:
+        title = f"depth of {verdict.frames} frames reprojected into each other, {verdict.pairs} pairs"
+        tables["conventions"] = title, _convention_table(checked)
     if checked.persistence:
         every = f", every {_ordinal(checked.fused_stride)} pixel of each axis" if checked.fused_stride > 1 else ""
         whose = "all" if checked.fused_frames == checked.selected else f"{checked.fused_frames} evenly spaced"
-        yield f"observation persistence, {whose} frames fused{every}", _persistence_table(checked)
+        tables["persistence"] = f"observation persistence, {whose} frames fused{every}", _persistence_table(checked)
     if checked.labels:
-        yield "labels, % of the pixels", _label_table(checked)
+        tables["labels"] = "labels, % of the pixels", _label_table(checked)
+    return tables
 
 
 def _convention_table(checked: SceneCheck) -> Table:
@@ -116,26 +122,32 @@ def _label_table(checked: SceneCheck) -> Table:
     return table
 
 
-def _advice(checked: SceneCheck) -> Iterator[str]:
-    if checked.persistence and checked.fused_frames < checked.selected:
+def _advice(checked: SceneCheck, *, verbose: bool) -> Iterator[str]:
+    if verbose and checked.motion is not None:
+        (least, most), (from_, to) = checked.motion.shift, checked.motion.turn
+        yield (
+            f"camera   moves {least:.1%} to {most:.0%} of the depth and turns {from_:.0f} to {to:.0f} degrees from"
+            " frame to compared frame"
+        )
+    if verbose and checked.persistence and checked.fused_frames < checked.selected:
         times = checked.selected / checked.fused_frames
         yield (
-            f"OP is that of {checked.fused_frames} frames (at most {FUSED_FRAMES} are fused here); all"
-            f" {checked.selected} see a voxel about {times:.2g} times as often.\n"
+            f"OP       is that of {checked.fused_frames} frames (at most {FUSED_FRAMES} are fused here); all"
+            f" {checked.selected} see a voxel about {times:.2g} times as often"
         )
     if checked.noise is not None:
         yield (
-            f"Depth is off by {_metres(checked.noise.between)} between frames, by {_metres(checked.noise.within)}"
-            f" within one (medians); a pixel covers {_metres(checked.noise.footprint)}."
+            f"depth    off by {_metres(checked.noise.between)} between frames, {_metres(checked.noise.within)}"
+            f" within one; a pixel covers {_metres(checked.noise.footprint)}"
         )
     suggestion = checked.suggestion
     if suggestion is None:
         return
-    yield "Suggested:"
     if suggestion.voxel_size is not None:
-        yield f"  voxel_size: {suggestion.voxel_size:g}, {suggestion.voxel_size_reason}"
-        yield f"  pixel_stride: {suggestion.pixel_stride}, {suggestion.pixel_stride_reason}"
-    yield f"  frames.stride: {suggestion.frame_stride}, {suggestion.frame_stride_reason}\n"
+        yield f"voxels   --voxel-size {suggestion.voxel_size:g}: {suggestion.voxel_size_reason}"
+        if verbose:
+            yield f"pixels   --pixel-stride {suggestion.pixel_stride}: {suggestion.pixel_stride_reason}"
+    yield f"frames   --frames ::{suggestion.frame_stride}: {suggestion.frame_stride_reason}"
 
 
 def _conclusion(checked: SceneCheck) -> str:

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from semstab.cli.options import Quiet, ScopeOption, print_lines, say
+from semstab.cli.options import Quiet, ScopeOption, Verbose, print_lines, say
 
 
 def compare(
@@ -18,6 +18,7 @@ def compare(
     scope: ScopeOption = None,
     markdown: Annotated[bool, typer.Option(
         "--markdown", metavar="", help="Print Markdown, for a pull request.")] = False,
+    verbose: Verbose = False,
     quiet: Quiet = False,
 ) -> None:  # fmt: skip
     """What differs between runs: by how much, how surely, in which classes and places, and which frames did it."""
@@ -36,7 +37,7 @@ def compare(
         print_lines([as_markdown(comparison)], quiet=quiet)
         return
     if not quiet:
-        print_comparison(comparison, Console())
+        print_comparison(comparison, Console(), verbose=verbose)
     if out is not None:
         print_lines([f"folder: {out}; report: {out / 'report.html'}"], quiet=quiet)
 

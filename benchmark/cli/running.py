@@ -254,6 +254,7 @@ def check(
     settings: opt.DatasetSettings = None,
     options: opt.DatasetOptions = None,
     json_file: Annotated[Path | None, typer.Option("--json", metavar="FILE", help="Also write all numbers.")] = None,
+    verbose: opt.Verbose = False,
     quiet: opt.Quiet = False,
 ) -> None:
     """Does this dataset make sense: poses, depth, units, labels? Exit code 0 where it does, 2 where not."""
@@ -269,7 +270,7 @@ def check(
     selected = resolve(load_config(config, chosen(named, settings, options, dataset, data, frames)))
     console, results = Console(quiet=quiet), []
     for checked in check_scenes(selected):
-        print_check(checked, console)
+        print_check(checked, console, verbose=verbose)
         results.append(checked)
     if json_file is not None:
         write_json(json_file, {"schema": SCHEMA, "scenes": [checked.to_dict() for checked in results]})

@@ -317,7 +317,7 @@ class Judgement:
         if self.verdict == "fails":
             bounded = self.rule.bounds_a_loss and self.found.low <= self.rule.limit
             return "a loss is shown, and not that it is within the limit" if bounded else "the contrary is shown"
-        return self.found.undecided or "the data show neither"
+        return self.found.undecided or "neither is shown, more frames may tell"
 
     def digits(self, value: float) -> str:
         """A number of the rule's measure."""

@@ -29,16 +29,21 @@ def headline(result: GateResult) -> str:
 
 
 def lines(result: GateResult, width: int = 80) -> Iterator[str]:
-    """For the terminal."""
-    yield from _wrapped(f"gate: {result.new}" + (f" against {result.against}" if result.against else ""), width, 2)
-    yield from _wrapped(f"  {_scenes(result)}; {_ends(result)}", width, 2)
+    """For the terminal: the outcome, a line a rule, and why rules are undecided or fail."""
+    yield headline(result)
+    against = f" against {result.against}" if result.against else ""
+    yield from _wrapped(f"  {result.new}{against}, {_scenes(result)}; {_ends(result)}", width, 2)
     for note in result.notes:
         yield from _wrapped(f"  {note}", width, 2)
+    yield ""
+    longest = max((len(each.rule.text) for each in result.judgements), default=0)
     for each in result.judgements:
-        yield from _wrapped(f"{each.verdict.upper():<9} {each.rule.text}", width, INDENT)
-        yield from _wrapped(f"{'':{INDENT}}{each.values}", width, INDENT)
-        yield from _wrapped(f"{'':{INDENT}}{each.reason} ({each.about})", width, INDENT)
-    yield headline(result)
+        yield from _wrapped(f"  {each.verdict.upper():<9}  {each.rule.text:<{longest}}  {each.values}", width, 13)
+    yield ""
+    for why in dict.fromkeys(f"{each.verdict}: {each.reason} ({each.about})" for each in result.judgements):
+        yield from _wrapped(f"  {why}", width, 4)
+    if result.count("undecided"):
+        yield "  more     --plan: how many frames each rule needs; --out gate.md"
 
 
 def plan(result: GateResult) -> Iterator[str]:

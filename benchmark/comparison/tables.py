@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import textwrap
 from collections.abc import Iterator, Mapping, Sequence
 
 from rich.console import Console
@@ -249,7 +250,17 @@ BASES: dict[Basis, str] = {
 
 def sentences(comparison: RunComparison) -> list[str]:
     """One run after the other, then what could not be compared."""
-    lines = [sentence for own in comparison.overall for sentence in _of_run(comparison, own)]
+    return [*answers(comparison), *remarks(comparison)]
+
+
+def answers(comparison: RunComparison) -> list[str]:
+    """What differs, run by run."""
+    return [sentence for own in comparison.overall for sentence in _of_run(comparison, own)]
+
+
+def remarks(comparison: RunComparison) -> list[str]:
+    """What was paired, and what could not be compared, scene by scene."""
+    lines = []
     for scene in comparison.scenes:
         if scene.basis in ("observations", "voxels"):
             lines.append(f"{scene.scene}: {scene.voxels:,} voxels, {BASES[scene.basis]}.")
@@ -328,16 +339,21 @@ def _of_areas(areas: Sequence[Area]) -> str:
 SHOWN = {
     "comparison": ("measure", "base", "other", "difference", "change"),
     "comparison_classes": ("class", "worse", "better", VERDICT.key, "alpha_between"),
-    "comparison_areas": ("what", "class", "confused_with", "voxels", "loss", "x", "y", "z"),
+    "comparison_areas": ("class", "confused_with", "voxels", "loss", "x", "y", "z"),
 }
 """The columns of each table that fit; files have all of them."""
 
 
-def print_comparison(comparison: RunComparison, console: Console) -> None:
-    """The answer in sentences, then the differences, the classes and the locations that got worse."""
-    for sentence in sentences(comparison):
+def print_comparison(comparison: RunComparison, console: Console, *, verbose: bool = False) -> None:
+    """The answer in sentences, the differences, and what was paired; verbose: also classes and areas."""
+    for sentence in answers(comparison):
         console.print(sentence, highlight=False, markup=False)
     for table in tables(comparison):
-        if table.name in SHOWN:
+        if table.name == "comparison" or (verbose and table.name in SHOWN):
             text = to_terminal(dataclasses.replace(table.only(*SHOWN[table.name]), caption=""), WIDTH)
             console.print(f"\n{text}", highlight=False, markup=False, soft_wrap=True)
+    for sentence in remarks(comparison):
+        wrapped = textwrap.wrap(f"  {sentence}", console.width, subsequent_indent="    ")
+        console.print("\n".join(wrapped), highlight=False, markup=False)
+    if not verbose:
+        console.print("  more     -v: classes and areas; --out DIR: report.html, tables, maps", highlight=False)

@@ -28,6 +28,7 @@ from semstab.metrics import compare
 from semstab.metrics.agreement import rows_of
 from semstab.metrics.summary import TableSums
 from semstab.model.events import Events
+from semstab.model.evidence import stretches
 from semstab.model.frames import LeftOut
 from semstab.model.measures import dominant, mean, measures, vss
 from semstab.model.parquet import Tile
@@ -161,7 +162,8 @@ def no_voxels(task: Task, config: Config) -> DataError:
 
 def _checked(live: LiveMap, table: VoxelTable, reference: NumpySample) -> Agreement:
     expected, one_in = dataclasses.replace(reference.table(), classes=table.classes), reference.one_in
-    drawn = rows_of(table, in_sample(table.index.T, one_in))
+    some_in = [in_sample(np.stack([table.ix[s], table.iy[s], table.iz[s]]), one_in) for s in stretches(len(table))]
+    drawn = rows_of(table, np.concatenate(some_in))
     units = (live.unit, dataclasses.replace(live.unit, backend="numpy"))
     return dataclasses.replace(compare(drawn, expected, units, tolerance=live.work.config.tolerance), one_in=one_in)
 

@@ -134,7 +134,7 @@ def _compared_maps(
 ) -> BackboneComparison | None:
     """The comparison of a scene's maps; None where there are not two or more of them in one label space.
 
-    With the logs of all of them, also under other rules of fusion; with the samples of all, on matched observations.
+    With the samples of all, on matched observations.
     """
     first = next(iter(regions()))
     classes = {table.classes for table in first.tables.values()}

@@ -209,24 +209,19 @@ class Relabelled:
     def lines(self) -> Iterator[str]:
         """Yield the report, a line each."""
         yield f"{self.scene}, {self.name}: {self.frames} frames in {self.folder}"
-        counts = [
-            (self.confirmed, "confirmed"),
-            (self.changed, "changed"),
-            (self.filled, "filled in"),
-            (self.unseen, "dropped for want of depth or a voxel"),
-            (self.unstable, "dropped as unstable"),
-        ]
-        yield f"  of {self.pixels:,} pixels " + ", ".join(f"{n / self.pixels:.1%} {what}" for n, what in counts)
-        if not self.leave_one_out:
-            yield "  the stability of these maps says nothing: a voxel has one class in all of them"
+        counts = {
+            "confirmed": self.confirmed, "changed": self.changed, "filled in": self.filled,
+            "dropped for want of depth or a voxel": self.unseen, "dropped as unstable": self.unstable,
+        }  # fmt: skip
+        yield f"  of {self.pixels:,} pixels"
+        yield from (f"    {n / self.pixels:6.1%} {what}" for what, n in counts.items())
         if self.correctness is not None:
             c = self.correctness
-            yield (
-                f"  accuracy {c.before.accuracy:.4f} before and {c.after.accuracy:.4f} after, mean IoU"
-                f" {c.before.miou:.4f} and {c.after.miou:.4f}: {c.after.pixels:,} pixels with ground truth and a label"
-                f" in both; all {c.all_before.pixels:,} before: {c.all_before.accuracy:.4f},"
-                f" mean IoU {c.all_before.miou:.4f}"
-            )
+            yield f"  where both have a label and ground truth, {c.after.pixels:,} pixels:"
+            yield f"    accuracy {c.before.accuracy:.3f} before, {c.after.accuracy:.3f} after"
+            yield f"    mean IoU {c.before.miou:.3f} before, {c.after.miou:.3f} after"
+        if not self.leave_one_out:
+            yield "  a verdict on these maps means nothing: a voxel has one class in all of them"
 
 
 class Tally:

@@ -61,35 +61,12 @@ def same_voxels(first: VoxelTable, *others: VoxelTable) -> bool:
     return all(np.array_equal(getattr(first, name), getattr(other, name)) for other in others for name in names)
 
 
-def shared_observations(*logs: Events) -> list[Events]:
-    """The observations (voxel, frame) that all logs have, of each log, in the same order.
-
-    Raises DataError where the logs differ in K or voxel size.
-    """
-    require_same_grid(*logs)
-    names = ("ix", "iy", "iz", "voxel", "frame")
-    if all(np.array_equal(getattr(logs[0], name), getattr(log, name)) for log in logs[1:] for name in names):
-        return list(logs)
-    index = [np.stack([log.ix, log.iy, log.iz], axis=1) for log in logs]
-    frames = 1 + max((int(log.frame.max()) for log in logs if len(log)), default=0)
-    keys = [key[log.voxel] * frames + log.frame for key, log in zip(_dense(index), logs, strict=True)]
-    common = reduce(lambda a, b: np.intersect1d(a, b, assume_unique=True), keys)
-    return [observations(log, np.flatnonzero(np.isin(own, common))) for log, own in zip(logs, keys, strict=True)]
-
-
 def observations(log: Events, rows: Int64) -> Events:
     """These rows of a log, ascending, with the voxels that they are of."""
     voxels, of = np.unique(log.voxel[rows], return_inverse=True)
     own: dict[str, Any] = {name: getattr(log, name)[voxels] for name in ("ix", "iy", "iz")}
     own |= {"frame": log.frame[rows], "evidence": log.evidence.take(rows), "pixels": log.pixels[rows]}
     return dataclasses.replace(log, **own, voxel=of)
-
-
-def _dense(indices: Sequence[npt.NDArray[np.integer]]) -> list[Int64]:
-    """A number for each voxel of the index arrays (n, 3), the same in all, from 0 on without gaps."""
-    keys = voxel_keys(*indices)
-    distinct = np.unique(np.concatenate(keys))
-    return [np.searchsorted(distinct, key) for key in keys]
 
 
 def rows_of(table: VoxelTable, where: Mask) -> VoxelTable:

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Literal
 
 from semstab.model.measures import Quantity
-from semstab.model.statistics import UNDEFINED, Estimate, Interval, RuleMeans
+from semstab.model.statistics import UNDEFINED, Estimate, Interval
 
 ByBackbone = Mapping[str, Estimate]
 
@@ -151,21 +151,6 @@ class ComparedObservations:
 
 
 @dataclass(frozen=True)
-class RuleComparison:
-    """The backbones under each rule of fusion, on their common voxels with OP >= 2.
-
-    values         by rule and backbone
-    orders         by the key of what is compared and rule, the best backbone first
-    order_changes  by key, whether the order depends on the rule
-    """
-
-    voxels: int
-    values: Mapping[str, Mapping[str, RuleMeans]]
-    orders: Mapping[str, Mapping[str, tuple[str, ...]]]
-    order_changes: Mapping[str, bool]
-
-
-@dataclass(frozen=True)
 class BackboneComparison:
     """Several backbones' maps of one scene beside each other."""
 
@@ -177,7 +162,6 @@ class BackboneComparison:
     standardised: Standardised
     paired: Paired
     observations: ComparedObservations | None
-    fusion_rules: RuleComparison | None
 
 
 # What differs between runs; in JSON as the fields say. Undefined numbers are NaN.

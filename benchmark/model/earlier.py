@@ -13,10 +13,13 @@ SCHEMA = 2
 """The schema that is translated."""
 
 KEYS: Mapping[str, str] = {
-    "judged": "headline", "reach": "ceiling_share", "beyond_coin": "excess_over_chance", "settling": "drift_below_null",
-    "each_place": "voxel_weighted", "question": "scope", "matters": "counts_for_verdict", "reached": "share",
+    "judged": "headline", "reach": "ceiling_share", "each_place": "voxel_weighted", "question": "scope",
+    "matters": "counts_for_verdict", "reached": "share",
 }  # fmt: skip
 """Keys of schema 2, and what they are called now."""
+
+GONE = ("beyond_coin", "fusion_rules")
+"""Keys of schema 2 that are not read any more."""
 
 SCOPES: Mapping[str, str] = {"this map": "these frames", "the next flight": "other scenes"}
 
@@ -32,7 +35,7 @@ def _value(value: Any) -> Any:
         return [_value(item) for item in value]
     if not isinstance(value, Mapping):
         return value
-    named = {KEYS.get(key, key): _value(item) for key, item in value.items()}
+    named = {KEYS.get(key, key): _value(item) for key, item in value.items() if key not in GONE}
     if "scope" in named and "low" in named:  # an interval
         named["scope"] = SCOPES.get(named["scope"], named["scope"])
         named["locations"] = named.pop("places", 0)

@@ -16,16 +16,7 @@ from semstab.errors import DataError
 from semstab.model import parquet
 from semstab.model.evidence import Evidence
 from semstab.model.information import entropy_bits, js_divergence, normalise
-from semstab.model.voxels import (
-    INDEX,
-    OF_EVENTS,
-    OF_VOXELS,
-    VoxelTable,
-    freeze,
-    in_order,
-    index_columns,
-    require_memory,
-)
+from semstab.model.voxels import INDEX, OF_EVENTS, OF_VOXELS, VoxelTable, freeze, in_order, require_memory
 
 COMPUTED = [name for name in OF_VOXELS if name not in (*INDEX, "evidence")]
 """Of a voxel's row, from its observations."""
@@ -136,29 +127,6 @@ class Events:
         again = np.flatnonzero(np.diff(self.voxel, prepend=-1) == 0)
         drift[again] = js_divergence(belief[again], belief[again - 1])
         return drift
-
-    def coarsen(self, factor: int) -> Events:
-        """The log on voxels `factor` times as large, in order of frame index within a voxel.
-
-        s_bar of a frame is the mean over its pixels, so the mean of the finer voxels' s_bar weighted by their pixels.
-        """
-        index = np.stack([self.ix, self.iy, self.iz], axis=1) // factor
-        coarse, parent = np.unique(index, axis=0, return_inverse=True)
-        pairs = np.stack([parent.ravel()[self.voxel], self.frame], axis=1)
-        pairs, rows = np.unique(pairs, axis=0, return_inverse=True)
-        pixels = np.zeros(len(pairs), dtype=np.int64)
-        evidence = np.zeros((len(pairs), self.evidence.K))
-        np.add.at(pixels, rows.ravel(), self.pixels)
-        np.add.at(evidence, rows.ravel(), self.evidence[:] * self.pixels[:, None])
-        return Events(
-            **index_columns(coarse),
-            voxel=pairs[:, 0].astype(np.int64),
-            frame=pairs[:, 1].astype(np.int32),
-            evidence=Evidence.of(evidence / pixels[:, None]),
-            pixels=pixels,
-            voxel_size=self.voxel_size * factor,
-            classes=self.classes,
-        )
 
     def rows(self, voxels: Int64) -> Events:
         """The log of these of its voxels (r,), ascending."""

@@ -135,16 +135,11 @@ class Evidence(NDArrayOperatorsMixin):
     @property
     def concentration(self) -> Concentration:
         """How the rows are spread over the classes."""
-        return self.known or Concentration.of(*self.entries, self.K, self.unseen)
+        return self.known or Concentration.of(*self.entries)
 
     def measured(self) -> Self:
         """The same, with its concentration, so that nobody computes that again: 34 bytes a row."""
         return replace(self, known=self.concentration)
-
-    @property
-    def unseen(self) -> Float64 | None:
-        """(n,) what each class without an entry has, None for 0."""
-        return None
 
     def chunks(self) -> Iterator[slice]:
         """Consecutive rows that together are small when dense."""

@@ -89,27 +89,14 @@ class Concentration:
     squares: Float64
 
     @classmethod
-    def of(
-        cls,
-        starts: Int64,
-        label: UInt16,
-        weight: Float64,
-        K: int,
-        rest: Float64 | None = None,
-        bits: Float64 | None = None,
-    ) -> Concentration:
-        """Of entries as `Evidence` has them; rest (n,) is what each class without one has, 0 where it is not given.
-
-        bits (n,) is the entropy, where that is known.
-        """
+    def of(cls, starts: Int64, label: UInt16, weight: Float64) -> Concentration:
+        """Of entries as `Evidence` has them."""
         from semstab.model.kernels import concentrate
 
-        n = len(starts) - 1
-        largest, lead, squares = (np.empty(n) for _ in range(3))
-        found, own = np.empty(n, np.uint16), np.empty(n) if bits is None else bits
-        others = np.zeros(0) if rest is None else rest
-        concentrate(starts, label, weight, others, K, bits is not None, largest, lead, own, found, squares)
-        return cls(largest, lead, own, found, squares)
+        largest, lead, bits, squares = np.empty((4, len(starts) - 1))
+        dominant = np.empty(len(starts) - 1, np.uint16)
+        concentrate(starts, label, weight, largest, lead, bits, dominant, squares)
+        return cls(largest, lead, bits, dominant, squares)
 
     def take(self, rows: Any) -> Concentration:
         """Of some rows: a slice, their numbers, or a mask (n,)."""

@@ -56,57 +56,26 @@ def has_other(labels: Any, count: int, ignore: int) -> bool:
 
 @serial
 def concentrate(
-    starts: Any,
-    label: Any,
-    weight: Any,
-    rest: Any,
-    K: int,
-    known: bool,
-    largest: Any,
-    lead: Any,
-    bits: Any,
-    dominant: Any,
-    squares: Any,
+    starts: Any, label: Any, weight: Any, largest: Any, lead: Any, bits: Any, dominant: Any, squares: Any
 ) -> None:
-    """Fill largest, lead, bits, dominant and squares (n,), see `Concentration`.
-
-    rest (n,) is what each class without an entry, or with one of 0, has; nothing where it is empty. Where bits are
-    known they are left as they are.
-    """
+    """Fill largest, lead, bits, dominant and squares (n,), see `Concentration`."""
     for i in range(starts.shape[0] - 1):
-        first, end = starts[i], starts[i + 1]
-        unseen = rest[i] if rest.shape[0] else 0.0
-        others = K - (end - first)
-        total, square = others * unseen, others * unseen * unseen
-        top, second, best, gap = -1.0, 0.0, 0, 0
-        for e in range(first, end):
-            w = weight[e] if weight[e] != 0.0 else unseen
+        total = square = top = second = spread = 0.0
+        best = 0
+        for e in range(starts[i], starts[i + 1]):
+            w = weight[e]
             total += w
             square += w * w
             if w > top:
-                second, top, best = max(top, 0.0), w, label[e]
+                second, top, best = top, w, label[e]
             elif w > second:
                 second = w
-            gap += 1 if label[e] == gap else 0  # the lowest class without an entry
-        if others > 0:
-            if unseen > top or (unseen == top and gap < best):
-                second, top, best = (unseen if others > 1 else max(top, 0.0)), unseen, gap
-            elif unseen > second:
-                second = unseen
-        squares[i], dominant[i] = square, best
+        for e in range(starts[i], starts[i + 1]):
+            if 0.0 < weight[e] < total:
+                p = weight[e] / total
+                spread -= p * np.log2(p)
+        squares[i], dominant[i], bits[i] = square, best, max(spread, 0.0)
         largest[i], lead[i] = top / total, top / total - second / total
-        if known:
-            continue
-        bits[i] = 0.0
-        if end - first > 1 or unseen > 0.0:
-            spread = 0.0
-            for e in range(first, end):
-                p = (weight[e] if weight[e] != 0.0 else unseen) / total
-                if p > 0.0:
-                    spread -= p * np.log2(p)
-            if unseen > 0.0 and others > 0:
-                spread -= others * (unseen / total) * np.log2(unseen / total)
-            bits[i] = max(spread, 0.0)
 
 
 @serial

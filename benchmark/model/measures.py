@@ -25,7 +25,7 @@ Values = TypeVar("Values", bound=npt.NDArray[Any])
 
 
 class Beliefs(Protocol):
-    """What a measure is a function of, for n voxels: a VoxelTable has it, a growing map, and other rules of fusion."""
+    """What a measure is a function of, for n voxels: a VoxelTable has it, and a growing map."""
 
     @property
     def op(self) -> Int32:

@@ -246,7 +246,7 @@ class Failure:
     message: str
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Result:
     """All that a run or a study found; tables, figures, report and terminal are made from it.
 
@@ -273,6 +273,10 @@ class Result:
     comparisons: tuple[BackboneComparison, ...] = ()
     compared: tuple[Agreement, ...] = ()
     advice: Mapping[str, VoxelAdvice] = field(default_factory=dict)
+
+    def __repr__(self) -> str:
+        models, units = ", ".join(self.backbones), len(self.records)
+        return f"<Result '{self.name}': {models} on {', '.join(self.scenes)}; {units} units, {self.backend}>"
 
     def select(
         self, sweep: str = BASE, *, scene: str | None = None, backbone: str | None = None, value: float | None = None

@@ -11,7 +11,7 @@ from typing import Literal
 
 from semstab.core.json_form import INLINE
 from semstab.core.types import THESE_FRAMES, Scope
-from semstab.model.measures import Measure, MeasureMeans
+from semstab.model.measures import MeasureMeans
 
 # --- Parts ------------------------------------------------------------------------------------------------------------
 
@@ -353,29 +353,6 @@ class CorrectnessStatistics:
 
 
 @dataclass(frozen=True)
-class RuleMeans:
-    """Means over the voxels with OP >= 2 under a rule of fusion; how right it is where ground truth tells, else NaN."""
-
-    means: MeasureMeans = field(metadata=INLINE)
-    accuracy: float = math.nan
-    miou: float = math.nan
-    ece: float = math.nan
-    brier: float = math.nan
-
-    def __getitem__(self, measure: Measure) -> float:
-        return self.means[measure]
-
-
-@dataclass(frozen=True)
-class RuleOutcome:
-    """What a rule of fusion makes of a map; relabelled_share is the part of the voxels that get another class."""
-
-    rule: str
-    values: RuleMeans = field(metadata=INLINE)
-    relabelled_share: float
-
-
-@dataclass(frozen=True)
 class StratumStatistics:
     """Means over a stratum of OP."""
 
@@ -387,18 +364,6 @@ class StratumStatistics:
     sbd_excess: float
     entropy_within: float
     entropy_between: float
-
-
-@dataclass(frozen=True)
-class ExcessOverChance:
-    """What a coin tossed as often as places were seen would not show; 0 for it, whatever the OP.
-
-    disagreement  PSA of the places that two frames saw less that of the places that more saw
-    drift_below_null      SBD in random order less SBD as seen, of the places that three frames or more saw, bits
-    """
-
-    disagreement: Interval
-    drift_below_null: Interval
 
 
 # --- One map ----------------------------------------------------------------------------------------------------------
@@ -430,9 +395,7 @@ class MapStatistics:
     uncertainty: EntropyParts
     geometry: Losses | None
     correctness: CorrectnessStatistics | None
-    fusion_rules: tuple[RuleOutcome, ...] | None
     strata: tuple[StratumStatistics, ...]
-    excess_over_chance: ExcessOverChance
     labelled: float = math.nan
 
     @property
@@ -446,4 +409,4 @@ class MapStatistics:
     @property
     def sections(self) -> int:
         """How many of the sections that need more than the map could be computed."""
-        return sum(section is not None for section in (self.geometry, self.correctness, self.fusion_rules))
+        return sum(section is not None for section in (self.geometry, self.correctness))

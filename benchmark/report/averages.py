@@ -1,4 +1,4 @@
-"""Means of a study's units over scenes and repeats: tables, figures and findings all take them from here."""
+"""Means of a study's units over scenes and repeats: tables and figures all take them from here."""
 
 from __future__ import annotations
 
@@ -33,8 +33,6 @@ class Pooled:
     psa        pairwise semantic agreement
     alpha      Krippendorff's alpha
     drift      SBD, bits, and drift_null, that of the same observations in random order, where it is known
-    disagreement, drift_below_null  as in `ExcessOverChance`
-    vss_error  half of the 95 % interval of VSS; without statistics as if voxels were independent and at their worst
     """
 
     voxels: int
@@ -50,9 +48,6 @@ class Pooled:
     alpha: Estimate = UNDEFINED
     drift: Estimate = UNDEFINED
     drift_null: float = math.nan
-    disagreement: Estimate = UNDEFINED
-    drift_below_null: Estimate = UNDEFINED
-    vss_error: float = math.nan
 
     @property
     def excess_drift(self) -> float:
@@ -96,11 +91,6 @@ def pooled(records: Sequence[Record]) -> Pooled:
         alpha=_estimate(records, lambda found: found.agreement.alpha),
         drift=_estimate(records, lambda found: found.drift.sbd if found.order_known else UNDEFINED),
         drift_null=_macro(records, lambda found: found.drift.null if found.order_known else UNDEFINED),
-        disagreement=_together(records, lambda found: found.excess_over_chance.disagreement),
-        drift_below_null=_together(
-            records, lambda found: found.excess_over_chance.drift_below_null if found.order_known else UNDEFINED
-        ),
-        vss_error=_vss_error(records, voxels),
     )
 
 
@@ -124,11 +114,6 @@ def _estimate(records: Sequence[Record], take: Callable[[MapStatistics], Estimat
     if any(math.isnan(estimate.low) for estimate in found if not math.isnan(estimate.value)):
         return Estimate(macro_mean([estimate.value for estimate in found]), math.nan, math.nan)
     return _together(records, take)
-
-
-def _vss_error(records: Sequence[Record], voxels: int) -> float:
-    vss = _together(records, lambda found: found.agreement.vss)
-    return (vss.high - vss.low) / 2 if not math.isnan(vss.low) else 1.96 * 0.5 / math.sqrt(max(voxels, 1))
 
 
 def _macro(records: Sequence[Record], take: Callable[[MapStatistics], Estimate]) -> float:

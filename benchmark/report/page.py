@@ -21,7 +21,6 @@ from semstab.report.averages import by_backbone, describe, levels, over_recurren
 from semstab.report.charts import SERIES, Line, dot_chart, line_chart
 from semstab.report.figures.maps import Overview, Views
 from semstab.report.figures.topdown import EMPTY, FromAbove
-from semstab.report.findings import Answer, Finding, findings
 from semstab.report.html import filled, jpeg, png, table_block
 from semstab.report.loaded import read_series
 from semstab.report.narrative import differences, notes, warnings
@@ -55,7 +54,6 @@ def render(
     above  of units, by their slugs, the voxels that are seen from above; those of the others are read
     """
     everything, result = result, of_interest(result)
-    tested = findings(result)
     shown, views = list(_scenes(result, folder, above)), [table_block(table) for table in tables(everything)]
     return filled(
         "report.html.j2",
@@ -73,8 +71,6 @@ def render(
         layers=_script({"categories": CATEGORIES, "colors": CATEGORY_COLORS, "sbd": SBD_END}),
         charts_all=[*_by_op(result), *_sweeps(result)],
         tables=views,
-        findings=[_finding(row) for row in tested if row.verdict is not Answer.UNTESTED],
-        untested=[_finding(row) for row in tested if row.verdict is Answer.UNTESTED],
         failures=[_failure(row) for row in result.failures],
         facts=list(_facts(result.manifest)),
         manifest=json.dumps(result.manifest, indent=2, default=str),
@@ -347,27 +343,6 @@ def _sweeps(result: Result) -> Iterator[dict[str, str]]:
             if any(np.isfinite(line.y).any() for line in lines):
                 label = f"{sweep.title}, {sweep.unit}" if sweep.unit else sweep.title
                 yield {"title": f"{title} by {sweep.title}", "chart": line_chart(lines, label, title, zero=False)}
-
-
-def _finding(finding: Finding) -> dict[str, Any]:
-    return {
-        "claim": finding.claim,
-        "rule": relations(finding.rule),
-        "caveat": relations(finding.caveat),
-        "verdict": finding.said,
-        "kind": finding.verdict.name.lower() if finding.said == finding.verdict.value else "part",
-        "evidence": [
-            {
-                "what": ", ".join(filter(None, (row.backbone, row.condition))),
-                "verdict": row.verdict.value,
-                "kind": row.verdict.name.lower(),
-                "numbers": relations(row.outcome.numbers),
-                "why": relations(row.outcome.why),
-                "scenes": f"{row.scenes[0]} of {row.scenes[1]} scenes" if row.scenes[1] > 1 else "",
-            }
-            for row in finding.evidence
-        ],
-    }
 
 
 def _title(result: Result) -> str:

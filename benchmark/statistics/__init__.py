@@ -20,7 +20,6 @@ from semstab.statistics.correctness import correctness, join_truth, quadrants, r
 from semstab.statistics.correlogram import correlogram
 from semstab.statistics.description import Analysis, analyse, describe
 from semstab.statistics.drift import benjamini_hochberg, expected_sbd, flips, voxel_drift
-from semstab.statistics.fusion_rules import RULES, fuse
 from semstab.statistics.model_comparison import compare_backbones, coverage, paired
 from semstab.statistics.observations import CellObservations, ObservationSample, Views
 from semstab.statistics.paired_differences import claimed_together, standardised
@@ -29,7 +28,6 @@ from semstab.statistics.sampler import Sampler
 from semstab.statistics.verdict import verdict
 
 __all__ = [
-    "RULES",
     "Analysis",
     "BackboneComparison",
     "CellObservations",
@@ -56,7 +54,6 @@ __all__ = [
     "expected_sbd",
     "fleiss_kappa",
     "flips",
-    "fuse",
     "join_truth",
     "krippendorff_alpha",
     "losses",

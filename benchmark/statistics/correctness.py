@@ -14,10 +14,9 @@ from semstab.metrics import strata
 from semstab.metrics.agreement import require_same_grid, same_voxels, shared_rows
 from semstab.metrics.summary import groups_of
 from semstab.model.evidence import Evidence
-from semstab.model.information import by_group
-from semstab.model.measures import Beliefs, MeasureMeans, Quantity, Voxels, dominant, measures
+from semstab.model.measures import Quantity, dominant
 from semstab.model.results import RECURRENT
-from semstab.model.statistics import UNKNOWN, Correctness, Quadrants, Reliability, RuleMeans
+from semstab.model.statistics import UNKNOWN, Correctness, Quadrants, Reliability
 from semstab.model.voxels import VoxelTable
 from semstab.statistics.accumulate import Cubes, CubeSums
 from semstab.statistics.agreement import LIKELY, STABLE, ratio_of, stability_posterior
@@ -81,11 +80,9 @@ class Predictions:
     def of(cls, evidence: Float64 | Evidence, label: Int64) -> Predictions:
         """Beliefs as evidence (n, K), up to a factor; what is said where the label is -1 means nothing."""
         evidence = Evidence.of(evidence)
-        count, spread = np.diff(evidence.starts), evidence.concentration
-        of, rest = np.repeat(np.arange(len(evidence)), count), evidence.unseen
-        rest = np.zeros(len(evidence)) if rest is None else rest
-        total = np.bincount(of, weights=evidence.weight, minlength=len(evidence)) + (evidence.K - count) * rest
-        hit, own = evidence.label == label[of], rest.copy()
+        spread, of = evidence.concentration, np.repeat(np.arange(len(evidence)), np.diff(evidence.starts))
+        total = np.bincount(of, weights=evidence.weight, minlength=len(evidence))
+        hit, own = evidence.label == label[of], np.zeros(len(evidence))
         own[of[hit]] = evidence.weight[hit]
         error = spread.squares / total**2 - 2 * own / total + 1
         return cls(label, spread.label.astype(np.int64), spread.largest, error, evidence.K)
@@ -151,31 +148,6 @@ def reliability_of(sums: Float64) -> tuple[Reliability, ...]:
         Reliability(b / BINS, (b + 1) / BINS, int(count[b]), float(confidence[b]), float(accuracy[b]))
         for b in range(BINS)
     )
-
-
-def rule_sums(fused: Beliefs, where: Mask, truth: Truth | None = None) -> Float64:
-    """(3 M,) of each measure its sum, how often it is defined and how often OP is high enough; then `judged_sums`.
-
-    Over the voxels for which `where` (n,) holds.
-    """
-    evidence = Evidence.of(fused.evidence).measured()
-    fused = Voxels(fused.op, evidence, fused.drift_sum)
-    total, defined = by_group(where - np.int64(1), [measure.of(fused) for measure in measures()], 1)
-    often = [np.count_nonzero(where & (fused.op >= measure.lowest_op)) for measure in measures()]
-    rows = np.stack([total[0], defined[0], often], axis=1).ravel()
-    if truth is None:
-        return rows
-    return np.concatenate([rows, judged_sums(Predictions.of(evidence, truth.label), truth.known & where)])
-
-
-def rule_means_of(sums: Float64) -> RuleMeans:
-    """Means from `rule_sums`."""
-    n = 3 * len(measures())
-    means = MeasureMeans.of_sums(sums[:n])
-    if len(sums) == n:
-        return RuleMeans(means)
-    right = correctness_of(sums[n:])
-    return RuleMeans(means, right.accuracy, right.miou, right.ece, right.brier)
 
 
 def reliability(belief: Float64 | Evidence, label: Int64) -> tuple[Reliability, ...]:

@@ -21,7 +21,6 @@ from semstab.model.statistics import (
     DriftStatistics,
     DriftTests,
     EntropyParts,
-    ExcessOverChance,
     FlipRates,
     FrameAgreement,
     HeadlineStatistics,
@@ -61,7 +60,6 @@ from semstab.statistics.sections import (
     log_sums,
     place_sums,
     row_columns,
-    rule_outcomes,
 )
 from semstab.statistics.verdict import LIMITS, Limits, verdict
 
@@ -125,7 +123,7 @@ def describe(
 ) -> MapStatistics:
     """Return all statistics of one map: a `MapSample` is drawn and analysed.
 
-    events  the log behind the table; without it there is no drift test, no flip rate and no other fusion rule
+    events  the log behind the table; without it there is no drift test and no flip rate
     truth   the map of the ground truth labels of the same frames; without it correctness is not known
     limit   the map of view-independent labels (`ceiling`), from which geometry's part of the disagreement follows
 
@@ -227,9 +225,7 @@ def analyse(
         uncertainty=EntropyParts(means["entropy"], means["entropy_within"], means["entropy_between"]),
         geometry=None if limit is None else losses(table, limit),
         correctness=None if truth is None else _correctness(table, truth, stable, cubes, edges),
-        fusion_rules=None if events is None else rule_outcomes(table, events, truth),
         strata=_strata(whole, table, columns, edges),
-        excess_over_chance=ExcessOverChance(means["coin"], means["steadier"]),
         labelled=labelled,
     )
     return Analysis(summary, whole, influence, sample, shares, drawn)

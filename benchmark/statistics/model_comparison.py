@@ -10,18 +10,17 @@ import numpy as np
 
 from semstab.core.types import Float64, Int64
 from semstab.errors import ConfigError
-from semstab.metrics.agreement import require_same_grid, require_same_map, shared_rows
-from semstab.model.contrast import BackboneComparison, MapCoverage, Paired, Rank, Ranking, RuleComparison, Standardised
+from semstab.metrics.agreement import require_same_grid, shared_rows
+from semstab.model.contrast import BackboneComparison, MapCoverage, Paired, Rank, Ranking, Standardised
 from semstab.model.events import Events
-from semstab.model.measures import Measure, Quantity, dominant, measures
+from semstab.model.measures import Quantity, dominant, measures
 from semstab.model.results import RECURRENT
-from semstab.model.statistics import UNDEFINED, Estimate, RuleMeans
+from semstab.model.statistics import UNDEFINED, Estimate
 from semstab.model.voxels import VoxelTable
-from semstab.statistics import fusion_rules
 from semstab.statistics.accumulate import CubeSums
 from semstab.statistics.agreement import ALPHA, ALPHA_BETWEEN, PSA, alpha_columns, alpha_of, between_of, ratio_of
 from semstab.statistics.cluster_sums import Statistic
-from semstab.statistics.correctness import ACCURACY, ECE, MIOU, join_truth, rule_means_of, rule_sums
+from semstab.statistics.correctness import ACCURACY, join_truth
 from semstab.statistics.observations import CellObservations
 from semstab.statistics.paired_differences import (
     EDGES,
@@ -30,7 +29,6 @@ from semstab.statistics.paired_differences import (
     Tables,
     common_weights,
     compared_observations,
-    decided,
     differences,
     standardised_of,
     stratum_counts,
@@ -210,7 +208,6 @@ def compare_backbones(
     paired        values, differences and rankings on the voxels that all saw twice or more; where there are samples of
                   looks (`Sampler`), on the looks that all made, with the same weights
     looks         what these are, and what the order owes to what was left out; None without samples
-    fusion_rules  the same ranking under other fusion rules, from the events of all backbones; None without them
     Raises ConfigError for fewer than two maps, DataError where they differ in K or voxel size.
     """
     if len(tables) < 2:
@@ -248,7 +245,6 @@ def compare_regions(
         standardised=Standardised(EDGES, tuple(weights.tolist()), thin_share(observed, weights), everywhere),
         paired=_paired(regions, shared, seed),
         observations=None if shared is None else shared.found,
-        fusion_rules=None if first.events is None else _by_rule(regions, mixed=mixed),
     )
 
 
@@ -281,37 +277,3 @@ def truth_at(regions: Regions, locations: VoxelTable) -> VoxelTable | None:
     """The ground truth's voxels that these are of; None without any."""
     result = [own.truth.rows(shared_rows(own.truth, locations)[0]) for own in regions() if own.truth is not None]
     return VoxelTable.joined(result) if result else None
-
-
-def _by_rule(regions: Regions, *, mixed: bool) -> RuleComparison:
-    """Each rule's means on the common voxels with OP >= 2, and the order of the backbones that follows, best first."""
-    sums: dict[str, dict[str, Float64]] = {rule: {} for rule in fusion_rules.RULES}
-    voxels, known = 0, False
-    for region in regions():
-        assert region.events is not None
-        rows, known = repeated_rows(region.tables), region.truth is not None
-        voxels += len(rows[0])
-        for (name, table), own in zip(region.tables.items(), rows, strict=True):
-            log = decided(region.events[name]) if mixed else region.events[name]
-            require_same_map(table, log)
-            truth = None if region.truth is None else join_truth(table, region.truth)
-            where = np.zeros(len(table), np.bool_)
-            where[own] = True
-            for rule, fused in zip(sums, fusion_rules.fuse_all(log, fusion_rules.RULES), strict=True):
-                sums[rule][name] = sums[rule].get(name, 0.0) + rule_sums(fused, where, truth)
-    values = {rule: {name: rule_means_of(own) for name, own in by_name.items()} for rule, by_name in sums.items()}
-    orders = {
-        quantity.key: {rule: _order(quantity, by_name) for rule, by_name in values.items()}
-        for quantity in (*measures(), *((ACCURACY, MIOU, ECE) if known else ()))
-    }
-    changes = {key: len(set(by_rule.values())) > 1 for key, by_rule in orders.items()}
-    return RuleComparison(voxels, values, orders, changes)
-
-
-def _order(quantity: Quantity, rows: Mapping[str, RuleMeans]) -> tuple[str, ...]:
-    """The backbones by a measure, or by how right they are; the best first."""
-    values: dict[str, float] = {
-        name: row[quantity] if isinstance(quantity, Measure) else getattr(row, quantity.key)
-        for name, row in rows.items()
-    }
-    return tuple(sorted(values, key=lambda name: (math.isnan(values[name]), quantity.sign * values[name])))

@@ -11,14 +11,11 @@ import numpy as np
 import numpy.typing as npt
 
 from semstab.core.types import Float64
-from semstab.model.events import Events
-from semstab.model.measures import Beliefs, sbd, vss
-from semstab.model.statistics import Flipping, Interval, RuleOutcome
+from semstab.model.measures import sbd, vss
+from semstab.model.statistics import Flipping, Interval
 from semstab.model.voxels import VoxelTable
-from semstab.statistics import fusion_rules
 from semstab.statistics.accumulate import Cubes, CubeSums, Mean
-from semstab.statistics.agreement import alpha_of, between_of, decompose, disagreement, kappa_of, psa, ratio_of
-from semstab.statistics.correctness import Truth, rule_means_of, rule_sums
+from semstab.statistics.agreement import alpha_of, between_of, decompose, disagreement, kappa_of, psa
 from semstab.statistics.drift import (
     TESTABLE,
     OrderTest,
@@ -58,17 +55,11 @@ def row_columns(table: VoxelTable, null: Float64) -> Columns:
     }
 
 
-def _less(sums: Float64) -> Float64:
-    """A ratio less another, (...,) from sums (..., 4)."""
-    return ratio_of(sums[..., :2]) - ratio_of(sums[..., 2:])
-
-
 SIGNED = (-1.0, 1.0)
 MEANS: Mapping[str, Mean] = {
     **{name: Mean(name) for name in ("psa", "vss", "within", "between", "sbd", "null")},
     **{name: Mean(name) for name in ("entropy", "entropy_within", "entropy_between")},
-    **{name: Mean(name, bounds=SIGNED) for name in ("excess", "steadier")},
-    "coin": Mean("coin", _less, SIGNED),
+    "excess": Mean("excess", bounds=SIGNED),
     "kappa": Mean("kappa", kappa_of, SIGNED, "agreement"),
     "alpha": Mean("alpha", alpha_of, SIGNED, "agreement"),
     "alpha_between": Mean("alpha", between_of, SIGNED, "agreement"),
@@ -91,7 +82,7 @@ OF_CHANGES: Mapping[str, Mean] = {
 
 def place_sums(table: VoxelTable, columns: Columns, cubes: Cubes) -> CubeSums:
     """Return the sums over cubes of the voxels with OP >= 2 of which `MEANS` are functions."""
-    T, op, agreement = table.op.astype(np.float64), table.op, columns["psa"]
+    T, agreement = table.op.astype(np.float64), columns["psa"]
     sums = cubes.means(
         {
             "psa": agreement,
@@ -99,12 +90,9 @@ def place_sums(table: VoxelTable, columns: Columns, cubes: Cubes) -> CubeSums:
             "sbd": columns["sbd_excess"] + columns["sbd_null"],
             "null": columns["sbd_null"],
             "excess": columns["sbd_excess"],
-            "steadier": np.where(op > 2, -columns["sbd_excess"], np.nan),
             "entropy": columns["entropy_within"] + columns["entropy_between"],
             "entropy_within": columns["entropy_within"],
             "entropy_between": columns["entropy_between"],
-            "of two": np.where(op == 2, agreement, np.nan),
-            "of more": np.where(op > 2, agreement, np.nan),
             "observations": T,
             "agreeing": T * agreement,
             "own": table.self_sum,
@@ -120,7 +108,6 @@ def place_sums(table: VoxelTable, columns: Columns, cubes: Cubes) -> CubeSums:
     by_observation, by_voxel = cubes.sums_by_class(table.evidence, weight, weight / each)
     further = {
         **{name: [sums[name][:, :1], observations] for name in ("within", "between")},
-        "coin": [sums.pop("of two"), sums.pop("of more")],
         "kappa": [sums["psa"], by_voxel],  # as of `kappa_columns`, and of `alpha_columns` twice
         "alpha": [agreeing, observations, own, by_observation],
         "voxel_weighted": [sums["psa"], own_of_one, by_voxel],
@@ -243,23 +230,3 @@ def log_sums(
         "trend_q": trend_q,
     }
     return columns, log
-
-
-# --- Other rules of fusion
-
-
-def rule_outcomes(table: VoxelTable, events: Events, truth: Truth | None) -> tuple[RuleOutcome, ...]:
-    """Return the means over the voxels with OP >= 2 under each rule of fusion."""
-    rows = np.flatnonzero(table.op >= 2)
-    _, *others = fusion_rules.RULES  # the first one is the map's own
-    some, own = table.rows(rows), None if truth is None else Truth(truth.known[rows], truth.label[rows])
-    fused: list[Beliefs] = [some, *fusion_rules.fuse_all(events, others, evidence=some.evidence, rows=rows)]
-    labels, every = [fusion_rules.labels(belief.evidence) for belief in fused], np.ones(len(rows), np.bool_)
-    return tuple(
-        RuleOutcome(
-            rule,
-            rule_means_of(rule_sums(belief, every, own)),
-            np.count_nonzero(label != labels[0]) / len(rows) if len(rows) else math.nan,
-        )
-        for rule, belief, label in zip(fusion_rules.RULES, fused, labels, strict=True)
-    )

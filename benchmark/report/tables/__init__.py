@@ -8,7 +8,7 @@ from pathlib import Path
 from semstab.core.files import keep_only, write_json, write_text
 from semstab.model.records import Result
 from semstab.report.remedies import of_interest
-from semstab.report.tables.correctness import ceiling, comparison, correctness, correlogram, rules
+from semstab.report.tables.correctness import ceiling, comparison, correctness, correlogram
 from semstab.report.tables.remedies import remedy_tables
 from semstab.report.tables.stability import (
     agreement,
@@ -43,7 +43,7 @@ __all__ = [
 
 BUILDERS = (
     glance, verdicts, flicker, scenes, persistence, classes, temporal_agreement, correlogram, class_agreement, drift,
-    uncertainty, ceiling, correctness, cross_backbone, comparison, rules, sensitivity, voxel_sizes, reduced, fusion,
+    uncertainty, ceiling, correctness, cross_backbone, comparison, sensitivity, voxel_sizes, reduced, fusion,
     compared, agreement,
 )  # fmt: skip
 """In the paper's order, the statistics with what they belong to; each makes none where the study has nothing for it."""

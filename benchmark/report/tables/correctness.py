@@ -1,4 +1,4 @@
-"""Right beside stable where ground truth tells: geometry's part, correctness, quadrants, rules of fusion."""
+"""Right beside stable where ground truth tells: geometry's part, correctness, quadrants."""
 
 from __future__ import annotations
 
@@ -7,21 +7,10 @@ from collections.abc import Callable, Mapping, Sequence
 
 from semstab.metrics import macro_mean
 from semstab.model.contrast import BackboneComparison, ComparedObservations, MapCoverage
-from semstab.model.measures import VSS, Quantity, measures
 from semstab.model.records import Result
-from semstab.model.statistics import (
-    Correctness,
-    Correlogram,
-    Estimate,
-    LagBin,
-    Losses,
-    MapStatistics,
-    Quadrants,
-    RuleMeans,
-    RuleOutcome,
-)
-from semstab.report.tables.stability import of_measures, settings
-from semstab.report.tables.statistics import INTERVALS, SEEN_TWICE, Number, by_scene, grouped, judged_records
+from semstab.model.statistics import Correctness, Correlogram, Estimate, LagBin, Losses, MapStatistics, Quadrants
+from semstab.report.tables.stability import settings
+from semstab.report.tables.statistics import INTERVALS, Number, by_scene, grouped, judged_records
 from semstab.report.tables.table import Column, Group, Row, Table
 from semstab.statistics.correctness import ACCURACY, BRIER, ECE, MIOU
 from semstab.statistics.correlogram import STANDARD
@@ -105,30 +94,6 @@ def _quadrants(result: Result) -> list[Table]:
     return by_scene(result, "quadrants", "Stable and right", caption, columns, numbers)
 
 
-def rules(result: Result) -> list[Table]:
-    """Other rules of fusion applied to the same log of observations, macro means over scenes."""
-    judged = {
-        name: grouped((row for _, found in rows for row in found.fusion_rules or ()), lambda row: row.rule)
-        for name, rows in judged_records(result).items()
-    }
-    judged = {name: rows for name, rows in judged.items() if rows}
-    if not judged:
-        return []
-    columns = (
-        Column("rule", "Rule"),
-        *of_measures(),
-        Column("relabelled_percent", "Relabelled (%)", 2),
-        *map(Column.of, RIGHT),
-    )
-    groups = tuple(Group(name, _rule_rows(rows)) for name, rows in judged.items())
-    caption = (
-        f"{SEEN_TWICE} Averaging is the paper's rule; majority counts votes; product multiplies the frames' evidence as"
-        " Bayes' rule does, geometric is its geometric mean. Relabelled: share of the voxels whose dominant class is"
-        f" not that of averaging. Macro means: each scene counts once.{_order_by_rule(judged)}"
-    )
-    return [Table("rules", "Rules of fusion", caption, columns, groups)]
-
-
 # --- Parts ------------------------------------------------------------------------------------------------------------
 
 
@@ -149,48 +114,10 @@ def _stratum_rows(strata: Sequence[Sequence[Correctness]]) -> tuple[Row, ...]:
     )
 
 
-def _right(rows: Sequence[Correctness | RuleMeans]) -> list[float]:
+def _right(rows: Sequence[Correctness]) -> list[float]:
     """The macro mean of each of RIGHT."""
     values = [(row.accuracy, row.miou, row.ece, row.brier) for row in rows]
     return [macro_mean(column) for column in zip(*values, strict=True)]
-
-
-def _rule_rows(by_rule: Mapping[str, Sequence[RuleOutcome]]) -> tuple[Row, ...]:
-    return tuple(
-        (
-            rule,
-            *(macro_mean([row.values[measure] for row in rows]) for measure in measures()),
-            100 * macro_mean([row.relabelled_share for row in rows]),
-            *_right([row.values for row in rows]),
-        )
-        for rule, rows in by_rule.items()
-    )
-
-
-def _order_by_rule(judged: Mapping[str, Mapping[str, Sequence[RuleOutcome]]]) -> str:
-    """Whether the order of the backbones by VSS and by accuracy depends on the rule, as a sentence."""
-    if len(judged) < 2:
-        return ""
-    takers: dict[Quantity, Callable[[RuleMeans], float]] = {
-        VSS: lambda row: row[VSS],
-        ACCURACY: lambda row: row.accuracy,
-    }
-    changed = []
-    for quantity, take in takers.items():
-        by_rule: dict[str, dict[str, float]] = {}
-        for backbone, rules_of in judged.items():
-            for rule, rows in rules_of.items():
-                by_rule.setdefault(rule, {})[backbone] = macro_mean([take(row.values) for row in rows])
-        changed += [quantity.word] if len({_order(values) for values in by_rule.values()}) > 1 else []
-    verb = f"changes by {' and by '.join(changed)}" if changed else "is the same"
-    return f" From rule to rule the order of the backbones {verb}."
-
-
-def _order(values: Mapping[str, float]) -> tuple[str, ...]:
-    """The backbones whose value is defined, the highest first."""
-    return tuple(
-        sorted((name for name, value in values.items() if not math.isnan(value)), key=lambda name: -values[name])
-    )
 
 
 # The backbones beside each other, on the same places and at the same number of observations.

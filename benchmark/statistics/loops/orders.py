@@ -1,4 +1,4 @@
-"""Compiled loops over the observations of voxels: in the orders in which they could have come, and by fusion rules.
+"""Compiled loops over the observations of voxels: in the orders in which they could have come.
 
 Voxels of the same OP go through the same random orders, each beginning with its observations in an order of its own,
 which depends on its location and the seed only: the same seed gives the same numbers for any number of threads.
@@ -12,7 +12,7 @@ import numpy as np
 from numba.core import types
 from numba.extending import intrinsic
 
-from semstab.backends.shared.beliefs import js_term, plogp, plogp_of
+from semstab.backends.shared.beliefs import js_term, plogp_of
 from semstab.backends.shared.keys import mix
 from semstab.backends.shared.score_loops import DOUBLES
 from semstab.backends.shared.score_loops import LANES as EIGHT
@@ -348,71 +348,3 @@ def expected_one_hot(chunk, n, T, log_factorial, drifts, out):
                 log_p += log_factorial[rest] - log_factorial[t - c] - log_factorial[rest - t + c]
                 total += np.exp(log_p) * drifts[c, t]
         out[i] = n[i] / T[i] * total
-
-
-# Compiled loop that fuses the observations of voxels by several rules.
-
-AVERAGING, MAJORITY, PRODUCT, GEOMETRIC = range(4)
-
-
-@serial
-def _observe(log, row, rule, floor, certain, number, total):
-    """Add an observation to the sums total (A,) of evidence, of votes, or of log2(max(s, floor) / floor).
-
-    certain is that of s = 1.
-    """
-    starts, label, weight = log
-    best = starts[row]
-    for e in range(starts[row], starts[row + 1]):
-        best = e if weight[e] > weight[best] else best
-        if rule == AVERAGING:
-            total[number[label[e]]] += weight[e]
-        elif rule >= PRODUCT and weight[e] > floor:
-            total[number[label[e]]] += certain if weight[e] == 1.0 else np.log2(weight[e] / floor)
-    if rule == MAJORITY:
-        total[number[label[best]]] += 1.0
-
-
-@serial
-def _pooled(total, scale, others, after):
-    """The belief after (A + 1,) that is proportional to 2^(scale * total); the last one is that of `others` classes."""
-    norm, top, A = 0.0, total.max(), total.shape[0] - 1
-    for a in range(A + 1):
-        after[a] = np.exp2((total[a] - top) * scale)
-        norm += after[a] * (others if a == A else 1.0)
-    after /= norm
-
-
-@serial
-def fuse_by_rules(chunk, starts, ends, log, K, first, classes, rules, floor, belief, rest, drift_sum, bits):
-    """Fuse each voxel's observations by each of the rules (R,).
-
-    starts, ends (n,) bound their rows of the log, classes[first[i] : first[i + 1]] are the classes that a voxel saw.
-    belief (R, m) takes the beliefs in these after the last observation, rest (R, n) that in each of the others, which
-    are all alike, drift_sum (R, n) the sum of the Jensen-Shannon divergences of successive beliefs, bits (R, n) the
-    entropy of the last one, in bits both.
-    """
-    number, certain = np.empty(K, np.int64), np.log2(1.0 / floor)
-    for i in range(chunk, starts.shape[0], CHUNKS):
-        A = first[i + 1] - first[i]
-        for a in range(A):
-            number[classes[first[i] + a]] = a
-        total, before, after = np.empty(A + 1), np.zeros(A + 1), np.empty(A + 1)
-        for r in range(rules.shape[0]):
-            total[:], logs_before, drift = 0.0, 0.0, 0.0
-            for t in range(ends[i] - starts[i]):
-                _observe(log, starts[i] + t, rules[r], floor, certain, number, total)
-                if rules[r] >= PRODUCT:
-                    _pooled(total, 1.0 if rules[r] == PRODUCT else 1.0 / (t + 1), K - A, after)
-                else:
-                    after[:] = total * (1.0 / (t + 1))
-                logs = mixed = 0.0
-                for a in range(A + 1):
-                    many, own = K - A if a == A else 1.0, plogp(after[a])
-                    logs += many * own
-                    mixed += many * (own if before[a] == after[a] else plogp(0.5 * (before[a] + after[a])))
-                if t > 0:
-                    drift += min(max(0.5 * (logs_before + logs) - mixed, 0.0), 1.0)
-                before[:], logs_before = after, logs
-            belief[r, first[i] : first[i + 1]], rest[r, i] = before[:A], before[A]
-            drift_sum[r, i], bits[r, i] = drift, max(-logs_before, 0.0)
