@@ -41,6 +41,9 @@ RENAMED: dict[str, str | None] = {
     "statistics.fusion_rules": None,
     "fusion_rules": None,
     "rules": None,
+    "sizes": None,  # of fewer frames and pixels
+    "voxel_sizes": None,
+    "advice": None,
     "agreement.each_place": "voxel_weighted",
     "leave_own_out": "leave_one_out",
     # the sample is no longer cut to what the truth saw too; the ceiling comes from pairs of frames, not from labels

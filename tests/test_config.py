@@ -14,7 +14,8 @@ def test_defaults_are_the_papers() -> None:
     config = Config()
     assert (config.voxel_size, config.strata, config.dataset.name) == (0.2, [1, 2, 5], "city")
     assert [backend.name for backend in config.fused_by()] == ["numba"]
-    assert [backend.name for backend in load_config().fused_by()] == ["numba", "numpy"]  # the city is checked whole
+    assert [backend.name for backend in load_config().fused_by()] == ["numba"]
+    assert load_config().check == "sample"
 
 
 def test_the_checking_backend_is_not_fused_twice() -> None:

@@ -44,7 +44,7 @@ def test_a_resolved_study_is_read_back(tmp_path) -> None:
 def test_a_run_is_a_study_without_sweeps(tmp_path) -> None:
     """The same settings by the same names; only what nobody asked for differs: its name, and the check."""
     run, study = load_config(write(tmp_path, voxel_size=0.5)), load_study(write(tmp_path, voxel_size=0.5))
-    assert (run.check, study.check) == ("numpy", None)
+    assert (run.check, study.check) == ("sample", None)
     assert run.model_copy(update={"name": "mine", "check": None}) == study
 
 

@@ -385,7 +385,7 @@ def _thumbnail(shape: tuple[int, ...]) -> tuple[slice, slice]:
 
 FACTORS = (0.5, 1.0, 2.0)
 
-SIZE_FRAMES, SIZE_PIXELS = 16, 2**16
+SIZE_FRAMES, SIZE_PIXELS = 12, 2**15
 """At most so many frames, evenly spaced, are fused once more at each voxel size, and about so many pixels of each."""
 
 

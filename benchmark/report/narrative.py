@@ -10,9 +10,12 @@ from semstab.metrics import macro_mean
 from semstab.model.measures import VSS
 from semstab.model.records import Record, Result
 from semstab.model.results import UnitSummary, VoxelAdvice
+from semstab.model.statistics import Interval
 from semstab.report.averages import ENOUGH, by_backbone, pooled
 from semstab.report.tables.stability import comparable
-from semstab.statistics.agreement import ALPHA
+from semstab.statistics.agreement import ALPHA_BETWEEN
+from semstab.statistics.cluster_sums import ClusterSums
+from semstab.statistics.intervals import difference, mean_of
 from semstab.statistics.verdict import LIMITS
 
 MOSTLY_ONCE = 0.5
@@ -59,9 +62,13 @@ def warnings(result: Result) -> Iterator[str]:
         yield "labels and soft scores do not compare by VSS, entropy or alpha: semstab-bench show RUN reduced"
     for record in result.select():
         yield from (f"{_name(record.summary, result)}: {text}" for text in _suspicions(record))
-    for run in runs:
-        if (drowned := _one_class(run)) is not None:
-            yield f"{_name(run, result)}: {drowned}"
+    largest = {max(run.table.classes, key=lambda row: row.voxels).name for run in runs if _one_class(run)}
+    for name in largest:
+        shares = [row.share for run in runs for row in run.table.classes if row.name == name]
+        yield (
+            f"'{name}' covers {min(shares):.0%} of the map or more and makes most of its numbers; read them by class,"
+            f" or leave it out: --set exclude.classes=[{name}]"
+        )
 
 
 def _is_untested(record: Record) -> bool:
@@ -108,15 +115,9 @@ def _size(scene: str, found: VoxelAdvice, result: Result) -> str:
     return f"{where}{size} are so small that noise tears locations apart: --voxel-size {found.suggested:g}"
 
 
-def _one_class(run: UnitSummary) -> str | None:
+def _one_class(run: UnitSummary) -> bool:
     """Whether one class covers most of the map, so that it makes most of the numbers."""
-    largest = max(run.table.classes, key=lambda row: row.voxels)
-    if largest.share < ONE_CLASS:
-        return None
-    return (
-        f"'{largest.name}' covers {largest.share:.0%} of the map and makes most of its numbers; read them by class, or"
-        f" leave it out: --set exclude.classes=[{largest.name}]"
-    )
+    return max(row.share for row in run.table.classes) >= ONE_CLASS
 
 
 def mixed(runs: Sequence[UnitSummary]) -> bool:
@@ -133,18 +134,28 @@ def notes(result: Result) -> Iterator[str]:
 
 
 def differences(result: Result) -> Iterator[str]:
-    """How far alpha differs from the first model's on the locations that all saw, where that was compared."""
-    for comparison in result.comparisons:
-        first = comparison.backbones[0]
-        for row in comparison.paired.differences:
-            if row.measure == ALPHA.key and first in (row.a, row.b) and not math.isnan(row.difference.value):
-                sign = 1.0 if row.b == first else -1.0
-                other = row.a if row.b == first else row.b
-                value = sign * row.difference.value
-                low, high = sorted((sign * row.difference.low, sign * row.difference.high))
-                clear = "" if low > 0 or high < 0 else ": not told apart"
-                place = f"{comparison.scene}: " if len(result.scenes) > 1 else ""
-                yield f"{place}{other} less {first}: alpha {value:+.2f} ({low:+.2f} to {high:+.2f}){clear}"
+    """Which models are more or less stable than the first, by alpha between frames, for the same scene flown again."""
+    records = [record for record in result.select() if record.unit.backbone != GROUND_TRUTH]
+    first, *others = by_backbone(records).items() if records else [("", [])]
+    for name, own in others:
+        pairs = [(a, b) for a in own for b in first[1] if a.unit.scene == b.unit.scene]
+        found = [_less(a, b) for a, b in pairs if not mixed([a.summary, b.summary])]
+        if known := [each for each in found if each is not None and not math.isnan(each.low)]:
+            change = mean_of(known)
+            low, high = sorted((change.low, change.high))
+            told = "more stable than" if low > 0 else "less stable than" if high < 0 else "not told apart from"
+            ends = f"{low:+.2f} to {high:+.2f}".replace("0.", ".")
+            scenes = f", {len(known)} scenes" if len(known) > 1 else ""
+            yield f"{name} is {told} {first[0]}: alpha {change.value:+.2f} ({ends}){scenes}"
+
+
+def _less(record: Record, other: Record) -> Interval | None:
+    """The difference of alpha between frames, on the cubes of space and frames that both have; None where unknown."""
+    files = record.influence_file, other.influence_file
+    if any(file is None or not file.is_file() for file in files):
+        return None
+    a, b = (ClusterSums.load(file) for file in files if file is not None)
+    return difference(a.without_truth(), b.without_truth(), ALPHA_BETWEEN.key)
 
 
 def _ranking(result: Result) -> Iterator[str]:

@@ -27,6 +27,9 @@ share of its height, that have others below them at half of its height or more: 
 SLENDER = 2.0
 """A map that is seen to be so many times as large from a side is shown from there: a wall, a facade."""
 
+SPARSE = 16
+"""Columns of cells a voxel from which on those that are there are found by sorting."""
+
 OUTLIERS = 0.01
 """Share of the voxels that may lie outside of the map at each of its four sides: lone ones far away would shrink it."""
 
@@ -102,14 +105,15 @@ def best_view(table: VoxelTable, up: npt.ArrayLike) -> tuple[Mask, Float64, str]
     """Which voxels (n,) to look at, against which axis (3,), and what that view is called."""
     right, ahead, up_axis = level_axes(up)
     every = np.ones(len(table), dtype=np.bool_)
-    areas = [_area(table, axis) for axis in (up_axis, right, ahead)]
+    centers = table.centers
+    areas = [_numbered(_columns(centers, axis, table.voxel_size))[1] for axis in (up_axis, right, ahead)]
     if max(areas[1:]) > SLENDER * areas[0]:
         return every, -right if areas[1] > areas[2] else -ahead, "from the side"
-    heights = table.centers @ up_axis
+    heights = centers @ up_axis
     low, high = np.quantile(heights, [OUTLIERS, 1 - OUTLIERS])
     cut = high - LID * (high - low)
-    _, column = np.unique(_columns(table, up_axis), return_inverse=True)
-    top, bottom = (np.full(column.max() + 1, end) for end in (-np.inf, np.inf))
+    column, count = _numbered(_columns(centers, up_axis, table.voxel_size))
+    top, bottom = (np.full(count, end) for end in (-np.inf, np.inf))
     np.maximum.at(top, column, heights)
     np.minimum.at(bottom, column, heights)
     covered_columns = (top > cut) & (bottom < high - 0.5 * (high - low))
@@ -118,18 +122,23 @@ def best_view(table: VoxelTable, up: npt.ArrayLike) -> tuple[Mask, Float64, str]
     return heights <= cut, up_axis, f"cut open at {cut:.2g} m"
 
 
-def _area(table: VoxelTable, axis: Float64) -> int:
-    """Cells that voxels cover, seen along an axis."""
-    return len(np.unique(_columns(table, axis)))
-
-
-def _columns(table: VoxelTable, axis: Float64) -> Int64:
+def _columns(centers: Float64, axis: Float64, voxel_size: float) -> Int64:
     """A number (n,) for the column of cells along an axis that each voxel lies in."""
     right, ahead, _ = level_axes(axis)
-    centers = table.centers
-    x, y = (np.floor(centers @ along / table.voxel_size).astype(np.int64) for along in (right, ahead))
+    x, y = (np.floor(centers @ along / voxel_size).astype(np.int64) for along in (right, ahead))
     columns: Int64 = (x - x.min()) * (np.ptp(y) + 1) + (y - y.min())
     return columns
+
+
+def _numbered(columns: Int64) -> tuple[Int64, int]:
+    """The same numbers without gaps (n,), and how many there are."""
+    if columns.max() > SPARSE * len(columns):
+        numbers, own = np.unique(columns, return_inverse=True)
+        return own, len(numbers)
+    there = np.zeros(columns.max() + 1, np.int64)
+    there[columns] = 1
+    number = np.cumsum(there)
+    return number[columns] - 1, int(number[-1])
 
 
 @dataclass(frozen=True, eq=False)
