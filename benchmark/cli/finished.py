@@ -171,8 +171,8 @@ def export(
 
     for file in write(
         run, to, scene=scene, backbone=backbone, backend=backend, measures=measure, min_op=min_op,
-        classes=classes or (), commit=thresholds, cell=cell, asprs=asprs, radius=radius, classify=classify, join=join,
-        task_format=task_format, most=most,
+        classes=classes or (), thresholds=thresholds, cell=cell, asprs=asprs, radius=radius, classify=classify,
+        join=join, task_format=task_format, most=most,
     ):  # fmt: skip
         print_lines([f"{file.path}: {file.content}", *(f"  {note}" for note in file.notes)], quiet=quiet)
 

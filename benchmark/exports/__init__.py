@@ -66,12 +66,13 @@ def export(
     measures: Sequence[str] | None = None,
     min_op: int = 1,
     classes: Sequence[str] = (),
-    commit: str | Path | None = None,
+    thresholds: str | Path | None = None,
     cell: int = 1,
     asprs: str | Path | None = None,
     classify: str | Path | None = None,
     radius: float | None = None,
     join: str | Path | None = None,
+    commit: str | Path | None = None,
     onto: str | Path | None = None,
     beside: str | Path | None = None,
     task_format: str | None = None,
@@ -82,7 +83,7 @@ def export(
     scene, backbone, backend  which unit; may be left out where there is one, and for the base backend
     measures  columns that go along: measures, op, category, psa, or what the run's Parquet file has
     min_op, classes  only voxels seen that often, of these dominant classes
-    commit    file of thresholds: only voxels whose label has the evidence that they ask for (`AcceptanceThresholds`)
+    thresholds  a file of them: only voxels whose label has the evidence that they ask for (`AcceptanceThresholds`)
     cell      edge of a raster's cell, in voxels
     asprs     YAML file CLASS: CODE for LAS; else the table that ships for the taxonomy
     classify  a cloud: write this cloud, classified; a point outside of all voxels takes the nearest one within
@@ -90,7 +91,7 @@ def export(
     join      a Parquet file with further columns of the same voxels, such as `compare` writes
     task_format  coco, labelstudio, cvat or fiftyone: write at most so many (`most`) annotation tasks for it, the places
               where frames disagree, instead of the map
-    onto, beside  names of `classify` and `join` in the version before
+    commit, onto, beside  names of `thresholds`, `classify` and `join` in the version before
 
     Raises ConfigError, DataError, MissingDependencyError, each with the file.
     """
@@ -102,14 +103,14 @@ def export(
             raise ConfigError(f"{file}: format '{file.suffix}' is not known; {nearest(file.suffix, SUFFIXES)}")
     result = load_result(run)
     record = result.record(scene=scene, backbone=backbone, backend=backend)
-    thresholds = None if commit is None else AcceptanceThresholds.load(commit)
     settings = Settings(cell, None if asprs is None else Path(asprs))
-    classify, join = classify or onto, join or beside
+    classify, join, thresholds = classify or onto, join or beside, thresholds or commit
+    accepted = None if thresholds is None else AcceptanceThresholds.load(thresholds)
 
     @functools.cache
     def chosen(usual: tuple[str, ...] | None) -> Chosen:
         return Chosen(
-            result, record, columns=measures or usual, min_op=min_op, classes=classes, commit=thresholds,
+            result, record, columns=measures or usual, min_op=min_op, classes=classes, thresholds=accepted,
             join=None if join is None else Path(join),
         )  # fmt: skip
 

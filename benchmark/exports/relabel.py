@@ -53,7 +53,7 @@ class Belief:
     categories     of these categories, of any where none is named
     leave_one_out  without the frame's own vote, and seen by another frame. Drift stays that of all votes: it depends
                    on their order
-    commit         whose label has the evidence that these thresholds ask for
+    thresholds     whose label has the evidence that these thresholds ask for
 
     Raises ConfigError for a category that there is not, and values out of range.
     """
@@ -62,7 +62,7 @@ class Belief:
     min_psa: float = 0.0
     categories: tuple[str, ...] = ()
     leave_one_out: bool = False
-    commit: AcceptanceThresholds | None = None
+    thresholds: AcceptanceThresholds | None = None
 
     def __post_init__(self) -> None:
         if not 0 <= self.min_psa <= 1:
@@ -79,14 +79,14 @@ class Belief:
         if self.categories:
             with np.errstate(invalid="ignore"):  # the belief of no vote
                 believed &= np.isin(categories(table), [CATEGORIES.index(name) for name in self.categories])
-        if self.commit is not None:
-            believed &= self.commit.decide(table) >= 0
+        if self.thresholds is not None:
+            believed &= self.thresholds.decide(table) >= 0
         return believed
 
     def settings(self) -> dict[str, object]:
         """Return the criteria for JSON."""
         own = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
-        return own | {"commit": None if self.commit is None else self.commit.model_dump(by_alias=True)}
+        return own | {"thresholds": None if self.thresholds is None else self.thresholds.model_dump(by_alias=True)}
 
 
 class FusedLabels:

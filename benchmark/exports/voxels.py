@@ -91,7 +91,7 @@ class Voxels:
 class Chosen:
     """The voxels of a unit that are exported, tile by tile; the latest tiles stay in memory.
 
-    Those with OP >= min_op and one of these dominant classes, all where none is named; with thresholds (commit), of
+    Those with OP >= min_op and one of these dominant classes, all where none is named; with thresholds, of
     those the ones whose label has enough evidence. `columns` names measures, op, category, psa, columns of the unit's
     Parquet file, or of a file to `join`, which has some of the same voxels; where not given, see `usual`.
     Raises ConfigError for a name that is not there, and where no voxel is left.
@@ -108,13 +108,13 @@ class Chosen:
         min_op: int = 1,
         classes: Sequence[str] = (),
         join: Path | None = None,
-        commit: AcceptanceThresholds | None = None,
+        thresholds: AcceptanceThresholds | None = None,
     ) -> None:
         if record.voxels_file is None:
             raise ConfigError(f"{record.unit.slug}: its voxels were not kept; run it with a folder")
         self._result, self._record = result, record
         self._columns, self._join = columns, join
-        self._min_op, self._classes, self._commit = min_op, classes, commit
+        self._min_op, self._classes, self._thresholds = min_op, classes, thresholds
         tiles = {file: parquet.tile_of(file) if record.in_tiles else None for file in files_of(record.voxels_file)}
         self._files = {(0, 0) if tile is None else (tile.x, tile.y): file for file, tile in tiles.items()}
         self.size = next(None if tile is None else tile.size for tile in tiles.values())
@@ -141,7 +141,7 @@ class Chosen:
                 yield place
         if not left:
             limits = f"OP >= {self._min_op}" + (f" and class {' or '.join(self._classes)}" if self._classes else "")
-            limits += " and the evidence that --thresholds asks for" if self._commit is not None else ""
+            limits += " and the evidence that --thresholds asks for" if self._thresholds is not None else ""
             raise ConfigError(f"{self._record.voxels_file}: no voxel with {limits}; OP goes up to {self._highest}")
 
     @cached_property
@@ -159,8 +159,8 @@ class Chosen:
         keep = table.op >= self._min_op
         if self._classes:
             keep &= np.isin(dominant(table), rows_named(self._classes, names, str(record.voxels_file)))
-        if self._commit is not None:
-            keep &= self._commit.decide(table) >= 0
+        if self._thresholds is not None:
+            keep &= self._thresholds.decide(table) >= 0
         further = {} if self._join is None else joined_columns(table, self._join)
         columns = {
             name: further.get(name) or _column(name, table, file) for name in self._columns or (*usual(), *further)
