@@ -46,6 +46,9 @@ RENAMED: dict[str, str | None] = {
     "advice": None,
     "agreement.each_place": "voxel_weighted",
     "leave_own_out": "leave_one_out",
+    "foresight": "next_frame",
+    "foresight_by_frame": "next_frame_by_frame",
+    "foresight_percent": "next_frame_percent",
     # the sample is no longer cut to what the truth saw too; the ceiling comes from pairs of frames, not from labels
     "statistics.reach": None,
     "statistics.correlogram": None,

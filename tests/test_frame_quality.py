@@ -35,7 +35,7 @@ def wall(k):
 def test_who_is_right_and_steady():
     maps = [wall(k) for k in range(5)]
     found = judged(maps, truth=maps)
-    assert (found.accuracy, found.miou, found.foresight, found.coverage) == (1, 1, 1, 1)
+    assert (found.accuracy, found.miou, found.next_frame, found.coverage) == (1, 1, 1, 1)
     assert (found.stable_wrong, found.changes) == (0, 0)
     assert np.isnan(found.lag)
     assert (found.model, found.filters, found.milliseconds) == ("net", "ema:0.6", 1.5)
@@ -49,7 +49,7 @@ def test_what_is_stable_and_wrong_is_told_from_what_is_right():
     assert found.accuracy == pytest.approx(1 - share)
     assert found.miou == pytest.approx((1 / 2 + 1 + 0) / 3, abs=0.02)
     assert found.stable_wrong == pytest.approx(share, abs=0.02)
-    assert found.foresight == 1
+    assert found.next_frame == 1
 
 
 def test_labels_that_stay_behind_are_not_foreseen():
@@ -57,17 +57,17 @@ def test_labels_that_stay_behind_are_not_foreseen():
     maps = [wall(k) for k in range(5)]
     found = judged([maps[0]] * 5, model=maps)
     moving = [np.mean(maps[0][:, 2:] == maps[k + 1][:, :-2]) for k in range(4)]
-    assert found.foresight == pytest.approx(np.mean(moving), abs=1e-9)
-    np.testing.assert_allclose(found.foresight_by_frame, moving)
+    assert found.next_frame == pytest.approx(np.mean(moving), abs=1e-9)
+    np.testing.assert_allclose(found.next_frame_by_frame, moving)
     assert np.isnan(found.accuracy)
     assert found.accuracy_by_frame == ()
 
 
-def test_foresight_does_not_count_what_a_filter_repeats():
+def test_next_frame_does_not_count_what_a_filter_repeats():
     rng = np.random.default_rng(0)
     noise = [rng.integers(0, 2, SHAPE) for _ in range(9)]
     frozen = judged([noise[0]] * 9, model=noise, still=True)
-    assert frozen.foresight == pytest.approx(0.5, abs=0.03)
+    assert frozen.next_frame == pytest.approx(0.5, abs=0.03)
 
 
 def test_coverage_counts_labels_left():

@@ -19,7 +19,14 @@ NAN = float("nan")
 
 
 def remedy(filters="", flicker=0.2, worth=0.8, **more):
-    known = {"plain": flicker, "alpha": 0.5, "foresight": worth, "accuracy": worth, "miou": worth, "stable_wrong": 0.05}
+    known = {
+        "plain": flicker,
+        "alpha": 0.5,
+        "next_frame": worth,
+        "accuracy": worth,
+        "miou": worth,
+        "stable_wrong": 0.05,
+    }
     return Remedy(filters, flicker, **{**known, "lag": 0.0, "coverage": 1.0, "milliseconds": 2.0, **more})
 
 

@@ -64,7 +64,7 @@ SCALE_APART = 2.5
 LEAST_SCALE_ERROR = 1.1
 """Depth that is too long or too short by less is measurement, not a wrong unit."""
 
-MOST_RIVALS = 3
+MOST_CANDIDATES = 3
 """Alternatives that are named beside the best one, where they fit as well."""
 
 SIMPLER = 1.1
@@ -209,7 +209,7 @@ class Judgement:
     # --- another convention ------------------------------------------------------------------------------------------
 
     def _best(self) -> Fit | None:
-        """The alternative that clearly beats the configured convention; where there are several, see `_rivals`."""
+        """The alternative that clearly beats the configured convention; where there are several, see `_candidates`."""
         return self._refuting[0] if self._refuting else None
 
     @cached_property
@@ -303,8 +303,8 @@ class Judgement:
         else:
             found = f"as configured {mine.share:.1%} of the points are seen again; depth reprojects with"
         text = f"{found} {best.error:.2%} error under {', '.join(lines)} ({self.reading.advice(best.convention)})"
-        if rivals := [self._name(fit) for fit in self._refuting[1:]][:MOST_RIVALS]:
-            text += f"; these frames cannot tell it from {' or '.join(rivals)}"
+        if candidates := [self._name(fit) for fit in self._refuting[1:]][:MOST_CANDIDATES]:
+            text += f"; these frames cannot tell it from {' or '.join(candidates)}"
         return self._as("unsound", text, lines, best)
 
     # --- what cannot be told -----------------------------------------------------------------------------------------

@@ -139,8 +139,8 @@ def worse_areas(common: Common, number: int) -> Worse:
     wrong_area = None
     if result.true is not None and result.right is not None:
         loss = -result.right.astype(float)
-        wrong_area, wrong_rivals = _clusters(index, result.true, loss, 1.0)
-        listed += _areas("truth", wrong_area, wrong_rivals, loss, index, size, result.true, names, observations)
+        wrong_area, wrong_alike = _clusters(index, result.true, loss, 1.0)
+        listed += _areas("truth", wrong_area, wrong_alike, loss, index, size, result.true, names, observations)
 
     def numbers(table: VoxelTable) -> tuple[Int64, Int64 | None]:
         """The areas of some voxels (n,), which hold those that matter among them."""

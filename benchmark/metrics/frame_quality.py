@@ -32,7 +32,7 @@ class FrameQualityMeter:
         self._lag = Lag()
         self._before: tuple[Frame, Frame, Frame | None] | None = None
         self._accuracy: list[float] = []
-        self._foresight: list[float] = []
+        self._next_frame: list[float] = []
 
     def add(self, frame: Frame, model: Frame, truth: Frame | None) -> None:
         """Add the next frame."""
@@ -57,7 +57,7 @@ class FrameQualityMeter:
             model=model,
             filters=filters,
             coverage=_share(labelled, sayable),
-            foresight=_share(foreseen, met),
+            next_frame=_share(foreseen, met),
             accuracy=_share(right.sum(), self._confusion.sum()),
             miou=float(np.mean(right[there] / union[there])) if there.any() else math.nan,
             stable_wrong=_share(stale, compared),
@@ -65,7 +65,7 @@ class FrameQualityMeter:
             changes=self._lag.changes,
             milliseconds=milliseconds,
             accuracy_by_frame=tuple(self._accuracy),
-            foresight_by_frame=tuple(self._foresight),
+            next_frame_by_frame=tuple(self._next_frame),
         )
 
     def _compare(
@@ -76,7 +76,7 @@ class FrameQualityMeter:
         before = seen.bring(frame.predicted)
         met = labelled & model_now.valid
         foreseen = met & (before == model_now.predicted)
-        self._foresight.append(_share(foreseen.sum(), met.sum()))
+        self._next_frame.append(_share(foreseen.sum(), met.sum()))
         self._count(foreseen=foreseen, met=met)
         if truth is None or truth_now is None:
             return

@@ -14,7 +14,8 @@ SCHEMA = 2
 
 KEYS: Mapping[str, str] = {
     "judged": "headline", "reach": "ceiling_share", "each_place": "voxel_weighted", "question": "scope",
-    "matters": "counts_for_verdict", "reached": "share",
+    "matters": "counts_for_verdict", "reached": "share", "foresight": "next_frame",
+    "foresight_by_frame": "next_frame_by_frame",
 }  # fmt: skip
 """Keys of schema 2, and what they are called now."""
 

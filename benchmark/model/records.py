@@ -86,20 +86,20 @@ class FrameQuality:
 
     model, filters  whose labels they are, and what was done to them ('ema:0.6+threshold:0.5'; '' for nothing)
     coverage      labelled pixels for one that the model labels
-    foresight     of the pixels that the next frame sees again, those whose label the model gives that place then.
+    next_frame    of the pixels that the next frame sees again, those whose label the model gives that place then.
                   No filter saw that frame: what it only repeats does not count for it
     accuracy      of the labelled pixels, those that are right; miou the mean over classes of intersection over union
     stable_wrong  of the pixels seen again, those that keep a label that is wrong
     lag           frames by which labels follow a true change later than the model, see `semstab.metrics.frame_quality`;
                   changes: the pixels that it was counted on
     milliseconds  of CPU time that the filters took for a frame, in the median
-    accuracy_by_frame, foresight_by_frame  the same of each frame, and of each pair
+    accuracy_by_frame, next_frame_by_frame  the same of each frame, and of each pair
     """
 
     model: str
     filters: str = ""
     coverage: float = math.nan
-    foresight: float = math.nan
+    next_frame: float = math.nan
     accuracy: float = math.nan
     miou: float = math.nan
     stable_wrong: float = math.nan
@@ -107,7 +107,7 @@ class FrameQuality:
     changes: int = 0
     milliseconds: float = 0.0
     accuracy_by_frame: tuple[float, ...] = ()
-    foresight_by_frame: tuple[float, ...] = ()
+    next_frame_by_frame: tuple[float, ...] = ()
 
 
 @dataclass(frozen=True)

@@ -31,14 +31,14 @@ class Remedy:
     flicker   of places seen in two frames in a row, those whose label changes: motion-compensated
     plain     the same at the same pixel, whatever it shows
     alpha     between frames, of the fused map
-    better    in how many frames, of how many, the accuracy is above the model's; without truth the foresight
+    better    in how many frames, of how many, the accuracy is above the model's; without truth the next frame's
     """
 
     filters: str
     flicker: float
     plain: float
     alpha: float
-    foresight: float
+    next_frame: float
     accuracy: float
     miou: float
     stable_wrong: float
@@ -67,8 +67,8 @@ class Remedies:
         return not math.isnan(self.unfiltered.accuracy)
 
     def worth(self, row: Remedy) -> float:
-        """What a filter must not lower: accuracy; without ground truth foresight."""
-        return row.accuracy if self.has_truth else row.foresight
+        """What a filter must not lower: accuracy; without ground truth next-frame consistency."""
+        return row.accuracy if self.has_truth else row.next_frame
 
     def harmless(self, row: Remedy) -> bool:
         """Whether it costs nothing that must not be lost, whatever it does for stability."""
@@ -76,7 +76,7 @@ class Remedies:
         if row.coverage < LEAST_COVERAGE:
             return False
         if not self.has_truth:
-            return row.foresight >= base.foresight - ALIKE
+            return row.next_frame >= base.next_frame - ALIKE
         return row.accuracy >= base.accuracy and row.miou >= base.miou and not row.lag > MOST_LAG
 
     @property
@@ -148,7 +148,7 @@ def advice(found: Remedies) -> Iterator[str]:
     """What to use and why; what only seems to help; what cannot be known."""
     best, base = found.best, found.unfiltered
     if best is None:
-        least = "accuracy, IoU, coverage or time to follow" if found.has_truth else "foresight or coverage"
+        least = "accuracy, IoU, coverage or time to follow" if found.has_truth else "next-frame consistency or coverage"
         yield f"Use none of these filters over {found.model}: none steadies it without a loss of {least}."
     else:
         yield f"Use --filter {typed(best)} over {found.model}: {_why(found, best)}."
@@ -162,8 +162,8 @@ def advice(found: Remedies) -> Iterator[str]:
     if not found.has_truth:
         yield (
             "There is no ground truth: whether labels are right, and how late they follow a true change, is not known."
-            f" The choice rests on foresight, how often a label is what {found.model} says of the place in the next"
-            " frame, which no filter has seen. What the model gets wrong in every frame stays wrong."
+            f" The choice rests on next-frame consistency, how often a label is what {found.model} says of the place in"
+            " the next frame, which no filter has seen. What the model gets wrong in every frame stays wrong."
         )
     elif not math.isfinite(base.lag):
         yield "Nothing changes in what is seen here: how late labels follow is not known."
@@ -184,8 +184,8 @@ def _why(found: Remedies, best: Remedy) -> str:
         )
     else:
         parts.append(
-            f"foresight goes from {100 * base.foresight:.1f} to {100 * best.foresight:.1f} % (better in {better} of"
-            f" {frames} frames)"
+            f"next-frame consistency goes from {100 * base.next_frame:.1f} to {100 * best.next_frame:.1f} % (better in"
+            f" {better} of {frames} frames)"
         )
     if found.has_truth and math.isfinite(best.lag):
         parts.append(f"labels follow a change {best.lag:.1f} frames late")
@@ -200,7 +200,7 @@ def _harm(found: Remedies, row: Remedy) -> str:
     if row.flicker >= base.flicker:
         steady = f"has {100 * row.plain:.1f} % flicker at the same pixel ({100 * base.plain:.1f} % without)"
     if not found.has_truth:
-        return f"{steady}, but foresees {100 * row.foresight:.1f} % of the next labels ({100 * base.foresight:.1f} %)"
+        return f"{steady}, but foresees {100 * row.next_frame:.1f} % of the next labels ({100 * base.next_frame:.1f} %)"
     late = f", and it follows changes {row.lag:.1f} frames late" if math.isfinite(row.lag) else ""
     return (
         f"{steady}, but {100 * row.stable_wrong:.0f} % of what it shows is stable and wrong"
@@ -222,7 +222,7 @@ def _row(records: Sequence[Record], unfiltered: Sequence[Record]) -> Remedy:
         alpha=macro_mean([row.alpha_between.value for row in judged]),
         **{
             name: mean(name)
-            for name in ("foresight", "accuracy", "miou", "stable_wrong", "lag", "coverage", "milliseconds")
+            for name in ("next_frame", "accuracy", "miou", "stable_wrong", "lag", "coverage", "milliseconds")
         },
         better=_better(records, unfiltered),
     )
@@ -235,6 +235,6 @@ def _better(records: Sequence[Record], unfiltered: Sequence[Record]) -> tuple[in
     for record in records:
         a, b = record.quality, before.get(record.unit.scene)
         if a is not None and b is not None:
-            kind = "accuracy_by_frame" if any(math.isfinite(v) for v in b.accuracy_by_frame) else "foresight_by_frame"
+            kind = "accuracy_by_frame" if any(math.isfinite(v) for v in b.accuracy_by_frame) else "next_frame_by_frame"
             pairs += zip(getattr(a, kind), getattr(b, kind), strict=False)
     return sum(a > b for a, b in pairs), len(pairs)

@@ -10,7 +10,7 @@ COLUMNS = (
     Column("filter", "Filter"),
     Column("flicker_percent", "Flicker (%)", 2, "lower", over="Steady?"),
     Column("alpha", "alpha", 3, over="Steady?"),
-    Column("foresight_percent", "Foresight (%)", 2, "higher", over="Right?"),
+    Column("next_frame_percent", "Next frame (%)", 2, "higher", over="Right?"),
     Column("accuracy_percent", "Accuracy (%)", 2, "higher", over="Right?"),
     Column("miou_percent", "mIoU (%)", 2, "higher", over="Right?"),
     Column("stable_wrong_percent", "Stable, wrong (%)", 2, "lower", over="Right?"),
@@ -21,7 +21,7 @@ COLUMNS = (
 CAPTION = (
     "Flicker: of the places that two frames in a row see, those whose label changes (camera motion taken out). Alpha:"
     " agreement between frames in the fused map; it rises with any memory of frames before, as frames that share one"
-    " are no longer independent: of a filter that remembers a high alpha says nothing. Foresight: of the places that"
+    " are no longer independent: of a filter that remembers a high alpha says nothing. Next frame: of the places that"
     " the next frame sees, those whose label the unfiltered model gives them there; no filter has seen that frame, so"
     " what it merely repeats does not count. Accuracy and mean IoU: of the labelled pixels of single frames. Stable,"
     " wrong: of the places seen again, those that keep a label that is wrong. Lag: frames by which labels follow a true"
@@ -48,7 +48,7 @@ def row(remedy: Remedy) -> Row:
         remedy.filters or "none",
         100 * remedy.flicker,
         remedy.alpha,
-        100 * remedy.foresight,
+        100 * remedy.next_frame,
         100 * remedy.accuracy,
         100 * remedy.miou,
         100 * remedy.stable_wrong,
