@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import Any, cast
 
@@ -10,8 +11,19 @@ from pydantic import BaseModel
 from semstab.config import DatasetConfig, validated
 from semstab.core.registry import Entry, Registry
 from semstab.datasets.scene import GROUND_TRUTH, Dataset, Filtering, Scene
+from semstab.errors import DataError
 
-__all__ = ["GROUND_TRUTH", "REGISTRY", "Dataset", "Filtering", "Scene", "open_dataset", "options_model", "resolved"]
+__all__ = [
+    "GROUND_TRUTH",
+    "REGISTRY",
+    "Dataset",
+    "Filtering",
+    "Scene",
+    "open_dataset",
+    "options_model",
+    "recognise",
+    "resolved",
+]
 
 REGISTRY = Registry(
     "dataset",
@@ -69,3 +81,38 @@ def open_dataset(name: str, options: dict[str, Any] | BaseModel) -> Dataset:
     cls = REGISTRY.load(name)
     validated = options if isinstance(options, BaseModel) else cls.Options.model_validate(options)
     return cast("Dataset", cls(validated))
+
+
+RECOGNISED = (
+    "odm", "hololens", "tum", "seven_scenes", "replica", "scannet", "tartanair", "transforms_json", "colmap",
+    "posed_folder",
+)  # fmt: skip
+"""Formats that a folder is recognised as: the one whose scenes lie highest, of these the first."""
+
+
+def recognise(root: Path) -> tuple[str, str]:
+    """Return the dataset that a folder of scenes is of, and what tells so.
+
+    Raises DataError with the nearest formats, and what they lack, where it is none; of an empty folder it is a
+    `posed_folder`, whose reader says what is missing.
+    """
+    near, fits = list[tuple[float, str]](), list[tuple[int, int, str, str]]()
+    for rank, name in enumerate(RECOGNISED):
+        cls: Any = REGISTRY.load(name)
+        try:
+            folders = cls(cls.Options(root=root)).folders
+        except DataError:
+            marks = re.findall(r"[\w.]+/(?:[\w./]+)?|\w+\.(?:txt|json)", cls.contents)
+            lacks = [mark for mark in marks if not (root / mark).exists()]
+            if len(lacks) < len(marks):
+                near.append((len(lacks) / len(marks), f"{name} (lacks {', '.join(lacks)})"))
+        else:
+            deep = min(len(folder.relative_to(root).parts) for folder in folders)
+            count = f"{len(folders)} scene{'s' if len(folders) > 1 else ''}"
+            fits.append((deep, rank, name, f"{cls.contents}; {count}"))
+    if fits:
+        return min(fits)[2:]
+    if not near:
+        return RECOGNISED[-1], ""
+    listed = " or ".join(text for _, text in sorted(near)[:3])
+    raise DataError(f"{root}: no format is recognised; nearly {listed}; or name it: --dataset NAME")

@@ -5,10 +5,12 @@ from __future__ import annotations
 import contextlib
 import io
 import logging
+import os
 import signal
 import sys
 import threading
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Annotated, Any
 
 import typer
@@ -72,6 +74,9 @@ class Command(TyperCommand):
         return _without_kind(super().get_params(ctx))
 
 
+OF_PATHS = ("run", "check", "predict")
+"""Commands whose first word may be a folder: --data."""
+
 EARLIER = {
     "commit": "calibrate", "--commit": "--thresholds", "--onto": "--classify", "--beside": "--join",
     "--leave-own-out": "--leave-one-out", "--trust-geometry": "--no-geometry-check",
@@ -100,6 +105,10 @@ class Group(TyperGroup):
         own = {"--help", "-h", "--version", "--install-completion", "--show-completion"}
         if not args or (args[0].startswith("-") and args[0] not in own):
             args = ["run", *args]
+        if args[0] not in self.commands and args[0] not in own and (os.sep in args[0] or Path(args[0]).is_dir()):
+            args = ["run", "--data", *args]
+        if args[0] in OF_PATHS and len(args) > 1 and not args[1].startswith("-"):
+            args = [args[0], "--data", *args[1:]]
         return super().parse_args(ctx, [_of_today(word, k) for k, word in enumerate(args)])
 
     def format_help(self, ctx: Any, formatter: Any) -> None:

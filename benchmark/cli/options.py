@@ -60,14 +60,14 @@ SETTINGS, LABELS, CHECKS, MACHINE = "Settings", "Labels", "Checks", "Machine"
 # fmt: off
 ConfigFile = Annotated[Path | None, typer.Option("--config", "-c", help="YAML file with settings.",
     rich_help_panel=SETTINGS)]
-DataFolder = Annotated[Path | None, typer.Option(help="Folder of scenes in posed_folder layout, or one scene.")]
+DataFolder = Annotated[Path | None, typer.Option(help="Folder of scenes, or one scene; its format is recognised.")]
 DatasetOptions = Annotated[list[str] | None, typer.Option(
     "--option", metavar="KEY=VALUE", help="Option of the dataset, short for --set dataset.options.KEY=VALUE.",
     rich_help_panel=SETTINGS)]
 DatasetSettings = Annotated[list[str] | None, typer.Option(
     "--set", metavar="KEY=VALUE", help="Any setting, e.g. dataset.options.depth_scale=5000.", rich_help_panel=SETTINGS)]
 DatasetName = Annotated[str | None, typer.Option(
-    help="Dataset, as named by `semstab-bench list`.", show_default="posed_folder with --data, else city",
+    help="Dataset, as named by `semstab-bench list`.", show_default="what --data is, else city",
     autocompletion=datasets)]
 Scenes = Annotated[list[str] | None, typer.Option(
     "--scene", "-s", help="Scene; repeatable; or 'all'.", show_default="all", autocompletion=scenes)]
@@ -154,7 +154,9 @@ def select_dataset(content: dict[str, Any], name: str | None, data: Path | None,
         raise ConfigError(f"{data}: there is no such folder")
     options = {"root": None if data is None else str(data), "seed": seed}
     options = {key: value for key, value in options.items() if value is not None}
-    name = name or ("posed_folder" if data is not None else None)
+    given = content.get("dataset")
+    if name is None and data is not None and not (isinstance(given, dict) and "name" in given):
+        name = _recognised(data)
     if name is None and not options:
         return
     group = content.setdefault("dataset", {})
@@ -163,6 +165,15 @@ def select_dataset(content: dict[str, Any], name: str | None, data: Path | None,
     if name is not None:
         group["name"] = name
     group["options"] = group.get("options", {}) | options
+
+
+def _recognised(data: Path) -> str:
+    from semstab.datasets import recognise
+
+    name, why = recognise(data)
+    if name != "posed_folder":
+        say(f"{data}: read as {name} ({why})")
+    return name
 
 
 def say(text: str) -> None:

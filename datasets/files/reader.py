@@ -82,6 +82,11 @@ class FileDataset(Dataset, Generic[Options]):
         """Return the scenes below the root, in natural order; raises what `find_scenes` raises."""
         return find_scenes(root, self.is_scene, self.contents)
 
+    @property
+    def folders(self) -> list[Path]:
+        """Of its scenes."""
+        return [entry.folder for entry in self._entries.values()]
+
     def settled(self, folder: Path) -> FileOptions:
         """Return the options with which a scene's folder is read."""
         return self.options

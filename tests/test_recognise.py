@@ -1,0 +1,44 @@
+"""Which dataset a folder is of: every format as itself, near misses; and PATH alone on the command line."""
+
+from __future__ import annotations
+
+import shutil
+
+import pytest
+from command_line import bench, error_of
+from dataset_writers import FORMATS, source
+
+from semstab.datasets import recognise
+from semstab.errors import DataError
+
+CAMERA = ("--set", "dataset.options.intrinsics=[40,40,24,18]")
+
+
+@pytest.mark.parametrize("name", FORMATS)
+def test_a_format_is_recognised_as_itself(name, tmp_path):
+    form = FORMATS[name]
+    form.write(tmp_path / "data" / "scene", source(form.scale))
+    assert recognise(tmp_path / "data" / "scene")[0] == form.dataset
+    found, why = recognise(tmp_path / "data")
+    assert found == form.dataset
+    assert why.endswith("1 scene")
+
+
+def test_what_is_nearly_a_format_says_what_it_lacks(tmp_path):
+    FORMATS["hololens"].write(tmp_path, source(1000))
+    (tmp_path / "K.txt").unlink()
+    shutil.rmtree(tmp_path / "depth")
+    with pytest.raises(DataError, match=r"nearly hololens \(lacks depth/, K.txt\).*--dataset NAME"):
+        recognise(tmp_path)
+    (tmp_path / "empty").mkdir()
+    assert recognise(tmp_path / "empty")[0] == "posed_folder"
+
+
+def test_a_path_alone_is_checked_and_run(tmp_path):
+    FORMATS["tum"].write(tmp_path / "rgbd", source(5000))
+    result = bench("check", tmp_path / "rgbd", *CAMERA, cwd=tmp_path)
+    assert "read as tum (depth.txt, groundtruth.txt and rgb.txt; 1 scene)" in result.stderr
+    assert "rgbd    " in result.stdout
+    assert error_of(tmp_path / "nothing", cwd=tmp_path).endswith("nothing: there is no such folder")
+    result = bench(tmp_path / "rgbd", *CAMERA, "--out", tmp_path / "run", cwd=tmp_path, code=2)
+    assert "labels" in result.stderr  # there are none
