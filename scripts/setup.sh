@@ -55,19 +55,6 @@ if ! .venv/bin/python -c '' 2>/dev/null; then
     "$python" -m venv .venv
 fi
 
-# Python finds semstab in a tree of links, where pip links file by file. Links to folders in its place let a new file in
-# any of them be found at once; what is new in benchmark/ itself is linked here. None is replaced that stands.
-link_folders() {
-    local tree path link
-    tree=$(cat .venv/lib/python*/site-packages/__editable__.semstab-*.pth)/semstab
-    mkdir -p "$tree"
-    for path in benchmark/* backends backbones datasets configs conformance; do
-        link=$tree/${path##*/}
-        [ -L "$link" ] || { rm -rf "$link" && ln -s "$PWD/$path" "$link"; }
-    done
-    for link in "$tree"/*; do [ -e "$link" ] || rm "$link"; done
-}
-
 extras=${1:+[$1]}
 wanted=$(cat setup.cfg pyproject.toml | sha256sum)
 installed=$(cat .venv/semstab-setup 2>/dev/null || true)
@@ -76,7 +63,6 @@ if [ "$installed" != "$wanted $extras" ] && [ "$installed" != "$wanted [dev]" ];
     .venv/bin/python -m pip install --quiet --disable-pip-version-check -e ".$extras" || stop "pip could not install semstab"
     echo "$wanted $extras" >.venv/semstab-setup
 fi
-link_folders
 
 # As pip does for what it copies: Python itself does not where PYTHONDONTWRITEBYTECODE is set, and each start would compile.
 .venv/bin/python -m compileall -q benchmark backends backbones datasets configs conformance

@@ -35,8 +35,9 @@ def built(tmp_path_factory: pytest.TempPathFactory) -> tuple[list[Path], Path, P
     """The source's files, the unpacked sdist, and a wheel built from it, as installers do; of a copy of the source."""
     base = tmp_path_factory.mktemp("packaging")
     copy = base / "source"
-    for folder in (*PACKAGES, "docs"):
-        shutil.copytree(SOURCE / folder, copy / folder, ignore=shutil.ignore_patterns("__pycache__"))
+    for folder in (*PACKAGES, "docs", "src"):
+        ignored = shutil.ignore_patterns("__pycache__")
+        shutil.copytree(SOURCE / folder, copy / folder, symlinks=True, ignore=ignored)
     for name in ("setup.cfg", "pyproject.toml", "README.md", "LICENSE", "MANIFEST.in"):
         shutil.copy(SOURCE / name, copy)
     files = [path.relative_to(copy) for folder in PACKAGES for path in (copy / folder).rglob("*") if path.is_file()]
