@@ -70,4 +70,4 @@ def test_what_is_missing_is_told(run, tmp_path, monkeypatch):
     fails(ConfigError, "with --events", bare.events)
     fails(DataError, "s__m__numpy.csv: cannot be read", bare.series)
     monkeypatch.setitem(sys.modules, "pandas", None)
-    fails(MissingDependencyError, "pip install pandas", run.table(backbone="a").to_pandas)
+    fails(MissingDependencyError, r"pip install 'semstab\[pandas\]'", run.table(backbone="a").to_pandas)

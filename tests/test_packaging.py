@@ -50,9 +50,11 @@ def built(tmp_path_factory: pytest.TempPathFactory) -> tuple[list[Path], Path, P
 
 def test_wheel_and_sdist_hold_every_file(built) -> None:
     files, unpacked, wheel = built
-    assert [path for path in (*files, "README.md", "docs/definitions.md") if not (unpacked / path).is_file()] == []
+    installed = [Path(PACKAGES[path.parts[0]], *path.parts[1:]) for path in files]
+    wanted = [*(Path("src", path) for path in installed), "README.md", "docs/definitions.md"]
+    assert [path for path in wanted if not (unpacked / path).is_file()] == []
     held = set(zipfile.ZipFile(wheel).namelist())
-    assert [path for path in files if str(Path(PACKAGES[path.parts[0]], *path.parts[1:])) not in held] == []
+    assert [path for path in installed if str(path) not in held] == []
     assert {name.split("/")[0] for name in held} == {"semstab", f"{wheel.name.split('-py3')[0]}.dist-info"}
 
 

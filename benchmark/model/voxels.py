@@ -44,7 +44,7 @@ def to_pandas(columns: Mapping[str, Any]) -> pd.DataFrame:
     try:
         import pandas  # noqa: F401  what Arrow needs for it
     except ImportError as error:
-        raise MissingDependencyError("data frames need pandas; pip install pandas, or take to_arrow()") from error
+        raise MissingDependencyError("data frames need pandas: pip install 'semstab[pandas]', or take to_arrow()") from error
     return to_arrow(columns).to_pandas()
 
 

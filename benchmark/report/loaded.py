@@ -4,8 +4,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
+import numpy.typing as npt
+
+from semstab.core.arrays import values_of
 from semstab.engine.folder import load_result
 from semstab.errors import ConfigError, DataError, summarize_error
 from semstab.model import voxels
@@ -15,6 +18,7 @@ from semstab.model.voxels import VoxelTable
 
 if TYPE_CHECKING:
     import pandas as pd
+    import pyarrow as pa
 
 
 @dataclass(frozen=True)
@@ -43,7 +47,7 @@ class Run:
         file = self.result.record(scene=scene, backbone=backbone, backend=backend).series
         if file is None:
             raise DataError(f"{self.folder}: the run kept no series of this unit; run it again")
-        return read_series(file)
+        return voxels.to_pandas(_columns(file))
 
     def events(self, *, scene: str | None = None, backbone: str | None = None, backend: str | None = None) -> Events:
         """The log of a unit's observations. Raises ConfigError where the run kept none."""
@@ -61,19 +65,20 @@ def load(folder: str | Path) -> Run:
     return Run(Path(folder), load_result(folder))
 
 
-def read_series(file: Path) -> pd.DataFrame:
-    """The time series in a file: one row a frame. Raises DataError where it cannot be read."""
+def read_series(file: Path) -> dict[str, npt.NDArray[Any]]:
+    """Read the time series in a file: by column (n,) values, one a frame, NaN or None where a value is missing.
+
+    Raises DataError where it cannot be read.
+    """
+    return {name: values_of(column) for name, column in _columns(file).items()}
+
+
+def _columns(file: Path) -> dict[str, pa.ChunkedArray]:
     import pyarrow as pa
     from pyarrow import csv
 
     try:
         read = csv.read_csv(str(file))
-        columns = {name: read.column(name) for name in read.column_names}
-    except (
-        OSError,
-        ValueError,
-        LookupError,
-        pa.ArrowException,
-    ) as error:  # LookupError: a name that is there twice
+        return {name: read.column(name) for name in read.column_names}
+    except (OSError, ValueError, LookupError, pa.ArrowException) as error:  # LookupError: a name that is there twice
         raise DataError(f"{file}: cannot be read ({summarize_error(error)})") from error
-    return voxels.to_pandas(columns)
