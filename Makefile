@@ -27,7 +27,7 @@ test: setup-dev
 	$(BIN)/pytest -n auto --maxprocesses 4 --dist loadfile
 
 docs: setup-dev
-	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --quiet
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
 
 FUZZ_SECONDS := 3600
 FUZZ_SEED := 1
