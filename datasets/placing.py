@@ -220,7 +220,7 @@ def _linearised(crs: str, path: Path) -> Georeference:
     geographic = Transformer.from_pipeline(
         f"+proj=pipeline +step +inv +proj=topocentric +ellps=WGS84 {place} +step +inv +proj=cart +ellps=WGS84"
     )
-    lon, lat, up = geographic.transform(*np.vstack([np.zeros(3), STEP * np.eye(3)]).T)
+    lon, lat, up = np.array(geographic.transform(*np.vstack([np.zeros(3), STEP * np.eye(3)]).T))
     east, north = Proj(CRS.from_wkt(crs))(lon, lat)
     points = np.stack([east, north, up], axis=1)
     if not np.isfinite(points).all():

@@ -62,7 +62,8 @@ class Georeference:
 
     def projected(self, points: Float64) -> Float64:
         """Return points (n, 3) of the scene in the projection."""
-        return self.along(points) + np.array(self.offset)
+        projected: Float64 = self.along(points) + np.array(self.offset)
+        return projected
 
     def back_along(self, points: Float64) -> Float64:
         """Return in the scene's coordinates points (n, 3) of the projection less the offset."""
