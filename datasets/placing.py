@@ -142,7 +142,7 @@ def place_of(folder: Path, opensfm: Path, shots: Mapping[str, Poses], find: Posi
             " (%s), and the map is as far off; put opensfm/%s and %s of this run back, or give crs, offset, linear",
             folder, off, known.source, explained, taken.words, MATRIX, REFERENCE,
         )  # fmt: skip
-    words = f"{taken.words}; cameras {off:.2g} m (median, horizontal) from {known.source}"
+    words = f"{taken.words}; cameras {off:.2f} m (median, horizontal) from {known.source}"
     return Place(taken.georeference, words, taken.mesh_origin)
 
 

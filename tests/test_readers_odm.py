@@ -302,7 +302,7 @@ def test_the_matrix_is_not_applied_to_poses_that_are_in_the_projection(tmp_path,
         )
     scene = opened(folder)
     assert scene.georeference == Georeference(wkt(down.UTM, "x"), down.OFFSET)
-    assert "less the offset of odm_georeferencing/coords.txt; cameras 0 m" in scene.placed
+    assert "less the offset of odm_georeferencing/coords.txt; cameras 0.00 m" in scene.placed
     assert ("is a file left from another version of ODM?" in caplog.text) is not kept
 
 
@@ -362,7 +362,7 @@ def test_what_gps_explains_is_said_and_not_warned_of(tmp_path, caplog) -> None:
     folder = write_project(tmp_path / "field")
     write_georeference(folder)
     write_gps(folder, "images", shift=3)
-    assert opened(folder).placed.endswith("cameras 3 m (median, horizontal) from the GPS of the images")
+    assert opened(folder).placed.endswith("cameras 3.00 m (median, horizontal) from the GPS of the images")
     assert not caplog.records
 
 
