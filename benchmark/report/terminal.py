@@ -336,6 +336,8 @@ class ProgressBar(Observer):
         for scene in plan.scenes.values():
             if scene.depth_from is not None:
                 self.notes.append(f"{scene.name}: depth from {scene.depth_from}")
+            if scene.placed is not None:
+                self.notes.append(f"{scene.name}: {scene.placed}")
         missing = units.keys() - finished.keys()
         self.bar.update(self.work, total=sum(units[identity].frames for identity in missing))
         if self.bar.console.is_interactive:
