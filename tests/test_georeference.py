@@ -65,4 +65,4 @@ def test_an_offset_needs_its_reference_system(root) -> None:
 
 def test_without_pyproj_it_is_said_what_to_install(monkeypatch) -> None:
     monkeypatch.setitem(sys.modules, "pyproj", None)
-    fails(MissingDependencyError, r'proj.txt: .*pip install "semstab\[geo\]"', wkt, UTM, "proj.txt")
+    fails(MissingDependencyError, r"proj.txt: .*pip install 'semstab\[geo\]'", wkt, UTM, "proj.txt")

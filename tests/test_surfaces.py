@@ -321,7 +321,7 @@ def test_without_the_extra_it_is_said_what_to_install(tmp_path, monkeypatch) -> 
 
     path = down.write_raster(tmp_path / "r.tif")
     monkeypatch.setitem(sys.modules, "rasterio", None)
-    fails(MissingDependencyError, r'r.tif: .*pip install "semstab\[geo\]"', Surface(path).depth, view())
+    fails(MissingDependencyError, r"r.tif: .*pip install 'semstab\[geo\]'", Surface(path).depth, view())
 
 
 def test_without_a_size_it_is_said_what_to_set(flight, mesh, tmp_path) -> None:

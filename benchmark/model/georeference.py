@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 from semstab.errors import ConfigError, MissingDependencyError, summarize_error
 
-INSTALL = 'pip install "semstab[geo]"'
+INSTALL = "pip install 'semstab[geo]'"
 """What a message says where a package of the extra `geo` is not installed."""
 
 
