@@ -164,10 +164,37 @@ USES = {
 }
 
 
-def link(base: Path, copy: Path) -> Path:
-    """Copy an environment by hard links, which pip never writes through; returns its Python."""
-    shutil.copytree(base, copy, symlinks=True, copy_function=os.link)
-    return copy / "bin" / "python"
+@dataclass(frozen=True)
+class Fresh:
+    """A base install, and copies of it with an extra each; extras with the same requirements share one.
+
+    folder       where all of it lies, and where the commands run
+    wheel        of this source
+    constraints  a file for pip
+    """
+
+    folder: Path
+    wheel: Path
+    constraints: Path
+
+    @property
+    def base(self) -> Path:
+        """The base install's Python."""
+        return self.folder / "venv-base" / "bin" / "python"
+
+    def with_extra(self, name: str) -> Path:
+        """Return the Python of the base install with one extra, made by hard links, which pip never writes through."""
+        extras = fresh.setup()["options.extras_require"]
+        first = next(each for each in extras if extras[each] == extras[name])
+        venv = self.folder / f"venv-{first}"
+        if not venv.exists():
+            shutil.copytree(self.folder / "venv-base", venv, symlinks=True, copy_function=os.link)
+            self.install(venv / "bin" / "python", f"{self.wheel}[{name}]")
+        return venv / "bin" / "python"
+
+    def install(self, python: Path, what: str) -> None:
+        """Install without byte code: most of it is never run here."""
+        fresh.pip(python, "install", "--no-compile", "-c", str(self.constraints), what)
 
 
 def words_of(command: Sequence[str], out: str, presence: str) -> list[str]:
@@ -175,14 +202,12 @@ def words_of(command: Sequence[str], out: str, presence: str) -> list[str]:
     return [{"OUT": out, "PRESENCE": presence}.get(word, word) for word in command]
 
 
-def try_extra(name: str, base: Path, wheel: Path, folder: Path, constraints: Path) -> str:
+def try_extra(name: str, there: Fresh) -> str:
     """Return the extra's row of the table. Raises SystemExit where it does not do what it is for."""
-    use, without = USES[name], base / "bin" / "python"
-    python = link(base, folder / f"venv-{name}")
-    before = fresh.sizes(python)
-    fresh.pip(python, "install", "-c", str(constraints), f"{wheel}[{name}]")
-    after = fresh.sizes(python)
-    if changed := {each for each in before if after.get(each) != before[each]} - {"pip"}:
+    use, folder = USES[name], there.folder
+    python, without = there.with_extra(name), there.with_extra(use.over) if use.over else there.base
+    before, after = fresh.sizes(there.base), fresh.sizes(python)
+    if changed := {each for each in before if after.get(each) != before[each]}:
         print(f"note: {name} changes {', '.join(sorted(changed))}", file=sys.stderr)
     for file, text in use.files:
         (folder / file).write_text(text)
@@ -196,16 +221,11 @@ def try_extra(name: str, base: Path, wheel: Path, folder: Path, constraints: Pat
         raise SystemExit(f"{name}: {use.said!r} is not in\n{done.stdout}")
     if use.proof:
         fresh.run([str(python), "-c", use.proof], folder)
-    if use.over:
-        without = link(base, folder / f"venv-{name}-without")
-        fresh.pip(without, "install", "-c", str(constraints), f"{wheel}[{use.over}]")
     for command in use.commands:
         done = fresh.run([str(without), *words_of(command, f"without-{name}", "missing")], folder, code=2)
         errors = [line for line in done.stderr.splitlines() if line.startswith("error:") or "Traceback" in line]
         if len(errors) != 1 or f"pip install 'semstab[{name}]'" not in errors[0]:
             raise SystemExit(f"{name}: without it, {' '.join(command)} says\n{done.stderr}")
-    for venv in folder.glob(f"venv-{name}*"):
-        shutil.rmtree(venv)
     added = set(after) - set(before)
     cost = f"{len(added)}, {sum(after[each] for each in added) / 1e6:,.0f} MB"
     return f"| `{name}` | {use.shown} | works | {cost} | {seconds:.0f} |"
@@ -221,19 +241,18 @@ def main() -> None:
     if unknown := [name for name in names if name not in USES]:
         raise SystemExit(f"not known what it is for: {', '.join(unknown)}; say it in USES")
     with tempfile.TemporaryDirectory() as place:
-        folder, base = Path(place), Path(place) / "base-venv"
-        constraints = folder / "constraints.txt"
-        constraints.write_text("\n".join(options.constraint))
-        wheel, python = fresh.build_wheel(folder), fresh.make_venv(base)
-        fresh.pip(python, "install", "-c", str(constraints), str(wheel))
-        semstab = (str(python), "-m", "semstab")
+        folder = Path(place)
+        there = Fresh(folder, fresh.build_wheel(folder), folder / "constraints.txt")
+        there.constraints.write_text("\n".join(options.constraint))
+        there.install(fresh.make_venv(folder / "venv-base"), str(there.wheel))
+        semstab = (str(there.base), "-m", "semstab")
         fresh.run([*semstab, "convert", "--scene", "scene0", "--backbone", "sim-flicker", "--out", "scene"], folder)
         fresh.run([*semstab, *SCENE, "--out", "base"], folder)
         print("| extra | what was run | result | packages, MB added | seconds |\n|---|---|---|---|---|", flush=True)
         failed = False
         for name in names:
             try:
-                print(try_extra(name, base, wheel, folder, constraints), flush=True)
+                print(try_extra(name, there), flush=True)
             except SystemExit as error:  # the next ones are tried all the same
                 failed = True
                 print(f"| `{name}` | {USES[name].shown} | fails | | |", flush=True)

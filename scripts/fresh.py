@@ -19,7 +19,8 @@ Done = subprocess.CompletedProcess[str]
 SIZES = """
 import json
 from importlib import metadata
-size = lambda d: sum(f.locate().stat().st_size for f in d.files or () if f.locate().is_file())
+files = lambda d: (f.locate() for f in d.files or () if f.suffix != ".pyc")
+size = lambda d: sum(f.stat().st_size for f in files(d) if f.is_file())
 print(json.dumps({d.metadata["Name"].lower(): size(d) for d in metadata.distributions()}))
 """
 
@@ -58,7 +59,7 @@ def pip(python: Path, *words: str) -> None:
 
 
 def sizes(python: Path) -> dict[str, int]:
-    """Return the bytes of the installed files of each distribution in an environment."""
+    """Return the bytes of the installed files of each distribution in an environment, without byte code."""
     return {str(name): int(size) for name, size in json.loads(run([str(python), "-c", SIZES]).stdout).items()}
 
 

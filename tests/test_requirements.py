@@ -1,4 +1,4 @@
-"""setup.cfg declares each package that is imported; its lowest versions are those that were run; each extra has a use."""
+"""setup.cfg declares each package that is imported, lowest versions are those that were run, each extra has a use."""
 
 from __future__ import annotations
 
