@@ -1,11 +1,12 @@
 # A fresh Debian or Ubuntu machine needs no more than `make bench` and `make test`.
 BIN := .venv/bin
 
-.PHONY: help setup setup-dev bench test docs fuzz fuzz-short faults lint format clean
+.PHONY: help setup setup-dev bench quick test docs fuzz fuzz-short faults lint format clean
 
 help:
 	@echo 'make bench   set up, then fuse the built-in city with Open3D: semstab-bench --backend open3d'
 	@echo 'make test    set up, then lint, types and import contract beside a minute of damaged files, and the whole test suite'
+	@echo 'make quick   between edits, a minute at most: ruff, and the tests of what changed since the last commit'
 	@echo 'make fuzz    damage files of every kind for an hour (FUZZ_SECONDS=3600 FUZZ_SEED=1); fuzz-short: a minute'
 	@echo 'make faults  kill a hundred runs, studies, predictions and conversions, fill their disk, and see that nothing is lost'
 	@echo 'make docs    build the documentation into site/, warnings are errors'
@@ -26,6 +27,11 @@ test: setup-dev
 	$(MAKE) --no-print-directory -j2 --output-sync=target lint fuzz-short
 	$(BIN)/pytest -n auto --maxprocesses 4 --dist loadfile
 
+quick: setup-dev
+	@$(BIN)/ruff check --quiet .
+	@$(BIN)/ruff format --check --quiet .
+	@$(BIN)/python scripts/quick.py
+
 docs: setup-dev
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --quiet
 
@@ -41,13 +47,11 @@ faults: setup-dev
 	$(BIN)/python tests/faults/kills.py 100
 	$(BIN)/python tests/faults/disk.py 12
 
-BUDGETS := --report
 lint: setup-dev
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 	$(BIN)/lint-imports
-	$(BIN)/python scripts/budgets.py $(BUDGETS)
 
 format: setup-dev
 	$(BIN)/ruff check --fix .

@@ -77,7 +77,7 @@ class TorchFile:
             from semstab.backbones.checkpoint import checked_device
         except ImportError as error:
             raise MissingDependencyError(
-                f"{path}: needs torch ({summarize_error(error)}); pip install 'semstab[segformer]'"
+                f"{path}: needs torch ({summarize_error(error)}); pip install 'semstab[torch]'"
             ) from error
         self._torch, self._device = torch, checked_device(device)
         if threads is not None:

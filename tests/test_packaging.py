@@ -8,12 +8,15 @@ import shutil
 import subprocess
 import sys
 import tarfile
+import venv
 import zipfile
 from email import message_from_bytes
+from importlib import metadata
 from pathlib import Path
 from typing import Any
 
 import pytest
+from declared_only import closure
 
 SOURCE = Path(__file__).parents[1]
 PACKAGES = {
@@ -73,17 +76,73 @@ def test_the_metadata_say_who_what_and_where(built) -> None:
     assert [link for link in links if not link.startswith("https://")] == []  # an index has none of our files
 
 
-def test_an_installed_wheel_starts_in_an_empty_folder(built, tmp_path) -> None:
-    """Only what it depends on is there already."""
-    install = ("pip", "install", "--quiet", "--no-deps", "--no-index", "--no-compile", "--target", str(tmp_path))
-    subprocess.run([sys.executable, "-m", *install, str(built[2])], check=True, capture_output=True)
-    where = {**os.environ, "PYTHONPATH": str(tmp_path), "COLUMNS": "120"}
-    started = (("-c", "import semstab; print(semstab.__file__)"), ("-m", "semstab", "--help"))
-    module, text = (
-        subprocess.run(
-            [sys.executable, *args], cwd=tmp_path, env=where, check=True, capture_output=True, text=True
-        ).stdout
-        for args in started
+@pytest.fixture(scope="module")
+def installed(built, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A clean environment that holds the wheel and what it declares, as `pip install` leaves it; its folder bin/.
+
+    The files of the dependencies are links to those of this environment: nothing is downloaded.
+    """
+    environment = tmp_path_factory.mktemp("clean")
+    venv.create(environment, symlinks=True)
+    python = environment / "bin" / "python"
+    (site,) = environment.glob("lib/python*/site-packages")
+    for name in closure(["semstab"]) - {"semstab"}:
+        for file in metadata.distribution(name).files or ():
+            source, target = Path(str(file.locate())), site / file
+            if source.is_file() and ".." not in file.parts and not target.exists():
+                target.parent.mkdir(parents=True, exist_ok=True)
+                target.symlink_to(source)
+    for words in (("install", "--quiet", "--no-deps", "--no-index", str(built[2])), ("check",)):
+        subprocess.run([sys.executable, "-m", "pip", "--python", python, *words], check=True, capture_output=True)
+    return python.parent
+
+
+@pytest.fixture(scope="module")
+def elsewhere(installed, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder in which the installed command has done its main job."""
+    folder = tmp_path_factory.mktemp("elsewhere")
+    done = command(installed, folder, "--backend", "open3d", "--frames", "::4", "--out", "run")
+    assert done.returncode == 0, done.stderr
+    return folder
+
+
+def command(installed: Path, folder: Path, *words: str) -> subprocess.CompletedProcess[str]:
+    hidden = ("PYTHONPATH", "VIRTUAL_ENV")
+    environment = {name: value for name, value in os.environ.items() if name not in hidden} | {"COLUMNS": "120"}
+    return subprocess.run(
+        [installed / "semstab-bench", *words], cwd=folder, env=environment, capture_output=True, text=True, check=False
     )
-    assert Path(module.strip()).is_relative_to(tmp_path)
-    assert "--voxel-size" in text
+
+
+def test_an_installed_wheel_does_its_main_job_in_any_folder(elsewhere, installed) -> None:
+    found = {path.name for path in (elsewhere / "run").iterdir()}
+    assert {"report.html", "recording.rrd", "tables", "summary.json"} <= found
+    assert list((elsewhere / "run" / "tables").glob("*.csv"))
+    where = subprocess.run(
+        [installed / "python", "-c", "import semstab; print(semstab.__file__)"],
+        cwd=elsewhere, check=True, capture_output=True, text=True,
+    )  # fmt: skip
+    assert Path(where.stdout.strip()).is_relative_to(installed.parent)
+
+
+@pytest.mark.parametrize(
+    ("words", "extra"),
+    [
+        (("export", "run", "--scene", "scene0", "--backbone", "sim-flicker", "--to", "map.laz"), "geo"),
+        (("export", "run", "--scene", "scene0", "--backbone", "sim-flicker", "--to", "map.tif"), "geo"),
+        (("--predict", "segformer", "--out", "predicted"), "segformer"),
+        (("--predict", "model.pt", "--out", "predicted"), "torch"),
+        (("--predict", "model.onnx", "--out", "predicted"), "onnx"),
+        (("--scheduler", "tcp://127.0.0.1:1", "--out", "far"), "cluster"),
+        (("--backend", "torch", "--out", "accelerated"), "torch"),
+    ],
+)
+def test_what_needs_an_extra_says_in_one_line_how_to_install_it(elsewhere, installed, words, extra) -> None:
+    for name in ("model.pt", "model.onnx"):
+        (elsewhere / name).write_bytes(b"")
+    done = command(installed, elsewhere, *words)
+    assert done.returncode == 2
+    (line,) = done.stderr.splitlines()
+    assert line.startswith("error: ")
+    assert f"pip install 'semstab[{extra}]'" in line
+    assert not (elsewhere / words[-1]).exists() or words[-1].endswith(".pt")

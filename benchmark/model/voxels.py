@@ -44,7 +44,8 @@ def to_pandas(columns: Mapping[str, Any]) -> pd.DataFrame:
     try:
         import pandas  # noqa: F401  what Arrow needs for it
     except ImportError as error:
-        raise MissingDependencyError("data frames need pandas: pip install 'semstab[pandas]', or take to_arrow()") from error
+        install = "pip install 'semstab[pandas]', or take to_arrow()"
+        raise MissingDependencyError(f"data frames need pandas; {install}") from error
     return to_arrow(columns).to_pandas()
 
 
