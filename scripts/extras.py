@@ -135,14 +135,16 @@ USES = {
         "a run with `crs`, `export` to .laz and .tif",
         (
             ("-m", "semstab", *SCENE, "--option", "crs=EPSG:32615", "--out", "OUT"),
-            ("-m", "semstab", "export", "geo", "--to", "map.laz"),
-            ("-m", "semstab", "export", "geo", "--to", "map.tif"),
+            ("-m", "semstab", "export", "with-geo", "--to", "map.laz"),
+            ("-m", "semstab", "export", "with-geo", "--to", "map.tif"),
         ),
         "map.tif",
         proof=GEO,
     ),
     "pandas": Use(
-        "`semstab.load(RUN).summary`", (("-c", CALL.format(call="print(semstab.load('base').summary)")),), "alpha"
+        "`semstab.load(RUN).summary`",
+        (("-c", CALL.format(call="print(semstab.load('base').summary)")),),
+        "flicker_percent",
     ),
     "cluster": Use(
         "`--scheduler` with two workers",
@@ -215,7 +217,7 @@ def try_extra(name: str, there: Fresh) -> str:
         fresh.run([str(python), "-c", use.prepare], folder)
     start = time.monotonic()
     for command in use.commands:
-        done = fresh.run([str(python), *words_of(command, name, "there")], folder)
+        done = fresh.run([str(python), *words_of(command, f"with-{name}", "there")], folder)
     seconds = time.monotonic() - start
     if use.said not in done.stdout:
         raise SystemExit(f"{name}: {use.said!r} is not in\n{done.stdout}")
