@@ -33,7 +33,7 @@ quick: setup-dev
 	@$(BIN)/python scripts/quick.py
 
 docs: setup-dev
-	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --quiet
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
 
 FUZZ_SECONDS := 3600
 FUZZ_SEED := 1

@@ -321,6 +321,8 @@ def convert_scene(scene: Scene, config: Config, path: Path, depth_error: float, 
         settings["up_axis"] = up
     if scene.georeference is not None:
         settings |= {"crs": scene.georeference.crs, "offset": list(scene.georeference.offset)}
+        if scene.georeference.turned:
+            settings["linear"] = [list(row) for row in scene.georeference.linear]
     with contextlib.closing(folder):
         folder.begin(folder.form or depth_format(work.probe(), depth_error), settings)
         try:

@@ -22,7 +22,8 @@ from semstab.datasets.files.scene import FileScene
 from semstab.datasets.formats.disk import natural, subfolders
 from semstab.datasets.formats.images import COLOR_SUFFIXES, DEPTH_SUFFIXES
 from semstab.datasets.geometry.lenses import Lens
-from semstab.datasets.opensfm import GEOREFERENCING, Shot, georeference_of, read_reconstruction
+from semstab.datasets.opensfm import Shot, read_reconstruction
+from semstab.datasets.placing import Place, Positions, place_of
 from semstab.errors import DataError
 from semstab.model.georeference import Georeference
 
@@ -35,6 +36,7 @@ MESHES = (
     "odm_meshing/odm_mesh.ply", "odm_meshing/odm_25dmesh.ply", "odm_texturing*/odm_textured_model_geo.obj",
     "odm_texturing*/*_geo.obj",
 )  # fmt: skip
+GEOREFERENCED = "odm_texturing*/*_geo.obj"
 DSM = "odm_dem/dsm.tif"
 MVE = "mve/views/view_{:04d}.mve/depth-L0.mvei"
 DMAPS = "undistorted/openmvs/depthmaps"
@@ -174,6 +176,7 @@ class Odm(FileDataset[OdmOptions]):
     def __init__(self, options: OdmOptions) -> None:
         self._depth = Template("depth", options.depth, ("name",), ("name",))
         self._read: dict[Path, list[Shot]] = {}
+        self._places: dict[Path, Place | None] = {}
         super().__init__(options)
 
     def find_scenes(self, root: Path) -> Iterator[SceneEntry]:
@@ -215,15 +218,37 @@ class Odm(FileDataset[OdmOptions]):
         scene = super().scene(name)
         kind = self.settled(scene.folder).depth_from
         scene.depth_from = f"{kind}, {scene.depth_from or LOCATIONS[kind]}" if kind is not None else scene.depth_from
+        place = None if self.options.crs is not None else self._place(scene.folder)
+        scene.placed = None if place is None else place.words
         return scene
 
     def georeference(self, folder: Path, options: FileOptions) -> Georeference | None:
-        """Return the reference of the options, else the project's coords.txt and proj.txt, else OpenSfM's reference."""
+        """Return the reference of the options, else what `place_of` finds in the project's files."""
         if options.crs is not None:
             return super().georeference(folder, options)
-        project = self._project(folder)
-        T_cw = [shot.T_cw for shot in self._shots(project.poses)]
-        return georeference_of(folder / GEOREFERENCING, project.opensfm, T_cw)
+        place = self._place(folder)
+        return None if place is None else place.georeference
+
+    def mesh_origin(self, folder: Path, surface: Path) -> tuple[float, float, float] | None:
+        """Return where ODM's georeferenced meshes count from in a project whose poses are not in the projection."""
+        place = None if self.options.crs is not None else self._place(folder)
+        georeferenced = any(surface == path for path in folder.glob(GEOREFERENCED))
+        return place.mesh_origin if place is not None and georeferenced else None
+
+    def _place(self, folder: Path) -> Place | None:
+        if folder not in self._places:
+            project = self._project(folder)
+            shots = {bare_name(shot.name): shot.T_cw for shot in self._shots(project.poses)}
+            names = {bare_name(shot.name): shot.name for shot in self._shots(project.poses)}
+            photographs, contents = [folder / "images", project.opensfm / "images"], Folders()
+            if self.options.images is not None:
+                photographs.append(self.options.images)
+
+            def photograph(name: str) -> Path | None:
+                return find_image(photographs, names[name], contents, str(project.poses))
+
+            self._places[folder] = place_of(folder, project.opensfm, shots, Positions(bare_name, photograph))
+        return self._places[folder]
 
     def frames(self, folder: Path) -> list[FrameSource]:
         """Return a frame for each shot, in natural order of names. Raises what `read_reconstruction` raises."""

@@ -5,20 +5,17 @@ Source: opensfm.org, Reconstruction Format and Geometric Models; OpenDroneMap ha
 
 from __future__ import annotations
 
-import logging
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from semstab.core.types import Float64
-from semstab.datasets.formats.disk import number, pixels, read_content, read_object, read_text
+from semstab.datasets.formats.disk import number, pixels, read_content
 from semstab.datasets.geometry.cameras import Camera, Poses
 from semstab.datasets.geometry.lenses import Lens
 from semstab.errors import DataError
-from semstab.model.georeference import Georeference
 
 MAX_BYTES = 2**32
 """With the points of thousands of photographs."""
@@ -131,74 +128,3 @@ def _lens(values: Mapping[str, Any], where: str) -> tuple[Camera, Lens | None]:
 
 def _or_zero(values: Mapping[str, Any], key: str, where: str) -> float:
     return number(values, key, where) if key in values else 0.0
-
-
-# Where a project of OpenDroneMap or OpenSfM lies on Earth: coords.txt and proj.txt, or reference_lla.json.
-
-logger = logging.getLogger("semstab")
-
-GEOREFERENCING = "odm_georeferencing"
-MAX_TEXT_BYTES = 2**26
-
-FAR = 200.0
-"""Metres: GPS in drones errs by tens of metres at most; camera centres further off lie in other coordinates."""
-
-
-def georeference_of(folder: Path, opensfm: Path, T_cw: Sequence[Poses]) -> Georeference | None:
-    """That of a project whose cameras have these poses, None where it has none.
-
-    Projects of OpenDroneMap lie in the projection of proj.txt less the offset of coords.txt. Where their cameras do
-    not lie at the positions of coords.txt, they are topocentric about OpenSfM's reference, as those of OpenSfM are.
-    Raises DataError for damaged files, ConfigError for a projection that is not known.
-    """
-    centres = np.array([-T[:3, :3].T @ T[:3, 3] for T in T_cw])
-    coords, proj = folder / "coords.txt", folder / "proj.txt"
-    if not coords.is_file():
-        return _topocentric(opensfm)
-    east, north, positions = _read_coords(coords)
-    off = 0.0  # metres over the ground between the middles of cameras and positions
-    if len(positions):
-        off = float(np.hypot(*(np.median(centres[:, :2], axis=0) - np.median(positions[:, :2], axis=0))))
-    if off > FAR and (local := _topocentric(opensfm)) is not None:
-        return local
-    if off > FAR:
-        logger.warning("%s: the cameras lie %.0f m from its positions; is it of another project?", coords, off)
-    return Georeference.of(_crs(coords, proj), (east, north, 0.0), str(proj if proj.is_file() else coords))
-
-
-def _crs(coords: Path, proj: Path) -> str:
-    """proj.txt, else the first line of coords.txt: 'WGS84 UTM 15N' or a PROJ string."""
-    if proj.is_file():
-        return read_text(proj, MAX_TEXT_BYTES).strip()
-    words = read_text(coords, MAX_TEXT_BYTES).split("\n")[0].split()
-    if len(words) == 3 and words[:2] == ["WGS84", "UTM"] and words[2][:-1].isdecimal():
-        return f"EPSG:{(326 if words[2][-1] == 'N' else 327) * 100 + int(words[2][:-1])}"
-    return " ".join(words)
-
-
-def _read_coords(path: Path) -> tuple[float, float, Float64]:
-    """Return the offset to the east and north, and the positions (n, 3) of the photographs relative to it."""
-    lines = [line.split() for line in read_text(path, MAX_TEXT_BYTES).splitlines()[1:] if line.strip()]
-    try:
-        numbers = [[float(word) for word in line] for line in lines]
-        east, north = numbers[0]
-        positions = np.array(numbers[1:], dtype=np.float64).reshape(-1, 3)
-    except (ValueError, IndexError) as error:
-        raise DataError(f"{path}: expected a projection, 'EAST NORTH', then 'x y z' a line; run ODM again") from error
-    if not np.isfinite([east, north]).all():
-        raise DataError(f"{path}: the offset {east:g} {north:g} is not finite; run ODM again")
-    return east, north, positions
-
-
-def _topocentric(opensfm: Path) -> Georeference | None:
-    """Return east, north and up about OpenSfM's reference, as a transverse Mercator projection about the same point.
-
-    Within a kilometre the two differ by centimetres: by the height above the ellipsoid over the Earth's radius.
-    """
-    path = opensfm / "reference_lla.json"
-    if not path.is_file():
-        return None
-    content = read_object(path)
-    latitude, longitude, altitude = (number(content, key, str(path)) for key in ("latitude", "longitude", "altitude"))
-    crs = f"+proj=tmerc +lat_0={latitude!r} +lon_0={longitude!r} +k=1 +datum=WGS84 +units=m +no_defs +type=crs"
-    return Georeference.of(crs, (0.0, 0.0, altitude), str(path))

@@ -53,6 +53,7 @@ class Scene(ABC):
     regions            maps of regions without classes, which `frame` reads by name and nothing fuses
     up                 (3,) unit vector of the world's up axis, or None where it is not known
     georeference       where it lies on Earth, or None where that is not known
+    placed             how that was found and how well it fits, in words, or None
     folder             where its files lie and label maps of it are looked for, or None where it has none
     label_paths        where label maps are looked for, of the first frame, with BACKBONE for any name
     settings_file      the file that says what no option says, or None where there is no such file
@@ -70,6 +71,7 @@ class Scene(ABC):
     regions: tuple[str, ...] = ()
     up: Float64 | None = None
     georeference: Georeference | None = None
+    placed: str | None = None
     folder: Path | None = None
     label_paths: tuple[str, ...] = ()
     settings_file: Path | None = None

@@ -19,7 +19,10 @@ import trimesh
 from command_line import bench
 from posed_config import configure, dataset_of
 from posed_scene import fails
+from rasterio.transform import rowcol
 from records import voxels as voxels_by_hand
+from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
 
 import semstab
 from semstab.errors import ConfigError, DataError, MissingDependencyError
@@ -28,6 +31,7 @@ from semstab.exports.clouds import codes
 from semstab.exports.maps import seen_from_above
 from semstab.exports.voxels import Column, Voxels
 from semstab.metrics import categories, dominant, vss
+from semstab.model.georeference import Georeference
 
 CRS, OFFSET = "EPSG:32615", (576714, 5188162, 200)
 CLASSES = ["wall", "door", "window"]
@@ -348,3 +352,95 @@ def test_the_command(fused):
     assert "WGS 84 / UTM zone 15N (EPSG:32615)" in done.stdout
     assert "without ASPRS code (--asprs): wall, door, window" in done.stdout
     assert (fused / "a.las").exists()
+
+
+# --- a scene whose axes are not those of the projection ---------------------------------------------------------------
+
+QUARTER = ((0.0, -1.0, 0.0), (1.0, 0.0, 0.0), (0.0, 0.0, 1.0))
+SLIGHT = tuple(map(tuple, Rotation.from_euler("zx", [0.73, 0.02], degrees=True).as_matrix().tolist()))
+
+
+@pytest.fixture(scope="module", params=[QUARTER, SLIGHT], ids=["a quarter", "0.73 degrees"])
+def turned(request, fused):
+    """The run once more, of the same scene in a frame that is turned to the projection; its name and matrix."""
+    name = f"turned-{len(list(fused.glob('turned-*')))}"
+    options = {"crs": CRS, "offset": OFFSET, "linear": request.param}
+    config = configure(fused / "scene", dataset=dataset_of(fused / "scene", **options), check=None)
+    semstab.run(config, out=fused / name, report=False)
+    return name, np.array(request.param)
+
+
+def test_every_format_has_the_coordinates_of_the_projection(fused, table, turned):
+    run, linear = turned
+    expected = table.centers @ linear.T + OFFSET
+    (kept,) = semstab.load_result(fused / run).georeference.values()
+    assert (np.array(kept.linear) == linear).all()
+    cloud = laspy.read(written(fused, "t.las", run))
+    np.testing.assert_allclose(cloud.xyz, expected, atol=5.1e-4)
+    ply = o3d.t.io.read_point_cloud(str(written(fused, "t.ply", run)))
+    np.testing.assert_allclose(ply.point.positions.numpy(), expected, atol=1e-6)
+    rows = pyarrow.parquet.read_table(written(fused, "t.parquet", run))
+    np.testing.assert_allclose(np.stack([rows[axis] for axis in "xyz"], axis=1), expected, atol=1e-6)
+    mesh = trimesh.load_scene(written(fused, "t.glb", run))
+    origin = np.array(mesh.metadata["origin"])
+    x, z, y = (mesh.to_geometry().vertices @ np.diag([1, 1, -1])).T  # glTF's y is up, its z towards the viewer
+    corners = table.index[:, None] + np.array([*np.ndindex(2, 2, 2)])
+    corners = corners.reshape(-1, 3) * table.voxel_size @ linear.T + OFFSET
+    found = np.stack([x, y, z], axis=1) + origin
+    assert cKDTree(corners).query(found)[0].max() < 1e-4
+
+
+def test_the_raster_of_a_turned_scene_has_the_voxels_where_they_lie(fused, table, turned):
+    run, linear = turned
+    points, r = table.centers @ linear.T + OFFSET, table.voxel_size
+    with rasterio.open(written(fused, "t.tif", run)) as file:
+        bands = dict(zip(file.descriptions, file.read(), strict=True))
+        row, column = (np.array(at, int) for at in rowcol(file.transform, points[:, 0], points[:, 1]))
+        y, x = np.nonzero(np.isfinite(bands["class"]))
+        centres = np.stack(file.xy(y, x), axis=1)
+    heights = bands["height"][row, column]
+    assert np.isfinite(heights).all()  # no voxel is lost
+    assert (heights >= points[:, 2] - 1e-4).all()
+    assert cKDTree(points[:, :2]).query(centres)[0].max() <= r * np.sqrt(0.5) + 1e-6  # and no cell is made up
+
+
+def test_a_turned_plane_has_no_gaps():
+    ground = np.stack([*np.indices((40, 40)).reshape(2, -1), np.zeros(1600, int)], axis=1).astype(np.int32)
+    made = voxels_by_hand(*[(1, 3, [3, 0, 0])] * len(ground), r=0.25)
+    table = dataclasses.replace(made, **dict(zip(("ix", "iy", "iz"), ground.T, strict=True)))
+    for degrees in (0.73, 30, 45):
+        axes = tuple(map(tuple, Rotation.from_euler("z", degrees, degrees=True).as_matrix().tolist()))
+        voxels = dataclasses.replace(as_voxels(table), georeference=Georeference("", (0.0, 0.0, 0.0), axes))
+        bands, west, north = seen_from_above(voxels)
+        empty = np.argwhere(np.isnan(bands["height"].values))
+        x, y = west + (empty[:, 1] + 0.5) * table.voxel_size, north - (empty[:, 0] + 0.5) * table.voxel_size
+        back = np.stack([x, y, 0 * x], axis=1) @ np.array(axes)
+        inside = ((back[:, :2] > 0) & (back[:, :2] < 40 * table.voxel_size)).all(axis=1)
+        assert not inside.any()
+
+
+def test_a_cloud_in_the_projection_is_classified_by_a_turned_run(fused, table, turned):
+    run, linear = turned
+    points = table.centers @ linear.T + OFFSET
+    cloud = ply_cloud(fused / "tc.ply", points)
+    (done,) = export(fused / run, fused / "td.ply", backbone="a", classify=cloud, radius=0)
+    assert "100.0%" in done.content
+    after = o3d.t.io.read_point_cloud(str(fused / "td.ply"))
+    assert (after.point["class"].numpy().ravel() == dominant(table) + 1).all()
+
+
+def test_few_points_that_are_met_are_warned_of(fused, table, caplog):
+    points = table.centers + OFFSET
+
+    def classify(cloud, **options):
+        caplog.clear()
+        export(fused / "run", fused / "few.ply", backbone="a", classify=ply_cloud(fused / "f.ply", cloud), **options)
+        return caplog.text
+
+    assert classify(points) == ""
+    high = np.concatenate([points[-3:], points[:3], points + np.array([0, 0, 50])])
+    assert "f.ply: only " in classify(high)
+    assert "the map may be shifted or turned, or the cloud is of another place or height" in caplog.text
+    assert classify(high, classes=CLASSES) == ""
+    large = np.concatenate([points, points + np.array([500, 0, 0]), points + np.array([0, 500, 0])])
+    assert "the cloud is larger than the map; of the points over the map 100.0% do" in classify(large)

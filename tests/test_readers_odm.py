@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import os
+import re
+import shutil
 import struct
 from pathlib import Path
 
@@ -11,8 +13,11 @@ import cv2
 import looking_down as down
 import numpy as np
 import pytest
+import trimesh
 from dataset_writers import save, shot, write_reconstruction
+from PIL import Image
 from posed_scene import fails
+from scipy.spatial.transform import Rotation
 
 from semstab.datasets import open_dataset
 from semstab.errors import ConfigError, DataError
@@ -183,18 +188,18 @@ def test_the_georeference_of_a_project(tmp_path) -> None:
     assert opened(folder).georeference == expected
 
 
-def test_topocentric_cameras_lie_about_the_reference_of_opensfm(tmp_path) -> None:
+def test_a_project_of_opensfm_alone_lies_about_its_reference(tmp_path) -> None:
     from pyproj import CRS, Transformer
 
     folder = write_project(tmp_path / "field")
-    write_georeference(folder, shift=700)
     (folder / "opensfm/reference_lla.json").write_text('{"latitude": 46.84, "longitude": -91.99, "altitude": 180.0}')
-    georeference = opened(folder).georeference
-    assert georeference.offset == (0, 0, 180)
+    scene = opened(folder)
+    assert scene.georeference.offset == (0, 0, 180)
+    assert scene.placed.endswith("no known position to compare the cameras with")
     crs = "+proj=pipeline +step +proj=cart +ellps=WGS84 +step +proj=topocentric +ellps=WGS84"
     topocentric = Transformer.from_pipeline(f"{crs} +lat_0=46.84 +lon_0=-91.99 +h_0=180")
     points = np.array([[0.0, 0, 0], [500, -300, 20], [-900, 900, 45]])
-    longitude, latitude = Transformer.from_crs(CRS.from_wkt(georeference.crs), 4326, always_xy=True).transform(
+    longitude, latitude = Transformer.from_crs(CRS.from_wkt(scene.georeference.crs), 4326, always_xy=True).transform(
         points[:, 0], points[:, 1]
     )
     back = np.stack(topocentric.transform(longitude, latitude, points[:, 2] + 180), axis=1)
@@ -202,11 +207,230 @@ def test_topocentric_cameras_lie_about_the_reference_of_opensfm(tmp_path) -> Non
     np.testing.assert_allclose(back[:, :2], points[:, :2], atol=0.05)
 
 
-def test_cameras_far_from_the_positions_of_the_project_are_pointed_out(tmp_path, caplog) -> None:
+def made_matrix(degrees: float = 0.73, offset=(576734.25, 5188175.5, 180.0)) -> np.ndarray:
+    """From a frame that is turned and tilted a little to the projection, 24 m off the offset of coords.txt."""
+    T = np.eye(4)
+    T[:3, :3] = Rotation.from_euler("zx", [degrees, 0.01 if degrees % 90 else 0], degrees=True).as_matrix()
+    T[:3, 3] = offset
+    return T
+
+
+def bring_into(folder: Path, T: np.ndarray) -> np.ndarray:
+    """Bring a project's poses and mesh from the projection less its offset into the frame that T maps from."""
+    to = np.linalg.inv(T)
+    to[:3, 3] += to[:3, :3] @ down.OFFSET
+    path = folder / "opensfm/undistorted/reconstruction.json"
+    content = json.loads(path.read_text())
+    for values in content[0]["shots"].values():
+        R = Rotation.from_rotvec(values["rotation"]).as_matrix()
+        t = np.array(values["translation"])
+        centre = to[:3, :3] @ (-R.T @ t) + to[:3, 3]
+        R = R @ to[:3, :3].T
+        values |= {"rotation": Rotation.from_matrix(R).as_rotvec().tolist(), "translation": (-R @ centre).tolist()}
+    path.unlink()
+    path.write_text(json.dumps(content))
+    for mesh in folder.glob("odm_meshing/*.ply"):
+        loaded = trimesh.load(mesh, process=False)
+        vertices = loaded.vertices @ to[:3, :3].T + to[:3, 3]
+        mesh.unlink()
+        float64_ply(mesh, vertices, loaded.faces)
+    return to
+
+
+def float64_ply(path: Path, vertices: np.ndarray, faces: np.ndarray) -> None:
+    head = f"ply\nformat binary_little_endian 1.0\nelement vertex {len(vertices)}\n"
+    head += "".join(f"property double {axis}\n" for axis in "xyz")
+    head += f"element face {len(faces)}\nproperty list uchar int vertex_indices\nend_header\n"
+    rows = np.empty(len(faces), [("n", "u1"), ("corners", "<i4", 3)])
+    rows["n"], rows["corners"] = 3, faces
+    path.write_bytes(head.encode() + vertices.astype("<f8").tobytes() + rows.tobytes())
+
+
+def write_matrix(folder: Path, T: np.ndarray) -> None:
+    rows = "\n".join(" ".join(map(repr, row)) for row in T.tolist())
+    (folder / "opensfm/geocoords_transformation.txt").write_text(rows + "\n")
+
+
+def write_shots(folder: Path, shift: float = 0.0) -> None:
+    """ODM's report of the cameras, all of them shifted to the east."""
+    from pyproj import Transformer
+
+    to_degrees = Transformer.from_crs(32615, 4326, always_xy=True)
+    features = []
+    for k, name in enumerate(NAMES):
+        east, north, up = down.pose(k)[:3, 3] + down.OFFSET
+        at = to_degrees.transform(east + shift, north)
+        geometry = {"type": "Point", "coordinates": [*at, up]}
+        features.append({"type": "Feature", "properties": {"filename": f"{name}.JPG"}, "geometry": geometry})
+    (folder / "odm_report").mkdir()
+    (folder / "odm_report/shots.geojson").write_text(json.dumps({"type": "FeatureCollection", "features": features}))
+
+
+def where_cameras_lie(scene) -> np.ndarray:
+    """(n, 3) in the projection."""
+    return scene.georeference.projected(np.array([scene.geometry(k).T_wc[:3, 3] for k in range(len(scene))]))
+
+
+@pytest.mark.parametrize("absolute", [True, False])
+def test_topocentric_poses_are_brought_into_the_projection_by_the_matrix(tmp_path, absolute, caplog) -> None:
+    folder = write_project(tmp_path / "field")
+    write_georeference(folder)
+    before = opened(folder)
+    expected, depth = where_cameras_lie(before), before.depth(1)
+    T = made_matrix()
+    bring_into(folder, T)
+    write_matrix(folder, T if absolute else T - np.array([[0, 0, 0, x] for x in (*down.OFFSET, 0)]))
+    scene = opened(folder)
+    assert scene.georeference.turned
+    np.testing.assert_allclose(where_cameras_lie(scene), expected, atol=1e-6)
+    np.testing.assert_allclose(scene.depth(1), depth, atol=1e-4)
+    assert "by opensfm/geocoords_transformation.txt; cameras " in scene.placed
+    assert not caplog.records
+    write_shots(folder)
+    found = re.search(r"cameras (\S+) m \(median, horizontal\) from odm_report/shots", opened(folder).placed)
+    assert float(found[1]) < 1e-3
+
+
+@pytest.mark.parametrize("kept", [True, False])
+def test_the_matrix_is_not_applied_to_poses_that_are_in_the_projection(tmp_path, kept, caplog) -> None:
+    folder = write_project(tmp_path / "field")
+    write_georeference(folder)
+    write_matrix(folder, made_matrix())  # of an earlier run
+    if kept:
+        shutil.copy(
+            folder / "opensfm/undistorted/reconstruction.json", folder / "opensfm/reconstruction.topocentric.json"
+        )
+    scene = opened(folder)
+    assert scene.georeference == Georeference(wkt(down.UTM, "x"), down.OFFSET)
+    assert "less the offset of odm_georeferencing/coords.txt; cameras 0.00 m" in scene.placed
+    assert ("is a file left from another version of ODM?" in caplog.text) is not kept
+
+
+def test_without_the_matrix_the_reference_of_opensfm_gives_it(tmp_path, caplog) -> None:
+    """The expected matrix is OpenSfM's: differences of a metre, carried through ECEF to the projection."""
+    from pyproj import Transformer
+
+    lat, lon, alt = 46.8421, -91.9941, 12.0
+    so, co, sa, ca = (f(np.radians(x)) for x in (lon, lat) for f in (np.sin, np.cos))
+    axes = np.array([[-so, -sa * co, ca * co], [co, -sa * so, ca * so], [0, ca, sa]])
+    origin = np.array(Transformer.from_crs(4979, 4978, always_xy=True).transform(lon, lat, alt))
+    degrees = Transformer.from_crs(4978, 4979, always_xy=True).transform(*(origin[:, None] + axes @ np.eye(3, 4)))
+    east, north = Transformer.from_crs(4326, 32615, always_xy=True).transform(*degrees[:2])
+    q = np.stack([east, north, degrees[2]], axis=1)
+    folder = write_project(tmp_path / "field")
+    write_georeference(folder)
+    expected = where_cameras_lie(opened(folder))
+    near = make_orthogonal((q[:3] - q[3]).T)
+    assert np.degrees(np.arctan2(near[1, 0], near[0, 0])) == pytest.approx(0.73, abs=0.01)  # convergence of meridians
+    T = np.eye(4)
+    T[:3, :3], T[:3, 3] = near, q[3]
+    bring_into(folder, T)
+    where = json.dumps({"latitude": lat, "longitude": lon, "altitude": alt})
+    (folder / "opensfm/reference_lla.json").write_text(where)
+    scene = opened(folder)
+    np.testing.assert_allclose(scene.georeference.linear, (q[:3] - q[3]).T, atol=1e-7)
+    np.testing.assert_allclose(scene.georeference.offset, q[3], atol=1e-5)
+    scale = 4e-4 * np.hypot(*(expected[:, :2] - q[3][:2]).T).max()
+    np.testing.assert_allclose(where_cameras_lie(scene)[:, :2], expected[:, :2], atol=scale)
+    assert "by opensfm/reference_lla.json; cameras " in scene.placed
+    assert not caplog.records
+
+
+def make_orthogonal(axes: np.ndarray) -> np.ndarray:
+    u, _, vt = np.linalg.svd(axes)
+    return u @ vt
+
+
+@pytest.mark.parametrize("source", ["coords.txt", "shots.geojson", "opensfm/exif", "images"])
+def test_cameras_24_m_from_where_they_were_are_warned_of(tmp_path, source, caplog) -> None:
+    folder = write_project(tmp_path / "field")
+    write_georeference(folder, shift=24 / np.sqrt(2) if source == "coords.txt" else 0)
+    if source == "shots.geojson":
+        write_shots(folder, shift=24)
+    if source in ("opensfm/exif", "images"):
+        write_gps(folder, source, shift=24)
+    scene = opened(folder)
+    assert scene.georeference.offset == down.OFFSET
+    assert re.search(r"the cameras lie 24(\.\d)? m \(median, horizontal\) from ", caplog.text)
+    assert (
+        "put opensfm/geocoords_transformation.txt and reference_lla.json of this run back, or give crs" in caplog.text
+    )
+    assert f"from {KNOWN[source]}" in scene.placed
+
+
+def test_what_gps_explains_is_said_and_not_warned_of(tmp_path, caplog) -> None:
+    folder = write_project(tmp_path / "field")
+    write_georeference(folder)
+    write_gps(folder, "images", shift=3)
+    assert opened(folder).placed.endswith("cameras 3.00 m (median, horizontal) from the GPS of the images")
+    assert not caplog.records
+
+
+KNOWN = {
+    "coords.txt": "the positions in odm_georeferencing/coords.txt",
+    "shots.geojson": "odm_report/shots.geojson",
+    "opensfm/exif": "the GPS of the images (opensfm/exif)",
+    "images": "the GPS of the images",
+}
+
+
+def write_gps(folder: Path, where: str, shift: float) -> None:
+    """GPS of all images but the last, as OpenSfM keeps it or as EXIF of the photographs."""
+    from pyproj import Transformer
+
+    to_degrees = Transformer.from_crs(32615, 4326, always_xy=True)
+    for k, name in enumerate(NAMES[:2]):
+        east, north, _ = down.pose(k)[:3, 3] + down.OFFSET
+        lon, lat = to_degrees.transform(east + shift, north)
+        if where == "opensfm/exif":
+            put(
+                folder / f"opensfm/exif/{name}.JPG.exif",
+                json.dumps({"gps": {"latitude": lat, "longitude": lon}}).encode(),
+            )
+            continue
+        exif = Image.Exif()
+        parts = ((int(x), int(x * 60 % 60), x * 3600 % 60) for x in (lat, -lon))
+        exif[0x8825] = dict(zip((1, 2, 3, 4), ("N", next(parts), "W", next(parts)), strict=True))
+        (folder / "images").mkdir(exist_ok=True)
+        Image.new("RGB", SIZE).save(folder / f"images/{name}.JPG", exif=exif)
+
+
+def test_a_textured_mesh_of_topocentric_poses_is_brought_back(tmp_path) -> None:
+    """ODM writes it turned into the projection, less the matrix's east and north."""
+    folder = write_project(tmp_path / "field")
+    write_georeference(folder)
+    depth, T = opened(folder).depth(0), made_matrix()
+    bring_into(folder, T)
+    write_matrix(folder, T)
+    (folder / "odm_meshing/odm_25dmesh.ply").unlink()
+    down.write_mesh(folder / "odm_texturing/odm_textured_model_geo.obj", shift=np.array(down.OFFSET) - [*T[:2, 3], 0])
+    scene = opened(folder)
+    assert scene.depth_from.endswith("odm_textured_model_geo.obj")
+    np.testing.assert_allclose(scene.depth(0), depth, atol=1e-4)
+    write_raster = down.write_raster(folder / "odm_dem/dsm.tif")
+    assert opened(folder, depth_from="dsm").depth_from.endswith(write_raster.name)
+    np.testing.assert_allclose(opened(folder, depth_from="dsm").depth(0), depth, atol=1e-4)
+
+
+def test_an_alignment_to_another_cloud_is_followed(tmp_path) -> None:
+    folder = write_project(tmp_path / "field")
+    write_georeference(folder)
+    moved = np.eye(4)
+    moved[:3, 3] = [2, -3, 7]
+    (folder / "odm_georeferencing/alignment_matrix.json").write_text(json.dumps(moved.tolist()))
+    scene = opened(folder)
+    assert scene.georeference.offset == (576716, 5188159, 7)
+    assert "moved by odm_georeferencing/alignment_matrix.json" in scene.placed
+
+
+def test_options_say_more_than_files(tmp_path) -> None:
     folder = write_project(tmp_path / "field")
     write_georeference(folder, shift=700)
-    assert opened(folder).georeference.offset == down.OFFSET
-    assert "coords.txt: the cameras lie 990 m from its positions" in caplog.text
+    turn = ((0, -1, 0), (1, 0, 0), (0, 0, 1))
+    scene = opened(folder, crs="EPSG:32616", offset=(1, 2, 3), linear=turn)
+    assert scene.georeference == Georeference(wkt("EPSG:32616", "x"), (1, 2, 3), turn)
+    assert scene.placed is None
+    fails(ConfigError, "cannot be inverted", opened, folder, crs="EPSG:32616", linear=((1, 0, 0),) * 3)
 
 
 # --- lenses -----------------------------------------------------------------------------------------------------------
@@ -396,12 +620,26 @@ def test_a_truncated_depth_map_is_named(tmp_path, kind) -> None:
         ("proj.txt", "+proj=nowhere", ConfigError, r"proj.txt: '\+proj=nowhere' is no reference system"),
         ("coords.txt", "WGS84 UTM 15N\n576714\n", DataError, "coords.txt: expected a projection, 'EAST NORTH'"),
         ("coords.txt", "WGS84 UTM 15N\n", DataError, "coords.txt: expected a projection, 'EAST NORTH'"),
+        ("alignment_matrix.json", "[1, 2]", DataError, "alignment_matrix.json: expected four rows of four numbers"),
+        ("../opensfm/geocoords_transformation.txt", "1 0 0\n", DataError, "transformation.txt: expected four rows"),
+        (
+            "../opensfm/reference_lla.json",
+            '{"latitude": 95, "longitude": 0, "altitude": 0}',
+            DataError,
+            "is no latitude",
+        ),
+        (
+            "../odm_report/shots.geojson",
+            '{"features": [1]}',
+            DataError,
+            "shots.geojson: expected points with a filename",
+        ),
     ],
 )
 def test_a_damaged_georeference_is_named(tmp_path, file, text, kind, match) -> None:
     folder = write_project(tmp_path / "field")
     write_georeference(folder)
-    (folder / "odm_georeferencing" / file).write_text(text)
+    put((folder / "odm_georeferencing" / file).resolve(), text.encode())
     fails(kind, match, opened, folder)
 
 
@@ -449,3 +687,35 @@ def test_the_project_of_a_real_flight_is_its_posed_folder(brighton) -> None:
         both = (ours.depth > 0) & (theirs.depth > 0)
         assert np.abs(ours.depth - theirs.depth)[both].max() < 0.002
         assert np.mean((ours.depth > 0) != (theirs.depth > 0)) < 3e-4  # rays along the surface's own border
+
+
+@pytest.mark.parametrize("known", ["matrix", "poses in the projection"])
+def test_the_real_flight_in_a_turned_frame_lies_where_it_lay(brighton, tmp_path, known, caplog) -> None:
+    """Poses and mesh turned by 0.73 degrees and shifted by 24 m: what is exported is the same to a millimetre."""
+    folder = tmp_path / "flight"
+    shutil.copytree(brighton / "odm", folder)
+    for path in (folder, *folder.rglob("*")):
+        path.chmod(0o755)
+    T = made_matrix()
+    write_matrix(folder, T)
+    if known == "matrix":
+        bring_into(folder, T)
+    images = {"casts": False, "images": brighton / "color"}
+    there = open_dataset("odm", {"root": brighton / "odm"} | images).scene("odm")
+    here = open_dataset("odm", {"root": folder} | images).scene("flight")
+    assert here.georeference.turned is (known == "matrix")
+    assert ("left from another version" in caplog.text) is (known != "matrix")
+    np.testing.assert_allclose(where_cameras_lie(here), where_cameras_lie(there), atol=1e-4)
+    for index in (0, 9):
+        ours, theirs = here.geometry(index), there.geometry(index)
+        both = (ours.depth > 0) & (theirs.depth > 0)
+        assert np.mean((ours.depth > 0) != (theirs.depth > 0)) < 3e-4
+        gap = here.georeference.projected(seen(ours, both)) - there.georeference.projected(seen(theirs, both))
+        assert np.quantile(np.abs(gap), 0.999) < 0.001
+
+
+def seen(frame, mask: np.ndarray) -> np.ndarray:
+    """(n, 3) the points of the scene at pixels of a frame."""
+    K, (v, u) = frame.intrinsics, np.nonzero(mask)
+    rays = np.stack([(u - K.cx) / K.fx, (v - K.cy) / K.fy, np.ones(len(u))], axis=1)
+    return (rays * frame.depth[mask][:, None].astype(float)) @ frame.T_wc[:3, :3].T + frame.T_wc[:3, 3]

@@ -26,10 +26,10 @@ from semstab.report.terminal import print_summary
 from semstab.settings import load_config, resolve
 
 
-def printed(result) -> str:
+def printed(result, **options) -> str:
     """What the terminal says of it, with single spaces."""
     text = io.StringIO()
-    print_summary(result, Console(file=text, width=80))
+    print_summary(result, Console(file=text, width=80), **options)
     return " ".join(text.getvalue().split())
 
 
@@ -57,6 +57,12 @@ def test_own_data_is_checked_on_a_sample_of_the_voxels(tmp_path) -> None:
         assert (row.backends, row.one_in) == (("numba", "numpy"), 16)
         assert 0 < row.voxels[0] == row.voxels[1] < result.select()[0].summary.table.voxels / 4
     assert "checked numba against numpy on" in printed(result)
+    longest = {"seconds": {"reference": 3.6, "statistics": 5.1, "keep": 0.4, "all": 9.0}}
+    timed = dataclasses.replace(result, manifest=result.manifest | longest)
+    assert "9 s (wall time by stage: statistics 5, check 4)" in printed(timed, seconds=9.2)
+    elsewhere = {"units": {"executor": "2 local processes"}}
+    timed = dataclasses.replace(timed, manifest=timed.manifest | elsewhere)
+    assert "9 s (wall time by stage, all workers: statistics 5, check 4)" in printed(timed, seconds=9.2)
     assert semstab.run(config, out=tmp_path / "run", report=False).manifest["units"]["kept"] == 2
 
 

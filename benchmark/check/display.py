@@ -32,6 +32,8 @@ def print_check(checked: SceneCheck, console: Console, *, verbose: bool = False)
     state = "unsound" if checked.problems else checked.verdict.state
     console.print()
     say(f"  {state.upper()}  {_conclusion(checked)}", 4, STATES[state])
+    if checked.placed is not None:
+        say(f"  place    {checked.placed}", 11)
     for remark in checked.remarks:
         say(f"  look: {remark}", 4, "yellow")
     tables = _tables(checked)

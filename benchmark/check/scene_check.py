@@ -167,7 +167,8 @@ class SceneCheck:
     """All that is known about a scene from its sample; `verdict` alone is about geometry.
 
     `remarks` are what looks wrong, but may be right: values that mean 'no depth', labels that are not registered.
-    `depth_from` says where depth comes from, where that is not a file a frame.
+    `depth_from` says where depth comes from, where that is not a file a frame;
+    `placed` how its georeference was found and how well it fits.
     Where the geometry is unsound nothing is said about overlap, noise and voxels.
     """
 
@@ -187,6 +188,7 @@ class SceneCheck:
     suggestion: Suggestion | None = None
     remarks: tuple[str, ...] = ()
     depth_from: str | None = None
+    placed: str | None = None
 
     @property
     def problems(self) -> tuple[str, ...]:
@@ -230,6 +232,7 @@ def check_scene(scene: Scene, config: Config) -> SceneCheck:
         motion=_motion(sample),
         verdict=verdict,
         depth_from=scene.depth_from,
+        placed=scene.placed,
         labels=tuple(_labels(scene, name, indices, config, look) for name in backbones),
         remarks=tuple(remarks(scene, [look.views[at] for at in sorted(look.views)], how, look.tally.backbone)),
     )

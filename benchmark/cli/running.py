@@ -48,7 +48,7 @@ def run(
         help="CPU:0, or CUDA:0 for backends that take a device.", show_default="the backend's own",
         rich_help_panel=opt.MACHINE)] = None,
     check: Annotated[str | None, typer.Option(
-        metavar="sample|BACKEND|none", show_default="sample; of the built-in city numpy",
+        metavar="sample|BACKEND|none", show_default="sample",
         help="Check voxel by voxel against the numpy reference on a random sample, or against a backend on all.",
         rich_help_panel=opt.CHECKS)] = None,
     seed: Annotated[int | None, typer.Option(help="Seed of a simulated dataset.", show_default="0",

@@ -264,7 +264,7 @@ def _other_frame_of_reference(entries: Sequence[Entry]) -> str:
             without = entry if own is None else entries[0]
             return f"{without.where} has no georeference, and the other has one"
         if own is not None and first is not None and own != first:
-            what = "coordinate reference systems" if own.crs != first.crs else "offsets of the coordinates"
+            what = "coordinate reference systems" if own.crs != first.crs else "frames of the coordinates"
             return f"the {what} of {entries[0].where} and {entry.where} differ"
     return ""
 

@@ -235,7 +235,7 @@ def _all_rows(own: Against) -> Iterator[Row]:
         )  # fmt: skip
 
 
-# What a comparison comparison, in sentences: on the terminal, in Markdown and above the report.
+# What a comparison found, in sentences: on the terminal, in Markdown and above the report.
 
 MOST_CLASSES = 4
 """Classes that are told of in a sentence."""

@@ -199,6 +199,7 @@ def manifest(plan: Plan, units: UnitResults, executor: str, command: Sequence[st
         "units": counts | {"executor": executor},
         "geometry": {scene: verdict.summary() for scene, verdict in units.geometry.items()},
         "depth_from": {name: scene.depth_from for name, scene in plan.scenes.items() if scene.depth_from},
+        "placed": {name: scene.placed for name, scene in plan.scenes.items() if scene.placed},
     }
 
 

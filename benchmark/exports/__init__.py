@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import logging
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,6 +22,12 @@ from semstab.statistics.acceptance import AcceptanceThresholds
 from semstab.task import Task
 
 __all__ = ["SUFFIXES", "Exported", "export"]
+
+
+logger = logging.getLogger("semstab")
+
+FEW_MET = 0.5
+"""Share of a cloud's points with a voxel, below which cloud and map may not lie in one place."""
 
 
 @dataclass(frozen=True)
@@ -142,8 +149,23 @@ def _classified(chosen: Chosen, cloud: Path, file: Path, radius: float | None, s
     some = chosen.first
     tally = joining.classify(chosen, cloud, file, some.table.voxel_size if radius is None else radius, settings.asprs)
     share = tally.classified / tally.points
+    if chosen.whole and share < FEW_MET:
+        logger.warning("%s: %s", cloud, _few_met(tally, some))
     content = f"{tally.points:,} points, {share:.1%} of them classified"
     return Exported(file, content, tuple(_notes(some, file.suffix.lower(), settings)))
+
+
+def _few_met(tally: joining.Tally, some: Voxels) -> str:
+    """Why few points of a cloud may have a voxel."""
+    said = f"only {tally.classified / tally.points:.1%} of its points lie in or beside a voxel"
+    within = tally.classified / max(1, tally.over)
+    if within >= FEW_MET:
+        return f"{said}: the cloud is larger than the map; of the points over the map {within:.1%} do"
+    where = "has no georeference" if some.georeference is None else "may be shifted or turned"
+    return (
+        f"{said} ({within:.1%} of those over the map): the map {where}, or the cloud is of another"
+        " place or height; look at what check says of the project's place, or set a larger --radius"
+    )
 
 
 def _notes(voxels: Voxels, kind: str, settings: Settings) -> Iterator[str]:

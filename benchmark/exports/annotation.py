@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -97,7 +98,10 @@ def annotation_tasks(chosen: Chosen, task: Task, most: int) -> list[AnnotationTa
 
 @dataclass(frozen=True, eq=False)
 class _Places:
-    """The voxels that are annotated; (n,) the place of each, 0, 1, ..., its two classes, and its entropy in bits."""
+    """The voxels that are annotated; (n,) the place of each, 0, 1, ..., its two classes, and its entropy in bits.
+
+    projected  brings points (n, 3) of the scene into its projection, where it has one
+    """
 
     table: VoxelTable
     place: Int64
@@ -105,7 +109,7 @@ class _Places:
     other: Int64
     bits: Float64
     names: tuple[str, ...]
-    offset: Float64
+    projected: Callable[[Float64], Float64]
 
     @classmethod
     def of(cls, chosen: Chosen, most: int) -> _Places:
@@ -125,7 +129,13 @@ class _Places:
         rank[np.argsort(-total, kind="stable")] = np.arange(len(total))
         rows = np.flatnonzero(rank[place] < most)
         return cls(
-            table.rows(rows), rank[place[rows]], label[rows], other[rows], entropy[rows], first.classes, first.offset
+            table.rows(rows),
+            rank[place[rows]],
+            label[rows],
+            other[rows],
+            entropy[rows],
+            first.classes,
+            first.in_file,
         )
 
     def task(self, views: list[_View], task: Task) -> AnnotationTask:
@@ -133,7 +143,7 @@ class _Places:
         best, names = views[0], task.scene.image_name
         own = self.place == best.place
         k = int(np.flatnonzero(own)[0])
-        center = self.table.centers[own].mean(axis=0) + self.offset
+        center = self.projected(self.table.centers[own].mean(axis=0, keepdims=True))[0]
         return AnnotationTask(
             best.bits, self.names[self.label[k]], self.names[self.other[k]], int(own.sum()),
             float(np.median(self.table.op[own])), tuple(center.tolist()), best.frame, names(best.frame), best.size,

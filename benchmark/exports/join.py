@@ -36,10 +36,10 @@ NONE = -1
 
 
 class VoxelLookup:
-    """Finds voxels of a table by coordinates, the scene's plus an offset; a radius of 0 takes no neighbours."""
+    """Finds voxels of a table by coordinates of the scene; a radius of 0 takes no neighbours."""
 
-    def __init__(self, table: VoxelTable, offset: npt.ArrayLike = (0.0, 0.0, 0.0), radius: float = 0.0) -> None:
-        self.table, self._offset, self._radius = table, np.asarray(offset, dtype=np.float64), radius
+    def __init__(self, table: VoxelTable, radius: float = 0.0) -> None:
+        self.table, self._radius = table, radius
         index = self.table.index.astype(np.int64)
         self._low, self._high = index.min(axis=0), index.max(axis=0)
         (self._keys,) = voxel_keys(index)
@@ -48,7 +48,7 @@ class VoxelLookup:
     def bounds(self) -> tuple[Float64, Float64]:
         """(3,) the lowest and the highest coordinates that may belong to a voxel, metres."""
         r = self.table.voxel_size
-        return self._low * r + self._offset - self._radius, (self._high + 1) * r + self._offset + self._radius
+        return self._low * r - self._radius, (self._high + 1) * r + self._radius
 
     def rows(self, points: Float64) -> Int64:
         """Return (n,) the voxel of each point (n, 3), a row of the table, or NONE."""
@@ -56,7 +56,6 @@ class VoxelLookup:
 
     def nearest(self, points: Float64) -> tuple[Int64, Float64]:
         """Return the voxels, and the distance of their centres, 0 for the voxel that a point lies in."""
-        points = points - self._offset
         index = np.floor(points / self.table.voxel_size).astype(np.int64)
         inside = np.flatnonzero(((index >= self._low) & (index <= self._high)).all(axis=1))
         rows, apart = np.full(len(points), NONE), np.full(len(points), np.inf)
@@ -71,7 +70,7 @@ class VoxelLookup:
 
     def _around(self, points: Float64) -> tuple[Int64, Float64]:
         """Return (n,) the voxel whose centre is nearest to each point, within the radius, and its distance."""
-        low, high = (edge - self._offset for edge in self.bounds)
+        low, high = self.bounds
         near = np.flatnonzero(((points >= low) & (points <= high)).all(axis=1))
         rows, apart = np.full(len(points), NONE), np.full(len(points), np.inf)
         apart[near], nearest = self._tree.query(points[near], distance_upper_bound=self._radius, workers=-1)
@@ -100,17 +99,19 @@ OLD_CODES = 31
 
 @dataclass
 class Tally:
-    """The number of points, the number with a voxel, and their bounds."""
+    """The number of points, those with a voxel, those within the map's bounds from above, and the bounds of all."""
 
     points: int = 0
     classified: int = 0
+    over: int = 0
     low: Float64 = field(default_factory=lambda: np.full(3, np.inf))
     high: Float64 = field(default_factory=lambda: np.full(3, -np.inf))
 
-    def add(self, points: Float64, classified: int) -> None:
-        """Count a chunk of points (n, 3), of which `classified` have a voxel."""
+    def add(self, points: Float64, classified: int, over: int) -> None:
+        """Count a chunk of points (n, 3), of which `classified` have a voxel, and `over` lie over the map."""
         self.points += len(points)
         self.classified += classified
+        self.over += over
         self.low = np.minimum(self.low, points.min(axis=0, initial=np.inf))
         self.high = np.maximum(self.high, points.max(axis=0, initial=-np.inf))
 
@@ -160,8 +161,19 @@ class _Finder:
 
     def lookup(self, place: Place) -> VoxelLookup:
         """Return the lookup of a tile with voxels."""
-        voxels = self.chosen[place]
-        return VoxelLookup(voxels.table, voxels.offset, self._radius)
+        return VoxelLookup(self.chosen[place].table, self._radius)
+
+    @cached_property
+    def bounds(self) -> tuple[Float64, Float64]:
+        """(3,) the lowest and the highest coordinates of the file that may belong to a voxel, metres."""
+        low, high = np.full(3, np.inf), np.full(3, -np.inf)
+        for place in self.chosen.places():
+            voxels, r = self.chosen[place], self.chosen.first.table.voxel_size
+            index = voxels.table.index
+            box = np.stack([index.min(axis=0) * r - self._radius, (index.max(axis=0) + 1) * r + self._radius])
+            corners = voxels.in_file(np.array([*itertools.product(*box.T)]))
+            low, high = np.minimum(low, corners.min(axis=0)), np.maximum(high, corners.max(axis=0))
+        return low, high
 
     def __call__(self, points: Float64) -> Taken:
         some, apart = self.chosen.first, np.full(len(points), np.inf)
@@ -169,17 +181,20 @@ class _Finder:
         columns = {
             name: np.zeros(len(points), clouds.as_stored(own.values).dtype) for name, own in some.columns.items()
         }
-        for place, rows in self._near(points - some.offset):
+        placed = some.in_scene(points)
+        for place, rows in self._near(placed):
             voxels = self.chosen[place]
             if not len(voxels.table):
                 continue
-            nearest, distance = self._lookups[place].nearest(points[rows])
+            nearest, distance = self._lookups[place].nearest(placed[rows])
             nearer = distance < apart[rows]
             to, of = rows[nearer], nearest[nearer]
             apart[to], label[to] = distance[nearer], voxels.classified[of]
             for name, own in columns.items():
                 own[to] = clouds.as_stored(voxels.columns[name].values)[of]
-        self.tally.add(points, int(np.isfinite(apart).sum()))
+        low, high = (edge[:2] for edge in self.bounds)
+        over = ((points[:, :2] >= low) & (points[:, :2] <= high)).all(axis=1)
+        self.tally.add(points, int(np.isfinite(apart).sum()), int(over.sum()))
         return Taken(label, columns)
 
     def _near(self, points: Float64) -> Iterator[tuple[Place, Int64]]:
@@ -202,8 +217,7 @@ class _Finder:
 
 def _outside(cloud: Path, finder: _Finder) -> DataError:
     """Return the error of a cloud without a point in the map."""
-    boxes = [finder.lookup(place).bounds for place in finder.chosen.places()]
-    map_box = np.min([low for low, _ in boxes], axis=0), np.max([high for _, high in boxes], axis=0)
+    map_box = finder.bounds
     there, here = (
         " to ".join("(" + ", ".join(f"{value:.1f}" for value in corner) + ")" for corner in box)
         for box in ((finder.tally.low, finder.tally.high), map_box)

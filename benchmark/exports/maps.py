@@ -138,9 +138,31 @@ def _axes(voxels: Voxels) -> tuple[Float64, Float64, Float64]:
 def _covered(voxels: Voxels) -> tuple[Int64, Int64]:
     """The cells (m, 2) of one voxel's width, and the voxel (m,) that covers each."""
     right, ahead, above = _axes(voxels)
-    table = voxels.table
-    plane = np.stack([table.centers @ ahead, table.centers @ right], axis=1)
+    table, laid = voxels.table, voxels.laid
+    plane = np.stack([laid @ ahead, laid @ right], axis=1)
+    if voxels.georeference is not None and voxels.georeference.turned:
+        return _covered_by_turned(plane, voxels.linear[1::-1, 1::-1], table.voxel_size)
     return covered(plane, above, table.voxel_size, table.voxel_size)
+
+
+def _covered_by_turned(plane: Float64, axes: Float64, edge: float) -> tuple[Int64, Int64]:
+    """The cells (m, 2) under voxels whose sides are not along the raster's, and the voxel (m,) that covers each.
+
+    A voxel covers the cell that its centre lies in, and those whose centres lie under it: by the first no voxel is
+    lost, by the second there are no gaps between neighbours.
+
+    plane  (n, 2) centres
+    axes   (2, 2) from the scene's level axes to the raster's
+    """
+    own, to_scene, rows = np.floor(plane / edge).astype(np.int64), np.linalg.inv(axes).T, np.arange(len(plane))
+    cells, of = [own], [rows]
+    for step in np.ndindex(3, 3):
+        cell = own + (np.array(step) - 1)
+        apart = ((cell + 0.5) * edge - plane) @ to_scene
+        under = ((apart >= -edge / 2) & (apart < edge / 2)).all(axis=1) & (cell != own).any(axis=1)
+        cells.append(cell[under])
+        of.append(rows[under])
+    return np.concatenate(cells), np.concatenate(of)
 
 
 def _window(voxels: Voxels, cell: int) -> Window:
@@ -180,7 +202,7 @@ def _bands(voxels: Voxels, cell: int, window: Window) -> Mapping[str, Column]:
     inside = ((fine // cell >= window.low) & (fine // cell <= window.high)).all(axis=1)
     fine, rows = fine[inside], rows[inside]
     cells, (H, W), (_, _, above) = fine // cell, window.shape, _axes(voxels)
-    height = (voxels.table.centers + voxels.offset) @ above
+    height = voxels.points @ above
     top = _topmost(fine, height[rows])
     at = (window.high[0] - cells[:, 0]) * W + cells[:, 1] - window.low[1]
     over, every = _Cells(at[top], rows[top], (H, W)), _Cells(at, rows, (H, W))
@@ -252,13 +274,13 @@ def write_mesh(chosen: Chosen, path: Path) -> int:
     corners = {place: chosen[place].table.index.min(axis=0).astype(np.int64) for place in chosen.places()}
     some, low = chosen.first, np.min([*corners.values()], axis=0)
     extras = {
-        "origin": (low * some.table.voxel_size + some.offset).tolist(),
+        "origin": (some.linear @ (low * some.table.voxel_size) + some.offset).tolist(),
         "coordinates": "the scene" if some.georeference is None else crs_name(some.georeference),
         "voxel_size": some.table.voxel_size,
         "classes": list(some.classes),
     }
     scene: Any = trimesh.Scene(metadata=extras)
-    voxels, size, to_gltf = 0, 0, some.table.voxel_size * _to_gltf(some.up).T
+    voxels, size, to_gltf = 0, 0, some.table.voxel_size * (_to_gltf(some.up) @ some.linear).T
     for place in corners:
         part = chosen[place]
         voxels += len(part.table)

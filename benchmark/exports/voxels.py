@@ -23,7 +23,7 @@ from semstab.metrics import CATEGORIES, categories
 from semstab.metrics.agreement import rows_of, voxel_keys
 from semstab.model import labels as colors
 from semstab.model import parquet
-from semstab.model.georeference import Georeference
+from semstab.model.georeference import IDENTITY, Georeference
 from semstab.model.labels import name_key
 from semstab.model.measures import dominant, measures
 from semstab.model.parquet import files_of
@@ -75,11 +75,29 @@ class Voxels:
     @property
     def points(self) -> Float64:
         """(n, 3) centres: global coordinates where there is a georeference, else the scene's; metres."""
-        return self.table.centers + self.offset
+        return self.in_file(self.table.centers)
+
+    @property
+    def laid(self) -> Float64:
+        """(n, 3) centres along the axes of `points`, without the offset; metres."""
+        return self.table.centers if self.georeference is None else self.georeference.along(self.table.centers)
+
+    @property
+    def linear(self) -> Float64:
+        """(3, 3) from the scene's axes to those of `points`."""
+        return np.array(IDENTITY if self.georeference is None else self.georeference.linear)
+
+    def in_file(self, points: Float64) -> Float64:
+        """Return coordinates (n, 3) of the scene as `points` has them."""
+        return points if self.georeference is None else self.georeference.projected(points)
+
+    def in_scene(self, points: Float64) -> Float64:
+        """Return coordinates (n, 3) as `points` has them in those of the scene."""
+        return points if self.georeference is None else self.georeference.in_scene(points)
 
     @property
     def offset(self) -> Float64:
-        """(3,) the file's coordinates less the scene's."""
+        """(3,) `points` less `laid`."""
         return np.zeros(3) if self.georeference is None else np.array(self.georeference.offset)
 
     @property
@@ -120,6 +138,11 @@ class Chosen:
         self.size = next(None if tile is None else tile.size for tile in tiles.values())
         self._highest = 0
         self._at_hand = SizedCache(self._read, lambda voxels: len(voxels.table), AT_HAND)
+
+    @property
+    def whole(self) -> bool:
+        """Return whether no voxel is left out."""
+        return self._min_op <= 1 and not self._classes and self._thresholds is None
 
     def __contains__(self, place: Place) -> bool:
         return place in self._files

@@ -1,34 +1,78 @@
-"""Where a scene lies on Earth: the projection of its coordinates, and the offset by which they were made small."""
+"""Where a scene lies on Earth: a projection, and the affine map that brings the scene's coordinates into it."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
+import numpy as np
+
+from semstab.core.types import Float64
 from semstab.errors import ConfigError, MissingDependencyError, summarize_error
 
 INSTALL = "pip install 'semstab[geo]'"
 """What a message says where a package of the extra `geo` is not installed."""
 
+SINGULAR = 1e-6
+"""Determinant of a matrix that flattens the scene; those of topocentric scenes are 1 to a thousandth."""
+
+
+Row = tuple[float, float, float]
+Linear = tuple[Row, Row, Row]
+
+IDENTITY: Linear = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
+
 
 @dataclass(frozen=True)
 class Georeference:
-    """Coordinates in the projection are those of the scene plus the offset: x to the east, y to the north, z up.
+    """Coordinates in the projection are `linear` times those of the scene, plus `offset`.
+
+    A scene whose axes are the projection's (x to the east, y to the north, z up) has the identity as `linear`. A
+    topocentric scene is turned against the projection by the convergence of meridians, and scaled by some parts in ten
+    thousand.
 
     crs     the coordinate reference system as WKT (2:2019), in metres
     offset  (east, north, up), metres
+    linear  rows of the (3, 3) matrix
     """
 
     crs: str
     offset: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    linear: Linear = IDENTITY
 
     @classmethod
-    def of(cls, crs: str, offset: tuple[float, float, float], where: str) -> Georeference:
+    def of(cls, crs: str, offset: tuple[float, float, float], where: str, linear: Linear | None = None) -> Georeference:
         """From a reference system in any words that pyproj reads: EPSG:32615, '+proj=utm +zone=15', WKT.
 
-        Raises ConfigError with `where` (the file or option) for one that is not known, or not in metres,
-        MissingDependencyError without pyproj.
+        Raises ConfigError with `where` (the file or option) for one that is not known, or not in metres, and for a
+        matrix that cannot be inverted; MissingDependencyError without pyproj.
         """
-        return cls(wkt(crs, where), offset)
+        if linear is not None and not abs(np.linalg.det(np.array(linear))) > SINGULAR:
+            raise ConfigError(f"{where}: the matrix from the scene to the projection cannot be inverted; write it anew")
+        return cls(wkt(crs, where), offset, IDENTITY if linear is None else linear)
+
+    @property
+    def turned(self) -> bool:
+        """Whether the scene's axes are not those of the projection."""
+        return self.linear != IDENTITY
+
+    def along(self, points: Float64) -> Float64:
+        """Return points (n, 3) of the scene along the axes of the projection, without the offset."""
+        along: Float64 = points @ np.array(self.linear).T if self.turned else points
+        return along
+
+    def projected(self, points: Float64) -> Float64:
+        """Return points (n, 3) of the scene in the projection."""
+        projected: Float64 = self.along(points) + np.array(self.offset)
+        return projected
+
+    def back_along(self, points: Float64) -> Float64:
+        """Return in the scene's coordinates points (n, 3) of the projection less the offset."""
+        back: Float64 = np.linalg.solve(np.array(self.linear), points.T).T if self.turned else points
+        return back
+
+    def in_scene(self, points: Float64) -> Float64:
+        """Return points (n, 3) of the projection in the scene's coordinates."""
+        return self.back_along(points - np.array(self.offset))
 
 
 def wkt(crs: str, where: str) -> str:

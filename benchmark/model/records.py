@@ -32,11 +32,10 @@ SCENE__BACKBONE.npz with the arrays frame (its index), labels (H, W) rows 0..K-1
 where the dataset has it, color (H, W, 3). Beside them sums by frame and cube of space, `InfluenceSums`."""
 
 REGIONS = "region_maps"
+"""Not a sweep: the label sources that hold regions without classes."""
 
 MAPS = 6
 """Maps that a notebook shows of a result."""
-
-"""Not a sweep: the label sources that hold regions without classes."""
 
 
 @dataclass(frozen=True, order=True)

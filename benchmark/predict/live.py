@@ -143,6 +143,7 @@ class PredictedScene(Scene):
         self.ground_truth = inner.ground_truth
         self.up = inner.up
         self.georeference = inner.georeference
+        self.placed = inner.placed
         self.surface = inner.surface
         self.depth_from = inner.depth_from
         self.folder = inner.folder

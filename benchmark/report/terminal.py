@@ -13,6 +13,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from semstab.check import Verdict
 from semstab.config import BASE
+from semstab.engine.executors import InProcess
 from semstab.engine.observer import Observer
 from semstab.engine.units import Plan
 from semstab.metrics import CATEGORIES, macro_mean
@@ -294,7 +295,9 @@ def _where(result: Result, out: Path | None, seconds: float | None) -> Iterator[
         stages = {STAGE_NAMES.get(k, k): v for k, v in result.manifest.get("seconds", {}).items() if k != "all"}
         longest = sorted(stages, key=lambda name: -stages[name])[:3]
         parts = ", ".join(f"{name} {stages[name]:.0f}" for name in longest if stages[name] >= 1)
-        yield f"  {seconds:.0f} s{f' (CPU work of {parts})' if parts else ''}"
+        here = result.manifest.get("units", {}).get("executor") == InProcess.name
+        what = f"wall time by stage{'' if here else ', all workers'}"  # theirs is added up, and may exceed the run's
+        yield f"  {seconds:.0f} s{f' ({what}: {parts})' if parts else ''}"
     if out is None:
         return
     if (out / "report.html").exists():
@@ -333,6 +336,8 @@ class ProgressBar(Observer):
         for scene in plan.scenes.values():
             if scene.depth_from is not None:
                 self.notes.append(f"{scene.name}: depth from {scene.depth_from}")
+            if scene.placed is not None:
+                self.notes.append(f"{scene.name}: {scene.placed}")
         missing = units.keys() - finished.keys()
         self.bar.update(self.work, total=sum(units[identity].frames for identity in missing))
         if self.bar.console.is_interactive:

@@ -43,6 +43,10 @@ FourIntrinsics = Annotated[
 Offset = Annotated[
     tuple[Finite, Finite, Finite] | None, Field(description="[east, north, up], metres, from the scene to crs")
 ]
+Linear = Annotated[
+    tuple[tuple[Finite, Finite, Finite], tuple[Finite, Finite, Finite], tuple[Finite, Finite, Finite]] | None,
+    Field(description="3x3 rows from the scene to crs, before offset is added; axes that are not those of crs"),
+]
 Size = Annotated[tuple[PositiveInt, PositiveInt] | None, Field(description="[width, height] of the intrinsics' image")]
 GroundTruth = Annotated[str | None, Field(description="template of ground truth label maps, in the scene's folder")]
 VoidIds = Annotated[dict[str, tuple[Id, ...]], Field(description="ids that mean 'no label', by label source, or gt")]
@@ -84,6 +88,7 @@ class FileSettings(Settings):
     metres_per_unit: MetresPerUnit = 1.0
     crs: str | None = Field(None, description="projected reference system in metres: EPSG:32615, PROJ string or WKT")
     offset: Offset = None
+    linear: Linear = None
 
     intrinsics_size: Size = None
     pixel_centre: PixelCentre = 0
@@ -95,6 +100,8 @@ class FileSettings(Settings):
             raise ValueError("give classes or taxonomy, not both")
         if self.offset is not None and self.crs is None:
             raise ValueError("give crs with offset")
+        if self.linear is not None and self.crs is None:
+            raise ValueError("give crs with linear")
         return self
 
 

@@ -71,7 +71,8 @@ class FileDataset(Dataset, Generic[Options]):
                 )
             cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
             casts = None if options.casts is False else options.casts or cache / "semstab" / "casts"
-            surface = Surface(options.surface, options.surface_cell, georeference, casts)
+            origin = self.mesh_origin(entry.folder, options.surface)
+            surface = Surface(options.surface, options.surface_cell, georeference, casts, origin)
         scene = FileScene(entry, frames, options, self.class_ids(), surface)
         scene.georeference = georeference
         scene.labels_like_depth = self.labels_like_depth
@@ -95,7 +96,11 @@ class FileDataset(Dataset, Generic[Options]):
         """Return where a scene lies on Earth: what the options say, else None. Raises what `Georeference.of` raises."""
         if options.crs is None:
             return None
-        return Georeference.of(options.crs, options.offset or (0.0, 0.0, 0.0), f"{folder}: crs")
+        return Georeference.of(options.crs, options.offset or (0.0, 0.0, 0.0), f"{folder}: crs", options.linear)
+
+    def mesh_origin(self, folder: Path, surface: Path) -> tuple[float, float, float] | None:
+        """Return where in the projection the coordinates of a mesh count from, None where they are the scene's."""
+        return None
 
     def depth_files(self, folder: Path, before: str, after: str, *, instead: Iterable[str]) -> dict[str, Path]:
         """Return the depth images of a folder by name, as `files_named` finds them.

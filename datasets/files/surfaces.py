@@ -10,7 +10,7 @@ import threading
 import zlib
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -47,10 +47,10 @@ class Heights(NamedTuple):
 
 
 def read_heights(path: Path, cell: float | None, georeference: Georeference | None) -> Heights:
-    """Return the first band of a GeoTIFF, in the scene's coordinates, averaged to cells of `cell` metres if given.
+    """Return the first band of a GeoTIFF, averaged to cells of `cell` metres if given.
 
-    A larger one than `MOST_CELLS` becomes coarser. Raises DataError for a rotated raster, ConfigError where it lies in
-    another projection than the scene.
+    Coordinates are less the offset of the georeference. A larger one than `MOST_CELLS` becomes coarser.
+    Raises DataError for a rotated raster, ConfigError where it lies in another projection than the scene.
     """
     import rasterio
 
@@ -142,7 +142,8 @@ def read_triangles(path: Path, cell: float | None, georeference: Georeference | 
 
 def _raster(path: Path, cell: float | None, georeference: Georeference | None) -> Triangles:
     heights = read_heights(path, cell, georeference)
-    return _of_heights(heights, f"height raster, cells of {abs(heights.dx):.3g} m")
+    found = _of_heights(heights, f"height raster, cells of {abs(heights.dx):.3g} m")
+    return _in_scene(found, georeference)
 
 
 def _las(path: Path, cell: float | None, georeference: Georeference | None) -> Triangles:
@@ -155,7 +156,14 @@ def _las(path: Path, cell: float | None, georeference: Georeference | None) -> T
             for points in file.chunk_iterator(points_at_once(file.header)):
                 yield np.stack([points.x, points.y, points.z], axis=1) - offset
 
-    return _of_points(path, np.concatenate([*chunks(), np.zeros((0, 3))]), cell)
+    return _in_scene(_of_points(path, np.concatenate([*chunks(), np.zeros((0, 3))]), cell), georeference)
+
+
+def _in_scene(triangles: Triangles, georeference: Georeference | None) -> Triangles:
+    """Bring triangles along the axes of the projection, less the offset, into the scene's coordinates."""
+    if georeference is None or not georeference.turned:
+        return triangles
+    return replace(triangles, vertices=georeference.back_along(triangles.vertices))
 
 
 def _mesh(path: Path, cell: float | None, _: Georeference | None) -> Triangles:
@@ -429,13 +437,22 @@ PROBE = (9, 16)
 class Surface:
     """Opened by its file's digest; its triangles are read when a cast is asked for that is not stored.
 
+    A mesh whose coordinates count from `mesh_origin`, (3,) in the projection, is brought into the scene; without one
+    its coordinates are the scene's.
+
     Threads may ask at once. Raises DataError where the file cannot be read.
     """
 
     def __init__(
-        self, path: Path, cell: float | None = None, georeference: Georeference | None = None, casts: Path | None = None
+        self,
+        path: Path,
+        cell: float | None = None,
+        georeference: Georeference | None = None,
+        casts: Path | None = None,
+        mesh_origin: tuple[float, float, float] | None = None,
     ) -> None:
         self.path = path
+        self._mesh_origin = None if path.suffix.lower() in SEEN_FROM_ABOVE else mesh_origin
         self._cell = cell
         self._georeference = georeference
         self._casts = Casts(casts, self.digest)
@@ -446,12 +463,18 @@ class Surface:
     def digest(self) -> bytes:
         """Return bytes that are equal where the surface is."""
         offset = None if self._georeference is None else self._georeference.offset
-        return file_digest(self.path) + repr((self._cell, offset)).encode()
+        said: tuple[object, ...] = (self._cell, offset)
+        if self._georeference is not None and self._georeference.turned:
+            said = (*said, self._georeference.linear)
+        return file_digest(self.path) + repr(said if self._mesh_origin is None else (*said, self._mesh_origin)).encode()
 
     @cached_property
     def triangles(self) -> Triangles:
         """Return the surface in the scene's coordinates. Raises what `read_triangles` raises."""
-        return read_triangles(self.path, self._cell, self._georeference)
+        found = read_triangles(self.path, self._cell, self._georeference)
+        if self._mesh_origin is None or self._georeference is None:
+            return found
+        return replace(found, vertices=self._georeference.in_scene(found.vertices + np.array(self._mesh_origin)))
 
     def depth(self, view: View) -> Float32:
         """Return depth (H, W) of a view along the optical axis in metres, 0 where it sees no surface."""
