@@ -20,7 +20,7 @@ from transformers import AutoImageProcessor, SegformerImageProcessorPil
 
 from semstab.config import Settings
 from semstab.core.files import read_json
-from semstab.errors import ConfigError, DataError, summarize_error
+from semstab.errors import ConfigError, DataError, MissingDependencyError, summarize_error
 
 if not transformers.is_torch_available():  # else its classes are stand-ins that fail when they are used
     raise ImportError(f"transformers {transformers.__version__} does not work with torch {torch.__version__}")
@@ -246,7 +246,9 @@ def load_processor(checkpoint: Checkpoint, processing: Processing, **settings: A
     where that library is not installed, DataError where the checkpoint's preprocessing cannot be done by it.
     """
     if processing == "torchvision" and importlib.util.find_spec("torchvision") is None:
-        raise ConfigError("processor: torchvision is not installed; leave it out, or pip install torchvision")
+        raise MissingDependencyError(
+            "processor: torchvision is not installed; leave it out, or pip install 'semstab[torchvision]'"
+        )
     own = checkpoint.preprocessing()
     kind = own.get("image_processor_type") or own.get("feature_extractor_type")
     if processing == "pil" and kind == "SegformerFeatureExtractor":

@@ -23,7 +23,7 @@ OPEN3D_LIBRARIES = "libusb-1.0-0 libegl1 libgl1 libx11-6 libudev1 libidn2-0 libg
 GIVEN = ("voxel_size", "num_classes", "within")
 """Settings of every map; the rest are options of its backend."""
 
-WITH_OPEN3D = f"pip install open3d, and on Debian or Ubuntu: apt-get install {OPEN3D_LIBRARIES}"
+WITH_OPEN3D = f"pip install semstab, and on Debian or Ubuntu: apt-get install {OPEN3D_LIBRARIES}"
 
 REGISTRY = Registry(
     "backend",
@@ -35,7 +35,7 @@ REGISTRY = Registry(
         "numba": Entry(
             "semstab.backends.numba_hash:NumbaHash",
             "the fast one on a CPU: an open-addressing hash map in compiled parallel code",
-            install="pip install numba",
+            install="pip install semstab",
         ),
         "open3d": Entry(
             "semstab.backends.open3d_blocks:Open3DBlocks",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 import shutil
 
 import numpy as np
@@ -14,7 +15,7 @@ from pictures import blobs
 
 from semstab.backbones import create
 from semstab.backbones.sam import SamOptions, SamProposer
-from semstab.errors import ConfigError, DataError
+from semstab.errors import ConfigError, DataError, MissingDependencyError
 
 WIDE = [blobs(shift=k) for k in range(2)]
 TALL = [np.ascontiguousarray(image.transpose(1, 0, 2)) for image in WIDE]
@@ -129,12 +130,18 @@ def test_a_size_that_a_model_cannot_see_is_one_line():
         ("eomt", {"image_size": 32}, "sees windows of the size that it was made for"),
         ("eomt", {"engine": "onnx"}, "engine onnx cannot run a 'eomt' model"),
         ("segformer", {"prompts": ["a", "b"]}, "prompts and threshold are for 'clipseg' models, not for 'segformer'"),
-        ("segformer", {"processor": "torchvision"}, "processor: torchvision is not installed"),
     ],
 )
 def test_options_that_do_not_fit(kind, options, message):
     with pytest.raises(ConfigError, match=message):
         create("transformers", model=str(tiny(kind)), **options)
+
+
+def test_without_torchvision_it_is_said_what_to_install(monkeypatch):
+    there = importlib.util.find_spec
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: None if name == "torchvision" else there(name))
+    with pytest.raises(MissingDependencyError, match=r"leave it out, or pip install 'semstab\[torchvision\]'$"):
+        create("transformers", model=str(tiny("segformer")), processor="torchvision")
 
 
 # --- The preprocessing's library --------------------------------------------------------------------------------------

@@ -349,4 +349,4 @@ def test_without_hypothesis_the_error_says_what_to_install():
     failed = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     last_line = failed.stderr.strip().splitlines()[-1]
     assert last_line.startswith("semstab.errors.MissingDependencyError: semstab.testing cannot be used")
-    assert last_line.endswith("pip install pytest hypothesis")
+    assert last_line.endswith("pip install 'semstab[testing]'")

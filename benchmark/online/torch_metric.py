@@ -5,9 +5,16 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from typing import Any
 
-import torch
-import torch.distributed as dist
-from torchmetrics import Metric
+from semstab.errors import MissingDependencyError
+
+try:
+    import torch
+    import torch.distributed as dist
+    from torchmetrics import Metric
+except ImportError as missing:
+    raise MissingDependencyError(
+        f"semstab.online.torch_metric cannot be used ({missing}); pip install 'semstab[training]'"
+    ) from missing
 
 from semstab.online import metric
 from semstab.online.metric import State

@@ -112,7 +112,7 @@ def viewer_command() -> list[str]:
     own = Path(sys.executable).with_name("rerun")
     program = str(own) if own.exists() else shutil.which("rerun")
     if program is None:
-        raise ConfigError("the rerun viewer is not installed; pip install rerun-sdk, or record into a file")
+        raise ConfigError("the rerun viewer is not installed; pip install semstab, or record into a file")
     return [program, "--bind", "127.0.0.1"]
 
 

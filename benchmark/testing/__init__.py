@@ -20,7 +20,7 @@ try:
     import pytest  # noqa: F401
 except ImportError as missing:
     raise MissingDependencyError(
-        f"semstab.testing cannot be used ({missing}); pip install pytest hypothesis"
+        f"semstab.testing cannot be used ({missing}); pip install 'semstab[testing]'"
     ) from missing
 
 from semstab.testing.builders import (

@@ -1,0 +1,89 @@
+"""setup.cfg declares each package that is imported, lowest versions are those that were run, each extra has a use."""
+
+from __future__ import annotations
+
+import ast
+import importlib
+import re
+import sys
+from configparser import ConfigParser
+from pathlib import Path
+
+import pytest
+
+SOURCE = Path(__file__).parents[1]
+PRODUCT = ("benchmark", "backends", "backbones", "datasets")
+BROUGHT_BY = {
+    "PIL": "pillow",
+    "cv2": "opencv-python-headless",
+    "lazrs": "laspy[lazrs]",
+    "rerun": "rerun-sdk",
+    "yaml": "pyyaml",
+}
+
+
+def lines(text: str) -> set[str]:
+    """The names of requirements, with their extras."""
+    return {re.split(r"[<>=]", line)[0] for line in text.split()}
+
+
+@pytest.fixture(scope="module")
+def declared() -> ConfigParser:
+    found = ConfigParser()
+    found.read(SOURCE / "setup.cfg")
+    return found
+
+
+@pytest.fixture
+def script(monkeypatch):
+    monkeypatch.syspath_prepend(str(SOURCE / "scripts"))
+    return importlib.import_module
+
+
+def imports(folder: str) -> set[str]:
+    """The packages that a folder's files import, wherever in a file."""
+    found: set[str] = set()
+    for file in (SOURCE / folder).glob("**/*.py"):
+        for node in ast.walk(ast.parse(file.read_text())):
+            if isinstance(node, ast.Import):
+                found |= {each.name.partition(".")[0] for each in node.names}
+            elif isinstance(node, ast.ImportFrom) and node.module and not node.level:
+                found.add(node.module.partition(".")[0])
+    return found - sys.stdlib_module_names - {"semstab"}
+
+
+def test_every_import_is_declared(declared) -> None:
+    extras = dict(declared["options.extras_require"])
+    del extras["dev"]
+    known = lines(declared["options"]["install_requires"]).union(*map(lines, extras.values()))
+    used = set.union(*map(imports, PRODUCT))
+    assert {"numpy", "torch", "laspy", "pytest"} <= used
+    brought = {BROUGHT_BY.get(name, name.replace("_", "-")) for name in used}
+    known.add("laspy")
+    assert brought - known == set()
+
+
+def test_what_is_required_always_is_imported(declared) -> None:
+    used = {BROUGHT_BY.get(name, name.replace("_", "-")) for folder in PRODUCT for name in imports(folder)}
+    assert lines(declared["options"]["install_requires"]) - used == set()
+
+
+def test_the_constraints_are_the_lower_bounds(script) -> None:
+    lowest = script("lowest")
+    assert lowest.FILE.read_text() == lowest.constraints()
+    assert "numpy==2.0\n" in lowest.constraints()
+
+
+def test_each_extra_has_a_use(declared, script) -> None:
+    assert set(script("extras").USES) | {"dev"} == set(declared["options.extras_require"])
+
+
+def test_each_message_names_an_extra_that_there_is(declared) -> None:
+    named: set[str] = set()
+    for folder in PRODUCT:
+        for file in (SOURCE / folder).glob("**/*.py"):
+            said = re.findall(r"pip install ([^;,)\n]+)", file.read_text())
+            named |= {"".join(re.findall(r"semstab\[(\w+)\]", each)) or each.strip("\"' ") for each in said}
+    extras = set(declared["options.extras_require"]) - {"dev"}
+    assert {"geo", "torch", "cluster"} <= named
+    assert {name for name in named - extras if not name.startswith(("semstab", "opencv-python-headless<5"))} == set()
