@@ -23,7 +23,7 @@ CORE = (
     "test_metrics", "test_measures", "test_statistics_agreement", "test_config", "test_registry", "test_declared",
     "test_pipeline", "test_cli", "test_backends",
 )  # fmt: skip
-"""Equations against the oracle, settings, what a fresh machine has, a run, the command line, backends: in this order."""
+"""Equations, settings, what a fresh machine has, a run, the command line, backends: in this order."""
 
 FOLDERS = {"benchmark": "semstab"} | {
     name: f"semstab.{name}" for name in ("backends", "backbones", "datasets", "configs", "conformance")
