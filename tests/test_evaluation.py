@@ -19,7 +19,7 @@ import semstab
 from semstab.core.json_form import to_json
 from semstab.engine import Observer, load_result, run_study
 from semstab.engine.memory import map_bytes
-from semstab.errors import ConfigError
+from semstab.errors import ConfigError, DataError
 from semstab.model.events import Events
 from semstab.model.voxels import VoxelTable
 from semstab.report.tables import tables
@@ -102,6 +102,15 @@ def test_without_asking_there_is_what_the_map_alone_tells(tmp_path) -> None:
     assert result.comparisons == ()
     again = semstab.engine.run(configure(root, events=True), out=tmp_path / "run")  # kept
     assert to_json(again.runs[0].statistics) == to_json(entry.statistics)
+
+
+def test_a_summary_with_ranks_but_not_their_values_is_refused(ran, tmp_path) -> None:
+    _, _, summary = ran
+    changed = json.loads(json.dumps(summary))
+    changed["comparisons"][0]["paired"]["values"] = {}
+    (tmp_path / "summary.json").write_text(json.dumps(changed))
+    with pytest.raises(DataError, match=r"summary\.json: .*ranks . by alpha_between without a value"):
+        load_result(tmp_path)
 
 
 class Interrupting(Observer):

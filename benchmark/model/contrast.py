@@ -104,6 +104,12 @@ class Paired:
     differences: tuple[PairedDifference, ...]
     rankings: tuple[Ranking, ...]
 
+    def __post_init__(self) -> None:
+        for ranking in self.rankings:
+            for rank in ranking.ranks:
+                if rank.backbone not in self.values.get(ranking.measure, {}):
+                    raise ValueError(f"ranks {rank.backbone} by {ranking.measure} without a value")
+
     def of(self, quantity: Quantity) -> ByBackbone:
         """The values of what is compared, by backbone."""
         return self.values[quantity.key]
