@@ -3,8 +3,8 @@
     python scripts/quick.py             # since HEAD; where nothing changed, the core alone
     python scripts/quick.py HEAD~3      # since another commit
 
-A test file is near a changed file where it changed itself, or where it imports the changed module, its package or a
-neighbour in it. `make test` runs all.
+A test file is near a changed file where it changed itself, where it has its name (test_readers_odm.py that of odm.py),
+or where it imports the changed module, its package or a neighbour in it. `make test` runs all.
 """
 
 from __future__ import annotations
@@ -73,7 +73,8 @@ def selected(files: set[Path]) -> list[Path]:
     tests = {path.relative_to(ROOT): set(imported(path)) for path in sorted((ROOT / "tests").rglob("test_*.py"))}
     modules = [module for file in files if (module := module_of(file)) is not None]
     near = {test: min((distance(names, module) for module in modules), default=9) for test, names in tests.items()}
-    near |= {test: -1 for test in tests if test in files}
+    named = {file.stem for file in files if module_of(file) is not None}
+    near |= {test: -1 for test in tests if test in files or named & set(test.stem.split("_"))}
     core = [ROOT / "tests" / f"{name}.py" for name in CORE]
     order = sorted((test for test, far in near.items() if far < 9), key=near.__getitem__)
     return list(dict.fromkeys([*order, *(path.relative_to(ROOT) for path in core)]))
