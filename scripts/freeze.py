@@ -271,7 +271,11 @@ def write_scores(folder: Path, K: int) -> None:
 
 
 def link_tree(root: Path, tree: Path) -> Path:
-    """A folder from which `import semstab` takes the code of a checkout, by its setup.cfg."""
+    """A folder from which `import semstab` takes the code of a checkout: src/semstab, or by the setup.cfg of 0.3."""
+    if (root / "src").is_dir():
+        tree.mkdir(parents=True)
+        (tree / "semstab").symlink_to(root / "src" / "semstab")
+        return tree
     setup = configparser.ConfigParser()
     setup.read(root / "setup.cfg")
     lines = setup["options"]["package_dir"].split()  # name = folder

@@ -10,6 +10,7 @@ import shutil
 import subprocess
 import sys
 from collections.abc import Iterable, Sequence
+from importlib import metadata
 from pathlib import Path
 
 SOURCE = Path(__file__).parents[1]
@@ -61,6 +62,36 @@ def pip(python: Path, *words: str) -> None:
 def sizes(python: Path) -> dict[str, int]:
     """Return the bytes of the installed files of each distribution in an environment, without byte code."""
     return {str(name): int(size) for name, size in json.loads(run([str(python), "-c", SIZES]).stdout).items()}
+
+
+def key(distribution: str) -> str:
+    """Return the name of a distribution as all its spellings are compared.
+
+    >>> key("PyYAML"), key("pydantic_core")
+    ('pyyaml', 'pydantic-core')
+    """
+    return re.sub(r"[-_.]+", "-", distribution).lower()
+
+
+def needed(names: Iterable[str]) -> set[str]:
+    """Return these distributions and all that they need, as far as installed; extras that they ask for, too."""
+    from packaging.requirements import Requirement
+
+    found: set[tuple[str, str]] = set()
+    waiting = [(key(name), "") for name in names]
+    while waiting:
+        name, extra = waiting.pop()
+        if (name, extra) in found:
+            continue
+        try:
+            requirements = map(Requirement, metadata.requires(name) or ())
+        except metadata.PackageNotFoundError:
+            continue
+        found.add((name, extra))
+        for each in requirements:
+            if each.marker is None or each.marker.evaluate({"extra": extra}):
+                waiting += [(key(each.name), own) for own in ("", *each.extras)]
+    return {name for name, _ in found}
 
 
 def lowest_versions(requirements: Iterable[str]) -> list[str]:

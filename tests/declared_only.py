@@ -9,44 +9,25 @@ import, so that neither semstab nor what it depends on finds more than on a fres
 from __future__ import annotations
 
 import json
-import re
 import subprocess
 import sys
 from collections.abc import Sequence
 from importlib import metadata
 from importlib.machinery import ModuleSpec, PathFinder
+from pathlib import Path
 from typing import Any
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "scripts"))
+import fresh
 
 BESIDE = {"semstab", "pip", "setuptools"}
 
 
-def key(distribution: str) -> str:
-    """Return the name of a distribution as all its spellings are compared."""
-    return re.sub(r"[-_.]+", "-", distribution).lower()
-
-
-def closure(names: Sequence[str]) -> set[str]:
-    """Return these distributions and all that they need, without extras that nobody asks for."""
-    from packaging.requirements import Requirement
-
-    found: set[tuple[str, str]] = set()
-    waiting = [(key(name), "") for name in names]
-    while waiting:
-        name, extra = waiting.pop()
-        if (name, extra) in found:
-            continue
-        found.add((name, extra))
-        for requirement in map(Requirement, metadata.requires(name) or ()):
-            if requirement.marker is None or requirement.marker.evaluate({"extra": extra}):
-                waiting += [(key(requirement.name), each) for each in ("", *requirement.extras)]
-    return {name for name, _ in found}
-
-
 def hide_undeclared() -> list[str]:
     """Hide the packages of all other distributions, as if they were not installed; returns their import names."""
-    declared = closure(["semstab"]) | BESIDE
+    declared = fresh.needed(["semstab"]) | BESIDE
     brought = metadata.packages_distributions()
-    hidden = {name for name, by in brought.items() if not {key(each) for each in by} & declared}
+    hidden = {name for name, by in brought.items() if not {fresh.key(each) for each in by} & declared}
     find = PathFinder.find_spec
 
     def find_spec(name: str, path: Any = None, target: Any = None) -> ModuleSpec | None:

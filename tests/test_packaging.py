@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from declared_only import closure
+from fresh import needed
 
 SOURCE = Path(__file__).parents[1]
 PACKAGES = {
@@ -86,7 +86,7 @@ def installed(built, tmp_path_factory: pytest.TempPathFactory) -> Path:
     venv.create(environment, symlinks=True)
     python = environment / "bin" / "python"
     (site,) = environment.glob("lib/python*/site-packages")
-    for name in closure(["semstab"]) - {"semstab"}:
+    for name in needed(["semstab"]) - {"semstab"}:
         for file in metadata.distribution(name).files or ():
             source, target = Path(str(file.locate())), site / file
             if source.is_file() and ".." not in file.parts and not target.exists():

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import ast
-import importlib
 import re
 import sys
 from configparser import ConfigParser
 from pathlib import Path
 
+import extras
+import lowest
 import pytest
 
 SOURCE = Path(__file__).parents[1]
@@ -32,12 +33,6 @@ def declared() -> ConfigParser:
     found = ConfigParser()
     found.read(SOURCE / "setup.cfg")
     return found
-
-
-@pytest.fixture
-def script(monkeypatch):
-    monkeypatch.syspath_prepend(str(SOURCE / "scripts"))
-    return importlib.import_module
 
 
 def imports(folder: str) -> set[str]:
@@ -68,14 +63,13 @@ def test_what_is_required_always_is_imported(declared) -> None:
     assert lines(declared["options"]["install_requires"]) - used == set()
 
 
-def test_the_constraints_are_the_lower_bounds(script) -> None:
-    lowest = script("lowest")
+def test_the_constraints_are_the_lower_bounds() -> None:
     assert lowest.FILE.read_text() == lowest.constraints()
     assert "numpy==2.0\n" in lowest.constraints()
 
 
-def test_each_extra_has_a_use(declared, script) -> None:
-    assert set(script("extras").USES) | {"dev"} == set(declared["options.extras_require"])
+def test_each_extra_has_a_use(declared) -> None:
+    assert set(extras.USES) | {"dev"} == set(declared["options.extras_require"])
 
 
 def test_each_message_names_an_extra_that_there_is(declared) -> None:
