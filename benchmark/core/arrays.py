@@ -53,6 +53,7 @@ def _read(kind: Any, arrays: Mapping[str, npt.NDArray[Any]], path: str) -> Any:
     if dataclasses.is_dataclass(kind):
         return from_arrays(kind, arrays, path)  # type: ignore[arg-type]
     origin = get_origin(kind)
+    origin = get_origin(getattr(origin, "__value__", None)) or origin  # NDArray is a `type` alias from NumPy 2.5 on
     if origin is not None and origin is not np.ndarray and issubclass(origin, Mapping):
         return {key: arrays[own] for key, own in inside.items()}
     if origin is tuple:
