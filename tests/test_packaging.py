@@ -23,6 +23,7 @@ PACKAGES = {
     "benchmark": "semstab",
     **{folder: f"semstab/{folder}" for folder in ("backends", "backbones", "datasets", "configs", "conformance")},
 }
+Done = subprocess.CompletedProcess[str]
 BUILD = "import sys; from setuptools import build_meta; print(getattr(build_meta, sys.argv[1])(sys.argv[2]))"
 
 
@@ -106,11 +107,11 @@ def elsewhere(installed, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def command(installed: Path, folder: Path, *words: str) -> subprocess.CompletedProcess[str]:
+def command(installed: Path, folder: Path, *words: str, program: str = "semstab-bench") -> Done:
     hidden = ("PYTHONPATH", "VIRTUAL_ENV")
     environment = {name: value for name, value in os.environ.items() if name not in hidden} | {"COLUMNS": "120"}
     return subprocess.run(
-        [installed / "semstab-bench", *words], cwd=folder, env=environment, capture_output=True, text=True, check=False
+        [installed / program, *words], cwd=folder, env=environment, capture_output=True, text=True, check=False
     )
 
 
@@ -118,11 +119,8 @@ def test_an_installed_wheel_does_its_main_job_in_any_folder(elsewhere, installed
     found = {path.name for path in (elsewhere / "run").iterdir()}
     assert {"report.html", "recording.rrd", "tables", "summary.json"} <= found
     assert list((elsewhere / "run" / "tables").glob("*.csv"))
-    where = subprocess.run(
-        [installed / "python", "-c", "import semstab; print(semstab.__file__)"],
-        cwd=elsewhere, check=True, capture_output=True, text=True,
-    )  # fmt: skip
-    assert Path(where.stdout.strip()).is_relative_to(installed.parent)
+    where = command(installed, elsewhere, "-c", "import semstab; print(semstab.__file__)", program="python").stdout
+    assert Path(where.strip()).is_relative_to(installed.parent)
 
 
 @pytest.mark.parametrize(
