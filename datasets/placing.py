@@ -44,6 +44,9 @@ MOST_PHOTOGRAPHS = 100
 MOST_MATCHED = 1500
 """Cameras whose positions are matched one by one where they have no names."""
 
+EARTH = 1e9
+"""Metres from the origin of a projection that no position on the Earth has."""
+
 STEP = 1.0
 """Metres from the reference at which the topocentric frame is made linear, as OpenSfM does."""
 
@@ -88,7 +91,9 @@ class _Known:
             return float(np.median([np.hypot(*(cameras[name] - self.named[name])) for name in both])) if both else None
         if not len(self.unnamed) or not cameras:
             return None
-        ours = np.array([*cameras.values()])
+        ours = _on_earth(np.array([*cameras.values()]))
+        if not len(ours):
+            return None
         if max(len(ours), len(self.unnamed)) > MOST_MATCHED:
             return float(np.hypot(*(np.median(ours, axis=0) - np.median(self.unnamed, axis=0))))
         from scipy.optimize import linear_sum_assignment
@@ -277,7 +282,12 @@ def _read_coords(path: Path) -> tuple[float, float, Float64]:
         raise DataError(f"{path}: expected a projection, 'EAST NORTH', then 'x y z' a line; run ODM again") from error
     if not np.isfinite([east, north]).all():
         raise DataError(f"{path}: the offset {east:g} {north:g} is not finite; run ODM again")
-    return east, north, positions[np.isfinite(positions).all(axis=1)]
+    return east, north, _on_earth(positions)
+
+
+def _on_earth(positions: Float64) -> Float64:
+    """Return the rows that can lie on the Earth: a damaged number leaves others to compare with."""
+    return positions[(np.abs(positions) < EARTH).all(axis=1)]  # NaN is not less
 
 
 # --- known positions --------------------------------------------------------------------------------------------------

@@ -366,6 +366,19 @@ def test_what_gps_explains_is_said_and_not_warned_of(tmp_path, caplog) -> None:
     assert not caplog.records
 
 
+@pytest.mark.parametrize(
+    ("damaged", "words"), [(1, "cameras 0.00 m (median"), (3, "no known position to compare the cameras with")]
+)
+def test_positions_beyond_the_earth_are_left_out(tmp_path, damaged, words, caplog) -> None:
+    folder = write_project(tmp_path / "field")
+    write_georeference(folder)
+    coords = folder / "odm_georeferencing/coords.txt"
+    lines = coords.read_text().splitlines()
+    coords.write_text("\n".join(lines[:-damaged] + ["1e300 0 0"] * damaged))
+    assert words in opened(folder).placed
+    assert not caplog.records
+
+
 KNOWN = {
     "coords.txt": "the positions in odm_georeferencing/coords.txt",
     "shots.geojson": "odm_report/shots.geojson",
