@@ -299,6 +299,9 @@ def test_a_damaged_frame_file_is_one_line(tmp_path):
     np.savez(tmp_path / "b.npz", frame=0, labels=np.array([{}], dtype=object), palette=PALETTE)
     for k, content in enumerate((b"", b"not an archive", b"PK\x03\x04broken")):
         (tmp_path / f"{k}.npz").write_bytes(content)
+    later = bytearray((tmp_path / "a.npz").read_bytes())
+    later[later.index(b"PK\x01\x02") + 6] = 109  # the version of ZIP that is needed to extract: 10.9
+    (tmp_path / "later.npz").write_bytes(later)
     for path in tmp_path.iterdir():
         with pytest.raises(DataError, match=rf"{path.name}: not a saved frame") as caught:
             Overview.load(path)

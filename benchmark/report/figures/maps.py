@@ -115,7 +115,7 @@ class Overview:
                 int(own["frame"]), own["labels"], own.get("color"), own["palette"],
                 None if worst[0] is None else WorstFrames(*worst),
             )  # fmt: skip
-        except (ValueError, TypeError, KeyError, zipfile.BadZipFile) as error:
+        except (ValueError, TypeError, KeyError, RuntimeError, zipfile.BadZipFile) as error:
             raise DataError(
                 f"{path}: not a saved frame ({summarize_error(error)}); delete it, and it is made again"
             ) from error
