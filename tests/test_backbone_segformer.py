@@ -143,7 +143,9 @@ def test_identity_has_the_settings_that_change_labels(option, matters):
     assert (usual != other) == matters
 
 
-def test_lower_precision_is_nearly_the_same():
+def test_lower_precision_is_nearly_the_same(monkeypatch):
+    # oneDNN errs in strided bfloat16 convolutions of few channels on CPUs with AMX (pytorch/pytorch#169688)
+    monkeypatch.setattr(torch.backends.mkldnn, "enabled", False)
     labels, low = (
         create("segformer", model=str(tiny("segformer")), dtype=dtype).predict(IMAGES[:1])[0].labels
         for dtype in ("float32", "bfloat16")
