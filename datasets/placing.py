@@ -89,18 +89,16 @@ class _Known:
         if self.named:
             both = [name for name in cameras if name in self.named]
             return float(np.median([np.hypot(*(cameras[name] - self.named[name])) for name in both])) if both else None
-        if not len(self.unnamed) or not cameras:
+        ours, known = _on_earth(np.array([*cameras.values()]).reshape(-1, 2)), _on_earth(self.unnamed)
+        if not len(known) or not len(ours):
             return None
-        ours = _on_earth(np.array([*cameras.values()]))
-        if not len(ours):
-            return None
-        if max(len(ours), len(self.unnamed)) > MOST_MATCHED:
-            return float(np.hypot(*(np.median(ours, axis=0) - np.median(self.unnamed, axis=0))))
+        if max(len(ours), len(known)) > MOST_MATCHED:
+            return float(np.hypot(*(np.median(ours, axis=0) - np.median(known, axis=0))))
         from scipy.optimize import linear_sum_assignment
         from scipy.spatial.distance import cdist
 
         # of all assignments the squares of distances are least for the true one, however far all are shifted
-        squares = cdist(ours, self.unnamed, "sqeuclidean")
+        squares = cdist(ours, known, "sqeuclidean")
         return float(np.sqrt(np.median(squares[linear_sum_assignment(squares)])))
 
 
@@ -282,7 +280,7 @@ def _read_coords(path: Path) -> tuple[float, float, Float64]:
         raise DataError(f"{path}: expected a projection, 'EAST NORTH', then 'x y z' a line; run ODM again") from error
     if not np.isfinite([east, north]).all():
         raise DataError(f"{path}: the offset {east:g} {north:g} is not finite; run ODM again")
-    return east, north, _on_earth(positions)
+    return east, north, positions
 
 
 def _on_earth(positions: Float64) -> Float64:

@@ -367,14 +367,20 @@ def test_what_gps_explains_is_said_and_not_warned_of(tmp_path, caplog) -> None:
 
 
 @pytest.mark.parametrize(
-    ("damaged", "words"), [(1, "cameras 0.00 m (median"), (3, "no known position to compare the cameras with")]
+    ("line", "damaged", "words"),
+    [
+        (-1, "1e300 0 0", "cameras 0.00 m (median"),
+        (-1, "nan 0 0", "cameras 0.00 m (median"),
+        (1, "1e300 5188162", "no known position to compare the cameras with"),
+    ],
 )
-def test_positions_beyond_the_earth_are_left_out(tmp_path, damaged, words, caplog) -> None:
+def test_positions_beyond_the_earth_are_left_out(tmp_path, line, damaged, words, caplog) -> None:
     folder = write_project(tmp_path / "field")
     write_georeference(folder)
     coords = folder / "odm_georeferencing/coords.txt"
     lines = coords.read_text().splitlines()
-    coords.write_text("\n".join(lines[:-damaged] + ["1e300 0 0"] * damaged))
+    lines[line] = damaged
+    coords.write_text("\n".join(lines))
     assert words in opened(folder).placed
     assert not caplog.records
 
