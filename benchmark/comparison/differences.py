@@ -23,7 +23,6 @@ from semstab.comparison.tables import (
     IOU,
     ONE_AGAINST_ALL,
     PRECISION,
-    REACHED,
     RECALL,
     quantities,
 )
@@ -36,7 +35,7 @@ from semstab.model.results import slug
 from semstab.model.statistics import UNKNOWN, Interval
 from semstab.model.voxels import VoxelTable
 from semstab.statistics.accumulate import Cubes
-from semstab.statistics.agreement import ALPHA_BETWEEN, ratio_of
+from semstab.statistics.agreement import ALPHA, ratio_of
 from semstab.statistics.cluster_sums import ClusterSums, functional, of_space_alone, value
 from semstab.statistics.correctness import ACCURACY, MIOU
 from semstab.statistics.intervals import LEVEL as INTERVAL_LEVEL
@@ -54,11 +53,8 @@ from semstab.statistics.intervals import (
 )
 from semstab.statistics.paired_differences import LEAST_VOXELS, holm
 
-FORGIVING, DECIDED = (REACHED, ALPHA_BETWEEN), (ACCURACY, MIOU, RECALL, PRECISION, IOU)
-"""Measures that forgive what a score leaves open, and those of the fused labels alone."""
-
-OF_ANY_SIZE = (REACHED, *DECIDED)
-"""Measures that hardly depend on the size of voxels."""
+OF_ANY_SIZE = OF_LIKELIEST = (ALPHA, ACCURACY, MIOU, RECALL, PRECISION, IOU)
+"""Measures that hardly depend on the size of voxels, and need no more than the likeliest classes of scores."""
 
 LEVEL = 0.05
 """Corrected p-value below which a difference is claimed."""
@@ -115,8 +111,6 @@ def _rows(common: Common, base: Entry, other: Entry, number: int) -> Iterator[Co
     for quantity in IN_SUMS:
         if _comparable(quantity, common):
             yield from _row(quantity, common.sums[0], common.sums[number], common)
-    if _comparable(REACHED, common):
-        yield from _row(REACHED, before, after, common)
     if common.basis != "flights" and not common.sizes_differ:
         change = sums_difference(COVERAGE.key, after, before)
         yield Contrast(COVERAGE.key, "", 1.0, 1 + change.value, change, math.nan, "")
@@ -129,12 +123,8 @@ def _rows(common: Common, base: Entry, other: Entry, number: int) -> Iterator[Co
 
 
 def _comparable(quantity: Quantity, common: Common) -> bool:
-    """Whether voxels of all sizes, other frames, and labels and scores gain alike by it, where they are compared."""
-    if (common.sizes_differ and quantity not in OF_ANY_SIZE) or (common.frames_differ and quantity is REACHED):
-        return False
-    if not common.mixed:
-        return True
-    return quantity not in FORGIVING if common.basis == "observations" else quantity in DECIDED
+    """Return whether voxels of all sizes, and labels and scores, gain alike by a quantity, where they are compared."""
+    return quantity in OF_ANY_SIZE or not (common.sizes_differ or common.mixed)
 
 
 def _row(
@@ -143,7 +133,8 @@ def _row(
     key = quantity.key
     before, after = value(base, key, k), value(other, key, k)
     if not (math.isnan(before) and math.isnan(after)):
-        scope = THESE_FRAMES if THESE_FRAMES in map(scope_of, (base, other)) else common.scope
+        scopes = [scope_of(sums, key=key) for sums in (base, other)]
+        scope = THESE_FRAMES if THESE_FRAMES in scopes else common.scope
         apart = common.basis == "flights"
         change = sums_difference(key, other, base, k, scope=scope, same_frames=common.same_frames, apart=apart)
         yield Contrast(key, of, before, after, change, math.nan, "")
@@ -223,8 +214,6 @@ def _with_p_value(interval: Interval, level: float = INTERVAL_LEVEL) -> Interval
 def _against_all(common: Common, base: Entry, other: Entry, names: Sequence[str], number: int) -> Iterator[Contrast]:
     for quantity in ONE_AGAINST_ALL:
         before, after = common.sums[0], common.sums[number]
-        if quantity is REACHED:
-            before, after = base.sums.without_truth(), other.sums.without_truth()
         if not _comparable(quantity, common):
             continue
         for k, name in enumerate(names):

@@ -14,7 +14,7 @@ from typing import Any, Literal
 import numpy as np
 import numpy.typing as npt
 
-from semstab.comparison.pairing import Common, in_share, joint_class
+from semstab.comparison.pairing import Common, joint_class
 from semstab.core.types import Float64, Int32, Int64, Mask
 from semstab.metrics.agreement import shared_rows, voxel_keys
 from semstab.model.contrast import Area, FrameShare
@@ -23,6 +23,7 @@ from semstab.model.measures import dominant
 from semstab.model.voxels import VoxelTable
 from semstab.statistics.agreement import disagreement
 from semstab.statistics.correctness import join_truth
+from semstab.statistics.model_comparison import in_share
 
 WORSE = 0.2
 """A voxel got worse where so much of its agreement is lost: of ten observations, one turned to another class."""
@@ -132,7 +133,7 @@ def worse_areas(common: Common, number: int) -> Worse:
     result, seen = Changed.joined(left), Changed.joined(shown)
     index = result.table.index
     area, improved_alike = _clusters(index, result.label, -result.change, WORSE)
-    observations = _observations(common, number, index)
+    observations = _observations(common, number, index, result.table.voxel_size)
     names = result.table.classes or tuple(str(k) for k in range(result.table.K))
     size = result.table.voxel_size
     listed = _areas("agreement", area, improved_alike, -result.change, index, size, result.label, names, observations)
@@ -308,17 +309,18 @@ def _top_frames(seen: Seen) -> tuple[FrameShare, ...]:
     )
 
 
-def _observations(common: Common, number: int, index: Int32) -> Observations | None:
+def _observations(common: Common, number: int, index: Int32, voxel_size: float) -> Observations | None:
     if not common.logs:
         return None
-    base, other = (_rows_of(common.logs[k], index) for k in (0, number))
+    base, other = (_rows_of(common.logs[k], index, voxel_size) for k in (0, number))
     there = base[0] >= 0
     return Observations(base[0][there], base[1][there], base[2][there], other[2][there])
 
 
-def _rows_of(log: Events, index: Int32) -> tuple[Int64, Int64, Float64]:
-    """Of each observation the row of its voxel, -1 where that is not among them, its frame, and what it says."""
-    own, wanted = voxel_keys(np.stack([log.ix, log.iy, log.iz], axis=1), index)
+def _rows_of(log: Events, index: Int32, voxel_size: float) -> tuple[Int64, Int64, Float64]:
+    """Of each observation of a cell the row of the voxel that holds it, -1 where there is none, its frame and shares."""
+    centre = (np.stack([log.ix, log.iy, log.iz], axis=1) + 0.5) * log.voxel_size
+    own, wanted = voxel_keys(np.floor(centre / voxel_size).astype(np.int32), index)
     at = np.minimum(np.searchsorted(wanted, own), max(len(wanted) - 1, 0))
     row = np.where(wanted[at] == own, at, -1) if len(wanted) else np.full(len(own), -1)
     return row[log.voxel].astype(np.int64), log.frame.astype(np.int64), log.evidence[:]

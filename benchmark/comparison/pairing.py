@@ -12,7 +12,7 @@ import numpy as np
 
 from semstab.comparison.runs import Entry
 from semstab.core.types import THIS_SCENE, Int64, Mask, Scope
-from semstab.metrics.agreement import observations, rows_of, shared_rows
+from semstab.metrics.agreement import rows_of
 from semstab.model.contrast import Basis, ComparedObservations, MapCoverage
 from semstab.model.events import Events
 from semstab.model.measures import sbd
@@ -22,16 +22,13 @@ from semstab.model.voxels import VoxelTable
 from semstab.statistics.accumulate import cluster_sums_of
 from semstab.statistics.cluster_sums import ClusterSums
 from semstab.statistics.correctness import join_truth
-from semstab.statistics.drift import expected_sbd, streams
-from semstab.statistics.model_comparison import Region, Regions, coverage_of, held, repeated_rows, truth_at
+from semstab.statistics.drift import expected_sbd
+from semstab.statistics.model_comparison import Region, Regions, common_voxels, coverage_of, held, share_of
 from semstab.statistics.observations import CellObservations
 from semstab.statistics.paired_differences import compared_observations
 
 NEAR = 1e-3
 """Metres within which cameras of the same frame lie."""
-
-MOST = 1 << 22
-"""Voxels that are in memory at a time: of more common ones a sample is compared, and shown."""
 
 SAMPLED = "of {millions:.3g} million common voxels 1 in {n} is compared, by a hash of its location"
 SHOWN = "figures and the recording show the voxels that changed, and 1 in {n} of the others"
@@ -39,18 +36,20 @@ SHOWN = "figures and the recording show the voxels that changed, and 1 in {n} of
 FEW = 0.1
 """A part of a map's voxels below which it is said how few are in common."""
 
+OTHER_OBSERVATIONS = "the runs are of other frames: nothing is paired on observations, and alpha is of each run's own"
+OTHER_CELLS = "the runs have cells of {sizes}, for want of the same pixels: alpha is of each run's own observations"
+
 BY_CUBES = (
     "compared are sums in the same cubes of space, each map with all its voxels; what needs them voxel by voxel is"
 )
 BY_CUBES += " left out: the locations that got worse"
-OTHER_SIZES = f"voxels of {{sizes}}: {BY_CUBES}, and what depends on their size (alpha, PSA, VSS, SBD, coverage, ECE)"
+OTHER_SIZES = f"voxels of {{sizes}}: {BY_CUBES}, and what depends on their size (PSA, VSS, SBD, coverage, ECE)"
 
 
-OBSERVATIONS_DECIDED = (
-    "labels stand beside scores: each observation is reduced to its largest class; the share of the ceiling and"
-    " alpha between frames, which forgive what a score leaves open, are left out"
+LABELS_AND_SCORES = (
+    "labels stand beside scores: alpha, and what is right of the fused labels, are of the likeliest classes; the rest,"
+    " which spreads the evidence of scores, is left out"
 )
-NOT_DECIDED = "labels stand beside scores, and common observations are not known: of agreement nothing can be compared"
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,11 +59,11 @@ class Common:
     sums    of each run, of the common locations; for `cubes` and `flights` of its whole map
     mixed   whether labels stand beside scores
     tables  of the common locations; none for `cubes` and `flights`
-    logs    of these tables, where observations are in common
+    logs    of the common observations of cells, where there are some
     label   (n,) the true class of each of their voxels, -1 where it is not known; None without ground truth
     observations   what the common observations are
-    regions where there are voxels: the whole maps if they were made of the same frames and are all of labels or all of
-            scores, else `tables`, location by location, with the ground truth
+    regions where there are voxels of the same frames, all of labels or all of scores: the whole maps with the ground
+            truth
     shown   the part of them that figures show beside those that changed
     scope   of the intervals, where frames tell
     sizes_differ, frames_differ  whether voxels do, and the frames of runs that are paired on observations
@@ -89,18 +88,17 @@ class Common:
 
     def among(self, where: Mask) -> tuple[ClusterSums, ...]:
         """The sums of some of the common locations (n,)."""
-        return tuple(
-            _sums(rows_of(table, where), _some(log, where), None if self.label is None else self.label[where])
-            for table, log in zip(self.tables, self.logs or (None,) * len(self.tables), strict=True)
-        )
+        label = None if self.label is None else self.label[where]
+        return tuple(_sums(rows_of(table, where), label) for table in self.tables)
 
 
 def pair(entries: Sequence[Entry], names: Sequence[str], scope: Scope = THIS_SCENE) -> Common:
     """The most that all runs of a scene have in common. Raises DataError where a file of a run cannot be read."""
     result = _paired(entries, names)
     mixed = len({entry.summary.reduced is None for entry in entries}) > 1
-    notes = (OBSERVATIONS_DECIDED if result.basis == "observations" else NOT_DECIDED,) if mixed else ()
-    return replace(result, scope=scope, mixed=mixed, notes=(*result.notes, *notes))
+    regions = None if mixed or result.frames_differ else result.regions
+    notes = (LABELS_AND_SCORES,) if mixed else ()
+    return replace(result, scope=scope, mixed=mixed, regions=regions, notes=(*result.notes, *notes))
 
 
 def _paired(entries: Sequence[Entry], names: Sequence[str]) -> Common:
@@ -117,7 +115,7 @@ def _paired(entries: Sequence[Entry], names: Sequence[str]) -> Common:
     covered = coverage_of(names, [held(region.tables) for region in regions()])
     if not any(row.common_share for row in covered):
         return _apart(entries, "the maps have no voxel in common: other locations, or other frames of reference")
-    result = _by_observations(names, records, regions) or _by_voxels(regions)
+    result = _with_observations(_by_voxels(entries, regions), names, records)
     shown = share_of(min(row.voxels for row in covered))
     notes = (*result.notes, *_notes(covered), *((SHOWN.format(n=round(1 / shown)),) if shown < 1 else ()))
     return replace(result, notes=notes, regions=result.regions or regions, coverage=covered, shown=shown)
@@ -138,19 +136,6 @@ def _regions(
         yield Region(dict(zip(names, tables, strict=True)), None, known)
 
 
-def share_of(voxels: int) -> float:
-    """Which part of so many is at most MOST; a power of 1/2."""
-    return 1.0 if voxels <= MOST else 2.0 ** -math.ceil(math.log2(voxels / MOST))
-
-
-def in_share(table: VoxelTable, share: float) -> Mask:
-    """(n,) which voxels are in the sample that is so large a part of all, by a hash of their index."""
-    if share >= 1:
-        return np.ones(len(table), np.bool_)
-    drawn: Mask = streams(table, slice(None), 0) >> np.uint64(11) < np.uint64(share * 2**53)
-    return drawn
-
-
 def joint_class(tables: Iterable[VoxelTable]) -> Int64:
     """The dominant class (n,) of the same voxels in several maps, each counting alike."""
     first, *others = tables
@@ -164,44 +149,37 @@ def joint_class(tables: Iterable[VoxelTable]) -> Int64:
 # --- What is in common ------------------------------------------------------------------------------------------------
 
 
-def _by_observations(names: Sequence[str], records: Sequence[Record], regions: Regions) -> Common | None:
-    """The observations that all made; None where the observations of one were not kept, or are of other frames."""
-    files = [file for record in records if (file := record.looks_file) is not None and file.is_file()]
+def _by_voxels(entries: Sequence[Entry], regions: Regions) -> Common:
+    """The voxels that all saw twice or more; of very many a sample. Alpha is of each run's own observations."""
+    common = common_voxels(regions)
+    tables, share = tuple(common.tables.values()), common.share
+    label = None if common.truth is None else join_truth(tables[0], common.truth).label
+    sums = tuple(
+        replace(_sums(table, label), fine=entry.sums.fine, coarse=entry.sums.coarse)
+        for table, entry in zip(tables, entries, strict=True)
+    )
+    millions = len(tables[0]) / share / 1e6
+    sampled = () if share == 1 else (SAMPLED.format(millions=millions, n=round(1 / share)),)
+    return Common("voxels", sampled, sums, False, tables, (), label)
+
+
+def _with_observations(common: Common, names: Sequence[str], records: Sequence[Record]) -> Common:
+    """With alpha of the observations that all made; of their own where one's were not kept, or cannot be paired."""
+    files = [file for record in records if (file := record.observations_file) is not None and file.is_file()]
     there = [CellObservations.load(file) for file in files]
-    if len(there) < len(records) or not _same_frames(there):
-        return None
-    shared = compared_observations(dict(zip(names, there, strict=True)))
-    tables = tuple(log.table() for log in shared.logs.values())
-    if not any(table.op.max(initial=0) >= 2 for table in tables):
-        return None
-    truth = truth_at(regions, tables[0])
-    label = None if truth is None else join_truth(tables[0], truth).label
-    logs = tuple(shared.logs.values())
-    sums = tuple(_sums(table, log, label) for table, log in zip(tables, logs, strict=True))
-    notes = _fewer_frames(there)
-    apart = Region(dict(zip(names, tables, strict=True)), None, truth) if notes or shared.found.decided else None
-    of_observations = None if apart is None else lambda: [apart]
-    own = (tables, logs, label, shared.found, of_observations)
-    return Common("observations", notes, sums, False, *own, frames_differ=bool(notes))
-
-
-def _by_voxels(regions: Regions) -> Common:
-    """The voxels that all saw twice or more, whatever each saw of them; of very many a sample."""
-    common = sum(len(repeated_rows(region.tables)[0]) for region in regions())
-    share, parts, truths = share_of(common), [], []
-    for region in regions():
-        pairs = zip(region.tables.values(), repeated_rows(region.tables), strict=True)
-        own = [table.rows(rows) for table, rows in pairs]
-        drawn = in_share(own[0], share)
-        parts.append([table.rows(drawn) for table in own])
-        if region.truth is not None:
-            truths.append(region.truth.rows(shared_rows(region.truth, parts[-1][0])[0]))
-    tables = tuple(VoxelTable.joined(own) for own in zip(*parts, strict=True))
-    label = join_truth(tables[0], VoxelTable.joined(truths)).label if truths else None
-    sums = tuple(_sums(table, None, label) for table in tables)
-    note = "the runs made other observations, of other frames: they are paired on voxels alone, for these frames"
-    sampled = () if share == 1 else (SAMPLED.format(millions=common / 1e6, n=round(1 / share)),)
-    return Common("voxels", (note, *sampled), sums, False, tables, (), label, same_frames=False)
+    reason = OTHER_OBSERVATIONS
+    if len(there) == len(records) and _same_frames(there):
+        reason = OTHER_CELLS.format(sizes=" and ".join(f"{own.cell_size:g} m" for own in there))
+        if len({own.cell_size for own in there}) == 1:
+            shared = compared_observations(dict(zip(names, there, strict=True)))
+            cells = shared.sums.values()
+            sums = (replace(own, fine=of.fine, coarse=of.coarse) for own, of in zip(common.sums, cells, strict=True))
+            notes, logs = _fewer_frames(there), tuple(shared.logs.values())
+            return replace(
+                common, basis="observations", notes=(*common.notes, *notes), sums=tuple(sums), logs=logs,
+                observations=shared.compared, frames_differ=bool(notes),
+            )  # fmt: skip
+    return replace(common, notes=(reason, *common.notes), same_frames=False, frames_differ=True)
 
 
 def _apart(entries: Sequence[Entry], reason: str) -> Common:
@@ -220,12 +198,8 @@ def _of_whole_maps(basis: Basis, note: str, entries: Sequence[Entry]) -> Common:
     return Common(basis, (note,), sums)
 
 
-def _sums(table: VoxelTable, log: Events | None, label: Int64 | None) -> ClusterSums:
-    return cluster_sums_of(table, log, label, sbd_excess=sbd(table) - expected_sbd(table))
-
-
-def _some(log: Events | None, where: Mask) -> Events | None:
-    return None if log is None else observations(log, np.flatnonzero(where[log.voxel]))
+def _sums(table: VoxelTable, label: Int64 | None) -> ClusterSums:
+    return cluster_sums_of(table, None, label, sbd_excess=sbd(table) - expected_sbd(table))
 
 
 def _same_frames(observations: Sequence[CellObservations]) -> bool:
@@ -241,16 +215,12 @@ def _same_frames(observations: Sequence[CellObservations]) -> bool:
 
 
 def _fewer_frames(observations: Sequence[CellObservations]) -> tuple[str, ...]:
-    """Where not all of a run's frames are in the others."""
-    frames = [own.views.frame for own in observations]
-    both = len(functools.reduce(np.intersect1d, frames))
-    listed = " and ".join(str(len(own)) for own in frames)
-    if both == max(map(len, frames)):
+    """Where a run left out frames that others have."""
+    if len({own.frames for own in observations}) == 1:
         return ()
-    return (
-        f"of {listed} frames the {both} that all have are compared; the share of the ceiling and"
-        " flicker, which are of all, are left out",
-    )
+    both = len(functools.reduce(np.intersect1d, [own.views.frame for own in observations]))
+    listed = " and ".join(str(own.frames) for own in observations)
+    return (f"the runs fused {listed} frames: alpha is of the {both} views that all have; flicker is left out",)
 
 
 # --- What is not ------------------------------------------------------------------------------------------------------

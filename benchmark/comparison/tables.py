@@ -10,19 +10,18 @@ from collections.abc import Iterator, Mapping, Sequence
 from rich.console import Console
 
 from semstab.comparison.locations import MOST
-from semstab.model.contrast import Against, Area, Basis, Contrast, FrameShare, RunComparison
+from semstab.model.contrast import Against, Area, Basis, ComparedObservations, Contrast, FrameShare, RunComparison
 from semstab.model.measures import ENTROPY, VSS, Quantity, measures
 from semstab.model.statistics import Interval
 from semstab.report.tables.correctness import coverage_table, ignored_table
 from semstab.report.tables.table import Column, Group, Row, Table, to_terminal
 from semstab.report.terminal import WIDTH
-from semstab.statistics.agreement import ALPHA, ALPHA_BETWEEN, PSA
+from semstab.statistics.agreement import ALPHA, PSA, VOXEL_ALPHA
 from semstab.statistics.correctness import ACCURACY, ECE, MIOU
 from semstab.statistics.intervals import LEAST_FRAMES
 
 # What is compared, in the order of the tables.
 
-REACHED = Quantity(key="reached", title="Share of the ceiling", short="of ceiling", better="higher", digits=(3, 4))
 RECURRENT_VSS = Quantity(key="vss", title="VSS at OP>=3", better="higher", digits=VSS.digits)
 SBD_EXCESS = Quantity(key="sbd_excess", title="SBD excess", unit="bits", better="lower", digits=(4, 4))
 FLICKER = Quantity(key="compensated_flicker_percent", title="Flicker", unit="%", better="lower", digits=(2, 2))
@@ -34,15 +33,12 @@ RECALL = Quantity(key="accuracy", title="Recall", better="higher", needs="truth"
 PRECISION = Quantity(key="precision", title="Precision", better="higher", needs="truth")
 IOU = Quantity(key="iou", title="IoU", better="higher", needs="truth")
 
-VERDICT = REACHED
-"""What a verdict rests on, and so the first row."""
-
 HEADLINES = (
-    VERDICT, ALPHA_BETWEEN, ALPHA, PSA, RECURRENT_VSS, SBD_EXCESS, FLICKER, COVERAGE, ACCURACY, MIOU, ECE, MISLEADING,
+    ALPHA, PSA, RECURRENT_VSS, SBD_EXCESS, FLICKER, COVERAGE, ACCURACY, MIOU, ECE, MISLEADING, VOXEL_ALPHA,
 )  # fmt: skip
-"""What every table shows."""
+"""What every table shows; the first row is what verdicts rest on."""
 
-BY_CLASS = (VERDICT, ALPHA_BETWEEN, ALPHA, PSA, RECURRENT_VSS, SBD_EXCESS, RECALL, PRECISION, IOU, ECE, MISLEADING)
+BY_CLASS = (ALPHA, VOXEL_ALPHA, PSA, RECURRENT_VSS, SBD_EXCESS, RECALL, PRECISION, IOU, ECE, MISLEADING)
 """What is compared class by class."""
 
 
@@ -56,17 +52,17 @@ def by_key(chosen: Sequence[Quantity]) -> Mapping[str, Quantity]:
     return {quantity.key: quantity for quantity in chosen}
 
 
-IN_SUMS = (ALPHA_BETWEEN, ALPHA, PSA, RECURRENT_VSS, SBD_EXCESS, ENTROPY, ACCURACY, MIOU, ECE, MISLEADING)
+IN_SUMS = (ALPHA, VOXEL_ALPHA, PSA, RECURRENT_VSS, SBD_EXCESS, ENTROPY, ACCURACY, MIOU, ECE, MISLEADING)
 """Of these the sums by frame and location tell all."""
 
-ONE_AGAINST_ALL = (VERDICT, ALPHA_BETWEEN, ALPHA, RECALL, PRECISION, IOU)
+ONE_AGAINST_ALL = (ALPHA, VOXEL_ALPHA, RECALL, PRECISION, IOU)
 """By class: of that class against all others; the rest is of the locations of that class."""
 
 
 ALL_SCENES = "all scenes"
 NAMED_FRAMES = 5
 
-IN_CLASSES = (VERDICT, ALPHA_BETWEEN, PSA, RECALL, IOU)
+IN_CLASSES = (ALPHA, PSA, RECALL, IOU)
 """What the table of classes has beside each other."""
 
 ANSWERS = (
@@ -115,9 +111,8 @@ def _differences(comparison: RunComparison) -> Table:
     groups = tuple(Group(heading(comparison, scope, own), _rows(own, HEADLINES)) for scope, own in scopes(comparison))
     macro = " Over all scenes each scene counts once." if len(comparison.scenes) > 1 else ""
     caption = (
-        "On the locations that all runs saw; the share of the ceiling and coverage are of each run's whole map, flicker"
-        " of"
-        " its images; coverage is the number of voxels seen twice or more, for each one of the base. Undecided: too few"
+        "Alpha is of the observations that all runs made, the rest of the voxels that all saw twice or more; coverage is"
+        " of each run's whole map, flicker of its images; coverage is the number of voxels seen twice or more, for each one of the base. Undecided: too few"
         f" frames, or errors reach as far as the scene. {ANSWERS}{macro}"
     )
     return Table("comparison", "Differences", caption, columns, groups, "scope")
@@ -241,7 +236,7 @@ MOST_CLASSES = 4
 """Classes that are told of in a sentence."""
 
 BASES: dict[Basis, str] = {
-    "observations": "paired on the observations (a voxel in a frame) that all runs made, each with the same weight",
+    "observations": "paired; alpha on the observations (a cell in a view) that all runs made, each with the same weight",
     "voxels": "paired on the voxels that all runs saw twice or more",
     "cubes": "paired on cubes of space",
     "flights": "not paired",
@@ -264,8 +259,24 @@ def remarks(comparison: RunComparison) -> list[str]:
     for scene in comparison.scenes:
         if scene.basis in ("observations", "voxels"):
             lines.append(f"{scene.scene}: {scene.voxels:,} voxels, {BASES[scene.basis]}.")
+        if scene.observations is not None:
+            lines += [f"{scene.scene}: {text}." for text in _left_out(scene.observations)]
         lines += [f"{scene.scene}: {note}." for note in scene.notes]
     return lines
+
+
+def _left_out(observations: ComparedObservations) -> Iterator[str]:
+    """Say which share of the observations each run left out, and alpha where that counts against it."""
+    for row in observations.ignored:
+        if row.missing >= LEAST_LEFT_OUT:
+            counted = f"alpha is {row.alpha:.3f} where leaving out counts as a class of its own"
+            yield f"{row.backbone} leaves {row.missing:.1%} of the pixels without a label that others label; {counted}"
+    if observations.depends and any(row.missing >= LEAST_LEFT_OUT for row in observations.ignored):
+        yield "the order of the runs depends on what was left out"
+
+
+LEAST_LEFT_OUT = 0.005
+"""Share of the pixels left without a label from which on it is said."""
 
 
 def _of_run(comparison: RunComparison, own: Against) -> Iterator[str]:
@@ -287,9 +298,9 @@ def _of_run(comparison: RunComparison, own: Against) -> Iterator[str]:
 
 
 def _stability(comparison: RunComparison, own: Against) -> str:
-    """What the share of the ceiling says, on which verdicts rest, or the first measure that is known."""
+    """Say how alpha differs, on which verdicts rest, or the first measure that is known."""
     rows = {row.measure: row for row in own.contrasts}
-    quantity = next((each for each in HEADLINES if each.key in rows), VERDICT)
+    quantity = next((each for each in HEADLINES if each.key in rows), ALPHA)
     row = rows.get(quantity.key)
     if row is None:
         return f"{own.other} and {comparison.base} have nothing that can be compared."
@@ -338,7 +349,7 @@ def _of_areas(areas: Sequence[Area]) -> str:
 
 SHOWN = {
     "comparison": ("measure", "base", "other", "difference", "change"),
-    "comparison_classes": ("class", "worse", "better", VERDICT.key, "alpha_between"),
+    "comparison_classes": ("class", "worse", "better", ALPHA.key),
     "comparison_areas": ("class", "confused_with", "voxels", "loss", "x", "y", "z"),
 }
 """The columns of each table that fit; files have all of them."""

@@ -120,8 +120,9 @@ class Ignored:
     """What a backbone left out of the observations that any backbone labelled, and what that may be worth.
 
     missing            share of their pixels
-    psa_low, psa_high  bounds of its mean PSA, whatever the missing observations would have said (Manski 1990)
-    alpha              between frames, where to leave a location out is a class of its own
+    psa_low, psa_high  bounds of the agreement of two views in a cell, whatever the missing observations would have said
+                       (Manski 1990): the worst case, and the best
+    alpha              by the convention that to leave a location out is a class of its own
     """
 
     backbone: str
@@ -133,18 +134,16 @@ class Ignored:
 
 @dataclass(frozen=True)
 class ComparedObservations:
-    """What was compared: the cells of voxels that all backbones labelled in a frame, each with the same weight.
+    """What was compared: the cells that all backbones labelled in a view, each with the same weight.
 
-    voxels, observations  sampled ones that they are of
-    decided               whether each observation was reduced to its largest class: labels were compared with scores
-    order                 of the backbones by the primary measure on these observations, the best first
-    order_ignored         the same where to leave a location out is a class of its own
-    bounded               whether the bounds of PSA keep its order of the backbones, whatever was left out
+    cells, observations  sampled ones that they are of
+    order                of the backbones by alpha on these observations, the best first
+    order_ignored        the same where to leave a location out is a class of its own
+    bounded              whether the bounds of the agreement keep the order of the backbones, whatever was left out
     """
 
-    voxels: int
+    cells: int
     observations: int
-    decided: bool
     ignored: tuple[Ignored, ...]
     order: tuple[str, ...]
     order_ignored: tuple[str, ...]
@@ -173,7 +172,7 @@ class BackboneComparison:
 # What differs between runs; in JSON as the fields say. Undefined numbers are NaN.
 
 Basis = Literal["observations", "voxels", "cubes", "flights"]
-"""What was paired: observations (a voxel in a frame) that all made; voxels that all saw twice or more; cubes of space,
+"""What was paired: observations (a cell in a view) that all made; voxels that all saw twice or more; cubes of space,
 each map with all its voxels; nothing, each flight by itself."""
 
 

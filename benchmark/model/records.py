@@ -25,7 +25,10 @@ if TYPE_CHECKING:
     import pyarrow as pa
 
 UNITS, VOXELS, TRUTH, EVENTS, FRAMES, OVERVIEW = "units", "voxels", "truth", "events", "frames", "overview"
-LOOKS, INFLUENCE = "looks", "influence"
+OBSERVATIONS, SUMS = "observations", "sums"
+SUMS_0_4 = "influence"
+"""Folder of the sums in runs before 0.4."""
+
 """Folders of what is kept of units: what their numbers are; the voxel tables SCENE__BACKBONE__BACKEND.parquet; those of
 the ground truth of the same frames; logs of observations; time series; and the frames that figures show,
 SCENE__BACKBONE.npz with the arrays frame (its index), labels (H, W) rows 0..K-1 or the ignore id, palette (K, 3) and,
@@ -163,9 +166,9 @@ class Record:
         return self._beside(FRAMES, ".csv")
 
     @property
-    def looks_file(self) -> Path | None:
-        """File of its sampled looks, which is there where the statistics judged its map."""
-        return self._beside(LOOKS)
+    def observations_file(self) -> Path | None:
+        """File of its sampled observations, which is there where its map has statistics."""
+        return self._beside(OBSERVATIONS)
 
     @property
     def events_file(self) -> Path | None:

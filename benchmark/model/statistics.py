@@ -67,7 +67,7 @@ class Interval(Estimate):
 UNKNOWN = Interval(math.nan, math.nan, math.nan)
 
 Level = Literal[
-    "stable", "usable", "unstable", "undecided", "too coarse", "misleading", "no verdict",
+    "stable", "usable", "unstable", "undecided", "uninformative", "misleading", "no verdict",
 ]  # fmt: skip
 
 
@@ -103,52 +103,88 @@ class ClassAgreement:
     name: str
     observations: float
     kappa: float
-    alpha: float
+    voxel_alpha: float
 
 
 @dataclass(frozen=True)
 class FrameAgreement:
-    """Do frames agree about a place? Over the voxels with OP >= 2.
+    """Agreement of frames at the voxels with OP >= 2, whose size it depends on.
 
-    within, between  the parts of 1 - PSA that are there within a frame, and between frames
-    alpha_between    alpha of the evidence of frames: forgives what is within one
-    voxel_weighted       the same with each voxel counting once, however often it was seen: weights that flights share
+    Attributes:
+        psa: Probability that two frames agree.
+        kappa: Fleiss' kappa.
+        voxel_alpha: Krippendorff's alpha.
+        vss: The paper's VSS.
+        within: Part of 1 - PSA that is there within a frame.
+        between: Part of 1 - PSA that is there between frames.
+        classes: The same of each class.
     """
 
     psa: Interval
     kappa: Interval
-    alpha: Interval
+    voxel_alpha: Interval
     vss: Interval
     within: Interval
     between: Interval
-    alpha_between: Interval
-    voxel_weighted: Interval
     classes: tuple[ClassAgreement, ...]
 
 
 @dataclass(frozen=True)
-class ClassCeilingShare:
-    """`CeilingShare` of one class against all others.
+class ClassAlpha:
+    """Alpha of one class against all others.
 
-    locations           voxels with OP >= 2 of which it is the dominant class
-    counts_for_verdict  whether it has enough of them to be judged
-    unstable            the probability that its share of the ceiling is below 2/3; NaN where that is not known
+    Attributes:
+        name: The class.
+        locations: Voxels with OP >= 2 of which it is the dominant class.
+        counts_for_verdict: Whether the verdict depends on it.
+        alpha: Alpha with its interval.
+        unstable: Probability that alpha is below the level 'usable'; NaN where that is not known.
     """
 
     name: str
     locations: float
     counts_for_verdict: bool
-    alpha: float
-    ceiling: float
-    share: Interval
+    alpha: Interval
     unstable: float
 
 
 @dataclass(frozen=True)
-class LagBin:
-    """Pairs of looks at a place that are `low` to `high` apart, `mean` in the mean.
+class CellAgreement:
+    """The observations that alpha rests on: labels of sampled cells, about as wide as a pixel's footprint.
 
-    alpha    between frames, of these pairs and beyond their own chance
+    Attributes:
+        cell_size: Edge of a fine cell in metres.
+        cells: Fine cells that two views saw or more.
+        frames: Frames that were fused.
+        views: Distinct views among them: a camera that stands still has one.
+        chance: Probability that two observations from anywhere on the map agree.
+        largest_class: The class with most observations, and `largest_share` its share of them.
+        labelled: Share of the locations with depth that have a label in at least half of their observations.
+        classes: Alpha of each class.
+    """
+
+    cell_size: float
+    cells: int
+    frames: int
+    views: int
+    chance: float
+    largest_class: str
+    largest_share: float
+    labelled: float
+    classes: tuple[ClassAlpha, ...]
+
+    @property
+    def critical_classes(self) -> tuple[ClassAlpha, ...]:
+        """The classes that count for the verdict, those most probably unstable first."""
+        known = [row for row in self.classes if row.counts_for_verdict and not math.isnan(row.unstable)]
+        return tuple(sorted(known, key=lambda row: (-row.unstable, row.alpha.value)))
+
+
+@dataclass(frozen=True)
+class LagBin:
+    """Pairs of observations of a cell that are `low` to `high` apart, `mean` in the mean.
+
+    alpha    of these pairs, beyond their own chance
     """
 
     low: float
@@ -160,7 +196,7 @@ class LagBin:
 
 @dataclass(frozen=True)
 class Correlogram:
-    """Agreement beyond chance by how far apart two looks are; bins with few pairs are left out.
+    """Agreement beyond chance by how far apart two observations are; bins with few pairs are left out.
 
     time      frames
     angle     degrees between the directions of view
@@ -177,39 +213,16 @@ class Correlogram:
 
 
 @dataclass(frozen=True)
-class CeilingShare:
-    """Alpha between frames beside its ceiling, which seeing other parts of a voxel sets, in sampled voxels.
-
-    Intervals are as those of `HeadlineStatistics`.
-
-    voxels   sampled ones with OP >= 2
-    share    alpha / ceiling: what it would be had frames seen the same cells, whatever the size of the voxels
-    """
-
-    voxels: int
-    alpha: Interval
-    ceiling: Interval
-    share: Interval
-    classes: tuple[ClassCeilingShare, ...]
-
-    @property
-    def judged_classes(self) -> tuple[ClassCeilingShare, ...]:
-        """The classes that count, those most probably unstable first."""
-        known = [row for row in self.classes if row.counts_for_verdict and not math.isnan(row.unstable)]
-        return tuple(sorted(known, key=lambda row: (-row.unstable, row.share.value)))
-
-
-@dataclass(frozen=True)
 class HeadlineStatistics:
     """The numbers that a verdict rests on, with intervals for the same scene flown again.
 
-    Where frames are not known, or too few to tell, the intervals are for these frames, as their `scope` says. vss is at
-    OP >= 3; the last two are undefined without ground truth.
+    Where frames are not known, or too few to tell, the intervals are for these frames, as their `scope` says. alpha is
+    of sampled cells, NaN without them; psa and vss are of voxels, at OP >= 2 and OP >= 3; the last two are undefined
+    without ground truth.
     """
 
-    psa: Interval
     alpha: Interval
-    alpha_between: Interval
+    psa: Interval
     vss: Interval
     accuracy: Interval
     wrong_of_stable: Interval
@@ -371,10 +384,7 @@ class StratumStatistics:
 
 @dataclass(frozen=True)
 class MapStatistics:
-    """All that the statistics say of one map.
-
-    labelled  the part of the locations with depth that have a label in half of their observations or more
-    """
+    """All statistics of one map."""
 
     schema: int
     name: str
@@ -389,14 +399,13 @@ class MapStatistics:
     agreement: FrameAgreement
     flipping: Flipping | None
     headline: HeadlineStatistics
-    ceiling_share: CeilingShare | None
+    cells: CellAgreement | None
     correlogram: Correlogram | None
     drift: DriftStatistics
     uncertainty: EntropyParts
     geometry: Losses | None
     correctness: CorrectnessStatistics | None
     strata: tuple[StratumStatistics, ...]
-    labelled: float = math.nan
 
     @property
     def order_known(self) -> bool:

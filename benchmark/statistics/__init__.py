@@ -7,7 +7,6 @@ several; docs/metrics.md derives each measure.
 from semstab.model.contrast import BackboneComparison
 from semstab.model.statistics import Estimate, Reliability
 from semstab.statistics.agreement import (
-    alpha_between,
     class_agreement,
     decompose,
     disagreement,
@@ -15,13 +14,13 @@ from semstab.statistics.agreement import (
     krippendorff_alpha,
     psa,
 )
-from semstab.statistics.ceiling import ceiling, ceiling_share, losses, rendered
 from semstab.statistics.correctness import correctness, join_truth, quadrants, reliability, stable_wrong
 from semstab.statistics.correlogram import correlogram
 from semstab.statistics.description import Analysis, analyse, describe
 from semstab.statistics.drift import benjamini_hochberg, expected_sbd, flips, voxel_drift
+from semstab.statistics.geometry import ceiling, losses, rendered
 from semstab.statistics.model_comparison import compare_backbones, coverage, paired
-from semstab.statistics.observations import CellObservations, ObservationSample, Views
+from semstab.statistics.observations import CellObservations, Views
 from semstab.statistics.paired_differences import claimed_together, standardised
 from semstab.statistics.sample import MapSample
 from semstab.statistics.sampler import Sampler
@@ -33,15 +32,12 @@ __all__ = [
     "CellObservations",
     "Estimate",
     "MapSample",
-    "ObservationSample",
     "Reliability",
     "Sampler",
     "Views",
-    "alpha_between",
     "analyse",
     "benjamini_hochberg",
     "ceiling",
-    "ceiling_share",
     "claimed_together",
     "class_agreement",
     "compare_backbones",

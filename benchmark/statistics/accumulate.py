@@ -35,7 +35,7 @@ from semstab.statistics.cluster_sums import (
     width,
 )
 from semstab.statistics.intervals import EstimateSpec, confidence_intervals, spec_of_cubes
-from semstab.statistics.observations import ObservationSample
+from semstab.statistics.observations import CellObservations
 
 # Cubes of space over any set of voxels, and intervals for these frames of any statistic of their sums.
 
@@ -181,7 +181,7 @@ def cluster_sums_of(
     events: Events | None = None,
     true_label: Int64 | None = None,
     *,
-    sample: ObservationSample | None = None,
+    cells: CellObservations | None = None,
     sbd_excess: Float64 | None = None,
     edge: float | None = None,
     cubes: Cubes | None = None,
@@ -189,10 +189,9 @@ def cluster_sums_of(
 ) -> ClusterSums:
     """Return the sums of a map.
 
-    events      its log; without it, but with a sample, frames are known of the sampled voxels only; without either a
-                location counts as a whole, and the frames are not known
+    events      its log; without it a location counts as a whole, and the frames are not known
     true_label  (n,) the true class of each voxel, -1 where it is not known
-    sample      what was seen of sampled voxels
+    cells       the labels of sampled cells, from which alpha follows
     sbd_excess  (n,) SBD of each voxel less that in random order, NaN where that is not known
     edge        of the cubes in metres, a power of 2, where several maps are to have the same; else the smallest that
                 leaves at most MOST_CELLS
@@ -206,30 +205,34 @@ def cluster_sums_of(
         whole = _sums_of_log(events, cubes, dominant(table), true_label, likely)
     whole = _with_frameless_sums(whole, table, cubes, true_label, sbd_excess)
     whole = whole.coarsened(whole.edge, whole.step)  # one row for each cube and group of frames, in order
-    if sample is None:
-        return whole
-    some = Cubes.of_log(sample.seen, whole.edge)
-    seen = replace(_sums_of_log(sample.seen, some), classes=whole.classes)
-    whole = _with_frames(whole, seen) if events is None else whole
-    return replace(whole, seen=seen, same_cells=_of_same_cells(seen, sample, some))
+    return whole if cells is None else with_cells(whole, cells)
 
 
-def _of_same_cells(seen: ClusterSums, sample: ObservationSample, cubes: Cubes) -> ClusterSums:
-    """The sums of a sample had frames seen the same cells of its voxels: pairs of them agree by that much more."""
-    from scipy.sparse import csr_array
+def with_cells(whole: ClusterSums, cells: CellObservations) -> ClusterSums:
+    """Return the sums with those of sampled cells: fine ones, and coarse ones twice as wide."""
+    parts = []
+    for times in (1, 2):
+        log = cells.observations(times * cells.coarsening)
+        own = _sums_of_log(log, Cubes.of_log(log, whole.edge))
+        parts.append(replace(own, classes=whole.classes))
+    step = max(part.step for part in parts)
+    fine, coarse = (part.coarsened(part.edge, step) for part in parts)
+    return replace(whole, fine=fine, coarse=coarse)
 
-    log = sample.seen
-    at = cubes.at[log.voxel].astype(np.int64)
-    again = np.flatnonzero(at >= 0)
-    row = distinct_rows(np.stack([at, log.frame // max(seen.step, 1)], axis=1)[again])[1]
-    ones = np.ones(len(row))
-    counts = csr_array((ones, (row, log.voxel[again])), shape=(len(seen.cell), len(log)))
-    shift = csr_array((sample.shift, (sample.voxel, sample.label)), shape=(len(log), log.K))
-    apart, columns, own = (counts @ shift).toarray(), seen.columns.copy(), layout(seen.K, truth=False)
-    columns[:, own["agreeing"].start] -= apart.sum(axis=1) / 2
-    if "class_apart" in own:
-        columns[:, own["class_apart"]] += apart
-    return replace(seen, columns=columns)
+
+def sums_of_cells(cells: CellObservations, edge: float | None = None) -> ClusterSums:
+    """Return sums of sampled cells alone, without those of a map.
+
+    Args:
+        cells: Labels of sampled cells.
+        edge: Edge of the cubes in metres, a power of 2; the smallest that leaves at most MOST_CELLS by default.
+    """
+    if edge is None:
+        log = cells.observations()
+        edge = cubes_of((log.ix, log.iy, log.iz), log.voxel_size, some=np.diff(log.bounds) >= 2)[2]
+    none, frame = np.zeros((0, 3), np.int32), np.zeros(0, np.int32)
+    columns = np.zeros((0, width(cells.K, truth=False)))
+    return with_cells(ClusterSums(none, frame, columns, edge, 0, cells.cell_size, cells.K, cells.classes), cells)
 
 
 def _sums_of_log(
@@ -272,33 +275,6 @@ def _sums_of_log(
         events.classes,
         truth,
         len(np.unique(events.frame)),
-    )
-
-
-def _with_frames(whole: ClusterSums, seen: ClusterSums) -> ClusterSums:
-    """The sums of a whole map, with the share that each frame has in a cube as in a sample of its voxels.
-
-    What the sample does not account for stands in rows of its own, whose frame is -1. Agreement by class, which a table
-    of evidence that is not one-hot cannot tell, comes from the sample.
-    """
-    cells, row = distinct_rows(np.concatenate([whole.cell, seen.cell]))
-    mine, theirs = np.split(row, [len(whole.cell)])
-    count = [np.bincount(of, weights=part["observations"][:, 0], minlength=len(cells))
-             for of, part in ((mine, whole), (theirs, seen))]  # fmt: skip
-    scale = count[0][theirs] / np.maximum(count[1][theirs], 1.0)
-    by_frame = np.zeros((len(seen.cell), whole.columns.shape[1]))
-    by_frame[:, : seen.columns.shape[1]] = seen.columns * scale[:, None]
-    left = np.zeros((len(cells), whole.columns.shape[1]))
-    np.add.at(left, mine, whole.columns)
-    np.subtract.at(left, theirs, by_frame)
-    left[np.isnan(left)] = 0.0  # sums by class that a table cannot tell: the sample alone has them
-    return replace(
-        whole,
-        cell=np.concatenate([seen.cell, cells]).astype(np.int32),
-        frame=np.concatenate([seen.frame, np.full(len(cells), -1)]).astype(np.int32),
-        columns=np.concatenate([by_frame, left]),
-        step=seen.step,
-        fused=seen.fused,
     )
 
 

@@ -23,9 +23,10 @@ from semstab.model.voxels import VoxelTable
 PSA = Quantity(key="psa", title="PSA", better="higher")
 KAPPA = Quantity(key="kappa", title="Kappa", better="higher", digits=(2, 4))
 ALPHA = Quantity(key="alpha", title="Alpha", better="higher", digits=(3, 4))
-ALPHA_BETWEEN = Quantity(
-    key="alpha_between", title="Alpha between frames", short="alpha b.f.", better="higher", digits=(3, 4)
-)
+"""The agreement of two views at the same spot beyond chance: the number that decides, see `docs/metrics.md`."""
+
+VOXEL_ALPHA = Quantity(key="voxel_alpha", title="Voxel alpha", better="higher", digits=(3, 4))
+"""Krippendorff's alpha of the voxels of a map, which depends on their size."""
 
 STABLE = 0.8
 """A voxel is stable where PSA >= 0.8: of ten frames at most one disagrees."""
@@ -102,7 +103,7 @@ def kappa_of(sums: Float64) -> Float64:
 
 
 def alpha_columns(table: VoxelTable, weights: Float64 | None = None) -> Float64:
-    """(n, 3 + K): what Krippendorff's alpha, and alpha between frames, are functions of by their sums over voxels.
+    """(n, 3 + K): what Krippendorff's alpha is a function of by its sums over voxels.
 
     weights (n,) count voxels by themselves instead of by their OP: the same ones for several flights make their alphas
     comparable where these saw some places more often than others.
@@ -121,16 +122,6 @@ def alpha_of(sums: Float64) -> Float64:
     return _beyond_chance(ratio_of(sums[..., :2]), expected)
 
 
-def alpha_between(table: VoxelTable) -> float:
-    """Krippendorff's alpha with the distance ||s - s'||^2 / 2, of the voxels with OP >= 2, each counting by its OP.
-
-    1 - D / D_e: D is the mean distance of two frames' evidence at a voxel, ||s_t||^2 averaged less PSA, and D_e the
-    same between all observations, as if they were of one voxel. On one-hot evidence it is `krippendorff_alpha`. Two
-    frames that both see the same mixture agree here, and frames that both give the same scores.
-    """
-    return float(between_of(alpha_columns(table).sum(axis=0)))
-
-
 def disagreement(table: VoxelTable) -> tuple[Float64, Float64]:
     """1 - PSA of each voxel as a sum (n,), (n,): within a frame, and between frames; NaN where OP < 2.
 
@@ -141,29 +132,6 @@ def disagreement(table: VoxelTable) -> tuple[Float64, Float64]:
     again = table.op >= 2
     own = np.where(again, table.self_sum / table.op, np.nan)
     return 1 - own, np.maximum(own - agreement, 0.0)
-
-
-def between_of(sums: Float64) -> Float64:
-    """Alpha between frames (...,) from the sums (..., 3 + K) of `alpha_columns`."""
-    n, own = sums[..., 1], sums[..., 2]
-    with np.errstate(invalid="ignore", divide="ignore"):
-        expected = own / n - ((sums[..., 3:] ** 2).sum(axis=-1) - own) / (n * (n - 1))
-        ratio = (own - sums[..., 0]) / n / expected
-    beyond: Float64 = np.where(expected.real > ONE_HOT, 1 - ratio, np.nan)
-    return beyond
-
-
-def class_of(sums: Float64) -> Float64:
-    """Alpha between frames (...,) of a class against all others, from sums (..., 4).
-
-    Every observation is reduced to s_k and two of them are (s_k - s'_k)^2 apart: `alpha_between` of two classes.
-    """
-    apart, n, squares, total = np.moveaxis(sums, -1, 0)
-    with np.errstate(invalid="ignore", divide="ignore"):
-        expected = 2 * (n * squares - total**2) / (n * (n - 1))
-        ratio = apart / n / expected
-    beyond: Float64 = np.where(expected.real > ONE_HOT, 1 - ratio, np.nan)
-    return beyond
 
 
 def class_agreement(table: VoxelTable, events: Events | None = None) -> tuple[ClassAgreement, ...]:

@@ -23,7 +23,7 @@ from semstab.core.files import atomic_path, parse_json
 from semstab.core.json_form import from_json
 from semstab.core.types import Float64, Int32, Int64, Mask
 from semstab.errors import DataError, summarize_error
-from semstab.statistics.agreement import ONE_HOT, alpha_of, between_of, class_of, ratio_of
+from semstab.statistics.agreement import ONE_HOT, alpha_of, ratio_of
 
 # --- Columns ----------------------------------------------------------------------------------------------------------
 
@@ -155,7 +155,9 @@ def distinct_rows(rows: npt.NDArray[np.integer]) -> tuple[Int64, Int64]:
 Statistic = Callable[[Float64], Float64]
 Scale = Literal["share", "agreement", "plain"]
 
-OF_0_3, SCHEMA = 2, 3
+SCHEMA = 4
+WITHOUT_CELLS = 2, 3
+"""Versions of files whose samples had no cells: only the sums of their maps are read."""
 MOST_CELLS, MOST_GROUPS = 256, 64
 """Cubes of space and groups of frames that are kept apart, at most."""
 
@@ -181,8 +183,8 @@ class ClusterSums:
     step     frames of a group, a power of 2; 0 where they are not known
     fused    how many frames they come from
     truth    whether ground truth is in it
-    seen     the same of the sampled voxels alone, where there is an `ObservationSample`; same_cells of what they would
-             be had frames seen the same cells of each voxel, in the same rows
+    fine, coarse  the same of sampled cells, which are units instead of voxels and views instead of frames, and of cells
+             twice as wide, where there are `CellObservations`
     """
 
     cell: Int32
@@ -195,8 +197,8 @@ class ClusterSums:
     classes: tuple[str, ...] = ()
     truth: bool = False
     fused: int = 0
-    seen: ClusterSums | None = None
-    same_cells: ClusterSums | None = None
+    fine: ClusterSums | None = None
+    coarse: ClusterSums | None = None
 
     def __getitem__(self, name: str) -> Float64:
         """Sums (m, 1), or (m, K) by class, of that name."""
@@ -244,8 +246,8 @@ class ClusterSums:
             columns=columns,
             edge=edge,
             step=step if known else 0,
-            seen=self.seen and self.seen.coarsened(edge, step),
-            same_cells=self.same_cells and self.same_cells.coarsened(edge, step),
+            fine=self.fine and self.fine.coarsened(edge, self.fine.step),
+            coarse=self.coarse and self.coarse.coarsened(edge, self.coarse.step),
         )
 
     def without_truth(self) -> ClusterSums:
@@ -258,8 +260,9 @@ class ClusterSums:
         import pyarrow as pa
         import pyarrow.parquet as pq
 
-        parts = [part for part in (self, self.seen, self.same_cells) if part is not None]
-        about = {name: getattr(self, name) for name in ("edge", "step", "voxel_size", "K", "classes", "truth", "fused")}
+        parts = [part for part in (self, self.fine, self.coarse) if part is not None]
+        about = {name: getattr(self, name) for name in ("edge", "K", "classes", "truth")}
+        about |= {name: [getattr(part, name) for part in parts] for name in ("step", "voxel_size", "fused")}
         lengths = [len(part.frame) for part in parts]
         cell, frame = np.concatenate([part.cell for part in parts]), np.concatenate([part.frame for part in parts])
         columns = np.zeros((sum(lengths), self.columns.shape[1]))
@@ -272,7 +275,7 @@ class ClusterSums:
         ]
         arrays = [np.repeat(np.arange(len(parts)), lengths), *cell.T, frame, *columns.T]
         content = pa.table({name: arrow.column(array) for name, array in zip([*KEYS, *names], arrays, strict=True)})
-        text = json.dumps({"schema": SCHEMA, "kind": "InfluenceSums", **about})
+        text = json.dumps({"schema": SCHEMA, "kind": "ClusterSums", **about})
         with atomic_path(path) as temporary:
             pq.write_table(content.replace_schema_metadata({"semstab": text}), temporary, compression="zstd")
 
@@ -287,34 +290,35 @@ class ClusterSums:
                 content = file.read()
             about = parse_json((content.schema.metadata or {})[b"semstab"])
             kind, version = about.pop("kind"), about.pop("schema")
-            if kind != "InfluenceSums" or version not in (OF_0_3, SCHEMA):
+            old = (kind, version) in (("InfluenceSums", each) for each in WITHOUT_CELLS)
+            if not old and (kind, version) != ("ClusterSums", SCHEMA):
                 raise DataError("of another kind or version")
-            about = dataclasses.asdict(from_json(SumsMeta, about, path))
+            if old:
+                about |= {name: [about.get(name, 0)] for name in ("step", "voxel_size", "fused")}
+            meta = from_json(SumsMeta, about, path)
             part, *keys = (_key(arrow.values_of(content.column(name)), name) for name in KEYS)
             columns = np.stack([*map(arrow.values_of, content.columns[len(KEYS) :])], axis=1)
-            if columns.shape[1] != width(about["K"], truth=about["truth"]):
-                raise DataError(f"{columns.shape[1]} columns of sums for {about['K']} classes")
+            if columns.shape[1] != width(meta.K, truth=meta.truth):
+                raise DataError(f"{columns.shape[1]} columns of sums for {meta.K} classes")
             if np.any(np.abs(columns) > LARGEST**2):
                 raise DataError("a sum is larger than a map can have it")
-            parts: list[ClusterSums | None] = []
-            for number in range(1 if version == OF_0_3 else 3):  # its sample had another ceiling
-                own = part == number
-                some = about | ({"truth": False} if number else {})
-                sums = columns[own, : width(about["K"], truth=some["truth"])].astype(np.float64)
+            parts: list[ClusterSums] = []
+            for number, (step, voxel_size, fused) in enumerate(
+                zip(meta.step, meta.voxel_size, meta.fused, strict=True)
+            ):
+                own, truth = part == number, meta.truth and not number
+                sums = columns[own, : width(meta.K, truth=truth)].astype(np.float64)
                 cell, frame = np.stack([key[own] for key in keys[:3]], axis=1), keys[3][own]
-                made = cls(cell.astype(np.int32), frame.astype(np.int32), sums, **some)
-                parts.append(made if own.any() or not number else None)
-            whole, seen, same_cells = (*parts, None, None)[:3]
-            if seen is not None and (same_cells is None or not np.array_equal(seen.frame, same_cells.frame)):
-                raise DataError("the sums of the sample, and of its cells, are of other rows")
+                where = cell.astype(np.int32), frame.astype(np.int32), sums, meta.edge, step
+                parts.append(cls(*where, voxel_size, meta.K, meta.classes, truth, fused))
         except (OSError, LookupError, TypeError, ValueError, OverflowError, pa.ArrowException) as error:
-            raise DataError(f"{path}: not a file of influence sums ({summarize_error(error)})") from error
-        assert whole is not None
-        return dataclasses.replace(whole, seen=seen, same_cells=same_cells)
+            raise DataError(f"{path}: not a file of cluster sums ({summarize_error(error)})") from error
+        whole, *cells = parts
+        return dataclasses.replace(whole, fine=cells[0], coarse=cells[1]) if cells else whole
 
 
 KEYS = ("part", "ix", "iy", "iz", "frame")
-"""The columns of the file before the sums; part 0 is the map, 1 what was seen of the sample, 2 of the same cells."""
+"""The columns of the file before the sums; part 0 is the map, 1 the fine cells, 2 the coarse ones."""
 
 
 LARGEST = 2.0**30
@@ -323,23 +327,28 @@ LARGEST = 2.0**30
 
 @dataclass(frozen=True)
 class SumsMeta:
-    """What the file says of its sums; see `InfluenceSums`."""
+    """What the file says of its sums: step, voxel_size and fused of each part; see `ClusterSums`."""
 
     edge: float
-    step: int
-    voxel_size: float
     K: int
     classes: tuple[str, ...]
     truth: bool
-    fused: int = 0
+    step: tuple[int, ...]
+    voxel_size: tuple[float, ...]
+    fused: tuple[int, ...]
 
     def __post_init__(self) -> None:
-        if not (0 < self.voxel_size < math.inf and self.K > 0 and len(self.classes) in (0, self.K)):
-            raise DataError(f"{self.K} classes, {len(self.classes)} names, voxels of {self.voxel_size:g} m")
+        parts = {len(each) for each in (self.step, self.voxel_size, self.fused)}
+        if not (parts <= {1} or parts <= {3}):
+            raise DataError("sums of other parts than a map, fine and coarse cells")
+        sizes = all(0 < size < math.inf for size in self.voxel_size)
+        if not (sizes and self.K > 0 and len(self.classes) in (0, self.K)):
+            raise DataError(f"{self.K} classes, {len(self.classes)} names, voxels of {self.voxel_size[0]:g} m")
         if not (0 < self.edge <= LARGEST and math.frexp(self.edge)[0] == 0.5):
             raise DataError(f"cubes of {self.edge:g} m, which is no power of 2 of that size")
-        if not 0 <= self.step <= LARGEST or self.step & (self.step - 1):
-            raise DataError(f"groups of {self.step} frames, which is no power of 2 of that size")
+        for step in self.step:
+            if not 0 <= step <= LARGEST or step & (step - 1):
+                raise DataError(f"groups of {step} frames, which is no power of 2 of that size")
 
 
 def _joined(index: Int32, times: float) -> Int64:
@@ -356,21 +365,27 @@ def _key(values: npt.NDArray[Any], name: str) -> npt.NDArray[Any]:
 
 
 def aligned(*parts: ClusterSums) -> tuple[ClusterSums, ...]:
-    """The sums at the finest cubes and groups of frames that all of them have.
+    """Return the sums at the finest cubes and groups of frames that all of them have, those of cells alike.
 
-    Raises DataError where they differ in what their columns are.
+    Raises:
+        DataError: If they differ in what their columns are.
     """
     if len({(part.K, part.classes, part.truth) for part in parts}) > 1:
         raise DataError("sums of maps of different classes, or with and without ground truth, do not fit together")
     edge, steps = max(part.edge for part in parts), [part.step for part in parts]
     step = max(steps) if all(steps) else 0
-    return tuple(part if (part.edge, part.step) == (edge, step) else part.coarsened(edge, step) for part in parts)
+    same = [part if (part.edge, part.step) == (edge, step) else part.coarsened(edge, step) for part in parts]
+    fine, coarse = [part.fine for part in same if part.fine], [part.coarse for part in same if part.coarse]
+    if len(fine) < len(same) or len(coarse) < len(same):
+        return tuple(same)
+    cells = zip(same, aligned(*fine), aligned(*coarse), strict=True)
+    return tuple(dataclasses.replace(part, fine=one, coarse=two) for part, one, two in cells)
 
 
 # --- What follows from the sums ---------------------------------------------------------------------------------------
 
 
-Part = Literal["map", "seen", "same_cells"]
+Part = Literal["map", "fine", "coarse"]
 
 
 @dataclass(frozen=True)
@@ -381,7 +396,7 @@ class Functional:
     of         the number (...,) from these sums (..., C)
     low, high  its range
     scale      of its interval: a 'share' or mean of numbers from 0 to 1, an 'agreement', at most 1, or 'plain'
-    parts      the sums that it is of, side by side: the map's own, or the sample's
+    parts      the sums that it is of, each with its weight: of a map, or of sampled cells
     pairs      the first sum is of pairwise agreement, which of a place that two frames saw neither has for itself alone
 
     The second sum counts what the first is a sum of.
@@ -393,7 +408,11 @@ class Functional:
     high: float = 1.0
     scale: Scale = "share"
     pairs: bool = False
-    parts: tuple[Part, ...] = ("map",)
+    parts: tuple[tuple[Part, float], ...] = (("map", 1.0),)
+
+
+CELLS: tuple[tuple[Part, float], ...] = (("fine", 2.0), ("coarse", -1.0))
+"""2 alpha(h) - alpha(2 h): alpha falls with the size of cells, to first order linearly, by what they mix."""
 
 
 def class_alpha_of(sums: Float64) -> Float64:
@@ -405,34 +424,13 @@ def class_alpha_of(sums: Float64) -> Float64:
     return value
 
 
-def class_between_of(sums: Float64) -> Float64:
-    """The same of alpha between frames, which forgives what is within one."""
-    apart, n, total, squares = np.moveaxis(sums, -1, 0)
-    return class_of(np.stack([apart - 2 * (total - squares), n, squares, total], axis=-1))
-
-
-def ratio_to(of: Statistic) -> Statistic:
-    """A number over that of further sums, side by side; NaN where that is no better than chance."""
-
-    def ratio(sums: Float64) -> Float64:
-        one, other = np.split(sums, 2, axis=-1)
-        below = of(other)
-        with np.errstate(invalid="ignore"):  # of complex sums, by which slopes are found
-            quotient: Float64 = of(one) / np.where(below.real > 0, below, np.nan)
-        return quotient
-
-    return ratio
-
-
 ALPHA_SUMS = ("agreeing", "observations", "own", "evidence")
 CLASS_SUMS = ("class_apart", "observations", "evidence", "class_own")
 
 FUNCTIONALS: Mapping[str, Functional] = {
     "psa": Functional(("psa", "voxels"), ratio_of, pairs=True),
-    "alpha": Functional(ALPHA_SUMS, alpha_of, -1.0, 1.0, "agreement", pairs=True),
-    "alpha_between": Functional(ALPHA_SUMS, between_of, -1.0, 1.0, "agreement", pairs=True),
-    "reached": Functional(ALPHA_SUMS, between_of, -1.0, 1.0, "agreement", pairs=True, parts=("same_cells",)),
-    "ceiling": Functional(ALPHA_SUMS, ratio_to(between_of), 0.0, 1.0, "plain", parts=("seen", "same_cells")),
+    "alpha": Functional(ALPHA_SUMS, alpha_of, -1.0, 1.0, "agreement", pairs=True, parts=CELLS),
+    "voxel_alpha": Functional(ALPHA_SUMS, alpha_of, -1.0, 1.0, "agreement", pairs=True),
     "vss": Functional(("vss", "recurrent"), ratio_of),
     "entropy": Functional(("entropy", "voxels"), ratio_of),
     "accuracy": Functional(("right", "known"), ratio_of),
@@ -442,16 +440,13 @@ FUNCTIONALS: Mapping[str, Functional] = {
     "miou": Functional(("known", "known", "class_right", "class_known", "class_predicted"), miou_of, scale="plain"),
     "ece": Functional(("judged", "judged", "gap"), ece_of, scale="plain"),
 }
-"""By key: PSA, both alphas, the share of its ceiling that alpha between frames reaches and that ceiling, and entropy at
-OP >= 2, VSS at OP >= 3, SBD less that in random order where that is known; with ground truth the accuracy of the fused
+"""By key: alpha, of cells that two views saw or more; PSA, Krippendorff's alpha of voxels and entropy at OP >= 2, VSS at OP >= 3, SBD less that in random order where that is known; with ground truth the accuracy of the fused
 labels at OP >= 2 and of single looks, the wrong among the stable places at OP >= 3, mean intersection over union and
 expected calibration error at OP >= 2."""
 
 BY_CLASS: Mapping[str, Functional] = {
-    "alpha": Functional(CLASS_SUMS, class_alpha_of, -1.0, 1.0, "agreement"),
-    "alpha_between": Functional(CLASS_SUMS, class_between_of, -1.0, 1.0, "agreement"),
-    "reached": Functional(CLASS_SUMS, class_between_of, -1.0, 1.0, "agreement", parts=("same_cells",)),
-    "ceiling": Functional(CLASS_SUMS, ratio_to(class_between_of), 0.0, 1.0, "plain", parts=("seen", "same_cells")),
+    "alpha": Functional(CLASS_SUMS, class_alpha_of, -1.0, 1.0, "agreement", parts=CELLS),
+    "voxel_alpha": Functional(CLASS_SUMS, class_alpha_of, -1.0, 1.0, "agreement"),
     "accuracy": Functional(("class_right", "class_known"), ratio_of),
     "precision": Functional(("class_right", "class_predicted"), ratio_of),
     "iou": Functional(("class_right", "known", "class_known", "class_predicted"), iou_of),
@@ -470,29 +465,34 @@ def functional(key: str, k: int | None = None) -> Functional:
     return FUNCTIONALS[key] if k is None else BY_CLASS[key]
 
 
-def parts_of(sums: ClusterSums, number: Functional) -> tuple[ClusterSums, ...]:
-    """The sums that a number is of: the map's, or the sample's; none where they are not there."""
-    parts = [sums if name == "map" else sums.seen if name == "seen" else sums.same_cells for name in number.parts]
-    there = tuple(part for part in parts if part is not None)
-    known = all(set(number.names) <= set(layout(part.K, truth=part.truth)) for part in there)
-    return there if known and len(there) == len(parts) else ()
+def parts_of(sums: ClusterSums, number: Functional) -> tuple[tuple[ClusterSums, float], ...]:
+    """Return the sums that a number is of, each with its weight; none where they are not there."""
+    of = {"map": sums, "fine": sums.fine, "coarse": sums.coarse}
+    there = [(part, weight) for name, weight in number.parts if (part := of[name]) is not None]
+    known = all(set(number.names) <= set(layout(part.K, truth=part.truth)) for part, _ in there)
+    return tuple(there) if known and len(there) == len(number.parts) else ()
 
 
-def sums_for(sums: ClusterSums, key: str, k: int | None = None) -> Float64:
-    """The sums (m, C) that a number is of; (0, 0) where they are not there."""
-    number = functional(key, k)
-    own = [part[name] for part in parts_of(sums, number) for name in number.names]
-    if not own:
-        return np.zeros((0, 0))
+def columns_of(part: ClusterSums, key: str, k: int | None = None) -> Float64:
+    """Return the sums (m, C) of a part that a number is of."""
+    own = [part[name] for name in functional(key, k).names]
     if k is not None:
         own = [columns[:, min(k, columns.shape[1] - 1)][:, None] for columns in own]
     return np.concatenate(own, axis=1)
 
 
 def value(sums: ClusterSums, key: str, k: int | None = None) -> float:
-    """The number; NaN where undefined."""
-    columns = sums_for(sums, key, k)
-    return float(functional(key, k).of(columns.sum(axis=0))) if columns.size else math.nan
+    """Return the number; NaN where undefined."""
+    number = functional(key, k)
+    parts = parts_of(sums, number)
+    own = [weight * float(number.of(columns_of(part, key, k).sum(axis=0))) for part, weight in parts]
+    return sum(own) if own else math.nan
+
+
+def frames_of(sums: ClusterSums, key: str, k: int | None = None) -> int:
+    """Return how many frames, or views, a number is of, about; 0 where they are not known."""
+    parts = parts_of(sums, functional(key, k))
+    return parts[0][0].frame_count if parts else 0
 
 
 def cubes_of(

@@ -1,4 +1,4 @@
-"""Agreement beyond chance of two observations of a voxel, by how far apart they are: time, angle, range and baseline.
+"""Agreement beyond chance of two observations of a cell, by how far apart they are: time, angle, range and baseline.
 
 One number of a map averages over all pairs of frames, so that it says as much about the flight as about the model.
 """
@@ -16,10 +16,10 @@ from semstab.core.types import Float64, Int64
 from semstab.model.events import Events
 from semstab.model.evidence import Evidence
 from semstab.model.statistics import UNKNOWN, Correlogram, LagBin
-from semstab.statistics.agreement import between_of
+from semstab.statistics.agreement import alpha_of
 from semstab.statistics.cluster_sums import MOST_GROUPS, cubes_of
 from semstab.statistics.intervals import confidence_intervals, spec_of_observations
-from semstab.statistics.observations import ObservationSample
+from semstab.statistics.observations import CellObservations
 
 STANDARD = (5.0, 15.0)
 """Degrees between the viewing directions at which alpha is stated: a baseline of a tenth to a quarter of the range."""
@@ -44,14 +44,14 @@ AXES = EDGES | {"standard": STANDARD}
 BINS = tuple((axis, *edges) for axis, own in AXES.items() for edges in itertools.pairwise(own))
 
 
-def correlogram(sample: ObservationSample) -> Correlogram:
-    """Return alpha between frames in bins of the distance of two observations, over pairs at sampled voxels.
+def correlogram(cells: CellObservations) -> Correlogram:
+    """Return alpha of fine cells in bins of the distance of two observations.
 
-    Of a voxel's looks those that are 1, 2, 4, 8, ... looks apart are paired, so that the cost is linear. Chance is that
+    Of a cell's observations those that are 1, 2, 4, 8, ... apart are paired, so that the cost is linear. Chance is that
     of the pairs in the bin. Bands are at 95 %, for this scene flown again where the frames of a bin tell of it, else
     for these frames.
     """
-    seen = sample.seen
+    seen = cells.observations()
     labels = np.unique(seen.evidence.label)  # of the others nothing changes
     cubes, of, edge = _cubes(seen)
     step, most = 1, min(MOST_GROUPS, max(1, MOST_SUMS // (max(len(cubes), 1) * (3 + len(labels)))))
@@ -62,7 +62,7 @@ def correlogram(sample: ObservationSample) -> Correlogram:
     cube, group = np.divmod(there, max(len(frames), 1))
     sums = _BinSums(seen.evidence.only(labels), len(there))
     pairs, distance = np.zeros((2, len(BINS) + 1))
-    for first, second, apart in _pairs(sample, seen):
+    for first, second, apart in _pairs(cells, seen):
         bins = _bins(apart)
         pairs += np.bincount(bins.ravel(), minlength=len(pairs))
         distance += np.bincount(bins.ravel(), weights=apart.ravel(), minlength=len(pairs))
@@ -75,7 +75,7 @@ def correlogram(sample: ObservationSample) -> Correlogram:
         own = sums.total[k, some]
         halves = own[:, :2]  # of its agreement with the other one, neither observation has half for itself alone
         where = cubes[cube[some]], frames[group[some]], edge, step
-        specs.append(spec_of_observations(*where, own, halves, between_of))
+        specs.append(spec_of_observations(*where, own, halves, alpha_of))
         rows.append((k, float(distance[k] / pairs[k]), int(pairs[k])))
     of_axis: dict[str, tuple[LagBin, ...]] = dict.fromkeys(AXES, ())
     for (k, lag, count), alpha in zip(rows, confidence_intervals(specs), strict=True):
@@ -93,9 +93,9 @@ def _cubes(seen: Events) -> tuple[Any, Any, float]:
     return cubes, of, edge
 
 
-def _pairs(sample: ObservationSample, seen: Events) -> Iterator[tuple[Int64, Int64, Float64]]:
+def _pairs(cells: CellObservations, seen: Events) -> Iterator[tuple[Int64, Int64, Float64]]:
     """The pairs (m,) of observations that are 1, 2, 4, ... apart, lag by lag, and how far (m, 5), along `AXES`."""
-    rank, centre = sample.views.rank(seen.frame), sample.views.centre
+    rank, centre = cells.views.rank(seen.frame), cells.views.centre
     index = np.stack([seen.ix, seen.iy, seen.iz], axis=1)
     ray = centre[rank] - ((index + 0.5) * seen.voxel_size)[seen.voxel]
     distance = np.linalg.norm(ray, axis=1)
@@ -121,7 +121,7 @@ def _bins(apart: Float64) -> Int64:
 
 
 class _BinSums:
-    """Sums of pairs of observations by bin and cluster (bins + 1, C, 3 + K), of which `between_of` is a function.
+    """Sums of pairs of observations by bin and cluster (bins + 1, C, 3 + K), of which `alpha_of` is a function.
 
     Of s . s' with the other observation, of observations, of ||s||^2, and of s.
     """

@@ -13,10 +13,12 @@ from semstab.metrics.agreement import shared_rows
 from semstab.metrics.summary import STRATA, groups_of
 from semstab.model.events import Events
 from semstab.model.information import by_group
-from semstab.model.measures import SBD
+from semstab.model.measures import SBD, dominant
 from semstab.model.results import TableSummary
 from semstab.model.statistics import (
+    CellAgreement,
     ClassAgreement,
+    ClassAlpha,
     CorrectnessStatistics,
     DriftStatistics,
     DriftTests,
@@ -32,8 +34,7 @@ from semstab.model.statistics import (
 from semstab.model.voxels import VoxelTable
 from semstab.statistics.accumulate import Cubes, CubeSums, cluster_sums_of
 from semstab.statistics.agreement import class_agreement_of, class_sums, ratio_of, shares_of, stability_posterior
-from semstab.statistics.ceiling import ceiling_share_from, ceiling_specs, locations_by_class, losses
-from semstab.statistics.cluster_sums import ClusterSums
+from semstab.statistics.cluster_sums import MOST_CLASSES, ClusterSums
 from semstab.statistics.correctness import (
     Predictions,
     Truth,
@@ -47,8 +48,9 @@ from semstab.statistics.correctness import (
 )
 from semstab.statistics.correlogram import correlogram
 from semstab.statistics.drift import expected_sbd, voxel_drift
-from semstab.statistics.intervals import confidence_intervals, headline_specs
-from semstab.statistics.observations import ObservationSample
+from semstab.statistics.geometry import losses
+from semstab.statistics.intervals import confidence_intervals, headline_specs, probability_above, scope_of, spec_of
+from semstab.statistics.observations import CellObservations
 from semstab.statistics.sample import MapSample
 from semstab.statistics.sections import (
     MEANS,
@@ -63,7 +65,7 @@ from semstab.statistics.sections import (
 )
 from semstab.statistics.verdict import LIMITS, Limits, verdict
 
-SCHEMA = 1
+SCHEMA = 2
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,7 +117,7 @@ def describe(
     truth: VoxelTable | None = None,
     *,
     limit: VoxelTable | None = None,
-    observations: ObservationSample | None = None,
+    cells: CellObservations | None = None,
     name: str = "",
     seed: int = 0,
     edges: Sequence[int] = STRATA,
@@ -131,12 +133,12 @@ def describe(
     limit do not belong to the table.
     """
     sample = MapSample.draw(table, events, truth, edges=edges)
-    return analyse(sample, observations, limit=limit, name=name, seed=seed, edges=edges, critical=critical).summary
+    return analyse(sample, cells, limit=limit, name=name, seed=seed, edges=edges, critical=critical).summary
 
 
 def analyse(
     sample: MapSample,
-    observations: ObservationSample | None = None,
+    cells: CellObservations | None = None,
     *,
     limit: VoxelTable | None = None,
     name: str = "",
@@ -148,7 +150,7 @@ def analyse(
 ) -> Analysis:
     """Return all statistics of one map; the same seed gives the same numbers.
 
-    observations  taken of the same frames by a `Sampler`; without them agreement has no ceiling to be judged against
+    cells     labels of sampled cells, taken of the same frames by a `Sampler`; without them there is no alpha, and no verdict
     limit     the map of view-independent labels; the ground truth's where it is not given
     name      of the backbone, for the verdict
     edges     upper bounds of the strata of OP
@@ -173,7 +175,7 @@ def analyse(
         table,
         events,
         None if truth is None else truth.label,
-        sample=None if observations is None else observations,
+        cells=cells,
         sbd_excess=columns["sbd_excess"],
         cubes=cubes,
         stable=stable,
@@ -186,12 +188,8 @@ def analyse(
     of_flips = [] if log is None else confidence_intervals(log.places.specs(OF_FLIPS))
     means = dict(zip(MEANS, confidence_intervals(of_places.specs(MEANS)), strict=True))
     whole = sample.summary.summary(table.voxel_size, table.classes, edges)
-    reach = None
-    if observations is not None:
-        reached = confidence_intervals(ceiling_specs(influence, table.K, scope))
-        reach = ceiling_share_from(locations_by_class(table), influence, reached, critical=critical, limits=limits)
     headline, count = HeadlineStatistics(*confidence_intervals(headline_specs(influence, scope))), len(cubes.cell)
-    labelled = math.nan if observations is None else observations.labelled
+    agreeing = None if cells is None else cell_agreement(cells, influence, table, scope, critical, limits)
     repeats = whole.means.voxels[SBD.key]
     repeated = Repeated(repeats, repeats / whole.voxels if whole.voxels else math.nan)
     flips_of_map = flipping.flipping(unsteady, table.classes)
@@ -206,36 +204,81 @@ def analyse(
         repeated=repeated,
         blocks=count,
         verdict=verdict(
-            name or "backbone",
+            name or "model",
             headline=headline,
-            ceiling=reach,
+            cells=agreeing,
             flips=flips_of_map,
             voxels=repeated.voxels,
             share=repeated.share,
             blocks=count,
-            labelled=labelled,
             limits=limits,
         ),
         agreement=_agreement(means, class_agreement_of(class_sums(table, events), table.classes)),
         flipping=flips_of_map,
         headline=headline,
-        ceiling_share=reach,
-        correlogram=None if observations is None else correlogram(observations),
+        cells=agreeing,
+        correlogram=None if cells is None else correlogram(cells),
         drift=_drift(repeats, means, of_places, log, of_flips),
         uncertainty=EntropyParts(means["entropy"], means["entropy_within"], means["entropy_between"]),
         geometry=None if limit is None else losses(table, limit),
         correctness=None if truth is None else _correctness(table, truth, stable, cubes, edges),
         strata=_strata(whole, table, columns, edges),
-        labelled=labelled,
     )
     return Analysis(summary, whole, influence, sample, shares, drawn)
+
+
+def cell_agreement(
+    cells: CellObservations,
+    sums: ClusterSums,
+    table: VoxelTable,
+    scope: Scope = THIS_SCENE,
+    critical: Sequence[str] = (),
+    limits: Limits = LIMITS,
+) -> CellAgreement:
+    """Return alpha of each class, and what the observations are that alpha rests on.
+
+    Args:
+        cells: Labels of sampled cells.
+        sums: Sums of the map with these cells.
+        table: The map, by which locations of a class are counted.
+        scope: Scope of the intervals, where views tell of it.
+        critical: Classes that the verdict depends on; where none is named, those with enough locations.
+        limits: Limits of the verdict.
+    """
+    fine = sums.fine
+    assert fine is not None
+    names, named = sums.classes or tuple(str(k) for k in range(table.K)), set(critical) & set(sums.classes)
+    locations = np.bincount(dominant(table)[table.op >= 2], minlength=table.K).tolist()
+    own, evidence = scope_of(sums, scope), fine["evidence"].sum(axis=0)
+    alphas = confidence_intervals(spec_of(sums, "alpha", k, own) for k in range(table.K) if table.K <= MOST_CLASSES)
+    n, largest = float(fine["observations"].sum()), int(evidence.argmax())
+    return CellAgreement(
+        cell_size=cells.coarsening * cells.cell_size,
+        cells=round(float(fine["voxels"].sum())),
+        frames=cells.frames,
+        views=len(cells.views),
+        chance=float((evidence**2).sum() - fine["own"].sum()) / (n * (n - 1)) if n > 1 else math.nan,
+        largest_class=names[largest],
+        largest_share=float(evidence[largest]) / n if n else math.nan,
+        labelled=cells.labelled_share(),
+        classes=tuple(
+            ClassAlpha(
+                name,
+                locations[k],
+                name in named if named else locations[k] >= limits.class_locations,
+                alpha,
+                1 - probability_above(alpha, limits.usable, "agreement"),
+            )
+            for k, (name, alpha) in enumerate(zip(names, alphas, strict=False))
+        ),
+    )
 
 
 # --- Sections ---------------------------------------------------------------------------------------------------------
 
 
 def _agreement(means: Mapping[str, Interval], classes: tuple[ClassAgreement, ...]) -> FrameAgreement:
-    names = ("psa", "kappa", "alpha", "vss", "within", "between", "alpha_between", "voxel_weighted")
+    names = ("psa", "kappa", "voxel_alpha", "vss", "within", "between")
     return FrameAgreement(**{name: means[name] for name in names}, classes=classes)
 
 

@@ -20,9 +20,10 @@ from semstab.statistics.cluster_sums import (
     Scale,
     Statistic,
     aligned,
+    columns_of,
+    frames_of,
     functional,
     parts_of,
-    sums_for,
     value,
 )
 from semstab.statistics.variance import (
@@ -89,8 +90,9 @@ def spec_of(
 ) -> EstimateSpec:
     """For `answers`, see `estimate`."""
     number = functional(key, k)
-    bounds = number.low, number.high
-    return EstimateSpec(value(sums, key, k), grid_of(sums, key, k), scope, number.scale, bounds, level)
+    bounds, own = (number.low, number.high), value(sums, key, k)
+    clipped = own if math.isnan(own) else min(max(own, number.low), number.high)
+    return EstimateSpec(clipped, grid_of(sums, key, k), scope, number.scale, bounds, level)
 
 
 def difference(
@@ -117,8 +119,9 @@ def difference(
     one, other = grid_of(a, key, k), grid_of(b, key, k)
     if one is None or other is None:
         return Interval(result, math.nan, math.nan, undecided=NO_PLACES)
-    scope = scope if a.step else THESE_FRAMES
-    paired = (not a.step or same_flight(a, b)) if same_frames is None else same_frames
+    own, theirs = (parts_of(sums, functional(key, k))[0][0] for sums in (a, b))
+    scope = scope if own.step else THESE_FRAMES
+    paired = (not own.step or same_flight(own, theirs)) if same_frames is None else same_frames
     between = one.minus(other)
     with one_thread():
         spread = spread_of(between, scope) if paired else spread_of_flights(one, other, between, scope)
@@ -132,13 +135,16 @@ def difference(
 
 def identical(a: ClusterSums, b: ClusterSums, key: str, k: int | None = None) -> bool:
     """Whether a number is of the very same sums in two maps, so that it has no difference, anywhere."""
-    result = []
-    for part in aligned(a, b):
-        columns = sums_for(part, key, k)
-        rows = parts_of(part, functional(key, k))[:1]
-        where = columns.any(axis=1) & bool(rows)
-        result.append([columns[where], *(own[where] for each in rows for own in (each.cell, each.frame))])
-    return all(np.array_equal(one, other, equal_nan=True) for one, other in zip(*result, strict=True))
+    one, other = ([part for part, _ in parts_of(own, functional(key, k))] for own in aligned(a, b))
+    if len(one) != len(other):
+        return False
+    for pair in zip(one, other, strict=True):
+        columns = [columns_of(part, key, k) for part in pair]
+        rows = [own.any(axis=1) for own in columns]
+        same = [(own[where], part.cell[where], part.frame[where]) for own, where, part in zip(columns, rows, pair, strict=True)]
+        if not all(np.array_equal(x, y, equal_nan=True) for x, y in zip(*same, strict=True)):
+            return False
+    return True
 
 
 def no_difference(interval: Interval) -> Interval:
@@ -197,15 +203,15 @@ def spec_of_observations(
     return EstimateSpec(result, grid, THIS_SCENE if notes else THESE_FRAMES, "agreement", (-1.0, 1.0), level)
 
 
-def scope_of(sums: ClusterSums, wanted: Scope = THIS_SCENE) -> Scope:
-    """Return what verdicts on a map are about: what is wanted if frames tell of it, else these frames."""
-    return wanted if sums.frame_count >= LEAST_FRAMES else THESE_FRAMES
+def scope_of(sums: ClusterSums, wanted: Scope = THIS_SCENE, key: str = "alpha") -> Scope:
+    """Return the scope of a number's interval: what is wanted if enough frames tell of it, else these frames."""
+    return wanted if frames_of(sums, key) >= LEAST_FRAMES else THESE_FRAMES
 
 
 def headline_specs(sums: ClusterSums, wanted: Scope = THIS_SCENE) -> Iterator[EstimateSpec]:
-    """For `answers`: the numbers that a verdict on a map rests on, in the order of `HeadlineStatistics`."""
-    scope = scope_of(sums, wanted)
-    return (spec_of(sums, field.name, scope=scope) for field in dataclasses.fields(HeadlineStatistics))
+    """Yield the specs of the numbers that a verdict on a map rests on, in the order of `HeadlineStatistics`."""
+    for field in dataclasses.fields(HeadlineStatistics):
+        yield spec_of(sums, field.name, scope=scope_of(sums, wanted, field.name))
 
 
 def _answer(spec: EstimateSpec, grid: Influences) -> Interval:
@@ -221,13 +227,15 @@ def _answer(spec: EstimateSpec, grid: Influences) -> Interval:
 
 
 def grid_of(sums: ClusterSums, key: str, k: int | None = None) -> Influences | None:
-    """The influences on a number; None where it is not defined, or all is in one cube."""
-    number, columns = functional(key, k), sums_for(sums, key, k)
-    if not columns.size:
-        return None
-    rows = parts_of(sums, number)[0]
-    halves = rows.of(("twice_agreeing", "twice")) * (0.5 if key == "psa" else 1.0) if number.pairs else None
-    return influences(rows.index, columns, number.of, halves)
+    """Return the influences on a number; None where it is not defined, or all is in one cube."""
+    number, total = functional(key, k), None
+    for part, weight in parts_of(sums, number):
+        halves = part.of(("twice_agreeing", "twice")) * (0.5 if key == "psa" else 1.0) if number.pairs else None
+        own = influences(part.index, columns_of(part, key, k), number.of, halves)
+        if own is None:
+            return None
+        total = own.times(weight) if total is None else total.plus(own.times(weight))
+    return total
 
 
 def probability_above(interval: Interval, threshold: float, scale: Scale) -> float:
@@ -235,7 +243,7 @@ def probability_above(interval: Interval, threshold: float, scale: Scale) -> flo
     from scipy import special
 
     low, high = interval.low, interval.high
-    if scale == "agreement":  # by the end that no bound cuts off, on the scale of log(1 - x)
+    if scale == "agreement" and interval.value < 1 - TINY:  # by the end that no bound cuts off, on log(1 - x)
         value, error = -math.log(max(1 - interval.value, TINY)), -math.log(max(1 - interval.value, TINY))
         error -= -math.log(max(1 - low, TINY))
         above = -math.log(max(1 - threshold, TINY))

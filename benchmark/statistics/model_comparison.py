@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from semstab.core.types import Float64, Int64
+from semstab.core.types import Float64, Int64, Mask
 from semstab.errors import ConfigError
 from semstab.metrics.agreement import require_same_grid, shared_rows
 from semstab.model.contrast import BackboneComparison, MapCoverage, Paired, Rank, Ranking, Standardised
@@ -18,9 +18,11 @@ from semstab.model.results import RECURRENT
 from semstab.model.statistics import UNDEFINED, Estimate
 from semstab.model.voxels import VoxelTable
 from semstab.statistics.accumulate import CubeSums
-from semstab.statistics.agreement import ALPHA, ALPHA_BETWEEN, PSA, alpha_columns, alpha_of, between_of, ratio_of
-from semstab.statistics.cluster_sums import Statistic
+from semstab.statistics.agreement import ALPHA, PSA, VOXEL_ALPHA, alpha_columns, alpha_of, ratio_of
+from semstab.statistics.cluster_sums import CELLS, ClusterSums, Statistic, columns_of, distinct_rows
 from semstab.statistics.correctness import ACCURACY, join_truth
+from semstab.statistics.drift import streams
+from semstab.statistics.intervals import estimate, scope_of
 from semstab.statistics.observations import CellObservations
 from semstab.statistics.paired_differences import (
     EDGES,
@@ -80,7 +82,7 @@ def coverage_of(names: Sequence[str], parts: Sequence[Int64]) -> tuple[MapCovera
 
 def compared(*, truth: bool) -> tuple[Quantity, ...]:
     """All that is compared, in the order of the tables; what needs ground truth only where there is some."""
-    quantities = (ALPHA_BETWEEN, PSA, ALPHA, *measures(), ACCURACY)
+    quantities = (ALPHA, PSA, *measures(), VOXEL_ALPHA, ACCURACY)
     return tuple(quantity for quantity in quantities if truth or quantity.needs != "truth")
 
 
@@ -99,47 +101,70 @@ def paired(
     truth: VoxelTable | None = None,
     *,
     logs: Mapping[str, Events] | None = None,
-    whole: Tables | None = None,
-    primary: Quantity = ALPHA_BETWEEN,
+    cells: Mapping[str, ClusterSums] | None = None,
     seed: int = 0,
 ) -> Paired:
-    """Compare backbones voxel by voxel where all of them observed at least twice.
+    """Compare backbones by alpha of common observations, and voxel by voxel where all of them observed at least twice.
 
-    truth is the map of the ground truth labels; without it there is no accuracy. Only the primary measure is tested,
-    alpha or alpha between frames, for this scene flown again where the logs of the tables are given, else for these
-    frames; the other differences describe. Ranks come from resamples of the cubes of space, the same ones for every
-    measure. `whole` are the same tables before observations were reduced to a class, where they were: alpha between
-    frames is that of these.
+    Only alpha is tested, for this scene flown again; the other differences describe. Ranks come from resamples of the
+    cubes of space, the same ones for every measure.
+
+    Args:
+        tables: The maps.
+        truth: The map of the ground truth labels; without it there is no accuracy.
+        logs: The logs of the tables: with them other numbers are for this scene flown again, else for these frames.
+        cells: Sums of each backbone's common observations; without them there is no alpha.
+        seed: Of the resamples.
     """
     rows = repeated_rows(tables)
-    columns, statistics = _columns(tables, rows, truth, whole or tables)
-    common = OnCommonLocations.of(tables, rows, truth, logs or {}, reduced=whole is not None and primary == ALPHA)
+    columns, statistics = _columns(tables, rows, truth)
+    common = OnCommonLocations.of(tables, rows, truth, logs or {})
+    of_cells = cells or {}
     values: dict[str, dict[str, Estimate]] = {}
+    if of_cells:
+        values[ALPHA.key] = {name: estimate(sums, ALPHA.key, scope=scope_of(sums)).ends for name, sums in of_cells.items()}
     for measure, statistic in statistics.items():
         own = columns[measure]
         values[measure.key] = {
             name: UNDEFINED if common is None else common.value(measure, name, own[name], statistic) for name in tables
         }
-    count = 0 if common is None else common.cubes.count
-    drawn = np.zeros((1, 0))
-    if count:
-        drawn = np.random.default_rng(seed).multinomial(count, np.full(count, 1 / count), size=REPLICATES).astype(float)
-    rankings = []
+    rankings = [_ranking(ALPHA, _alpha_of_cells, _by_cube(of_cells), seed)] if of_cells else []
     for measure, statistic in statistics.items():
         sums = {name: np.zeros((0, own.shape[1])) if common is None else common.cubes.sums(own)
                 for name, own in columns[measure].items()}  # fmt: skip
-        rankings.append(_ranking(measure, statistic, sums, drawn))
-    paired_rows = differences(primary, columns, statistics, common)
-    return Paired(primary.key, len(rows[0]), count, values, paired_rows, tuple(rankings))
+        rankings.append(_ranking(measure, statistic, sums, seed))
+    paired_rows = differences(columns, statistics, common, of_cells)
+    blocks = 0 if common is None else common.cubes.count
+    return Paired(ALPHA.key, len(rows[0]), blocks, values, paired_rows, tuple(rankings))
+
+
+def _by_cube(cells: Mapping[str, ClusterSums]) -> dict[str, Float64]:
+    """Sums (G, 2 C) over the cubes that hold cells of any model, of fine cells and of coarse ones side by side."""
+    parts = {name: [own for own in (sums.fine, sums.coarse) if own is not None] for name, sums in cells.items()}
+    cubes, row = distinct_rows(np.concatenate([own.cell for each in parts.values() for own in each]))
+    ends, result = iter(np.split(row, np.cumsum([len(own.cell) for each in parts.values() for own in each]))), {}
+    for name, each in parts.items():
+        sums = []
+        for own in each:
+            columns = columns_of(own, ALPHA.key)
+            sums.append(np.zeros((len(cubes), columns.shape[1])))
+            np.add.at(sums[-1], next(ends), columns)
+        result[name] = np.hstack(sums)
+    return result
+
+
+def _alpha_of_cells(sums: Float64) -> Float64:
+    """Alpha (...,) from sums (..., 2 C) of fine cells and of coarse ones."""
+    parts = zip(CELLS, np.split(sums, 2, axis=-1), strict=True)
+    return np.sum([weight * alpha_of(own) for (_, weight), own in parts], axis=0)
 
 
 def _columns(
-    tables: Tables, rows: Sequence[Int64], truth: VoxelTable | None, whole: Tables
+    tables: Tables, rows: Sequence[Int64], truth: VoxelTable | None
 ) -> tuple[dict[Quantity, dict[str, Float64]], dict[Quantity, Statistic]]:
-    """By measure: each backbone's columns on the common voxels, and what makes the measure of their sums."""
-    quantities = compared(truth=truth is not None)
-    alphas: dict[Quantity, Statistic] = {ALPHA: alpha_of, ALPHA_BETWEEN: between_of}
-    statistics = {quantity: alphas.get(quantity, ratio_of) for quantity in quantities}
+    """By measure of voxels: each backbone's columns on the common ones, and what makes the measure of their sums."""
+    quantities = [quantity for quantity in compared(truth=truth is not None) if quantity is not ALPHA]
+    statistics = {quantity: alpha_of if quantity is VOXEL_ALPHA else ratio_of for quantity in quantities}
     columns: dict[Quantity, dict[str, Float64]] = {measure: {} for measure in statistics}
     for measure, values in voxelwise().items():
         own = [values(table)[r] for table, r in zip(tables.values(), rows, strict=True)]
@@ -149,7 +174,7 @@ def _columns(
             for name, value in zip(tables, own, strict=True)
         }
     for (name, table), r in zip(tables.items(), rows, strict=True):
-        columns[ALPHA][name], columns[ALPHA_BETWEEN][name] = alpha_columns(table)[r], alpha_columns(whole[name])[r]
+        columns[VOXEL_ALPHA][name] = alpha_columns(table)[r]
         if truth is not None:
             true = join_truth(table, truth)
             right = np.stack([true.known & (dominant(table) == true.label), true.known], axis=1)
@@ -157,8 +182,11 @@ def _columns(
     return columns, statistics
 
 
-def _ranking(measure: Quantity, statistic: Statistic, sums: Mapping[str, Float64], drawn: Float64) -> Ranking:
-    """From the sums (G, C) of each backbone over cubes, and how often each cube is in each resample (R, G)."""
+def _ranking(measure: Quantity, statistic: Statistic, sums: Mapping[str, Float64], seed: int) -> Ranking:
+    """From the sums (G, C) of each backbone over cubes, by resamples of these."""
+    count, drawn = len(next(iter(sums.values()))), np.zeros((1, 0))
+    if count:
+        drawn = np.random.default_rng(seed).multinomial(count, np.full(count, 1 / count), size=REPLICATES).astype(float)
     values = {name: float(statistic(own.sum(axis=0))) for name, own in sums.items()}
     resampled = np.stack([measure.sign * statistic(drawn @ own) for own in sums.values()])
     ranks = 1 + (resampled[None] < resampled[:, None]).sum(axis=1)
@@ -181,11 +209,12 @@ REPLICATES = 2000
 
 @dataclass(frozen=True, eq=False)
 class Region:
-    """Several backbones' maps of a scene, or what each has in one place, their logs, and the ground truth there."""
+    """Several backbones' maps of a scene, or a part of it, their logs, and the ground truth; share: of all voxels."""
 
     tables: Tables
     events: Mapping[str, Events] | None = None
     truth: VoxelTable | None = None
+    share: float = 1.0
 
 
 Regions = Callable[[], Iterable[Region]]
@@ -197,7 +226,7 @@ def compare_backbones(
     events: Mapping[str, Events] | None = None,
     truth: VoxelTable | None = None,
     *,
-    looks: Mapping[str, CellObservations] | None = None,
+    observations: Mapping[str, CellObservations] | None = None,
     scene: str = "",
     seed: int = 0,
 ) -> BackboneComparison:
@@ -205,26 +234,30 @@ def compare_backbones(
 
     coverage      what each map holds
     standardised  means at a common distribution of OP, each map with all its voxels; none of labels beside scores
-    paired        values, differences and rankings on the voxels that all saw twice or more; where there are samples of
-                  looks (`Sampler`), on the looks that all made, with the same weights
-    looks         what these are, and what the order owes to what was left out; None without samples
+    paired        values, differences and rankings: alpha of the observations that all made, with the same weights, where
+                  there are samples of them (`Sampler`); other measures on the voxels that all saw twice or more
+    observations  what these are, and what the order owes to what was left out; None without samples
     Raises ConfigError for fewer than two maps, DataError where they differ in K or voxel size.
     """
     if len(tables) < 2:
         raise ConfigError(f"there are {len(tables)} backbones to compare; give two or more")
     whole = Region(tables, events, truth)
-    return compare_regions(lambda: [whole], looks=looks, scene=scene, seed=seed)
+    return compare_regions(lambda: [whole], observations=observations, scene=scene, seed=seed)
 
 
 def compare_regions(
-    regions: Regions, *, looks: Mapping[str, CellObservations] | None = None, scene: str = "", seed: int = 0
+    regions: Regions,
+    *,
+    observations: Mapping[str, CellObservations] | None = None,
+    mixed: bool = False,
+    scene: str = "",
+    seed: int = 0,
 ) -> BackboneComparison:
-    """What `compare_backbones` says of maps that are seen region by region; whole ones without samples of looks."""
+    """Compare maps region by region, see `compare_backbones`; mixed: some are of labels and some of scores."""
     first = next(iter(regions()))
     names = tuple(first.tables)
     require_same_grid(*first.tables.values())
-    shared = None if looks is None else compared_observations({name: looks[name] for name in names})
-    mixed = shared is not None and shared.found.decided
+    shared = None if observations is None else compared_observations({name: observations[name] for name in names})
     held_there, counts, strata = [], list[Int64](), dict[str, list[CubeSums]]()
     for region in regions():
         held_there.append(held(region.tables))
@@ -244,36 +277,54 @@ def compare_regions(
         coverage=coverage_of(names, held_there),
         standardised=Standardised(EDGES, tuple(weights.tolist()), thin_share(observed, weights), everywhere),
         paired=_paired(regions, shared, seed),
-        observations=None if shared is None else shared.found,
+        observations=None if shared is None else shared.compared,
     )
 
 
 def _paired(regions: Regions, shared: SharedObservations | None, seed: int) -> Paired:
-    """On common looks where there are some, else on the common voxels with all looks of each map."""
-    if shared is None:
-        parts = list(regions())
-        tables = {name: VoxelTable.joined([own.tables[name] for own in parts]) for name in parts[0].tables}
-        truths = [own.truth for own in parts if own.truth is not None]
-        truth = VoxelTable.joined(truths) if truths else None
-        logs = _joined_logs(parts)
-        return paired(tables, truth, logs=logs, seed=seed)
-    tables = {name: log.table() for name, log in shared.logs.items()}
-    return paired(
-        tables,
-        truth_at(regions, next(iter(tables.values()))),
-        logs=shared.logs,
-        whole={name: log.table() for name, log in shared.whole.items()},
-        primary=shared.primary,
-        seed=seed,
-    )
+    """On common observations, and on the common voxels with all observations of each map; of very many a sample."""
+    common = common_voxels(regions)
+    cells = None if shared is None else shared.sums
+    return paired(common.tables, common.truth, logs=common.events, cells=cells, seed=seed)
 
 
-def _joined_logs(parts: Sequence[Region]) -> dict[str, Events] | None:
+MOST = 1 << 22
+"""Voxels that are in memory at a time: of more common ones a sample is compared."""
+
+
+def share_of(voxels: int) -> float:
+    """Return the largest power of 1/2 that leaves at most MOST of so many voxels."""
+    return 1.0 if voxels <= MOST else 2.0 ** -math.ceil(math.log2(voxels / MOST))
+
+
+def in_share(table: VoxelTable, share: float) -> Mask:
+    """Return (n,) which voxels are in the sample that is so large a part of all, by a hash of their index."""
+    if share >= 1:
+        return np.ones(len(table), np.bool_)
+    drawn: Mask = streams(table, slice(None), 0) >> np.uint64(11) < np.uint64(share * 2**53)
+    return drawn
+
+
+def common_voxels(regions: Regions) -> Region:
+    """Return the voxels that every map saw twice or more, with their logs and the ground truth; of very many a sample."""
+    count = sum(len(repeated_rows(region.tables)[0]) for region in regions())
+    share, parts = share_of(count), list[Region]()
+    for region in regions():
+        tables, logs, rows = {}, {}, repeated_rows(region.tables)
+        drawn = in_share(next(iter(region.tables.values())).rows(rows[0]), share)
+        for (name, table), own in zip(region.tables.items(), rows, strict=True):
+            tables[name] = table.rows(own[drawn])
+            if region.events is not None:
+                logs[name] = region.events[name].rows(own[drawn])
+        first, truth = next(iter(tables.values())), region.truth
+        true = None if truth is None else truth.rows(shared_rows(truth, first)[0])
+        parts.append(Region(tables, logs or None, true))
+    tables = {name: VoxelTable.joined([own.tables[name] for own in parts]) for name in parts[0].tables}
     logs = [own.events for own in parts if own.events is not None]
-    return {name: Events.joined([own[name] for own in logs]) for name in logs[0]} if logs else None
-
-
-def truth_at(regions: Regions, locations: VoxelTable) -> VoxelTable | None:
-    """The ground truth's voxels that these are of; None without any."""
-    result = [own.truth.rows(shared_rows(own.truth, locations)[0]) for own in regions() if own.truth is not None]
-    return VoxelTable.joined(result) if result else None
+    truths = [own.truth for own in parts if own.truth is not None]
+    return Region(
+        tables,
+        {name: Events.joined([own[name] for own in logs]) for name in tables} if logs else None,
+        VoxelTable.joined(truths) if truths else None,
+        share,
+    )

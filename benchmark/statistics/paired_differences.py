@@ -18,21 +18,20 @@ from semstab.errors import ConfigError, DataError
 from semstab.metrics.agreement import observations, require_same_grid, rows_of
 from semstab.model.contrast import BackboneComparison, ComparedObservations, Ignored, PairedDifference
 from semstab.model.events import Events
-from semstab.model.evidence import Evidence
 from semstab.model.information import by_group
 from semstab.model.measures import ENTROPY, Quantity, mean, measures
 from semstab.model.statistics import UNDEFINED, UNKNOWN, Estimate, Interval
 from semstab.model.voxels import VoxelTable
-from semstab.statistics.accumulate import Cubes, CubeSums, cluster_sums_of
-from semstab.statistics.agreement import ALPHA, ALPHA_BETWEEN, PSA, alpha_between, psa, ratio_of
-from semstab.statistics.cluster_sums import ClusterSums, Statistic
+from semstab.statistics.accumulate import Cubes, CubeSums, cluster_sums_of, sums_of_cells
+from semstab.statistics.agreement import ALPHA, PSA, VOXEL_ALPHA, psa, ratio_of
+from semstab.statistics.cluster_sums import ClusterSums, Statistic, value
 from semstab.statistics.correctness import ACCURACY, join_truth
 from semstab.statistics.intervals import difference, estimate, scope_of
 from semstab.statistics.observations import CellObservations, Views
 
 Rows = Int64
 
-SUMMED = (ALPHA_BETWEEN, PSA, ALPHA, ENTROPY, ACCURACY)
+SUMMED = (VOXEL_ALPHA, PSA, ENTROPY, ACCURACY)
 """What the sums tell; of VSS they have that of places seen three times, of SBD nothing."""
 
 
@@ -49,18 +48,9 @@ class OnCommonLocations:
 
     @classmethod
     def of(
-        cls,
-        tables: Mapping[str, VoxelTable],
-        rows: Sequence[Rows],
-        truth: VoxelTable | None,
-        logs: Mapping[str, Events],
-        *,
-        reduced: bool,
+        cls, tables: Tables, rows: Sequence[Rows], truth: VoxelTable | None, logs: Mapping[str, Events]
     ) -> OnCommonLocations | None:
-        """Of these rows of each table; None where there are none.
-
-        Where observations were `reduced` to a class, alpha between frames is not that of the sums.
-        """
+        """Return these rows of each table; None where there are none."""
         if not len(rows[0]):
             return None
         first = next(iter(tables.values()))
@@ -73,47 +63,40 @@ class OnCommonLocations:
             some = rows_of(table, where)
             label = None if truth is None else join_truth(some, truth).label
             sums[name] = cluster_sums_of(some, log, label, edge=cubes.edge)
-        unknown = ({ACCURACY} if truth is None else set()) | ({ALPHA_BETWEEN} if reduced else set())
-        return cls(sums, cubes, frozenset(SUMMED) - unknown)
+        return cls(sums, cubes, frozenset(SUMMED) - ({ACCURACY} if truth is None else set()))
 
     def value(self, measure: Quantity, name: str, columns: Float64, statistic: Statistic) -> Estimate:
         """Of one backbone; columns (n, C) are those that the statistic is of."""
         if measure in self.known:
             sums = self.sums[name]
-            return estimate(sums, measure.key, scope=scope_of(sums)).ends
-        bounds = (-1.0, 1.0) if measure in (ALPHA, ALPHA_BETWEEN) else (0.0, 1.0)
-        return self.cubes.estimate(columns, statistic, bounds, "agreement" if bounds[0] else None).ends
+            return estimate(sums, measure.key, scope=scope_of(sums, key=measure.key)).ends
+        return self.cubes.estimate(columns, statistic).ends
 
     def difference(self, measure: Quantity, a: str, b: str, columns: Mapping[str, Float64], of: Statistic) -> Interval:
         """Of backbone a less backbone b."""
         if measure in self.known:
-            return difference(self.sums[a], self.sums[b], measure.key, scope=scope_of(self.sums[a]))
+            scope = scope_of(self.sums[a], key=measure.key)
+            return difference(self.sums[a], self.sums[b], measure.key, scope=scope)
         C = columns[a].shape[1]
         both = np.concatenate([columns[a], columns[b]], axis=1)
         return self.cubes.estimate(both, lambda sums: of(sums[..., :C]) - of(sums[..., C:]), (-2.0, 2.0), "plain")
 
-    def tested(self, primary: Quantity, a: str, b: str) -> Interval:
-        """The difference of the primary measure, for this scene flown again."""
-        return difference(self.sums[a], self.sums[b], primary.key)
-
 
 def differences(
-    primary: Quantity,
     columns: Mapping[Quantity, Mapping[str, Float64]],
     statistics: Mapping[Quantity, Statistic],
     common: OnCommonLocations | None,
+    cells: Mapping[str, ClusterSums],
 ) -> tuple[PairedDifference, ...]:
-    """Of each measure and pair of backbones; only the primary measure is tested."""
-    result = []
+    """Return the differences of each measure and pair of backbones; only alpha is tested, from the sums of cells."""
+    result = [
+        _row(ALPHA, a, b, difference(cells[a], cells[b], ALPHA.key), tested=True)
+        for a, b in itertools.combinations(cells, 2)
+    ]
     for measure, own in columns.items():
         for a, b in itertools.combinations(own, 2):
-            if common is None:
-                interval = UNKNOWN
-            elif measure == primary:
-                interval = common.tested(primary, a, b)
-            else:
-                interval = common.difference(measure, a, b, own, statistics[measure])
-            result.append(_row(measure, a, b, interval, tested=measure == primary))
+            interval = UNKNOWN if common is None else common.difference(measure, a, b, own, statistics[measure])
+            result.append(_row(measure, a, b, interval, tested=False))
     return _claimed(result)
 
 
@@ -247,83 +230,79 @@ def _stratum(table: VoxelTable, edges: Sequence[int]) -> Int64:
     return np.where(table.op >= 2, np.searchsorted(edges, table.op) + 1, 0)
 
 
-# Several maps on the very looks that all of them made, and what their order owes to the looks that some left out.
+# Several models on the very observations that all of them made, and what their order owes to those that some left out.
 
 
 @dataclass(frozen=True, eq=False)
 class CommonObservations:
-    """Maps of one scene, observed alike.
+    """Models of one scene, observed alike.
 
-    logs      of each map: the looks at cells that all made, each with as many pixels as the map with fewest has there
-    ignoring  of each map: the looks that any made, with one class more, the last, for what the map did not label
-    missing   share of the pixels of these that the map did not label
+    shared    of each: the observations of cells that all made, with as many pixels as the model with fewest has there
+    ignoring  of each: the observations that any made, with one class more, the last, for what the model did not label
+    missing   share of the pixels of these that the model did not label
     """
 
-    logs: tuple[Events, ...]
-    ignoring: tuple[Events, ...]
+    shared: tuple[CellObservations, ...]
+    ignoring: tuple[CellObservations, ...]
     missing: tuple[float, ...]
 
 
-def common_observations(maps: Sequence[CellObservations]) -> CommonObservations:
-    """What samples of the same frames have in common. Raises DataError where they differ in K or voxel size."""
-    if len({(sample.K, sample.voxel_size) for sample in maps}) > 1:
-        raise DataError("samples of other classes or voxel sizes cannot be compared; fuse both alike")
-    maps = _of_the_same_voxels([sample.labelled() for sample in maps])
-    look, first = _numbered(maps)
-    pixels = np.stack([np.bincount(own, sample.weight, len(first)) for own, sample in zip(look, maps, strict=True)])
+def common_observations(models: Sequence[CellObservations]) -> CommonObservations:
+    """Return what samples of the same frames have in common.
+
+    Raises:
+        DataError: If they differ in K or in the size of cells.
+    """
+    if len({(sample.K, sample.cell_size) for sample in models}) > 1:
+        raise DataError("samples of other classes or cell sizes cannot be compared; fuse both with the same pixels")
+    models = _of_the_same_blocks([sample.labelled() for sample in models])
+    of, first = _numbered(models)
+    pixels = np.stack([np.bincount(own, sample.weight, len(first)) for own, sample in zip(of, models, strict=True)])
     least, most = pixels.min(axis=0), pixels.max(axis=0)
-    locations = CellObservations.joined(maps).only(first)
-    logs, ignoring = [], []
-    for sample, own, seen in zip(maps, look, pixels, strict=True):
-        shared = dataclasses.replace(sample, weight=sample.weight * (least / np.where(seen > 0, seen, 1.0))[own])
-        logs.append(shared.only(least[own] > 0).observations())
-        ignoring.append(_filled(sample, locations, most - seen).observations())
+    locations = CellObservations.joined(models).only(first)
+    shared, ignoring = [], []
+    for sample, own, seen in zip(models, of, pixels, strict=True):
+        weight = sample.weight * (least / np.where(seen > 0, seen, 1.0))[own]
+        shared.append(dataclasses.replace(sample, weight=weight).only(least[own] > 0))
+        ignoring.append(_filled(sample, locations, most - seen))
     total = most.sum()
     missing = tuple(float(1 - seen.sum() / total) if total else math.nan for seen in pixels)
-    return CommonObservations(tuple(logs), tuple(ignoring), missing)
+    return CommonObservations(tuple(shared), tuple(ignoring), missing)
 
 
-def _of_the_same_voxels(maps: Sequence[CellObservations]) -> list[CellObservations]:
-    """The voxels that are in all samples by their hash, with the frames of all numbered alike."""
-    share = min(sample.share for sample in maps)
-    views = Views.joined([sample.views for sample in maps])
+def _of_the_same_blocks(models: Sequence[CellObservations]) -> list[CellObservations]:
+    """The blocks that are in all samples by their hash, with the views of all numbered alike."""
+    share = min(sample.share for sample in models)
+    views = Views.joined([sample.views for sample in models])
     views = views.take(np.sort(np.unique(views.frame, return_index=True)[1]))
     same = []
-    for sample in maps:
+    for sample in models:
         left = sample.only(sample.drawn < share)
         rank = views.rank(sample.views.frame)
         same.append(dataclasses.replace(left, view=rank[left.view].astype(np.int32), views=views, share=share))
     return same
 
 
-def _numbered(maps: Sequence[CellObservations]) -> tuple[list[Int64], Int64]:
-    """The number of each entry's look, the same in all maps, and one entry of each look among those of all maps."""
-    F = max((len(sample.views) for sample in maps), default=1)
-    all_of_them = CellObservations.joined(maps)
+def _numbered(models: Sequence[CellObservations]) -> tuple[list[Int64], Int64]:
+    """The number of each entry's observation, the same in all models, and one entry of each among those of all."""
+    F = max((len(sample.views) for sample in models), default=1)
+    all_of_them = CellObservations.joined(models)
     _, cell = np.unique(all_of_them.key, return_inverse=True)
-    _, first, look = np.unique(cell * F + all_of_them.view, return_index=True, return_inverse=True)
-    return np.split(look, np.cumsum([len(sample) for sample in maps])[:-1]), first
+    _, first, of = np.unique(cell * F + all_of_them.view, return_index=True, return_inverse=True)
+    return np.split(of, np.cumsum([len(sample) for sample in models])[:-1]), first
 
 
-def _filled(looks: CellObservations, locations: CellObservations, ignored: Float64) -> CellObservations:
-    """A map's entries, and those of a further class that has the pixels `ignored` of each of the places."""
-    further = dataclasses.replace(locations, label=np.full(len(locations), looks.K, np.uint16), weight=ignored).only(
-        ignored > 0
-    )
-    return dataclasses.replace(CellObservations.joined([looks, further]), K=looks.K + 1, classes=())
-
-
-def decided(log: Events) -> Events:
-    """Each look reduced to its largest class, the lowest on ties: what labels and scores have in common."""
-    label = log.evidence.rowwise(lambda s: s.round(9).argmax(axis=1))  # sums in another order are equal still
-    one_hot = Evidence(np.arange(len(log) + 1), label.astype(np.uint16), np.ones(len(log)), log.K)
-    return dataclasses.replace(log, evidence=one_hot)
+def _filled(sample: CellObservations, locations: CellObservations, ignored: Float64) -> CellObservations:
+    """A model's entries, and those of a further class that has the pixels `ignored` of each of the locations."""
+    label = np.full(len(locations), sample.K, np.uint16)
+    further = dataclasses.replace(locations, label=label, weight=ignored).only(ignored > 0)
+    return dataclasses.replace(CellObservations.joined([sample, further]), K=sample.K + 1, classes=())
 
 
 def psa_bounds(log: Events) -> tuple[float, float]:
-    """The least and the largest that the mean PSA can be, whatever the looks at the last class would have said.
+    """Return the least and the largest that the mean PSA can be, whatever observations of the last class would have said.
 
-    Manski (1990, American Economic Review 80): pairs of looks of which one is missing agree never, or always.
+    Manski (1990, American Economic Review 80): pairs of observations of which one is missing agree never, or always.
     """
     starts = log.starts
     T = np.diff(np.append(starts, len(log))).astype(np.float64)
@@ -344,51 +323,37 @@ def psa_bounds(log: Events) -> tuple[float, float]:
     return float(low.mean()), float(high.mean())
 
 
-# What the order of backbones owes to the looks that some of them left out.
-
-
 @dataclass(frozen=True, eq=False)
 class SharedObservations:
-    """The logs of backbones on common looks, the same before any was reduced, what is compared first, what is said."""
+    """Sums of each model's common observations, their logs by fine cells, and what was compared."""
 
+    sums: Mapping[str, ClusterSums]
     logs: Mapping[str, Events]
-    whole: Mapping[str, Events]
-    primary: Quantity
-    found: ComparedObservations
+    compared: ComparedObservations
 
 
-def compared_observations(looks: Mapping[str, CellObservations]) -> SharedObservations:
-    """The looks that all backbones made; where labels are compared with scores, each as its largest class.
-
-    Two frames that both give a class 0.6 agree by 0.52 in expectation, and entirely by alpha between frames; labels
-    know no such looks. So that neither gains, both are compared by what they decide.
-    """
-    names = list(looks)
-    both = common_observations([looks[name] for name in names])
-    mixed = len({own.soft for own in looks.values()}) > 1
-    reduce = decided if mixed else (lambda log: log)
-    logs = dict(zip(names, map(reduce, both.logs), strict=True))
-    ignoring = dict(zip(names, map(reduce, both.ignoring), strict=True))
-    value = {name: alpha_between(log.table()) for name, log in logs.items()}
+def compared_observations(samples: Mapping[str, CellObservations]) -> SharedObservations:
+    """Return the observations that all models made, and what their order owes to those that some left out."""
+    names = list(samples)
+    both = common_observations([samples[name] for name in names])
+    shared, ignoring = (dict(zip(names, each, strict=True)) for each in (both.shared, both.ignoring))
+    logs = {name: own.observations() for name, own in shared.items()}
+    sums: dict[str, ClusterSums] = {}
+    for name, own in shared.items():
+        sums[name] = sums_of_cells(own, None if not sums else next(iter(sums.values())).edge)
     ignored = tuple(
-        Ignored(name, missing, *psa_bounds(ignoring[name]), alpha_between(ignoring[name].table()))
-        for name, missing in zip(names, both.missing, strict=True)
+        Ignored(name, missing, *psa_bounds(own.observations()), value(sums_of_cells(own), ALPHA.key))
+        for (name, own), missing in zip(ignoring.items(), both.missing, strict=True)
     )
-    order = tuple(sorted(names, key=lambda name: -value[name]))
     first = next(iter(logs.values()))
     bounds = {row.backbone: (row.psa_low, row.psa_high) for row in ignored}
     by_psa = sorted(names, key=lambda name: -mean(psa(logs[name].table())))
-    return SharedObservations(
-        logs,
-        dict(zip(names, both.logs, strict=True)),
-        ALPHA if mixed else ALPHA_BETWEEN,
-        ComparedObservations(
-            voxels=len(first.ix),
-            observations=len(first),
-            decided=mixed,
-            ignored=ignored,
-            order=order,
-            order_ignored=tuple(row.backbone for row in sorted(ignored, key=lambda row: -row.alpha)),
-            bounded=all(bounds[better][0] >= bounds[worse][1] for better, worse in itertools.pairwise(by_psa)),
-        ),
+    compared = ComparedObservations(
+        cells=len(first.ix),
+        observations=len(first),
+        ignored=ignored,
+        order=tuple(sorted(names, key=lambda name: -value(sums[name], ALPHA.key))),
+        order_ignored=tuple(row.backbone for row in sorted(ignored, key=lambda row: -row.alpha)),
+        bounded=all(bounds[better][0] >= bounds[worse][1] for better, worse in itertools.pairwise(by_psa)),
     )
+    return SharedObservations(sums, logs, compared)

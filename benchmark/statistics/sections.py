@@ -15,7 +15,7 @@ from semstab.model.measures import sbd, vss
 from semstab.model.statistics import Flipping, Interval
 from semstab.model.voxels import VoxelTable
 from semstab.statistics.accumulate import Cubes, CubeSums, Mean
-from semstab.statistics.agreement import alpha_of, between_of, decompose, disagreement, kappa_of, psa
+from semstab.statistics.agreement import alpha_of, decompose, disagreement, kappa_of, psa
 from semstab.statistics.drift import (
     TESTABLE,
     OrderTest,
@@ -61,9 +61,7 @@ MEANS: Mapping[str, Mean] = {
     **{name: Mean(name) for name in ("entropy", "entropy_within", "entropy_between")},
     "excess": Mean("excess", bounds=SIGNED),
     "kappa": Mean("kappa", kappa_of, SIGNED, "agreement"),
-    "alpha": Mean("alpha", alpha_of, SIGNED, "agreement"),
-    "alpha_between": Mean("alpha", between_of, SIGNED, "agreement"),
-    "voxel_weighted": Mean("voxel_weighted", between_of, SIGNED, "agreement"),
+    "voxel_alpha": Mean("voxel_alpha", alpha_of, SIGNED, "agreement"),
 }
 """Over the voxels with OP >= 2, of values where they are defined, and agreement beyond chance."""
 
@@ -96,21 +94,17 @@ def place_sums(table: VoxelTable, columns: Columns, cubes: Cubes) -> CubeSums:
             "observations": T,
             "agreeing": T * agreement,
             "own": table.self_sum,
-            "own of an observation": table.self_sum / T,
             **{name: T * columns[f"disagreement_{name}"] for name in ("within", "between")},
         }
     )
-    observations, agreeing, own, own_of_one = (
-        sums.pop(name)[:, :1] for name in ("observations", "agreeing", "own", "own of an observation")
-    )
+    observations, agreeing, own = (sums.pop(name)[:, :1] for name in ("observations", "agreeing", "own"))
     weight = table.evidence.weight
     each = np.repeat(T, np.diff(table.evidence.starts))
     by_observation, by_voxel = cubes.sums_by_class(table.evidence, weight, weight / each)
     further = {
         **{name: [sums[name][:, :1], observations] for name in ("within", "between")},
-        "kappa": [sums["psa"], by_voxel],  # as of `kappa_columns`, and of `alpha_columns` twice
-        "alpha": [agreeing, observations, own, by_observation],
-        "voxel_weighted": [sums["psa"], own_of_one, by_voxel],
+        "kappa": [sums["psa"], by_voxel],  # as of `kappa_columns`, and of `alpha_columns`
+        "voxel_alpha": [agreeing, observations, own, by_observation],
     }
     return CubeSums(cubes.cell, cubes.edge, sums | {name: np.hstack(parts) for name, parts in further.items()})
 

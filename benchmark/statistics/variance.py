@@ -13,6 +13,7 @@ the American Statistical Association 72).
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 import math
 from collections.abc import Sequence
@@ -167,29 +168,29 @@ class Influences:
         """Return what so many locations without a single error may have missed."""
         return self.one_off * float(1 - ((1 - level) / 2) ** (1 / len(self.places)))
 
+    def times(self, factor: float) -> Influences:
+        """Return the influences on a multiple of the number."""
+        scaled = {name: factor * getattr(self, name) for name in ("block", "cell")}
+        return dataclasses.replace(self, **scaled, one_off=abs(factor) * self.one_off)
+
     def minus(self, other: Influences) -> Influences:
         """Return the influences on the difference of two numbers."""
+        return self.plus(other.times(-1.0))
+
+    def plus(self, other: Influences) -> Influences:
+        """Return the influences on the sum of two numbers."""
         locations, rows = np.unique(np.concatenate([self.places, other.places]), axis=0, return_inverse=True)
         frames, columns = np.unique(np.concatenate([self.frames, other.frames]), return_inverse=True)
         block, everything = np.zeros(len(locations)), np.zeros(len(locations))
         cell, size = np.zeros((len(locations), len(frames))), np.zeros((len(locations), len(frames)))
         row, column = np.split(rows.ravel(), [len(self.places)]), np.split(columns, [len(self.frames)])
-        for grid, sign, at, to in zip((self, other), (1.0, -1.0), row, column, strict=True):
-            block[at] += sign * grid.block
+        for grid, at, to in zip((self, other), row, column, strict=True):
+            block[at] += grid.block
             everything[at] += grid.all
-            cell[np.ix_(at, to)] += sign * grid.cell
+            cell[np.ix_(at, to)] += grid.cell
             size[np.ix_(at, to)] += grid.size
-        return Influences(
-            locations,
-            frames,
-            block,
-            cell,
-            size,
-            everything,
-            self.edge,
-            self.per_group,
-            max(self.one_off, other.one_off),
-        )
+        one_off = max(self.one_off, other.one_off)
+        return Influences(locations, frames, block, cell, size, everything, self.edge, self.per_group, one_off)
 
 
 def influences(

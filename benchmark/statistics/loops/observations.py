@@ -37,8 +37,8 @@ def hash_row(at_x, at_y, at_z, hashed):
 
 
 @serial
-def draw(depth, valid, labels, ray_x, ray_y, T, size, share, origin, reach, cell, drawn, label, pixel):
-    """The pixels that show a sampled voxel: key of the cell, hash, label and number; returns how many they are."""
+def draw(depth, valid, labels, ray_x, ray_y, T, size, share, origin, reach, cell, drawn, label):
+    """The pixels that show a sampled block: key of the cell, hash and label; returns how many they are."""
     n = held = 0
     H, W = depth.shape
     at, hashed, last = np.empty((3, W), np.int32), np.empty(W, np.uint32), np.uint32(share - 1)
@@ -54,7 +54,7 @@ def draw(depth, valid, labels, ray_x, ray_y, T, size, share, origin, reach, cell
         for u in found[:end]:
             d = np.float64(depth[v, u])
             x[held], y[held], z[held] = ray_x[u] * d, ray_y[v] * d, d
-            drawn[n], label[n], pixel[n] = hashed[u], labels[v, u], v * W + u
+            drawn[n], label[n] = hashed[u], labels[v, u]
             n += valid[v, u]
             held += valid[v, u]
         if held >= HELD or v == H - 1:
@@ -106,12 +106,11 @@ def digit(part):
 
 
 @serial
-def grouped(cell, label, drawn, of, pixels):
-    """The number (n,) of each pixel's cell and label in order of appearance, and how many pixels each of these has.
+def grouped(cell, label, drawn, pixels):
+    """Move each pair of a cell and a label to the front, once, in order of appearance, and count its pixels (n,).
 
-    Cells, labels and hashes move to the front, once each; returns how many they are. Those of one voxel lie side by
-    side in the table, as they do in the image. Nobody can foretell whether a pixel's cell is a new one, so that there
-    is no branch for it. The numbers are left out where `of` is empty.
+    Return how many pairs there are. Those of one block lie side by side in the table, as they do in the image. Nobody
+    can foretell whether a pixel's cell is a new one, so that there is no branch for it.
     """
     bits = 7
     while len(cell) > 1 << bits:
@@ -132,134 +131,43 @@ def grouped(cell, label, drawn, of, pixels):
         table[slot] = number
         n += new
         pixels[number] += 1.0
-        if len(of):
-            of[i] = number
     return n
 
 
-@serial
-def add_rows(rows, of, sums):
-    """Add rows (n, K) to those of the sums (m, K) that they are of."""
-    for i in range(len(rows)):
-        for k in range(rows.shape[1]):
-            sums[of[i], k] += rows[i, k]
-
-
-# Compiled passes over entries in order of voxel and frame: what cells show, and what each look at a voxel says.
+# The compiled pass over entries in order of cell and view.
 
 
 @serial
-def same_cells(key, view, label, weight, cells, K, least, kept, of, classes, shift):
-    """Whether `least` frames or more saw each entry's cell, and how far agreement is off for want of the same cells.
+def observe(number, view, label, weight, K, first, of, pixels, starts, classes, shares):
+    """Write each observation: its cell, its pixels, and the share of each class among them, classes ascending.
 
-    Two frames that saw other cells of a voxel may disagree because it holds several things, whatever the labels are
-    worth. Within a frame two pixels lie in the same cell with a probability q0, in two frames with q. From pairs of
-    frames comes D, how far apart they are about a class, and so its means over pixels of the same cell and of others:
-    (q0 - q) (D_same - D_other) is what is to be added to D for frames that see what they see of themselves.
-    Entries are in order of voxel and frame; kept (n,) says which count. `of` numbers voxels that have one, and with
-    classes and shift (n,) takes a row for each voxel and class; returns how many rows there are.
-    """
-    seen, last, which = np.zeros(cells, np.int64), np.full(cells, -1), (1 << DIGITS) - 1
-    w, W, W2 = np.zeros((3, cells))
-    s, S, S2, same = np.zeros((4, K))
-    x, X, X2, XW = np.zeros((4, cells, K))
-    m = start = 0
-    number = -1
-    while start < len(key):
-        end, voxel = start, key[start] >> DIGITS
-        while end < len(key) and key[end] >> DIGITS == voxel:
-            c = key[end] & which
-            seen[c] += last[c] != view[end]
-            last[c] = view[end]
-            end += 1
-        T, first = 0, start
-        while first < end:
-            after, total = first, 0.0
-            while after < end and view[after] == view[first]:
-                kept[after] = seen[key[after] & which] >= least
-                total += weight[after] * kept[after]
-                after += 1
-            T += total > 0.0
-            for i in range(first, after):
-                if kept[i]:
-                    c, k, part = key[i] & which, label[i], weight[i] / total
-                    x[c, k] += part
-                    w[c] += part
-                    s[k] += part
-            for i in range(first, after):
-                if kept[i]:
-                    c, k = key[i] & which, label[i]
-                    X[c, k] += x[c, k]
-                    X2[c, k] += x[c, k] ** 2
-                    XW[c, k] += x[c, k] * w[c]
-                    S[k] += x[c, k]
-                    x[c, k] = 0.0
-                    S2[k] += s[k] ** 2
-                    s[k] = 0.0
-            for i in range(first, after):
-                if kept[i]:
-                    c = key[i] & which
-                    W[c] += w[c]
-                    W2[c] += w[c] ** 2
-                    w[c] = 0.0
-            first = after
-        number += T > 0
-        pairs, within, among = T * (T - 1.0), 0.0, 0.0
-        for i in range(start, end):
-            c, k = key[i] & which, label[i]
-            same[k] += 2.0 * (X[c, k] * W[c] - XW[c, k] - X[c, k] ** 2 + X2[c, k])
-            X[c, k] = X2[c, k] = XW[c, k] = 0.0
-        for i in range(start, end):
-            c = key[i] & which
-            within += W2[c]
-            among += W[c] ** 2 - W2[c]
-            W[c] = W2[c] = 0.0
-            seen[c], last[c] = 0, -1
-        some = among > 1e-9 and pairs - among > 1e-9
-        for i in range(start, end):
-            k = label[i]
-            if some and S[k] > 0.0:
-                apart = 2.0 * (S[k] * (T - 1.0) - S[k] ** 2 + S2[k])
-                of[m], classes[m] = number, k
-                shift[m] = (within / T - among / pairs) * (same[k] / among - (apart - same[k]) / (pairs - among))
-                m += 1
-            S[k] = S2[k] = same[k] = 0.0
-        start = end
-    return m
-
-
-@serial
-def look(key, view, label, weight, kept, K, first, of, pixels, starts, classes, shares):
-    """The looks at voxels: of each its voxel, its pixels, and the share of each class among them, classes ascending.
-
-    Only of what is kept. `first` is an entry of each look, `of` counts voxels that have one; returns how many looks,
-    and how many classes of them together, there are. All arrays are as long as the entries, `starts` longer by one.
+    number, view (m,) are the cell and the view of each entry, in order. `first` is an entry of each observation, `of`
+    counts cells; returns how many observations there are, and how many classes of them together. All arrays are as long
+    as the entries, `starts` is longer by one.
     """
     sums, met = np.zeros(K), np.empty(K, np.int64)
     n = m = start = 0
-    voxels = -1
+    cells = -1
     before = np.int64(-1)
     starts[0] = 0
-    while start < len(key):
-        end, many, total, voxel = start, 0, 0.0, key[start] >> DIGITS
-        while end < len(key) and key[end] >> DIGITS == voxel and view[end] == view[start]:
-            if kept[end]:
-                if sums[label[end]] == 0.0:
-                    met[many] = label[end]
-                    many += 1
-                sums[label[end]] += weight[end]
-                total += weight[end]
+    while start < len(number):
+        end, many, total, cell = start, 0, 0.0, number[start]
+        while end < len(number) and number[end] == cell and view[end] == view[start]:
+            if sums[label[end]] == 0.0:
+                met[many] = label[end]
+                many += 1
+            sums[label[end]] += weight[end]
+            total += weight[end]
             end += 1
-        if many:
-            voxels += voxel != before
-            before = voxel
-            first[n], of[n], pixels[n] = start, voxels, total
-            if many > 1:
-                met[:many].sort()
-            for own in met[:many]:
-                classes[m], shares[m], sums[own] = own, sums[own] / total, 0.0
-                m += 1
-            n += 1
-            starts[n] = m
+        cells += cell != before
+        before = cell
+        first[n], of[n], pixels[n] = start, cells, total
+        if many > 1:
+            met[:many].sort()
+        for own in met[:many]:
+            classes[m], shares[m], sums[own] = own, sums[own] / total, 0.0
+            m += 1
+        n += 1
+        starts[n] = m
         start = end
     return n, m

@@ -1,113 +1,30 @@
-"""Agreement beside its ceiling: what it would be had frames seen the same cells of each voxel.
+"""Geometry or semantics: what agreement would be left if the labels did not depend on the view at all.
 
-Voxels hold more than one thing, and frames see other parts of them: that sets a ceiling to agreement, which falls as
-voxels grow. Two frames share a cell of a voxel less often than two pixels of a frame do. What that costs follows from
-the pairs of frames that did see the same cell, so that errors of the labels lower neither the share nor the ceiling.
+View-independent labels are fused under the same poses, depth and noise. What is lost there is geometry's: pixels that
+fall into the wrong voxel, voxels that hold more than one thing. The rest of the loss is the model's.
 """
 
 from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator
 
 import numpy as np
 import numpy.typing as npt
 
 from semstab.backends import FusionBackend
 from semstab.backends.shared.association import back_project, voxel_index
-from semstab.core.types import THIS_SCENE, Float64, Int64, Scope
+from semstab.core.types import Int64
 from semstab.errors import DataError
 from semstab.metrics import dominant
 from semstab.metrics.agreement import shared_rows, voxel_keys
 from semstab.model.frames import Frame
 from semstab.model.labels import IGNORE_8BIT, IGNORE_16BIT
-from semstab.model.statistics import CeilingShare, ClassCeilingShare, Interval, Losses
+from semstab.model.statistics import Losses
 from semstab.model.voxels import VoxelTable
-from semstab.statistics.accumulate import Cubes, CubeSums, cluster_sums_of
+from semstab.statistics.accumulate import Cubes, CubeSums
 from semstab.statistics.agreement import psa, ratio_of
-from semstab.statistics.cluster_sums import ClusterSums, value
-from semstab.statistics.intervals import EstimateSpec, confidence_intervals, probability_above, scope_of, spec_of
-from semstab.statistics.observations import ObservationSample
-from semstab.statistics.verdict import LIMITS, Limits
-
-
-def ceiling_share(
-    sample: ObservationSample,
-    table: VoxelTable,
-    sums: ClusterSums | None = None,
-    *,
-    critical: Sequence[str] = (),
-    limits: Limits = LIMITS,
-) -> CeilingShare:
-    """Alpha between frames in the sampled voxels beside what it would be of the same cells, of all classes and of each.
-
-    table     the whole map: how many places a class has
-    sums      of the map with that sample, where they are there already
-    critical  names of the classes that matter; where none is given, those with enough
-    """
-    sums = cluster_sums_of(table, sample=sample) if sums is None else sums
-    locations = locations_by_class(table)
-    result = confidence_intervals(ceiling_specs(sums, table.K))
-    return ceiling_share_from(locations, sums, result, critical=critical, limits=limits)
-
-
-def locations_by_class(table: VoxelTable) -> Float64:
-    """Return (K,) voxels with OP >= 2 by their dominant class."""
-    return np.bincount(dominant(table)[table.op >= 2], minlength=table.K).astype(np.float64)
-
-
-def ceiling_specs(sums: ClusterSums, K: int, wanted: Scope = THIS_SCENE) -> Iterator[EstimateSpec]:
-    """For `answers`: alpha in the sample, its ceiling, and what share of it is reached, by K classes together and by
-    each."""
-    assert sums.seen is not None
-    scope = scope_of(sums, wanted)
-    yield spec_of(sums.seen, "alpha_between", scope=scope)
-    yield spec_of(sums, "ceiling", scope=scope)
-    for k in (None, *range(K)):
-        yield spec_of(sums, "reached", k, scope)
-
-
-def ceiling_share_from(
-    locations: Float64,
-    sums: ClusterSums,
-    result: Sequence[Interval],
-    *,
-    critical: Sequence[str] = (),
-    limits: Limits = LIMITS,
-) -> CeilingShare:
-    """The same from the sums of a map with a sample; places (K,) of each class.
-
-    result  the answers to `ceiling_specs`
-    """
-    assert sums.seen is not None
-    names = sums.classes or tuple(str(k) for k in range(len(locations)))
-    named = set(critical) & set(names)
-    alpha, ceiling, reached, *of_classes = result
-    return CeilingShare(
-        voxels=round(float(sums.seen["voxels"].sum())),
-        alpha=alpha,
-        ceiling=ceiling,
-        share=reached,
-        classes=tuple(
-            ClassCeilingShare(
-                name,
-                float(locations[k]),
-                name in named if named else bool(locations[k] >= limits.class_locations),
-                value(sums.seen, "alpha_between", k),
-                value(sums, "ceiling", k),
-                of_classes[k],
-                1 - probability_above(of_classes[k], limits.usable, "agreement"),
-            )
-            for k, name in enumerate(names)
-        ),
-    )
-
-
-# Geometry or semantics: what agreement would be left if the labels did not depend on the view at all.
-#
-# View-independent labels are fused under the same poses, depth and noise. What is lost there is geometry's: pixels that
-# fall into the wrong voxel, voxels that hold more than one thing. The rest of the loss is the model's.
 
 
 def ceiling(
