@@ -44,7 +44,11 @@ def compare(
 
 # The commands gate and calibrate: quality gates, and thresholds from which labels may be acted on.
 
-FAILED = 4
+REMEDY = {
+    "undecided": "take more frames (--plan says how many), or accept undecided rules with --undecided pass",
+    "fails": "mend the model, or keep it regardless with --save-baseline alone, without rules",
+}
+"""What to do, by the outcome, so that a baseline is saved."""
 
 
 def gate(
@@ -58,7 +62,7 @@ def gate(
     level: Annotated[float | None, typer.Option(
         help="How often a rule may err on each side.", show_default="0.05")] = None,
     undecided: Annotated[str | None, typer.Option(
-        metavar="pass|fail", help="Verdict on rules that stay open.", show_default="pass")] = None,
+        metavar="report|pass|fail", help="Undecided rules: exit code 5, or 0, or 4.", show_default="report")] = None,
     scope: ScopeOption = None,
     out: Annotated[list[Path] | None, typer.Option(
         "--out", "-o", metavar="FILE", help=".xml (JUnit), .md (pull request), .json; repeatable.")] = None,
@@ -67,7 +71,7 @@ def gate(
     plan: Annotated[bool, typer.Option("--plan", metavar="", help="Say how many frames each rule needs.")] = False,
     quiet: Quiet = False,
 ) -> None:  # fmt: skip
-    """Fail where a new model is shown to be worse: exit code 4 where a rule fails."""
+    """Fail where a new model is shown to be worse: exit code 4 where a rule fails, 5 where one is undecided."""
     from rich.console import Console
 
     from semstab.comparison import gate_report
@@ -81,8 +85,15 @@ def gate(
         for file in out or ():
             gate_report.write(result, file)
         print_lines(gate_report.plan(result) if plan else gate_report.lines(result, Console().width), quiet=quiet)
-        if result.failed and not plan:
-            raise typer.Exit(FAILED)
+        if save_baseline is not None and not result.passed:
+            say(
+                f"{save_baseline}: no baseline is saved, as the gate {gate_report.OUTCOMES[result.outcome]};"
+                f" {REMEDY[result.outcome]}"
+            )
+        if not (result.passed or plan):
+            raise typer.Exit(result.exit_code)
+        if not result.passed:
+            return
     if save_baseline is not None:
         save_summary(open_run(new), save_baseline)
         print_lines([f"{save_baseline}: a baseline of {save_baseline.stat().st_size:,} bytes"], quiet=quiet)
