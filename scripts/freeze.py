@@ -439,9 +439,7 @@ class Comparison:
         """All that the commands of a case left."""
         ours, theirs = listing(old), listing(new)
         codes = [(folder / "exit_codes").read_text() for folder in (old, new)]
-        if (
-            len({re.sub("[45]", "0", own) for own in codes}) > 1
-        ):  # which gates fail, or are open, follows from intervals
+        if len({re.sub("[45]", "0", own) for own in codes}) > 1:  # outcomes of gates follow from intervals
             self.differ("exit codes", *codes)
         names = {where: name for where in ours if (name := renamed_file(where)) is not None}
         self.new["files"] += len(theirs.keys() - set(names.values()))
