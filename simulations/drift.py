@@ -2,14 +2,14 @@
 
     python simulations/drift.py [--trials 40]
 
-A camera goes once around a floor of 24 x 24 voxels of four classes, in 30 frames, each of which sees eight in ten of the
-voxels, by pixels as many at the end as at the beginning, or growing from 1 to 20. A model errs by one of these kinds,
-about a quarter of the time, and in one pixel of twenty anyhow; it does not change but for the last kind. Prints a table
-in Markdown: the mean trend, and the shares of the flights whose interval lies above zero, and below.
+A camera goes once around a floor of 24 x 24 voxels of four classes, in 30 frames, each of which sees eight in ten of
+the voxels, by about 6 pixels at all times, or by more and more, 1 to 20. A model errs by one of these kinds, about a
+quarter of the time, and in one pixel of twenty anyhow; it changes in the last kind only. Prints a table in Markdown:
+the mean trend, and the shares of the flights whose interval lies above zero, and below.
 
     pixel       each pixel by itself                        block       4 x 4 voxels as one, anew in each frame
     persistent  the same places in all frames               view        each place from its own directions
-    class       half of the blocks, of one class            boundary    labels are shifted by a voxel, anew in each frame
+    class       half of the blocks, of one class            boundary    labels shift by a voxel, anew in each frame
     burst       one frame in eight, by most of its pixels   lasting     a pattern that fades over six frames
     ramp        each pixel by itself, at a rate that grows from 15 to 35 %: drift
 """
@@ -101,9 +101,10 @@ def main() -> None:
         for growing in (False, True):
             rng = np.random.default_rng([KINDS.index(kind), growing])
             found = [trend_of(flight(kind, growing, rng)) for _ in range(trials)]
+            pixels = "growing" if growing else "alike"
             mean = 100 * np.mean([own.value for own in found])
             above, below = np.mean([(own.low > 0, own.high < 0) for own in found], axis=0)
-            print(f"| {kind} | {'growing' if growing else 'alike'} | {mean:.1f} | {above:.3f} | {below:.3f} |", flush=True)
+            print(f"| {kind} | {pixels} | {mean:.1f} | {above:.3f} | {below:.3f} |", flush=True)
 
 
 if __name__ == "__main__":

@@ -45,7 +45,7 @@ class Trends:
     Odd and even observations have a slope over time each. Their product is 0 in the mean for errors that are
     independent between frames, however much each frame errs.
 
-    common     the product of both slopes, summed over classes, as variation: that of observations on a straight line
+    common     the product of both slopes, summed over classes, as variation: that of observations on such lines
     variation  of the odd and of the even observations about their own means: sums of ||s_t - mean||^2
     """
 
@@ -54,7 +54,7 @@ class Trends:
 
     @property
     def share(self) -> Float64:
-        """What part (n,) of the variation goes one way in time: 1 on a line, -1 to 1; of one voxel it is noisy."""
+        """What part (n,) of the variation goes one way in time, -1 to 1; of one voxel it is noisy."""
         return self.common / self.variation
 
 
