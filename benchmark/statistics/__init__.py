@@ -19,7 +19,7 @@ from semstab.statistics.ceiling import ceiling, ceiling_share, losses, rendered
 from semstab.statistics.correctness import correctness, join_truth, quadrants, reliability, stable_wrong
 from semstab.statistics.correlogram import correlogram
 from semstab.statistics.description import Analysis, analyse, describe
-from semstab.statistics.drift import benjamini_hochberg, expected_sbd, flips, voxel_drift
+from semstab.statistics.drift import expected_sbd, flips, trends
 from semstab.statistics.model_comparison import compare_backbones, coverage, paired
 from semstab.statistics.observations import CellObservations, ObservationSample, Views
 from semstab.statistics.paired_differences import claimed_together, standardised
@@ -39,7 +39,6 @@ __all__ = [
     "Views",
     "alpha_between",
     "analyse",
-    "benjamini_hochberg",
     "ceiling",
     "ceiling_share",
     "claimed_together",
@@ -64,6 +63,6 @@ __all__ = [
     "rendered",
     "stable_wrong",
     "standardised",
+    "trends",
     "verdict",
-    "voxel_drift",
 ]
