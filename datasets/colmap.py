@@ -123,7 +123,8 @@ def has_model(folder: Path) -> bool:
 def read_model(folder: Path) -> tuple[Path, list[ModelImage]]:
     """Return the file of the images, and the images in the natural order of their names; binary goes before text.
 
-    Raises DataError for a damaged file, an image without its camera, or a camera that distorts.
+    Raises:
+        DataError: For a damaged file, an image without its camera, or a camera that distorts.
     """
     binary = (folder / "cameras.bin").is_file()
     path, cameras_path = (folder / f"{part}{'.bin' if binary else '.txt'}" for part in ("images", "cameras"))
