@@ -1,4 +1,4 @@
-"""What the command line does, from Python: a run or a study, with its tables, figures and report."""
+"""The command line from Python: a run or a study, with its tables, figures and report."""
 
 from __future__ import annotations
 

@@ -38,24 +38,26 @@ from semstab.task import Task, read, truth_task
 # The class of the map at each pixel of a frame, where its voxel meets the criteria.
 
 UNSEEN, UNSTABLE = -1, -2
-"""Instead of a class: no depth or no voxel there; a voxel that fails the criteria."""
+"""Marks instead of a class: no depth or no voxel there; a voxel that fails the criteria."""
 
 DECIMALS = 9
-"""Of evidence without a frame's own vote: a rounding error decides no tie."""
+"""Decimals of evidence without a frame's own vote: a rounding error decides no tie."""
 
 
 @dataclass(frozen=True)
 class Belief:
     """The criteria that a voxel must meet.
 
-    min_op         seen by so many frames
-    min_psa        their pairs of frames agree so often; a voxel seen once has no pair
-    categories     of these categories, of any where none is named
-    leave_one_out  without the frame's own vote, and seen by another frame. Drift stays that of all votes: it depends
-                   on their order
-    thresholds     whose label has the evidence that these thresholds ask for
+    Attributes:
+        min_op: Seen by so many frames.
+        min_psa: Their pairs of frames agree so often; a voxel seen once has no pair.
+        categories: Of these categories, of any where none is named.
+        leave_one_out: Without the frame's own vote, and seen by another frame. Drift stays that of all votes: it
+            depends on their order.
+        thresholds: Whose label has the evidence that these thresholds ask for.
 
-    Raises ConfigError for a category that there is not, and values out of range.
+    Raises:
+        ConfigError: For a category that there is not, and values out of range.
     """
 
     min_op: int = 1
@@ -72,7 +74,7 @@ class Belief:
                 raise ConfigError(f"no category '{name}'; {nearest(name, CATEGORIES)}")
 
     def of(self, table: VoxelTable) -> Mask:
-        """(n,) whether each voxel meets them."""
+        """Return (n,) whether each voxel meets them."""
         believed = table.op >= max(self.min_op, 1)
         if self.min_psa > 0:
             believed &= np.nan_to_num(psa(table), nan=-1.0) >= self.min_psa
@@ -90,7 +92,7 @@ class Belief:
 
 
 class FusedLabels:
-    """Looks up the classes of a map that a frame sees; the latest tiles stay in memory."""
+    """The classes of a map that a frame sees, looked up; the latest tiles stay in memory."""
 
     def __init__(self, tiles: Tiles[VoxelTable], belief: Belief, num_classes: int) -> None:
         self._tiles, self._belief, self._K = tiles, belief, num_classes
@@ -99,7 +101,7 @@ class FusedLabels:
         )
 
     def of(self, frame: Frame, pixel_stride: int = 1) -> Int64:
-        """(H, W) rows 0..K-1 of the map's classes, UNSEEN or UNSTABLE, whatever the frame's own labels are.
+        """Return (H, W) rows 0..K-1 of the map's classes, UNSEEN or UNSTABLE, whatever the frame's own labels are.
 
         The frame is one of those that were fused, with every pixel_stride-th pixel of each axis.
         """
@@ -171,10 +173,11 @@ class Accuracy:
 
 @dataclass(frozen=True)
 class Correctness:
-    """Against ground truth: the labels before; of the pixels that have a label before and after, both; all after.
+    """Labels against ground truth: before; of the pixels that have a label before and after, both; all after.
 
-    all_before, all_after  of all pixels with such a label
-    before, after          of the same pixels, those that kept a label or took another
+    Attributes:
+        all_before, all_after: Of all pixels with such a label.
+        before, after: Of the same pixels, those that kept a label or took another.
     """
 
     all_before: Accuracy
@@ -187,9 +190,10 @@ class Correctness:
 class Relabelled:
     """Numbers of pixels of a relabelled source, whose maps are in `folder`.
 
-    confirmed  have the class that they had      changed   have another one
-    filled     had none                          unseen    had one, and have no depth or no voxel
-    unstable   had one, and their voxel fails the criteria
+    Attributes:
+        confirmed: Have the class that they had      changed   have another one.
+        filled: Had none                          unseen    had one, and have no depth or no voxel.
+        unstable: Had one, and their voxel fails the criteria.
     """
 
     scene: str
@@ -286,12 +290,14 @@ def relabel(
 ) -> Relabelled:
     """Write the fused class of every pixel of every frame of a unit to OUT/labels/NAME.
 
-    scene, backbone, backend  which unit; may be left out where there is one, and for the base backend
-    name  of the new source, BACKBONE-fused where not given; its classes are in its folder
-    belief  the criteria of a voxel; other pixels are ignored, as are those without depth
+    Args:
+        scene, backbone, backend: Which unit; may be left out where there is one, and for the base backend.
+        name: Of the new source, BACKBONE-fused where not given; its classes are in its folder.
+        belief: The criteria of a voxel; other pixels are ignored, as are those without depth.
 
-    Raises ConfigError, and DataError where the data is no longer what was fused, or its label maps cannot have the
-    depth's pixels.
+    Raises:
+        ConfigError, DataError: If the data is no longer what was fused, or its label maps cannot have the depth's
+            pixels.
     """
     result = load_result(run)
     record = result.record(scene=scene, backbone=backbone, backend=backend)
@@ -338,7 +344,8 @@ def relabel(
 def task_of(run: Path, record: Record, fused: Mapping[str, str]) -> tuple[Task, int]:
     """Return the unit as it was fused, from inputs of these digests, and its pixel stride.
 
-    Raises DataError where its data has changed since.
+    Raises:
+        DataError: If its data has changed since.
     """
     plan = make_plan(load_config(run / SETTINGS))
     scene, backbone = record.unit.scene, record.unit.backbone
