@@ -197,7 +197,8 @@ def class_sums(classes: torch.Tensor, masks: torch.Tensor, size: tuple[int, int]
 
     Args:
         classes: (Q, K + 1) logits, 'none' last.
-        masks: (Q, h', w') logits, brought to `size` first where one is given.
+        masks: (Q, h', w') logits.
+        size: (h, w) that the masks are brought to first, None to leave them.
     """
     masks = masks.float() if size is None else bilinear(masks.float(), size)
     return torch.einsum("qk,qhw->khw", classes.float().softmax(dim=-1)[:, :-1], masks.sigmoid())

@@ -54,6 +54,7 @@ def self_self_attention(attention: Any, tokens: torch.Tensor) -> torch.Tensor:
 
     Args:
         attention: A transformers CLIPAttention.
+        tokens: (N, T, D), what its block's first layer norm puts out.
     """
     q, k, v = (
         project(tokens).view(*tokens.shape[:2], attention.num_heads, attention.head_dim).transpose(1, 2)
@@ -254,6 +255,9 @@ def slide(
     """Return mean logits (Q, H, W) of all windows over an image (3, H, W).
 
     Args:
+        pixels: (3, H, W) image, normalised.
+        window: Side of a window, pixels.
+        stride: Pixels from one window to the next.
         logits_of: One window (3, h, w) to its logits (Q, h, w); h and w are `window`, or less where the image is
             smaller.
     """

@@ -319,8 +319,13 @@ class TorchMap(FusionBackend):
         """Fuse one frame of tensors on any device, or arrays; those that are on the map's device are not copied.
 
         Args:
-            depth: (H, W) float metres, intrinsics and T_wc (4, 4) as a `Frame` has them.
-            labels, scores, logits: One of them, as a `TensorPrediction` has them: scores and logits are (K, H, W).
+            depth: (H, W) float metres.
+            intrinsics: Those of the depth image.
+            T_wc: (4, 4) camera-to-world, as a `Frame` has it.
+            index: The index of the frame.
+            labels: (H, W), as a `TensorPrediction` has them; give labels, scores or logits.
+            scores: (K, H, W), as a `TensorPrediction` has them.
+            logits: (K, H, W), as a `TensorPrediction` has them.
 
         Raises:
             DataError: If the frame cannot be fused, with the map unchanged.

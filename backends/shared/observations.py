@@ -132,7 +132,8 @@ class Change:
         """Return the change of the n touched voxels, from their evidence.
 
         Args:
-            before, after: (n, K) evidence before and after the frame; all 0 before the first.
+            before: (n, K) evidence before the frame; all 0 before the first.
+            after: (n, K) evidence after the frame.
             op: (n,) observations including this one.
             pixels: (n,) of the frame.
         """
@@ -166,8 +167,10 @@ class MapTotal:
         """Account for a frame that went into the map just now, and report it.
 
         Args:
-            started, associated: `time.perf_counter()` when its fusion began, and when its pixels had become
-                observations.
+            frame: Its index.
+            change: Its effect on the map.
+            started: `time.perf_counter()` when its fusion began.
+            associated: The same when its pixels had become observations; NaN where that is not told apart.
         """
         finished = time.perf_counter()
         self.voxels += change.new

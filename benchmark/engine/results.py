@@ -95,6 +95,9 @@ def _agreements(config: Config, records: Sequence[Record], tables: Tables, *, mu
     """Yield how far backends agree on each scene and backbone that both fused.
 
     Args:
+        config: The settings of the run.
+        records: Its records, those of the first backend first.
+        tables: Their voxel tables.
         must: For each pair of those that must agree; else for the first backend and each other one, where one of the
             two need not agree.
     """

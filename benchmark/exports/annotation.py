@@ -79,7 +79,8 @@ def annotation_tasks(chosen: Chosen, task: Task, most: int) -> list[AnnotationTa
 
     Args:
         chosen: The voxels that may be annotated.
-        task: Whose frames were fused.
+        task: The task whose frames were fused.
+        most: The largest number of tasks.
 
     Raises:
         ConfigError: If frames disagree nowhere, or no frame shows it large enough.
@@ -243,7 +244,8 @@ def outlined(seen: Mask, voxel: float, smallest: float) -> tuple[tuple[Float64, 
     """Return polygons around pixels (H, W), gaps up to the width of a voxel filled, and what they enclose.
 
     Args:
-        voxel: Its width, pixels.
+        seen: (H, W) pixels to outline.
+        voxel: Width of a voxel, pixels.
         smallest: Area of an outline, square pixels.
     """
     width = int(np.clip(np.ceil(voxel), 3, 31)) | 1

@@ -154,6 +154,7 @@ def _covered_by_turned(plane: Float64, axes: Float64, edge: float) -> tuple[Int6
     Args:
         plane: (n, 2) centres.
         axes: (2, 2) from the scene's level axes to the raster's.
+        edge: Edge of a cell and of a voxel, in the unit of `plane`.
     """
     own, to_scene, rows = np.floor(plane / edge).astype(np.int64), np.linalg.inv(axes).T, np.arange(len(plane))
     cells, of = [own], [rows]
@@ -327,6 +328,8 @@ def _sides(index: Int64, label: Int64, adjacent: Int64) -> tuple[Int64, Int64, I
     """Return corners (v, 3) with their class (v,), and the sides (m, 4) between them, that are not between two voxels.
 
     Args:
+        index: (n, 3) voxels.
+        label: (n,) their classes.
         adjacent: (b, 3) voxels that hide sides, and have none here.
     """
     low = index.min(axis=0) - 1

@@ -191,9 +191,11 @@ class Relabelled:
     """Numbers of pixels of a relabelled source, whose maps are in `folder`.
 
     Attributes:
-        confirmed: Have the class that they had      changed   have another one.
-        filled: Had none                          unseen    had one, and have no depth or no voxel.
-        unstable: Had one, and their voxel fails the criteria.
+        confirmed: Pixels that have the class that they had.
+        changed: Pixels that have another class.
+        filled: Pixels that had none.
+        unseen: Pixels that had one, and have no depth or no voxel.
+        unstable: Pixels that had one, and whose voxel fails the criteria.
     """
 
     scene: str
@@ -291,9 +293,18 @@ def relabel(
     """Write the fused class of every pixel of every frame of a unit to OUT/labels/NAME.
 
     Args:
-        scene, backbone, backend: Which unit; may be left out where there is one, and for the base backend.
-        name: Of the new source, BACKBONE-fused where not given; its classes are in its folder.
+        run: Folder of the run.
+        out: Folder that gets labels/NAME.
         belief: The criteria of a voxel; other pixels are ignored, as are those without depth.
+        scene: Scene of the unit; may be left out where there is one.
+        backbone: Backbone of the unit; may be left out where there is one.
+        backend: Backend of the unit, the base backend where not given.
+        name: Name of the new source, BACKBONE-fused where not given; its classes are in its folder.
+        overwrite: Whether other predictions in the folder are replaced.
+        progress: Called with what is done, how much of it is done, and how much there is.
+
+    Returns:
+        The folder that was written, and how many pixels were confirmed, changed and filled.
 
     Raises:
         ConfigError, DataError: If the data is no longer what was fused, or its label maps cannot have the depth's

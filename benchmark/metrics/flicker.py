@@ -254,8 +254,10 @@ def matched_region_flicker(
     (`semstab.pixels.warp.warp`) and count where that is defined.
 
     Args:
-        previous, current: (H, W) region ids, 0 for a pixel without a region.
+        previous: (H, W) region ids of the previous frame, 0 for a pixel without a region.
+        current: (H, W) region ids of the current frame.
         valid: (H, W) pixels that count; all where not given.
+        iou_threshold: IoU that a pair must exceed.
 
     Raises:
         DataError: If the maps differ in size.

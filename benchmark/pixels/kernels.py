@@ -47,7 +47,8 @@ def look_up(depth: Any, rays: Any, motion: Any, other_depth: Any, camera: Any, t
         depth: (H, W) of the view, metres; 0, negative, NaN and inf are invalid.
         rays: (u - cx) / fx of each column, then (v - cy) / fy of each row.
         motion: Three rows of four numbers, from the view's camera axes to the other's.
-        other_depth: (H', W') of the other view, whose intrinsics are camera = (fx, fy, cx, cy).
+        other_depth: (H', W') of the other view.
+        camera: (fx, fy, cx, cy), the intrinsics of the other view.
         tolerance: Of the occlusion test, relative to the distance from the other camera.
         out: (H, W) int32, is filled.
     """

@@ -242,13 +242,23 @@ def run(
     quiet: bool,
     top_k: int | None = None,
 ) -> list[SequenceReport]:
-    """Predict what is selected. Raises ConfigError, DataError, MissingDependencyError; what was finished stays.
+    """Predict what is selected, and return a report a sequence.
 
     Args:
         predictor: Settings of `PredictorConfig` without options.
-        options: Of the backbone.
+        options: Options of the backbone.
+        images: Folder or files of images, None where they are those of scenes.
+        dataset: Resolved settings of the dataset, where the images are those of scenes.
+        scenes: Names of the scenes; all where None.
+        frames: Settings of `FrameSelection`.
+        out: Folder of the predictions; the scene's own where None.
+        batch: Images that the backbone is given together.
+        overwrite: Whether other predictions in the folder are replaced.
+        quiet: Whether nothing is printed.
         top_k: How many scores a pixel keeps; None for all.
-        dataset: Resolved, where the images are those of scenes.
+
+    Raises:
+        ConfigError, DataError, MissingDependencyError: If something cannot be predicted; what was finished stays.
     """
     if top_k is not None and not predictor.get("scores"):
         raise ConfigError("--top-k says how many scores a pixel keeps; add --scores, or leave it out")

@@ -100,6 +100,8 @@ def components(index: Int64 | None, size: float, classes: LabelSpace, voxels: Vo
     Args:
         index: (n, 3) relative to the map's origin: small, so that the viewer's float32 keeps it exact; None where only
             colours and values changed.
+        size: Edge of a voxel, metres.
+        classes: The label space, with its colours.
         voxels: Measured, so that each is computed in one pass.
     """
     where: dict[str, Any] = {}
@@ -214,6 +216,8 @@ class VoxelLogger:
         """Log the final map in place of the growing one; return how it was thinned, where it is too large.
 
         Args:
+            stream: The recording.
+            table: The final map.
             factor: Edge of the blocks of a table that is thinned already.
         """
         index = table.index - self._origin

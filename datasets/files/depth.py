@@ -158,6 +158,9 @@ def stored_depth(
     """Return depth (H, W) of a frame's file in metres along the optical axis; values that mean 'no depth' become 0.
 
     Args:
+        frame: The frame whose depth is read.
+        options: The settings of the dataset's files.
+        read: Reads the content of a file.
         camera: Gives the intrinsics of the depth image of a shape.
     """
     scale = options.depth_scale or frame.depth_scale

@@ -112,6 +112,9 @@ class FileDataset(Dataset, Generic[Options]):
         """Return the depth images of a folder by name, as `files_named` finds them.
 
         Args:
+            folder: The folder of the depth images.
+            before: What stands before the name of the frame in that of the file.
+            after: What stands after it.
             instead: Names of frames, by their poses or images, which a surface gives depth where no depth image is
                 there.
         """
@@ -188,7 +191,15 @@ def frames_of(
     """Yield a frame for each depth image, with its colour if any; `pose` and `color` are templates with {name}.
 
     Args:
+        folder: The folder of the scene.
+        depth: Depth images by the names of their frames.
+        camera: Intrinsics of the depth images.
+        pose: File of a pose, a template with {name}, or of all poses.
+        color: File of a colour image, a template with {name}.
         poses: (n, 4, 4) in the same order, where `pose` is the file of them all.
+        label_camera: Intrinsics of the label maps, where they are others.
+        depth_scale: Stored units in a metre, where the files say it.
+        what: Name of the depth images in messages.
 
     Raises:
         DataError: If that file has another number of poses than there are depth images, or what goes with each.
