@@ -85,8 +85,8 @@ class Streamed:
     """A prediction whose scores come class by class, so that they never are in memory at once.
 
     Attributes:
-        labels: As of a `Prediction`.
-        maps: Gives the scores (H, W) float32 of each class in order, anew at each call.
+        labels: Those of a `Prediction`.
+        maps: A function that gives the scores (H, W) float32 of each class in order, anew at each call.
     """
 
     labels: Labels
@@ -99,7 +99,7 @@ class Backbone(Protocol):
     Attributes:
         label_space: The classes of its labels and scores, or None where it predicts regions without classes.
         gives_scores: Whether `predict` can give scores.
-        fit_frames: How many images `fit` wants, 0 for most.
+        fit_frames: Number of images that `fit` wants, 0 for most.
         sequential: Whether what it says of an image depends on the images before: it then gets the selected frames of a
             sequence in order, all of them, from the first one after `reset`.
         wants_geometry: Whether `predict` is also given `geometry=`, one `Frame` an image: its depth, intrinsics and

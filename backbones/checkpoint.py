@@ -55,7 +55,7 @@ class Checkpoint:
 
     Attributes:
         name: The folder, or the id on the hub.
-        folder: Where the files are.
+        folder: The folder of the files.
         revision: The commit on the hub, or the digest of the files.
     """
 

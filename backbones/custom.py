@@ -40,10 +40,10 @@ class Code:
     """A class or a function in a user's file or package.
 
     Attributes:
-        text: As it was named.
-        name: Of the class or the function.
+        text: The name as it was given.
+        name: Name of the class or the function.
         target: Itself.
-        module: Where it is.
+        module: The module that holds it.
     """
 
     text: str

@@ -33,8 +33,8 @@ class OnnxFile:
     """A network of one image, run by ONNX Runtime on the CPU.
 
     Attributes:
-        shape: That its input must have, None for each free side; empty where nothing is known.
-        dtype: Of its input.
+        shape: Shape that its input must have, None for each free side; empty where nothing is known.
+        dtype: Type of its input.
     """
 
     def __init__(self, path: Path, device: str, threads: int | None) -> None:

@@ -94,7 +94,7 @@ class NumbaHash:
 
     Attributes:
         evidence: 'float64', or 'float32' for half the memory of the evidence.
-        threads: How many to use; all of numba's where not given.
+        threads: Number of threads; all of numba's where not given.
         history: Keep every observation, for `events`; memory then grows with each.
         within: The voxels that the map is restricted to.
     """

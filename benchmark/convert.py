@@ -278,8 +278,8 @@ class Converted:
     """The result of converting one scene.
 
     Attributes:
-        folder: Of the converted scene.
-        frames: How many were selected, of which `written` were new or not complete.
+        folder: Folder of the converted scene.
+        frames: Number of selected frames, of which `written` were new or not complete.
         depth: How its depth is stored, in words.
         renamed: Label sources that have another name in the folder.
         lost: Things of the scene that a posed folder does not hold.

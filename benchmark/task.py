@@ -25,9 +25,9 @@ class Task:
     """A backbone on a scene: which frames, and how its labels become rows of evidence.
 
     Attributes:
-        indices: Of the frames, ascending; a range where they are evenly spaced.
-        top_k: How many scores of each pixel are fused, the largest; all where not given.
-        left_out: How many frames were selected but lack a file or a pose.
+        indices: Indices of the frames, ascending; a range where they are evenly spaced.
+        top_k: Number of the largest scores of a pixel that are fused; all where not given.
+        left_out: Number of selected frames that lack a file or a pose.
     """
 
     scene: Scene

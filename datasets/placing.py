@@ -56,8 +56,8 @@ class Place:
     """The place of a project on Earth.
 
     Attributes:
-        words: How that was found, and how well the cameras fit.
-        mesh_origin: What the coordinates of ODM's *_geo.obj count from in the projection; None: they are the scene's.
+        words: How that was found and how well the cameras fit, in words.
+        mesh_origin: Origin of ODM's *_geo.obj in the projection; None: they are the scene's.
     """
 
     georeference: Georeference

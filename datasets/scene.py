@@ -33,7 +33,7 @@ class Filtering:
     Attributes:
         model: The label source without them; the source itself where that is not there.
         filters: 'ema:0.6+threshold:0.5'; '' where there are none.
-        milliseconds: Of CPU time that they took for a frame so far, in the median.
+        milliseconds: CPU time that they took for a frame so far, in the median.
     """
 
     model: str
@@ -54,14 +54,14 @@ class Scene(ABC):
         further: Label sources that are read by name only, none of 'all'.
         regions: Maps of regions without classes, which `frame` reads by name and nothing fuses.
         up: (3,) unit vector of the world's up axis, or None where it is not known.
-        georeference: Where it lies on Earth, or None where that is not known.
+        georeference: Place on Earth, or None where that is not known.
         placed: How that was found and how well it fits, in words, or None.
-        folder: Where its files lie and label maps of it are looked for, or None where it has none.
-        label_paths: Where label maps are looked for, of the first frame, with BACKBONE for any name.
+        folder: Folder of its files, where label maps are looked for, or None where it has none.
+        label_paths: Paths where the first frame's label maps are looked for, with BACKBONE for any name.
         settings_file: The file that says what no option says, or None where there is no such file.
         labels_like_depth: Whether its label maps have the pixels of the depth, not those of the colour images.
         surface: The file of the surface that depth is cast at, or None where it is not cast.
-        depth_from: Where depth comes from, in words, where that is not a file a frame.
+        depth_from: Source of depth, in words, where that is not a file a frame.
         on_photographs: Whether `image` is a distorted photograph, which `color` shows undistorted.
         skips_incomplete: Whether selected frames that lack a file are left out; else they are an error.
     """
@@ -253,7 +253,7 @@ class Selected:
     """Indices of frames, in order.
 
     Attributes:
-        indices: Those to read.
+        indices: Indices of the frames to read.
         incomplete: Selected ones that were left out because they lack a file.
         lost: Selected ones that were left out because tracking was lost.
     """

@@ -106,7 +106,7 @@ class Change:
     Attributes:
         points: Pixels that it counted.
         voxels: Voxels that it touched.
-        new: Of them, those seen for the first time.
+        new: Those of the voxels that were seen for the first time.
         drift: D_JS(p^(t), p^(t-1)) of the others, bits.
         vss: VSS after the frame, less VSS before it; a new voxel had none.
         entropy: Likewise entropy, bits.

@@ -138,7 +138,7 @@ def _words_of_stretch(
 ):  # fmt: skip
     """Write the words of a stretch of a row; return whether a pixel is out of their reach, or of that of packed keys.
 
-    - `ray_a`, `ray_b`, `ray_c (n,)`, `down (3,)`, `start (3,)`: a pixel's coordinates are depth (ray + down) + start
+    - `ray_a`, `ray_b`, `ray_c` (n,), `down` (3,), `start` (3,): a pixel's coordinates are depth (ray + down) + start
     """
     lost = 0
     if _words_fused(

@@ -41,7 +41,7 @@ class Convention:
     """One way to read a scene's files.
 
     Attributes:
-        pose: What the pose matrices map.
+        pose: The direction in which the pose matrices map.
         axes: The camera's axes in them.
         depth: Planar, along the optical axis, or along the pixel's ray.
         factor: On depth, relative to the configured reading.

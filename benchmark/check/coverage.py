@@ -66,7 +66,7 @@ class Persistence:
     """The distribution of OP at a voxel size, from frames that were fused.
 
     Attributes:
-        shares: Of the voxels by stratum: OP = 1, OP = 2, 3 to 5, more.
+        shares: Shares of the voxels by stratum: OP = 1, OP = 2, 3 to 5, more.
         stays: Share of the points that fall into the same voxel when another frame sees them.
     """
 
@@ -82,7 +82,7 @@ class Noise:
     """Noise of depth, metres: a point seen again is off by `between`, pixels of one frame by `within`; medians.
 
     Attributes:
-        footprint: What a pixel covers at the median depth, metres.
+        footprint: Width that a pixel covers at the median depth, metres.
     """
 
     between: float

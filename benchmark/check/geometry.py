@@ -85,7 +85,7 @@ class Fit:
 
     Attributes:
         error: Median relative depth error of the points that are seen again; NaN where none is.
-        share: Of the sampled points that are seen again, 0 to 1.
+        share: Share of the sampled points that are seen again, 0 to 1.
         points: Their number.
     """
 
@@ -114,10 +114,10 @@ class Verdict:
         state: Sound; unsound; or unclear, where the frames do not tell.
         text: Why, in one line.
         mend: Lines of configuration that would mend it, where they are known.
-        error, share: Of the configured convention, see `Fit`.
-        frames, pairs: How many were looked at.
-        undetermined: What these frames cannot tell, because an alternative fits as well, and the reason where it is
-            known.
+        error, share: Those of the configured convention, see `Fit`.
+        frames, pairs: Numbers of those that were looked at.
+        undetermined: Parts of it that these frames cannot tell, because an alternative fits as well, and the reason
+            where it is known.
         fits: The configured convention and the alternatives of interest, by name.
     """
 

@@ -202,8 +202,8 @@ class ImageMatch:
     """The match of neighbouring images: correlation of grey values, mean over pairs.
 
     Attributes:
-        now: With depth as it is.
-        best: With depth larger by the share `change`, which is `metres` of the median depth.
+        now: The match with depth as it is.
+        best: The match with depth larger by the share `change`, which is `metres` of the median depth.
     """
 
     now: float
@@ -344,9 +344,9 @@ class Sentinel:
     """A value that stands alone at the far end of the depths.
 
     Attributes:
-        value: As it is stored.
-        metres: What it is read as.
-        share: Of the pixels with depth.
+        value: The value as it is stored.
+        metres: The depth that it is read as.
+        share: Share of the pixels with depth.
         next: The largest depth below it, metres.
     """
 

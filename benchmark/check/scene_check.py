@@ -53,7 +53,7 @@ class Histogram:
         classes: Share of them by class, in the taxonomy's order; by id where no taxonomy is known.
         ignored: Share with the ignore id, or without usable scores.
         unknown: Share by id that no class has.
-        problem: What is wrong, or None.
+        problem: The fault, or None.
     """
 
     backbone: str
@@ -293,7 +293,7 @@ class Look:
         points: About how many points are reprojected in all.
         fused: Number of frames, evenly spaced, that are kept for fusing, too.
         passing_over: Leave out frames that cannot be read, instead of raising what reading them raises.
-        with_color: Also look at the size of a colour image: intrinsics may be for that.
+        with_color: Whether to look also at the size of a colour image: intrinsics may be for that.
     """
 
     def __init__(

@@ -52,8 +52,9 @@ def group_bytes(proc: Path, cgroups: Path) -> int | None:
     """Return what the control groups of a process leave to it, page cache included; None where none has a limit.
 
     Args:
-        proc: As /proc/self; lines of its file `cgroup` are such as '4:memory:/user' or, of version 2, '0::/user'.
-        cgroups: As /sys/fs/cgroup: version 2, or version 1 with a folder `memory`.
+        proc: A folder like /proc/self; lines of its file `cgroup` are such as '4:memory:/user' or, of version 2,
+            '0::/user'.
+        cgroups: A folder like /sys/fs/cgroup: version 2, or version 1 with a folder `memory`.
     """
     left, lines = list[int](), list[str]()
     with contextlib.suppress(OSError):

@@ -98,8 +98,8 @@ def _agreements(config: Config, records: Sequence[Record], tables: Tables, *, mu
         config: The settings of the run.
         records: Its records, those of the first backend first.
         tables: Their voxel tables.
-        must: For each pair of those that must agree; else for the first backend and each other one, where one of the
-            two need not agree.
+        must: Whether to take each pair of those that must agree; else for the first backend and each other one, where
+            one of the two need not agree.
     """
     checked = {backend.name for backend in config.fused_by() if must_agree(backend)}
     groups: dict[tuple[str, str], list[Record]] = {}

@@ -72,7 +72,7 @@ class TileMeta:
 
     Attributes:
         files: Digests of its files, by their path in the folder.
-        checked: How far it agrees with the reference on a sample of its voxels.
+        checked: Agreement with the reference on a sample of its voxels.
         origin: Voxel of the first camera.
     """
 
@@ -89,7 +89,7 @@ class TileResult(TileMeta):
 
     Attributes:
         series: (F, C) NUMBERS of each frame.
-        sums: Of its voxels, by name, as `TableSums` has them.
+        sums: Sums of its voxels, by name, as `TableSums` has them.
         reduced: Sums of the map of labels that soft scores were reduced to; empty where there are none.
         image: (F, C) stability of each frame in image coordinates, poses (F, 3, 3) of the cameras: of all frames.
         seen: (m, 3) a frame and a tile that it meets, ascending by frame.

@@ -26,7 +26,7 @@ class Start:
     """A start of a run: its name, the run's folder, the processes that share the machine (width).
 
     Attributes:
-        threads: That decode frames ahead; 0: each when it is wanted, None: as many as the machine has for it.
+        threads: Threads that decode frames ahead; 0: each when it is wanted, None: as many as the machine has for it.
     """
 
     name: str
@@ -45,7 +45,7 @@ class TileTask:
     """One tile of the map of a unit; without a place, the pass over all frames that fuses nothing.
 
     Attributes:
-        key: Of the unit, under which results are kept.
+        key: Key of the unit, under which results are kept.
         size: Voxels along the edge of a tile.
         place: (x, y) of the tile: ix // size, iy // size.
         origin: Voxel of the first camera, where it is known.
@@ -83,10 +83,10 @@ class Work:
     """A unit to compute, or a tile of one, and what is wanted of it; see `semstab.engine.units.PlannedUnit`.
 
     Attributes:
-        config: With its frames one by one: those of its sequence that all label sources of the plan have.
-        left_out: How many selected frames lack a file or a pose.
+        config: Settings with the frames one by one: those of its sequence that all label sources of the plan have.
+        left_out: Number of selected frames that lack a file or a pose.
         regions: Whether it is the flicker of regions without classes, and nothing is fused.
-        tile: Of a unit in tiles; None for all of a unit.
+        tile: The tile of a unit in tiles; None for all of a unit.
     """
 
     start: Start
@@ -149,7 +149,7 @@ class Outcome:
         files: Further files by their path in the folder, where the worker does not see that folder.
         cause: The exception, where the work failed in this very process; trace where it was raised.
         table: The voxels of a unit that observers watch, where it was fused in this process.
-        seconds: That its pass took, by stage; of the last outcome of a pass only.
+        seconds: Seconds that its pass took, by stage; of the last outcome of a pass only.
     """
 
     identity: str

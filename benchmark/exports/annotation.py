@@ -50,7 +50,7 @@ class AnnotationTask:
     Attributes:
         score: Bits of entropy that its label removes from the map: the sum over the voxels that the outline shows.
         label: The fused class, and `other` the next one; names.
-        voxels: Of the place; `op`, how many frames saw them in the median.
+        voxels: Number of voxels of the place; `op` is the median of the frames that saw them.
         center: (3,) of the place, metres: global coordinates where the scene has a georeference.
         frame: Number of the best view, `image` the name of its files.
         outline: Polygons (n, 2) in pixels x, y of the image of `size` (width, height).
@@ -186,9 +186,9 @@ class _View:
     """A place in a frame.
 
     Attributes:
-        bits: Of the voxels that it shows.
-        pixels: Of the outline.
-        area: Of the surface across the line of sight, square metres: the more frontal, the larger.
+        bits: Bits of the voxels that it shows.
+        pixels: Pixels of the outline.
+        area: Area of the surface across the line of sight, square metres: the more frontal, the larger.
         sharp: Mean square of the image's second derivative in the outline.
     """
 

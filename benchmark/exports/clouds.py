@@ -41,8 +41,8 @@ class Header:
     """The header of a binary PLY file.
 
     Attributes:
-        dtype: Of a point.
-        count: How many points there are.
+        dtype: Type of a point.
+        count: Number of points.
         size: Bytes of the header.
         comments: Its comment lines, without the word.
     """

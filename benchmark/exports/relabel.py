@@ -51,7 +51,7 @@ class Belief:
     Attributes:
         min_op: Seen by so many frames.
         min_psa: Their pairs of frames agree so often; a voxel seen once has no pair.
-        categories: Of these categories, of any where none is named.
+        categories: Categories that a voxel may be in, any where none is named.
         leave_one_out: Without the frame's own vote, and seen by another frame. Drift stays that of all votes: it
             depends on their order.
         thresholds: Whose label has the evidence that these thresholds ask for.
@@ -176,8 +176,8 @@ class Correctness:
     """Labels against ground truth: before; of the pixels that have a label before and after, both; all after.
 
     Attributes:
-        all_before, all_after: Of all pixels with such a label.
-        before, after: Of the same pixels, those that kept a label or took another.
+        all_before, all_after: Accuracy on all pixels with such a label.
+        before, after: Accuracy on the same pixels, those that kept a label or took another.
     """
 
     all_before: Accuracy

@@ -62,7 +62,7 @@ class Voxels:
         colors: (K, 3) RGB.
         taxonomy: Whose classes they are.
         up: (3,) the scene's up axis, None where it is not known.
-        georeference: Of the scene, None where it has none.
+        georeference: Georeference of the scene, None where it has none.
     """
 
     table: VoxelTable

@@ -42,7 +42,7 @@ class CompensatedFlicker:
     """Flicker between two views of the same surface points.
 
     Attributes:
-        flicker_percent: Of the co-visible pixels, those whose label differs; NaN where no pixel is co-visible.
+        flicker_percent: Percentage of the co-visible pixels whose label differs; NaN where no pixel is co-visible.
         share: co-visible pixels, of the current frame's valid ones, 0 to 1; NaN where none is valid.
     """
 
@@ -226,7 +226,7 @@ class RegionChange:
     """The change of regions between two frames.
 
     Attributes:
-        flicker_percent: Of the pixels valid in both, those that left their region; NaN where there are none.
+        flicker_percent: Percentage of the pixels valid in both that left their region; NaN where there are none.
         matched: Regions in both frames.
         births, deaths: Regions of the current frame that are new, of the previous one that are gone.
         variation_of_information: Between the two partitions, bits, the unassigned pixels being one part; NaN likewise.

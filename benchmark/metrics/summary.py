@@ -271,12 +271,12 @@ class CategoryThresholds:
 
 
 def categories(table: VoxelTable, thresholds: CategoryThresholds | None = None) -> UInt8:
-    """Return category of each voxel (n,), an index into CATEGORIES; the first of these that applies.
+    """Return the category of each voxel (n,), an index into CATEGORIES; the first of these that applies.
 
-    low persistence  OP < min_op: too few observations to tell
-    drifting  SBD >= drifting_bits: observations still move the belief
-    uncertain  entropy >= uncertain_bits: the belief has settled on no clear answer
-    stable  a clear answer, and little movement
+    - low persistence: OP < min_op, too few observations to tell
+    - drifting: SBD >= drifting_bits, observations still move the belief
+    - uncertain: entropy >= uncertain_bits, the belief has settled on no clear answer
+    - stable: a clear answer, and little movement
 
     Drifting comes first because nearly all drifting voxels are ambiguous as well, but not the other way round: with
     more observations a voxel that stays ambiguous goes from drifting to uncertain.

@@ -33,7 +33,7 @@ class Standardised:
 
     Attributes:
         edges: Upper edges of the strata of OP.
-        weights: Of the strata.
+        weights: Weights of the strata.
         thin: The part of the weights that lies in strata which some map hardly has: values there rest on few voxels.
     """
 
@@ -52,10 +52,10 @@ class PairedDifference:
     """A measure of backbone a minus that of b on the voxels that all saw twice or more.
 
     Attributes:
-        p_value: That there is none, of the primary measure; p_holm corrects it for all pairs, and all scenes of a
+        p_value: P-value of no difference in the primary measure; p_holm corrects it for all pairs, and all scenes of a
             study, of which something may be claimed (Holm 1979). The other measures describe: they have intervals and
             no test.
-        scope: What interval and p-value answer, see `Interval`.
+        scope: Question that interval and p-value answer, see `Interval`.
         undecided: Why nothing may be claimed; empty where something may.
     """
 
@@ -98,7 +98,7 @@ class Paired:
 
     Attributes:
         primary: The key of what is tested.
-        values: What is `compared`, by its key and backbone.
+        values: Values that are `compared`, by its key and backbone.
     """
 
     primary: str
@@ -143,7 +143,7 @@ class ComparedObservations:
     Attributes:
         voxels, observations: Sampled ones that they are of.
         decided: Whether each observation was reduced to its largest class: labels were compared with scores.
-        order: Of the backbones by the primary measure on these observations, the best first.
+        order: Order of the backbones by the primary measure on these observations, the best first.
         order_ignored: The same where to leave a location out is a class of its own.
         bounded: Whether the bounds of PSA keep its order of the backbones, whatever was left out.
     """
@@ -192,8 +192,8 @@ class Contrast:
         of: The class whose locations it is of; empty: all.
         difference: The run's less the base's, with its interval, the scope that this answers, and the p-value that
             there is none.
-        p_holm: That p-value corrected for all that stand in one list with it (Holm 1979).
-        change: What is said of it: 'better', 'worse', or nothing.
+        p_holm: The p-value corrected for all that stand in one list with it (Holm 1979).
+        change: Verdict: 'better', 'worse', or nothing.
     """
 
     measure: str
@@ -219,11 +219,11 @@ class Area:
     """Neighbouring voxels of a class that got worse.
 
     Attributes:
-        number: From 1 on, the largest loss first; in the column `area`.
+        number: Number from 1 on, the largest loss first; in the column `area`.
         what: 'agreement': frames agree less; 'truth': right before, wrong now.
         of: The class that both runs together give these voxels, or the true one.
         confused_with: The class that the top contributing frames give.
-        voxels: How many.
+        voxels: Number of voxels.
         loss: Mean over them: of agreement between frames, or 1.
         centre: Metres, as the run has coordinates.
         size: Metres from end to end.
@@ -270,9 +270,9 @@ class SceneComparison:
     """The runs on one scene.
 
     Attributes:
-        notes: What cannot be compared here, and why.
-        voxels: That all saw twice or more; 0 where they are not known.
-        frames: That they come from, about.
+        notes: Notes on what cannot be compared here, and why.
+        voxels: Number of voxels that all saw twice or more; 0 where they are not known.
+        frames: Number of frames that they come from, about.
     """
 
     scene: str

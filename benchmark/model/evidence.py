@@ -46,7 +46,7 @@ class Evidence(NDArrayOperatorsMixin):
         label: (m,) uint16 the entry's class, ascending within a row.
         weight: (m,) float64.
         K: Number of classes.
-        known: How the rows are spread over the classes, where that was found already: see `measured`.
+        known: The spread of rows over the classes, where that was found already: see `measured`.
     """
 
     starts: Int64

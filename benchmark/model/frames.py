@@ -86,7 +86,7 @@ class Frame:
     Attributes:
         index: Number in the sequence.
         depth: (H, W) float32, metres along the optical axis (planar z); 0, negative, NaN and inf are invalid.
-        intrinsics: Of the depth image; or its 3x3 camera matrix.
+        intrinsics: Intrinsics of the depth image; or its 3x3 camera matrix.
         T_wc: (4, 4) or (3, 4) float64 camera-to-world, metres; camera axes x right, y down, z forward (OpenCV).
         labels: (H, W) uint8 or uint16 class ids, ignore id 255 or 65535; other integers become the smaller one; or.
         scores: (H, W, K) float, non-negative; normalised per pixel where they are used.
@@ -94,9 +94,9 @@ class Frame:
         mask: (H, W) bool, True where a thing moves that is not to be fused, optional; `semstab.pixels.preparation`.
         left_out: (H, W) bool, the pixels that were left out of fusion for what they show, optional.
         unlabelled: (H, W) bool, the pixels with depth to which a model gave no label, optional.
-        scores_left_out: What was left out of the scores, where only the largest are kept.
+        scores_left_out: Part of the scores that was left out, where only the largest are kept.
         timestamp: Seconds, optional.
-        files: Which file each field came from ('depth', 'pose', 'labels', ...); error messages name it.
+        files: File that each field came from ('depth', 'pose', 'labels', ...); error messages name it.
 
     Raises:
         DataError: If shapes disagree, the pose is not rigid or not finite, or a type is wrong.

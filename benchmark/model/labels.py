@@ -117,11 +117,11 @@ class LabelSpace:
     """The classes of a label map: ids, names and colours, without the ignore id.
 
     Attributes:
-        name: Of the taxonomy.
+        name: Name of the taxonomy.
         classes: K >= 2 distinct names; evidence vectors follow their order.
         ids: The id of each class in label maps; 0..K-1 unless given.
         colors: RGB of each class.
-        members: For each class, names of other taxonomies that fall into it.
+        members: Names, for each class, of other taxonomies that fall into it.
         ignored: Names of other taxonomies that are left out.
 
     Raises:

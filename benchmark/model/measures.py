@@ -105,12 +105,12 @@ class Quantity:
     """A number that is reported.
 
     Attributes:
-        key: Of its columns and JSON entries.
-        title: In print; `short` where there is little room, `unit` where it has one.
-        better: Which way is good.
+        key: Key of its columns and JSON entries.
+        title: Title in print; `short` where there is little room, `unit` where it has one.
+        better: Direction that is good.
         digits: Decimals where a map is summarised, and where maps are compared.
-        needs: What it is computed from: the voxel table, the log of events as well, or the ground truth as well.
-        section: Of the paper, where it defines it.
+        needs: Source: the voxel table, the log of events as well, or the ground truth as well.
+        section: Section of the paper, where it defines it.
     """
 
     key: str
@@ -144,8 +144,8 @@ class Measure(Quantity):
 
     Attributes:
         of: Computes it: (n,), NaN where undefined; from dense evidence, some voxels at a time.
-        lowest_op: From which OP on it is defined.
-        range: Of its colours, in which maps differ; values beyond look like the ends.
+        lowest_op: Lowest OP at which it is defined.
+        range: Range of its colours, in which maps differ; values beyond look like the ends.
         panel: Whether it has a panel in the figure of a map: not where another one shows the same places.
     """
 

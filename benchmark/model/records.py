@@ -46,7 +46,7 @@ class Variation:
         sweep: 'base', 'shared_taxonomy', 'backends', or what is swept: 'voxel_size' (metres), 'pixel_stride',
             'frame_count', 'depth_noise' (relative standard deviation), 'translation_noise' (metres), 'rotation_noise'
             (degrees), 'translation_drift' (metres a square root of frame), 'rotation_drift' (degrees likewise).
-        value: Of it; None for 'base', 'shared_taxonomy' and 'backends'.
+        value: Value of the swept setting; None for 'base', 'shared_taxonomy' and 'backends'.
         repeat: Counts the repeats of a random variation from 0; each has a seed of its own.
     """
 
@@ -89,13 +89,13 @@ class FrameQuality:
     Attributes:
         model, filters: Whose labels they are, and what was done to them ('ema:0.6+threshold:0.5'; '' for nothing).
         coverage: Labelled pixels for one that the model labels.
-        next_frame: Of the pixels that the next frame sees again, those whose label the model gives that place then. No
+        next_frame: Share of the pixels seen again by the next frame whose label the model gives that place then. No
             filter saw that frame: what it only repeats does not count for it.
-        accuracy: Of the labelled pixels, those that are right; miou the mean over classes of intersection over union.
-        stable_wrong: Of the pixels seen again, those that keep a label that is wrong.
+        accuracy: Share of the labelled pixels that are right; miou the mean over classes of intersection over union.
+        stable_wrong: Share of the pixels seen again that keep a label that is wrong.
         lag: Frames by which labels follow a true change later than the model, see `semstab.metrics.frame_quality`;
             changes: the pixels that it was counted on.
-        milliseconds: Of CPU time that the filters took for a frame, in the median.
+        milliseconds: CPU time that the filters took for a frame, in the median.
         accuracy_by_frame, next_frame_by_frame: The same of each frame, and of each pair.
     """
 
@@ -119,10 +119,10 @@ class Record:
 
     Attributes:
         key: Hash of its inputs and settings, under which it is kept.
-        summary: What is reported of it: unit (scene, backbone, backend), means, strata, classes, times, and what
+        summary: Its report: unit (scene, backbone, backend), means, strata, classes, times, and what
             `semstab.statistics` says of the map.
-        image_space: Of the 'base' units; all NaN elsewhere.
-        quality: Of the labels of single frames, where `frame_quality` asked for it.
+        image_space: Image-space measures of the 'base' units; all NaN elsewhere.
+        quality: Quality of the labels of single frames, where `frame_quality` asked for it.
         voxels_file: File of its voxel table, or the folder of its tiles, for the 'base' and 'backends' units; None
             elsewhere.
         truth_file: File of the ground truth's voxels of the same frames, where the statistics fused it.
@@ -227,9 +227,9 @@ class UnitContent:
         input: Digest of its input.
         up: The scene's up axis, where it is known or could be estimated.
         files: Digests of the unit's other files, by their path in the folder.
-        regions: Of a source of regions, instead of a summary.
-        advice: Where its voxel size lies, where that was looked at.
-        checked: How far it agrees with the reference on a sample of its voxels, where it was checked so.
+        regions: Series of a source of regions, instead of a summary.
+        advice: Advice on its voxel size, where that was looked at.
+        checked: Agreement with the reference on a sample of its voxels, where it was checked so.
     """
 
     input: str
@@ -258,14 +258,14 @@ class Result:
 
     Attributes:
         backend: The base backend: that of every unit but those of the 'backends' variation.
-        records: In the order of the plan.
-        agreement: Of each pair of backends that must agree, on each scene and backbone that both fused.
+        records: Records in the order of the plan.
+        agreement: Agreement of each pair of backends that must agree, on each scene and backbone that both fused.
         up: (x, y, z) unit vector of the world's up axis by scene, where it is known or could be estimated.
-        georeference: By scene, where it lies on Earth, where that is known.
+        georeference: Place on Earth by scene, where that is known.
         regions: Flicker of the label sources that are regions without classes.
         compared: The same of each other backend and the base one, which need not agree.
-        advice: Where the voxel size lies, scene by scene, for data of files.
-        comparisons: With `statistics`: the backbones of each scene beside each other, as `compare_backbones` says it.
+        advice: Advice on the voxel size, scene by scene, for data of files.
+        comparisons: The backbones, with `statistics`, of each scene beside each other, as `compare_backbones` says it.
     """
 
     name: str

@@ -76,7 +76,7 @@ class FrameReport:
         frame: The frame's index.
         points: Valid pixels ('sampled points').
         voxels: Voxels the frame touched ('observations').
-        new_voxels: Of them, voxels seen for the first time.
+        new_voxels: Those of the voxels that were seen for the first time.
         drift_sum: Sum over the other ones of D_JS(p^(t), p^(t-1)), bits.
         seconds: wall-clock time of integrate.
         map_voxels: Voxels in the map.
@@ -256,8 +256,9 @@ class Agreement:
     """The agreement of two backends' maps of the same frames; one entry of 'agreement' in summary.json.
 
     Attributes:
-        differences: Of OP, of every measure, of the evidence and of the label (1 where it is another), by their keys.
-        one_in: Of so many voxels, drawn at random, one was compared.
+        differences: Differences of OP, of every measure, of the evidence and of the label (1 where it is another), by
+            their keys.
+        one_in: Number of voxels of which one, drawn at random, was compared.
     """
 
     scene: str

@@ -49,7 +49,7 @@ def look_up(depth: Any, rays: Any, motion: Any, other_depth: Any, camera: Any, t
         motion: Three rows of four numbers, from the view's camera axes to the other's.
         other_depth: (H', W') of the other view.
         camera: (fx, fy, cx, cy), the intrinsics of the other view.
-        tolerance: Of the occlusion test, relative to the distance from the other camera.
+        tolerance: Tolerance of the occlusion test, relative to the distance from the other camera.
         out: (H, W) int32, is filled.
     """
     there, z = other_depth.reshape(-1), np.empty(depth.shape[1])

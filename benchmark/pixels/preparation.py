@@ -52,9 +52,9 @@ def perturb(frame: Frame, noise: Perturbation, scene: str) -> Frame:
     Every number depends on the seed, the scene's name, the frame's index and the pixel only: all backbones and backends
     see the same disturbed geometry, in whatever order frames are read and whichever are sampled.
 
-    depth  d (1 + depth_noise n), with n drawn for each pixel; a depth that falls to 0 or below is invalid
-    position  t + translation_noise n + translation_drift w, world axes
-    rotation  R exp(rotation_drift w) exp(rotation_noise n), rotation vectors in camera axes, about the camera
+    - depth: d (1 + depth_noise n), with n drawn for each pixel; a depth that falls to 0 or below is invalid
+    - position: t + translation_noise n + translation_drift w, world axes
+    - rotation: R exp(rotation_drift w) exp(rotation_noise n), rotation vectors in camera axes, about the camera
 
     n is a standard normal number drawn anew in each frame, w the sum of one for each frame since the sequence began: a
     random walk, 0 at frame 0, whose standard deviation grows with the square root of the index.

@@ -96,7 +96,7 @@ class Filter(ABC):
     """Beliefs in, beliefs out, image by image; one is made for each sequence. `REGISTRY` names its subclasses.
 
     Attributes:
-        parameter: What stands behind the colon.
+        parameter: Name of the number behind the colon.
         sequential: Whether it remembers the images before.
         wants_geometry: Whether it looks at depth and pose.
         wants_color: Whether it looks at the image.

@@ -56,11 +56,11 @@ class PredictionFolder:
 
     Attributes:
         path: The folder.
-        kind: Of maps: PNG ids, .npz scores (K, H, W), PNG region ids.
+        kind: Kind of maps: PNG ids, .npz scores (K, H, W), PNG region ids.
         settings: All that the maps depend on beside the image, for JSON.
-        about: What else the manifest says.
+        about: The rest of the manifest.
         space: The classes; None for regions.
-        top_k: How many scores a pixel keeps; None for all.
+        top_k: Number of scores that a pixel keeps; None for all.
 
     Raises:
         ConfigError: If the folder holds maps of other settings or of other origin.

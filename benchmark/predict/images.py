@@ -62,8 +62,8 @@ class Picture:
     """An image of a sequence as a model is shown it.
 
     Attributes:
-        geometry: Of models that want it, at the image's pixels.
-        digest: Of all that is shown.
+        geometry: Geometry for models that want it, at the image's pixels.
+        digest: Hash of all that is shown.
     """
 
     index: int

@@ -356,7 +356,8 @@ class InOrder:
 
     Attributes:
         indices: The frames that it is shown.
-        claim: Is told whose the backbone is now, and says whether it was somebody else's: then it begins again.
+        claim: A function that is told whose the backbone is now, and says whether it was somebody else's: then it
+            begins again.
     """
 
     def __init__(

@@ -93,13 +93,13 @@ class SequenceOptions:
     """The settings of a prediction of a sequence.
 
     Attributes:
-        name: What the predictions are called.
-        scores: Also keep soft scores, in `score_type`.
-        top_k: Of these only the largest of each pixel, so many; None for all.
+        name: Name of the predictions.
+        scores: Whether to keep soft scores, too, in `score_type`.
+        top_k: Number of the largest scores that a pixel keeps; None for all.
         batch: Images that the model sees at once.
         threads: Threads that decode images ahead.
         overwrite: Replace predictions of other settings.
-        command: What was typed, for the manifest.
+        command: The command line, for the manifest.
     """
 
     name: str
@@ -117,10 +117,10 @@ class SequenceReport:
     """The outcome of a prediction: where it is, how many frames, how fast.
 
     Attributes:
-        folders: That were written.
+        folders: Folders that were written.
         predicted: Frames that the model saw; `kept` ones were there from before.
-        model_seconds: In the model; `seconds` in all, decoding and writing included.
-        regions: Of a model without classes, what changed from frame to frame.
+        model_seconds: Seconds in the model; `seconds` are those in all, decoding and writing included.
+        regions: For a model without classes, the change from frame to frame.
     """
 
     sequence: str

@@ -62,7 +62,7 @@ class SceneLog:
 
     Attributes:
         origin: (3,) voxels, None before anything of the scene is logged.
-        bounds: Of its first finished map, None before that.
+        bounds: Bounds of its first finished map, None before that.
     """
 
     def __init__(self, tasks: list[Task]) -> None:

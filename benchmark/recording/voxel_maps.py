@@ -37,7 +37,7 @@ class ColorMode:
 
     Attributes:
         tab: Its name where there is little room; `title` is that of its views.
-        range: Of the values that the colour map spans; None where voxels have a colour of their own.
+        range: Range of values that the colour map spans; None where voxels have a colour of their own.
     """
 
     tab: str

@@ -168,7 +168,7 @@ class Flight:
     """A smooth path along an axis through the town's origin, the camera looking ahead and down.
 
     Attributes:
-        number: Which town it flies over.
+        number: Number of the town that it flies over.
         length: Metres from the first frame to the last, along the axis.
         axis: Heading of the axis, radians.
         sway: Metres to each side, and how many such waves the path has.

@@ -99,8 +99,8 @@ class Movers:
     """Moving things of one kind that go along streets at a constant speed, and start again at the other end.
 
     Attributes:
-        low, length, at: Of their streets; along_s whether it runs along the plan's s axis.
-        offset: From the street's middle; start and speed along it, towards its high end where positive.
+        low, length, at: Bounds of their streets; along_s says whether one runs along the plan's s axis.
+        offset: Distance from the street's middle; start and speed along it, towards its high end where positive.
         tint, size: (n, 3) and (n,) or (n, 3): their appearance.
     """
 

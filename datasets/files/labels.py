@@ -53,7 +53,7 @@ class LabelSource:
     """One label source of a scene: where a frame's file would be.
 
     Attributes:
-        folders: What lies there.
+        folders: The listed content of folders.
         first: The first frame that has a file, and the file; None where none has.
     """
 
@@ -165,8 +165,8 @@ class LabelMaps:
     """The predictions for the frames of a scene: the label sources, their classes, and the maps in their own pixels.
 
     Attributes:
-        class_ids: By label source a table from the ids of its files to those of its taxonomy, where they differ.
-        folders: What lies where maps may be.
+        class_ids: A table by label source, from the ids of its files to those of its taxonomy, where they differ.
+        folders: The listed content of the folders where maps may be.
 
     Raises:
         ConfigError: For options that cannot be used.

@@ -229,14 +229,14 @@ class FrameSource:
     """The files and numbers that one frame comes from.
 
     Attributes:
-        name: What path templates call it.
+        name: Name of the frame in path templates.
         depth: The file.
         pose_file: The file that holds its pose, or all poses.
-        camera: Of the depth image.
+        camera: Intrinsics of the depth image.
         pose: (4, 4) in the dataset's convention, where it is not in a file of its own.
-        label_camera: Of the images that label maps belong to, where that is another one.
+        label_camera: Intrinsics of the images of label maps, where that is another one.
         label_lens: The same where they are distorted photographs.
-        color_lens: Of the colour image, where that is distorted.
+        color_lens: Lens of the colour image, where that is distorted.
         photograph: The distorted photograph, where label maps belong to it.
         aliases: Other names that its label maps may have.
         color: The file that it has, or would have; None where that is not known.

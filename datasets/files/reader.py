@@ -113,8 +113,8 @@ class FileDataset(Dataset, Generic[Options]):
 
         Args:
             folder: The folder of the depth images.
-            before: What stands before the name of the frame in that of the file.
-            after: What stands after it.
+            before: Part of the file's name before that of the frame.
+            after: Part of the file's name after it.
             instead: Names of frames, by their poses or images, which a surface gives depth where no depth image is
                 there.
         """

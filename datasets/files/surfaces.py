@@ -393,7 +393,7 @@ class Casts:
     significance, zstd.
 
     Attributes:
-        surface: What the surface is, bytes that are equal where it is.
+        surface: Bytes that are equal where the surface is the same.
     """
 
     def __init__(self, folder: Path | None, surface: bytes) -> None:
