@@ -177,7 +177,7 @@ def image_digest(image: Image) -> str:
 
 
 def narrowed(ids: npt.NDArray[Any], classes: int) -> Labels:
-    """Return class ids as the narrowest type that holds so many classes and the ignore id."""
+    """Return the class ids as the narrowest type that holds so many classes and the ignore id."""
     return ids.astype(np.uint8) if classes <= IGNORE_8BIT else ids.astype(np.uint16)
 
 

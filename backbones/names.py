@@ -92,7 +92,7 @@ def class_mapping(source: LabelSpace, target: LabelSpace, leniency: Leniency = "
 
 
 def _candidates(name: str, vocabulary: Vocabulary | None, leniency: Leniency) -> Sequence[str]:
-    """Return names of a class in the target, the best first."""
+    """Return the names of a class in the target, the best first."""
     target = None if vocabulary is None else vocabulary.target_of(name, leniency)
     if vocabulary is None or target is not None:
         return [*([target] if target else []), *_names(name)]

@@ -350,7 +350,7 @@ class SamHeuristic(SamRaw):
 
 
 def mask_features(hsv: Image, mask: Mask) -> dict[str, float]:
-    """Return mean colour, area share and aspect of a mask that is not empty; hsv as OpenCV scales it.
+    """Return the mean colour, area share and aspect of a mask that is not empty; hsv as OpenCV scales it.
 
     The mean hue is that of the summed unit vectors: of 179 and 3 it is 1.
     """

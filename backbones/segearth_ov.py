@@ -252,7 +252,7 @@ def starts(length: int, window: int, stride: int) -> list[int]:
 def slide(
     pixels: torch.Tensor, window: int, stride: int, logits_of: Callable[[torch.Tensor], torch.Tensor]
 ) -> torch.Tensor:
-    """Return mean logits (Q, H, W) of all windows over an image (3, H, W).
+    """Return the mean logits (Q, H, W) of all windows over an image (3, H, W).
 
     Args:
         pixels: (3, H, W) image, normalised.

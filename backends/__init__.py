@@ -136,7 +136,7 @@ class GrowingMap(FusionBackend, Protocol):
         """Return a table column (n,), such as op or drift_sum, for the voxels of those rows; for all if not given."""
 
     def evidence_of(self, rows: Int64) -> Float64:
-        """Return evidence (n, K) of the voxels of those rows."""
+        """Return the evidence (n, K) of the voxels of those rows."""
 
     def index_of(self, rows: Int64) -> Int64:
         """Return voxel indices (n, 3) of the voxels of those rows."""
@@ -189,7 +189,7 @@ def keeps_log(name: str) -> bool:
 
 
 def expected_bytes(name: str, voxels: int, observations: int, num_classes: int, *, soft: bool = False) -> int:
-    """Return bytes that a backend's map of that size takes, roughly; 0 for one that does not say.
+    """Return the bytes that a backend's map of that size takes, roughly; 0 for one that does not say.
 
     A backend says it with a static method of that name, those three parameters, and `soft` where a map of scores takes
     other than one of labels.

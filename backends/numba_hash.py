@@ -221,7 +221,7 @@ class NumbaHash:
         return values
 
     def evidence_of(self, rows: Int64) -> Float64:
-        """Return evidence (n, K) of the voxels of those rows."""
+        """Return the evidence (n, K) of the voxels of those rows."""
         return np.asarray(self._evidence_of(rows.astype(np.int32)))
 
     @property
@@ -250,7 +250,7 @@ class NumbaHash:
             self._slots = slots
 
     def _make_dense(self, seen: ObservedScores, row: Int64, new: Int64) -> Int64:
-        """Return room for a dense row for each of the frame's voxels; where those of each partition begin."""
+        """Return the room for a dense row for each of the frame's voxels; where those of each partition begin."""
         needed = new
         if self._dense_used < len(self):  # else only the frame's new voxels have none
             without = (row < 0) | (self._records["next"][np.maximum(row, 0)] > DENSE)

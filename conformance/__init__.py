@@ -44,7 +44,7 @@ class Verdict:
 
 
 def case_names() -> tuple[str, ...]:
-    """Return names of the cases, in the order in which they are best passed."""
+    """Return the names of the cases, in the order in which they are best passed."""
     return tuple(_cases().joinpath("order.txt").read_text(encoding="utf-8").split())
 
 

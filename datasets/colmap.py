@@ -220,7 +220,7 @@ def _images_bin(file: BinaryIO, path: Path) -> Iterator[Registered]:
 
 
 def _lines(file: BinaryIO) -> Iterator[tuple[int, str]]:
-    """Yield number and stripped text of every line: points can take gigabytes, so no file is read whole."""
+    """Yield the number and stripped text of every line: points can take gigabytes, so no file is read whole."""
     for number, line in enumerate(file, start=1):
         yield number, line.decode("utf-8", errors="replace").strip()
 

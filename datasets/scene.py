@@ -167,15 +167,15 @@ class Scene(ABC):
         return self.geometry(index).T_wc
 
     def intrinsics(self, index: int, shape: tuple[int, ...]) -> Intrinsics:
-        """Return intrinsics of the frame's depth image, of shape (H, W); pixels."""
+        """Return the intrinsics of the frame's depth image, of shape (H, W); pixels."""
         return self.geometry(index).intrinsics
 
     def color(self, index: int) -> UInt8 | None:
-        """Return colour (H, W, 3) uint8 RGB, None where the frame has none."""
+        """Return the colour (H, W, 3) uint8 RGB, None where the frame has none."""
         return self.geometry(index, color=True).color
 
     def image(self, index: int) -> UInt8:
-        """Return colour (H, W, 3) uint8 RGB.
+        """Return the colour (H, W, 3) uint8 RGB.
 
         Raises:
             DataError: If the frame has none.

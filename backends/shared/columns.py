@@ -102,7 +102,7 @@ def blocks_of(index: Int64, resolution: int) -> tuple[Int32, Int64, Int32]:
 
 @serial
 def _number(index, r, blocks, block, place, slots):
-    """Return number the blocks in order of appearance; returns how many there are."""
+    """Number the blocks in order of appearance, and return how many there are."""
     mask = slots.shape[0] - 1
     n = 0
     for v in range(index.shape[0]):

@@ -83,7 +83,7 @@ def drawn_pixels(depth, wanted, camera, T, size, odd, one_in):
 
 
 def columns_of(within, origin):
-    """Return lowest and highest but one of the first two coordinates, as packed keys count, (4,).
+    """Return the lowest and highest but one of the first two coordinates, as packed keys count, (4,).
 
     Or (0,) for all voxels.
     """

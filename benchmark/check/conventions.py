@@ -55,7 +55,7 @@ class Convention:
     ratio: Ratio = (1.0, 1.0)
 
     def differs_in(self, other: Convention) -> tuple[str, ...]:
-        """Return names of the fields in which two conventions differ."""
+        """Return the names of the fields in which two conventions differ."""
         names = (field.name for field in dataclasses.fields(self))
         return tuple(name for name in names if getattr(self, name) != getattr(other, name))
 

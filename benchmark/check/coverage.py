@@ -148,7 +148,7 @@ class Coverage:
         )
 
     def stays(self, voxel_size: float) -> float:
-        """Return share of the points that fall into the same voxel when another frame sees them.
+        """Return the share of the points that fall into the same voxel when another frame sees them.
 
         NaN where none does.
         """

@@ -131,7 +131,7 @@ def _changes(values: npt.NDArray[Any], changed: Callable[[Any, Any], Any]) -> Ma
 
 
 def _thinned(edges: Mask) -> Map:
-    """Return share of edges in each cell of a coarse grid, smoothed a little, without its mean."""
+    """Return the share of edges in each cell of a coarse grid, smoothed a little, without its mean."""
     import cv2
 
     cell = max(1, math.ceil(edges.shape[1] / WIDTH))

@@ -74,7 +74,7 @@ class View:
         return pose
 
     def kept_camera(self, convention: Convention) -> Intrinsics:
-        """Return intrinsics of the kept pixels."""
+        """Return the intrinsics of the kept pixels."""
         width, height = self.size
         made_for = (width * convention.ratio[0], height * convention.ratio[1])
         return self.camera.resized(cast(Any, made_for), self.size).every(self.stride)

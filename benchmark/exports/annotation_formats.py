@@ -95,7 +95,7 @@ def coco(file: TaskFile) -> Iterator[str]:
 
 
 def label_studio(file: TaskFile) -> Iterator[str]:
-    """Yield label Studio's tasks with a predicted polygon, and the labelling set-up."""
+    """Yield Label Studio's tasks with a predicted polygon, and the labelling set-up."""
     rows = []
     for rank, task in enumerate(file.tasks, start=1):
         W, H = task.size

@@ -18,7 +18,7 @@ from semstab.pixels.warp import DEPTH_TOLERANCE, correspond
 
 
 def flicker_percent(previous: Frame, current: Frame) -> float:
-    """Return share of the pixels valid in both frames whose label differs, same pixel coordinates, in percent.
+    """Return the share of the pixels valid in both frames whose label differs, same pixel coordinates, in percent.
 
     Soft scores count by their largest class. NaN where no pixel is valid in both.
 
@@ -246,7 +246,7 @@ def matched_region_flicker(
     *,
     iou_threshold: float = IOU_THRESHOLD,
 ) -> RegionChange:
-    """Return flicker of region maps whose ids mean nothing across frames, such as Segment Anything's proposals.
+    """Return the flicker of region maps whose ids mean nothing across frames, such as Segment Anything's proposals.
 
     Regions are matched one to one so that the sum of their IoUs over the valid pixels is largest (Hungarian method);
     pairs with an IoU of at most iou_threshold come apart again. flicker = 1 - (pixels in both regions of a pair +

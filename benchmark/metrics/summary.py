@@ -290,7 +290,7 @@ def categorise(
     bits: Float64,
     thresholds: CategoryThresholds | None = None,
 ) -> UInt8:
-    """Return category (n,) by OP, SBD in bits and entropy in bits, (n,) each; see `categories`."""
+    """Return the category (n,) by OP, SBD in bits and entropy in bits, (n,) each; see `categories`."""
     limits = thresholds or CategoryThresholds()
     category = np.full(len(op), STABLE, dtype=np.uint8)
     category[bits >= limits.uncertain_bits] = UNCERTAIN
@@ -300,6 +300,6 @@ def categorise(
 
 
 def category_shares(table: VoxelTable, thresholds: CategoryThresholds | None = None) -> dict[str, float]:
-    """Return share of the voxels in each category, 0 to 1, by name; NaN where the map is empty."""
+    """Return the share of the voxels in each category, 0 to 1, by name; NaN where the map is empty."""
     counts = np.bincount(categories(table, thresholds), minlength=len(CATEGORIES))
     return {name: float(n / len(table)) if len(table) else math.nan for name, n in zip(CATEGORIES, counts, strict=True)}

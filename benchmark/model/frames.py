@@ -56,7 +56,7 @@ class Intrinsics:
         return np.array([[self.fx, 0, self.cx], [0, self.fy, self.cy], [0, 0, 1]], dtype=np.float64)
 
     def every(self, stride: int) -> Intrinsics:
-        """Return intrinsics of the image that keeps pixels 0, stride, 2 stride, ... of each axis."""
+        """Return the intrinsics of the image that keeps pixels 0, stride, 2 stride, ... of each axis."""
         return Intrinsics(self.fx / stride, self.fy / stride, self.cx / stride, self.cy / stride)
 
     def resized(self, size: tuple[int, int], to: tuple[int, int]) -> Intrinsics:

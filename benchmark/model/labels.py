@@ -299,7 +299,7 @@ class LabelMapping:
         return mapped
 
     def _table(self, itemsize: int) -> Int32:
-        """Return target row for each id a map can hold.
+        """Return the target row for each id a map can hold.
 
         The target's ignore id for ignored ones, UNKNOWN for the rest.
         """
@@ -315,7 +315,7 @@ class LabelMapping:
 
 
 def shipped_taxonomies() -> tuple[str, ...]:
-    """Return names of the taxonomies that ship with semstab."""
+    """Return the names of the taxonomies that ship with semstab."""
     folder = importlib.resources.files("semstab.configs") / "taxonomies"
     return tuple(sorted(item.name.removesuffix(".yaml") for item in folder.iterdir() if item.name.endswith(".yaml")))
 

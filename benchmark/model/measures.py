@@ -187,7 +187,7 @@ def mean_drift(drift_sum: Float64, op: Int32) -> Float64:
 
 
 def op(table: Beliefs) -> Int32:
-    """Return observation Persistence (n,): the number of frames that observed the voxel."""
+    """Return the Observation Persistence (n,): the number of frames that observed the voxel."""
     return table.op
 
 
@@ -199,7 +199,7 @@ def entropy(table: Beliefs) -> Float64:
 
 @by_row(lambda found: found.bits)
 def bits(table: Rows) -> Float64:
-    """Return entropy (n,): -sum_k p_k log2 p_k, bits."""
+    """Return the entropy (n,): -sum_k p_k log2 p_k, bits."""
     return entropy_bits(normalise(table.evidence))
 
 
@@ -216,7 +216,7 @@ def margin(table: Rows) -> Float64:
 
 @by_row(lambda found: found.label.astype(np.int64))
 def dominant(table: Rows) -> Int64:
-    """Return dominant class (n,): argmax_k e_k, the lowest on ties."""
+    """Return the dominant class (n,): argmax_k e_k, the lowest on ties."""
     label: Int64 = table.evidence.argmax(axis=1)
     return label
 

@@ -13,7 +13,7 @@ from semstab.core.compiled import compiled, parallel, serial
 
 @serial
 def _seen_at(d: float, ray_x: float, ray_y: float, motion: Any, camera: Any) -> tuple[float, float, float]:
-    """Return column, row and depth in the other camera of the point at depth d along a ray.
+    """Return the column, row and depth in the other camera of the point at depth d along a ray.
 
     Depth 0 where it is not seen.
     """

@@ -54,7 +54,7 @@ class ImageFiles:
         self._files = files
 
     def __len__(self) -> int:
-        """Return number of files."""
+        """Return the number of files."""
         return len(self._files)
 
     def image(self, index: int) -> Image:
@@ -199,7 +199,7 @@ class PredictionBar(PredictionObserver):
 
 
 def speed_text(frames: int, seconds: float, left: int) -> str:
-    """Return speed and time left.
+    """Return the speed and time left.
 
     >>> speed_text(10, 20.0, 30)
     '0.50 frames/s, 0:01:00 left'

@@ -23,7 +23,7 @@ class ImageSequence(Protocol):
     labels_like_depth: bool
 
     def __len__(self) -> int:
-        """Return number of images."""
+        """Return the number of images."""
         ...
 
     def image(self, index: int) -> Image:

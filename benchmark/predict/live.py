@@ -164,7 +164,7 @@ class PredictedScene(Scene):
         self._of_labels: dict[str, tuple[StoredSequence, Backbone]] = {}
 
     def __len__(self) -> int:
-        """Return number of frames."""
+        """Return the number of frames."""
         return len(self._inner)
 
     @property

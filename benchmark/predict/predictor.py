@@ -112,7 +112,7 @@ class Stored(Backbone):
         return [Prediction(self._labels(frame), shares(frame) if scores else None) for frame in geometry]
 
     def _labels(self, frame: Frame) -> Labels:
-        """Return class ids; of scores the likeliest class's."""
+        """Return the class ids; of scores the likeliest class's."""
         if frame.labels is not None:
             return frame.labels
         assert self.label_space is not None
@@ -416,5 +416,5 @@ class InOrder:
 
 
 def size_of(prediction: Prediction) -> int:
-    """Return bytes that a prediction keeps in memory."""
+    """Return the bytes that a prediction keeps in memory."""
     return prediction.labels.nbytes + (0 if prediction.scores is None else prediction.scores.nbytes)

@@ -143,7 +143,7 @@ class SceneLog:
 
 
 def color_of(frame: Frame) -> bytes | None:
-    """Return colour as JPEG, in the size of the labels; None where the frame has none.
+    """Return the colour as JPEG, in the size of the labels; None where the frame has none.
 
     Raises:
         DataError: If its file cannot be read.

@@ -52,7 +52,7 @@ class _Placed:
     roofs: Float64
 
     def local(self, x: Float64, y: Float64, z: Float64) -> Float64:
-        """Return World points of points in the buildings' own axes; z is above the floor."""
+        """Return the world points of points in the buildings' own axes; z is above the floor."""
         c, s = np.cos(self.yaw), np.sin(self.yaw)
         return self.position + np.stack([c * x - s * y, s * x + c * y, z], axis=-1)
 
@@ -143,7 +143,7 @@ def _windows(b: _Placed) -> Surface:
 
 
 def _roof(ridge: float, faces: list[list[int]]) -> Shape:
-    """Return slopes of unit extent under a ridge of a length along x; their undersides are open."""
+    """Return the slopes of unit extent under a ridge of a length along x; their undersides are open."""
     eaves = [[-0.5, -0.5, 0], [0.5, -0.5, 0], [0.5, 0.5, 0], [-0.5, 0.5, 0]]
     return shape([*eaves, [-ridge / 2, 0, 1], [ridge / 2, 0, 1]], faces)
 

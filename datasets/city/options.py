@@ -185,7 +185,7 @@ class Flight:
     pitch: float
 
     def path(self, share: Float64) -> tuple[Float64, Float64]:
-        """Return World x and y (relative to the origin) after a share 0..1 of the flight."""
+        """Return the world x and y (relative to the origin) after a share 0..1 of the flight."""
         along = (share - 0.5) * self.length + OFF_GRID[0]
         across = self.sway * np.sin(2 * np.pi * self.waves * share) + OFF_GRID[1]
         c, s = np.cos(self.axis), np.sin(self.axis)
@@ -216,7 +216,7 @@ class Flight:
 
 
 def look(heading: float, down: float, roll: float) -> Float64:
-    """Return rotation (3, 3) from camera axes (right, down, ahead) to the world's, for angles in radians."""
+    """Return the rotation (3, 3) from camera axes (right, down, ahead) to the world's, for angles in radians."""
     ahead = np.array([np.cos(heading) * np.cos(down), np.sin(heading) * np.cos(down), -np.sin(down)])
     right = np.array([np.sin(heading), -np.cos(heading), 0.0])
     below = np.cross(ahead, right)

@@ -153,7 +153,7 @@ def render(still: Caster, moving: Caster, T: Float64, intrinsics: Intrinsics, sh
 
 
 def pixel_rays(intrinsics: Intrinsics, T: Float64, rows: slice, width: int) -> Float64:
-    """Return World directions (n, 3) of the rays of rows of pixels; the ray parameter is planar depth."""
+    """Return the world directions (n, 3) of the rays of rows of pixels; the ray parameter is planar depth."""
     x = (np.arange(width) - intrinsics.cx) / intrinsics.fx
     y = (np.arange(rows.start, rows.stop) - intrinsics.cy) / intrinsics.fy
     rays = y[:, None, None] * T[:3, 1] + x[None, :, None] * T[:3, 0] + T[:3, 2]

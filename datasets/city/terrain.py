@@ -35,14 +35,14 @@ class Layout:
         return cls(float(rng.uniform(0.1, np.pi / 2 - 0.1)), bend, 2 * np.pi / length, phase)
 
     def to_world(self, s: Float64, t: Float64) -> tuple[Float64, Float64]:
-        """Return World x and y of plan points."""
+        """Return the world x and y of plan points."""
         a = s + self.bend[0] * np.sin(self.wavenumber[0] * t + self.phase[0])
         b = t + self.bend[1] * np.sin(self.wavenumber[1] * s + self.phase[1])
         c, d = np.cos(self.yaw), np.sin(self.yaw)
         return c * a - d * b, d * a + c * b
 
     def heading(self, s: Float64, t: Float64, angle: Float64) -> Float64:
-        """Return heading in the world of what points along `angle` (radians from the s axis) at plan points."""
+        """Return the heading in the world of what points along `angle` (radians from the s axis) at plan points."""
         a = self.bend[0] * self.wavenumber[0] * np.cos(self.wavenumber[0] * t + self.phase[0])
         b = self.bend[1] * self.wavenumber[1] * np.cos(self.wavenumber[1] * s + self.phase[1])
         along_s, along_t = np.cos(angle), np.sin(angle)
@@ -187,7 +187,7 @@ class Terrain:
         return cls(waves, rng.uniform(0, 2 * np.pi, size=6), amplitudes, float(rng.uniform(2, 9)))
 
     def height(self, x: Float64, y: Float64) -> Float64:
-        """Return height of the ground in metres at (x, y), arrays of one shape."""
+        """Return the height of the ground in metres at (x, y), arrays of one shape."""
         phase = np.multiply.outer(x, self.waves[:, 0]) + np.multiply.outer(y, self.waves[:, 1]) + self.phases
         height: Float64 = self.base + np.sin(phase) @ self.amplitudes
         return height

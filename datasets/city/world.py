@@ -278,7 +278,7 @@ def _near(points: Sequence[tuple[float, ...]], layout: Layout, path: Float64, di
 
 
 def _distance(points: Float64, path: Float64) -> Float64:
-    """Return distance of points (n, 2) from the nearest vertex of a path (m, 2)."""
+    """Return the distance of points (n, 2) from the nearest vertex of a path (m, 2)."""
     offsets = points[:, None] - path[None]
     distance: Float64 = np.sqrt((offsets**2).sum(axis=2).min(axis=1))
     return distance

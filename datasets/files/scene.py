@@ -203,7 +203,7 @@ class FileScene(Scene):
         return depth
 
     def color(self, index: int) -> UInt8 | None:
-        """Return colour (H, W, 3) uint8 RGB, None where the frame has none; needs no labels. Raises DataError."""
+        """Return the colour (H, W, 3) uint8 RGB, None where the frame has none; needs no labels. Raises DataError."""
         source = self._frame(index)
         path = self._color_file(source)
         if path is None or source.color_lens is None:
@@ -230,7 +230,7 @@ class FileScene(Scene):
         return self._frame(index).name
 
     def intrinsics(self, index: int, shape: tuple[int, ...]) -> Intrinsics:
-        """Return intrinsics of the frame's depth image, of shape (H, W); pixels."""
+        """Return the intrinsics of the frame's depth image, of shape (H, W); pixels."""
         camera, options = self._frame(index).camera, self.options
         return Camera(camera.intrinsics, options.intrinsics_size or camera.size).at(shape, options.pixel_centre or 0.0)
 

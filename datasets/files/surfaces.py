@@ -475,7 +475,7 @@ class Surface:
 
     @cached_property
     def digest(self) -> bytes:
-        """Return bytes that are equal where the surface is."""
+        """Return the bytes that are equal where the surface is."""
         offset = None if self._georeference is None else self._georeference.offset
         said: tuple[object, ...] = (self._cell, offset)
         if self._georeference is not None and self._georeference.turned:

@@ -298,7 +298,7 @@ MAX_TABLE_BYTES = 2**28
 
 
 def records(path: Path) -> Iterator[tuple[int, str]]:
-    """Yield number, from 1, and text of each line that is neither empty nor a comment (#).
+    """Yield the number, from 1, and text of each line that is neither empty nor a comment (#).
 
     Raises:
         DataError: If the file cannot be read or is larger than any such table.

@@ -80,7 +80,7 @@ def read_depth(path: Path, scale: float | None = None, read: Read = read_bytes) 
 
 
 def read_labels(path: Path, space: LabelSpace | None = None, read: Read = read_bytes) -> Labels:
-    """Return class ids (H, W) uint8 or uint16, in the ids of the file; RGB maps through the colours of `space`.
+    """Return the class ids (H, W) uint8 or uint16, in the ids of the file; RGB maps through the colours of `space`.
 
     Wider integers are narrowed.
 
@@ -140,7 +140,7 @@ def read_mask(path: Path, read: Read = read_bytes) -> Mask:
 
 
 def read_color(path: Path) -> UInt8:
-    """Return colour (H, W, 3) uint8 RGB of PNG, JPEG or TIFF, not rotated by EXIF.
+    """Return the colour (H, W, 3) uint8 RGB of PNG, JPEG or TIFF, not rotated by EXIF.
 
     Raises:
         DataError: If damaged.

@@ -58,7 +58,7 @@ def _nearest(values: Pixels, K: Intrinsics, K_fit: Intrinsics, shape: tuple[int,
 
 
 def _positions(K: Intrinsics, K_depth: Intrinsics, shape: tuple[int, int]) -> tuple[Float64, Float64]:
-    """Return row of each row, column of each column of the depth image in the other one, in pixels."""
+    """Return the row of each row, column of each column of the depth image in the other one, in pixels."""
     v = K.fy * (np.arange(shape[0], dtype=np.float64) - K_depth.cy) / K_depth.fy + K.cy
     u = K.fx * (np.arange(shape[1], dtype=np.float64) - K_depth.cx) / K_depth.fx + K.cx
     return v.clip(-FAR, FAR), u.clip(-FAR, FAR)
@@ -181,7 +181,7 @@ def undistorted(
 def _source_pixels(
     lens: Lens, source: tuple[int, int], K: Intrinsics, shape: tuple[int, int]
 ) -> tuple[Float32, Float32]:
-    """Return column and row (H, W), in an image of the lens of shape `source`, of each pixel of the pinhole."""
+    """Return the column and row (H, W), in an image of the lens of shape `source`, of each pixel of the pinhole."""
     import cv2
 
     inner = lens.camera.at(source)
@@ -196,7 +196,7 @@ def _source_pixels(
 
 
 def _reach(lens: Lens, farthest: float) -> float:
-    """Return distance from the axis, a metre ahead, up to which the lens maps further out what lies further out."""
+    """Return the distance from the axis, a metre ahead, up to which the lens maps further out what lies further out."""
     radius = np.linspace(0, farthest, SAMPLES)
     if lens.model == "brown":
         k1, k2, _, _, k3 = lens.coefficients
