@@ -185,7 +185,10 @@ def maker(name: str) -> tuple[type[BaseModel], Callable[[Any], Backbone]]:
     """Return the options of backbones of that name, and their constructor, which takes them.
 
     A name is that of a registered class, of a user's code (FILE.py:NAME, package.module:NAME), or of a network's file
-    (net.onnx). Raises ConfigError, DataError, MissingDependencyError.
+    (net.onnx).
+
+    Raises:
+        ConfigError, DataError, MissingDependencyError: If it cannot be loaded.
     """
     from semstab.backbones.custom import is_code, own_maker
     from semstab.backbones.network import NetworkFile, NetworkOptions, is_network

@@ -50,9 +50,9 @@ class EncodedImage(NamedTuple):
 
 
 def encode_sam(model: Any, processor: Any, image: Image) -> EncodedImage:
-    """Return segment Anything, and SAM-HQ (Ke et al.
+    """Return an image as Segment Anything, or SAM-HQ, encodes it (Ke et al. 2023).
 
-    2023): the longer side is resized to the model's, the rest is padding.
+    The longer side is resized to the model's, the rest is padding.
     """
     inputs = processor(images=image, input_data_format="channels_last", return_tensors="pt")
     height, width = (int(side) for side in inputs["reshaped_input_sizes"][0])
@@ -65,9 +65,9 @@ def encode_sam(model: Any, processor: Any, image: Image) -> EncodedImage:
 
 
 def encode_sam2(model: Any, settings: Mapping[str, Any], image: Image) -> EncodedImage:
-    """Return segment Anything 2 (Ravi et al.
+    """Return an image as Segment Anything 2 encodes it (Ravi et al. 2024).
 
-    2024): the image is squeezed into a square; transformers needs torchvision.
+    The image is squeezed into a square; transformers needs torchvision.
     """
     side = int(model.config.prompt_encoder_config.image_size)
     try:

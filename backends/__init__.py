@@ -174,17 +174,17 @@ def create(
 
 
 def restrictable(name: str) -> bool:
-    """Return maps of the backend of that name can be restricted to an extent."""
+    """Return whether maps of the backend of that name can be restricted to an extent."""
     return bool(getattr(REGISTRY.load(name), "pointwise", True))
 
 
 def takes_option(name: str, option: str) -> bool:
-    """Return the backend of that name has such an option, for example 'device'."""
+    """Return whether the backend of that name has such an option, for example 'device'."""
     return option in _options(REGISTRY.load(name))
 
 
 def keeps_log(name: str) -> bool:
-    """Return the backend of that name can give the log of its observations: with option `history`, or always."""
+    """Return whether the backend of that name can give the log of its observations: with option `history`, or always."""
     return takes_option(name, "history") or getattr(REGISTRY.load(name), "keeps_log", False)
 
 

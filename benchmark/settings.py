@@ -21,7 +21,10 @@ def load_config(
 ) -> Config:
     """Return the configuration of a file, or of settings by name, over the defaults in configs/datasets/.
 
-    Overrides go on top. Raises ConfigError.
+    Overrides go on top.
+
+    Raises:
+        ConfigError: If a setting cannot be used.
     """
     base = settings if isinstance(settings, Mapping) else _of_file(settings)
     content = _over(base, overrides or {})

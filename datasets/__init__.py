@@ -78,7 +78,13 @@ def resolved(config: DatasetConfig) -> DatasetConfig:
 
 
 def open_dataset(name: str, options: dict[str, Any] | BaseModel) -> Dataset:
-    """Open a dataset by name with its options. Raises ConfigError, DataError or MissingDependencyError."""
+    """Open a dataset by name with its options.
+
+    Raises:
+        ConfigError: If the name or an option cannot be used.
+        DataError: If the data cannot be read.
+        MissingDependencyError: If a package that it needs is not installed.
+    """
     cls = REGISTRY.load(name)
     validated = options if isinstance(options, BaseModel) else cls.Options.model_validate(options)
     return cast("Dataset", cls(validated))

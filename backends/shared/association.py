@@ -91,7 +91,7 @@ def check_depth(frame: Frame) -> None:
 
 
 def _whole_millimetres(depth: Float32) -> bool:
-    """Return valid depths (n,) are whole numbers, as no measurement in metres is, and too large to be near."""
+    """Return whether valid depths (n,) are whole numbers, as no measurement in metres is, and too large to be near."""
     if depth.size < DISTINCT or np.median(depth) < FAR or not np.array_equal(depth, np.floor(depth)):
         return False
     return len(np.unique(depth)) >= DISTINCT

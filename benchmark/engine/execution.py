@@ -41,8 +41,10 @@ def run(
 ) -> Result:
     """Fuse, measure and compare what the configuration selects; as `run_study`, but a failing unit is an error.
 
-    Without a folder `out` the result has summaries, but no voxels. Raises ConfigError or DataError, or the error of a
-    unit, once everything else has been written.
+    Without a folder `out` the result has summaries, but no voxels.
+
+    Raises:
+        ConfigError, DataError: If the plan cannot be made, or a unit failed, once everything else has been written.
     """
     with contextlib.ExitStack() as stack:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory()) if out is None else out)

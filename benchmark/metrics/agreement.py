@@ -58,7 +58,7 @@ def shared_rows(*tables: VoxelTable) -> list[Int64]:
 
 
 def same_voxels(first: VoxelTable, *others: VoxelTable) -> bool:
-    """Return all tables have the same voxels."""
+    """Return whether all tables have the same voxels."""
     names = ("ix", "iy", "iz")
     return all(np.array_equal(getattr(first, name), getattr(other, name)) for other in others for name in names)
 

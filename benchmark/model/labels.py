@@ -375,7 +375,7 @@ def _taxonomy_text(name: str) -> tuple[str, str]:
 
 
 def name_key(name: str) -> str:
-    """Return names compare without case, surrounding space, and the choice between space, '_' and '-'."""
+    """Return a name as names compare: without case, surrounding space, and the choice between space, '_' and '-'."""
     return " ".join(name.replace("_", " ").replace("-", " ").lower().split())
 
 

@@ -165,14 +165,14 @@ class Measure(Quantity):
 
 @by_row(lambda found: found.largest)
 def vss(table: Rows) -> Float64:
-    """Return voxel Semantic Stability (n,): max_k e_k / sum_k e_k, in [1/K, 1]; read it with OP."""
+    """Return the Voxel Semantic Stability (n,): max_k e_k / sum_k e_k, in [1/K, 1]; read it with OP."""
     concentration: Float64 = table.evidence.max(axis=1) / table.evidence.sum(axis=1)
     return concentration
 
 
 @whole
 def sbd(table: Beliefs) -> Float64:
-    """Return semantic Belief Drift (n,): mean over t = 2..T of D_JS(p^(t), p^(t-1)), bits, in [0, 1].
+    """Return the Semantic Belief Drift (n,): mean over t = 2..T of D_JS(p^(t), p^(t-1)), bits, in [0, 1].
 
     NaN where OP < 2.
     """

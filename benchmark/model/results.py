@@ -42,7 +42,7 @@ class Unit:
 
 
 def slug(*names: str) -> str:
-    """Return names joined to a file name: other names give another one.
+    """Join names to a file name: other names give another one.
 
     A name stays as it is where it consists of letters, digits, '.', '_' and '-', begins with none of '.', '_', does not
     end with '_', holds no '__' and is at most LONGEST_NAME bytes long. Else what does not fit becomes '-', what is too

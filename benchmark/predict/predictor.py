@@ -56,7 +56,7 @@ class Kept(Wrapped):
         return [self._one(image, scores, frame) for image, frame in zip(images, frames, strict=True)]
 
     def _one(self, image: Image, scores: bool, frame: Sequence[Frame]) -> Prediction:
-        """Return scores are kept wherever there are some: whoever asks later may want them."""
+        """Predict an image; scores are kept wherever there are some: whoever asks later may want them."""
         file = self._folder / f"{self._key(image, frame)}.npz"
         there = read_arrays(file)
         if there is None:
