@@ -184,7 +184,7 @@ def takes_option(name: str, option: str) -> bool:
 
 
 def keeps_log(name: str) -> bool:
-    """Return whether the backend of that name can give the log of its observations: with option `history`, or always."""
+    """Return whether the backend of that name can give a log of observations: with option `history`, or always."""
     return takes_option(name, "history") or getattr(REGISTRY.load(name), "keeps_log", False)
 
 

@@ -49,12 +49,12 @@ class Belief:
     """The criteria that a voxel must meet.
 
     Attributes:
-        min_op: Seen by so many frames.
-        min_psa: Their pairs of frames agree so often; a voxel seen once has no pair.
+        min_op: Number of frames that must see a voxel.
+        min_psa: Share of its pairs of frames that must agree; a voxel seen once has no pair.
         categories: Categories that a voxel may be in, any where none is named.
-        leave_one_out: Without the frame's own vote, and seen by another frame. Drift stays that of all votes: it
+        leave_one_out: Whether the frame's own vote is left out, and another frame must see it. Drift stays that of all votes: it
             depends on their order.
-        thresholds: Whose label has the evidence that these thresholds ask for.
+        thresholds: Thresholds whose evidence the label must have.
 
     Raises:
         ConfigError: For a category that there is not, and values out of range.

@@ -32,7 +32,7 @@ class Events:
         frame: (m,) int32 frame index.
         evidence: (m, K) s_bar, the mean of the frame's evidence in the voxel; kept sparse.
         pixels: (m,) int32 pixels behind it.
-        voxel_size: R, metres.
+        voxel_size: r, metres.
         classes: The K class names, where they are known.
     """
 

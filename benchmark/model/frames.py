@@ -88,8 +88,8 @@ class Frame:
         depth: (H, W) float32, metres along the optical axis (planar z); 0, negative, NaN and inf are invalid.
         intrinsics: Intrinsics of the depth image; or its 3x3 camera matrix.
         T_wc: (4, 4) or (3, 4) float64 camera-to-world, metres; camera axes x right, y down, z forward (OpenCV).
-        labels: (H, W) uint8 or uint16 class ids, ignore id 255 or 65535; other integers become the smaller one; or.
-        scores: (H, W, K) float, non-negative; normalised per pixel where they are used.
+        labels: (H, W) uint8 or uint16 class ids, ignore id 255 or 65535; other integers become the smaller one.
+        scores: (H, W, K) float, in place of labels, non-negative; normalised per pixel where they are used.
         color: (H, W, 3) uint8 RGB, optional.
         mask: (H, W) bool, True where a thing moves that is not to be fused, optional; `semstab.pixels.preparation`.
         left_out: (H, W) bool, the pixels that were left out of fusion for what they show, optional.

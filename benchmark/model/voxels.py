@@ -154,7 +154,7 @@ class VoxelTable:
         last_frame: (n,) int32 highest frame index that saw it.
         self_sum: (n,) float64 sum over frames of ||s_bar||^2.
         frame_entropy_sum: (n,) float64 sum over frames of the entropy of s_bar, bits.
-        voxel_size: R, metres.
+        voxel_size: r, metres.
         classes: The K class names, where they are known.
 
     Raises:
