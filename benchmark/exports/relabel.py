@@ -52,8 +52,8 @@ class Belief:
         min_op: Number of frames that must see a voxel.
         min_psa: Share of its pairs of frames that must agree; a voxel seen once has no pair.
         categories: Categories that a voxel may be in, any where none is named.
-        leave_one_out: Whether the frame's own vote is left out, and another frame must see it. Drift stays that of all votes: it
-            depends on their order.
+        leave_one_out: Whether the frame's own vote is left out, and another frame must see it. Drift stays that of all
+            votes: it depends on their order.
         thresholds: Thresholds whose evidence the label must have.
 
     Raises:
