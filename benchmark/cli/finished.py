@@ -21,7 +21,7 @@ def compare(
     verbose: Verbose = False,
     quiet: Quiet = False,
 ) -> None:  # fmt: skip
-    """What differs between runs: by how much, how surely, in which classes and places, and which frames did it."""
+    """Compare runs: by how much they differ, how surely, in which classes and places, and which frames did it."""
     from rich.console import Console
 
     from semstab.comparison.tables import print_comparison
@@ -106,7 +106,7 @@ def calibrate(
     confidence: Annotated[float, typer.Option(help="With which this is to hold, class by class.")] = 0.95,
     quiet: Quiet = False,
 ) -> None:
-    """For each class the least evidence at which its labels are right often enough to be acted on."""
+    """Find for each class the least evidence at which its labels are right often enough to be acted on."""
     from semstab.comparison.calibration import calibrate_run, lines
 
     thresholds = calibrate_run(run, precision=precision, confidence=confidence)
@@ -177,7 +177,7 @@ def export(
     most: Annotated[int, typer.Option("--most", "-n", min=1, help="Annotation tasks at most.")] = 50,
     quiet: Quiet = False,
 ) -> None:  # fmt: skip
-    """The fused map as a point cloud, raster, mesh or table, with how far to trust each location."""
+    """Write the fused map as a point cloud, raster, mesh or table, with how far to trust each location."""
     from semstab.exports import export as write
 
     for file in write(
@@ -205,7 +205,7 @@ def relabel(
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace maps of other settings.")] = False,
     quiet: Quiet = False,
 ) -> None:  # fmt: skip
-    """The fused classes back in every frame: label maps of a new source, unstable voxels ignored."""
+    """Write the fused classes back into every frame: label maps of a new source, unstable voxels ignored."""
     from rich.console import Console
 
     from semstab.convert import frame_bar
@@ -227,7 +227,7 @@ def relabel(
 
 
 def list_() -> None:
-    """Backends, datasets, backbones, filters, taxonomies and studies, each with 'ready' or what to install."""
+    """List backends, datasets, backbones, filters, taxonomies and studies, each with 'ready' or what to install."""
     from rich.console import Console
     from rich.markup import escape
     from rich.table import Table

@@ -58,8 +58,7 @@ def locations_by_class(table: VoxelTable) -> Float64:
 
 
 def ceiling_specs(sums: ClusterSums, K: int, wanted: Scope = THIS_SCENE) -> Iterator[EstimateSpec]:
-    """For `answers`: alpha in the sample, its ceiling, and what share of it is reached, by K classes together and by
-    each."""
+    """Yield for `answers` alpha in the sample, its ceiling, and the share reached, together and by class of K."""
     assert sums.seen is not None
     scope = scope_of(sums, wanted)
     yield spec_of(sums.seen, "alpha_between", scope=scope)
