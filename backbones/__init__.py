@@ -68,11 +68,12 @@ UNASSIGNED = 0
 
 @dataclass(frozen=True, eq=False)
 class Prediction:
-    """What a backbone says about one image.
+    """The prediction of a backbone for one image.
 
-    labels  (H, W) uint8 or uint16: ids of its label space, 255 (65535) where it says nothing; of a backbone without
-            classes, region ids from 1, `UNASSIGNED` where there is no region
-    scores  (H, W, K) float32 that sum to 1 over the classes, or None where only labels are wanted
+    Attributes:
+        labels: (H, W) uint8 or uint16: ids of its label space, 255 (65535) where it says nothing; of a backbone without
+            classes, region ids from 1, `UNASSIGNED` where there is no region.
+        scores: (H, W, K) float32 that sum to 1 over the classes, or None where only labels are wanted.
     """
 
     labels: Labels
@@ -83,8 +84,9 @@ class Prediction:
 class Streamed:
     """A prediction whose scores come class by class, so that they never are in memory at once.
 
-    labels  as of a `Prediction`
-    maps    gives the scores (H, W) float32 of each class in order, anew at each call
+    Attributes:
+        labels: Those of a `Prediction`.
+        maps: A function that gives the scores (H, W) float32 of each class in order, anew at each call.
     """
 
     labels: Labels
@@ -94,14 +96,15 @@ class Streamed:
 class Backbone(Protocol):
     """Images in, label maps or scores out. Its class has `Options`, a pydantic model, and is made with one of it.
 
-    label_space     the classes of its labels and scores, or None where it predicts regions without classes
-    gives_scores    whether `predict` can give scores
-    fit_frames      how many images `fit` wants, 0 for most
-    sequential      whether what it says of an image depends on the images before: it then gets the selected frames of a
-                    sequence in order, all of them, from the first one after `reset`
-    wants_geometry  whether `predict` is also given `geometry=`, one `Frame` an image: its depth, intrinsics and pose at
-                    the image's own pixels, depth 0 where it is not known; labels are all 0, there is no colour
-    streams         whether `stream` keeps less in memory than `predict`: it is called where scores are many
+    Attributes:
+        label_space: The classes of its labels and scores, or None where it predicts regions without classes.
+        gives_scores: Whether `predict` can give scores.
+        fit_frames: Number of images that `fit` wants, 0 for most.
+        sequential: Whether what it says of an image depends on the images before: it then gets the selected frames of a
+            sequence in order, all of them, from the first one after `reset`.
+        wants_geometry: Whether `predict` is also given `geometry=`, one `Frame` an image: its depth, intrinsics and
+            pose at the image's own pixels, depth 0 where it is not known; labels are all 0, there is no colour.
+        streams: Whether `stream` keeps less in memory than `predict`: it is called where scores are many.
     """
 
     label_space: LabelSpace | None = None
@@ -112,7 +115,7 @@ class Backbone(Protocol):
     streams: bool = False
 
     def fit(self, images: Sequence[Image]) -> Backbone:
-        """The backbone adapted to a sequence by its first `fit_frames` images; itself where that is nothing.
+        """Return the backbone adapted to a sequence by its first `fit_frames` images; itself where that is nothing.
 
         Called once a sequence, before the first `predict`, whatever frames are predicted later.
         """
@@ -123,19 +126,19 @@ class Backbone(Protocol):
         return
 
     def predict(self, images: Sequence[Image], *, scores: bool = False) -> list[Prediction]:
-        """One prediction an image, in order, of the image's size. The images have one size.
+        """Return one prediction an image, in order, of the image's size. The images have one size.
 
         The result does not depend on how images are put together into batches, but for rounding.
         """
         ...
 
     def stream(self, image: Image) -> Streamed:
-        """What `predict` says with scores, these class by class."""
+        """Return what `predict` says with scores, these class by class."""
         (prediction,) = self.predict([image], scores=True)
         return streamed(prediction)
 
     def identity(self) -> dict[str, Any]:
-        """All that its output depends on beside the image, for JSON: settings, and what they name by its content.
+        """Return what the output depends on beside the image, for JSON: settings, and the content of what they name.
 
         Predictions are kept and reused under it.
         """
@@ -143,7 +146,7 @@ class Backbone(Protocol):
 
 
 def streamed(prediction: Prediction) -> Streamed:
-    """A prediction whose scores, where it has any, are handed out class by class."""
+    """Return a prediction whose scores, where it has any, are handed out class by class."""
     scores = prediction.scores
     return Streamed(prediction.labels, lambda: iter(() if scores is None else np.moveaxis(scores, 2, 0)))
 
@@ -157,7 +160,7 @@ def ask(
 
 
 def content_digest(path: Path) -> str:
-    """A hash of a file, or of the names and contents of all files in a folder."""
+    """Return a hash of a file, or of the names and contents of all files in a folder."""
     digest = hashlib.blake2b(digest_size=16)
     for file in [path] if path.is_file() else sorted(each for each in path.rglob("*") if each.is_file()):
         digest.update(b"" if file == path else str(file.relative_to(path)).encode() + b"\0")
@@ -167,22 +170,25 @@ def content_digest(path: Path) -> str:
 
 
 def image_digest(image: Image) -> str:
-    """A hash of an image's size and colours."""
+    """Return a hash of an image's size and colours."""
     content = hashlib.blake2b(repr(image.shape).encode(), digest_size=16)
     content.update(np.ascontiguousarray(image).data)
     return content.hexdigest()
 
 
 def narrowed(ids: npt.NDArray[Any], classes: int) -> Labels:
-    """Class ids as the narrowest type that holds so many classes and the ignore id."""
+    """Return the class ids as the narrowest type that holds so many classes and the ignore id."""
     return ids.astype(np.uint8) if classes <= IGNORE_8BIT else ids.astype(np.uint16)
 
 
 def maker(name: str) -> tuple[type[BaseModel], Callable[[Any], Backbone]]:
-    """The options of backbones of that name, and their constructor, which takes them.
+    """Return the options of backbones of that name, and their constructor, which takes them.
 
     A name is that of a registered class, of a user's code (FILE.py:NAME, package.module:NAME), or of a network's file
-    (net.onnx). Raises ConfigError, DataError, MissingDependencyError.
+    (net.onnx).
+
+    Raises:
+        ConfigError, DataError, MissingDependencyError: If it cannot be loaded.
     """
     from semstab.backbones.custom import is_code, own_maker
     from semstab.backbones.network import NetworkFile, NetworkOptions, is_network
@@ -196,15 +202,17 @@ def maker(name: str) -> tuple[type[BaseModel], Callable[[Any], Backbone]]:
 
 
 def options_model(name: str) -> type[BaseModel]:
-    """The pydantic model of a backbone's options. Raises what `maker` raises."""
+    """Return the pydantic model of a backbone's options. Raises what `maker` raises."""
     return maker(name)[0]
 
 
 def create(name: str, **options: Any) -> Backbone:
     """Load a backbone by name with its options.
 
-    Raises ConfigError for an unknown name or option, DataError for a model that cannot be loaded,
-    MissingDependencyError where its packages are not installed.
+    Raises:
+        ConfigError: For an unknown name or option.
+        DataError: For a model that cannot be loaded.
+        MissingDependencyError: If its packages are not installed.
     """
     model, make = maker(name)
     return make(validated(model, options, f"backbone '{name}': "))

@@ -35,7 +35,7 @@ class Wrapped(Backbone):
         self.wants_geometry = inner.wants_geometry
 
     def fit(self, images: Sequence[Image]) -> Self:
-        """A copy around the inner backbone adapted to the sequence."""
+        """Return a copy around the inner backbone adapted to the sequence."""
         fitted = copy.copy(self)
         fitted.inner = self.inner.fit(images)
         return fitted
@@ -67,13 +67,15 @@ MEMBERS = (
 )  # fmt: skip
 
 SUM_TOLERANCE = 0.01
-"""By how much a pixel's scores may miss 1: half precision does."""
+"""The largest distance of a pixel's summed scores from 1, which half precision may reach."""
 
 
 class Checked(Wrapped):
     """A backbone whose predictions are checked: one line says what is wrong with them.
 
-    Raises ConfigError for a class that is no backbone, DataError for predictions that are none of these images.
+    Raises:
+        ConfigError: For a class that is no backbone.
+        DataError: For predictions that are none of these images.
     """
 
     def __init__(self, backbone: Any, name: str) -> None:
@@ -90,7 +92,7 @@ class Checked(Wrapped):
             raise ConfigError(f"backbone '{name}': label_space is a {what}; make it a semstab.LabelSpace, or None")
 
     def fit(self, images: Sequence[Image]) -> Self:
-        """The backbone adapted to a sequence."""
+        """Return the backbone adapted to a sequence."""
         fitted = super().fit(images)
         if not hasattr(fitted.inner, "predict"):
             raise ConfigError(f"backbone '{self.name}': fit gave {_kind(fitted.inner)}; let it return the backbone")
@@ -113,7 +115,7 @@ class Checked(Wrapped):
         return Streamed(answer.labels, lambda: self._maps(answer, image.shape[:2]))
 
     def identity(self) -> dict[str, Any]:
-        """That of the backbone, which JSON must hold."""
+        """Return the identity of the backbone, which JSON must hold."""
         identity: Any = self.inner.identity()
         try:
             json.dumps(identity, allow_nan=False)
@@ -174,7 +176,7 @@ class Checked(Wrapped):
 
 
 def _add_up(scores: npt.NDArray[np.floating[Any]]) -> bool:
-    """Whether the scores (H, W, K) of each pixel are not negative and sum to 1; or to 0, where nothing is said."""
+    """Return whether each pixel's scores (H, W, K) are not negative and sum to 1, or to 0 where nothing is said."""
     total = scores.sum(axis=2, dtype=np.float32)
     return bool((scores >= 0).all() and ((np.abs(total - 1) <= SUM_TOLERANCE) | (total == 0)).all())
 

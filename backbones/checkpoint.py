@@ -34,7 +34,7 @@ HUB_TIMEOUT = 10.0
 
 
 class ModelOptions(Settings):
-    """Which pretrained model, and how it runs."""
+    """The settings that name a pretrained model and say how it runs."""
 
     model: str = Field(description="a folder that save_pretrained wrote, or an id on the Hugging Face hub")
     revision: str | None = Field(None, description="branch, tag or commit on the hub; the newest where not given")
@@ -45,7 +45,7 @@ class ModelOptions(Settings):
     threads: int | None = Field(None, ge=1, description="threads on a CPU; torch's own number where not given")
 
     def identity(self) -> dict[str, Any]:
-        """The options that its output depends on; the model itself is named by `Checkpoint.revision`."""
+        """Return the options that its output depends on; the model itself is named by `Checkpoint.revision`."""
         return self.model_dump(mode="json", exclude={"model", "revision", "threads"})
 
 
@@ -53,9 +53,10 @@ class ModelOptions(Settings):
 class Checkpoint:
     """The files of one version of a model.
 
-    name      the folder, or the id on the hub
-    folder    where the files are
-    revision  the commit on the hub, or the digest of the files
+    Attributes:
+        name: The folder, or the id on the hub.
+        folder: The folder of the files.
+        revision: The commit on the hub, or the digest of the files.
     """
 
     name: str
@@ -71,7 +72,9 @@ class Checkpoint:
     def find(cls, options: ModelOptions) -> Checkpoint:
         """Look in the file system, then in the hub's cache, then on the hub.
 
-        Raises DataError where the model is in none of them, ConfigError for a name that is no model's.
+        Raises:
+            DataError: If the model is in none of them.
+            ConfigError: For a name that is no model's.
         """
         folder = Path(options.model).expanduser()
         if folder.is_dir():
@@ -85,7 +88,11 @@ class Checkpoint:
         return cls(options.model, fetched, fetched.name)
 
     def preprocessing(self) -> dict[str, Any]:
-        """What preprocessor_config.json says; nothing where it is not there. Raises DataError where it is damaged."""
+        """Return the content of preprocessor_config.json, empty where it is not there.
+
+        Raises:
+            DataError: If it is damaged.
+        """
         file = self.folder / "preprocessor_config.json"
         if not file.is_file():
             return {}
@@ -95,9 +102,10 @@ class Checkpoint:
         return content
 
     def load(self, loader: Any, **options: Any) -> Any:
-        """What `loader.from_pretrained` makes of the folder, without network.
+        """Return the result of `loader.from_pretrained` on the folder, without network.
 
-        Raises DataError where it makes nothing.
+        Raises:
+            DataError: If it makes nothing.
         """
         with _quiet():
             try:
@@ -107,9 +115,11 @@ class Checkpoint:
                 raise DataError(f"{self.folder}: {what} cannot load it ({_first_sentence(error)}); {AGAIN}") from error
 
     def load_model(self, loader: Any, options: ModelOptions) -> Any:
-        """A model on its device, ready to predict.
+        """Return a model on its device, ready to predict.
 
-        Raises DataError where weights are missing or have other shapes, ConfigError for a device that is not there.
+        Raises:
+            DataError: If weights are missing or have other shapes.
+            ConfigError: For a device that is not there.
         """
         device = checked_device(options.device)
         if options.threads is not None:
@@ -128,12 +138,16 @@ AGAIN = "name a folder that save_pretrained wrote, or a hub id, of such a model"
 
 
 def bilinear(images: torch.Tensor, size: Any) -> torch.Tensor:
-    """Images (K, h, w) brought to (K, H, W), pixel areas aligned."""
+    """Return images (K, h, w) brought to (K, H, W), pixel areas aligned."""
     return torch.nn.functional.interpolate(images[None], size=size, mode="bilinear", align_corners=False)[0]
 
 
 def checked_device(name: str) -> torch.device:
-    """The device of that name. Raises ConfigError where torch has none."""
+    """Return the device of that name.
+
+    Raises:
+        ConfigError: If torch has none.
+    """
     try:
         device = torch.device(name)
         torch.empty(0, device=device)
@@ -153,7 +167,7 @@ def _require_model(folder: Path) -> None:
 
 
 def _digest(folder: Path) -> str:
-    """Of the names and contents of the files that loading may read."""
+    """Return the hash of the names and contents of the files that loading may read."""
     digest = hashlib.blake2b(digest_size=16)
     for path in sorted(folder.iterdir()):
         if path.suffix in (".json", ".txt", ".safetensors", ".bin") and path.is_file():
@@ -164,7 +178,7 @@ def _digest(folder: Path) -> str:
 
 
 def _cached(options: ModelOptions) -> Path | None:
-    """The folder of the hub's cache, where an earlier download left the whole model there."""
+    """Return the folder of the hub's cache, where an earlier download left the whole model there."""
     try:
         folder = Path(
             str(huggingface_hub.snapshot_download(options.model, revision=options.revision, local_files_only=True))
@@ -207,13 +221,13 @@ def _download(options: ModelOptions) -> Path:
 
 
 def _first_sentence(error: Exception) -> str:
-    """Without the paragraphs of advice that libraries append."""
+    """Return the first sentence of an error, without the paragraphs of advice that libraries append."""
     return re.split(r"(?<=[.:;]) |\n", summarize_error(error), maxsplit=1)[0].rstrip(".:;")
 
 
 @contextlib.contextmanager
 def _quiet() -> Iterator[None]:
-    """Without the progress bar and the notes of transformers, which would break into our own."""
+    """Silence the progress bar and the notes of transformers, which would break into our own."""
     notes: Any = transformers.utils.logging
     verbosity, bars = notes.get_verbosity(), notes.is_progress_bar_enabled()
     notes.set_verbosity_error()
@@ -232,7 +246,7 @@ Processing = Literal["pil", "torchvision"]
 
 
 class ImageModelOptions(ModelOptions):
-    """Which pretrained model, how it runs, and by which library images are resized for it."""
+    """The settings that name a pretrained model, say how it runs, and which library resizes images for it."""
 
     processor: Processing = Field(
         "pil", description="pil or torchvision: they resize differently, which changes up to 2 % of the labels"
@@ -240,10 +254,13 @@ class ImageModelOptions(ModelOptions):
 
 
 def load_processor(checkpoint: Checkpoint, processing: Processing, **settings: Any) -> Any:
-    """The checkpoint's own preprocessing, without a crop, done by the library that is asked for and no other.
+    """Return the checkpoint's own preprocessing, without a crop, done by the library that is asked for and no other.
 
-    Checkpoints of before transformers 5 may name a 'feature extractor' that is no longer there. Raises ConfigError
-    where that library is not installed, DataError where the checkpoint's preprocessing cannot be done by it.
+    Checkpoints of before transformers 5 may name a 'feature extractor' that is no longer there.
+
+    Raises:
+        ConfigError: If that library is not installed.
+        DataError: If the checkpoint's preprocessing cannot be done by it.
     """
     if processing == "torchvision" and importlib.util.find_spec("torchvision") is None:
         raise MissingDependencyError(
@@ -270,7 +287,7 @@ def load_processor(checkpoint: Checkpoint, processing: Processing, **settings: A
 
 
 class SegmenterOptions(ImageModelOptions):
-    """Which checkpoint, at which image size, run by what, asked for what."""
+    """The settings of a segmenter: checkpoint, image size, engine and prompts."""
 
     image_size: PositiveInt | tuple[PositiveInt, PositiveInt] | None = Field(
         None,

@@ -36,9 +36,10 @@ class ColourClusterOptions(Settings):
 class Codebook:
     """Cluster centres of normalised features.
 
-    mean, deviation  (D,) of the features that it was fitted to
-    centres          (K, D), by increasing lightness
-    variance         mean squared distance of a feature from its centre, an axis
+    Attributes:
+        mean, deviation: (D,) of the features that it was fitted to.
+        centres: (K, D), by increasing lightness.
+        variance: Mean squared distance of a feature from its centre, an axis.
     """
 
     mean: Features
@@ -66,7 +67,11 @@ class ColourClusters(Backbone):
         self.codebook = codebook
 
     def fit(self, images: Sequence[Image]) -> ColourClusters:
-        """With the codebook of these images. Raises ConfigError where they have fewer pixels than clusters."""
+        """Return the backbone with the codebook of these images.
+
+        Raises:
+            ConfigError: If they have fewer pixels than clusters.
+        """
         rng = np.random.default_rng(self.options.seed)
         drawn = []
         for image in images:
@@ -77,13 +82,17 @@ class ColourClusters(Backbone):
         return ColourClusters(self.options, _codebook(np.concatenate(drawn), self.options))
 
     def predict(self, images: Sequence[Image], *, scores: bool = False) -> list[Prediction]:
-        """Raises ConfigError where `fit` was not called."""
+        """See `Backbone`.
+
+        Raises:
+            ConfigError: If `fit` was not called.
+        """
         if self.codebook is None:
             raise ConfigError("colour-clusters has no codebook yet; call fit with the first images of the sequence")
         return [_predict(pixel_features(image, self.options.scale), self.codebook, scores) for image in images]
 
     def identity(self) -> dict[str, Any]:
-        """The settings and the codebook."""
+        """Return the settings and the codebook."""
         book = self.codebook
         arrays = () if book is None else (book.mean, book.deviation, book.centres)
         digest = hashlib.blake2b(b"".join(array.tobytes() for array in arrays), digest_size=16).hexdigest()
@@ -91,7 +100,7 @@ class ColourClusters(Backbone):
 
 
 def pixel_features(image: Image, scale: float) -> Features:
-    """(H, W, 4): Lab colour in a Gaussian window, lightness 0 to 100, and the deviation of lightness in it."""
+    """Return (H, W, 4): Lab colour in a Gaussian window, lightness 0 to 100, and the deviation of lightness in it."""
     lab = cv2.cvtColor(image.astype(np.float32) / np.float32(255), cv2.COLOR_RGB2LAB)
     mean = cv2.GaussianBlur(lab, (0, 0), scale)
     lightness = lab[..., 0]

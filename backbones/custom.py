@@ -39,10 +39,11 @@ MODULE = re.compile(r"[A-Za-z_]\w*(\.[A-Za-z_]\w*)*")
 class Code:
     """A class or a function in a user's file or package.
 
-    text    as it was named
-    name    of the class or the function
-    target  itself
-    module  where it is
+    Attributes:
+        text: The name as it was given.
+        name: Name of the class or the function.
+        target: Itself.
+        module: The module that holds it.
     """
 
     text: str
@@ -52,7 +53,12 @@ class Code:
 
     @classmethod
     def load(cls, text: str) -> Code:
-        """Import it. Raises ConfigError where it is not there, MissingDependencyError, DataError where it fails."""
+        """Import it.
+
+        Raises:
+            ConfigError: If it is not there.
+            MissingDependencyError, DataError: If it fails.
+        """
         place, _, name = text.rpartition(":")
         in_file = place.endswith(".py")
         if not name.isidentifier() or not (in_file or MODULE.fullmatch(place)):
@@ -74,12 +80,16 @@ class Code:
 
     @property
     def digest(self) -> str:
-        """Of the file that it stands in."""
+        """The hash of the file that it stands in."""
         file = self.module.__file__
         return "" if file is None else content_digest(Path(file))
 
     def accepts(self, options: dict[str, Any], *more: Any) -> None:
-        """Raises ConfigError where it cannot be called with `more` and these options."""
+        """Check the call with `more` and these options.
+
+        Raises:
+            ConfigError: If it cannot be called so.
+        """
         try:
             inspect.signature(self.target).bind(*more, **options)
         except ValueError:  # compiled code does not say
@@ -91,18 +101,18 @@ class Code:
 
 
 def is_code(name: str) -> bool:
-    """Whether a backbone's name says where code is, and is none of a registry."""
+    """Return whether a backbone's name says where code is, and is none of a registry."""
     return ":" in name or name.endswith(".py")
 
 
 def absolute(name: str) -> str:
-    """The name of code, its file's from the root of the file system."""
+    """Return the name of code, its file's from the root of the file system."""
     place, _, what = name.rpartition(":")
     return f"{Path(place).expanduser().absolute()}:{what}" if place.endswith(".py") else name
 
 
 def guarded(text: str, do: Callable[[], T]) -> T:
-    """What user's code does; what it raises becomes one line that says where it was raised."""
+    """Run a user's code, and turn an error in it into one line that says where it was raised."""
     try:
         return do()
     except (ConfigError, DataError, MissingDependencyError):
@@ -143,13 +153,13 @@ def _of_file(path: Path) -> ModuleType:
 
 
 def _may_import_from(folder: Path) -> None:
-    """Last, so that nothing there takes the place of an installed package."""
+    """Append the folder to the search path, where nothing in it takes the place of an installed package."""
     if str(folder) not in sys.path:
         sys.path.append(str(folder))
 
 
 class OwnOptions(BaseModel):
-    """What the code is called with, and the names of its classes."""
+    """The options that the code is called with, and the names of its classes."""
 
     model_config = ConfigDict(extra="allow", frozen=True)
 
@@ -159,7 +169,7 @@ class OwnOptions(BaseModel):
 
 
 def own_maker(text: str) -> tuple[type[BaseModel], Callable[[Any], Backbone]]:
-    """The options of a user's class or function, and what makes a backbone of it with them.
+    """Return the options of a user's class or function, and what makes a backbone of it with them.
 
     Both raise ConfigError, DataError, MissingDependencyError, each in one line.
     """
@@ -187,7 +197,7 @@ class OfCode(Wrapped):
         self._about = {"code": code.digest, "options": contents(options)}
 
     def identity(self) -> dict[str, Any]:
-        """Its own, its file and its options."""
+        """Return its own, its file and its options."""
         return {**self.inner.identity(), **self._about}
 
 
@@ -227,12 +237,16 @@ class OwnModel(Backbone):
     def predict(
         self, images: Sequence[Image], *, scores: bool = False, geometry: Sequence[Frame] = ()
     ) -> list[Prediction]:
-        """See `Backbone`. Raises DataError for an answer that is neither labels nor scores."""
+        """See `Backbone`.
+
+        Raises:
+            DataError: For an answer that is neither labels nor scores.
+        """
         shown = zip(images, geometry, strict=True) if self.wants_geometry else zip(images, strict=True)
         return [self._predict(image, frame, scores) for image, *frame in shown]
 
     def identity(self) -> dict[str, Any]:
-        """Its file, its options, its classes."""
+        """Return its file, its options, its classes."""
         assert self.label_space is not None
         about = {"code": self._code.digest, "name": self._code.name, "options": contents(self._options)}
         return {**about, "classes": list(self.label_space.classes)}
@@ -256,24 +270,28 @@ class OwnModel(Backbone):
 
 
 def contents(options: Mapping[str, Any]) -> dict[str, Any]:
-    """Options by what they say; a file or a folder by what is in it."""
+    """Return options by what they say; a file or a folder by what is in it."""
     return {
         key: content_digest(Path(value).expanduser()) if is_path(value) else value for key, value in options.items()
     }
 
 
 def is_path(value: Any) -> bool:
-    """Whether an option names a file or a folder that is there."""
+    """Return whether an option names a file or a folder that is there."""
     return isinstance(value, str) and bool(Path(value).suffix or "/" in value) and Path(value).expanduser().exists()
 
 
 def _array(output: Any) -> npt.NDArray[Any]:
-    """An array of what a model gives; tensors come from where they are."""
+    """Return an array of what a model gives; tensors come from where they are."""
     return np.asarray(output.detach().cpu().numpy() if hasattr(output, "detach") else output)
 
 
 def _ids(labels: npt.NDArray[Any], classes: int, who: str) -> Labels:
-    """Labels as the narrowest type. Raises DataError for one that is no class and not ignored."""
+    """Return labels as the narrowest type.
+
+    Raises:
+        DataError: For one that is no class and not ignored.
+    """
     ignore = IGNORE_8BIT if classes <= IGNORE_8BIT else IGNORE_16BIT
     wrong = (labels >= classes) & (labels != ignore)
     if wrong.any():

@@ -1,4 +1,4 @@
-"""What each kind of checkpoint says of images: one value a class and pixel, the largest of which is the label."""
+"""The output of each kind of checkpoint for images: one value a class and pixel, the largest of which is the label."""
 
 from __future__ import annotations
 
@@ -50,7 +50,11 @@ class SemanticHead:
         self._kind = kind
 
     def maps(self, images: Sequence[Image]) -> list[torch.Tensor]:
-        """The logits. Raises ConfigError where the model cannot see images of that size."""
+        """Return the logits.
+
+        Raises:
+            ConfigError: If the model cannot see images of that size.
+        """
         shorter = self._size or _shorter_side(self._processor)
         height, width = shorter if isinstance(shorter, tuple) else working_size(images[0].shape[:2], shorter)
         pixels = self._processor(
@@ -112,7 +116,7 @@ class UniversalHead:
             self._masks = (size["shortest_edge"], size.get("longest_edge") or size["shortest_edge"])
 
     def maps(self, images: Sequence[Image]) -> list[torch.Tensor]:
-        """The sums."""
+        """Return the sums."""
         settings = {"images": list(images), "input_data_format": "channels_last", "return_tensors": "pt", **self._size}
         if self._task is not None:
             settings["task_inputs"] = ["semantic"] * len(images)
@@ -159,7 +163,7 @@ class PromptedHead:
         self._seen = {"size": {"height": side, "width": side}}
 
     def maps(self, images: Sequence[Image]) -> list[torch.Tensor]:
-        """The logits."""
+        """Return the logits."""
         settings = {"images": list(images), "input_data_format": "channels_last", "return_tensors": "pt", **self._seen}
         pixels = self._processor(**settings)["pixel_values"].to(self._model.device, self._model.dtype)
         K, more = len(self._prompts), {"conditional_embeddings": self._prompts, "interpolate_pos_encoding": True}
@@ -171,7 +175,11 @@ Head = SemanticHead | UniversalHead | PromptedHead
 
 
 def load_head(checkpoint: Checkpoint, options: SegmenterOptions, kind: str) -> Head:
-    """Load a kind of checkpoint. Raises DataError, with the kinds that there are, for another one."""
+    """Load a kind of checkpoint.
+
+    Raises:
+        DataError: For another one, with the kinds that there are.
+    """
     if kind in SEMANTIC:
         return SemanticHead(checkpoint, options, kind)
     if options.engine != "torch":
@@ -185,17 +193,19 @@ def load_head(checkpoint: Checkpoint, options: SegmenterOptions, kind: str) -> H
 
 
 def class_sums(classes: torch.Tensor, masks: torch.Tensor, size: tuple[int, int] | None) -> torch.Tensor:
-    """(K, h, w): over queries q of softmax(classes)[q, k] times sigmoid(masks)[q], without the class 'none'.
+    """Return (K, h, w): over queries q of softmax(classes)[q, k] times sigmoid(masks)[q], without the class 'none'.
 
-    classes  (Q, K + 1) logits, 'none' last
-    masks    (Q, h', w') logits, brought to `size` first where one is given
+    Args:
+        classes: (Q, K + 1) logits, 'none' last.
+        masks: (Q, h', w') logits.
+        size: (h, w) that the masks are brought to first, None to leave them.
     """
     masks = masks.float() if size is None else bilinear(masks.float(), size)
     return torch.einsum("qk,qhw->khw", classes.float().softmax(dim=-1)[:, :-1], masks.sigmoid())
 
 
 def working_size(image: tuple[int, ...], shorter: int) -> tuple[int, int]:
-    """(height, width) of the image's shape whose shorter side is about that long, in multiples of 32 pixels.
+    """Return (height, width) of the image's shape whose shorter side is about that long, in multiples of 32 pixels.
 
     >>> working_size((1080, 1920), 512)
     (512, 896)
@@ -206,7 +216,7 @@ def working_size(image: tuple[int, ...], shorter: int) -> tuple[int, int]:
 
 
 def _square(kind: str, config: Any, processor: Any, options: SegmenterOptions) -> tuple[int, int]:
-    """The side of the square that the model sees; an image is squeezed into it, which is said."""
+    """Return the side of the square that the model sees; an image is squeezed into it, which is said."""
     wanted, made_for = options.image_size, getattr(config, "image_size", None) or _shorter_side(processor)
     side = made_for if wanted is None else wanted if isinstance(wanted, int) else wanted[0]
     if isinstance(wanted, tuple) and wanted[0] != wanted[1]:
@@ -218,13 +228,13 @@ def _square(kind: str, config: Any, processor: Any, options: SegmenterOptions) -
 
 
 def _shorter_side(processor: Any) -> int:
-    """Of the images that the checkpoint was made for, pixels."""
+    """Return the shorter side, in pixels, of the images that the checkpoint was made for."""
     size = processor.size
     return int(size.get("shortest_edge") or min(size["height"], size["width"]))
 
 
 def _merged(sums: Sequence[torch.Tensor], inputs: Any, images: Sequence[Image]) -> list[torch.Tensor]:
-    """Windows along the longer side put together, averaged where they overlap."""
+    """Return windows along the longer side put together, averaged where they overlap."""
     offsets = [[int(value) for value in offset] for offset in inputs["patch_offsets"]]
     merged = []
     for k, image in enumerate(images):
@@ -251,7 +261,10 @@ class OnnxEngine:
     """Pixels (N, 3, h, w) to logits (N, K, h', w') on the CPU in float32, an image at a time.
 
     What was exported of that version of a model is kept in the cache folder, where it can be written.
-    Raises ConfigError for another device or dtype, MissingDependencyError without onnxruntime.
+
+    Raises:
+        ConfigError: For another device or dtype.
+        MissingDependencyError: Without onnxruntime.
     """
 
     def __init__(self, model: torch.nn.Module, options: ModelOptions, revision: str) -> None:
@@ -273,7 +286,11 @@ class OnnxEngine:
         self._sessions: dict[tuple[int, ...], Any] = {}
 
     def __call__(self, pixels: torch.Tensor) -> torch.Tensor:
-        """Logits of the images. Raises DataError for a model that cannot be exported."""
+        """Return logits of the images.
+
+        Raises:
+            DataError: For a model that cannot be exported.
+        """
         shape = tuple(pixels.shape[1:])
         if shape not in self._sessions:
             self._sessions[shape] = self._session(pixels[:1])

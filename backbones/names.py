@@ -1,4 +1,4 @@
-"""From a model's own classes to those of a taxonomy, by name: what Cityscapes and ADE20K call UAVid's classes."""
+"""A mapping from a model's own classes to a taxonomy's by name: what Cityscapes and ADE20K call UAVid's classes."""
 
 from __future__ import annotations
 
@@ -29,11 +29,12 @@ Leniency = Literal["strict", "lenient"]
 
 @dataclass(frozen=True)
 class Vocabulary:
-    """What one family of models calls the classes of UAVid; see configs/backbones/class_names.yaml.
+    """The names that one family of models has for the classes of UAVid; see configs/backbones/class_names.yaml.
 
-    recognised_by  names that only this vocabulary has, and always has
-    rest           the class of what no class takes
-    strict         class to the names that certainly are it; `lenient` to the names that are it on a generous view
+    Attributes:
+        recognised_by: Names that only this vocabulary has, and always has.
+        rest: The class of what no class takes.
+        strict: Class to the names that certainly are it; `lenient` to the names that are it on a generous view.
     """
 
     recognised_by: Sequence[str]
@@ -42,12 +43,12 @@ class Vocabulary:
     lenient: Mapping[str, Sequence[str]]
 
     def matches(self, space: LabelSpace) -> bool:
-        """Whether a model's classes come from this vocabulary."""
+        """Return whether a model's classes come from this vocabulary."""
         own = {name_key(part) for name in space.classes for part in _names(name)}
         return {name_key(name) for name in self.recognised_by} <= own
 
     def target_of(self, name: str, leniency: Leniency) -> str | None:
-        """The class of UAVid that a name is, None where it is none."""
+        """Return the class of UAVid that a name is, None where it is none."""
         tables = (self.strict, self.lenient) if leniency == "lenient" else (self.strict,)
         targets = {name_key(each): target for table in tables for target, names in table.items() for each in names}
         return next((targets[key] for key in map(name_key, _names(name)) if key in targets), None)
@@ -55,7 +56,7 @@ class Vocabulary:
 
 @functools.cache
 def vocabularies() -> Mapping[str, Vocabulary]:
-    """Those that ship, by name."""
+    """Return the vocabularies that ship, by name."""
     file = importlib.resources.files("semstab.configs") / "backbones" / "class_names.yaml"
     content = parse_yaml(file.read_text(encoding="utf-8"), file.name)
     return {name: Vocabulary(**entry) for name, entry in content.items()}
@@ -91,7 +92,7 @@ def class_mapping(source: LabelSpace, target: LabelSpace, leniency: Leniency = "
 
 
 def _candidates(name: str, vocabulary: Vocabulary | None, leniency: Leniency) -> Sequence[str]:
-    """Names of a class in the target, the best first."""
+    """Return the names of a class in the target, the best first."""
     target = None if vocabulary is None else vocabulary.target_of(name, leniency)
     if vocabulary is None or target is not None:
         return [*([target] if target else []), *_names(name)]
@@ -102,7 +103,9 @@ class InTaxonomy(Wrapped):
     """A backbone whose labels and scores are given in the classes of a taxonomy, ids 0 to K - 1.
 
     Labels are the mapped classes of the model's own decision; scores of classes that fall together are added up.
-    Raises ConfigError for a backbone without classes, and what `class_mapping` raises.
+
+    Raises:
+        ConfigError: For a backbone without classes, and what `class_mapping` raises.
     """
 
     def __init__(self, backbone: Backbone, target: LabelSpace, leniency: Leniency) -> None:
@@ -133,12 +136,12 @@ class InTaxonomy(Wrapped):
         return Streamed(labels, lambda: self._maps(streamed, labels != ignore_id(labels)))
 
     def identity(self) -> dict[str, Any]:
-        """That of the inner backbone, and where each class goes."""
+        """Return the identity of the inner backbone, and where each class goes."""
         rows = list(self._mapping.rows)
         return {**self.inner.identity(), "taxonomy": self._mapping.target.to_dict(), "rows": rows}
 
     def _maps(self, streamed: Streamed, labelled: Mask) -> Iterator[Float32]:
-        """Those of classes that fall together added up, 0 where the label is ignored."""
+        """Yield the maps with those of classes that fall together added up, 0 where the label is ignored."""
         totals = np.zeros((len(self._mapping.target), *labelled.shape), dtype=np.float32)
         for row, scores in zip(self._mapping.rows, streamed.maps(), strict=True):
             if row is not None:
@@ -147,7 +150,7 @@ class InTaxonomy(Wrapped):
 
 
 def _names(name: str) -> list[str]:
-    """The name, and the synonyms in one like 'door;double door' or 'building, edifice'."""
+    """Return the name, and the synonyms in one like 'door;double door' or 'building, edifice'."""
     parts = [part.strip() for part in re.split(r"[;,]", name)]
     return [name, *parts] if len(parts) > 1 else [name]
 
@@ -156,9 +159,10 @@ def _names(name: str) -> list[str]:
 
 
 def class_names(classes: Sequence[str] | str) -> Sequence[str] | LabelSpace:
-    """'a,b,c', a list, a text file with a name a line, or a taxonomy's YAML.
+    """Return 'a,b,c', a list, a text file with a name a line, or a taxonomy's YAML.
 
-    Raises ConfigError where they are none, or cannot be read.
+    Raises:
+        ConfigError: If they are none, or cannot be read.
     """
     if not isinstance(classes, str):
         return classes

@@ -32,8 +32,9 @@ ONNX_TYPES = {"tensor(float)": np.float32, "tensor(float16)": np.float16, "tenso
 class OnnxFile:
     """A network of one image, run by ONNX Runtime on the CPU.
 
-    shape  that its input must have, None for each free side; empty where nothing is known
-    dtype  of its input
+    Attributes:
+        shape: Shape that its input must have, None for each free side; empty where nothing is known.
+        dtype: Type of its input.
     """
 
     def __init__(self, path: Path, device: str, threads: int | None) -> None:
@@ -63,7 +64,7 @@ class OnnxFile:
         self.shape = tuple(side if isinstance(side, int) else None for side in about.shape)
 
     def __call__(self, pixels: Array) -> list[Array]:
-        """Its outputs, in order."""
+        """Return its outputs, in order."""
         return [np.asarray(output) for output in self._session.run(None, {self._input: pixels})]
 
 
@@ -97,7 +98,7 @@ class TorchFile:
             ) from error
 
     def __call__(self, pixels: Array) -> list[Array]:
-        """Its outputs, in order."""
+        """Return its outputs, in order."""
         with self._torch.inference_mode():
             result = self._module(self._torch.from_numpy(pixels).to(self._device))
         outputs = list(result.values()) if isinstance(result, Mapping) else result
@@ -119,11 +120,15 @@ class TorchFile:
 
 
 FORMATS: Mapping[str, type[OnnxFile | TorchFile]] = {".onnx": OnnxFile, ".pt": TorchFile, ".pt2": TorchFile}
-"""By suffix."""
+"""The readers of network files, by suffix."""
 
 
 def load_network(path: Path, device: str, threads: int | None) -> OnnxFile | TorchFile:
-    """The network of a file. Raises ConfigError, DataError or MissingDependencyError that names it."""
+    """Return the network of a file.
+
+    Raises:
+        ConfigError, DataError, MissingDependencyError: If that fails; the message names it.
+    """
     if path.suffix not in FORMATS:
         raise ConfigError(f"{path}: no network is read from '{path.suffix}'; name a file of {', '.join(FORMATS)}")
     if not path.is_file():
@@ -140,7 +145,7 @@ def _only(path: Path, inputs: Sequence[str]) -> Sequence[str]:
 
 @contextlib.contextmanager
 def _quiet() -> Iterator[None]:
-    """Without the notes of torch: that TorchScript is old, and its own log of what cannot be loaded."""
+    """Silence the notes of torch: that TorchScript is old, and its own log of what cannot be loaded."""
     notes = logging.getLogger("torch.export")
     level = notes.level
     notes.setLevel(logging.CRITICAL)
@@ -153,7 +158,7 @@ def _quiet() -> Iterator[None]:
 
 
 class NetworkOptions(Settings):
-    """How an image is given to the network, and what it gives back."""
+    """The settings that say how an image is given to the network, and what it gives back."""
 
     classes: list[str] | str | None = Field(
         None, description="names in the order of its output; or a file: a name a line, or a taxonomy's YAML"
@@ -194,11 +199,15 @@ class NetworkFile(Backbone):
         self._digest = content_digest(path)
 
     def predict(self, images: Sequence[Image], *, scores: bool = False) -> list[Prediction]:
-        """See `Backbone`. Raises DataError for an output that is none of these classes."""
+        """See `Backbone`.
+
+        Raises:
+            DataError: For an output that is none of these classes.
+        """
         return [self._prediction(image, scores) for image in images]
 
     def identity(self) -> dict[str, Any]:
-        """The file's content and the settings."""
+        """Return the file's content and the settings."""
         assert self.label_space is not None
         settings = self._options.model_dump(mode="json", exclude={"classes", "threads"})
         return {"file": self._digest, **settings, "classes": list(self.label_space.classes)}
@@ -242,7 +251,7 @@ class NetworkFile(Backbone):
         return Prediction(narrowed(labels, K), np.divide(full, total, out=np.zeros_like(full), where=total > 0))
 
     def _pixels(self, image: Image) -> Array:
-        """(1, 3, h, w) or (1, h, w, 3) as the network takes it."""
+        """Return (1, 3, h, w) or (1, h, w, 3) as the network takes it."""
         size = self._size or image.shape[:2]
         seen = image if image.shape[:2] == size else np.asarray(PIL.Image.fromarray(image).resize(size[::-1], 2))
         seen = seen if self._options.channels == "rgb" else seen[..., ::-1]
@@ -267,7 +276,11 @@ class NetworkFile(Backbone):
         return outputs[self._options.output]
 
     def _map(self, output: Array, classes: tuple[int, ...]) -> Array:
-        """The output of one image as (K, h, w), of labels as (h, w). Raises DataError where it is none."""
+        """Return the output of one image as (K, h, w), of labels as (h, w).
+
+        Raises:
+            DataError: If it is none.
+        """
         values = output[0] if output.ndim > 2 and output.shape[0] == 1 else output
         if not classes and values.ndim == 3 and 1 in (values.shape[0], values.shape[-1]):
             values = values[0] if values.shape[0] == 1 else values[..., 0]
@@ -280,17 +293,17 @@ class NetworkFile(Backbone):
 
 
 def is_network(name: str) -> bool:
-    """Whether a backbone's name is a network's file."""
+    """Return whether a backbone's name is a network's file."""
     return Path(name).suffix in FORMATS
 
 
 def upsampled(values: Float32, shape: tuple[int, int]) -> Float32:
-    """A map (h, w) at (H, W), bilinear, pixel areas aligned."""
+    """Return a map (h, w) at (H, W), bilinear, pixel areas aligned."""
     return np.asarray(cv2.resize(np.ascontiguousarray(values), shape[::-1], interpolation=cv2.INTER_LINEAR), np.float32)
 
 
 def largest(maps: Float32, shape: tuple[int, int]) -> Int64:
-    """(H, W) which of the maps (K, h, w), upsampled, is the largest, the lowest on ties; one at a time."""
+    """Return (H, W) which of the maps (K, h, w), upsampled, is the largest, the lowest on ties; one at a time."""
     best, label = upsampled(maps[0], shape), np.zeros(shape, dtype=np.int64)
     for k in range(1, len(maps)):
         value = upsampled(maps[k], shape)

@@ -38,9 +38,10 @@ IMAGENET_MEAN, IMAGENET_STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
 class EncodedImage(NamedTuple):
     """An image as the model has encoded it.
 
-    embedding  arguments of the model
-    extent     (height, width) of the image in the pixels in which points are given
-    padded     (height, width) of these pixels with the padding, None without any
+    Attributes:
+        embedding: Arguments of the model.
+        extent: (height, width) of the image in the pixels in which points are given.
+        padded: (height, width) of these pixels with the padding, None without any.
     """
 
     embedding: Mapping[str, Any]
@@ -49,7 +50,10 @@ class EncodedImage(NamedTuple):
 
 
 def encode_sam(model: Any, processor: Any, image: Image) -> EncodedImage:
-    """Segment Anything, and SAM-HQ (Ke et al. 2023): the longer side is resized to the model's, the rest is padding."""
+    """Return an image as Segment Anything, or SAM-HQ, encodes it (Ke et al. 2023).
+
+    The longer side is resized to the model's, the rest is padding.
+    """
     inputs = processor(images=image, input_data_format="channels_last", return_tensors="pt")
     height, width = (int(side) for side in inputs["reshaped_input_sizes"][0])
     pixels = inputs["pixel_values"].to(model.device, model.dtype)
@@ -61,7 +65,10 @@ def encode_sam(model: Any, processor: Any, image: Image) -> EncodedImage:
 
 
 def encode_sam2(model: Any, settings: Mapping[str, Any], image: Image) -> EncodedImage:
-    """Segment Anything 2 (Ravi et al. 2024): the image is squeezed into a square; transformers needs torchvision."""
+    """Return an image as Segment Anything 2 encodes it (Ravi et al. 2024).
+
+    The image is squeezed into a square; transformers needs torchvision.
+    """
     side = int(model.config.prompt_encoder_config.image_size)
     try:
         mean = torch.tensor(settings.get("image_mean") or IMAGENET_MEAN).reshape(3, 1, 1)
@@ -80,11 +87,11 @@ KINDS = ("SamModel", "SamHQModel", "Sam2Model")
 
 MOST_REGIONS = 65535
 CACHE_VERSION = 2
-"""Of the method: proposals that an earlier one left in a cache are made again."""
+"""The version of the method: proposals that an earlier one left in a cache are made again."""
 
 
 class SamOptions(ImageModelOptions):
-    """Which checkpoint, and which of its masks are taken."""
+    """The settings that name a checkpoint, and say which of its masks are taken."""
 
     points_per_side: int = Field(32, ge=1, le=256, description="the image is asked at a grid of so many points a side")
     points_per_batch: int = Field(64, ge=1, description="points at a time; changes speed and memory, not the masks")
@@ -105,9 +112,10 @@ class SamOptions(ImageModelOptions):
 class Proposals:
     """Masks of one image, packed to bits.
 
-    shape   (H, W) of the image
-    packed  (n, ceil(H W / 8)) uint8
-    scores  (n,) the model's own estimate of each mask's IoU
+    Attributes:
+        shape: (H, W) of the image.
+        packed: (n, ceil(H W / 8)) uint8.
+        scores: (n,) the model's own estimate of each mask's IoU.
     """
 
     shape: tuple[int, int]
@@ -133,7 +141,8 @@ class Proposals:
 class SamProposer:
     """A Segment Anything model that proposes masks, with a cache of them where a folder is given.
 
-    Raises DataError for a checkpoint of another kind.
+    Raises:
+        DataError: For a checkpoint of another kind.
     """
 
     def __init__(self, options: SamOptions) -> None:
@@ -341,7 +350,7 @@ class SamHeuristic(SamRaw):
 
 
 def mask_features(hsv: Image, mask: Mask) -> dict[str, float]:
-    """Return mean colour, area share and aspect of a mask that is not empty; hsv as OpenCV scales it.
+    """Return the mean colour, area share and aspect of a mask that is not empty; hsv as OpenCV scales it.
 
     The mean hue is that of the summed unit vectors: of 179 and 3 it is 1.
     """
@@ -359,7 +368,11 @@ def mask_features(hsv: Image, mask: Mask) -> dict[str, float]:
 
 
 def read_rules(path: Path | None) -> Rules:
-    """Read the rules of a file, or those that ship. Raises ConfigError that names file and setting."""
+    """Read the rules of a file, or those that ship.
+
+    Raises:
+        ConfigError: If that fails; the message names file and setting.
+    """
     shipped = importlib.resources.files("semstab.configs") / "backbones" / "sam_heuristic.yaml"
     path = path or Path(str(shipped))
     return validated(Rules, read_yaml(path), f"{path}: ")
@@ -379,7 +392,9 @@ class SamVote(Wrapped):
     """Masks painted by area, the largest first, each in the label that most of its pixels have (ties: the lowest id).
 
     Pixels that the voter ignores do not vote; outside the masks its labels stay.
-    Raises ConfigError for a voter without classes.
+
+    Raises:
+        ConfigError: For a voter without classes.
     """
 
     Options: type[BaseModel] = SamVoteOptions

@@ -25,13 +25,16 @@ from semstab.model.labels import LabelSpace
 
 
 def dense_features(model: Any, pixels: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-    """Features in the space that images and texts share, not normalised: (N, D) of the image, (N, D, h, w) of patches.
+    """Return features in the space that images and texts share.
 
-    model   a transformers CLIPModel in evaluation mode
-    pixels  (N, 3, H, W) normalised; H and W are multiples of the patch size
+    (N, D) of the image, (N, D, h, w) of patches, not normalised.
 
     All blocks but the last are CLIP's own. The last one is `self_self_attention` of its first layer norm's output, with
     neither residual nor MLP.
+
+    Args:
+        model: A transformers CLIPModel in evaluation mode.
+        pixels: (N, 3, H, W) normalised; H and W are multiples of the patch size.
     """
     vision = model.vision_model
     patch, native = vision.config.patch_size, vision.config.image_size
@@ -47,9 +50,11 @@ def dense_features(model: Any, pixels: torch.Tensor) -> tuple[torch.Tensor, torc
 
 
 def self_self_attention(attention: Any, tokens: torch.Tensor) -> torch.Tensor:
-    """(N, T, D): out_proj of (softmax(q q^T) + softmax(k k^T) + softmax(v v^T)) v, each product by sqrt(d), every head.
+    """Return (N, T, D): out_proj of (softmax(q q^T) + softmax(k k^T) + softmax(v v^T)) v, products by sqrt(d), a head.
 
-    attention  a transformers CLIPAttention
+    Args:
+        attention: A transformers CLIPAttention.
+        tokens: (N, T, D), what its block's first layer norm puts out.
     """
     q, k, v = (
         project(tokens).view(*tokens.shape[:2], attention.num_heads, attention.head_dim).transpose(1, 2)
@@ -66,7 +71,7 @@ SHIPPED = importlib.resources.files("semstab.configs") / "backbones" / "segearth
 
 
 class Prompts(Settings):
-    """See configs/backbones/segearth_uavid.yaml."""
+    """The prompts of each class; see configs/backbones/segearth_uavid.yaml."""
 
     name: str = Field("prompts", description="of the taxonomy that the classes make")
     classes: list[str] = Field(min_length=2, description="a class an entry; after commas its other names")
@@ -107,12 +112,20 @@ class Prompts(Settings):
         return [(k, part.strip()) for k, entry in enumerate(self.classes) for part in entry.split(",")]
 
     def label_space(self) -> LabelSpace:
-        """The classes. Raises ConfigError for a name that repeats."""
+        """Return the classes.
+
+        Raises:
+            ConfigError: For a name that repeats.
+        """
         return LabelSpace(self.name, tuple(self.names))
 
 
 def read_prompts(path: Path | None) -> Prompts:
-    """The prompts of a file, those for UAVid where none is named. Raises ConfigError that names file and setting."""
+    """Return the prompts of a file, those for UAVid where none is named.
+
+    Raises:
+        ConfigError: If that fails; the message names file and setting.
+    """
     path = path or Path(str(SHIPPED))
     return validated(Prompts, read_yaml(path), f"{path}: ")
 
@@ -144,7 +157,7 @@ class JointBilateralUpsampler(nn.Module):
         self.fixup_proj = _two_layers(3 + taps, taps, taps)
 
     def forward(self, source: torch.Tensor, guidance: torch.Tensor) -> torch.Tensor:
-        """(N, C, H, W) from source (N, C, h, w) and guidance (N, 3, H, W); H and W must exceed the radius."""
+        """Return (N, C, H, W) from source (N, C, h, w) and guidance (N, 3, H, W); H and W must exceed the radius."""
         kernel = self.kernel(guidance)
         bicubic = nn.functional.interpolate(source, size=guidance.shape[-2:], mode="bicubic", align_corners=False)
         result = torch.zeros_like(bicubic)
@@ -153,7 +166,7 @@ class JointBilateralUpsampler(nn.Module):
         return result
 
     def kernel(self, guidance: torch.Tensor) -> torch.Tensor:
-        """(N, taps, H, W) the weight of each neighbour, row by row."""
+        """Return (N, taps, H, W) the weight of each neighbour, row by row."""
         key = self.range_proj(guidance)
         likeness = torch.stack([(key * neighbour).sum(dim=1) for neighbour in self._neighbours(key)], dim=1)
         temperature = self.range_temp.exp().clamp(1e-4, 1e4)
@@ -165,7 +178,7 @@ class JointBilateralUpsampler(nn.Module):
         return torch.as_tensor(kernel + 0.1 * self.fixup_proj(torch.cat([kernel, guidance], dim=1)))
 
     def _neighbours(self, x: torch.Tensor) -> list[torch.Tensor]:
-        """Of each tap the image (N, C, H, W), moved so that a pixel holds that neighbour; mirrored at the border."""
+        """Return for each tap the image (N, C, H, W), moved so that a pixel holds that neighbour; mirrored outside."""
         H, W = x.shape[-2:]
         mirrored = nn.functional.pad(x, [self.radius] * 4, mode="reflect")
         taps = range(self.diameter)
@@ -182,7 +195,11 @@ class SimFeatUp(nn.Module):
 
     @classmethod
     def load(cls, path: Path, channels: int, device: torch.device, dtype: torch.dtype) -> SimFeatUp:
-        """From a checkpoint, ready to use. Raises DataError where the file is none, or has other shapes."""
+        """Load it from a checkpoint, ready to use.
+
+        Raises:
+            DataError: If the file is none, or has other shapes.
+        """
         if not path.is_file():
             raise DataError(f"{path}: there is no SimFeatUp checkpoint; leave upsampler out for bilinear upsampling")
         try:
@@ -199,9 +216,10 @@ class SimFeatUp(nn.Module):
         return module.to(device, dtype).eval()
 
     def forward(self, features: torch.Tensor, image: torch.Tensor) -> torch.Tensor:
-        """(N, C, 16 h, 16 w) from features (N, C, h, w) and the normalised image (N, 3, H, W) behind them.
+        """Return (N, C, 16 h, 16 w) from features (N, C, h, w) and the normalised image (N, 3, H, W) behind them.
 
-        Raises ConfigError for fewer than 3x3 patches, over which a neighbourhood cannot be mirrored.
+        Raises:
+            ConfigError: For fewer than 3x3 patches, over which a neighbourhood cannot be mirrored.
         """
         if 2 * min(features.shape[-2:]) <= self.up.radius:
             raise ConfigError(
@@ -222,7 +240,7 @@ def _two_layers(inputs: int, hidden: int, outputs: int) -> nn.Sequential:
 
 
 def starts(length: int, window: int, stride: int) -> list[int]:
-    """Where windows begin along an axis; the last one ends at the border.
+    """Return the first pixels of the windows along an axis; the last window ends at the border.
 
     >>> starts(448, 224, 112), starts(299, 224, 112), starts(200, 224, 112)
     ([0, 112, 224], [0, 75], [0])
@@ -234,9 +252,14 @@ def starts(length: int, window: int, stride: int) -> list[int]:
 def slide(
     pixels: torch.Tensor, window: int, stride: int, logits_of: Callable[[torch.Tensor], torch.Tensor]
 ) -> torch.Tensor:
-    """Mean logits (Q, H, W) of all windows over an image (3, H, W).
+    """Return the mean logits (Q, H, W) of all windows over an image (3, H, W).
 
-    logits_of  one window (3, h, w) to its logits (Q, h, w); h and w are `window`, or less where the image is smaller
+    Args:
+        pixels: (3, H, W) image, normalised.
+        window: Side of a window, pixels.
+        stride: Pixels from one window to the next.
+        logits_of: One window (3, h, w) to its logits (Q, h, w); h and w are `window`, or less where the image is
+            smaller.
     """
     H, W = pixels.shape[1:]
     total, count = pixels.new_zeros(()), pixels.new_zeros(H, W)
@@ -251,7 +274,7 @@ def slide(
 
 
 def padded(pixels: torch.Tensor, multiple: int) -> tuple[torch.Tensor, tuple[slice, ...]]:
-    """The image (..., H, W) between zeros so that both sides are multiples, and where it lies in it."""
+    """Return the image (..., H, W) between zeros so that both sides are multiples, and where it lies in it."""
     H, W = pixels.shape[-2:]
     top, left = -H % multiple // 2, -W % multiple // 2
     bottom, right = -H % multiple - top, -W % multiple - left
@@ -264,7 +287,7 @@ CLIP_STD = (0.26862954, 0.26130258, 0.27577711)
 
 
 class SegEarthOptions(ModelOptions):
-    """Which CLIP, its prompts, and how the image is shown to it."""
+    """The settings that name a CLIP and its prompts, and say how the image is shown to it."""
 
     model: str = Field("openai/clip-vit-base-patch16", description="a CLIP folder, or an id on the Hugging Face hub")
     prompts: Path | None = Field(None, description="YAML file like configs/backbones/segearth_uavid.yaml, the default")
@@ -310,7 +333,7 @@ class SegEarthOV(Backbone):
         return [self._prediction(image, scores) for image in images]
 
     def identity(self) -> dict[str, Any]:
-        """The checkpoints, the settings and the prompts."""
+        """Return the checkpoints, the settings and the prompts."""
         upsampler = self.options.upsampler
         return {
             "revision": self.checkpoint.revision,
@@ -339,7 +362,7 @@ class SegEarthOV(Backbone):
         return Prediction(labels, share.cpu().numpy())
 
     def window_logits(self, window: torch.Tensor) -> torch.Tensor:
-        """(queries, h, w) cosines of a window (3, h, w)."""
+        """Return (queries, h, w) cosines of a window (3, h, w)."""
         pixels, place = padded(window[None], int(self._model.vision_model.config.patch_size))
         whole, patches = dense_features(self._model, pixels)
         if self._upsampler is not None:
@@ -350,7 +373,7 @@ class SegEarthOV(Backbone):
 
     @torch.inference_mode()
     def _text_features(self, tokenizer: Any, prompts: Prompts) -> torch.Tensor:
-        """(queries, D): of each name the normalised mean of the normalised features of its sentences."""
+        """Return (queries, D): of each name the normalised mean of the normalised features of its sentences."""
         features = []
         for _, name in prompts.queries:
             sentences = [template.format(name) for template in prompts.templates]
@@ -362,7 +385,9 @@ class SegEarthOV(Backbone):
 
 
 def normalised(image: Image, longer: int) -> Float32:
-    """(3, h, w) float32 with CLIP's mean and deviation; the image's shape is kept, its longer side becomes `longer`.
+    """Return (3, h, w) float32 with CLIP's mean and deviation.
+
+    The image's shape is kept, its longer side becomes `longer`.
 
     Bilinear without a low-pass filter, as SegEarth-OV does it.
     """

@@ -61,7 +61,7 @@ class Segmenter(Backbone):
         return self._streamed(maps, image.shape[:2])
 
     def identity(self) -> dict[str, Any]:
-        """The checkpoint's revision and the settings."""
+        """Return the checkpoint's revision and the settings."""
         return {"revision": self.checkpoint.revision, **self.options.identity()}
 
     def _streamed(self, maps: torch.Tensor, size: tuple[int, ...]) -> Streamed:
@@ -77,7 +77,7 @@ class Segmenter(Backbone):
 def _shares(
     maps: torch.Tensor, size: tuple[int, ...], largest: torch.Tensor | None, sure: torch.Tensor | None
 ) -> Iterator[Float32]:
-    """Of each class the share (H, W) that its upsampled map has of all: the softmax where the largest is given.
+    """Yield the share (H, W) of each class's upsampled map in all: the softmax where the largest is given.
 
     0 where no class has any, or where the label is not sure. Each map is upsampled twice, and none is kept.
     """
@@ -95,7 +95,7 @@ def _shares(
 
 
 def label_space(id2label: Mapping[int, str], name: str) -> LabelSpace:
-    """The classes of a checkpoint in the order of its logits; names that repeat get their number."""
+    """Return the classes of a checkpoint in the order of its logits; names that repeat get their number."""
     names = [" ".join(str(id2label[k]).split()) for k in sorted(id2label)]
     keys = [name.lower() for name in names]
     distinct = [f"{name} {k}" if keys.count(keys[k]) > 1 else name for k, name in enumerate(names)]
@@ -103,7 +103,7 @@ def label_space(id2label: Mapping[int, str], name: str) -> LabelSpace:
 
 
 def largest_upsampled(maps: torch.Tensor, size: tuple[int, ...]) -> tuple[torch.Tensor, torch.Tensor]:
-    """(H, W) the largest of the maps (K, h, w) upsampled bilinearly to `size`, and whose it is, the lowest on ties.
+    """Return (H, W) the largest of maps (K, h, w), upsampled bilinearly to `size`, and whose it is (ties: the lowest).
 
     Class by class in chunks: 150 classes at 3840x2160 would take 5 GB at once.
     """

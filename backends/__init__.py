@@ -57,7 +57,7 @@ REGISTRY = Registry(
 
 
 class FusionBackend(Protocol):
-    """Fuses frames into metric voxels. Made with `voxel_size` (metres), `num_classes` (K >= 2) and options of its own.
+    """A fusion of frames into metric voxels, made with `voxel_size` (metres), `num_classes` (K >= 2) and own options.
 
     A pixel (u, v) with depth d falls into the voxel floor(x_w / r), evaluated in float64 in this order, so that
     every backend decides alike at a voxel's face:
@@ -74,14 +74,15 @@ class FusionBackend(Protocol):
     def integrate(self, frame: Frame) -> FrameReport:
         """Fuse one frame: one more observation of the voxels it sees, whatever its index.
 
-        Raises DataError, with the map unchanged, where the frame cannot be fused.
+        Raises:
+            DataError: If the frame cannot be fused, with the map unchanged.
         """
 
     def table(self) -> VoxelTable:
-        """The map so far."""
+        """Return the map so far."""
 
     def events(self) -> Events | None:
-        """The log of observations, or None where the backend keeps none."""
+        """Return the log of observations, or None where the backend keeps none."""
         return None
 
 
@@ -89,10 +90,11 @@ class FusionBackend(Protocol):
 class Changes:
     """The change that one frame made to each of the n voxels that it saw.
 
-    row            (n,) int64 the voxel's number: voxels are numbered from 0 in the order of their first observation
-    key            (n,) int64 its index, packed, relative to the map's origin; overwritten by the next frame
-    drift          (n,) float32 D_JS of its belief before and after the frame, bits; NaN where it was not seen before
-    before, after  (n,) uint16 its dominant class; where it was not seen before, both are the one after
+    Attributes:
+        row: (n,) int64 the voxel's number: voxels are numbered from 0 in the order of their first observation.
+        key: (n,) int64 its index, packed, relative to the map's origin; overwritten by the next frame.
+        drift: (n,) float32 D_JS of its belief before and after the frame, bits; NaN where it was not seen before.
+        before, after: (n,) uint16 its dominant class; where it was not seen before, both are the one after.
     """
 
     row: Int64
@@ -103,7 +105,7 @@ class Changes:
 
     @classmethod
     def room(cls, row: Int64, key: Int64) -> Changes:
-        """To be filled, for the voxels of these rows and keys."""
+        """Return changes to be filled, for the voxels of these rows and keys."""
         n = len(row)
         return cls(row, key, np.empty(n, np.float32), np.empty(n, np.uint16), np.empty(n, np.uint16))
 
@@ -128,26 +130,29 @@ class GrowingMap(FusionBackend, Protocol):
         """The change of each voxel by the last frame."""
 
     def __len__(self) -> int:
-        """The number of voxels."""
+        """Return the number of voxels."""
 
     def column(self, name: str, rows: Int64 | slice = ...) -> npt.NDArray[Any]:
-        """That column of the table (n,), such as op or drift_sum, of the voxels of those rows; of all if not given."""
+        """Return a table column (n,), such as op or drift_sum, for the voxels of those rows; for all if not given."""
 
     def evidence_of(self, rows: Int64) -> Float64:
-        """Evidence (n, K) of the voxels of those rows."""
+        """Return the evidence (n, K) of the voxels of those rows."""
 
     def index_of(self, rows: Int64) -> Int64:
-        """Voxel indices (n, 3) of the voxels of those rows."""
+        """Return voxel indices (n, 3) of the voxels of those rows."""
 
 
 def create(
     name: str, *, voxel_size: float, num_classes: int, within: Extent | None = None, **options: Any
 ) -> FusionBackend:
-    """A new, empty map, restricted to the voxels `within` an extent where one is given.
+    """Return a new, empty map, restricted to the voxels `within` an extent where one is given.
 
     voxel_size in metres, num_classes K >= 2; options are the backend's own (open3d: device, block_resolution).
-    Raises ConfigError for an unknown name or option, and for an extent where the backend does not associate pixel by
-    pixel; MissingDependencyError where its engine is not installed.
+
+    Raises:
+        ConfigError: For an unknown name or option, and for an extent where the backend does not associate pixel by
+            pixel.
+        MissingDependencyError: If its engine is not installed.
     """
     cls = REGISTRY.load(name)
     known = _options(cls)
@@ -169,22 +174,22 @@ def create(
 
 
 def restrictable(name: str) -> bool:
-    """Maps of the backend of that name can be restricted to an extent."""
+    """Return whether maps of the backend of that name can be restricted to an extent."""
     return bool(getattr(REGISTRY.load(name), "pointwise", True))
 
 
 def takes_option(name: str, option: str) -> bool:
-    """The backend of that name has such an option, for example 'device'."""
+    """Return whether the backend of that name has such an option, for example 'device'."""
     return option in _options(REGISTRY.load(name))
 
 
 def keeps_log(name: str) -> bool:
-    """The backend of that name can give the log of its observations: with option `history`, or always."""
+    """Return whether the backend of that name can give a log of observations: with option `history`, or always."""
     return takes_option(name, "history") or getattr(REGISTRY.load(name), "keeps_log", False)
 
 
 def expected_bytes(name: str, voxels: int, observations: int, num_classes: int, *, soft: bool = False) -> int:
-    """Bytes that a backend's map of that size takes, roughly; 0 for one that does not say.
+    """Return the bytes that a backend's map of that size takes, roughly; 0 for one that does not say.
 
     A backend says it with a static method of that name, those three parameters, and `soft` where a map of scores takes
     other than one of labels.

@@ -53,7 +53,7 @@ class History:
         self.voxel_size = voxel_size
         self.num_classes = num_classes
         self._seen: list[tuple[int, Int32, Int32, UInt16, UInt16, Float64]] = []
-        """Of each frame its index, rows of the map, pixels, and entries as in `Observed`, without empty ones."""
+        """The index, rows of the map, pixels, and entries as in `Observed`, without empty ones, of each frame."""
 
     def append(self, seen: Observed, row: Int64, frame: int) -> None:
         """Keep a copy of the observations of the map's rows that outlives the next frame."""
@@ -63,7 +63,7 @@ class History:
         self._seen.append((frame, rows, pixels, entries, seen.label[some], seen.weight[some]))
 
     def events(self, order: Int32, index: dict[str, Any]) -> Events:
-        """The observations in order of integration within a voxel; voxels are the map's rows in that order."""
+        """Return the observations in order of integration within a voxel; voxels are the map's rows in that order."""
         rank = np.empty(len(order), np.int64)
         rank[order] = np.arange(len(order))
         observations, entries = np.zeros(len(order) + 1, np.int64), np.zeros(len(order) + 1, np.int64)
@@ -92,10 +92,11 @@ class NumbaHash:
 
     A map reaches 2^20 voxels to either side of its first camera.
 
-    evidence  'float64', or 'float32' for half the memory of the evidence
-    threads   how many to use; all of numba's where not given
-    history   keep every observation, for `events`; memory then grows with each
-    within    the voxels that the map is restricted to
+    Attributes:
+        evidence: 'float64', or 'float32' for half the memory of the evidence.
+        threads: Number of threads; all of numba's where not given.
+        history: Keep every observation, for `events`; memory then grows with each.
+        within: The voxels that the map is restricted to.
     """
 
     _loaded: ClassVar[bool] = False
@@ -139,7 +140,7 @@ class NumbaHash:
 
     @staticmethod
     def expected_bytes(voxels: int, observations: int, num_classes: int, soft: bool = False) -> int:
-        """A record, its share of the nodes or a dense row of scores, and room to grow; the hash."""
+        """Return a record, its share of the nodes or a dense row of scores, and room to grow; the hash."""
         return (110 + (9 * num_classes if soft else 0)) * voxels
 
     def integrate(self, frame: Frame) -> FrameReport:
@@ -190,11 +191,11 @@ class NumbaHash:
         return Change.of((seen.pixels.sum(), len(seen.key), new.sum(), drift, vss, entropy, recurrent))
 
     def __len__(self) -> int:
-        """The number of voxels."""
+        """Return the number of voxels."""
         return self._total.voxels
 
     def table(self) -> VoxelTable:
-        """The map so far."""
+        """Return the map so far."""
         order = self._order()
         index = columns_of_keys(self._records["key"][order], self.origin)
         columns = ("op", "drift_sum", "pixels", "first_frame", "last_frame", "self_sum", "frame_entropy_sum")
@@ -211,16 +212,16 @@ class NumbaHash:
         return Evidence(starts, label, weight, self.num_classes)
 
     def _order(self) -> Int32:
-        """The voxels' rows in the order of the table; packed keys sort like (ix, iy, iz)."""
+        """Return the voxels' rows in the order of the table; packed keys sort like (ix, iy, iz)."""
         return np.argsort(self._records["key"][: len(self)], kind="stable").astype(np.int32)
 
     def column(self, name: str, rows: Int64 | slice = np.s_[:]) -> npt.NDArray[Any]:
-        """That column of the table (n,), such as op or drift_sum, of the voxels of those rows; of all if not given."""
+        """Return a table column (n,), such as op or drift_sum, for the voxels of those rows; for all if not given."""
         values: npt.NDArray[Any] = self._records[name][: len(self)][rows].copy()  # the array may move as it grows
         return values
 
     def evidence_of(self, rows: Int64) -> Float64:
-        """Evidence (n, K) of the voxels of those rows."""
+        """Return the evidence (n, K) of the voxels of those rows."""
         return np.asarray(self._evidence_of(rows.astype(np.int32)))
 
     @property
@@ -229,11 +230,11 @@ class NumbaHash:
         return np.zeros(3, dtype=np.int64) if self._pixels.origin is None else self._pixels.origin
 
     def index_of(self, rows: Int64) -> Int64:
-        """Voxel indices (n, 3) of the voxels of those rows."""
+        """Return voxel indices (n, 3) of the voxels of those rows."""
         return index_of_keys(self._records["key"][rows], self.origin)
 
     def events(self) -> Events | None:
-        """Every observation in order of integration within a voxel, where there is a `history`; else None."""
+        """Return every observation in order of integration within a voxel, where there is a `history`; else None."""
         if self._history is None:
             return None
         order = self._order()
@@ -249,7 +250,7 @@ class NumbaHash:
             self._slots = slots
 
     def _make_dense(self, seen: ObservedScores, row: Int64, new: Int64) -> Int64:
-        """Room for a dense row for each of the frame's voxels; where those of each partition begin."""
+        """Return the room for a dense row for each of the frame's voxels; where those of each partition begin."""
         needed = new
         if self._dense_used < len(self):  # else only the frame's new voxels have none
             without = (row < 0) | (self._records["next"][np.maximum(row, 0)] > DENSE)

@@ -24,7 +24,7 @@ SLOT = np.dtype([("key", np.int64), ("row", np.int64)])
 
 
 def record_types(evidence: Any) -> tuple[np.dtype[Any], np.dtype[Any]]:
-    """The types of a voxel's record and of a node of its chain, for evidence of that float type."""
+    """Return the types of a voxel's record and of a node of its chain, for evidence of that float type."""
     record = [
         ("key", np.int64), ("pixels", np.int64), ("drift_sum", np.float64), ("self_sum", np.float64),
         ("frame_entropy_sum", np.float64), ("value", evidence), ("next", np.int32), ("op", np.int32),
@@ -36,7 +36,7 @@ def record_types(evidence: Any) -> tuple[np.dtype[Any], np.dtype[Any]]:
 
 @parallel
 def look_up(key, bounds, slots, row, slot, new):
-    """The row of each voxel; new ones enter the hash and are numbered -1, -2, ... within their partition."""
+    """Look up the row of each voxel; new ones enter the hash and are numbered -1, -2, ... within their partition."""
     mask = np.uint64(slots.shape[1] - 1)
     for p in nb.prange(PARTITIONS):
         n = 0
@@ -75,7 +75,7 @@ def rehash(old, new):
 
 @serial
 def begin(record, key, label, frame):
-    """A voxel that no frame has seen before."""
+    """Begin a voxel that no frame has seen before."""
     record.key, record.label, record.next = key, label, ALONE
     record.value = record.drift_sum = record.self_sum = record.frame_entropy_sum = 0.0
     record.pixels = record.op = 0
@@ -240,7 +240,7 @@ def update(
 
 @parallel
 def count_chain(records, nodes, dense, order, count):
-    """How many classes the records in that order have evidence of: count[1:] of (n + 1,)."""
+    """Count the classes that the records in that order have evidence of: count[1:] of (n + 1,)."""
     for i in nb.prange(order.shape[0]):
         at = np.int64(records[order[i]].next)
         if at <= DENSE:
@@ -254,7 +254,7 @@ def count_chain(records, nodes, dense, order, count):
 
 @parallel
 def read_chain(records, nodes, dense, order, starts, label, weight):
-    """Evidence of the records in that order as entries, starts (n + 1,) being the first of each, ascending by class."""
+    """Read these records' evidence in order as entries; starts (n + 1,) is the first of each, ascending by class."""
     for i in nb.prange(order.shape[0]):
         last = starts[i]
         record = records[order[i]]
@@ -306,7 +306,7 @@ def update_dense(
 ):  # fmt: skip
     """Add the frame's observations, whose voxels get dense rows from `dense_base` of their partition on.
 
-    seen, seen_sums  row and sums of `ObservedScores`; the others as in `update`
+    - `seen`, `seen_sums`: row and sums of `ObservedScores`; the others as in `update`
     """
     stride = dense.shape[1]
     flat = dense.reshape(-1)
@@ -360,7 +360,7 @@ def _touch_ahead_dense(v, last, row, records, flat, stride, seen, seen_sums):
 
 @serial
 def _unroll(record, nodes, evidence):
-    """The evidence of a voxel without a dense row into an unused one; its nodes are not used again."""
+    """Write the evidence of a voxel without a dense row into an unused one; its nodes are not used again."""
     evidence[:] = 0.0
     if record.op == 0:
         return

@@ -27,10 +27,10 @@ from semstab.model.results import FrameReport
 from semstab.model.voxels import Extent, VoxelTable, index_columns
 
 ONE_IN, MOST = 16, 10_000
-"""Of so many voxels the sample holds one; of twice as many, and so on, where the map has more than the sample may."""
+"""One voxel in `ONE_IN` is in the sample; one in twice as many, and so on, where the map has more than `MOST` allow."""
 
 ODD = np.array([-0x61C8864680B583EB, -0x3D4D51C2D82B14B1, 0x165667B19E3779F9])
-"""Of each axis, to mix an index's bits (odd numbers of Steele and Vigna's splitmix and of xxHash)."""
+"""The factors, one an axis, that mix an index's bits (odd numbers of Steele and Vigna's splitmix and of xxHash)."""
 
 
 class _Seen(NamedTuple):
@@ -60,7 +60,10 @@ class NumpyReference:
 
     @staticmethod
     def expected_bytes(voxels: int, observations: int, num_classes: int, soft: bool = False) -> int:
-        """A dictionary's entry and the evidence a voxel; an observation is in the history, and sorted for a table."""
+        """Return a dictionary's entry and the evidence a voxel.
+
+        An observation is in the history, and sorted for a table.
+        """
         return voxels * (240 + 9 * num_classes) + observations * (90 + (25 * num_classes if soft else 0))
 
     def integrate(self, frame: Frame) -> FrameReport:
@@ -79,11 +82,11 @@ class NumpyReference:
         return self._total.add(frame.index, change, started)
 
     def table(self) -> VoxelTable:
-        """The map so far, from the history."""
+        """Return the map so far, from the history."""
         return self.events().table()
 
     def events(self) -> Events:
-        """The history: every observation of every voxel."""
+        """Return the history: every observation of every voxel."""
         voxels = np.frombuffer(b"".join(self._row), dtype=np.int64).reshape(-1, 3)
         order = np.lexsort(voxels.T[::-1])
         rank = np.empty_like(order)
@@ -104,13 +107,13 @@ class NumpyReference:
         )
 
     def _observe(self, frame: Frame) -> Observations:
-        """What the valid pixels observe that fall into the extent."""
+        """Return what the valid pixels observe that fall into the extent."""
         valid = frame.valid
         pixels = valid if self.within is None else valid & falling_into(self.within, frame, self.voxel_size)
         return observe(frame, self.voxel_size, self.num_classes, pixels)
 
     def _rows(self, seen: Observations) -> Int64:
-        """The rows of the frame's voxels, new ones added."""
+        """Return the rows of the frame's voxels, new ones added."""
         voxels = np.ascontiguousarray(seen.index, dtype=np.int64).view("V24").ravel().tolist()
         rows = np.fromiter(map(self._row.__getitem__, voxels), dtype=np.int64, count=len(voxels))
         if len(self._row) > len(self._op):
@@ -141,7 +144,7 @@ class NumpySample(NumpyReference):
         return report
 
     def table(self) -> VoxelTable:
-        """The map of the sample so far."""
+        """Return the map of the sample so far."""
         table = super().table()
         return table.rows(in_sample(table.index.T, self.one_in))
 
@@ -157,7 +160,7 @@ class NumpySample(NumpyReference):
 
 
 def in_sample(index: npt.NDArray[np.integer], one_in: int = ONE_IN) -> Mask:
-    """Which voxels of that index (3, n) are in the sample of one in so many, a power of 2."""
+    """Return which voxels of that index (3, n) are in the sample of one in so many, a power of 2."""
     mixed = np.zeros(index.shape[1], np.int64)
     for axis, odd in zip(index, ODD, strict=True):
         mixed += axis * odd

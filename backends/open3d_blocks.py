@@ -31,7 +31,7 @@ INITIAL_BYTES = 32 * 2**20
 """Memory for attributes that a new map takes at once: small maps never grow."""
 
 LEAST_BLOCKS = 4
-"""Of a new map, however many classes there are."""
+"""The blocks of a new map at least, however many classes there are."""
 
 FILLED, OFTEN = 0.2, 1.2
 """Share of the voxels of a block that a frame sees, and how many times as many all frames do."""
@@ -48,9 +48,10 @@ class Open3DBlocks(FusionBackend):
 
     A map reaches 2^20 voxels to either side of its first camera.
 
-    device            'CPU:0', or 'CUDA:0' where Open3D sees such a device
-    block_resolution  voxels along an edge of a block; a block takes memory for all of its voxels
-    within            the voxels that the map is restricted to
+    Attributes:
+        device: 'CPU:0', or 'CUDA:0' where Open3D sees such a device.
+        block_resolution: Voxels along an edge of a block; a block takes memory for all of its voxels.
+        within: The voxels that the map is restricted to.
     """
 
     def __init__(
@@ -82,7 +83,7 @@ class Open3DBlocks(FusionBackend):
 
     @staticmethod
     def expected_bytes(voxels: int, observations: int, num_classes: int, soft: bool = False) -> int:
-        """The attributes of all voxels of a block, of which frames see that share, the more the more frames there are.
+        """Return the bytes of the attributes of all voxels of a block; frames see a larger share the more there are.
 
         A grid has room for more; it grows into another one, but of two maps, of scores and of labels, one after the
         other. An empty one has blocks.
@@ -105,7 +106,7 @@ class Open3DBlocks(FusionBackend):
         return self._total.add(frame.index, change, started, observed)
 
     def table(self) -> VoxelTable:
-        """The map so far: the voxels of all active blocks that a frame has seen."""
+        """Return the map so far: the voxels of all active blocks that a frame has seen."""
         blocks = self.grid.hashmap().active_buf_indices().cpu().numpy().astype(np.int64)
         voxels_a_block = self.block_resolution**3
         rows = (blocks[:, None] * voxels_a_block + np.arange(voxels_a_block)).ravel()
@@ -118,7 +119,7 @@ class Open3DBlocks(FusionBackend):
         return VoxelTable(**index_columns(index[order]), **values, evidence=evidence, voxel_size=self.voxel_size)
 
     def _new_grid(self, blocks: int) -> VoxelBlockGrid:
-        """An empty grid with room for that many blocks."""
+        """Return an empty grid with room for that many blocks."""
         return VoxelBlockGrid(
             attr_names=tuple(self.attributes),
             attr_dtypes=tuple(dtype for dtype, _ in self.attributes.values()),
@@ -147,7 +148,10 @@ class Open3DBlocks(FusionBackend):
             self.grid.hashmap().activate(self._tensor(new))
 
     def _activate(self, index: Int64) -> Int64:
-        """Rows of voxels (n, 3), at least one, in the attributes, their blocks activated; new ones start at 0."""
+        """Return rows of voxels (n, 3), at least one, in the attributes, their blocks activated.
+
+        New ones start at 0.
+        """
         blocks, block, place = blocks_of(index, self.block_resolution)
         self._add_blocks(blocks)
         buffer, _ = self.grid.hashmap().find(self._tensor(blocks))
@@ -155,7 +159,7 @@ class Open3DBlocks(FusionBackend):
         return buffers[block] * self.block_resolution**3 + place
 
     def _index_of(self, rows: Int64) -> Int64:
-        """Voxel indices (n, 3) of rows: the inverse of `_activate`."""
+        """Return voxel indices (n, 3) of rows: the inverse of `_activate`."""
         r = self.block_resolution
         block, offset = np.divmod(rows, r**3)
         keys: Int64 = self.grid.hashmap().key_tensor().cpu().numpy().astype(np.int64)
@@ -175,7 +179,10 @@ class Open3DBlocks(FusionBackend):
         return change
 
     def _attribute(self, name: str) -> Any:
-        """The attribute, flattened to (voxels, channels); taken anew each time, because a rehash moves the buffers."""
+        """Return the attribute, flattened to (voxels, channels).
+
+        Taken anew each time, because a rehash moves the buffers.
+        """
         values = self.grid.attribute(name)
         return values.reshape((-1, values.shape[-1]))
 

@@ -41,9 +41,10 @@ class Open3DProjective(Open3DBlocks):
     pixel's point in it: all that matter, where a pixel is no wider than a voxel. `pixels` counts the look-ups, one a
     voxel and frame, and so do the points that are reported.
 
-    band              half-width of the band around the surface, in voxels along the optical axis
-    device            as in Open3DBlocks
-    block_resolution  likewise; between wider pixels it decides which voxels are visited
+    Attributes:
+        band: half-width of the band around the surface, in voxels along the optical axis.
+        device: As in Open3DBlocks.
+        block_resolution: Likewise; between wider pixels it decides which voxels are visited.
     """
 
     pointwise = False
@@ -59,7 +60,7 @@ class Open3DProjective(Open3DBlocks):
 
 
 class Projector(Aggregator):
-    """Turns frames into observations by projecting voxels; a key is the number of the voxel within the frame."""
+    """A projection of voxels that turns frames into observations; a key is the number of the voxel within the frame."""
 
     def __init__(self, voxel_size: float, num_classes: int, block_resolution: int, band: float) -> None:
         super().__init__(voxel_size, num_classes)
@@ -73,9 +74,10 @@ class Projector(Aggregator):
         )
 
     def observe(self, frame: Frame) -> Observed:
-        """The frame's observations, one pixel each; the first frame's camera sets the origin.
+        """Return the frame's observations, one pixel each; the first frame's camera sets the origin.
 
-        Raises DataError for a label outside the classes, or a point more than 2^20 voxels from the origin.
+        Raises:
+            DataError: For a label outside the classes, or a point more than 2^20 voxels from the origin.
         """
         check_depth(frame)
         check_frame(frame, self.num_classes)
@@ -86,11 +88,11 @@ class Projector(Aggregator):
         return self._observed(frame, np.concatenate([pixel for _, pixel in parts] or [np.zeros(0, dtype=np.int64)]))
 
     def index_of(self, key: Int64) -> Int64:
-        """Voxel indices (n, 3) of the last frame's keys."""
+        """Return voxel indices (n, 3) of the last frame's keys."""
         return self._index[key]
 
     def _touched(self, frame: Frame) -> Int64:
-        """Blocks (n, 3) near the voxels that hold a point of a valid pixel, sorted.
+        """Return blocks (n, 3) near the voxels that hold a point of a valid pixel, sorted.
 
         Open3D's own search among the pixels' points takes seconds where there are millions of them, or looks at each
         fourth pixel only. It computes in float32, so the voxels count from a block near the camera.
@@ -108,7 +110,7 @@ class Projector(Aggregator):
         return blocks[np.lexsort(blocks.T[::-1])] + corner
 
     def _in_band(self, frame: Frame, blocks: Int64) -> tuple[Int64, Int64]:
-        """Of the blocks' voxels those in the band: their indices (n, 3), and the flat index of the pixel of each."""
+        """Return the blocks' voxels in the band: their indices (n, 3), and the flat index of the pixel of each."""
         H, W = frame.shape
         K, R_cw = frame.intrinsics, np.linalg.inv(frame.T_wc[:3, :3])
         corner = (blocks * self.block_resolution * self.voxel_size - frame.T_wc[:3, 3]) @ R_cw.T
@@ -125,7 +127,7 @@ class Projector(Aggregator):
         return blocks[block] * self.block_resolution + self._local[local], pixel[near]
 
     def _observed(self, frame: Frame, pixel: Int64) -> Observed:
-        """The evidence of the pixels (n,), each for its voxel: one label each, or K normalised scores."""
+        """Return the evidence of the pixels (n,), each for its voxel: one label each, or K normalised scores."""
         n = len(pixel)
         if frame.labels is not None:
             labels, weights = frame.labels.reshape(-1)[pixel].astype(np.uint16), np.ones(n)

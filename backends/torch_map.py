@@ -49,7 +49,7 @@ from semstab.model.voxels import VoxelTable
 
 
 def device_of(name: str | None) -> torch.device:
-    """The device of that name, as torch or Open3D writes it."""
+    """Return the device of that name, as torch or Open3D writes it."""
     if name is None:
         return torch.device("cuda", torch.cuda.current_device()) if torch.cuda.is_available() else torch.device("cpu")
     try:
@@ -126,7 +126,9 @@ class TorchMaps:
     ) -> dict[str, FrameReport]:
         """Fuse what some of the backbones say of one view; a report for each.
 
-        Raises DataError, with all maps unchanged, where one of them cannot be fused, ConfigError for an unknown name.
+        Raises:
+            DataError: If one of them cannot be fused, with all maps unchanged.
+            ConfigError: For an unknown name.
         """
         started = time.perf_counter()
         view = DepthView.of(depth, intrinsics, T_wc, index, self.device)
@@ -158,7 +160,11 @@ class TorchMaps:
         }
 
     def table(self, name: str) -> VoxelTable:
-        """The map of a backbone so far, brought to memory. Raises ConfigError for an unknown name."""
+        """Return the map of a backbone so far, brought to memory.
+
+        Raises:
+            ConfigError: For an unknown name.
+        """
         columns = self._columns_of(name)
         used = torch.nonzero(self.storage.hash.keys != EMPTY)[:, 0]
         keys, order = torch.sort(self.storage.hash.keys[used])  # packed keys sort like (ix, iy, iz)
@@ -189,7 +195,7 @@ class TorchMaps:
     def _look_up(
         self, seen: Association, evidence: Mapping[str, ViewEvidence], view: DepthView, grid: MapGrid
     ) -> tuple[torch.Tensor, int]:
-        """Rows of the view's voxels, new ones included, and the number of voxels then; checks the evidence."""
+        """Return rows of the view's voxels, new ones included, and the number of voxels then; checks the evidence."""
         rows = self.storage.hash.find(seen.keys)
         observed = torch.zeros_like(rows, dtype=torch.bool)
         for of_name in evidence.values():
@@ -212,7 +218,11 @@ class TorchMaps:
         return torch.where(new, row_of_new, rows), self.storage.voxels + int(added)
 
     def _first_grid(self, view: DepthView) -> MapGrid:
-        """Keys that count from the camera's voxel. Raises DataError where the camera is out of reach."""
+        """Return keys that count from the camera's voxel.
+
+        Raises:
+            DataError: If the camera is out of reach.
+        """
         camera = view.camera.T_wc[:3, 3]
         origin = np.floor(camera / self.voxel_size)
         if np.abs(origin).max() > INDEX_LIMIT - 2 * HALF:
@@ -226,12 +236,15 @@ class TorchMaps:
 
 
 def _where(view: DepthView, kind: str, name: str) -> str:
-    """The name of a backbone's labels, scores or logits in an error."""
+    """Return the name of a backbone's labels, scores or logits in an error."""
     return view.camera.where(kind) + (f" of '{name}'" if name else "")
 
 
 def _at_home(column: torch.Tensor, rows: torch.Tensor) -> npt.NDArray[Any]:
-    """Rows of a column in memory; they are gathered a part at a time, so that the device needs no second column."""
+    """Return rows of a column in memory.
+
+    They are gathered a part at a time, so that the device needs no second column.
+    """
     home = torch.empty((len(rows), *column.shape[1:]), dtype=column.dtype)
     for part in parts(len(rows), COPIED_ROWS):
         home[part] = column[rows[part]].cpu()
@@ -244,11 +257,13 @@ class TorchMap(FusionBackend):
 
     A map reaches 2^20 voxels to either side of its first camera.
 
-    device     'CUDA:0', 'CPU:0', ...; the first CUDA device where torch sees one, else the CPU
-    precision  'float64', which decides at a voxel's face as the other backends do, or 'float32' for points and
-               evidence: less memory, and faster where the device is slow in float64
-    memory_gb  the most that the map may take of the device, the copy that growing takes included; no bound if not given
-    reserve    voxels to make room for at once: a map that does not outgrow them copies nothing
+    Attributes:
+        device: 'CUDA:0', 'CPU:0', ...; the first CUDA device where torch sees one, else the CPU.
+        precision: 'float64', which decides at a voxel's face as the other backends do, or 'float32' for points and
+            evidence: less memory, and faster where the device is slow in float64.
+        memory_gb: The most that the map may take of the device, the copy that growing takes included; no bound if not
+            given.
+        reserve: Voxels to make room for at once: a map that does not outgrow them copies nothing.
     """
 
     def __init__(
@@ -270,12 +285,12 @@ class TorchMap(FusionBackend):
 
     @property
     def device(self) -> torch.device:
-        """Where the map is."""
+        """The device of the map."""
         return self.maps.device
 
     @staticmethod
     def expected_bytes(voxels: int, observations: int, num_classes: int) -> int:
-        """Half as many rows again as there are voxels, the copy of the evidence that growing takes, and the hash."""
+        """Return the bytes of half as many rows again as voxels, the evidence's copy while it grows, and the hash."""
         return voxels * (20 * num_classes + 66 + 6 * SLOT_BYTES)
 
     def integrate(self, frame: Frame) -> FrameReport:
@@ -303,14 +318,21 @@ class TorchMap(FusionBackend):
     ) -> FrameReport:
         """Fuse one frame of tensors on any device, or arrays; those that are on the map's device are not copied.
 
-        depth                   (H, W) float metres, intrinsics and T_wc (4, 4) as a `Frame` has them
-        labels, scores, logits  one of them, as a `TensorPrediction` has them: scores and logits are (K, H, W)
+        Args:
+            depth: (H, W) float metres.
+            intrinsics: Those of the depth image.
+            T_wc: (4, 4) camera-to-world, as a `Frame` has it.
+            index: The index of the frame.
+            labels: (H, W), as a `TensorPrediction` has them; give labels, scores or logits.
+            scores: (K, H, W), as a `TensorPrediction` has them.
+            logits: (K, H, W), as a `TensorPrediction` has them.
 
-        Raises DataError, with the map unchanged, where the frame cannot be fused.
+        Raises:
+            DataError: If the frame cannot be fused, with the map unchanged.
         """
         predicted = TensorPrediction(labels=labels, scores=scores, logits=logits)
         return self.maps.integrate_tensors(depth, intrinsics, T_wc, {"": predicted}, index=index)[""]
 
     def table(self) -> VoxelTable:
-        """The map so far, brought to memory."""
+        """Return the map so far, brought to memory."""
         return self.maps.table("")

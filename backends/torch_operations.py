@@ -21,14 +21,14 @@ from semstab.backends.torch_storage import Columns, DepthView, Labels, MapGrid, 
 from semstab.model.results import RECURRENT
 
 NONE, LOST = -1, -2
-"""Instead of a voxel: the pixel has no depth, or its point is out of the map's reach."""
+"""Marks instead of a voxel: the pixel has no depth, or its point is out of the map's reach."""
 
 SCORE_BITS, SCORE_BITS_SINGLE = 48, 25
 """Scores are summed in units of 2^-48, or of 2^-(62 - b) in images of 2^b > 2^14 pixels (2^-39 at 3840x2160); shares
 that were computed in float32 in units of 2^-25, half the distance of the float32 numbers below 1."""
 
 SUMS = len(fields(Change))
-"""How many numbers `update` returns: those of a `Change`, in its order."""
+"""The count of numbers that `update` returns: those of a `Change`, in its order."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,10 +46,11 @@ class Association:
 class ViewEvidence:
     """The evidence of one backbone for the n voxels of a view: s_bar = sums / (scale * pixels).
 
-    sums    (K, n) integer
-    pixels  (n,) int64 pixels that count; 0 in voxels that the backbone does not see
-    flags   (3,) int64 what is wrong: the highest label id that a pixel which counts has, where that is no class, else
-            -1 or a class; whether such a pixel is out of reach; whether a score is below 0
+    Attributes:
+        sums: (K, n) integer.
+        pixels: (n,) int64 pixels that count; 0 in voxels that the backbone does not see.
+        flags: (3,) int64 what is wrong: the highest label id that a pixel which counts has, where that is no class,
+            else -1 or a class; whether such a pixel is out of reach; whether a score is below 0.
     """
 
     sums: torch.Tensor
@@ -59,17 +60,17 @@ class ViewEvidence:
 
 
 def score_scale(pixels: int, double: bool) -> float:
-    """Units of a score of 1: a power of 2, such that the sum over all pixels fits 63 bits."""
+    """Return units of a score of 1: a power of 2, such that the sum over all pixels fits 63 bits."""
     return 2.0 ** min(SCORE_BITS if double else SCORE_BITS_SINGLE, 62 - pixels.bit_length())
 
 
 def chunk_of(device: torch.device) -> int:
-    """Numbers that are worked on at a time: few enough for a CPU's cache, enough to fill an accelerator."""
+    """Return numbers that are worked on at a time: few enough for a CPU's cache, enough to fill an accelerator."""
     return 1 << 16 if device.type == "cpu" else 1 << 22
 
 
 def parts(total: int, size: int) -> Iterator[slice]:
-    """The range in parts of that size, at least 1."""
+    """Return the range in parts of that size, at least 1."""
     size = max(size, 1)
     return (slice(start, min(start + size, total)) for start in range(0, total, size))
 
@@ -78,7 +79,7 @@ def parts(total: int, size: int) -> Iterator[slice]:
 
 
 def associate(view: DepthView, grid: MapGrid) -> Association:
-    """The voxels of a view, ascending by key, and the one of each pixel."""
+    """Return the voxels of a view, ascending by key, and the one of each pixel."""
     H, W = view.depth.shape
     terms = (camera_terms if grid.dtype == torch.float64 else camera_terms_single)(view, grid)
     rows = parts(H, chunk_of(view.depth.device) // W)
@@ -92,7 +93,7 @@ def associate(view: DepthView, grid: MapGrid) -> Association:
 
 
 def _keys(view: DepthView, grid: MapGrid, terms: list[torch.Tensor], rows: slice) -> torch.Tensor:
-    """Packed keys (pixels,) int64 of some rows of a view, NONE without depth, LOST out of reach."""
+    """Return packed keys (pixels,) int64 of some rows of a view, NONE without depth, LOST out of reach."""
     depth = view.depth[rows]
     ok = (depth > 0) & (depth < torch.inf)
     d = torch.where(ok, depth, 0).to(grid.dtype)
@@ -110,7 +111,7 @@ def _keys(view: DepthView, grid: MapGrid, terms: list[torch.Tensor], rows: slice
 
 
 def camera_terms(view: DepthView, grid: MapGrid) -> list[torch.Tensor]:
-    """Rays (W,), (H, 1), the pose (3, 4, 1, 1), voxel size (1,) and origin (3, 1, 1), in float64."""
+    """Return rays (W,), (H, 1), the pose (3, 4, 1, 1), voxel size (1,) and origin (3, 1, 1), in float64."""
     ray_x, ray_y = view.rays
     T = view.camera.T_wc[:3, :, None, None]
     origin = np.array(grid.origin)[:, None, None]
@@ -118,7 +119,7 @@ def camera_terms(view: DepthView, grid: MapGrid) -> list[torch.Tensor]:
 
 
 def camera_terms_single(view: DepthView, grid: MapGrid) -> list[torch.Tensor]:
-    """a (3, 1, W), b (3, H, 1), start and offset (3, 1, 1) in float32: x_w / r = d (a + b) + start, from the camera.
+    """Return a (3, 1, W), b (3, H, 1), start and offset (3, 1, 1), float32: x_w / r = d (a + b) + start.
 
     In units of voxels, with the whole voxels of the camera's position left to the integers: so float32 holds no more
     than the distance from the camera, and decides alike in UTM-sized coordinates.
@@ -133,7 +134,7 @@ def camera_terms_single(view: DepthView, grid: MapGrid) -> list[torch.Tensor]:
 
 
 def _uploaded(terms: list[npt.NDArray[Any]], dtype: torch.dtype, device: torch.device) -> list[torch.Tensor]:
-    """The arrays as tensors on the device, behind one another, in one copy."""
+    """Return the arrays as tensors on the device, behind one another, in one copy."""
     flat = torch.tensor(np.concatenate([term.ravel() for term in terms]), dtype=dtype, device=device)
     parts_of = torch.split_with_sizes(flat, [term.size for term in terms])
     return [part.reshape(term.shape) for part, term in zip(parts_of, terms, strict=True)]
@@ -143,7 +144,7 @@ def _uploaded(terms: list[npt.NDArray[Any]], dtype: torch.dtype, device: torch.d
 
 
 def count_labels(seen: Association, predicted: Labels, num_classes: int) -> ViewEvidence:
-    """Pixels of each class in each voxel."""
+    """Return pixels of each class in each voxel."""
     n, K, voxels = len(seen.keys), num_classes, seen.voxel.reshape(-1)
     sums = voxels.new_zeros(K * n)
     flags = seen.keys.new_tensor([-1, 0, 0])
@@ -159,7 +160,7 @@ def count_labels(seen: Association, predicted: Labels, num_classes: int) -> View
 
 
 def sum_scores(seen: Association, predicted: Scores, num_classes: int) -> ViewEvidence:
-    """Sums of the normalised scores in each voxel."""
+    """Return sums of the normalised scores in each voxel."""
     n, K, voxels = len(seen.keys), num_classes, seen.voxel.reshape(-1)
     scale = score_scale(len(voxels), double=predicted.values.dtype == torch.float64 or not predicted.softmax)
     sums, pixels = seen.keys.new_zeros(K * n), seen.keys.new_zeros(n)
@@ -180,7 +181,7 @@ def sum_scores(seen: Association, predicted: Scores, num_classes: int) -> ViewEv
 
 
 def shares(values: torch.Tensor, softmax: bool) -> tuple[torch.Tensor, torch.Tensor]:
-    """Scores or logits (K, P) as shares that sum to 1, and which pixels (P,) have such."""
+    """Return scores or logits (K, P) as shares that sum to 1, and which pixels (P,) have such."""
     if softmax:
         s = torch.softmax(values if values.dtype == torch.float64 else values.to(torch.float32), dim=0)
         return s, torch.isfinite(s[0])
@@ -235,5 +236,5 @@ def _observe(
 
 
 def _entropy_bits(p: torch.Tensor) -> torch.Tensor:
-    """Shannon entropy of distributions (n, K), in bits."""
+    """Return Shannon entropy of distributions (n, K), in bits."""
     return torch.xlogy(p, p).sum(dim=1) * (-1 / math.log(2))

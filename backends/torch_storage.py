@@ -54,7 +54,7 @@ class VoxelHash:
 
     @property
     def capacity(self) -> int:
-        """How many voxels it takes."""
+        """Return how many voxels it takes."""
         return int(FULL * len(self.keys))
 
     @property
@@ -63,7 +63,7 @@ class VoxelHash:
         return SLOT_BYTES * len(self.keys)
 
     def find(self, keys: torch.Tensor) -> torch.Tensor:
-        """Rows (n,) int64 of keys (n,), EMPTY for those that the hash does not hold."""
+        """Return rows (n,) int64 of keys (n,), EMPTY for those that the hash does not hold."""
         rows = torch.full_like(keys, EMPTY)
         mask = len(self.keys) - 1
         at, searched = mix(keys) & mask, torch.arange(len(keys), device=keys.device)
@@ -92,19 +92,19 @@ class VoxelHash:
 
 
 def mix(key: torch.Tensor) -> torch.Tensor:
-    """The finaliser of splitmix64: every bit of the key moves every bit of the hash."""
+    """Return the finaliser of splitmix64: every bit of the key moves every bit of the hash."""
     for bits, odd in ((30, 0xBF58476D1CE4E5B9), (27, 0x94D049BB133111EB)):
         key = (key ^ _shifted(key, bits)) * (odd - (1 << 64))
     return key ^ _shifted(key, 31)
 
 
 def _shifted(x: torch.Tensor, bits: int) -> torch.Tensor:
-    """A logical shift to the right, which torch has for unsigned numbers only."""
+    """Return a logical shift to the right, which torch has for unsigned numbers only."""
     return (x >> bits) & ((1 << (64 - bits)) - 1)
 
 
 def slots_for(voxels: int) -> int:
-    """Slots of a hash for that many voxels: a power of 2."""
+    """Return slots of a hash for that many voxels: a power of 2."""
     return 1 << max(10, (int(voxels / FULL) - 1).bit_length())
 
 
@@ -170,7 +170,8 @@ class Storage:
     def make_room(self, needed: int, where: str, wanted: int = 0) -> None:
         """Make room for that many voxels, and for half as many again as there was if there is memory for them.
 
-        Raises DataError, with the maps unchanged, where they would outgrow `memory_gb`, or the device.
+        Raises:
+            DataError: If they would outgrow `memory_gb`, or the device, with the maps unchanged.
         """
         if needed <= self.capacity:
             return
@@ -194,7 +195,7 @@ class Storage:
             ) from error
 
     def _bytes_to_grow(self, voxels: int) -> int:
-        """The most memory taken while it grows: what it is then, and the column or hash that is copied."""
+        """Return the most memory taken while it grows: what it is then, and the column or hash that is copied."""
         columns = self.columns.values()
         then = SLOT_BYTES * slots_for(voxels) + voxels * sum(c.row_bytes for c in columns)
         copied = max(self.hash.bytes, *(c.values["evidence"].nbytes for c in columns))
@@ -224,12 +225,14 @@ Image = torch.Tensor | npt.NDArray[Any]
 class TensorPrediction:
     """The prediction of a backbone for each pixel of a view: one of the three. A batch dimension of 1 is left away.
 
-    labels  (H, W) integer class ids. Ignored are 255 in uint8 and 65535 in uint16; in other types every negative id,
-            and 255 (65535 where there are more classes than that)
-    scores  (K, H, W) float, non-negative; normalised per pixel, pixels without a finite positive sum left out
-    logits  (K, H, W) float, as models give them; softmax over the classes, in float32 unless they are float64
+    Attributes:
+        labels: (H, W) integer class ids. Ignored are 255 in uint8 and 65535 in uint16; in other types every negative
+            id, and 255 (65535 where there are more classes than that).
+        scores: (K, H, W) float, non-negative; normalised per pixel, pixels without a finite positive sum left out.
+        logits: (K, H, W) float, as models give them; softmax over the classes, in float32 unless they are float64.
 
-    Raises DataError where none or several are given.
+    Raises:
+        DataError: If none or several are given.
     """
 
     labels: Image | None = None
@@ -261,8 +264,9 @@ class TensorPrediction:
 class DepthView:
     """A depth image on the device, with its camera.
 
-    depth   (H, W) float32, contiguous, metres along the optical axis
-    camera  a frame of one empty pixel, or the whole frame: index, intrinsics, pose, and the names of files
+    Attributes:
+        depth: (H, W) float32, contiguous, metres along the optical axis.
+        camera: A frame of one empty pixel, or the whole frame: index, intrinsics, pose, and the names of files.
     """
 
     depth: torch.Tensor
@@ -272,7 +276,11 @@ class DepthView:
     def of(
         cls, depth: Image, intrinsics: Intrinsics, T_wc: npt.ArrayLike, index: int, device: torch.device
     ) -> DepthView:
-        """A view of a depth image on any device, copied where it is elsewhere. Raises DataError as Frame does."""
+        """Return a view of a depth image on any device, copied where it is elsewhere.
+
+        Raises:
+            DataError: As Frame does.
+        """
         if isinstance(T_wc, torch.Tensor):
             T_wc = T_wc.detach().cpu().numpy()
         no_depth, no_label = np.zeros((1, 1), dtype=np.float32), np.zeros((1, 1), dtype=np.uint8)
@@ -295,7 +303,7 @@ class DepthView:
         return (u - K.cx) / K.fx, (v - K.cy) / K.fy
 
     def frame(self, usable: torch.Tensor) -> Frame:
-        """The view as a frame in memory, in which the pixels (H, W) that are usable have the label 0."""
+        """Return the view as a frame in memory, in which the pixels (H, W) that are usable have the label 0."""
         labels = torch.where(usable, 0, IGNORE_8BIT).to(torch.uint8)
         return dataclasses.replace(
             self.camera, depth=self.depth.cpu().numpy(), labels=labels.cpu().numpy(), scores=None, color=None
@@ -319,9 +327,10 @@ class Scores:
 
 
 def evidence_of(prediction: TensorPrediction, view: DepthView, num_classes: int, where: str) -> Labels | Scores:
-    """The prediction of a backbone for the view's pixels, on the view's device; `where` is its name in errors.
+    """Return the prediction of a backbone for the view's pixels, on the view's device; `where` is its name in errors.
 
-    Raises DataError where the image does not fit the depth image, or is of a wrong type.
+    Raises:
+        DataError: If the image does not fit the depth image, or is of a wrong type.
     """
     kind, device = prediction.kind, view.depth.device
     image = without_batch(on_device(prediction.image, device), dimensions=2 if kind == "labels" else 3)
@@ -339,14 +348,17 @@ def evidence_of(prediction: TensorPrediction, view: DepthView, num_classes: int,
 
 
 def on_device(image: Image, device: torch.device) -> torch.Tensor:
-    """The image as a tensor on that device; one that is there already, or an array where that is memory, is shared."""
+    """Return the image as a tensor on that device.
+
+    One that is there already, or an array where that is memory, is shared.
+    """
     if isinstance(image, torch.Tensor):
         return image.detach().to(device)
     return from_dlpack(np.ascontiguousarray(image)).to(device)  # unlike from_numpy it takes read-only arrays
 
 
 def without_batch(image: torch.Tensor, dimensions: int) -> torch.Tensor:
-    """The image without a leading batch dimension of 1."""
+    """Return the image without a leading batch dimension of 1."""
     return image[0] if image.ndim == dimensions + 1 and len(image) == 1 else image
 
 

@@ -7,13 +7,13 @@ import sys
 
 
 def _end(*_: object) -> None:
-    """Nothing is begun yet, or everything is done: an exception would come out of the midst of an import."""
+    """End the process at once: nothing is begun yet, or all is done; an exception would come out of an import."""
     sys.stderr.write("interrupted\n")
     os._exit(130)
 
 
 def main() -> None:
-    """Entry point of the console script."""
+    """Run the command line; the entry point of the console script."""
     if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
         signal.signal(signal.SIGINT, _end)
     gc.set_threshold(50_000)  # modules are no garbage, and looking for some takes a tenth of all imports

@@ -1,4 +1,4 @@
-"""What the command line does, from Python: a run or a study, with its tables, figures and report."""
+"""The command line from Python: a run or a study, with its tables, figures and report."""
 
 from __future__ import annotations
 
@@ -27,8 +27,21 @@ def run(
     """Fuse, measure and compare what the configuration selects, without printing; it may be a dict or a YAML file.
 
     A folder `out`, in which the finished units of an earlier start are kept, gets the summary, voxels, time series and,
-    unless `report` is False, tables, figures and report.html. An executor says where the work is done.
-    Raises ConfigError or DataError; what was finished before stays in the folder.
+    unless `report` is False, tables, figures and report.html.
+
+    Args:
+        config: Settings, or a YAML file with them.
+        out: Folder of the results; without it they are in memory alone.
+        executor: Does the work; where not given, this process does it.
+        observers: Objects that are told what happens.
+        command: The command line, for the manifest.
+        report: Whether tables, figures and report.html are written.
+
+    Returns:
+        The summaries of all units, with their voxels where `out` is given.
+
+    Raises:
+        ConfigError, DataError: If something cannot be used or read; what was finished before stays in the folder.
     """
     reporting = [Reporting(out)] if report and out is not None else []
     return execute(as_config(config), out=out, executor=executor, observers=[*observers, *reporting], command=command)
@@ -43,6 +56,6 @@ def run_study(
     command: Sequence[str] = (),
     report: bool = True,
 ) -> Result:
-    """Return the same of a study: a unit that fails is among the result's failures, and the others finish."""
+    """Run a study as `run` does: a unit that fails is among the result's failures, and the others finish."""
     reporting = [Reporting(out)] if report else []
     return execute_study(as_config(config), out, executor=executor, observers=[*observers, *reporting], command=command)

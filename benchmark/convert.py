@@ -81,7 +81,7 @@ class DepthFormat:
 
 
 def quantised(depth: Float32, scale: float) -> tuple[UInt16, float]:
-    """Depth in whole units of 1 / scale metres, invalid pixels 0, and by how many metres the worst pixel is off.
+    """Return depth in whole units of 1 / scale metres, invalid pixels 0, and by how many metres the worst pixel is off.
 
     The error is infinite where depth does not fit into 16 bits, or a valid pixel would become invalid.
     """
@@ -96,7 +96,10 @@ def quantised(depth: Float32, scale: float) -> tuple[UInt16, float]:
 
 
 def depth_format(depths: Sequence[Float32], tolerance: float) -> DepthFormat:
-    """The 16-bit format that holds these images best, exactly if there is one; floats where none is good enough."""
+    """Return the 16-bit format that holds these images best, exactly if there is one.
+
+    Floats where none is good enough.
+    """
     scales = sorted(KNOWN_SCALES, key=lambda scale: (scale != MILLIMETRES, scale))
     errors = {scale: max(quantised(depth, scale)[1] for depth in depths) for scale in scales}
     best = min(scales, key=lambda scale: errors[scale])
@@ -110,10 +113,12 @@ class DepthFormatError(Exception):
 class SceneFolder:
     """The folder of one scene.
 
-    settings   all that its files depend on; a folder of other settings is not touched
-    tolerance  metres by which stored depth may be off
+    Attributes:
+        settings: All that its files depend on; a folder of other settings is not touched.
+        tolerance: Metres by which stored depth may be off.
 
-    Raises ConfigError where the folder holds something else.
+    Raises:
+        ConfigError: If the folder holds something else.
     """
 
     def __init__(self, path: Path, settings: Mapping[str, Any], tolerance: float) -> None:
@@ -169,7 +174,8 @@ class SceneFolder:
     def write_geometry(self, name: str, frame: Frame) -> None:
         """Write depth, pose, colour and mask of a frame.
 
-        Raises DepthFormatError, or DataError where its intrinsics are not those of the frames before.
+        Raises:
+            DepthFormatError, DataError: If its intrinsics are not those of the frames before.
         """
         assert self.form is not None
         stored = self.form.stored(frame.depth, self._tolerance)
@@ -212,7 +218,7 @@ class SceneFolder:
         return self.path / "labels" / folder_name(backbone) / f"{name}.png"
 
     def _require_same_camera(self, frame: Frame) -> None:
-        """One intrinsics.txt serves all frames."""
+        """Check that one intrinsics.txt serves all frames."""
         path = self.path / "intrinsics.txt"
         if self._intrinsics is None and not path.exists():
             write_text(path, matrix_text(frame.intrinsics.matrix))
@@ -224,7 +230,7 @@ class SceneFolder:
             )
 
     def _claim(self) -> DepthFormat | None:
-        """How an earlier start stored depth; None where there was none."""
+        """Return how an earlier start stored depth; None where there was none."""
         manifest = self.path / CONVERSION_FILE
         if not manifest.is_file():
             if self.path.exists() and (not self.path.is_dir() or any(self.path.glob("[!.]*"))):
@@ -246,18 +252,18 @@ class SceneFolder:
 
 
 def folder_name(name: str) -> str:
-    """The name itself where a folder can be called so, or else its `slug`."""
+    """Return the name itself where a folder can be called so, or else its `slug`."""
     fits = name.isprintable() and len(name.encode()) <= LONGEST_NAME and not set(name) & set("/\\")
     return name if fits and name[:1] not in ("", ".", "-") else slug(name)
 
 
 def matrix_text(matrix: Float64) -> str:
-    """A matrix as text, one row a line, that reads back to the same numbers."""
+    """Return a matrix as text, one row a line, that reads back to the same numbers."""
     return "".join(" ".join(f"{value:.17g}" for value in row) + "\n" for row in matrix)
 
 
 def _bare(backbone: str) -> str:
-    """The folder below scores/: posed_folder adds the suffix to its name."""
+    """Return the folder below scores/: posed_folder adds the suffix to its name."""
     return folder_name(backbone.removesuffix(SCORES_SUFFIX))
 
 
@@ -271,11 +277,12 @@ Reporter = Callable[[str, int, int], None]
 class Converted:
     """The result of converting one scene.
 
-    folder   of the converted scene
-    frames   how many were selected, of which `written` were new or not complete
-    depth    how its depth is stored, in words
-    renamed  label sources that have another name in the folder
-    lost     things of the scene that a posed folder does not hold
+    Attributes:
+        folder: Folder of the converted scene.
+        frames: Number of selected frames, of which `written` were new or not complete.
+        depth: How its depth is stored, in words.
+        renamed: Label sources that have another name in the folder.
+        lost: Things of the scene that a posed folder does not hold.
     """
 
     scene: str
@@ -296,7 +303,9 @@ def convert(
     stay. Depth becomes 16-bit PNG where no pixel is off by more than `depth_error` metres, else float32 .npy; with 0
     the folder gives the voxels of the source. `progress` is called after each frame: task, frames done, all frames.
 
-    Raises ConfigError for a folder that holds something else, DataError for frames that a posed folder cannot hold.
+    Raises:
+        ConfigError: For a folder that holds something else.
+        DataError: For frames that a posed folder cannot hold.
     """
     dataset = open_dataset(config.dataset.name, config.dataset.options)
     for name in selected(config.scenes, dataset.scenes, (), "scene", config.dataset.name):
@@ -404,12 +413,12 @@ class _Work:
 
 
 def _name(index: int) -> str:
-    """The name of a frame's files: frames keep their order, and their number where all are converted."""
+    """Return the name of a frame's files: frames keep their order, and their number where all are converted."""
     return f"{index:06d}"
 
 
 def _up_axis(scene: Scene) -> str | None:
-    """The name of the world's up axis, where it is one."""
+    """Return the name of the world's up axis, where it is one."""
     return next((name for name, axis in UP_AXES.items() if scene.up is not None and (scene.up == axis).all()), None)
 
 
@@ -418,7 +427,7 @@ def _up_axis(scene: Scene) -> str | None:
 
 @contextmanager
 def frame_bar(console: Console) -> Iterator[Callable[[str, int, int], None]]:
-    """A progress bar of the frames of one label source; call it with task, frames done, all frames."""
+    """Show a progress bar of the frames of one label source; call it with task, frames done, all frames."""
     columns = (TextColumn("{task.description}", markup=False), BarColumn(), MofNCompleteColumn(), TextColumn("frames"))
     with Progress(*columns, TimeRemainingColumn(), console=console, transient=True) as bar:
         work = bar.add_task("starting", total=None)

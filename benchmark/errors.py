@@ -16,7 +16,7 @@ OUT_OF_MEMORY = (
 
 
 class SemstabError(Exception):
-    """Something the caller can mend. The message, a line, says what is wrong, where, and what to do."""
+    """An error that the caller can mend. The message, a line, says what is wrong, where, and what to do."""
 
     exit_code = 2
 
@@ -49,10 +49,10 @@ def nearest(name: str, known: Sequence[str]) -> str:
 
 
 def sanitize(text: str) -> str:
-    """Return a text as a line for people: escaped where a character has no shape of its own, in bounds.
+    r"""Return a text as a line for people: escaped where a character has no shape of its own, in bounds.
 
-    >>> sanitize("no scene 'a\\nb'")
-    "no scene 'a\\\\nb'"
+    >>> sanitize("no scene 'a\nb'")
+    "no scene 'a\\nb'"
     """
     head = LONGEST_LINE * 2 // 3
     ends = text[:LONGEST_LINE] + text[LONGEST_LINE:][-LONGEST_LINE:]

@@ -25,12 +25,14 @@ def remedies_config(
     content: Mapping[str, Any],
     kept: Path | None = None,
 ) -> tuple[Config, list[str]]:
-    """The study `remedies` with these models, and filters over label sources of the scenes, in a dataset's settings.
+    """Return the study `remedies` with these models, and filters over the scenes' label sources, as dataset settings.
 
     Without models or sources all sources are taken; without filters those of the shipped study, its map prior in voxels
     of the run. What a model says is kept in a folder. Also says which filters are left out, as no scores are there.
 
-    Raises ConfigError for what is not known, DataError for a scene that cannot be read.
+    Raises:
+        ConfigError: For what is not known.
+        DataError: For a scene that cannot be read.
     """
     content = merge(dataset_defaults(content), content)
     config = resolve(load_config(None, {key: value for key, value in content.items() if key != "backbones"}))
@@ -50,13 +52,13 @@ def remedies_config(
 
 
 def _in_voxels(chain: str, size: float) -> str:
-    """A chain with the numbers of its filters; the map prior has the run's voxels where none is said."""
+    """Return a chain with the numbers of its filters; the map prior has the run's voxels where none is said."""
     texts = (f"map-prior:{size:g}" if text == "map-prior" else text for text in chain.split("+"))
     return "+".join(str(parse(text)) for text in texts)
 
 
 def _able(grid: Sequence[str], predictors: Sequence[PredictorConfig], scene: Scene) -> tuple[list[str], list[str]]:
-    """The filters that all models can take, and what to say of the others."""
+    """Return the filters that all models can take, and what to say of the others."""
     needing = [text for text in grid if parse(text.partition("+")[0]).kind.needs_scores]
     without = [each.label_name for each in predictors if needing and not _gives_scores(each, scene)]
     if not without:

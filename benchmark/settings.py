@@ -21,7 +21,10 @@ def load_config(
 ) -> Config:
     """Return the configuration of a file, or of settings by name, over the defaults in configs/datasets/.
 
-    Overrides go on top. Raises ConfigError.
+    Overrides go on top.
+
+    Raises:
+        ConfigError: If a setting cannot be used.
     """
     base = settings if isinstance(settings, Mapping) else _of_file(settings)
     content = _over(base, overrides or {})
@@ -37,7 +40,10 @@ def as_config(settings: Config | Mapping[str, Any] | str | Path) -> Config:
 def load_study(study: str | Path, overrides: Mapping[str, Any] | None = None) -> Config:
     """Return the configuration of a study's file, or of a shipped study by its name.
 
-    Its name is the file's, and only backends that it names check it. Raises ConfigError for an unknown study.
+    Its name is the file's, and only backends that it names check it.
+
+    Raises:
+        ConfigError: For an unknown study.
     """
     path = _shipped("studies") / f"{study}.yaml" if str(study) in shipped_studies() else Path(study)
     if path.suffix not in (".yaml", ".yml"):
@@ -116,7 +122,7 @@ def _of_file(path: str | Path | None) -> dict[str, Any]:
 
 
 def _over(content: Mapping[str, Any], overrides: Mapping[str, Any]) -> dict[str, Any]:
-    """Overrides on top of a file, short forms written out; no `scene_frames` at all clear those of the file."""
+    """Return overrides on top of a file, short forms written out; no `scene_frames` at all clear those of the file."""
     long = [dict(content), dict(overrides)]
     for each in long:
         if isinstance(dataset := each.get("dataset"), str):

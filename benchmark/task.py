@@ -24,9 +24,10 @@ from semstab.pixels.preparation import keep_largest, leave_out, perturb
 class Task:
     """A backbone on a scene: which frames, and how its labels become rows of evidence.
 
-    indices   of the frames, ascending; a range where they are evenly spaced
-    top_k     how many scores of each pixel are fused, the largest; all where not given
-    left_out  how many frames were selected but lack a file or a pose
+    Attributes:
+        indices: Indices of the frames, ascending; a range where they are evenly spaced.
+        top_k: Number of the largest scores of a pixel that are fused; all where not given.
+        left_out: Number of selected frames that lack a file or a pose.
     """
 
     scene: Scene
@@ -93,7 +94,8 @@ def _chosen_frames(scene: Scene, config: Config, sources: Sequence[str]) -> Sele
 def frame_indices(scene: Scene, config: Config, sources: Sequence[str] = ()) -> list[int]:
     """Return the frames of a scene that the configuration selects, to be read with the labels of these sources.
 
-    Raises ConfigError where there is none, and what `select_frames` raises.
+    Raises:
+        ConfigError: If there is none, and what `select_frames` raises.
     """
     return _chosen_frames(scene, config, sources).indices
 

@@ -149,8 +149,8 @@ def fused(watch: Watch, folder: Path, voxel_size: float, K: int) -> Any:
 def sections(table: VoxelTable, events: Events) -> dict[str, Callable[[], Any]]:
     """What of the statistics is timed by itself."""
     return {
-        "drift of each voxel": lambda: statistics.voxel_drift(table, events),
-        "drift of the scene": lambda: statistics.drift.order_test(table, events),
+        "drift in random order": lambda: statistics.expected_sbd(table, events),
+        "trends": lambda: statistics.trends(events),
         "flips": lambda: statistics.flips(events),
         "agreement by class": lambda: statistics.class_agreement(table, events),
     }

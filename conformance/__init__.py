@@ -32,7 +32,7 @@ TOLERANCE = 1e-9
 """Largest difference of a sum or a measure; counts are equal."""
 
 SECONDS = 60.0
-"""How long a program may take for a case."""
+"""Seconds that a program may take for a case."""
 
 
 @dataclass(frozen=True)
@@ -44,12 +44,16 @@ class Verdict:
 
 
 def case_names() -> tuple[str, ...]:
-    """Names of the cases, in the order in which they are best passed."""
+    """Return the names of the cases, in the order in which they are best passed."""
     return tuple(_cases().joinpath("order.txt").read_text(encoding="utf-8").split())
 
 
 def case_folder(name: str) -> Path:
-    """The folder of a case. Raises ConfigError where there is none of that name."""
+    """Return the folder of a case.
+
+    Raises:
+        ConfigError: If there is none of that name.
+    """
     if name not in case_names():
         raise ConfigError(f"no case '{name}'; {nearest(name, case_names())}")
     return _cases() / name
@@ -58,7 +62,8 @@ def case_folder(name: str) -> Path:
 def conform(command: str, only: Sequence[str] = (), tolerance: float = TOLERANCE) -> Iterator[Verdict]:
     """Run `command CASE OUT` for each case, or for some, and compare what it wrote to OUT with what is expected.
 
-    Raises ConfigError for a case that there is not, or a command that cannot be read or started.
+    Raises:
+        ConfigError: For a case that there is not, or a command that cannot be read or started.
     """
     folders = [case_folder(name) for name in only or case_names()]
     try:
@@ -75,7 +80,7 @@ def conform(command: str, only: Sequence[str] = (), tolerance: float = TOLERANCE
 
 
 def compared(folder: Path, out: Path, tolerance: float = TOLERANCE) -> str:
-    """Where a program's table differs from the expected one; empty where it does not."""
+    """Return where a program's table differs from the expected one; empty where it does not."""
     try:
         return next(differences(read_rows(folder / EXPECTED), read_rows(out), tolerance), "")
     except DataError as error:
@@ -111,7 +116,7 @@ KINDS: Mapping[str, tuple[str, str]] = {
     "labels8": ("labels", "<u1"), "labels16": ("labels", "<u2"), "scores16": ("scores", "<f2"),
     "scores32": ("scores", "<f4"),
 }  # fmt: skip
-"""By the word of a frame's line: the suffix of the file, and the type of its numbers."""
+"""The suffix of the file and the type of its numbers, by the word of a frame's line."""
 
 PLACE = ("ix", "iy", "iz")
 COUNTS = ("op", "pixels", "first_frame", "last_frame")
@@ -127,7 +132,7 @@ Rows = dict[Voxel, dict[str, float]]
 
 
 def read_case(folder: Path) -> tuple[float, int, list[Frame]]:
-    """Voxel size (metres), number of classes, and frames in the order in which they are fused."""
+    """Return voxel size (metres), number of classes, and frames in the order in which they are fused."""
     first, *lines = (folder / CASE).read_text(encoding="utf-8").splitlines()
     if first != FIRST_LINE:
         raise DataError(f"{folder / CASE}: begins with '{first}', not with '{FIRST_LINE}'")
@@ -150,7 +155,7 @@ def _read_frame(folder: Path, classes: int, index: str, width: str, height: str,
 
 
 def write_case(folder: Path, voxel_size: float, classes: int, frames: Sequence[Frame]) -> None:
-    """The files of a case but for the expected table."""
+    """Write the files of a case but for the expected table."""
     folder.mkdir(parents=True, exist_ok=True)
     lines = [FIRST_LINE, f"voxel_size {voxel_size!r}", f"num_classes {classes}"]
     for frame in frames:
@@ -169,7 +174,7 @@ def write_case(folder: Path, voxel_size: float, classes: int, frames: Sequence[F
 
 
 def write_rows(path: Path, table: VoxelTable) -> None:
-    """A voxel table with its measures as CSV, numbers with as many digits as they have; an undefined one is empty."""
+    """Write a voxel table with its measures as CSV, with all digits of a number; an undefined one is empty."""
     columns: dict[str, npt.NDArray[Any]] = {name: getattr(table, name) for name in (*PLACE, *COUNTS, *SUMS)}
     columns |= {f"evidence_{k}": table.evidence[:, k] for k in range(table.K)}
     columns |= {measure.key: measure.of(table) for measure in measures()}
@@ -182,7 +187,11 @@ def write_rows(path: Path, table: VoxelTable) -> None:
 
 
 def read_rows(path: Path) -> Rows:
-    """The rows of a table by voxel; an empty field is NaN. Raises DataError that names file and line."""
+    """Return the rows of a table by voxel; an empty field is NaN.
+
+    Raises:
+        DataError: If that fails; the message names file and line.
+    """
     try:
         reader = csv.reader(io.StringIO(read_limited(path, MAX_TABLE_BYTES).decode("utf-8")))
         header = [name.strip() for name in next(reader, [])]
@@ -203,7 +212,7 @@ def read_rows(path: Path) -> Rows:
 
 
 def differences(expected: Rows, actual: Rows, tolerance: float) -> Iterator[str]:
-    """In words, where a program's rows are not those that are expected: voxels, then column by column."""
+    """Yield in words where a program's rows are not the expected ones: voxels, then column by column."""
     if lost := sorted(expected.keys() - actual.keys()):
         yield f"the voxel {lost[0]} is missing{_more(lost)}"
     if extra := sorted(actual.keys() - expected.keys()):

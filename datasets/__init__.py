@@ -69,7 +69,8 @@ def options_model(name: str) -> type[BaseModel]:
 def resolved(config: DatasetConfig) -> DatasetConfig:
     """Return the dataset with every default of its options filled in, paths absolute.
 
-    Raises ConfigError for a dataset or an option that cannot be used.
+    Raises:
+        ConfigError: For a dataset or an option that cannot be used.
     """
     options = validated(options_model(config.name), config.options, f"dataset '{config.name}', options: ")
     paths = {key: value.absolute() for key, value in options if isinstance(value, Path)}
@@ -77,7 +78,13 @@ def resolved(config: DatasetConfig) -> DatasetConfig:
 
 
 def open_dataset(name: str, options: dict[str, Any] | BaseModel) -> Dataset:
-    """Open a dataset by name with its options. Raises ConfigError, DataError or MissingDependencyError."""
+    """Open a dataset by name with its options.
+
+    Raises:
+        ConfigError: If the name or an option cannot be used.
+        DataError: If the data cannot be read.
+        MissingDependencyError: If a package that it needs is not installed.
+    """
     cls = REGISTRY.load(name)
     validated = options if isinstance(options, BaseModel) else cls.Options.model_validate(options)
     return cast("Dataset", cls(validated))
@@ -93,8 +100,9 @@ RECOGNISED = (
 def recognise(root: Path) -> tuple[str, str]:
     """Return the dataset that a folder of scenes is of, and what tells so.
 
-    Raises DataError with the nearest formats, and what they lack, where it is none; of an empty folder it is a
-    `posed_folder`, whose reader says what is missing.
+    Raises:
+        DataError: If it is none; of an empty folder it is a `posed_folder`, whose reader says what is missing, with the
+            nearest formats, and what they lack.
     """
     near, fits = list[tuple[float, str]](), list[tuple[int, int, str, str]]()
     for rank, name in enumerate(RECOGNISED):

@@ -123,7 +123,8 @@ def has_model(folder: Path) -> bool:
 def read_model(folder: Path) -> tuple[Path, list[ModelImage]]:
     """Return the file of the images, and the images in the natural order of their names; binary goes before text.
 
-    Raises DataError for a damaged file, an image without its camera, or a camera that distorts.
+    Raises:
+        DataError: For a damaged file, an image without its camera, or a camera that distorts.
     """
     binary = (folder / "cameras.bin").is_file()
     path, cameras_path = (folder / f"{part}{'.bin' if binary else '.txt'}" for part in ("images", "cameras"))
@@ -219,7 +220,7 @@ def _images_bin(file: BinaryIO, path: Path) -> Iterator[Registered]:
 
 
 def _lines(file: BinaryIO) -> Iterator[tuple[int, str]]:
-    """Yield number and stripped text of every line: points can take gigabytes, so no file is read whole."""
+    """Yield the number and stripped text of every line: points can take gigabytes, so no file is read whole."""
     for number, line in enumerate(file, start=1):
         yield number, line.decode("utf-8", errors="replace").strip()
 

@@ -34,7 +34,11 @@ class HoloLens(FileDataset[HoloLensOptions]):
         return (folder / "poses.txt").is_file() and (folder / "K.txt").is_file()
 
     def frames(self, folder: Path) -> Iterable[FrameSource]:
-        """Return a frame for each line of poses.txt. Raises DataError where there are not as many images."""
+        """Return a frame for each line of poses.txt.
+
+        Raises:
+            DataError: If there are not as many images.
+        """
         camera = Camera(read_intrinsics(folder / "K.txt"))
         poses = read_table(folder / "poses.txt", 16, "a flattened 4x4 matrix").reshape(-1, 4, 4)
         images = files_named(folder / "images", "", ".png")

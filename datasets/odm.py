@@ -72,7 +72,7 @@ def find_project(folder: Path) -> Project | None:
 
 PHOTO_SUFFIXES = (".JPG", ".jpg", ".JPEG", ".jpeg", ".png", ".PNG", ".tif", ".TIF", ".tiff", ".TIFF")
 ADDED_SUFFIXES = ("", ".tif", ".jpg", ".png")
-"""What ODM appends to the name of an undistorted image."""
+"""The suffixes that ODM appends to the name of an undistorted image."""
 
 
 def bare_name(shot: str) -> str:
@@ -196,7 +196,8 @@ class Odm(FileDataset[OdmOptions]):
     def settled(self, folder: Path) -> OdmOptions:
         """Return the options with the source of depth that the project has.
 
-        Raises DataError where it has none, or not the one that is asked for.
+        Raises:
+            DataError: If it has none, or not the one that is asked for.
         """
         options = self.options
         if options.surface is not None:

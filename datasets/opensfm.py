@@ -18,7 +18,7 @@ from semstab.datasets.geometry.lenses import Lens
 from semstab.errors import DataError
 
 MAX_BYTES = 2**32
-"""With the points of thousands of photographs."""
+"""The most bytes of a file, with the points of thousands of photographs."""
 
 COEFFICIENTS: Mapping[str, tuple[str, tuple[str, ...]]] = {
     "perspective": ("brown", ("k1", "k2", "", "", "")),
@@ -28,14 +28,15 @@ COEFFICIENTS: Mapping[str, tuple[str, tuple[str, ...]]] = {
     "fisheye": ("fisheye", ("k1", "k2", "", "")),
     "fisheye_opencv": ("fisheye", ("k1", "k2", "k3", "k4")),
 }
-"""By projection type the model of its lens, and which key each of the lens's coefficients has, if any."""
+"""The model of the lens by projection type, and which key each of the lens's coefficients has, if any."""
 
 
 @dataclass(frozen=True, eq=False)
 class Shot:
     """One photograph: its name, its pose (4, 4) world-to-camera, its camera without distortion, and its lens.
 
-    lens  None where nothing distorts
+    Attributes:
+        lens: None where nothing distorts.
     """
 
     name: str
@@ -47,7 +48,8 @@ class Shot:
 def read_reconstruction(path: Path, wanted: int | None = None) -> list[Shot]:
     """Return the shots of the only reconstruction of a file, or of the one with that number, in its order.
 
-    Raises DataError for a damaged file, several reconstructions where none is wanted, or an unknown camera model.
+    Raises:
+        DataError: For a damaged file, several reconstructions where none is wanted, or an unknown camera model.
     """
     reconstructions = read_content(path, MAX_BYTES)
     if not isinstance(reconstructions, list) or {type(one) for one in reconstructions} != {dict}:

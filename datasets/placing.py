@@ -1,4 +1,4 @@
-"""Where a project of OpenDroneMap or OpenSfM lies on Earth, and by how many metres its cameras say so.
+"""Places of projects of OpenDroneMap or OpenSfM on Earth, and by how many metres their cameras say so.
 
 Sources: OpenDroneMap's stages run_opensfm, odm_georeferencing and odm_report, and OpenSfM's export_geocoords, in their
 versions from 2018 to 2026; docs/drones.md has the table of which version writes which frame.
@@ -53,10 +53,11 @@ STEP = 1.0
 
 @dataclass(frozen=True)
 class Place:
-    """Where a project lies.
+    """The place of a project on Earth.
 
-    words        how that was found, and how well the cameras fit
-    mesh_origin  what the coordinates of ODM's *_geo.obj count from in the projection; None: they are the scene's
+    Attributes:
+        words: How that was found and how well the cameras fit, in words.
+        mesh_origin: Origin of ODM's *_geo.obj in the projection; None: they are the scene's.
     """
 
     georeference: Georeference
@@ -66,7 +67,7 @@ class Place:
 
 @dataclass(frozen=True)
 class Positions:
-    """Finds known positions: `bare` takes the suffixes of images off a name, `photograph` finds that of a bare name."""
+    """A search for known positions: `bare` takes suffixes off a name, `photograph` finds the image of a bare name."""
 
     bare: Callable[[str], str]
     photograph: Callable[[str], Path | None]
@@ -76,7 +77,8 @@ class Positions:
 class _Known:
     """Known positions over the ground, east and north in the projection, by name or (n, 2) without; `source` in words.
 
-    exact  whether they were computed of these cameras, not measured
+    Attributes:
+        exact: Whether they were computed of these cameras, not measured.
     """
 
     source: str
@@ -114,7 +116,10 @@ def place_of(folder: Path, opensfm: Path, shots: Mapping[str, Poses], find: Posi
 
     What the files say is compared with known positions of the cameras; where another frame fits clearly better, that
     is taken, with a warning, and where the cameras lie further off than GPS explains it is warned of.
-    Raises DataError for damaged files, ConfigError for a projection that is not known.
+
+    Raises:
+        DataError: For damaged files.
+        ConfigError: For a projection that is not known.
     """
     candidates, sure = _candidates(folder, opensfm)
     if not candidates:
@@ -185,7 +190,7 @@ def _candidates(folder: Path, opensfm: Path) -> tuple[list[_Candidate], bool]:
 
 
 def _turned(georeference: Georeference, source: str) -> _Candidate:
-    """That of topocentric poses; of its meshes ODM took the height of the projection, but not east and north."""
+    """Return the place of topocentric poses; of its meshes ODM took the projection's height, but not east and north."""
     east, north, _ = georeference.offset
     return _Candidate(georeference, f"poses topocentric, brought into the projection by {source}", (east, north, 0.0))
 
@@ -197,7 +202,11 @@ def _as_matrix(georeference: Georeference) -> Float64:
 
 
 def _matrix_of(rows: Any, path: Path) -> Float64:
-    """Return (4, 4) of rows of numbers or words. Raises DataError for anything but an affine map."""
+    """Return (4, 4) of rows of numbers or words.
+
+    Raises:
+        DataError: For anything but an affine map.
+    """
     try:
         T = np.array([[float(value) for value in row] for row in rows])
     except (TypeError, ValueError) as error:
@@ -260,7 +269,7 @@ def _reference(path: Path) -> tuple[float, float, float]:
 
 
 def _crs(coords: Path, proj: Path) -> str:
-    """proj.txt, else the first line of coords.txt: 'WGS84 UTM 15N' or a PROJ string."""
+    """Return proj.txt, else the first line of coords.txt: 'WGS84 UTM 15N' or a PROJ string."""
     if proj.is_file():
         return read_text(proj, MAX_TEXT_BYTES).strip()
     words = read_text(coords, MAX_TEXT_BYTES).split("\n")[0].split()
@@ -317,7 +326,7 @@ def _known(folder: Path, opensfm: Path, names: list[str], find: Positions, crs: 
 
 
 def _of_shots(path: Path | None, bare: Callable[[str], str]) -> Iterator[tuple[str, float, float]]:
-    """Names, longitudes and latitudes of the cameras as ODM reports them."""
+    """Yield names, longitudes and latitudes of the cameras as ODM reports them."""
     if path is None or not path.is_file():
         return
     content = read_content(path, MAX_SHOTS_BYTES)
@@ -332,7 +341,7 @@ def _of_shots(path: Path | None, bare: Callable[[str], str]) -> Iterator[tuple[s
 
 
 def _of_opensfm(folder: Path, bare: Callable[[str], str]) -> Iterator[tuple[str, float, float]]:
-    """The same of the images' GPS as OpenSfM keeps it, a file an image; what has none is passed over."""
+    """Yield the same of the images' GPS as OpenSfM keeps it, a file an image; what has none is passed over."""
     for path in _spread(sorted(folder.glob("*.exif"))):
         gps = read_object(path).get("gps")
         if isinstance(gps, dict) and {"latitude", "longitude"} <= gps.keys():
@@ -341,7 +350,7 @@ def _of_opensfm(folder: Path, bare: Callable[[str], str]) -> Iterator[tuple[str,
 
 
 def _of_photographs(names: list[str], photograph: Callable[[str], Path | None]) -> Iterator[tuple[str, float, float]]:
-    """The same of the photographs' EXIF data; what has none, or cannot be read, is passed over."""
+    """Yield the same of the photographs' EXIF data; what has none, or cannot be read, is passed over."""
     for name in _spread(names):
         path = photograph(name)
         if path is not None and (at := _exif_position(path)) is not None:

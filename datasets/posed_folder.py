@@ -44,7 +44,11 @@ class PosedFolder(FileDataset[PosedOptions]):
         return (folder / ("depth" if self.options.surface is None else "pose")).is_dir()
 
     def frames(self, folder: Path) -> Iterator[FrameSource]:
-        """Yield a frame for each name of a depth image or a pose. Raises DataError for two files of one frame."""
+        """Yield a frame for each name of a depth image or a pose.
+
+        Raises:
+            DataError: For two files of one frame.
+        """
         depth = files_by_stem(folder / "depth", DEPTH_SUFFIXES)
         poses = files_by_stem(folder / "pose", (".txt",))
         colors = files_by_stem(folder / "color", COLOR_SUFFIXES)
@@ -58,7 +62,11 @@ class PosedFolder(FileDataset[PosedOptions]):
             )  # fmt: skip
 
     def settled(self, folder: Path) -> FileOptions:
-        """scene.yaml, where there is one, with the options on top. Raises ConfigError with the file and the setting."""
+        """Return scene.yaml, where there is one, with the options on top.
+
+        Raises:
+            ConfigError: If that fails, with the file and the setting.
+        """
         settings = _scene_settings(folder / SETTINGS_FILE)
         options = {key: getattr(self.options, key) for key in opt.FileSettings.model_fields}
         given = {key: value for key, value in options.items() if value not in (None, (), {})}

@@ -22,7 +22,7 @@ from semstab.errors import DataError
 
 @dataclass(frozen=True)
 class Export:
-    """Where one of the two exports has its files, and its camera where no file says it."""
+    """The paths of one of the two exports, and its camera where no file says it."""
 
     trajectory: str
     depth: str
@@ -58,7 +58,11 @@ class Replica(FileDataset[ReplicaOptions]):
         return self._export(folder) is not None
 
     def frames(self, folder: Path) -> Iterable[FrameSource]:
-        """Return a frame for each depth image. Raises DataError where there are not as many poses."""
+        """Return a frame for each depth image.
+
+        Raises:
+            DataError: If there are not as many poses.
+        """
         export = self._export(folder)
         assert export is not None
         poses = read_table(folder / export.trajectory, 16, "a flattened 4x4 matrix").reshape(-1, 4, 4)

@@ -71,9 +71,10 @@ class ScanNet(FileDataset[ScanNetOptions]):
 
 
 def read_class_table(path: Path, column: str) -> UInt16:
-    """(65536,) the column's id for each ScanNet id; `IGNORE_16BIT` where the column is empty, `NO_ID` where no row is.
+    """Return (65536,) the column's id for each ScanNet id; `IGNORE_16BIT` where it is empty, `NO_ID` where no row is.
 
-    Raises DataError for a file without the columns, or an id that is no whole number.
+    Raises:
+        DataError: For a file without the columns, or an id that is no whole number.
     """
     lines = read_text(path, MAX_TABLE_BYTES).splitlines()
     header = lines[0].split("\t") if lines else []
@@ -94,7 +95,7 @@ def _id(text: str | None, path: Path, line: int) -> int:
 
 
 def _matrix_file(folder: Path, which: Which) -> Path:
-    """Of SensReader's export, or of the export of 25,000 frames."""
+    """Return the file of SensReader's export, or of the export of 25,000 frames."""
     path = folder / f"intrinsic/intrinsic_{which}.txt"
     other = folder / f"intrinsics_{which}.txt"
     return other if not path.is_file() and other.is_file() else path

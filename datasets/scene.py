@@ -30,9 +30,10 @@ GROUND_TRUTH = "gt"
 class Filtering:
     """Filters between a model and what is read as a label source.
 
-    model         the label source without them; the source itself where that is not there
-    filters       'ema:0.6+threshold:0.5'; '' where there are none
-    milliseconds  of CPU time that they took for a frame so far, in the median
+    Attributes:
+        model: The label source without them; the source itself where that is not there.
+        filters: 'ema:0.6+threshold:0.5'; '' where there are none.
+        milliseconds: CPU time that they took for a frame so far, in the median.
     """
 
     model: str
@@ -46,22 +47,23 @@ class Scene(ABC):
     A dataset has to give `name`, `backbones`, and the four methods that are abstract; the rest are defaults for what a
     scene may lack, or slower ways to get what `frame` holds too.
 
-    name               the scene's name, usable in a file name
-    backbones          names of the label sources, without the ground truth
-    ground_truth       whether `frame(i, "gt")` works too
-    further            label sources that are read by name only, none of 'all'
-    regions            maps of regions without classes, which `frame` reads by name and nothing fuses
-    up                 (3,) unit vector of the world's up axis, or None where it is not known
-    georeference       where it lies on Earth, or None where that is not known
-    placed             how that was found and how well it fits, in words, or None
-    folder             where its files lie and label maps of it are looked for, or None where it has none
-    label_paths        where label maps are looked for, of the first frame, with BACKBONE for any name
-    settings_file      the file that says what no option says, or None where there is no such file
-    labels_like_depth  whether its label maps have the pixels of the depth, not those of the colour images
-    surface            the file of the surface that depth is cast at, or None where it is not cast
-    depth_from         where depth comes from, in words, where that is not a file a frame
-    on_photographs     whether `image` is a distorted photograph, which `color` shows undistorted
-    skips_incomplete   whether selected frames that lack a file are left out; else they are an error
+    Attributes:
+        name: The scene's name, usable in a file name.
+        backbones: Names of the label sources, without the ground truth.
+        ground_truth: Whether `frame(i, "gt")` works too.
+        further: Label sources that are read by name only, none of 'all'.
+        regions: Maps of regions without classes, which `frame` reads by name and nothing fuses.
+        up: (3,) unit vector of the world's up axis, or None where it is not known.
+        georeference: Place on Earth, or None where that is not known.
+        placed: How that was found and how well it fits, in words, or None.
+        folder: Folder of its files, where label maps are looked for, or None where it has none.
+        label_paths: Paths where the first frame's label maps are looked for, with BACKBONE for any name.
+        settings_file: The file that says what no option says, or None where there is no such file.
+        labels_like_depth: Whether its label maps have the pixels of the depth, not those of the colour images.
+        surface: The file of the surface that depth is cast at, or None where it is not cast.
+        depth_from: Source of depth, in words, where that is not a file a frame.
+        on_photographs: Whether `image` is a distorted photograph, which `color` shows undistorted.
+        skips_incomplete: Whether selected frames that lack a file are left out; else they are an error.
     """
 
     name: str
@@ -95,7 +97,8 @@ class Scene(ABC):
 
         Without `color` a scene may leave colour out, where that saves time.
 
-        Raises DataError that names the file.
+        Raises:
+            DataError: If that fails; the message names the file.
         """
 
     @abstractmethod
@@ -122,7 +125,7 @@ class Scene(ABC):
 
     @property
     def settings(self) -> Mapping[str, Any]:
-        """By which conventions its files are read, by name of option: what a check may advise to change."""
+        """The conventions by which its files are read, by name of option: what a check may advise to change."""
         return {}
 
     @property
@@ -131,7 +134,7 @@ class Scene(ABC):
         return None
 
     def frame_name(self, index: int) -> str:
-        """What people know a frame by: its files' name, else its index."""
+        """Return what people know a frame by: its files' name, else its index."""
         return str(index)
 
     def filtering(self, backbone: str) -> Filtering:
@@ -139,7 +142,11 @@ class Scene(ABC):
         return Filtering(backbone)
 
     def geometry(self, index: int, *, color: bool = False) -> Frame:
-        """Return the frame but for its labels: all pixels are of class 0. Raises DataError that names the file."""
+        """Return the frame but for its labels: all pixels are of class 0.
+
+        Raises:
+            DataError: If that fails; the message names the file.
+        """
         sources = (*((GROUND_TRUTH,) if self.ground_truth else ()), *self.backbones[:1])
         for source in sources:  # the ground truth is the cheapest, but may be sparse
             try:
@@ -160,15 +167,19 @@ class Scene(ABC):
         return self.geometry(index).T_wc
 
     def intrinsics(self, index: int, shape: tuple[int, ...]) -> Intrinsics:
-        """Return intrinsics of the frame's depth image, of shape (H, W); pixels."""
+        """Return the intrinsics of the frame's depth image, of shape (H, W); pixels."""
         return self.geometry(index).intrinsics
 
     def color(self, index: int) -> UInt8 | None:
-        """Return colour (H, W, 3) uint8 RGB, None where the frame has none."""
+        """Return the colour (H, W, 3) uint8 RGB, None where the frame has none."""
         return self.geometry(index, color=True).color
 
     def image(self, index: int) -> UInt8:
-        """Return colour (H, W, 3) uint8 RGB. Raises DataError where the frame has none."""
+        """Return the colour (H, W, 3) uint8 RGB.
+
+        Raises:
+            DataError: If the frame has none.
+        """
         color = self.color(index)
         if color is None:
             raise DataError(f"{self.name}, {self.image_name(index)}: the frame has no colour image to predict on")
@@ -181,7 +192,10 @@ class Scene(ABC):
     def predicted(self, index: int, *, labels: Labels | None = None, scores: Scores | None = None) -> Frame:
         """Return the frame with labels (H, W) or scores (H, W, K) that were predicted on its colour image; no colour.
 
-        They are brought to the depth's pixels. Raises DataError where image and depth do not show the same view.
+        They are brought to the depth's pixels.
+
+        Raises:
+            DataError: If image and depth do not show the same view.
         """
         frame = self.geometry(index)
         where = f"{self.name}, {self.image_name(index)}"
@@ -192,7 +206,8 @@ class Scene(ABC):
     def view(self, index: int, shape: tuple[int, int]) -> Frame:
         """Return depth and pose of the frame at the pixels of its colour image, of shape (H, W); all labels are 0.
 
-        Raises DataError where image and depth do not show the same view.
+        Raises:
+            DataError: If image and depth do not show the same view.
         """
         return at_image(self.geometry(index), shape, f"{self.name}, {self.image_name(index)}")
 
@@ -209,7 +224,11 @@ class Dataset(ABC):
 
     @abstractmethod
     def scene(self, name: str) -> Scene:
-        """Open one. Raises DataError where its files are missing or contradict each other."""
+        """Open one.
+
+        Raises:
+            DataError: If its files are missing or contradict each other.
+        """
 
 
 # Names and paths as error messages list them.
@@ -233,9 +252,10 @@ logger = logging.getLogger("semstab")
 class Selected:
     """Indices of frames, in order.
 
-    indices     those to read
-    incomplete  selected ones that were left out because they lack a file
-    lost        selected ones that were left out because tracking was lost
+    Attributes:
+        indices: Indices of the frames to read.
+        incomplete: Selected ones that were left out because they lack a file.
+        lost: Selected ones that were left out because tracking was lost.
     """
 
     indices: list[int]
@@ -253,8 +273,11 @@ def select_frames(
 ) -> Selected:
     """Return the selected frames of a sequence, to be read with the labels of these sources, or its colour.
 
-    A warning names the frames that are left out. Reads no image. Raises ConfigError for a frame or a time that the
-    scene does not have, DataError where selected frames lack files and the scene does not leave such frames out.
+    A warning names the frames that are left out. Reads no image.
+
+    Raises:
+        ConfigError: For a frame or a time that the scene does not have.
+        DataError: If selected frames lack files and the scene does not leave such frames out.
     """
     times = scene.timestamps
     chosen = selection.indices(len(scene), None if times is None else times.tolist())

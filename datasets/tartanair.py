@@ -47,7 +47,11 @@ class TartanAir(FileDataset[TartanAirOptions]):
         return (folder / f"pose_{side}.txt").is_file() and self.has_depth(folder / f"depth_{side}")
 
     def frames(self, folder: Path) -> Iterable[FrameSource]:
-        """Return a frame for each depth map. Raises DataError where there are not as many poses."""
+        """Return a frame for each depth map.
+
+        Raises:
+            DataError: If there are not as many poses.
+        """
         side = self.options.camera
         path = folder / f"pose_{side}.txt"
         numbers = read_table(path, 7, "tx ty tz qx qy qz qw")

@@ -62,7 +62,9 @@ def read_transforms(path: Path, root: Path, folder: Path, depth: Template | None
     """Return the frames of a transforms.json, whose paths are relative to it and stay in root.
 
     `depth` says, relative to `folder`, where depth maps are that the file does not name.
-    Raises DataError that names the file and the frame for missing or damaged values, distortion, or no depth.
+
+    Raises:
+        DataError: For missing or damaged values, distortion, or no depth; the message names the file and the frame.
     """
     content, folders = read_object(path), Folders()
     entries = content.get("frames")
@@ -126,7 +128,7 @@ def _camera(values: Mapping[str, Any], where: str) -> Camera:
 
 
 def _focal(values: Mapping[str, Any], axis: str, where: str) -> float | None:
-    """Focal length in pixels, from fl_x or the angle of the field of view; None where neither is given."""
+    """Return focal length in pixels, from fl_x or the angle of the field of view; None where neither is given."""
     if values.get(f"fl_{axis}") is not None:
         return number(values, f"fl_{axis}", where)
     if values.get(f"camera_angle_{axis}") is None:

@@ -63,7 +63,8 @@ class Tum(FileDataset[TumOptions]):
 
         Where a surface gives the depth and no depth.txt is there, one a colour image.
 
-        Raises DataError for time stamps that do not ascend, or where nothing fits together in time.
+        Raises:
+            DataError: For time stamps that do not ascend, or where nothing fits together in time.
         """
         trajectory = inside(self.options.root, folder, self.options.trajectory, "option trajectory")
         numbers = read_table(trajectory, 8, "timestamp tx ty tz qx qy qz qw")
@@ -122,7 +123,7 @@ class Tum(FileDataset[TumOptions]):
 
 
 def mutual_nearest(times: Float64, others: Float64, max_difference: float) -> npt.NDArray[np.intp]:
-    """For each of the ascending times the index of the other one where each is the other's nearest; -1 for none."""
+    """Return for each ascending time the index of the other one where each is the other's nearest; -1 for none."""
     to_other, back = nearest(times, others), nearest(others, times)
     mutual = (back[to_other] == np.arange(len(times))) & (np.abs(others[to_other] - times) <= max_difference)
     return np.where(mutual, to_other, -1)

@@ -20,9 +20,9 @@ class Fields(griffe.Extension):  # type: ignore[misc]
 
 
 def listed(text: str) -> str:
-    """The text with its aligned fields as list items.
+    r"""Return the text with its aligned fields as list items.
 
-    >>> print(listed("Two.\\n\\nop      frames\\n        that saw it\\nclass   its name"))
+    >>> print(listed("Two.\n\nop      frames\n        that saw it\nclass   its name"))
     Two.
     <BLANKLINE>
     - `op`: frames that saw it

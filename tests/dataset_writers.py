@@ -102,7 +102,7 @@ def with_axes(T_wc: np.ndarray, axes: str) -> np.ndarray:
 
 
 def quaternion(R) -> np.ndarray:
-    """x y z w."""
+    """Return x y z w."""
     return Rotation.from_matrix(R).as_quat()
 
 

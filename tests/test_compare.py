@@ -52,7 +52,7 @@ def write_scene(folder: Path, sources: dict[str, set[int]], name: str = "wall") 
 
 @pytest.fixture(scope="module")
 def runs(tmp_path_factory) -> Path:
-    """old with the label source net; new with net, whose doors are windows in FAULTY, and same, as net was."""
+    """Runs: old with the label source net; new with net, whose doors are windows in FAULTY, and same, as net was."""
     base = tmp_path_factory.mktemp("compare")
     write_scene(base / "a", {"net": set()})
     write_scene(base / "b", {"net": set(FAULTY), "same": set()})

@@ -103,7 +103,7 @@ print(caller(1), sum(caller.stats.cache_hits.values()))
 
 
 def test_code_is_compiled_again_where_what_it_takes_in_has_changed_or_is_damaged(tmp_path) -> None:
-    """numba looks at a function's own file alone, and would go on with the code of a helper that is no more."""
+    """The numba cache looks at a function's own file, and would go on with the code of a helper that is no more."""
 
     def called() -> str:
         path = f"{tmp_path}{os.pathsep}{Path(semstab.__file__).parents[1]}"

@@ -98,7 +98,7 @@ def test_without_asking_there_is_what_the_map_alone_tells(tmp_path) -> None:
     table = VoxelTable.load(tmp_path / "run" / "voxels" / f"{entry.unit.slug}.parquet")
     sample = CellObservations.load(tmp_path / "run" / "looks" / f"{entry.unit.slug}.parquet").sample()
     assert to_json(entry.statistics) == to_json(describe(table, observations=sample, name="a"))
-    assert entry.statistics.drift.tests is None
+    assert entry.statistics.drift.trend is None
     assert result.comparisons == ()
     again = semstab.engine.run(configure(root, events=True), out=tmp_path / "run")  # kept
     assert to_json(again.runs[0].statistics) == to_json(entry.statistics)
@@ -137,9 +137,9 @@ def test_the_first_backend_that_keeps_a_log_has_all_statistics(tmp_path) -> None
     root = tiny_scene.write(tmp_path / "wall", ("a",))
     result = semstab.engine.run(configure(root, backends=["open3d"], check="numpy", statistics=True))
     open3d, numpy = result.runs
-    assert open3d.statistics.drift.tests is None
+    assert open3d.statistics.drift.trend is None
     assert open3d.statistics.correctness is not None
-    assert numpy.statistics.drift.tests is not None
+    assert numpy.statistics.drift.trend is not None
     assert numpy.statistics.agreement.alpha.value == pytest.approx(open3d.statistics.agreement.alpha.value)
     plain = semstab.engine.run(configure(root, backends=["open3d"], check="numpy"))
     assert [entry.statistics is not None for entry in plain.runs] == [True, False]
@@ -159,7 +159,7 @@ def test_no_ground_truth_no_judgement(tmp_path) -> None:
     (root / "labels/gt").rmdir()
     (entry,) = semstab.engine.run(configure(root, statistics=True)).runs
     assert entry.statistics.correctness is entry.statistics.geometry is None
-    assert entry.statistics.drift.tests is not None
+    assert entry.statistics.drift.trend is not None
 
 
 def test_backbones_of_different_classes_are_not_compared(tmp_path) -> None:
@@ -217,8 +217,9 @@ def test_the_tables_of_a_study_have_the_numbers_of_its_units(studied) -> None:
         assert row["psa"] == pytest.approx(dataclasses.asdict(own.agreement.psa), nan_ok=True)
         assert row["flip_rate"] == own.drift.flips.rate.value
     for row in rows_of(found, "drift"):
-        assert "sbd_p" not in row  # so few frames cannot tell how long errors last
-        assert row["trend"] == pytest.approx(base[row["backbone"]].drift.tests.trend, nan_ok=True)
+        trend = base[row["backbone"]].drift.trend
+        assert row["trend_voxels"] == trend.voxels
+        assert row["trend_percent"]["value"] == pytest.approx(100 * trend.share.value, nan_ok=True)
         assert row["sbd"] - row["sbd_null"] == pytest.approx(row["sbd_excess"]["value"])
     for row in rows_of(found, "ceiling"):
         assert row["disagreement"]["value"] == pytest.approx(row["geometry"]["value"] + row["model"]["value"])

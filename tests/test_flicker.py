@@ -122,8 +122,10 @@ def at_x(x, labels, depth, index=0, **more):
 
 
 def test_motion_alone_is_no_flicker():
-    """A wall at 2 m with a pattern; the camera moves by one pixel, so the pattern moves by one, and 3 of 4 pixels stay
-    in view. Without compensation each border of the pattern counts."""
+    """A wall at 2 m with a pattern; the camera moves by one pixel, so the pattern moves by one.
+
+    3 of 4 pixels stay in view. Without compensation each border of the pattern counts.
+    """
     previous = at_x(0, [[0, 0, 1, 2]], 2)
     current = at_x(0.25, [[0, 1, 2, 2]], 2)
     assert flicker_percent(previous, current) == 50
@@ -137,8 +139,11 @@ def test_what_changes_on_the_surface_is_flicker():
 
 
 def test_what_was_occluded_does_not_count():
-    """A board at 1 m hides a pixel of the wall. From 0.25 m to the right, the board is out of view, and the wall behind
-    it, seen for the first time, is not compared with the board."""
+    """A board at 1 m hides a pixel of the wall.
+
+    From 0.25 m to the right, the board is out of view, and the wall behind it, seen for the first time, is not compared
+    with the board.
+    """
     previous = at_x(0, [[0, 1, 0, 0]], [[2, 1, 2, 2]])
     current = at_x(0.25, [[0, 0, 0, 0]], 2)
     assert correspond(current, previous).pixel.tolist() == [[-1, 2, 3, -1]]

@@ -101,8 +101,11 @@ def wall(index, depth=2.6, labels=0, shape=(5, 5), T_wc=None):
 
 
 def test_a_wall_is_two_layers_thick():
-    """Centres at z = 2.5 and 3.5 m lie within 1 m of the wall at 2.6 m, those at 1.5 m do not. At 2.5 m the centre of
-    voxel x = 1 is 1 m off the axis, 2 pixels, and in the image; at 3.5 m it is 1.4 pixels off. x = 2 is outside."""
+    """Centres at z = 2.5 and 3.5 m lie within 1 m of the wall at 2.6 m, those at 1.5 m do not.
+
+    At 2.5 m the centre of voxel x = 1 is 1 m off the axis, 2 pixels, and in the image; at 3.5 m it is 1.4 pixels off.
+    x = 2 is outside.
+    """
     table_of = projective(1.0)
     table_of.integrate(wall(0))
     expected = [(x, y, z) for x in (-1, 0, 1) for y in (-1, 0, 1) for z in (2, 3)]

@@ -36,7 +36,7 @@ def scene(request, tmp_path):
 
 
 def test_models_that_colmap_itself_wrote(tmp_path):
-    """pycolmap writes text and binary, with rigs, frames and points beside them; both are read alike."""
+    """Text and binary that pycolmap writes, with rigs, frames and points beside them, are read alike."""
     pycolmap = pytest.importorskip("pycolmap", reason="needs pycolmap")
     frames = ds.source()
     fx, fy, cx, cy = ds.four(frames[0])

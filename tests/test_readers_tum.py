@@ -64,7 +64,7 @@ def test_lost_poses_are_no_neighbours():
 
 
 def test_quaternions_turn_as_they_should(tmp_path):
-    """x y z w = 0 0 sin(a/2) cos(a/2) turns by a about z."""
+    """A quaternion x y z w = 0 0 sin(a/2) cos(a/2) turns by a about z."""
     T = from_quaternions(np.array([[2.0, 0, 0]]), np.array([[0, 0, math.sin(0.5), math.cos(0.5)]]), tmp_path)
     np.testing.assert_allclose(T, turning([1.0]), atol=1e-12)
     lost = from_quaternions(np.array([[0.0, 0, 0]]), np.array([[0, 0, math.nan, 1]]), tmp_path)

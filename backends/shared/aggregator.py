@@ -1,4 +1,4 @@
-"""From the pixels of a frame to its observations, one a voxel: labels by tiles of the image, scores likewise."""
+"""Observations, one a voxel, from the pixels of a frame: labels by tiles of the image, scores likewise."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ SAMPLE = 1 << 10
 
 
 class Aggregator:
-    """Turns frames into observations, of the voxels of an extent where one is given; reuses its work space."""
+    """A step from frames to observations, of the voxels of an extent where one is given; it reuses its work space."""
 
     def __init__(self, voxel_size: float, num_classes: int, within: Extent | None = None) -> None:
         self.voxel_size = voxel_size
@@ -40,9 +40,10 @@ class Aggregator:
         self._space = WorkSpace()
 
     def observe(self, frame: Frame) -> Observed | ObservedScores:
-        """The frame's observations; the first frame's camera sets the origin.
+        """Return the frame's observations; the first frame's camera sets the origin.
 
-        Raises DataError for a label outside the classes, or a voxel out of reach of the packed keys.
+        Raises:
+            DataError: For a label outside the classes, or a voxel out of reach of the packed keys.
         """
         origin = self._origin_at(frame) if self.origin is None else self.origin
         seen: Observed | ObservedScores | None
@@ -59,12 +60,12 @@ class Aggregator:
         return seen
 
     def index_of(self, key: Int64) -> Int64:
-        """Voxel indices (n, 3) of packed keys."""
+        """Return voxel indices (n, 3) of packed keys."""
         assert self.origin is not None
         return index_of_keys(key, self.origin)
 
     def _origin_at(self, frame: Frame) -> Int64:
-        """The camera's voxel, from which the packed keys count."""
+        """Return the camera's voxel, from which the packed keys count."""
         origin = np.floor(frame.T_wc[:3, 3] / self.voxel_size)
         if np.abs(origin).max() > INDEX_LIMIT - 2 * HALF:
             voxel_index(frame.T_wc[:3, 3:], self.voxel_size, frame)
@@ -74,7 +75,7 @@ class Aggregator:
     # --- Labels -------------------------------------------------------------------------------------------------------
 
     def _labels(self, frame: Frame, origin: Int64) -> Observed | None:
-        """The observations of labels, or None where the frame reaches too far or a label is outside the classes."""
+        """Return the observations of labels, None where the frame reaches too far or a label is no class."""
         assert frame.labels is not None
         space, (H, W) = self._space, frame.shape
         corner = np.floor(frame.T_wc[:3, 3] / self.voxel_size).astype(np.int64) - origin + (HALF - NEAR)
@@ -143,7 +144,7 @@ class Aggregator:
         return seen
 
     def _far_labels(self, frame: Frame, origin: Int64) -> Observed:
-        """The observations of a frame beyond the reach of words, associated as the reference does it."""
+        """Return the observations of a frame beyond the reach of words, associated as the reference does it."""
         assert frame.labels is not None
         valid = frame.valid
         index = voxel_index(back_project(frame, valid), self.voxel_size, frame) - origin[:, None] + HALF
@@ -175,7 +176,7 @@ class Aggregator:
     # --- Scores -------------------------------------------------------------------------------------------------------
 
     def _scores(self, frame: Frame, origin: Int64) -> Observed | ObservedScores | None:
-        """The observations of scores, or None where a pixel with depth is out of reach.
+        """Return the observations of scores, or None where a pixel with depth is out of reach.
 
         As dense rows where the voxels have evidence for most of the classes, else by its entries.
 
@@ -236,21 +237,24 @@ class Aggregator:
 
 
 def _rays(frame: Frame) -> tuple[Float64, Float64]:
-    """(u - cx) / fx of each column and (v - cy) / fy of each row."""
+    """Return (u - cx) / fx of each column and (v - cy) / fy of each row."""
     (H, W), camera = frame.shape, frame.intrinsics
     u, v = np.arange(W, dtype=np.float64), np.arange(H, dtype=np.float64)
     return (u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy
 
 
 def _offsets(spread: Int64) -> tuple[Int64, Int64]:
-    """Where the entries of each band go in each partition (PARTITIONS, bands), and the first one of each partition."""
+    """Return where each band's entries go in each partition (PARTITIONS, bands), and the first of each partition."""
     ends = np.cumsum(spread.T.reshape(-1))
     offset = np.concatenate([[0], ends[:-1]]).reshape(PARTITIONS, -1)
     return offset, np.append(offset[:, 0], ends[-1])
 
 
 def _flat(scores: Any) -> Any:
-    """Scores one after the other, half-precision ones as their bits; what compiled code does not know, in float64."""
+    """Return scores one after the other, half-precision ones as their bits.
+
+    What compiled code does not know, in float64.
+    """
     kind = scores.dtype if scores.dtype in (np.float16, np.float32) else np.float64
     values = fixed(scores.astype(kind, copy=False)).reshape(-1)
     return values.view(np.uint16) if kind == np.float16 else values

@@ -1,4 +1,4 @@
-"""From the pixels of a frame to voxels: back-projection, voxel index, and one evidence vector a voxel.
+"""Voxels from the pixels of a frame: back-projection, voxel index, and one evidence vector a voxel.
 
 Paper, Semantic Evidence and World-Space Association, and Persistent Voxel Evidence.
 """
@@ -41,9 +41,10 @@ FEW = 1 << 15
 class Observations:
     """The observations of n voxels by one frame, sorted by index.
 
-    index   (n, 3) int64 voxel index
-    s_bar   (n, K) float64 mean evidence of the frame's pixels in the voxel
-    pixels  (n,) int64 how many they are
+    Attributes:
+        index: (n, 3) int64 voxel index.
+        s_bar: (n, K) float64 mean evidence of the frame's pixels in the voxel.
+        pixels: (n,) int64 how many they are.
     """
 
     index: Int64
@@ -90,14 +91,14 @@ def check_depth(frame: Frame) -> None:
 
 
 def _whole_millimetres(depth: Float32) -> bool:
-    """Valid depths (n,) are whole numbers, as no measurement in metres is, and too large to be near."""
+    """Return whether valid depths (n,) are whole numbers, as no measurement in metres is, and too large to be near."""
     if depth.size < DISTINCT or np.median(depth) < FAR or not np.array_equal(depth, np.floor(depth)):
         return False
     return len(np.unique(depth)) >= DISTINCT
 
 
 def observe(frame: Frame, voxel_size: float, num_classes: int, pixels: Mask | None = None) -> Observations:
-    """The frame's observations: s_bar(q) = 1/|A_t(q)| sum of s_i over the pixels A_t(q) that fall into voxel q.
+    """Return the frame's observations: s_bar(q) = 1/|A_t(q)| sum of s_i over the pixels A_t(q) that fall into voxel q.
 
     Only of some of its valid `pixels` (H, W), where these are given.
     """
@@ -113,7 +114,7 @@ def observe(frame: Frame, voxel_size: float, num_classes: int, pixels: Mask | No
 
 
 def back_project(frame: Frame, pixels: Mask | None = None) -> Float64:
-    """World coordinates (3, n), metres, of the frame's valid pixels, or of some of them (H, W), in row order.
+    """Return World coordinates (3, n), metres, of the frame's valid pixels, or of some of them (H, W), in row order.
 
     x_w = T_wc d ((u - cx) / fx, (v - cy) / fy, 1).
 
@@ -123,7 +124,7 @@ def back_project(frame: Frame, pixels: Mask | None = None) -> Float64:
 
 
 def pixels_held(frame: Frame, pixels: Mask, voxel_size: float, holds: Callable[[Int64], Mask]) -> Mask:
-    """Those of the pixels (H, W) whose voxels, by their index (3, n), are held."""
+    """Return which of the pixels (H, W) fall into voxels that are held, by their index (3, n)."""
     held = [holds(voxel_index(points, voxel_size, frame)) for points in _points(frame, pixels)]
     chosen = np.zeros_like(pixels)
     chosen[pixels] = np.concatenate(held)
@@ -131,7 +132,7 @@ def pixels_held(frame: Frame, pixels: Mask, voxel_size: float, holds: Callable[[
 
 
 def _points(frame: Frame, pixels: Mask) -> Iterator[Float64]:
-    """World coordinates (3, n) of some pixels, of a few rows at a time: a large frame would take much memory."""
+    """Yield World coordinates (3, n) of some pixels, of a few rows at a time: a large frame would take much memory."""
     H, W = frame.shape
     K, R, t = frame.intrinsics, frame.T_wc[:3, :3], frame.T_wc[:3, 3]
     across, down = (np.arange(W) - K.cx) / K.fx, (np.arange(H) - K.cy) / K.fy
@@ -144,9 +145,10 @@ def _points(frame: Frame, pixels: Mask) -> Iterator[Float64]:
 
 
 def voxel_index(points: Float64, voxel_size: float, frame: Frame) -> Int64:
-    """Voxel index (3, n) of world points (3, n): q = floor(x_w / r).
+    """Return voxel index (3, n) of world points (3, n): q = floor(x_w / r).
 
-    Raises DataError where an index does not fit 32 bits, with the frame and its extent.
+    Raises:
+        DataError: If an index does not fit 32 bits, with the frame and its extent.
     """
     q = np.floor(points / voxel_size)
     if q.size and not (q.min() >= -INDEX_LIMIT and q.max() < INDEX_LIMIT):
@@ -159,9 +161,10 @@ def voxel_index(points: Float64, voxel_size: float, frame: Frame) -> Int64:
 
 
 def pack(index: Int64, frame: Frame) -> tuple[Int64, Int64, tuple[int, ...]]:
-    """One int64 key for each voxel of a frame, ascending with (ix, iy, iz); its lowest corner and size undo it.
+    """Return one int64 key for each voxel of a frame, ascending with (ix, iy, iz); its lowest corner and size undo it.
 
-    Raises DataError where the frame's extent holds too many voxels for a key.
+    Raises:
+        DataError: If the frame's extent holds too many voxels for a key.
     """
     low = index.min(axis=1, keepdims=True)
     size = tuple(int(n) for n in index.max(axis=1) - low[:, 0] + 1)
@@ -174,12 +177,12 @@ def pack(index: Int64, frame: Frame) -> tuple[Int64, Int64, tuple[int, ...]]:
 
 
 def unpack(key: Int64, low: Int64, size: tuple[int, ...]) -> Int64:
-    """The voxel indices (n, 3) behind keys made by `pack`."""
+    """Return the voxel indices (n, 3) behind keys made by `pack`."""
     return np.stack(np.unravel_index(key, size), axis=1) + low
 
 
 def _sums_of_evidence(frame: Frame, num_classes: int, chosen: Mask, voxel: Int64, voxels: int) -> Float64:
-    """Sums (m, K) of s over the pixels of each voxel, by the voxel (n,) of each: one-hot labels, or scores of sum 1."""
+    """Return the sums (m, K) of s over the pixels of each voxel (n,): of one-hot labels, or of scores that sum to 1."""
     if frame.labels is not None and frame.scores is None:  # never a vector a pixel: of many classes it takes too much
         seen = voxel * num_classes + frame.labels[chosen]
         return np.bincount(seen, minlength=voxels * num_classes).reshape(voxels, num_classes).astype(np.float64)
@@ -207,17 +210,17 @@ class Restricted:
         return self._backend.integrate(dataclasses.replace(frame, depth=depth))
 
     def table(self) -> VoxelTable:
-        """The voxels of the columns; a map in single precision may have put a pixel one voxel beyond."""
+        """Return the voxels of the columns; a map in single precision may have put a pixel one voxel beyond."""
         table = self._backend.table()
         inside = self._within.holds(table.index.T)
         return table if inside.all() else table.rows(inside)
 
     def events(self) -> Events | None:
-        """The log, where the backend keeps one."""
+        """Return the log, where the backend keeps one."""
         return self._backend.events()
 
 
 def falling_into(within: Extent, frame: Frame, voxel_size: float) -> Mask:
-    """The pixels (H, W) with depth whose voxels are in the extent."""
+    """Return the pixels (H, W) with depth whose voxels are in the extent."""
     there: Mask = np.isfinite(frame.depth) & (frame.depth > 0)
     return pixels_held(frame, there, voxel_size, within.holds)

@@ -23,18 +23,18 @@ LOWEST = 0x3FE5_8000_0000_0000
 """The bits of the least m: a step has 1 in its middle, so that the logarithm of what is near 1 is exact to its bits."""
 
 TERMS = 8
-"""Of the series, which is off by 2^-50 of itself at most where |r| is at most 1/32."""
+"""The terms of the series, which is off by 2^-50 of itself at most where |r| is at most 1/32."""
 
 
 @functools.cache
 def _series() -> list[float]:
-    """log2(1 + r) / r in powers of r."""
+    """Return the coefficients of log2(1 + r) / r in powers of r."""
     line = np.polynomial.Chebyshev.interpolate(lambda r: np.log1p(r) / r / np.log(2), TERMS - 1, [-1 / 32, 1 / 32])
     return [float(term) for term in line.convert(kind=np.polynomial.Polynomial).coef]
 
 
 def _table() -> tuple[list[float], list[float]]:
-    """The factor of m in each step, about 1 over its middle, and what that takes from the logarithm."""
+    """Return the factor of m in each step, about 1 over its middle, and what that takes from the logarithm."""
     edges = np.array([LOWEST + (i << (MANTISSA_BITS - STEP_BITS)) for i in range(STEPS + 1)]).view(np.float64)
     inverse = np.where((edges[:-1] < 1) & (edges[1:] > 1), 1.0, 2.0 / (edges[:-1] + edges[1:]))
     return inverse.tolist(), (-np.log2(inverse.astype(np.longdouble))).astype(np.float64).tolist()
@@ -44,8 +44,10 @@ INVERSE, LOGARITHM = _table()
 
 
 def plogp_of(context: Any, builder: Any, p: Any) -> Any:
-    """The vector of p log2 p of 0 <= p <= 2, 0 for 0, to a few units in the last place of the logarithm (with fused
-    multiply-add, as machines have; else to 2^-52).
+    """Return the vector of p log2 p of 0 <= p <= 2, 0 for 0.
+
+    It is right to a few units in the last place of the logarithm (with fused multiply-add, as machines have; else to
+    2^-52).
 
     p = 2^e m, m from `LOWEST` to twice that; m c = 1 + r with c by m's step, and log p = e - log c + log(1 + r).
     """
@@ -72,7 +74,7 @@ def _fused(builder: Any, a: Any, b: Any, c: Any) -> Any:
 
 
 def _looked_up(context: Any, builder: Any, step: Any, table: list[float]) -> Any:
-    """The table's number of each lane's step: from two registers, or else from memory."""
+    """Return the table's number of each lane's step: from two registers, or else from memory."""
     _, _, features = context.codegen().magic_tuple()
     if "+avx512f" in features:
         kind = ir.FunctionType(DOUBLES, [DOUBLES, INTS, DOUBLES])
@@ -95,8 +97,9 @@ RESULT = types.Tuple([types.float64] * 5 + [types.intp])
 
 @intrinsic
 def observe_eights(_typing: Any, evidence: Any, _sums: Any, _share: Any, _before: Any, _after: Any) -> Any:
-    """observe_eights(evidence, sums, share, before, after): add s = share * sums to evidence, and what comes of it.
+    """Add s = share * sums to evidence, and return what comes of it.
 
+    Arguments: evidence, sums, share, before, after.
     Both arrays hold as many numbers, a multiple of `LANES`; those beyond the classes are 0. With p = before * evidence
     as it was, and q = after * evidence as it is then: the sums over classes of q log2 q, m log2 m of m = (p + q) / 2,
     s^2 and s log2 s; the largest evidence and its class, the lowest on a tie.
@@ -152,7 +155,7 @@ def observe_eights(_typing: Any, evidence: Any, _sums: Any, _share: Any, _before
 
 
 def _over_lanes(builder: Any, what: str, kind: Any, values: list[Any], flags: list[str]) -> Any:
-    """Such a sum, or such an extreme, of the lanes of a vector."""
+    """Return a sum, or an extreme, of the lanes of a vector."""
     name = f"llvm.vector.reduce.{what}.v{LANES}{'i64' if kind == INT else 'f64'}"
     reduce = cgutils.get_or_insert_function(
         builder.module, ir.FunctionType(kind, [value.type for value in values]), name
@@ -162,13 +165,13 @@ def _over_lanes(builder: Any, what: str, kind: Any, values: list[Any], flags: li
 
 @serial
 def plogp(p):
-    """p log2 p, 0 for 0."""
+    """Return p log2 p, 0 for 0."""
     return p * np.log2(p) if p > 0.0 else 0.0
 
 
 @serial
 def js_term(p, q):
-    """One class's part of the Jensen-Shannon divergence, bits."""
+    """Return one class's part of the Jensen-Shannon divergence, bits."""
     m = 0.5 * (p + q)
     term = 0.0
     if p > 0.0 and m > 0.0:
@@ -182,7 +185,7 @@ def js_term(p, q):
 def observe_row(evidence, sums, pixels, op, dominant, plogp_before, out):
     """Add one observation to a voxel's dense evidence, seen `op` times before.
 
-    evidence, sums  as `observe_eights` takes them; sums are those of the normalised scores of its pixels
+    - `evidence`, `sums`: as `observe_eights` takes them; sums are those of the normalised scores of its pixels
 
     `dominant` and `plogp_before` are what the observation before left in out[4] and out[7], which spares looking for
     them. Leaves in `out` the change of VSS, that of the entropy in bits, the drift in bits, the dominant class before

@@ -92,7 +92,7 @@ def _update_rows(
 
 
 def blocks_of(index: Int64, resolution: int) -> tuple[Int32, Int64, Int32]:
-    """The distinct blocks (m, 3) of voxels (n, 3), the row of each voxel's block, and its place in it, x fastest."""
+    """Return the distinct blocks (m, 3) of voxels (n, 3), each voxel's block as a row, and its place (x fastest)."""
     size = 1 << max(4, (2 * len(index)).bit_length())
     blocks, block = np.empty((len(index), 3), dtype=np.int32), np.empty(len(index), dtype=np.int64)
     place, slots = np.empty(len(index), dtype=np.int32), np.full(size, -1, dtype=np.int32)
@@ -102,7 +102,7 @@ def blocks_of(index: Int64, resolution: int) -> tuple[Int32, Int64, Int32]:
 
 @serial
 def _number(index, r, blocks, block, place, slots):
-    """Number the blocks in order of appearance; returns how many there are."""
+    """Number the blocks in order of appearance, and return how many there are."""
     mask = slots.shape[0] - 1
     n = 0
     for v in range(index.shape[0]):

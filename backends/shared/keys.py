@@ -19,7 +19,7 @@ HALF = 1 << 20
 
 
 def columns_of_keys(keys: Int64, origin: npt.ArrayLike) -> dict[str, Any]:
-    """The columns ix, iy, iz (n,) of packed keys (n,), which sort like them."""
+    """Return the columns ix, iy, iz (n,) of packed keys (n,), which sort like them."""
     offset = np.asarray(origin) - HALF
     return {
         name: ((keys >> shift & 2 * HALF - 1) + start).astype(np.int32)
@@ -28,12 +28,12 @@ def columns_of_keys(keys: Int64, origin: npt.ArrayLike) -> dict[str, Any]:
 
 
 def index_of_keys(keys: Int64, origin: npt.ArrayLike) -> Int64:
-    """Voxel indices (n, 3) of packed keys (n,)."""
+    """Return voxel indices (n, 3) of packed keys (n,)."""
     return np.stack([*columns_of_keys(keys, origin).values()], axis=1, dtype=np.int64)
 
 
 def out_of_reach(frame: Frame, origin: npt.ArrayLike, voxel_size: float) -> DataError:
-    """The error for a frame that has points too far from the origin, or too far for 32-bit indices altogether."""
+    """Return the error for a frame with points too far from the origin, or too far for 32-bit indices altogether."""
     points = back_project(frame)
     voxel_index(points, voxel_size, frame)
     low, high = (edge.round(1).tolist() for edge in (points.min(axis=1), points.max(axis=1)))
@@ -51,7 +51,7 @@ PARTITIONS = 64
 
 @serial
 def mix(key):
-    """The finaliser of splitmix64: every bit of the key moves every bit of the hash."""
+    """Return the finaliser of splitmix64: every bit of the key moves every bit of the hash."""
     x = np.uint64(key)
     x ^= x >> np.uint64(30)
     x *= np.uint64(0xBF58476D1CE4E5B9)
@@ -63,11 +63,11 @@ def mix(key):
 
 @serial
 def partition_of(key):
-    """The partition of a key: the top 6 bits of its hash."""
+    """Return the partition of a key: the top 6 bits of its hash."""
     return np.int64(mix(key) >> np.uint64(58))
 
 
 def partitions_of(keys: Int64) -> Int64:
-    """The partition of each key (n,)."""
+    """Return the partition of each key (n,)."""
     partition: Int64 = (mix.py_func(keys) >> np.uint64(58)).astype(np.int64)
     return partition

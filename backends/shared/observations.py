@@ -20,12 +20,13 @@ from semstab.model.results import RECURRENT, FrameReport
 class Observed:
     """The observations of a frame as sparse rows, grouped by partition; valid until the next frame is observed.
 
-    key     (n,) int64 packed voxel index, relative to the origin
-    pixels  (n,) int64 pixels in the voxel
-    start   (n + 1,) int64 first entry of each voxel
-    label   (m,) uint16 classes seen in the voxel, ascending
-    weight  (m,) float64 pixels of that class, or the sum of their normalised scores; s_bar = weight / pixels
-    bounds  (PARTITIONS + 1,) int64 first voxel of each partition
+    Attributes:
+        key: (n,) int64 packed voxel index, relative to the origin.
+        pixels: (n,) int64 pixels in the voxel.
+        start: (n + 1,) int64 first entry of each voxel.
+        label: (m,) uint16 classes seen in the voxel, ascending.
+        weight: (m,) float64 pixels of that class, or the sum of their normalised scores; s_bar = weight / pixels.
+        bounds: (PARTITIONS + 1,) int64 first voxel of each partition.
     """
 
     key: Int64
@@ -40,12 +41,13 @@ class Observed:
 class ObservedScores:
     """The observations of a frame as dense rows, grouped by partition; valid until the next frame is observed.
 
-    key     (n,) int64 packed voxel index, relative to the origin
-    pixels  (n,) int64 pixels in the voxel
-    row     (n,) int64 place of each voxel's first sum in `sums`
-    sums    float64, the sums of the voxels' normalised scores, K in a row; s_bar = sums / pixels
-    bounds  (PARTITIONS + 1,) int64 first voxel of each partition
-    K       number of classes
+    Attributes:
+        key: (n,) int64 packed voxel index, relative to the origin.
+        pixels: (n,) int64 pixels in the voxel.
+        row: (n,) int64 place of each voxel's first sum in `sums`.
+        sums: float64, the sums of the voxels' normalised scores, K in a row; s_bar = sums / pixels.
+        bounds: (PARTITIONS + 1,) int64 first voxel of each partition.
+        K: Number of classes.
     """
 
     key: Int64
@@ -56,17 +58,17 @@ class ObservedScores:
     K: int
 
     def rows(self, some: slice = np.s_[:]) -> Float64:
-        """The sums (n, K) of some voxels."""
+        """Return the sums (n, K) of some voxels."""
         sums: Float64 = self.sums[self.row[some, None] + np.arange(self.K)]
         return sums
 
     def only(self, some: Mask) -> ObservedScores:
-        """Those of some of the voxels (n,)."""
+        """Return the scores of some of the voxels (n,)."""
         bounds = np.concatenate([[0], np.cumsum(some)])[self.bounds]
         return ObservedScores(self.key[some], self.pixels[some], self.row[some], self.sums, bounds, self.K)
 
     def sparse(self) -> Observed:
-        """The same by entries, of which there are none for classes without evidence."""
+        """Return the same by entries, of which there are none for classes without evidence."""
         sums = self.rows()
         voxel, label = np.nonzero(sums)
         start = np.searchsorted(voxel, np.arange(len(self.key) + 1))
@@ -84,7 +86,7 @@ class WorkSpace:
         self._arrays: dict[str, npt.NDArray[Any]] = {}
 
     def room(self, name: str, *shape: int, dtype: Any = np.int64) -> npt.NDArray[Any]:
-        """An array of that shape with whatever is in it."""
+        """Return an array of that shape with whatever is in it."""
         size = int(np.prod(shape))
         if name not in self._arrays or len(self._arrays[name]) < size:
             length = max(size, 1) * np.dtype(dtype).itemsize
@@ -101,13 +103,14 @@ class WorkSpace:
 class Change:
     """The change of a map by one frame, summed over the voxels that it touched.
 
-    points     pixels that it counted
-    voxels     voxels that it touched
-    new        of them, those seen for the first time
-    drift      D_JS(p^(t), p^(t-1)) of the others, bits
-    vss        VSS after the frame, less VSS before it; a new voxel had none
-    entropy    likewise entropy, bits
-    recurrent  voxels that it made recurrent
+    Attributes:
+        points: Pixels that it counted.
+        voxels: Voxels that it touched.
+        new: Those of the voxels that were seen for the first time.
+        drift: D_JS(p^(t), p^(t-1)) of the others, bits.
+        vss: VSS after the frame, less VSS before it; a new voxel had none.
+        entropy: Likewise entropy, bits.
+        recurrent: Voxels that it made recurrent.
     """
 
     points: int
@@ -120,17 +123,19 @@ class Change:
 
     @classmethod
     def of(cls, sums: Iterable[float]) -> Change:
-        """From numbers in the order of the fields."""
+        """Make it of numbers in the order of the fields."""
         points, voxels, new, drift, vss, entropy, recurrent = sums
         return cls(int(points), int(voxels), int(new), float(drift), float(vss), float(entropy), int(recurrent))
 
     @classmethod
     def between(cls, before: Float64, after: Float64, op: Int64, pixels: Int64) -> Change:
-        """Of the n touched voxels, from their evidence.
+        """Return the change of the n touched voxels, from their evidence.
 
-        before, after  (n, K) evidence before and after the frame; all 0 before the first
-        op             (n,) observations including this one
-        pixels         (n,) of the frame
+        Args:
+            before: (n, K) evidence before the frame; all 0 before the first.
+            after: (n, K) evidence after the frame.
+            op: (n,) observations including this one.
+            pixels: (n,) of the frame.
         """
         known = op > 1
         before, after = np.asfortranarray(before), np.asfortranarray(after)  # sums over few classes run along n
@@ -156,12 +161,16 @@ class MapTotal:
         self.recurrent = 0
         self.vss = 0.0
         self.entropy = 0.0
-        """In bits."""
+        """The summed entropy, in bits."""
 
     def add(self, frame: int, change: Change, started: float, associated: float = math.nan) -> FrameReport:
         """Account for a frame that went into the map just now, and report it.
 
-        started, associated  `time.perf_counter()` when its fusion began, and when its pixels had become observations
+        Args:
+            frame: Its index.
+            change: Its effect on the map.
+            started: `time.perf_counter()` when its fusion began.
+            associated: The same when its pixels had become observations; NaN where that is not told apart.
         """
         finished = time.perf_counter()
         self.voxels += change.new

@@ -22,13 +22,15 @@ FACE = 2.0**30
 
 @serial
 def in_voxels(r0, r1, r2, t, x, y, z, size):
-    """A coordinate of a point of the camera in the map, in voxels; the order of operations is the protocol's."""
+    """Return a coordinate of a point of the camera in the map, in voxels; the order of operations is the protocol's."""
     return (((r0 * x + r1 * y) + r2 * z) + t) / size
 
 
 @serial
 def exact_keys_of_row(depth, labels, ray_x, ray_y, T, size, ox, oy, oz, ignore, out):
-    """Packed keys of a row of pixels, -1 where a pixel does not count; returns 1 where one is out of reach, else 0.
+    """Return packed keys of a row of pixels, -1 where a pixel does not count.
+
+    Returns 1 where one is out of reach, else 0.
 
     One loop without branches, which the compiler turns into vector instructions.
     """
@@ -58,7 +60,7 @@ def exact_keys_of_row(depth, labels, ray_x, ray_y, T, size, ox, oy, oz, ignore, 
 
 @serial
 def drawn_pixels(depth, wanted, camera, T, size, odd, one_in):
-    """Which of the wanted pixels (H, W) may fall into a voxel of the sample: all that do, and those close to a face.
+    """Return the wanted pixels (H, W) that may fall into a voxel of the sample: all that do, and those close to a face.
 
     A filter for the numpy reference, which decides on the pixels that are left by itself.
     """
@@ -81,7 +83,10 @@ def drawn_pixels(depth, wanted, camera, T, size, odd, one_in):
 
 
 def columns_of(within, origin):
-    """Lowest and highest but one of the first two coordinates, as packed keys count, (4,); or (0,) for all voxels."""
+    """Return the lowest and highest but one of the first two coordinates, as packed keys count, (4,).
+
+    Or (0,) for all voxels.
+    """
     if within is None:
         return np.zeros(0, dtype=np.int64)
     (x0, y0), (x1, y1) = within.low, within.high
@@ -90,7 +95,7 @@ def columns_of(within, origin):
 
 
 def frame_terms(ray_x: Floats, T: Float64, size: float, reach: int) -> tuple[Float64, float]:
-    """Rays (3, W) of the columns along the world's axes, in voxels a metre of depth, and the margin of a voxel's face.
+    """Return the columns' rays (3, W) along the world's axes, voxels a metre of depth, and the margin of a face.
 
     The margin bounds what rounding can move a point by, voxels. Of a point within reach no term is above
     8 reach + |t| / r voxels, and each of a dozen operations rounds its result by 2^-53 of that at most.
@@ -107,7 +112,7 @@ AHEAD = 16
 
 @intrinsic
 def touch(_typing: Any, array: Any, _index: Any) -> Any:
-    """touch(array, i): bring row i of an array (n,) into the cache; nothing waits for it."""
+    """Bring row i of an array (n,) into the cache; nothing waits for it."""
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         values = context.make_array(signature.args[0])(context, builder, arguments[0])
@@ -121,7 +126,7 @@ def touch(_typing: Any, array: Any, _index: Any) -> Any:
 
 
 def ask_for(builder: Any, pointer: Any) -> None:
-    """Code that asks for the memory at a pointer, to be written; there need be none."""
+    """Write code that asks for the memory at a pointer, to be written; there need be none."""
     number = ir.IntType(32)
     kind = ir.FunctionType(ir.VoidType(), [cgutils.voidptr_t, number, number, number])
     prefetch = cgutils.get_or_insert_function(builder.module, kind, "llvm.prefetch.p0")
@@ -134,5 +139,5 @@ def ask_for(builder: Any, pointer: Any) -> None:
 
 @intrinsic
 def bits_of(_typing: Any, _value: Any) -> Any:
-    """The bits of a double, as int64; those of numbers from 0 on sort like the numbers."""
+    """Return the bits of a double, as int64; those of numbers from 0 on sort like the numbers."""
     return types.int64(types.float64), lambda _, builder, __, given: builder.bitcast(given[0], ir.IntType(64))

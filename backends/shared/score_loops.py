@@ -1,4 +1,4 @@
-"""From the soft scores of a frame to its observations."""
+"""Observations from the soft scores of a frame."""
 
 from __future__ import annotations
 
@@ -34,8 +34,9 @@ ZEROS = ir.Constant(DOUBLES, [0.0] * LANES)
 
 @intrinsic
 def scale_eight(_typing: Any, scores: Any, _at: Any, _K: Any, keys: Any, scale: Any, _u: Any) -> Any:
-    """scale_eight(scores, at, K, keys, scale, u): 1 / the sum of each of eight pixels' scores, from scores[at] on.
+    """Invert the sum of each of eight pixels' scores, from scores[at] on.
 
+    Arguments: scores, at, K, keys, scale, u.
     Leaves it in scale[u : u + 8]; keys[u : u + 8], int64, become -1 where it is not a positive number.
     """
 
@@ -64,8 +65,9 @@ def scale_eight(_typing: Any, scores: Any, _at: Any, _K: Any, keys: Any, scale: 
 def add_two(
     _typing: Any, scores: Any, _at: Any, _K: Any, scale: Any, _u: Any, _end: Any, sums: Any, _to: Any, _fresh: Any
 ) -> Any:
-    """add_two(scores, at, K, scale, u, end, sums, to, fresh): add u's scores and the next pixel's to their voxel.
+    """Add u's scores and the next pixel's to their voxel.
 
+    Arguments: scores, at, K, scale, u, end, sums, to, fresh.
     sums[to : to + K] += scale[u] * scores[at + u * K : at + (u + 1) * K], or = where `fresh`, and likewise of u + 1 if
     that is below `end`; it is read in any case, as nobody can predict whether it is, and must be there.
 
@@ -104,7 +106,7 @@ def _data(context: Any, builder: Any, signature: Any, arguments: Any, i: int) ->
 
 
 def _sums(context: Any, builder: Any, kind: Any, array: Any, places: list[Any], K: Any) -> list[Any]:
-    """For each place the vector of sums of every eighth of the K numbers from there on."""
+    """Return for each place the vector of sums of every eighth of the K numbers from there on."""
     totals = [cgutils.alloca_once_value(builder, ZEROS) for _ in places]
     for total in totals:
         builder.store(ZEROS, total)
@@ -118,7 +120,10 @@ def _sums(context: Any, builder: Any, kind: Any, array: Any, places: list[Any], 
 
 
 def _folded(builder: Any, vectors: list[Any]) -> Any:
-    """The sums of the lanes of eight vectors, as one vector: the lanes of each are halved three times, in pairs."""
+    """Return the sums of the lanes of eight vectors, as one vector.
+
+    The lanes of each are halved three times, in pairs.
+    """
     lanes = LANES
     while len(vectors) > 1:
         half = lanes // 2
@@ -136,9 +141,9 @@ def _by_eights(
     context: Any, builder: Any, kind: Any, array: Any, places: list[Any], K: Any,
     do: Callable[[list[Any], Any], None],
 ) -> None:  # fmt: skip
-    """Code that does something with each eight of the K numbers from each place, the rest filled up by 0.
+    """Write code that does something with each eight of the K numbers from each place, the rest filled up by 0.
 
-    do  is given a vector of doubles for each place, and the place of its first one among the K
+    - `do`: is given a vector of doubles for each place, and the place of its first one among the K
     """
     number, vector = NUMBERS[kind.dtype], ir.VectorType(NUMBERS[kind.dtype], LANES)
     data = builder.bitcast(context.make_array(kind)(context, builder, array).data, number.as_pointer())
@@ -163,7 +168,7 @@ def _by_eights(
 
 
 def spread(builder: Any, value: Any, vector: Any) -> Any:
-    """A vector of equal values."""
+    """Return a vector of equal values."""
     one = builder.insert_element(ir.Constant(vector, ir.Undefined), value, INT32(0))
     return builder.shuffle_vector(one, one, ir.Constant(ir.VectorType(INT32, vector.count), [0] * vector.count))
 
@@ -188,16 +193,16 @@ def sum_scores(
     depth, labels, scores, ending, K, ray_x, ray_y, T, size, origin, room, row_keys,
     tables, table_rows, stretches, scales, key, count, sums, entries, lost, spread,
 ):  # fmt: skip
-    """The voxels of each band, some of them twice, with the sums of their pixels' scores, each scaled to sum 1.
+    """Sum the scores of each voxel's pixels, each scaled to sum 1, band by band; some voxels come twice.
 
     Where a band has more than `room` of them, its number in `entries` is -1, and its rest is left undone.
 
-    labels   (W,) 0 wherever there is depth: scores have no ignore id
-    scores   (H * W * K,), see `vectors`
-    ending   the last scores of at least a tile's row, and room for as many: where reading goes beyond the image
-    key      (bands * room,) packed voxels, their pixels in `count`, and their sums (bands * room * stride,) in `sums`
-    lost     (bands,) whether a pixel with depth is out of reach
-    spread   (bands, PARTITIONS) of the voxels by partition
+    - `labels`: (W,) 0 wherever there is depth: scores have no ignore id
+    - `scores`: (H * W * K,), see `vectors`
+    - `ending`: the last scores of at least a tile's row, and room for as many: where reading goes beyond the image
+    - `key`: (bands * room,) packed voxels, their pixels in `count`, and their sums (bands * room * stride,) in `sums`
+    - `lost`: (bands,) whether a pixel with depth is out of reach
+    - `spread`: (bands, PARTITIONS) of the voxels by partition
     """
     H, W = depth.shape
     stride = -(-K // LANES) * LANES
@@ -236,9 +241,9 @@ def sum_scores(
 def _add_stretch(scores, at, K, stride, words, scale, run_word, run_end, table, table_row, key, count, sums, n):
     """Add a stretch of pixels to their voxels, of which there are n; how many then, or -1 where there is no room.
 
-    scores, at  their scores begin at scores[at]
-    words       their keys, and at least LANES times -1 behind the last one, up to a multiple of LANES; those of pixels
-                without a prediction become -1
+    - `scores`, `at`: their scores begin at scores[at]
+    - `words`: their keys, and at least LANES times -1 behind the last one, up to a multiple of LANES; those of pixels
+      without a prediction become -1
     """
     pixels = words.shape[0] - LANES
     for u in range(0, pixels, LANES):
@@ -272,7 +277,7 @@ def _add_stretch(scores, at, K, stride, words, scale, run_word, run_end, table, 
 
 @parallel
 def scatter_rows(key, count, room, stride, entries, offset, out_key, out_pixels, out_row):
-    """Entries by partition, and within one by band and order of appearance; `out_row` is the place of their sums."""
+    """Order entries by partition, within one by band and appearance; `out_row` is the place of their sums."""
     for band in nb.prange(entries.shape[0]):
         cursor = offset[:, band].copy()
         for e in range(band * room, band * room + entries[band]):
@@ -286,7 +291,7 @@ def scatter_rows(key, count, room, stride, entries, offset, out_key, out_pixels,
 def merge_rows(edges, key, pixels, row, again, first, sums, K, voxels):
     """Add up the entries of each voxel in place: in its first one, and in its sums; their number goes into `voxels`.
 
-    again, first  work space: the sums of an entry of a voxel that has one already, and those of its first one
+    - `again`, `first`: work space: the sums of an entry of a voxel that has one already, and those of its first one
     """
     for p in nb.prange(PARTITIONS):
         low, high = edges[p], edges[p + 1]

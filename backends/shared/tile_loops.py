@@ -32,8 +32,9 @@ WORDS, MASK = ir.VectorType(INT, LANES), ir.VectorType(ir.IntType(1), LANES)
 
 @intrinsic
 def runs_of_eight(_typing: Any, word: Any, _at: Any, run_word: Any, run_end: Any, _n: Any) -> Any:
-    """runs_of_eight(word, at, run_word, run_end, n): how many runs there are after words `at` to `at + 7`, n before.
+    """Count the runs after words `at` to `at + 7`, n before.
 
+    Arguments: word, at, run_word, run_end, n.
     A run ends with a word that differs from the one that follows, which must be there. All arrays are int64.
     """
 
@@ -51,7 +52,7 @@ def runs_of_eight(_typing: Any, word: Any, _at: Any, run_word: Any, run_end: Any
 
 
 def _compressed(builder: Any, own: Any, words: Any, ends: Any, at: Any, n: Any) -> Any:
-    """By instructions that put the chosen numbers of a vector side by side."""
+    """Compress by instructions that put the chosen numbers of a vector side by side."""
     word = builder.load(builder.bitcast(own, WORDS.as_pointer()), align=8)
     following = builder.load(builder.bitcast(builder.gep(own, [INT(1)]), WORDS.as_pointer()), align=8)
     last = builder.icmp_unsigned("!=", word, following)
@@ -68,7 +69,7 @@ def _compressed(builder: Any, own: Any, words: Any, ends: Any, at: Any, n: Any) 
 
 
 def _one_by_one(builder: Any, own: Any, words: Any, ends: Any, at: Any, n: Any) -> Any:
-    """Each word where the last run would end, to be written over unless it does."""
+    """Return each word where the last run would end, to be written over unless it does."""
     so_far = INT(0)
     word = builder.load(own)
     for lane in range(LANES):
@@ -102,7 +103,7 @@ SHIFT = np.uint64(64 - TABLE_BITS)
 
 @compiled(fastmath={"contract"})
 def _words_fused(depth, labels, ignore, ray_a, ray_b, ray_c, a0, b0, c0, ta, tb, tc, face, out):
-    """The words of pixels; and any doubt, see `keys_fused`.
+    """Return the words of pixels; and any doubt, see `keys_fused`.
 
     Coordinates are counted from -2^16, half the width of a face included (`face_terms`): the bits of such a number are
     those of 2^16, with the coordinate and a binary fraction in their places, where it is within reach.
@@ -123,7 +124,7 @@ def _words_fused(depth, labels, ignore, ray_a, ray_b, ray_c, a0, b0, c0, ta, tb,
 
 
 def face_terms(margin: float) -> tuple[float, int]:
-    """Half the width of a voxel's face, in whose bounds a pixel is in doubt, and which bits of a fraction are 0 there.
+    """Return half a voxel's face's width, within which a pixel is in doubt, and which bits of a fraction are 0 there.
 
     The margin is that of rounding (`frame_terms`); two more roundings are to 2^-36, and the width is a power of two.
     """
@@ -135,9 +136,9 @@ def face_terms(margin: float) -> tuple[float, int]:
 def _words_of_stretch(
     depth, labels, ray_x, ray_y, T, size, origin, corner, ignore, ray_a, ray_b, ray_c, down, start, face, keys, out
 ):  # fmt: skip
-    """The words of a stretch of a row; returns whether a pixel is out of their reach, or out of that of packed keys.
+    """Write the words of a stretch of a row; return whether a pixel is out of their reach, or of that of packed keys.
 
-    ray_a, ray_b, ray_c (n,), down (3,), start (3,)  a pixel's coordinates are depth (ray + down) + start
+    - `ray_a`, `ray_b`, `ray_c` (n,), `down` (3,), `start` (3,): a pixel's coordinates are depth (ray + down) + start
     """
     lost = 0
     if _words_fused(
@@ -179,7 +180,7 @@ def _key_of(a, b, c, corner):
 
 @serial
 def _enter_runs(word, run_word, run_end, table, table_count, entry, count, n):
-    """The runs of a stretch of words into the table; what gives way is an entry. Returns how many there are."""
+    """Return the runs of a stretch of words into the table; what gives way is an entry. Returns how many there are."""
     runs = 0
     for u in range(0, word.shape[0] - LANES, LANES):
         runs = runs_of_eight(word, u, run_word, run_end, runs)
@@ -211,7 +212,7 @@ def find_words(
     depth, labels, ray_x, ray_y, T, size, origin, corner, columns, rays, down, begin, face, ignore, room, stretches,
     tables, table_counts, word, count, partition, entries, lost, spread, low, high,
 ):  # fmt: skip
-    """Entries of each band of ROWS rows: words with counts, some of them twice; their extent and spread by partition.
+    """Find each band's entries: words with counts, some of them twice; their extent and spread by partition.
 
     Each band has `room` for them. `lost`: a pixel is out of reach of the words. low, high (bands, 4): of the
     coordinates, and of the label.
@@ -270,7 +271,7 @@ def _describe(word, count, n, corner, partition, spread, low, high):
 
 @parallel
 def scatter_words(word, count, partition, room, entries, offset, low, shift, out_word, out_count):
-    """Entries by partition, their words packed to the frame's extent: bits `shift` upwards hold a, b, c, then label."""
+    """Order entries by partition, words packed to the frame's extent: bits `shift` upwards hold a, b, c, then label."""
     for band in nb.prange(entries.shape[0]):
         cursor = offset[:, band].copy()
         for e in range(band * room, band * room + entries[band]):
@@ -337,7 +338,7 @@ def emit_voxels(
     word, count, word2, count2, edges, flipped, bounds, entry_bounds, low, shift, corner, key, pixels, start, label,
     weight,
 ):  # fmt: skip
-    """The observations: close the gaps between partitions, and unpack the words."""
+    """Write the observations: close the gaps between partitions, and unpack the words."""
     label_mask = (np.int64(1) << shift[2]) - 1
     b_mask, c_mask = (np.int64(1) << (shift[0] - shift[1])) - 1, (np.int64(1) << (shift[1] - shift[2])) - 1
     for p in nb.prange(PARTITIONS):

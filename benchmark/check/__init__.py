@@ -1,4 +1,4 @@
-"""Does a dataset make sense: poses, depth, units, intrinsics, labels, and what voxels it can carry."""
+"""A check that a dataset makes sense: poses, depth, units, intrinsics, labels, and what voxels it can carry."""
 
 from semstab.check.geometry import Verdict
 from semstab.check.scene_check import (

@@ -1,4 +1,4 @@
-"""How a scene's files are read: the configured way, the ways that people mistake for it, and what sets them."""
+"""Conventions of a scene's files: the configured one, those that people mistake for it, and what sets them."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ SNAP = 0.1
 """A depth scale that was found from the data may be a known one that is this close to it."""
 
 OPTION = "dataset.options."
-"""What the path of a dataset's option begins with."""
+"""The beginning of the path of a dataset's option."""
 
 RATIOS = (0.25, 0.5, 2.0, 4.0)
 """Sizes that intrinsics are for, relative to the depth image, where they were not scaled with it; others come from the
@@ -40,11 +40,12 @@ SAME_RATIO = 0.15
 class Convention:
     """One way to read a scene's files.
 
-    pose    what the pose matrices map
-    axes    the camera's axes in them
-    depth   planar, along the optical axis, or along the pixel's ray
-    factor  on depth, relative to the configured reading
-    ratio   size of the image that the intrinsics are for, relative to the configured one: width, height
+    Attributes:
+        pose: The direction in which the pose matrices map.
+        axes: The camera's axes in them.
+        depth: Planar, along the optical axis, or along the pixel's ray.
+        factor: On depth, relative to the configured reading.
+        ratio: Size of the image that the intrinsics are for, relative to the configured one: width, height.
     """
 
     pose: str = "camera_to_world"
@@ -54,13 +55,13 @@ class Convention:
     ratio: Ratio = (1.0, 1.0)
 
     def differs_in(self, other: Convention) -> tuple[str, ...]:
-        """Names of the fields in which two conventions differ."""
+        """Return the names of the fields in which two conventions differ."""
         names = (field.name for field in dataclasses.fields(self))
         return tuple(name for name in names if getattr(self, name) != getattr(other, name))
 
 
 def alternatives(configured: Convention, ratios: tuple[Ratio, ...]) -> Iterator[Convention]:
-    """Every combination of pose, axes and kind of depth; with other intrinsics only planar or ray as configured.
+    """Yield every combination of pose, axes and kind of depth; with other intrinsics only planar or ray as configured.
 
     The configured convention comes first; factors are searched for each of them.
     """
@@ -75,15 +76,16 @@ def alternatives(configured: Convention, ratios: tuple[Ratio, ...]) -> Iterator[
 
 @dataclass(frozen=True)
 class Reading:
-    """What is configured, and how a change of it is written down.
-
-    said     values by name of setting, those of scene.yaml and the dataset's options together
-    options  names and values of the dataset's options
-    size     (width, height) of the depth images
-    ratios   sizes that the intrinsics may be for, relative to what is said
-    file     the scene.yaml that says what no option does, where the dataset has one
+    """The configured convention, and how a change of it is written down.
 
     depth_scale is units of stored depth in a metre, None where only the dataset's own files know.
+
+    Attributes:
+        said: Values by name of setting, those of scene.yaml and the dataset's options together.
+        options: Names and values of the dataset's options.
+        size: (width, height) of the depth images.
+        ratios: Sizes that the intrinsics may be for, relative to what is said.
+        file: The scene.yaml that says what no option does, where the dataset has one.
     """
 
     said: Mapping[str, Any]
@@ -100,18 +102,21 @@ class Reading:
         return Convention(**{field: self.said[name] for field, name in names.items() if name in self.said})
 
     def usual_factor(self, factor: float) -> float:
-        """The factor that leads to a depth scale which datasets use, if one is near; else to one of three digits."""
+        """Return the factor that leads to a depth scale which datasets use, if one is near.
+
+        Else to one of three digits.
+        """
         now = 1.0 if self.depth_scale is None else self.depth_scale
         near = min(KNOWN_SCALES, key=lambda known: abs(known * factor / now - 1))
         return now / (near if abs(near * factor / now - 1) <= SNAP else float(f"{now / factor:.3g}"))
 
     def size_after(self, ratio: Ratio) -> list[int]:
-        """[width, height] of the image that the intrinsics are for, where it is `ratio` times the configured one."""
+        """Return [width, height] of the image of the intrinsics where it is `ratio` times the configured one."""
         said = self.said.get("intrinsics_size", self.size)
         return [round(side * share) for side, share in zip(said, ratio, strict=True)]
 
     def lines(self, convention: Convention) -> tuple[str, ...]:
-        """The lines of configuration that make the files be read that way: of scene.yaml, or of the options."""
+        """Return the lines of configuration that make the files be read that way: of scene.yaml, or of the options."""
         said = {
             "pose": ("pose_convention", convention.pose),
             "axes": ("camera_axes", convention.axes),
@@ -127,7 +132,7 @@ class Reading:
         return f"{self.depth_scale / factor:.5g}"
 
     def advice(self, convention: Convention) -> str:
-        """Where the lines are to be written, and what else may be wrong."""
+        """Return where the lines are to be written, and what else may be wrong."""
         where, factor = self._where(self.lines(convention)), convention.factor
         if factor == 1:
             return where
@@ -137,7 +142,7 @@ class Reading:
         return f"{where}; depth is {times}, or {unit}"
 
     def _where(self, lines: tuple[str, ...]) -> str:
-        """Where such lines are to be written."""
+        """Return where such lines are to be written."""
         them = "it" if len(lines) == 1 else "them"
         names = {line.removeprefix(OPTION).partition(":")[0] for line in lines}
         if any(not line.startswith(OPTION) for line in lines):
@@ -147,7 +152,7 @@ class Reading:
         return "the dataset has no such option: convert it, then write it into the scene.yaml"
 
     def change(self, name: str, value: str) -> str:
-        """A setting with its value, and where it is written."""
+        """Return a setting with its value, and where it is written."""
         line = self._line(name, value)
         return f"{line} ({self._where((line,))})"
 
@@ -159,7 +164,10 @@ class Reading:
 def reading(
     scene: Scene, frame: Frame, options: Mapping[str, Any], color_shape: tuple[int, ...] | None = None
 ) -> Reading:
-    """How a scene is configured. `frame` is one of its own; the shape (H, W, 3) of its colour suggests intrinsics."""
+    """Return how a scene is configured.
+
+    `frame` is one of its own; the shape (H, W, 3) of its colour suggests intrinsics.
+    """
     said = {**options, **scene.settings}
     height, width = frame.shape
     return Reading(
@@ -173,7 +181,7 @@ def reading(
 
 
 def _ratios(frame: Frame, color_shape: tuple[int, ...] | None) -> Iterator[Ratio]:
-    """Sizes that the intrinsics may be for, relative to the depth image's."""
+    """Yield sizes that the intrinsics may be for, relative to the depth image's."""
     height, width = frame.shape
     camera = frame.intrinsics
     possible = [(one, one) for one in RATIOS]

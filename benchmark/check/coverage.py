@@ -1,4 +1,4 @@
-"""What the frames of a scene share, how noisy their depth is, and what voxels that carries."""
+"""Coverage: what the frames of a scene share, how noisy their depth is, and what voxels that carries."""
 
 from __future__ import annotations
 
@@ -44,12 +44,13 @@ BINS = ((1, 1), (2, 2), (3, 8), (9, 27))
 
 @dataclass(frozen=True)
 class Overlap:
-    """What frames see of each other that lie `apart` selected frames apart, from the first to the last number.
+    """The overlap of frames that lie `apart` selected frames apart, from the first to the last number.
 
-    in_view     share of a frame's points that lie in the other image
-    covisible   share of them that have depth there, too
-    error       median relative depth error of those
-    agreement   share of those on the same surface whose labels agree, NaN without labels
+    Attributes:
+        in_view: Share of a frame's points that lie in the other image.
+        covisible: Share of them that have depth there, too.
+        error: Median relative depth error of those.
+        agreement: Share of those on the same surface whose labels agree, NaN without labels.
     """
 
     apart: tuple[int, int]
@@ -64,8 +65,9 @@ class Overlap:
 class Persistence:
     """The distribution of OP at a voxel size, from frames that were fused.
 
-    shares  of the voxels by stratum: OP = 1, OP = 2, 3 to 5, more
-    stays   share of the points that fall into the same voxel when another frame sees them
+    Attributes:
+        shares: Shares of the voxels by stratum: OP = 1, OP = 2, 3 to 5, more.
+        stays: Share of the points that fall into the same voxel when another frame sees them.
     """
 
     voxel_size: float
@@ -77,9 +79,10 @@ class Persistence:
 
 @dataclass(frozen=True)
 class Noise:
-    """Of depth, metres: a point seen again is off by `between`, pixels of one frame by `within`; medians.
+    """Noise of depth, metres: a point seen again is off by `between`, pixels of one frame by `within`; medians.
 
-    footprint  what a pixel covers at the median depth, metres
+    Attributes:
+        footprint: Width that a pixel covers at the median depth, metres.
     """
 
     between: float
@@ -103,9 +106,10 @@ class Suggestion:
 class Seen:
     """Points of one view that another one sees on the same surface.
 
-    offset  (N,) metres between the two depths
-    first, second  (N, 3) the point, and the point of the pixel that sees it, in the world
-    agree   whether their labels agree, for those that have one in both
+    Attributes:
+        offset: (N,) metres between the two depths.
+        first, second: (N, 3) the point, and the point of the pixel that sees it, in the world.
+        agree: Whether their labels agree, for those that have one in both.
     """
 
     offset: Float64
@@ -115,7 +119,7 @@ class Seen:
 
 
 class Coverage:
-    """What the views of a sample share under the configured convention."""
+    """The share of a scene that the views of a sample have in common under the configured convention."""
 
     def __init__(self, sample: Sample) -> None:
         self.sample = sample
@@ -124,7 +128,7 @@ class Coverage:
         self._seen = {pair: self._same_surface(pair) for pair in sample.pairs}
 
     def overlaps(self) -> list[Overlap]:
-        """One row a distance between frames."""
+        """Return one row a distance between frames."""
         rows = []
         for low, high in BINS:
             pairs = [(a, b) for a, b in self.sample.pairs if low <= abs(a - b) <= high]
@@ -133,7 +137,7 @@ class Coverage:
         return rows
 
     def noise(self) -> Noise:
-        """How far depth is off, between frames and within one."""
+        """Return how far depth is off, between frames and within one."""
         offsets = [seen.offset for seen in self._seen.values()]
         views = self.sample.views.values()
         footprints = [view.depth[view.v, view.u] / view.camera.fx for view in views]
@@ -144,7 +148,10 @@ class Coverage:
         )
 
     def stays(self, voxel_size: float) -> float:
-        """Share of the points that fall into the same voxel when another frame sees them; NaN where none does."""
+        """Return the share of the points that fall into the same voxel when another frame sees them.
+
+        NaN where none does.
+        """
         seen = self._seen.values()
         first, second = ([getattr(one, name) for one in seen] for name in ("first", "second"))
         if not first:
@@ -183,7 +190,7 @@ class Coverage:
 
 
 def world_points(view: View, u: Int64, v: Int64) -> Float64:
-    """(N, 3) world coordinates of kept pixels, metres."""
+    """Return (N, 3) world coordinates of kept pixels, metres."""
     K = view.camera.every(view.stride)
     depth = view.depth[v, u].astype(np.float64)
     points = np.stack([(u - K.cx) / K.fx * depth, (v - K.cy) / K.fy * depth, depth], axis=1)
@@ -192,7 +199,7 @@ def world_points(view: View, u: Int64, v: Int64) -> Float64:
 
 
 def plane_residuals(view: View) -> Float64:
-    """Distance in metres of sampled depths from the plane through their two neighbours in the row, along the ray.
+    """Return the distance in metres of sampled depths from the plane through their row neighbours, along the ray.
 
     Inverse depth is linear in pixels on a plane: its second difference is noise, or the surface's curvature.
     """
@@ -208,7 +215,8 @@ def plane_residuals(view: View) -> Float64:
 def persistence(views: Sequence[View], coverage: Coverage, voxel_size: float, pixel_stride: int) -> Persistence:
     """Fuse the views, every n-th pixel of them, and count how often each voxel is seen.
 
-    Raises DataError where a point lies further out than voxels of that size are counted.
+    Raises:
+        DataError: If a point lies further out than voxels of that size are counted.
     """
     backend = create("numba", voxel_size=voxel_size, num_classes=2)
     for view in views:
@@ -220,7 +228,7 @@ def persistence(views: Sequence[View], coverage: Coverage, voxel_size: float, pi
 
 
 def fused_stride(size: tuple[int, int], pixel_stride: int) -> int:
-    """The pixel stride at which frames of that (width, height) are fused: the run's, or a larger one."""
+    """Return the pixel stride at which frames of that (width, height) are fused: the run's, or a larger one."""
     return max(pixel_stride, math.ceil(math.sqrt(size[0] * size[1] / FUSED_PIXELS)))
 
 
@@ -231,12 +239,12 @@ def _without_labels(view: View, pixel_stride: int) -> Frame:
 
 
 def suggested_size(coverage: Coverage) -> float | None:
-    """The smallest voxel size in which points fall again, metres; None where frames do not see the same."""
+    """Return the smallest voxel size in which points fall again, metres; None where frames do not see the same."""
     return next((size for size in SIZES if coverage.stays(size) >= STAYS), None)
 
 
 def suggest(coverage: Coverage, overlaps: Sequence[Overlap], stride: int) -> Suggestion:
-    """Voxel size, pixel stride and frame stride that suit the data; `stride` is the selected frames' own."""
+    """Return voxel size, pixel stride and frame stride that suit the data; `stride` is the selected frames' own."""
     voxel_size = suggested_size(coverage)
     views = coverage.sample.views.values()
     far = float(np.percentile(np.concatenate([view.depth[view.v, view.u] for view in views]), 95))

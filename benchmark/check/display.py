@@ -22,7 +22,7 @@ MOST_COLUMNS = 100
 
 
 def print_check(checked: SceneCheck, console: Console, *, verbose: bool = False) -> None:
-    """The verdict, then what explains it; verbose: every table."""
+    """Print the verdict, then what explains it; verbose: every table."""
 
     def say(text: str, indent: int, style: str = "") -> None:
         lines = textwrap.wrap(text, min(console.width, MOST_COLUMNS), subsequent_indent=" " * indent)
@@ -61,7 +61,7 @@ def _heading(checked: SceneCheck) -> str:
 
 
 def _tables(checked: SceneCheck) -> dict[str, tuple[str, Table]]:
-    """Titles and tables by name."""
+    """Return titles and tables by name."""
     verdict, tables = checked.verdict, dict[str, tuple[str, Table]]()
     if checked.overlaps:
         tables["overlap"] = "what frames share, by how far apart they are", _overlap_table(checked)
@@ -180,14 +180,14 @@ def _number(value: float) -> str:
 
 
 def _metres(value: float) -> str:
-    """A length in the unit that reads best."""
+    """Return a length in the unit that reads best."""
     if math.isnan(value):
         return NOTHING
     return f"{value:.3g} m" if value >= 1 else f"{100 * value:.3g} cm" if value >= 0.1 else f"{1e3 * value:.3g} mm"
 
 
 def _ordinal(n: int) -> str:
-    """'2nd', '3rd', '11th'."""
+    """Return '2nd', '3rd', '11th'."""
     last = 0 if n % 100 in (11, 12, 13) else n % 10
     return f"{n}{_ENDINGS.get(last, 'th')}"
 

@@ -31,7 +31,7 @@ MIN_SHARE = 0.03
 """A convention under which fewer points are seen again, in number or share, has no evidence for or against it."""
 
 LEAST_OF_OTHER = 0.2
-"""Nor has one that sees again less than this part of what the configured convention sees."""
+"""The least part of what the configured convention sees that an alternative must see again, too."""
 
 BETTER = 0.75
 MIN_GAIN = 0.001
@@ -42,21 +42,21 @@ WON_PAIRS = 0.8
 
 PAIR_POINTS = 20
 LEAST_PAIRS = 3
-"""... at least as many points seen again; where fewer pairs have, it must stand out from all others instead."""
+"""The least pairs with enough points seen again; where fewer have, it must stand out from all others instead."""
 
 GOOD = 0.05
 """A convention with a larger error is not proposed, and as configured it is not called sound."""
 
 STRIKING = 0.02
-"""Where the configured convention has no evidence, only an error as low as this refutes it, ..."""
+"""The error that refutes a configured convention without evidence of its own, ..."""
 
 CONTRAST = 1 / 3
-"""... and only where it is at most this part of the error of every other convention."""
+"""... where it is at most this part of the error of every other convention."""
 
 HOPELESS_ERROR = 0.1
 HOPELESS_SHARE = 0.3
 HOPELESS_POINTS = 1000
-"""Where the configured error is larger at that much overlap, the data are unsound though nothing explains it."""
+"""The overlap at which a larger configured error makes the data unsound, though nothing explains it."""
 
 SCALE_APART = 2.5
 """Factors nearer to each other than this are one hypothesis about the unit, measured twice."""
@@ -68,12 +68,12 @@ MOST_CANDIDATES = 3
 """Alternatives that are named beside the best one, where they fit as well."""
 
 SIMPLER = 1.1
-"""Of conventions whose errors differ by less than this factor, the one with the fewest changes is taken."""
+"""The factor within which errors of conventions count as equal: the one with the fewest changes is taken."""
 
 HARDLY_MOVES = 0.01
 HARDLY_TURNS = 1.0
 HARDLY_DEEP = 1.05
-"""Below these a reason is given for what frames cannot tell: motion as a share of the depth, degrees, and the ratio of
+"""Limits below which a reason says what frames cannot tell: motion as a share of depth, degrees, and the ratio of
 the 90th to the 10th percentile of depth."""
 
 State = Literal["sound", "unsound", "unclear"]
@@ -81,11 +81,12 @@ State = Literal["sound", "unsound", "unclear"]
 
 @dataclass(frozen=True)
 class Fit:
-    """How well depth reprojects under a convention.
+    """The error of depth that is reprojected under a convention.
 
-    error   median relative depth error of the points that are seen again; NaN where none is
-    share   of the sampled points that are seen again, 0 to 1
-    points  their number
+    Attributes:
+        error: Median relative depth error of the points that are seen again; NaN where none is.
+        share: Share of the sampled points that are seen again, 0 to 1.
+        points: Their number.
     """
 
     convention: Convention
@@ -95,11 +96,11 @@ class Fit:
 
     @property
     def has_evidence(self) -> bool:
-        """Whether enough is seen again to judge by the error."""
+        """Return whether enough is seen again to judge by the error."""
         return self.points >= MIN_POINTS and self.share >= MIN_SHARE
 
     def clearly_beats(self, other: Fit) -> bool:
-        """Whether its error is clearly lower; one with enough overlap beats one with too little."""
+        """Return whether its error is clearly lower; one with enough overlap beats one with too little."""
         if not other.has_evidence or other.share < LEAST_OF_OTHER * self.share:
             return True
         return self.error <= min(BETTER * other.error, other.error - MIN_GAIN)
@@ -107,15 +108,17 @@ class Fit:
 
 @dataclass(frozen=True)
 class Verdict:
-    """What a check of the geometry found.
+    """The outcome of a check of the geometry.
 
-    state         sound; unsound; or unclear, where the frames do not tell
-    text          why, in one line
-    mend          lines of configuration that would mend it, where they are known
-    error, share  of the configured convention, see `Fit`
-    frames, pairs how many were looked at
-    undetermined  what these frames cannot tell, because an alternative fits as well, and the reason where it is known
-    fits          the configured convention and the alternatives of interest, by name
+    Attributes:
+        state: Sound; unsound; or unclear, where the frames do not tell.
+        text: Why, in one line.
+        mend: Lines of configuration that would mend it, where they are known.
+        error, share: Those of the configured convention, see `Fit`.
+        frames, pairs: Numbers of those that were looked at.
+        undetermined: Parts of it that these frames cannot tell, because an alternative fits as well, and the reason
+            where it is known.
+        fits: The configured convention and the alternatives of interest, by name.
     """
 
     state: State
@@ -130,11 +133,11 @@ class Verdict:
     fits: tuple[tuple[str, Fit], ...] = ()
 
     def summary(self) -> dict[str, Any]:
-        """What a run's manifest keeps."""
+        """Return what a run's manifest keeps."""
         return {name: getattr(self, name) for name in ("state", "text", "error", "share", "frames", "pairs")}
 
     def to_dict(self) -> dict[str, Any]:
-        """The JSON object."""
+        """Return the JSON object."""
         rows = [{"name": name, **dataclasses.asdict(fit)} for name, fit in self.fits]
         return {field.name: getattr(self, field.name) for field in dataclasses.fields(self)} | {"fits": rows}
 
@@ -154,7 +157,7 @@ class Judgement:
         self.fits += self._measured_scale(self.configured)
 
     def verdict(self) -> Verdict:
-        """The verdict in words."""
+        """Return the verdict in words."""
         if (best := self._best()) is not None:
             return self._refuted(best)
         return self._as(*(self._without_evidence() or self._unexplained() or self._in_agreement()))
@@ -209,7 +212,10 @@ class Judgement:
     # --- another convention ------------------------------------------------------------------------------------------
 
     def _best(self) -> Fit | None:
-        """The alternative that clearly beats the configured convention; where there are several, see `_candidates`."""
+        """Return the alternative that clearly beats the configured convention.
+
+        Where there are several, see `_candidates`.
+        """
         return self._refuting[0] if self._refuting else None
 
     @cached_property
@@ -232,7 +238,7 @@ class Judgement:
         return len(fit.convention.differs_in(self.sample.configured)), fit.error
 
     def _rounded(self, fit: Fit) -> Fit:
-        """The fit with its factor measured, then at the unit that datasets use where that is near and fits as well."""
+        """Return the fit with its factor measured, then at a unit that datasets use if near and as good a fit."""
         if fit.convention.factor == 1:
             return fit
         measured = min([fit, *self._measured_scale(fit)], key=lambda one: one.error)
@@ -241,7 +247,7 @@ class Judgement:
         return measured if measured.clearly_beats(known) else known
 
     def _may_refute(self, fit: Fit) -> bool:
-        """Whether a fit has what it takes to refute the configured one, as far as that costs nothing to see."""
+        """Return whether a fit has what it takes to refute the configured one, as far as that costs nothing to see."""
         mine, factor = self.configured, fit.convention.factor
         size = max(factor, 1 / factor)
         if fit is mine or not fit.has_evidence or fit.share < LEAST_OF_OTHER * mine.share:
@@ -259,12 +265,12 @@ class Judgement:
         return sum(won) >= WON_PAIRS * len(won) if len(won) >= LEAST_PAIRS else self._stands_out(fit)
 
     def _scale_is_told(self, fit: Fit) -> bool:
-        """Whether depth ten times as long and as short fits clearly worse: not where the camera hardly moves."""
+        """Return whether depth ten times as long and as short fits clearly worse: not where the camera hardly moves."""
         others = _fits(self.sample, fit.convention, fit.convention.factor * np.array([0.1, 10]))
         return all(fit.clearly_beats(other) for other in others)
 
     def _stands_out(self, fit: Fit) -> bool:
-        """Whether every convention with another motion between the frames fits far worse."""
+        """Return whether every convention with another motion between the frames fits far worse."""
         near = (other for other in self.fits if other.has_evidence and other.error * CONTRAST < fit.error)
         same_depth = (
             dataclasses.replace(one, convention=dataclasses.replace(one.convention, depth=fit.convention.depth))
@@ -273,7 +279,7 @@ class Judgement:
         return all(_one_hypothesis(fit, other) or self._moves_alike(fit, other) for other in same_depth)
 
     def _won_pairs(self, fit: Fit) -> list[bool]:
-        """For each pair of frames where both see enough, whether the alternative has the lower error."""
+        """Return for each pair of frames where both see enough whether the alternative has the lower error."""
         errors = [
             self.sample.errors(one.convention, np.array([one.convention.factor])) for one in (fit, self.configured)
         ]
@@ -281,7 +287,10 @@ class Judgement:
         return [a < b for (a, m), (b, n) in zip(*rows, strict=True) if min(m, n) >= PAIR_POINTS]
 
     def _moves_alike(self, fit: Fit, other: Fit) -> bool:
-        """Whether two conventions give the same motion between the frames; then they make the same map, but turned."""
+        """Return whether two conventions give the same motion between the frames.
+
+        Then they make the same map, but turned.
+        """
         if fit.convention.ratio != other.convention.ratio or fit.convention.depth != other.convention.depth:
             return False
         f, g = fit.convention.factor, other.convention.factor
@@ -290,7 +299,10 @@ class Judgement:
         return all(np.abs(R - Q).max() < 0.01 and np.abs(s / f - t / g).max() < tolerance for (R, s), (Q, t) in motions)
 
     def _measured_scale(self, near: Fit) -> list[Fit]:
-        """Fits of the same convention with factors around a given one: between those of the search, then nearer."""
+        """Return fits of the same convention with factors around a given one.
+
+        Between those of the search, then nearer.
+        """
         coarse = _fits(self.sample, near.convention, near.convention.factor * np.power(10.0, np.arange(-12, 13) / 72))
         best = min(coarse, key=lambda fit: (math.isnan(fit.error), fit.error)).convention
         fine = _fits(self.sample, best, best.factor * np.power(10.0, np.arange(-10, 11) / 720))
@@ -310,7 +322,7 @@ class Judgement:
     # --- what cannot be told -----------------------------------------------------------------------------------------
 
     def _single_changes(self) -> Iterator[Fit]:
-        """The fits that differ from the configured convention in one thing; of factors only ten and a tenth."""
+        """Yield the fits that differ from the configured convention in one thing; of factors only ten and a tenth."""
         for fit in self.fits:
             changed = fit.convention.differs_in(self.sample.configured)
             decade = math.isclose(abs(math.log10(fit.convention.factor)), 1, abs_tol=1e-9)
@@ -321,7 +333,7 @@ class Judgement:
         return not self.configured.clearly_beats(fit)
 
     def _undetermined(self) -> tuple[str, ...]:
-        """Settings that could be otherwise; of scales and sizes the setting alone, of the others the value."""
+        """Return settings that could be otherwise; of scales and sizes the setting alone, of the others the value."""
         names = []
         for fit in filter(self._is_undetermined, self._single_changes()):
             (changed,) = fit.convention.differs_in(self.sample.configured)
@@ -337,7 +349,7 @@ class Judgement:
         return ", ".join(self.reading.lines(fit.convention)) or "as configured"
 
     def _shown(self, best: Fit | None) -> Iterator[tuple[str, Fit]]:
-        """The configured convention, the best one, and those that differ in one thing."""
+        """Yield the configured convention, the best one, and those that differ in one thing."""
         yield "as configured", self.configured
         if best is not None:
             yield self._name(best), best
@@ -366,18 +378,18 @@ def _fits(sample: Sample, convention: Convention, factors: Float64) -> list[Fit]
 
 
 def _one_hypothesis(fit: Fit, other: Fit) -> bool:
-    """Whether two conventions differ in no more than how exactly the unit of depth is known."""
+    """Return whether two conventions differ in no more than how exactly the unit of depth is known."""
     a, b = fit.convention, other.convention
     return 1 / SCALE_APART < a.factor / b.factor < SCALE_APART and set(a.differs_in(b)) <= {"factor"}
 
 
 def _is_of_poses(fit: Fit, mine: Fit) -> bool:
-    """Whether a fit differs from another one in what the poses mean, or in the unit."""
+    """Return whether a fit differs from another one in what the poses mean, or in the unit."""
     return set(fit.convention.differs_in(mine.convention)) <= {"pose", "axes", "factor"}
 
 
 def shifts_and_turns(sample: Sample) -> tuple[Float64, Float64]:
-    """For each pair how far the camera moves, as a share of the depth, and turns, in degrees."""
+    """Return for each pair how far the camera moves, as a share of the depth, and turns, in degrees."""
     motions = sample.motions(sample.configured)
     depth = _typical(sample, lambda depths: float(np.median(depths)))
     shifts = np.array([np.linalg.norm(t) / depth for _, t in motions])
@@ -386,13 +398,13 @@ def shifts_and_turns(sample: Sample) -> tuple[Float64, Float64]:
 
 
 def _typical(sample: Sample, measure: Callable[[Float64], float]) -> float:
-    """The median over the views of a measure of their sampled depths; NaN where none has any."""
+    """Return the median over the views of a measure of their sampled depths; NaN where none has any."""
     values = [measure(view.depth[view.v, view.u].astype(np.float64)) for view in sample.views.values() if len(view.u)]
     return float(np.median(values)) if values else math.nan
 
 
 def _reason(sample: Sample) -> str:
-    """Why frames may not tell conventions apart, as far as their motion and depth show it."""
+    """Return why frames may not tell conventions apart, as far as their motion and depth show it."""
     shifts, turns = shifts_and_turns(sample)
     spread = _typical(sample, lambda depths: float(np.divide(*np.percentile(depths, (90, 10)))))
     reasons = {

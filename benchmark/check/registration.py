@@ -49,7 +49,7 @@ Edges = tuple[Float32, Mask]
 
 @dataclass(frozen=True)
 class Offset:
-    """What would bring the label maps onto the depth: enlarge them about the centre, then move them, pixels."""
+    """The change that brings the label maps onto the depth: enlarge them about the centre, then move them, pixels."""
 
     scale: float
     shift: tuple[float, float]
@@ -65,7 +65,9 @@ class Offset:
 
 
 def find_offset(pairs: Sequence[Edges]) -> Offset | None:
-    """How far edges (H, W) of labels or images are off those of depth (H, W), frame by frame; None where they fit.
+    """Return how far edges (H, W) of labels or images are off those of depth (H, W), frame by frame.
+
+    None where they fit.
 
     Both halves of the frames have to say the same, so that edges that have nothing to do with each other do not count.
     """
@@ -88,7 +90,7 @@ def find_offset(pairs: Sequence[Edges]) -> Offset | None:
 
 
 def depth_edges(depth: Float32) -> Mask:
-    """(H, W) where neighbouring pixels lie on different surfaces.
+    """Return (H, W) where neighbouring pixels lie on different surfaces.
 
     Small gaps are closed with the farthest depth around them: beside an edge sensors miss what lies behind it.
     """
@@ -103,18 +105,18 @@ def depth_edges(depth: Float32) -> Mask:
 
 
 def label_edges(labels: npt.NDArray[Any], ignore: int) -> Mask:
-    """(H, W) where neighbouring pixels have different labels."""
+    """Return (H, W) where neighbouring pixels have different labels."""
     return _changes(labels, lambda a, b: (a != b) & (a != ignore) & (b != ignore))
 
 
 def grey_levels(color: UInt8) -> UInt8:
-    """(H, W) brightness of colour (H, W, 3) from 0 to 254, so that it can be brought to the depth like labels."""
+    """Return the brightness (H, W) of colour (H, W, 3), 0 to 254, which can be brought to the depth like labels."""
     grey: UInt8 = (color.mean(axis=2) * (254 / 255)).astype(np.uint8)
     return grey
 
 
 def image_edges(grey: npt.NDArray[Any]) -> Mask:
-    """(H, W) where a grey image changes most: a tenth of its pixels."""
+    """Return (H, W) where a grey image changes most: a tenth of its pixels."""
     dy, dx = np.gradient(grey.astype(np.float32))
     strength = np.hypot(dx, dy)
     edges: Mask = strength > max(float(np.quantile(strength, 0.9)), 1.0)
@@ -129,7 +131,7 @@ def _changes(values: npt.NDArray[Any], changed: Callable[[Any, Any], Any]) -> Ma
 
 
 def _thinned(edges: Mask) -> Map:
-    """Share of edges in each cell of a coarse grid, smoothed a little, without its mean."""
+    """Return the share of edges in each cell of a coarse grid, smoothed a little, without its mean."""
     import cv2
 
     cell = max(1, math.ceil(edges.shape[1] / WIDTH))
@@ -139,7 +141,10 @@ def _thinned(edges: Mask) -> Map:
 
 
 def _fits(a: Map, b: Map) -> Map:
-    """(scales, shifts in y, shifts in x): correlation of map a with map b, enlarged about the centre and moved."""
+    """Return (scales, shifts in y, shifts in x).
+
+    Correlation of map a with map b, enlarged about the centre and moved.
+    """
     import cv2
 
     H, W = a.shape
@@ -166,7 +171,7 @@ def _identity(fits: Map) -> tuple[int, ...]:
 
 
 def _distance(one: tuple[int, ...], other: tuple[int, ...], shape: tuple[int, ...]) -> float:
-    """How far two registrations lie apart in the middle of the image's sides, as a share of its width."""
+    """Return how far two registrations lie apart in the middle of the image's sides, as a share of its width."""
     H, W = shape
     scale = abs(SCALES[one[0]] - SCALES[other[0]])
     x, y = (abs(one[k] - other[k]) / W for k in (2, 1))
@@ -178,7 +183,7 @@ def _distance(one: tuple[int, ...], other: tuple[int, ...], shape: tuple[int, ..
 # Depth that is cast at a surface agrees between frames wherever the surface lies; the photographs do not.
 
 CHANGES = np.linspace(-0.3, 0.3, 241)
-"""By which shares of it depth is made larger."""
+"""The shares of it by which depth is made larger."""
 
 LONGEST_SIDE = 800
 """Pixels of the images that are compared: a step of depth then moves them by a pixel or so."""
@@ -194,10 +199,11 @@ MATCHING = 0.35
 
 @dataclass(frozen=True)
 class ImageMatch:
-    """How neighbouring images match: correlation of grey values, mean over pairs.
+    """The match of neighbouring images: correlation of grey values, mean over pairs.
 
-    now     with depth as it is
-    best    with depth larger by the share `change`, which is `metres` of the median depth
+    Attributes:
+        now: The match with depth as it is.
+        best: The match with depth larger by the share `change`, which is `metres` of the median depth.
     """
 
     now: float
@@ -230,7 +236,7 @@ def match_images(scene: Scene, views: Mapping[int, View], pairs: Sequence[Pair])
 
 
 def judge_surface(match: ImageMatch | None, frames: int) -> Verdict:
-    """What the images say of a surface and the poses."""
+    """Return what the images say of a surface and the poses."""
     if match is None:
         return Verdict(
             "unclear",
@@ -287,7 +293,7 @@ def _image(scene: Scene, view: View) -> _Image | None:
 
 
 def _correlations(a: View, image_a: _Image, b: View, image_b: _Image) -> Float64:
-    """(changes,) correlation of the first image's grey values with those that they meet in the second."""
+    """Return (changes,) correlation of the first image's grey values with those that they meet in the second."""
     v, u = np.nonzero((a.depth > 0) & (a.depth < np.inf))
     if len(u) < LEAST_POINTS:
         return np.full(len(CHANGES), np.nan)
@@ -324,10 +330,10 @@ def _correlation(a: Float32, b: Float32) -> float:
 # Stored values that mean 'no depth', where they are taken for metres: 65535 of 16 bits is 65 m away.
 
 FULL = 65535.0
-"""What 16 bits hold at most: hardly ever a distance."""
+"""The largest number of 16 bits: hardly ever a distance."""
 
 LEAST_SHARE = 1e-3
-"""Of the pixels with depth that have one and the same value, the largest of all."""
+"""The least share of the pixels with depth that have one and the same value, the largest of all."""
 
 GAP = 2.0
 """A value marks pixels where it is so many times the largest depth below it."""
@@ -337,10 +343,11 @@ GAP = 2.0
 class Sentinel:
     """A value that stands alone at the far end of the depths.
 
-    value   as it is stored
-    metres  what it is read as
-    share   of the pixels with depth
-    next    the largest depth below it, metres
+    Attributes:
+        value: The value as it is stored.
+        metres: The depth that it is read as.
+        share: Share of the pixels with depth.
+        next: The largest depth below it, metres.
     """
 
     value: float
@@ -356,7 +363,7 @@ class Sentinel:
 
 
 def find_sentinel(depths: Iterable[Float32], scale: float) -> Sentinel | None:
-    """The value of which `depths` (metres, `scale` stored units each) have many at the far end, and none near it."""
+    """Return the value that many `depths` (metres, `scale` stored units each) have at the far end, none near it."""
     valid = [depth[(depth > 0) & (depth < np.inf)] for depth in depths]
     pixels = sum(values.size for values in valid)
     largest = max((values.max() for values in valid if values.size), default=np.float32(0))
@@ -376,7 +383,7 @@ REGISTERED_FRAMES = 16
 
 
 def remarks(scene: Scene, views: Sequence[View], how: Reading, backbone: str) -> Iterator[str]:
-    """One line each; the views have the labels of `backbone`, or none."""
+    """Yield one line each; the views have the labels of `backbone`, or none."""
     if how.convention.depth == "planar" and (
         found := find_sentinel((view.depth for view in views), how.depth_scale or 1)
     ):
@@ -392,7 +399,7 @@ def remarks(scene: Scene, views: Sequence[View], how: Reading, backbone: str) ->
 
 
 def _edges(scene: Scene, views: Sequence[View]) -> Iterator[Edges]:
-    """Depth and edges of the labels, or without labels of the images, of views."""
+    """Yield depth and edges of the labels, or without labels of the images, of views."""
     for view in views:
         if view.labels is not None:
             yield view.depth, label_edges(view.labels, view.ignore_id)

@@ -19,7 +19,7 @@ from semstab.model.frames import Frame, Intrinsics
 # Which frames and pixels a check looks at, and what it keeps of them: bounded at any length and image size.
 
 MAX_PIXELS = 2**20
-"""Of a larger image only every n-th pixel of each axis is kept."""
+"""The most pixels of an image: of a larger one only every n-th pixel of each axis is kept."""
 
 STEPS = (0, 1, 2, 8, 27)
 """Frames of a cluster, counted from its first one: their pairs lie 1 to 27 selected frames apart."""
@@ -29,13 +29,14 @@ Pair = tuple[int, int]
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """What is kept of a frame: every stride-th pixel, and of those a sample.
+    """The part of a frame that is kept: every stride-th pixel, and of those a sample.
 
-    depth   (H, W) planar, metres, as configured
-    camera  intrinsics of the whole image, whose (width, height) is `size`
-    T_wc    (4, 4) camera-to-world, OpenCV axes, as configured
-    labels  (H, W) class ids, or None where the scene has no labels
-    u, v    (N,) the sample: kept pixels with valid depth
+    Attributes:
+        depth: (H, W) planar, metres, as configured.
+        camera: Intrinsics of the whole image, whose (width, height) is `size`.
+        T_wc: (4, 4) camera-to-world, OpenCV axes, as configured.
+        labels: (H, W) class ids, or None where the scene has no labels.
+        u, v: (N,) the sample: kept pixels with valid depth.
     """
 
     index: int
@@ -64,7 +65,7 @@ class View:
         return cls(frame.index, depth, frame.intrinsics, (W, H), stride, frame.T_wc, labels, frame.ignore_id, u, v)
 
     def pose(self, convention: Convention, configured: Convention) -> Float64:
-        """(4, 4) camera-to-world, OpenCV axes, were the file read by that convention."""
+        """Return (4, 4) camera-to-world, OpenCV axes, were the file read by that convention."""
         pose = self.T_wc.copy()
         pose[:3, :3] = pose[:3, :3] @ CAMERA_AXES[configured.axes].T
         if convention.pose != configured.pose:
@@ -73,13 +74,13 @@ class View:
         return pose
 
     def kept_camera(self, convention: Convention) -> Intrinsics:
-        """Intrinsics of the kept pixels."""
+        """Return the intrinsics of the kept pixels."""
         width, height = self.size
         made_for = (width * convention.ratio[0], height * convention.ratio[1])
         return self.camera.resized(cast(Any, made_for), self.size).every(self.stride)
 
     def planar(self, u: Int64, v: Int64, convention: Convention, configured: Convention) -> Float64:
-        """Planar depth at kept pixels, were the file read by that convention, but for its factor."""
+        """Return planar depth at kept pixels, were the file read by that convention, but for its factor."""
         depth: Float64 = self.depth[v, u].astype(np.float64)
         if convention.depth == configured.depth:
             return depth
@@ -89,7 +90,7 @@ class View:
 
 
 def clusters(length: int, count: int) -> list[list[int]]:
-    """Positions of neighbouring frames to compare: `count` clusters, evenly spaced over a sequence of that length."""
+    """Return positions of neighbouring frames to compare: `count` clusters, evenly spaced over a sequence."""
     steps = [step for step in STEPS if step <= min(length - 1, max(1, 0.75 * (length - 1)))]
     room = length - 1 - steps[-1]
     starts = {int(room * (k + 0.5) / count) for k in range(count)}
@@ -97,22 +98,22 @@ def clusters(length: int, count: int) -> list[list[int]]:
 
 
 def evenly(length: int, count: int) -> list[int]:
-    """At most `count` positions of a sequence, evenly spaced, the first and the last among them."""
+    """Return at most `count` positions of a sequence, evenly spaced, the first and the last among them."""
     return sorted({round(position) for position in np.linspace(0, length - 1, min(length, count)).tolist()})
 
 
 def pairs_within(groups: Sequence[Sequence[int]]) -> list[Pair]:
-    """Every ordered pair of two positions of one cluster, each once."""
+    """Return every ordered pair of two positions of one cluster, each once."""
     return sorted({(a, b) for group in groups for a in group for b in group if a != b})
 
 
 def label_source(scene: Scene) -> str | None:
-    """The backbone with which frames are read where none is named; the ground truth where there is no other."""
+    """Return the backbone with which frames are read where none is named; the ground truth where there is no other."""
     return scene.backbones[0] if scene.backbones else GROUND_TRUTH if scene.ground_truth else None
 
 
 def reader(scene: Scene, backbone: str | None, *, color: bool = False) -> Callable[[int], Frame]:
-    """How a frame is read: with a backbone's labels, or where there are none, with all pixels class 0."""
+    """Return how a frame is read: with a backbone's labels, or where there are none, with all pixels class 0."""
     if backbone is None:
         return lambda index: scene.geometry(index, color=color)
     return lambda index: scene.frame(index, backbone, color=color)
@@ -127,7 +128,7 @@ class Sample:
     configured: Convention
 
     def errors(self, convention: Convention, factors: Float64) -> list[Float64]:
-        """For each pair, (F, N) relative error of the first view's sample in the second one; inf where not seen."""
+        """Return for each pair the relative error (F, N) of the first view's sample in the second; inf if not seen."""
         return [self.matched(pair, convention, factors).error for pair in self.pairs]
 
     def matched(self, pair: Pair, convention: Convention, factors: Float64) -> Matches:
@@ -149,20 +150,21 @@ class Sample:
         return Matches(u, v, z, seen, inside, error)
 
     def motions(self, convention: Convention) -> list[tuple[Float64, Float64]]:
-        """For each pair, the rotation and translation from the first camera to the second."""
+        """Return for each pair the rotation and translation from the first camera to the second."""
         poses = {at: view.pose(convention, self.configured) for at, view in self.views.items()}
         return [motion(poses[a], poses[b]) for a, b in self.pairs]
 
 
 @dataclass(frozen=True, eq=False)
 class Matches:
-    """Where a sample of N points lies in another view, for F factors on depth; all (F, N).
+    """The places of a sample of N points in another view, for F factors on depth; all (F, N).
 
-    u, v    the nearest kept pixel there
-    z       distance from there along the optical axis, over the factor
-    depth   planar depth of that pixel, over the factor
-    inside  whether the point lies in that image, before the camera
-    error   |depth / z - 1|, inf where the point is not seen: not inside, or no depth there
+    Attributes:
+        u, v: The nearest kept pixel there.
+        z: Distance from there along the optical axis, over the factor.
+        depth: Planar depth of that pixel, over the factor.
+        inside: Whether the point lies in that image, before the camera.
+        error: |depth / z - 1|, inf where the point is not seen: not inside, or no depth there.
     """
 
     u: Int64
@@ -174,13 +176,13 @@ class Matches:
 
 
 def motion(pose: Float64, other: Float64) -> tuple[Float64, Float64]:
-    """(3, 3), (3,) from a camera's axes to the other's; exact for large coordinates, which cancel first."""
+    """Return (3, 3), (3,) from a camera's axes to the other's; exact for large coordinates, which cancel first."""
     back = np.linalg.inv(other[:3, :3])
     return back @ pose[:3, :3], back @ (pose[:3, 3] - other[:3, 3])
 
 
 def median_of_seen(errors: npt.NDArray[Any]) -> Float64:
-    """Median along the last axis of those that are finite (the lower one of two); NaN where there is none."""
+    """Return median along the last axis of those that are finite (the lower one of two); NaN where there is none."""
     ordered = np.sort(errors, axis=-1)
     seen = np.isfinite(ordered).sum(axis=-1)
     middle = np.take_along_axis(ordered, np.maximum(seen - 1, 0)[..., None] // 2, axis=-1)[..., 0]

@@ -47,12 +47,13 @@ MOST_IDS = 5
 class Histogram:
     """The labels of a backbone in some frames.
 
-    space     its taxonomy's name, or None where none is known
-    pixels    looked at
-    classes   share of them by class, in the taxonomy's order; by id where no taxonomy is known
-    ignored   share with the ignore id, or without usable scores
-    unknown   share by id that no class has
-    problem   what is wrong, or None
+    Attributes:
+        space: Its taxonomy's name, or None where none is known.
+        pixels: Looked at.
+        classes: Share of them by class, in the taxonomy's order; by id where no taxonomy is known.
+        ignored: Share with the ignore id, or without usable scores.
+        unknown: Share by id that no class has.
+        problem: The fault, or None.
     """
 
     backbone: str
@@ -65,7 +66,7 @@ class Histogram:
 
 
 class Tally:
-    """Counts the labels of a backbone, frame by frame."""
+    """The labels of a backbone, counted frame by frame."""
 
     def __init__(self, backbone: str) -> None:
         self.backbone = backbone
@@ -83,7 +84,7 @@ class Tally:
             self._widths.add(frame.scores.shape[2])
 
     def histogram(self, space: LabelSpace | None, missing: str | None = None) -> Histogram:
-        """The shares, with what is wrong about them; `missing` says why there is no taxonomy."""
+        """Return the shares, with what is wrong about them; `missing` says why there is no taxonomy."""
         ids = self._named(space)
         total = max(1, self._ignored + ids.total())
         if space is None:
@@ -102,7 +103,7 @@ class Tally:
         )
 
     def _named(self, space: LabelSpace | None) -> Counter[int]:
-        """The counts by the taxonomy's ids: scores count in its order, and 255 in a 16-bit map may mean 'ignore'."""
+        """Return the counts by the taxonomy's ids: scores count in its order, and 255 of 16 bits may mean 'ignore'."""
         if space is None:
             return self._ids
         if self._widths:
@@ -131,7 +132,7 @@ SCHEMA = 1
 CLUSTERS = 4
 POINTS = 8000
 LEAST_POINTS_A_VIEW, MOST_POINTS_A_VIEW = 50, 500
-"""About so many points are reprojected, from neighbouring frames at so many places of the sequence."""
+"""The number of points that are reprojected, from neighbouring frames at so many places of the sequence."""
 
 QUICK_POINTS = 2400
 CONFIRMING_CLUSTERS = 3
@@ -146,7 +147,7 @@ VOXEL_FACTORS = (0.5, 1.0, 2.0)
 
 @dataclass(frozen=True)
 class Depth:
-    """Of the sampled frames: share of valid pixels, and percentiles of their depth, metres."""
+    """The depth of the sampled frames: share of valid pixels, and percentiles, metres."""
 
     valid: float
     p5: float
@@ -156,7 +157,7 @@ class Depth:
 
 @dataclass(frozen=True)
 class Motion:
-    """How far the camera moves between the compared frames, smallest and largest: share of the depth, and degrees."""
+    """The motion between the compared frames, smallest and largest: share of the depth, and degrees."""
 
     shift: tuple[float, float]
     turn: tuple[float, float]
@@ -192,14 +193,14 @@ class SceneCheck:
 
     @property
     def problems(self) -> tuple[str, ...]:
-        """What makes the scene unsound, one line each."""
+        """Return what makes the scene unsound, one line each."""
         geometry = [self.verdict.text] if self.verdict.state == "unsound" else []
         if self.depth.valid == 0:
             geometry.append("no pixel of the sampled frames has valid depth; check the files and depth_scale")
         return tuple(geometry) + tuple(labels.problem for labels in self.labels if labels.problem is not None)
 
     def to_dict(self) -> dict[str, Any]:
-        """The JSON object."""
+        """Return the JSON object."""
         content = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
         said = {"verdict": self.verdict.to_dict(), "problems": self.problems, "sound": not self.problems}
         return {name: to_json(value) for name, value in (content | said).items()}
@@ -208,7 +209,8 @@ class SceneCheck:
 def check(config: Config) -> Iterator[SceneCheck]:
     """Check the scenes that a resolved configuration selects, one by one.
 
-    Raises ConfigError or DataError where there is no such scene or a file cannot be read.
+    Raises:
+        ConfigError, DataError: If there is no such scene or a file cannot be read.
     """
     dataset = open_dataset(config.dataset.name, config.dataset.options)
     for name in selected(config.scenes, dataset.scenes, (), "scene", config.dataset.name):
@@ -250,7 +252,7 @@ def quick_check(scene: Scene, indices: Sequence[int], options: Mapping[str, Any]
 def quick_look(
     scene: Scene, indices: Sequence[int], options: Mapping[str, Any] | None = None
 ) -> tuple[Verdict, Sample | None]:
-    """The verdict of `quick_check`, and the frames that it looked at; None where there are not two."""
+    """Return the verdict of `quick_check`, and the frames that it looked at; None where there are not two."""
     verdict, sample = Verdict("unclear", "it takes two frames to tell whether depth and poses agree"), None
     for count in (1, CONFIRMING_CLUSTERS):
         look = Look(scene, indices, None, clusters(len(indices), count), count * QUICK_POINTS, passing_over=True)
@@ -264,7 +266,11 @@ def quick_look(
 
 
 def require_sound(scene: Scene, indices: Sequence[int], options: Mapping[str, Any] | None = None) -> Verdict:
-    """The verdict of `quick_check`. Raises DataError where depth and poses contradict each other."""
+    """Return the verdict of `quick_check`.
+
+    Raises:
+        DataError: If depth and poses contradict each other.
+    """
     verdict = quick_check(scene, indices, options)
     refuse_unsound(scene.name, verdict)
     return verdict
@@ -281,12 +287,13 @@ def refuse_unsound(scene: str, verdict: Verdict) -> None:
 class Look:
     """The frames of a scene that a check reads, thinned as they come in.
 
-    source        label source to read frames with; None needs no labels
-    groups        positions in `indices` of frames that are compared with each other
-    points        about how many points are reprojected in all
-    fused         number of frames, evenly spaced, that are kept for fusing, too
-    passing_over  leave out frames that cannot be read, instead of raising what reading them raises
-    with_color    also look at the size of a colour image: intrinsics may be for that
+    Attributes:
+        source: Label source to read frames with; None needs no labels.
+        groups: Positions in `indices` of frames that are compared with each other.
+        points: About how many points are reprojected in all.
+        fused: Number of frames, evenly spaced, that are kept for fusing, too.
+        passing_over: Leave out frames that cannot be read, instead of raising what reading them raises.
+        with_color: Whether to look also at the size of a colour image: intrinsics may be for that.
     """
 
     def __init__(
@@ -332,25 +339,25 @@ class Look:
                 self.views[position] = View.of(frame, self._points, labelled=self._labelled)
 
     def reading(self, options: Mapping[str, Any]) -> Reading:
-        """How the scene is configured."""
+        """Return how the scene is configured."""
         assert self._first is not None
         return reading(self.scene, self._first, options, self._color_shape)
 
     def sample(self, options: Mapping[str, Any]) -> Sample:
-        """The frames that are compared."""
+        """Return the frames that are compared."""
         views = {position: view for position, view in self.views.items() if position in self._compared}
         pairs = [pair for pair in self._pairs if pair[0] in views and pair[1] in views]
         return Sample(views, pairs, self.reading(options).convention)
 
     def verdict(self, options: Mapping[str, Any], *, thorough: bool) -> Verdict:
-        """Of depth reprojected from frame to frame; of depth that is cast at a surface, of what the images say."""
+        """Judge depth reprojected from frame to frame; depth that is cast at a surface, by what the images say."""
         sample = self.sample(options)
         if self.scene.surface is not None:
             return judge_surface(match_images(self.scene, sample.views, sample.pairs), len(sample.views))
         return judge(sample, self.reading(options), thorough=thorough)
 
     def depth(self) -> Depth:
-        """Of all frames that were read."""
+        """Return the depth of all frames that were read."""
         valid = [np.mean((view.depth > 0) & (view.depth < np.inf)) for view in self.views.values()]
         depths = np.concatenate([view.depth[view.v, view.u] for view in self.views.values()])
         p5, p50, p95 = np.percentile(depths, (5, 50, 95)) if len(depths) else (np.nan,) * 3
@@ -358,7 +365,7 @@ class Look:
 
 
 def _with_coverage(checked: SceneCheck, look: Look, sample: Sample, config: Config) -> SceneCheck:
-    """What can be said about overlap, noise and voxels, where depth and poses may agree."""
+    """Return what can be said about overlap, noise and voxels, where depth and poses may agree."""
     coverage = Coverage(sample)
     overlaps = coverage.overlaps()
     noise = coverage.noise() if overlaps and any(row.covisible > 0 for row in overlaps) else None
@@ -381,7 +388,7 @@ def _with_coverage(checked: SceneCheck, look: Look, sample: Sample, config: Conf
 
 
 def _persistence(views: Sequence[View], coverage: Coverage, voxel_size: float, stride: int) -> Persistence | None:
-    """The distribution of OP; None where points lie so far out that voxels of that size cannot be counted."""
+    """Return the distribution of OP; None where points lie so far out that voxels of that size cannot be counted."""
     try:
         return persistence(views, coverage, voxel_size, stride)
     except DataError:
@@ -389,7 +396,10 @@ def _persistence(views: Sequence[View], coverage: Coverage, voxel_size: float, s
 
 
 def _motion(sample: Sample) -> Motion | None:
-    """How far the camera moves and turns from one compared frame to another; None where no depth compares with it."""
+    """Return how far the camera moves and turns from one compared frame to another.
+
+    None where no depth compares with it.
+    """
     if not sample.pairs:
         return None
     shifts, turns = shifts_and_turns(sample)
@@ -399,7 +409,7 @@ def _motion(sample: Sample) -> Motion | None:
 
 
 def _labels(scene: Scene, backbone: str, indices: Sequence[int], config: Config, look: Look) -> Histogram:
-    """The labels of a backbone: of the frames that were read already, or of a few read for it."""
+    """Return the labels of a backbone: of the frames that were read already, or of a few read for it."""
     tally = look.tally
     if backbone != tally.backbone:
         tally = Tally(backbone)
@@ -418,16 +428,19 @@ def _labels(scene: Scene, backbone: str, indices: Sequence[int], config: Config,
 # Which voxel size suits the data, and where a given one lies.
 
 SCENES = 3
-"""Of more scenes some are looked at; the largest size suits all of them."""
+"""The most scenes that are looked at; the largest size suits all of them."""
 
 MADE = "city"
 """The dataset that is made, not measured: nothing is to be told of its voxels."""
 
 
 def with_voxel_size(config: Config) -> tuple[Config, dict[str, VoxelAdvice]]:
-    """The configuration, with the voxel size that `check` suggests for data of files where it says none.
+    """Return the configuration, with the voxel size that `check` suggests for data of files where it says none.
 
-    And why, scene by scene. Raises ConfigError or DataError where there is no such scene.
+    And why, scene by scene.
+
+    Raises:
+        ConfigError, DataError: If there is no such scene.
     """
     if config.sets_voxel_size or config.dataset.name == MADE:
         return config, {}
@@ -444,7 +457,7 @@ def with_voxel_size(config: Config) -> tuple[Config, dict[str, VoxelAdvice]]:
 
 
 def advise(sample: Sample | None, config: Config) -> VoxelAdvice | None:
-    """Where the configured voxel size lies; None where nothing can be told of it."""
+    """Return where the configured voxel size lies; None where nothing can be told of it."""
     if sample is None or not sample.pairs or config.dataset.name == MADE:
         return None
     coverage = Coverage(sample)
@@ -453,7 +466,7 @@ def advise(sample: Sample | None, config: Config) -> VoxelAdvice | None:
 
 
 def _coverage(config: Config, scene: Scene) -> Coverage | None:
-    """What a scene's frames share; None where they cannot be read: whoever needs them says so."""
+    """Return what a scene's frames share; None where they cannot be read: whoever needs them says so."""
     backbones = selected(config.backbones, scene.backbones, scene.by_name, "backbone", scene.name)
     with contextlib.suppress(DataError):
         indices = frame_indices(scene, config, backbones)

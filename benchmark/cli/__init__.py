@@ -70,7 +70,7 @@ class Command(TyperCommand):
     """A command whose flags are shown as such."""
 
     def get_params(self, ctx: Any) -> list[Any]:
-        """Its parameters, and --help."""
+        """Return its parameters, and --help."""
         return _without_kind(super().get_params(ctx))
 
 
@@ -112,7 +112,7 @@ class Group(TyperGroup):
         return super().parse_args(ctx, [_of_today(word, k) for k, word in enumerate(args)])
 
     def format_help(self, ctx: Any, formatter: Any) -> None:
-        """The group's own help, with the options of `run` in it."""
+        """Write the group's own help, with the options of `run` in it."""
         own = self.params
         self.params = [*own, *self.commands["run"].params]
         try:
@@ -166,7 +166,7 @@ def root(
         bool, typer.Option("--version", callback=_version, is_eager=True, help="Say the version.")
     ] = False,
 ) -> None:
-    """Options that stand before the command."""
+    """Take the options that stand before the command."""
 
 
 for command, name in (
@@ -178,7 +178,7 @@ for command, name in (
 
 
 class _Once(logging.Filter):
-    """What the check and the run would both warn of is said once."""
+    """A filter that says once what the check and the run would both warn of."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -193,7 +193,7 @@ class _Once(logging.Filter):
 
 
 def main() -> None:
-    """Entry point of the console script."""
+    """Run the command line; the entry point of the console script."""
     configure_process()
     logging.getLogger("semstab").addFilter(_Once())
     for stream in (sys.stdout, sys.stderr):

@@ -21,7 +21,7 @@ def compare(
     verbose: Verbose = False,
     quiet: Quiet = False,
 ) -> None:  # fmt: skip
-    """What differs between runs: by how much, how surely, in which classes and places, and which frames did it."""
+    """Compare runs: by how much they differ, how surely, in which classes and places, and which frames did it."""
     from rich.console import Console
 
     from semstab.comparison.tables import print_comparison
@@ -44,7 +44,11 @@ def compare(
 
 # The commands gate and calibrate: quality gates, and thresholds from which labels may be acted on.
 
-FAILED = 4
+REMEDY = {
+    "undecided": "take more frames (--plan says how many), or accept undecided rules with --undecided pass",
+    "fails": "mend the model, or keep it regardless with --save-baseline alone, without rules",
+}
+"""What to do, by the outcome, so that a baseline is saved."""
 
 
 def gate(
@@ -58,7 +62,7 @@ def gate(
     level: Annotated[float | None, typer.Option(
         help="How often a rule may err on each side.", show_default="0.05")] = None,
     undecided: Annotated[str | None, typer.Option(
-        metavar="pass|fail", help="Verdict on rules that stay open.", show_default="pass")] = None,
+        metavar="report|pass|fail", help="Undecided rules: exit code 5, or 0, or 4.", show_default="report")] = None,
     scope: ScopeOption = None,
     out: Annotated[list[Path] | None, typer.Option(
         "--out", "-o", metavar="FILE", help=".xml (JUnit), .md (pull request), .json; repeatable.")] = None,
@@ -67,7 +71,7 @@ def gate(
     plan: Annotated[bool, typer.Option("--plan", metavar="", help="Say how many frames each rule needs.")] = False,
     quiet: Quiet = False,
 ) -> None:  # fmt: skip
-    """Fail where a new model is shown to be worse: exit code 4 where a rule fails."""
+    """Fail where a new model is shown to be worse: exit code 4 where a rule fails, 5 where one is undecided."""
     from rich.console import Console
 
     from semstab.comparison import gate_report
@@ -81,8 +85,15 @@ def gate(
         for file in out or ():
             gate_report.write(result, file)
         print_lines(gate_report.plan(result) if plan else gate_report.lines(result, Console().width), quiet=quiet)
-        if result.failed and not plan:
-            raise typer.Exit(FAILED)
+        if save_baseline is not None and not result.passed:
+            say(
+                f"{save_baseline}: no baseline is saved, as the gate {gate_report.OUTCOMES[result.outcome]};"
+                f" {REMEDY[result.outcome]}"
+            )
+        if not (result.passed or plan):
+            raise typer.Exit(result.exit_code)
+        if not result.passed:
+            return
     if save_baseline is not None:
         save_summary(open_run(new), save_baseline)
         print_lines([f"{save_baseline}: a baseline of {save_baseline.stat().st_size:,} bytes"], quiet=quiet)
@@ -95,7 +106,7 @@ def calibrate(
     confidence: Annotated[float, typer.Option(help="With which this is to hold, class by class.")] = 0.95,
     quiet: Quiet = False,
 ) -> None:
-    """For each class the least evidence at which its labels are right often enough to be acted on."""
+    """Find for each class the least evidence at which its labels are right often enough to be acted on."""
     from semstab.comparison.calibration import calibrate_run, lines
 
     thresholds = calibrate_run(run, precision=precision, confidence=confidence)
@@ -166,7 +177,7 @@ def export(
     most: Annotated[int, typer.Option("--most", "-n", min=1, help="Annotation tasks at most.")] = 50,
     quiet: Quiet = False,
 ) -> None:  # fmt: skip
-    """The fused map as a point cloud, raster, mesh or table, with how far to trust each location."""
+    """Write the fused map as a point cloud, raster, mesh or table, with how far to trust each location."""
     from semstab.exports import export as write
 
     for file in write(
@@ -194,7 +205,7 @@ def relabel(
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace maps of other settings.")] = False,
     quiet: Quiet = False,
 ) -> None:  # fmt: skip
-    """The fused classes back in every frame: label maps of a new source, unstable voxels ignored."""
+    """Write the fused classes back into every frame: label maps of a new source, unstable voxels ignored."""
     from rich.console import Console
 
     from semstab.convert import frame_bar
@@ -216,7 +227,7 @@ def relabel(
 
 
 def list_() -> None:
-    """Backends, datasets, backbones, filters, taxonomies and studies, each with 'ready' or what to install."""
+    """List backends, datasets, backbones, filters, taxonomies and studies, each with 'ready' or what to install."""
     from rich.console import Console
     from rich.markup import escape
     from rich.table import Table

@@ -120,7 +120,7 @@ def study(
     quiet: opt.Quiet = False,
     verbose: opt.Verbose = False,
 ) -> None:  # fmt: skip
-    """Everything that the paper reports: scenes x backbones x backends x variations. Resumes where it was."""
+    """Run everything that the paper reports: scenes x backbones x backends x variations. Resumes where it was."""
     from semstab.model.results import slug
     from semstab.settings import load_study
 
@@ -149,7 +149,7 @@ def remedies(
     jobs: opt.Jobs = 1,
     quiet: opt.Quiet = False,
 ) -> None:
-    """Which filter makes this model more stable: how right, how late, at what price. Resumes where it was.
+    """Find which filter makes this model more stable: how right, how late, at what price. Resumes where it was.
 
     --filter tries others than the usual ones; chains are written with a plus sign, ema-warped:0.6+threshold:0.5.
     """
@@ -257,7 +257,7 @@ def check(
     verbose: opt.Verbose = False,
     quiet: opt.Quiet = False,
 ) -> None:
-    """Does this dataset make sense: poses, depth, units, labels? Exit code 0 where it does, 2 where not."""
+    """Check that a dataset makes sense: poses, depth, units, labels. Exit code 0 where it does, 2 where not."""
     from rich.console import Console
 
     from semstab.check import SCHEMA
@@ -376,7 +376,7 @@ def convert(
 
 
 class FigureFormat(StrEnum):
-    """In which figures are written."""
+    """The file format of figures."""
 
     png = "png"
     svg = "svg"

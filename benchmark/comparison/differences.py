@@ -112,7 +112,7 @@ def _rows(common: Common, base: Entry, other: Entry, number: int) -> Iterator[Co
         if _comparable(quantity, common):
             yield from _row(quantity, common.sums[0], common.sums[number], common)
     if common.basis != "flights" and not common.sizes_differ:
-        change = sums_difference(COVERAGE.key, after, before)
+        change = sums_difference(COVERAGE.key, after, before, same_frames=common.same_frames)
         yield Contrast(COVERAGE.key, "", 1.0, 1 + change.value, change, math.nan, "")
     if base.flicker and (base.flicker.keys() == other.flicker.keys() or common.same_frames is False):
         yield _flicker(base.flicker, other.flicker, paired=common.same_frames is not False)
@@ -160,7 +160,7 @@ def sums_difference(
     if new.truth != base.truth:
         new, base = new.without_truth(), base.without_truth()
     if key == COVERAGE.key:
-        return _with_p_value(coverage(new, base, level), level)
+        return _with_p_value(coverage(new, base, level, same_frames=same_frames), level)
     scope, number = THESE_FRAMES if of_space_alone(key, k) else scope, functional(key, k)
     if apart:
         return unpaired(estimate(new, key, k, scope, level), estimate(base, key, k, scope, level), level)

@@ -6,7 +6,7 @@ import dataclasses
 import math
 import os
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -36,7 +36,16 @@ from semstab.model.statistics import Interval
 from semstab.statistics.agreement import ALPHA, ALPHA_BETWEEN, PSA
 from semstab.statistics.cluster_sums import ClusterSums, of_space_alone, sums_for, value
 from semstab.statistics.correctness import ACCURACY, ECE, MIOU
-from semstab.statistics.intervals import LEAST_FRAMES, estimate, mean_of, mean_over_frames, standard_error
+from semstab.statistics.intervals import (
+    LEAST_FRAMES,
+    counted,
+    estimate,
+    mean_of,
+    mean_over_frames,
+    shares_of,
+    standard_error,
+    within_a_flight,
+)
 
 # What a rule may be about: the numbers that follow from the sums of a run, and what to run for those it lacks.
 
@@ -132,6 +141,7 @@ class Rule:
     change   of what: how far the measure fell from the baseline's ('drop'), or rose; its own value where none is named
     below    whether that shall be below the limit, or above
     limit    as the measure is given: shares from 0 to 1, flicker in percent
+    or_equal  whether it may be the limit itself, which counts alone can tell
     """
 
     text: str
@@ -141,6 +151,7 @@ class Rule:
     limit: float
     scene: str | None = None
     class_name: str | None = None
+    or_equal: bool = False
 
     def of_each(self, classes: Sequence[str]) -> tuple[Rule, ...]:
         """The rules that it stands for: itself, or with 'class *' one for each class."""
@@ -169,7 +180,10 @@ def parse(text: str) -> Rule:
     change: Change | None = None
     if result["change"]:
         change = "drop" if result["change"].lower() == "drop" else "rise"
-    rule = Rule(text.strip(), measure, change, result["relation"][0] == "<", limit, result["scene"], result["class"])
+    relation = result["relation"]
+    rule = Rule(
+        text.strip(), measure, change, relation[0] == "<", limit, result["scene"], result["class"], len(relation) > 1
+    )
     _check_rule(rule)
     return rule
 
@@ -195,10 +209,12 @@ def verdict(rule: Rule, interval: Interval) -> Verdict:
     """What an interval, each of whose ends is passed with the gate's level, says of a rule.
 
     Passes where the whole of it keeps to the limit. Fails where none of it does; a loss fails as soon as it is shown
-    and not shown to be smaller than the limit.
+    and not shown to be smaller than the limit. A number that is known is not undecided.
     """
     if interval.undecided or math.isnan(interval.low) or math.isnan(interval.high):
         return "undecided"
+    if interval.low == interval.high == rule.limit:
+        return "passes" if rule.or_equal else "fails"
     shown, limit = (interval, rule.limit) if rule.below else (negative(interval), -rule.limit)
     low, high = shown.low, shown.high
     if high < limit:
@@ -231,11 +247,14 @@ def negative(interval: Interval) -> Interval:
 
 # The settings of a gate: its rules, the level, what is to become of what is undecided.
 
+Undecided = Literal["report", "pass", "fail"]
+
 
 class GateConfig(BaseModel):
     """What stands in gate.yaml.
 
     level   the probability with which a rule may fail that holds, or pass that does not
+    undecided  what a gate with undecided rules does: 'report' them, so that it neither passes nor fails; 'pass', 'fail'
     scope   for which data rules are judged: 'this scene' flown again, 'these frames', or 'other scenes' like these
     """
 
@@ -243,7 +262,7 @@ class GateConfig(BaseModel):
 
     rules: tuple[str, ...] = ()
     level: float = Field(0.05, ge=1e-4, le=0.25)
-    undecided: Literal["pass", "fail"] = "pass"
+    undecided: Undecided = "report"
     scope: ScopeSetting = THIS_SCENE
 
 
@@ -310,8 +329,15 @@ class Judgement:
         return max(LEAST_FRAMES, math.ceil(self.found.frames * (z * error / margin) ** 2))
 
     @property
+    def counted(self) -> bool:
+        """Whether it was counted, and is no estimate."""
+        return self.rule.measure.quantity is COVERAGE and self.found.decided and self.found.low == self.found.high
+
+    @property
     def reason(self) -> str:
         """Why, in a few words."""
+        if self.counted:
+            return "counted"
         if self.verdict == "passes":
             return "shown"
         if self.verdict == "fails":
@@ -328,6 +354,8 @@ class Judgement:
     def values(self) -> str:
         """'0.481 to 0.462, drop 0.019 [0.012, 0.026]'."""
         ends = f"[{self.digits(self.found.low)}, {self.digits(self.found.high)}]"
+        if self.counted:
+            return f"{self.rule.change} {self.digits(self.found.value)}"
         if self.rule.change is None:
             return f"{self.digits(self.found.value)} {ends}"
         change = f"{self.rule.change} {self.digits(self.found.value)} {ends}"
@@ -336,11 +364,16 @@ class Judgement:
         return f"{self.digits(self.base)} to {self.digits(self.new)}, {change}"
 
 
+EXIT_CODES: Mapping[Verdict, int] = {"passes": 0, "fails": 4, "undecided": 5}
+"""Of the command, by the outcome."""
+
+
 @dataclass(frozen=True)
 class GateResult:
     """Everything that a gate found.
 
     new, against  what was judged, and the baseline, empty where there is none
+    undecided   what becomes of undecided rules, see `GateConfig`
     notes       what a reader has to know beside
     """
 
@@ -348,7 +381,7 @@ class GateResult:
     against: str
     scenes: tuple[str, ...]
     level: float
-    undecided: str
+    undecided: Undecided
     judgements: tuple[Judgement, ...]
     notes: tuple[str, ...] = ()
 
@@ -362,12 +395,23 @@ class GateResult:
         return self.outcome == "fails"
 
     @property
+    def passed(self) -> bool:
+        """Whether all rules pass, or are undecided where that passes: only then a baseline is saved."""
+        return self.outcome == "passes"
+
+    @property
     def outcome(self) -> Verdict:
-        """Of all rules together."""
-        undecided = self.count("undecided") > 0
-        if self.count("fails") or (undecided and self.undecided == "fail"):
+        """Of all rules together; undecided rules count as `undecided` says."""
+        if self.count("fails"):
             return "fails"
-        return "undecided" if undecided else "passes"
+        if not self.count("undecided") or self.undecided == "pass":
+            return "passes"
+        return "fails" if self.undecided == "fail" else "undecided"
+
+    @property
+    def exit_code(self) -> int:
+        """With which the command ends: 0 where the gate passes, 4 where it fails, 5 where it is undecided."""
+        return EXIT_CODES[self.outcome]
 
 
 def gate(new: str | os.PathLike[str], against: str | os.PathLike[str] | None, config: GateConfig) -> GateResult:
@@ -392,8 +436,11 @@ def gate(new: str | os.PathLike[str], against: str | os.PathLike[str] | None, co
             pairs = _pairs(rule, own, base, scenes)
             _require_values(rule, pairs)
             judged.append(_judged(rule, pairs, config.level / len(rules), config.scope))
+            notes += _counts(judged[-1], pairs)
     judged_run, against_run = ("" if run is None else f"{run.backbone} ({run.source})" for run in (own, base))
-    return GateResult(judged_run, against_run, scenes, config.level, config.undecided, tuple(judged), tuple(notes))
+    return GateResult(
+        judged_run, against_run, scenes, config.level, config.undecided, tuple(judged), tuple(dict.fromkeys(notes))
+    )
 
 
 def _notes(own: RunHandle, base: RunHandle | None, scenes: Sequence[str]) -> list[str]:
@@ -495,6 +542,9 @@ def _value(rule: Rule, entry: Entry) -> float:
 
 
 def _found(rule: Rule, new: Entry, base: Entry | None, level: float, scope: Scope) -> Interval:
+    if rule.measure.quantity is COVERAGE and base is not None and _same_frames(new, base):
+        change = counted(_covered(new.sums, base.sums), new.sums)
+        return change if rule.change == "rise" else negative(change)
     if rule.measure.quantity is not FLICKER:
         return bounded(rule, new.sums, None if base is None else base.sums, k=_k(rule, new), level=level, scope=scope)
     if scope == OTHER_SCENES:
@@ -503,3 +553,32 @@ def _found(rule: Rule, new: Entry, base: Entry | None, level: float, scope: Scop
         return mean_over_frames(np.array([*new.flicker]), np.array([*new.flicker.values()]), 1 - 2 * level)
     result = flicker_difference(new.flicker, base.flicker, level=1 - 2 * level)
     return result if rule.change == "rise" else negative(result)
+
+
+# --- Coverage, which is counted ---------------------------------------------------------------------------------------
+
+
+def _same_frames(new: Entry, base: Entry) -> bool:
+    """Whether both are of the same frames, in some of which a model may have given no label."""
+    return new.summary.frames == base.summary.frames and within_a_flight(new.sums, base.sums)
+
+
+def _covered(new: ClusterSums, base: ClusterSums) -> float:
+    """The change of the count that fell most: of voxels with OP >= 2, or of labelled observations in them.
+
+    A model that gives some locations no label loses voxels; one that gives them a label in fewer frames observations.
+    """
+    return min(shares_of(new, base).values()) - 1
+
+
+def _counts(judged: Judgement, pairs: Sequence[Pair]) -> list[str]:
+    """What was counted for a rule on coverage."""
+    if not judged.counted:
+        return []
+    shares = [shares_of(new.sums, base.sums) for new, base in pairs if base is not None]
+    voxels, observations = (float(np.mean([own[name] for own in shares])) for name in ("voxels", "observations"))
+    where = f" of {judged.rule.scene}" if judged.rule.scene else ""
+    return [
+        f"coverage{where}: {100 * voxels:.1f} % of the baseline's voxels with OP >= 2,"
+        f" {100 * observations:.1f} % of its labelled observations in such voxels"
+    ]

@@ -16,21 +16,55 @@ from semstab.errors import ConfigError
 
 SCHEMA = 1
 INDENT = 10
+MOST_NAMED = 4
+"""Rules that the headline names, of each verdict."""
+
 OUTCOMES: Mapping[Verdict, str] = {"passes": "passes", "fails": "fails", "undecided": "is undecided"}
 SIGNS: Mapping[Verdict, str] = {"passes": "✅", "fails": "❌", "undecided": "❔"}
 
 
 def headline(result: GateResult) -> str:
-    """'1 fails, 2 pass: the gate fails'; a gate with rules that the data leave open is undecided, never passed."""
-    counts = [(n, verdict) for verdict in ("fails", "undecided", "passes") if (n := result.count(verdict))]
-    plural = {"fails": "fail", "passes": "pass", "undecided": "undecided"}
-    listed = ", ".join(f"{n} {verdict if n == 1 else plural[verdict]}" for n, verdict in counts)
-    return f"{listed}: the gate {OUTCOMES[result.outcome]}"
+    """The outcome, and which rules decided: the gate fails: 'alpha > 0.8' fails; 1 of 2 rules is undecided: ..."""
+    return f"the gate {OUTCOMES[result.outcome]}: {'; '.join(decided_by(result))}"
+
+
+def decided_by(result: GateResult) -> tuple[str, ...]:
+    """Which rules decided on a gate, then the others."""
+    texts = {
+        verdict: _said(result, verdict)
+        for verdict in ("fails", "undecided", "passes")
+        if result.count(verdict) and not (verdict == "passes" and result.count("fails"))
+    }
+    if result.passed:
+        texts = dict(reversed(texts.items()))
+    return tuple(texts.values())
+
+
+def _said(result: GateResult, verdict: Verdict) -> str:
+    """'2 of 4 rules are undecided: ...'."""
+    n, rules = result.count(verdict), len(result.judgements)
+    if verdict == "fails":
+        return f"{_named(result, verdict)} {'fails' if n == 1 else 'fail'}"
+    many = f"{n} of {rules} rules"
+    if verdict == "passes":
+        return f"{_named(result, verdict)} passes" if rules == 1 else f"{many} {'passes' if n == 1 else 'pass'}"
+    counts = {"report": "", "pass": ", which counts as passed", "fail": ", which counts as failed"}[result.undecided]
+    if rules == 1:
+        return f"{_named(result, verdict)} is undecided{counts}"
+    return f"{many} {'is' if n == 1 else 'are'} undecided{counts}: {_named(result, verdict, ', ')}"
+
+
+def _named(result: GateResult, verdict: Verdict, last: str = " and ") -> str:
+    """The rules of a verdict, the first ones by their text."""
+    rules = [f"'{each.rule.text}'" for each in result.judgements if each.verdict == verdict]
+    if len(rules) > MOST_NAMED:
+        return f"{', '.join(rules[:MOST_NAMED])}{last}{len(rules) - MOST_NAMED} more"
+    return last.join(filter(None, [", ".join(rules[:-1]), rules[-1]]))
 
 
 def lines(result: GateResult, width: int = 80) -> Iterator[str]:
     """For the terminal: the outcome, a line a rule, and why rules are undecided or fail."""
-    yield headline(result)
+    yield from _wrapped(headline(result), width, 2)
     against = f" against {result.against}" if result.against else ""
     yield from _wrapped(f"  {result.new}{against}, {_scenes(result)}; {_ends(result)}", width, 2)
     for note in result.notes:
@@ -51,7 +85,7 @@ def plan(result: GateResult) -> Iterator[str]:
     yield f"frames from which on a rule is decided with a probability of {POWER:.0%}, by the spread of these runs"
     for each in result.judgements:
         needed, now = each.frames_needed(result.level), each.found.frames
-        text = f"{needed:,} ({now} now)" if needed else "no number of frames tells"
+        text = f"{needed:,} ({now} now)" if needed else "counted" if each.counted else "no number of frames tells"
         yield f"  {each.rule.text}: {text}"
 
 
@@ -80,7 +114,9 @@ def markdown(result: GateResult) -> str:
         for each in result.judgements
     ]
     text = [
-        f"### {SIGNS[result.outcome]} semstab gate: {headline(result)}",
+        f"### {SIGNS[result.outcome]} semstab: the gate {OUTCOMES[result.outcome]}",
+        "",
+        f"{_plain('; '.join(decided_by(result)))}.",
         "",
         f"{_code(result.new)}{against}, {_cell(_scenes(result))}; {_ends(result)}.",
         *(f"\n{_cell(note)}" for note in result.notes),
@@ -90,6 +126,11 @@ def markdown(result: GateResult) -> str:
         *rows,
     ]
     return "\n".join(text) + "\n"
+
+
+def _plain(text: str) -> str:
+    """Text that Markdown takes for nothing else, as a rule may name any class."""
+    return re.sub(r"([\\`*_{}\[\]<>|#])", r"\\\1", text)
 
 
 def _cell(text: str) -> str:
@@ -112,7 +153,7 @@ def as_json(result: GateResult) -> str:
         for each in result.judgements
     ]  # fmt: skip
     content = {
-        "schema": SCHEMA, "gate": result.outcome, "new": result.new,
+        "schema": SCHEMA, "gate": result.outcome, "exit_code": result.exit_code, "new": result.new,
         "against": result.against or None, "scenes": result.scenes, "level": result.level,
         "undecided": result.undecided, "notes": result.notes, "rules": [to_json(row) for row in rows],
     }  # fmt: skip
@@ -120,7 +161,10 @@ def as_json(result: GateResult) -> str:
 
 
 def junit(result: GateResult) -> str:
-    """JUnit XML: a test case a rule; one that is undecided is skipped, or a failure where that fails."""
+    """JUnit XML: a test case a rule; one that is undecided is skipped, or a failure where that fails.
+
+    Properties of the suite are the outcome of the gate and the exit code.
+    """
     undecided_fails = result.undecided == "fail"
     failures = result.count("fails") + (result.count("undecided") if undecided_fails else 0)
     skipped = 0 if undecided_fails else result.count("undecided")
@@ -128,6 +172,9 @@ def junit(result: GateResult) -> str:
         "testsuite", name="semstab gate", tests=str(len(result.judgements)), failures=str(failures), errors="0",
         skipped=str(skipped),
     )  # fmt: skip
+    properties = ElementTree.SubElement(suite, "properties")
+    for name, content in (("gate", result.outcome), ("exit_code", str(result.exit_code))):
+        ElementTree.SubElement(properties, "property", name=name, value=content)
     for each in result.judgements:
         case = ElementTree.SubElement(suite, "testcase", classname="semstab.gate", name=_xml(each.rule.text), time="0")
         if each.verdict == "fails" or (each.verdict == "undecided" and undecided_fails):

@@ -42,14 +42,14 @@ LEAST_TILE = 8
 
 
 class DatasetConfig(Settings):
-    """Which dataset, with the options of its own."""
+    """The settings that name a dataset, with the options of its own."""
 
     name: str = Field("city", description="a name from `semstab-bench list`")
     options: dict[str, Any] = Field(default_factory=dict, description="options of that dataset")
 
 
 class BackendConfig(Part):
-    """Which fusion backend, with the options of its own; where it fuses, and whether it must agree with the others."""
+    """The settings that name a fusion backend: its options, where it fuses, whether it must agree with the others."""
 
     name: str = Field(description="a name from `semstab-bench list`")
     options: dict[str, Any] = Field(default_factory=dict, description="options of that backend")
@@ -146,7 +146,7 @@ class Config(Settings):
     if not TYPE_CHECKING:
 
         def __init__(self, **settings):
-            """Raises ConfigError in one line, as `build` does."""
+            """Check the settings. Raises ConfigError in one line, as `build` does."""
             try:
                 super().__init__(**settings)
             except ValidationError as error:
@@ -210,7 +210,11 @@ class Config(Settings):
 
     @classmethod
     def build(cls, content: Mapping[str, Any], where: str = "configuration") -> Self:
-        """Validate settings. Raises ConfigError that names `where`, the setting, the nearest known one."""
+        """Validate settings.
+
+        Raises:
+            ConfigError: If that fails; the message names `where`, the setting, the nearest known one.
+        """
         return validated(cls, content, f"{where}: ")
 
     @property
@@ -227,7 +231,8 @@ class Config(Settings):
     def only(self, parts: Sequence[str]) -> Config:
         """Return the base units and these parts alone: sweeps, 'shared_taxonomy', 'backends'.
 
-        Raises ConfigError for a part that there is not.
+        Raises:
+            ConfigError: For a part that there is not.
         """
         known = {name for name, _ in self.sweeps.given()} | {BASE, SHARED, BACKENDS}
         for part in parts:
@@ -244,5 +249,5 @@ class Config(Settings):
         )
 
     def to_yaml(self) -> str:
-        """YAML that reads back to the same settings."""
+        """Return YAML that reads back to the same settings."""
         return yaml.safe_dump(self.model_dump(mode="json"), sort_keys=False, allow_unicode=True)

@@ -28,7 +28,11 @@ class Settings(BaseModel):
 
 
 def read_yaml(path: str | Path) -> dict[str, Any]:
-    """Return the mapping in a YAML file. Raises ConfigError in one line where there is none."""
+    """Return the mapping in a YAML file.
+
+    Raises:
+        ConfigError: If there is none; the message is one line.
+    """
     try:
         text = read_limited(path, MAX_YAML_BYTES).decode("utf-8")
     except OSError as error:
@@ -136,7 +140,7 @@ Counts = Values[Annotated[int, Field(ge=1)]]
 
 
 class Sweeps(Settings):
-    """What is varied one by one."""
+    """The settings that are varied one by one."""
 
     voxel_size: Lengths | None = Field(None, description="edges of a voxel, metres")
     depth_noise: Noise | None = Field(None, description="see `semstab.config.Perturbation`, like the next four")
@@ -161,7 +165,8 @@ Indices = list[int]
 def in_full(selection: Any) -> Any:
     """Return a selection of frames as settings, also of START:STOP:STRIDE (parts may be empty) or a list of frames.
 
-    Raises ConfigError for another text.
+    Raises:
+        ConfigError: For another text.
     """
     if not isinstance(selection, str | int):
         return {"list": selection} if isinstance(selection, Sequence) else selection
@@ -175,7 +180,7 @@ def in_full(selection: Any) -> Any:
 
 
 class FrameSelection(Settings):
-    """Which frames of a sequence: those of a list; or each stride-th from start to before stop, in a range of time.
+    """The frames of a sequence to use: a list; or each stride-th from start to before stop, in a range of time.
 
     Of these at most `count`: the first ones, or with `spacing: even` evenly spaced ones, the first and last included.
     """
@@ -209,7 +214,7 @@ class FrameSelection(Settings):
 
     @classmethod
     def of(cls, indices: Sequence[int]) -> Self:
-        """Of exactly these frames, ascending; in a few numbers where they are a range."""
+        """Select exactly these frames, ascending; in a few numbers where they are a range."""
         if isinstance(indices, range):
             return cls(start=indices.start, stop=indices.stop, stride=indices.step)
         return cls(list=tuple(indices))
@@ -217,8 +222,10 @@ class FrameSelection(Settings):
     def indices(self, length: int, timestamps: Sequence[float] | None = None) -> Indices:
         """Return the selected indices of a sequence of that length, whose frames were taken at `timestamps` (seconds).
 
-        A frame whose time is not known (NaN) lies in no range of time. Raises ConfigError for a listed frame that is
-        not there, or a range of time where the sequence has none.
+        A frame whose time is not known (NaN) lies in no range of time.
+
+        Raises:
+            ConfigError: For a listed frame that is not there, or a range of time where the sequence has none.
         """
         if self.list is not None:
             if self.list[-1] >= length:

@@ -38,7 +38,11 @@ def to_arrays(value: Any, name: str = "") -> Arrays:
 
 
 def from_arrays(cls: type[T], arrays: Mapping[str, npt.NDArray[Any]], name: str = "") -> T:
-    """Return the data class that `to_arrays` took apart. Raises KeyError where an array of it is missing."""
+    """Return the data class that `to_arrays` took apart.
+
+    Raises:
+        KeyError: If an array of it is missing.
+    """
     below, hints = f"{name}/" if name else "", get_type_hints(cls)
     names = [field.name for field in dataclasses.fields(cls)]  # type: ignore[arg-type]
     return cls(**{field: _read(hints[field], arrays, below + field) for field in names})
@@ -77,7 +81,11 @@ class Rows:
         self._numbers.extend(np.nan if value is None else value for value in row)
 
     def row(self, at: int) -> list[float]:
-        """Return one row. Raises IndexError where there is none."""
+        """Return one row.
+
+        Raises:
+            IndexError: If there is none.
+        """
         start = range(len(self))[at] * self.columns
         return self._numbers[start : start + self.columns].tolist()
 

@@ -25,7 +25,7 @@ from semstab.core.types import UInt8
 from semstab.errors import ConfigError, DataError, summarize_error
 
 TEMPORARY = ".semstab-"
-"""How names of files begin that are not whole yet."""
+"""The beginning of the names of files that are not whole yet."""
 
 MAX_YAML_BYTES = 2**24
 
@@ -52,7 +52,11 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
 
 
 class FolderLock:
-    """A folder that one process owns until `release`, or until it dies. Raises ConfigError where another one has it."""
+    """A folder that one process owns until `release`, or until it dies.
+
+    Raises:
+        ConfigError: If another one has it.
+    """
 
     def __init__(self, path: Path) -> None:
         path.mkdir(parents=True, exist_ok=True)
@@ -137,7 +141,11 @@ def keep_only(written: Collection[Path], folder: Path) -> None:
 
 
 def parse_json(text: str | bytes) -> Any:
-    """Return the content of JSON. Raises ValueError where it is none, or nested too deeply."""
+    """Return the content of JSON.
+
+    Raises:
+        ValueError: If it is none, or nested too deeply.
+    """
     try:
         return json.loads(text)
     except RecursionError as error:
@@ -215,7 +223,7 @@ def read_arrays(path: Path) -> Arrays | None:
 
 
 def _digest(arrays: Arrays) -> UInt8:
-    """Of names, types, shapes and numbers."""
+    """Return the hash of names, types, shapes and numbers."""
     digest = hashlib.blake2b(digest_size=16)
     for name, array in sorted(arrays.items()):
         digest.update(repr((name, array.dtype.str, array.shape)).encode() + np.ascontiguousarray(array).tobytes())

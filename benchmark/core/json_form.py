@@ -80,8 +80,11 @@ def _fields(fields: list[tuple[str, bool]], value: Any) -> dict[str, Any]:
 def from_json(cls: type[T], content: Any, where: str | Path) -> T:
     """Read what `to_json` made of a `cls`; `where` is the file, for messages.
 
-    Unknown keys are ignored, a missing field takes its default. Raises DataError in one line that names the file and
-    the field where the content is not that of a `cls`.
+    Unknown keys are ignored, a missing field takes its default.
+
+    Raises:
+        DataError: If the content is not that of a `cls`; the message names the file and the field; the message is one
+            line.
     """
     from pydantic import ValidationError
 
@@ -95,7 +98,11 @@ def from_json(cls: type[T], content: Any, where: str | Path) -> T:
 
 
 def number(content: Any) -> float:
-    """Return a number of JSON, NaN for null. Raises ValueError for other content."""
+    """Return a number of JSON, NaN for null.
+
+    Raises:
+        ValueError: For other content.
+    """
     if content is None:
         return math.nan
     if type(content) is float or (type(content) is int and abs(content) < 2**1023):

@@ -13,7 +13,7 @@ from typing import Generic, TypeVar
 
 LOOK_AHEAD_BYTES = 1 << 30
 MOST_THREADS = 8
-"""Used where no number is given: more threads than this only hold more frames in memory."""
+"""The threads where no number is given: more than this only hold more frames in memory."""
 
 K = TypeVar("K")
 T = TypeVar("T")
@@ -80,7 +80,7 @@ def _timed(read: Callable[[K], T], index: K) -> tuple[T, float]:
 
 
 class SizedCache(Generic[K, T]):
-    """Loads by key, and keeps what was used last while its sizes sum to at most `most`, one thing at least."""
+    """A cache that loads by key and keeps what was used last, at least one item, while sizes sum to at most `most`."""
 
     def __init__(self, load: Callable[[K], T], size: Callable[[T], int], most: int) -> None:
         self._load, self._size, self._most = load, size, most

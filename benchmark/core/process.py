@@ -51,8 +51,10 @@ def resident_bytes() -> int:
 def group_bytes(proc: Path, cgroups: Path) -> int | None:
     """Return what the control groups of a process leave to it, page cache included; None where none has a limit.
 
-    proc     as /proc/self; lines of its file `cgroup` are such as '4:memory:/user' or, of version 2, '0::/user'
-    cgroups  as /sys/fs/cgroup: version 2, or version 1 with a folder `memory`
+    Args:
+        proc: A folder like /proc/self; lines of its file `cgroup` are such as '4:memory:/user' or, of version 2,
+            '0::/user'.
+        cgroups: A folder like /sys/fs/cgroup: version 2, or version 1 with a folder `memory`.
     """
     left, lines = list[int](), list[str]()
     with contextlib.suppress(OSError):
@@ -121,7 +123,7 @@ def follow_parent(listening: Connection) -> None:
 
 
 class Stopwatch:
-    """Adds up wall-clock seconds by stage."""
+    """Wall-clock seconds added up by stage."""
 
     def __init__(self) -> None:
         self.seconds: defaultdict[str, float] = defaultdict(float)

@@ -1,4 +1,4 @@
-"""What can be named on the command line: a table from name to class, imported on first use.
+"""Names on the command line: a table from name to class, imported on first use.
 
 Built-in entries are one line each; other packages add theirs with the entry point groups
 `semstab.backends`, `semstab.datasets`, `semstab.backbones` and `semstab.filters`.
@@ -45,7 +45,11 @@ class Registry:
         }
 
     def entry(self, name: str) -> Entry:
-        """Return the entry of that name. Raises ConfigError, with the nearest known name, where there is none."""
+        """Return the entry of that name.
+
+        Raises:
+            ConfigError: If there is none, with the nearest known name.
+        """
         entries = self.entries()
         if name not in entries:
             raise ConfigError(f"{self.kind} '{name}' is not known; {nearest(name, sorted(entries))}")
@@ -54,8 +58,10 @@ class Registry:
     def load(self, name: str) -> Any:
         """Import the class behind a name.
 
-        Raises ConfigError where the name is not known, MissingDependencyError where its packages are not installed, or
-        fail when they are imported, as those of versions that do not fit each other do.
+        Raises:
+            ConfigError: If the name is not known.
+            MissingDependencyError: If its packages are not installed, or fail when they are imported, as those of
+                versions that do not fit each other do.
         """
         entry = self.entry(name)
         module, _, attribute = entry.target.partition(":")

@@ -18,7 +18,7 @@ UInt8 = npt.NDArray[np.uint8]
 Mask = npt.NDArray[np.bool_]
 
 Scope = Literal["these frames", "this scene", "other scenes"]
-"""What varies in an interval: locations, frames of the same scene flown again, or both."""
+"""The source of variation in an interval: locations, frames of the same scene flown again, or both."""
 
 THESE_FRAMES: Scope = "these frames"
 THIS_SCENE: Scope = "this scene"

@@ -41,8 +41,10 @@ def run(
 ) -> Result:
     """Fuse, measure and compare what the configuration selects; as `run_study`, but a failing unit is an error.
 
-    Without a folder `out` the result has summaries, but no voxels. Raises ConfigError or DataError, or the error of a
-    unit, once everything else has been written.
+    Without a folder `out` the result has summaries, but no voxels.
+
+    Raises:
+        ConfigError, DataError: If the plan cannot be made, or a unit failed, once everything else has been written.
     """
     with contextlib.ExitStack() as stack:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory()) if out is None else out)
@@ -69,8 +71,11 @@ def run_study(
     Each unit is kept when it is finished, under a key of its settings and its input: a killed study is resumed by the
     same command, and a changed setting computes again only the units that it touches. `command` goes into the manifest.
 
-    Raises ConfigError or DataError where the plan does not fit together, or a scene's depth and poses contradict each
-    other, before anything is computed. A unit that fails later is among the result's failures, and the others finish.
+    A unit that fails later is among the result's failures, and the others finish.
+
+    Raises:
+        ConfigError, DataError: If the plan does not fit together, or a scene's depth and poses contradict each other,
+            before anything is computed.
     """
     return _execute(config, Path(out), executor or InProcess(), observers, command)[0]
 
@@ -78,7 +83,7 @@ def run_study(
 def _execute(
     config: Config, out: Path, executor: Executor, observing: Sequence[Observer], command: Sequence[str]
 ) -> tuple[Result, Mapping[str, BaseException]]:
-    """The result, and the exceptions of failing units in this process, by message."""
+    """Return the result, and the exceptions of failing units in this process, by message."""
     started, observers = time.perf_counter(), Observers(observing)
     config = resolve(config)
     config, advice = with_voxel_size(config)
@@ -143,7 +148,7 @@ class _Execution:
                     self._keep(planned[own.identity], own, in_tiles=unit is not None)
 
     def _begin(self, start: Start) -> tuple[list[Work], dict[str, TiledUnit]]:
-        """Works of the units that are fused whole, and the units in tiles; those that cannot be fused fail."""
+        """Return the work of units that are fused whole, and the units in tiles; those that cannot be fused fail."""
         with self.units.watch("sizing"):
             sizing = planned_sizes(self._plan.config, self._missing, self._executor.width)
             trim_malloc()

@@ -23,13 +23,13 @@ from semstab.errors import ConfigError, MissingDependencyError
 
 CONNECT_SECONDS = 10
 AWAY = OSError, RuntimeError, AttributeError
-"""What a client of Dask raises where its scheduler does not answer, while it gives it up, and once it has none."""
+"""The errors of a client of Dask whose scheduler does not answer, while it gives it up, and once it has none."""
 
 LOST = "the scheduler went away; start it again, and the same command goes on from what is kept"
 
 Future = cf.Future[tuple[Outcome, ...]]
 NextJob = Callable[[], Job | None]
-"""Gives the next job; None where there is none, until outcomes that were yielded call for more."""
+"""A function that gives the next job; None where there is none until outcomes that were yielded call for more."""
 
 
 class Executor:
@@ -47,7 +47,7 @@ class Executor:
         raise NotImplementedError
 
     def close(self) -> None:
-        """Nothing more is to be run."""
+        """End it: nothing more is to be run."""
 
 
 class InProcess(Executor):
@@ -62,7 +62,7 @@ class InProcess(Executor):
 
 
 class LocalProcesses(Executor):
-    """That many processes on this machine, which share its cores and its free memory."""
+    """An executor of that many processes on this machine, which share its cores and its free memory."""
 
     elsewhere = True
 
@@ -187,7 +187,9 @@ def _use_threads(count: int) -> None:
 class DaskCluster(Executor):
     """The workers of a Dask scheduler, for example tcp://127.0.0.1:8786; they must have semstab and see the data.
 
-    Raises MissingDependencyError without dask, ConfigError where no scheduler answers.
+    Raises:
+        MissingDependencyError: Without dask.
+        ConfigError: If no scheduler answers.
     """
 
     elsewhere = True
@@ -206,7 +208,9 @@ class DaskCluster(Executor):
         """Yield outcomes as jobs finish. The scheduler gives the job of a worker that died to another one.
 
         There are never more at the scheduler than its workers have threads, so that whoever is free has the next one.
-        Raises ConfigError where the scheduler went away and jobs are left.
+
+        Raises:
+            ConfigError: If the scheduler went away and jobs are left.
         """
         if (first := next_job()) is None:
             return
@@ -229,7 +233,7 @@ class DaskCluster(Executor):
             raise ConfigError(LOST)
 
     def _threads(self) -> int:
-        """Threads of the workers that there are now; 0 where the scheduler does not answer."""
+        """Return threads of the workers that there are now; 0 where the scheduler does not answer."""
         try:
             self.width = max(1, sum(self._client.nthreads().values()))
         except AWAY:
@@ -275,5 +279,5 @@ def _distributed() -> Any:
 
 
 def cores() -> int:
-    """Cores that this process may use."""
+    """Return cores that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

@@ -41,7 +41,7 @@ from semstab.statistics.verdict import Limits
 from semstab.task import Task, read
 
 WORST = 3
-"""So many frames are named that moved the map most."""
+"""The number of frames that are named because they moved the map most."""
 
 SMALL = 1 << 30
 """A process with fewer bytes keeps freed memory for the next table."""
@@ -53,7 +53,8 @@ Savers = dict[str, Callable[[Path], None]]
 def finish(live: LiveMap, stream: Stream, watch: Stopwatch) -> Outcome:
     """Measure a map, a tile of one or the pass over the frames of tiles, and write its files.
 
-    Raises DataError where no pixel of a whole map was valid.
+    Raises:
+        DataError: If no pixel of a whole map was valid.
     """
     work, config, tile = live.work, live.work.config, live.work.tile
     fused = _fused_map(live, watch) if work.fuses else None
@@ -110,7 +111,7 @@ class FusedMap(NamedTuple):
 
 
 def _fused_map(live: LiveMap, watch: Stopwatch) -> FusedMap:
-    """The tables of a map, whose backend is let go: the statistics have its memory."""
+    """Return the tables of a map, whose backend is let go: the statistics have its memory."""
     assert live.backend is not None
     config, classes = live.work.config, live.task.mapping.target.classes
     with watch("table"):
@@ -127,7 +128,7 @@ def _fused_map(live: LiveMap, watch: Stopwatch) -> FusedMap:
 
 
 def _left(live: LiveMap, table: VoxelTable, events: Events | None = None) -> tuple[VoxelTable, Events | None]:
-    """The map and its log without the locations whose fused class is left out."""
+    """Return the map and its log without the locations whose fused class is left out."""
     if not live.left_out:
         return table, events
     keep = np.flatnonzero(~np.isin(dominant(table), live.left_out))
@@ -135,7 +136,7 @@ def _left(live: LiveMap, table: VoxelTable, events: Events | None = None) -> tup
 
 
 def analyse_sample(task: Task, config: Config, sample: MapSample, observations: ObservationSample | None) -> Analysis:
-    """The statistics of a map; its true labels are right, and bound how far geometry lets labels agree."""
+    """Return the statistics of a map; its true labels are right, and bound how far geometry lets labels agree."""
     return analyse(
         sample, observations, name=task.backbone, edges=config.strata, critical=config.critical_classes,
         scope=config.scope, limits=Limits(**config.verdict.model_dump()),
@@ -150,7 +151,7 @@ def _quality(stream: Stream) -> FrameQuality | None:
 
 
 def no_voxels(task: Task, config: Config) -> DataError:
-    """The error of an empty map: it says what is missing in the first frame."""
+    """Return the error of an empty map: it says what is missing in the first frame."""
     frame = read(task, task.indices[0], config.pixel_stride)
     depth = np.mean(np.isfinite(frame.depth) & (frame.depth > 0))
     labelled = np.mean(frame.predicted != frame.ignore_id)
@@ -214,7 +215,7 @@ def _reduced(sums: Float64) -> ReducedScores:
 
 
 def _worst(rows: Series, scene: Scene) -> tuple[FrameDrift, ...]:
-    """The frames that moved the map most, of those that met as many known voxels as half of the frames do."""
+    """Return the frames that moved the map most, of those that met as many known voxels as half of the frames do."""
     known, drift = rows.column("voxels") - rows.column("new_voxels"), rows.drift
     met = np.flatnonzero(known >= max(1, np.median(known) if len(known) else 0))
     worst = met[np.argsort(-drift[met], kind="stable")][:WORST]
@@ -242,7 +243,7 @@ def _savers(
     sample: MapSample | None,
     analysis: Analysis | None,
 ) -> Savers:
-    """The files of a unit, of a tile, or of the pass over the frames of tiles.
+    """Return the files of a unit, of a tile, or of the pass over the frames of tiles.
 
     A tile's voxels to which statistics add columns wait in its folder until the whole map is there.
     """
@@ -336,16 +337,19 @@ of the points once in 300 draws."""
 def estimate_up(points: VoxelTable | npt.ArrayLike, poses: Sequence[npt.ArrayLike] | npt.ArrayLike) -> Float64:
     """Return the world's up axis (3,): the normal, towards the cameras, of the plane that is likely the ground.
 
-    points  a fused map, whose voxels count by area; or world points (n, 3), metres
-    poses   (m, 4, 4) camera-to-world of the frames behind it, OpenCV axes; or (m, 3, 3): down, forward and centre
-
     Up in the image is up in the world for a level camera, and straight ahead for one that looks down. So of the largest
     planes of the map (RANSAC, seeded) the cameras see from above, the one with the largest share * cos(angle to the up
     of a camera that looks 27 degrees down) is taken: before a level camera a wall counts half as much as a floor.
 
     It is wrong where the ground is not among the largest planes (a façade filmed from the street, a tilted table top),
     where cameras are rolled by tens of degrees, and by the ground's own slope. Set `up_axis` instead then.
-    Raises DataError where there are fewer than 3 points, or no plane with the cameras above it.
+
+    Args:
+        points: A fused map, whose voxels count by area; or world points (n, 3), metres.
+        poses: (m, 4, 4) camera-to-world of the frames behind it, OpenCV axes; or (m, 3, 3): down, forward and centre.
+
+    Raises:
+        DataError: If there are fewer than 3 points, or no plane with the cameras above it.
     """
     at = points.centers if isinstance(points, VoxelTable) else np.asarray(points, dtype=np.float64)
     down, forward, centre = np.asarray(poses, dtype=np.float64)[:, :3, -3:].transpose(2, 0, 1)
@@ -359,7 +363,7 @@ def estimate_up(points: VoxelTable | npt.ArrayLike, poses: Sequence[npt.ArrayLik
 
 
 def _planes(points: Float64, cameras: Float64) -> Iterator[tuple[Float64, float]]:
-    """Normal (3,) towards the cameras, and share of the points, of the largest planes: each in what others left."""
+    """Yield normal (3,) towards the cameras and share of points of the largest planes, each in what others left."""
     origin = np.median(points, axis=0)
     rest, cameras = points - origin, cameras - origin
     rng = np.random.default_rng(0)
@@ -382,7 +386,7 @@ def _planes(points: Float64, cameras: Float64) -> Iterator[tuple[Float64, float]
 
 
 def _largest_plane(points: Float64, distance: float, rng: np.random.Generator) -> Mask:
-    """Which points (n,) lie within a distance of that plane through three of them which has most (RANSAC).
+    """Return which points (n,) lie within a distance of that plane through three of them which has most (RANSAC).
 
     Here and not by Open3D, as a run that fuses without it takes a second to load it.
     """

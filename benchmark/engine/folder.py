@@ -48,7 +48,7 @@ LAYOUT = "# semstab, folder layout 4"
 """First line of config.yaml: a folder that begins otherwise is of another version."""
 
 EARLIER_LAYOUT = "# semstab, folder layout 3"
-"""Of version 0.3, whose results are read for one version."""
+"""The first line of version 0.3, whose results are read for one version."""
 
 SETTINGS = "config.yaml"
 FAILURES = "failures.log"
@@ -74,7 +74,8 @@ def require_file_names(out: Path, units: Iterable[Unit]) -> None:
 class Folder:
     """OUT/ of a run or study, with what was computed with the same settings; one process owns it until `close`.
 
-    Raises ConfigError where another process does, or where it holds something else, or results of an earlier version.
+    Raises:
+        ConfigError: If another process does, or where it holds something else, or results of an earlier version.
     """
 
     def __init__(self, path: str | Path, config: Config) -> None:
@@ -140,7 +141,7 @@ class Folder:
                 log.write(f"{outcome.error}\n{outcome.trace}\n")
 
     def record(self, planned: PlannedUnit, content: UnitContent) -> Record:
-        """The record of a unit from the content of its file."""
+        """Return the record of a unit from the content of its file."""
         assert content.summary is not None
         suffix = "" if _in_tiles(planned.unit, content) else ".parquet"
         voxels, truth = (f"{name}/{planned.unit.slug}{suffix}" for name in (VOXELS, TRUTH))
@@ -166,7 +167,7 @@ class Folder:
 
     @contextlib.contextmanager
     def started(self, config: Config) -> Iterator[Start]:
-        """A start, by whose name workers know the folder while the block lasts."""
+        """Begin a start, by whose name workers know the folder while the block lasts."""
         start = Start(uuid.uuid4().hex, self.path, config.threads)
         for name in WRITTEN:
             for folder in (self.path / name, *self.path.glob(f"{name}/*/")):
@@ -179,7 +180,7 @@ class Folder:
             start.marker.unlink(missing_ok=True)
 
     def _is_whole(self, planned: PlannedUnit, content: UnitContent) -> bool:
-        """Whether the unit's file has what is wanted of it, and its other files are there as they were."""
+        """Return whether the unit's file has what is wanted of it, and its other files are there as they were."""
         if planned.regions:
             return content.regions is not None
         summary = content.summary
@@ -192,7 +193,7 @@ class Folder:
         )
 
     def are_whole(self, files: Mapping[str, str | None]) -> bool:
-        """Whether files are there, with these digests; the first that is not as it was is told."""
+        """Return whether files are there, with these digests; the first that is not as it was is told."""
         for name, digest in files.items():
             path = self.path / name
             if digest is None or not path.exists():
@@ -218,12 +219,16 @@ def _in_tiles(unit: Unit, content: UnitContent, of: str = VOXELS) -> list[str]:
 
 
 def unit_key(identity: str, digest: str) -> str:
-    """Under which a unit is kept: the hash of its settings, then one of its input."""
+    """Return the key of a unit: the hash of its settings, then one of its input."""
     return identity + hashlib.blake2b(digest.encode(), digest_size=8).hexdigest()
 
 
 def load_result(folder: str | Path) -> Result:
-    """What a finished run or study found, from its folder. Raises DataError where it is not there or damaged."""
+    """Return what a finished run or study found, from its folder.
+
+    Raises:
+        DataError: If it is not there or damaged.
+    """
     folder = Path(folder)
     path = folder / "summary.json"
     if _is_earlier(folder, (LAYOUT, EARLIER_LAYOUT)):
@@ -242,7 +247,7 @@ def load_result(folder: str | Path) -> Result:
 
 
 def _contradiction(result: Result) -> str | None:
-    """What in a result refers to something that is not in it; None where nothing does."""
+    """Return what in a result refers to something that is not in it; None where nothing does."""
     if other := [record.unit.backend for record in result.select() if record.unit.backend != result.backend]:
         return f"a run at the base settings is fused by '{other[0]}', not by '{result.backend}'"
     for record in result.records:
@@ -259,7 +264,7 @@ def _contradiction(result: Result) -> str | None:
 
 
 def _with_files(records: Sequence[Record], change: Callable[[Path], Path]) -> tuple[Record, ...]:
-    """The records with other paths of their files: in summary.json as they are called in the folder."""
+    """Return the records with other paths of their files: in summary.json as they are called in the folder."""
 
     def files(record: Record) -> dict[str, Any]:
         return {name: (path := getattr(record, name)) and change(path) for name in ("voxels_file", "truth_file")}
@@ -268,7 +273,7 @@ def _with_files(records: Sequence[Record], change: Callable[[Path], Path]) -> tu
 
 
 def _claimed(path: Path) -> dict[str, Any] | None:
-    """The settings of an earlier start; None where there is none. Changes nothing."""
+    """Return the settings of an earlier start; None where there is none. Changes nothing."""
     if not path.exists():
         return None
     if not path.is_dir():

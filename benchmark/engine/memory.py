@@ -89,7 +89,7 @@ FEW = 8
 """Pairs of successive frames, evenly spaced, from which the size of a map is estimated."""
 
 SHARE = 0.5
-"""Of the memory for maps, a tile takes so much: a hash or a grid that doubles needs room."""
+"""The part of the memory for maps that a tile takes: a hash or a grid that doubles needs room."""
 
 CROWDED = 1.5
 """A tile may have that many times the mean number of voxels of its size."""
@@ -197,7 +197,10 @@ class MapSize(NamedTuple):
 
 
 def _tile_edge(planned: PlannedUnit, size: MapSize, budget: float, width: int, *, soft: bool) -> int:
-    """The largest edge of a tile, a power of 2, within the budget; smaller where several processes share the tiles."""
+    """Return the largest edge of a tile, a power of 2, within the budget.
+
+    Smaller where several processes share the tiles.
+    """
     edge = LARGEST
     while edge > SMALLEST:
         voxels = min(CROWDED * size.by_column * edge**2, size.voxels)
@@ -239,7 +242,7 @@ def _count(seen: Sequence[Int64]) -> int:
 
 
 def _geometry(task: Task, settings: Config, index: int) -> Frame:
-    """The frame as it is fused, but for its labels, which may leave pixels out."""
+    """Return the frame as it is fused, but for its labels, which may leave pixels out."""
     frame = task.scene.geometry(index)
     if task.perturbation is not None:
         frame = perturb(frame, task.perturbation, task.scene.name)
@@ -252,11 +255,11 @@ STEP = 32e6
 """Bytes by which the process may grow before its maps are measured again."""
 
 AMPLE = 4
-"""Where that many times the bytes of the maps are left, freed memory is kept: the next images need not clear it."""
+"""The free memory, in bytes of the maps, from which on freed memory is kept: the next images need not clear it."""
 
 
 class MemoryBudget:
-    """Watches the memory of a pass: `memory_gb` or what is free, shared by `width` processes."""
+    """The memory budget of a pass: `memory_gb` or what is free, shared by `width` processes."""
 
     def __init__(self, memory_gb: float | None, width: int) -> None:
         self._limit = None if memory_gb is None else memory_gb * GB / width

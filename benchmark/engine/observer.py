@@ -1,4 +1,4 @@
-"""Who watches a run or a study: the progress bar, the recording and the report are observers."""
+"""Observers of a run or a study, such as the progress bar, the recording and the report."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 
 class Observer:
-    """Watches; override what is of interest.
+    """An observer of a run; override what is of interest.
 
     An observer sees frames and live maps of the units at the base settings, by whatever backend, that are fused whole
     in this process: not of those in tiles, and not of those that other processes or machines fuse.
@@ -29,37 +29,37 @@ class Observer:
     wants_color = False
 
     def run_started(self, plan: Plan, finished: Mapping[str, UnitContent]) -> None:
-        """The plan is made, nothing is fused yet; an earlier start finished these units, by identity."""
+        """Take note that the plan is made and nothing fused yet; an earlier start finished these units, by identity."""
 
     def geometry_checked(self, task: Task, verdict: Verdict) -> None:
-        """Depth and poses of the task's scene were compared, and do not contradict each other."""
+        """Take note that depth and poses of the task's scene were compared, and do not contradict each other."""
 
     def group_started(self, task: Task, config: Config, backends: Mapping[Unit, FusionBackend]) -> None:
-        """The task's frames go into these maps from now on; `config` has the settings of the first of these units."""
+        """Take note of the maps that the task's frames go into; `config` is that of the first of these units."""
 
     def frame_fused(self, task: Task, frame: Frame, rows: Mapping[Unit, FrameRow]) -> None:
-        """A frame went into all maps of the group; `frame` holds labels in the run's label space."""
+        """Take note that a frame went into all maps of the group; `frame` holds labels in the run's label space."""
 
     def advanced(self, frames: int, what: str) -> None:
-        """So many frames went into a map, wherever that is; `what` names the unit."""
+        """Take note that so many frames went into a map, wherever that is; `what` names the unit."""
 
     def unit_finished(
         self, planned: PlannedUnit, content: UnitContent | None, table: VoxelTable | None, error: str | None
     ) -> None:
-        """A unit is computed and kept, or failed for the reason in `error`.
+        """Take note that a unit is computed and kept, or failed for the reason in `error`.
 
         The table holds its voxels where it is watched and was fused whole in this process.
         """
 
     def run_finished(self, result: Result) -> None:
-        """The summary has been written."""
+        """Take note that the summary has been written."""
 
     def close(self) -> None:
-        """The end, also after an interruption."""
+        """Take note of the end, also after an interruption."""
 
 
 class Observers:
-    """Tells several of them; one that fails hears nothing more, and the run goes on without it."""
+    """Several observers as one; one that fails hears nothing more, and the run goes on without it."""
 
     def __init__(self, observers: Sequence[Observer] = ()) -> None:
         self._listening = list(observers)
@@ -67,7 +67,7 @@ class Observers:
 
     @property
     def want_color(self) -> bool:
-        """Whether frames should have their colour."""
+        """Return whether frames should have their colour."""
         return any(observer.wants_color for observer in self._listening)
 
     def tell(self, call: Callable[[Observer], None]) -> None:

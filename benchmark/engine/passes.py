@@ -76,8 +76,9 @@ def fuse_sequence(fusion: Fusion) -> Iterator[Outcome]:
 class Fusion:
     """The maps of a pass, and the bookkeeping around it: failures, memory, time by stage.
 
-    failed   outcomes of the works that failed
-    put_off  works for another pass, where all maps do not fit into the memory
+    Attributes:
+        failed: Outcomes of the works that failed.
+        put_off: Works for another pass, where all maps do not fit into the memory.
     """
 
     def __init__(self, scene: Scene, works: Sequence[Work], observers: Observers) -> None:
@@ -99,7 +100,7 @@ class Fusion:
                 observers.tell(lambda observer: observer.group_started(task, config, backends))  # noqa: B023
 
     def decoded_frames(self) -> Generator[Fetched[Decoded], None, None]:
-        """Frames in order, decoded ahead by threads."""
+        """Yield frames in order, decoded ahead by threads."""
         fetched = prefetch(self._decode, self.order, threads=self._threads, size=lambda each: each.nbytes)
         with contextlib.closing(fetched):
             for each in fetched:
@@ -123,7 +124,7 @@ class Fusion:
 
     @contextlib.contextmanager
     def failing(self, maps: Sequence[LiveMap]) -> Iterator[None]:
-        """An error that is raised in the block becomes the outcome of these maps, which are given up."""
+        """Turn an error that is raised in the block into the outcome of these maps, which are given up."""
         lost = list(maps)
         try:
             yield
@@ -179,7 +180,7 @@ def _scene(work: Work) -> Scene:
 
 @functools.lru_cache(maxsize=1)
 def _dataset(_start: str, name: str, options: str) -> Dataset:
-    """The dataset, opened once for a start: its scenes share what they read or render."""
+    """Return the dataset, opened once for a start: its scenes share what they read or render."""
     return open_dataset(name, json.loads(options))
 
 
@@ -194,7 +195,7 @@ def _ground_truth(scene: Scene, index: int) -> Frame | None:
 
 
 def _measured_regions(scene: Scene, work: Work) -> Outcome:
-    """The outcome of a unit of regions: the means over its pairs of sampled frames."""
+    """Return the outcome of a unit of regions: the means over its pairs of sampled frames."""
     try:
         rows = [_compared(*pair) for pair in itertools.pairwise(_region_frames(scene, work))]
         flicker, compensated, share = zip(*rows, strict=True) if rows else ((), (), ())
@@ -225,7 +226,7 @@ def _region_frames(scene: Scene, work: Work) -> Iterator[Frame]:
 
 
 def _compared(previous: Frame, current: Frame) -> tuple[float, float, float]:
-    """Flicker, compensated flicker (percent), and the co-visible share of two successive frames."""
+    """Return flicker, compensated flicker (percent), and the co-visible share of two successive frames."""
     before, now = previous.predicted, current.predicted
     flicker = math.nan
     if previous.shape == current.shape:

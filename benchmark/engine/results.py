@@ -49,7 +49,7 @@ class UnitResults:
 
 
 def result_of(plan: Plan, folder: Folder, units: UnitResults) -> Result:
-    """The result of all units that there are: how they agree, and how backbones compare."""
+    """Return the result of all units that there are: how they agree, and how backbones compare."""
     contents, errors, config = units.contents, units.errors, plan.config
     records = tuple(folder.record(each, contents[each.identity]) for each in plan.units if each.identity in contents)
     tables = Tables(most=len({record.unit.backend for record in records}))
@@ -92,10 +92,14 @@ def advice_of(plan: Plan, contents: Mapping[str, UnitContent]) -> dict[str, Voxe
 
 
 def _agreements(config: Config, records: Sequence[Record], tables: Tables, *, must: bool) -> Iterator[Agreement]:
-    """How far backends agree on each scene and backbone that both fused.
+    """Yield how far backends agree on each scene and backbone that both fused.
 
-    must  for each pair of those that must agree; else for the first backend and each other one, where one of the two
-          need not agree
+    Args:
+        config: The settings of the run.
+        records: Its records, those of the first backend first.
+        tables: Their voxel tables.
+        must: Whether to take each pair of those that must agree; else for the first backend and each other one, where
+            one of the two need not agree.
     """
     checked = {backend.name for backend in config.fused_by() if must_agree(backend)}
     groups: dict[tuple[str, str], list[Record]] = {}
@@ -117,7 +121,7 @@ def _alike(config: Config, a: Record, b: Record, tables: Tables) -> Agreement:
 
 
 def _comparisons(config: Config, records: Sequence[Record], tables: Tables) -> Iterator[BackboneComparison]:
-    """The comparison of each scene's base units; with accuracy where there is ground truth."""
+    """Yield the comparison of each scene's base units; with accuracy where there is ground truth."""
     base = [record for record in records if record.variation.sweep == BASE and record.unit.backbone != GROUND_TRUTH]
     for scene in dict.fromkeys(record.unit.scene for record in base):
         there = [record for record in base if record.unit.scene == scene]
@@ -132,7 +136,7 @@ def _comparisons(config: Config, records: Sequence[Record], tables: Tables) -> I
 def _compared_maps(
     scene: str, regions: Regions, observations: Mapping[str, CellObservations] | None
 ) -> BackboneComparison | None:
-    """The comparison of a scene's maps; None where there are not two or more of them in one label space.
+    """Return the comparison of a scene's maps; None where there are not two or more of them in one label space.
 
     With the samples of all, on matched observations.
     """
@@ -146,7 +150,7 @@ def _compared_maps(
 
 
 def _regions_of(there: Sequence[Record], config: Config, tables: Tables) -> Regions:
-    """The maps of a scene's units tile by tile, or whole, with their logs and the ground truth."""
+    """Yield the maps of a scene's units tile by tile, or whole, with their logs and the ground truth."""
     names = [record.unit.backbone for record in there]
     in_tiles = any(record.in_tiles for record in there)
     files = [record.events_file for record in there if config.events]

@@ -59,8 +59,9 @@ OVERVIEW_WIDTH = 1280
 class LiveMap:
     """A work whose frames are being fused, and what goes with its map.
 
-    backend  None where nothing is fused; truth fuses the ground truth, hard the likeliest class of soft scores
-    tiles    (n, 3) each frame and a tile that it meets, where nothing is fused; origin the voxel of its first camera
+    Attributes:
+        backend: None where nothing is fused; truth fuses the ground truth, hard the likeliest class of soft scores.
+        tiles: (n, 3) each frame and a tile that it meets, where nothing is fused; origin the voxel of its first camera.
     """
 
     work: Work
@@ -148,7 +149,7 @@ class LiveMap:
         return [self.task.mapping.target.classes.index(name) for name in self.work.config.exclude.classes]
 
     def sampled_observations(self) -> CellObservations | None:
-        """What was sampled, without the locations that are left out."""
+        """Return what was sampled, without the locations that are left out."""
         if self.sampler is None:
             return None
         return self.sampler.looks(self.task.mapping.target.classes).without(self.left_out)
@@ -220,7 +221,7 @@ class Stream:
         return self._poses.table().reshape(-1, 3, 3)
 
     def prepare(self, fetched: Fetched[Decoded]) -> Prepared:
-        """The frame as the stream's maps fuse it, with its colour only where an observer wants it."""
+        """Return the frame as the stream's maps fuse it, with its colour only where an observer wants it."""
         decoded = fetched.item
         if decoded.error is not None:
             raise decoded.error
@@ -234,7 +235,7 @@ class Stream:
         return Prepared(fetched, frame, truth)
 
     def measure(self, now: Prepared, reports: Mapping[LiveMap, FrameReport]) -> dict[LiveMap, FrameRow]:
-        """Flicker and stability in image coordinates, beside the reports of the maps: a row of each series."""
+        """Return flicker and stability in image coordinates, beside the reports of the maps: a row of each series."""
         frame, decoded, flicker, compensated = now.frame, now.fetched.item, math.nan, math.nan
         with self._watch("flicker") as lap:
             if self._sequential and self._previous is not None and self._previous.shape == frame.shape:
@@ -271,7 +272,7 @@ class Stream:
 
 
 def streams_of(maps: Iterable[LiveMap], watch: Stopwatch, observers: Observers) -> list[Stream]:
-    """The maps by what they share of each frame; tiles share frames though each fuses those that see it."""
+    """Return the maps by what they share of each frame; tiles share frames though each fuses those that see it."""
     groups: dict[Any, list[LiveMap]] = {}
     for live in maps:
         config = live.work.config
@@ -282,7 +283,7 @@ def streams_of(maps: Iterable[LiveMap], watch: Stopwatch, observers: Observers) 
 
 
 def frame_order(streams: Iterable[Stream]) -> Sequence[int]:
-    """The frames of all of them."""
+    """Return the frames of all of them."""
     first, *others = {stream.frames for stream in streams} or {range(0)}
     return first if isinstance(first, range) and not others else sorted({*first}.union(*others))
 
@@ -307,13 +308,13 @@ COLUMNS = ("compensated_flicker_percent", "compensated_share", "vc8", "vc16", "s
 """Numbers of a frame and those before it, by the name of their mean over all frames."""
 
 EDGES_EVERY = 8
-"""Of so many frames one is searched for edges."""
+"""The number of frames of which one is searched for edges."""
 
 SIDE = 640
 """Pixels of the longer side from which on every n-th pixel of each axis is measured, so that fusion does not wait."""
 
 WORST, THUMBNAIL = 3, 320
-"""So many frames with the most flicker are kept for the report, with at most so many pixels on the longer side."""
+"""The number of frames with the most flicker that the report keeps, and the most pixels of their longer side."""
 
 
 def edge_recall(frame: Frame) -> float:
@@ -326,7 +327,7 @@ def edge_recall(frame: Frame) -> float:
 
 
 class ImageSpaceMeter:
-    """Takes the sampled frames of a unit in order; only the last one stays in memory. rows has COLUMNS of each."""
+    """The image-space measures of a unit's frames, taken in order; only the last one stays in memory."""
 
     def __init__(self, rows: npt.ArrayLike = ()) -> None:
         self.rows = Rows(len(COLUMNS), rows)
@@ -371,7 +372,7 @@ class ImageSpaceMeter:
         return arrays | ({"worst_color": np.stack(known)} if known and len(known) == len(frames) else {})
 
     def result(self, flicker_percent: float) -> ImageSpace:
-        """Means over the frames so far, beside the flicker of the unit's summary."""
+        """Return means over the frames so far, beside the flicker of the unit's summary."""
         return ImageSpace(flicker_percent, **{name: mean(self.rows.column(k)) for k, name in enumerate(COLUMNS)})
 
 
@@ -386,11 +387,11 @@ def _thumbnail(shape: tuple[int, ...]) -> tuple[slice, slice]:
 FACTORS = (0.5, 1.0, 2.0)
 
 SIZE_FRAMES, SIZE_PIXELS = 12, 2**15
-"""At most so many frames, evenly spaced, are fused once more at each voxel size, and about so many pixels of each."""
+"""The most frames, evenly spaced, that are fused once more at each voxel size, and the pixels of each, about."""
 
 
 class SizeSample:
-    """Some pixels of some of a task's frames, from which alpha follows at half, once and twice the voxel size."""
+    """Pixels of some of a task's frames, from which alpha follows at half, once and twice the voxel size."""
 
     def __init__(self, task: Task, config: Config) -> None:
         self._indices = frozenset(task.indices[k] for k in evenly(len(task.indices), SIZE_FRAMES))
@@ -409,7 +410,7 @@ class SizeSample:
             self._frames.append(dataclasses.replace(some, color=None, mask=None, left_out=None, **images))
 
     def alphas(self) -> tuple[SizeAlpha, ...]:
-        """Krippendorff's alpha at each voxel size; none where the scene is larger than a map of the smallest."""
+        """Return Krippendorff's alpha at each voxel size; none where the scene is larger than a map of the smallest."""
         frames = self._frames
         if any(frame.scores is not None for frame in frames):
             frames = [frame if frame.labels is None else self._one_hot(frame, frame.labels) for frame in frames]

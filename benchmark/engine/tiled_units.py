@@ -70,7 +70,7 @@ class TiledUnit:
         return f"{unit.scene} · {unit.backbone} · {unit.backend}"
 
     def next_job(self) -> Job | None:
-        """The next tile; None where there is none, until the pass over the frames tells them."""
+        """Return the next tile; None where there is none, until the pass over the frames tells them."""
         if self._failed or not self._waiting:
             return None
         task, frames = self._waiting.pop(0)
@@ -93,7 +93,7 @@ class TiledUnit:
         return self.ended()
 
     def ended(self) -> Outcome | None:
-        """The outcome of the unit once all of its tiles are there."""
+        """Return the outcome of the unit once all of its tiles are there."""
         if self._tiles is None or len(self._results) < 1 + len(self._tiles):
             return None
         tiles = {task: self._results[name] for name, (task, _) in self._tiles.items()}
@@ -105,14 +105,14 @@ class TiledUnit:
         return Outcome(self.planned.identity, content)
 
     def step(self) -> int:
-        """The frames by which the progress advances now: all of the unit's once all tiles are there."""
+        """Return the frames by which the progress advances now: all of the unit's once all tiles are there."""
         parts = 1 + (GUESS if self._tiles is None else len(self._tiles))
         reached = self.planned.frames * len(self._results) // parts
         step, self._advanced = max(0, reached - self._advanced), max(reached, self._advanced)
         return step
 
     def _begin_tiles(self) -> list[TileFrames]:
-        """The tiles that are still to be computed; files of the unit that belong to none of them are removed."""
+        """Return the tiles that are still to be computed; files of the unit that belong to none of them are removed."""
         frames = self._results[self._frames.name]
         self._tiles = {}
         for place, own in frames.tiles().items():
@@ -143,7 +143,11 @@ def assembled(
     sample: MapSample | None,
     start: Start,
 ) -> UnitContent:
-    """Return the content of a unit from its frames and tiles. Raises DataError where no pixel was valid."""
+    """Return the content of a unit from its frames and tiles.
+
+    Raises:
+        DataError: If no pixel was valid.
+    """
     tasks, tiles, folder = [*results], [*results.values()], start.folder
     task, config, unit = planned.task, planned.config, planned.unit
     sums = functools.reduce(operator.add, (TableSums.read(tile.sums) for tile in tiles)) if tiles else None
@@ -182,7 +186,7 @@ def assembled(
 
 
 def _with_columns(task: TileTask, slug: str, analysis: Analysis, folder: Path) -> Savers:
-    """The file of a tile's voxels, once more with the columns of the statistics."""
+    """Return the file of a tile's voxels, once more with the columns of the statistics."""
     assert task.place is not None
     waiting = folder / task.folder / VOXELS / f"tile={task.place[0]}_{task.place[1]}.parquet"
 
@@ -196,7 +200,7 @@ def _with_columns(task: TileTask, slug: str, analysis: Analysis, folder: Path) -
 
 
 def _centers(files: Sequence[Path], voxel_size: float, step: int) -> Float64:
-    """(n, 3) of every n-th voxel, metres, in the order of a whole table."""
+    """Return (n, 3) of every n-th voxel, metres, in the order of a whole table."""
     parts = [VoxelTable.columns(file, ("ix", "iy", "iz")) for file in files]
     index = np.concatenate([np.stack([*part.values()], axis=1)[::step] for part in parts])
     return (index[np.lexsort(index.T[::-1])] + 0.5) * voxel_size

@@ -32,10 +32,13 @@ MARGIN = 1.0
 
 
 def tiles_met(frame: Frame, voxel_size: float, size: int) -> Int32:
-    """(n, 2) the tiles of that edge in voxels that the frustum between the least and the largest depth meets.
+    """Return (n, 2) the tiles of that edge in voxels that the frustum between the least and the largest depth meets.
 
     A tile is left out where a line separates it from the corners of the frustum, seen from above. None is left out that
-    a pixel falls into. Raises DataError where there are too many.
+    a pixel falls into.
+
+    Raises:
+        DataError: If there are too many.
     """
     depth = frame.depth[(frame.depth > 0) & np.isfinite(frame.depth)]
     if not depth.size:
@@ -67,9 +70,10 @@ def tiles_met(frame: Frame, voxel_size: float, size: int) -> Int32:
 class TileMeta:
     """The fields of a result that are no arrays.
 
-    files    digests of its files, by their path in the folder
-    checked  how far it agrees with the reference on a sample of its voxels
-    origin   voxel of the first camera
+    Attributes:
+        files: Digests of its files, by their path in the folder.
+        checked: Agreement with the reference on a sample of its voxels.
+        origin: Voxel of the first camera.
     """
 
     files: Mapping[str, str]
@@ -83,11 +87,12 @@ class TileMeta:
 class TileResult(TileMeta):
     """The result of a whole unit, of one tile, or of the pass over all frames; those of tiles make a unit's.
 
-    series   (F, C) NUMBERS of each frame
-    sums     of its voxels, by name, as `TableSums` has them
-    reduced  sums of the map of labels that soft scores were reduced to; empty where there are none
-    image    (F, C) stability of each frame in image coordinates, poses (F, 3, 3) of the cameras: of all frames
-    seen     (m, 3) a frame and a tile that it meets, ascending by frame
+    Attributes:
+        series: (F, C) NUMBERS of each frame.
+        sums: Sums of its voxels, by name, as `TableSums` has them.
+        reduced: Sums of the map of labels that soft scores were reduced to; empty where there are none.
+        image: (F, C) stability of each frame in image coordinates, poses (F, 3, 3) of the cameras: of all frames.
+        seen: (m, 3) a frame and a tile that it meets, ascending by frame.
     """
 
     series: Float64
@@ -119,7 +124,7 @@ class TileResult(TileMeta):
         return cls(**vars(meta), **own, sums=sums)
 
     def tiles(self) -> dict[tuple[int, int], list[int]]:
-        """The frames that meet each tile, in order, by its place."""
+        """Return the frames that meet each tile, in order, by its place."""
         frames: dict[tuple[int, int], list[int]] = {}
         for index, x, y in self.seen.tolist():
             frames.setdefault((x, y), []).append(index)
@@ -134,13 +139,13 @@ ARRAYS = ("series", "reduced", "image", "poses", "seen")
 SUMS = ("points", "voxels", "new_voxels", "drift_sum", "seconds")
 
 SECONDS = ("association_seconds", "update_seconds")
-"""Not known of a frame that no tile fused."""
+"""The columns that are not known of a frame that no tile fused."""
 
 MEANS = ("map_vss", "map_entropy", "map_recurrent")
 
 
 def joined_series(frames: Float64, tiles: Sequence[Float64]) -> Series:
-    """The time series of a unit, from the rows of NUMBERS of its frames, and those of each tile of its map."""
+    """Return the time series of a unit, from the rows of NUMBERS of its frames, and those of each tile of its map."""
     column, rows = {name: k for k, name in enumerate(NUMBERS)}, frames.copy()
     frame = rows[:, column["frame"]]
     totals = {name: np.zeros(len(rows)) for name in MEANS}
@@ -162,6 +167,6 @@ def joined_series(frames: Float64, tiles: Sequence[Float64]) -> Series:
 
 
 def _latest(frame: Float64, own: Float64, values: Float64) -> Float64:
-    """(F,) the value of the last of its own frames at each frame, 0 before them."""
+    """Return (F,) the value of the last of its own frames at each frame, 0 before them."""
     latest: Float64 = np.concatenate([np.zeros(1), values])[np.searchsorted(own, frame, side="right")]
     return latest

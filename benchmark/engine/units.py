@@ -52,13 +52,14 @@ NOISES = tuple(name for name in Perturbation.model_fields if name != "seed")
 class PlannedUnit:
     """A backbone on a scene, fused by a backend under one variation, and what is wanted of it.
 
-    config       its settings as those of a run of its own: one scene, one backbone, one backend
-    task         the unit, opened and checked
-    identity     hash of the settings that its numbers depend on; what shares it is computed once
-    image_space  whether its stability in image coordinates is wanted
-    kept         whether its voxels and its time series are kept
-    judged       whether the statistics say something of its map: not of the one that others are only checked against
-    sampled      whether its map is checked against the reference on a sample of its voxels
+    Attributes:
+        config: Its settings as those of a run of its own: one scene, one backbone, one backend.
+        task: The unit, opened and checked.
+        identity: Hash of the settings that its numbers depend on; what shares it is computed once.
+        image_space: Whether its stability in image coordinates is wanted.
+        kept: Whether its voxels and its time series are kept.
+        judged: Whether the statistics say something of its map: not of the one that others are only checked against.
+        sampled: Whether its map is checked against the reference on a sample of its voxels.
     """
 
     variation: Variation
@@ -77,12 +78,12 @@ class PlannedUnit:
 
     @property
     def frames(self) -> int:
-        """How many go into its map."""
+        """Return how many go into its map."""
         return len(self.task.indices)
 
     @property
     def regions(self) -> bool:
-        """Whether it is the flicker of regions without classes, and nothing is fused."""
+        """Return whether it is the flicker of regions without classes, and nothing is fused."""
         return self.variation.sweep == REGIONS
 
     def merged_with(self, other: PlannedUnit) -> PlannedUnit:
@@ -101,11 +102,11 @@ class Plan:
     regions: tuple[PlannedUnit, ...]
 
     def every(self) -> list[PlannedUnit]:
-        """The units, then the regions."""
+        """Return the units, then the regions."""
         return [*self.units, *self.regions]
 
     def distinct(self) -> dict[str, PlannedUnit]:
-        """What is to be computed, by its identity, with all that is wanted of it anywhere."""
+        """Return what is to be computed, by its identity, with all that is wanted of it anywhere."""
         distinct: dict[str, PlannedUnit] = {}
         for each in (*self.regions, *self.units):
             known = distinct.get(each.identity)
@@ -129,7 +130,8 @@ class Plan:
 def make_plan(config: Config) -> Plan:
     """Open what the configuration selects and check that it fits together; no image is read.
 
-    Raises ConfigError, DataError or MissingDependencyError where something does not.
+    Raises:
+        ConfigError, DataError, MissingDependencyError: If something does not.
     """
     for backend in config.fused_by():  # an engine that is missing is said before all else
         create(backend.name, voxel_size=config.voxel_size, num_classes=2, **backend.options)
@@ -179,12 +181,12 @@ def _base_units(config: Config, scenes: Mapping[str, Scene]) -> Iterator[Planned
 
 
 def _is_sampled(config: Config, backend: BackendConfig) -> bool:
-    """Whether what that backend fuses is checked against a sample: not the reference itself."""
+    """Return whether what that backend fuses is checked against a sample: not the reference itself."""
     return config.check == SAMPLE and backend.name != "numpy" and must_agree(backend)
 
 
 def must_agree(backend: BackendConfig) -> bool:
-    """Whether it must agree with the others: as it is configured, or else if it associates pixel by pixel."""
+    """Return whether it must agree with the others: as it is configured, or else if it associates pixel by pixel."""
     pointwise: bool = getattr(REGISTRY.load(backend.name), "pointwise", True)
     return pointwise if backend.check is None else backend.check
 
@@ -225,7 +227,10 @@ def _varied_units(config: Config, base: Sequence[PlannedUnit], scenes: Mapping[s
 
 
 def _variations(config: Config) -> Iterator[tuple[Variation, Part, Any]]:
-    """Each point of each sweep, where it applies, and its value; then the taxonomy or the backend that is changed."""
+    """Yield each point of each sweep, where it applies, and its value.
+
+    Then the taxonomy or the backend that is changed.
+    """
     if config.shared_taxonomy is not None:
         yield Variation(SHARED), Part(), config.shared_taxonomy
     for sweep, part in config.sweeps.given():
@@ -252,14 +257,17 @@ def _changed_settings(config: Config, variation: Variation, value: Any, base: Co
 
 
 def _evenly_sampled(count: int, base: Config) -> FrameSelection:
-    """`count` frames, evenly spaced over the extent of the base's: from its start to its stop, or over its list."""
+    """Return `count` frames, evenly spaced over the extent of the base's.
+
+    From its start to its stop, or over its list.
+    """
     extent = base.frames.model_dump(include={"start", "stop", "from_time", "to_time"})
     even, listed = FrameSelection(**extent, spacing="even", count=count), base.frames.list
     return even if listed is None else FrameSelection(list=[listed[k] for k in even.indices(len(listed))])
 
 
 def _check_count(variation: Variation, task: Task) -> None:
-    """Fewer frames than asked for would pass for another sampling density."""
+    """Check that a sweep got all frames that it asks for: fewer would pass for another sampling density."""
     chosen = len(task.indices) + task.left_out  # what lacks a pose or a file is left out, and said so
     if variation.sweep == "frame_count" and chosen != variation.value:
         raise ConfigError(

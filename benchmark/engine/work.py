@@ -1,4 +1,4 @@
-"""What is sent to a worker, and what comes back: small enough for another machine."""
+"""Messages to a worker, and what comes back: small enough for another machine."""
 
 from __future__ import annotations
 
@@ -25,7 +25,8 @@ FRAMES = "frames"
 class Start:
     """A start of a run: its name, the run's folder, the processes that share the machine (width).
 
-    threads  that decode frames ahead; 0: each when it is wanted, None: as many as the machine has for it
+    Attributes:
+        threads: Threads that decode frames ahead; 0: each when it is wanted, None: as many as the machine has for it.
     """
 
     name: str
@@ -43,11 +44,13 @@ class Start:
 class TileTask:
     """One tile of the map of a unit; without a place, the pass over all frames that fuses nothing.
 
-    key     of the unit, under which results are kept
-    size    voxels along the edge of a tile
-    place   (x, y) of the tile: ix // size, iy // size
-    origin  voxel of the first camera, where it is known
-    bound   highest hash in the sample of the tiles before, where that is full: no voxel above it will be in the map's
+    Attributes:
+        key: Key of the unit, under which results are kept.
+        size: Voxels along the edge of a tile.
+        place: (x, y) of the tile: ix // size, iy // size.
+        origin: Voxel of the first camera, where it is known.
+        bound: Highest hash in the sample of the tiles before, where that is full: no voxel above it will be in the
+            map's.
     """
 
     key: str
@@ -58,12 +61,12 @@ class TileTask:
 
     @property
     def name(self) -> str:
-        """Of its result."""
+        """The name of its result."""
         return f"{self.size}_{FRAMES}" if self.place is None else f"{self.size}_{self.place[0]}_{self.place[1]}"
 
     @property
     def folder(self) -> str:
-        """Of the results of the unit, in the folder of the run."""
+        """The folder of the unit's results, in the folder of the run."""
         return f"{TILES}/{self.key}"
 
     @property
@@ -79,10 +82,11 @@ class TileTask:
 class Work:
     """A unit to compute, or a tile of one, and what is wanted of it; see `semstab.engine.units.PlannedUnit`.
 
-    config    with its frames one by one: those of its sequence that all label sources of the plan have
-    left_out  how many selected frames lack a file or a pose
-    regions   whether it is the flicker of regions without classes, and nothing is fused
-    tile      of a unit in tiles; None for all of a unit
+    Attributes:
+        config: Settings with the frames one by one: those of its sequence that all label sources of the plan have.
+        left_out: Number of selected frames that lack a file or a pose.
+        regions: Whether it is the flicker of regions without classes, and nothing is fused.
+        tile: The tile of a unit in tiles; None for all of a unit.
     """
 
     start: Start
@@ -100,30 +104,30 @@ class Work:
 
     @classmethod
     def of(cls, planned: PlannedUnit, start: Start) -> Work:
-        """The whole of a planned unit."""
+        """Return the whole of a planned unit."""
         unit, wanted = planned.unit, (planned.image_space, planned.kept, planned.judged, planned.sampled)
         config = planned.config.model_copy(update={"frames": FrameSelection.of(planned.task.indices)})
         own = (unit.scene, unit.backbone, planned.identity, config)
         return cls(start, *own, *wanted, planned.task.left_out, planned.regions)
 
     def in_tile(self, tile: TileTask, frames: Sequence[int] | None = None) -> Work:
-        """The same of one tile and these frames alone."""
+        """Return the same of one tile and these frames alone."""
         selection = {} if frames is None else {"frames": FrameSelection.of(as_range(frames))}
         return replace(self, config=self.config.model_copy(update=selection), tile=tile)
 
     @property
     def fuses(self) -> bool:
-        """Whether there is a map."""
+        """Return whether there is a map."""
         return self.tile is None or self.tile.place is not None
 
     @property
     def watched(self) -> bool:
-        """Whether observers see its frames and its map: it is kept, and fused whole."""
+        """Return whether observers see its frames and its map: it is kept, and fused whole."""
         return self.kept and self.tile is None
 
     @property
     def measures_images(self) -> bool:
-        """Whether it takes the frames in sequence, to measure them in image coordinates."""
+        """Return whether it takes the frames in sequence, to measure them in image coordinates."""
         return self.tile is None or self.tile.place is None
 
     @property
@@ -140,11 +144,12 @@ Job = tuple[Work, ...]
 class Outcome:
     """The outcome of a work: the content of its file, or the one line that says why there is none.
 
-    tile     name of the tile that was computed, or could not be
-    files    further files by their path in the folder, where the worker does not see that folder
-    cause    the exception, where the work failed in this very process; trace where it was raised
-    table    the voxels of a unit that observers watch, where it was fused in this process
-    seconds  that its pass took, by stage; of the last outcome of a pass only
+    Attributes:
+        tile: Name of the tile that was computed, or could not be.
+        files: Further files by their path in the folder, where the worker does not see that folder.
+        cause: The exception, where the work failed in this very process; trace where it was raised.
+        table: The voxels of a unit that observers watch, where it was fused in this process.
+        seconds: Seconds that its pass took, by stage; of the last outcome of a pass only.
     """
 
     identity: str
@@ -158,7 +163,7 @@ class Outcome:
     seconds: Mapping[str, float] = field(default_factory=dict)
 
     def __getstate__(self) -> dict[str, object]:
-        """Without the exception, which may not travel, and the voxels, which are in the folder."""
+        """Leave out the exception, which may not travel, and the voxels, which are in the folder."""
         return {**self.__dict__, "cause": None, "table": None}
 
 
@@ -181,7 +186,7 @@ def _one_line(error: Exception) -> str:
 
 
 def jobs_of(works: Iterable[Work], width: int) -> list[Job]:
-    """Works by the sequence that they read, in as many jobs as can run at once: the largest ones are halved.
+    """Return work by the sequence that it reads, in as many jobs as can run at once: the largest ones are halved.
 
     Works that observers watch stay together: they are shown a frame once it went into all of these maps.
     """

@@ -58,7 +58,7 @@ WRITERS: Mapping[str, Writer] = {
     ".parquet": lambda chosen, path, settings: tabular.write_parquet(chosen, path),
     ".csv": lambda chosen, path, settings: tabular.write_csv(chosen, path),
 }
-"""By suffix; each takes a map tile by tile and returns the number of voxels."""
+"""The writers by suffix; each takes a map tile by tile and returns the number of voxels."""
 
 SUFFIXES = tuple(WRITERS)
 
@@ -87,20 +87,34 @@ def export(
 ) -> list[Exported]:
     """Write a unit of the run in a folder to files, in the format that each one's suffix names (`SUFFIXES`).
 
-    scene, backbone, backend  which unit; may be left out where there is one, and for the base backend
-    measures  columns that go along: measures, op, category, psa, or what the run's Parquet file has
-    min_op, classes  only voxels seen that often, of these dominant classes
-    thresholds  a file of them: only voxels whose label has the evidence that they ask for (`AcceptanceThresholds`)
-    cell      edge of a raster's cell, in voxels
-    asprs     YAML file CLASS: CODE for LAS; else the table that ships for the taxonomy
-    classify  a cloud: write this cloud, classified; a point outside of all voxels takes the nearest one within
-              `radius` metres, a voxel's edge where not given
-    join      a Parquet file with further columns of the same voxels, such as `compare` writes
-    task_format  coco, labelstudio, cvat or fiftyone: write at most so many (`most`) annotation tasks for it, the places
-              where frames disagree, instead of the map
-    commit, onto, beside  names of `thresholds`, `classify` and `join` in the version before
+    Args:
+        run: Folder of the run.
+        to: Files to write, one or several.
+        scene: Scene of the unit; may be left out where there is one.
+        backbone: Backbone of the unit; may be left out where there is one.
+        backend: Backend of the unit, the base backend where not given.
+        measures: Columns that go along: measures, op, category, psa, or what the run's Parquet file has.
+        min_op: Only voxels seen that often are written.
+        classes: Only voxels of these dominant classes are written; all where empty.
+        thresholds: A file of them: only voxels whose label has the evidence that they ask for (`AcceptanceThresholds`).
+        cell: Edge of a raster's cell, in voxels.
+        asprs: YAML file CLASS: CODE for LAS; else the table that ships for the taxonomy.
+        classify: A cloud: write this cloud, classified; a point outside of all voxels takes the nearest one within
+            `radius`.
+        radius: Metres, a voxel's edge where not given.
+        join: A Parquet file with further columns of the same voxels, such as `compare` writes.
+        commit: Name of `thresholds` in the version before.
+        onto: Name of `classify` in the version before.
+        beside: Name of `join` in the version before.
+        task_format: 'coco', 'labelstudio', 'cvat' or 'fiftyone': write annotation tasks for it, the places where frames
+            disagree, instead of the map.
+        most: The largest number of annotation tasks.
 
-    Raises ConfigError, DataError, MissingDependencyError, each with the file.
+    Returns:
+        Each file that was written, with what it holds.
+
+    Raises:
+        ConfigError, DataError, MissingDependencyError: If a file cannot be written; the message names it.
     """
     files = [Path(file) for file in ([to] if isinstance(to, str | Path) else to)]
     for file in files:
@@ -156,7 +170,7 @@ def _classified(chosen: Chosen, cloud: Path, file: Path, radius: float | None, s
 
 
 def _few_met(tally: joining.Tally, some: Voxels) -> str:
-    """Why few points of a cloud may have a voxel."""
+    """Return why few points of a cloud may have a voxel."""
     said = f"only {tally.classified / tally.points:.1%} of its points lie in or beside a voxel"
     within = tally.classified / max(1, tally.over)
     if within >= FEW_MET:

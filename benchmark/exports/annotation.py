@@ -28,7 +28,7 @@ from semstab.statistics import psa
 from semstab.task import Task
 
 MIN_PSA = 0.8
-"""Where fewer pairs of frames agree a place is annotated, as where belief drifts or is uncertain."""
+"""The share of pairs of frames that must agree: below, a place is annotated, as where belief drifts or is uncertain."""
 
 BLOCK = 16
 """Largest edge of a place, voxels: what a person can judge at once."""
@@ -40,20 +40,21 @@ SMALLEST = 1 / 5000
 """Part of an image, 8 x 8 pixels of 640 x 480, that an outline encloses; what is smaller cannot be judged."""
 
 MORE = 8
-"""So many times the tasks wanted are looked for in the frames: no frame may show a place well."""
+"""The factor on the tasks wanted by which more are looked for in the frames: no frame may show a place well."""
 
 
 @dataclass(frozen=True, eq=False)
 class AnnotationTask:
     """A place to annotate, in the image that shows it best.
 
-    score    bits of entropy that its label removes from the map: the sum over the voxels that the outline shows
-    label    the fused class, and `other` the next one; names
-    voxels   of the place; `op`, how many frames saw them in the median
-    center   (3,) of the place, metres: global coordinates where the scene has a georeference
-    frame    number of the best view, `image` the name of its files
-    outline  polygons (n, 2) in pixels x, y of the image of `size` (width, height)
-    views    names of the other images that show it, the best first
+    Attributes:
+        score: Bits of entropy that its label removes from the map: the sum over the voxels that the outline shows.
+        label: The fused class, and `other` the next one; names.
+        voxels: Number of voxels of the place; `op` is the median of the frames that saw them.
+        center: (3,) of the place, metres: global coordinates where the scene has a georeference.
+        frame: Number of the best view, `image` the name of its files.
+        outline: Polygons (n, 2) in pixels x, y of the image of `size` (width, height).
+        views: Names of the other images that show it, the best first.
     """
 
     score: float
@@ -76,11 +77,14 @@ def annotation_tasks(chosen: Chosen, task: Task, most: int) -> list[AnnotationTa
     frames disagree. Its best view has the largest product of size in the image, how frontal and how sharp it is. A
     place where all frames are wrong alike is not found.
 
-    chosen  the voxels that may be annotated
-    task    whose frames were fused
+    Args:
+        chosen: The voxels that may be annotated.
+        task: The task whose frames were fused.
+        most: The largest number of tasks.
 
-    Raises ConfigError where frames disagree nowhere, or no frame shows it large enough; DataError where the frames have
-    no colour image.
+    Raises:
+        ConfigError: If frames disagree nowhere, or no frame shows it large enough.
+        DataError: If the frames have no colour image.
     """
     places = _Places.of(chosen, MORE * most)
     views = [view for fetched in prefetch(lambda i: _views(task, i, places), task.indices) for view in fetched.item]
@@ -100,7 +104,8 @@ def annotation_tasks(chosen: Chosen, task: Task, most: int) -> list[AnnotationTa
 class _Places:
     """The voxels that are annotated; (n,) the place of each, 0, 1, ..., its two classes, and its entropy in bits.
 
-    projected  brings points (n, 3) of the scene into its projection, where it has one
+    Attributes:
+        projected: Brings points (n, 3) of the scene into its projection, where it has one.
     """
 
     table: VoxelTable
@@ -113,7 +118,7 @@ class _Places:
 
     @classmethod
     def of(cls, chosen: Chosen, most: int) -> _Places:
-        """At most so many places, those with the most entropy."""
+        """Return the places with the most entropy, at most so many."""
         parts = list(chosen)
         first = parts[0]
         table = VoxelTable.joined([part.table.rows(_disagreed(part.table)) for part in parts])
@@ -139,7 +144,7 @@ class _Places:
         )
 
     def task(self, views: list[_View], task: Task) -> AnnotationTask:
-        """The task of a place from its views, the best first."""
+        """Return the task of a place from its views, the best first."""
         best, names = views[0], task.scene.image_name
         own = self.place == best.place
         k = int(np.flatnonzero(own)[0])
@@ -152,14 +157,14 @@ class _Places:
 
 
 def _disagreed(table: VoxelTable) -> Int64:
-    """The rows of voxels on which frames disagree."""
+    """Return the rows of voxels on which frames disagree."""
     category = np.array(CATEGORIES)[categories(table)]
     wanted = np.isin(category, ("drifting", "uncertain")) | (np.nan_to_num(psa(table), nan=1.0) < MIN_PSA)
     return np.flatnonzero(wanted & (table.op >= 2))
 
 
 def _connected(index: npt.NDArray[np.integer[Any]], classes: Int64) -> Int64:
-    """The connected set (n,) of each voxel (n, 3) with others of its classes (n, 2); large ones are cut into blocks."""
+    """Return the connected set (n,) of each voxel (n, 3) with others of its classes (n, 2); blocks cut large ones."""
     pairs, n = cKDTree(index).query_pairs(NEIGHBOURS, output_type="ndarray"), len(index)
 
     def sets(alike: npt.NDArray[np.integer[Any]]) -> Int64:
@@ -180,10 +185,11 @@ def _connected(index: npt.NDArray[np.integer[Any]], classes: Int64) -> Int64:
 class _View:
     """A place in a frame.
 
-    bits     of the voxels that it shows
-    pixels   of the outline
-    area     of the surface across the line of sight, square metres: the more frontal, the larger
-    sharp    mean square of the image's second derivative in the outline
+    Attributes:
+        bits: Bits of the voxels that it shows.
+        pixels: Pixels of the outline.
+        area: Area of the surface across the line of sight, square metres: the more frontal, the larger.
+        sharp: Mean square of the image's second derivative in the outline.
     """
 
     place: int
@@ -197,13 +203,13 @@ class _View:
 
 
 def _ranked(views: list[_View]) -> list[_View]:
-    """The views of a place, the best first."""
+    """Return the views of a place, the best first."""
     area, sharp = (max(getattr(view, name) for view in views) for name in ("area", "sharp"))
     return sorted(views, key=lambda view: -view.bits * view.pixels * (view.area / area) * (view.sharp / sharp))
 
 
 def _views(task: Task, index: int, places: _Places) -> list[_View]:
-    """The places that a frame shows."""
+    """Return the places that a frame shows."""
     image = task.scene.color(index)
     if image is None:
         raise DataError(f"{task.scene.name}, {task.scene.image_name(index)}: the frame has no colour image to annotate")
@@ -237,8 +243,10 @@ def _view(
 def outlined(seen: Mask, voxel: float, smallest: float) -> tuple[tuple[Float64, ...], Mask]:
     """Return polygons around pixels (H, W), gaps up to the width of a voxel filled, and what they enclose.
 
-    voxel     its width, pixels
-    smallest  area of an outline, square pixels
+    Args:
+        seen: (H, W) pixels to outline.
+        voxel: Width of a voxel, pixels.
+        smallest: Area of an outline, square pixels.
     """
     width = int(np.clip(np.ceil(voxel), 3, 31)) | 1
     kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (width, width))

@@ -25,8 +25,9 @@ MOST = 50
 class TaskFile:
     """Tasks of a scene, the most urgent first, and the file that they go to.
 
-    space   the classes that are annotated
-    source  the label source, whose fused classes are proposed
+    Attributes:
+        space: The classes that are annotated.
+        source: The label source, whose fused classes are proposed.
     """
 
     tasks: Sequence[AnnotationTask]
@@ -37,27 +38,27 @@ class TaskFile:
 
     @property
     def folder(self) -> Path:
-        """Where the images are: tasks_images beside tasks.json."""
+        """The folder of the images: tasks_images beside tasks.json."""
         return self.path.with_name(f"{self.path.stem}_images")
 
     def image(self, task: AnnotationTask) -> str:
-        """The file of a task's image, relative to that of the tasks."""
+        """Return the file of a task's image, relative to that of the tasks."""
         return f"{self.folder.name}/{task.image.replace('/', '_')}.jpg"
 
     def by_image(self) -> dict[str, list[tuple[int, AnnotationTask]]]:
-        """The tasks, numbered from 1, by the file of their image."""
+        """Return the tasks, numbered from 1, by the file of their image."""
         found: dict[str, list[tuple[int, AnnotationTask]]] = {}
         for rank, task in enumerate(self.tasks, start=1):
             found.setdefault(self.image(task), []).append((rank, task))
         return found
 
     def beside(self, ending: str) -> Path:
-        """A further file: tasks_ENDING beside tasks.json."""
+        """Return a further file: tasks_ENDING beside tasks.json."""
         return self.path.with_name(f"{self.path.stem}_{ending}")
 
 
 def about(task: AnnotationTask) -> dict[str, Any]:
-    """What is known of a task's place."""
+    """Return what is known of a task's place."""
     return {
         "score": round(task.score, 3), "fused": task.label, "second": task.other, "voxels": task.voxels, "op": task.op,
         "center": [round(x, 3) for x in task.center], "views": list(task.views),
@@ -65,7 +66,7 @@ def about(task: AnnotationTask) -> dict[str, Any]:
 
 
 def coco(file: TaskFile) -> Iterator[str]:
-    """COCO's instances: polygons with a score; the order is that of the scores."""
+    """Yield COCO's instances: polygons with a score; the order is that of the scores."""
     numbers = {name: k for k, name in enumerate(file.by_image(), start=1)}
     sizes = {file.image(task): task.size for task in file.tasks}
     ids = {name: k for k, name in enumerate(file.space.classes, start=1)}
@@ -94,7 +95,7 @@ def coco(file: TaskFile) -> Iterator[str]:
 
 
 def label_studio(file: TaskFile) -> Iterator[str]:
-    """Label Studio's tasks with a predicted polygon, and the labelling set-up."""
+    """Yield Label Studio's tasks with a predicted polygon, and the labelling set-up."""
     rows = []
     for rank, task in enumerate(file.tasks, start=1):
         W, H = task.size
@@ -124,7 +125,7 @@ def label_studio(file: TaskFile) -> Iterator[str]:
 
 
 def cvat(file: TaskFile) -> Iterator[str]:
-    """CVAT for images 1.1, and the labels for the task's raw constructor."""
+    """Yield CVAT for images 1.1, and the labels for the task's raw constructor."""
     images, colors, own = file.by_image(), list(_colors(file.space)), ("task", "score", "second")
     text = ("mutable", "False"), ("input_type", "text"), ("default_value", ""), ("values", "")
     attributes = [_node("attribute", _node("name", what), *(_node(*pair) for pair in text)) for what in own]
@@ -157,7 +158,7 @@ def cvat(file: TaskFile) -> Iterator[str]:
 
 
 def fiftyone(file: TaskFile) -> Iterator[str]:
-    """FiftyOne's dataset as JSON: a sample an image, with polylines."""
+    """Yield FiftyOne's dataset as JSON: a sample an image, with polylines."""
     fields, labels = "fiftyone.core.fields", "fiftyone.core.labels.Polylines"
     samples = []
     for name, tasks in file.by_image().items():
@@ -188,7 +189,7 @@ FORMATS: Mapping[str, tuple[str, Callable[[TaskFile], Iterator[str]]]] = {
     "coco": (".json", coco), "labelstudio": (".json", label_studio), "cvat": (".xml", cvat),
     "fiftyone": (".json", fiftyone),
 }  # fmt: skip
-"""By name: the suffix of the file, and what writes it and yields how it is opened."""
+"""The formats by name: the suffix of the file, and what writes it and yields how it is opened."""
 
 
 def check(kind: str, path: Path) -> None:
@@ -210,14 +211,14 @@ def write_tasks(file: TaskFile, kind: str, task: Task) -> tuple[str, ...]:
 
 
 def _colors(space: LabelSpace) -> Iterator[tuple[str, str]]:
-    """Each class with its colour: '#ff0000'."""
+    """Yield each class with its colour: '#ff0000'."""
     yield from (
         (name, "#{:02x}{:02x}{:02x}".format(*color)) for name, color in zip(space.classes, space.colors, strict=True)
     )
 
 
 def _node(tag: str, *content: ElementTree.Element | str, **attributes: str) -> ElementTree.Element:
-    """An element with a text or others in it."""
+    """Return an element with a text or others in it."""
     node = ElementTree.Element(tag, attributes)
     node.text = "".join(each for each in content if isinstance(each, str)) or None
     node.extend(each for each in content if not isinstance(each, str))

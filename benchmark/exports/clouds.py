@@ -40,10 +40,11 @@ LONGEST_HEADER = 2**20
 class Header:
     """The header of a binary PLY file.
 
-    dtype     of a point
-    count     how many points there are
-    size      bytes of the header
-    comments  its comment lines, without the word
+    Attributes:
+        dtype: Type of a point.
+        count: Number of points.
+        size: Bytes of the header.
+        comments: Its comment lines, without the word.
     """
 
     dtype: np.dtype[np.void]
@@ -53,7 +54,11 @@ class Header:
 
     @classmethod
     def read(cls, file: BinaryIO, path: Path) -> Header:
-        """Read the header of a cloud. Raises DataError for another file than a binary PLY of points alone."""
+        """Read the header of a cloud.
+
+        Raises:
+            DataError: For another file than a binary PLY of points alone.
+        """
         lines = list(_header_lines(file, path))
         try:
             return cls._parsed(lines, file.tell(), path)
@@ -167,7 +172,8 @@ FIRST_OF_1_4 = 6
 def write_las(parts: Iterable[Voxels], path: Path, asprs: Path | None = None) -> int:
     """Write the voxels' centres to the millimetre, part after part; return the number of voxels.
 
-    Raises MissingDependencyError, and ConfigError for a table of codes.
+    Raises:
+        MissingDependencyError, ConfigError: For a table of codes.
     """
     las, left = with_lazrs(path), iter(parts)
     first = next(left)
@@ -231,7 +237,9 @@ def codes(voxels: Voxels, table: Path | None = None) -> UInt8:
     """Return (1 + K,) the ASPRS code of 'unclassified' and of each class, from a YAML file CLASS: CODE.
 
     Without a file the codes are those that ship for the taxonomy.
-    Raises ConfigError for a class that is not there or a code out of range.
+
+    Raises:
+        ConfigError: For a class that is not there or a code out of range.
     """
     row = {name_key(name): k for k, name in enumerate(voxels.classes, start=1)}
     if table is not None:

@@ -36,7 +36,7 @@ NONE = -1
 
 
 class VoxelLookup:
-    """Finds voxels of a table by coordinates of the scene; a radius of 0 takes no neighbours."""
+    """A search for voxels of a table by coordinates of the scene; a radius of 0 takes no neighbours."""
 
     def __init__(self, table: VoxelTable, radius: float = 0.0) -> None:
         self.table, self._radius = table, radius
@@ -133,7 +133,10 @@ def classify(chosen: Chosen, cloud: Path, out: Path, radius: float, asprs: Path 
 
     A point belongs to the voxel that it lies in, else to the nearest whose centre is within `radius` metres; else it
     has class 0 'unclassified' and zeros. Classes count from 1.
-    Raises ConfigError for files of different or unknown kinds, DataError for a damaged cloud, or one outside the map.
+
+    Raises:
+        ConfigError: For files of different or unknown kinds.
+        DataError: For a damaged cloud, or one outside the map.
     """
     of_las = partial(_classify_las, asprs=asprs)
     kinds: dict[str, Writer] = {".las": of_las, ".laz": of_las, ".ply": _classify_ply}
@@ -153,7 +156,7 @@ def classify(chosen: Chosen, cloud: Path, out: Path, radius: float, asprs: Path 
 
 
 class _Finder:
-    """Finds the voxels of points, tile by tile; the latest tiles stay in memory."""
+    """A search for the voxels of points, tile by tile; the latest tiles stay in memory."""
 
     def __init__(self, chosen: Chosen, radius: float) -> None:
         self.chosen, self.tally, self._radius = chosen, Tally(), radius

@@ -34,7 +34,7 @@ STABLE = len(CATEGORIES) - 1
 
 
 def write_raster(chosen: Chosen, path: Path, cell: int = 1) -> int:
-    """FILE.tif with bands in single precision (NaN: no voxel), and FILE.class.tif with the classes and their colours.
+    """Write FILE.tif with bands in single precision (NaN: no voxel), and FILE.class.tif with classes and their colours.
 
     A cell is `cell` voxels wide. Its class is that of the summed belief of the topmost voxels of its columns, each
     measure their mean, height the highest one's centre; the share of stable voxels is that of all voxels below as well.
@@ -105,18 +105,18 @@ class Window:
         return self.high[0] - self.low[0] + 1, self.high[1] - self.low[1] + 1
 
     def around(self, other: Window) -> Window:
-        """The smallest that holds both."""
+        """Return the smallest that holds both."""
         low, high = (
             tuple(map(of, *ends)) for of, ends in ((min, (self.low, other.low)), (max, (self.high, other.high)))
         )
         return Window((low[0], low[1]), (high[0], high[1]))
 
     def meets(self, other: Window) -> bool:
-        """Whether they share a cell."""
+        """Return whether they share a cell."""
         return all(self.low[k] <= other.high[k] and other.low[k] <= self.high[k] for k in (0, 1))
 
     def parts(self) -> Iterator[Window]:
-        """Windows that make it up, of WINDOW cells a side, from the farthest row on, as files have their blocks."""
+        """Yield windows that make it up, WINDOW cells a side, from the farthest row on, as files have their blocks."""
         for last in range(self.high[0], self.low[0] - 1, -WINDOW):
             for first in range(self.low[1], self.high[1] + 1, WINDOW):
                 low = max(self.low[0], last - WINDOW + 1), first
@@ -124,7 +124,7 @@ class Window:
 
 
 def seen_from_above(voxels: Voxels, cell: int = 1) -> tuple[Mapping[str, Column], float, float]:
-    """The bands (H, W) float32 by name, the first row the farthest ahead, and the coordinates of their corner."""
+    """Return the bands (H, W) float32 by name, first row the farthest ahead, and the coordinates of their corner."""
     whole = _fitting(_window(voxels, cell))
     return _bands(voxels, cell, whole), *_corner(voxels, whole, cell)
 
@@ -136,7 +136,7 @@ def _axes(voxels: Voxels) -> tuple[Float64, Float64, Float64]:
 
 
 def _covered(voxels: Voxels) -> tuple[Int64, Int64]:
-    """The cells (m, 2) of one voxel's width, and the voxel (m,) that covers each."""
+    """Return the cells (m, 2) of one voxel's width, and the voxel (m,) that covers each."""
     right, ahead, above = _axes(voxels)
     table, laid = voxels.table, voxels.laid
     plane = np.stack([laid @ ahead, laid @ right], axis=1)
@@ -146,13 +146,15 @@ def _covered(voxels: Voxels) -> tuple[Int64, Int64]:
 
 
 def _covered_by_turned(plane: Float64, axes: Float64, edge: float) -> tuple[Int64, Int64]:
-    """The cells (m, 2) under voxels whose sides are not along the raster's, and the voxel (m,) that covers each.
+    """Return the cells (m, 2) under voxels whose sides are not along the raster's, and the voxel (m,) that covers each.
 
     A voxel covers the cell that its centre lies in, and those whose centres lie under it: by the first no voxel is
     lost, by the second there are no gaps between neighbours.
 
-    plane  (n, 2) centres
-    axes   (2, 2) from the scene's level axes to the raster's
+    Args:
+        plane: (n, 2) centres.
+        axes: (2, 2) from the scene's level axes to the raster's.
+        edge: Edge of a cell and of a voxel, in the unit of `plane`.
     """
     own, to_scene, rows = np.floor(plane / edge).astype(np.int64), np.linalg.inv(axes).T, np.arange(len(plane))
     cells, of = [own], [rows]
@@ -166,14 +168,18 @@ def _covered_by_turned(plane: Float64, axes: Float64, edge: float) -> tuple[Int6
 
 
 def _window(voxels: Voxels, cell: int) -> Window:
-    """The cells that voxels cover."""
+    """Return the cells that voxels cover."""
     cells = _covered(voxels)[0] // cell
     (low, first), (high, last) = cells.min(axis=0).tolist(), cells.max(axis=0).tolist()
     return Window((low, first), (high, last))
 
 
 def _fitting(window: Window) -> Window:
-    """Raises ConfigError where it has too many cells for a raster."""
+    """Return the window.
+
+    Raises:
+        ConfigError: If it has too many cells for a raster.
+    """
     H, W = window.shape
     if H * W > MOST_CELLS:
         raise ConfigError(f"the raster would have {W} x {H} cells; choose larger ones with --cell, or fewer voxels")
@@ -181,14 +187,14 @@ def _fitting(window: Window) -> Window:
 
 
 def _corner(voxels: Voxels, whole: Window, cell: int) -> tuple[float, float]:
-    """The coordinates west and north of a raster of these cells."""
+    """Return the coordinates west and north of a raster of these cells."""
     (right, ahead, _), edge = _axes(voxels), cell * voxels.table.voxel_size
     west, north = whole.low[1] * edge + voxels.offset @ right, (whole.high[0] + 1) * edge + voxels.offset @ ahead
     return float(west), float(north)
 
 
 def _abouts(voxels: Voxels) -> Iterator[tuple[str, str, str]]:
-    """Name, unit and explanation of each band."""
+    """Yield name, unit and explanation of each band."""
     yield "class", "", "1 to K, of the topmost voxels"
     for name, column in voxels.columns.items():
         yield name, column.unit, f"{column.about}, mean of the topmost voxels"
@@ -197,7 +203,7 @@ def _abouts(voxels: Voxels) -> Iterator[tuple[str, str, str]]:
 
 
 def _bands(voxels: Voxels, cell: int, window: Window) -> Mapping[str, Column]:
-    """The bands of a window, by the voxels of the tiles that it shows."""
+    """Return the bands of a window, by the voxels of the tiles that it shows."""
     fine, rows = _covered(voxels)
     inside = ((fine // cell >= window.low) & (fine // cell <= window.high)).all(axis=1)
     fine, rows = fine[inside], rows[inside]
@@ -222,7 +228,7 @@ class _Cells:
         self.empty = np.bincount(at, minlength=shape[0] * shape[1]).reshape(shape) == 0
 
     def mean(self, values: npt.NDArray[Any]) -> Float64:
-        """Of values (n,) of the voxels (H, W); NaN where none is defined."""
+        """Return the mean (H, W) of values (n,) of the voxels; NaN where none is defined."""
         taken = values[self._rows].astype(np.float64)
         defined, n = ~np.isnan(taken), self.empty.size
         total = np.bincount(self._at[defined], taken[defined], minlength=n)
@@ -231,14 +237,14 @@ class _Cells:
         return mean
 
     def highest(self, values: Float64) -> Float64:
-        """The largest of values (n,) of the voxels (H, W); NaN where there is none."""
+        """Return the largest of values (n,) of the voxels (H, W); NaN where there is none."""
         most = np.full(self.empty.size, -np.inf)
         np.maximum.at(most, self._at, values[self._rows])
         return np.where(np.isinf(most), np.nan, most).reshape(self._shape)
 
 
 def _topmost(cells: Int64, height: Float64) -> Int64:
-    """Which entry (m,) is the highest of each cell (m, 2)."""
+    """Return which entry (m,) is the highest of each cell (m, 2)."""
     order = np.lexsort((height, cells[:, 1], cells[:, 0]))
     last = np.append((np.diff(cells[order], axis=0) != 0).any(axis=1), True)
     topmost: Int64 = order[last]
@@ -259,7 +265,7 @@ MOST_SPANNED = 2**40
 """Cells that the voxels of a tile may span: corners are packed into one number."""
 
 MOST_BYTES = 2**31
-"""Of the meshes of a file: glTF counts in 32 bits, and trimesh makes a file in memory."""
+"""The most bytes of the meshes of a file: glTF counts in 32 bits, and trimesh makes a file in memory."""
 
 
 def write_mesh(chosen: Chosen, path: Path) -> int:
@@ -267,7 +273,9 @@ def write_mesh(chosen: Chosen, path: Path) -> int:
 
     glTF is in single precision: coordinates count from `origin`, and the scene's extras say where that is. glTF's y is
     up, where the scene's up axis is known.
-    Raises ConfigError where the voxels span too much, or are too many for a file.
+
+    Raises:
+        ConfigError: If the voxels span too much, or are too many for a file.
     """
     import trimesh
 
@@ -306,7 +314,7 @@ def write_mesh(chosen: Chosen, path: Path) -> int:
 
 
 def _adjacent(chosen: Chosen, place: Place) -> Int64:
-    """The voxels (n, 3) of the tiles around one that may touch it."""
+    """Return the voxels (n, 3) of the tiles around one that may touch it."""
     found, size = [np.zeros((0, 3), np.int64)], chosen.size
     for (dx, dy), axis, at in (((1, 0), 0, 0), ((-1, 0), 0, -1), ((0, 1), 1, 0), ((0, -1), 1, -1)):
         other = place[0] + dx, place[1] + dy
@@ -317,9 +325,12 @@ def _adjacent(chosen: Chosen, place: Place) -> Int64:
 
 
 def _sides(index: Int64, label: Int64, adjacent: Int64) -> tuple[Int64, Int64, Int64]:
-    """Corners (v, 3) with their class (v,), and the sides (m, 4) between them, that are not between two voxels.
+    """Return corners (v, 3) with their class (v,), and the sides (m, 4) between them, that are not between two voxels.
 
-    adjacent  (b, 3) voxels that hide sides, and have none here
+    Args:
+        index: (n, 3) voxels.
+        label: (n,) their classes.
+        adjacent: (b, 3) voxels that hide sides, and have none here.
     """
     low = index.min(axis=0) - 1
     size = index.max(axis=0) - low + 3  # a cell more on each side: every neighbour has a key
@@ -340,7 +351,7 @@ def _sides(index: Int64, label: Int64, adjacent: Int64) -> tuple[Int64, Int64, I
 
 
 def _to_gltf(up: tuple[float, float, float] | None) -> Float64:
-    """(3, 3) from the scene's axes to glTF's: x right, y up, z towards the viewer."""
+    """Return (3, 3) from the scene's axes to glTF's: x right, y up, z towards the viewer."""
     if up is None:
         return np.eye(3)
     right, ahead, above = level_axes(up)

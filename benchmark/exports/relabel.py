@@ -38,24 +38,26 @@ from semstab.task import Task, read, truth_task
 # The class of the map at each pixel of a frame, where its voxel meets the criteria.
 
 UNSEEN, UNSTABLE = -1, -2
-"""Instead of a class: no depth or no voxel there; a voxel that fails the criteria."""
+"""Marks instead of a class: no depth or no voxel there; a voxel that fails the criteria."""
 
 DECIMALS = 9
-"""Of evidence without a frame's own vote: a rounding error decides no tie."""
+"""Decimals of evidence without a frame's own vote: a rounding error decides no tie."""
 
 
 @dataclass(frozen=True)
 class Belief:
     """The criteria that a voxel must meet.
 
-    min_op         seen by so many frames
-    min_psa        their pairs of frames agree so often; a voxel seen once has no pair
-    categories     of these categories, of any where none is named
-    leave_one_out  without the frame's own vote, and seen by another frame. Drift stays that of all votes: it depends
-                   on their order
-    thresholds     whose label has the evidence that these thresholds ask for
+    Attributes:
+        min_op: Number of frames that must see a voxel.
+        min_psa: Share of its pairs of frames that must agree; a voxel seen once has no pair.
+        categories: Categories that a voxel may be in, any where none is named.
+        leave_one_out: Whether the frame's own vote is left out, and another frame must see it. Drift stays that of all
+            votes: it depends on their order.
+        thresholds: Thresholds whose evidence the label must have.
 
-    Raises ConfigError for a category that there is not, and values out of range.
+    Raises:
+        ConfigError: For a category that there is not, and values out of range.
     """
 
     min_op: int = 1
@@ -72,7 +74,7 @@ class Belief:
                 raise ConfigError(f"no category '{name}'; {nearest(name, CATEGORIES)}")
 
     def of(self, table: VoxelTable) -> Mask:
-        """(n,) whether each voxel meets them."""
+        """Return (n,) whether each voxel meets them."""
         believed = table.op >= max(self.min_op, 1)
         if self.min_psa > 0:
             believed &= np.nan_to_num(psa(table), nan=-1.0) >= self.min_psa
@@ -90,7 +92,7 @@ class Belief:
 
 
 class FusedLabels:
-    """Looks up the classes of a map that a frame sees; the latest tiles stay in memory."""
+    """The classes of a map that a frame sees, looked up; the latest tiles stay in memory."""
 
     def __init__(self, tiles: Tiles[VoxelTable], belief: Belief, num_classes: int) -> None:
         self._tiles, self._belief, self._K = tiles, belief, num_classes
@@ -99,7 +101,7 @@ class FusedLabels:
         )
 
     def of(self, frame: Frame, pixel_stride: int = 1) -> Int64:
-        """(H, W) rows 0..K-1 of the map's classes, UNSEEN or UNSTABLE, whatever the frame's own labels are.
+        """Return (H, W) rows 0..K-1 of the map's classes, UNSEEN or UNSTABLE, whatever the frame's own labels are.
 
         The frame is one of those that were fused, with every pixel_stride-th pixel of each axis.
         """
@@ -171,10 +173,11 @@ class Accuracy:
 
 @dataclass(frozen=True)
 class Correctness:
-    """Against ground truth: the labels before; of the pixels that have a label before and after, both; all after.
+    """Labels against ground truth: before; of the pixels that have a label before and after, both; all after.
 
-    all_before, all_after  of all pixels with such a label
-    before, after          of the same pixels, those that kept a label or took another
+    Attributes:
+        all_before, all_after: Accuracy on all pixels with such a label.
+        before, after: Accuracy on the same pixels, those that kept a label or took another.
     """
 
     all_before: Accuracy
@@ -187,9 +190,12 @@ class Correctness:
 class Relabelled:
     """Numbers of pixels of a relabelled source, whose maps are in `folder`.
 
-    confirmed  have the class that they had      changed   have another one
-    filled     had none                          unseen    had one, and have no depth or no voxel
-    unstable   had one, and their voxel fails the criteria
+    Attributes:
+        confirmed: Pixels that have the class that they had.
+        changed: Pixels that have another class.
+        filled: Pixels that had none.
+        unseen: Pixels that had one, and have no depth or no voxel.
+        unstable: Pixels that had one, and whose voxel fails the criteria.
     """
 
     scene: str
@@ -286,12 +292,23 @@ def relabel(
 ) -> Relabelled:
     """Write the fused class of every pixel of every frame of a unit to OUT/labels/NAME.
 
-    scene, backbone, backend  which unit; may be left out where there is one, and for the base backend
-    name  of the new source, BACKBONE-fused where not given; its classes are in its folder
-    belief  the criteria of a voxel; other pixels are ignored, as are those without depth
+    Args:
+        run: Folder of the run.
+        out: Folder that gets labels/NAME.
+        belief: The criteria of a voxel; other pixels are ignored, as are those without depth.
+        scene: Scene of the unit; may be left out where there is one.
+        backbone: Backbone of the unit; may be left out where there is one.
+        backend: Backend of the unit, the base backend where not given.
+        name: Name of the new source, BACKBONE-fused where not given; its classes are in its folder.
+        overwrite: Whether other predictions in the folder are replaced.
+        progress: Called with what is done, how much of it is done, and how much there is.
 
-    Raises ConfigError, and DataError where the data is no longer what was fused, or its label maps cannot have the
-    depth's pixels.
+    Returns:
+        The folder that was written, and how many pixels were confirmed, changed and filled.
+
+    Raises:
+        ConfigError, DataError: If the data is no longer what was fused, or its label maps cannot have the depth's
+            pixels.
     """
     result = load_result(run)
     record = result.record(scene=scene, backbone=backbone, backend=backend)
@@ -338,7 +355,8 @@ def relabel(
 def task_of(run: Path, record: Record, fused: Mapping[str, str]) -> tuple[Task, int]:
     """Return the unit as it was fused, from inputs of these digests, and its pixel stride.
 
-    Raises DataError where its data has changed since.
+    Raises:
+        DataError: If its data has changed since.
     """
     plan = make_plan(load_config(run / SETTINGS))
     scene, backbone = record.unit.scene, record.unit.backbone

@@ -55,13 +55,14 @@ class Column:
 class Voxels:
     """The voxels of a map that are exported, in the order of its table.
 
-    table        their rows
-    columns      numbers of each, by name
-    classes      K names
-    colors       (K, 3) RGB
-    taxonomy     whose classes they are
-    up           (3,) the scene's up axis, None where it is not known
-    georeference of the scene, None where it has none
+    Attributes:
+        table: Their rows.
+        columns: Numbers of each, by name.
+        classes: K names.
+        colors: (K, 3) RGB.
+        taxonomy: Whose classes they are.
+        up: (3,) the scene's up axis, None where it is not known.
+        georeference: Georeference of the scene, None where it has none.
     """
 
     table: VoxelTable
@@ -112,9 +113,12 @@ class Chosen:
     Those with OP >= min_op and one of these dominant classes, all where none is named; with thresholds, of
     those the ones whose label has enough evidence. `columns` names measures, op, category, psa, columns of the unit's
     Parquet file, or of a file to `join`, which has some of the same voxels; where not given, see `usual`.
-    Raises ConfigError for a name that is not there, and where no voxel is left.
 
-    size  edge of a tile in voxels, None for the one tile of a map in a single file
+    Attributes:
+        size: Edge of a tile in voxels, None for the one tile of a map in a single file.
+
+    Raises:
+        ConfigError: For a name that is not there, and where no voxel is left.
     """
 
     def __init__(
@@ -156,7 +160,11 @@ class Chosen:
         return (self[place] for place in self.places())
 
     def places(self) -> Iterator[Place]:
-        """Yield the tiles that have voxels. Raises ConfigError where none has."""
+        """Yield the tiles that have voxels.
+
+        Raises:
+            ConfigError: If none has.
+        """
         left = False
         for place in self._files:
             if len(self[place].table):
@@ -216,7 +224,8 @@ def together(parts: Sequence[Voxels]) -> Voxels:
 def joined_columns(table: VoxelTable, file: Path) -> dict[str, Column]:
     """Return the columns of a file with rows of these voxels, as `compare` writes it; 0, or NaN, without a row.
 
-    Raises DataError where it is no such file, or has voxels of another size.
+    Raises:
+        DataError: If it is no such file, or has voxels of another size.
     """
     import pyarrow.parquet as pq
 
@@ -250,7 +259,11 @@ def usual() -> tuple[str, ...]:
 
 
 def rows_named(wanted: Sequence[str], names: Sequence[str], where: str) -> list[int]:
-    """The rows of classes by name. Raises ConfigError with the nearest known one."""
+    """Return the rows of classes by name.
+
+    Raises:
+        ConfigError: If that fails, with the nearest known one.
+    """
     known = {name_key(name): row for row, name in enumerate(names)}
     for name in wanted:
         if name_key(name) not in known:
@@ -289,14 +302,17 @@ def _colors(overview: Path, K: int) -> UInt8:
 
 
 def write_parquet(parts: Iterable[Voxels], path: Path) -> int:
-    """Columns, part after part, and in the metadata entry 'semstab' what they mean; what is undefined is null."""
+    """Return columns, part after part, and in the metadata entry 'semstab' what they mean.
+
+    What is undefined is null.
+    """
     import pyarrow.parquet as pq
 
     return _written(parts, path, lambda file, schema: pq.ParquetWriter(file, schema, compression="zstd"))
 
 
 def write_csv(parts: Iterable[Voxels], path: Path) -> int:
-    """Columns, part after part; what is undefined is an empty field."""
+    """Return columns, part after part; what is undefined is an empty field."""
     from pyarrow import csv
 
     return _written(parts, path, csv.CSVWriter)

@@ -23,9 +23,10 @@ from semstab.model.voxels import VoxelTable
 
 
 def voxel_keys(*indices: npt.NDArray[np.integer]) -> list[Int64]:
-    """One int64 key a voxel of each index array (n, 3), ascending with (ix, iy, iz), the same for all arrays.
+    """Return one int64 key a voxel of each index array (n, 3), ascending with (ix, iy, iz), the same for all arrays.
 
-    Raises DataError where the voxels span more than 2^63 cells together.
+    Raises:
+        DataError: If the voxels span more than 2^63 cells together.
     """
     filled = [index for index in indices if len(index)]
     if not filled:
@@ -43,9 +44,10 @@ def voxel_keys(*indices: npt.NDArray[np.integer]) -> list[Int64]:
 
 
 def shared_rows(*tables: VoxelTable) -> list[Int64]:
-    """Rows of the voxels that all tables hold, one array a table, in the same order of voxels.
+    """Return rows of the voxels that all tables hold, one array a table, in the same order of voxels.
 
-    Raises DataError where the tables differ in K or voxel size.
+    Raises:
+        DataError: If the tables differ in K or voxel size.
     """
     require_same_grid(*tables)
     if same_voxels(*tables):
@@ -56,13 +58,13 @@ def shared_rows(*tables: VoxelTable) -> list[Int64]:
 
 
 def same_voxels(first: VoxelTable, *others: VoxelTable) -> bool:
-    """All tables have the same voxels."""
+    """Return whether all tables have the same voxels."""
     names = ("ix", "iy", "iz")
     return all(np.array_equal(getattr(first, name), getattr(other, name)) for other in others for name in names)
 
 
 def observations(log: Events, rows: Int64) -> Events:
-    """These rows of a log, ascending, with the voxels that they are of."""
+    """Return these rows of a log, ascending, with the voxels that they are of."""
     voxels, of = np.unique(log.voxel[rows], return_inverse=True)
     own: dict[str, Any] = {name: getattr(log, name)[voxels] for name in ("ix", "iy", "iz")}
     own |= {"frame": log.frame[rows], "evidence": log.evidence.take(rows), "pixels": log.pixels[rows]}
@@ -70,7 +72,7 @@ def observations(log: Events, rows: Int64) -> Events:
 
 
 def rows_of(table: VoxelTable, where: Mask) -> VoxelTable:
-    """The voxels of a table for which `where` (n,) holds."""
+    """Return the voxels of a table for which `where` (n,) holds."""
     return table.rows(where)
 
 
@@ -112,7 +114,9 @@ def compare(
 
     They agree where no quantity differs by more than `tolerance`, and where at most `voxel_share` of the voxels are in
     one map only. An SBD that is undefined in one map only counts as a difference of 1, its range.
-    Raises DataError where the maps differ in K or voxel size.
+
+    Raises:
+        DataError: If the maps differ in K or voxel size.
     """
     in_a, in_b = shared_rows(a, b)
     chunks = [
@@ -135,7 +139,7 @@ def compare(
 
 
 def together(parts: Sequence[Agreement]) -> Agreement:
-    """The agreement on a map, from that on each of its parts."""
+    """Return the agreement on a map, from that on each of its parts."""
     shared = [part.voxels[0] - part.only_in[0] for part in parts]
     return replace(
         parts[0],
@@ -155,7 +159,7 @@ def _together(parts: Sequence[Deviation], voxels: Sequence[int]) -> Deviation:
 
 @dataclass(frozen=True, eq=False)
 class _Rows:
-    """Some rows of a map, as measures read them."""
+    """Part of a map's rows, as measures read them."""
 
     op: Int32
     evidence: Float64
@@ -167,7 +171,7 @@ class _Rows:
 
 
 def _differences(a: _Rows, b: _Rows) -> dict[str, tuple[float, float]]:
-    """The largest difference of each quantity and the mean over the classes summed over the voxels."""
+    """Return the largest difference of each quantity and the mean over the classes summed over the voxels."""
     of_measures = {measure.key: _difference(measure.of(a), measure.of(b)) for measure in measures()}
     other = dominant(a) != dominant(b)
     return {

@@ -18,10 +18,12 @@ from semstab.pixels.warp import DEPTH_TOLERANCE, correspond
 
 
 def flicker_percent(previous: Frame, current: Frame) -> float:
-    """Share of the pixels valid in both frames whose label differs, same pixel coordinates, in percent.
+    """Return the share of the pixels valid in both frames whose label differs, same pixel coordinates, in percent.
 
     Soft scores count by their largest class. NaN where no pixel is valid in both.
-    Raises DataError where the frames differ in size.
+
+    Raises:
+        DataError: If the frames differ in size.
     """
     if previous.shape != current.shape:
         sizes = " and ".join(f"{W}x{H}" for H, W in (previous.shape, current.shape))
@@ -39,8 +41,9 @@ def flicker_percent(previous: Frame, current: Frame) -> float:
 class CompensatedFlicker:
     """Flicker between two views of the same surface points.
 
-    flicker_percent  of the co-visible pixels, those whose label differs; NaN where no pixel is co-visible
-    share            co-visible pixels, of the current frame's valid ones, 0 to 1; NaN where none is valid
+    Attributes:
+        flicker_percent: Percentage of the co-visible pixels whose label differs; NaN where no pixel is co-visible.
+        share: co-visible pixels, of the current frame's valid ones, 0 to 1; NaN where none is valid.
     """
 
     flicker_percent: float
@@ -50,13 +53,14 @@ class CompensatedFlicker:
 def compensated_flicker(
     previous: Frame, current: Frame, *, depth_tolerance: float = DEPTH_TOLERANCE
 ) -> CompensatedFlicker:
-    """Flicker after the previous frame's labels are warped into the current one, so that camera motion is not counted.
+    """Return flicker after the previous frame's labels are warped into the current one: camera motion is not counted.
 
     A pixel is co-visible where it is valid, the previous camera saw the same surface point (see
     `semstab.pixels.warp.correspond`), and the pixel that saw it was valid too. Soft scores count by their largest
     class; the frames may differ in size. Equals `flicker_percent` where camera and depth stay as they are.
 
-    Raises ConfigError where depth_tolerance is not above 0 and below 1.
+    Raises:
+        ConfigError: If depth_tolerance is not above 0 and below 1.
     """
     from semstab.model.kernels import count_changed_at
 
@@ -90,7 +94,8 @@ class VideoConsistency:
     all of them, right or wrong; `value` is the mean over all clips of n consecutive frames, the last one included.
     Frames are added one by one, and none stays in memory. Clips do not reach across a change of the image size.
 
-    n  frames a clip, at least 2; VSPW reports 8 and 16
+    Attributes:
+        n: Frames a clip, at least 2; VSPW reports 8 and 16.
     """
 
     def __init__(self, n: int) -> None:
@@ -101,17 +106,22 @@ class VideoConsistency:
     def add(self, labels: Labels, valid: Mask, truth: Labels) -> float:
         """Add the next frame; return the consistency of the clip that ends with it, NaN where none does.
 
-        labels  (H, W) predicted ids
-        valid   (H, W) pixels that count: neither prediction nor truth is to be ignored; a pixel counts in a clip where
-                it counts in all of its frames
-        truth   (H, W) ground truth ids
+        Args:
+            labels: (H, W) predicted ids.
+            valid: (H, W) pixels that count: neither prediction nor truth is to be ignored; a pixel counts in a clip
+                where it counts in all of its frames.
+            truth: (H, W) ground truth ids.
 
-        Raises DataError where the sizes differ.
+        Raises:
+            DataError: If the sizes differ.
         """
         return self._clips.add(self._prediction.add(labels, valid), self._truth.add(truth, valid))
 
     def skip(self) -> float:
-        """The next frame has no ground truth, and is in no clip: where its truth stays the same is not known. NaN."""
+        """Return the next frame has no ground truth, and is in no clip: where its truth stays the same is not known.
+
+        NaN.
+        """
         self._prediction.end()
         self._truth.end()
         return math.nan
@@ -136,7 +146,8 @@ class SelfConsistency:
     def add(self, labels: Labels, valid: Mask) -> float:
         """Add the next frame's ids (H, W) and its pixels that count; return its clip's consistency, NaN for none.
 
-        Raises DataError where the sizes differ.
+        Raises:
+            DataError: If the sizes differ.
         """
         return self._clips.add(self._prediction.add(labels, valid), self._valid.add(valid.view(np.uint8), valid))
 
@@ -147,7 +158,7 @@ class SelfConsistency:
 
 
 class _Run:
-    """For how many frames, up to n, each pixel has counted and had its label."""
+    """The number of frames, up to n, for which each pixel has counted and had its label."""
 
     def __init__(self, n: int) -> None:
         if not 2 <= n <= np.iinfo(np.int16).max:
@@ -156,7 +167,7 @@ class _Run:
         self.end()
 
     def end(self) -> None:
-        """The next frame does not follow those before it."""
+        """End the run: the next frame does not follow those before it."""
         self._length: npt.NDArray[np.int16] = np.zeros((0, 0), dtype=np.int16)
         self._labels: Labels = np.zeros((0, 0), dtype=np.uint8)
 
@@ -183,7 +194,7 @@ class _Clips:
         self._count = 0
 
     def add(self, constant: npt.NDArray[np.int16], counted: npt.NDArray[np.int16]) -> float:
-        """Of the pixels that have counted for n frames, the share whose prediction has been constant as long."""
+        """Return the share of the pixels that have counted for n frames whose prediction has been constant as long."""
         from semstab.pixels.kernels import count_long
 
         pixels, consistent = count_long(flat(counted), flat(constant), self.n)
@@ -214,10 +225,11 @@ IOU_THRESHOLD = 0.25
 class RegionChange:
     """The change of regions between two frames.
 
-    flicker_percent           of the pixels valid in both, those that left their region; NaN where there are none
-    matched                   regions in both frames
-    births, deaths            regions of the current frame that are new, of the previous one that are gone
-    variation_of_information  between the two partitions, bits, the unassigned pixels being one part; NaN likewise
+    Attributes:
+        flicker_percent: Percentage of the pixels valid in both that left their region; NaN where there are none.
+        matched: Regions in both frames.
+        births, deaths: Regions of the current frame that are new, of the previous one that are gone.
+        variation_of_information: Between the two partitions, bits, the unassigned pixels being one part; NaN likewise.
     """
 
     flicker_percent: float
@@ -234,17 +246,22 @@ def matched_region_flicker(
     *,
     iou_threshold: float = IOU_THRESHOLD,
 ) -> RegionChange:
-    """Flicker of region maps whose ids mean nothing across frames, such as Segment Anything's proposals.
-
-    previous, current  (H, W) region ids, 0 for a pixel without a region
-    valid              (H, W) pixels that count; all where not given
+    """Return the flicker of region maps whose ids mean nothing across frames, such as Segment Anything's proposals.
 
     Regions are matched one to one so that the sum of their IoUs over the valid pixels is largest (Hungarian method);
     pairs with an IoU of at most iou_threshold come apart again. flicker = 1 - (pixels in both regions of a pair +
     pixels unassigned in both) / valid pixels. To leave out camera motion, warp the previous map first
     (`semstab.pixels.warp.warp`) and count where that is defined.
 
-    Raises DataError where the maps differ in size, ConfigError for a threshold that is not from 0 to below 1.
+    Args:
+        previous: (H, W) region ids of the previous frame, 0 for a pixel without a region.
+        current: (H, W) region ids of the current frame.
+        valid: (H, W) pixels that count; all where not given.
+        iou_threshold: IoU that a pair must exceed.
+
+    Raises:
+        DataError: If the maps differ in size.
+        ConfigError: For a threshold that is not from 0 to below 1.
     """
     if not 0 <= iou_threshold < 1:
         raise ConfigError(f"iou_threshold = {iou_threshold:g}: use a share from 0 to below 1")
@@ -290,7 +307,7 @@ class _Contingency:
         return int(self.shared[np.ix_(p, q)].sum())
 
     def pairs(self, iou_threshold: float) -> list[tuple[int, int]]:
-        """Rows and columns of the regions that are one."""
+        """Return rows and columns of the regions that are one."""
         from scipy.optimize import linear_sum_assignment
 
         rows, columns = np.flatnonzero(self.previous_ids), np.flatnonzero(self.current_ids)
@@ -301,7 +318,10 @@ class _Contingency:
         return [(int(rows[i]), int(columns[j])) for i, j in matched if iou[i, j] > iou_threshold]
 
     def variation_of_information(self) -> float:
-        """H(previous | current) + H(current | previous) = 2 H(both) - H(previous) - H(current); Meila 2007, JMVA 98."""
+        """Return h(previous | current) + H(current | previous) = 2 H(both) - H(previous) - H(current).
+
+        Meila 2007, JMVA 98.
+        """
         if not self.pixels:
             return math.nan
         joint, before, after = (

@@ -20,7 +20,7 @@ NONE = -1
 
 
 class FrameQualityMeter:
-    """Takes the frames of a sequence in order, each as a filter left it, as the model said it, and as it truly is.
+    """The quality of frames taken in order, each as a filter left it, as the model said it, and as it truly is.
 
     All have labels in one label space of K classes and one size; the truth may be missing.
     """
@@ -48,7 +48,7 @@ class FrameQualityMeter:
         self._before = frame, model, truth
 
     def result(self, model: str, filters: str, milliseconds: float) -> FrameQuality:
-        """The quality so far of filters over a model, which took so many milliseconds a frame."""
+        """Return the quality so far of filters over a model, which took so many milliseconds a frame."""
         labelled, sayable, foreseen, met, stale, compared = self._counts
         right = np.diag(self._confusion)
         union = self._confusion.sum(axis=0) + self._confusion.sum(axis=1) - right
@@ -127,12 +127,12 @@ class Lag:
 
     @property
     def changes(self) -> int:
-        """How many pixels changed, where the model followed at once."""
+        """Return how many pixels changed, where the model followed at once."""
         return int(self._waiting[0])
 
     @property
     def mean(self) -> float:
-        """In frames; NaN where nothing changed."""
+        """The mean in frames; NaN where nothing changed."""
         if not self._waiting[0]:
             return math.nan
         waiting = np.maximum(self._waiting, 1)
@@ -140,7 +140,7 @@ class Lag:
 
 
 def _near(truth: Frame, where: Correspondence, true: npt.NDArray[Any]) -> Mask:
-    """Pixels whose class was seen within a pixel of where they lay before."""
+    """Return pixels whose class was seen within a pixel of where they lay before."""
     padded = np.pad(truth.predicted, 1, mode="edge")
     H, W = truth.shape
     near = np.zeros(true.shape, dtype=np.bool_)

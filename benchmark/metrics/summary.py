@@ -52,12 +52,13 @@ def summarise(table: VoxelTable, edges: Sequence[int] = STRATA) -> TableSummary:
 class TableSums:
     """The sums behind a map's summary; those of the parts of a map add up to those of the map.
 
-    total    (3,) points, observations, voxels
-    stratum, kind, recurrence, step  sums of every measure by stratum, by dominant class, of the voxels below OP 3 and
-             the recurrent ones, and by finer strata beyond the last edge: see `_by_group`
-    category voxels in each of CATEGORIES
-    confusion  (K, K) evidence for a class (column) in the voxels that another one dominates (row); (0, 0) beyond
-             MOST_CONFUSED classes
+    Attributes:
+        total: (3,) points, observations, voxels.
+        stratum, kind, recurrence, step: Sums of every measure by stratum, by dominant class, of the voxels below OP 3
+            and the recurrent ones, and by finer strata beyond the last edge: see `_by_group`.
+        category: Voxels in each of CATEGORIES.
+        confusion: (K, K) evidence for a class (column) in the voxels that another one dominates (row); (0, 0) beyond
+            MOST_CONFUSED classes.
     """
 
     total: Float64
@@ -70,7 +71,7 @@ class TableSums:
 
     @classmethod
     def of(cls, table: VoxelTable, edges: Sequence[int] = STRATA) -> TableSums:
-        """Those of a table."""
+        """Return the sums of a table."""
         steps = _steps(edges)
         groups = (len(edges) + 1, table.K, 2, len(steps) + 1)
         sums = [np.zeros((1 + 3 * len(measures()), n)) for n in groups]
@@ -95,19 +96,19 @@ class TableSums:
         return cls(np.array(total, dtype=np.float64), sums[0], sums[1], sums[2], sums[3], category, confusion)
 
     def arrays(self) -> dict[str, Float64]:
-        """All of it by name, as `read` takes it."""
+        """Return all of it by name, as `read` takes it."""
         return {f"table {name}": value for name, value in vars(self).items()}
 
     @classmethod
     def read(cls, arrays: Mapping[str, Float64]) -> TableSums:
-        """From its arrays, among others."""
+        """Read it from its arrays, among others."""
         return cls(**{field.name: arrays[f"table {field.name}"] for field in dataclasses.fields(cls)})
 
     def __add__(self, other: TableSums) -> TableSums:
         return TableSums(*(own + more for own, more in zip(vars(self).values(), vars(other).values(), strict=True)))
 
     def summary(self, voxel_size: float, classes: Sequence[str], edges: Sequence[int] = STRATA) -> TableSummary:
-        """The summary; the edges are those of the sums."""
+        """Return the summary; the edges are those of the sums."""
         points, observations, voxels = (int(value) for value in self.total)
         K = self.kind.shape[1]
         names = classes or tuple(str(k) for k in range(K))
@@ -148,8 +149,11 @@ def _steps(edges: Sequence[int]) -> list[int]:
 
 
 def _by_group(values: Sequence[Float64], op: Int32, group: Int64, groups: int) -> Float64:
-    """(1 + 3 M, groups) of values (n,) of M measures: voxels, then of each measure its sum, how often it is defined,
-    and how often OP is high enough for it."""
+    """Return (1 + 3 M, groups) of the values (n,) of M measures.
+
+    The first row counts voxels; then come of each measure its sum, how often it is defined, and how often OP is high
+    enough for it.
+    """
     levels = sorted({1, *(measure.lowest_op for measure in measures())})
     enough = [np.where(op >= level, 1.0, np.nan) for level in levels]
     sums, defined = by_group(group, [*values, *enough], groups)
@@ -161,13 +165,13 @@ def _by_group(values: Sequence[Float64], op: Int32, group: Int64, groups: int) -
 
 
 def groups_of(op: Int32, edges: Sequence[int]) -> Int64:
-    """Which stratum of OP (n,) each voxel is in: how many of the edges lie below its OP."""
+    """Return which stratum of OP (n,) each voxel is in: how many of the edges lie below its OP."""
     group: Int64 = np.searchsorted(edges, np.arange(int(op.max(initial=0)) + 1))[op]
     return group
 
 
 def strata(edges: Sequence[int]) -> list[tuple[str, int, int]]:
-    """Name, lowest and highest OP of each stratum.
+    """Return name, lowest and highest OP of each stratum.
 
     >>> strata([1, 2, 5])[2:]
     [('3<=OP<=5', 3, 5), ('OP>5', 6, 2147483647)]
@@ -178,7 +182,7 @@ def strata(edges: Sequence[int]) -> list[tuple[str, int, int]]:
 
 
 def split_last(tables: Sequence[TableSummary]) -> list[Means]:
-    """The last stratum of several tables together in about equal parts, where most of their voxels are in it.
+    """Return the last stratum of several tables together in about equal parts, where most of their voxels are in it.
 
     In addition to the strata, whose edges are the paper's: `well_seen` names the finer ones.
     """
@@ -201,18 +205,18 @@ def split_last(tables: Sequence[TableSummary]) -> list[Means]:
 
 
 def _lowest(name: str) -> int:
-    """The lowest OP of a stratum, by its name."""
+    """Return the lowest OP of a stratum, by its name."""
     return int(re.findall(r"\d+", name)[0])
 
 
 def _range(first: str, last: str) -> str:
-    """The name of a stratum from the names of its first and last step."""
+    """Return the name of a stratum from the names of its first and last step."""
     low, highest = _lowest(first), re.findall(r"\d+", last)[-1]
     return f"{low}<=OP<={highest}" if "<=" in last else f"OP>={low}"
 
 
 def pool(groups: Sequence[Means], voxels: int) -> Means:
-    """The means over the voxels of several tables' groups together; `voxels` counts all voxels of these tables.
+    """Return the means over the voxels of several tables' groups together; `voxels` counts all voxels of these tables.
 
     Strata and class tables of several scenes pool their voxels; scene tables give macro means instead.
     """
@@ -225,7 +229,7 @@ def pool(groups: Sequence[Means], voxels: int) -> Means:
 
 
 def macro_mean(values: Sequence[float]) -> float:
-    """The mean over scenes, each counting once, of those where the value is defined; NaN where none is."""
+    """Return the mean over scenes, each counting once, of those where the value is defined; NaN where none is."""
     return mean(np.array(values, dtype=np.float64))
 
 
@@ -239,16 +243,18 @@ def _weighted(values: Sequence[float], weights: Sequence[int]) -> float:
 
 @dataclass(frozen=True)
 class CategoryThresholds:
-    """Where one category ends and the next begins.
+    """The limits between one category and the next.
 
-    min_op          fewer observations are low persistence; the paper calls a voxel recurrent from OP = 3 on
-    drifting_bits   SBD from which on the belief is still on the move. The paper's backbones have 0.041 and 0.019 bits
-                    on average over recurrent voxels. One dissent among three labels has 0.095 bits or more; one among
-                    four 0.046 if it comes last, 0.113 if it comes second
-    uncertain_bits  entropy of the belief from which on it is ambiguous. In bits, because the normalised entropy of the
-                    same split falls with K: a vote of 3 to 1 between two classes has 0.811 bits, one of 4 to 1 0.722
+    Attributes:
+        min_op: Fewer observations are low persistence; the paper calls a voxel recurrent from OP = 3 on.
+        drifting_bits: SBD from which on the belief is still on the move. The paper's backbones have 0.041 and 0.019
+            bits on average over recurrent voxels. One dissent among three labels has 0.095 bits or more; one among four
+            0.046 if it comes last, 0.113 if it comes second.
+        uncertain_bits: Entropy of the belief from which on it is ambiguous. In bits, because the normalised entropy of
+            the same split falls with K: a vote of 3 to 1 between two classes has 0.811 bits, one of 4 to 1 0.722.
 
-    Raises ConfigError where one of them is out of range.
+    Raises:
+        ConfigError: If one of them is out of range.
     """
 
     min_op: int = RECURRENT
@@ -265,12 +271,12 @@ class CategoryThresholds:
 
 
 def categories(table: VoxelTable, thresholds: CategoryThresholds | None = None) -> UInt8:
-    """Category of each voxel (n,), an index into CATEGORIES; the first of these that applies.
+    """Return the category of each voxel (n,), an index into CATEGORIES; the first of these that applies.
 
-    low persistence  OP < min_op: too few observations to tell
-    drifting         SBD >= drifting_bits: observations still move the belief
-    uncertain        entropy >= uncertain_bits: the belief has settled on no clear answer
-    stable           a clear answer, and little movement
+    - low persistence: OP < min_op, too few observations to tell
+    - drifting: SBD >= drifting_bits, observations still move the belief
+    - uncertain: entropy >= uncertain_bits, the belief has settled on no clear answer
+    - stable: a clear answer, and little movement
 
     Drifting comes first because nearly all drifting voxels are ambiguous as well, but not the other way round: with
     more observations a voxel that stays ambiguous goes from drifting to uncertain.
@@ -284,7 +290,7 @@ def categorise(
     bits: Float64,
     thresholds: CategoryThresholds | None = None,
 ) -> UInt8:
-    """Category (n,) by OP, SBD in bits and entropy in bits, (n,) each; see `categories`."""
+    """Return the category (n,) by OP, SBD in bits and entropy in bits, (n,) each; see `categories`."""
     limits = thresholds or CategoryThresholds()
     category = np.full(len(op), STABLE, dtype=np.uint8)
     category[bits >= limits.uncertain_bits] = UNCERTAIN
@@ -294,6 +300,6 @@ def categorise(
 
 
 def category_shares(table: VoxelTable, thresholds: CategoryThresholds | None = None) -> dict[str, float]:
-    """Share of the voxels in each category, 0 to 1, by name; NaN where the map is empty."""
+    """Return the share of the voxels in each category, 0 to 1, by name; NaN where the map is empty."""
     counts = np.bincount(categories(table, thresholds), minlength=len(CATEGORIES))
     return {name: float(n / len(table)) if len(table) else math.nan for name, n in zip(CATEGORIES, counts, strict=True)}

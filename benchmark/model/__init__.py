@@ -1,1 +1,1 @@
-"""What a scene's frames become: frames, label spaces, voxel tables, measures, and the results that are reported."""
+"""Frames, and what they become: label spaces, voxel tables, measures, and the results that are reported."""

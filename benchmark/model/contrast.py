@@ -1,4 +1,4 @@
-"""What `semstab.statistics` says of several backbones' maps of one scene; in JSON as the fields say."""
+"""The comparison that `semstab.statistics` makes of several backbones' maps of one scene; in JSON as the fields say."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ ByBackbone = Mapping[str, Estimate]
 
 @dataclass(frozen=True)
 class MapCoverage:
-    """What a backbone's map covers. `repeated` is OP >= 2, `recurrent` OP >= 3, `alone` voxels in no other map."""
+    """The coverage of a backbone's map: `repeated` is OP >= 2, `recurrent` OP >= 3, `alone` voxels in no other map."""
 
     backbone: str
     voxels: int
@@ -31,9 +31,10 @@ class MapCoverage:
 class Standardised:
     """Means at a common distribution of OP, by the key of what is compared and backbone.
 
-    edges    upper edges of the strata of OP
-    weights  of the strata
-    thin     the part of the weights that lies in strata which some map hardly has: values there rest on few voxels
+    Attributes:
+        edges: Upper edges of the strata of OP.
+        weights: Weights of the strata.
+        thin: The part of the weights that lies in strata which some map hardly has: values there rest on few voxels.
     """
 
     edges: tuple[int, ...]
@@ -42,7 +43,7 @@ class Standardised:
     values: Mapping[str, ByBackbone]
 
     def of(self, quantity: Quantity, backbone: str) -> Estimate:
-        """A backbone's mean; undefined for what is no mean over voxels."""
+        """Return a backbone's mean; undefined for what is no mean over voxels."""
         return self.values.get(quantity.key, {}).get(backbone, UNDEFINED)
 
 
@@ -50,10 +51,12 @@ class Standardised:
 class PairedDifference:
     """A measure of backbone a minus that of b on the voxels that all saw twice or more.
 
-    p_value  that there is none, of the primary measure; p_holm corrects it for all pairs, and all scenes of a study, of
-             which something may be claimed (Holm 1979). The other measures describe: they have intervals and no test
-    scope   what interval and p-value answer, see `Interval`
-    undecided  why nothing may be claimed; empty where something may
+    Attributes:
+        p_value: P-value of no difference in the primary measure; p_holm corrects it for all pairs, and all scenes of a
+            study, of which something may be claimed (Holm 1979). The other measures describe: they have intervals and
+            no test.
+        scope: Question that interval and p-value answer, see `Interval`.
+        undecided: Why nothing may be claimed; empty where something may.
     """
 
     measure: str
@@ -93,8 +96,9 @@ class Ranking:
 class Paired:
     """Backbones on the voxels that every one of them observed at least twice.
 
-    primary  the key of what is tested
-    values   what is `compared`, by its key and backbone
+    Attributes:
+        primary: The key of what is tested.
+        values: Values that are `compared`, by its key and backbone.
     """
 
     primary: str
@@ -111,18 +115,19 @@ class Paired:
                     raise ValueError(f"ranks {rank.backbone} by {ranking.measure} without a value")
 
     def of(self, quantity: Quantity) -> ByBackbone:
-        """The values of what is compared, by backbone."""
+        """Return the values of what is compared, by backbone."""
         return self.values[quantity.key]
 
 
 @dataclass(frozen=True)
 class Ignored:
-    """What a backbone left out of the observations that any backbone labelled, and what that may be worth.
+    """The observations that a backbone left out of those that any backbone labelled, and what that may be worth.
 
-    missing            share of their pixels
-    psa_low, psa_high  bounds of the agreement of two views in a cell, whatever the missing observations would have said
-                       (Manski 1990): the worst case, and the best
-    alpha              by the convention that to leave a location out is a class of its own
+    Attributes:
+        missing: Share of their pixels.
+        psa_low, psa_high: Bounds of the agreement of two views in a cell, whatever the missing observations would have
+            said (Manski 1990): the worst case, and the best.
+        alpha: By the convention that to leave a location out is a class of its own.
     """
 
     backbone: str
@@ -134,12 +139,13 @@ class Ignored:
 
 @dataclass(frozen=True)
 class ComparedObservations:
-    """What was compared: the cells that all backbones labelled in a view, each with the same weight.
+    """The compared observations: the cells that all backbones labelled in a view, each with the same weight.
 
-    cells, observations  sampled ones that they are of
-    order                of the backbones by alpha on these observations, the best first
-    order_ignored        the same where to leave a location out is a class of its own
-    bounded              whether the bounds of the agreement keep the order of the backbones, whatever was left out
+    Attributes:
+        cells, observations: Sampled ones that they are of.
+        order: Order of the backbones by alpha on these observations, the best first.
+        order_ignored: The same where to leave a location out is a class of its own.
+        bounded: Whether the bounds of the agreement keep the order of the backbones, whatever was left out.
     """
 
     cells: int
@@ -151,7 +157,7 @@ class ComparedObservations:
 
     @property
     def depends(self) -> bool:
-        """Whether the order depends on what was left out."""
+        """Return whether the order depends on what was left out."""
         return self.order != self.order_ignored or not self.bounded
 
 
@@ -172,7 +178,7 @@ class BackboneComparison:
 # What differs between runs; in JSON as the fields say. Undefined numbers are NaN.
 
 Basis = Literal["observations", "voxels", "cubes", "flights"]
-"""What was paired: observations (a cell in a view) that all made; voxels that all saw twice or more; cubes of space,
+"""The unit of pairing: observations (a cell in a view) that all made; voxels that all saw twice or more; cubes,
 each map with all its voxels; nothing, each flight by itself."""
 
 
@@ -180,12 +186,13 @@ each map with all its voxels; nothing, each flight by itself."""
 class Contrast:
     """A measure in a run, beside that in the base.
 
-    measure     its key
-    of          the class whose locations it is of; empty: all
-    difference  the run's less the base's, with its interval, the scope that this answers, and the p-value that there
-                is none
-    p_holm      that p-value corrected for all that stand in one list with it (Holm 1979)
-    change      what is said of it: 'better', 'worse', or nothing
+    Attributes:
+        measure: Its key.
+        of: The class whose locations it is of; empty: all.
+        difference: The run's less the base's, with its interval, the scope that this answers, and the p-value that
+            there is none.
+        p_holm: The p-value corrected for all that stand in one list with it (Holm 1979).
+        change: Verdict: 'better', 'worse', or nothing.
     """
 
     measure: str
@@ -210,16 +217,17 @@ class FrameShare:
 class Area:
     """Neighbouring voxels of a class that got worse.
 
-    number   from 1 on, the largest loss first; in the column `area`
-    what     'agreement': frames agree less; 'truth': right before, wrong now
-    of       the class that both runs together give these voxels, or the true one
-    confused_with  the class that the top contributing frames give
-    voxels   how many
-    loss     mean over them: of agreement between frames, or 1
-    centre   metres, as the run has coordinates
-    size     metres from end to end
-    improved_alike   areas that improved by as much or more, in all: what chance gives where nothing got worse
-    frames   the top contributing ones, the worst first; empty where the observations were not kept
+    Attributes:
+        number: Number from 1 on, the largest loss first; in the column `area`.
+        what: 'agreement': frames agree less; 'truth': right before, wrong now.
+        of: The class that both runs together give these voxels, or the true one.
+        confused_with: The class that the top contributing frames give.
+        voxels: Number of voxels.
+        loss: Mean over them: of agreement between frames, or 1.
+        centre: Metres, as the run has coordinates.
+        size: Metres from end to end.
+        improved_alike: Areas that improved by as much or more, in all: what chance gives where nothing got worse.
+        frames: The top contributing ones, the worst first; empty where the observations were not kept.
     """
 
     number: int
@@ -238,10 +246,11 @@ class Area:
 class Against:
     """A run against the base on one scene, or on all.
 
-    compared  voxels whose change is known
-    worse, better  voxels whose frames agree less, or more, by a fifth or more
-    top_frames  the top contributing frames of all areas together
-    columns   file of each voxel's change and area, relative to the folder
+    Attributes:
+        compared: Voxels whose change is known.
+        worse, better: Voxels whose frames agree less, or more, by a fifth or more.
+        top_frames: The top contributing frames of all areas together.
+        columns: File of each voxel's change and area, relative to the folder.
     """
 
     other: str
@@ -259,9 +268,10 @@ class Against:
 class SceneComparison:
     """The runs on one scene.
 
-    notes   what cannot be compared here, and why
-    voxels    that all saw twice or more; 0 where they are not known
-    frames    that they come from, about
+    Attributes:
+        notes: Notes on what cannot be compared here, and why.
+        voxels: Number of voxels that all saw twice or more; 0 where they are not known.
+        frames: Number of frames that they come from, about.
     """
 
     scene: str
@@ -287,7 +297,8 @@ class Compared:
 class RunComparison:
     """Runs beside the first one, the base.
 
-    overall  macro means over the scenes, each counting once
+    Attributes:
+        overall: Macro means over the scenes, each counting once.
     """
 
     schema: int

@@ -20,7 +20,10 @@ ONCE, NOWHERE = (221, 221, 221), (255, 255, 255)
 def from_above(index: Int32, vss: Float64, up: npt.ArrayLike | None = None) -> UInt8:
     """Return a picture (H, W, 3) RGB of the topmost voxels (n, 3): VSS from 0, dark, to 1, yellow; grey where NaN.
 
-    up  direction out of the picture; the map's shortest side where not given
+    Args:
+        index: (n, 3) voxels.
+        vss: (n,) VSS of each.
+        up: Direction out of the picture; the map's shortest side where not given.
     """
     import cv2
 

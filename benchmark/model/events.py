@@ -19,20 +19,21 @@ from semstab.model.information import entropy_bits, js_divergence, normalise
 from semstab.model.voxels import INDEX, OF_EVENTS, OF_VOXELS, VoxelTable, freeze, in_order, require_memory
 
 COMPUTED = [name for name in OF_VOXELS if name not in (*INDEX, "evidence")]
-"""Of a voxel's row, from its observations."""
+"""The columns of a voxel's row that its observations give."""
 
 
 @dataclass(frozen=True, eq=False)
 class Events:
     """The log of observations: m rows, one a (voxel, frame), grouped by voxel and in order of integration within one.
 
-    ix, iy, iz  (n,) int32 the voxels, sorted
-    voxel       (m,) int32 row into them, ascending
-    frame       (m,) int32 frame index
-    evidence    (m, K) s_bar, the mean of the frame's evidence in the voxel; kept sparse
-    pixels      (m,) int32 pixels behind it
-    voxel_size  r, metres
-    classes     the K class names, where they are known
+    Attributes:
+        ix, iy, iz: (n,) int32 the voxels, sorted.
+        voxel: (m,) int32 row into them, ascending.
+        frame: (m,) int32 frame index.
+        evidence: (m, K) s_bar, the mean of the frame's evidence in the voxel; kept sparse.
+        pixels: (m,) int32 pixels behind it.
+        voxel_size: r, metres.
+        classes: The K class names, where they are known.
     """
 
     ix: Int32
@@ -80,7 +81,7 @@ class Events:
         return self.bounds[1:]
 
     def table(self) -> VoxelTable:
-        """The voxel table, each column from its definition (paper, Persistent Voxel Evidence)."""
+        """Return the voxel table, each column from its definition (paper, Persistent Voxel Evidence)."""
         parts = [log._columns() for log in self._few_at_a_time()]
         columns: dict[str, Any] = {name: np.concatenate([part[name] for part in parts]) for name in COMPUTED}
         evidence = Evidence.joined([part["evidence"] for part in parts])
@@ -101,7 +102,7 @@ class Events:
         }
 
     def _few_at_a_time(self) -> Iterator[Events]:
-        """The logs of voxels one after the other, of as many as have little evidence when it is dense."""
+        """Yield the logs of voxels one after the other, of as many as have little evidence when it is dense."""
         edges = np.array([some.start for some in self.evidence.chunks()])
         cuts = np.unique(np.append(np.searchsorted(self.starts, edges), len(self.ix))).tolist()
         for first, last in zip(cuts, cuts[1:] or cuts, strict=False):
@@ -111,7 +112,10 @@ class Events:
             yield replace(self, **columns, voxel=self.voxel[own] - first, evidence=self.evidence.take(own))
 
     def beliefs(self) -> Float64:
-        """(m, K) the belief p^(t) after each observation: the normalised sum of the voxel's evidence up to it."""
+        """Return (m, K) the belief p^(t) after each observation.
+
+        The normalised sum of the voxel's evidence up to it.
+        """
         accumulated = self.evidence[:]
         age = np.arange(len(self)) - self.starts[self.voxel]
         by_age = np.argsort(age, kind="stable")
@@ -121,7 +125,10 @@ class Events:
         return normalise(accumulated)
 
     def drift(self) -> Float64:
-        """(m,) D_JS(p^(t), p^(t-1)) in bits, that each observation caused at its voxel; 0 for a voxel's first."""
+        """Return (m,) D_JS(p^(t), p^(t-1)) in bits, that each observation caused at its voxel.
+
+        0 for a voxel's first.
+        """
         belief = self.beliefs()
         drift = np.zeros(len(self))
         again = np.flatnonzero(np.diff(self.voxel, prepend=-1) == 0)
@@ -129,7 +136,7 @@ class Events:
         return drift
 
     def rows(self, voxels: Int64) -> Events:
-        """The log of these of its voxels (r,), ascending."""
+        """Return the log of these of its voxels (r,), ascending."""
         first = self.bounds[voxels]
         count = self.bounds[voxels + 1] - first
         number = np.repeat(np.arange(len(voxels), dtype=np.int32), count)
@@ -151,7 +158,7 @@ class Events:
 
     @classmethod
     def joined(cls, parts: Sequence[Events]) -> Events:
-        """One log of the voxels of several that share none."""
+        """Return one log of the voxels of several that share none."""
         if len(parts) == 1:
             return parts[0]
         index = {name: np.concatenate([getattr(part, name) for part in parts]) for name in INDEX}
@@ -174,7 +181,8 @@ class Events:
     def load(cls, path: str | Path) -> Events:
         """Read what `save` wrote, a file or a folder of tiles, all of it.
 
-        Raises DataError where a file is missing, damaged or of another kind, or a log in tiles is larger than memory.
+        Raises:
+            DataError: If a file is missing, damaged or of another kind, or a log in tiles is larger than memory.
         """
         files = parquet.files_of(path)
         if len(files) > 1:

@@ -17,20 +17,23 @@ CHUNK_VALUES = 1 << 18
 """Rows are made dense so many values at a time: what fits into a core's cache costs no new memory."""
 
 PAIRWISE = 8
-"""From so many classes on NumPy's sum over them depends on their layout; below, class by class is the faster one."""
+"""The number of classes from which on NumPy's sum depends on their layout; below, class by class is the faster one."""
 
 STRETCH = 1 << 17
-"""So many voxels are looked at together, where sums over all of them are wanted."""
+"""The voxels that are looked at together, where sums over all of them are wanted."""
 
 
 def row_chunks(rows: int, K: int) -> Iterator[slice]:
-    """Slices of consecutive rows whose dense evidence has at most `CHUNK_VALUES` values; one at least, if empty."""
+    """Return slices of consecutive rows whose dense evidence has at most `CHUNK_VALUES` values.
+
+    One at least, if empty.
+    """
     step = max(1, CHUNK_VALUES // max(K, 1))
     return (slice(first, min(first + step, rows)) for first in range(0, max(rows, 1), step))
 
 
 def stretches(rows: int, most: int = STRETCH) -> Iterator[slice]:
-    """Consecutive rows, few enough that what is computed of them takes little memory; one stretch at least."""
+    """Return consecutive rows, few enough that what is computed of them takes little memory; one stretch at least."""
     return (slice(first, min(first + most, rows)) for first in range(0, max(rows, 1), most))
 
 
@@ -38,11 +41,12 @@ def stretches(rows: int, most: int = STRETCH) -> Iterator[slice]:
 class Evidence(NDArrayOperatorsMixin):
     """An array (n, K) by its entries that are not 0. Indexed by rows it gives dense rows; NumPy sees all of it dense.
 
-    starts  (n + 1,) int64 first entry of each row
-    label   (m,) uint16 the entry's class, ascending within a row
-    weight  (m,) float64
-    K       number of classes
-    known   how the rows are spread over the classes, where that was found already: see `measured`
+    Attributes:
+        starts: (n + 1,) int64 first entry of each row.
+        label: (m,) uint16 the entry's class, ascending within a row.
+        weight: (m,) float64.
+        K: Number of classes.
+        known: The spread of rows over the classes, where that was found already: see `measured`.
     """
 
     starts: Int64
@@ -53,7 +57,7 @@ class Evidence(NDArrayOperatorsMixin):
 
     @classmethod
     def of(cls, rows: npt.ArrayLike | Evidence) -> Evidence:
-        """Dense rows (n, K), or evidence as it is."""
+        """Return dense rows (n, K), or evidence as it is."""
         if isinstance(rows, Evidence):
             return rows
         dense = np.asarray(rows, dtype=np.float64)
@@ -61,7 +65,7 @@ class Evidence(NDArrayOperatorsMixin):
 
     @classmethod
     def read(cls, rows: int, K: int, dense: Callable[[slice], Float64]) -> Evidence:
-        """So many rows of what gives a slice of them, dense (r, K)."""
+        """Read so many rows of what gives a slice of them, dense (r, K)."""
         counts, labels, weights = [np.zeros(1, np.int64)], [], []
         for some in row_chunks(rows, K):
             part = dense(some)
@@ -73,7 +77,7 @@ class Evidence(NDArrayOperatorsMixin):
 
     @classmethod
     def joined(cls, parts: Sequence[Evidence]) -> Evidence:
-        """The rows of one after the other."""
+        """Return the rows of one after the other."""
         counts = np.concatenate([[0], *(np.diff(part.starts) for part in parts)])
         label, weight = (np.concatenate([getattr(part, name) for part in parts]) for name in ("label", "weight"))
         return cls(np.cumsum(counts), label, weight, parts[0].K)
@@ -112,7 +116,7 @@ class Evidence(NDArrayOperatorsMixin):
         return self.take(rows)._stretch()
 
     def take(self, rows: Any) -> Evidence:
-        """The rows (r,) of these numbers, or for which a mask (n,) holds."""
+        """Return the rows (r,) of these numbers, or for which a mask (n,) holds."""
         known = None if self.known is None else self.known.take(rows)
         if isinstance(rows, slice) and rows.step in (None, 1):
             first, last, _ = rows.indices(len(self))
@@ -128,25 +132,25 @@ class Evidence(NDArrayOperatorsMixin):
         return Evidence(starts, label, weight, self.K, known=known)
 
     def only(self, labels: UInt16) -> Evidence:
-        """Of these classes (k,), ascending, among which are all that have an entry: they become 0 to k - 1."""
+        """Return the evidence of these ascending classes (k,), which have all the entries: they become 0 to k - 1."""
         label = np.searchsorted(labels, self.label).astype(np.uint16)
         return Evidence(self.starts, label, self.weight, len(labels))
 
     @property
     def concentration(self) -> Concentration:
-        """How the rows are spread over the classes."""
+        """Return how the rows are spread over the classes."""
         return self.known or Concentration.of(*self.entries)
 
     def measured(self) -> Self:
-        """The same, with its concentration, so that nobody computes that again: 34 bytes a row."""
+        """Return the same, with its concentration, so that nobody computes that again: 34 bytes a row."""
         return replace(self, known=self.concentration)
 
     def chunks(self) -> Iterator[slice]:
-        """Consecutive rows that together are small when dense."""
+        """Return consecutive rows that together are small when dense."""
         return row_chunks(len(self), self.K)
 
     def rowwise(self, formula: Callable[[Float64], npt.NDArray[Any]]) -> npt.NDArray[Any]:
-        """What a formula makes of dense rows (r, K), chunk by chunk: (n, ...)."""
+        """Return what a formula makes of dense rows (r, K), chunk by chunk: (n, ...)."""
         return np.concatenate([formula(self[some]) for some in self.chunks()])
 
     @property
@@ -155,26 +159,26 @@ class Evidence(NDArrayOperatorsMixin):
         return np.dtype(np.float64)
 
     def sum(self, axis: int, *, keepdims: bool = False) -> Float64:
-        """Of each row (n,) for axis 1, of each class (K,) for axis 0."""
+        """Return the sum of each row (n,) for axis 1, of each class (K,) for axis 0."""
         if axis == 0:
             return np.bincount(self.label, weights=self.weight, minlength=self.K).astype(np.float64)
         return self.rowwise(lambda rows: rows.sum(axis=1, keepdims=keepdims))
 
     def max(self, axis: int) -> Float64:
-        """The largest of each row (n,)."""
+        """Return the largest of each row (n,)."""
         return self.rowwise(lambda rows: rows.max(axis=axis))
 
     def argmax(self, axis: int) -> Int64:
-        """The class of the largest of each row (n,), the lowest on ties."""
+        """Return the class of the largest of each row (n,), the lowest on ties."""
         return self.rowwise(lambda rows: rows.argmax(axis=axis).astype(np.int64))
 
     def tolist(self) -> list[list[float]]:
-        """All of it, dense."""
+        """Return all of it, dense."""
         content: list[list[float]] = self[:].tolist()
         return content
 
     def _stretch(self, first: int = 0, last: int | None = None) -> Float64:
-        """Dense rows from the first to before the last."""
+        """Return dense rows from the first to before the last."""
         starts = self.starts[first : (len(self) if last is None else max(first, last)) + 1]
         dense = np.zeros((len(starts) - 1, self.K), order="F" if self.K < PAIRWISE else "C")
         entries = slice(starts[0], starts[-1])

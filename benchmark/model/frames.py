@@ -36,7 +36,11 @@ class Intrinsics:
 
     @classmethod
     def from_matrix(cls, K: npt.ArrayLike) -> Intrinsics:
-        """From a 3x3 (or 4x4) camera matrix. Raises DataError where it has skew or another shape."""
+        """Make it of a 3x3 (or 4x4) camera matrix.
+
+        Raises:
+            DataError: If it has skew or another shape.
+        """
         K = np.asarray(K, dtype=np.float64)
         if K.shape not in ((3, 3), (4, 4)):
             raise DataError(f"intrinsics: expected a 3x3 matrix, got shape {K.shape}")
@@ -52,11 +56,11 @@ class Intrinsics:
         return np.array([[self.fx, 0, self.cx], [0, self.fy, self.cy], [0, 0, 1]], dtype=np.float64)
 
     def every(self, stride: int) -> Intrinsics:
-        """Intrinsics of the image that keeps pixels 0, stride, 2 stride, ... of each axis."""
+        """Return the intrinsics of the image that keeps pixels 0, stride, 2 stride, ... of each axis."""
         return Intrinsics(self.fx / stride, self.fy / stride, self.cx / stride, self.cy / stride)
 
     def resized(self, size: tuple[int, int], to: tuple[int, int]) -> Intrinsics:
-        """Intrinsics after resizing the image from (width, height) `size` to `to`; pixel areas, not centres, align."""
+        """Return intrinsics after the image is resized from `size` (width, height) to `to`; pixel areas align."""
         sx, sy = to[0] / size[0], to[1] / size[1]
         return Intrinsics(self.fx * sx, self.fy * sy, (self.cx + 0.5) * sx - 0.5, (self.cy + 0.5) * sy - 0.5)
 
@@ -79,21 +83,23 @@ IMAGES = ("depth", "labels", "scores", "color", "mask", "left_out", "unlabelled"
 class Frame:
     """One observation of the scene, validated where it is made; its arrays are read-only views.
 
-    index       number in the sequence
-    depth       (H, W) float32, metres along the optical axis (planar z); 0, negative, NaN and inf are invalid
-    intrinsics  of the depth image; or its 3x3 camera matrix
-    T_wc        (4, 4) or (3, 4) float64 camera-to-world, metres; camera axes x right, y down, z forward (OpenCV)
-    labels      (H, W) uint8 or uint16 class ids, ignore id 255 or 65535; other integers become the smaller one; or
-    scores      (H, W, K) float, non-negative; normalised per pixel where they are used
-    color       (H, W, 3) uint8 RGB, optional
-    mask        (H, W) bool, True where a thing moves that is not to be fused, optional; `semstab.pixels.preparation`
-    left_out    (H, W) bool, the pixels that were left out of fusion for what they show, optional
-    unlabelled  (H, W) bool, the pixels with depth to which a model gave no label, optional
-    scores_left_out  what was left out of the scores, where only the largest are kept
-    timestamp   seconds, optional
-    files       which file each field came from ('depth', 'pose', 'labels', ...); error messages name it
+    Attributes:
+        index: Number in the sequence.
+        depth: (H, W) float32, metres along the optical axis (planar z); 0, negative, NaN and inf are invalid.
+        intrinsics: Intrinsics of the depth image; or its 3x3 camera matrix.
+        T_wc: (4, 4) or (3, 4) float64 camera-to-world, metres; camera axes x right, y down, z forward (OpenCV).
+        labels: (H, W) uint8 or uint16 class ids, ignore id 255 or 65535; other integers become the smaller one.
+        scores: (H, W, K) float, in place of labels, non-negative; normalised per pixel where they are used.
+        color: (H, W, 3) uint8 RGB, optional.
+        mask: (H, W) bool, True where a thing moves that is not to be fused, optional; `semstab.pixels.preparation`.
+        left_out: (H, W) bool, the pixels that were left out of fusion for what they show, optional.
+        unlabelled: (H, W) bool, the pixels with depth to which a model gave no label, optional.
+        scores_left_out: Part of the scores that was left out, where only the largest are kept.
+        timestamp: Seconds, optional.
+        files: File that each field came from ('depth', 'pose', 'labels', ...); error messages name it.
 
-    Raises DataError where shapes disagree, the pose is not rigid or not finite, or a type is wrong.
+    Raises:
+        DataError: If shapes disagree, the pose is not rigid or not finite, or a type is wrong.
     """
 
     index: int
@@ -166,7 +172,7 @@ class Frame:
 
     @property
     def left_out_pixels(self) -> int:
-        """How many pixels were left out of fusion for what they show."""
+        """Return how many pixels were left out of fusion for what they show."""
         return 0 if self.left_out is None else int(np.count_nonzero(self.left_out))
 
     @property
@@ -176,12 +182,12 @@ class Frame:
 
     @property
     def _images(self) -> dict[str, npt.NDArray[Any]]:
-        """Those that the frame has, by field."""
+        """The images that the frame has, by field."""
         images = {name: getattr(self, name) for name in IMAGES}
         return {name: image for name, image in images.items() if image is not None}
 
     def every(self, stride: int) -> Frame:
-        """The frame that keeps every stride-th pixel of each axis, from pixel (0, 0), with its intrinsics."""
+        """Return the frame that keeps every stride-th pixel of each axis, from pixel (0, 0), with its intrinsics."""
         if stride == 1:
             return self
         pick = (slice(None, None, stride), slice(None, None, stride))
@@ -189,7 +195,7 @@ class Frame:
         return dataclasses.replace(self, intrinsics=self.intrinsics.every(stride), **kept)
 
     def where(self, what: str) -> str:
-        """What an error message calls a field: its file where it has one, else the frame and the field."""
+        """Return what an error message calls a field: its file where it has one, else the frame and the field."""
         return self.files.get(what, f"frame {self.index}, {what}")
 
     def _set(self, name: str, value: npt.NDArray[Any]) -> None:
@@ -240,7 +246,7 @@ class Frame:
         return labels
 
     def _narrowed(self, labels: npt.NDArray[Any]) -> npt.NDArray[Any]:
-        """Integers of another type as uint8, or as uint16 where there is one above 255."""
+        """Return integers of another type as uint8, or as uint16 where there is one above 255."""
         where = self.where("labels")
         if not (np.issubdtype(labels.dtype, np.integer) or labels.dtype == np.bool_):
             raise DataError(f"{where}: labels are {labels.dtype}; use uint8 or uint16 (ignore 255 or 65535)")
@@ -277,7 +283,7 @@ class Frame:
 
 
 def _intrinsics(given: Any, where: str) -> Intrinsics:
-    """Intrinsics, or a camera matrix as such."""
+    """Return intrinsics, or a camera matrix as such."""
     if isinstance(given, Intrinsics):
         return given
     try:
@@ -288,7 +294,7 @@ def _intrinsics(given: Any, where: str) -> Intrinsics:
 
 
 def _in_line(matrix: Float64) -> str:
-    """A matrix in one line, as an error message shows it."""
+    """Return a matrix in one line, as an error message shows it."""
     return "[" + "; ".join(" ".join(f"{value:.4g}" for value in row) for row in matrix) + "]"
 
 

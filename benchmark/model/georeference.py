@@ -1,4 +1,4 @@
-"""Where a scene lies on Earth: a projection, and the affine map that brings the scene's coordinates into it."""
+"""The place of a scene on Earth: a projection, and the affine map that brings the scene's coordinates into it."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from semstab.core.types import Float64
 from semstab.errors import ConfigError, MissingDependencyError, summarize_error
 
 INSTALL = "pip install 'semstab[geo]'"
-"""What a message says where a package of the extra `geo` is not installed."""
+"""The advice of a message where a package of the extra `geo` is not installed."""
 
 SINGULAR = 1e-6
 """Determinant of a matrix that flattens the scene; those of topocentric scenes are 1 to a thousandth."""
@@ -30,9 +30,10 @@ class Georeference:
     topocentric scene is turned against the projection by the convergence of meridians, and scaled by some parts in ten
     thousand.
 
-    crs     the coordinate reference system as WKT (2:2019), in metres
-    offset  (east, north, up), metres
-    linear  rows of the (3, 3) matrix
+    Attributes:
+        crs: The coordinate reference system as WKT (2:2019), in metres.
+        offset: (east, north, up), metres.
+        linear: Rows of the (3, 3) matrix.
     """
 
     crs: str
@@ -41,10 +42,12 @@ class Georeference:
 
     @classmethod
     def of(cls, crs: str, offset: tuple[float, float, float], where: str, linear: Linear | None = None) -> Georeference:
-        """From a reference system in any words that pyproj reads: EPSG:32615, '+proj=utm +zone=15', WKT.
+        """Make it of a reference system in any words that pyproj reads: EPSG:32615, '+proj=utm +zone=15', WKT.
 
-        Raises ConfigError with `where` (the file or option) for one that is not known, or not in metres, and for a
-        matrix that cannot be inverted; MissingDependencyError without pyproj.
+        Raises:
+            ConfigError: For one that is not known, or not in metres, and for a matrix that cannot be inverted, with
+                `where` (the file or option).
+            MissingDependencyError: Without pyproj.
         """
         if linear is not None and not abs(np.linalg.det(np.array(linear))) > SINGULAR:
             raise ConfigError(f"{where}: the matrix from the scene to the projection cannot be inverted; write it anew")
@@ -52,7 +55,7 @@ class Georeference:
 
     @property
     def turned(self) -> bool:
-        """Whether the scene's axes are not those of the projection."""
+        """Return whether the scene's axes are not those of the projection."""
         return self.linear != IDENTITY
 
     def along(self, points: Float64) -> Float64:
@@ -76,7 +79,7 @@ class Georeference:
 
 
 def wkt(crs: str, where: str) -> str:
-    """The WKT of a projected reference system in metres, with its number where there is one; errors as `of`."""
+    """Return the WKT of a projected reference system in metres, with its number where there is one; errors as `of`."""
     try:
         from pyproj import CRS
         from pyproj.exceptions import CRSError

@@ -15,14 +15,14 @@ Array = Float64
 
 
 def normalise(evidence: npt.ArrayLike) -> Array:
-    """The belief p: non-negative evidence (..., K) scaled to sum to 1 (paper, Persistent Voxel Evidence)."""
+    """Return the belief p: non-negative evidence (..., K) scaled to sum to 1 (paper, Persistent Voxel Evidence)."""
     e = np.asarray(evidence, dtype=np.float64)
     belief: Array = e / e.sum(axis=-1, keepdims=True)
     return belief
 
 
 def entropy_bits(p: npt.ArrayLike) -> Array:
-    """Shannon entropy -sum_k p_k log2 p_k of distributions (..., K), in bits; 0 log 0 = 0.
+    """Return Shannon entropy -sum_k p_k log2 p_k of distributions (..., K), in bits; 0 log 0 = 0.
 
     >>> float(entropy_bits([0.5, 0.5]))
     1.0
@@ -34,7 +34,7 @@ def entropy_bits(p: npt.ArrayLike) -> Array:
 
 
 def js_divergence(p: npt.ArrayLike, q: npt.ArrayLike) -> Array:
-    """Jensen-Shannon divergence of distributions (..., K), in bits, so in [0, 1] (Lin 1991, IEEE TIT 37).
+    """Return Jensen-Shannon divergence of distributions (..., K), in bits, so in [0, 1] (Lin 1991, IEEE TIT 37).
 
     D_JS(p, q) = 1/2 sum_k p_k log2(p_k / m_k) + 1/2 sum_k q_k log2(q_k / m_k), with m = (p + q) / 2.
 
@@ -51,7 +51,7 @@ def js_divergence(p: npt.ArrayLike, q: npt.ArrayLike) -> Array:
 
 
 def _relative_entropy(p: Array, m: Array) -> Array:
-    """Kullback-Leibler divergence sum_k p_k log2(p_k / m_k), in bits; 0 where m_k underflows to 0."""
+    """Return Kullback-Leibler divergence sum_k p_k log2(p_k / m_k), in bits; 0 where m_k underflows to 0."""
     p, m = np.broadcast_arrays(p, m)
     ratio = np.divide(p, m, out=np.ones(p.shape), where=np.minimum(p, m) > 0)
     divergence: Array = (p * np.log2(ratio)).sum(axis=-1)
@@ -73,13 +73,14 @@ APART = 8
 
 @dataclass(frozen=True, eq=False)
 class Concentration:
-    """Of rows of evidence e (n, K), in one pass over their entries; p is e scaled to sum to 1.
+    """The concentration of rows of evidence e (n, K), in one pass over their entries; p is e scaled to sum to 1.
 
-    largest  (n,) max_k p_k
-    lead     (n,) the largest p less the second largest
-    bits     (n,) entropy of p
-    label    (n,) uint16 argmax_k e_k, the lowest on ties
-    squares  (n,) ||e||^2
+    Attributes:
+        largest: (n,) max_k p_k.
+        lead: (n,) the largest p less the second largest.
+        bits: (n,) entropy of p.
+        label: (n,) uint16 argmax_k e_k, the lowest on ties.
+        squares: (n,) ||e||^2.
     """
 
     largest: Float64
@@ -90,7 +91,7 @@ class Concentration:
 
     @classmethod
     def of(cls, starts: Int64, label: UInt16, weight: Float64) -> Concentration:
-        """Of entries as `Evidence` has them."""
+        """Compute it of entries as `Evidence` has them."""
         from semstab.model.kernels import concentrate
 
         largest, lead, bits, squares = np.empty((4, len(starts) - 1))
@@ -99,7 +100,7 @@ class Concentration:
         return cls(largest, lead, bits, dominant, squares)
 
     def take(self, rows: Any) -> Concentration:
-        """Of some rows: a slice, their numbers, or a mask (n,)."""
+        """Return that of some rows: a slice, their numbers, or a mask (n,)."""
         return Concentration(*(values[rows] for values in vars(self).values()))
 
 
@@ -108,7 +109,7 @@ def by_group(
     values: Sequence[npt.NDArray[Any]] | Float64,
     groups: int,
 ) -> tuple[Float64, Float64]:
-    """(groups, C) sums of C values (n,) by group (n,), and how often they are defined; -1 is no group."""
+    """Return (groups, C) sums of C values (n,) by group (n,), and how often they are defined; -1 is no group."""
     from semstab.model.kernels import add_by_group
 
     wide = -(-len(values) // TOGETHER) * TOGETHER

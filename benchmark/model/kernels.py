@@ -20,7 +20,7 @@ def mark_valid(depth: Any, labels: Any, ignore: int, out: Any) -> None:
 
 @serial
 def count_changed(valid: Any, labels: Any, other_valid: Any, other_labels: Any) -> tuple[int, int]:
-    """The number of pixels that are valid in both frames, and of those among them whose labels differ."""
+    """Return the number of pixels that are valid in both frames, and of those among them whose labels differ."""
     both = changed = 0
     for i in range(valid.size):
         common = valid[i] & other_valid[i]
@@ -31,7 +31,7 @@ def count_changed(valid: Any, labels: Any, other_valid: Any, other_labels: Any) 
 
 @serial
 def count_changed_at(at: Any, valid: Any, labels: Any, other_valid: Any, other_labels: Any) -> tuple[int, int]:
-    """Of the valid pixels those that see a valid pixel of the other view, `at`, and those whose label differs there."""
+    """Count the valid pixels that see a valid pixel of the other view, `at`, and those whose label differs there."""
     seen = changed = 0
     for i in range(len(at)):
         j = max(at[i], 0)
@@ -43,7 +43,7 @@ def count_changed_at(at: Any, valid: Any, labels: Any, other_valid: Any, other_l
 
 @serial
 def has_other(labels: Any, count: int, ignore: int) -> bool:
-    """Whether a map of ids (n,) holds one that is neither below `count` nor the ignore id."""
+    """Return whether a map of ids (n,) holds one that is neither below `count` nor the ignore id."""
     first, ignored = labels.dtype.type(count), labels.dtype.type(ignore)
     other = False
     for i in range(labels.size):

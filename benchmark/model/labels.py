@@ -32,16 +32,16 @@ PALETTE: tuple[Color, ...] = (
 )  # fmt: skip
 
 GLOW: tuple[Color, ...] = ((150, 0, 40), (230, 30, 0), (255, 140, 0), (255, 230, 60), (255, 255, 230))
-"""What the recording shows drift in, from little to much: no class is given a colour of this fire."""
+"""The colours of drift in the recording, from little to much: no class is given a colour of this fire."""
 
 CLEAR = 45.0
 """Distance in RGB that classes keep from it; Tol's colours do."""
 
 LEVELS = tuple(range(0, 256, 17))
-"""Of each channel of the colours that are chosen from."""
+"""The levels of each channel of the colours that are chosen from."""
 
 LIGHTNESS = (0.3, 0.92)
-"""Of these colours, in OKLab: neither ink nor paper."""
+"""The lightness of these colours, in OKLab: neither ink nor paper."""
 
 TO_LMS = np.array(
     [[0.41222147, 0.53633254, 0.05144599], [0.2119035, 0.6806995, 0.107397], [0.0883025, 0.2817188, 0.6299787]]
@@ -49,15 +49,15 @@ TO_LMS = np.array(
 TO_LAB = np.array(
     [[0.21045426, 0.79361779, -0.00407205], [1.9779985, -2.4285922, 0.4505937], [0.0259040, 0.7827718, -0.8086758]]
 )
-"""From linear RGB to OKLab (Ottosson 2020, A perceptual color space for image processing)."""
+"""The matrices from linear RGB to OKLab (Ottosson 2020, A perceptual color space for image processing)."""
 
 DEUTAN = np.array([[0.29275, 0.70725, 0.0], [0.29275, 0.70725, 0.0], [-0.02234, 0.02234, 1.0]])
-"""What linear RGB looks like without green cones (Vienot, Brettel, Mollon 1999, Color Research and Application)."""
+"""The look of linear RGB without green cones (Vienot, Brettel, Mollon 1999, Color Research and Application)."""
 
 
 @functools.cache
 def palette(K: int) -> tuple[Color, ...]:
-    """K colours: Tol's, and of those that are left the one farthest from all before, each by itself.
+    """Return K colours: Tol's, and of those that are left the one farthest from all before, each by itself.
 
     >>> len(set(palette(150)))
     150
@@ -79,13 +79,13 @@ def palette(K: int) -> tuple[Color, ...]:
 
 
 def between(colors: Sequence[Color], n: int) -> Float64:
-    """(n, 3) colours from the first to the last, evenly along the line through all of them."""
+    """Return (n, 3) colours from the first to the last, evenly along the line through all of them."""
     at = np.linspace(0, len(colors) - 1, n)
     return np.stack([np.interp(at, np.arange(len(colors)), channel) for channel in np.transpose(colors)], axis=1)
 
 
 def _places(colors: npt.NDArray[np.integer]) -> Float64:
-    """(n, 6) OKLab of colours (n, 3), as they are and without green cones."""
+    """Return (n, 6) OKLab of colours (n, 3), as they are and without green cones."""
     share = colors / 255
     linear = np.where(share <= 0.04045, share / 12.92, ((share + 0.055) / 1.055) ** 2.4)
     return np.concatenate([_oklab(linear), _oklab(np.clip(linear @ DEUTAN.T, 0, 1))], axis=1)
@@ -97,7 +97,7 @@ def _oklab(linear: Float64) -> Float64:
 
 
 def _distance(places: Float64, one: Float64) -> Float64:
-    """(n,) how far colours look from one: to all eyes, and half as much to those without green cones."""
+    """Return (n,) how far colours look from one: to all eyes, and half as much to those without green cones."""
     difference = places - one
     seen = np.linalg.norm(difference[:, :3], axis=1) + 0.5 * np.linalg.norm(difference[:, 3:], axis=1)
     found: Float64 = seen
@@ -109,21 +109,23 @@ IGNORE_16BIT = 65535
 LEFT_OUT = -1
 """The row of a name that a label space ignores."""
 UNKNOWN = -1
-"""In a mapping's table: an id that the source label space does not have."""
+"""The mark in a mapping's table for an id that the source label space does not have."""
 
 
 @dataclass(frozen=True)
 class LabelSpace:
     """The classes of a label map: ids, names and colours, without the ignore id.
 
-    name     of the taxonomy
-    classes  K >= 2 distinct names; evidence vectors follow their order
-    ids      the id of each class in label maps; 0..K-1 unless given
-    colors   RGB of each class
-    members  for each class, names of other taxonomies that fall into it
-    ignored  names of other taxonomies that are left out
+    Attributes:
+        name: Name of the taxonomy.
+        classes: K >= 2 distinct names; evidence vectors follow their order.
+        ids: The id of each class in label maps; 0..K-1 unless given.
+        colors: RGB of each class.
+        members: Names, for each class, of other taxonomies that fall into it.
+        ignored: Names of other taxonomies that are left out.
 
-    Raises ConfigError where these contradict each other.
+    Raises:
+        ConfigError: If these contradict each other.
     """
 
     name: str
@@ -158,16 +160,17 @@ class LabelSpace:
 
     @classmethod
     def load(cls, name_or_path: str | Path) -> LabelSpace:
-        """A taxonomy that ships with semstab, by name (`uavid7`), or from a YAML file.
+        """Return a taxonomy that ships with semstab, by name (`uavid7`), or from a YAML file.
 
-        Raises ConfigError where there is no such taxonomy or the file is not one.
+        Raises:
+            ConfigError: If there is no such taxonomy or the file is not one.
         """
         text, where = _taxonomy_text(str(name_or_path))
         return cls.from_dict(parse_yaml(text, where), where)
 
     @classmethod
     def from_dict(cls, content: Any, where: str = "taxonomy") -> LabelSpace:
-        """From the content of a taxonomy file: name, classes (names, or name, id, color, members), ignored."""
+        """Read the content of a taxonomy file: name, classes (names, or name, id, color, members), ignored."""
         if not isinstance(content, dict) or not isinstance(content.get("classes"), list):
             raise ConfigError(f"{where}: a taxonomy needs a list 'classes'")
         known = ("name", "classes", "ignored")
@@ -190,14 +193,14 @@ class LabelSpace:
         )
 
     def to_dict(self) -> dict[str, Any]:
-        """The content of a taxonomy file; `from_dict` reads it back."""
+        """Return the content of a taxonomy file; `from_dict` reads it back."""
         rows = zip(self.classes, self.ids, self.colors, self.members, strict=True)
         classes = [{"name": n, "id": i, "color": list(c), "members": list(m)} for n, i, c, m in rows]
         return {"name": self.name, "classes": classes, "ignored": list(self.ignored)}
 
     @property
     def row_of(self) -> dict[str, int]:
-        """By `name_key` of its classes and their members the row of the class; LEFT_OUT of what it ignores."""
+        """The row of each class by `name_key` of it and its members; LEFT_OUT for what the space ignores."""
         rows = {name_key(name): LEFT_OUT for name in self.ignored}
         for row, (name, members) in enumerate(zip(self.classes, self.members, strict=True)):
             rows |= {name_key(key): row for key in (name, *members)}
@@ -210,7 +213,8 @@ class LabelSpace:
     def mapping_to(self, target: LabelSpace) -> LabelMapping:
         """Map each class of this space to the class of `target` with its name, or among whose members it is.
 
-        Raises ConfigError, naming them, where classes are mapped nowhere and are not listed as ignored.
+        Raises:
+            ConfigError: If classes are mapped nowhere and are not listed as ignored, naming them.
         """
         known = target.row_of
         if lost := [name for name in self.classes if name_key(name) not in known]:
@@ -224,7 +228,7 @@ class LabelSpace:
 
 @dataclass(frozen=True)
 class LabelMapping:
-    """From the ids of one label space to rows 0..K-1 of another; `rows` has None where a class is ignored."""
+    """A mapping from the ids of one label space to rows 0..K-1 of another; `rows` has None where a class is ignored."""
 
     source: LabelSpace
     target: LabelSpace
@@ -237,7 +241,7 @@ class LabelMapping:
             )
 
     def named(self, names: Iterable[str]) -> tuple[int, ...]:
-        """Positions of the source classes that have one of these names, or become a class that has."""
+        """Return positions of the source classes that have one of these names, or become a class that has."""
         wanted = {name_key(name) for name in names}
         rows = {row for row, name in enumerate(self.target.classes) if name_key(name) in wanted}
         pairs = zip(self.source.classes, self.rows, strict=True)
@@ -246,7 +250,8 @@ class LabelMapping:
     def labels(self, labels: UInt8 | UInt16, where: str) -> UInt8 | UInt16:
         """Map a label map of any shape; the ignore id stays one.
 
-        Raises DataError with `where` (the file) for an id that the source space does not have.
+        Raises:
+            DataError: For an id that the source space does not have, with `where` (the file).
         """
         if self._keeps(labels):
             return labels
@@ -263,7 +268,7 @@ class LabelMapping:
         return _look_up(table.astype(np.uint8 if len(self.target) <= IGNORE_8BIT else np.uint16), labels)
 
     def _keeps(self, labels: npt.NDArray[Any]) -> bool:
-        """Whether the map stays as it is: 8-bit ids that are the rows already, and none but those and the ignore id."""
+        """Return whether the map stays as it is: its 8-bit ids are the rows already, or the ignore id."""
         from semstab.model.kernels import has_other
 
         K = len(self.target)
@@ -274,7 +279,9 @@ class LabelMapping:
         """Map soft scores (H, W, K of the source): classes that fall together are summed, ignored ones dropped.
 
         Where an ignored class has the largest score, as where a label map has its id, all scores are 0: ignored.
-        Raises DataError where the number of classes differs from the source space's.
+
+        Raises:
+            DataError: If the number of classes differs from the source space's.
         """
         if scores.shape[2] != len(self.source):
             raise DataError(
@@ -292,7 +299,10 @@ class LabelMapping:
         return mapped
 
     def _table(self, itemsize: int) -> Int32:
-        """Target row for each id a map can hold; the target's ignore id for ignored ones, UNKNOWN for the rest."""
+        """Return the target row for each id a map can hold.
+
+        The target's ignore id for ignored ones, UNKNOWN for the rest.
+        """
         ignore = IGNORE_8BIT if len(self.target) <= IGNORE_8BIT else IGNORE_16BIT
         table = np.full(1 << (8 * itemsize), UNKNOWN, dtype=np.int32)
         for class_id, row in zip(self.source.ids, self.rows, strict=True):
@@ -305,31 +315,31 @@ class LabelMapping:
 
 
 def shipped_taxonomies() -> tuple[str, ...]:
-    """Names of the taxonomies that ship with semstab."""
+    """Return the names of the taxonomies that ship with semstab."""
     folder = importlib.resources.files("semstab.configs") / "taxonomies"
     return tuple(sorted(item.name.removesuffix(".yaml") for item in folder.iterdir() if item.name.endswith(".yaml")))
 
 
 def ignore_id(labels: npt.NDArray[Any]) -> int:
-    """The id of a pixel without a label in a map of that type: 255, or 65535 in 16-bit maps."""
+    """Return the id of a pixel without a label in a map of that type: 255, or 65535 in 16-bit maps."""
     return IGNORE_8BIT if labels.dtype == np.uint8 else IGNORE_16BIT
 
 
 def fixed(array: Any) -> Any:
-    """The array contiguous and read-only, so that numba compiles one version for all."""
+    """Return the array contiguous and read-only, so that numba compiles one version for all."""
     array = np.ascontiguousarray(array).view()
     array.flags.writeable = False
     return array
 
 
 def flat(image: npt.NDArray[Any]) -> npt.NDArray[Any]:
-    """The image's values (n,), fixed."""
+    """Return the image's values (n,), fixed."""
     values: npt.NDArray[Any] = fixed(image).reshape(-1)
     return values
 
 
 def _present(labels: npt.NDArray[Any]) -> Mask:
-    """For each id that the type can hold, whether the map has it."""
+    """Return for each id that the type can hold whether the map has it."""
     if labels.dtype == np.uint8 and labels.ndim == 2 and labels.size:
         import cv2
 
@@ -340,7 +350,7 @@ def _present(labels: npt.NDArray[Any]) -> Mask:
 
 
 def _look_up(table: npt.NDArray[Any], labels: npt.NDArray[Any]) -> npt.NDArray[Any]:
-    """table[labels]."""
+    """Return table[labels]."""
     if labels.dtype == np.uint8 and labels.ndim == 2 and labels.size:
         import cv2
 
@@ -365,7 +375,7 @@ def _taxonomy_text(name: str) -> tuple[str, str]:
 
 
 def name_key(name: str) -> str:
-    """Names compare without case, surrounding space, and the choice between space, '_' and '-'."""
+    """Return a name as names compare: without case, surrounding space, and the choice between space, '_' and '-'."""
     return " ".join(name.replace("_", " ").replace("-", " ").lower().split())
 
 

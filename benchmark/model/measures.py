@@ -1,4 +1,4 @@
-"""What is measured of a voxel: each measure declared once, its formula with its name, its digits, which way is good.
+"""Measures of a voxel: each declared once, its formula with its name, its digits, which way is good.
 
 Summaries, comparisons, tables, figures, Parquet, the terminal and the recording take all of it from here.
 """
@@ -25,7 +25,7 @@ Values = TypeVar("Values", bound=npt.NDArray[Any])
 
 
 class Beliefs(Protocol):
-    """What a measure is a function of, for n voxels: a VoxelTable has it, and a growing map."""
+    """The arguments of a measure, for n voxels: a VoxelTable has them, and a growing map."""
 
     @property
     def op(self) -> Int32:
@@ -42,7 +42,7 @@ class Beliefs(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class Rows:
-    """Some voxels whose evidence is dense: what formulas are computed on."""
+    """Voxels whose evidence is dense: what formulas are computed on."""
 
     op: Int32
     evidence: Float64
@@ -51,7 +51,7 @@ class Rows:
 
 @dataclass(frozen=True, eq=False)
 class Voxels:
-    """Some voxels whose evidence is kept by its entries."""
+    """Voxels whose evidence is kept by its entries."""
 
     op: Int32
     evidence: Evidence
@@ -59,13 +59,13 @@ class Voxels:
 
 
 def chunks(table: Beliefs) -> Iterator[Rows]:
-    """The voxels, few enough at a time for dense evidence."""
+    """Return the voxels, few enough at a time for dense evidence."""
     n, K = table.evidence.shape
     return (Rows(table.op[some], table.evidence[some], table.drift_sum[some]) for some in row_chunks(n, K))
 
 
 def by_chunk(formula: Callable[[Rows], Values]) -> Callable[[Beliefs], Values]:
-    """A formula of voxels, computed without dense evidence of all of them."""
+    """Return a formula of voxels, computed without dense evidence of all of them."""
 
     @functools.wraps(formula)
     def of(table: Beliefs) -> Values:
@@ -76,7 +76,7 @@ def by_chunk(formula: Callable[[Rows], Values]) -> Callable[[Beliefs], Values]:
 
 
 def whole(formula: Callable[[Beliefs], Values]) -> Callable[[Beliefs], Values]:
-    """A formula of voxels that needs no dense evidence of them."""
+    """Return a formula of voxels that needs no dense evidence of them."""
     formula.whole = True  # type: ignore[attr-defined]
     return formula
 
@@ -84,7 +84,7 @@ def whole(formula: Callable[[Beliefs], Values]) -> Callable[[Beliefs], Values]:
 def by_row(
     found: Callable[[Concentration], Values],
 ) -> Callable[[Callable[[Rows], Values]], Callable[[Beliefs], Values]]:
-    """A formula of voxels that, where their evidence is kept by its entries, the one pass over these finds."""
+    """Return a formula of voxels that, where their evidence is kept by its entries, the one pass over these finds."""
 
     def decorate(formula: Callable[[Rows], Values]) -> Callable[[Beliefs], Values]:
         @whole
@@ -104,12 +104,13 @@ def by_row(
 class Quantity:
     """A number that is reported.
 
-    key      of its columns and JSON entries
-    title    in print; `short` where there is little room, `unit` where it has one
-    better   which way is good
-    digits   decimals where a map is summarised, and where maps are compared
-    needs    what it is computed from: the voxel table, the log of events as well, or the ground truth as well
-    section  of the paper, where it defines it
+    Attributes:
+        key: Key of its columns and JSON entries.
+        title: Title in print; `short` where there is little room, `unit` where it has one.
+        better: Direction that is good.
+        digits: Decimals where a map is summarised, and where maps are compared.
+        needs: Source: the voxel table, the log of events as well, or the ground truth as well.
+        section: Section of the paper, where it defines it.
     """
 
     key: str
@@ -141,10 +142,11 @@ class Quantity:
 class Measure(Quantity):
     """A number of each voxel, from 0 to `largest`.
 
-    of         computes it: (n,), NaN where undefined; from dense evidence, some voxels at a time
-    lowest_op  from which OP on it is defined
-    range      of its colours, in which maps differ; values beyond look like the ends
-    panel      whether it has a panel in the figure of a map: not where another one shows the same places
+    Attributes:
+        of: Computes it: (n,), NaN where undefined; from dense evidence, some voxels at a time.
+        lowest_op: Lowest OP at which it is defined.
+        range: Range of its colours, in which maps differ; values beyond look like the ends.
+        panel: Whether it has a panel in the figure of a map: not where another one shows the same places.
     """
 
     of: Callable[[Beliefs], Float64]
@@ -163,44 +165,47 @@ class Measure(Quantity):
 
 @by_row(lambda found: found.largest)
 def vss(table: Rows) -> Float64:
-    """Voxel Semantic Stability (n,): max_k e_k / sum_k e_k, in [1/K, 1]; read it with OP."""
+    """Return the Voxel Semantic Stability (n,): max_k e_k / sum_k e_k, in [1/K, 1]; read it with OP."""
     concentration: Float64 = table.evidence.max(axis=1) / table.evidence.sum(axis=1)
     return concentration
 
 
 @whole
 def sbd(table: Beliefs) -> Float64:
-    """Semantic Belief Drift (n,): mean over t = 2..T of D_JS(p^(t), p^(t-1)), bits, in [0, 1]; NaN where OP < 2."""
+    """Return the Semantic Belief Drift (n,): mean over t = 2..T of D_JS(p^(t), p^(t-1)), bits, in [0, 1].
+
+    NaN where OP < 2.
+    """
     return mean_drift(table.drift_sum, table.op)
 
 
 def mean_drift(drift_sum: Float64, op: Int32) -> Float64:
-    """SBD (n,) from the summed drift in bits (n,) and OP (n,); see `sbd`."""
+    """Return SBD (n,) from the summed drift in bits (n,) and OP (n,); see `sbd`."""
     mean = np.full(len(op), np.nan)
     np.divide(drift_sum, op - 1, out=mean, where=op >= 2)
     return mean
 
 
 def op(table: Beliefs) -> Int32:
-    """Observation Persistence (n,): the number of frames that observed the voxel."""
+    """Return the Observation Persistence (n,): the number of frames that observed the voxel."""
     return table.op
 
 
 @whole
 def entropy(table: Beliefs) -> Float64:
-    """Normalised entropy (n,): -sum_k p_k log p_k / log K, in [0, 1]; report it together with K."""
+    """Return normalised entropy (n,): -sum_k p_k log p_k / log K, in [0, 1]; report it together with K."""
     return bits(table) / math.log2(table.evidence.shape[1])
 
 
 @by_row(lambda found: found.bits)
 def bits(table: Rows) -> Float64:
-    """Entropy (n,): -sum_k p_k log2 p_k, bits."""
+    """Return the entropy (n,): -sum_k p_k log2 p_k, bits."""
     return entropy_bits(normalise(table.evidence))
 
 
 @by_row(lambda found: found.lead)
 def margin(table: Rows) -> Float64:
-    """How far the dominant class is ahead (n,): the largest belief less the second largest, in [0, 1]."""
+    """Return how far the dominant class is ahead (n,): the largest belief less the second largest, in [0, 1]."""
     belief = normalise(table.evidence)
     top = np.arange(len(belief)), belief.argmax(axis=1)
     first = belief[top]
@@ -211,7 +216,7 @@ def margin(table: Rows) -> Float64:
 
 @by_row(lambda found: found.label.astype(np.int64))
 def dominant(table: Rows) -> Int64:
-    """Dominant class (n,): argmax_k e_k, the lowest on ties."""
+    """Return the dominant class (n,): argmax_k e_k, the lowest on ties."""
     label: Int64 = table.evidence.argmax(axis=1)
     return label
 
@@ -238,12 +243,16 @@ _REGISTER = {measure.key: measure for measure in (VSS, SBD, ENTROPY, MARGIN)}
 
 
 def measures() -> tuple[Measure, ...]:
-    """Those of every summary, in the order of the paper's tables."""
+    """Return the measures of every summary, in the order of the paper's tables."""
     return tuple(_REGISTER.values())
 
 
 def register(measure: Measure) -> None:
-    """Add a measure to every summary from now on. Raises ConfigError where its key is taken."""
+    """Add a measure to every summary from now on.
+
+    Raises:
+        ConfigError: If its key is taken.
+    """
     if measure.key in _REGISTER:
         raise ConfigError(f"there is a measure '{measure.key}' already; choose another key")
     _REGISTER[measure.key] = measure
@@ -263,7 +272,7 @@ def registered(measure: Measure) -> Iterator[None]:
 
 
 def mean(values: npt.NDArray[Any]) -> float:
-    """The mean of the values that are defined; NaN where none is."""
+    """Return the mean of the values that are defined; NaN where none is."""
     defined = values[~np.isnan(values)]
     return float(defined.mean()) if defined.size else math.nan
 
@@ -281,13 +290,13 @@ class MeasureMeans:
 
     @classmethod
     def over(cls, values: Mapping[Measure, Float64], op: Int32, where: Mask) -> MeasureMeans:
-        """Of values (n,) of each measure over the voxels for which `where` (n,) holds."""
+        """Return the means of each measure's values (n,) over the voxels for which `where` (n,) holds."""
         rare = {m.key: int(np.count_nonzero(where & (op >= m.lowest_op))) for m in values if m.lowest_op > 1}
         return cls({measure.key: mean(value[where]) for measure, value in values.items()}, rare)
 
     @classmethod
     def of_sums(cls, sums: Float64) -> MeasureMeans:
-        """From (3 M,): of every measure its sum, over how many voxels it is defined, and in how many OP is enough."""
+        """Make it of (3 M,): each measure's sum, over how many voxels it is defined, and in how many OP is enough."""
         of = dict(zip(measures(), sums.reshape(-1, 3), strict=True))
         value = {measure.key: float(total) / n if n else math.nan for measure, (total, n, _) in of.items()}
         return cls(value, {m.key: int(often) for m, (_, _, often) in of.items() if m.lowest_op > 1})
@@ -296,16 +305,16 @@ class MeasureMeans:
         return self.value[measure.key]
 
     def of_all(self) -> list[float]:
-        """The mean of every measure, in their order."""
+        """Return the mean of every measure, in their order."""
         return [self[measure] for measure in measures()]
 
     def json_content(self) -> dict[str, float]:
-        """Entries by key."""
+        """Return entries by key."""
         return {**self.value, **{f"{key}_voxels": n for key, n in self.voxels.items()}}
 
     @classmethod
     def of_json_content(cls, content: Any) -> MeasureMeans:
-        """The entries of all measures."""
+        """Return the entries of all measures."""
         rare = {measure.key: f"{measure.key}_voxels" for measure in measures() if measure.lowest_op > 1}
         for key in (*(measure.key for measure in measures()), *rare.values()):
             if key not in content:

@@ -32,8 +32,9 @@ TILE = re.compile(r"tile=(-?\d+)_(-?\d+)\.parquet")
 class Tile:
     """Columns of voxels that a file holds alone: those with ix // size = x and iy // size = y.
 
-    size  voxels along its edge, a power of 2
-    map   names the map that it is a part of
+    Attributes:
+        size: Voxels along its edge, a power of 2.
+        map: Names the map that it is a part of.
     """
 
     x: int
@@ -43,7 +44,7 @@ class Tile:
 
     @property
     def name(self) -> str:
-        """Of its file."""
+        """The name of its file."""
         return f"tile={self.x}_{self.y}.parquet"
 
 
@@ -55,7 +56,7 @@ def write(
     classes: Sequence[str],
     tile: Tile | None = None,
 ) -> None:
-    """Columns (n,) and (n, K), part after part, one at least; atomically."""
+    """Write columns (n,) and (n, K), part after part, one at least; atomically."""
     import pyarrow as pa
     import pyarrow.parquet as pq
 
@@ -72,9 +73,10 @@ def write(
 
 
 def files_of(path: str | Path) -> list[Path]:
-    """The files of a table: itself, or the tiles in a folder, by x and y.
+    """Return the files of a table: itself, or the tiles in a folder, by x and y.
 
-    Raises DataError where a tile is none of the others' map.
+    Raises:
+        DataError: If a tile is none of the others' map.
     """
     path = Path(path)
     if not path.is_dir():
@@ -93,7 +95,11 @@ def files_of(path: str | Path) -> list[Path]:
 
 
 def tile_of(path: Path) -> Tile:
-    """Which tile a file is. Raises DataError where it is none."""
+    """Return which tile a file is.
+
+    Raises:
+        DataError: If it is none.
+    """
     about = _about(path)
     with reading(path):
         x, y = about["tile"]
@@ -101,7 +107,7 @@ def tile_of(path: Path) -> Tile:
 
 
 def voxel_size_of(path: Path) -> float:
-    """The edge of a table's voxels, metres."""
+    """Return the edge of a table's voxels, metres."""
     about = _about(path)
     with reading(path):
         return float(about["voxel_size"])
@@ -118,7 +124,11 @@ def _about(path: Path) -> dict[str, Any]:
 
 
 def rows_in(files: Iterable[Path]) -> int:
-    """How many rows files have. Raises DataError as `reading` does."""
+    """Return how many rows files have.
+
+    Raises:
+        DataError: As `reading` does.
+    """
     import pyarrow.parquet as pq
 
     total = 0
@@ -129,7 +139,7 @@ def rows_in(files: Iterable[Path]) -> int:
 
 
 def names_in(path: str | Path) -> list[str]:
-    """The columns of single numbers that a table in a file, or in tiles, has."""
+    """Return the columns of single numbers that a table in a file, or in tiles, has."""
     import pyarrow as pa
     import pyarrow.parquet as pq
 
@@ -139,7 +149,11 @@ def names_in(path: str | Path) -> list[str]:
 
 
 def columns(path: Path, names: Sequence[str]) -> dict[str, npt.NDArray[Any]]:
-    """Columns (n,) of a file by name. Raises DataError where one is not there."""
+    """Return columns (n,) of a file by name.
+
+    Raises:
+        DataError: If one is not there.
+    """
     import pyarrow.parquet as pq
 
     with reading(path), pq.ParquetFile(path) as file:  # pq.read_table imports pandas
@@ -149,7 +163,7 @@ def columns(path: Path, names: Sequence[str]) -> dict[str, npt.NDArray[Any]]:
 
 @contextmanager
 def reading(path: str | Path) -> Iterator[None]:
-    """Whatever is wrong with a file's content is a DataError of one line that names the file."""
+    """Turn whatever is wrong with a file's content into a DataError of one line that names the file."""
     import pyarrow as pa
 
     try:
@@ -159,7 +173,7 @@ def reading(path: str | Path) -> Iterator[None]:
 
 
 def read(path: str | Path, names: Iterable[str]) -> dict[str, Any]:
-    """Columns by name, voxel_size and classes; what it raises becomes a DataError in `reading`."""
+    """Return columns by name, voxel_size and classes; what it raises becomes a DataError in `reading`."""
     import pyarrow.parquet as pq
 
     with pq.ParquetFile(path) as content:
@@ -188,7 +202,7 @@ def _to_arrow(values: npt.NDArray[Any]) -> pa.Array:
 
 
 def _to_numpy(column: pa.ChunkedArray) -> npt.NDArray[Any] | Evidence:
-    """Values (n,); rows of classes are sparse."""
+    """Return values (n,); rows of classes are sparse."""
     import pyarrow as pa
 
     if column.null_count:

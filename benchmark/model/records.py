@@ -1,4 +1,4 @@
-"""What a run or a study found: one record a unit, and the voxel tables behind the units at its base settings."""
+"""Records of a run or a study, one a unit, and the voxel tables behind the units at its base settings."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ SCENE__BACKBONE.npz with the arrays frame (its index), labels (H, W) rows 0..K-1
 where the dataset has it, color (H, W, 3). Beside them sums by frame and cube of space, `InfluenceSums`."""
 
 REGIONS = "region_maps"
-"""Not a sweep: the label sources that hold regions without classes."""
+"""The name, not of a sweep, for the label sources that hold regions without classes."""
 
 MAPS = 6
 """Maps that a notebook shows of a result."""
@@ -45,11 +45,12 @@ MAPS = 6
 class Variation:
     """One point of one sweep, in one repeat: what differs from the base settings.
 
-    sweep   'base', 'shared_taxonomy', 'backends', or what is swept: 'voxel_size' (metres), 'pixel_stride',
+    Attributes:
+        sweep: 'base', 'shared_taxonomy', 'backends', or what is swept: 'voxel_size' (metres), 'pixel_stride',
             'frame_count', 'depth_noise' (relative standard deviation), 'translation_noise' (metres), 'rotation_noise'
-            (degrees), 'translation_drift' (metres a square root of frame), 'rotation_drift' (degrees likewise)
-    value   of it; None for 'base', 'shared_taxonomy' and 'backends'
-    repeat  counts the repeats of a random variation from 0; each has a seed of its own
+            (degrees), 'translation_drift' (metres a square root of frame), 'rotation_drift' (degrees likewise).
+        value: Value of the swept setting; None for 'base', 'shared_taxonomy' and 'backends'.
+        repeat: Counts the repeats of a random variation from 0; each has a seed of its own.
     """
 
     sweep: str = BASE
@@ -63,13 +64,15 @@ class ImageSpace:
 
     All but flicker_percent are of every n-th pixel of each axis, where the longer side has more than 640.
 
-    flicker_percent              pixels valid in both of two consecutive frames whose label differs
-    compensated_flicker_percent  the same after the previous map is warped by depth and pose, occluded pixels left out
-    edge_recall                  share of the edges of depth with a border of labels within two pixels
-    compensated_share            co-visible share: pixels that the warped map reaches, of the valid ones, 0 to 1
-    vc8, vc16                    video consistency over clips of 8 and 16 frames, 0 to 1: of the pixels whose ground
-                                 truth stays the same, those whose prediction does; NaN without ground truth
-    self_vc8, self_vc16          the same of all pixels that are valid in each frame of a clip, without ground truth
+    Attributes:
+        flicker_percent: Pixels valid in both of two consecutive frames whose label differs.
+        compensated_flicker_percent: The same after the previous map is warped by depth and pose, occluded pixels left
+            out.
+        edge_recall: Share of the edges of depth with a border of labels within two pixels.
+        compensated_share: co-visible share: pixels that the warped map reaches, of the valid ones, 0 to 1.
+        vc8, vc16: Video consistency over clips of 8 and 16 frames, 0 to 1: of the pixels whose ground truth stays the
+            same, those whose prediction does; NaN without ground truth.
+        self_vc8, self_vc16: The same of all pixels that are valid in each frame of a clip, without ground truth.
     """
 
     flicker_percent: float = math.nan
@@ -84,18 +87,19 @@ class ImageSpace:
 
 @dataclass(frozen=True)
 class FrameQuality:
-    """What the labels of single frames are worth, as filters left them; shares are 0 to 1, NaN where undefined.
+    """The worth of single frames' labels, as filters left them; shares are 0 to 1, NaN where undefined.
 
-    model, filters  whose labels they are, and what was done to them ('ema:0.6+threshold:0.5'; '' for nothing)
-    coverage      labelled pixels for one that the model labels
-    next_frame    of the pixels that the next frame sees again, those whose label the model gives that place then.
-                  No filter saw that frame: what it only repeats does not count for it
-    accuracy      of the labelled pixels, those that are right; miou the mean over classes of intersection over union
-    stable_wrong  of the pixels seen again, those that keep a label that is wrong
-    lag           frames by which labels follow a true change later than the model, see `semstab.metrics.frame_quality`;
-                  changes: the pixels that it was counted on
-    milliseconds  of CPU time that the filters took for a frame, in the median
-    accuracy_by_frame, next_frame_by_frame  the same of each frame, and of each pair
+    Attributes:
+        model, filters: Whose labels they are, and what was done to them ('ema:0.6+threshold:0.5'; '' for nothing).
+        coverage: Labelled pixels for one that the model labels.
+        next_frame: Share of the pixels seen again by the next frame whose label the model gives that place then. No
+            filter saw that frame: what it only repeats does not count for it.
+        accuracy: Share of the labelled pixels that are right; miou the mean over classes of intersection over union.
+        stable_wrong: Share of the pixels seen again that keep a label that is wrong.
+        lag: Frames by which labels follow a true change later than the model, see `semstab.metrics.frame_quality`;
+            changes: the pixels that it was counted on.
+        milliseconds: CPU time that the filters took for a frame, in the median.
+        accuracy_by_frame, next_frame_by_frame: The same of each frame, and of each pair.
     """
 
     model: str
@@ -116,13 +120,15 @@ class FrameQuality:
 class Record:
     """One finished unit.
 
-    key         hash of its inputs and settings, under which it is kept
-    summary     what is reported of it: unit (scene, backbone, backend), means, strata, classes, times, and
-                what `semstab.statistics` says of the map
-    image_space of the 'base' units; all NaN elsewhere
-    quality     of the labels of single frames, where `frame_quality` asked for it
-    voxels_file file of its voxel table, or the folder of its tiles, for the 'base' and 'backends' units; None elsewhere
-    truth_file  file of the ground truth's voxels of the same frames, where the statistics fused it
+    Attributes:
+        key: Hash of its inputs and settings, under which it is kept.
+        summary: Its report: unit (scene, backbone, backend), means, strata, classes, times, and what
+            `semstab.statistics` says of the map.
+        image_space: Image-space measures of the 'base' units; all NaN elsewhere.
+        quality: Quality of the labels of single frames, where `frame_quality` asked for it.
+        voxels_file: File of its voxel table, or the folder of its tiles, for the 'base' and 'backends' units; None
+            elsewhere.
+        truth_file: File of the ground truth's voxels of the same frames, where the statistics fused it.
     """
 
     key: str
@@ -135,7 +141,7 @@ class Record:
 
     @property
     def statistics(self) -> MapStatistics | None:
-        """What `semstab.statistics` says of the map."""
+        """Return what `semstab.statistics` says of the map."""
         return self.summary.statistics
 
     @property
@@ -144,18 +150,18 @@ class Record:
         return self.summary.unit
 
     def table(self) -> VoxelTable:
-        """Its voxels, read from their file."""
+        """Return its voxels, read from their file."""
         if self.voxels_file is None:
             raise ValueError(f"{self.unit.slug}: the voxels of {self.variation} were not kept")
         return VoxelTable.load(self.voxels_file)
 
     @property
     def in_tiles(self) -> bool:
-        """Whether its voxels are a folder of tiles."""
+        """Return whether its voxels are a folder of tiles."""
         return self.voxels_file is not None and self.voxels_file.is_dir()
 
     def tiles(self) -> Iterator[VoxelTable]:
-        """Its voxels, tile by tile; of a map in one file all of them."""
+        """Return its voxels, tile by tile; of a map in one file all of them."""
         if self.voxels_file is None:
             raise ValueError(f"{self.unit.slug}: the voxels of {self.variation} were not kept")
         return VoxelTable.iter_tiles(self.voxels_file)
@@ -192,7 +198,7 @@ class Tables:
         self._loaded: dict[str, VoxelTable] = {}
 
     def of(self, record: Record) -> VoxelTable:
-        """The record's table."""
+        """Return the record's table."""
         slug = record.unit.slug
         if slug not in self._loaded:
             while len(self._loaded) >= self._most:
@@ -218,14 +224,15 @@ class RegionFlicker:
 
 @dataclass(frozen=True)
 class UnitContent:
-    """What the file of a finished unit holds, from which its record comes.
+    """The content of a finished unit's file, from which its record comes.
 
-    input    digest of its input
-    up       the scene's up axis, where it is known or could be estimated
-    files    digests of the unit's other files, by their path in the folder
-    regions  of a source of regions, instead of a summary
-    advice   where its voxel size lies, where that was looked at
-    checked  how far it agrees with the reference on a sample of its voxels, where it was checked so
+    Attributes:
+        input: Digest of its input.
+        up: The scene's up axis, where it is known or could be estimated.
+        files: Digests of the unit's other files, by their path in the folder.
+        regions: Series of a source of regions, instead of a summary.
+        advice: Advice on its voxel size, where that was looked at.
+        checked: Agreement with the reference on a sample of its voxels, where it was checked so.
     """
 
     input: str
@@ -252,15 +259,16 @@ class Failure:
 class Result:
     """All that a run or a study found; tables, figures, report and terminal are made from it.
 
-    backend    the base backend: that of every unit but those of the 'backends' variation
-    records    in the order of the plan
-    agreement  of each pair of backends that must agree, on each scene and backbone that both fused
-    up         (x, y, z) unit vector of the world's up axis by scene, where it is known or could be estimated
-    georeference  by scene, where it lies on Earth, where that is known
-    regions    flicker of the label sources that are regions without classes
-    compared   the same of each other backend and the base one, which need not agree
-    advice     where the voxel size lies, scene by scene, for data of files
-    comparisons  with `statistics`: the backbones of each scene beside each other, as `compare_backbones` says it
+    Attributes:
+        backend: The base backend: that of every unit but those of the 'backends' variation.
+        records: Records in the order of the plan.
+        agreement: Agreement of each pair of backends that must agree, on each scene and backbone that both fused.
+        up: (x, y, z) unit vector of the world's up axis by scene, where it is known or could be estimated.
+        georeference: Place on Earth by scene, where that is known.
+        regions: Flicker of the label sources that are regions without classes.
+        compared: The same of each other backend and the base one, which need not agree.
+        advice: Advice on the voxel size, scene by scene, for data of files.
+        comparisons: The backbones, with `statistics`, of each scene beside each other, as `compare_backbones` says it.
     """
 
     name: str
@@ -283,7 +291,7 @@ class Result:
     def select(
         self, sweep: str = BASE, *, scene: str | None = None, backbone: str | None = None, value: float | None = None
     ) -> tuple[Record, ...]:
-        """The records of a sweep, of one scene, one backbone, one value where given."""
+        """Return the records of a sweep, of one scene, one backbone, one value where given."""
         return tuple(
             record
             for record in self.records
@@ -294,9 +302,10 @@ class Result:
         )
 
     def record(self, *, scene: str | None = None, backbone: str | None = None, backend: str | None = None) -> Record:
-        """The one record at the base settings of that scene, backbone and backend, the base backend where not given.
+        """Return the record at the base settings of that scene, backbone and backend, the base backend if not given.
 
-        Raises ConfigError where there is none, or several, with what there is.
+        Raises:
+            ConfigError: If there is none, or several, with what there is.
         """
         kept = (*self.select(), *self.select(BACKENDS))
         asked = {"scene": scene, "backbone": backbone, "backend": backend or self.backend}
@@ -325,7 +334,7 @@ class Result:
         return _distinct([record.unit.backbone for record in self.select()])
 
     def sweeps(self) -> dict[str, tuple[float, ...]]:
-        """The swept values, ascending, of each sweep that has values."""
+        """Return the swept values, ascending, of each sweep that has values."""
         found: dict[str, set[float]] = {}
         for record in self.records:
             if record.variation.value is not None:
@@ -340,11 +349,15 @@ class Result:
         return tuple(r.summary for group in groups for r in units if (r.unit.scene, r.unit.backbone) == group)
 
     def to_arrow(self) -> pa.Table:
-        """One row a unit: what it is, how much there is, the mean of every measure, of recurrent voxels too."""
+        """Return one row a unit: what it is, how much there is, the mean of every measure, of recurrent voxels too."""
         return voxels.to_arrow(self._columns())
 
     def to_pandas(self) -> pd.DataFrame:
-        """The same as a data frame. Raises MissingDependencyError without pandas."""
+        """Return the same as a data frame.
+
+        Raises:
+            MissingDependencyError: Without pandas.
+        """
         return voxels.to_pandas(self._columns())
 
     def _columns(self) -> dict[str, Any]:
@@ -352,7 +365,7 @@ class Result:
         return {name: [row[name] for row in rows] for name in (rows[0] if rows else ())}
 
     def _repr_html_(self) -> str:
-        """The summary table, the verdicts and maps from above, in a notebook."""
+        """Return the summary table, the verdicts and maps from above, in a notebook."""
         rows: list[list[voxels.Cell]] = []
         for run in self.runs:
             table, unit = run.table, run.unit
@@ -373,7 +386,7 @@ class Result:
 
     @property
     def agrees(self) -> bool:
-        """Whether backends that must agree do so everywhere."""
+        """Return whether backends that must agree do so everywhere."""
         return all(row.agrees for row in self.agreement)
 
 

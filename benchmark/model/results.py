@@ -1,4 +1,4 @@
-"""What a run reports: the report of one fused frame, the summary of one unit, the agreement of two backends."""
+"""Reports of a run: of one fused frame, the summary of one unit, the agreement of two backends."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ SCHEMA = 3
 """Version of summary.json."""
 
 STAGES = ("decode", "wait", "flicker", "association", "update", "logging")
-"""Where a frame's time goes: decoding in a worker thread, beside the rest; waiting for it; flicker; the two parts of
+"""The stages of a frame's time: decoding in a worker thread, beside the rest; waiting for it; flicker; the two parts of
 fusion, where the backend tells them apart; telling the observers."""
 
 LONGEST_NAME = 60
@@ -42,7 +42,7 @@ class Unit:
 
 
 def slug(*names: str) -> str:
-    """Names joined to a file name: other names give another one.
+    """Join names to a file name: other names give another one.
 
     A name stays as it is where it consists of letters, digits, '.', '_' and '-', begins with none of '.', '_', does not
     end with '_', holds no '__' and is at most LONGEST_NAME bytes long. Else what does not fit becomes '-', what is too
@@ -65,21 +65,24 @@ def _slug(name: str) -> str:
 
 @dataclass(frozen=True)
 class FrameReport:
-    """What fusing one frame did. The map's means are those after the frame; NaN where a backend does not keep them.
+    """The effect of fusing one frame.
 
-    frame            the frame's index
-    points           valid pixels ('sampled points')
-    voxels           voxels the frame touched ('observations')
-    new_voxels       of them, voxels seen for the first time
-    drift_sum        sum over the other ones of D_JS(p^(t), p^(t-1)), bits
-    seconds          wall-clock time of integrate
-    map_voxels       voxels in the map
-    map_vss          mean VSS over them
-    map_entropy      mean normalised entropy over them
-    map_recurrent    share of them with OP >= 3
+    The map's means are those after the frame; NaN where a backend does not keep them.
 
     Of `seconds`, where a backend tells them apart, association_seconds go from pixels to voxels with their evidence,
     update_seconds into the map.
+
+    Attributes:
+        frame: The frame's index.
+        points: Valid pixels ('sampled points').
+        voxels: Voxels the frame touched ('observations').
+        new_voxels: Those of the voxels that were seen for the first time.
+        drift_sum: Sum over the other ones of D_JS(p^(t), p^(t-1)), bits.
+        seconds: wall-clock time of integrate.
+        map_voxels: Voxels in the map.
+        map_vss: Mean VSS over them.
+        map_entropy: Mean normalised entropy over them.
+        map_recurrent: Share of them with OP >= 3.
     """
 
     frame: int
@@ -118,13 +121,13 @@ class Means:
         return self.means[measure]
 
     def defined(self, measure: Measure) -> int:
-        """The voxels over which the measure's mean runs."""
+        """Return the voxels over which the measure's mean runs."""
         return self.means.voxels.get(measure.key, self.voxels)
 
 
 @dataclass(frozen=True)
 class TableSummary:
-    """What a voxel table says as a whole: one row of the paper's scene table, its strata and its classes.
+    """The summary of a voxel table: one row of the paper's scene table, its strata and its classes.
 
     `summary[VSS]` is the mean of a measure over all voxels where it is defined. `well_seen` is the last stratum in
     finer steps of OP. `categories` has the share of the voxels in each stability category, `confused_with` for each
@@ -178,7 +181,7 @@ class UnitSummary:
     reduced: ReducedScores | None = None
 
     def row(self) -> dict[str, str | int | float]:
-        """What it is, how much there is, and the mean of every measure, of the recurrent voxels alone as well."""
+        """Return a row: what it is, how much there is, the mean of every measure, also of recurrent voxels alone."""
         table, unit = self.table, self.unit
         return {
             "scene": unit.scene, "backbone": unit.backbone, "backend": unit.backend, "taxonomy": self.taxonomy,
@@ -192,10 +195,11 @@ class UnitSummary:
 
 @dataclass(frozen=True)
 class ReducedScores:
-    """What soft scores come to where each pixel is reduced to its likeliest class: what hard labels compare with.
+    """The result of soft scores where each pixel is reduced to its likeliest class: what hard labels compare with.
 
-    vss, recurrent_vss  over all voxels, and over those with OP >= 3
-    alpha               Krippendorff's, of the voxels with OP >= 2
+    Attributes:
+        vss, recurrent_vss: Over all voxels, and over those with OP >= 3.
+        alpha: Krippendorff's, of the voxels with OP >= 2.
     """
 
     vss: float
@@ -215,12 +219,13 @@ class FrameDrift:
 
 @dataclass(frozen=True)
 class VoxelAdvice:
-    """Where a voxel size lies, by the depth of a few frames reprojected into each other.
+    """The place of a voxel size, by the depth of a few frames reprojected into each other.
 
-    voxel_size  metres
-    stays       share of the points that fall into the same voxel when another frame sees them
-    suggested   the smallest size in which half of them do, metres; None where nothing can be told
-    chosen      whether it was chosen for that, and not given
+    Attributes:
+        voxel_size: Metres.
+        stays: Share of the points that fall into the same voxel when another frame sees them.
+        suggested: The smallest size in which half of them do, metres; None where nothing can be told.
+        chosen: Whether it was chosen for that, and not given.
     """
 
     voxel_size: float
@@ -248,10 +253,12 @@ class Deviation:
 
 @dataclass(frozen=True)
 class Agreement:
-    """How far two backends' maps of the same frames agree; one entry of 'agreement' in summary.json.
+    """The agreement of two backends' maps of the same frames; one entry of 'agreement' in summary.json.
 
-    differences  of OP, of every measure, of the evidence and of the label (1 where it is another), by their keys
-    one_in       of so many voxels, drawn at random, one was compared
+    Attributes:
+        differences: Differences of OP, of every measure, of the evidence and of the label (1 where it is another), by
+            their keys.
+        one_in: Number of voxels of which one, drawn at random, was compared.
     """
 
     scene: str

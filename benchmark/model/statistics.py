@@ -246,24 +246,15 @@ class Flipping:
 
 
 @dataclass(frozen=True)
-class DriftTests:
-    """The order of observations, tested: `OrderTest` and how many voxels were tested one by one, and found.
+class Trend:
+    """How far the belief moves one way in time: the share of the disagreement that odd and even observations both show.
 
-    sbd_p, trend_p   whether stretches of time could have come in any order: so many `stretches`, over `voxels`
-    trend_excess     the trend less that in random order
-    trending_voxels  of the tested ones: their disagreement goes one way in time
+    0 in the mean where frames err independently. Drift of the model is not told from errors that depend on the view,
+    or that last over frames. `voxels` tell: they have OP >= 6, and their observations differ.
     """
 
-    sbd_p: float
-    trend: float
-    trend_null: float
-    trend_excess: Interval
-    trend_p: float
-    stretches: int
+    share: Interval
     voxels: int
-    tested_voxels: int
-    unusual_sbd_voxels: int
-    trending_voxels: int
 
 
 @dataclass(frozen=True)
@@ -284,7 +275,7 @@ class DriftStatistics:
     sbd: Interval
     null: Interval
     excess: Interval
-    tests: DriftTests | None = None
+    trend: Trend | None = None
     flips: FlipRates | None = None
 
 

@@ -27,8 +27,9 @@ T = TypeVar("T", VoxelTable, Events)
 class Tiles(Generic[T]):
     """The tiles of a map, or of its log, by place; one in a single file has one, which holds all.
 
-    size        edge of a tile in voxels, None for that one
-    voxel_size  metres
+    Attributes:
+        size: Edge of a tile in voxels, None for that one.
+        voxel_size: Metres.
     """
 
     def __init__(self, load: Mapping[Place, Callable[[], T]], size: int | None, voxel_size: float) -> None:
@@ -38,7 +39,11 @@ class Tiles(Generic[T]):
 
     @classmethod
     def open(cls, path: str | Path, kind: type[T]) -> Tiles[T]:
-        """Those of a file, or of a folder of tiles. Raises DataError where it is damaged."""
+        """Open a file, or a folder of tiles.
+
+        Raises:
+            DataError: If it is damaged.
+        """
         files = parquet.files_of(path)
         voxel_size = parquet.voxel_size_of(files[0])
         if not Path(path).is_dir():
@@ -49,7 +54,7 @@ class Tiles(Generic[T]):
 
     @classmethod
     def of(cls, table: T) -> Tiles[T]:
-        """A table as the one tile of its map."""
+        """Return a table as the one tile of its map."""
         return cls({(0, 0): lambda: table}, None, table.voxel_size)
 
     def __iter__(self) -> Iterator[Place]:
@@ -59,7 +64,7 @@ class Tiles(Generic[T]):
         return self._tables[place]
 
     def holding(self, points: Float64) -> Iterator[tuple[Place, Int64]]:
-        """The tiles in which some of these points (n, 3) of the scene lie, metres, with the rows (m,) of these."""
+        """Yield the tiles in which some of these points (n, 3) lie, metres, with the rows (m,) of these."""
         if self.size is None:
             yield (0, 0), np.arange(len(points))
             return
@@ -72,7 +77,7 @@ class Tiles(Generic[T]):
                 yield (x, y), own
 
     def region(self, place: Place, size: int) -> T:
-        """The voxels of a wider tile of that size, a multiple of the own one."""
+        """Return the voxels of a wider tile of that size, a multiple of the own one."""
         if self.size is None:
             table = self[0, 0]
             return table.rows(np.flatnonzero((table.ix // size == place[0]) & (table.iy // size == place[1])))
@@ -81,7 +86,7 @@ class Tiles(Generic[T]):
         return type(first).joined([self[own] for own in inside]) if inside else first.rows(np.zeros(0, np.int64))
 
     def wider(self, size: int) -> set[Place]:
-        """The wider tiles of that size that hold a voxel."""
+        """Return the wider tiles of that size that hold a voxel."""
         if self.size is not None:
             return {self._in_wider(own, size) for own in self}
         table = self[0, 0]
@@ -94,7 +99,10 @@ class Tiles(Generic[T]):
 
 
 def side_by_side(maps: Sequence[Tiles[Any]]) -> Iterator[tuple[Any, ...]]:
-    """The voxels of several maps region by region, by the widest of their tiles; of maps in single files at once."""
+    """Yield the voxels of several maps region by region, by the widest of their tiles.
+
+    Of maps in single files at once.
+    """
     sizes = [own.size for own in maps if own.size is not None]
     if not sizes:
         yield tuple(own[0, 0] for own in maps)

@@ -1,4 +1,4 @@
-"""What fusion leaves behind: one row a voxel."""
+"""The result of fusion: one row a voxel."""
 
 from __future__ import annotations
 
@@ -33,14 +33,18 @@ CAPTION = "VSS from above, dark 0 to yellow 1; grey: seen once"
 
 
 def to_arrow(columns: Mapping[str, Any]) -> pa.Table:
-    """The columns; what is undefined is null."""
+    """Return the columns; what is undefined is null."""
     import pyarrow as pa
 
     return pa.table({name: pa.array(values, from_pandas=True) for name, values in columns.items()})
 
 
 def to_pandas(columns: Mapping[str, Any]) -> pd.DataFrame:
-    """The columns; names are categories. Raises MissingDependencyError without pandas."""
+    """Return the columns; names are categories.
+
+    Raises:
+        MissingDependencyError: Without pandas.
+    """
     try:
         import pandas  # noqa: F401  what Arrow needs for it
     except ImportError as error:
@@ -50,14 +54,14 @@ def to_pandas(columns: Mapping[str, Any]) -> pd.DataFrame:
 
 
 def named(rows: npt.NDArray[np.integer[Any]], names: Sequence[str]) -> pa.DictionaryArray:
-    """A column of names by their rows."""
+    """Return a column of names by their rows."""
     import pyarrow as pa
 
     return pa.DictionaryArray.from_arrays(rows.astype(np.int32), list(names))
 
 
 def as_html(title: str, headers: Sequence[str], rows: Sequence[Sequence[Cell]]) -> str:
-    """A table with a caption; whatever names hold is shown as it is."""
+    """Return a table with a caption; whatever names hold is shown as it is."""
     head = "".join(f"<th>{html.escape(header)}</th>" for header in headers)
     body = "".join("<tr>" + "".join(f"<td>{html.escape(_text(cell))}</td>" for cell in row) + "</tr>" for row in rows)
     caption = f'<caption style="text-align: left; white-space: nowrap">{html.escape(title)}</caption>'
@@ -65,7 +69,7 @@ def as_html(title: str, headers: Sequence[str], rows: Sequence[Sequence[Cell]]) 
 
 
 def number(value: float, digits: int) -> str:
-    """With so many decimals; '-' where there is none."""
+    """Format a value with so many decimals; '-' where there is none."""
     return "-" if math.isnan(value) else f"{value:.{digits}f}"
 
 
@@ -78,7 +82,7 @@ def _text(cell: Cell) -> str:
 Types = dict[str, type[np.generic]]
 
 BYTES_A_VOXEL = 200
-"""Of a table that is put together from tiles: twice what it takes."""
+"""The bytes a voxel of a table that is put together from tiles: twice what it takes."""
 
 INDEX: Types = {"ix": np.int32, "iy": np.int32, "iz": np.int32}
 OF_VOXELS: Types = INDEX | {
@@ -86,16 +90,16 @@ OF_VOXELS: Types = INDEX | {
     "last_frame": np.int32, "self_sum": np.float64, "frame_entropy_sum": np.float64,
 }  # fmt: skip
 OF_EVENTS: Types = {"voxel": np.int32, "frame": np.int32, "evidence": np.float64, "pixels": np.int32}
-"""Of both by name: where a voxel is, and what its row and that of an observation have."""
+"""The columns of both by name: where a voxel is, and what its row and that of an observation have."""
 
 
 def index_columns(index: npt.NDArray[np.integer[Any]]) -> dict[str, Any]:
-    """Voxel indices (n, 3) as the columns ix, iy, iz."""
+    """Return voxel indices (n, 3) as the columns ix, iy, iz."""
     return dict(zip(INDEX, index.T.astype(np.int32), strict=True))
 
 
 def in_order(index: Mapping[str, npt.NDArray[Any]]) -> Int64:
-    """The order of voxels by ix, iy, iz."""
+    """Return the order of voxels by ix, iy, iz."""
     order: Int64 = np.lexsort([index[name] for name in reversed(INDEX)])
     return order
 
@@ -113,7 +117,8 @@ def require_memory(path: Path, files: Sequence[Path]) -> None:
 def freeze(table: Any, types: Types, like: npt.NDArray[Any]) -> None:
     """Make a table's columns arrays of their types that cannot be written to, as long as that one.
 
-    Raises DataError where one is not.
+    Raises:
+        DataError: If one is not.
     """
     for name, dtype in types.items():
         given = getattr(table, name)
@@ -139,19 +144,21 @@ def _evidence(table: Any, given: npt.NDArray[Any] | Evidence) -> Evidence:
 class VoxelTable:
     """The fused map: n voxels sorted by (ix, iy, iz). Everything reported about a voxel is a function of its row.
 
-    ix, iy, iz         (n,) int32 voxel index, floor(x_w / r)
-    op                 (n,) int32 observation persistence: the number of frames that saw the voxel
-    evidence           (n, K) accumulated evidence e(q), the sum over frames of s_bar; kept sparse
-    drift_sum          (n,) float64 sum over t >= 2 of the JS divergence of successive beliefs, bits
-    pixels             (n,) int64 pixels that fell into the voxel, all frames
-    first_frame        (n,) int32 lowest frame index that saw it
-    last_frame         (n,) int32 highest frame index that saw it
-    self_sum           (n,) float64 sum over frames of ||s_bar||^2
-    frame_entropy_sum  (n,) float64 sum over frames of the entropy of s_bar, bits
-    voxel_size         r, metres
-    classes            the K class names, where they are known
+    Attributes:
+        ix, iy, iz: (n,) int32 voxel index, floor(x_w / r).
+        op: (n,) int32 observation persistence: the number of frames that saw the voxel.
+        evidence: (n, K) accumulated evidence e(q), the sum over frames of s_bar; kept sparse.
+        drift_sum: (n,) float64 sum over t >= 2 of the JS divergence of successive beliefs, bits.
+        pixels: (n,) int64 pixels that fell into the voxel, all frames.
+        first_frame: (n,) int32 lowest frame index that saw it.
+        last_frame: (n,) int32 highest frame index that saw it.
+        self_sum: (n,) float64 sum over frames of ||s_bar||^2.
+        frame_entropy_sum: (n,) float64 sum over frames of the entropy of s_bar, bits.
+        voxel_size: r, metres.
+        classes: The K class names, where they are known.
 
-    Raises DataError where columns disagree in length or rows are not sorted and distinct.
+    Raises:
+        DataError: If columns disagree in length or rows are not sorted and distinct.
     """
 
     ix: Int32
@@ -197,20 +204,24 @@ class VoxelTable:
         return (self.index.astype(np.float64) + 0.5) * self.voxel_size
 
     def rows(self, rows: Any) -> VoxelTable:
-        """The table of some of its voxels: a slice, their numbers ascending, or a mask (n,)."""
+        """Return the table of some of its voxels: a slice, their numbers ascending, or a mask (n,)."""
         columns: dict[str, Any] = {name: getattr(self, name)[rows] for name in OF_VOXELS if name != "evidence"}
         return replace(self, **columns, evidence=self.evidence.take(rows))
 
     def measured(self) -> VoxelTable:
-        """The same with what measures are functions of, which is then computed once: see `Evidence.measured`."""
+        """Return the same with what measures are functions of, which is then computed once: see `Evidence.measured`."""
         return self if self.evidence.known is not None else replace(self, evidence=self.evidence.measured())
 
     def to_arrow(self) -> pa.Table:
-        """Columns of every voxel: index, x, y, z in metres, op, class, every measure, evidence_CLASS."""
+        """Return columns of every voxel: index, x, y, z in metres, op, class, every measure, evidence_CLASS."""
         return to_arrow(self._columns())
 
     def to_pandas(self) -> pd.DataFrame:
-        """The same as a data frame. Raises MissingDependencyError without pandas."""
+        """Return the same as a data frame.
+
+        Raises:
+            MissingDependencyError: Without pandas.
+        """
         return to_pandas(self._columns())
 
     def _columns(self) -> dict[str, Any]:
@@ -226,7 +237,7 @@ class VoxelTable:
         }  # fmt: skip
 
     def _repr_html_(self) -> str:
-        """The means of all voxels and of the recurrent ones, in a notebook."""
+        """Return the means of all voxels and of the recurrent ones, in a notebook."""
         values = {measure: measure.of(self) for measure in measures()}
         rows: list[list[Cell]] = []
         for name, where in (("all", self.op > 0), ("OP >= 3", self.op >= 3)):
@@ -267,7 +278,8 @@ class VoxelTable:
     def load(cls, path: str | Path) -> VoxelTable:
         """Read what `save` wrote, a file or a folder of tiles, all of it.
 
-        Raises DataError where a file is missing, damaged or of another kind, or a map in tiles is larger than memory.
+        Raises:
+            DataError: If a file is missing, damaged or of another kind, or a map in tiles is larger than memory.
         """
         files = parquet.files_of(path)
         if len(files) > 1:
@@ -276,14 +288,15 @@ class VoxelTable:
 
     @classmethod
     def iter_tiles(cls, path: str | Path) -> Iterator[VoxelTable]:
-        """The tiles of a map one after the other, by x and y; of a map in one file that file."""
+        """Return the tiles of a map one after the other, by x and y; of a map in one file that file."""
         return map(cls._read, parquet.files_of(path))
 
     @classmethod
     def columns(cls, path: str | Path, names: Sequence[str]) -> dict[str, npt.NDArray[Any]]:
-        """Single columns (n,) by name, also measures and what else the file has, in the order of `load`.
+        """Return single columns (n,) by name, also measures and what else the file has, in the order of `load`.
 
-        Raises DataError where one is not there.
+        Raises:
+            DataError: If one is not there.
         """
         files, sorting = parquet.files_of(path), tuple(INDEX)
         wanted = [*dict.fromkeys((*names, *(sorting if len(files) > 1 else ())))]
@@ -294,7 +307,7 @@ class VoxelTable:
 
     @classmethod
     def joined(cls, parts: Sequence[VoxelTable]) -> VoxelTable:
-        """One table of the voxels of several that share none."""
+        """Return one table of the voxels of several that share none."""
         if len(parts) == 1:
             return parts[0]
         index = {name: np.concatenate([getattr(part, name) for part in parts]) for name in INDEX}
@@ -320,7 +333,9 @@ class VoxelTable:
 class Extent:
     """The voxels with low <= (ix, iy) < high, whatever their iz.
 
-    origin  voxel of the first camera of the whole map, where that is known: soft scores are rounded as they are there
+    Attributes:
+        origin: Voxel of the first camera of the whole map, where that is known: soft scores are rounded as they are
+            there.
     """
 
     low: tuple[int, int]
@@ -328,7 +343,7 @@ class Extent:
     origin: tuple[int, int, int] | None = None
 
     def holds(self, index: npt.NDArray[np.integer]) -> Mask:
-        """Whether each of the voxels of these indices (3, n) is one of them: (n,)."""
+        """Return whether each of the voxels of these indices (3, n) is one of them: (n,)."""
         ix, iy = index[0], index[1]
         inside: Mask = (ix >= self.low[0]) & (ix < self.high[0])
         inside &= (iy >= self.low[1]) & (iy < self.high[1])

@@ -13,7 +13,10 @@ from semstab.core.compiled import compiled, parallel, serial
 
 @serial
 def _seen_at(d: float, ray_x: float, ray_y: float, motion: Any, camera: Any) -> tuple[float, float, float]:
-    """Column, row and depth in the other camera of the point at depth d along a ray; depth 0 where it is not seen."""
+    """Return the column, row and depth in the other camera of the point at depth d along a ray.
+
+    Depth 0 where it is not seen.
+    """
     (fx, fy, cx, cy), (to_x, to_y, to_z) = camera, motion
     x, y = ray_x * d, ray_y * d
     z = to_z[0] * x + to_z[1] * y + to_z[2] * d + to_z[3]
@@ -24,8 +27,10 @@ def _seen_at(d: float, ray_x: float, ray_y: float, motion: Any, camera: Any) -> 
 
 @serial
 def _look_up_row(depth: Any, ray_x: Any, ray_y: float, motion: Any, camera: Any, shape: Any, at: Any, z: Any) -> None:
-    """The flat index of the pixel of the other view, of some shape, in which each point of a row falls, or -1; and its
-    depth there. Without a branch, for vectors."""
+    """Find the flat index of the other view's pixel in which each point of a row falls, or -1, and its depth there.
+
+    There is no branch, so that it runs on vectors.
+    """
     H, W = float(shape[0]), float(shape[1])
     for u in range(len(depth)):
         column, row, z[u] = _seen_at(float(depth[u]), ray_x[u], ray_y, motion, camera)
@@ -36,14 +41,16 @@ def _look_up_row(depth: Any, ray_x: Any, ray_y: float, motion: Any, camera: Any,
 
 @serial
 def look_up(depth: Any, rays: Any, motion: Any, other_depth: Any, camera: Any, tolerance: float, out: Any) -> None:
-    """For each pixel of a view the flat index of the other view's pixel that sees the same surface, or -1.
+    """Find for each pixel of a view the flat index of the other view's pixel that sees the same surface, or -1.
 
-    depth        (H, W) of the view, metres; 0, negative, NaN and inf are invalid
-    rays         (u - cx) / fx of each column, then (v - cy) / fy of each row
-    motion       three rows of four numbers, from the view's camera axes to the other's
-    other_depth  (H', W') of the other view, whose intrinsics are camera = (fx, fy, cx, cy)
-    tolerance    of the occlusion test, relative to the distance from the other camera
-    out          (H, W) int32, is filled
+    Args:
+        depth: (H, W) of the view, metres; 0, negative, NaN and inf are invalid.
+        rays: (u - cx) / fx of each column, then (v - cy) / fy of each row.
+        motion: Three rows of four numbers, from the view's camera axes to the other's.
+        other_depth: (H', W') of the other view.
+        camera: (fx, fy, cx, cy), the intrinsics of the other view.
+        tolerance: Tolerance of the occlusion test, relative to the distance from the other camera.
+        out: (H, W) int32, is filled.
     """
     there, z = other_depth.reshape(-1), np.empty(depth.shape[1])
     for v in range(depth.shape[0]):
@@ -57,11 +64,12 @@ def look_up(depth: Any, rays: Any, motion: Any, other_depth: Any, camera: Any, t
 def blend(
     depth: Any, rays: Any, motion: Any, other_depth: Any, camera: Any, tolerance: float, values: Any, out: Any
 ) -> None:
-    """For each pixel of a view the linear mean of those of the other view's four nearest pixels that see the same
-    surface and hold something; arguments as of `look_up`, and
+    """Blend the other view's four nearest pixels that see the same surface and hold something, by linear weights.
 
-    values  (H', W', K) of the other view's pixels, 0 or more, all 0 where they hold nothing
-    out     (H, W, K) zeros, is filled; 0 where there is nothing
+    The other arguments are those of `look_up`.
+
+    - `values`: (H', W', K) of the other view's pixels, 0 or more, all 0 where they hold nothing
+    - `out`: (H, W, K) zeros, is filled; 0 where there is nothing
     """
     ray_x, ray_y = rays
     H, W, K = values.shape
@@ -95,7 +103,10 @@ CHUNKS = 256
 
 @compiled(fastmath={"reassoc", "contract"})
 def _total(scores, at, K, shift, unit):
-    """The sum of K scores by their bits: moved up by `shift` they are those of a double, the score in that unit."""
+    """Return the sum of K scores by their bits.
+
+    Moved up by `shift` they are those of a double, the score in that unit.
+    """
     total = 0.0
     for c in range(K):
         total += np.int64(np.int64(scores[at + c]) << shift).view(np.float64)
@@ -108,9 +119,9 @@ def cut(scores, k, kept, shift, unit, infinite, shares):
 
     Bits of numbers from 0 on sort like the numbers, and NaN is above all: it is kept, and the pixel stays unusable.
 
-    shift, unit  see `_total`; infinite: the bits of infinity
-    shares       (CHUNKS, 3), 0: pixels with a prediction, the sum of the shares of their scores that are left out, and
-                 the largest one
+    - `shift`, `unit`: see `_total`; infinite: the bits of infinity
+    - `shares`: (CHUNKS, 3), 0: pixels with a prediction, the sum of the shares of their scores that are left out, and
+      the largest one
     """
     n, K = kept.shape
     for chunk in nb.prange(CHUNKS):
@@ -144,7 +155,7 @@ def cut(scores, k, kept, shift, unit, infinite, shares):
 
 @serial
 def lengthen(labels: Any, before: Any, valid: Any, most: int, length: Any) -> None:
-    """For how many frames, `most` at most, each pixel has counted and had its label; all arrays are (n,)."""
+    """Count the frames, `most` at most, for which each pixel has counted and had its label; all arrays are (n,)."""
     for i in range(len(length)):
         kept = np.int32(length[i]) if labels[i] == before[i] else np.int32(0)
         length[i] = min(kept + np.int32(1), np.int32(most)) if valid[i] else np.int32(0)
@@ -152,7 +163,7 @@ def lengthen(labels: Any, before: Any, valid: Any, most: int, length: Any) -> No
 
 @serial
 def count_long(counted: Any, constant: Any, n: int) -> tuple[int, int]:
-    """The pixels whose first length is n, and those among them whose second one is too."""
+    """Return the pixels whose first length is n, and those among them whose second one is too."""
     pixels = both = 0
     for i in range(len(counted)):
         long = counted[i] >= n

@@ -1,4 +1,4 @@
-"""Things that move are no evidence about a place: pixels of some classes, or under a mask, are left out of fusion."""
+"""Moving things are no evidence about a place: pixels of some classes, or under a mask, are left out of fusion."""
 
 from __future__ import annotations
 
@@ -17,7 +17,9 @@ from semstab.pixels.kernels import CHUNKS, cut
 
 
 def leave_out(frame: Frame, classes: Sequence[int] = (), *, masks: bool = True) -> Frame:
-    """The frame without the pixels of these classes, and without masked ones; the frame itself where that is none.
+    """Return the frame without the pixels of these classes, and without masked ones.
+
+    The frame itself where that is none.
 
     classes are ids in label maps, and positions in soft scores, where a pixel's class is that of its largest score.
     The pixels lose their label; `left_out` marks those of them that had a valid depth and label.
@@ -45,14 +47,14 @@ DEPTH, POSE, WALK = range(3)
 
 
 def perturb(frame: Frame, noise: Perturbation, scene: str) -> Frame:
-    """The frame with noise on its depth and its pose.
+    """Return the frame with noise on its depth and its pose.
 
     Every number depends on the seed, the scene's name, the frame's index and the pixel only: all backbones and backends
     see the same disturbed geometry, in whatever order frames are read and whichever are sampled.
 
-    depth     d (1 + depth_noise n), with n drawn for each pixel; a depth that falls to 0 or below is invalid
-    position  t + translation_noise n + translation_drift w, world axes
-    rotation  R exp(rotation_drift w) exp(rotation_noise n), rotation vectors in camera axes, about the camera
+    - depth: d (1 + depth_noise n), with n drawn for each pixel; a depth that falls to 0 or below is invalid
+    - position: t + translation_noise n + translation_drift w, world axes
+    - rotation: R exp(rotation_drift w) exp(rotation_noise n), rotation vectors in camera axes, about the camera
 
     n is a standard normal number drawn anew in each frame, w the sum of one for each frame since the sequence began: a
     random walk, 0 at frame 0, whose standard deviation grows with the square root of the index.
@@ -76,7 +78,7 @@ def _noisy_depth(frame: Frame, noise: Perturbation, scene: str) -> Float32:
 
 
 def _rotation(degrees: Float64) -> Float64:
-    """The rotation matrix (3, 3) of a rotation vector."""
+    """Return the rotation matrix (3, 3) of a rotation vector."""
     import cv2
 
     return np.asarray(cv2.Rodrigues(np.deg2rad(degrees))[0], dtype=np.float64)
@@ -97,11 +99,13 @@ def _random(noise: Perturbation, scene: str, *what: int) -> Any:
 
 BITS = {2: np.uint16, 4: np.uint32, 8: np.uint64}
 AS_DOUBLE = {2: (42, 2.0**1008), 4: (29, 2.0**896), 8: (0, 1.0)}
-"""By how much the bits of a number are moved up to be those of a double, and the unit that it then counts."""
+"""The shift of a number's bits that makes them those of a double, and the unit that it then counts."""
 
 
 def keep_largest(frame: Frame, k: int) -> Frame:
-    """The frame with the k largest scores of each pixel, of equal ones those of the lowest classes; the rest are 0.
+    """Return the frame with the k largest scores of each pixel, of equal ones those of the lowest classes.
+
+    The rest are 0.
 
     A pixel without a prediction stays without. `scores_left_out` of the frame says what share of them was left out.
     """

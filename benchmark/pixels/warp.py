@@ -20,9 +20,10 @@ DEPTH_TOLERANCE = 0.01
 
 @dataclass(frozen=True, eq=False)
 class Correspondence:
-    """Which pixel of another view sees the surface point behind each pixel of a frame.
+    """The pixel of another view that sees the surface point behind each pixel of a frame.
 
-    pixel  (H, W) int32 flat index into the other view's images, -1 where it does not see the point
+    Attributes:
+        pixel: (H, W) int32 flat index into the other view's images, -1 where it does not see the point.
     """
 
     pixel: Int32
@@ -33,7 +34,10 @@ class Correspondence:
         return self.pixel >= 0
 
     def bring(self, values: npt.NDArray[Any], fill: Any = 0) -> npt.NDArray[Any]:
-        """Values (H', W', ...) of the other view at the frame's pixels, (H, W, ...); `fill` where not visible."""
+        """Return values (H', W', ...) of the other view at the frame's pixels, (H, W, ...).
+
+        `fill` where not visible.
+        """
         flat = values.reshape(-1, *values.shape[2:])
         brought: npt.NDArray[Any] = flat[self.pixel]
         brought[~self.visible] = fill
@@ -48,7 +52,8 @@ def correspond(frame: Frame, other: Frame, *, depth_tolerance: float = DEPTH_TOL
     else the point is occluded; infinity switches this test off. Labels do not matter. The frames may differ in size
     and intrinsics.
 
-    Raises ConfigError where the tolerance is not above 0 and below 1, and not infinity.
+    Raises:
+        ConfigError: If the tolerance is not above 0 and below 1, and not infinity.
     """
     from semstab.pixels.kernels import look_up
 
@@ -68,7 +73,7 @@ def correspond(frame: Frame, other: Frame, *, depth_tolerance: float = DEPTH_TOL
 def warp(
     values: npt.NDArray[Any], source: Frame, target: Frame, *, depth_tolerance: float = DEPTH_TOLERANCE, fill: Any = 0
 ) -> tuple[npt.NDArray[Any], Mask]:
-    """Values (H', W', ...) of the source's pixels as the target sees them, (H, W, ...), and where it does, (H, W).
+    """Return values (H, W, ...) of source pixels (H', W', ...) as the target sees them, and where it does, (H, W).
 
     Labels, scores, colours: the nearest pixel's value, never a mixture. See `correspond`.
     """
@@ -77,14 +82,14 @@ def warp(
 
 
 def motion(frame: Frame, other: Frame) -> Float64:
-    """(3, 4) from the frame's camera axes to the other's; exact for large coordinates, which cancel first."""
+    """Return (3, 4) from the frame's camera axes to the other's; exact for large coordinates, which cancel first."""
     R = np.linalg.inv(other.T_wc[:3, :3])  # not the transpose: poses are orthonormal to 1e-3 only
     t = frame.T_wc[:3, 3] - other.T_wc[:3, 3]
     return np.column_stack([R @ frame.T_wc[:3, :3], R @ t])
 
 
 def by_rows(matrix: Float64) -> tuple[tuple[float, ...], ...]:
-    """A matrix as tuples, which compiled loops keep in registers."""
+    """Return a matrix as tuples, which compiled loops keep in registers."""
     return tuple(tuple(row) for row in matrix.tolist())
 
 
@@ -92,7 +97,7 @@ def by_rows(matrix: Float64) -> tuple[tuple[float, ...], ...]:
 
 
 def carry(belief: Float32, source: Frame, target: Frame, *, depth_tolerance: float = DEPTH_TOLERANCE) -> Float32:
-    """Beliefs (H', W', K) of the source's pixels as the target's pixels see them (H, W, K), 0 where none is.
+    """Return beliefs (H', W', K) of the source's pixels as the target's pixels see them (H, W, K), 0 where none is.
 
     Backward warping, linear between those of the four nearest pixels that see the same surface: their depth differs
     from the point's distance z by at most depth_tolerance * z, and they say something. Nearest pixels, carried on from

@@ -36,7 +36,8 @@ from semstab.predict.sequence import PredictionObserver, SequenceOptions, Sequen
 class ImageFiles:
     """Image files by a pattern such as 'flight/*.png', in natural order.
 
-    Raises DataError where none fits, or two have one name.
+    Raises:
+        DataError: If none fits, or two have one name.
     """
 
     labels_like_depth = False
@@ -53,32 +54,40 @@ class ImageFiles:
         self._files = files
 
     def __len__(self) -> int:
-        """Number of files."""
+        """Return the number of files."""
         return len(self._files)
 
     def image(self, index: int) -> Image:
-        """(H, W, 3) uint8 RGB. Raises DataError that names the file."""
+        """Return (H, W, 3) uint8 RGB.
+
+        Raises:
+            DataError: If that fails; the message names the file.
+        """
         return read_color(self._files[index])
 
     def image_name(self, index: int) -> str:
-        """The file's name without suffix."""
+        """Return the file's name without suffix."""
         return self._files[index].stem
 
     def missing(self, index: int, sources: Sequence[str] = (), *, color: bool = False) -> list[str]:
-        """Nothing: what is missing was not found."""
+        """Return nothing: what is missing was not found."""
         return []
 
     def predicted(self, index: int, *, labels: Labels | None = None, scores: Scores | None = None) -> Frame | None:
-        """None: single images have no depth."""
+        """Return none: single images have no depth."""
         return None
 
     def view(self, index: int, shape: tuple[int, int]) -> Frame | None:
-        """None: single images have no depth."""
+        """Return none: single images have no depth."""
         return None
 
 
 def chosen(names: Sequence[str] | None, known: Sequence[str], where: str) -> Sequence[str]:
-    """The named scenes, all where none are named. Raises ConfigError for one that is not there."""
+    """Return the named scenes, all where none are named.
+
+    Raises:
+        ConfigError: For one that is not there.
+    """
     if lost := [name for name in names or () if name not in known]:
         raise ConfigError(f"{where}: no scene '{lost[0]}'; there is {', '.join(known)}")
     return list(dict.fromkeys(names)) if names is not None else known
@@ -87,7 +96,7 @@ def chosen(names: Sequence[str] | None, known: Sequence[str], where: str) -> Seq
 # What a prediction command does: which images of which sequence, and where their predictions go.
 
 IMAGES: Mapping[str, Any] = {"color": True}
-"""What of a frame must be there where a model looks at images."""
+"""The parts of a frame that must be there where a model looks at images."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,7 +109,11 @@ class Job:
 
 
 def file_job(pattern: str, frames: FrameSelection, out: Path | None) -> Job:
-    """Images by a pattern. Raises ConfigError without `out`, or where no image is selected."""
+    """Return images by a pattern.
+
+    Raises:
+        ConfigError: Without `out`, or where no image is selected.
+    """
     if out is None:
         raise ConfigError("--images: predictions of single images need a place; name it with --out")
     files = ImageFiles(pattern)
@@ -114,12 +127,15 @@ def scene_jobs(
     out: Path | None,
     looks_at: Mapping[str, Any] = IMAGES,
 ) -> list[Job]:
-    """The scenes of a dataset; predictions go into the scene's own folder, into `out`, or of several into out/SCENE.
+    """Return the scenes of a dataset.
+
+    Predictions go into the scene's own folder, into `out`, or of several into out/SCENE.
 
     `looks_at` says what of a frame must be there, as for `select_frames`.
 
-    Raises ConfigError for a dataset without folders of its own where there is no `out`, and for a scene or frames that
-    are not there.
+    Raises:
+        ConfigError: For a dataset without folders of its own where there is no `out`, and for a scene or frames that
+            are not there.
     """
     opened = open_dataset(dataset.name, dataset.options)
     names = chosen(scenes, opened.scenes, dataset.name)
@@ -169,7 +185,7 @@ class PredictionBar(PredictionObserver):
         self._bar.start()
 
     def frame_done(self, kept: bool) -> None:
-        """One frame further."""
+        """Advance by one frame."""
         self._left -= 1
         if kept and not self._predicted:
             self._started = time.monotonic()
@@ -183,7 +199,7 @@ class PredictionBar(PredictionObserver):
 
 
 def speed_text(frames: int, seconds: float, left: int) -> str:
-    """Speed and time left.
+    """Return the speed and time left.
 
     >>> speed_text(10, 20.0, 30)
     '0.50 frames/s, 0:01:00 left'
@@ -196,7 +212,7 @@ def speed_text(frames: int, seconds: float, left: int) -> str:
 
 
 def print_report(report: SequenceReport, console: Console) -> None:
-    """One sequence: how many frames, how fast, where; of regions, how much they change."""
+    """Print how many frames of a sequence, how fast, where; of regions, how much they change."""
     kept = f", {report.kept} kept from before" if report.kept else ""
     speed = ""
     if report.predicted:
@@ -226,12 +242,23 @@ def run(
     quiet: bool,
     top_k: int | None = None,
 ) -> list[SequenceReport]:
-    """Predict what is selected. Raises ConfigError, DataError, MissingDependencyError; what was finished stays.
+    """Predict what is selected, and return a report a sequence.
 
-    predictor  settings of `PredictorConfig` without options
-    options    of the backbone
-    top_k      how many scores a pixel keeps; None for all
-    dataset    resolved, where the images are those of scenes
+    Args:
+        predictor: Settings of `PredictorConfig` without options.
+        options: Options of the backbone.
+        images: Folder or files of images, None where they are those of scenes.
+        dataset: Resolved settings of the dataset, where the images are those of scenes.
+        scenes: Names of the scenes; all where None.
+        frames: Settings of `FrameSelection`.
+        out: Folder of the predictions; the scene's own where None.
+        batch: Images that the backbone is given together.
+        overwrite: Whether other predictions in the folder are replaced.
+        quiet: Whether nothing is printed.
+        top_k: Number of scores that a pixel keeps; None for all.
+
+    Raises:
+        ConfigError, DataError, MissingDependencyError: If something cannot be predicted; what was finished stays.
     """
     if top_k is not None and not predictor.get("scores"):
         raise ConfigError("--top-k says how many scores a pixel keeps; add --scores, or leave it out")
@@ -260,7 +287,7 @@ def run(
 
 
 def _loader(config: PredictorConfig) -> Callable[[Job], tuple[ImageSequence, Backbone]]:
-    """What gives the images of a job and who predicts on them: one model for all, or each scene's own labels."""
+    """Return what gives the images of a job and who predicts on them: one model for all, or each scene's own labels."""
     if config.backbone != STORED:
         backbone = load_predictor(config)
         return lambda job: (job.sequence, backbone)
@@ -286,7 +313,7 @@ def _next_command(
     *,
     several: bool,
 ) -> str:
-    """What fuses the predictions: of the same scenes and frames, read the same way, as the others have none."""
+    """Return what fuses the predictions: of the same scenes and frames, read the same way, as the others have none."""
     words = ["semstab-bench", *([] if dataset.name == "posed_folder" else ["--dataset", dataset.name])]
     words += ["--data", str(dataset.options["root"])] if "root" in dataset.options else []
     for key, value in _said(dataset).items():
@@ -303,7 +330,7 @@ def _next_command(
 
 
 def _said(dataset: DatasetConfig) -> dict[str, Any]:
-    """The dataset's options that are not as they are by themselves, but for its root."""
+    """Return the dataset's options that are not as they are by themselves, but for its root."""
     usual = {
         name: field.get_default(call_default_factory=True)
         for name, field in options_model(dataset.name).model_fields.items()

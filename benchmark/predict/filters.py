@@ -1,4 +1,4 @@
-"""What steadies a model's labels: `parse("ema:0.6")` makes a filter, `Filtered` puts some over a backbone."""
+"""Filters that steady a model's labels: `parse("ema:0.6")` makes one, `Filtered` puts some over a backbone."""
 
 from __future__ import annotations
 
@@ -59,7 +59,11 @@ class Parameter:
     whole: bool = False
 
     def read(self, text: str, where: str) -> float:
-        """The number in a text. Raises ConfigError that begins with `where`."""
+        """Return the number in a text.
+
+        Raises:
+            ConfigError: If it is none; the message begins with `where`.
+        """
         try:
             value = float(text)
         except ValueError:
@@ -72,9 +76,10 @@ class Parameter:
 
 @dataclass(frozen=True, eq=False)
 class Shown:
-    """What a filter may look at beside the belief.
+    """The data that a filter may look at beside the belief.
 
-    frame  depth and pose at the image's pixels, where the filter wants geometry
+    Attributes:
+        frame: Depth and pose at the image's pixels, where the filter wants geometry.
     """
 
     image: Image
@@ -90,11 +95,12 @@ class Shown:
 class Filter(ABC):
     """Beliefs in, beliefs out, image by image; one is made for each sequence. `REGISTRY` names its subclasses.
 
-    parameter       what stands behind the colon
-    sequential      whether it remembers the images before
-    wants_geometry  whether it looks at depth and pose
-    wants_color     whether it looks at the image
-    needs_scores    whether labels alone will not do; else a label counts as certain
+    Attributes:
+        parameter: Name of the number behind the colon.
+        sequential: Whether it remembers the images before.
+        wants_geometry: Whether it looks at depth and pose.
+        wants_color: Whether it looks at the image.
+        needs_scores: Whether labels alone will not do; else a label counts as certain.
     """
 
     parameter: ClassVar[Parameter]
@@ -108,7 +114,7 @@ class Filter(ABC):
 
     @abstractmethod
     def __call__(self, belief: Belief, shown: Shown) -> Belief:
-        """The belief after what it does; the array that it is given stays as it is."""
+        """Return the belief after what it does; the array that it is given stays as it is."""
 
 
 @dataclass(frozen=True)
@@ -120,7 +126,7 @@ class FilterSpec:
     kind: type[Filter]
 
     def __call__(self) -> Filter:
-        """A new one, which remembers nothing."""
+        """Return a new one, which remembers nothing."""
         return self.kind(self.value)
 
     def __str__(self) -> str:
@@ -128,9 +134,10 @@ class FilterSpec:
 
 
 def parse(text: str) -> FilterSpec:
-    """'ema:0.6', or 'ema' with its usual number.
+    """Return 'ema:0.6', or 'ema' with its usual number.
 
-    Raises ConfigError for an unknown name or a number that it cannot have.
+    Raises:
+        ConfigError: For an unknown name or a number that it cannot have.
     """
     name, _, value = text.strip().partition(":")
     kind = cast("type[Filter]", REGISTRY.load(name))
@@ -139,14 +146,14 @@ def parse(text: str) -> FilterSpec:
 
 
 def one_hot(rows: npt.NDArray[Any], K: int) -> Belief:
-    """Beliefs that are certain: (H, W) rows 0..K-1, K where nothing is said."""
+    """Return beliefs that are certain: (H, W) rows 0..K-1, K where nothing is said."""
     belief = np.zeros((rows.size, K + 1), dtype=np.float32)
     belief[np.arange(rows.size), rows.reshape(-1)] = 1
     return belief[:, :K].reshape(*rows.shape, K)
 
 
 def normalised(belief: Belief) -> Belief:
-    """Shares of each pixel's sum, in place; 0 where that is 0."""
+    """Return shares of each pixel's sum, in place; 0 where that is 0."""
     total = belief.sum(axis=2, keepdims=True)
     np.divide(belief, total, out=belief, where=total > 0)
     return belief
@@ -156,10 +163,12 @@ def normalised(belief: Belief) -> Belief:
 
 
 class Filtered(Wrapped):
-    """What a backbone says, after filters in their order. Where it says nothing, nothing is said.
+    """A backbone behind filters in their order. Where it says nothing, nothing is said.
 
-    Filters see its scores where it has any; else its labels count as certain. Raises ConfigError for a backbone without
-    classes, and for one without scores where the first filter needs them.
+    Filters see its scores where it has any; else its labels count as certain.
+
+    Raises:
+        ConfigError: For a backbone without classes, and for one without scores where the first filter needs them.
     """
 
     def __init__(self, inner: Backbone, filters: Sequence[FilterSpec], name: str) -> None:
@@ -177,7 +186,7 @@ class Filtered(Wrapped):
         self.sequential = inner.sequential or any(spec.kind.sequential for spec in filters)
         self.wants_geometry = inner.wants_geometry or any(spec.kind.wants_geometry for spec in filters)
         self.seconds: list[float] = []
-        """Of CPU time that the filters took for each image so far."""
+        """Seconds of CPU time that the filters took for each image so far."""
         self._begin(())
 
     def reset(self) -> None:
@@ -194,7 +203,7 @@ class Filtered(Wrapped):
         return [self._filtered(*each, scores) for each in zip(found, images, frames, strict=True)]
 
     def identity(self) -> dict[str, Any]:
-        """That of the inner backbone, and the filters."""
+        """Return the identity of the inner backbone, and the filters."""
         return {**self.inner.identity(), "filters": [str(spec) for spec in self.filters]}
 
     def _begin(self, shape: tuple[int, ...]) -> None:
@@ -215,7 +224,7 @@ class Filtered(Wrapped):
 
 
 def belief_of(prediction: Prediction, space: LabelSpace) -> Belief:
-    """Its scores, 0 where the label is ignored; of labels alone, each of them certain."""
+    """Return its scores, 0 where the label is ignored; of labels alone, each of them certain."""
     ignored = prediction.labels == ignore_id(prediction.labels)
     if prediction.scores is not None:
         return np.where(ignored[..., None], np.float32(0), prediction.scores)
@@ -226,7 +235,10 @@ def belief_of(prediction: Prediction, space: LabelSpace) -> Belief:
 
 
 def labels_of(belief: Belief, space: LabelSpace, like: npt.NDArray[Any]) -> Labels:
-    """The likeliest class of each pixel, by its id in maps such as `like`; the ignore id where nothing is said."""
+    """Return the likeliest class of each pixel, by its id in maps such as `like`.
+
+    The ignore id where nothing is said.
+    """
     ids = np.array([*space.ids], dtype=like.dtype)[belief.argmax(axis=2)]
     ids[~belief.any(axis=2)] = ignore_id(like)
     return ids if like.dtype == np.uint8 else narrowed(ids, np.iinfo(np.uint16).max)
@@ -290,7 +302,7 @@ class EmaWarped(Filter):
 
 
 def mixed(before: Belief, now: Belief, keep: float) -> Belief:
-    """keep * before + (1 - keep) * now; one of them alone where the other says nothing."""
+    """Return keep * before + (1 - keep) * now; one of them alone where the other says nothing."""
     weight = np.where(now.any(axis=2), np.where(before.any(axis=2), keep, 0.0), 1.0).astype(np.float32)[..., None]
     return weight * before + (1 - weight) * now
 
@@ -333,7 +345,7 @@ class Guided(Filter):
         return normalised(np.maximum(filtered, 0))
 
     def _sum(self, values: Any) -> Grey:
-        """Over the window of each pixel."""
+        """Return the sums over the window of each pixel."""
         import cv2
 
         side = 2 * int(self.value) + 1
@@ -370,7 +382,7 @@ class Vote(Filter):
         return normalised(counts[:, :K].reshape(belief.shape))
 
     def _seen_now(self, shown: Shown, nothing: int) -> Iterator[Rows]:
-        """The last label maps at the pixels of this one, the newest first; `nothing` where one says nothing."""
+        """Return the last label maps at the pixels of this one, the newest first; `nothing` where one says nothing."""
         return (rows for rows, _ in reversed(self._last))
 
 

@@ -28,7 +28,7 @@ SCHEMA = 1
 
 MANIFEST_FILE = "predictions.json"
 SAVE_SECONDS = 5.0
-"""How much work a killed process may lose at most."""
+"""Seconds of work that a killed process may lose at most."""
 
 Kind = Literal["labels", "scores", "regions"]
 ScoreType = Literal["float16", "float32"]
@@ -44,7 +44,7 @@ class _Predicted:
 
 @dataclass(frozen=True)
 class _Manifest:
-    """What predictions.json says that a later start needs."""
+    """The content of predictions.json that a later start needs."""
 
     key: str
     settings: Mapping[str, Any]
@@ -54,14 +54,16 @@ class _Manifest:
 class PredictionFolder:
     """labels/NAME, scores/NAME or regions/NAME of a scene; what an earlier start of the same finished is kept.
 
-    path      the folder
-    kind      of maps: PNG ids, .npz scores (K, H, W), PNG region ids
-    settings  all that the maps depend on beside the image, for JSON
-    about     what else the manifest says
-    space     the classes; None for regions
-    top_k     how many scores a pixel keeps; None for all
+    Attributes:
+        path: The folder.
+        kind: Kind of maps: PNG ids, .npz scores (K, H, W), PNG region ids.
+        settings: All that the maps depend on beside the image, for JSON.
+        about: The rest of the manifest.
+        space: The classes; None for regions.
+        top_k: Number of scores that a pixel keeps; None for all.
 
-    Raises ConfigError where the folder holds maps of other settings or of other origin.
+    Raises:
+        ConfigError: If the folder holds maps of other settings or of other origin.
     """
 
     def __init__(
@@ -97,11 +99,15 @@ class PredictionFolder:
         self._lock: FolderLock | None = None
 
     def has(self, name: str, image: str) -> bool:
-        """Whether the map of that frame is there, predicted from an image of that digest."""
+        """Return whether the map of that frame is there, predicted from an image of that digest."""
         return name in self._frames and self._frames[name].image == image and self.file(name).is_file()
 
     def file(self, name: str) -> Path:
-        """Where a frame's map is. Raises DataError for a name that leads out of the folder."""
+        """Return where a frame's map is.
+
+        Raises:
+            DataError: For a name that leads out of the folder.
+        """
         return inside(self.path, self.path, f"{name}{self._suffix}", f"image {name[:80]!r}")
 
     def write(self, name: str, image: str, values: npt.NDArray[Any], seconds: float) -> None:
@@ -145,7 +151,7 @@ class PredictionFolder:
         self._saved = time.monotonic()
 
     def _claim(self, overwrite: bool) -> dict[str, _Predicted]:
-        """The frames that an earlier start finished."""
+        """Return the frames that an earlier start finished."""
         manifest = self.path / MANIFEST_FILE
         if not manifest.is_file():
             suffixes = SCORE_SUFFIXES if self.kind == "scores" else LABEL_SUFFIXES
@@ -175,7 +181,7 @@ def _files(path: Path) -> list[Path]:
 
 
 def _first_change(old: Mapping[str, Any], new: Mapping[str, Any]) -> str:
-    """The first setting that differs, with both values, in a few words."""
+    """Return the first setting that differs, with both values, in a few words."""
     for key in [*new, *(key for key in old if key not in new)]:
         if old.get(key) != new.get(key):
             there, here = (_short(values.get(key)) for values in (old, new))
@@ -191,16 +197,20 @@ def _short(value: Any) -> str:
 # Soft scores class by class, as they go to disk: one map in memory at a time, or few where the largest are kept.
 
 Maps = Callable[[], Iterator[Float32]]
-"""Gives the scores (H, W) of each class in order, anew at each call."""
+"""A function that gives the scores (H, W) of each class in order, anew at each call."""
 
 
 def resized(maps: Maps, shape: tuple[int, ...], where: str) -> Maps:
-    """The maps at the pixels of an image (H, W) of the same view; linear. Raises DataError for another view."""
+    """Return the maps at the pixels of an image (H, W) of the same view; linear.
+
+    Raises:
+        DataError: For another view.
+    """
     return lambda: (fitted(each[..., None], shape, where)[..., 0] for each in maps())
 
 
 def largest_only(maps: Maps, count: int) -> Maps:
-    """The maps with 0 in the place of all but each pixel's largest scores; more than `count` where some are equal."""
+    """Yield the maps with 0 for all but each pixel's largest scores; more than `count` where some are equal."""
 
     def kept() -> Iterator[Float32]:
         largest: list[Float32] = []  # in falling order, (H, W) each

@@ -1,4 +1,4 @@
-"""What a model predicts on, whatever it is: colour images in order."""
+"""Images that a model predicts on, wherever they are from, in order."""
 
 from __future__ import annotations
 
@@ -23,27 +23,37 @@ class ImageSequence(Protocol):
     labels_like_depth: bool
 
     def __len__(self) -> int:
-        """Number of images."""
+        """Return the number of images."""
         ...
 
     def image(self, index: int) -> Image:
-        """(H, W, 3) uint8 RGB. Raises DataError that names the file, or says that there is no colour."""
+        """Return (H, W, 3) uint8 RGB.
+
+        Raises:
+            DataError: If that fails; the message names the file, or says that there is no colour.
+        """
         ...
 
     def image_name(self, index: int) -> str:
-        """What the files of its prediction are called, without suffix."""
+        """Return what the files of its prediction are called, without suffix."""
         ...
 
     def missing(self, index: int, sources: Sequence[str] = (), *, color: bool = False) -> list[str]:
-        """Files that the frame lacks, its image among them where colour is asked for."""
+        """Return files that the frame lacks, its image among them where colour is asked for."""
         ...
 
     def predicted(self, index: int, *, labels: Labels | None = None, scores: Scores | None = None) -> Frame | None:
-        """The frame with what was predicted on its image, at the depth's pixels; None where there is no depth."""
+        """Return the frame with what was predicted on its image, at the depth's pixels.
+
+        None where there is no depth.
+        """
         ...
 
     def view(self, index: int, shape: tuple[int, int]) -> Frame | None:
-        """Depth and pose of the frame at the pixels of its image, of shape (H, W); None where there is no depth."""
+        """Return depth and pose of the frame at the pixels of its image, of shape (H, W).
+
+        None where there is no depth.
+        """
         ...
 
 
@@ -51,8 +61,9 @@ class ImageSequence(Protocol):
 class Picture:
     """An image of a sequence as a model is shown it.
 
-    geometry  of models that want it, at the image's pixels
-    digest    of all that is shown
+    Attributes:
+        geometry: Geometry for models that want it, at the image's pixels.
+        digest: Hash of all that is shown.
     """
 
     index: int
@@ -68,14 +79,18 @@ class Picture:
 
 
 def picture(sequence: ImageSequence, index: int, backbone: Backbone) -> Picture:
-    """What the backbone is shown of an index. Raises DataError that names the file, and as `geometry_of`."""
+    """Return what the backbone is shown of an index.
+
+    Raises:
+        DataError: If that fails; the message names the file, and as `geometry_of`.
+    """
     pixels = sequence.image(index)
     geometry = geometry_of(sequence, index, pixels, backbone)
     return Picture(index, sequence.image_name(index), pixels, geometry, shown_digest(pixels, geometry))
 
 
 def shown_digest(pixels: Image, geometry: Sequence[Frame]) -> str:
-    """A hash of an image, and of what else is shown of it."""
+    """Return a hash of an image, and of what else is shown of it."""
     digest = image_digest(pixels)
     for frame in geometry:
         seen = hashlib.blake2b(repr((digest, frame.intrinsics)).encode(), digest_size=16)
@@ -87,9 +102,10 @@ def shown_digest(pixels: Image, geometry: Sequence[Frame]) -> str:
 
 
 def geometry_of(sequence: ImageSequence, index: int, pixels: Image, backbone: Backbone) -> tuple[Frame, ...]:
-    """Of backbones that want it the frame's depth and pose at the image's pixels; else nothing.
+    """Return the frame's depth and pose at the image's pixels for a backbone that wants it; else nothing.
 
-    Raises ConfigError where there is none.
+    Raises:
+        ConfigError: If there is none.
     """
     if not backbone.wants_geometry:
         return ()
@@ -102,6 +118,6 @@ def geometry_of(sequence: ImageSequence, index: int, pixels: Image, backbone: Ba
 
 
 def first_images(sequence: ImageSequence, count: int) -> list[Image]:
-    """The first images of a sequence that are there, to which a model is fitted whatever frames are selected."""
+    """Return the first images of a sequence that are there, to which a model is fitted whatever frames are selected."""
     there = (index for index in range(len(sequence)) if not sequence.missing(index, color=True))
     return [sequence.image(index) for index in itertools.islice(there, count)]

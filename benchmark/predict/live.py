@@ -94,16 +94,20 @@ class PredictedDataset(Dataset):
         return self._dataset.scenes
 
     def scene(self, name: str) -> PredictedScene:
-        """Open one; raises what the inner dataset raises."""
+        """Open a scene; raises what the inner dataset raises."""
         return PredictedScene(self._dataset.scene(name), self)
 
     @property
     def predictors(self) -> Mapping[str, PredictorConfig]:
-        """By label source."""
+        """The predictors by label source."""
         return self._configs
 
     def model(self, source: str) -> Backbone:
-        """The model behind a label source. Raises ConfigError where there is none of that name."""
+        """Return the model behind a label source.
+
+        Raises:
+            ConfigError: If there is none of that name.
+        """
         if source not in self._configs:
             raise ConfigError(f"backbone '{source}' does not predict here; there is {', '.join(self._configs)}")
         with self.lock:
@@ -113,7 +117,7 @@ class PredictedDataset(Dataset):
             return self._loaded[source]
 
     def _shared(self, config: PredictorConfig) -> Backbone:
-        """The model itself, loaded once for all that is put around it, unless it remembers what it was shown."""
+        """Return the model itself, loaded once for all that is put around it, unless it remembers what it was shown."""
         what = json.dumps([config.backbone, config.options], sort_keys=True)
         model = self._models.get(what) or create(config.backbone, **config.options)
         if not getattr(model, "sequential", False):
@@ -121,12 +125,12 @@ class PredictedDataset(Dataset):
         return model
 
     def frames_of(self, scene: Scene, source: str) -> list[int]:
-        """What a sequential backbone is shown of a scene: the selected frames that have what it looks at."""
+        """Return what a sequential backbone is shown of a scene: the selected frames that have what it looks at."""
         selection = self._options.scene_frames.get(scene.name, self._options.frames)
         return select_frames(scene, selection, **self._configs[source].looks_at).indices
 
     def claim(self, source: str, who: object) -> bool:
-        """Whether the model was last shown a sequence by somebody else; from now on it is `who` that shows."""
+        """Return whether the model was last shown a sequence by somebody else; from now on it is `who` that shows."""
         before, self._shown_by[source] = self._shown_by.get(source), who
         return before is not who
 
@@ -160,7 +164,7 @@ class PredictedScene(Scene):
         self._of_labels: dict[str, tuple[StoredSequence, Backbone]] = {}
 
     def __len__(self) -> int:
-        """Number of frames."""
+        """Return the number of frames."""
         return len(self._inner)
 
     @property
@@ -173,18 +177,18 @@ class PredictedScene(Scene):
         return self._inner.frame_name(index)
 
     def tracked(self, index: int) -> bool:
-        """Whether the frame has a pose."""
+        """Return whether the frame has a pose."""
         return self._inner.tracked(index)
 
     def missing(self, index: int, sources: Sequence[str] = (), *, color: bool = False) -> list[str]:
-        """Files that the frame lacks; it needs its colour where a model is among the sources."""
+        """Return files that the frame lacks; it needs its colour where a model is among the sources."""
         wanted = [self._dataset.predictors[source].looks_at for source in sources if source in self.backbones]
         stored = [*{source: None for each in wanted for source in each["sources"]}]
         truth = [source for source in sources if source == GROUND_TRUTH]
         return self._inner.missing(index, [*stored, *truth], color=color or any(each["color"] for each in wanted))
 
     def filtering(self, backbone: str) -> Filtering:
-        """What was done to a label source before it is read."""
+        """Return what was done to a label source before it is read."""
         if backbone == GROUND_TRUTH:
             return Filtering(backbone)
         known, one = self._dataset.predictors, self._dataset.predictors[backbone]
@@ -195,7 +199,7 @@ class PredictedScene(Scene):
 
     @property
     def settings(self) -> Mapping[str, Any]:
-        """By which conventions its files are read, by name of option."""
+        """The conventions by which its files are read, by name of option."""
         return self._inner.settings
 
     @property
@@ -204,15 +208,15 @@ class PredictedScene(Scene):
         return self._inner.depth_scale
 
     def predicted(self, index: int, *, labels: Labels | None = None, scores: Scores | None = None) -> Frame:
-        """The frame with what was predicted on its image."""
+        """Return the frame with what was predicted on its image."""
         return self._inner.predicted(index, labels=labels, scores=scores)
 
     def view(self, index: int, shape: tuple[int, int]) -> Frame:
-        """Depth and pose at the pixels of the colour image, of shape (H, W)."""
+        """Return depth and pose at the pixels of the colour image, of shape (H, W)."""
         return self._inner.view(index, shape)
 
     def geometry(self, index: int, *, color: bool = False) -> Frame:
-        """The frame but for its labels; nothing is predicted for it."""
+        """Return the frame but for its labels; nothing is predicted for it."""
         return self._inner.geometry(index, color=color)
 
     def color(self, index: int) -> UInt8 | None:
@@ -220,11 +224,15 @@ class PredictedScene(Scene):
         return self._inner.color(index)
 
     def image_name(self, index: int) -> str:
-        """What the frame's files are called."""
+        """Return what the frame's files are called."""
         return self._inner.image_name(index)
 
     def label_space(self, backbone: str) -> LabelSpace:
-        """The classes that the model predicts. Raises ConfigError for a model without classes."""
+        """Return the classes that the model predicts.
+
+        Raises:
+            ConfigError: For a model without classes.
+        """
         if backbone == GROUND_TRUTH:
             space: LabelSpace | None = self._inner.label_space(GROUND_TRUTH)
         else:
@@ -234,7 +242,10 @@ class PredictedScene(Scene):
         return space
 
     def frame(self, index: int, backbone: str, *, color: bool = True) -> Frame:
-        """The frame with what the model says about its image. Raises what the inner scene and the model raise."""
+        """Return the frame with what the model says about its image.
+
+        Raises what the inner scene and the model raise.
+        """
         if backbone == GROUND_TRUTH:
             return self._inner.frame(index, backbone, color=color)
         sequence = self._sequence(backbone)
@@ -251,9 +262,12 @@ class PredictedScene(Scene):
         return dataclasses.replace(frame, color=shown if color else None)
 
     def digest(self, indices: list[int], backbone: str) -> str:
-        """A hash of the model, its settings, and the image, depth and pose of those frames.
+        """Return a hash of the model, its settings, and the image, depth and pose of those frames.
 
-        A sequential model's is of all frames that it is shown. Raises ConfigError for a frame that is not.
+        A sequential model's is of all frames that it is shown.
+
+        Raises:
+            ConfigError: For a frame that is not.
         """
         if backbone == GROUND_TRUTH:
             return self._inner.digest(indices, backbone)
@@ -276,7 +290,7 @@ class PredictedScene(Scene):
         return digest.hexdigest()
 
     def _predict(self, index: int, backbone: str, image: Image) -> Prediction:
-        """What the model says about a frame; scores where they are wanted."""
+        """Return what the model says about a frame; scores where they are wanted."""
         with self._lock:
             model = self._model(backbone)
             if model.sequential:
@@ -304,18 +318,18 @@ class PredictedScene(Scene):
         return self._in_order[backbone]
 
     def _model(self, backbone: str) -> Backbone:
-        """The model, fitted to this sequence's first images."""
+        """Return the model, fitted to this sequence's first images."""
         if backbone not in self._fitted:
             model = self._unfitted(backbone)
             self._fitted[backbone] = model.fit(first_images(self._inner, model.fit_frames))
         return self._fitted[backbone]
 
     def _unfitted(self, backbone: str) -> Backbone:
-        """The model as it is loaded; the scene's own labels are a model of this scene alone."""
+        """Return the model as it is loaded; the scene's own labels are a model of this scene alone."""
         return self._stored(backbone)[1] if self._takes_stored(backbone) else self._dataset.model(backbone)
 
     def _sequence(self, backbone: str) -> ImageSequence:
-        """What the model is shown."""
+        """Return what the model is shown."""
         return self._stored(backbone)[0] if self._takes_stored(backbone) else self._inner
 
     def _takes_stored(self, backbone: str) -> bool:
@@ -330,7 +344,7 @@ class PredictedScene(Scene):
 
 
 def _with_remedies(options: PredictedOptions) -> Iterator[PredictorConfig]:
-    """The backbones, each followed by itself behind each of the remedies."""
+    """Yield the backbones, each followed by itself behind each of the remedies."""
     for predictor in options.backbones:
         yield predictor
         for remedy in options.remedies:
@@ -342,7 +356,7 @@ def _with_remedies(options: PredictedOptions) -> Iterator[PredictorConfig]:
 
 
 def _digest(image: UInt8, frame: Frame) -> bytes:
-    """Of all that a frame holds but its labels."""
+    """Return the hash of all that a frame holds but its labels."""
     digest = hashlib.blake2b(repr((image.shape, frame.shape, frame.intrinsics)).encode(), digest_size=16)
     for array in (image, frame.depth, frame.T_wc):
         digest.update(np.ascontiguousarray(array).data)

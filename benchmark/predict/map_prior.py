@@ -51,7 +51,7 @@ class MapPrior(Filter):
         return normalised((np.float32(MOST_CERTAIN) * belief + uniform) * prior)
 
     def _rows(self, frame: Frame) -> Int32:
-        """(H, W) the row of each pixel's voxel in the evidence, -1 without depth or out of reach."""
+        """Return (H, W) the row of each pixel's voxel in the evidence, -1 without depth or out of reach."""
         if not len(self._row_of_voxel):
             self._origin = np.floor(frame.T_wc[:3, 3] / self.value)
         (H, W), K, T = frame.shape, frame.intrinsics, frame.T_wc.copy()
@@ -66,7 +66,7 @@ class MapPrior(Filter):
 def find_rows(depth: Any, rays: Any, T: Any, size: float, row_of_voxel: Any, out: Any) -> None:
     """Fill `out` (H, W) int32 with the row of each pixel's voxel, -1 where it has none; a new voxel takes the next row.
 
-    rays  (u - cx) / fx of each column, then (v - cy) / fy of each row
+    - `rays`: (u - cx) / fx of each column, then (v - cy) / fy of each row
     """
     ray_x, ray_y = rays
     before, row = np.int64(-1), np.int32(-1)
@@ -105,8 +105,9 @@ def read_priors(row: Any, evidence: Any, out: Any) -> None:
 
 @serial
 def add_frame(row: Any, belief: Any, evidence: Any, pixels: Any) -> None:
-    """Add to each row of `evidence` the mean belief of its pixels with a prediction; `pixels` (n,) are zeros before and
-    after.
+    """Add to each row of `evidence` the mean belief of its pixels with a prediction.
+
+    `pixels` (n,) are zeros before and after.
     """
     H, W, K = belief.shape
     for step in range(3):

@@ -56,7 +56,7 @@ class Kept(Wrapped):
         return [self._one(image, scores, frame) for image, frame in zip(images, frames, strict=True)]
 
     def _one(self, image: Image, scores: bool, frame: Sequence[Frame]) -> Prediction:
-        """Scores are kept wherever there are some: whoever asks later may want them."""
+        """Predict an image; scores are kept wherever there are some: whoever asks later may want them."""
         file = self._folder / f"{self._key(image, frame)}.npz"
         there = read_arrays(file)
         if there is None:
@@ -81,15 +81,18 @@ NEAR = 4
 
 
 class StoredOptions(Settings):
-    """Which labels."""
+    """The settings that name stored labels."""
 
     source: str = Field(min_length=1, description="a label source of the scene: a folder of labels/, NAME-scores, ...")
 
 
 class Stored(Backbone):
-    """Says of each frame what the scene's labels or scores of it say; its images are shown by `StoredSequence`.
+    """A backbone that gives the scene's own labels or scores of each frame; `StoredSequence` shows it its images.
 
-    gives_scores is that of the scene's first frame that has such labels. Raises ConfigError where there are none.
+    gives_scores is that of the scene's first frame that has such labels.
+
+    Raises:
+        ConfigError: If there are none.
     """
 
     Options = StoredOptions
@@ -109,7 +112,7 @@ class Stored(Backbone):
         return [Prediction(self._labels(frame), shares(frame) if scores else None) for frame in geometry]
 
     def _labels(self, frame: Frame) -> Labels:
-        """Class ids; of scores the likeliest class's."""
+        """Return the class ids; of scores the likeliest class's."""
         if frame.labels is not None:
             return frame.labels
         assert self.label_space is not None
@@ -120,7 +123,7 @@ class Stored(Backbone):
         return labels
 
     def identity(self) -> dict[str, Any]:
-        """Where the labels are from; what they are is in the digest of each frame."""
+        """Return where the labels are from; what they are is in the digest of each frame."""
         assert self.label_space is not None
         return {NAME: self._source, "classes": self.label_space.to_dict()}
 
@@ -142,12 +145,12 @@ class StoredSequence:
 
     @property
     def has_scores(self) -> bool:
-        """Whether the first frame that has these labels has scores."""
+        """Return whether the first frame that has these labels has scores."""
         first = next((index for index in range(len(self)) if not self.missing(index)), 0)
         return self.scene.frame(first, self.source, color=False).scores is not None
 
     def image(self, index: int) -> Image:
-        """(H, W, 3) uint8 RGB at the depth's pixels; black where nobody looks at it."""
+        """Return (H, W, 3) uint8 RGB at the depth's pixels; black where nobody looks at it."""
         import cv2
 
         if not self._color:
@@ -163,24 +166,24 @@ class StoredSequence:
         return np.asarray(cv2.resize(image, shape[::-1], interpolation=cv2.INTER_AREA), dtype=np.uint8)
 
     def image_name(self, index: int) -> str:
-        """What the frame's files are called."""
+        """Return what the frame's files are called."""
         return self.scene.image_name(index)
 
     def missing(self, index: int, sources: Sequence[str] = (), *, color: bool = False) -> list[str]:
-        """Files that the frame lacks, its labels among them."""
+        """Return files that the frame lacks, its labels among them."""
         return self.scene.missing(index, [*sources, self.source], color=self._color)
 
     def predicted(self, index: int, *, labels: Labels | None = None, scores: Scores | None = None) -> Frame:
-        """The frame with other labels or scores."""
+        """Return the frame with other labels or scores."""
         return dataclasses.replace(self._frame(index), labels=labels, scores=scores)
 
     def view(self, index: int, shape: tuple[int, int]) -> Frame:
-        """The frame, with its labels."""
+        """Return the frame, with its labels."""
         return self._frame(index)
 
 
 def shares(frame: Frame) -> Any:
-    """Scores (H, W, K) float32 that sum to 1 where they can be used, else to 0; None of labels."""
+    """Return scores (H, W, K) float32 that sum to 1 where they can be used, else to 0; None of labels."""
     if frame.scores is None:
         return None
     said = (frame.predicted != ignore_id(frame.predicted))[..., None]
@@ -189,7 +192,7 @@ def shares(frame: Frame) -> Any:
 
 
 class PredictorConfig(Settings):
-    """Which backbone predicts, and how its predictions are called and given."""
+    """The settings that name a backbone, and say how its predictions are called and given."""
 
     backbone: str = Field(description="a name from `semstab-bench list`; or FILE.py:NAME, net.onnx")
     name: str | None = Field(None, description="what its predictions are called; the backbone's name by default")
@@ -224,7 +227,7 @@ class PredictorConfig(Settings):
 
     @property
     def label_name(self) -> str:
-        """What its label maps are called."""
+        """Return what its label maps are called."""
         if self.name is not None:
             return self.name
         stem = Path(self.backbone).stem if is_network(self.backbone) else self.backbone.rpartition(":")[2]
@@ -245,17 +248,17 @@ class PredictorConfig(Settings):
 
     @property
     def wants_color(self) -> bool:
-        """Whether its filters look at images."""
+        """Return whether its filters look at images."""
         return any(parse(text).kind.wants_color for text in self.filters)
 
     @property
     def looks_at(self) -> dict[str, Any]:
-        """What of a scene's frames must be there, as `select_frames` takes it."""
+        """Return what of a scene's frames must be there, as `select_frames` takes it."""
         stored = self.backbone == NAME
         return {"sources": [self.options["source"]] if stored else [], "color": not stored or self.wants_color}
 
     def resolved(self) -> PredictorConfig:
-        """With every default of the backbone's options, and absolute paths.
+        """Return the settings with every default of the backbone's options, and absolute paths.
 
         Raises ConfigError for an option that cannot be used, MissingDependencyError.
         """
@@ -267,22 +270,30 @@ class PredictorConfig(Settings):
 
 
 def load_predictor(config: PredictorConfig) -> Backbone:
-    """The backbone, in its taxonomy where one is named, behind its filters. Raises what `create` raises.
+    """Return the backbone, in its taxonomy where one is named, behind its filters. Raises what `create` raises.
 
-    Raises ConfigError where scores are wanted of a backbone that has none, or classes map nowhere.
+    Raises:
+        ConfigError: If scores are wanted of a backbone that has none, or classes map nowhere.
     """
     return completed(config, create(config.backbone, **config.options))
 
 
 def stored_labels(config: PredictorConfig, scene: Scene) -> tuple[StoredSequence, Backbone]:
-    """The same of a scene's own labels, and the frames that it is shown. Raises ConfigError where there are none."""
+    """Return the same of a scene's own labels, and the frames that it is shown.
+
+    Raises:
+        ConfigError: If there are none.
+    """
     options = validated(StoredOptions, config.options, f"backbone '{config.backbone}': ")
     sequence = StoredSequence(scene, options.source, config.wants_color)
     return sequence, completed(config, Stored(options, sequence))
 
 
 def completed(config: PredictorConfig, model: Backbone, kept: Path | None = None) -> Backbone:
-    """A model with all that is asked for around it; what it said of an image is looked up in the folder `kept`."""
+    """Return a model with all that is asked for around it.
+
+    What it said of an image is looked up in the folder `kept`.
+    """
     backbone: Backbone = Checked(model, config.label_name)
     if kept is not None and not backbone.sequential:
         backbone = Kept(backbone, kept)
@@ -300,11 +311,12 @@ OWN = ("name", "scores", "taxonomy", "mapping", "filters")
 
 
 def parse_predictor(text: str, more: Mapping[str, Any] | None = None, filters: Sequence[str] = ()) -> PredictorConfig:
-    """'segformer,model=FOLDER,taxonomy=uavid3': the backbone, then settings of the predictor, or its own options.
+    """Parse 'segformer,model=FOLDER,taxonomy=uavid3': the backbone, then settings of the predictor, or its own options.
 
     `more` are options, and `filters` come after its own, that are said elsewhere.
 
-    Raises ConfigError for anything else.
+    Raises:
+        ConfigError: For anything else.
     """
     backbone, *settings = re.split(r",(?![^\[{]*[\]}])", text)  # not at the commas of a list
     own: dict[str, Any] = {}
@@ -320,7 +332,7 @@ def parse_predictor(text: str, more: Mapping[str, Any] | None = None, filters: S
 
 
 def _absolute(options: BaseModel) -> BaseModel:
-    """Paths, what names a file, and a model that is a folder, from the root of the file system."""
+    """Return paths, what names a file, and a model that is a folder, from the root of the file system."""
     paths: dict[str, Any] = {key: value.absolute() for key, value in options if isinstance(value, Path)}
     paths |= {key: str(Path(value).expanduser().absolute()) for key, value in options if is_path(value)}
     model = getattr(options, "model", None)
@@ -338,11 +350,14 @@ LEAST_KEPT = 4
 
 
 class InOrder:
-    """What a sequential backbone says of each frame of a sequence, shown to it in order, whatever is asked for when.
+    """The predictions of a sequential backbone, shown a sequence in order, whatever is asked for when.
 
-    indices  the frames that it is shown
-    claim    is told whose the backbone is now, and says whether it was somebody else's: then it begins again
     Where a prediction is no longer at hand, the backbone is shown the sequence from its first frame again.
+
+    Attributes:
+        indices: The frames that it is shown.
+        claim: A function that is told whose the backbone is now, and says whether it was somebody else's: then it
+            begins again.
     """
 
     def __init__(
@@ -360,7 +375,11 @@ class InOrder:
         self._kept: dict[int, Prediction] = {}
 
     def at(self, index: int) -> Prediction:
-        """Raises ConfigError for a frame that the backbone is not shown."""
+        """Return the prediction of a frame.
+
+        Raises:
+            ConfigError: For a frame that the backbone is not shown.
+        """
         place = self._placed(index)
         if index not in self._kept:
             if self._claim(self) or place < self._next:
@@ -371,9 +390,10 @@ class InOrder:
         return self._kept[index]
 
     def shown_for(self, indices: Sequence[int]) -> list[int]:
-        """The frames that the backbone is shown for the sake of these: its labels depend on all of them.
+        """Return the frames that the backbone is shown for the sake of these: its labels depend on all of them.
 
-        Raises ConfigError for a frame that is not among them.
+        Raises:
+            ConfigError: For a frame that is not among them.
         """
         return list(self.indices[: max(map(self._placed, indices), default=-1) + 1])
 
@@ -396,5 +416,5 @@ class InOrder:
 
 
 def size_of(prediction: Prediction) -> int:
-    """Bytes that a prediction keeps in memory."""
+    """Return the bytes that a prediction keeps in memory."""
     return prediction.labels.nbytes + (0 if prediction.scores is None else prediction.scores.nbytes)

@@ -33,9 +33,10 @@ COLUMNS = ("previous", "frame", *(field.name for field in fields(RegionChange)))
 class RegionSeries:
     """One change a pair of successive frames: at the same pixel coordinates, and with camera motion taken out.
 
-    frames       names, one more than there are changes
-    plain        previous and current map as they are
-    compensated  the previous map warped by depth and pose; empty where these are not known
+    Attributes:
+        frames: Names, one more than there are changes.
+        plain: Previous and current map as they are.
+        compensated: The previous map warped by depth and pose; empty where these are not known.
     """
 
     frames: tuple[str, ...]
@@ -53,7 +54,7 @@ class RegionSeries:
         return macro_mean([change.flicker_percent for change in self.compensated])
 
     def write(self, path: Path) -> None:
-        """One row a pair and kind, as CSV; an undefined number is an empty field."""
+        """Write one row a pair and kind, as CSV; an undefined number is an empty field."""
         text = io.StringIO()
         writer = csv.writer(text, lineterminator="\n")
         writer.writerow(("kind", *COLUMNS))
@@ -89,15 +90,16 @@ SCORE_BYTES = 1 << 28
 
 @dataclass(frozen=True)
 class SequenceOptions:
-    """How a sequence is predicted.
+    """The settings of a prediction of a sequence.
 
-    name        what the predictions are called
-    scores      also keep soft scores, in `score_type`
-    top_k       of these only the largest of each pixel, so many; None for all
-    batch       images that the model sees at once
-    threads     threads that decode images ahead
-    overwrite   replace predictions of other settings
-    command     what was typed, for the manifest
+    Attributes:
+        name: Name of the predictions.
+        scores: Whether to keep soft scores, too, in `score_type`.
+        top_k: Number of the largest scores that a pixel keeps; None for all.
+        batch: Images that the model sees at once.
+        threads: Threads that decode images ahead.
+        overwrite: Replace predictions of other settings.
+        command: The command line, for the manifest.
     """
 
     name: str
@@ -112,12 +114,13 @@ class SequenceOptions:
 
 @dataclass(frozen=True)
 class SequenceReport:
-    """What was done: where it is, how many frames, how fast.
+    """The outcome of a prediction: where it is, how many frames, how fast.
 
-    folders        that were written
-    predicted      frames that the model saw; `kept` ones were there from before
-    model_seconds  in the model; `seconds` in all, decoding and writing included
-    regions        of a model without classes, what changed from frame to frame
+    Attributes:
+        folders: Folders that were written.
+        predicted: Frames that the model saw; `kept` ones were there from before.
+        model_seconds: Seconds in the model; `seconds` are those in all, decoding and writing included.
+        regions: For a model without classes, the change from frame to frame.
     """
 
     sequence: str
@@ -130,18 +133,18 @@ class SequenceReport:
 
     @property
     def frames_per_second(self) -> float:
-        """Of the predicted ones, all included; NaN where there were none."""
+        """The speed of the predicted frames, all included; NaN where there were none."""
         return self.predicted / self.seconds if self.predicted else float("nan")
 
 
 class PredictionObserver:
-    """Watches a prediction; override what is of interest."""
+    """An observer of a prediction; override what is of interest."""
 
     def sequence_started(self, name: str, frames: int) -> None:
-        """A sequence of so many selected frames is begun."""
+        """Take note that a sequence of so many selected frames is begun."""
 
     def frame_done(self, kept: bool) -> None:
-        """One frame further: predicted, or kept from before."""
+        """Take note of one more frame: predicted, or kept from before."""
 
 
 def predict_sequence(
@@ -158,7 +161,9 @@ def predict_sequence(
     same finished are kept; an image whose content changed is predicted again. A sequential backbone that lacks a frame
     is shown all of them again from the first one.
 
-    Raises ConfigError where the folder holds other predictions, DataError that names an image; what was finished stays.
+    Raises:
+        ConfigError: If the folder holds other predictions.
+        DataError: If that fails; the message names an image; what was finished stays.
     """
     for observer in observers:
         observer.sequence_started(sequence.name, len(indices))
@@ -198,7 +203,10 @@ class _Work:
         self._model_seconds = 0.0
 
     def pictures(self) -> Iterator[Picture]:
-        """What the model is shown, in order; what a sequential one says depends on all that it was shown before."""
+        """Yield what the model is shown, in order.
+
+        What a sequential one says depends on all that it was shown before.
+        """
         if self.backbone.sequential:
             self.backbone.reset()
         so_far = ""
@@ -214,7 +222,7 @@ class _Work:
                 yield item
 
     def kept(self, picture: Picture) -> bool:
-        """Whether an earlier start finished it."""
+        """Return whether an earlier start finished it."""
         return all(folder.has(picture.name, picture.digest) for folder in self.folders)
 
     def take(self, picture: Picture, anew: bool) -> None:
@@ -257,19 +265,19 @@ class _Work:
             folder.close()
 
     def report(self, seconds: float, series: RegionSeries | None) -> SequenceReport:
-        """What was done."""
+        """Return what was done."""
         paths = tuple(folder.path for folder in self.folders)
         return SequenceReport(
             self.sequence.name, paths, self._predicted, self._kept, self._model_seconds, seconds, series
         )
 
     def _too_large(self, picture: Picture) -> bool:
-        """Whether all scores of an image would take too much memory, and the backbone can give them one by one."""
+        """Return whether all scores of an image take too much memory, and the backbone can give them one by one."""
         size = 4 * picture.pixels.shape[0] * picture.pixels.shape[1] * len(self.backbone.label_space or ())
         return self.options.scores and self.backbone.streams and size > SCORE_BYTES
 
     def _write(self, picture: Picture, found: Streamed, seconds: float) -> None:
-        """At the pixels that the scene's label files have."""
+        """Write a prediction at the pixels that the scene's label files have."""
         alike = self.sequence.labels_like_depth
         frame = self.sequence.predicted(picture.index, labels=found.labels) if alike else None
         for folder in self.folders:
@@ -312,13 +320,13 @@ def _folders(
 
 
 def _selection(names: Sequence[str]) -> str:
-    """Which frames a sequential backbone saw, in a few words that are equal where all of them are."""
+    """Return which frames a sequential backbone saw, in a few words that are equal where all of them are."""
     digest = content_key({"names": list(names)})[:8]
     return f"{len(names)} from {names[0]} to {names[-1]} ({digest})" if names else "none"
 
 
 def _versions() -> dict[str, str | None]:
-    """Of the packages that compute; None for those that are not installed."""
+    """Return the versions of the packages that compute; None for those that are not installed."""
     versions: dict[str, Any] = {"semstab": importlib.metadata.version("semstab")}
     for package in REPORTED_PACKAGES:
         try:

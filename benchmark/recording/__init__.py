@@ -2,28 +2,27 @@
 
 Entities, all below the scene's name:
 
-camera, camera/color                    Transform3D and Pinhole; EncodedImage (JPEG)
-camera/BACKBONE/labels                  SegmentationImage: classes
-camera/BACKBONE/contradictions          the same: where labels are not the dominant class of the map
-                                        before the frame
-camera/BACKBONE/drift                   the same: drift that the frame caused at each pixel's voxel. A Transform3D
-                                        spreads each picture over the camera's image
-depth, trajectory                       DepthImage; LineStrips3D
-map/BACKBONE/BACKEND/CHUNK              VoxelGridMap, coloured by class; components category:colors, op:values
-                                        and KEY:values of each measure, which the views map to its own
-series/NAME/BACKBONE/BACKEND            Scalars: a series of `SERIES`
-flips/BACKBONE/voxel_N                  StateChange: the dominant class of the voxels that drifted most
-flips_report/BACKBONE, flips_at/...     TextDocument: the top contributing frames; Points3D: where those voxels are
-camera/BACKBONE/flips                   Points2D: those voxels in the frame, where their numbers lie inside its image
-difference/BACKBONE/A and B/PART        VoxelGridMap: voxels where two backends differ
-difference_report/BACKBONE/A and B      TextDocument: how many they are
-legend, all_classes                     Points2D: the classes and their colours, those with the most voxels first
-log                                     TextLog: each unit's final numbers
+- `camera`, `camera/color`: Transform3D and Pinhole; EncodedImage (JPEG)
+- `camera/BACKBONE/labels`: SegmentationImage: classes
+- `camera/BACKBONE/contradictions`: the same: where labels are not the dominant class of the map before the frame
+- `camera/BACKBONE/drift`: the same: drift that the frame caused at each pixel's voxel. A Transform3D spreads each
+  picture over the camera's image
+- `depth`, `trajectory`: DepthImage; LineStrips3D
+- `map/BACKBONE/BACKEND/CHUNK`: VoxelGridMap, coloured by class; components category:colors, op:values and KEY:values of
+  each measure, which the views map to its own
+- `series/NAME/BACKBONE/BACKEND`: Scalars: a series of `SERIES`
+- `flips/BACKBONE/voxel_N`: StateChange: the dominant class of the voxels that drifted most
+- `flips_report/BACKBONE`, `flips_at/...`: TextDocument: the top contributing frames; Points3D: where those voxels are
+- `camera/BACKBONE/flips`: Points2D: those voxels in the frame, where their numbers lie inside its image
+- `difference/BACKBONE/A and B/PART`: VoxelGridMap: voxels where two backends differ
+- `difference_report/BACKBONE/A and B`: TextDocument: how many they are
+- `legend`, `all_classes`: Points2D: the classes and their colours, those with the most voxels first
+- `log`: TextLog: each unit's final numbers
 
 and in the recording of a comparison
 
-change/RUN/agreement, .../truth         VoxelGridMap: what each voxel that changed lost or gained
-change/RUN/.../same, .../locations      Points3D: the other voxels; the locations that got worse, with their numbers
+- `change/RUN/agreement`, `.../truth`: VoxelGridMap: what each voxel that changed lost or gained
+- `change/RUN/.../same`, `.../locations`: Points3D: the other voxels; the locations that got worse, with their numbers
 """
 
 from semstab.recording.layout import record_changes

@@ -1,4 +1,4 @@
-"""What is recorded once a scene: axes, legend, and the camera with pose, colour and depth.
+"""The parts that are recorded once a scene: axes, legend, and the camera with pose, colour and depth.
 
 The camera has the frame's size. Pictures are smaller where that saves much; transforms lay them over each other.
 """
@@ -60,8 +60,9 @@ class SceneLog:
 
     The camera's pictures are logged once a frame, whichever backbones and backends fuse it.
 
-    origin  (3,) voxels, None before anything of the scene is logged
-    bounds  of its first finished map, None before that
+    Attributes:
+        origin: (3,) voxels, None before anything of the scene is logged.
+        bounds: Bounds of its first finished map, None before that.
     """
 
     def __init__(self, tasks: list[Task]) -> None:
@@ -142,9 +143,10 @@ class SceneLog:
 
 
 def color_of(frame: Frame) -> bytes | None:
-    """Return colour as JPEG, in the size of the labels; None where the frame has none.
+    """Return the colour as JPEG, in the size of the labels; None where the frame has none.
 
-    Raises DataError where its file cannot be read.
+    Raises:
+        DataError: If its file cannot be read.
     """
     from PIL import Image
 

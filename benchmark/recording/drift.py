@@ -69,11 +69,12 @@ def contexts() -> dict[str, rr.AnnotationContext]:
 
 @dataclass(frozen=True, eq=False)
 class FrameChanges:
-    """What a frame did to the n voxels that it saw, whatever becomes of the map.
+    """The changes that a frame made to the n voxels that it saw, whatever becomes of the map.
 
-    key     (n,) int64 packed voxel index, relative to the origin
-    drift   (n,) float32 bits, NaN where the voxel was not seen before
-    before  (n,) uint16 dominant class before the frame; where the voxel was not seen, after it
+    Attributes:
+        key: (n,) int64 packed voxel index, relative to the origin.
+        drift: (n,) float32 bits, NaN where the voxel was not seen before.
+        before: (n,) uint16 dominant class before the frame; where the voxel was not seen, after it.
     """
 
     frame: Frame
@@ -140,7 +141,7 @@ class View(NamedTuple):
 
 
 class DriftLog:
-    """Follows a map voxel by voxel, a live one or else one of its own, and remembers which frames moved a belief."""
+    """A log of a map's drift, of a live one or else one of its own, that remembers which frames moved a belief."""
 
     def __init__(self, voxel_size: float, num_classes: int, live: GrowingMap | None = None) -> None:
         self.map: GrowingMap = NumbaHash(voxel_size, num_classes) if live is None else live

@@ -1,4 +1,4 @@
-"""How the viewer opens a recording, without a click: maps left, camera right, series below, a tab for each scene."""
+"""The viewer's layout of a recording: maps left, camera right, series below, a tab for each scene."""
 
 from __future__ import annotations
 
@@ -45,9 +45,10 @@ BACKGROUND = (72, 72, 78)
 class SceneBounds:
     """Points and cameras that the views of a scene's maps show.
 
-    points   (n, 3) metres, of the voxels or a sample of them
-    cameras  (m, 4, 4) poses in the same world
-    up       (3,), where it is known
+    Attributes:
+        points: (n, 3) metres, of the voxels or a sample of them.
+        cameras: (m, 4, 4) poses in the same world.
+        up: (3,), where it is known.
     """
 
     points: Float64
@@ -145,7 +146,7 @@ class Legend:
 
     @property
     def room(self) -> int:
-        """How many classes the legend that is always seen has room for."""
+        """Return how many classes the legend that is always seen has room for."""
         return LINES * self._columns
 
     def height(self, lines: int | None = None) -> float:

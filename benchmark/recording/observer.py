@@ -48,10 +48,11 @@ BYTES_A_VOXEL = 120
 
 
 class GroupLog:
-    """What is recorded of one backbone on a scene.
+    """The recording of one backbone on a scene.
 
-    live      a map that is being fused and can be followed; without it the recording fuses one of its own
-    followed  whether a map is followed at all
+    Attributes:
+        live: A map that is being fused and can be followed; without it the recording fuses one of its own.
+        followed: Whether a map is followed at all.
     """
 
     def __init__(
@@ -95,7 +96,7 @@ class GroupLog:
     ) -> None:
         """Log a unit's final voxels, their differences from the drawn unit, its numbers, the agreement of its frames.
 
-        factor  of a table that is thinned already: it is not compared
+        - `factor`: of a table that is thinned already: it is not compared
         """
         unit, first = summary.unit, drawn(self.task)
         if factor == 1:
@@ -136,14 +137,17 @@ class GroupLog:
 
 
 class Recording(Observer):
-    """Writes one recording while the run is fused; a killed run leaves a recording up to a moment before.
-
-    target  a file, or a `Target`: a file and a viewer
+    """An observer that writes one recording during the run; a killed run leaves one up to a moment before.
 
     The file is opened at the first fused frame: a start that finds every unit finished leaves an earlier recording
     alone, unless a kill cut it. Series and voxels of units that were not fused whole in this process come from the
-    run's folder. Call `close` where a run does not come to its end. Raises ConfigError where the file cannot be
-    written.
+    run's folder. Call `close` where a run does not come to its end.
+
+    Attributes:
+        target: A file, or a `Target`: a file and a viewer.
+
+    Raises:
+        ConfigError: If the file cannot be written.
     """
 
     def __init__(self, target: str | Path | Target) -> None:
@@ -245,7 +249,8 @@ class Recording(Observer):
     def close(self) -> None:
         """Write out what is pending and close the file; a second call does nothing.
 
-        Raises ConfigError where the end cannot be written: the disk is full, for example.
+        Raises:
+            ConfigError: If the end cannot be written: the disk is full, for example.
         """
         stream, self._stream = self._stream, None
         if stream is None:

@@ -1,4 +1,4 @@
-"""Where a recording goes: into a file, and to a viewer while the run goes on."""
+"""Targets of a recording: a file, and a viewer while the run goes on."""
 
 from __future__ import annotations
 
@@ -24,10 +24,10 @@ DEFAULT_URL = "rerun+http://127.0.0.1:9876/proxy"
 CHOICES = "FILE.rrd, spawn, connect, rerun+http://HOST:PORT/proxy, serve, or off"
 
 FOOTER, FOOTER_BYTES = b"RRF2FOOT", 64
-"""How a recording ends, among its last bytes."""
+"""The mark that ends a recording, among its last bytes."""
 
 ANSWER_SECONDS, SPAWN_SECONDS = 5.0, 30.0
-"""How long a viewer may take to answer, and one that is started to listen."""
+"""Seconds that a viewer may take to answer, and one that is started to listen."""
 
 HTTP2_SETTINGS = b"\x04"
 HTTP2_PREFACE = b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n" + bytes(3) + HTTP2_SETTINGS + bytes(5)
@@ -43,7 +43,11 @@ class Target:
 
     @classmethod
     def parse(cls, text: str | None, default: Path) -> Target:
-        """Read `--rerun`; `default` is the file where it names none. Raises ConfigError for anything else."""
+        """Read `--rerun`; `default` is the file where it names none.
+
+        Raises:
+            ConfigError: For anything else.
+        """
         if text is None:
             return cls(default)
         if text in ("spawn", "serve"):
@@ -60,11 +64,15 @@ class Target:
 
     @property
     def live(self) -> bool:
-        """Whether somebody may watch while the run goes on."""
+        """Return whether somebody may watch while the run goes on."""
         return self.viewer is not None
 
     def open(self) -> rr.RecordingStream:
-        """Open a stream into it. Raises ConfigError where the file cannot be written, or the viewer is not there."""
+        """Open a stream into it.
+
+        Raises:
+            ConfigError: If the file cannot be written, or the viewer is not there.
+        """
         stream = rr.RecordingStream(APPLICATION)
         try:
             self.file.parent.mkdir(parents=True, exist_ok=True)
@@ -107,7 +115,8 @@ def is_whole(file: Path) -> bool:
 def viewer_command() -> list[str]:
     """Return the command of the viewer that came with the SDK, for this machine only.
 
-    Raises ConfigError where it is missing.
+    Raises:
+        ConfigError: If it is missing.
     """
     own = Path(sys.executable).with_name("rerun")
     program = str(own) if own.exists() else shutil.which("rerun")
@@ -117,7 +126,11 @@ def viewer_command() -> list[str]:
 
 
 def _spawn(url: str) -> None:
-    """Start a viewer that outlives this process, and wait until it answers. Raises ConfigError where it ends before."""
+    """Start a viewer that outlives this process, and wait until it answers.
+
+    Raises:
+        ConfigError: If it ends before.
+    """
     command = [*viewer_command(), "--port", str(_address(url)[1])]
     environment = os.environ | {"RERUN_APP_ONLY": "true"}
     viewer = subprocess.Popen(

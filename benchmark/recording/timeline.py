@@ -28,7 +28,7 @@ def path(*parts: str) -> str:
 
 
 class Clock:
-    """Sets a stream's time: the frame's number, and its timestamp where there is one."""
+    """The time of a stream: the frame's number, and its timestamp where there is one."""
 
     def __init__(self) -> None:
         self._dated: bool | None = None  # a timeline has one type: the first timestamp decides
@@ -52,7 +52,7 @@ MOST_PENDING = 4
 
 
 class Background:
-    """Does jobs one after the other, each at the time of its frame."""
+    """A thread that does jobs one after the other, each at the time of its frame."""
 
     def __init__(self, stream: rr.RecordingStream, clock: Clock) -> None:
         self._stream = stream
@@ -130,7 +130,11 @@ def log_row(stream: rr.RecordingStream, unit: Unit, task: Task, cells: Mapping[s
 
 
 def read_rows(file: Path) -> list[tuple[int, float | None, dict[str, str]]]:
-    """Return frame, timestamp and cells of each row of a time series. Raises DataError where it is damaged."""
+    """Return frame, timestamp and cells of each row of a time series.
+
+    Raises:
+        DataError: If it is damaged.
+    """
     try:
         with file.open(encoding="utf-8", newline="") as lines:
             return [
@@ -142,7 +146,11 @@ def read_rows(file: Path) -> list[tuple[int, float | None, dict[str, str]]]:
 
 
 def log_file(stream: rr.RecordingStream, unit: Unit, task: Task, file: Path, clock: Clock) -> None:
-    """Log a unit's time series from its CSV. Raises DataError where it is damaged."""
+    """Log a unit's time series from its CSV.
+
+    Raises:
+        DataError: If it is damaged.
+    """
     for frame, timestamp, cells in read_rows(file):
         try:
             clock.set(stream, frame, timestamp)

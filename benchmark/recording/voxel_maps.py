@@ -33,10 +33,11 @@ from semstab.model.voxels import VoxelTable
 
 @dataclass(frozen=True)
 class ColorMode:
-    """How a map is coloured; ranges are fixed, so that a colour means the same in every recording.
+    """A colouring of a map; ranges are fixed, so that a colour means the same in every recording.
 
-    tab    its name where there is little room; `title` is that of its views
-    range  of the values that the colour map spans; None where voxels have a colour of their own
+    Attributes:
+        tab: Its name where there is little room; `title` is that of its views.
+        range: Range of values that the colour map spans; None where voxels have a colour of their own.
     """
 
     tab: str
@@ -73,7 +74,7 @@ MOST_A_FRAME = 10_000
 """Voxels, of the budget, for which a frame pays: short runs need not log everything anew with each frame."""
 
 NEW = 10
-"""How many voxels that were seen again wait for one that is not drawn yet."""
+"""The number of voxels seen again that wait for one that is not drawn yet."""
 
 
 def edges() -> Int64:
@@ -96,9 +97,12 @@ def packed(colors: npt.ArrayLike) -> UInt32:
 def components(index: Int64 | None, size: float, classes: LabelSpace, voxels: Voxels) -> list[Any]:
     """Return a grid that shows the dominant class, with all else that it can show; see `visualizer`.
 
-    index   (n, 3) relative to the map's origin: small, so that the viewer's float32 keeps it exact; None where only
-            colours and values changed
-    voxels  measured, so that each is computed in one pass
+    Args:
+        index: (n, 3) relative to the map's origin: small, so that the viewer's float32 keeps it exact; None where only
+            colours and values changed.
+        size: Edge of a voxel, metres.
+        classes: The label space, with its colours.
+        voxels: Measured, so that each is computed in one pass.
     """
     where: dict[str, Any] = {}
     if index is not None:
@@ -140,8 +144,9 @@ def defaults(name: str) -> list[rr.VoxelGridMap]:
 def thinned(index: Int64, factor: int = 1) -> tuple[int, Int64]:
     """Return the edge of blocks of voxels, few enough to draw, and the row of one voxel in each, ascending.
 
-    index   (n, 3) relative to the map's origin, with which blocks are aligned
-    factor  the least edge, a power of 2
+    Args:
+        index: (n, 3) relative to the map's origin, with which blocks are aligned.
+        factor: The least edge, a power of 2.
     """
     rows = np.arange(len(index))
     while factor > 1 or len(rows) > MAX_VOXELS:
@@ -210,7 +215,10 @@ class VoxelLogger:
     def finish(self, stream: rr.RecordingStream, table: VoxelTable, factor: int = 1) -> str:
         """Log the final map in place of the growing one; return how it was thinned, where it is too large.
 
-        factor  edge of the blocks of a table that is thinned already
+        Args:
+            stream: The recording.
+            table: The final map.
+            factor: Edge of the blocks of a table that is thinned already.
         """
         index = table.index - self._origin
         factor, rows = thinned(index) if factor == 1 else (factor, np.arange(len(index)))
@@ -244,7 +252,7 @@ def log_difference(
 ) -> str:
     """Log the voxels that one of two maps has only, and those whose VSS differs by more than the tolerance.
 
-    tables  the two maps by the names of their backends
+    - `tables`: the two maps by the names of their backends
 
     Returns how many there are, in words. They are of the final maps, so they are logged for all times.
     """

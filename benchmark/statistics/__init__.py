@@ -17,7 +17,7 @@ from semstab.statistics.agreement import (
 from semstab.statistics.correctness import correctness, join_truth, quadrants, reliability, stable_wrong
 from semstab.statistics.correlogram import correlogram
 from semstab.statistics.description import Analysis, analyse, describe
-from semstab.statistics.drift import benjamini_hochberg, expected_sbd, flips, voxel_drift
+from semstab.statistics.drift import expected_sbd, flips, trends
 from semstab.statistics.geometry import ceiling, losses, rendered
 from semstab.statistics.model_comparison import compare_backbones, coverage, paired
 from semstab.statistics.observations import CellObservations, Views
@@ -36,7 +36,6 @@ __all__ = [
     "Sampler",
     "Views",
     "analyse",
-    "benjamini_hochberg",
     "ceiling",
     "claimed_together",
     "class_agreement",
@@ -60,6 +59,6 @@ __all__ = [
     "rendered",
     "stable_wrong",
     "standardised",
+    "trends",
     "verdict",
-    "voxel_drift",
 ]

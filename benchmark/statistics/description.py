@@ -21,7 +21,6 @@ from semstab.model.statistics import (
     ClassAlpha,
     CorrectnessStatistics,
     DriftStatistics,
-    DriftTests,
     EntropyParts,
     FlipRates,
     FrameAgreement,
@@ -30,6 +29,7 @@ from semstab.model.statistics import (
     MapStatistics,
     Repeated,
     StratumStatistics,
+    Trend,
 )
 from semstab.model.voxels import VoxelTable
 from semstab.statistics.accumulate import Cubes, CubeSums, cluster_sums_of
@@ -47,7 +47,7 @@ from semstab.statistics.correctness import (
     wrong_of_steady,
 )
 from semstab.statistics.correlogram import correlogram
-from semstab.statistics.drift import expected_sbd, voxel_drift
+from semstab.statistics.drift import expected_sbd
 from semstab.statistics.geometry import losses
 from semstab.statistics.intervals import confidence_intervals, headline_specs, probability_above, scope_of, spec_of
 from semstab.statistics.observations import CellObservations
@@ -125,7 +125,7 @@ def describe(
 ) -> MapStatistics:
     """Return all statistics of one map: a `MapSample` is drawn and analysed.
 
-    events  the log behind the table; without it there is no drift test and no flip rate
+    events  the log behind the table; without it there is no trend and no flip rate
     truth   the map of the ground truth labels of the same frames; without it correctness is not known
     limit   the map of view-independent labels (`ceiling`), from which geometry's part of the disagreement follows
 
@@ -166,8 +166,7 @@ def analyse(
     limit = sample.truth if limit is None else limit
     shares = shares_of(table)
     stable = stability_posterior(table, shares)
-    drift = None if events is None else voxel_drift(table, events, seed=seed)
-    null = expected_sbd(table) if drift is None else drift.null
+    null = expected_sbd(table, events, seed=seed)
     columns = row_columns(table, null)
     cubes = Cubes.of(table)
     of_places = place_sums(table, columns, cubes)
@@ -181,7 +180,9 @@ def analyse(
         stable=stable,
     )
     flipping = FlippingSums.of(table, stable, cubes)
-    drawn, log = log_sums(table, sample, cubes, drift, seed)
+    drawn, log = log_sums(sample, cubes)
+    if log is not None:
+        drawn["sbd_null"] = null
     if truth is not None:
         drawn["true_label"] = truth.label
     (unsteady,) = confidence_intervals(flipping.specs())
@@ -285,23 +286,11 @@ def _agreement(means: Mapping[str, Interval], classes: tuple[ClassAgreement, ...
 def _drift(
     repeats: int, means: Mapping[str, Interval], locations: CubeSums, log: LogSums | None, of_flips: Sequence[Interval]
 ) -> DriftStatistics:
-    """SBD against its null; without a log only for one-hot evidence, and without tests."""
-    tests, rates, sampled = None, None, locations["psa"][1]
+    """SBD beside its null; without a log only for one-hot evidence, and without flips and trend."""
+    trend, rates, sampled = None, None, locations["psa"][1]
     if log is not None:
-        one_way, by_chance, all_of_it = log.trend
-        since, excess = confidence_intervals(log.places.specs(OF_CHANGES))
-        tests = DriftTests(
-            sbd_p=log.test.p_value,
-            trend=float(one_way / all_of_it) if all_of_it else math.nan,
-            trend_null=float(by_chance / all_of_it) if all_of_it else math.nan,
-            trend_excess=excess,
-            trend_p=log.test.trend_p,
-            stretches=log.test.stretches,
-            voxels=log.test.voxels,
-            tested_voxels=log.tested,
-            unusual_sbd_voxels=log.unusual,
-            trending_voxels=log.trending,
-        )
+        since, share = confidence_intervals(log.places.specs(OF_CHANGES))
+        trend = Trend(share, log.telling)
         rate, null, beyond = of_flips
         rates = FlipRates(rate, null, beyond, since)
     return DriftStatistics(
@@ -309,7 +298,7 @@ def _drift(
         sbd=means["sbd"],
         null=means["null"],
         excess=means["excess"],
-        tests=tests,
+        trend=trend,
         flips=rates,
     )
 

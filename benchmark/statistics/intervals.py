@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from semstab.core.types import THESE_FRAMES, THIS_SCENE, Float64, Scope
+from semstab.core.types import THESE_FRAMES, THIS_SCENE, Float64, Int64, Scope
 from semstab.model.statistics import UNKNOWN, HeadlineStatistics, Interval
 from semstab.statistics.agreement import ratio_of
 from semstab.statistics.cluster_sums import (
@@ -383,8 +383,14 @@ def difference_over_frames(a: Mapping[int, float], b: Mapping[int, float], level
     return mean_over_frames(np.array(frames), differences, level)
 
 
-def coverage(new: ClusterSums, base: ClusterSums, level: float = LEVEL) -> Interval:
-    """How many voxels with OP >= 2 a map has for each one of another, less 1, paired on cubes, for these frames."""
+def coverage(new: ClusterSums, base: ClusterSums, level: float = LEVEL, *, same_frames: bool | None = None) -> Interval:
+    """How many voxels with OP >= 2 a map has for each one of another, less 1, for these frames.
+
+    Of the same frames (where that is not given, the sums tell) it is a count, without an interval; else an estimate,
+    paired on cubes.
+    """
+    if same_flight(new, base) if same_frames is None else same_frames:
+        return counted(shares_of(new, base)["voxels"] - 1, new)
     edge = max(new.edge, base.edge)
     parts = [sums.coarsened(edge, 0) for sums in (new, base)]
     cell, row = np.unique(np.concatenate([part.cell for part in parts]), axis=0, return_inverse=True)
@@ -397,10 +403,35 @@ def coverage(new: ClusterSums, base: ClusterSums, level: float = LEVEL) -> Inter
     return no_difference(result) if np.allclose(after, before, rtol=1e-9) else result
 
 
+def shares_of(new: ClusterSums, base: ClusterSums) -> dict[str, float]:
+    """How many voxels with OP >= 2, and labelled observations in them, a map has for each one of another; else NaN."""
+    totals = {name: [round(float(part[name].sum())) for part in (new, base)] for name in ("voxels", "observations")}
+    return {name: after / before if before else math.nan for name, (after, before) in totals.items()}
+
+
+def counted(value: float, sums: ClusterSums) -> Interval:
+    """A change that is a count of the frames of some sums, and no estimate; undecided where it is undefined."""
+    return Interval(
+        value, value, value, frames=sums.frame_count, locations=sums.cells, degrees=math.inf,
+        undecided=NO_PLACES if math.isnan(value) else "", p_value=0.0 if abs(value) > 0 else math.nan,
+    )  # fmt: skip
+
+
 def same_flight(a: ClusterSums, b: ClusterSums) -> bool:
     """Whether both have the same groups of frames, so that they can be paired."""
-    step = max(a.step, b.step)
-    if not a.step or not b.step:
-        return False
-    one, other = (np.unique(part.frame[part.frame >= 0] // (step // part.step)) for part in (a, b))
+    one, other = _groups_of(a, b)
     return len(one) > 0 and np.array_equal(one, other)
+
+
+def within_a_flight(a: ClusterSums, b: ClusterSums) -> bool:
+    """Whether one has no groups of frames but the other's, as where a model gives no label in whole frames."""
+    one, other = _groups_of(a, b)
+    both = len(np.intersect1d(one, other))
+    return both > 0 and both in (len(one), len(other))
+
+
+def _groups_of(a: ClusterSums, b: ClusterSums) -> tuple[Int64, Int64]:
+    """The groups of frames of both, of the same number of frames each; none where they are not known."""
+    step, known = max(a.step, b.step), bool(a.step and b.step)
+    one, other = (np.unique(part.frame[part.frame >= 0] // (step // part.step if known else 1)) for part in (a, b))
+    return (one.astype(np.int64), other.astype(np.int64)) if known else (np.zeros(0, np.int64), np.zeros(0, np.int64))

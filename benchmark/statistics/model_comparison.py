@@ -48,8 +48,7 @@ def coverage(tables: Tables) -> tuple[MapCoverage, ...]:
 
 
 def held(tables: Tables) -> Int64:
-    """(M, 6) of each map, or of its part in one place: voxels, observations, repeated and recurrent voxels, common to
-    all, in no other."""
+    """Return (M, 6): each map's (part's) voxels, observations, repeated and recurrent voxels, common ones, own ones."""
     common = len(shared_rows(*tables.values())[0])
     rows = []
     for name, table in tables.items():

@@ -16,25 +16,11 @@ from semstab.model.statistics import Flipping, Interval
 from semstab.model.voxels import VoxelTable
 from semstab.statistics.accumulate import Cubes, CubeSums, Mean
 from semstab.statistics.agreement import alpha_of, decompose, disagreement, kappa_of, psa
-from semstab.statistics.drift import (
-    TESTABLE,
-    OrderTest,
-    VoxelDrift,
-    benjamini_hochberg,
-    flips,
-    in_stretches,
-    order_test,
-    rounded_up,
-    trend_columns,
-    voxel_drift,
-)
+from semstab.statistics.drift import flips, trends
 from semstab.statistics.intervals import EstimateSpec
 from semstab.statistics.sample import MapSample
 
 Columns = dict[str, npt.NDArray[Any]]
-
-FALSE_DISCOVERIES = 0.05
-"""Rate at which single voxels are reported as trending, or as drifting unusually."""
 
 
 # --- Columns and means ------------------------------------------------------------------------------------------------
@@ -73,7 +59,7 @@ OF_FLIPS: Mapping[str, Mean] = {
 
 OF_CHANGES: Mapping[str, Mean] = {
     "frames_since": Mean("frames_since", bounds=(0.0, math.inf)),
-    "trend_excess": Mean("trend_excess", bounds=SIGNED),
+    "trend": Mean("trend", bounds=SIGNED),
 }
 """Over fewer voxels."""
 
@@ -170,25 +156,17 @@ def _together(table: VoxelTable, unsteady: Float64) -> Float64:
 
 @dataclass(frozen=True, eq=False)
 class LogSums:
-    """The sums and tests that need a log: sums over cubes, `trend_columns` summed (3,), and how many voxels trend."""
+    """The sums over cubes that need a log, and how many voxels tell of a trend."""
 
     places: CubeSums
-    trend: Float64
-    test: OrderTest
-    tested: int
-    unusual: int
-    trending: int
+    telling: int
 
 
-def log_sums(
-    table: VoxelTable, sample: MapSample, cubes: Cubes, drift: VoxelDrift | None, seed: int
-) -> tuple[Columns, LogSums | None]:
+def log_sums(sample: MapSample, cubes: Cubes) -> tuple[Columns, LogSums | None]:
     """The columns and sums that need a log; none without one."""
-    if sample.events is None or drift is None:
+    if sample.events is None:
         return {}, None
-    changes = flips(sample.events)
-    tell, trend = trend_columns(table, drift)
-    trends = cubes.rows(tell).sums(trend)
+    changes, trend = flips(sample.events), trends(sample.events)
     means = {
         "flip_rate": changes.rate,
         "flip_null": changes.null,
@@ -196,31 +174,11 @@ def log_sums(
         "frames_since": changes.since,
     }
     sums = cubes.means(means)
-    sums["trend_excess"] = np.stack([trends[:, 0] - trends[:, 1], trends[:, 2]], axis=1)
-    test = order_test(table, sample.events, seed=seed)
-    tested, op = drift, table.op
-    if test.lasting > 1:  # single observations are not exchangeable: the means over stretches may be
-        log_of_means = in_stretches(sample.events, test.lasting)
-        means_of = log_of_means.table()
-        tested, op = voxel_drift(means_of, log_of_means, seed=seed), means_of.op
-    drift_q = benjamini_hochberg(np.where(op >= TESTABLE, tested.p_value, np.nan))
-    trend_q = benjamini_hochberg(rounded_up(np.where(op >= TESTABLE, tested.trend_p, np.nan)))
-    log = LogSums(
-        CubeSums(cubes.cell, cubes.edge, sums),
-        trends.sum(axis=0),
-        test,
-        int(np.count_nonzero(~np.isnan(trend_q))),
-        int(np.count_nonzero(drift_q <= FALSE_DISCOVERIES)),
-        int(np.count_nonzero(trend_q <= FALSE_DISCOVERIES)),
-    )
+    sums["trend"] = cubes.sums(np.nan_to_num(np.stack([trend.common, trend.variation], axis=1)))
+    log = LogSums(CubeSums(cubes.cell, cubes.edge, sums), int(np.count_nonzero(~np.isnan(trend.variation))))
     columns: Columns = {
-        "sbd_null": drift.null,
-        "drift_p": tested.p_value,
-        "trend": drift.trend,
-        "trend_p": tested.trend_p,
+        "trend": trend.share,
         "flip_rate": changes.rate,
         "frames_since_flip": changes.since,
-        "drift_q": drift_q,
-        "trend_q": trend_q,
     }
     return columns, log

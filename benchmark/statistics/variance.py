@@ -350,16 +350,6 @@ def spread_of_flights(one: Influences, other: Influences, between: Influences, s
     return parts.spread() if (parts.variance > 0).all() else EXACT
 
 
-def longest_effect(effect: Float64, weight: Float64, at: Float64, level: float) -> float:
-    """Return for how many frames effects (F,) of frames at times (F,) last at most, with that probability."""
-    likely = _of_frames(effect, weight, np.zeros((len(effect),) * 2), at).weight
-    if len(likely) < 2:
-        return 0.0
-    by_range = likely.reshape(len(LASTING), -1).sum(axis=1)
-    rho = LASTING[min(int(np.searchsorted(np.cumsum(by_range), level)), len(LASTING) - 1)]
-    return -float(np.median(np.diff(at))) / math.log(rho) if rho > 0 else 0.0
-
-
 def spread_of_frames(effect: Float64, weight: Float64, at: Float64) -> Spread:
     """Return the spread of sum(weight * effect) of a series (F,) over frames taken at times (F,), ascending."""
     parts = _of_frames(effect, weight, np.zeros((len(effect),) * 2), at)

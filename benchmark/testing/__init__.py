@@ -58,9 +58,10 @@ __all__ = [
 class BackendConformance(EvidenceTests, GeometryTests, ContractTests, PropertyTests):
     """The contract of every fusion backend. A subclass defines `create`; the rest is inherited.
 
-    tolerance    largest difference of a sum (evidence, drift, ...) from its exact value; 1e-9 for float64
-    voxel_share  part of the voxels that may differ from the reference on random frames, because other arithmetic puts
-                 a point on the other side of a voxel's face; 0 for float64
-    reach        voxels that a map holds to either side of its first camera, 2^31 unless the backend says that it
-                 reaches less far; what lies beyond is refused
+    Attributes:
+        tolerance: Largest difference of a sum (evidence, drift, ...) from its exact value; 1e-9 for float64.
+        voxel_share: Part of the voxels that may differ from the reference on random frames, because other arithmetic
+            puts a point on the other side of a voxel's face; 0 for float64.
+        reach: Voxels that a map holds to either side of its first camera, 2^31 unless the backend says that it reaches
+            less far; what lies beyond is refused.
     """

@@ -51,7 +51,7 @@ def sight_line(
     along: str = "z",
     dtype: type[Any] = np.uint8,
 ) -> Frame:
-    """A frame whose pixels all look along one line: pixel i lies at start + depth_i * axis, exactly.
+    """Return a frame whose pixels all look along one line: pixel i lies at start + depth_i * axis, exactly.
 
     The focal length is so long (2^60 pixels) that the pixels' rays coincide. A hit is (depth, label id), or
     (depth, K scores); `dtype` is the label map's, or the scores'. With voxels of 1 m the default line runs through the
@@ -71,7 +71,10 @@ def sight_line(
 
 
 def random_frames(seed: int, count: int = 3, K: int = 4) -> list[Frame]:
-    """A camera that wanders and turns before a scattered scene; depth has gaps, every other frame has soft scores."""
+    """Return a camera that wanders and turns before a scattered scene.
+
+    Depth has gaps, every other frame has soft scores.
+    """
     rng = np.random.default_rng(seed)
     frames = []
     for index in range(count):
@@ -105,7 +108,7 @@ checks = settings(
 
 
 def as_frames(sequence: Iterable[Sequence[Hit]]) -> list[Frame]:
-    """The frames of a random sequence."""
+    """Return the frames of a random sequence."""
     return [sight_line(index, hits) for index, hits in enumerate(sequence)]
 
 
@@ -113,12 +116,12 @@ def as_frames(sequence: Iterable[Sequence[Hit]]) -> list[Frame]:
 
 
 def voxels(table: VoxelTable) -> list[Voxel]:
-    """The voxels of a table in its order."""
+    """Return the voxels of a table in its order."""
     return [(int(x), int(y), int(z)) for x, y, z in table.index]
 
 
 def only(table: VoxelTable) -> int:
-    """The row of a map of one voxel."""
+    """Return the row of a map of one voxel."""
     assert len(table) == 1
     return 0
 
@@ -128,7 +131,7 @@ SUMS = ("evidence", "drift_sum", "self_sum", "frame_entropy_sum")
 
 
 def assert_same_map(a: VoxelTable, b: VoxelTable, tolerance: float, leaving_out: Sequence[str] = ()) -> None:
-    """The same voxels with the same rows: counts are equal, sums agree to `tolerance`."""
+    """Assert that the same voxels have the same rows: counts are equal, sums agree to `tolerance`."""
     assert voxels(a) == voxels(b)
     for name in EXACT:
         if name not in leaving_out:
@@ -139,7 +142,7 @@ def assert_same_map(a: VoxelTable, b: VoxelTable, tolerance: float, leaving_out:
 
 
 def share_that_differs(a: VoxelTable, b: VoxelTable, tolerance: float) -> float:
-    """The share of all voxels that are in one map only, or whose rows differ by more than `tolerance`."""
+    """Return the share of all voxels that are in one map only, or whose rows differ by more than `tolerance`."""
     rows_a, rows_b = _rows(a), _rows(b)
     everywhere = rows_a.keys() | rows_b.keys()
     same = [
@@ -167,16 +170,16 @@ class BackendTests:
     reach: int = 2**31
 
     def create(self, voxel_size: float, num_classes: int) -> FusionBackend:
-        """A new, empty map."""
+        """Return a new, empty map."""
         raise NotImplementedError("a subclass of BackendConformance says how its backend is made")
 
     def fuse(self, *frames: Frame, voxel_size: float = 1.0, K: int = 3) -> VoxelTable:
-        """The map of these frames."""
+        """Return the map of these frames."""
         backend = self.create(voxel_size, K)
         for frame in frames:
             backend.integrate(frame)
         return backend.table()
 
     def near(self, value: Any) -> Any:
-        """`value`, give or take the tolerance."""
+        """Return `value`, give or take the tolerance."""
         return pytest.approx(value, abs=self.tolerance)

@@ -159,7 +159,7 @@ class ContractTests(BackendTests):
         self.assert_refused(sight_line(7, [(0.5, 1), (1.5, 1)], start=(0.5, -(2.0**31) - 1, 0.5)), "frame 7")
 
     def assert_refused(self, frame: Frame, message: str) -> None:
-        """The frame is a DataError with that message, and neither the map nor its further course shows a trace."""
+        """Assert that the frame is a DataError with that message, and leaves no trace in the map or its future."""
         first, later = sight_line(0, [(0.5, 0)]), sight_line(8, [(0.5, 1), (1.5, 2)])
         backend = self.create(1.0, 3)
         backend.integrate(first)
@@ -202,7 +202,7 @@ class ContractTests(BackendTests):
             before = after
 
     def assert_report(self, report: FrameReport, before: VoxelTable, after: VoxelTable) -> None:
-        """Counts and drift are differences; the means over the map may be NaN, where a backend keeps none."""
+        """Assert that counts and drift are differences; the means may be NaN, where a backend keeps none."""
         assert report.points == after.pixels.sum() - before.pixels.sum()
         assert report.voxels == after.op.sum() - before.op.sum()
         assert report.new_voxels == len(after) - len(before)

@@ -101,7 +101,7 @@ class EvidenceTests(BackendTests):
         assert table.frame_entropy_sum[q] == self.near(H_THIRD)
 
     def test_dominant_class_is_the_lowest_on_ties(self) -> None:
-        """e = (0, 1, 1): classes 1 and 2 tie, and 1 is the dominant one."""
+        """Evidence (0, 1, 1): classes 1 and 2 tie, and 1 is the dominant one."""
         table = self.fuse(sight_line(0, [(0.5, 2)]), sight_line(1, [(0.5, 1)]))
         assert dominant(table).tolist() == [1]
 
@@ -189,7 +189,7 @@ class GeometryTests(BackendTests):
             assert dominant(table).tolist() == [0, 1, 2]
 
     def test_a_face_belongs_to_the_voxel_above(self) -> None:
-        """q = floor(x_w / r): in voxels of 2^-k m the points -0.5, 0 and 0.5 m are faces, exactly."""
+        """Voxels q = floor(x_w / r): of 2^-k m the points -0.5, 0 and 0.5 m are faces, exactly."""
         for k in range(1, 8):
             table = self.fuse(sight_line(0, [(0.5, 0), (1, 0), (1.5, 0)], start=(0, 0, -1)), voxel_size=2.0**-k)
             assert table.iz.tolist() == [-(2 ** (k - 1)), 0, 2 ** (k - 1)]

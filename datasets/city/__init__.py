@@ -48,7 +48,11 @@ class City(Dataset):
         return tuple(FLIGHTS)
 
     def scene(self, name: str) -> CityScene:
-        """Open a scene; its town is built when the first frame is asked for. Raises DataError for an unknown name."""
+        """Open a scene; its town is built when the first frame is asked for.
+
+        Raises:
+            DataError: For an unknown name.
+        """
         if name not in FLIGHTS:
             raise DataError(f"city: scene '{name}' is not known; {nearest(name, self.scenes)}")
         if self._last is None or self._last.name != name:
@@ -70,7 +74,7 @@ class CityScene(Scene):
         self._flight = FLIGHTS[name]
         self.origin = np.array(options.origin, dtype=np.float64)
         self.rendered: dict[int, Rendered] = {}
-        """By index; those that fit into memory."""
+        """The rendered frames by index; those that fit into memory."""
         self._lock = threading.Lock()
 
     def __len__(self) -> int:
@@ -83,20 +87,26 @@ class CityScene(Scene):
 
     @property
     def camera(self) -> Intrinsics:
-        """Of every frame: square pixels, the optical axis in the middle of the image."""
+        """The camera of every frame: square pixels, the optical axis in the middle of the image."""
         W, H = self._options.width, self._options.height
         f = W / (2 * np.tan(np.deg2rad(self._options.field_of_view) / 2))
         return Intrinsics(f, f, (W - 1) / 2, (H - 1) / 2)
 
     def label_space(self, backbone: str) -> LabelSpace:
-        """uavid8, for every backbone. Raises ConfigError for an unknown one."""
+        """Return uavid8, for every backbone.
+
+        Raises:
+            ConfigError: For an unknown one.
+        """
         self._model(backbone)
         return uavid8()
 
     def frame(self, index: int, backbone: str, *, color: bool = True) -> Frame:
         """Render frame 0 <= index < len with a backbone's labels or scores; colour comes with it.
 
-        Raises DataError for a frame, ConfigError for a backbone that does not exist.
+        Raises:
+            DataError: For a frame.
+            ConfigError: For a backbone that does not exist.
         """
         model = self._model(backbone)
         T = self._pose(index)
@@ -123,7 +133,7 @@ class CityScene(Scene):
         )
 
     def digest(self, indices: list[int], backbone: str) -> str:
-        """A hash of all settings that the frames depend on; nothing is rendered."""
+        """Return a hash of all settings that the frames depend on; nothing is rendered."""
         model = self._model(backbone)
         content = {
             "generator": GENERATOR_VERSION,
@@ -142,11 +152,11 @@ class CityScene(Scene):
 
     @cached_property
     def still(self) -> Caster:
-        """What rays hit of the town, whatever the time."""
+        """Return what rays hit of the town, whatever the time."""
         return Caster(self.world.still)
 
     def _share(self, index: int) -> float:
-        """How much of the flight lies behind at a frame."""
+        """Return how much of the flight lies behind at a frame."""
         return index / max(1, len(self) - 1)
 
     def _pose(self, index: int) -> Float64:
@@ -158,7 +168,10 @@ class CityScene(Scene):
         return self._flight.pose(self._share(index), ground, self._options.altitude)
 
     def _render(self, index: int, T: Float64) -> Rendered:
-        """The rendered frame, stored while there is room: a pass over all frames would drop old ones too early."""
+        """Return the rendered frame, stored while there is room.
+
+        A pass over all frames would drop old ones too early.
+        """
         with self._lock:
             if index in self.rendered:
                 return self.rendered[index]
@@ -171,7 +184,7 @@ class CityScene(Scene):
             return rendered
 
     def _model(self, backbone: str) -> SimulatedBackbone | None:
-        """The error model of a backbone, None for the ground truth."""
+        """Return the error model of a backbone, None for the ground truth."""
         if backbone == GROUND_TRUTH:
             return None
         if backbone not in self._options.backbones:

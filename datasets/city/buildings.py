@@ -52,7 +52,7 @@ class _Placed:
     roofs: Float64
 
     def local(self, x: Float64, y: Float64, z: Float64) -> Float64:
-        """World points of points in the buildings' own axes; z is above the floor."""
+        """Return the world points of points in the buildings' own axes; z is above the floor."""
         c, s = np.cos(self.yaw), np.sin(self.yaw)
         return self.position + np.stack([c * x - s * y, s * x + c * y, z], axis=-1)
 
@@ -61,7 +61,7 @@ class _Placed:
 
 
 def build(buildings: Sequence[Building], site: Site, rng: np.random.Generator) -> list[Surface]:
-    """Walls, roofs and windows of all buildings."""
+    """Return walls, roofs and windows of all buildings."""
     columns = np.array([b[:6] for b in buildings], dtype=np.float64)
     kind = np.array([b.roof for b in buildings])
     yaw = site.layout.heading(columns[:, 0], columns[:, 1], columns[:, 2])
@@ -81,7 +81,7 @@ def build(buildings: Sequence[Building], site: Site, rng: np.random.Generator) -
 
 
 def _pitched(b: _Placed, roof: Shape, rng: np.random.Generator) -> list[Surface]:
-    """Roofs that rise with 0.75 across the ridge and stand over the walls by OVERHANG; a chimney on each."""
+    """Return roofs that rise with 0.75 across the ridge and stand over the walls by OVERHANG; a chimney on each."""
     zero = np.zeros(len(b.yaw))
     size = b.size + np.array([2 * OVERHANG, 2 * OVERHANG, 0])
     size[:, 2] = _rise(size[:, 1])
@@ -102,7 +102,7 @@ def _gable_ends(b: _Placed) -> Surface:
 
 
 def _flat_roofs(b: _Placed, rng: np.random.Generator) -> list[Surface]:
-    """A roof surface within a parapet, and ventilators on it."""
+    """Return a roof surface within a parapet, and ventilators on it."""
     zero, height = np.zeros(len(b.yaw)), b.size[:, 2]
     surface = shape([[-0.5, -0.5, 0], [0.5, -0.5, 0], [0.5, 0.5, 0], [-0.5, 0.5, 0]], [[0, 1, 2, 3]])
     parts = [surface.place(BUILDING, b.local(zero, zero, height + 0.04), b.yaw, b.size, b.roofs)]
@@ -121,7 +121,7 @@ def _flat_roofs(b: _Placed, rng: np.random.Generator) -> list[Surface]:
 
 
 def _windows(b: _Placed) -> Surface:
-    """Panes every 2.6 m or so along each wall and on each storey, 3 cm in front of it."""
+    """Return panes every 2.6 m or so along each wall and on each storey, 3 cm in front of it."""
     rows, x, y, z, turn = [], [], [], [], []
     for row, (length, width, height) in enumerate(b.size):
         floors = np.arange(max(1, int(height / STOREY))) * STOREY + 0.95
@@ -143,7 +143,7 @@ def _windows(b: _Placed) -> Surface:
 
 
 def _roof(ridge: float, faces: list[list[int]]) -> Shape:
-    """Slopes of unit extent under a ridge of a length along x; their undersides are open."""
+    """Return the slopes of unit extent under a ridge of a length along x; their undersides are open."""
     eaves = [[-0.5, -0.5, 0], [0.5, -0.5, 0], [0.5, 0.5, 0], [-0.5, 0.5, 0]]
     return shape([*eaves, [-ridge / 2, 0, 1], [ridge / 2, 0, 1]], faces)
 
@@ -164,7 +164,7 @@ PIECE = 3.0
 
 
 def trees(spots: Sequence[Spot], site: Site, rng: np.random.Generator) -> list[Surface]:
-    """Broad-leaved trees of six forms and, one in six, conifers; a spot's size 1 is about 9 m."""
+    """Return broad-leaved trees of six forms and, one in six, conifers; a spot's size 1 is about 9 m."""
     s, t, _, size = columns(spots)
     position = site.on(s, t)
     forms = [_broadleaf(rng) for _ in range(6)] + [_conifer()]
@@ -179,7 +179,7 @@ def trees(spots: Sequence[Spot], site: Site, rng: np.random.Generator) -> list[S
 
 
 def bushes(spots: Sequence[Spot], site: Site, rng: np.random.Generator) -> Surface:
-    """Low round bushes, up to about 1.5 m."""
+    """Return low round bushes, up to about 1.5 m."""
     s, t, _, size = columns(spots)
     position = site.on(s, t, -0.1)
     bush = moved(blob(0, rng, 0.18), (0, 0, 0.45), (0.85, 0.85, 0.8))
@@ -189,12 +189,12 @@ def bushes(spots: Sequence[Spot], site: Site, rng: np.random.Generator) -> Surfa
 
 
 def hedges(barriers: Sequence[Barrier], site: Site, rng: np.random.Generator) -> Surface:
-    """Hedges 0.9 m thick and about 1.4 m high."""
+    """Return hedges 0.9 m thick and about 1.4 m high."""
     return _barriers(barriers, (0.9, 1.4), LOW_VEGETATION, HEDGE, site, rng)
 
 
 def fences(barriers: Sequence[Barrier], site: Site, rng: np.random.Generator) -> Surface:
-    """Fences 8 cm thick and about 1.2 m high."""
+    """Return fences 8 cm thick and about 1.2 m high."""
     return _barriers(barriers, (0.08, 1.2), CLUTTER, WOOD, site, rng)
 
 
@@ -223,7 +223,7 @@ def _barriers(
 
 
 def _broadleaf(rng: np.random.Generator) -> Shape:
-    """A trunk and a crown of one large and three smaller dented balls; 9 m high, 6 to 7 m wide."""
+    """Return a trunk and a crown of one large and three smaller dented balls; 9 m high, 6 to 7 m wide."""
     crown = [moved(blob(1, rng, 0.16), (0, 0, 5.6), (2.9, 2.9, 3.1))]
     for angle in rng.uniform(0, 0.8) + np.arange(3) * 2.1:
         reach, z, radius = rng.uniform(1.3, 2.0), rng.uniform(4.6, 6.8), rng.uniform(1.5, 2.0)
@@ -233,6 +233,6 @@ def _broadleaf(rng: np.random.Generator) -> Shape:
 
 
 def _conifer() -> Shape:
-    """A trunk under three stacked cones; 11 m high."""
+    """Return a trunk under three stacked cones; 11 m high."""
     tiers = [cone(9, (z, z + h), (r, 0.02)) for z, h, r in ((1.4, 4.6, 2.3), (4.2, 4.2, 1.75), (7.0, 4.0, 1.15))]
     return combine(cone(6, (-0.3, 2.0), (0.25, 0.22), color=BARK), *tiers)

@@ -14,13 +14,13 @@ from semstab.datasets.city.simulation import Simulation, View, hash_integers
 from semstab.model.labels import IGNORE_8BIT
 
 CLASSES, BORDER, CELL, DRAWS = 8, 4, 2.0, 3
-"""Of the taxonomy; pixels about a border without label; metres of a cell of one label; predictions that must agree."""
+"""Classes of the taxonomy; pixels about a border without label; metres of a cell of one label; predictions to agree."""
 
 Labeller = Callable[[UInt8, View, Simulation], UInt8]
 
 
 def _blurred(size: int) -> Labeller:
-    """The class that most pixels of a window have."""
+    """Return the class that most pixels of a window have."""
 
     def labels(predicted: UInt8, _view: View, _model: Simulation) -> UInt8:
         shares = [cv2.blur((predicted == k).astype(np.float32), (size, size)) for k in range(CLASSES)]
@@ -30,7 +30,7 @@ def _blurred(size: int) -> Labeller:
 
 
 def _coarse(size: int) -> Labeller:
-    """The label of the pixel in the middle of a block, for all of it."""
+    """Return the label of the pixel in the middle of a block, for all of it."""
 
     def labels(predicted: UInt8, _view: View, _model: Simulation) -> UInt8:
         v, u = (np.minimum(np.arange(n) // size * size + size // 2, n - 1) for n in predicted.shape)
@@ -46,7 +46,7 @@ def _without_borders(predicted: UInt8, _view: View, _model: Simulation) -> UInt8
 
 
 def _without_doubt(predicted: UInt8, view: View, model: Simulation) -> UInt8:
-    """Without the pixels that the model would label otherwise in another frame from the same place."""
+    """Return labels without the pixels that the model would label otherwise in another frame from the same place."""
     again = [model.labels(dataclasses.replace(view, frame=view.frame + 10**6 * k)) for k in range(1, DRAWS)]
     sure = np.all([other == predicted for other in again], axis=0) & (view.rendered.incidence > 0.5)
     return np.where(sure, predicted, np.uint8(IGNORE_8BIT))
@@ -74,11 +74,11 @@ LABELLERS: Mapping[str, Labeller] = {
     "world-locked": _locked_to_the_world,
     "by-row": _by_row,
 }
-"""By name: what each makes of a model's labels."""
+"""The labellers by name: what each makes of a model's labels."""
 
 
 def relabelled(model: Simulation, view: View) -> UInt8:
-    """The labels of a model, or what its labeller makes of them; 255 where there is nothing."""
+    """Return the labels of a model, or what its labeller makes of them; 255 where there is nothing."""
     predicted = model.labels(view)
     if not model.model.labeller:
         return predicted

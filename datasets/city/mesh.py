@@ -28,13 +28,13 @@ class Surface:
 
     @classmethod
     def of_class(cls, vertices: Float64, faces: Int64, class_id: int, color: npt.ArrayLike) -> Surface:
-        """A surface of one class; `color` is one RGB or one a face."""
+        """Return a surface of one class; `color` is one RGB or one a face."""
         colors = np.broadcast_to(np.asarray(color, dtype=np.float64), (len(faces), 3))
         return cls(vertices, faces, np.full(len(faces), class_id, dtype=np.uint8), colors)
 
 
 def join(surfaces: Sequence[Surface]) -> Surface:
-    """All surfaces as one, in the given order."""
+    """Return all surfaces as one, in the given order."""
     vertices, faces, colors = _joined(surfaces)
     return Surface(vertices, faces, np.concatenate([s.classes for s in surfaces]), colors)
 
@@ -47,7 +47,7 @@ def _joined(parts: Sequence[Surface | Shape]) -> tuple[Float64, Int64, Float64]:
 
 
 def choose(colors: Float64, count: int, rng: np.random.Generator) -> Float64:
-    """(count, 3) colours, drawn at random from a few."""
+    """Return (count, 3) colours, drawn at random from a few."""
     return colors[rng.integers(len(colors), size=count)]
 
 
@@ -83,7 +83,7 @@ class Shape:
 
 
 def shape(vertices: npt.ArrayLike, faces: npt.ArrayLike, color: Color | None = None) -> Shape:
-    """A shape of triangles or quads of one colour; without a colour, its faces take the tint."""
+    """Return a shape of triangles or quads of one colour; without a colour, its faces take the tint."""
     corners = np.asarray(faces, dtype=np.int64)
     if corners.shape[1] == 4:
         corners = np.concatenate([corners[:, [0, 1, 2]], corners[:, [0, 2, 3]]])
@@ -92,7 +92,7 @@ def shape(vertices: npt.ArrayLike, faces: npt.ArrayLike, color: Color | None = N
 
 
 def combine(*shapes: Shape) -> Shape:
-    """Several shapes as one template."""
+    """Return several shapes as one template."""
     return Shape(*_joined(shapes), np.concatenate([s.tinted for s in shapes]))
 
 
@@ -104,7 +104,7 @@ def box(
     color: Color | None = None,
     taper: tuple[float, float] = (1.0, 1.0),
 ) -> Shape:
-    """A box without its bottom; `taper` scales the top's (x, y) about its centre."""
+    """Return a box without its bottom; `taper` scales the top's (x, y) about its centre."""
     corners = np.array([[x[0], y[0]], [x[1], y[0]], [x[1], y[1]], [x[0], y[1]]])
     centre = corners.mean(axis=0)
     top = centre + (corners - centre) * taper
@@ -113,12 +113,12 @@ def box(
 
 
 def pane() -> Shape:
-    """An upright unit rectangle in the x-z plane, tinted: a window or a door."""
+    """Return an upright unit rectangle in the x-z plane, tinted: a window or a door."""
     return shape([[-0.5, 0, 0], [0.5, 0, 0], [0.5, 0, 1], [-0.5, 0, 1]], [[0, 1, 2, 3]])
 
 
 def cone(sides: int, z: tuple[float, float], radius: tuple[float, float], *, color: Color | None = None) -> Shape:
-    """The mantle of a frustum with `sides` sides, from radius[0] at z[0] to radius[1] at z[1]."""
+    """Return the mantle of a frustum with `sides` sides, from radius[0] at z[0] to radius[1] at z[1]."""
     angle = np.arange(sides) * (2 * np.pi / sides)
     ring = np.stack([np.cos(angle), np.sin(angle)], axis=1)
     vertices = np.concatenate([np.c_[ring * radius[k], np.full(sides, z[k])] for k in (0, 1)])
@@ -128,7 +128,7 @@ def cone(sides: int, z: tuple[float, float], radius: tuple[float, float], *, col
 
 
 def blob(subdivisions: int, rng: np.random.Generator, roughness: float) -> Shape:
-    """A ball of radius 1 about the origin with a dented surface, tinted; from trimesh's icosphere."""
+    """Return a ball of radius 1 about the origin with a dented surface, tinted; from trimesh's icosphere."""
     import trimesh
 
     ball = trimesh.creation.icosphere(subdivisions=subdivisions)
@@ -137,7 +137,7 @@ def blob(subdivisions: int, rng: np.random.Generator, roughness: float) -> Shape
 
 
 def moved(template: Shape, offset: npt.ArrayLike, scale: npt.ArrayLike) -> Shape:
-    """The template scaled about its origin, then moved."""
+    """Return the template scaled about its origin, then moved."""
     vertices = template.vertices * np.asarray(scale) + np.asarray(offset)
     return Shape(vertices, template.faces, template.colors, template.tinted)
 
@@ -149,5 +149,5 @@ CLUTTER, BUILDING, ROAD, STATIC_CAR, TREE, LOW_VEGETATION, HUMAN, MOVING_CAR = r
 
 @cache
 def uavid8() -> LabelSpace:
-    """The label space of the town's ground truth and of every simulated backbone."""
+    """Return the label space of the town's ground truth and of every simulated backbone."""
     return LabelSpace.load("uavid8")

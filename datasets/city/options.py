@@ -25,7 +25,7 @@ CONFUSION: dict[str, dict[str, float]] = {
     "human": {"clutter": 0.5, "road": 0.3, "low vegetation": 0.2},
     "moving car": {"static car": 0.7, "road": 0.2, "clutter": 0.1},
 }
-"""For each true class, what it is mistaken for, by weight: what segmentation networks confuse in UAVid images."""
+"""The classes that each true class is mistaken for, by weight: what segmentation networks confuse in UAVid images."""
 
 Share = Annotated[float, Field(ge=0, le=1)]
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9.-]*(_[A-Za-z0-9.-]+)*")
@@ -47,12 +47,9 @@ Labeller = Literal[
 
 
 class SimulatedBackbone(Settings):
-    """How one simulated backbone errs. Each draw is a function of the seed, the backbone's and the scene's name, and of
+    """The errors of one simulated backbone, by what each is drawn for.
 
-    place    the world cell: the same mistake in every view and frame (stable but wrong)
-    view     the world cell and the quantised direction and distance it is seen from
-    flicker  the world cell and the frame's index: anew in every frame
-    border   the pixel and the frame's index: a smooth random field displaces the label map
+    Each draw is a function of the seed, the backbone's and the scene's name, and of that.
 
     A cell is floor(x_w / cell). View errors have the probability
     view * min(1, 2 (1 - cos a)) * min(1, d / view_distance)
@@ -62,6 +59,12 @@ class SimulatedBackbone(Settings):
 
     Soft scores (softness > 0): the predicted class scores 1 - softness * u, with u drawn from [0, 1) for each cell and
     frame; the rest goes to the true class where the prediction is wrong, else to the class's row of `confusion`.
+
+    Attributes:
+        place: The world cell: the same mistake in every view and frame (stable but wrong).
+        view: The world cell and the quantised direction and distance it is seen from.
+        flicker: The world cell and the frame's index: anew in every frame.
+        border: The pixel and the frame's index: a smooth random field displaces the label map.
     """
 
     place: Share = Field(0.0, description="share of the world cells that are wrong in every view")
@@ -164,12 +167,13 @@ OFF_GRID = (0.271828, -0.314159)
 class Flight:
     """A smooth path along an axis through the town's origin, the camera looking ahead and down.
 
-    number    which town it flies over
-    length    metres from the first frame to the last, along the axis
-    axis      heading of the axis, radians
-    sway      metres to each side, and how many such waves the path has
-    swing     radians by which the camera's heading swings about the path's
-    pitch     radians that the camera looks down, below the horizon
+    Attributes:
+        number: Number of the town that it flies over.
+        length: Metres from the first frame to the last, along the axis.
+        axis: Heading of the axis, radians.
+        sway: Metres to each side, and how many such waves the path has.
+        swing: Radians by which the camera's heading swings about the path's.
+        pitch: Radians that the camera looks down, below the horizon.
     """
 
     number: int
@@ -181,19 +185,22 @@ class Flight:
     pitch: float
 
     def path(self, share: Float64) -> tuple[Float64, Float64]:
-        """World x and y (relative to the origin) after a share 0..1 of the flight."""
+        """Return the world x and y (relative to the origin) after a share 0..1 of the flight."""
         along = (share - 0.5) * self.length + OFF_GRID[0]
         across = self.sway * np.sin(2 * np.pi * self.waves * share) + OFF_GRID[1]
         c, s = np.cos(self.axis), np.sin(self.axis)
         return c * along - s * across, s * along + c * across
 
     def heading(self, share: float) -> float:
-        """Camera heading in radians: the path's direction and a swing about it."""
+        """Return camera heading in radians: the path's direction and a swing about it."""
         rate = self.sway * 2 * np.pi * self.waves * np.cos(2 * np.pi * self.waves * share) / self.length
         return float(self.axis + 0.7 * np.arctan(rate) + self.swing * np.sin(2 * np.pi * 1.3 * share + self.number))
 
     def pose(self, share: float, ground: float, altitude: float) -> Float64:
-        """Camera-to-world (4, 4), OpenCV axes, relative to the origin; `altitude` metres above the height `ground`."""
+        """Return camera-to-world (4, 4), OpenCV axes, relative to the origin.
+
+        `altitude` metres above the height `ground`.
+        """
         x, y = self.path(np.array([share]))
         wobble = np.sin(2 * np.pi * np.array([2.1, 3.3, 1.7]) * share + self.number)
         down = self.pitch + np.deg2rad(2.5) * wobble[0]
@@ -209,7 +216,7 @@ class Flight:
 
 
 def look(heading: float, down: float, roll: float) -> Float64:
-    """Rotation (3, 3) from camera axes (right, down, ahead) to the world's, for angles in radians."""
+    """Return the rotation (3, 3) from camera axes (right, down, ahead) to the world's, for angles in radians."""
     ahead = np.array([np.cos(heading) * np.cos(down), np.sin(heading) * np.cos(down), -np.sin(down)])
     right = np.array([np.sin(heading), -np.cos(heading), 0.0])
     below = np.cross(ahead, right)

@@ -1,4 +1,4 @@
-"""What stands on a plot: houses with gardens, apartment blocks, a market hall, a park or fields."""
+"""Plots of land and what stands on them: houses with gardens, apartment blocks, a market hall, a park or fields."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ class Building(NamedTuple):
 
 
 class Spot(NamedTuple):
-    """Something small that stands at a place: a tree, a bush, a car, a person."""
+    """A small thing that stands at a place: a tree, a bush, a car, a person."""
 
     s: float
     t: float
@@ -60,7 +60,7 @@ class Barrier(NamedTuple):
 
 
 def columns(rows: Sequence[Spot | Barrier]) -> Float64:
-    """Four arrays, one for each field; empty ones where there are no rows."""
+    """Return four arrays, one for each field; empty ones where there are no rows."""
     return np.array(rows, dtype=np.float64).reshape(-1, 4).T
 
 
@@ -103,7 +103,7 @@ class _Row(NamedTuple):
 
     @property
     def span(self) -> tuple[float, float]:
-        """Where the row begins and ends."""
+        """Both ends of the row."""
         return (self.land.s0, self.land.s1) if self.along_s else (self.land.t0, self.land.t1)
 
     def point(self, along: float, into: float) -> tuple[float, float]:
@@ -117,7 +117,7 @@ class _Row(NamedTuple):
 
 
 def _rows(land: Rectangle, two_from: float = np.inf) -> list[_Row]:
-    """One or, where the land is deep enough, two rows back to back along its longer side."""
+    """Return one or, where the land is deep enough, two rows back to back along its longer side."""
     s, t = land.size
     along_s = s >= t
     depth, low, high = (t, land.t0, land.t1) if along_s else (s, land.s0, land.s1)
@@ -138,7 +138,7 @@ def _houses(land: Rectangle, town: Inventory, rng: np.random.Generator) -> None:
 
 
 def _parcel(row: _Row, a0: float, a1: float, town: Inventory, rng: np.random.Generator) -> None:
-    """One house: driveway and car beside it, terrace and trees behind it, a hedge or fence along one border."""
+    """Build one house: driveway and car beside it, terrace and trees behind it, a hedge or fence along one border."""
     width = a1 - a0
     length, deep = min(rng.uniform(9, 12.5), width - 5.5), rng.uniform(7.5, 10)
     setback = rng.uniform(3.5, 6.0)
@@ -173,7 +173,7 @@ def _parcel(row: _Row, a0: float, a1: float, town: Inventory, rng: np.random.Gen
 
 
 def _apartments(land: Rectangle, town: Inventory, rng: np.random.Generator) -> None:
-    """Two rows of long buildings with a paved court between them, or one row with a car park behind it."""
+    """Build two rows of long buildings with a paved court between them, or one row with a car park behind it."""
     town.patches.append(Patch(land.within(-0.2), YARD_ABOVE - 0.02, CLUTTER, PAVING[int(rng.integers(len(PAVING)))]))
     floors = int(rng.integers(3, 5))
     for row in _rows(land, two_from=40.0):
@@ -206,7 +206,7 @@ def _apartments(land: Rectangle, town: Inventory, rng: np.random.Generator) -> N
 
 
 def _hall(land: Rectangle, town: Inventory, rng: np.random.Generator) -> None:
-    """A wide flat hall and a car park beside it."""
+    """Build a wide flat hall and a car park beside it."""
     town.patches.append(Patch(land.within(-0.2), YARD_ABOVE - 0.02, CLUTTER, (0.42, 0.42, 0.43)))
     row = _rows(land)[0]
     low, high = row.span
@@ -224,7 +224,7 @@ def _hall(land: Rectangle, town: Inventory, rng: np.random.Generator) -> None:
 
 
 def _park(land: Rectangle, town: Inventory, rng: np.random.Generator) -> None:
-    """Groups of trees on grass, two crossing paths with people on them."""
+    """Plant groups of trees on grass, two crossing paths with people on them."""
     (s, t), (cs, ct) = land.size, land.centre
     a, b = cs + rng.uniform(-0.2, 0.2) * s, ct + rng.uniform(-0.2, 0.2) * t
     for k, path in enumerate(
@@ -243,7 +243,7 @@ def _park(land: Rectangle, town: Inventory, rng: np.random.Generator) -> None:
 
 
 def _fields(land: Rectangle, town: Inventory, rng: np.random.Generator) -> None:
-    """Beds of crops in rows, a hedge around them and a shed."""
+    """Lay beds of crops in rows, a hedge around them and a shed."""
     row = _rows(land)[0]
     low, high = row.span
     count = max(2, round((high - low) / 11))

@@ -23,7 +23,7 @@ _MIX2 = np.uint64(0x94D049BB133111EB)
 
 
 def splitmix64(x: UInt64) -> UInt64:
-    """The output function of splitmix64 (Steele, Lea, Flood 2014) for states x, an array with an axis."""
+    """Return the output function of splitmix64 (Steele, Lea, Flood 2014) for states x, an array with an axis."""
     x = x + _GOLDEN
     x ^= x >> np.uint64(30)
     x *= _MIX1
@@ -34,7 +34,7 @@ def splitmix64(x: UInt64) -> UInt64:
 
 
 def salt(*parts: str | int) -> int:
-    """A 64-bit number that stands for names and numbers; the same in every process, unlike `hash`."""
+    """Return a 64-bit number that stands for names and numbers; the same in every process, unlike `hash`."""
     text = "\x1f".join(str(part) for part in parts)
     return int.from_bytes(hashlib.blake2b(text.encode(), digest_size=8).digest(), "little")
 
@@ -48,12 +48,12 @@ def hash_integers(seed: int, *coordinates: Int64) -> UInt64:
 
 
 def rehash(state: UInt64, seed: int) -> UInt64:
-    """A second, independent hash of what `state` is a hash of."""
+    """Return a second, independent hash of what `state` is a hash of."""
     return splitmix64(state ^ np.uint64(seed))
 
 
 def uniform(state: UInt64) -> Float64:
-    """Hashes as numbers in [0, 1), from their upper 53 bits."""
+    """Return hashes as numbers in [0, 1), from their upper 53 bits."""
     numbers: Float64 = (state >> np.uint64(11)).astype(np.float64) * 2.0**-53
     return numbers
 
@@ -76,12 +76,13 @@ GRAIN[BUILDING] = 0.06, 0.04
 
 @dataclass(frozen=True)
 class Rendered:
-    """What the camera sees, shared by all backbones of a scene.
+    """The image that the camera sees, shared by all backbones of a scene.
 
-    depth      (H, W) float32, planar z in metres; 0 where a ray hits nothing
-    classes    (H, W) uint8 uavid8 ids; 255 where a ray hits nothing
-    incidence  (H, W) float32, cosine of the angle between ray and surface normal, 0..1
-    color      (H, W, 3) uint8 RGB
+    Attributes:
+        depth: (H, W) float32, planar z in metres; 0 where a ray hits nothing.
+        classes: (H, W) uint8 uavid8 ids; 255 where a ray hits nothing.
+        incidence: (H, W) float32, cosine of the angle between ray and surface normal, 0..1.
+        color: (H, W, 3) uint8 RGB.
     """
 
     depth: Float32
@@ -113,7 +114,7 @@ class Caster:
         self._intersector: Any = RayMeshIntersector(mesh)
 
     def first(self, origin: Float64, directions: Float64) -> tuple[Int64, Float64]:
-        """The triangle that each ray of `directions` (n, 3) hits first (-1: none) and its ray parameter (inf: none)."""
+        """Return the triangle that each ray (n, 3) of `directions` hits first (-1: none), and its parameter (inf)."""
         if not len(self.normals):
             return np.full(len(directions), -1), np.full(len(directions), np.inf)
         origins = np.broadcast_to(origin, directions.shape)
@@ -127,7 +128,7 @@ class Caster:
         return face, parameter
 
     def blocks(self, points: Float64, direction: Float64) -> Mask:
-        """Whether a ray from each point (n, 3) along one direction hits anything."""
+        """Return whether a ray from each point (n, 3) along one direction hits anything."""
         if not len(self.normals):
             return np.zeros(len(points), dtype=bool)
         towards = np.broadcast_to(direction, points.shape)
@@ -152,7 +153,7 @@ def render(still: Caster, moving: Caster, T: Float64, intrinsics: Intrinsics, sh
 
 
 def pixel_rays(intrinsics: Intrinsics, T: Float64, rows: slice, width: int) -> Float64:
-    """World directions (n, 3) of the rays of rows of pixels; the ray parameter is planar depth."""
+    """Return the world directions (n, 3) of the rays of rows of pixels; the ray parameter is planar depth."""
     x = (np.arange(width) - intrinsics.cx) / intrinsics.fx
     y = (np.arange(rows.start, rows.stop) - intrinsics.cy) / intrinsics.fy
     rays = y[:, None, None] * T[:3, 1] + x[None, :, None] * T[:3, 0] + T[:3, 2]
@@ -190,7 +191,7 @@ def _nearest(casters: tuple[Caster, Caster], origin: Float64, directions: Float6
 
 
 def _shade(hit: _Hit, casters: tuple[Caster, Caster]) -> UInt8:
-    """Lambert's law under one sun with cast shadows, with grain that is tied to the place."""
+    """Return Lambert's law under one sun with cast shadows, with grain that is tied to the place."""
     light = np.maximum(hit.normals @ SUN, 0.0)
     lit = np.flatnonzero(light > 0)
     start = hit.points[lit] + SHADOW_OFFSET * (hit.normals[lit] + SUN)
@@ -205,7 +206,7 @@ def _shade(hit: _Hit, casters: tuple[Caster, Caster]) -> UInt8:
 
 
 def _noise(points: Float64, cell: float) -> Float64:
-    """Numbers in [-1, 1], one for each cubic cell of space."""
+    """Return numbers in [-1, 1], one for each cubic cell of space."""
     x, y, z = np.floor(points / cell).astype(np.int64).T
     return 2 * uniform(hash_integers(17, x, y, z)) - 1
 
@@ -220,8 +221,9 @@ Scores = Float32
 class View:
     """One frame as a backbone is given it.
 
-    frame   index, what flicker and border errors are drawn for
-    T_wc    (4, 4) camera-to-world; origin (3,), from where cells are counted
+    Attributes:
+        frame: Index, what flicker and border errors are drawn for.
+        T_wc: (4, 4) camera-to-world; origin (3,), from where cells are counted.
     """
 
     frame: int
@@ -231,7 +233,7 @@ class View:
     origin: Float64
 
     def positions(self, rows: slice) -> Float64:
-        """World coordinates (3, h, W) of rows of pixels, in the order of operations of the fusion backends."""
+        """Return World coordinates (3, h, W) of rows of pixels, in the order of operations of the fusion backends."""
         d = self.rendered.depth[rows].astype(np.float64)
         k, T = self.intrinsics, self.T_wc
         v = np.arange(rows.start, rows.start + len(d))[:, None]
@@ -254,14 +256,17 @@ class Simulation:
         self._factors = np.array([model.difficulty.get(name, 1.0) for name in names] + [0.0])
 
     def labels(self, view: View) -> Labels:
-        """Predicted ids (H, W) uint8; 255 where there is nothing."""
+        """Return predicted ids (H, W) uint8; 255 where there is nothing."""
         predicted = self._displaced_borders(view)
         for rows in _row_chunks(predicted.shape):
             predicted[rows] = self._with_errors(view, rows, predicted[rows])
         return predicted
 
     def scores(self, view: View) -> Scores:
-        """Soft scores (H, W, 8) float32 that sum to 1, the predicted class the largest; 0 where there is nothing."""
+        """Return soft scores (H, W, 8) float32 that sum to 1, the predicted class the largest.
+
+        0 where there is nothing.
+        """
         predicted = self.labels(view)
         scores = np.zeros((*predicted.shape, len(self._weights)), dtype=np.float32)
         for rows in _row_chunks(predicted.shape):
@@ -310,14 +315,17 @@ class Simulation:
         return scores
 
     def _cells(self, view: View, rows: slice) -> tuple[Int64, Int64, Int64]:
-        """Cell of each pixel, counted from the cell of the town's origin, so that errors move with the town."""
+        """Return cell of each pixel, counted from the cell of the town's origin, so that errors move with the town."""
         size = self.model.cell
         first = np.rint(view.origin / size)
         x, y, z = ((np.floor(x / size) - first[k]).astype(np.int64) for k, x in enumerate(view.positions(rows)))
         return x, y, z
 
     def _seen_from(self, view: View, cells: tuple[Int64, Int64, Int64]) -> tuple[tuple[Int64, Int64, Int64], Float64]:
-        """Quantised azimuth, elevation and distance of the camera as seen from the cell's centre; and that distance."""
+        """Return quantised azimuth, elevation and distance of the camera as seen from the cell's centre.
+
+        And that distance.
+        """
         model = self.model
         first = np.rint(view.origin / model.cell)
         x, y, z = ((cell + (first[k] + 0.5)) * model.cell - view.T_wc[k, 3] for k, cell in enumerate(cells))
@@ -335,7 +343,7 @@ class Simulation:
         return rehash(rehash(place, self._salts[kind]), frame)
 
     def _displaced_borders(self, view: View) -> Labels:
-        """The true label map, read at pixels displaced by a smooth field of at most `border` pixels along each axis."""
+        """Return the true label map, read at pixels displaced by a smooth field of at most `border` pixels an axis."""
         true = view.rendered.classes
         if not self.model.border:
             return true.copy()
@@ -348,7 +356,7 @@ class Simulation:
         return np.where(nothing, true, moved)
 
     def _field(self, frame: int, axis: int, shape: tuple[int, int]) -> Float32:
-        """Random numbers within +-border on a grid of border_scale pixels, interpolated to each pixel."""
+        """Return random numbers within +-border on a grid of border_scale pixels, interpolated to each pixel."""
         model, (H, W) = self.model, shape
         rows, columns = (int(np.ceil(n / model.border_scale)) + 1 for n in (H, W))
         v, u = (grid.astype(np.int64) for grid in np.indices((rows, columns)))
@@ -359,6 +367,6 @@ class Simulation:
 
 
 def _row_chunks(shape: tuple[int, ...]) -> list[slice]:
-    """Slices of rows of at most CHUNK pixels: what bounds the memory of a large image."""
+    """Return slices of rows of at most CHUNK pixels: what bounds the memory of a large image."""
     step = max(1, CHUNK // shape[1])
     return [slice(top, min(top + step, shape[0])) for top in range(0, shape[0], step)]

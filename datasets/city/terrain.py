@@ -21,7 +21,7 @@ LARGEST_BLOCK = 105.0
 
 @dataclass(frozen=True)
 class Layout:
-    """From plan coordinates (s, t) to the world's (x, y), both in metres: sine bends of some 10 m, then a turn."""
+    """A map from plan coordinates (s, t) to the world's (x, y), in metres: sine bends of some 10 m, then a turn."""
 
     yaw: float
     bend: Float64
@@ -30,19 +30,19 @@ class Layout:
 
     @classmethod
     def random(cls, rng: np.random.Generator) -> Layout:
-        """A turn by any angle; bends of 6 to 12 m over 240 to 380 m."""
+        """Return a turn by any angle; bends of 6 to 12 m over 240 to 380 m."""
         bend, length, phase = rng.uniform(6, 12, 2), rng.uniform(240, 380, 2), rng.uniform(0, 2 * np.pi, 2)
         return cls(float(rng.uniform(0.1, np.pi / 2 - 0.1)), bend, 2 * np.pi / length, phase)
 
     def to_world(self, s: Float64, t: Float64) -> tuple[Float64, Float64]:
-        """World x and y of plan points."""
+        """Return the world x and y of plan points."""
         a = s + self.bend[0] * np.sin(self.wavenumber[0] * t + self.phase[0])
         b = t + self.bend[1] * np.sin(self.wavenumber[1] * s + self.phase[1])
         c, d = np.cos(self.yaw), np.sin(self.yaw)
         return c * a - d * b, d * a + c * b
 
     def heading(self, s: Float64, t: Float64, angle: Float64) -> Float64:
-        """Heading in the world of what points along `angle` (radians from the s axis) at plan points."""
+        """Return the heading in the world of what points along `angle` (radians from the s axis) at plan points."""
         a = self.bend[0] * self.wavenumber[0] * np.cos(self.wavenumber[0] * t + self.phase[0])
         b = self.bend[1] * self.wavenumber[1] * np.cos(self.wavenumber[1] * s + self.phase[1])
         along_s, along_t = np.cos(angle), np.sin(angle)
@@ -70,11 +70,11 @@ class Rectangle:
         return (self.s0 + self.s1) / 2, (self.t0 + self.t1) / 2
 
     def shrunk(self, s0: float, s1: float, t0: float, t1: float) -> Rectangle:
-        """With each side moved inwards by its own distance."""
+        """Return the rectangle with each side moved inwards by its own distance."""
         return Rectangle(self.s0 + s0, self.s1 - s1, self.t0 + t0, self.t1 - t1)
 
     def within(self, margin: float) -> Rectangle:
-        """With all sides moved inwards."""
+        """Return the rectangle with all sides moved inwards."""
         return self.shrunk(margin, margin, margin, margin)
 
 
@@ -94,7 +94,7 @@ class Street:
         return self.high - self.low
 
     def strip(self, left: float, right: float, low: float | None = None, high: float | None = None) -> Rectangle:
-        """The part between two offsets from the middle, over the whole length by default."""
+        """Return the part between two offsets from the middle, over the whole length by default."""
         low, high = self.low if low is None else low, self.high if high is None else high
         if self.axis == "s":
             return Rectangle(low, high, self.at + left, self.at + right)
@@ -111,7 +111,7 @@ class Street:
         return 0.0 if self.axis == "s" else np.pi / 2
 
     def clear_of_crossings(self, along: Float64, streets: list[Street], distance: float) -> Float64:
-        """The points along this street at a distance from every street that meets it."""
+        """Return the points along this street at a distance from every street that meets it."""
         for other in streets:
             if other.axis != self.axis and other.low - 1 <= self.at <= other.high + 1:
                 along = along[np.abs(along - other.at) > distance + other.width / 2]
@@ -120,7 +120,7 @@ class Street:
 
 @dataclass(frozen=True)
 class Plot:
-    """What is left between streets: its rectangle and the widths of the streets at s0, s1, t0, t1."""
+    """The land between streets: its rectangle and the widths of the streets at s0, s1, t0, t1."""
 
     area: Rectangle
     widths: tuple[float, float, float, float]
@@ -179,7 +179,7 @@ class Terrain:
 
     @classmethod
     def random(cls, rng: np.random.Generator) -> Terrain:
-        """Six waves of 130 to 420 m, none steeper than 4 percent."""
+        """Return six waves of 130 to 420 m, none steeper than 4 percent."""
         wavelength = rng.uniform(130, 420, size=6)
         direction = rng.uniform(0, 2 * np.pi, size=6)
         waves = 2 * np.pi / wavelength[:, None] * np.stack([np.cos(direction), np.sin(direction)], axis=1)
@@ -187,23 +187,23 @@ class Terrain:
         return cls(waves, rng.uniform(0, 2 * np.pi, size=6), amplitudes, float(rng.uniform(2, 9)))
 
     def height(self, x: Float64, y: Float64) -> Float64:
-        """Height of the ground in metres at (x, y), arrays of one shape."""
+        """Return the height of the ground in metres at (x, y), arrays of one shape."""
         phase = np.multiply.outer(x, self.waves[:, 0]) + np.multiply.outer(y, self.waves[:, 1]) + self.phases
         height: Float64 = self.base + np.sin(phase) @ self.amplitudes
         return height
 
     def slope(self, x: Float64, y: Float64) -> Float64:
-        """dz/dx and dz/dy at (x, y), stacked on the last axis."""
+        """Return dz/dx and dz/dy at (x, y), stacked on the last axis."""
         phase = np.multiply.outer(x, self.waves[:, 0]) + np.multiply.outer(y, self.waves[:, 1]) + self.phases
         slope: Float64 = (np.cos(phase) * self.amplitudes) @ self.waves
         return slope
 
     def on(self, x: Float64, y: Float64, above: npt.ArrayLike = 0.0) -> Float64:
-        """Points (n, 3) that stand `above` metres over the ground at (x, y)."""
+        """Return points (n, 3) that stand `above` metres over the ground at (x, y)."""
         return np.stack([x, y, self.height(x, y) + np.asarray(above)], axis=-1)
 
     def mesh(self, low: Float64, high: Float64, rng: np.random.Generator) -> Surface:
-        """Grass over the rectangle from `low` to `high` (x, y), with ever larger triangles up to the horizon."""
+        """Return grass over the rectangle from `low` to `high` (x, y), with ever larger triangles up to the horizon."""
         steps = np.cumsum(SPACING * 1.25 ** np.arange(1, 21))
         far = steps[steps < HORIZON]
         fine = [np.arange(low[axis], high[axis] + SPACING, SPACING) for axis in (0, 1)]
@@ -220,25 +220,25 @@ class Terrain:
 
 @dataclass(frozen=True)
 class Site:
-    """Where a town stands: its street plan, and the ground under it."""
+    """The place of a town: its street plan, and the ground under it."""
 
     layout: Layout
     terrain: Terrain
 
     def on(self, s: Float64, t: Float64, above: npt.ArrayLike = 0.0) -> Float64:
-        """Points (n, 3) that stand `above` metres over the ground at plan points."""
+        """Return points (n, 3) that stand `above` metres over the ground at plan points."""
         return self.terrain.on(*self.layout.to_world(s, t), above)
 
     def stand(
         self, template: Shape, class_id: int, spots: Iterable[Float64], above: float, size: Float64, tint: Float64
     ) -> Surface:
-        """Copies of a shape that follow the ground at `spots`: plan coordinates s and t, and the angle in the plan."""
+        """Return copies of a shape that follow the ground at `spots`: plan coordinates s and t, and an angle there."""
         s, t, angle = spots
         lean = self.terrain.slope(*self.layout.to_world(s, t))
         return template.place(class_id, self.on(s, t, above), self.layout.heading(s, t, angle), size, tint, lean)
 
     def drape(self, area: Rectangle, above: float, class_id: int, color: npt.ArrayLike) -> Surface:
-        """A rectangle of the plan laid over the ground, `above` metres over it, in cells of at most SPACING."""
+        """Return a rectangle of the plan laid over the ground, `above` metres over it, in cells of at most SPACING."""
         sides = ((area.s0, area.s1), (area.t0, area.t1))
         s, t = (np.linspace(low, high, max(2, int(np.ceil((high - low) / SPACING)) + 1)) for low, high in sides)
         gs, gt = np.meshgrid(s, t, indexing="ij")
@@ -246,7 +246,7 @@ class Site:
 
 
 def grid_faces(rows: int, columns: int) -> Int64:
-    """Triangles of a grid of rows x columns vertices in C order."""
+    """Return triangles of a grid of rows x columns vertices in C order."""
     corner = (np.arange(rows - 1)[:, None] * columns + np.arange(columns - 1)).ravel()
     first = np.stack([corner, corner + columns, corner + columns + 1], axis=1)
     second = np.stack([corner, corner + columns + 1, corner + 1], axis=1)

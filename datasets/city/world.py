@@ -45,7 +45,7 @@ TROUSERS, SKIN = (0.20, 0.22, 0.30), (0.72, 0.55, 0.44)
 
 
 def car() -> Shape:
-    """A car 4.4 m long, 1.8 m wide, 1.45 m high; it drives along x and takes its paint as tint."""
+    """Return a car 4.4 m long, 1.8 m wide, 1.45 m high; it drives along x and takes its paint as tint."""
     wheels = [
         box((x - 0.32, x + 0.32), (y - 0.1, y + 0.1), (0, 0.62), color=TYRE) for x in (-1.4, 1.4) for y in (-0.8, 0.8)
     ]
@@ -58,7 +58,7 @@ def car() -> Shape:
 
 
 def person() -> Shape:
-    """A person 1.75 m high who faces x and takes the colour of their clothes as tint."""
+    """Return a person 1.75 m high who faces x and takes the colour of their clothes as tint."""
     return combine(
         box((-0.14, 0.14), (-0.19, 0.19), (0, 0.84), color=TROUSERS),
         box((-0.16, 0.16), (-0.26, 0.26), (0.82, 1.47), taper=(0.8, 0.85)),
@@ -67,7 +67,7 @@ def person() -> Shape:
 
 
 def _painted_cars(count: int, rng: np.random.Generator) -> tuple[Float64, Float64]:
-    """Scales of length, width and height, and paint; one in seven is a van."""
+    """Return scales of length, width and height, and paint; one in seven is a van."""
     paint = choose(PAINT, count, rng)
     sizes = rng.uniform([0.86, 0.95, 0.97], [1.08, 1.04, 1.12], size=(count, 3))
     sizes[rng.random(count) < 1 / 7] *= [1.2, 1.1, 1.4]
@@ -75,13 +75,13 @@ def _painted_cars(count: int, rng: np.random.Generator) -> tuple[Float64, Float6
 
 
 def _dressed_people(count: int, rng: np.random.Generator) -> tuple[Float64, Float64]:
-    """Scales of the three axes, and clothes."""
+    """Return scales of the three axes, and clothes."""
     clothes = choose(CLOTHES, count, rng)
     return np.tile(rng.uniform(0.9, 1.08, size=(count, 1)), (1, 3)), clothes
 
 
 def roadside_cars(streets: list[Street], rng: np.random.Generator) -> list[Spot]:
-    """Cars parked along the streets, clear of the crossings; on side streets on one side only."""
+    """Return cars parked along the streets, clear of the crossings; on side streets on one side only."""
     spots = []
     for street in streets:
         sides = (-1, 1) if street.width >= MAIN_WIDTH else (1,)
@@ -96,11 +96,12 @@ def roadside_cars(streets: list[Street], rng: np.random.Generator) -> list[Spot]
 
 @dataclass(frozen=True)
 class Movers:
-    """Things of one kind that go along streets at a constant speed, and start again at the other end.
+    """Moving things of one kind that go along streets at a constant speed, and start again at the other end.
 
-    low, length, at  of their streets; along_s whether it runs along the plan's s axis
-    offset           from the street's middle; start and speed along it, towards its high end where positive
-    tint, size       (n, 3) and (n,) or (n, 3): their appearance
+    Attributes:
+        low, length, at: Bounds of their streets; along_s says whether one runs along the plan's s axis.
+        offset: Distance from the street's middle; start and speed along it, towards its high end where positive.
+        tint, size: (n, 3) and (n,) or (n, 3): their appearance.
     """
 
     low: Float64
@@ -131,7 +132,7 @@ class Traffic:
 
     @classmethod
     def random(cls, streets: list[Street], site: Site, rng: np.random.Generator) -> Traffic:
-        """A car every 38 m of lane or so at 6 to 13 m/s, a walker every 70 m of sidewalk or so at 0.9 to 1.7 m/s."""
+        """Return a car every 38 m of lane or so, at 6 to 13 m/s, a walker every 70 m of sidewalk, at 0.9 to 1.7 m/s."""
         cars = _movers(streets, 38.0, lambda width: min(1.75, 0.135 * width), (6.0, 13.0), rng)
         walkers = _movers(streets, 70.0, lambda width: width / 2 + SIDEWALK / 2, (0.9, 1.7), rng)
         sizes, paint = _painted_cars(len(cars.at), rng)
@@ -139,7 +140,7 @@ class Traffic:
         return cls(site, replace(cars, size=sizes, tint=paint), replace(walkers, size=heights, tint=clothes))
 
     def at(self, seconds: float, camera: Float64) -> Surface:
-        """What moves as it stands at a time, as far as it is within SIGHT of the camera at (x, y, z)."""
+        """Return what moves as it stands at a time, as far as it is within SIGHT of the camera at (x, y, z)."""
         kinds = ((self.cars, car(), MOVING_CAR, ROAD_ABOVE), (self.walkers, person(), HUMAN, SIDEWALK_ABOVE))
         surfaces = []
         for movers, template, class_id, above in kinds:
@@ -158,7 +159,7 @@ def _movers(
     speeds: tuple[float, float],
     rng: np.random.Generator,
 ) -> Movers:
-    """On both sides of each street, keeping right; what shares a lane shares a speed and never collides."""
+    """Return movers on both sides of each street, keeping right; what shares a lane shares a speed."""
     rows = []
     for street in streets:
         for side in (-1.0, 1.0):
@@ -191,7 +192,7 @@ class World:
 
 @lru_cache(maxsize=2)
 def build_world(seed: int, flight: Flight) -> World:
-    """The town under a flight; the same for every camera, resolution and number of frames."""
+    """Return the town under a flight; the same for every camera, resolution and number of frames."""
     layout = Layout.random(_rng(seed, flight, 0))
     terrain = Terrain.random(_rng(seed, flight, 1))
     site = Site(layout, terrain)
@@ -216,12 +217,12 @@ def build_world(seed: int, flight: Flight) -> World:
 
 
 def _rng(seed: int, flight: Flight, purpose: int) -> np.random.Generator:
-    """A generator for one purpose, so that a change in one part of the town leaves the others as they are."""
+    """Return a generator for one purpose, so that a change in one part of the town leaves the others as they are."""
     return np.random.default_rng([seed, flight.number, purpose])
 
 
 def _street_trees(streets: Sequence[Street], rng: np.random.Generator) -> list[Spot]:
-    """Rows of trees along the sidewalks of the main roads."""
+    """Return rows of trees along the sidewalks of the main roads."""
     spots = []
     for street in streets:
         if street.width < MAIN_WIDTH:
@@ -235,7 +236,7 @@ def _street_trees(streets: Sequence[Street], rng: np.random.Generator) -> list[S
 
 
 def _ground(town: Inventory, streets: Sequence[Street], site: Site, path: Float64) -> list[Surface]:
-    """Streets with their markings, sidewalks, yards and fields, laid over the terrain one above the other."""
+    """Return streets with their markings, sidewalks, yards and fields, laid over the terrain one above the other."""
     surfaces = [site.drape(p.area, p.above, p.class_id, p.color) for p in town.patches]
     for number, street in enumerate(streets):
         half = street.width / 2
@@ -277,7 +278,7 @@ def _near(points: Sequence[tuple[float, ...]], layout: Layout, path: Float64, di
 
 
 def _distance(points: Float64, path: Float64) -> Float64:
-    """Distance of points (n, 2) from the nearest vertex of a path (m, 2)."""
+    """Return the distance of points (n, 2) from the nearest vertex of a path (m, 2)."""
     offsets = points[:, None] - path[None]
     distance: Float64 = np.sqrt((offsets**2).sum(axis=2).min(axis=1))
     return distance

@@ -35,7 +35,7 @@ DMAP_HEADER = struct.Struct("<2sBb4I2f")
 DMAP_CAMERA = 21 * 8
 """Bytes of K, R and C."""
 HEADER_BYTES = 2**18
-"""In which all that `dmap_header` reads lies: a name and the numbers of some thousand neighbours at most."""
+"""The bytes in which all that `dmap_header` reads lies: a name and the numbers of some thousand neighbours at most."""
 SAMPLES: Mapping[bytes, np.dtype[Any]] = {b"DR": np.dtype("<f4"), b"D2": np.dtype("<f2")}
 """Type of a sample by magic; newer files hold halves, which times 2 ** exponent are metres."""
 
@@ -43,7 +43,10 @@ SAMPLES: Mapping[bytes, np.dtype[Any]] = {b"DR": np.dtype("<f4"), b"D2": np.dtyp
 def read_mvei(path: Path, scale: float | None = None, read: Read = read_bytes) -> Float32:
     """Return depth (H, W) of a depth-LN.mvei, float32, as lengths of rays; 0 where there is none.
 
-    `scale` is units in a metre. Raises DataError where the file is no depth map, or truncated.
+    `scale` is units in a metre.
+
+    Raises:
+        DataError: If the file is no depth map, or truncated.
     """
     data = read(path)
     start = len(MVEI) + MVEI_HEADER.size
@@ -59,7 +62,8 @@ def read_mvei(path: Path, scale: float | None = None, read: Read = read_bytes) -
 class DmapHeader:
     """The header of a .dmap: shape (H, W), samples of `dtype` from byte `start`, times 2 ** exponent.
 
-    image  the name of the file that it is of
+    Attributes:
+        image: The name of the file that it is of.
     """
 
     image: str
@@ -70,7 +74,11 @@ class DmapHeader:
 
 
 def dmap_header(path: Path, data: bytes) -> DmapHeader:
-    """From the first bytes of a file, a few thousand suffice. Raises DataError where it is none."""
+    """Read it from the first bytes of a file, a few thousand suffice.
+
+    Raises:
+        DataError: If it is none.
+    """
     magic = data[:2]
     if magic not in SAMPLES or len(data) < DMAP_HEADER.size:
         raise DataError(f"{path}: not an OpenMVS depth map (it begins with {magic!r}); {AGAIN}")
@@ -100,7 +108,10 @@ def read_dmap(path: Path, scale: float | None = None, read: Read = read_bytes) -
 def read_depth_map(path: Path, scale: float | None = None, read: Read = read_bytes) -> Float32:
     """Return depth (H, W) of COLMAP's .bin, float32: the text 'width&height&channels&', then values, x fastest.
 
-    `scale` is units in a metre. Raises DataError for a normal map, another format, or a truncated file.
+    `scale` is units in a metre.
+
+    Raises:
+        DataError: For a normal map, another format, or a truncated file.
     """
     data = read(path)
     header = re.match(rb"(\d{1,9})&(\d{1,9})&(\d{1,9})&", data)
@@ -113,7 +124,11 @@ def read_depth_map(path: Path, scale: float | None = None, read: Read = read_byt
 
 
 def _metres(path: Path, data: bytes, start: int, shape: tuple[int, int], dtype: np.dtype[Any], scale: float) -> Float32:
-    """Return samples (H, W) of `scale` units in a metre as float32 metres. Raises DataError where some are missing."""
+    """Return samples (H, W) of `scale` units in a metre as float32 metres.
+
+    Raises:
+        DataError: If some are missing.
+    """
     if not (min(shape) > 0 and math.prod(shape) <= MAX_PIXELS):
         raise DataError(f"{path}: claims {shape[1]}x{shape[0]} pixels; is it damaged?")
     end = start + math.prod(shape) * dtype.itemsize
@@ -142,7 +157,11 @@ def stored_depth(
 ) -> Float32:
     """Return depth (H, W) of a frame's file in metres along the optical axis; values that mean 'no depth' become 0.
 
-    camera  gives the intrinsics of the depth image of a shape
+    Args:
+        frame: The frame whose depth is read.
+        options: The settings of the dataset's files.
+        read: Reads the content of a file.
+        camera: Gives the intrinsics of the depth image of a shape.
     """
     scale = options.depth_scale or frame.depth_scale
     depth = FORMATS.get(frame.depth.suffix.lower(), read_depth)(frame.depth, scale, read)
@@ -159,7 +178,8 @@ def stored_depth(
 def shape_of(frame: FrameSource, options: FileOptions) -> tuple[int, int]:
     """Return (H, W) of the cast depth of a frame: the size of its camera, else of its depth file or colour image.
 
-    Raises DataError where none is known.
+    Raises:
+        DataError: If none is known.
     """
     size = options.intrinsics_size or frame.camera.size
     if size is not None:

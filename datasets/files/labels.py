@@ -33,7 +33,7 @@ SUFFIXES: Mapping[Kind, tuple[str, ...]] = {
 DEFAULTS: Mapping[Kind, str] = {"labels": "labels/{backbone}/{name}", "scores": "scores/{backbone}/{name}"}
 REGIONS = "regions/{backbone}/{name}"
 LABEL_SPACE_FILE = "label_space.yaml"
-"""In a folder of label maps or scores: their classes, where they are not the scene's; a taxonomy file."""
+"""A taxonomy file in a folder of label maps or scores: their classes, where they are not the scene's."""
 
 SEPARATE = "{scene}/{backbone}/{name}"
 """The template of label maps in a folder of their own."""
@@ -52,8 +52,9 @@ class SceneEntry:
 class LabelSource:
     """One label source of a scene: where a frame's file would be.
 
-    folders  what lies there
-    first    the first frame that has a file, and the file; None where none has
+    Attributes:
+        folders: The listed content of folders.
+        first: The first frame that has a file, and the file; None where none has.
     """
 
     kind: Kind
@@ -78,7 +79,7 @@ class LabelSource:
         return None
 
     def missing(self, frame: FrameSource) -> list[str]:
-        """Nothing, or the path that the file of that frame would have."""
+        """Return nothing, or the path that the file of that frame would have."""
         if self.file(frame) is not None:
             return []
         return [_with_suffix(self.base / self.template.replace("{name}", frame.name), self.kind)]
@@ -91,8 +92,10 @@ def find_sources(
 
     labels of X are the backbone X, scores of X found by a template are X-scores, so that neither name depends on what
     else is there. A folder without a file of any frame is left out with a warning.
-    Raises ConfigError for a template that cannot be used, or a labels_root that is not there, DataError for a folder
-    that cannot be listed.
+
+    Raises:
+        ConfigError: For a template that cannot be used, or a labels_root that is not there.
+        DataError: For a folder that cannot be listed.
     """
     sources: dict[str, LabelSource] = {}
     base = options.labels_root or entry.folder
@@ -155,16 +158,18 @@ def _with_suffix(path: Path, kind: Kind) -> str:
 
 
 NO_ID = IGNORE_16BIT - 1
-"""In a table of class ids: an id that is not in it."""
+"""The mark in a table of class ids for an id that is not in it."""
 
 
 class LabelMaps:
     """The predictions for the frames of a scene: the label sources, their classes, and the maps in their own pixels.
 
-    class_ids  by label source a table from the ids of its files to those of its taxonomy, where they differ
-    folders    what lies where maps may be
+    Attributes:
+        class_ids: A table by label source, from the ids of its files to those of its taxonomy, where they differ.
+        folders: The listed content of the folders where maps may be.
 
-    Raises ConfigError for options that cannot be used.
+    Raises:
+        ConfigError: For options that cannot be used.
     """
 
     def __init__(
@@ -199,7 +204,11 @@ class LabelMaps:
         self._spaces: dict[str, LabelSpace | None] = {}
 
     def source(self, backbone: str) -> LabelSource:
-        """Return the files of a label source. Raises ConfigError where there is none of that name."""
+        """Return the files of a label source.
+
+        Raises:
+            ConfigError: If there is none of that name.
+        """
         known = self._sources
         if backbone not in known:
             hint = (
@@ -209,7 +218,11 @@ class LabelMaps:
         return known[backbone]
 
     def file(self, frame: FrameSource, backbone: str) -> Path:
-        """Return the file of a frame. Raises DataError where it is not there."""
+        """Return the file of a frame.
+
+        Raises:
+            DataError: If it is not there.
+        """
         source = self.source(backbone)
         if (file := source.file(frame)) is None:
             lost = [path for each in self._frames for path in source.missing(each)]
@@ -222,7 +235,9 @@ class LabelMaps:
         """Return the classes of a label source, read once; None for regions, and where nothing says them.
 
         They are those of option taxonomies, else of a label_space.yaml next to its maps, else of the scene.
-        Raises ConfigError for one that cannot be used.
+
+        Raises:
+            ConfigError: For one that cannot be used.
         """
         if backbone not in self._spaces:
             source = self.source(backbone)
@@ -261,7 +276,11 @@ class LabelMaps:
         return space
 
     def labels(self, backbone: str, path: Path, read: Read) -> Labels:
-        """Return ids (H, W) of one file, whose bytes `read` gives. Raises DataError that names it."""
+        """Return ids (H, W) of one file, whose bytes `read` gives.
+
+        Raises:
+            DataError: If that fails; the message names it.
+        """
         labels = images.read_labels(path, self.space(backbone), read)
         if backbone in self.class_ids:
             ids: Labels = self.class_ids[backbone][labels]
@@ -275,7 +294,11 @@ class LabelMaps:
         return labels
 
     def scores(self, backbone: str, path: Path, size: Size, read: Read) -> Scores:
-        """Return scores (H, W, K) of one file; `size` is (H, W) of the depth. Raises DataError that names it."""
+        """Return scores (H, W, K) of one file; `size` is (H, W) of the depth.
+
+        Raises:
+            DataError: If that fails; the message names it.
+        """
         scores = images.read_scores(path, self._options.scores_layout or "KHW", size, read)
         if void := self._options.void_ids.get(backbone):
             space = self.space(backbone)

@@ -57,7 +57,7 @@ ZERO_IS_VOID: dict[str, tuple[int, ...]] = {GROUND_TRUTH: (0,)}
 
 
 class FileSettings(Settings):
-    """How files are read; a reader replaces the defaults that its format fixes.
+    """The settings by which files are read; a reader replaces the defaults that its format fixes.
 
     Templates hold {scene} (the scene's folder below root), {backbone} and {name} (the frame's name); without a suffix
     they find any that can be read.
@@ -164,7 +164,8 @@ class Template:
 def matching_folders(base: Path, template: Template, placeholder: str, **values: str) -> dict[str, str]:
     """Return the folders on disk that fit the part of a template with `placeholder`: its value to the template with it.
 
-    Raises ConfigError where the placeholder is not in the name of a folder, or after one that is still open.
+    Raises:
+        ConfigError: If the placeholder is not in the name of a folder, or after one that is still open.
     """
     parts = PurePosixPath(template.filled(**values)).parts
     hole = f"{{{placeholder}}}"
@@ -179,9 +180,10 @@ def matching_folders(base: Path, template: Template, placeholder: str, **values:
 
 
 def inside(root: Path, folder: Path, relative: str, where: str) -> Path:
-    """`folder / relative`, which must lie in `root`, as `folder` does.
+    """Return `folder / relative`, which must lie in `root`, as `folder` does.
 
-    Raises DataError with `where` (the file that names the path) where it does not, or no path can be called so.
+    Raises:
+        DataError: If it does not, or no path can be called so, with `where` (the file that names the path).
     """
     if UNSAFE.search(relative) or len(relative) > LONGEST:
         raise DataError(f"{where}: {relative[:40]!r} cannot be the path of a file")
@@ -224,21 +226,22 @@ class Folders:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class FrameSource:
-    """Where one frame comes from.
+    """The files and numbers that one frame comes from.
 
-    name          what path templates call it
-    depth         the file
-    pose_file     the file that holds its pose, or all poses
-    camera        of the depth image
-    pose          (4, 4) in the dataset's convention, where it is not in a file of its own
-    label_camera  of the images that label maps belong to, where that is another one
-    label_lens    the same where they are distorted photographs
-    color_lens    of the colour image, where that is distorted
-    photograph    the distorted photograph, where label maps belong to it
-    aliases       other names that its label maps may have
-    color         the file that it has, or would have; None where that is not known
-    depth_scale   units in a metre, where the dataset's own files say so
-    timestamp     seconds
+    Attributes:
+        name: Name of the frame in path templates.
+        depth: The file.
+        pose_file: The file that holds its pose, or all poses.
+        camera: Intrinsics of the depth image.
+        pose: (4, 4) in the dataset's convention, where it is not in a file of its own.
+        label_camera: Intrinsics of the images of label maps, where that is another one.
+        label_lens: The same where they are distorted photographs.
+        color_lens: Lens of the colour image, where that is distorted.
+        photograph: The distorted photograph, where label maps belong to it.
+        aliases: Other names that its label maps may have.
+        color: The file that it has, or would have; None where that is not known.
+        depth_scale: Units in a metre, where the dataset's own files say so.
+        timestamp: Seconds.
     """
 
     name: str

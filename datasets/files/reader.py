@@ -30,11 +30,13 @@ Options = TypeVar("Options", bound=FileOptions)
 class FileDataset(Dataset, Generic[Options]):
     """Scenes of files below a root. A reader says what a scene's folder looks like, and lists its frames.
 
-    Raises DataError where there is no scene.
+    Attributes:
+        contents: The files of a scene's folder, for error messages.
+        labels_like_depth: Whether label maps that are made for it have the depth's pixels, not those of the images.
+        settings_file: Name of a file in a scene's folder that says what no option says, which `settled` reads.
 
-    contents           the files of a scene's folder, for error messages
-    labels_like_depth  whether label maps that are made for it have the depth's pixels, not those of the images
-    settings_file      name of a file in a scene's folder that says what no option says, which `settled` reads
+    Raises:
+        DataError: If there is no scene.
     """
 
     contents: str
@@ -51,7 +53,11 @@ class FileDataset(Dataset, Generic[Options]):
         return tuple(self._entries)
 
     def scene(self, name: str) -> FileScene:
-        """Open one. Raises ConfigError for a name that is not there, and what `FileScene` raises."""
+        """Open one.
+
+        Raises:
+            ConfigError: For a name that is not there, and what `FileScene` raises.
+        """
         if name not in self._entries:
             raise ConfigError(f"{self.options.root}: scene '{name}' is not there; {nearest(name, self.scenes)}")
         entry = self._entries[name]
@@ -85,7 +91,7 @@ class FileDataset(Dataset, Generic[Options]):
 
     @property
     def folders(self) -> list[Path]:
-        """Of its scenes."""
+        """The folders of its scenes."""
         return [entry.folder for entry in self._entries.values()]
 
     def settled(self, folder: Path) -> FileOptions:
@@ -105,7 +111,12 @@ class FileDataset(Dataset, Generic[Options]):
     def depth_files(self, folder: Path, before: str, after: str, *, instead: Iterable[str]) -> dict[str, Path]:
         """Return the depth images of a folder by name, as `files_named` finds them.
 
-        instead  names of frames, by their poses or images, which a surface gives depth where no depth image is there
+        Args:
+            folder: The folder of the depth images.
+            before: Part of the file's name before that of the frame.
+            after: Part of the file's name after it.
+            instead: Names of frames, by their poses or images, which a surface gives depth where no depth image is
+                there.
         """
         there = files_named(folder, before, after)
         if self.options.surface is None:
@@ -117,7 +128,7 @@ class FileDataset(Dataset, Generic[Options]):
         return self.options.surface is not None or folder.is_dir()
 
     def class_ids(self) -> Mapping[str, UInt16]:
-        """By label source, a table (65536,) from the ids of its files to those of its taxonomy, where they differ."""
+        """Return by label source a table (65536,) from its files' ids to those of its taxonomy, where they differ."""
         return {}
 
     @abstractmethod
@@ -126,13 +137,18 @@ class FileDataset(Dataset, Generic[Options]):
 
     @abstractmethod
     def frames(self, folder: Path) -> Iterable[FrameSource]:
-        """Return the frames of a scene's folder, in order, of different names. Raises DataError with the file."""
+        """Return the frames of a scene's folder, in order, of different names.
+
+        Raises:
+            DataError: If that fails, with the file.
+        """
 
 
 def find_scenes(root: Path, is_scene: Callable[[Path], bool], contents: str) -> list[SceneEntry]:
     """Return the root where it is a scene itself, else the scenes below it in natural order; one holds no other.
 
-    Raises DataError where there is none, or two would have one name.
+    Raises:
+        DataError: If there is none, or two would have one name.
     """
     if not os.path.isdir(root):  # noqa: PTH112  Path.is_dir raises where the name is too long
         raise DataError(f"{root}: there is no such folder; set root to a scene or to the folder above scenes")
@@ -174,9 +190,19 @@ def frames_of(
 ) -> Iterator[FrameSource]:
     """Yield a frame for each depth image, with its colour if any; `pose` and `color` are templates with {name}.
 
-    poses  (n, 4, 4) in the same order, where `pose` is the file of them all
+    Args:
+        folder: The folder of the scene.
+        depth: Depth images by the names of their frames.
+        camera: Intrinsics of the depth images.
+        pose: File of a pose, a template with {name}, or of all poses.
+        color: File of a colour image, a template with {name}.
+        poses: (n, 4, 4) in the same order, where `pose` is the file of them all.
+        label_camera: Intrinsics of the label maps, where they are others.
+        depth_scale: Stored units in a metre, where the files say it.
+        what: Name of the depth images in messages.
 
-    Raises DataError where that file has another number of poses than there are depth images, or what goes with each.
+    Raises:
+        DataError: If that file has another number of poses than there are depth images, or what goes with each.
     """
     if poses is not None and len(poses) != len(depth):
         raise DataError(

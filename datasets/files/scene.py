@@ -40,7 +40,9 @@ DEPTH, LABELS, MASK = "depth", "labels of ", "mask"
 class FileScene(Scene):
     """One sequence of files, each required when it is read; opening it reads no image.
 
-    Raises ConfigError for options that cannot be used, DataError for two frames of one name.
+    Raises:
+        ConfigError: For options that cannot be used.
+        DataError: For two frames of one name.
     """
 
     folder: Path
@@ -112,7 +114,7 @@ class FileScene(Scene):
 
     @property
     def settings(self) -> Mapping[str, Any]:
-        """By which conventions its files are read, by name of option."""
+        """The conventions by which its files are read, by name of option."""
         return self.options.model_dump()
 
     @property
@@ -123,15 +125,20 @@ class FileScene(Scene):
     def label_space(self, backbone: str) -> LabelSpace:
         """Return the classes of that label source.
 
-        Raises DataError where nothing says them, ConfigError where there is no such source, or it has none.
+        Raises:
+            DataError: If nothing says them.
+            ConfigError: If there is no such source, or it has none.
         """
         return self._maps.label_space(backbone, self.settings_file or self.folder)
 
     def frame(self, index: int, backbone: str, *, color: bool = True) -> Frame:
         """Return frame 0 <= index < len with that source's labels or scores, and colour where it has any.
 
-        Labels of another size than the depth are brought to its pixels. Raises DataError that names the file,
-        ConfigError where there is no such frame or backbone.
+        Labels of another size than the depth are brought to its pixels.
+
+        Raises:
+            DataError: If that fails; the message names the file.
+            ConfigError: If there is no such frame or backbone.
         """
         file, kind = self._maps.file(self._frame(index), backbone), self._maps.source(backbone).kind
         read = self._reader(index, LABELS + backbone)
@@ -144,14 +151,21 @@ class FileScene(Scene):
         return self._framed(index, depth, labels, scores, color=color, files={kind: file})
 
     def geometry(self, index: int, *, color: bool = False) -> Frame:
-        """Return the frame but for its labels: all pixels are of class 0. Raises DataError that names the file."""
+        """Return the frame but for its labels: all pixels are of class 0.
+
+        Raises:
+            DataError: If that fails; the message names the file.
+        """
         depth = self.depth(index)
         return self._framed(index, depth, np.zeros(depth.shape, dtype=np.uint8), None, color=color)
 
     def predicted(self, index: int, *, labels: Labels | None = None, scores: Scores | None = None) -> Frame:
         """Return the frame with labels (H, W) or scores (H, W, K) that were predicted on its colour image; no colour.
 
-        They are brought to the depth's pixels. Raises DataError that names the file.
+        They are brought to the depth's pixels.
+
+        Raises:
+            DataError: If that fails; the message names the file.
         """
         depth = self.depth(index)
         where = str(self._frame(index).color or self.image_name(index))
@@ -172,7 +186,11 @@ class FileScene(Scene):
         return at_image(self.geometry(index), shape, str(source.color or source.name), K)
 
     def depth(self, index: int) -> Float32:
-        """Return depth (H, W) float32 in metres along the optical axis. Raises DataError with the file."""
+        """Return depth (H, W) float32 in metres along the optical axis.
+
+        Raises:
+            DataError: If that fails, with the file.
+        """
         if self._surface is None:
             read = self._reader(index, DEPTH)
             return stored_depth(self._frame(index), self.options, read, lambda shape: self.intrinsics(index, shape))
@@ -185,7 +203,7 @@ class FileScene(Scene):
         return depth
 
     def color(self, index: int) -> UInt8 | None:
-        """Return colour (H, W, 3) uint8 RGB, None where the frame has none; needs no labels. Raises DataError."""
+        """Return the colour (H, W, 3) uint8 RGB, None where the frame has none; needs no labels. Raises DataError."""
         source = self._frame(index)
         path = self._color_file(source)
         if path is None or source.color_lens is None:
@@ -212,14 +230,17 @@ class FileScene(Scene):
         return self._frame(index).name
 
     def intrinsics(self, index: int, shape: tuple[int, ...]) -> Intrinsics:
-        """Return intrinsics of the frame's depth image, of shape (H, W); pixels."""
+        """Return the intrinsics of the frame's depth image, of shape (H, W); pixels."""
         camera, options = self._frame(index).camera, self.options
         return Camera(camera.intrinsics, options.intrinsics_size or camera.size).at(shape, options.pixel_centre or 0.0)
 
     def T_wc(self, index: int) -> Poses:
         """Return pose (4, 4) camera-to-world in metres, OpenCV camera axes; needs no labels.
 
-        Raises DataError that names the file. That the pose is rigid is checked by `Frame`.
+        That the pose is rigid is checked by `Frame`.
+
+        Raises:
+            DataError: If that fails; the message names the file.
         """
         source, options = self._frame(index), self.options
         stored = self._stored_pose(source).copy()

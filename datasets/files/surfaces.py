@@ -50,7 +50,10 @@ def read_heights(path: Path, cell: float | None, georeference: Georeference | No
     """Return the first band of a GeoTIFF, averaged to cells of `cell` metres if given.
 
     Coordinates are less the offset of the georeference. A larger one than `MOST_CELLS` becomes coarser.
-    Raises DataError for a rotated raster, ConfigError where it lies in another projection than the scene.
+
+    Raises:
+        DataError: For a rotated raster.
+        ConfigError: If it lies in another projection than the scene.
     """
     import rasterio
 
@@ -70,7 +73,11 @@ def read_heights(path: Path, cell: float | None, georeference: Georeference | No
 
 
 def heights_of_points(path: Path, points: Float64, cell: float | None) -> Heights:
-    """Return a grid of points (n, 3): in each cell their `HEIGHT_QUANTILE`. Raises DataError if it is too large."""
+    """Return a grid of points (n, 3): in each cell their `HEIGHT_QUANTILE`.
+
+    Raises:
+        DataError: If it is too large.
+    """
     points = points[np.isfinite(points).all(axis=1)]
     if len(points) < 4:
         raise DataError(f"{path}: a cloud of {len(points)} points is no surface")
@@ -125,7 +132,10 @@ def read_triangles(path: Path, cell: float | None, georeference: Georeference | 
 
     Rasters and clouds become a grid over x and y, with cells of `cell` metres where that is given. GeoTIFF, LAS and LAZ
     lie in the projection of the georeference, and the rest in the scene's coordinates.
-    Raises DataError for a file that holds no surface, MissingDependencyError where its library is not installed.
+
+    Raises:
+        DataError: For a file that holds no surface.
+        MissingDependencyError: If its library is not installed.
     """
     try:
         triangles = READERS.get(path.suffix.lower(), _mesh)(path, cell, georeference)
@@ -382,7 +392,8 @@ class Casts:
     A file holds a checksum, then the exact depth in a fifth of its bytes: differences along rows, their bytes by
     significance, zstd.
 
-    surface  what the surface is, bytes that are equal where it is
+    Attributes:
+        surface: Bytes that are equal where the surface is the same.
     """
 
     def __init__(self, folder: Path | None, surface: bytes) -> None:
@@ -440,7 +451,10 @@ class Surface:
     A mesh whose coordinates count from `mesh_origin`, (3,) in the projection, is brought into the scene; without one
     its coordinates are the scene's.
 
-    Threads may ask at once. Raises DataError where the file cannot be read.
+    Threads may ask at once.
+
+    Raises:
+        DataError: If the file cannot be read.
     """
 
     def __init__(
@@ -461,7 +475,7 @@ class Surface:
 
     @cached_property
     def digest(self) -> bytes:
-        """Return bytes that are equal where the surface is."""
+        """Return the bytes that are equal where the surface is."""
         offset = None if self._georeference is None else self._georeference.offset
         said: tuple[object, ...] = (self._cell, offset)
         if self._georeference is not None and self._georeference.turned:

@@ -32,7 +32,8 @@ DIGEST = "sha256"
 def read_bytes(path: Path, limit: int = MAX_BYTES) -> bytes:
     """Return the content of a file of at most `limit` bytes.
 
-    Raises DataError where it cannot be read, is no file, too large or empty, or is a Git LFS pointer.
+    Raises:
+        DataError: If it cannot be read, is no file, too large or empty, or is a Git LFS pointer.
     """
     try:
         data = read_limited(path, limit)
@@ -56,7 +57,11 @@ def digest(data: bytes) -> bytes:
 
 
 def file_digest(path: Path) -> bytes:
-    """Return the same of a file that was not read. Raises DataError where it cannot be."""
+    """Return the same of a file that was not read.
+
+    Raises:
+        DataError: If it cannot be.
+    """
     try:
         with open_file(path) as file:
             return hashlib.file_digest(file, DIGEST).digest()
@@ -71,14 +76,19 @@ def natural(name: str) -> tuple[list[str | int], str]:
 
 
 def subfolders(folder: Path) -> list[str]:
-    """Return names in natural order. Raises DataError where the folder cannot be listed."""
+    """Return names in natural order.
+
+    Raises:
+        DataError: If the folder cannot be listed.
+    """
     return sorted((entry.name for entry in _entries(folder) if entry.is_dir()), key=natural)
 
 
 def files_by_stem(folder: Path, suffixes: Container[str]) -> dict[str, str]:
     """Return the names of the files with one of these suffixes.
 
-    Raises DataError for two of one stem, or a folder that cannot be listed.
+    Raises:
+        DataError: For two of one stem, or a folder that cannot be listed.
     """
     files: dict[str, str] = {}
     for entry in _entries(folder):
@@ -93,7 +103,8 @@ def files_by_stem(folder: Path, suffixes: Container[str]) -> dict[str, str]:
 def files_named(folder: Path, before: str, after: str) -> dict[str, Path]:
     """Return the files 'BEFORE name AFTER' of a folder by name, in natural order; none where there is no folder.
 
-    Raises DataError where the folder cannot be listed.
+    Raises:
+        DataError: If the folder cannot be listed.
     """
     fitting = (entry.name for entry in _entries(folder) if entry.name.startswith(before) and entry.name.endswith(after))
     names = sorted((name[len(before) : len(name) - len(after)] for name in fitting), key=natural)
@@ -124,7 +135,7 @@ def decode_array(path: Path, data: bytes, key: str) -> npt.NDArray[Any]:
 
 
 def _decode_npy(where: str, data: bytes) -> npt.NDArray[Any]:
-    """Parsed by hand: numpy evaluates the header as Python, with its warnings, and allocates what it claims."""
+    """Return parsed by hand: numpy evaluates the header as Python, with its warnings, and allocates what it claims."""
     if not data.startswith(b"\x93NUMPY") or len(data) < 12:
         raise DataError(f"{where}: not an .npy array; {AGAIN}")
     width = 2 if data[6] == 1 else 4
@@ -167,7 +178,11 @@ MAX_JSON_BYTES = 2**28
 
 
 def read_object(path: Path) -> dict[str, Any]:
-    """Return the object in a file. Raises DataError where there is none."""
+    """Return the object in a file.
+
+    Raises:
+        DataError: If there is none.
+    """
     content = read_content(path, MAX_JSON_BYTES)
     if not isinstance(content, dict):
         raise DataError(f"{path}: expected an object with named values, got a {type(content).__name__}")
@@ -175,7 +190,11 @@ def read_object(path: Path) -> dict[str, Any]:
 
 
 def read_content(path: Path, limit: int) -> Any:
-    """Return the content of a JSON file of at most `limit` bytes. Raises DataError where it is none."""
+    """Return the content of a JSON file of at most `limit` bytes.
+
+    Raises:
+        DataError: If it is none.
+    """
     data = read_bytes(path, limit)
     try:
         return parse_json(data)
@@ -184,7 +203,11 @@ def read_content(path: Path, limit: int) -> Any:
 
 
 def pixels(content: Mapping[str, Any], key: str, where: str) -> int:
-    """Return the side of an image in an object. Raises DataError with `where` (the file) and the key."""
+    """Return the side of an image in an object.
+
+    Raises:
+        DataError: If that fails, with `where` (the file) and the key.
+    """
     value = number(content, key, where)
     if not 1 <= value <= 2**24:
         raise DataError(f"{where}: '{key}' is {value:g}; expected a number of pixels")
@@ -192,7 +215,11 @@ def pixels(content: Mapping[str, Any], key: str, where: str) -> int:
 
 
 def number(content: Mapping[str, Any], key: str, where: str) -> float:
-    """Return a finite number of an object. Raises DataError with `where` (the file) and the key."""
+    """Return a finite number of an object.
+
+    Raises:
+        DataError: If that fails, with `where` (the file) and the key.
+    """
     value = content.get(key)
     if value is None:
         raise DataError(f"{where}: '{key}' is missing; add it")
@@ -202,7 +229,11 @@ def number(content: Mapping[str, Any], key: str, where: str) -> float:
 
 
 def matrix(value: Any, where: str) -> Poses:
-    """Return (4, 4) from rows of 3x4 or 4x4 numbers, NaN and infinity among them. Raises DataError with `where`."""
+    """Return (4, 4) from rows of 3x4 or 4x4 numbers, NaN and infinity among them.
+
+    Raises:
+        DataError: If that fails, with `where`.
+    """
     try:
         T = np.array(value, dtype=np.float64)
     except (ValueError, TypeError, OverflowError) as error:
@@ -222,7 +253,8 @@ MAX_TEXT_BYTES = 2**16
 def read_pose(path: Path) -> Float64:
     """Return a (4, 4) matrix from 16 numbers, or from the 12 of its upper rows, apart by whitespace or commas.
 
-    Raises DataError for anything else.
+    Raises:
+        DataError: For anything else.
     """
     numbers = _numbers(path)
     if len(numbers) not in (12, 16):
@@ -232,7 +264,11 @@ def read_pose(path: Path) -> Float64:
 
 
 def read_intrinsics(path: Path) -> Intrinsics:
-    """Return intrinsics in pixels from a 3x3 or 4x4 matrix. Raises DataError for anything else."""
+    """Return intrinsics in pixels from a 3x3 or 4x4 matrix.
+
+    Raises:
+        DataError: For anything else.
+    """
     numbers = _numbers(path)
     if len(numbers) not in (9, 16):
         raise DataError(
@@ -262,9 +298,10 @@ MAX_TABLE_BYTES = 2**28
 
 
 def records(path: Path) -> Iterator[tuple[int, str]]:
-    """Yield number, from 1, and text of each line that is neither empty nor a comment (#).
+    """Yield the number, from 1, and text of each line that is neither empty nor a comment (#).
 
-    Raises DataError where the file cannot be read or is larger than any such table.
+    Raises:
+        DataError: If the file cannot be read or is larger than any such table.
     """
     for number, line in enumerate(read_text(path, MAX_TABLE_BYTES).split("\n"), start=1):
         text = line.strip()
@@ -275,7 +312,8 @@ def records(path: Path) -> Iterator[tuple[int, str]]:
 def read_table(path: Path, columns: int, what: str) -> Float64:
     """Return (n, columns) numbers, apart by whitespace or commas; `what` says in errors what a line is.
 
-    Raises DataError that names the line for another number of words, or one that is no number; and for no line.
+    Raises:
+        DataError: For another number of words, or one that is no number; and for no line; the message names the line.
     """
     values = array("d")
     for number, text in records(path):
@@ -289,7 +327,11 @@ def read_table(path: Path, columns: int, what: str) -> Float64:
 
 
 def to_number(word: str, path: Path, line: int) -> float:
-    """Return one number. Raises DataError that names the line."""
+    """Return one number.
+
+    Raises:
+        DataError: If that fails; the message names the line.
+    """
     try:
         return float(word)
     except ValueError as error:

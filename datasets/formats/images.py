@@ -50,7 +50,9 @@ def read_depth(path: Path, scale: float | None = None, read: Read = read_bytes) 
     """Return depth (H, W) in metres, float32, as stored: what marks a pixel invalid stays.
 
     `scale` is units per metre; not given, a 16-bit PNG holds millimetres and float files hold metres.
-    Raises DataError for another type, more than one channel, integers without a scale, or a damaged file.
+
+    Raises:
+        DataError: For another type, more than one channel, integers without a scale, or a damaged file.
     """
     data = read(path)
     suffix = path.suffix.lower()
@@ -78,10 +80,13 @@ def read_depth(path: Path, scale: float | None = None, read: Read = read_bytes) 
 
 
 def read_labels(path: Path, space: LabelSpace | None = None, read: Read = read_bytes) -> Labels:
-    """Class ids (H, W) uint8 or uint16, in the ids of the file; RGB maps through the colours of `space`.
+    """Return the class ids (H, W) uint8 or uint16, in the ids of the file; RGB maps through the colours of `space`.
 
-    Wider integers are narrowed. Raises DataError for a colour or an id that no class can have, an RGB map without
-    `space`, another type, or a damaged file.
+    Wider integers are narrowed.
+
+    Raises:
+        DataError: For a colour or an id that no class can have, an RGB map without `space`, another type, or a damaged
+            file.
     """
     data = read(path)
     if path.suffix.lower() != ".png":
@@ -102,10 +107,12 @@ def read_labels(path: Path, space: LabelSpace | None = None, read: Read = read_b
 def read_scores(
     path: Path, layout: Literal["KHW", "HWK"], size: Size, read: Read = read_bytes
 ) -> npt.NDArray[np.floating[Any]]:
-    """Soft scores (H, W, K) float16, float32 or float64, C-contiguous; `layout` is the file's.
+    """Return soft scores (H, W, K) float16, float32 or float64, C-contiguous; `layout` is the file's.
 
-    `size` is (H, W) of the depth, to recognise the other layout. Raises DataError where the file has another
-    type or layout, or is damaged.
+    `size` is (H, W) of the depth, to recognise the other layout.
+
+    Raises:
+        DataError: If the file has another type or layout, or is damaged.
     """
     scores = decode_array(path, read(path), "scores")
     if scores.ndim != 3 or scores.dtype.kind != "f":
@@ -122,7 +129,8 @@ def read_scores(
 def read_mask(path: Path, read: Read = read_bytes) -> Mask:
     """Return mask (H, W) bool, True where the image is 0: black is left out, as COLMAP and nerfstudio have it.
 
-    Raises DataError where it is no one-channel PNG, or damaged.
+    Raises:
+        DataError: If it is no one-channel PNG, or damaged.
     """
     with _whole_png(path, read(path)) as png:
         if png.kind not in ("grey", "palette"):
@@ -132,7 +140,11 @@ def read_mask(path: Path, read: Read = read_bytes) -> Mask:
 
 
 def read_color(path: Path) -> UInt8:
-    """Return colour (H, W, 3) uint8 RGB of PNG, JPEG or TIFF, not rotated by EXIF. Raises DataError if damaged."""
+    """Return the colour (H, W, 3) uint8 RGB of PNG, JPEG or TIFF, not rotated by EXIF.
+
+    Raises:
+        DataError: If damaged.
+    """
     data = read_bytes(path)
     suffix = path.suffix.lower()
     if suffix == ".png":
@@ -145,7 +157,11 @@ def read_color(path: Path) -> UInt8:
 
 
 def color_size(path: Path) -> Size:
-    """Return (width, height) of a colour image, from its header. Raises DataError where that is damaged."""
+    """Return (width, height) of a colour image, from its header.
+
+    Raises:
+        DataError: If that is damaged.
+    """
     from PIL import Image
 
     with _one_line(path, "colour"), Image.open(path) as image:
@@ -188,7 +204,11 @@ def _labels_by_color(path: Path, image: UInt8, space: LabelSpace) -> Labels:
 
 @functools.lru_cache(maxsize=2)
 def _ids_by_color(space: LabelSpace) -> UInt16:
-    """Return (2^24,) class id of each packed colour. Raises ConfigError where two classes share a colour."""
+    """Return (2^24,) class id of each packed colour.
+
+    Raises:
+        ConfigError: If two classes share a colour.
+    """
     if len(set(space.colors)) < len(space):
         shared = next(color for color in space.colors if space.colors.count(color) > 1)
         raise ConfigError(f"taxonomy {space.name}: two classes have the colour {shared}; give each its own")
@@ -365,7 +385,7 @@ def _imdecode(path: Path, data: bytes, mode: str) -> npt.NDArray[Any]:
 
 
 def _check_pixels(path: Path, width: int, height: int, pixel_bytes: int = 1) -> None:
-    """Before memory is allocated for what a header claims."""
+    """Check an image's size before memory is allocated for what a header claims."""
     most = min(MAX_PIXELS, MAX_IMAGE_BYTES // pixel_bytes)
     if not (width > 0 and height > 0 and width * height <= most):
         raise DataError(f"{path}: claims {width}x{height} pixels (at most {most} are read); is it damaged?")

@@ -22,7 +22,8 @@ FxFyCxCy = tuple[float, float, float, float]
 class Camera:
     """Intrinsics as a dataset states them, and the (width, height) that they are for; None: of any image's own.
 
-    Raises DataError for numbers that no camera has, so that nothing overflows.
+    Raises:
+        DataError: For numbers that no camera has, so that nothing overflows.
     """
 
     intrinsics: Intrinsics
@@ -36,7 +37,11 @@ class Camera:
 
     @classmethod
     def stated(cls, numbers: FxFyCxCy, size: tuple[int, int] | None, where: str) -> Camera:
-        """Return a camera as the file `where` states it. Raises DataError for numbers that no camera has."""
+        """Return a camera as the file `where` states it.
+
+        Raises:
+            DataError: For numbers that no camera has.
+        """
         try:
             return cls(Intrinsics(*numbers), size)
         except DataError as error:
@@ -66,7 +71,7 @@ CAMERA_AXES: Mapping[str, Poses] = {
     "opengl": np.diag([1.0, -1.0, -1.0]),
     "ned": np.array([[0.0, 0, 1], [1, 0, 0], [0, 1, 0]]),
 }
-"""From OpenCV camera axes (x right, y down, z forward) to the named ones: opengl has x right, y up, z backward;
+"""Rotations from OpenCV camera axes (x right, y down, z forward) to named ones: opengl has x right, y up, z backward;
 ned has x forward, y right, z down, as TartanAir."""
 
 UP_AXES: Mapping[str, tuple[float, float, float]] = {
@@ -79,9 +84,10 @@ LARGEST_COORDINATE = 1e9
 
 
 def to_camera_to_world(T: Poses, convention: str, axes: str, where: str) -> Poses:
-    """T (4, 4) of a convention and camera axes as camera-to-world with OpenCV axes; one that is not finite stays.
+    """Return T (4, 4) of a convention and camera axes as camera-to-world, OpenCV axes; one that is not finite stays.
 
-    Raises DataError with `where` (the file) where it cannot be inverted.
+    Raises:
+        DataError: If it cannot be inverted, with `where` (the file).
     """
     if not np.isfinite(T).all():
         return T
@@ -102,7 +108,8 @@ def to_camera_to_world(T: Poses, convention: str, axes: str, where: str) -> Pose
 def from_quaternions(translations: Poses, quaternions: Poses, path: Path) -> Poses:
     """Return (n, 4, 4) of translations (n, 3) and quaternions (n, 4), order x y z w; NaN where one is not finite.
 
-    Raises DataError that names the file and the pose, counted from 1, for a quaternion that is not of length 1.
+    Raises:
+        DataError: For a quaternion that is not of length 1; the message names the file and the pose, counted from 1.
     """
     from scipy.spatial.transform import Rotation
 
@@ -142,7 +149,7 @@ def at_times(
 
 
 def nearest(times: Float64, others: Float64) -> npt.NDArray[np.intp]:
-    """For each time the index of the nearest of the ascending others; of two as near the earlier one."""
+    """Return for each time the index of the nearest of the ascending others; of two as near the earlier one."""
     after = np.searchsorted(others, times).clip(max=len(others) - 1)
     before = np.maximum(after - 1, 0)
     return np.where(np.abs(times - others[before]) <= np.abs(others[after] - times), before, after)

@@ -58,7 +58,7 @@ def _nearest(values: Pixels, K: Intrinsics, K_fit: Intrinsics, shape: tuple[int,
 
 
 def _positions(K: Intrinsics, K_depth: Intrinsics, shape: tuple[int, int]) -> tuple[Float64, Float64]:
-    """Row of each row, column of each column of the depth image in the other one, in pixels."""
+    """Return the row of each row, column of each column of the depth image in the other one, in pixels."""
     v = K.fy * (np.arange(shape[0], dtype=np.float64) - K_depth.cy) / K_depth.fy + K.cy
     u = K.fx * (np.arange(shape[1], dtype=np.float64) - K_depth.cx) / K_depth.fx + K.cx
     return v.clip(-FAR, FAR), u.clip(-FAR, FAR)
@@ -89,7 +89,10 @@ SHAPE_TOLERANCE = 0.02
 def fitted(values: Pixels, shape: tuple[int, ...], where: str, what: str = "the image is") -> Pixels:
     """Return labels (H', W') or scores (H', W', K) at the pixels of an image (H, W) of the same view.
 
-    Nearest for ids, linear for scores. Raises DataError with `where`, its file, for another shape of image.
+    Nearest for ids, linear for scores.
+
+    Raises:
+        DataError: For another shape of image, with `where`, its file.
     """
     if values.shape[:2] == shape:
         return values
@@ -102,7 +105,10 @@ def fitted(values: Pixels, shape: tuple[int, ...], where: str, what: str = "the 
 def at_image(frame: Frame, shape: tuple[int, int], where: str, K: Intrinsics | None = None) -> Frame:
     """Return a frame's depth and pose at the pixels of its colour image (H, W); no labels, depth 0 if unknown.
 
-    K is the image's, where it shows another view than the depth. Raises DataError with `where` for another shape.
+    K is the image's, where it shows another view than the depth.
+
+    Raises:
+        DataError: For another shape, with `where`.
     """
     depth = frame.depth
     if K is None:
@@ -124,7 +130,7 @@ OUTSIDE = -(2.0**20)
 """Pixels at which no image is."""
 
 CHANNELS = 4
-"""That are interpolated at a time: OpenCV 5 ends the process with a hundred."""
+"""The channels that are interpolated at a time: OpenCV 5 ends the process with a hundred."""
 
 SAMPLES = 2000
 """Samples of the radius that show whether the distortion folds the image over."""
@@ -134,8 +140,9 @@ SAMPLES = 2000
 class Lens:
     """A camera that distorts: `camera` with its size, and what happens before its intrinsics.
 
-    brown    k1 k2 p1 p2 k3: radial and tangential
-    fisheye  k1 k2 k3 k4: of the angle to the optical axis
+    Attributes:
+        brown: k1 k2 p1 p2 k3: radial and tangential.
+        fisheye: k1 k2 k3 k4: of the angle to the optical axis.
     """
 
     camera: Camera
@@ -149,7 +156,9 @@ def undistorted(
     """Return an image of the lens, ids (H', W') or channels (H', W', C), as a pinhole with K and (H, W) sees it.
 
     Of ids the nearest, of channels linear between pixel centres; what the lens does not see is ignored, or 0.
-    Raises DataError with `where`, its file, where the image is not of the lens's shape.
+
+    Raises:
+        DataError: If the image is not of the lens's shape, with `where`, its file.
     """
     import cv2
 
@@ -172,7 +181,7 @@ def undistorted(
 def _source_pixels(
     lens: Lens, source: tuple[int, int], K: Intrinsics, shape: tuple[int, int]
 ) -> tuple[Float32, Float32]:
-    """Column and row (H, W), in an image of the lens of shape `source`, of each pixel of the pinhole."""
+    """Return the column and row (H, W), in an image of the lens of shape `source`, of each pixel of the pinhole."""
     import cv2
 
     inner = lens.camera.at(source)
@@ -187,7 +196,7 @@ def _source_pixels(
 
 
 def _reach(lens: Lens, farthest: float) -> float:
-    """Distance from the axis, a metre ahead, up to which the lens maps further out what lies further out."""
+    """Return the distance from the axis, a metre ahead, up to which the lens maps further out what lies further out."""
     radius = np.linspace(0, farthest, SAMPLES)
     if lens.model == "brown":
         k1, k2, _, _, k3 = lens.coefficients

@@ -9,7 +9,7 @@ from typing import TypeVar
 from semstab.metrics import macro_mean
 from semstab.model.measures import ENTROPY, VSS
 from semstab.model.records import Record, Result
-from semstab.model.statistics import UNDEFINED, CeilingShare, DriftStatistics, DriftTests, Estimate, MapStatistics
+from semstab.model.statistics import UNDEFINED, CeilingShare, DriftStatistics, Estimate, MapStatistics
 from semstab.report.averages import by_backbone
 from semstab.report.tables.table import Cell, Column, Group, Row, Table
 from semstab.statistics.agreement import ALPHA, KAPPA, PSA
@@ -96,43 +96,34 @@ def class_agreement(result: Result) -> list[Table]:
 
 
 def drift(result: Result) -> list[Table]:
-    """SBD beside what a random order of the same observations gives, and the drift in one direction."""
+    """SBD beside what a random order of the same observations gives, and what goes one way in time."""
     columns = (
         Column("voxels", "Voxels", 0),
         Column("sbd", "observed", 4, over="SBD (bits)"),
         Column("sbd_null", "random order", 4, over="SBD (bits)"),
         Column("sbd_excess", "excess", 4, signed=True, over="SBD (bits)"),
-        Column("sbd_p", "p", 3, over="SBD (bits)"),
-        Column("trend", "R² (time)", 3, over="Trend"),
-        Column("trend_null", "random order", 3, over="Trend"),
-        Column("trend_p", "p", 3, over="Trend"),
-        Column("trending_voxels", "trending", 0, over="Voxels"),
-        Column("tested_voxels", "tested", 0, over="Voxels"),
+        Column("trend_percent", "of the disagreement (%)", 1, signed=True, over="Trend in time"),
+        Column("trend_voxels", "voxels", 0, over="Trend in time"),
     )
     numbers: tuple[Number, ...] = (
         ordered(lambda drift: drift.voxels),
         ordered(lambda drift: drift.sbd.value),
         ordered(lambda drift: drift.null.value),
         ordered(lambda drift: drift.excess),
-        tested(lambda tests: tests.sbd_p),
-        tested(lambda tests: tests.trend),
-        tested(lambda tests: tests.trend_null),
-        tested(lambda tests: tests.trend_p),
-        tested(lambda tests: tests.trending_voxels),
-        tested(lambda tests: tests.tested_voxels),
+        lambda found: UNDEFINED if found.drift.trend is None else found.drift.trend.share.percent,
+        lambda found: math.nan if found.drift.trend is None else found.drift.trend.voxels,
     )
-    logged = any(r.statistics is not None and r.statistics.drift.tests is not None for r in result.select())
-    one_class = f"{SEEN_TWICE[:-1]}, where each frame says one class; --statistics adds the others, and tests of trend."
+    logged = any(r.statistics is not None and r.statistics.drift.trend is not None for r in result.select())
+    one_class = f"{SEEN_TWICE[:-1]}, where each frame says one class; --statistics adds the others, and the trend."
     seen = SEEN_TWICE if logged else one_class
-    tests = (
-        " Trend: share of the disagreement that goes one way in time. p: of values this far out, from random orders of"
-        " stretches of time; none where errors last, or depend on the view, too long for six of them: no test can tell"
-        " that from a trend. Trending: voxels whose own trend is significant at a false discovery rate of 5%, of those"
-        " seen in six stretches or more."
+    trend = (
+        " Trend in time: share of the disagreement that odd and even observations both show as a move in one direction,"
+        " in voxels seen six times or more that disagree; 0 in the mean where frames err independently. It cannot tell"
+        " drift of the model from errors that depend on the view or last over frames."
     )
     caption = (
         f"{seen} Random order: what the same observations give in the mean of all orders; excess: SBD less that."
-        f"{tests if logged else ''} {INTERVALS}"
+        f"{trend if logged else ''} {INTERVALS}"
     )
     return by_scene(result, "drift", "Belief drift against random order", caption, columns, numbers)
 
@@ -229,11 +220,6 @@ def judged_records(result: Result) -> dict[str, list[tuple[Record, MapStatistics
         for backbone, records in by_backbone(result.select()).items()
     }
     return {backbone: rows for backbone, rows in judged.items() if rows}
-
-
-def tested(take: Callable[[DriftTests], float]) -> Number:
-    """A number of the drift's tests; NaN where there are none."""
-    return lambda found: math.nan if found.drift.tests is None else take(found.drift.tests)
 
 
 def ordered(take: Callable[[DriftStatistics], float | Estimate]) -> Number:
