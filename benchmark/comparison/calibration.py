@@ -7,7 +7,6 @@ from pathlib import Path
 
 import numpy as np
 
-from semstab.comparison.pairing import in_share, share_of
 from semstab.comparison.runs import open_run
 from semstab.errors import ConfigError, DataError
 from semstab.model.records import Record
@@ -15,6 +14,7 @@ from semstab.model.tiles import Tiles, side_by_side
 from semstab.model.voxels import VoxelTable
 from semstab.statistics.acceptance import AcceptanceThresholds, calibrate
 from semstab.statistics.correctness import Truth, join_truth
+from semstab.statistics.model_comparison import in_share, share_of
 
 
 def calibrate_run(run: str | Path, *, precision: float = 0.95, confidence: float = 0.95) -> AcceptanceThresholds:

@@ -66,14 +66,14 @@ def contrasts(common: Common, base: Entry, other: Entry, number: int) -> tuple[C
     return tuple(result[quantity.key] for quantity in quantities() if quantity.key in result)
 
 
-def by_class(common: Common, base: Entry, other: Entry, number: int) -> tuple[Contrast, ...]:
+def by_class(common: Common, base: Entry, number: int) -> tuple[Contrast, ...]:
     """The same of each class: against all others, or of the locations of the class.
 
     These are by the ground truth, or else by what all runs together say, so that none of them chooses its own.
     """
     names = base.classes or tuple(str(k) for k in range(base.sums.K))
     own = list(_of_locations(common, names, number)) if common.tables else []
-    rows = [*_against_all(common, base, other, names, number), *own]
+    rows = [*_against_all(common, names, number), *own]
     order = {quantity.key: rank for rank, quantity in enumerate(BY_CLASS)}
     return tuple(sorted(rows, key=lambda row: (names.index(row.of), order[row.measure])))
 
@@ -211,7 +211,7 @@ def _with_p_value(interval: Interval, level: float = INTERVAL_LEVEL) -> Interval
 # --- By class ---------------------------------------------------------------------------------------------------------
 
 
-def _against_all(common: Common, base: Entry, other: Entry, names: Sequence[str], number: int) -> Iterator[Contrast]:
+def _against_all(common: Common, names: Sequence[str], number: int) -> Iterator[Contrast]:
     for quantity in ONE_AGAINST_ALL:
         before, after = common.sums[0], common.sums[number]
         if not _comparable(quantity, common):
@@ -295,7 +295,7 @@ def _scene(scene: str, runs: Sequence[RunHandle], scope: Scope) -> tuple[SceneCo
     common = pair(entries, names, scope)
     numbers = range(1, len(entries))
     everything = corrected([contrasts(common, entries[0], entries[n], n) for n in numbers])
-    classes = corrected([by_class(common, entries[0], entries[n], n) for n in numbers])
+    classes = corrected([by_class(common, entries[0], n) for n in numbers])
     against, changes = [], {}
     for n, own, of_classes in zip(numbers, everything, classes, strict=True):
         result = Against(names[n], own, of_classes)

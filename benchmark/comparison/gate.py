@@ -16,25 +16,15 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from semstab.comparison.differences import flicker_difference, sums_difference
 from semstab.comparison.runs import Entry, RunHandle, open_run, shared_scenes
-from semstab.comparison.tables import (
-    COVERAGE,
-    FLICKER,
-    IOU,
-    MISLEADING,
-    PRECISION,
-    REACHED,
-    RECALL,
-    RECURRENT_VSS,
-    SBD_EXCESS,
-)
+from semstab.comparison.tables import COVERAGE, FLICKER, IOU, MISLEADING, PRECISION, RECALL, RECURRENT_VSS, SBD_EXCESS
 from semstab.config import nearest, read_yaml, validated
 from semstab.config.settings import ScopeSetting
 from semstab.core.types import OTHER_SCENES, THESE_FRAMES, THIS_SCENE, Scope
 from semstab.errors import ConfigError, DataError
 from semstab.model.measures import ENTROPY, Quantity
 from semstab.model.statistics import Interval
-from semstab.statistics.agreement import ALPHA, ALPHA_BETWEEN, PSA
-from semstab.statistics.cluster_sums import ClusterSums, of_space_alone, sums_for, value
+from semstab.statistics.agreement import ALPHA, PSA, VOXEL_ALPHA
+from semstab.statistics.cluster_sums import ClusterSums, columns_of, functional, of_space_alone, parts_of, value
 from semstab.statistics.correctness import ACCURACY, ECE, MIOU
 from semstab.statistics.intervals import (
     LEAST_FRAMES,
@@ -76,11 +66,10 @@ class GateMeasure:
 MEASURES = (
     GateMeasure(PSA, "psa"),
     GateMeasure(ALPHA, "alpha", of_class=True),
-    GateMeasure(ALPHA_BETWEEN, "alpha between", of_class=True),
-    GateMeasure(REACHED, "reached", ("share of ceiling",), of_class=True),
     GateMeasure(RECURRENT_VSS, "vss"),
+    GateMeasure(VOXEL_ALPHA, "voxel alpha", of_class=True),
     GateMeasure(ENTROPY, "entropy"),
-    GateMeasure(SBD_EXCESS, "sbd excess", lacking="run it with --statistics, which keeps the order of looks"),
+    GateMeasure(SBD_EXCESS, "sbd excess", lacking="run it with --statistics, which keeps the order of observations"),
     GateMeasure(FLICKER, "flicker", lacking="run it again with two frames or more"),
     GateMeasure(COVERAGE, "coverage", only_change=True),
     GateMeasure(ACCURACY, "accuracy", lacking=TRUTH),
@@ -97,7 +86,7 @@ MEASURES = (
 NOTHING = "nothing that it is of was seen twice"
 SCORES = "one run has labels and the other scores, which spread their evidence; run both as labels"
 
-OF_EVIDENCE = (PSA, ALPHA, ALPHA_BETWEEN, REACHED, RECURRENT_VSS, ENTROPY, SBD_EXCESS, ECE)
+OF_EVIDENCE = (PSA, VOXEL_ALPHA, RECURRENT_VSS, ENTROPY, SBD_EXCESS, ECE)
 """What depends on whether a model gives labels or scores."""
 
 
@@ -482,8 +471,9 @@ def _has(rule: Rule, entry: Entry) -> bool:
         return len(entry.flicker) > 1
     if rule.measure.quantity is COVERAGE:
         return True
-    columns = sums_for(entry.sums, rule.measure.quantity.key, _k(rule, entry))
-    return bool(columns.size) and (rule.measure.quantity is not SBD_EXCESS or bool(columns[:, 1].any()))
+    key, k = rule.measure.quantity.key, _k(rule, entry)
+    parts = parts_of(entry.sums, functional(key, k))
+    return bool(parts) and (rule.measure.quantity is not SBD_EXCESS or bool(columns_of(entry.sums, key)[:, 1].any()))
 
 
 Pair = tuple[Entry, Entry | None]

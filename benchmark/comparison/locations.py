@@ -318,7 +318,7 @@ def _observations(common: Common, number: int, index: Int32, voxel_size: float) 
 
 
 def _rows_of(log: Events, index: Int32, voxel_size: float) -> tuple[Int64, Int64, Float64]:
-    """Of each observation of a cell the row of the voxel that holds it, -1 where there is none, its frame and shares."""
+    """Return of each observation the row of the voxel that holds its cell, or -1, its frame and its shares."""
     centre = (np.stack([log.ix, log.iy, log.iz], axis=1) + 0.5) * log.voxel_size
     own, wanted = voxel_keys(np.floor(centre / voxel_size).astype(np.int32), index)
     at = np.minimum(np.searchsorted(wanted, own), max(len(wanted) - 1, 0))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import functools
-import math
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -37,8 +36,6 @@ FEW = 0.1
 """A part of a map's voxels below which it is said how few are in common."""
 
 OTHER_OBSERVATIONS = "the runs are of other frames: nothing is paired on observations, and alpha is of each run's own"
-OTHER_CELLS = "the runs have cells of {sizes}, for want of the same pixels: alpha is of each run's own observations"
-
 BY_CUBES = (
     "compared are sums in the same cubes of space, each map with all its voxels; what needs them voxel by voxel is"
 )
@@ -167,19 +164,16 @@ def _with_observations(common: Common, names: Sequence[str], records: Sequence[R
     """With alpha of the observations that all made; of their own where one's were not kept, or cannot be paired."""
     files = [file for record in records if (file := record.observations_file) is not None and file.is_file()]
     there = [CellObservations.load(file) for file in files]
-    reason = OTHER_OBSERVATIONS
-    if len(there) == len(records) and _same_frames(there):
-        reason = OTHER_CELLS.format(sizes=" and ".join(f"{own.cell_size:g} m" for own in there))
-        if len({own.cell_size for own in there}) == 1:
-            shared = compared_observations(dict(zip(names, there, strict=True)))
-            cells = shared.sums.values()
-            sums = (replace(own, fine=of.fine, coarse=of.coarse) for own, of in zip(common.sums, cells, strict=True))
-            notes, logs = _fewer_frames(there), tuple(shared.logs.values())
-            return replace(
-                common, basis="observations", notes=(*common.notes, *notes), sums=tuple(sums), logs=logs,
-                observations=shared.compared, frames_differ=bool(notes),
-            )  # fmt: skip
-    return replace(common, notes=(reason, *common.notes), same_frames=False, frames_differ=True)
+    if len(there) < len(records) or not _same_frames(there):
+        return replace(common, notes=(OTHER_OBSERVATIONS, *common.notes), same_frames=False, frames_differ=True)
+    shared = compared_observations(dict(zip(names, there, strict=True)))
+    cells = shared.sums.values()
+    sums = (replace(own, fine=of.fine, coarse=of.coarse) for own, of in zip(common.sums, cells, strict=True))
+    notes, logs = _fewer_frames(there), tuple(shared.logs.values())
+    return replace(
+        common, basis="observations", notes=(*common.notes, *notes), sums=tuple(sums), logs=logs,
+        observations=shared.compared, frames_differ=bool(notes),
+    )  # fmt: skip
 
 
 def _apart(entries: Sequence[Entry], reason: str) -> Common:

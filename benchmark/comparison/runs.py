@@ -73,7 +73,7 @@ class Entry(EntryNumbers):
         if self.small is not None:
             return self.small[0]
         assert self.record is not None
-        file = self.record.influence_file
+        file = self.record.sums_file
         if file is None or not file.is_file():
             raise DataError(f"{self.where}: has no sums by frame and cube of {self.record.unit.slug}; run it again")
         try:

@@ -111,9 +111,10 @@ def _differences(comparison: RunComparison) -> Table:
     groups = tuple(Group(heading(comparison, scope, own), _rows(own, HEADLINES)) for scope, own in scopes(comparison))
     macro = " Over all scenes each scene counts once." if len(comparison.scenes) > 1 else ""
     caption = (
-        "Alpha is of the observations that all runs made, the rest of the voxels that all saw twice or more; coverage is"
-        " of each run's whole map, flicker of its images; coverage is the number of voxels seen twice or more, for each one of the base. Undecided: too few"
-        f" frames, or errors reach as far as the scene. {ANSWERS}{macro}"
+        "Alpha is of the observations that all runs made, the rest of the voxels that all saw twice or more; coverage"
+        " is of each run's whole map, flicker of its images. Coverage is the number of voxels seen twice or more, for"
+        " each one of the base. Undecided: too few frames, or errors reach as far as the scene."
+        f" {ANSWERS}{macro}"
     )
     return Table("comparison", "Differences", caption, columns, groups, "scope")
 
@@ -236,7 +237,7 @@ MOST_CLASSES = 4
 """Classes that are told of in a sentence."""
 
 BASES: dict[Basis, str] = {
-    "observations": "paired; alpha on the observations (a cell in a view) that all runs made, each with the same weight",
+    "observations": "paired; alpha is of the observations (a cell in a view) that all runs made, with the same weights",
     "voxels": "paired on the voxels that all runs saw twice or more",
     "cubes": "paired on cubes of space",
     "flights": "not paired",

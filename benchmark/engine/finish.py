@@ -21,7 +21,7 @@ from semstab.datasets import Scene
 from semstab.datasets.formats.disk import file_digest
 from semstab.engine.series import Series
 from semstab.engine.streams import ImageSpaceMeter, LiveMap, Stream, alpha_sums
-from semstab.engine.tiles import OBSERVATIONS, TileResult
+from semstab.engine.tiles import TILE_OBSERVATIONS, TileResult
 from semstab.engine.work import Outcome, Start
 from semstab.errors import DataError
 from semstab.metrics import compare
@@ -32,10 +32,10 @@ from semstab.model.evidence import stretches
 from semstab.model.frames import LeftOut
 from semstab.model.measures import dominant, mean, measures, vss
 from semstab.model.parquet import Tile
-from semstab.model.records import EVENTS, FRAMES, INFLUENCE, LOOKS, OVERVIEW, TRUTH, VOXELS, FrameQuality, UnitContent
+from semstab.model.records import EVENTS, FRAMES, OBSERVATIONS, OVERVIEW, SUMS, TRUTH, VOXELS, FrameQuality, UnitContent
 from semstab.model.results import RECURRENT, STAGES, Agreement, FrameDrift, ReducedScores, UnitSummary, slug
 from semstab.model.voxels import VoxelTable
-from semstab.statistics import Analysis, CellObservations, MapSample, ObservationSample, analyse
+from semstab.statistics import Analysis, CellObservations, MapSample, analyse
 from semstab.statistics.agreement import alpha_of, ratio_of
 from semstab.statistics.verdict import Limits
 from semstab.task import Task, read
@@ -70,8 +70,7 @@ def finish(live: LiveMap, stream: Stream, watch: Stopwatch) -> Outcome:
         if fused is not None:
             sums = (TableSums.of(fused.table, config.strata) if sample is None else sample.summary).arrays()
         if sample is not None and tile is None:
-            seen = None if observations is None else observations.sample()
-            analysis = analyse_sample(live.task, config, sample, seen)
+            analysis = analyse_sample(live.task, config, sample, observations)
         trim_malloc(least=SMALL)
     with watch("write"):
         files, returned = written(work.start, _savers(live, stream, fused, observations, sample, analysis))
@@ -135,7 +134,7 @@ def _left(live: LiveMap, table: VoxelTable, events: Events | None = None) -> tup
     return table.rows(keep), None if events is None else events.rows(keep)
 
 
-def analyse_sample(task: Task, config: Config, sample: MapSample, observations: ObservationSample | None) -> Analysis:
+def analyse_sample(task: Task, config: Config, sample: MapSample, observations: CellObservations | None) -> Analysis:
     """Return the statistics of a map; its true labels are right, and bound how far geometry lets labels agree."""
     return analyse(
         sample, observations, name=task.backbone, edges=config.strata, critical=config.critical_classes,
@@ -251,7 +250,7 @@ def _savers(
     if work.image_space and stream.overview:
         savers[f"{OVERVIEW}/{slug(unit.scene, unit.backbone)}.npz"] = partial(_save_overview, stream)
     if tile is not None and observations is not None:
-        savers[f"{tile.folder}/{tile.size}_{OBSERVATIONS}"] = observations.save
+        savers[f"{tile.folder}/{tile.size}_{TILE_OBSERVATIONS}"] = observations.save
     if tile is None and work.kept:
         savers |= unit_savers(live.task, live.rows, observations, analysis)
     if fused is None or not len(fused.table):
@@ -282,9 +281,9 @@ def unit_savers(task: Task, rows: Series, observations: CellObservations | None,
     slug = task.units[0].slug
     savers: Savers = {f"{FRAMES}/{slug}.csv": partial(rows.save_csv, names=task.scene.frame_name)}
     if observations is not None:
-        savers[f"{LOOKS}/{slug}.parquet"] = observations.save
+        savers[f"{OBSERVATIONS}/{slug}.parquet"] = observations.save
     if analysis is not None:
-        savers[f"{INFLUENCE}/{slug}.parquet"] = analysis.sums.save
+        savers[f"{SUMS}/{slug}.parquet"] = analysis.sums.save
     return savers
 
 

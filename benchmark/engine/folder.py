@@ -29,9 +29,9 @@ from semstab.model.measures import measures
 from semstab.model.records import (
     EVENTS,
     FRAMES,
-    INFLUENCE,
-    LOOKS,
+    OBSERVATIONS,
     OVERVIEW,
+    SUMS,
     TRUTH,
     UNITS,
     VOXELS,
@@ -52,7 +52,7 @@ EARLIER_LAYOUT = "# semstab, folder layout 3"
 
 SETTINGS = "config.yaml"
 FAILURES = "failures.log"
-WRITTEN = (UNITS, VOXELS, TRUTH, EVENTS, LOOKS, FRAMES, INFLUENCE, OVERVIEW, TILES, "tables", "figures")
+WRITTEN = (UNITS, VOXELS, TRUTH, EVENTS, OBSERVATIONS, FRAMES, SUMS, OVERVIEW, TILES, "tables", "figures")
 """Folders into which files are written."""
 
 
@@ -208,7 +208,7 @@ class Folder:
         voxels = _in_tiles(unit, content) or [f"{VOXELS}/{unit.slug}.parquet"]
         wanted = [*voxels, f"{FRAMES}/{unit.slug}.csv"] if planned.kept else []
         if planned.kept and planned.judged:
-            wanted.append(f"{INFLUENCE}/{unit.slug}.parquet")
+            wanted.append(f"{SUMS}/{unit.slug}.parquet")
         if planned.kept and planned.config.events and keeps_log(planned.unit.backend):
             wanted += _in_tiles(unit, content, EVENTS) or [f"{EVENTS}/{unit.slug}.parquet"]
         return wanted + ([f"{OVERVIEW}/{slug(unit.scene, unit.backbone)}.npz"] if planned.image_space else [])

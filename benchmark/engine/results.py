@@ -126,15 +126,16 @@ def _comparisons(config: Config, records: Sequence[Record], tables: Tables) -> I
     for scene in dict.fromkeys(record.unit.scene for record in base):
         there = [record for record in base if record.unit.scene == scene]
         if len(there) > 1:
-            files = {record.unit.backbone: record.looks_file for record in there}
+            files = {record.unit.backbone: record.observations_file for record in there}
             loaded = {name: CellObservations.load(file) for name, file in files.items() if file and file.exists()}
             regions, observations = _regions_of(there, config, tables), loaded if len(loaded) == len(there) else None
-            if (compared := _compared_maps(scene, regions, observations)) is not None:
+            mixed = len({record.summary.reduced is None for record in there}) > 1
+            if (compared := _compared_maps(scene, regions, observations, mixed=mixed)) is not None:
                 yield compared
 
 
 def _compared_maps(
-    scene: str, regions: Regions, observations: Mapping[str, CellObservations] | None
+    scene: str, regions: Regions, observations: Mapping[str, CellObservations] | None, *, mixed: bool
 ) -> BackboneComparison | None:
     """Return the comparison of a scene's maps; None where there are not two or more of them in one label space.
 
@@ -145,8 +146,9 @@ def _compared_maps(
     if len(first.tables) < 2 or len(classes) > 1:
         return None
     if first.truth is not None and first.truth.classes not in classes:
-        return _compared_maps(scene, lambda: (dataclasses.replace(own, truth=None) for own in regions()), observations)
-    return compare_regions(regions, looks=observations, scene=scene)
+        without = lambda: (dataclasses.replace(own, truth=None) for own in regions())  # noqa: E731
+        return _compared_maps(scene, without, observations, mixed=mixed)
+    return compare_regions(regions, observations=observations, mixed=mixed, scene=scene)
 
 
 def _regions_of(there: Sequence[Record], config: Config, tables: Tables) -> Regions:

@@ -92,7 +92,7 @@ class LiveMap:
             if work.sampled:
                 live.reference = NumpySample(config.voxel_size, K, work.within)
         if work.judged and work.measures_images:
-            live.sampler = Sampler(config.voxel_size, K)
+            live.sampler = Sampler(K)
             if work.image_space and not config.frame_quality:
                 live.sizes = SizeSample(task, config)  # filters share the sizes of what they are put over
         return live
@@ -152,7 +152,7 @@ class LiveMap:
         """Return what was sampled, without the locations that are left out."""
         if self.sampler is None:
             return None
-        return self.sampler.looks(self.task.mapping.target.classes).without(self.left_out)
+        return self.sampler.sample(self.task.mapping.target.classes).without(self.left_out)
 
 
 def new_map(config: Config, num_classes: int, within: Extent | None = None, *, log: bool = True) -> FusionBackend:

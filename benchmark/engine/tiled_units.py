@@ -22,7 +22,7 @@ from semstab.engine.finish import (
     written,
 )
 from semstab.engine.folder import Folder, unit_key
-from semstab.engine.tiles import OBSERVATIONS, TileResult, joined_series
+from semstab.engine.tiles import TILE_OBSERVATIONS, TileResult, joined_series
 from semstab.engine.units import PlannedUnit
 from semstab.engine.work import Job, Outcome, Start, TileTask, Work, failed
 from semstab.errors import SemstabError
@@ -154,12 +154,12 @@ def assembled(
     if sums is None or not sums.total[2]:
         raise no_voxels(task, config)
     rows = joined_series(frames.series, [tile.series for tile in tiles])
-    seen = folder / tasks[0].folder / f"{tasks[0].size}_{OBSERVATIONS}"
+    seen = folder / tasks[0].folder / f"{tasks[0].size}_{TILE_OBSERVATIONS}"
     observations = CellObservations.load(seen) if seen.exists() else None
     analysis = None
     if sample is not None:  # sums in the order of the tiles, not in that of their ends
         sample = dataclasses.replace(sample, summary=sums)
-        analysis = analyse_sample(task, config, sample, None if observations is None else observations.sample())
+        analysis = analyse_sample(task, config, sample, observations)
     files = {name: digest for each in (frames, *tiles) for name, digest in each.files.items()}
     files = {name: digest for name, digest in files.items() if not name.startswith(tasks[0].folder)}
     if planned.kept:

@@ -21,7 +21,7 @@ from semstab.model.frames import Frame
 from semstab.model.records import FrameQuality
 from semstab.model.results import Agreement, SizeAlpha
 
-OBSERVATIONS = "observations.parquet"
+TILE_OBSERVATIONS = "observations.parquet"
 """File of the sample of observations of all frames."""
 
 MOST_TILES = 1 << 16

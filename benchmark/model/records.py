@@ -26,13 +26,13 @@ if TYPE_CHECKING:
 
 UNITS, VOXELS, TRUTH, EVENTS, FRAMES, OVERVIEW = "units", "voxels", "truth", "events", "frames", "overview"
 OBSERVATIONS, SUMS = "observations", "sums"
-SUMS_0_4 = "influence"
-"""Folder of the sums in runs before 0.4."""
-
 """Folders of what is kept of units: what their numbers are; the voxel tables SCENE__BACKBONE__BACKEND.parquet; those of
 the ground truth of the same frames; logs of observations; time series; and the frames that figures show,
 SCENE__BACKBONE.npz with the arrays frame (its index), labels (H, W) rows 0..K-1 or the ignore id, palette (K, 3) and,
-where the dataset has it, color (H, W, 3). Beside them sums by frame and cube of space, `InfluenceSums`."""
+where the dataset has it, color (H, W, 3). Beside them sums by frame and cube of space, `ClusterSums`."""
+
+SUMS_BEFORE = "influence"
+"""Folder of the sums in runs before 0.4."""
 
 REGIONS = "region_maps"
 """The name, not of a sweep, for the label sources that hold regions without classes."""
@@ -182,9 +182,10 @@ class Record:
         return self._beside(EVENTS, "" if self.in_tiles else ".parquet")
 
     @property
-    def influence_file(self) -> Path | None:
+    def sums_file(self) -> Path | None:
         """File of its sums by frame and cube of space, which is there where its map was judged."""
-        return self._beside(INFLUENCE)
+        new = self._beside(SUMS)
+        return new if new is None or new.exists() else self._beside(SUMS_BEFORE)
 
     def _beside(self, folder: str, suffix: str = ".parquet") -> Path | None:
         return None if self.voxels_file is None else self.voxels_file.parents[1] / folder / f"{self.unit.slug}{suffix}"

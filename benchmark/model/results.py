@@ -199,12 +199,12 @@ class ReducedScores:
 
     Attributes:
         vss, recurrent_vss: Over all voxels, and over those with OP >= 3.
-        alpha: Krippendorff's, of the voxels with OP >= 2.
+        voxel_alpha: Krippendorff's alpha of the voxels with OP >= 2.
     """
 
     vss: float
     recurrent_vss: float
-    alpha: float
+    voxel_alpha: float
 
 
 @dataclass(frozen=True)
@@ -240,7 +240,7 @@ class SizeAlpha:
 
     voxel_size: float
     frames: int
-    alpha: float
+    voxel_alpha: float
 
 
 @dataclass(frozen=True)

@@ -24,8 +24,8 @@ from semstab.model.measures import SBD, VSS, mean
 from semstab.model.voxels import VoxelTable, index_columns
 from semstab.online.frames import as_array
 from semstab.online.summary import Summary
-from semstab.statistics import CellObservations, MapSample, Sampler, Views, analyse, krippendorff_alpha, psa
-from semstab.statistics.accumulate import cluster_sums_of
+from semstab.statistics import CellObservations, MapSample, Sampler, Views, analyse, psa
+from semstab.statistics.accumulate import sums_of_cells
 from semstab.statistics.cluster_sums import value
 from semstab.statistics.sampler import BUDGET
 
@@ -40,7 +40,7 @@ class State:
     """What a process saw of a sequence; states of several processes are added.
 
     updates  (n,) how often the belief of each voxel was moved by a further frame
-    cells    the sampled observations from which the ceiling follows; None where it is not wanted
+    cells    the sampled observations from which alpha follows; None where it is not wanted
     one_in   of so many voxels the table holds one
     """
 
@@ -74,17 +74,15 @@ class State:
         """Return the numbers of `Summary.NAMES`: what `summary` has too, without intervals."""
         table = self._table()
         whole, sample = summarise(table), MapSample.draw(table).table.measured()
-        share = math.nan
+        alpha = math.nan
         if self.cells is not None and len(self.cells):
-            seen = self.cells.sample()
-            share = value(cluster_sums_of(seen.seen.table(), sample=seen), "reached")
-        numbers = mean(psa(sample)), krippendorff_alpha(sample), share, self._flicker, whole.recurrent.share
-        return dict(zip(Summary.NAMES, map(float, (whole.recurrent[VSS], whole[SBD], *numbers)), strict=True))
+            alpha = min(value(sums_of_cells(self.cells), "alpha"), 1.0)
+        numbers = alpha, whole.recurrent[VSS], whole[SBD], mean(psa(sample)), self._flicker, whole.recurrent.share
+        return dict(zip(Summary.NAMES, map(float, numbers), strict=True))
 
     def summary(self) -> Summary:
         """Return what a run says of these frames."""
-        cells = None if self.cells is None else self.cells.sample()
-        analysis = analyse(MapSample.draw(self._table()), cells)
+        analysis = analyse(MapSample.draw(self._table()), self.cells)
         return Summary.of(self.frames, analysis.table, analysis.summary, self._flicker)
 
     def _table(self) -> VoxelTable:
@@ -143,7 +141,7 @@ class _Map:
         table = self._backend.table()
         if self._one_in > 1:
             table = table.rows(in_sample(table.index.T, self._one_in))
-        cells = None if self._sampler is None else self._sampler.looks()
+        cells = None if self._sampler is None else self._sampler.sample()
         flicker = self._flicker, self._pairs
         return State(self._frames, table, table.op.astype(np.int64) - 1, cells, flicker, self._one_in)
 
@@ -155,7 +153,7 @@ class TemporalStability:
     voxel_size    metres
     ignore_index  the label of pixels without one
     soft          fuse scores as they are; else the likeliest class of each pixel, as of label maps on disk
-    ceiling       also what part of the alpha is reached that geometry allows: a third of the time of an update
+    alpha         also sample the cells from which alpha, and a verdict, follow: a third of the time of an update
     max_voxels    of a sequence; a larger map is sampled at random, and its memory stays bounded
     backend       that fuses
 
@@ -175,7 +173,7 @@ class TemporalStability:
     """
 
     higher_is_better = True
-    """Of alpha, VSS, PSA and the share of the ceiling; SBD and flicker are better where they are low."""
+    """Of alpha, VSS and PSA; SBD and flicker are better where they are low."""
 
     def __init__(
         self,
@@ -184,7 +182,7 @@ class TemporalStability:
         *,
         ignore_index: int | None = IGNORE_8BIT,
         soft: bool = False,
-        ceiling: bool = True,
+        alpha: bool = True,
         max_voxels: int = MOST_VOXELS,
         backend: str = "numba",
     ) -> None:
@@ -194,7 +192,7 @@ class TemporalStability:
             raise ConfigError(f"max_voxels = {max_voxels}: use 1 or more")
         create(backend, voxel_size=voxel_size, num_classes=num_classes)
         self.num_classes, self.voxel_size, self.ignore_index, self.soft = num_classes, voxel_size, ignore_index, soft
-        self.ceiling, self.max_voxels, self.backend = ceiling, max_voxels, backend
+        self.alpha, self.max_voxels, self.backend = alpha, max_voxels, backend
         self._maps: dict[str, _Map] = {}
         self._merged: dict[str, State] = {}
 
@@ -223,7 +221,7 @@ class TemporalStability:
             self._maps[name].add(frame)
 
     def compute(self) -> dict[str, float]:
-        """Return vss@3, sbd (bits), psa, alpha, ceiling_share, flicker (percent) and op3_share, means over sequences.
+        """Return alpha, vss@3, sbd (bits), psa, flicker (percent) and op3_share, means over sequences.
 
         The same as a run says of these frames; NaN where undefined, as before the first update.
         """
@@ -249,7 +247,7 @@ class TemporalStability:
 
     def _new_map(self) -> _Map:
         backend = create(self.backend, voxel_size=self.voxel_size, num_classes=self.num_classes)
-        sampler = Sampler(self.voxel_size, self.num_classes) if self.ceiling else None
+        sampler = Sampler(self.num_classes) if self.alpha else None
         return _Map(backend, self.voxel_size, sampler, self.max_voxels)
 
     def _frames(
@@ -353,13 +351,15 @@ def _added(a: VoxelTable, b: VoxelTable, updates_a: Int64, updates_b: Int64) -> 
 
 
 def _joined(a: CellObservations, b: CellObservations) -> CellObservations:
-    """What both sampled, of the voxels that are in both samples; frames are numbered anew."""
-    share = min(a.share, b.share)
+    """What both sampled, of the blocks that are in both samples; frames are numbered anew."""
+    size, share = max(a.cell_size, b.cell_size), min(a.share, b.share)
     later = dataclasses.replace(b, view=b.view + np.int32(len(a.views)))
     views = Views.joined([a.views, b.views])
     views = dataclasses.replace(views, frame=np.arange(len(views)))
-    both = CellObservations.joined([each.only(each.drawn < share) for each in (a, later)])
+    both = CellObservations.joined(
+        [each.only(each.drawn < share) for each in (a.coarsened(size), later.coarsened(size))]
+    )
     while len(both) > BUDGET:
         share //= 2
         both = both.only(both.drawn < share)
-    return dataclasses.replace(both, views=views, share=share, soft=a.soft or b.soft)
+    return dataclasses.replace(both, views=views, share=share, frames=a.frames + b.frames)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -15,24 +14,29 @@ from semstab.model.statistics import MapStatistics
 class Summary:
     """The numbers of one map; NaN where undefined.
 
-    vss3, sbd, entropy    the paper's: VSS of the voxels with OP >= 3, SBD in bits of those with OP >= 2, entropy of all
-    psa, alpha            pairwise agreement of frames and Krippendorff's alpha, of the voxels with OP >= 2
-    ceiling_share         what part of the alpha that geometry allows between frames is reached, 0 to 1
-    flicker               percent of the co-visible pixels whose label changes from frame to frame, motion compensated
-    op3_share             part of the voxels with OP >= 3, 0 to 1
-    verdict, probability  the level, and how probable it is that it is right
+    Attributes:
+        frames: Frames that were fused.
+        voxels: Voxels of the map.
+        alpha: Agreement of two views at the same spot beyond chance, at most 1: the number that the verdict rests on.
+        vss3: The paper's VSS, of the voxels with OP >= 3.
+        sbd: The paper's SBD in bits, of the voxels with OP >= 2.
+        entropy: The paper's entropy, of all voxels.
+        psa: Probability that two frames agree, of the voxels with OP >= 2.
+        flicker: Percent of the co-visible pixels whose label changes from frame to frame, motion compensated.
+        op3_share: Share of the voxels with OP >= 3, 0 to 1.
+        verdict: The level.
+        probability: Probability that the level is right.
     """
 
-    NAMES: ClassVar = ("vss@3", "sbd", "psa", "alpha", "ceiling_share", "flicker", "op3_share")
+    NAMES: ClassVar = ("alpha", "vss@3", "sbd", "psa", "flicker", "op3_share")
 
     frames: int
     voxels: int
+    alpha: float
     vss3: float
     sbd: float
     entropy: float
     psa: float
-    alpha: float
-    ceiling_share: float
     flicker: float
     op3_share: float
     verdict: str
@@ -40,17 +44,16 @@ class Summary:
 
     @classmethod
     def of(cls, frames: int, table: TableSummary, statistics: MapStatistics, flicker: float) -> Summary:
-        """From what a run says of a map."""
-        share, agreement, verdict = statistics.ceiling_share, statistics.agreement, statistics.verdict
+        """Return the summary of a map's statistics."""
+        verdict = statistics.verdict
         return cls(
             frames=frames,
             voxels=table.voxels,
+            alpha=statistics.headline.alpha.value,
             vss3=float(table.recurrent[VSS]),
             sbd=float(table[SBD]),
             entropy=float(table[ENTROPY]),
-            psa=agreement.psa.value,
-            alpha=agreement.alpha.value,
-            ceiling_share=math.nan if share is None else share.share.value,
+            psa=statistics.agreement.psa.value,
             flicker=flicker,
             op3_share=table.recurrent.share,
             verdict=verdict.level,
@@ -58,6 +61,6 @@ class Summary:
         )
 
     def scalars(self) -> dict[str, float]:
-        """Those that are logged every epoch, by name."""
-        numbers = self.vss3, self.sbd, self.psa, self.alpha, self.ceiling_share, self.flicker, self.op3_share
+        """Return the numbers that are logged every epoch, by name."""
+        numbers = self.alpha, self.vss3, self.sbd, self.psa, self.flicker, self.op3_share
         return dict(zip(self.NAMES, numbers, strict=True))

@@ -88,7 +88,7 @@ def pooled(records: Sequence[Record]) -> Pooled:
         well_seen=tuple(split_last(tables)),
         fuse_ms_per_frame=macro_mean([record.summary.fuse_ms_per_frame for record in records]),
         psa=_estimate(records, lambda found: found.agreement.psa),
-        alpha=_estimate(records, lambda found: found.agreement.alpha),
+        alpha=_estimate(records, lambda found: found.headline.alpha),
         drift=_estimate(records, lambda found: found.drift.sbd if found.order_known else UNDEFINED),
         drift_null=_macro(records, lambda found: found.drift.null if found.order_known else UNDEFINED),
     )

@@ -7,15 +7,15 @@ from collections.abc import Iterator, Mapping, Sequence
 
 from semstab.datasets import GROUND_TRUTH
 from semstab.metrics import macro_mean
+from semstab.model.contrast import PairedDifference
 from semstab.model.measures import VSS
 from semstab.model.records import Record, Result
 from semstab.model.results import UnitSummary, VoxelAdvice
 from semstab.model.statistics import Interval
 from semstab.report.averages import ENOUGH, by_backbone, pooled
 from semstab.report.tables.stability import comparable
-from semstab.statistics.agreement import ALPHA_BETWEEN
-from semstab.statistics.cluster_sums import ClusterSums
-from semstab.statistics.intervals import difference, mean_of
+from semstab.statistics.agreement import ALPHA
+from semstab.statistics.intervals import mean_of
 from semstab.statistics.verdict import LIMITS
 
 MOSTLY_ONCE = 0.5
@@ -59,7 +59,7 @@ def warnings(result: Result) -> Iterator[str]:
         names = ", ".join(dict.fromkeys(record.unit.backbone for record in stable))
         yield f"stable says that frames of {names} agree, not that they are right: no ground truth was compared"
     if mixed(runs):
-        yield "labels and soft scores do not compare by VSS, entropy or alpha: semstab-bench show RUN reduced"
+        yield "labels and soft scores do not compare by VSS, entropy or voxel alpha: semstab-bench show RUN reduced"
     for record in result.select():
         yield from (f"{_name(record.summary, result)}: {text}" for text in _suspicions(record))
     largest = {max(run.table.classes, key=lambda row: row.voxels).name for run in runs if _one_class(run)}
@@ -84,8 +84,9 @@ def _suspicions(record: Record) -> Iterator[str]:
     found, recall = record.statistics, record.image_space.edge_recall
     if found is None or found.verdict.level not in ("stable", "usable"):
         return
-    if found.labelled < LIMITS.labelled:
-        yield f"{1 - found.labelled:.0%} of the locations have no label in most frames; what is left out cannot flicker"
+    if found.cells is not None and found.cells.labelled < LIMITS.labelled:
+        missing = f"{1 - found.cells.labelled:.0%} of the locations have no label in most frames"
+        yield f"{missing}; what is left out cannot flicker"
     if recall < LEAST_RECALL and record.unit.backbone != GROUND_TRUTH:
         yield (
             f"only {recall:.0%} of the edges of depth have a border of labels near them: are labels coarse, blurred, or"
@@ -134,28 +135,27 @@ def notes(result: Result) -> Iterator[str]:
 
 
 def differences(result: Result) -> Iterator[str]:
-    """Which models are more or less stable than the first, by alpha between frames, for the same scene flown again."""
-    records = [record for record in result.select() if record.unit.backbone != GROUND_TRUTH]
-    first, *others = by_backbone(records).items() if records else [("", [])]
-    for name, own in others:
-        pairs = [(a, b) for a in own for b in first[1] if a.unit.scene == b.unit.scene]
-        found = [_less(a, b) for a, b in pairs if not mixed([a.summary, b.summary])]
-        if known := [each for each in found if each is not None and not math.isnan(each.low)]:
+    """Say which models are more or less stable than the first, by alpha of the observations that both made."""
+    first, *others = by_backbone([r for r in result.select() if r.unit.backbone != GROUND_TRUTH]) or [""]
+    for name in others:
+        rows = [_less(name, first, row) for found in result.comparisons for row in found.paired.differences]
+        if known := [each for each in rows if each is not None]:
             change = mean_of(known)
-            low, high = sorted((change.low, change.high))
-            told = "more stable than" if low > 0 else "less stable than" if high < 0 else "not told apart from"
-            ends = f"{low:+.2f} to {high:+.2f}".replace("0.", ".")
+            told = "does not differ significantly from"
+            if change.decided and not change.low <= 0 <= change.high:
+                told = "is more stable than" if change.low > 0 else "is less stable than"
+            ends = f"{change.low:+.2f} to {change.high:+.2f}".replace("0.", ".")
             scenes = f", {len(known)} scenes" if len(known) > 1 else ""
-            yield f"{name} is {told} {first[0]}: alpha {change.value:+.2f} ({ends}){scenes}"
+            yield f"{name} {told} {first}: alpha {change.value:+.2f} ({ends}){scenes}"
 
 
-def _less(record: Record, other: Record) -> Interval | None:
-    """The difference of alpha between frames, on the cubes of space and frames that both have; None where unknown."""
-    files = record.influence_file, other.influence_file
-    if any(file is None or not file.is_file() for file in files):
+def _less(name: str, first: str, row: PairedDifference) -> Interval | None:
+    """Alpha of a model less that of the first, where a row of a comparison has it; None otherwise."""
+    if row.measure != ALPHA.key or {row.a, row.b} != {name, first} or math.isnan(row.difference.low):
         return None
-    a, b = (ClusterSums.load(file) for file in files if file is not None)
-    return difference(a.without_truth(), b.without_truth(), ALPHA_BETWEEN.key)
+    own, sign = row.difference, 1.0 if row.a == name else -1.0
+    low, high = sorted((sign * own.low, sign * own.high))
+    return Interval(sign * own.value, low, high, undecided=row.undecided)
 
 
 def _ranking(result: Result) -> Iterator[str]:

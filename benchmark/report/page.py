@@ -27,7 +27,7 @@ from semstab.report.narrative import differences, notes, warnings
 from semstab.report.remedies import advice, of_interest, remedies
 from semstab.report.tables import tables
 from semstab.report.tables.table import relations
-from semstab.report.terminal import class_alphas, miou
+from semstab.report.terminal import miou
 from semstab.statistics.verdict import LIMITS
 
 MOST_NAMED = 3
@@ -127,15 +127,9 @@ def _numbers(
         digits = 2 if scale == 1.0 else 0
         return f"95 % CI {scale * estimate.low:.{digits}f} to {scale * estimate.high:.{digits}f}"
 
-    shares = [found.ceiling_share for found in judged if found.ceiling_share is not None]
     head = None if one is None else one.headline
-    own = shares[0].share if one is not None and shares else None
-    yield (
-        "alpha between frames",
-        mean([f.headline.alpha_between.value for f in judged], "{:.2f}"),
-        interval(None if head is None else head.alpha_between),
-    )
-    yield "share of its ceiling", mean([s.share.value for s in shares], "{:.0f} %", 100), interval(own, 100)
+    alphas = [found.headline.alpha.value for found in judged]
+    yield "alpha", mean(alphas, "{:.2f}"), interval(None if head is None else head.alpha)
     psa = [found.headline.psa.value for found in judged]
     yield "two frames agree", mean(psa, "{:.0f} %", 100), "of the locations"
     flicker = [record.image_space.compensated_flicker_percent for record in records]
@@ -269,24 +263,18 @@ def _indexed(index: Int64, palette: UInt8) -> str:
 
 
 def _classes(records: Sequence[Record], colors: Mapping[str, int]) -> str:
-    """Each class with its share of the ceiling, or its alpha where no ceiling is known."""
+    """Each class that counts for the verdict, with its alpha."""
     rows: dict[str, list[tuple[int, str, Estimate]]] = {}
-    shares = [r.statistics.ceiling_share for r in records if r.statistics is not None]
-    known = all(shares) and bool(shares)
     for record in records:
         found, name = record.statistics, record.unit.backbone
-        if known and found is not None and found.ceiling_share is not None:
-            for own in found.ceiling_share.classes:
-                if own.counts_for_verdict:
-                    rows.setdefault(own.name, []).append((colors[name], name, own.share))
-        else:
-            for label, alpha in class_alphas([record]).items():
-                rows.setdefault(label, []).append((colors[name], name, Estimate(alpha, math.nan, math.nan)))
+        for own in () if found is None or found.cells is None else found.cells.classes:
+            if own.counts_for_verdict and not math.isnan(own.alpha.value):
+                rows.setdefault(own.name, []).append((colors[name], name, own.alpha))
     if not rows:
         return ""
     ordered = dict(sorted(rows.items(), key=lambda item: min(e.value for _, _, e in item[1])))
     guides = (LIMITS.usable, LIMITS.stable)
-    return dot_chart(ordered, "alpha, share of its ceiling" if known else "alpha of the class", guides)
+    return dot_chart(ordered, "alpha of the class", guides)
 
 
 def _distance(records: Sequence[Record], colors: Mapping[str, int]) -> Iterator[dict[str, str]]:
@@ -307,7 +295,7 @@ def _distance(records: Sequence[Record], colors: Mapping[str, int]) -> Iterator[
                     Line(name, [own.mean for own in bins], [alpha.value for alpha in alphas], ends, colors[name])
                 )
         if lines:
-            yield {"title": title, "chart": line_chart(lines, unit, "alpha between frames", zero=True)}
+            yield {"title": title, "chart": line_chart(lines, unit, "alpha of single cells", zero=True)}
 
 
 # --- All scenes together ----------------------------------------------------------------------------------------------

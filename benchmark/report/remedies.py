@@ -30,7 +30,7 @@ class Remedy:
     filters   '' for the model itself
     flicker   of places seen in two frames in a row, those whose label changes: motion-compensated
     plain     the same at the same pixel, whatever it shows
-    alpha     between frames, of the fused map
+    alpha     as verdicts have it
     better    in how many frames, of how many, the accuracy is above the model's; without truth the next frame's
     """
 
@@ -219,7 +219,7 @@ def _row(records: Sequence[Record], unfiltered: Sequence[Record]) -> Remedy:
         filters=qualities[0].filters,
         flicker=macro_mean([record.image_space.compensated_flicker_percent for record in records]) / 100,
         plain=macro_mean([record.image_space.flicker_percent for record in records]) / 100,
-        alpha=macro_mean([row.alpha_between.value for row in judged]),
+        alpha=macro_mean([row.alpha.value for row in judged]),
         **{
             name: mean(name)
             for name in ("next_frame", "accuracy", "miou", "stable_wrong", "lag", "coverage", "milliseconds")

@@ -111,15 +111,16 @@ def _verdict(run: UnitSummary) -> Iterator[str]:
     """The level, the number that it rests on, and what that number means."""
     found = run.statistics
     assert found is not None
-    level, alpha = found.verdict.level.upper(), found.headline.alpha_between
+    level, alpha = found.verdict.level.upper(), found.headline.alpha
     if found.verdict.level == "no verdict":
         yield from textwrap.wrap(found.verdict.line, WIDTH, initial_indent="  ", subsequent_indent="    ")
         return
-    share = ""
-    if found.ceiling_share is not None and not math.isnan(found.ceiling_share.share.value):
-        share = f", {_percent(found.ceiling_share.share.value)} of its ceiling {found.ceiling_share.ceiling.value:.2f}"
-    yield f"  {level}{_probability(found.verdict)}    alpha {alpha.value:.2f}{_interval(alpha)}{share}"
-    yield f"  act on labels from {_percent(LIMITS.stable)} of the ceiling on, with care from {_percent(LIMITS.usable)}"
+    yield f"  {level}{_probability(found.verdict)}    alpha {alpha.value:.2f}{_interval(alpha)}"
+    if found.verdict.level == "uninformative" and found.cells is not None:
+        share, name = _percent(found.cells.largest_share), found.cells.largest_class
+        yield f"  {share} of the observations are {name}: agreement says nothing about such a map"
+    else:
+        yield f"  act on labels from alpha {_short(LIMITS.stable)} on, with care from {_short(LIMITS.usable)}"
     psa = found.headline.psa.value
     yield f"  two frames see the same class at {_percent(psa)} of the locations"
     wrong = found.headline.wrong_of_stable
@@ -200,9 +201,9 @@ def _cells(record: Record) -> list[str]:
     level, alpha, agree = "-", "", math.nan
     if found is not None:
         level = f"{found.verdict.level}{_probability(found.verdict)}"
-        agree, between = 100 * found.headline.psa.value, found.headline.alpha_between
-        ends = "" if math.isnan(between.low) else f" ({_short(between.low)} to {_short(between.high)})"
-        alpha = f"{_number(between.value, 2)}{ends}"
+        agree, own = 100 * found.headline.psa.value, found.headline.alpha
+        ends = "" if math.isnan(own.low) else f" ({_short(own.low)} to {_short(own.high)})"
+        alpha = f"{_number(own.value, 2)}{ends}"
     vss, sbd = (run.table.recurrent[m] for m in measures()[:2])
     flicker = record.image_space.compensated_flicker_percent
     numbers = ((agree, 0), (flicker, 1), (vss, 3), (sbd, 4), (100 * miou(record), 1))
@@ -243,14 +244,11 @@ def _classes(records: Sequence[Record]) -> Iterator[str]:
 
 
 def class_alphas(records: Sequence[Record]) -> dict[str, float]:
-    """Krippendorff's alpha of each class, the macro mean over scenes, where it is known."""
+    """Return alpha of each class, the macro mean over scenes, where it is known."""
     found: dict[str, list[float]] = {}
     for statistics in (record.statistics for record in records if record.statistics is not None):
-        share = statistics.ceiling_share
-        between = {} if share is None else {row.name: row.alpha for row in share.classes}
-        for row in statistics.agreement.classes:
-            alpha = between.get(row.name, math.nan) if math.isnan(row.alpha) else row.alpha
-            found.setdefault(row.name, []).append(alpha)
+        for row in () if statistics.cells is None else statistics.cells.classes:
+            found.setdefault(row.name, []).append(row.alpha.value)
     means = {name: macro_mean(values) for name, values in found.items()}
     return {name: alpha for name, alpha in means.items() if not math.isnan(alpha)}
 

@@ -6,14 +6,7 @@ several; docs/metrics.md derives each measure.
 
 from semstab.model.contrast import BackboneComparison
 from semstab.model.statistics import Estimate, Reliability
-from semstab.statistics.agreement import (
-    class_agreement,
-    decompose,
-    disagreement,
-    fleiss_kappa,
-    krippendorff_alpha,
-    psa,
-)
+from semstab.statistics.agreement import class_agreement, decompose, disagreement, fleiss_kappa, krippendorff_alpha, psa
 from semstab.statistics.correctness import correctness, join_truth, quadrants, reliability, stable_wrong
 from semstab.statistics.correlogram import correlogram
 from semstab.statistics.description import Analysis, analyse, describe

@@ -440,8 +440,9 @@ FUNCTIONALS: Mapping[str, Functional] = {
     "miou": Functional(("known", "known", "class_right", "class_known", "class_predicted"), miou_of, scale="plain"),
     "ece": Functional(("judged", "judged", "gap"), ece_of, scale="plain"),
 }
-"""By key: alpha, of cells that two views saw or more; PSA, Krippendorff's alpha of voxels and entropy at OP >= 2, VSS at OP >= 3, SBD less that in random order where that is known; with ground truth the accuracy of the fused
-labels at OP >= 2 and of single looks, the wrong among the stable places at OP >= 3, mean intersection over union and
+"""By key: alpha, of cells that two views saw or more; PSA, Krippendorff's alpha of voxels and entropy at OP >= 2, VSS
+at OP >= 3, SBD less that in random order where that is known; with ground truth the accuracy of the fused labels at
+OP >= 2 and of single observations, the wrong among the stable locations at OP >= 3, mean intersection over union and
 expected calibration error at OP >= 2."""
 
 BY_CLASS: Mapping[str, Functional] = {

@@ -150,7 +150,8 @@ def analyse(
 ) -> Analysis:
     """Return all statistics of one map; the same seed gives the same numbers.
 
-    cells     labels of sampled cells, taken of the same frames by a `Sampler`; without them there is no alpha, and no verdict
+    cells     labels of sampled cells, taken of the same frames by a `Sampler`; without them there is no alpha and no
+              verdict
     limit     the map of view-independent labels; the ground truth's where it is not given
     name      of the backbone, for the verdict
     edges     upper bounds of the strata of OP

@@ -141,7 +141,10 @@ def identical(a: ClusterSums, b: ClusterSums, key: str, k: int | None = None) ->
     for pair in zip(one, other, strict=True):
         columns = [columns_of(part, key, k) for part in pair]
         rows = [own.any(axis=1) for own in columns]
-        same = [(own[where], part.cell[where], part.frame[where]) for own, where, part in zip(columns, rows, pair, strict=True)]
+        same = [
+            (own[where], part.cell[where], part.frame[where])
+            for own, where, part in zip(columns, rows, pair, strict=True)
+        ]
         if not all(np.array_equal(x, y, equal_nan=True) for x, y in zip(*same, strict=True)):
             return False
     return True

@@ -121,7 +121,9 @@ def paired(
     of_cells = cells or {}
     values: dict[str, dict[str, Estimate]] = {}
     if of_cells:
-        values[ALPHA.key] = {name: estimate(sums, ALPHA.key, scope=scope_of(sums)).ends for name, sums in of_cells.items()}
+        values[ALPHA.key] = {
+            name: estimate(sums, ALPHA.key, scope=scope_of(sums)).ends for name, sums in of_cells.items()
+        }
     for measure, statistic in statistics.items():
         own = columns[measure]
         values[measure.key] = {
@@ -155,7 +157,8 @@ def _by_cube(cells: Mapping[str, ClusterSums]) -> dict[str, Float64]:
 def _alpha_of_cells(sums: Float64) -> Float64:
     """Alpha (...,) from sums (..., 2 C) of fine cells and of coarse ones."""
     parts = zip(CELLS, np.split(sums, 2, axis=-1), strict=True)
-    return np.sum([weight * alpha_of(own) for (_, weight), own in parts], axis=0)
+    alpha: Float64 = np.sum([weight * alpha_of(own) for (_, weight), own in parts], axis=0)
+    return alpha
 
 
 def _columns(
@@ -163,7 +166,9 @@ def _columns(
 ) -> tuple[dict[Quantity, dict[str, Float64]], dict[Quantity, Statistic]]:
     """By measure of voxels: each backbone's columns on the common ones, and what makes the measure of their sums."""
     quantities = [quantity for quantity in compared(truth=truth is not None) if quantity is not ALPHA]
-    statistics = {quantity: alpha_of if quantity is VOXEL_ALPHA else ratio_of for quantity in quantities}
+    statistics: dict[Quantity, Statistic] = {
+        quantity: alpha_of if quantity is VOXEL_ALPHA else ratio_of for quantity in quantities
+    }
     columns: dict[Quantity, dict[str, Float64]] = {measure: {} for measure in statistics}
     for measure, values in voxelwise().items():
         own = [values(table)[r] for table, r in zip(tables.values(), rows, strict=True)]
@@ -233,8 +238,8 @@ def compare_backbones(
 
     coverage      what each map holds
     standardised  means at a common distribution of OP, each map with all its voxels; none of labels beside scores
-    paired        values, differences and rankings: alpha of the observations that all made, with the same weights, where
-                  there are samples of them (`Sampler`); other measures on the voxels that all saw twice or more
+    paired        values, differences and rankings: alpha of the observations that all made, with the same weights,
+                  where there are samples of them (`Sampler`); other measures on the voxels that all saw twice or more
     observations  what these are, and what the order owes to what was left out; None without samples
     Raises ConfigError for fewer than two maps, DataError where they differ in K or voxel size.
     """
@@ -305,7 +310,7 @@ def in_share(table: VoxelTable, share: float) -> Mask:
 
 
 def common_voxels(regions: Regions) -> Region:
-    """Return the voxels that every map saw twice or more, with their logs and the ground truth; of very many a sample."""
+    """Return the voxels that every map saw twice or more, with logs and ground truth; of very many a sample."""
     count = sum(len(repeated_rows(region.tables)[0]) for region in regions())
     share, parts = share_of(count), list[Region]()
     for region in regions():
@@ -319,11 +324,11 @@ def common_voxels(regions: Regions) -> Region:
         true = None if truth is None else truth.rows(shared_rows(truth, first)[0])
         parts.append(Region(tables, logs or None, true))
     tables = {name: VoxelTable.joined([own.tables[name] for own in parts]) for name in parts[0].tables}
-    logs = [own.events for own in parts if own.events is not None]
+    events = [own.events for own in parts if own.events is not None]
     truths = [own.truth for own in parts if own.truth is not None]
     return Region(
         tables,
-        {name: Events.joined([own[name] for own in logs]) for name in tables} if logs else None,
+        {name: Events.joined([own[name] for own in events]) for name in tables} if events else None,
         VoxelTable.joined(truths) if truths else None,
         share,
     )

@@ -141,7 +141,8 @@ class CellObservations:
     """Labels of the pixels of sampled cells, view by view: an entry (m,) for each cell, view and class.
 
     Cells are cubes about as wide as a pixel's footprint, so that what two views say of one cell is what they say of the
-    same spot; they do not depend on the voxels of a map. CELLS cells along each edge make a block, the unit of sampling.
+    same spot; they do not depend on the voxels of a map. A block of CELLS cells
+    along each edge is the unit of sampling.
 
     Attributes:
         key: (m,) int64 of the cell, see `keys_of`.
@@ -188,13 +189,25 @@ class CellObservations:
         footprint = float(np.median(self.views.footprint)) if len(self.views) else self.cell_size
         return int(min(max(2.0 ** math.ceil(math.log2(footprint / self.cell_size)), 1.0), CELLS // 2))
 
+    def coarsened(self, cell_size: float) -> CellObservations:
+        """Return the sample with larger cells, whose edge in metres is a power of 2, and with blocks of these."""
+        from semstab.statistics.loops.observations import hash_row
+
+        if cell_size == self.cell_size or not len(self):
+            return dataclasses.replace(self, cell_size=cell_size)
+        cell = self.cell // round(cell_size / self.cell_size)
+        (key, low), drawn = keys_of(cell), np.empty(len(self), np.uint32)
+        hash_row(*np.ascontiguousarray((cell // CELLS).T.astype(np.int32)), drawn)
+        larger = dataclasses.replace(self, key=key, drawn=drawn, low=low, cell_size=cell_size)
+        return larger.only(drawn < np.uint64(self.share))
+
     def labelled(self) -> CellObservations:
         """Return the entries of pixels that have a label."""
         return self.only(self.label < self.K)
 
     def labelled_share(self) -> float:
         """Return the share of the cells seen by two views that have a label in at least half of their observations."""
-        (coarse, view), of = np.unique(
+        (coarse, _), of = np.unique(
             np.stack([self._number(self.cell // CELLS), self.view]), axis=1, return_inverse=True
         )
         pixels, own = (np.bincount(of.ravel(), w) for w in (self.weight, self.weight * (self.label < self.K)))

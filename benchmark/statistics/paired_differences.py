@@ -24,7 +24,8 @@ from semstab.model.statistics import UNDEFINED, UNKNOWN, Estimate, Interval
 from semstab.model.voxels import VoxelTable
 from semstab.statistics.accumulate import Cubes, CubeSums, cluster_sums_of, sums_of_cells
 from semstab.statistics.agreement import ALPHA, PSA, VOXEL_ALPHA, psa, ratio_of
-from semstab.statistics.cluster_sums import ClusterSums, Statistic, value
+from semstab.statistics.cluster_sums import ClusterSums, Statistic
+from semstab.statistics.cluster_sums import value as value_of
 from semstab.statistics.correctness import ACCURACY, join_truth
 from semstab.statistics.intervals import difference, estimate, scope_of
 from semstab.statistics.observations import CellObservations, Views
@@ -251,11 +252,12 @@ def common_observations(models: Sequence[CellObservations]) -> CommonObservation
     """Return what samples of the same frames have in common.
 
     Raises:
-        DataError: If they differ in K or in the size of cells.
+        DataError: If they differ in K.
     """
-    if len({(sample.K, sample.cell_size) for sample in models}) > 1:
-        raise DataError("samples of other classes or cell sizes cannot be compared; fuse both with the same pixels")
-    models = _of_the_same_blocks([sample.labelled() for sample in models])
+    if len({sample.K for sample in models}) > 1:
+        raise DataError("samples of other classes cannot be compared; fuse both alike")
+    size = max(sample.cell_size for sample in models)
+    models = _of_the_same_blocks([sample.labelled().coarsened(size) for sample in models])
     of, first = _numbered(models)
     pixels = np.stack([np.bincount(own, sample.weight, len(first)) for own, sample in zip(of, models, strict=True)])
     least, most = pixels.min(axis=0), pixels.max(axis=0)
@@ -300,7 +302,7 @@ def _filled(sample: CellObservations, locations: CellObservations, ignored: Floa
 
 
 def psa_bounds(log: Events) -> tuple[float, float]:
-    """Return the least and the largest that the mean PSA can be, whatever observations of the last class would have said.
+    """Return the least and the largest mean PSA, whatever observations of the last class would have said.
 
     Manski (1990, American Economic Review 80): pairs of observations of which one is missing agree never, or always.
     """
@@ -342,7 +344,7 @@ def compared_observations(samples: Mapping[str, CellObservations]) -> SharedObse
     for name, own in shared.items():
         sums[name] = sums_of_cells(own, None if not sums else next(iter(sums.values())).edge)
     ignored = tuple(
-        Ignored(name, missing, *psa_bounds(own.observations()), value(sums_of_cells(own), ALPHA.key))
+        Ignored(name, missing, *psa_bounds(own.observations()), value_of(sums_of_cells(own), ALPHA.key))
         for (name, own), missing in zip(ignoring.items(), both.missing, strict=True)
     )
     first = next(iter(logs.values()))
@@ -352,7 +354,7 @@ def compared_observations(samples: Mapping[str, CellObservations]) -> SharedObse
         cells=len(first.ix),
         observations=len(first),
         ignored=ignored,
-        order=tuple(sorted(names, key=lambda name: -value(sums[name], ALPHA.key))),
+        order=tuple(sorted(names, key=lambda name: -value_of(sums[name], ALPHA.key))),
         order_ignored=tuple(row.backbone for row in sorted(ignored, key=lambda row: -row.alpha)),
         bounded=all(bounds[better][0] >= bounds[worse][1] for better, worse in itertools.pairwise(by_psa)),
     )

@@ -1,7 +1,7 @@
 """A sample of cells, as wide as a pixel's footprint, with the labels that each view gives them.
 
-A cell is in the sample by a hash of the block that holds it, so that all models of a flight sample the same cells. Memory
-is bounded: whenever there are too many entries, every second block is let go.
+A cell is in the sample by a hash of the block that holds it, so that all models of a flight sample the same cells.
+Memory is bounded: whenever there are too many entries, every second block is let go.
 """
 
 from __future__ import annotations
@@ -60,8 +60,8 @@ class Anchor:
 class Sampler:
     """Takes frames one by one, as they are fused; `sample` returns what is there.
 
-    The first frame sets the size of the cells: the power of 2 next above the median footprint of its pixels. Frames that a
-    standing camera takes are one view, and so are frames with the same pose and the same labels.
+    The first frame sets the size of the cells: the power of 2 next above the median footprint of its pixels. Frames
+    that a standing camera takes are one view, and so are frames with the same pose and the same labels.
 
     Args:
         num_classes: K.
@@ -95,7 +95,7 @@ class Sampler:
             self._take(view, *self._drawn(frame, there, labels))
 
     def _view_of(self, frame: Frame, labels: UInt16, depth: float) -> int | None:
-        """Return the view of a frame, a new one where it is none that was there; None where the frame repeats another."""
+        """Return the view of a frame, which may be a new one; None where the frame repeats another."""
         same = self._seen.get(digest := hashlib.blake2b(labels.tobytes(), digest_size=16).digest())
         if same is not None and same.sees_alike(frame):
             return None

@@ -37,8 +37,8 @@ PROBABLE = 0.9
 """A class is named as unstable from this probability on."""
 
 MOST_CHANCE = 0.9
-"""Probability that two observations from anywhere agree from which on a map says almost nothing: of a map with 95 % of one
-class any two agree at 90 % of the spots, whatever the labels are worth."""
+"""Probability that two observations from anywhere agree from which on a map says almost nothing: where 95 % of a map
+are one class, any two agree at 90 % of the spots, whatever the labels are worth."""
 
 DANGEROUS = 0.05
 """Largest share of the stable locations that may be wrong."""

@@ -125,7 +125,9 @@ def _right(rows: Sequence[Correctness]) -> list[float]:
 THIN = 0.1
 """Part of the weight in strata that hardly overlap, from which on the table says it."""
 
-_COMMON = "On the voxels that every backbone saw twice or more, and on looks (a place in a frame) that all labelled."
+_COMMON = (
+    "Alpha is of the observations (a cell in a view) that all labelled, the rest of voxels that all saw twice or more."
+)
 
 
 def comparison(result: Result) -> list[Table]:
@@ -133,8 +135,8 @@ def comparison(result: Result) -> list[Table]:
     if not result.comparisons:
         return []
     covered = coverage_table({found.scene: found.coverage for found in result.comparisons})
-    looks = {found.scene: found.observations for found in result.comparisons if found.observations is not None}
-    return [_differences(result), _ranking(result), covered, *([ignored_table(looks)] if looks else [])]
+    shared = {found.scene: found.observations for found in result.comparisons if found.observations is not None}
+    return [_differences(result), _ranking(result), covered, *([ignored_table(shared)] if shared else [])]
 
 
 def _differences(result: Result) -> Table:
@@ -150,8 +152,6 @@ def _differences(result: Result) -> Table:
         f"{_COMMON} Only the first measure is tested, its p corrected by Holm's method for all pairs of all scenes of"
         f" which something may be claimed; the others describe. {INTERVALS}"
     )
-    if any(found.observations is not None and found.observations.decided for found in result.comparisons):
-        caption += " Labels stand beside scores: each observation is reduced to its largest class."
     groups = tuple(Group(found.scene, _difference_rows(found)) for found in result.comparisons)
     return Table("comparison", "Differences on the same places", caption, columns, groups, "scene")
 
@@ -171,11 +171,11 @@ def _ranking(result: Result) -> Table:
         Column("backbone", "Backbone"),
         Column("range", "95% of resamples"),
         Column("best_percent", "first in (%)", 0),
-        Column("value", "Same looks", 4),
+        Column("value", "In common", 4),
         Column("standardised", "Same OP", 4),
     )
     caption = (
-        f"Same looks: {_COMMON[0].lower()}{_COMMON[1:]} Same OP: each map with all its voxels seen twice or more, its"
+        f"In common: {_COMMON[0].lower()}{_COMMON[1:]} Same OP: each map with all its voxels seen twice or more, its"
         f" strata of OP weighted by those of all maps together. {INTERVALS}"
     )
     thin = max(found.standardised.thin for found in result.comparisons)
@@ -202,22 +202,23 @@ def _ranking_rows(found: BackboneComparison) -> tuple[Row, ...]:
     )
 
 
-def ignored_table(looks: Mapping[str, ComparedObservations]) -> Table:
+def ignored_table(observations: Mapping[str, ComparedObservations]) -> Table:
     """What each backbone left out, by scene."""
     columns = (
         Column("backbone", "Backbone"),
         Column("missing_percent", "left out (%)", 1),
-        Column("psa_low", "at least", 3, over="PSA with these"),
+        Column("psa_low", "at least", 3, over="Agreement with these"),
         Column("psa_high", "at most", 3, over="PSA with these"),
         Column("alpha_ignored", "Alpha, leaving out as a class", 3),
         Column("order", "Order depends on it"),
     )
     caption = (
-        "Of the looks that any backbone labelled, what each left out, in pixels; PSA had these agreed never, or always"
-        " (Manski); alpha between frames where to leave a place out is a class of its own. The order depends on it"
-        " where that alpha, or PSA within its bounds, would order the backbones otherwise."
+        "The share of pixels that a backbone left without a label where another one gives one; the agreement of two"
+        " views in a cell had these pixels agreed never, or always (Manski); alpha by the convention that to leave a"
+        " cell out is a class of its own. The order depends on it where that alpha, or the agreement within its bounds,"
+        " would order the backbones otherwise."
     )
-    groups = tuple(Group(scene, _ignored_rows(found)) for scene, found in looks.items())
+    groups = tuple(Group(scene, _ignored_rows(found)) for scene, found in observations.items())
     return Table("comparison_ignored", "What was left out", caption, columns, groups, "scene")
 
 
@@ -256,15 +257,15 @@ def _coverage_row(row: MapCoverage) -> Row:
     )
 
 
-# Agreement at a stated distance of two looks, and from the nearest to the farthest.
+# Agreement at a stated distance of two observations, and from the nearest to the farthest.
 
 
 def correlogram(result: Result) -> list[Table]:
-    """Alpha between frames where views differ by a stated angle, and for the nearest and the farthest looks."""
+    """Alpha where views differ by a stated angle, and for the nearest and the farthest observations."""
     low, high = STANDARD
     stated = f"{low:g} to {high:g} degrees apart"
     columns = (
-        Column("standard", "found", 3, "higher", over=stated),
+        Column("standard", "alpha", 3, "higher", over=stated),
         Column("standard_pairs", "pairs", 0, over=stated),
         *(Column(f"{axis}_{end}", f"{end}", 3, over=f"By {axis}") for axis in _AXES for end in ("nearest", "farthest")),
     )
@@ -274,13 +275,13 @@ def correlogram(result: Result) -> list[Table]:
         *(_of(_end(axis, last)) for axis in _AXES for last in (0, -1)),
     )
     caption = (
-        "Alpha between frames of pairs of looks at a place, by how far apart they are: models and flights compare at a"
+        "Alpha of pairs of observations of a cell, by how far apart they are: models and flights compare at a"
         " stated angle between the directions of view, not over whatever pairs a flight has. Nearest, farthest: the"
         " first and the last bin with enough pairs in time (frames), angle, ratio of the ranges, and distance of the"
-        " cameras. In sampled voxels; intervals at 95%, for this scene flown again"
+        " cameras. Not extrapolated to cells without a size; intervals at 95%, for this scene flown again"
         f" if {LEAST_FRAMES} frames of a bin tell of it, else for these frames."
     )
-    return by_scene(result, "correlogram", "Agreement by distance of the looks", caption, columns, numbers)
+    return by_scene(result, "correlogram", "Agreement by distance of the observations", caption, columns, numbers)
 
 
 _AXES = ("time", "angle", "range", "baseline")

@@ -24,7 +24,7 @@ from semstab.report.averages import (
     swept,
 )
 from semstab.report.tables.table import Column, Group, Row, Table
-from semstab.statistics.agreement import ALPHA, PSA
+from semstab.statistics.agreement import ALPHA, PSA, VOXEL_ALPHA
 
 VOXELS = Column("voxels", "Voxels", 0)
 SHARE = Column("share_percent", "Voxels (%)", 2)
@@ -254,7 +254,7 @@ def _agreement_table(result: Result, sweep: Sweep) -> Table | None:
     groups = tuple(Group(name, tuple(_agreement_row(sweep, level) for level in rows)) for name, rows in found.items())
     caption = (
         "VSS is pooled over the voxels of all scenes; the rest is of those seen twice or more, macro means of the"
-        " scenes. PSA: share of pairs of frames that agree about a voxel; alpha: Krippendorff's, the same beyond"
+        " scenes. PSA: share of pairs of frames that agree about a voxel; alpha: of two views at the same spot, beyond"
         " chance; SBD excess: SBD less what the same observations give in random order (bits). These three do not"
         " depend on how often a voxel was seen; which voxels were seen twice still changes along the sweep. ± is the"
         " standard deviation over the repeats."
@@ -482,14 +482,15 @@ def reduced(result: Result) -> list[Table]:
         Column("scene", "Scene"),
         Column("vss", VSS.title, VSS.digits[0], VSS.better),
         Column("recurrent_vss", f"{VSS.title}, OP>=3", VSS.digits[0], VSS.better),
-        Column.of(ALPHA),
+        Column.of(VOXEL_ALPHA),
     )
     groups = tuple(
         Group(name, tuple(_reduced_row(record) for record in rows)) for name, rows in by_backbone(records).items()
     )
     caption = (
-        "Hard labels and soft scores do not compare by VSS, entropy or alpha, because scores spread their evidence."
-        " Here scores are reduced to each pixel's likeliest class, and labels are as they are."
+        "Hard labels and soft scores do not compare by VSS, entropy or voxel alpha, because scores spread their"
+        " evidence; alpha is of the likeliest classes. Here scores are reduced to each pixel's likeliest class, and labels are as"
+        " they are."
     )
     return [Table("reduced", "Labels and reduced scores", caption, columns, groups)]
 
@@ -497,8 +498,8 @@ def reduced(result: Result) -> list[Table]:
 def _reduced_row(record: Record) -> Row:
     found, table, statistics = record.summary.reduced, record.summary.table, record.summary.statistics
     if found is not None:
-        return record.unit.scene, found.vss, found.recurrent_vss, found.alpha
-    alpha = math.nan if statistics is None else statistics.agreement.alpha.value
+        return record.unit.scene, found.vss, found.recurrent_vss, found.voxel_alpha
+    alpha = math.nan if statistics is None else statistics.agreement.voxel_alpha.value
     return record.unit.scene, table[VSS], table.recurrent[VSS], alpha
 
 
@@ -507,8 +508,16 @@ def voxel_sizes(result: Result) -> list[Table]:
     groups = tuple(
         Group(name, rows)
         for name, records in by_backbone(result.select()).items()
-        if (rows := tuple((r.unit.scene, s.voxel_size, s.frames, s.alpha) for r in records for s in r.summary.sizes))
+        if (
+            rows := tuple(
+                (r.unit.scene, s.voxel_size, s.frames, s.voxel_alpha) for r in records for s in r.summary.sizes
+            )
+        )
     )
     columns = (Column("scene", "Scene"), Column("voxel_size", "Voxel (m)", 4), Column("frames", "Frames", 0))
     caption = "Krippendorff's alpha of the same frames in voxels of other sizes: how far it depends on that choice."
-    return [Table("voxel_sizes", "Other voxel sizes", caption, (*columns, Column.of(ALPHA)), groups)] if groups else []
+    return (
+        [Table("voxel_sizes", "Other voxel sizes", caption, (*columns, Column.of(VOXEL_ALPHA)), groups)]
+        if groups
+        else []
+    )

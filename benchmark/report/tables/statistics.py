@@ -9,13 +9,13 @@ from typing import TypeVar
 from semstab.metrics import macro_mean
 from semstab.model.measures import ENTROPY, VSS
 from semstab.model.records import Record, Result
-from semstab.model.statistics import UNDEFINED, CeilingShare, DriftStatistics, Estimate, MapStatistics
+from semstab.model.statistics import UNDEFINED, CellAgreement, ClassAlpha, DriftStatistics, Estimate, MapStatistics
 from semstab.report.averages import by_backbone
 from semstab.report.tables.table import Cell, Column, Group, Row, Table
-from semstab.statistics.agreement import ALPHA, KAPPA, PSA
+from semstab.statistics.agreement import ALPHA, KAPPA, PSA, VOXEL_ALPHA
 from semstab.statistics.drift import FLIP_RATE
 from semstab.statistics.intervals import LEAST_FRAMES
-from semstab.statistics.verdict import ADVICE
+from semstab.statistics.verdict import ADVICE, LIMITS
 
 SCENE = Column("scene", "Scene")
 REPEATED = Column("repeated_voxels", "Voxels", 0)
@@ -30,54 +30,54 @@ Number = Callable[[MapStatistics], float | Estimate]
 
 
 def temporal_agreement(result: Result) -> list[Table]:
-    """Do frames agree about a place? Measures that random thinning of the frames does not change."""
+    """Alpha and what it rests on, and agreement at the voxels, which depends on their size."""
     columns = (
+        Column.of(ALPHA),
+        Column("cells", "Cells", 0),
+        Column("views", "Views", 0),
+        Column("labelled_percent", "Labelled (%)", 0, "higher"),
         REPEATED,
-        *map(Column.of, (VSS, PSA, KAPPA, ALPHA)),
+        *map(Column.of, (VSS, PSA, KAPPA, VOXEL_ALPHA)),
         Column("within", "within a frame", 3, "lower", over="Disagreement"),
         Column("between", "between frames", 3, "lower", over="Disagreement"),
-        Column("alpha_between", "found", 3, "higher", over="Alpha between frames"),
-        Column("ceiling", "ceiling", 3, over="Alpha between frames"),
-        Column("reached_percent", "reached (%)", 0, "higher", over="Alpha between frames"),
         Column.of(FLIP_RATE),
     )
     numbers: tuple[Number, ...] = (
+        lambda found: found.headline.alpha.ends,
+        of_cells(lambda cells: cells.cells),
+        of_cells(lambda cells: cells.views),
+        of_cells(lambda cells: 100 * cells.labelled),
         lambda found: found.repeated.voxels,
         lambda found: found.agreement.vss.value,
         lambda found: found.agreement.psa,
         lambda found: found.agreement.kappa.value,
-        lambda found: found.agreement.alpha,
+        lambda found: found.agreement.voxel_alpha,
         lambda found: found.agreement.within.value,
         lambda found: found.agreement.between.value,
-        lambda found: found.agreement.alpha_between.value,
-        reached(lambda reach: reach.ceiling.value),
-        reached(lambda reach: reach.share.percent),
         lambda found: math.nan if found.drift.flips is None else found.drift.flips.rate.value,
     )
     caption = (
-        f"{SEEN_TWICE} PSA: share of pairs of frames that agree about a voxel; kappa (Fleiss) and alpha (Krippendorff):"
-        " the same beyond chance, 1 perfect, 0 chance; disagreement: the parts of 1 - PSA within a frame and between"
-        " frames; alpha between frames: of the latter alone, beside its ceiling, which seeing other parts of"
-        " voxels sets (in sampled voxels); flip rate: share of the steps from one observation to the next"
-        f" at which the predicted class changes. {INTERVALS}"
+        "Alpha: agreement of two views at the same spot beyond chance, 1 perfect, 0 chance, of sampled cells that two"
+        f" views saw, whatever the voxels are. {SEEN_TWICE} PSA: share of pairs of frames that agree about a voxel;"
+        " kappa (Fleiss) and voxel alpha (Krippendorff): the same beyond chance; disagreement: the parts of 1 - PSA"
+        " within a frame and between frames; flip rate: share of the steps from one observation to the next at which the"
+        f" predicted class changes. {INTERVALS}"
     )
     return by_scene(result, "temporal_agreement", "Agreement of the frames", caption, columns, numbers)
 
 
 def class_agreement(result: Result) -> list[Table]:
-    """Alpha of each class against all others, beside its ceiling; macro means over scenes."""
+    """Alpha of each class against all others; macro means over scenes."""
     judged = judged_records(result)
     groups = tuple(Group(name, _class_rows([found for _, found in rows])) for name, rows in judged.items())
     if not any(group.rows for group in groups):
         return []
     columns = (
         Column("observations", "Observations", 0),
-        Column("alpha_between", "found", 3, "higher", over="Alpha between frames"),
-        Column("ceiling", "ceiling", 3, over="Alpha between frames"),
-        Column("reached_percent", "reached (%)", 0, "higher", over="Alpha between frames"),
-        Column("counts_for_verdict", "Judged"),
+        Column.of(ALPHA),
+        Column("counts_for_verdict", "Counts for verdict"),
         Column("unstable_percent", "Unstable (%)", 0, "lower"),
-        *map(Column.of, (KAPPA, ALPHA)),
+        *map(Column.of, (KAPPA, VOXEL_ALPHA)),
     )
     cells = [row[1:] for group in groups for row in group.rows]
     known = [k for k in range(len(columns)) if any(_says(row[k]) for row in cells)]
@@ -85,11 +85,10 @@ def class_agreement(result: Result) -> list[Table]:
         Group(group.name, tuple((row[0], *(row[1 + k] for k in known)) for row in group.rows)) for group in groups
     )
     caption = (
-        f"{SEEN_TWICE} Each class against all others; observations are the evidence for it, in frames, of all scenes."
-        " Alpha between frames, its ceiling, and the share of it that is reached: in sampled voxels. Judged: it has"
-        " enough locations; unstable: the probability that its share of the ceiling is below 67 %. Classes that no"
-        " frame saw there are left out. Macro means: each scene counts once."
-        f" {INTERVALS}"
+        "Each class against all others; observations are the evidence for it in voxels seen twice or more, in frames,"
+        f" of all scenes. A class counts for the verdict where it has enough locations; unstable: the probability that"
+        f" its alpha is below {LIMITS.usable:.3f}. Classes that no frame saw are left out. Macro means: each scene counts"
+        f" once. {INTERVALS}"
     )
     title = "Agreement of the frames, by class"
     return [Table("class_agreement", title, caption, (Column("class", "Class"), *(columns[k] for k in known)), kept)]
@@ -227,9 +226,9 @@ def ordered(take: Callable[[DriftStatistics], float | Estimate]) -> Number:
     return lambda found: take(found.drift) if found.order_known else math.nan
 
 
-def reached(take: Callable[[CeilingShare], float | Estimate]) -> Number:
-    """A number of the ceiling; NaN where it is not known."""
-    return lambda found: math.nan if found.ceiling_share is None else take(found.ceiling_share)
+def of_cells(take: Callable[[CellAgreement], float]) -> Number:
+    """A number of the sampled cells; NaN where there are none."""
+    return lambda found: math.nan if found.cells is None else take(found.cells)
 
 
 def _value(found: float | Estimate) -> float:
@@ -261,20 +260,17 @@ def grouped(rows: Iterable[T], name: Callable[[T], str]) -> dict[str, list[T]]:
 
 def _class_rows(judged: Sequence[MapStatistics]) -> tuple[Row, ...]:
     by_name = grouped((row for found in judged for row in found.agreement.classes), lambda row: row.name)
-    reached = grouped(
-        (row for found in judged if found.ceiling_share for row in found.ceiling_share.classes), lambda row: row.name
-    )
+    cells = (found.cells for found in judged if found.cells is not None)
+    alphas: dict[str, list[ClassAlpha]] = grouped((row for own in cells for row in own.classes), lambda row: row.name)
     return tuple(
         (
             name,
             sum(row.observations for row in rows),
-            macro_mean([row.alpha for row in reached.get(name, [])]),
-            macro_mean([row.ceiling for row in reached.get(name, [])]),
-            _one_or_mean([row.share.percent for row in reached.get(name, [])]),
-            "yes" if any(row.counts_for_verdict for row in reached.get(name, [])) else "",
-            macro_mean([100 * row.unstable for row in reached.get(name, [])]),
+            _one_or_mean([row.alpha.ends for row in alphas.get(name, [])]),
+            "yes" if any(row.counts_for_verdict for row in alphas.get(name, [])) else "",
+            macro_mean([100 * row.unstable for row in alphas.get(name, [])]),
             macro_mean([row.kappa for row in rows]),
-            macro_mean([row.alpha for row in rows]),
+            macro_mean([row.voxel_alpha for row in rows]),
         )
         for name, rows in by_name.items()
         if any(row.observations for row in rows)
@@ -292,8 +288,8 @@ def _verdict_row(record: Record, found: MapStatistics) -> Row:
         record.unit.scene,
         found.verdict.level,
         100 * found.verdict.probability,
-        UNDEFINED if found.ceiling_share is None else found.ceiling_share.share.percent,
-        100 * found.labelled,
+        found.headline.alpha.ends,
+        math.nan if found.cells is None else 100 * found.cells.labelled,
         UNDEFINED if right is None else right.quadrants.wrong_of_stable.percent,
         found.repeated.voxels,
         100 * found.repeated.share,
