@@ -7,15 +7,16 @@ from collections.abc import Iterator, Mapping, Sequence
 
 from semstab.datasets import GROUND_TRUTH
 from semstab.metrics import macro_mean
-from semstab.model.contrast import PairedDifference
 from semstab.model.measures import VSS
 from semstab.model.records import Record, Result
 from semstab.model.results import UnitSummary, VoxelAdvice
-from semstab.model.statistics import Interval
 from semstab.report.averages import ENOUGH, by_backbone, pooled
 from semstab.report.tables.stability import comparable
 from semstab.statistics.agreement import ALPHA
-from semstab.statistics.intervals import mean_of
+from semstab.statistics.cluster_sums import ClusterSums
+from semstab.statistics.intervals import difference, mean_of
+from semstab.statistics.observations import CellObservations
+from semstab.statistics.paired_differences import compared_observations
 from semstab.statistics.verdict import LIMITS
 
 MOSTLY_ONCE = 0.5
@@ -135,11 +136,13 @@ def notes(result: Result) -> Iterator[str]:
 
 
 def differences(result: Result) -> Iterator[str]:
-    """Say which models are more or less stable than the first, by alpha of the observations that both made."""
-    first, *others = by_backbone([r for r in result.select() if r.unit.backbone != GROUND_TRUTH]) or [""]
+    """Say which models are more or less stable than the first, by alpha of the observations that all of them made."""
+    records = [record for record in result.select() if record.unit.backbone != GROUND_TRUTH]
+    first, *others = by_backbone(records) or [""]
+    sums = [_common_sums([r for r in records if r.unit.scene == scene]) for scene in result.scenes] if others else []
     for name in others:
-        rows = [_less(name, first, row) for found in result.comparisons for row in found.paired.differences]
-        if known := [each for each in rows if each is not None]:
+        each = [difference(own[name], own[first], ALPHA.key) for own in sums if {name, first} <= own.keys()]
+        if known := [one for one in each if not math.isnan(one.low)]:
             change = mean_of(known)
             told = "does not differ significantly from"
             if change.decided and not change.low <= 0 <= change.high:
@@ -149,13 +152,12 @@ def differences(result: Result) -> Iterator[str]:
             yield f"{name} {told} {first}: alpha {change.value:+.2f} ({ends}){scenes}"
 
 
-def _less(name: str, first: str, row: PairedDifference) -> Interval | None:
-    """Alpha of a model less that of the first, where a row of a comparison has it; None otherwise."""
-    if row.measure != ALPHA.key or {row.a, row.b} != {name, first} or math.isnan(row.difference.low):
-        return None
-    own, sign = row.difference, 1.0 if row.a == name else -1.0
-    low, high = sorted((sign * own.low, sign * own.high))
-    return Interval(sign * own.value, low, high, undecided=row.undecided)
+def _common_sums(records: Sequence[Record]) -> Mapping[str, ClusterSums]:
+    """Return the sums of the observations that all models of a scene made; none where they were not kept."""
+    files = {record.unit.backbone: record.observations_file for record in records}
+    there = {name: CellObservations.load(file) for name, file in files.items() if file is not None and file.is_file()}
+    same = len({own.classes for own in there.values()}) == 1
+    return compared_observations(there).sums if 1 < len(there) == len(files) and same else {}
 
 
 def _ranking(result: Result) -> Iterator[str]:

@@ -489,8 +489,8 @@ def reduced(result: Result) -> list[Table]:
     )
     caption = (
         "Hard labels and soft scores do not compare by VSS, entropy or voxel alpha, because scores spread their"
-        " evidence; alpha is of the likeliest classes. Here scores are reduced to each pixel's likeliest class, and labels are as"
-        " they are."
+        " evidence; alpha is of the likeliest classes. Here scores are reduced to each pixel's likeliest class, and"
+        " labels are as they are."
     )
     return [Table("reduced", "Labels and reduced scores", caption, columns, groups)]
 

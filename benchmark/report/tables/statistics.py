@@ -15,7 +15,7 @@ from semstab.report.tables.table import Cell, Column, Group, Row, Table
 from semstab.statistics.agreement import ALPHA, KAPPA, PSA, VOXEL_ALPHA
 from semstab.statistics.drift import FLIP_RATE
 from semstab.statistics.intervals import LEAST_FRAMES
-from semstab.statistics.verdict import ADVICE, LIMITS
+from semstab.statistics.verdict import ADVICE, DANGEROUS, DECIDED, LIMITS, MOST_CHANCE
 
 SCENE = Column("scene", "Scene")
 REPEATED = Column("repeated_voxels", "Voxels", 0)
@@ -60,8 +60,8 @@ def temporal_agreement(result: Result) -> list[Table]:
         "Alpha: agreement of two views at the same spot beyond chance, 1 perfect, 0 chance, of sampled cells that two"
         f" views saw, whatever the voxels are. {SEEN_TWICE} PSA: share of pairs of frames that agree about a voxel;"
         " kappa (Fleiss) and voxel alpha (Krippendorff): the same beyond chance; disagreement: the parts of 1 - PSA"
-        " within a frame and between frames; flip rate: share of the steps from one observation to the next at which the"
-        f" predicted class changes. {INTERVALS}"
+        " within a frame and between frames; flip rate: share of the steps from one observation to the next at which"
+        f" the predicted class changes. {INTERVALS}"
     )
     return by_scene(result, "temporal_agreement", "Agreement of the frames", caption, columns, numbers)
 
@@ -87,8 +87,8 @@ def class_agreement(result: Result) -> list[Table]:
     caption = (
         "Each class against all others; observations are the evidence for it in voxels seen twice or more, in frames,"
         f" of all scenes. A class counts for the verdict where it has enough locations; unstable: the probability that"
-        f" its alpha is below {LIMITS.usable:.3f}. Classes that no frame saw are left out. Macro means: each scene counts"
-        f" once. {INTERVALS}"
+        f" its alpha is below {LIMITS.usable:.3f}. Classes that no frame saw are left out. Macro means: each scene"
+        f" counts once. {INTERVALS}"
     )
     title = "Agreement of the frames, by class"
     return [Table("class_agreement", title, caption, (Column("class", "Class"), *(columns[k] for k in known)), kept)]
@@ -162,7 +162,7 @@ def verdicts(result: Result) -> list[Table]:
         SCENE,
         Column("verdict", "Verdict"),
         Column("probability_percent", "Probability (%)", 0),
-        Column("reached_percent", "% of ceiling", 0, "higher"),
+        Column.of(ALPHA),
         Column("labelled_percent", "Labelled (%)", 0, "higher"),
         Column("wrong_of_stable_percent", "False-stable rate (%)", 0, "lower"),
         REPEATED,
@@ -171,12 +171,12 @@ def verdicts(result: Result) -> list[Table]:
     )
     groups = tuple(Group(name, tuple(_verdict_row(*row) for row in rows)) for name, rows in judged.items())
     caption = (
-        f"{SEEN_TWICE} % of ceiling: alpha between frames over its ceiling. The verdict is the most probable level for"
-        " the same scene flown again: stable where that is at least 80, usable from 67, unstable below; undecided where"
-        " no level has 60 %; misleading where more than 5% of the stable locations are wrong, which only ground truth"
-        " tells. Labelled: locations that have a label in half of their observations or more; below 90 a model is at"
-        " most usable."
-        f" {INTERVALS}"
+        "The verdict is the most probable level of alpha for the same scene flown again: stable from"
+        f" {LIMITS.stable:g} on, usable from {LIMITS.usable:.3g}, unstable below; undecided where no level has"
+        f" {DECIDED:.0%}; misleading where more than {DANGEROUS:.0%} of the stable locations are wrong, which only ground"
+        f" truth tells; uninformative where two observations from anywhere agree at {MOST_CHANCE:.0%}. Labelled: locations"
+        f" that have a label in half of their observations or more; below {LIMITS.labelled:.0%} a model is at most"
+        f" usable. Voxels: seen twice or more. {INTERVALS}"
     )
     return [Table("verdicts", "Verdicts", caption, columns, groups)]
 
