@@ -175,8 +175,8 @@ def verdicts(result: Result) -> list[Table]:
         f" {LIMITS.stable:g} on, usable from {LIMITS.usable:.3g}, unstable below; undecided where no level has"
         f" {DECIDED:.0%}; misleading where more than {DANGEROUS:.0%} of the stable locations are wrong, which only"
         f" ground truth tells; uninformative where two observations from anywhere agree at {MOST_CHANCE:.0%}. Labelled:"
-        f" locations that have a label in half of their observations or more; below {LIMITS.labelled:.0%} a model is at most"
-        f" usable. Voxels: seen twice or more. {INTERVALS}"
+        f" locations that have a label in half of their observations or more; below {LIMITS.labelled:.0%} a model is at"
+        f" most usable. Voxels: seen twice or more. {INTERVALS}"
     )
     return [Table("verdicts", "Verdicts", caption, columns, groups)]
 
