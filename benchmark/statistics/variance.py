@@ -26,17 +26,15 @@ from threadpoolctl import ThreadpoolController
 from semstab.core.types import THESE_FRAMES, THIS_SCENE, Float64, Int64, Scope
 from semstab.statistics.cluster_sums import ClusterIndex, Statistic
 
-LASTING = (0.0, 0.5, 0.8, 0.9)
+LASTING = (0.0, 0.8)
 """Correlations rho of the effects of successive frames."""
 
-REACHES = (0.0, 0.08, 0.2, 0.4)
-"""How far effects of locations reach, as a share of the scene's extent."""
+REACHES = (0.0, 0.2)
+"""Correlation lengths of the effects of locations, as a share of the scene's extent."""
 
-PRIOR = (8.0, 4.0, 2.0, 1.0)
-"""Weights of these before the data: an effect that lasts as long as the flight cannot be told from none."""
-
-SIZES = 25
-"""Variances of an effect that are tried, evenly spaced in their logarithm."""
+SIZES = 7
+"""Variances of an effect that are tried, evenly spaced in their logarithm: more of them, or more correlations, cover no
+better (docs/validity.md)."""
 
 SMALLEST, UNLIKELY = 1e-4, 0.01
 """The smallest of them, as a share of the variance that was seen; the largest would show so little with this
@@ -129,11 +127,11 @@ def variances(
     seen, largest = whiten @ effect, (n - 1) / special.chdtri(n - 1, 1 - UNLIKELY)
     sizes = effect.var() * n / (n - 1) * np.geomspace(SMALLEST, largest, SIZES)
     logs, result = [], []
-    for reach, prior in zip(ranges, PRIOR, strict=True):
+    for reach in ranges:
         alike = np.exp(-distance / reach) if reach > 0 else np.eye(n)
         own, vectors = np.linalg.eigh(whiten @ alike @ whiten.T)
         total = 1 + np.outer(sizes, np.maximum(own, 0.0))
-        logs.append(math.log(prior) - 0.5 * (np.log(total) + (vectors.T @ seen) ** 2 / total).sum(axis=1))
+        logs.append(-0.5 * (np.log(total) + (vectors.T @ seen) ** 2 / total).sum(axis=1))
         result.append(sizes * (weight @ alike @ weight))
     log = np.concatenate(logs)
     likely = np.exp(log - log.max())
