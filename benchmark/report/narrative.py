@@ -43,6 +43,12 @@ def warnings(result: Result) -> Iterator[str]:
                 f"{_name(run, result)}: {run.frames_empty} of {run.frames} frames hold no pixel with both depth and a"
                 " label: semstab-bench check"
             )
+        cells = None if run.statistics is None else run.statistics.cells
+        if cells is not None and 2 * cells.views <= cells.frames:
+            yield (
+                f"{_name(run, result)}: {cells.frames} frames show {cells.views} distinct views, as the camera stands"
+                " still or frames repeat; views count, not frames"
+            )
         if (cut := run.scores_left_out) is not None:
             yield (
                 f"{_name(run, result)}: top_k leaves out {cut.mean:.2%} of a pixel's scores on average,"

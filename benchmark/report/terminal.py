@@ -91,7 +91,10 @@ def _head(name: str, result: Result, runs: Sequence[UnitSummary]) -> str:
     first = runs[0]
     frames = sorted({run.frames for run in runs})
     counts = f"{frames[0]} to {frames[-1]}" if len(frames) > 1 else f"{frames[0]}"
-    what = f"{counts} frames, {first.table.K} classes, {_metres(first.table.voxel_size)} voxels"
+    cells = [run.statistics.cells for run in runs if run.statistics is not None]
+    views = min((own.views for own in cells if own is not None and own.views < own.frames), default=None)
+    seen = "" if views is None else f" of {views} distinct views"
+    what = f"{counts} frames{seen}, {first.table.K} classes, {_metres(first.table.voxel_size)} voxels"
     line = f"{name}    {what}    {_geometry(result)}".rstrip()
     return line if len(line) <= WIDTH else f"{name}    {what}\n  {_geometry(result)}"
 
