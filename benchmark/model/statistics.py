@@ -31,7 +31,7 @@ class Estimate:
 
     @property
     def percent(self) -> Estimate:
-        """Of a share, in percent."""
+        """The share in percent."""
         return Estimate(100 * self.value, 100 * self.low, 100 * self.high)
 
 
@@ -42,13 +42,14 @@ UNDEFINED = Estimate(math.nan, math.nan, math.nan)
 class Interval(Estimate):
     """A value with its confidence interval.
 
-    scope      what varies. 'this scene': the frames, when the same scene is flown again; 'other scenes': frames and
-               locations; 'these frames': locations like these in these very frames
-    frames     that were fused, about; 0 where they are not known
-    locations  cubes of space that hold something that counts
-    degrees    of freedom of the standard error
-    undecided  why nothing may be claimed, and what to do; empty where something may
-    p_value    of a difference: that there is none
+    Attributes:
+        scope: What varies. 'this scene': the frames, when the same scene is flown again; 'other scenes': frames and
+            locations; 'these frames': locations like these in these very frames.
+        frames: That were fused, about; 0 where they are not known.
+        locations: Cubes of space that hold something that counts.
+        degrees: Of freedom of the standard error.
+        undecided: Why nothing may be claimed, and what to do; empty where something may.
+        p_value: Of a difference: that there is none.
     """
 
     scope: Scope = THESE_FRAMES
@@ -60,7 +61,7 @@ class Interval(Estimate):
 
     @property
     def decided(self) -> bool:
-        """Whether something may be claimed."""
+        """Return whether something may be claimed."""
         return not self.undecided
 
 
@@ -75,9 +76,10 @@ Level = Literal[
 class StabilityVerdict:
     """A backbone on a scene.
 
-    level        see ADVICE
-    probability  that the level is right, for the same scene flown again; NaN where it follows from no threshold
-    line         the reasons
+    Attributes:
+        level: See ADVICE.
+        probability: That the level is right, for the same scene flown again; NaN where it follows from no threshold.
+        line: The reasons.
     """
 
     level: Level
@@ -184,7 +186,8 @@ class CellAgreement:
 class LagBin:
     """Pairs of observations of a cell that are `low` to `high` apart, `mean` in the mean.
 
-    alpha    of these pairs, beyond their own chance
+    Attributes:
+        alpha: Of these pairs, beyond their own chance.
     """
 
     low: float
@@ -198,11 +201,12 @@ class LagBin:
 class Correlogram:
     """Agreement beyond chance by how far apart two observations are; bins with few pairs are left out.
 
-    time      frames
-    angle     degrees between the directions of view
-    range     ratio of the distances to the place, the larger one above
-    baseline  metres between the cameras
-    standard  the pairs with 5 to 15 degrees between them, for models and flights to be compared at
+    Attributes:
+        time: Frames.
+        angle: Degrees between the directions of view.
+        range: Ratio of the distances to the place, the larger one above.
+        baseline: Metres between the cameras.
+        standard: The pairs with 5 to 15 degrees between them, for models and flights to be compared at.
     """
 
     time: tuple[LagBin, ...]
@@ -232,10 +236,11 @@ class HeadlineStatistics:
 class Flipping:
     """Places about which frames do not agree: with OP >= 2, and two frames agree with a probability below 0.8.
 
-    share    of these places, each counting by how likely it is one, for these frames
-    seen     the part of them that four frames or more saw: of fewer looks it cannot be told whether errors come again
-             at the same places
-    a, b     the two classes between which most of them flip, with the part of all flips that is between these
+    Attributes:
+        share: Of these places, each counting by how likely it is one, for these frames.
+        seen: The part of them that four frames or more saw: of fewer looks it cannot be told whether errors come again
+            at the same places.
+        a, b: The two classes between which most of them flip, with the part of all flips that is between these.
     """
 
     share: Interval
@@ -318,9 +323,10 @@ class Reliability:
 class Correctness:
     """How right the fused labels of a group of voxels are; NaN where no voxel has a true class.
 
-    miou   mean over the classes that are true or predicted somewhere, of intersection over union
-    ece    expected calibration error: mean |accuracy - confidence| over 15 bins of the largest belief, by voxels
-    brier  mean over voxels of sum_k (p_k - y_k)^2, 0 to 2
+    Attributes:
+        miou: Mean over the classes that are true or predicted somewhere, of intersection over union.
+        ece: Expected calibration error: mean |accuracy - confidence| over 15 bins of the largest belief, by voxels.
+        brier: Mean over voxels of sum_k (p_k - y_k)^2, 0 to 2.
     """
 
     name: str
@@ -400,7 +406,7 @@ class MapStatistics:
 
     @property
     def order_known(self) -> bool:
-        """Whether a quarter of the places seen twice say what a random order of their observations gives.
+        """Return whether a quarter of the places seen twice say what a random order of their observations gives.
 
         Of soft scores without a log only a few do, and not just any.
         """
@@ -408,5 +414,5 @@ class MapStatistics:
 
     @property
     def sections(self) -> int:
-        """How many of the sections that need more than the map could be computed."""
+        """Return how many of the sections that need more than the map could be computed."""
         return sum(section is not None for section in (self.geometry, self.correctness))

@@ -36,7 +36,8 @@ def as_array(value: Any) -> npt.NDArray[Any]:
 def as_frame(given: Frame | Mapping[str, Any], index: int) -> tuple[Frame, Frame | None]:
     """Return frame `index` of a sequence, and the same with its true labels where they are given.
 
-    Raises DataError where a field is missing, unknown, or not what `Frame` takes.
+    Raises:
+        DataError: If a field is missing, unknown, or not what `Frame` takes.
     """
     if isinstance(given, Frame):
         return dataclasses.replace(given, index=index), None
@@ -71,7 +72,8 @@ class OwnFolder:
 class Sequence:
     """Frames of a program on disk, in a temporary folder that goes with the last reference to them.
 
-    classes  how many the largest label, or the scores, ask for; timestamps (n,) seconds, where all frames have one
+    Attributes:
+        classes: How many the largest label, or the scores, ask for; timestamps (n,) seconds, where all frames have one.
     """
 
     def __init__(self, frames: Iterable[Frame | Mapping[str, Any]]) -> None:
@@ -133,11 +135,15 @@ class Frames(Dataset):
 
     @property
     def scenes(self) -> tuple[str, ...]:
-        """Its one scene."""
+        """The one scene."""
         return (self._options.scene,)
 
     def scene(self, name: str) -> Scene:
-        """Open it. Raises DataError where the frames are gone."""
+        """Open it.
+
+        Raises:
+            DataError: If the frames are gone.
+        """
         sequence = self.sequences.get(self._options.token)
         if sequence is None:
             raise DataError(f"{name}: a program gave these frames to semstab.fuse, and they are gone; fuse them again")
@@ -159,7 +165,7 @@ class FramesScene(Scene):
         return self._sequence.count
 
     def label_space(self, backbone: str) -> LabelSpace:
-        """The same of the model and of the truth."""
+        """Return the same of the model and of the truth."""
         return self._space
 
     def frame(self, index: int, backbone: str, *, color: bool = True) -> Frame:

@@ -41,14 +41,18 @@ class FusedResult(Result):
         return Path(shutil.copyfile(page, path))
 
     def save(self, folder: str | Path) -> Path:
-        """Write the run's folder: summary, voxels, series, tables and report. Raises ConfigError where one is."""
+        """Write the run's folder: summary, voxels, series, tables and report.
+
+        Raises:
+            ConfigError: If one is.
+        """
         if Path(folder).exists() and (not Path(folder).is_dir() or any(Path(folder).iterdir())):
             raise ConfigError(f"{folder}: is not empty; choose another folder")
         Reporting(self.__fspath__()).run_finished(self)
         return Path(shutil.copytree(self.__fspath__(), folder, dirs_exist_ok=True))
 
     def __fspath__(self) -> str:
-        """The folder of its files, which goes with the result."""
+        """Return the folder of its files, which goes with the result."""
         return str(self._folder.path)
 
 
@@ -66,15 +70,17 @@ def fuse(
 ) -> FusedResult:
     """Fuse posed label maps, and return all that a run says of them: measures, strata, ceiling, verdict, intervals.
 
-    frames      `Frame`s, or mappings with labels (H, W) or scores (H, W, K), depth (H, W) in metres, intrinsics (3, 3),
-                T_wc (4, 4) or (3, 4) camera to world; color, mask, timestamp and truth (H, W) where there are such.
-                NumPy or torch. A generator is read once; its frames wait on disk, in a temporary folder
-    voxel_size  metres; where not given, what `check` suggests for the data
-    classes     names, in the order of the labels
-    recording   a file for the rerun viewer
-    settings    further settings of `Config`: statistics=True, scope='these frames', events=True, ...
+    - `frames`: `Frame`s, or mappings with labels (H, W) or scores (H, W, K), depth (H, W) in metres, intrinsics (3, 3),
+      T_wc (4, 4) or (3, 4) camera to world; color, mask, timestamp and truth (H, W) where there are such. NumPy or
+      torch. A generator is read once; its frames wait on disk, in a temporary folder
+    - `voxel_size`: metres; where not given, what `check` suggests for the data
+    - `classes`: names, in the order of the labels
+    - `recording`: a file for the rerun viewer
+    - `settings`: further settings of `Config`: statistics=True, scope='these frames', events=True, ...
 
-    Raises DataError for a frame that cannot be fused, with its number, and ConfigError for a setting.
+    Raises:
+        DataError: For a frame that cannot be fused, with its number.
+        ConfigError: For a setting.
     """
     sequence, token = Sequence(frames), uuid.uuid4().hex
     Frames.sequences[token] = sequence

@@ -37,11 +37,12 @@ MOST_VOXELS = 2_000_000
 
 @dataclass(frozen=True)
 class State:
-    """What a process saw of a sequence; states of several processes are added.
+    """State of one process for one sequence; states of several processes are added.
 
-    updates  (n,) how often the belief of each voxel was moved by a further frame
-    cells    the sampled observations from which alpha follows; None where it is not wanted
-    one_in   of so many voxels the table holds one
+    Attributes:
+        updates: (n,) how often the belief of each voxel was moved by a further frame.
+        cells: The sampled observations from which alpha follows; None where it is not wanted.
+        one_in: Of so many voxels the table holds one.
     """
 
     frames: int
@@ -86,7 +87,7 @@ class State:
         return Summary.of(self.frames, analysis.table, analysis.summary, self._flicker)
 
     def _table(self) -> VoxelTable:
-        """The map; of a voxel that two processes saw, SBD is the mean over the steps that were taken."""
+        """Return the map; of a voxel that two processes saw, SBD is the mean over the steps that were taken."""
         steps = self.table.op - 1
         fewer = self.updates < steps
         if not fewer.any():
@@ -128,7 +129,7 @@ class _Map:
             self._left_out = int(np.count_nonzero(~in_sample(index, self._one_in)))
 
     def _drawn(self, frame: Frame) -> Frame:
-        """The frame without depth where it shows voxels that are left out."""
+        """Return the frame without depth where it shows voxels that are left out."""
         if self._one_in == 1:
             return frame
         K, size = frame.intrinsics, self._voxel_size
@@ -149,14 +150,6 @@ class _Map:
 class TemporalStability:
     """How stable predictions are at the same physical place, over the frames of one or more sequences.
 
-    num_classes   K
-    voxel_size    metres
-    ignore_index  the label of pixels without one
-    soft          fuse scores as they are; else the likeliest class of each pixel, as of label maps on disk
-    alpha         also sample the cells from which alpha, and a verdict, follow: a third of the time of an update
-    max_voxels    of a sequence; a larger map is sampled at random, and its memory stays bounded
-    backend       that fuses
-
     Has the interface of torchmetrics, and is a `torchmetrics.Metric` where that is installed.
 
     >>> import numpy as np
@@ -170,6 +163,15 @@ class TemporalStability:
     ...     metric.update(predicted, depth, K, pose)
     >>> {name: round(float(value), 2) for name, value in metric.compute().items() if name in ("vss@3", "op3_share")}
     {'vss@3': 0.93, 'op3_share': 1.0}
+
+    Attributes:
+        num_classes: K.
+        voxel_size: Metres.
+        ignore_index: The label of pixels without one.
+        soft: Fuse scores as they are; else the likeliest class of each pixel, as of label maps on disk.
+        alpha: Also sample the cells from which alpha, and a verdict, follow: a third of the time of an update.
+        max_voxels: Of a sequence; a larger map is sampled at random, and its memory stays bounded.
+        backend: That fuses.
     """
 
     higher_is_better = True
@@ -201,14 +203,15 @@ class TemporalStability:
     ) -> None:
         """Fuse one frame, or a batch of frames in the order of time.
 
-        predicted   labels (H, W), or logits or probabilities (K, H, W); of a batch (B, H, W) or (B, K, H, W)
-        depth       (H, W) or (B, H, W) float, metres along the optical axis
-        intrinsics  (3, 3) or (B, 3, 3) camera matrix, or `Intrinsics`
-        T_wc        (4, 4) or (3, 4), camera to world in metres; or (B, ...)
-        sequence    which sequence they belong to, one name or one a frame; sequences may alternate
-
         Raises DataError, which names the frame of the batch, where shapes, labels or a pose cannot be; then no frame
         of the batch was fused.
+
+        Args:
+            predicted: Labels (H, W), or logits or probabilities (K, H, W); of a batch (B, H, W) or (B, K, H, W).
+            depth: (H, W) or (B, H, W) float, metres along the optical axis.
+            intrinsics: (3, 3) or (B, 3, 3) camera matrix, or `Intrinsics`.
+            T_wc: (4, 4) or (3, 4), camera to world in metres; or (B, ...).
+            sequence: Which sequence they belong to, one name or one a frame; sequences may alternate.
         """
         frames = self._frames(as_array(predicted), as_array(depth), intrinsics, as_array(T_wc))
         names = [sequence] * len(frames) if isinstance(sequence, str | int) else [*sequence]
@@ -253,7 +256,7 @@ class TemporalStability:
     def _frames(
         self, predicted: npt.NDArray[Any], depth: npt.NDArray[Any], intrinsics: Any, T_wc: Float64
     ) -> list[Frame]:
-        """The frames of a batch, checked."""
+        """Return the frames of a batch, checked."""
         if depth.ndim == 2:
             predicted, depth, T_wc = predicted[None], depth[None], T_wc[None]
         B = len(depth)
@@ -288,7 +291,7 @@ class TemporalStability:
         return dataclasses.replace(frame, unlabelled=none) if none.any() else frame
 
     def _checked(self, k: int, labels: npt.NDArray[Any]) -> npt.NDArray[Any]:
-        """Labels as uint8, or uint16 where there are more classes, with what is ignored under the highest id."""
+        """Return labels as uint8, or uint16 where there are more classes, with what is ignored under the highest id."""
         dtype, none = (np.uint8, IGNORE_8BIT) if self.num_classes < IGNORE_8BIT else (np.uint16, IGNORE_16BIT)
         known = (labels >= 0) & (labels < self.num_classes)
         if not known.all():
@@ -306,7 +309,7 @@ def _are_cameras(intrinsics: Any) -> bool:
 
 
 def _probabilities(logits: npt.NDArray[Any]) -> npt.NDArray[Any]:
-    """(H, W, K) scores that sum to 1: as given, or by a softmax where some are no probabilities."""
+    """Return (H, W, K) scores that sum to 1: as given, or by a softmax where some are no probabilities."""
     values = np.moveaxis(logits, 0, -1).astype(np.float32, copy=False)
     if values.min(initial=0) >= 0 and values.max(initial=1) <= 1:
         return values
@@ -316,7 +319,7 @@ def _probabilities(logits: npt.NDArray[Any]) -> npt.NDArray[Any]:
 
 
 def _sum(one: Mapping[str, State], other: Mapping[str, State]) -> dict[str, State]:
-    """The states of the sequences of both, those of one sequence added."""
+    """Return the states of the sequences of both, those of one sequence added."""
     both = dict(one)
     for name, state in other.items():
         both[name] = both[name] + state if name in both else state
@@ -324,7 +327,7 @@ def _sum(one: Mapping[str, State], other: Mapping[str, State]) -> dict[str, Stat
 
 
 def _added(a: VoxelTable, b: VoxelTable, updates_a: Int64, updates_b: Int64) -> tuple[VoxelTable, Int64]:
-    """The map of the frames of two maps, and how often its voxels were moved."""
+    """Return the map of the frames of two maps, and how often its voxels were moved."""
     index, of = np.unique(np.concatenate([a.index, b.index]), axis=0, return_inverse=True)
     n, of = len(index), of.ravel()
 
@@ -351,7 +354,7 @@ def _added(a: VoxelTable, b: VoxelTable, updates_a: Int64, updates_b: Int64) -> 
 
 
 def _joined(a: CellObservations, b: CellObservations) -> CellObservations:
-    """What both sampled, of the blocks that are in both samples; frames are numbered anew."""
+    """Return what both sampled, of the blocks that are in both samples; frames are numbered anew."""
     size, share = max(a.cell_size, b.cell_size), min(a.share, b.share)
     later = dataclasses.replace(b, view=b.view + np.int32(len(a.views)))
     views = Views.joined([a.views, b.views])

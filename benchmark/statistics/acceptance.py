@@ -46,10 +46,11 @@ NEVER = -1
 class Threshold(BaseModel):
     """From where on the labels of a class are acted on, and what the calibration showed of them.
 
-    by, at_least  the evidence that is asked for
-    never         that no threshold is shown to reach the precision: labels are not acted on; the rest is of the best
-    precision, low  share of such labels that are right, and the lower end of its one-sided interval
-    voxels, left    labels of the class with a known truth that were counted; share of all its labels that is left
+    Attributes:
+        by, at_least: The evidence that is asked for.
+        never: That no threshold is shown to reach the precision: labels are not acted on; the rest is of the best.
+        precision, low: Share of such labels that are right, and the lower end of its one-sided interval.
+        voxels, left: Labels of the class with a known truth that were counted; share of all its labels that is left.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
@@ -66,9 +67,10 @@ class Threshold(BaseModel):
 class AcceptanceThresholds(BaseModel):
     """Which labels of a map may be acted on, as a YAML file keeps it.
 
-    precision, confidence  labels of a class that are acted on are right with at least this probability; that a class'
-                           threshold promises too much has at most the probability 1 - confidence
-    left                   share of the calibration's voxels whose label is acted on
+    Attributes:
+        precision, confidence: Labels of a class that are acted on are right with at least this probability; that a
+            class' threshold promises too much has at most the probability 1 - confidence.
+        left: Share of the calibration's voxels whose label is acted on.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
@@ -95,9 +97,12 @@ class AcceptanceThresholds(BaseModel):
         write_text(Path(path), yaml.safe_dump(content, sort_keys=False, allow_unicode=True))
 
     def decide(self, table: VoxelTable) -> Int64:
-        """(n,) the class of each voxel whose label may be acted on, by its row in the table's classes; -1 elsewhere.
+        """Return (n,) the class of each voxel whose label may be acted on, by its row in the table's classes.
 
-        Raises DataError for a map of other classes, or voxels of another size.
+        -1 elsewhere.
+
+        Raises:
+            DataError: For a map of other classes, or voxels of another size.
         """
         self.require(table)
         label = dominant(table).astype(np.int64)
@@ -128,15 +133,20 @@ class AcceptanceThresholds(BaseModel):
 def calibrate(
     maps: Sequence[tuple[VoxelTable, Truth]], *, precision: float = 0.95, confidence: float = 0.95, on: str = ""
 ) -> AcceptanceThresholds:
-    """For each class the evidence, of OP, belief and margin, that leaves most labels, each right with that precision.
-
-    maps  of scenes with the same classes and voxel size, with the true class of their voxels; they err by themselves
+    """Return for each class the thresholds of OP, belief and margin that keep most labels at that precision.
 
     STEPS thresholds of each evidence are tried. One is taken where the lower end of the share of right labels is at
     least the precision, at the error 1 - confidence divided by all that are tried (Bonferroni; as in Angelopoulos et
     al. 2021, Learn then Test). The end is Clopper and Pearson's, for as many labels as these are worth (Korn and
     Graubard 1998): the variance is that of cubes of space, with errors that reach as far as the data show. Where errors
     are too few for that, cubes are counted instead of labels.
+
+    Args:
+        maps: Of scenes with the same classes and voxel size, with the true class of their voxels; they err by
+            themselves.
+        precision: Share of right labels that each class is to reach.
+        confidence: Probability with which it reaches it.
+        on: Name of the data, for messages.
     """
     tables = [table for table, _ in maps]
     if not 0 < precision < 1 or not 0.5 <= confidence < 1:
@@ -173,7 +183,7 @@ class _Labels:
             self._cell, self._of, self._edge = cubes_of((index[:, 0], index[:, 1], index[:, 2]), size)
 
     def least(self, precision: float, error: float) -> Threshold:
-        """The threshold that leaves most of them."""
+        """Return the threshold that leaves most of them."""
         tried, left = self._tried()
         best = Threshold(never=True)
         for by, at in sorted(tried, key=lambda pair: -left[pair]):
@@ -185,7 +195,7 @@ class _Labels:
         return best
 
     def _tried(self) -> tuple[list[tuple[Evidence, float]], dict[tuple[Evidence, float], int]]:
-        """Thresholds that leave different labels, chosen without a look at what is right, and how many each leaves."""
+        """Return thresholds that keep different labels, chosen without the truth, and how many each keeps."""
         tried: dict[bytes, tuple[Evidence, float]] = {}
         left = {}
         for by, values in self._evidence.items() if len(self._right) else ():
@@ -195,7 +205,7 @@ class _Labels:
         return list(tried.values()), left
 
     def _share(self, by: Evidence, at: float, error: float) -> tuple[float, float]:
-        """The share of those with so much evidence that is right, and its lower end."""
+        """Return the share of those with so much evidence that is right, and its lower end."""
         some = self._evidence[by] >= at
         of, cells = self._of[some], len(self._cell)
         right, every = self._right[some].astype(np.float64), np.ones(len(of))
@@ -210,7 +220,7 @@ class _Labels:
 
 
 def _of_few(sums: Float64, error: float) -> tuple[float, float]:
-    """The share that is right and its lower end, where too few cubes (m, 2) hold an error to tell how far these reach.
+    """Return the share that is right and its lower end, where few cubes (m, 2) hold an error.
 
     Cubes, of one size, count as right or wrong as a whole (Clopper and Pearson 1934).
     """

@@ -44,9 +44,10 @@ from semstab.statistics.observations import CellObservations
 class Cubes:
     """The cubes of voxels, and sums over those in each.
 
-    cell  (G, 3) int32 the cubes, sorted
-    at    (n,) int32 which of them each voxel is in, -1 for those that are left out
-    edge  metres, a power of 2
+    Attributes:
+        cell: (G, 3) int32 the cubes, sorted.
+        at: (n,) int32 which of them each voxel is in, -1 for those that are left out.
+        edge: Metres, a power of 2.
     """
 
     cell: Int32
@@ -55,7 +56,7 @@ class Cubes:
 
     @classmethod
     def of(cls, table: VoxelTable, edge: float | None = None, *, where: Mask | None = None) -> Cubes:
-        """Of a table, without the voxels for which `where` (n,), OP >= 2 if not given, does not hold.
+        """Return the cubes of a table, without the voxels for which `where` (n,), OP >= 2 if not given, does not hold.
 
         There are at most MOST_CELLS cubes, unless their edge is given, in metres.
         """
@@ -64,25 +65,25 @@ class Cubes:
 
     @classmethod
     def of_log(cls, events: Events, edge: float) -> Cubes:
-        """The same of the voxels of a log."""
+        """Return the same of the voxels of a log."""
         again = np.diff(events.bounds) >= 2
         return cls(*cubes_of((events.ix, events.iy, events.iz), events.voxel_size, edge, again))
 
     def rows(self, rows: Any) -> Cubes:
-        """The same cubes, for some of the voxels."""
+        """Return the same cubes, for some of the voxels."""
         return replace(self, at=self.at[rows])
 
     @property
     def count(self) -> int:
-        """How many cubes there are."""
+        """Return how many cubes there are."""
         return len(self.cell)
 
     def sums(self, columns: Float64) -> Float64:
-        """(G, C) over the voxels of each cube of columns (n, C), of what is not NaN."""
+        """Return (G, C) over the voxels of each cube of columns (n, C), of what is not NaN."""
         return by_group(self.at, columns.astype(np.float64, copy=False).T, self.count)[0]
 
     def means(self, values: Mapping[str, npt.NDArray[Any]]) -> dict[str, Float64]:
-        """(G, 2) by name: over the voxels of each cube where values (n,) are defined their sum, and how many."""
+        """Return (G, 2) by name: over the voxels of each cube where values (n,) are defined their sum, and how many."""
         both = by_group(self.at, [*values.values()], self.count)
         return {name: np.stack(own, axis=1) for name, *own in zip(values, both[0].T, both[1].T, strict=True)}
 
@@ -128,8 +129,9 @@ class Mean:
 class CubeSums:
     """Sums by name over the voxels of cubes; those of a map in parts follow from the parts'.
 
-    cell  (G, 3) int32 the cubes, of an edge in metres, a power of 2
-    sums  (G, C) of each name
+    Attributes:
+        cell: (G, 3) int32 the cubes, of an edge in metres, a power of 2.
+        sums: (G, C) of each name.
     """
 
     cell: Int32
@@ -137,7 +139,7 @@ class CubeSums:
     sums: Mapping[str, Float64]
 
     def __getitem__(self, name: str) -> Float64:
-        """Sums (C,) over all cubes."""
+        """Return sums (C,) over all cubes."""
         total: Float64 = self.sums[name].sum(axis=0)
         return total
 
@@ -161,7 +163,7 @@ class CubeSums:
 
     @classmethod
     def merged(cls, parts: Sequence[CubeSums]) -> CubeSums:
-        """The sums of a map from those of its parts, by the cubes of the whole map."""
+        """Return the sums of a map from those of its parts, by the cubes of the whole map."""
         edge = max(part.edge for part in parts)
         cells = np.concatenate([part.cell // round(edge / part.edge) for part in parts])
         while len((cubes := distinct_rows(cells))[0]) > MOST_CELLS:
@@ -189,13 +191,16 @@ def cluster_sums_of(
 ) -> ClusterSums:
     """Return the sums of a map.
 
-    events      its log; without it a location counts as a whole, and the frames are not known
-    true_label  (n,) the true class of each voxel, -1 where it is not known
-    cells       the labels of sampled cells, from which alpha follows
-    sbd_excess  (n,) SBD of each voxel less that in random order, NaN where that is not known
-    edge        of the cubes in metres, a power of 2, where several maps are to have the same; else the smallest that
-                leaves at most MOST_CELLS
-    cubes, stable  the cubes, and (n,) the stability posterior, where they are known already
+    Args:
+        table: The map.
+        events: Its log; without it a location counts as a whole, and the frames are not known.
+        true_label: (n,) the true class of each voxel, -1 where it is not known.
+        cells: The labels of sampled cells, from which alpha follows.
+        sbd_excess: (n,) SBD of each voxel less that in random order, NaN where that is not known.
+        edge: Of the cubes in metres, a power of 2, where several maps are to have the same; else the smallest that
+            leaves at most MOST_CELLS.
+        cubes: The cubes, where they are known already.
+        stable: (n,) the stability posterior, where it is known already.
     """
     cubes = Cubes.of(table, edge) if cubes is None else cubes
     likely = None if true_label is None else np.nan_to_num(stability_posterior(table) if stable is None else stable)
@@ -242,7 +247,7 @@ def _sums_of_log(
     true_label: Int64 | None = None,
     likely: Float64 | None = None,
 ) -> ClusterSums:
-    """The sums by cube and group of frames of the locations of a log, whose dominant classes are `fused`."""
+    """Return the sums by cube and group of frames of the locations of a log, whose dominant classes are `fused`."""
     from semstab.core.compiled import in_chunks
     from semstab.statistics.loops.clusters import add_influences
 
@@ -281,7 +286,7 @@ def _sums_of_log(
 def _with_frameless_sums(
     sums: ClusterSums, table: VoxelTable, cubes: Cubes, true_label: Int64 | None, sbd_excess: Float64 | None
 ) -> ClusterSums:
-    """With rows for the sums that belong to no frame: SBD less that in random order, and how far beliefs are right."""
+    """Return the sums with rows for those of no frame: SBD less that in random order, and how far beliefs are right."""
     columns, own = np.zeros((cubes.count, sums.columns.shape[1])), layout(sums.K, truth=sums.truth)
     if sbd_excess is not None:
         for name, values in zip(DRIFT, cubes.means({"": sbd_excess})[""].T, strict=True):
@@ -304,7 +309,7 @@ def _with_frameless_sums(
 
 
 def _sums_of_table(table: VoxelTable, cubes: Cubes, true_label: Int64 | None, likely: Float64 | None) -> ClusterSums:
-    """The sums of the locations of a table: each counts as a whole, frames are not known.
+    """Return the sums of the locations of a table: each counts as a whole, frames are not known.
 
     Sums by class are NaN for evidence that is not one-hot.
     """
@@ -338,7 +343,10 @@ def _sums_of_table(table: VoxelTable, cubes: Cubes, true_label: Int64 | None, li
 def _sums_with_truth(
     table: VoxelTable, cubes: Cubes, label: Int64, likely: Float64
 ) -> tuple[dict[str, npt.NDArray[Any]], dict[str, Float64]]:
-    """The part of `_sums_of_table` that needs true classes (n,): values (n,) of voxels, and sums by class (G, K)."""
+    """Return the part of `_sums_of_table` that needs true classes (n,).
+
+    Values (n,) of voxels, and sums by class (G, K).
+    """
     evidence, predicted, T = table.evidence, dominant(table), table.op
     of = np.repeat(np.arange(len(table)), np.diff(evidence.starts))
     hit = evidence.label == label[of]

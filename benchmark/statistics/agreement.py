@@ -36,7 +36,7 @@ ONE_HOT = 1e-9
 
 
 def psa(table: VoxelTable) -> Float64:
-    """Pairwise semantic agreement (n,): the mean of s_t . s_u over pairs of different frames, in [0, 1].
+    """Return pairwise semantic agreement (n,): the mean of s_t . s_u over pairs of different frames, in [0, 1].
 
     PSA = (||e||^2 - sum_t ||s_t||^2) / (T (T - 1)); NaN where T < 2. For frames that are independent draws from pi its
     expectation is ||pi||^2 for every T >= 2.
@@ -47,7 +47,7 @@ def psa(table: VoxelTable) -> Float64:
 
 
 def fleiss_kappa(table: VoxelTable) -> float:
-    """Fleiss' kappa of the voxels with OP >= 2, each counting once (Fleiss 1971, Psychological Bulletin 76).
+    """Return Fleiss' kappa of the voxels with OP >= 2, each counting once (Fleiss 1971, Psychological Bulletin 76).
 
     1 - (1 - mean PSA) / (1 - ||p||^2) with p the mean belief. OP may vary from voxel to voxel: where it does not, this
     is Fleiss' own definition. NaN where no two frames saw one place, or only one class was predicted.
@@ -56,7 +56,9 @@ def fleiss_kappa(table: VoxelTable) -> float:
 
 
 def krippendorff_alpha(table: VoxelTable) -> float:
-    """Krippendorff's alpha, nominal, of the voxels with OP >= 2, each counting by its OP (Krippendorff 2018, ch. 12).
+    """Return Krippendorff's alpha, nominal, of the voxels with OP >= 2, each counting by its OP (Krippendorff 2018, ch.
+
+    12).
 
     1 - (1 - A) / (1 - A_e): A is the mean of PSA weighted by OP, and A_e is the same agreement between all
     observations, as if they were of one voxel. NaN where no two frames saw one place, or only one class was predicted.
@@ -65,37 +67,37 @@ def krippendorff_alpha(table: VoxelTable) -> float:
 
 
 def alpha_sums(table: VoxelTable) -> Float64:
-    """(3 + K,) what Krippendorff's alpha of a map is a function of; those of its parts add up."""
+    """Return (3 + K,) what Krippendorff's alpha of a map is a function of; those of its parts add up."""
     return _sums(alpha_columns, table)
 
 
 def _sums(columns: Callable[[VoxelTable], Float64], table: VoxelTable) -> Float64:
-    """Sums (C,) of columns (n, C) over a table's voxels, of which few are dense at a time."""
+    """Return sums (C,) of columns (n, C) over a table's voxels, of which few are dense at a time."""
     return functools.reduce(np.add, (columns(table.rows(some)).sum(axis=0) for some in table.evidence.chunks()))
 
 
 def psa_columns(table: VoxelTable) -> Float64:
-    """(n, 2): what a mean of PSA is a function of by its sum over voxels."""
+    """Return (n, 2): what a mean of PSA is a function of by its sum over voxels."""
     again = table.op >= 2
     return np.stack([np.where(again, psa(table), 0.0), again], axis=1)
 
 
 def ratio_of(sums: Float64) -> Float64:
-    """A mean (...,) from the sums (..., 2) of values and of weights; NaN where the weights sum to 0."""
+    """Return a mean (...,) from the sums (..., 2) of values and of weights; NaN where the weights sum to 0."""
     with np.errstate(invalid="ignore", divide="ignore"):
         ratio: Float64 = sums[..., 0] / sums[..., 1]
     return ratio
 
 
 def kappa_columns(table: VoxelTable) -> Float64:
-    """(n, 2 + K): what Fleiss' kappa is a function of by its sum over voxels."""
+    """Return (n, 2 + K): what Fleiss' kappa is a function of by its sum over voxels."""
     again = (table.op >= 2)[:, None]
     belief = np.where(again, table.evidence / table.op[:, None], 0.0)
     return np.concatenate([psa_columns(table), belief], axis=1)
 
 
 def kappa_of(sums: Float64) -> Float64:
-    """Fleiss' kappa (...,) from sums (..., 2 + K)."""
+    """Return Fleiss' kappa (...,) from sums (..., 2 + K)."""
     observed = ratio_of(sums[..., :2])
     with np.errstate(invalid="ignore", divide="ignore"):
         expected = ((sums[..., 2:] / sums[..., 1:2]) ** 2).sum(axis=-1)
@@ -103,7 +105,7 @@ def kappa_of(sums: Float64) -> Float64:
 
 
 def alpha_columns(table: VoxelTable, weights: Float64 | None = None) -> Float64:
-    """(n, 3 + K): what Krippendorff's alpha is a function of by its sums over voxels.
+    """Return (n, 3 + K): what Krippendorff's alpha is a function of by its sums over voxels.
 
     weights (n,) count voxels by themselves instead of by their OP: the same ones for several flights make their alphas
     comparable where these saw some places more often than others.
@@ -115,7 +117,7 @@ def alpha_columns(table: VoxelTable, weights: Float64 | None = None) -> Float64:
 
 
 def alpha_of(sums: Float64) -> Float64:
-    """Krippendorff's alpha (...,) from sums (..., 3 + K)."""
+    """Return Krippendorff's alpha (...,) from sums (..., 3 + K)."""
     n = sums[..., 1]
     with np.errstate(invalid="ignore", divide="ignore"):
         expected = ((sums[..., 3:] ** 2).sum(axis=-1) - sums[..., 2]) / (n * (n - 1))
@@ -123,7 +125,7 @@ def alpha_of(sums: Float64) -> Float64:
 
 
 def disagreement(table: VoxelTable) -> tuple[Float64, Float64]:
-    """1 - PSA of each voxel as a sum (n,), (n,): within a frame, and between frames; NaN where OP < 2.
+    """Return 1 - PSA of each voxel as a sum (n,), (n,): within a frame, and between frames; NaN where OP < 2.
 
     Within: 1 - ||s_t||^2 averaged, two pixels of one frame. Between: half the mean ||s_t - s_u||^2 of two frames. The
     expectation of neither depends on OP where frames are independent draws.
@@ -135,7 +137,7 @@ def disagreement(table: VoxelTable) -> tuple[Float64, Float64]:
 
 
 def class_agreement(table: VoxelTable, events: Events | None = None) -> tuple[ClassAgreement, ...]:
-    """Kappa and alpha of each class, every observation reduced to (s_k, 1 - s_k).
+    """Return kappa and alpha of each class, every observation reduced to (s_k, 1 - s_k).
 
     Without events only one-hot evidence tells how the frames agree on a class: NaN where other evidence is there.
     """
@@ -177,7 +179,7 @@ def class_sums(table: VoxelTable, events: Events | None = None) -> Float64:
 
 
 def class_agreement_of(sums: Float64, classes: Sequence[str] = ()) -> tuple[ClassAgreement, ...]:
-    """Kappa and alpha of each class, from `class_sums`."""
+    """Return kappa and alpha of each class, from `class_sums`."""
     total, shares, apart, weighted, squares, voxels, n = sums
     with np.errstate(invalid="ignore", divide="ignore"):
         p = shares / voxels
@@ -190,12 +192,12 @@ def class_agreement_of(sums: Float64, classes: Sequence[str] = ()) -> tuple[Clas
 
 
 def one_hot_where(table: VoxelTable, where: Mask) -> bool:
-    """Whether all observations are one-hot of the voxels for which `where` (n,) holds."""
+    """Return whether all observations are one-hot of the voxels for which `where` (n,) holds."""
     return bool((np.abs(table.self_sum - table.op) <= ONE_HOT * table.op)[where].all())
 
 
 def _beyond_chance(observed: Float64, expected: Float64) -> Float64:
-    """1 - (1 - observed) / (1 - expected); NaN where chance alone would always agree."""
+    """Return 1 - (1 - observed) / (1 - expected); NaN where chance alone would always agree."""
     with np.errstate(invalid="ignore", divide="ignore"):
         ratio = (1 - observed) / (1 - expected)
     beyond: Float64 = np.where(1 - expected.real > ONE_HOT, 1 - ratio, np.nan)
@@ -209,9 +211,10 @@ def _beyond_chance(observed: Float64, expected: Float64) -> Float64:
 class Uncertainty:
     """Normalised entropy of each voxel (n,) as a sum of two parts, all in units of log K, in [0, 1].
 
-    within   mean entropy of the frames' own evidence: class borders, voxels larger than things, unsure scores
-    between  generalised Jensen-Shannon divergence of the frames' evidence: their disagreement in time
-    total    within + between, the entropy of the belief
+    Attributes:
+        within: Mean entropy of the frames' own evidence: class borders, voxels larger than things, unsure scores.
+        between: Generalised Jensen-Shannon divergence of the frames' evidence: their disagreement in time.
+        total: Within + between, the entropy of the belief.
     """
 
     within: Float64
@@ -242,7 +245,7 @@ STEPS, ROUNDS = 80, 200
 
 
 def stable_share(agreement: float = STABLE) -> float:
-    """The share p of the dominant class from which two frames agree with that probability: p^2 + (1 - p)^2."""
+    """Return the share p of the dominant class from which two frames agree with that probability: p^2 + (1 - p)^2."""
     return (1 + math.sqrt(2 * agreement - 1)) / 2
 
 
@@ -258,7 +261,7 @@ def shares_of(table: VoxelTable) -> Float64:
 
 
 def stability_posterior(table: VoxelTable, shares: Float64 | None = None, *, stable: float = STABLE) -> Float64:
-    """(n,) the probability that a location is stable, given its frames and all locations; NaN where OP < 2.
+    """Return (n,) the probability that a location is stable, given its frames and all locations; NaN where OP < 2.
 
     Of T frames m vote for the dominant class, which happens with the probability b(m; T, p) + b(T - m; T, p) where its
     share is p. How many locations have which p is estimated from all of them without any form of its distribution
@@ -277,7 +280,7 @@ STEPS_OF_P = 0.5 + 0.5 * (np.arange(STEPS) + 0.5) / STEPS
 
 
 def _likelihood(seen: Int64, most: Int64) -> Float64:
-    """(v, STEPS) of votes given each share, up to a factor of each row."""
+    """Return (v, STEPS) of votes given each share, up to a factor of each row."""
     m, rest, p, q = most[:, None], (seen - most)[:, None], np.log(STEPS_OF_P), np.log1p(-STEPS_OF_P)
     own, folded = m * p + rest * q, rest * p + m * q
     best = np.maximum(own, folded).max(axis=1, keepdims=True)
@@ -286,7 +289,10 @@ def _likelihood(seen: Int64, most: Int64) -> Float64:
 
 
 def _votes(table: VoxelTable) -> tuple[Int64, Int64, Int64]:
-    """Frames that saw a location and votes for its class, each pair once (v,); which pair each with OP >= 2 has."""
+    """Return frames that saw a location and votes for its class, each pair once (v,).
+
+    Which pair each with OP >= 2 has.
+    """
     again = table.op >= 2
     T = table.op[again].astype(np.int64)
     longest = int(T.max(initial=0)) + 1

@@ -45,7 +45,7 @@ WITHOUT_FRAMES = (*DRIFT, "judged", "gap")
 
 @functools.lru_cache(maxsize=16)
 def layout(K: int, *, truth: bool) -> Mapping[str, slice]:
-    """Which columns of the sums each name stands for; those by class have K columns, `gap` one for each bin."""
+    """Return which columns of the sums each name stands for; those by class have K columns, `gap` one for each bin."""
     by_class = K <= MOST_CLASSES
     widths = [(name, 1) for name in PLAIN] + [("evidence", K)]
     widths += [(name, K) for name in ("class_apart", "class_own")] if by_class else []
@@ -60,7 +60,7 @@ def layout(K: int, *, truth: bool) -> Mapping[str, slice]:
 
 
 def width(K: int, *, truth: bool) -> int:
-    """How many columns there are."""
+    """Return how many columns there are."""
     return max(int(part.stop) for part in layout(K, truth=truth).values())
 
 
@@ -68,7 +68,7 @@ def width(K: int, *, truth: bool) -> int:
 
 
 def iou_of(sums: Float64) -> Float64:
-    """Intersection over union (...,) of a class from how often it is right, a count, the true and the predicted."""
+    """Return intersection over union (...,) of a class from the right, a count, the true and the predicted."""
     right, _, true, predicted = np.moveaxis(sums, -1, 0)
     union = true + predicted - right
     with np.errstate(invalid="ignore", divide="ignore"):
@@ -77,7 +77,10 @@ def iou_of(sums: Float64) -> Float64:
 
 
 def miou_of(sums: Float64) -> Float64:
-    """Its mean (...,) over the classes that are true or predicted anywhere; a count twice, then the same three."""
+    """Return its mean (...,) over the classes that are true or predicted anywhere.
+
+    A count twice, then the same three.
+    """
     right, true, predicted = np.split(sums[..., 2:], 3, axis=-1)
     union = true + predicted - right
     there = union.real > 0
@@ -87,7 +90,7 @@ def miou_of(sums: Float64) -> Float64:
 
 
 def ece_of(sums: Float64) -> Float64:
-    """Expected calibration error (...,) from a count twice, and from right less confidence, summed in each bin."""
+    """Return expected calibration error (...,) from a count twice, and right less confidence in each bin."""
     gap = sums[..., 2:]
     with np.errstate(invalid="ignore", divide="ignore"):
         error: Float64 = (np.sign(gap.real) * gap).sum(axis=-1) / sums[..., 1]
@@ -101,9 +104,10 @@ def ece_of(sums: Float64) -> Float64:
 class ClusterIndex:
     """The cube of space and the group of frames of rows (m,), some of which belong to no frame.
 
-    cubes   (G, 3) sorted, of an edge in metres; row (m,) which of them each row is in
-    frames  (F,) the groups of frames, sorted, of so many each on average (per_group, 0 where they are not known)
-    known   (r,) the rows that belong to one, column (r,) which of them
+    Attributes:
+        cubes: (G, 3) sorted, of an edge in metres; row (m,) which of them each row is in.
+        frames: (F,) the groups of frames, sorted, of so many each on average (per_group, 0 where they are not known).
+        known: (r,) the rows that belong to one, column (r,) which of them.
     """
 
     cubes: Int64
@@ -174,17 +178,19 @@ def most_groups(K: int) -> int:
 class ClusterSums:
     """Sums over the observations in voxels with OP >= 2, a row for each cube of space and group of frames.
 
-    cell     (m, 3) int32 which cube: floor(voxel centre / edge), so that the cubes of all maps of a scene are the same
-    frame    (m,) int32 which group: frame index // step; -1 where the frames are not known, for want of a log, and for
-             sums that belong to none (`WITHOUT_FRAMES`)
-    columns  (m, C) float64, see `layout`. A place counts 1 / T for each of its T frames in `voxels`, 1 in
-             `observations`; its pairwise agreement is shared out among them in `psa` and `agreeing`
-    edge     metres, a power of 2
-    step     frames of a group, a power of 2; 0 where they are not known
-    fused    how many frames they come from
-    truth    whether ground truth is in it
-    fine, coarse  the same of sampled cells, which are units instead of voxels and views instead of frames, and of cells
-             twice as wide, where there are `CellObservations`
+    Attributes:
+        cell: (m, 3) int32 which cube: floor(voxel centre / edge), so that the cubes of all maps of a scene are the
+            same.
+        frame: (m,) int32 which group: frame index // step; -1 where the frames are not known, for want of a log, and
+            for sums that belong to none (`WITHOUT_FRAMES`).
+        columns: (m, C) float64, see `layout`. A place counts 1 / T for each of its T frames in `voxels`, 1 in
+            `observations`; its pairwise agreement is shared out among them in `psa` and `agreeing`.
+        edge: Metres, a power of 2.
+        step: Frames of a group, a power of 2; 0 where they are not known.
+        fused: How many frames they come from.
+        truth: Whether ground truth is in it.
+        fine, coarse: The same of sampled cells, which are units instead of voxels and views instead of frames, and of
+            cells twice as wide, where there are `CellObservations`.
     """
 
     cell: Int32
@@ -201,11 +207,11 @@ class ClusterSums:
     coarse: ClusterSums | None = None
 
     def __getitem__(self, name: str) -> Float64:
-        """Sums (m, 1), or (m, K) by class, of that name."""
+        """Return sums (m, 1), or (m, K) by class, of that name."""
         return self.columns[:, layout(self.K, truth=self.truth)[name]]
 
     def of(self, names: tuple[str, ...]) -> Float64:
-        """Sums (m, C) of several names side by side."""
+        """Return sums (m, C) of several names side by side."""
         return np.concatenate([self[name] for name in names], axis=1)
 
     @functools.cached_property
@@ -231,7 +237,7 @@ class ClusterSums:
         return len(self.index.cubes)
 
     def coarsened(self, edge: float, step: int) -> ClusterSums:
-        """With larger cubes, or groups of frames; step 0 forgets the frames."""
+        """Return the sums of larger cubes, or groups of frames; step 0 forgets the frames."""
         cell = _joined(self.cell, edge / self.edge)
         known = step and self.step
         frame = _joined(self.frame, step // self.step) if known else np.full(len(cell), -1)
@@ -251,7 +257,7 @@ class ClusterSums:
         )
 
     def without_truth(self) -> ClusterSums:
-        """Without what is right and wrong."""
+        """Return the sums without those of ground truth."""
         columns = self.columns[:, : width(self.K, truth=False)]
         return dataclasses.replace(self, columns=columns, truth=False)
 
@@ -281,7 +287,11 @@ class ClusterSums:
 
     @classmethod
     def load(cls, path: str | Path) -> ClusterSums:
-        """Read what `save` wrote. Raises DataError where the file is missing, damaged or of another kind."""
+        """Read what `save` wrote.
+
+        Raises:
+            DataError: If the file is missing, damaged or of another kind.
+        """
         import pyarrow as pa
         import pyarrow.parquet as pq
 
@@ -327,7 +337,7 @@ LARGEST = 2.0**30
 
 @dataclass(frozen=True)
 class SumsMeta:
-    """What the file says of its sums: step, voxel_size and fused of each part; see `ClusterSums`."""
+    """Metadata of a file of sums: step, voxel_size and fused of each part; see `ClusterSums`."""
 
     edge: float
     K: int
@@ -352,13 +362,13 @@ class SumsMeta:
 
 
 def _joined(index: Int32, times: float) -> Int64:
-    """Which cubes, or groups of frames, these are where so many are one; -1 of frames stays."""
+    """Return which cubes, or groups of frames, these are where so many are one; -1 of frames stays."""
     wide: Int64 = index.astype(np.int64) // round(min(times, 2.0**40))
     return wide
 
 
 def _key(values: npt.NDArray[Any], name: str) -> npt.NDArray[Any]:
-    """A column of whole numbers that fit; raises DataError where it is not."""
+    """Return a column of whole numbers that fit; raises DataError where it is not."""
     if values.dtype.kind not in "iu" or not np.array_equal(values, values.astype(np.int32)):
         raise DataError(f"a number of column '{name}' is out of range")
     return values
@@ -392,14 +402,16 @@ Part = Literal["map", "fine", "coarse"]
 class Functional:
     """A number that is a smooth function of sums over a map.
 
-    names      of the sums
-    of         the number (...,) from these sums (..., C)
-    low, high  its range
-    scale      of its interval: a 'share' or mean of numbers from 0 to 1, an 'agreement', at most 1, or 'plain'
-    parts      the sums that it is of, each with its weight: of a map, or of sampled cells
-    pairs      the first sum is of pairwise agreement, which of a place that two frames saw neither has for itself alone
-
     The second sum counts what the first is a sum of.
+
+    Attributes:
+        names: Of the sums.
+        of: The number (...,) from these sums (..., C).
+        low, high: Its range.
+        scale: Of its interval: a 'share' or mean of numbers from 0 to 1, an 'agreement', at most 1, or 'plain'.
+        parts: The sums that it is of, each with its weight: of a map, or of sampled cells.
+        pairs: The first sum is of pairwise agreement, which of a place that two frames saw neither has for itself
+            alone.
     """
 
     names: tuple[str, ...]
@@ -416,7 +428,7 @@ CELLS: tuple[tuple[Part, float], ...] = (("fine", 2.0), ("coarse", -1.0))
 
 
 def class_alpha_of(sums: Float64) -> Float64:
-    """Alpha (...,) of one class against all others, from the sums apart, observations, evidence and own squares."""
+    """Return alpha (...,) of a class against all others, from sums apart, observations, evidence, own squares."""
     apart, n, total, squares = np.moveaxis(sums, -1, 0)
     with np.errstate(invalid="ignore", divide="ignore"):
         expected = 2 * ((n - 1) * total - total**2 + squares) / (n * (n - 1))
@@ -457,12 +469,12 @@ BY_CLASS: Mapping[str, Functional] = {
 
 
 def of_space_alone(key: str, k: int | None = None) -> bool:
-    """Whether a number says nothing of frames, so that its intervals are for these frames."""
+    """Return whether a number says nothing of frames, so that its intervals are for these frames."""
     return set(functional(key, k).names) <= set(WITHOUT_FRAMES)
 
 
 def functional(key: str, k: int | None = None) -> Functional:
-    """What a key stands for: of all classes, or of class k."""
+    """Return what a key stands for: of all classes, or of class k."""
     return FUNCTIONALS[key] if k is None else BY_CLASS[key]
 
 

@@ -37,8 +37,9 @@ BINS = 15
 class Truth:
     """The true class of a map's voxels.
 
-    known  (n,) whether the ground truth saw the voxel and has a majority there
-    label  (n,) the true class; -1 where it is not known
+    Attributes:
+        known: (n,) whether the ground truth saw the voxel and has a majority there.
+        label: (n,) the true class; -1 where it is not known.
     """
 
     known: Mask
@@ -46,9 +47,10 @@ class Truth:
 
 
 def join_truth(table: VoxelTable, truth: VoxelTable) -> Truth:
-    """The true class of each voxel of `table`, from the map `truth` of the ground truth labels of the same frames.
+    """Return the true class of each voxel of `table`, from the map `truth` of ground truth labels.
 
-    Raises DataError where the maps differ in K or voxel size.
+    Raises:
+        DataError: If the maps differ in K or voxel size.
     """
     require_same_grid(table, truth)
     result = truth.evidence.concentration
@@ -64,10 +66,11 @@ def join_truth(table: VoxelTable, truth: VoxelTable) -> Truth:
 class Predictions:
     """Beliefs beside the true classes, (n,) each.
 
-    label, predicted  the true and the most likely class
-    confidence        belief in the latter
-    error             squared distance of the belief from certainty of the true class, for Brier's score
-    K                 number of classes
+    Attributes:
+        label, predicted: The true and the most likely class.
+        confidence: Belief in the latter.
+        error: Squared distance of the belief from certainty of the true class, for Brier's score.
+        K: Number of classes.
     """
 
     label: Int64
@@ -78,7 +81,7 @@ class Predictions:
 
     @classmethod
     def of(cls, evidence: Float64 | Evidence, label: Int64) -> Predictions:
-        """Beliefs as evidence (n, K), up to a factor; what is said where the label is -1 means nothing."""
+        """Return beliefs as evidence (n, K), up to a factor; what is said where the label is -1 means nothing."""
         evidence = Evidence.of(evidence)
         spread, of = evidence.concentration, np.repeat(np.arange(len(evidence)), np.diff(evidence.starts))
         total = np.bincount(of, weights=evidence.weight, minlength=len(evidence))
@@ -110,7 +113,7 @@ def judged_sums(judged: Predictions, where: Mask) -> Float64:
 
 
 def _judged_by_group(judged: Predictions, group: Int64, groups: int) -> Float64:
-    """(G, ...) `judged_sums` of each group; -1 is none."""
+    """Return (G, ...) `judged_sums` of each group; -1 is none."""
     some, K = np.flatnonzero(group >= 0), judged.K
     of, label, predicted, confidence = group[some], judged.label[some], judged.predicted[some], judged.confidence[some]
     right = judged.right[some].astype(np.float64)
@@ -128,7 +131,7 @@ def _judged_by_group(judged: Predictions, group: Int64, groups: int) -> Float64:
 
 
 def correctness_of(sums: Float64, name: str = "all") -> Correctness:
-    """What is said of voxels of these sums, see `judged_sums`."""
+    """Return what is said of voxels of these sums, see `judged_sums`."""
     n, right, error = sums[:3]
     if not n:
         return Correctness(name, 0, math.nan, math.nan, math.nan, math.nan)
@@ -140,7 +143,7 @@ def correctness_of(sums: Float64, name: str = "all") -> Correctness:
 
 
 def reliability_of(sums: Float64) -> tuple[Reliability, ...]:
-    """The bins of the reliability diagram of voxels of these sums, see `judged_sums`."""
+    """Return the bins of the reliability diagram of voxels of these sums, see `judged_sums`."""
     count, confidence, right = sums[3 : 3 + 3 * BINS].reshape(3, BINS)
     with np.errstate(invalid="ignore"):
         confidence, accuracy = confidence / count, right / count
@@ -175,7 +178,7 @@ QUADRANTS = ("stable_right", "stable_wrong", "unstable_right", "unstable_wrong")
 
 
 def quadrant_sums(table: VoxelTable, truth: Truth, stable: Float64, edge: float) -> CubeSums:
-    """What `quadrants_of` is a function of, over cubes of that edge, by the probability (n,) that each is stable."""
+    """Return the sums for `quadrants_of` over cubes of that edge, by the stability posterior (n,)."""
     counted, likely, right = _masks(table, truth, stable)
     cubes = Cubes.of(table, edge, where=counted)
     parts = (likely * right, likely * ~right, (1 - likely) * right, (1 - likely) * ~right)
@@ -185,7 +188,7 @@ def quadrant_sums(table: VoxelTable, truth: Truth, stable: Float64, edge: float)
 
 
 def quadrants_of(sums: CubeSums) -> Quadrants:
-    """The shares, from `quadrant_sums`."""
+    """Return the shares, from `quadrant_sums`."""
     voxels = int(sums["stable_right"][1])
     if not voxels:
         return Quadrants(0, *[UNKNOWN] * 5)
@@ -193,17 +196,17 @@ def quadrants_of(sums: CubeSums) -> Quadrants:
 
 
 def stable_wrong(table: VoxelTable, truth: Truth, *, stable: float = STABLE) -> Mask:
-    """(n,) the dangerous voxels: OP >= 3, more likely stable than not, and wrong."""
+    """Return (n,) the dangerous voxels: OP >= 3, more likely stable than not, and wrong."""
     return wrong_of_steady(table, truth, stability_posterior(table, stable=stable))
 
 
 def wrong_of_steady(table: VoxelTable, truth: Truth, stable: Float64) -> Mask:
-    """The same, by the probability (n,) that each is stable."""
+    """Return the same, by the probability (n,) that each is stable."""
     counted, likely, right = _masks(table, truth, stable)
     return counted & (likely >= LIKELY) & ~right
 
 
 def _masks(table: VoxelTable, truth: Truth, stable: Float64) -> tuple[Mask, Float64, Mask]:
-    """(n,) which voxels count, with what probability each is stable (0 where none is known), and which are right."""
+    """Return (n,) which voxels count, their stability posterior (0 where unknown), and which are right."""
     counted = truth.known & (table.op >= RECURRENT)
     return counted, np.nan_to_num(stable), dominant(table) == truth.label

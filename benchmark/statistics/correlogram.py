@@ -94,7 +94,10 @@ def _cubes(seen: Events) -> tuple[Any, Any, float]:
 
 
 def _pairs(cells: CellObservations, seen: Events) -> Iterator[tuple[Int64, Int64, Float64]]:
-    """The pairs (m,) of observations that are 1, 2, 4, ... apart, lag by lag, and how far (m, 5), along `AXES`."""
+    """Yield the pairs (m,) of observations that are 1, 2, 4, ...
+
+    apart, lag by lag, and how far (m, 5), along `AXES`.
+    """
     rank, centre = cells.views.rank(seen.frame), cells.views.centre
     index = np.stack([seen.ix, seen.iy, seen.iz], axis=1)
     ray = centre[rank] - ((index + 0.5) * seen.voxel_size)[seen.voxel]
@@ -111,7 +114,7 @@ def _pairs(cells: CellObservations, seen: Events) -> Iterator[tuple[Int64, Int64
 
 
 def _bins(apart: Float64) -> Int64:
-    """The number (m, 5) in `BINS` of each pair along each axis, the last one beyond the edges."""
+    """Return the number (m, 5) in `BINS` of each pair along each axis, the last one beyond the edges."""
     bins, before = np.empty(apart.shape, np.int64), 0
     for axis, edges in enumerate(AXES.values()):
         of = np.searchsorted(edges, apart[:, axis], side="right")

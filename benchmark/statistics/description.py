@@ -72,12 +72,13 @@ SCHEMA = 2
 class Analysis:
     """The statistics of a map.
 
-    summary  all numbers, as `describe` returns them
-    table    means of the measures over all voxels
-    sums     sums by frame and cube of space, from which intervals and differences follow without voxels
-    sample   the voxels that the statistics rest on
-    shares   how often the dominant class is seen, over all locations: see `steady`
-    drawn    columns (n,) of the voxels of the sample that need its log or its true labels
+    Attributes:
+        summary: All numbers, as `describe` returns them.
+        table: Means of the measures over all voxels.
+        sums: Sums by frame and cube of space, from which intervals and differences follow without voxels.
+        sample: The voxels that the statistics rest on.
+        shares: How often the dominant class is seen, over all locations: see `steady`.
+        drawn: Columns (n,) of the voxels of the sample that need its log or its true labels.
     """
 
     summary: MapStatistics
@@ -125,12 +126,14 @@ def describe(
 ) -> MapStatistics:
     """Return all statistics of one map: a `MapSample` is drawn and analysed.
 
-    events  the log behind the table; without it there is no trend and no flip rate
-    truth   the map of the ground truth labels of the same frames; without it correctness is not known
-    limit   the map of view-independent labels (`ceiling`), from which geometry's part of the disagreement follows
+    - `events`: the log behind the table; without it there is no trend and no flip rate
+    - `truth`: the map of the ground truth labels of the same frames; without it correctness is not known
+    - `limit`: the map of view-independent labels (`ceiling`), from which geometry's part of the disagreement follows
 
-    The other arguments are those of `analyse`. Raises DataError where events, truth or
-    limit do not belong to the table.
+    The other arguments are those of `analyse`.
+
+    Raises:
+        DataError: If events, truth or limit do not belong to the table.
     """
     sample = MapSample.draw(table, events, truth, edges=edges)
     return analyse(sample, cells, limit=limit, name=name, seed=seed, edges=edges, critical=critical).summary
@@ -150,17 +153,20 @@ def analyse(
 ) -> Analysis:
     """Return all statistics of one map; the same seed gives the same numbers.
 
-    cells     labels of sampled cells, taken of the same frames by a `Sampler`; without them there is no alpha and no
-              verdict
-    limit     the map of view-independent labels; the ground truth's where it is not given
-    name      of the backbone, for the verdict
-    edges     upper bounds of the strata of OP
-    critical  the classes that the verdict depends on; where none is named, all with enough locations
-    scope     of the headline and the share of the ceiling, where frames tell of it
-    limits    of the verdict
-
     Intervals are at 95 %, those of all other numbers for these frames; undefined numbers are NaN, and a section
     that cannot be computed is None.
+
+    Args:
+        sample: The map, or a sample of it, with its log and the ground truth.
+        cells: Labels of sampled cells, taken of the same frames by a `Sampler`; without them there is no alpha and no
+            verdict.
+        limit: The map of view-independent labels; the ground truth's where it is not given.
+        name: Of the model, for the verdict.
+        seed: Of random orders.
+        edges: Upper bounds of the strata of OP.
+        critical: The classes that the verdict depends on; where none is named, all with enough locations.
+        scope: Of the headline and the share of the ceiling, where frames tell of it.
+        limits: Of the verdict.
     """
     table, events = sample.table.measured(), sample.events
     truth = None if sample.truth is None else join_truth(table, sample.truth)
@@ -287,7 +293,7 @@ def _agreement(means: Mapping[str, Interval], classes: tuple[ClassAgreement, ...
 def _drift(
     repeats: int, means: Mapping[str, Interval], locations: CubeSums, log: LogSums | None, of_flips: Sequence[Interval]
 ) -> DriftStatistics:
-    """SBD beside its null; without a log only for one-hot evidence, and without flips and trend."""
+    """Return SBD beside its null; without a log only for one-hot evidence, and without flips and trend."""
     trend, rates, sampled = None, None, locations["psa"][1]
     if log is not None:
         since, share = confidence_intervals(log.places.specs(OF_CHANGES))

@@ -28,9 +28,10 @@ ENOUGH_LOOKS = 6
 class Flips:
     """Changes of the predicted class between successive observations of a voxel (n,); NaN where undefined.
 
-    rate   share of the steps from one observation to the next at which the class changes; OP >= 2
-    null   its expectation in random order: the share of all pairs of observations that differ
-    since  frames from the last change to the last observation; NaN where the class never changed
+    Attributes:
+        rate: Share of the steps from one observation to the next at which the class changes; OP >= 2.
+        null: Its expectation in random order: the share of all pairs of observations that differ.
+        since: Frames from the last change to the last observation; NaN where the class never changed.
     """
 
     rate: Float64
@@ -45,8 +46,9 @@ class Trends:
     Odd and even observations have a slope over time each. Their product is 0 in the mean for errors that are
     independent between frames, however much each frame errs.
 
-    common     the product of both slopes, summed over classes, as variation: that of observations on such lines
-    variation  of the odd and of the even observations about their own means: sums of ||s_t - mean||^2
+    Attributes:
+        common: The product of both slopes, summed over classes, as variation: that of observations on such lines.
+        variation: Of the odd and of the even observations about their own means: sums of ||s_t - mean||^2.
     """
 
     common: Float64
@@ -54,12 +56,12 @@ class Trends:
 
     @property
     def share(self) -> Float64:
-        """What part (n,) of the variation goes one way in time, -1 to 1; of one voxel it is noisy."""
+        """Return what part (n,) of the variation goes one way in time, -1 to 1; of one voxel it is noisy."""
         return self.common / self.variation
 
 
 def expected_sbd(table: VoxelTable, events: Events | None = None, *, seed: int = 0) -> Float64:
-    """SBD (n,) expected in random order, bits: exactly, from the counts of one-hot observations alone.
+    """Return SBD (n,) expected in random order, bits: exactly, from the counts of one-hot observations alone.
 
     Where a frame's pixels in the voxel disagree, or OP exceeds 256, it is the mean of eight turns of one random order;
     NaN there without the log behind the table, and where OP < 2.
@@ -129,13 +131,13 @@ def flips(events: Events) -> Flips:
 
 
 def lowest(numbers: UInt64, count: int) -> Int64:
-    """Which of numbers (n,) are the lowest so many, ascending."""
+    """Return which of numbers (n,) are the lowest so many, ascending."""
     few = np.argpartition(numbers, count)[:count] if count < len(numbers) else np.arange(len(numbers))
     return few[np.argsort(numbers[few])]
 
 
 def streams(table: VoxelTable, rows: Any, seed: int) -> UInt64:
-    """A random number (r,) of each of some voxels that depends on its index and the seed only."""
+    """Return a random number (r,) of each of some voxels that depends on its index and the seed only."""
     from semstab.statistics.loops import orders
 
     index = np.stack([table.ix[rows], table.iy[rows], table.iz[rows]], axis=1)

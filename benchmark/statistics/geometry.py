@@ -34,17 +34,21 @@ def ceiling(
     world: VoxelTable | None = None,
     views: Iterable[Frame] | None = None,
 ) -> VoxelTable:
-    """The map of view-independent labels: what the fusion of `frames` would be with a model that never errs.
-
-    frames        the frames as they were fused, noise included; one is held at a time
-    make_backend  makes a new, empty map of the same voxels: `lambda: create("numba", voxel_size=0.2, num_classes=7)`
-    world         a map whose dominant labels are rendered into the frames; where there is none, the frames' own labels
-                  count, which are to be the ground truth
-    views         the same frames free of the noise that was added to them: labels are seen from there
+    """Return the map of view-independent labels: what the fusion of `frames` would be with a model that never errs.
 
     With `world` the map itself and no `views` nothing is lost, as each pixel sees the voxel that it falls into. Give
     ground truth, a map of finer voxels, or the frames before noise was added.
-    Raises DataError where frames and views do not fit together.
+
+    Args:
+        frames: The frames as they were fused, noise included; one is held at a time.
+        make_backend: Makes a new, empty map of the same voxels: `lambda: create("numba", voxel_size=0.2,
+            num_classes=7)`.
+        world: A map whose dominant labels are rendered into the frames; where there is none, the frames' own labels
+            count, which are to be the ground truth.
+        views: The same frames free of the noise that was added to them: labels are seen from there.
+
+    Raises:
+        DataError: If frames and views do not fit together.
     """
     backend = make_backend()
     for frame in frames if world is None else rendered(frames, world, views):
@@ -53,10 +57,15 @@ def ceiling(
 
 
 def rendered(frames: Iterable[Frame], world: VoxelTable, views: Iterable[Frame] | None = None) -> Iterator[Frame]:
-    """The frames with the labels that the map shows in them: each pixel has the dominant label of the voxel it sees.
+    """Yield the frames with the labels that the map shows in them.
+
+    Each pixel has the dominant label of the voxel it sees.
 
     A pixel that sees no voxel of the map is ignored. `views` (the frames themselves where not given) say where a pixel
-    sees. Raises DataError where a view is missing or differs in size from its frame.
+    sees.
+
+    Raises:
+        DataError: If a view is missing or differs in size from its frame.
     """
     labels = _Labels(world)
     for frame, view in ((frame, frame) for frame in frames) if views is None else _paired(frames, views):
@@ -68,7 +77,8 @@ def rendered(frames: Iterable[Frame], world: VoxelTable, views: Iterable[Frame] 
 def losses(table: VoxelTable, limit: VoxelTable) -> Losses:
     """Split the disagreement in a model's map by the ceiling's map `limit` of the same voxels.
 
-    Raises DataError where the maps differ in K or voxel size.
+    Raises:
+        DataError: If the maps differ in K or voxel size.
     """
     rows, limit_rows = shared_rows(table, limit)
     both = (table.op[rows] >= 2) & (limit.op[limit_rows] >= 2)
@@ -102,7 +112,7 @@ class _Labels:
         self._labels = dominant(world).astype(self.dtype)
 
     def at(self, index: Int64) -> npt.NDArray[np.integer]:
-        """Labels (n,) of voxel indices (3, n)."""
+        """Return labels (n,) of voxel indices (3, n)."""
         x, y, z = index - self._low[:, None]
         inside = (
             (np.minimum(np.minimum(x, y), z) >= 0) & (x < self._size[0]) & (y < self._size[1]) & (z < self._size[2])

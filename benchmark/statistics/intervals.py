@@ -88,7 +88,7 @@ def estimate(
 def spec_of(
     sums: ClusterSums, key: str, k: int | None = None, scope: Scope = THIS_SCENE, level: float = LEVEL
 ) -> EstimateSpec:
-    """For `answers`, see `estimate`."""
+    """Return the spec of a number of a map, see `estimate`."""
     number = functional(key, k)
     bounds, own = (number.low, number.high), value(sums, key, k)
     clipped = own if math.isnan(own) else min(max(own, number.low), number.high)
@@ -105,10 +105,11 @@ def difference(
     same_frames: bool | None = None,
     level: float = LEVEL,
 ) -> Interval:
-    """A number of map a less that of map b, paired on places, and on frames where both have the same ones.
+    """Return a number of map a less that of map b, paired on places, and on frames where both have the same ones.
 
-    same_frames  False for another flight, whose frames have nothing to do with these; where it is not given, frames are
-                 paired if both maps have the same
+    - `same_frames`: False for another flight, whose frames have nothing to do with these; where it is not given, frames
+      are paired if both maps have the same
+
     Each map counts with all its voxels: those of the cubes that only one holds add to the variance. Of the very same
     sums there is no difference anywhere: exactly 0, without a p-value.
     """
@@ -134,7 +135,7 @@ def difference(
 
 
 def identical(a: ClusterSums, b: ClusterSums, key: str, k: int | None = None) -> bool:
-    """Whether a number is of the very same sums in two maps, so that it has no difference, anywhere."""
+    """Return whether a number is of the very same sums in two maps, so that it has no difference, anywhere."""
     one, other = ([part for part, _ in parts_of(own, functional(key, k))] for own in aligned(a, b))
     if len(one) != len(other):
         return False
@@ -151,7 +152,7 @@ def identical(a: ClusterSums, b: ClusterSums, key: str, k: int | None = None) ->
 
 
 def no_difference(interval: Interval) -> Interval:
-    """A difference that there is nowhere, of places and frames as found."""
+    """Return a difference that there is nowhere, of places and frames as found."""
     return dataclasses.replace(interval, value=0.0, low=0.0, high=0.0, degrees=math.inf, undecided="", p_value=math.nan)
 
 
@@ -164,7 +165,7 @@ def interval_of_cubes(
     bounds: tuple[float, float] = (-math.inf, math.inf),
     level: float = LEVEL,
 ) -> Interval:
-    """The statistic of sums (m, C) of cubes (m, 3) of an edge in metres, with its interval for these frames.
+    """Return the statistic of sums (m, C) of cubes (m, 3) of an edge in metres, with its interval for these frames.
 
     The second column counts what the first is a sum of.
     """
@@ -181,7 +182,7 @@ def spec_of_cubes(
     bounds: tuple[float, float] = (-math.inf, math.inf),
     level: float = LEVEL,
 ) -> EstimateSpec:
-    """For `answers`, see `of_places`."""
+    """Return the spec of a statistic of cubes, see `interval_of_cubes`."""
     grid = influences(index, columns, statistic)
     return EstimateSpec(float(statistic(columns.sum(axis=0))), grid, THESE_FRAMES, scale, bounds, level)
 
@@ -196,7 +197,7 @@ def spec_of_observations(
     statistic: Statistic,
     level: float = LEVEL,
 ) -> EstimateSpec:
-    """For `answers`: an agreement of sums (m, C) of cubes and groups of frames, see `influences`.
+    """Return the spec of an agreement of sums (m, C) of cubes and groups of frames, see `influences`.
 
     Its interval is for this scene flown again where frames tell of it, else for these frames.
     """
@@ -263,7 +264,7 @@ def probability_above(interval: Interval, threshold: float, scale: Scale) -> flo
 
 
 def _share_ends(p: float, spread: Spread, units: int, level: float) -> tuple[float, float]:
-    """Of a share, or of a mean of numbers from 0 to 1, by the looks that it is worth (Korn and Graubard 1998)."""
+    """Return the ends for a mean of numbers from 0 to 1, by its effective sample size (Korn and Graubard 1998)."""
     from scipy import special
 
     p = min(max(p, 0.0), 1.0)
@@ -278,7 +279,7 @@ def _share_ends(p: float, spread: Spread, units: int, level: float) -> tuple[flo
 
 
 def _ends(result: float, spread: Spread, unseen: float, scale: Scale, level: float) -> tuple[float, float]:
-    """By Student's t, for agreement on the scale log(1 - found), so that no end passes 1; or what may be unseen."""
+    """Return the ends by Student's t, for agreement on the scale log(1 - x), so that none passes 1."""
     if spread.variance <= TINY:
         return result - unseen, result if scale == "agreement" else result + unseen
     half = spread.half(level)
@@ -307,7 +308,7 @@ def _interval(result: float, low: float, high: float, grid: Influences, spread: 
 
 
 def unpaired(a: Interval, b: Interval, level: float = LEVEL) -> Interval:
-    """A number less another one of which nothing is shared, from their intervals (Zou and Donner 2008)."""
+    """Return a number less another one of which nothing is shared, from their intervals (Zou and Donner 2008)."""
     result = a.value - b.value
     low = result - math.hypot(a.value - a.low, b.high - b.value)
     high = result + math.hypot(a.high - a.value, b.value - b.low)
@@ -315,7 +316,7 @@ def unpaired(a: Interval, b: Interval, level: float = LEVEL) -> Interval:
 
 
 def mean_of(result: Sequence[Interval], level: float = LEVEL) -> Interval:
-    """The mean of numbers, of scenes for example, of which each errs by itself."""
+    """Return the mean of numbers, of scenes for example, of which each errs by itself."""
     n = len(result)
     value = sum(own.value for own in result) / n
     low = value - math.hypot(*(own.value - own.low for own in result)) / n
@@ -326,7 +327,7 @@ def mean_of(result: Sequence[Interval], level: float = LEVEL) -> Interval:
 def _combined(
     value: float, low: float, high: float, parts: Sequence[Interval], weight: float, level: float
 ) -> Interval:
-    """The p-value by the variances that the parts' intervals stand for, each with its degrees of freedom."""
+    """Return the p-value by the variances that the parts' intervals stand for, each with its degrees of freedom."""
     from scipy import special
 
     variances = [(weight * standard_error(own, level)) ** 2 for own in parts]
@@ -349,7 +350,7 @@ def _combined(
 
 
 def standard_error(interval: Interval, level: float = LEVEL) -> float:
-    """That which an interval by Student's t stands for."""
+    """Return the standard error that an interval by Student's t stands for."""
     from scipy import special
 
     if not interval.degrees > 0:
@@ -387,7 +388,7 @@ def difference_over_frames(a: Mapping[int, float], b: Mapping[int, float], level
 
 
 def coverage(new: ClusterSums, base: ClusterSums, level: float = LEVEL, *, same_frames: bool | None = None) -> Interval:
-    """How many voxels with OP >= 2 a map has for each one of another, less 1, for these frames.
+    """Return how many voxels with OP >= 2 a map has for each one of another, less 1, for these frames.
 
     Of the same frames (where that is not given, the sums tell) it is a count, without an interval; else an estimate,
     paired on cubes.
@@ -407,13 +408,16 @@ def coverage(new: ClusterSums, base: ClusterSums, level: float = LEVEL, *, same_
 
 
 def shares_of(new: ClusterSums, base: ClusterSums) -> dict[str, float]:
-    """How many voxels with OP >= 2, and labelled observations in them, a map has for each one of another; else NaN."""
+    """Return how many voxels with OP >= 2, and labelled observations in them, a map has for each one of another.
+
+    Else NaN.
+    """
     totals = {name: [round(float(part[name].sum())) for part in (new, base)] for name in ("voxels", "observations")}
     return {name: after / before if before else math.nan for name, (after, before) in totals.items()}
 
 
 def counted(value: float, sums: ClusterSums) -> Interval:
-    """A change that is a count of the frames of some sums, and no estimate; undecided where it is undefined."""
+    """Return a change that is a count of the frames of some sums, and no estimate; undecided where it is undefined."""
     return Interval(
         value, value, value, frames=sums.frame_count, locations=sums.cells, degrees=math.inf,
         undecided=NO_PLACES if math.isnan(value) else "", p_value=0.0 if abs(value) > 0 else math.nan,
@@ -421,20 +425,20 @@ def counted(value: float, sums: ClusterSums) -> Interval:
 
 
 def same_flight(a: ClusterSums, b: ClusterSums) -> bool:
-    """Whether both have the same groups of frames, so that they can be paired."""
+    """Return whether both have the same groups of frames, so that they can be paired."""
     one, other = _groups_of(a, b)
     return len(one) > 0 and np.array_equal(one, other)
 
 
 def within_a_flight(a: ClusterSums, b: ClusterSums) -> bool:
-    """Whether one has no groups of frames but the other's, as where a model gives no label in whole frames."""
+    """Return whether one has no groups of frames but the other's, as where a model gives no label in whole frames."""
     one, other = _groups_of(a, b)
     both = len(np.intersect1d(one, other))
     return both > 0 and both in (len(one), len(other))
 
 
 def _groups_of(a: ClusterSums, b: ClusterSums) -> tuple[Int64, Int64]:
-    """The groups of frames of both, of the same number of frames each; none where they are not known."""
+    """Return the groups of frames of both, of the same number of frames each; none where they are not known."""
     step, known = max(a.step, b.step), bool(a.step and b.step)
     one, other = (np.unique(part.frame[part.frame >= 0] // (step // part.step if known else 1)) for part in (a, b))
     return (one.astype(np.int64), other.astype(np.int64)) if known else (np.zeros(0, np.int64), np.zeros(0, np.int64))

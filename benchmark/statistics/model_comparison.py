@@ -43,7 +43,7 @@ from semstab.statistics.paired_differences import (
 
 
 def coverage(tables: Tables) -> tuple[MapCoverage, ...]:
-    """Coverage of each backbone's map; common_share is the part of its voxels that all maps hold."""
+    """Return coverage of each backbone's map; common_share is the part of its voxels that all maps hold."""
     return coverage_of(tuple(tables), [held(tables)])
 
 
@@ -61,7 +61,7 @@ def held(tables: Tables) -> Int64:
 
 
 def coverage_of(names: Sequence[str], parts: Sequence[Int64]) -> tuple[MapCoverage, ...]:
-    """Coverage of the maps by what their parts have, see `held`."""
+    """Return coverage of the maps by what their parts have, see `held`."""
     return tuple(
         MapCoverage(
             backbone=name,
@@ -80,7 +80,7 @@ def coverage_of(names: Sequence[str], parts: Sequence[Int64]) -> tuple[MapCovera
 
 
 def compared(*, truth: bool) -> tuple[Quantity, ...]:
-    """All that is compared, in the order of the tables; what needs ground truth only where there is some."""
+    """Return all that is compared, in the order of the tables; what needs ground truth only where there is some."""
     quantities = (ALPHA, PSA, *measures(), VOXEL_ALPHA, ACCURACY)
     return tuple(quantity for quantity in quantities if truth or quantity.needs != "truth")
 
@@ -89,7 +89,7 @@ def compared(*, truth: bool) -> tuple[Quantity, ...]:
 
 
 def repeated_rows(tables: Tables) -> list[Int64]:
-    """Rows of the voxels that every map saw twice or more, one array a map, in the same order of voxels."""
+    """Return rows of the voxels that every map saw twice or more, one array a map, in the same order of voxels."""
     rows = shared_rows(*tables.values())
     again = np.all([table.op[r] >= 2 for table, r in zip(tables.values(), rows, strict=True)], axis=0)
     return [r[again] for r in rows]
@@ -140,7 +140,7 @@ def paired(
 
 
 def _by_cube(cells: Mapping[str, ClusterSums]) -> dict[str, Float64]:
-    """Sums (G, 2 C) over the cubes that hold cells of any model, of fine cells and of coarse ones side by side."""
+    """Return sums (G, 2 C) over the cubes that hold cells of any model, fine and coarse ones side by side."""
     parts = {name: [own for own in (sums.fine, sums.coarse) if own is not None] for name, sums in cells.items()}
     cubes, row = distinct_rows(np.concatenate([own.cell for each in parts.values() for own in each]))
     ends, result = iter(np.split(row, np.cumsum([len(own.cell) for each in parts.values() for own in each]))), {}
@@ -155,7 +155,7 @@ def _by_cube(cells: Mapping[str, ClusterSums]) -> dict[str, Float64]:
 
 
 def _alpha_of_cells(sums: Float64) -> Float64:
-    """Alpha (...,) from sums (..., 2 C) of fine cells and of coarse ones."""
+    """Return alpha (...,) from sums (..., 2 C) of fine cells and of coarse ones."""
     parts = zip(CELLS, np.split(sums, 2, axis=-1), strict=True)
     alpha: Float64 = np.sum([weight * alpha_of(own) for (_, weight), own in parts], axis=0)
     return alpha
@@ -164,7 +164,7 @@ def _alpha_of_cells(sums: Float64) -> Float64:
 def _columns(
     tables: Tables, rows: Sequence[Int64], truth: VoxelTable | None
 ) -> tuple[dict[Quantity, dict[str, Float64]], dict[Quantity, Statistic]]:
-    """By measure of voxels: each backbone's columns on the common ones, and what makes the measure of their sums."""
+    """Return by measure of voxels each backbone's columns on the common ones, and the statistic of their sums."""
     quantities = [quantity for quantity in compared(truth=truth is not None) if quantity is not ALPHA]
     statistics: dict[Quantity, Statistic] = {
         quantity: alpha_of if quantity is VOXEL_ALPHA else ratio_of for quantity in quantities
@@ -187,7 +187,7 @@ def _columns(
 
 
 def _ranking(measure: Quantity, statistic: Statistic, sums: Mapping[str, Float64], seed: int) -> Ranking:
-    """From the sums (G, C) of each backbone over cubes, by resamples of these."""
+    """Return the ranking by the sums (G, C) of each backbone over cubes, and by resamples of these."""
     count, drawn = len(next(iter(sums.values()))), np.zeros((1, 0))
     if count:
         drawn = np.random.default_rng(seed).multinomial(count, np.full(count, 1 / count), size=REPLICATES).astype(float)
@@ -236,12 +236,15 @@ def compare_backbones(
 ) -> BackboneComparison:
     """Compare several backbones' maps of one scene; at least two.
 
-    coverage      what each map holds
-    standardised  means at a common distribution of OP, each map with all its voxels; none of labels beside scores
-    paired        values, differences and rankings: alpha of the observations that all made, with the same weights,
-                  where there are samples of them (`Sampler`); other measures on the voxels that all saw twice or more
-    observations  what these are, and what the order owes to what was left out; None without samples
-    Raises ConfigError for fewer than two maps, DataError where they differ in K or voxel size.
+    - `coverage`: what each map holds
+    - `standardised`: means at a common distribution of OP, each map with all its voxels; none of labels beside scores
+    - `paired`: values, differences and rankings: alpha of the observations that all made, with the same weights, where
+      there are samples of them (`Sampler`); other measures on the voxels that all saw twice or more
+    - `observations`: what these are, and what the order owes to what was left out; None without samples
+
+    Raises:
+        ConfigError: For fewer than two maps.
+        DataError: If they differ in K or voxel size.
     """
     if len(tables) < 2:
         raise ConfigError(f"there are {len(tables)} backbones to compare; give two or more")
@@ -286,7 +289,7 @@ def compare_regions(
 
 
 def _paired(regions: Regions, shared: SharedObservations | None, seed: int) -> Paired:
-    """On common observations, and on the common voxels with all observations of each map; of very many a sample."""
+    """Compare on common observations, and on the common voxels with all observations of each map."""
     common = common_voxels(regions)
     cells = None if shared is None else shared.sums
     return paired(common.tables, common.truth, logs=common.events, cells=cells, seed=seed)

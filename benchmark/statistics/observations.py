@@ -182,7 +182,7 @@ class CellObservations:
 
     @property
     def coarsening(self) -> int:
-        """How many cells of the sample make the edge of a fine cell, by the views' median footprint: 1 or 2.
+        """Return how many cells of the sample make the edge of a fine cell, by the views' median footprint: 1 or 2.
 
         A fine cell is one to two footprints wide; two of them make the edge of a coarse one, which a block holds whole.
         """
@@ -277,7 +277,7 @@ class CellObservations:
 
     @staticmethod
     def _number(cell: Int64) -> Int64:
-        """Number cells (n, 3) in lexical order: (n,), equal for equal cells."""
+        """Return number cells (n, 3) in lexical order: (n,), equal for equal cells."""
         low = cell.min(axis=0, initial=np.iinfo(np.int64).max)
         size = cell.max(axis=0, initial=np.iinfo(np.int64).min) - low + 1
         x, y, z = (cell - low).T
@@ -299,7 +299,11 @@ class CellObservations:
 
     @classmethod
     def load(cls, path: str | Path) -> CellObservations:
-        """Read what `save` wrote. Raises DataError where the file is missing, damaged or of another kind."""
+        """Read what `save` wrote.
+
+        Raises:
+            DataError: If the file is missing, damaged or of another kind.
+        """
         import pyarrow as pa
         import pyarrow.parquet as pq
 

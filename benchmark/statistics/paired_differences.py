@@ -40,7 +40,8 @@ SUMMED = (VOXEL_ALPHA, PSA, ENTROPY, ACCURACY)
 class OnCommonLocations:
     """Backbones on the same places (n, 3): the sums of each map there, and the cubes of space that hold them.
 
-    known  what the sums of these maps tell
+    Attributes:
+        known: What the sums of these maps tell.
     """
 
     sums: Mapping[str, ClusterSums]
@@ -67,14 +68,14 @@ class OnCommonLocations:
         return cls(sums, cubes, frozenset(SUMMED) - ({ACCURACY} if truth is None else set()))
 
     def value(self, measure: Quantity, name: str, columns: Float64, statistic: Statistic) -> Estimate:
-        """Of one backbone; columns (n, C) are those that the statistic is of."""
+        """Return the value of one backbone; columns (n, C) are those that the statistic is of."""
         if measure in self.known:
             sums = self.sums[name]
             return estimate(sums, measure.key, scope=scope_of(sums, key=measure.key)).ends
         return self.cubes.estimate(columns, statistic).ends
 
     def difference(self, measure: Quantity, a: str, b: str, columns: Mapping[str, Float64], of: Statistic) -> Interval:
-        """Of backbone a less backbone b."""
+        """Return the difference of backbone a less backbone b."""
         if measure in self.known:
             scope = scope_of(self.sums[a], key=measure.key)
             return difference(self.sums[a], self.sums[b], measure.key, scope=scope)
@@ -110,7 +111,7 @@ def _row(measure: Quantity, a: str, b: str, interval: Interval, *, tested: bool)
 
 
 def claimed_together(comparisons: Sequence[BackboneComparison]) -> tuple[BackboneComparison, ...]:
-    """Scenes of one study: p-values of all that may be claimed in any of them, corrected together."""
+    """Return scenes of one study: p-values of all that may be claimed in any of them, corrected together."""
     rows = _claimed([row for result in comparisons for row in result.paired.differences])
     ends = np.cumsum([0, *(len(result.paired.differences) for result in comparisons)])
     return tuple(
@@ -120,13 +121,15 @@ def claimed_together(comparisons: Sequence[BackboneComparison]) -> tuple[Backbon
 
 
 def _claimed(rows: Sequence[PairedDifference]) -> tuple[PairedDifference, ...]:
-    """With p-values corrected for the number of those that may be claimed; where nothing may there is none."""
+    """Return rows with p-values corrected for the number of those that may be claimed."""
     corrected = holm([float("nan") if row.undecided else row.p_value for row in rows])
     return tuple(dataclasses.replace(row, p_holm=p) for row, p in zip(rows, corrected, strict=True))
 
 
 def holm(p: Sequence[float]) -> list[float]:
-    """P-values corrected for their number: rejecting those <= q keeps the chance of any false one at q (Holm 1979).
+    """Return p-values corrected for their number.
+
+    Rejecting those <= q keeps the chance of any false one at q (Holm 1979).
 
     >>> [round(value, 2) for value in holm([0.01, 0.04, 0.03])]
     [0.03, 0.06, 0.06]
@@ -152,17 +155,19 @@ LEAST_VOXELS, LEAST_OVERLAP = 50, 0.1
 
 
 def voxelwise() -> dict[Quantity, Callable[[VoxelTable], Float64]]:
-    """What is compared and has one value a voxel (n,), NaN where undefined."""
+    """Return what is compared and has one value a voxel (n,), NaN where undefined."""
     return {PSA: psa, **{measure: measure.of for measure in measures()}}
 
 
 def stratum_counts(tables: Tables, edges: Sequence[int] = EDGES) -> Int64:
-    """(M, S) voxels of each map, or of its part in one region, in each stratum of OP."""
+    """Return (M, S) voxels of each map, or of its part in one region, in each stratum of OP."""
     return np.stack([np.bincount(_stratum(t, edges), minlength=len(edges) + 2)[1:] for t in tables.values()])
 
 
 def common_weights(counts: Int64) -> Float64:
-    """The common distribution of OP: shares (S,) of the strata among the voxels with OP >= 2 of all maps together.
+    """Return the common distribution of OP.
+
+    Shares (S,) of the strata among the voxels with OP >= 2 of all maps together.
 
     A stratum that is empty in some map has weight 0: there is nothing to compare it with.
     """
@@ -172,7 +177,7 @@ def common_weights(counts: Int64) -> Float64:
 
 
 def thin_share(counts: Int64, weights: Float64) -> float:
-    """The part of the weights in strata of which some map has few voxels, or a small part of what another has."""
+    """Return the weight of strata of which some map has few voxels, or a small part of what another has."""
     few = (counts < LEAST_VOXELS).any(axis=0)
     few |= counts.min(axis=0) < LEAST_OVERLAP * counts.max(axis=0)
     return float(weights[few].sum())
@@ -181,7 +186,7 @@ def thin_share(counts: Int64, weights: Float64) -> float:
 def standardised(
     tables: Tables, measure: Quantity, *, edges: Sequence[int] = EDGES, weights: Float64 | None = None
 ) -> dict[str, Estimate]:
-    """A measure's mean in each map, as it would be if all had the common distribution of OP (direct standardisation).
+    """Return a measure's mean in each map at the common distribution of OP (direct standardisation).
 
     sum_s w_s m_s with m_s the mean in stratum s; each map counts with all its voxels with OP >= 2.
     """
@@ -191,7 +196,7 @@ def standardised(
 
 
 def stratum_sums(table: VoxelTable, edges: Sequence[int] = EDGES) -> CubeSums:
-    """Of each quantity the sums over the voxels of each cube and stratum, then how many (G, 2 S)."""
+    """Return the sums of each quantity over the voxels of each cube and stratum, then how many (G, 2 S)."""
     stratum, S, cubes = _stratum(table, edges), len(edges) + 1, Cubes.of(table)
     group = np.where(cubes.at >= 0, cubes.at * S + stratum - 1, -1)
     quantities = voxelwise()
@@ -202,7 +207,7 @@ def stratum_sums(table: VoxelTable, edges: Sequence[int] = EDGES) -> CubeSums:
 
 
 def standardised_of(sums: CubeSums, weights: Float64) -> dict[str, Estimate]:
-    """Each quantity's mean at these weights, by key, from `stratum_sums`.
+    """Return each quantity's mean at these weights, by key, from `stratum_sums`.
 
     Its interval is that of a ratio of sums with the same influences: a voxel's value counts by how far it is from the
     mean of its stratum.
@@ -225,7 +230,7 @@ def standardised_of(sums: CubeSums, weights: Float64) -> dict[str, Estimate]:
 
 
 def _stratum(table: VoxelTable, edges: Sequence[int]) -> Int64:
-    """(n,) 0 for OP = 1, else 1 to len(edges) + 1."""
+    """Return (n,) 0 for OP = 1, else 1 to len(edges) + 1."""
     if list(edges) != sorted(set(edges)) or not edges or edges[0] < 2:
         raise ConfigError(f"edges = {list(edges)}: upper bounds of OP must ascend from 2 or more")
     return np.where(table.op >= 2, np.searchsorted(edges, table.op) + 1, 0)
@@ -238,9 +243,12 @@ def _stratum(table: VoxelTable, edges: Sequence[int]) -> Int64:
 class CommonObservations:
     """Models of one scene, observed alike.
 
-    shared    of each: the observations of cells that all made, with as many pixels as the model with fewest has there
-    ignoring  of each: the observations that any made, with one class more, the last, for what the model did not label
-    missing   share of the pixels of these that the model did not label
+    Attributes:
+        shared: Of each: the observations of cells that all made, with as many pixels as the model with fewest has
+            there.
+        ignoring: Of each: the observations that any made, with one class more, the last, for what the model did not
+            label.
+        missing: Share of the pixels of these that the model did not label.
     """
 
     shared: tuple[CellObservations, ...]
@@ -273,7 +281,7 @@ def common_observations(models: Sequence[CellObservations]) -> CommonObservation
 
 
 def _of_the_same_blocks(models: Sequence[CellObservations]) -> list[CellObservations]:
-    """The blocks that are in all samples by their hash, with the views of all numbered alike."""
+    """Return the blocks that are in all samples by their hash, with the views of all numbered alike."""
     share = min(sample.share for sample in models)
     views = Views.joined([sample.views for sample in models])
     views = views.take(np.sort(np.unique(views.frame, return_index=True)[1]))
@@ -286,7 +294,7 @@ def _of_the_same_blocks(models: Sequence[CellObservations]) -> list[CellObservat
 
 
 def _numbered(models: Sequence[CellObservations]) -> tuple[list[Int64], Int64]:
-    """The number of each entry's observation, the same in all models, and one entry of each among those of all."""
+    """Return the number of each entry's observation, alike in all models, and one entry of each observation."""
     F = max((len(sample.views) for sample in models), default=1)
     all_of_them = CellObservations.joined(models)
     _, cell = np.unique(all_of_them.key, return_inverse=True)
@@ -295,7 +303,7 @@ def _numbered(models: Sequence[CellObservations]) -> tuple[list[Int64], Int64]:
 
 
 def _filled(sample: CellObservations, locations: CellObservations, ignored: Float64) -> CellObservations:
-    """A model's entries, and those of a further class that has the pixels `ignored` of each of the locations."""
+    """Return a model's entries, and those of a further class that has the pixels `ignored` of each of the locations."""
     label = np.full(len(locations), sample.K, np.uint16)
     further = dataclasses.replace(locations, label=label, weight=ignored).only(ignored > 0)
     return dataclasses.replace(CellObservations.joined([sample, further]), K=sample.K + 1, classes=())

@@ -28,10 +28,11 @@ MOST_VOXELS = 500_000
 class MapSample:
     """At most MOST_VOXELS voxels of a map, drawn by a hash of their indices; all voxels of a smaller map.
 
-    table    rows of the drawn voxels, sorted as a VoxelTable is
-    events   their observations, where a log was kept
-    truth    the rows of the true labels' map at those voxels, where ground truth is known
-    summary  additive sums over ALL voxels of the map
+    Attributes:
+        table: Rows of the drawn voxels, sorted as a VoxelTable is.
+        events: Their observations, where a log was kept.
+        truth: The rows of the true labels' map at those voxels, where ground truth is known.
+        summary: Additive sums over ALL voxels of the map.
     """
 
     table: VoxelTable
@@ -51,7 +52,8 @@ class MapSample:
     ) -> MapSample:
         """Draw from a map or from a part of one.
 
-        Raises DataError where the events are not the log behind the table, or the truth has other classes or voxels.
+        Raises:
+            DataError: If the events are not the log behind the table, or the truth has other classes or voxels.
         """
         if events is not None:
             require_same_map(table, events)
@@ -67,7 +69,7 @@ class MapSample:
 
     @classmethod
     def merged(cls, parts: Sequence[MapSample], *, most: int = MOST_VOXELS) -> MapSample:
-        """The sample of a map from those of its disjoint parts: the lowest hashes of all of them."""
+        """Return the sample of a map from those of its disjoint parts: the lowest hashes of all of them."""
         table = VoxelTable.joined([part.table for part in parts])
         logs = [part.events for part in parts if part.events is not None]
         truths = [part.truth for part in parts if part.truth is not None]
@@ -80,11 +82,14 @@ class MapSample:
         return cls(table, events, truth, functools.reduce(operator.add, (part.summary for part in parts)))
 
     def bound(self, *, most: int = MOST_VOXELS) -> int | None:
-        """The highest hash of a voxel, where there are as many as a sample has; None where there is room for others."""
+        """Return the highest hash of a voxel, where there are as many as a sample has.
+
+        None where there is room for others.
+        """
         return int(streams(self.table, slice(None), 0).max()) if len(self.table) >= most else None
 
     def below(self, bound: int | None) -> MapSample:
-        """The part of it that a sample with that highest hash can take in."""
+        """Return the part of it that a sample with that highest hash can take in."""
         rows = slice(None) if bound is None else np.flatnonzero(streams(self.table, slice(None), 0) <= bound)
         if isinstance(rows, slice) or len(rows) == len(self.table):
             return self
@@ -98,7 +103,11 @@ class MapSample:
 
     @classmethod
     def load(cls, path: Path) -> MapSample:
-        """Read what `save` wrote. Raises DataError where the file is missing or damaged."""
+        """Read what `save` wrote.
+
+        Raises:
+            DataError: If the file is missing or damaged.
+        """
         arrays = read_arrays(path)
         if arrays is None:
             raise DataError(f"{path}: not a sample of a map; it is missing or damaged, start the run again")
@@ -106,5 +115,5 @@ class MapSample:
 
 
 def _drawn(table: VoxelTable, most: int) -> Int64:
-    """The rows of the voxels with the lowest hashes, ascending."""
+    """Return the rows of the voxels with the lowest hashes, ascending."""
     return np.sort(lowest(streams(table, slice(None), 0), most))

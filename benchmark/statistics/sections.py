@@ -106,11 +106,13 @@ UNIT = 2.0**-32
 
 @dataclass(frozen=True, eq=False)
 class FlippingSums:
-    """What is known of the places of a map that flip, as sums over its places with OP >= 2.
+    """Locations of a map that flip, as sums over its locations with OP >= 2.
 
-    share     over the cubes: how likely places are not stable, and how many there are
-    often     how many were seen ENOUGH times
-    together  (K, K), above the diagonal: how often two looks at one place are of two classes, where it is not stable
+    Attributes:
+        share: Over the cubes: how likely places are not stable, and how many there are.
+        often: How many were seen ENOUGH times.
+        together: (K, K), above the diagonal: how often two looks at one place are of two classes, where it is not
+            stable.
     """
 
     share: CubeSums
@@ -119,7 +121,7 @@ class FlippingSums:
 
     @classmethod
     def of(cls, table: VoxelTable, stable: Float64, cubes: Cubes) -> FlippingSums:
-        """Of a table, by the probability (n,) of `steady`, over the cubes of its voxels with OP >= 2."""
+        """Return the sums of a table by the stability posterior (n,), over the cubes of its voxels with OP >= 2."""
         unsteady = np.round((1 - stable) / UNIT) * UNIT
         share = CubeSums(cubes.cell, cubes.edge, cubes.means({"": unsteady}))
         return cls(share, int(np.count_nonzero(table.op >= ENOUGH)), _together(table, unsteady))
@@ -129,7 +131,7 @@ class FlippingSums:
         return self.share.specs({"": Mean("")})
 
     def flipping(self, share: Interval, classes: Sequence[str] = ()) -> Flipping:
-        """That share, as it was answered, and the two classes that stand together most often there."""
+        """Return that share with its interval, and the two classes that stand together most often there."""
         locations = self.share[""][1]
         seen = float(self.often / locations) if locations else float("nan")
         total = float(self.together.sum())
@@ -141,7 +143,7 @@ class FlippingSums:
 
 
 def _together(table: VoxelTable, unsteady: Float64) -> Float64:
-    """(K, K) of voxels that are unsteady with that probability (n,), NaN for those that do not count."""
+    """Return (K, K) of voxels that are unsteady with that probability (n,), NaN for those that do not count."""
     starts, label, weight = table.evidence.entries
     of = np.repeat(np.arange(len(table)), np.diff(starts))
     share, counts, pairs = weight / table.op[of], np.nan_to_num(unsteady)[of], np.zeros((table.K, table.K))
@@ -163,7 +165,7 @@ class LogSums:
 
 
 def log_sums(sample: MapSample, cubes: Cubes) -> tuple[Columns, LogSums | None]:
-    """The columns and sums that need a log; none without one."""
+    """Return the columns and sums that need a log; none without one."""
     if sample.events is None:
         return {}, None
     changes, trend = flips(sample.events), trends(sample.events)

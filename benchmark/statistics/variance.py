@@ -113,8 +113,12 @@ def variances(
 ) -> Variances:
     """Return what the variance of sum(weight * effect) may be if the effects (n,) are drawn anew.
 
-    noise     (n, n) covariance of the errors of `effect`
-    distance  (n, n) between the effects, whose correlation is exp(-distance / range); range 0: independent
+    Args:
+        effect: (n,) estimated effects.
+        weight: (n,) their weights.
+        noise: (n, n) covariance of the errors of `effect`.
+        distance: (n, n) between the effects, whose correlation is exp(-distance / range); range 0: independent.
+        ranges: Correlation lengths that are tried.
     """
     from scipy import special
 
@@ -145,11 +149,12 @@ def variances(
 class Influences:
     """Influences of locations and frames on a number.
 
-    places   (G, 3) cubes in which something counts, frames (F,) groups
-    block    (G,) influence of each cube; they sum to 0
-    cell     (G, F) of each group of frames in each cube
-    size     (G, F) how much is in it, all (G,) in each cube
-    one_off  what the number falls by where all that counts was not as the first sum has it, but the opposite
+    Attributes:
+        places: (G, 3) cubes in which something counts, frames (F,) groups.
+        block: (G,) influence of each cube; they sum to 0.
+        cell: (G, F) of each group of frames in each cube.
+        size: (G, F) how much is in it, all (G,) in each cube.
+        one_off: What the number falls by where all that counts was not as the first sum has it, but the opposite.
     """
 
     places: Int64
@@ -229,8 +234,9 @@ def influences(
 class Effects:
     """The model of a number's influences.
 
-    noise  the variance that comes from it, unit: of a single observation
-    frame  (F,) effects of the frames, error (F, F) the covariance of their errors; None where frames are not known
+    Attributes:
+        noise: The variance that comes from it, unit: of a single observation.
+        frame: (F,) effects of the frames, error (F, F) the covariance of their errors; None where frames are not known.
     """
 
     grid: Influences
@@ -364,7 +370,9 @@ AT_ONCE = 2**20
 
 
 def slope(statistic: Statistic, totals: Float64, direction: Float64) -> Float64:
-    """The derivative (...,) of a statistic at totals (..., C) along a direction (..., C); NaN where it is undefined.
+    """Return the derivative (...,) of a statistic at totals (..., C) along a direction (..., C).
+
+    NaN where it is undefined.
 
     By a step into the complex plane, which takes no difference and so loses no digit (Squire and Trapp 1998, SIAM
     Review 40).
@@ -376,7 +384,7 @@ def slope(statistic: Statistic, totals: Float64, direction: Float64) -> Float64:
 
 
 def gradient_of(statistic: Statistic, total: Float64) -> Float64:
-    """The gradient (C,) of a statistic at sums (C,), 0 where there is nothing to sum."""
+    """Return the gradient (C,) of a statistic at sums (C,), 0 where there is nothing to sum."""
     gradient = np.zeros_like(total)
     some = np.flatnonzero(total)
     for at in np.array_split(some, len(some) * len(total) // AT_ONCE + 1):

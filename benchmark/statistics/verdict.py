@@ -151,7 +151,7 @@ def _for(basis: Interval) -> str:
 
 
 def _alpha(alpha: Interval, cells: CellAgreement) -> str:
-    """'alpha 0.71 (0.69 to 0.73), probably unstable: car (98%)'."""
+    """Return 'alpha 0.71 (0.69 to 0.73), probably unstable: car (98%)'."""
     chance = ", no better than chance" if alpha.value < 0 else ""
     unstable = [row for row in cells.critical_classes[:3] if row.unstable >= PROBABLE]
     named = ", ".join(f"{row.name} ({row.unstable:.0%})" for row in unstable)

@@ -21,7 +21,7 @@ TIE = 1e-12
 
 @serial
 def _looks(log, first, T, number, active, x, total, squares, own):
-    """A voxel's observations by the classes that it ever saw, which are returned as how many they are.
+    """Return a voxel's observations by the classes that it ever saw, which are returned as how many they are.
 
     log is (starts, label, weight) of all observations. x (T * A,) takes the evidence by look and class, active (A,) the
     classes, ascending, total and squares (A,) the sums of evidence and of its squares, own (T,) those of each look's
@@ -56,7 +56,10 @@ def _looks(log, first, T, number, active, x, total, squares, own):
 
 @serial
 def _label(total, active, A, fused):
-    """Which class is the dominant one: that of the map, whose sums are rounded otherwise, or the lowest of equals."""
+    """Return which class is the dominant one.
+
+    That of the map, whose sums are rounded otherwise, or the lowest of equals.
+    """
     best, top = 0, total[0]
     for j in range(A):
         if active[j] == fused:
@@ -69,7 +72,7 @@ def _label(total, active, A, fused):
 
 @serial
 def _label_without(total, x, look, A):
-    """Which is the dominant class of the other observations."""
+    """Return which is the dominant class of the other observations."""
     best, top = 0, total[0] - x[look]
     for j in range(1, A):
         rest = total[j] - x[look + j]
@@ -80,7 +83,7 @@ def _label_without(total, x, look, A):
 
 @serial
 def _add_truth(sums, base, x, first, T, group, truth, likely, total, active, A, label, without, mean, column, K):
-    """What is right of a voxel: of the fused label by leaving a frame out, of each look by itself.
+    """Add what is right of a voxel: the fused label by leaving a frame out, each observation by itself.
 
     mean (A,) is room.
     """
@@ -123,7 +126,7 @@ def _add_truth(sums, base, x, first, T, group, truth, likely, total, active, A, 
 
 @serial
 def _agreement(total, squares, T, A, certain, surprise, apart):
-    """The agreement of two observations; of each class how surprising it is, and how far apart two of them are.
+    """Return the agreement of two observations; of each class how surprising it is, and how far apart two of them are.
 
     certain is what a class is to be sure of, log K.
     """

@@ -23,7 +23,7 @@ GOLDEN = np.uint64(0x9E3779B97F4A7C15)
 
 @serial
 def hash_row(at_x, at_y, at_z, hashed):
-    """The hash (n,) of voxels, uint32: of the weighted sum of their indices modulo 2^32, one of its own for each sum.
+    """Hash blocks (n,) to uint32: by the weighted sum of their indices modulo 2^32, one hash for each sum.
 
     It is mixed as in lowbias32 (Wellons 2018, Prospecting for Hash Functions). Products of 32 bits are vector
     instructions on every processor, those of 64 are not.
@@ -38,7 +38,7 @@ def hash_row(at_x, at_y, at_z, hashed):
 
 @serial
 def draw(depth, valid, labels, ray_x, ray_y, T, size, share, origin, reach, cell, drawn, label):
-    """The pixels that show a sampled block: key of the cell, hash and label; returns how many they are."""
+    """Return the pixels that show a sampled block: key of the cell, hash and label; returns how many they are."""
     n = held = 0
     H, W = depth.shape
     at, hashed, last = np.empty((3, W), np.int32), np.empty(W, np.uint32), np.uint32(share - 1)
@@ -65,7 +65,7 @@ def draw(depth, valid, labels, ray_x, ray_y, T, size, share, origin, reach, cell
 
 @serial
 def place_row(depth, ray_x, ray_y, T, size, at_x, at_y, at_z):
-    """The voxel of each pixel of a row, of invalid ones any; without a branch, for vectors."""
+    """Find the block of each pixel of a row, any of invalid ones; without a branch, for vectors."""
     x0, x1, x2, x3 = T[0, 0], T[0, 1], T[0, 2], T[0, 3]
     y0, y1, y2, y3 = T[1, 0], T[1, 1], T[1, 2], T[1, 3]
     z0, z1, z2, z3 = T[2, 0], T[2, 1], T[2, 2], T[2, 3]
@@ -79,7 +79,7 @@ def place_row(depth, ray_x, ray_y, T, size, at_x, at_y, at_z):
 
 @serial
 def cells_of(at_x, at_y, at_z, T, size, origin, reach, key):
-    """Keys (n,) of the cells of points of the camera, see `keys`; -1 out of reach."""
+    """Write keys (n,) of the cells of points of the camera, see `keys_of`; -1 out of reach."""
     x0, x1, x2, x3, low_x = T[0, 0], T[0, 1], T[0, 2], T[0, 3], float(origin[0] - reach)
     y0, y1, y2, y3, low_y = T[1, 0], T[1, 1], T[1, 2], T[1, 3], float(origin[1] - reach)
     z0, z1, z2, z3, low_z = T[2, 0], T[2, 1], T[2, 2], T[2, 3], float(origin[2] - reach)
@@ -100,7 +100,7 @@ def cells_of(at_x, at_y, at_z, T, size, origin, reach, key):
 
 @serial
 def digit(part):
-    """Which of the cells along a voxel's edge a part of it, from 0 to 1, falls in."""
+    """Return which of the cells along a voxel's edge a part of it, from 0 to 1, falls in."""
     cell = part * CELLS
     return np.int64(np.int32(cell if cell < CELLS else CELLS - 1.0))
 

@@ -25,7 +25,10 @@ TURNS = 8
 
 @intrinsic
 def _plogp_of_eight(_typing: Any, values: Any, _at: Any) -> Any:
-    """values[at : at + 8] = p log2 p of each, by vector instructions, which the compiler has for no library's log."""
+    """Return values[at .
+
+    At + 8] = p log2 p of each, by vector instructions, which the compiler has for no library's log.
+    """
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         array = context.make_array(signature.args[0])(context, builder, arguments[0])
@@ -38,7 +41,7 @@ def _plogp_of_eight(_typing: Any, values: Any, _at: Any) -> Any:
 
 @serial
 def _drifts(x, A, T, drift):
-    """The sums of drifts, bits, of observations x (A, T) in the turns of their order, to drift (TURNS,).
+    """Write the sums of drifts, bits, of observations x (A, T) in the turns of their order to drift (TURNS,).
 
     A step's drift is H(m) - (H(p) + H(q)) / 2 with the mean m of the beliefs p and q before and after: each belief but
     the first and last is one after, then one before.
@@ -62,7 +65,7 @@ def _drifts(x, A, T, drift):
 
 @serial
 def _dense(log, first, T, number, at, x):
-    """A voxel's T observations as columns `at` (T,) of x (A, T); returns A, how many classes it ever saw.
+    """Return a voxel's T observations as columns `at` (T,) of x (A, T); returns A, how many classes it ever saw.
 
     log is (starts, label, weight) of all observations; number is work space (K,), all -1.
     """
@@ -83,7 +86,7 @@ def _dense(log, first, T, number, at, x):
 
 @serial
 def draw_streams(index, seed, streams):
-    """A random stream of each voxel (n,) from its index (n, 3) and the seed."""
+    """Write a random number of each voxel (n,) from its index (n, 3) and the seed."""
     for i in range(index.shape[0]):
         state = seed
         for axis in range(3):
@@ -93,7 +96,7 @@ def draw_streams(index, seed, streams):
 
 @serial
 def _shuffle(order, T, state):
-    """A random order of T observations, to order (T,), from the stream (splitmix64) whose state (1,) it advances."""
+    """Write a random order of T observations to order (T,), by splitmix64, whose state (1,) it advances."""
     for t in range(T):
         state[0] += GOLDEN
         other = np.int64(((mix(state[0]) >> np.uint64(32)) * np.uint64(t + 1)) >> np.uint64(32))
@@ -103,7 +106,7 @@ def _shuffle(order, T, state):
 
 @serial
 def mean_drifts(chunk, voxels, first, T, log, K, entries, seeds, null):
-    """The mean drift a step in TURNS orders, turns of one random order, of these voxels (r,), to null (n,).
+    """Write the mean drift a step in TURNS orders, turns of one random order, of these voxels (r,) to null (n,).
 
     first, T (n,) are the voxels' rows of the log, seeds (n,) their random streams; `entries` is the most that one has.
     """
@@ -129,7 +132,7 @@ LONGEST_TABLE = 256
 
 @serial
 def one_hot_drifts(longest):
-    """D_JS of the beliefs after t and t + 1 one-hot observations, bits, at [c, t] of a table (longest, longest).
+    """Return D_JS of the beliefs after t and t + 1 one-hot observations, bits, at [c, t] of a table (longest, longest).
 
     The new class was seen c times among the t. The other classes' shares all shrink by the factor t / (t + 1), so only
     how many they are in all matters.
@@ -143,7 +146,7 @@ def one_hot_drifts(longest):
 
 @serial
 def expected_one_hot(chunk, n, T, log_factorial, drifts, out):
-    """The part of the expected sum of drifts that a class causes with n of T one-hot observations in random order.
+    """Return the part of the expected sum of drifts that a class causes with n of T one-hot observations.
 
     At step t + 1 it comes with probability n / T, and c of its other n - 1 observations are then among the t before it
     with the hypergeometric probability C(n-1, c) C(T-n, t-c) / C(T-1, t).
