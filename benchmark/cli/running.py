@@ -61,7 +61,7 @@ def run(
     events: Annotated[bool | None, typer.Option("--events", help="Also write the log of observations.",
     rich_help_panel=opt.SETTINGS)] = None,
     statistics: Annotated[bool | None, typer.Option(
-        "--statistics", help="Also test drift, judge by ground truth, compare backbones; takes longer.")] = None,
+        "--statistics", help="Also measure drift, judge by ground truth, compare backbones; takes longer.")] = None,
     scope: opt.ScopeOption = None,
     out: Annotated[Path | None, typer.Option("--out", "-o", help="Run folder.", show_default="runs/TIME")] = None,
     rerun: opt.Rerun = None,

@@ -88,7 +88,7 @@ class Exclusion(Settings):
 class VerdictSettings(Settings):
     """Thresholds of the verdict; see docs/metrics.md, The verdict."""
 
-    stable: float = Field(0.8, gt=0, lt=1, description="share of the ceiling from which labels may be relied on")
+    stable: float = Field(0.8, gt=0, lt=1, description="alpha from which labels may be relied on")
     usable: float = Field(2 / 3, gt=0, lt=1, description="and from which on they may be acted on with care")
     labelled: float = Field(0.9, ge=0, le=1, description="part of the locations that a stable model labels at least")
     class_locations: float = Field(100.0, ge=1, description="voxels that a class must dominate to be judged")
