@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from simulated_events import grid, log_of, log_of_evidence, soft
+from striped_floor import K, flight as over_stripes, fused, sampled
 
 from semstab.errors import DataError
 from semstab.metrics.agreement import rows_of
