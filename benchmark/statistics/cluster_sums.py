@@ -231,7 +231,7 @@ class ClusterSums:
         return len(self.index.cubes)
 
     def coarsened(self, edge: float, step: int) -> ClusterSums:
-        """With larger cubes, or groups of frames; step 0 forgets the frames."""
+        """With larger cubes, or groups of frames; step 0 forgets the frames of the map, not the views of its cells."""
         cell = _joined(self.cell, edge / self.edge)
         known = step and self.step
         frame = _joined(self.frame, step // self.step) if known else np.full(len(cell), -1)
