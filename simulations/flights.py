@@ -11,7 +11,7 @@ from semstab.model.events import Events
 from semstab.model.voxels import VoxelTable
 from semstab.statistics.accumulate import cluster_sums_of
 from semstab.statistics.cluster_sums import ClusterSums
-from semstab.statistics.observations import ObservationSample
+from semstab.statistics.observations import CellObservations, Views, keys_of
 
 ROUGH = 0.5
 """How abruptly a place is one on which the model errs."""
@@ -179,19 +179,26 @@ def sums_of(labels: np.ndarray, over: World, flight: Flight = Flight()) -> Clust
     """The sums of a flight, with the truth."""
     log = log_of(labels, over, flight)
     some = (labels >= 0).any(axis=1)
-    return cluster_sums_of(table_of(log), log, over.truth[some])
+    return cluster_sums_of(table_of(log), log, over.truth[some], cells=sample_of(labels, over, flight))
 
 
-def sample_of(labels: np.ndarray, over: World, flight: Flight, rng: np.random.Generator) -> ObservationSample:
-    """What a sampler takes of a flight: at borders each frame sees another part of the next class.
+def sample_of(
+    labels: np.ndarray, over: World, flight: Flight, rng: np.random.Generator | None = None
+) -> CellObservations:
+    """What a sampler takes of a flight: cells half as wide as a voxel, of which there is one in each voxel.
 
-    A label that errs moves all that the frame sees of a voxel by as many classes.
+    With an rng each frame sees at borders another part of the next class. A label that errs moves all that the frame
+    sees of a cell by as many classes.
     """
-    some = (labels >= 0).any(axis=1)
-    voxel, frame = np.nonzero(labels[some] >= 0)
-    n, mixed = len(voxel), over.mixed[some][voxel]
-    part = np.where(mixed > 0, np.clip(mixed + 0.3 * rng.standard_normal(n), 0, 1), 0.0)[:, None]
-    first = labels[some][voxel, frame]
-    evidence = (1 - part) * np.eye(flight.K)[first] + part * np.eye(flight.K)[(first + 1) % flight.K]
-    seen = Events(*over.index[some].T, voxel, frame, evidence, np.ones(n), 0.125)
-    return ObservationSample(seen, *([np.zeros(0, int)] * 3), (), soft=False)  # its cells are not known
+    cell, view = np.nonzero(labels >= 0)
+    first, n, part = labels[cell, view], len(cell), np.zeros(len(cell))
+    if rng is not None:
+        mixed = over.mixed[cell]
+        part = np.where(mixed > 0, np.clip(mixed + 0.3 * rng.standard_normal(n), 0, 1), 0.0)
+    key, low = keys_of(2 * over.index.astype(np.int64))
+    label = np.concatenate([first, (first + 1) % flight.K]).astype(np.uint16)
+    weight, twice = np.concatenate([1 - part, part]), np.tile(np.arange(n), 2)
+    F = labels.shape[1]
+    views = Views(np.arange(F), np.zeros((F, 3)), np.full(F, np.nan), np.full(F, 0.0625))
+    entries = key[cell[twice]], view[twice].astype(np.int32), label, weight, np.zeros(2 * n, np.uint32)
+    return CellObservations(*entries, low, views, 0.0625, flight.K, frames=F).only(weight > 0)

@@ -107,7 +107,7 @@ def these_frames(count: int, seed: int) -> Iterator[Row]:
     yield from trials(Flight(100, 2.0, coin=True), count, seed, THESE_FRAMES, KEYS, "floor 100 x 100, a coin")
     for soft, K in ((True, 2), (False, 5)):
         name = "floor 100 x 100, reach 2, " + ("scores" if soft else f"{K} classes")
-        flight, keys = Flight(100, 2.0, K=K, soft=soft), ("alpha_between", "accuracy")
+        flight, keys = Flight(100, 2.0, K=K, soft=soft), ("voxel_alpha", "accuracy")
         yield from trials(flight, count, seed, THESE_FRAMES, keys, name)
     for ease in (2.0, 2.5, 3.0):
         yield from trials(
@@ -145,7 +145,7 @@ def _flown(count: int, seed: int, scope: Scope) -> Iterator[Row]:
         yield from _of_frames(Flight(60, 2.0, 1.0, 40, 5, quality, city=True), count, seed, scope, "city 60 x 60")
         yield from _of_frames(Flight(45, 2.0, 1.0, 40, 5, quality, K=5), count, seed, scope, "five classes")
         yield from _of_frames(
-            Flight(45, 2.0, 1.0, 40, 5, quality, soft=True), count, seed, scope, "scores", "alpha_between"
+            Flight(45, 2.0, 1.0, 40, 5, quality, soft=True), count, seed, scope, "scores", "voxel_alpha"
         )
         yield from _of_frames(Flight(45, 2.0, 2.2, 40, 5, quality), count, seed, scope, "few errors")
         yield from _of_frames(Flight(45, 2.0, 1.0, 40, 5, quality), count, seed, scope, "", "psa")
@@ -173,7 +173,7 @@ def differences(count: int, seed: int) -> Iterator[Row]:
 
 
 def _pairs(flight: Flight, count: int, seed: int, scope: Scope = THIS_SCENE, where: str = "") -> Iterator[Row]:
-    key = "alpha_between" if flight.soft else "alpha"
+    key = "voxel_alpha" if flight.soft else "alpha"
     found: dict[str, list[Interval]] = {"same frames": [], "two flights": []}
     for trial in range(count):
         rng = np.random.default_rng([seed, trial])
@@ -198,7 +198,7 @@ APART = (1, 2, 4)
 def correlograms(count: int, seed: int) -> Iterator[Row]:
     """Bands of the bins in time. The target is the mean of all trials."""
     along = np.stack([np.linspace(0, 5.6, 40), np.full(40, 2.8), np.full(40, 10.0)], axis=1)
-    views = Views(np.arange(40), along, np.full(40, math.nan))
+    views = Views(np.arange(40), along, np.full(40, math.nan), np.full(40, 0.0625))
     for quality in ("alike", "uneven", "lasting"):
         flight = Flight(45, 2.0, 1.0, 40, 10, quality)
         found: dict[int, list[Interval]] = {apart: [] for apart in APART}
@@ -212,9 +212,7 @@ def correlograms(count: int, seed: int) -> Iterator[Row]:
         for apart, own in found.items():
             values = np.array([alpha.value for alpha in own])
             targets = np.full(count, values.mean())
-            yield Row(
-                f"40 frames, {quality}, strips, {apart} apart", "alpha_between", values.std(), targets, tuple(own)
-            )
+            yield Row(f"40 frames, {quality}, strips, {apart} apart", "alpha", values.std(), targets, tuple(own))
 
 
 # --- Table ------------------------------------------------------------------------------------------------------------

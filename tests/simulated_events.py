@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from semstab.model.events import Events
+from semstab.statistics import CellObservations, Views
+from semstab.statistics.observations import keys_of
 
 
 def log_of(labels, K=3, index=None, frames=None, voxel_size=0.2):
@@ -35,3 +39,19 @@ def grid(side):
 def soft(rng, n, F, K=3, alpha=0.5):
     """Random evidence (n, F, K) that is not one-hot."""
     return rng.dirichlet(np.full(K, alpha), size=(n, F))
+
+
+def cells_of(labels, K=3, index=None, centres=None, cell_size=0.125):
+    """The same labels (n, F), -1 where there is none, of sampled cells, one in each coarse cell: both alphas are alike.
+
+    One pixel shows a cell in each frame; the cameras at (F, 3) are 9 m above the first cell if not given.
+    """
+    labels = np.asarray(labels)
+    n, F = labels.shape
+    index = np.stack([np.zeros(n), np.zeros(n), np.arange(n)], axis=1) if index is None else index
+    key, low = keys_of(2 * np.asarray(index, np.int64))
+    cell, view = np.nonzero(labels >= 0)
+    centres = np.tile([0.0, 0.0, 9.0], (F, 1)) if centres is None else np.asarray(centres, float)
+    views = Views(np.arange(F), centres, np.full(F, math.nan), np.full(F, cell_size))
+    entries = key[cell], view.astype(np.int32), labels[cell, view].astype(np.uint16), np.ones(len(cell))
+    return CellObservations(*entries, np.zeros(len(cell), np.uint32), low, views, cell_size, K, frames=F)

@@ -25,7 +25,7 @@ from semstab.model.voxels import VoxelTable
 from semstab.report.tables import tables
 from semstab.report.tables.table import to_json as table_content
 from semstab.report.terminal import print_summary
-from semstab.statistics import CellObservations, MapSample, ObservationSample, analyse, describe
+from semstab.statistics import CellObservations, MapSample, analyse, describe
 from semstab.statistics.correctness import ACCURACY
 
 BACKBONES = ("a", "b", "gt")
@@ -47,10 +47,10 @@ def ran(tmp_path_factory):
     return base / "run", printed, json.loads((base / "run" / "summary.json").read_text())
 
 
-def saved(run: Path, backbone: str) -> tuple[VoxelTable, Events, ObservationSample]:
+def saved(run: Path, backbone: str) -> tuple[VoxelTable, Events, CellObservations]:
     name = f"wall__{backbone}__numpy.parquet"
-    looks = CellObservations.load(run / "looks" / name).sample()
-    return VoxelTable.load(run / "voxels" / name), Events.load(run / "events" / name), looks
+    cells = CellObservations.load(run / "observations" / name)
+    return VoxelTable.load(run / "voxels" / name), Events.load(run / "events" / name), cells
 
 
 def test_a_runs_statistics_are_those_of_its_saved_maps_and_events(ran) -> None:
@@ -58,9 +58,9 @@ def test_a_runs_statistics_are_those_of_its_saved_maps_and_events(ran) -> None:
     truth, *_ = saved(run, "gt")
     for entry in summary["runs"]:
         name = entry["backbone"]
-        table, events, sample = saved(run, name)
+        table, events, cells = saved(run, name)
         true = None if name == "gt" else truth
-        expected = analyse(MapSample.draw(table, events, true, edges=(1, 3)), sample, name=name, edges=(1, 3))
+        expected = analyse(MapSample.draw(table, events, true, edges=(1, 3)), cells, name=name, edges=(1, 3))
         assert entry["statistics"] == json.loads(json.dumps(to_json(expected.summary)))
         columns = pq.read_table(run / "voxels" / f"wall__{name}__numpy.parquet")
         for column, values in expected.columns(table).items():
@@ -96,8 +96,8 @@ def test_without_asking_there_is_what_the_map_alone_tells(tmp_path) -> None:
     result = semstab.engine.run(configure(root, events=True), out=tmp_path / "run")
     (entry,) = result.runs
     table = VoxelTable.load(tmp_path / "run" / "voxels" / f"{entry.unit.slug}.parquet")
-    sample = CellObservations.load(tmp_path / "run" / "looks" / f"{entry.unit.slug}.parquet").sample()
-    assert to_json(entry.statistics) == to_json(describe(table, observations=sample, name="a"))
+    cells = CellObservations.load(tmp_path / "run" / "observations" / f"{entry.unit.slug}.parquet")
+    assert to_json(entry.statistics) == to_json(describe(table, cells=cells, name="a"))
     assert entry.statistics.drift.trend is None
     assert result.comparisons == ()
     again = semstab.engine.run(configure(root, events=True), out=tmp_path / "run")  # kept
@@ -109,7 +109,7 @@ def test_a_summary_with_ranks_but_not_their_values_is_refused(ran, tmp_path) -> 
     changed = json.loads(json.dumps(summary))
     changed["comparisons"][0]["paired"]["values"] = {}
     (tmp_path / "summary.json").write_text(json.dumps(changed))
-    with pytest.raises(DataError, match=r"summary\.json: .*ranks . by alpha_between without a value"):
+    with pytest.raises(DataError, match=r"summary\.json: .*ranks . by alpha without a value"):
         load_result(tmp_path)
 
 
@@ -140,7 +140,8 @@ def test_the_first_backend_that_keeps_a_log_has_all_statistics(tmp_path) -> None
     assert open3d.statistics.drift.trend is None
     assert open3d.statistics.correctness is not None
     assert numpy.statistics.drift.trend is not None
-    assert numpy.statistics.agreement.alpha.value == pytest.approx(open3d.statistics.agreement.alpha.value)
+    assert numpy.statistics.agreement.voxel_alpha.value == pytest.approx(open3d.statistics.agreement.voxel_alpha.value)
+    assert numpy.statistics.headline.alpha.value == open3d.statistics.headline.alpha.value
     plain = semstab.engine.run(configure(root, backends=["open3d"], check="numpy"))
     assert [entry.statistics is not None for entry in plain.runs] == [True, False]
 
@@ -243,7 +244,7 @@ def test_agreement_stands_beside_the_sweep(studied) -> None:
     rows = [row for row in rows_of(found, "sensitivity_agreement_depth_noise") if row["backbone"] == "a"]
     (still,), noisy = (found.select("depth_noise", backbone="a", value=value) for value in (0, 0.05))
     assert rows[0]["psa"] == still.statistics.agreement.psa.value
-    alphas = [record.statistics.agreement.alpha.value for record in noisy]
+    alphas = [record.statistics.headline.alpha.value for record in noisy]
     assert rows[1]["alpha"]["mean"] == pytest.approx(np.mean(alphas))
     assert rows[1]["alpha"]["sd"] == pytest.approx(np.std(alphas, ddof=1))
 

@@ -76,7 +76,7 @@ def test_kappa_and_alpha_of_a_class_are_those_of_the_class_against_the_rest():
     events = log_of(labels)
     for k, row in enumerate(class_agreement(events.table(), events)):
         data = np.where(labels >= 0, labels == k, np.nan).T
-        assert row.alpha == pytest.approx(krippendorff.alpha(data, level_of_measurement="nominal"))
+        assert row.voxel_alpha == pytest.approx(krippendorff.alpha(data, level_of_measurement="nominal"))
 
 
 @checks
@@ -105,7 +105,7 @@ def test_kappa_and_alpha_of_soft_evidence_are_their_definitions():
         agree = np.mean([by_pairs(e) for e in both])
         q = both.mean(axis=(0, 1))
         assert row.kappa == pytest.approx(1 - (1 - agree) / (1 - q @ q))
-        assert row.alpha == pytest.approx(1 - (1 - agree) / (1 - by_pairs(both.reshape(-1, 2))))
+        assert row.voxel_alpha == pytest.approx(1 - (1 - agree) / (1 - by_pairs(both.reshape(-1, 2))))
 
 
 def test_alpha_is_zero_for_chance_and_one_for_agreement_and_voxels_seen_once_count_nowhere():
@@ -125,8 +125,8 @@ def test_alpha_is_zero_for_chance_and_one_for_agreement_and_voxels_seen_once_cou
     events = log_of(np.random.default_rng(8).integers(0, 3, size=(30, 4)))
     assert class_agreement(events.table()) == class_agreement(events.table(), events)
     mixed = log_of_evidence(soft(np.random.default_rng(9), 5, 3))
-    assert all(math.isnan(row.alpha) for row in class_agreement(mixed.table()))
-    assert not any(math.isnan(row.alpha) for row in class_agreement(mixed.table(), mixed))
+    assert all(math.isnan(row.voxel_alpha) for row in class_agreement(mixed.table()))
+    assert not any(math.isnan(row.voxel_alpha) for row in class_agreement(mixed.table(), mixed))
 
 
 @pytest.mark.parametrize("labels", [[[0, -1]], [[1, 1], [1, 1]]])

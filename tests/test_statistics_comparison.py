@@ -7,7 +7,7 @@ import math
 
 import numpy as np
 import pytest
-from simulated_events import grid, log_of
+from simulated_events import cells_of, grid, log_of
 from statsmodels.stats.multitest import multipletests
 
 from semstab.core.types import THESE_FRAMES, THIS_SCENE
@@ -22,14 +22,18 @@ from semstab.statistics.paired_differences import EDGES, common_weights, holm, s
 SIDE = 24
 
 
-def noisy(rng, F, error, side=SIDE, seen=None, K=3):
-    """A floor seen by F frames, whose labels err with that probability (a number, or one a voxel)."""
+def noisy(*arguments, **options):
+    """The map of `drawn` labels."""
+    labels, side, K = drawn(*arguments, **options)
+    return log_of(labels, K=K, index=grid(side)).table()
+
+
+def drawn(rng, F, error, side=SIDE, seen=None, K=3):
+    """Labels of a floor seen by F frames, which err with that probability (a number, or one a voxel); side and K."""
     own = rng.integers(0, K, size=(side * side, 1))
     wrong = rng.random((side * side, F)) < np.broadcast_to(error, (side * side,))[:, None]
     labels = np.where(wrong, rng.integers(0, K, size=wrong.shape), own)
-    if seen is not None:
-        labels = np.where(seen, labels, -1)
-    return log_of(labels, K=K, index=grid(side)).table()
+    return labels if seen is None else np.where(seen, labels, -1), side, K
 
 
 def often(rng, F, low):
@@ -99,15 +103,23 @@ def test_standardised_value_by_hand():
     assert math.isnan(standardised({"a": a, "b": never}, PSA)["a"].value)
 
 
-def two_backbones(rng, gap, side=32, F=4):
-    """Two backbones that err block by block of 4 x 4 voxels; the second errs more by `gap`."""
+def two_backbones(rng, gap, side=32, F=8):
+    """Two backbones that err block by block of 4 x 4 voxels, the second more by `gap`: their maps, and their cells."""
     blocks = rng.beta(2, 6, size=(side // 4, side // 4))
     error = np.kron(blocks, np.ones((4, 4))).ravel()
     shift = np.kron(rng.normal(0, 0.05, size=blocks.shape), np.ones((4, 4))).ravel()
-    return {
-        "a": noisy(rng, F, np.clip(error, 0, 1), side),
-        "b": noisy(rng, F, np.clip(error + gap + shift, 0, 1), side),
+    labels = {
+        "a": drawn(rng, F, np.clip(error, 0, 1), side)[0],
+        "b": drawn(rng, F, np.clip(error + gap + shift, 0, 1), side)[0],
     }
+    tables = {name: log_of(own, index=grid(side)).table() for name, own in labels.items()}
+    return tables, {name: cells_of(own, index=grid(side)) for name, own in labels.items()}
+
+
+def pair_of(rng, gap, **options):
+    """What is compared of two backbones."""
+    tables, cells = two_backbones(rng, gap, **options)
+    return compare_backbones(tables, observations=cells).paired
 
 
 def test_paired_differences_cover_and_their_test_keeps_its_level():
@@ -115,21 +127,20 @@ def test_paired_differences_cover_and_their_test_keeps_its_level():
     rng = np.random.default_rng(1)
     held, rejected = 0, 0
     for _ in range(15):
-        tables = two_backbones(rng, 0.0, side=24)
-        result = paired(tables)
+        result = pair_of(rng, 0.0, side=24)
         by_measure = {row.measure: row for row in result.differences}
         held += by_measure["psa"].difference.low <= 0 <= by_measure["psa"].difference.high
-        rejected += by_measure["alpha_between"].p_value <= 0.05
+        rejected += by_measure["alpha"].p_value <= 0.05
     assert held >= 12
     assert rejected <= 3
 
 
 def test_a_worse_backbone_is_found_by_difference_test_and_rank():
-    tables = two_backbones(np.random.default_rng(2), 0.15)
-    result = paired(tables)
+    result = pair_of(np.random.default_rng(2), 0.15)
     by_measure = {row.measure: row for row in result.differences}
     assert by_measure["psa"].difference.low > 0
     assert by_measure["alpha"].difference.low > 0
+    assert by_measure["voxel_alpha"].difference.low > 0
     assert by_measure["entropy"].difference.high < 0
     assert by_measure[result.primary].p_value < 0.001
     assert math.isnan(by_measure["psa"].p_value)  # it describes
@@ -137,14 +148,15 @@ def test_a_worse_backbone_is_found_by_difference_test_and_rank():
         assert [rank.backbone for rank in ranking.ranks] == ["a", "b"]
         assert ranking.ranks[0].best > 0.95
     rng = np.random.default_rng(3)
-    twins = two_backbones(rng, 0.0)
-    worst = two_backbones(rng, 0.4)["b"]
-    (by_psa,) = (r for r in paired({**twins, "worst": worst}).rankings if r.measure == "psa")
-    ranks = {rank.backbone: rank for rank in by_psa.ranks}
-    assert ranks["worst"].rank == ranks["worst"].low == 3
-    assert ranks["a"].best + ranks["b"].best == pytest.approx(1, abs=0.01)
-    assert {ranks["a"].low, ranks["b"].low} == {1}
-    assert {ranks["a"].high, ranks["b"].high} == {2}
+    twins, worst = two_backbones(rng, 0.0), two_backbones(rng, 0.4)
+    tables, cells = (own | {"worst": other["b"]} for own, other in zip(twins, worst, strict=True))
+    rankings = {own.measure: own for own in compare_backbones(tables, observations=cells).paired.rankings}
+    for measure in ("alpha", "psa"):
+        ranks = {rank.backbone: rank for rank in rankings[measure].ranks}
+        assert ranks["worst"].rank == ranks["worst"].low == 3
+        assert ranks["a"].best + ranks["b"].best == pytest.approx(1, abs=0.01)
+        assert {ranks["a"].low, ranks["b"].low} == {1}
+        assert {ranks["a"].high, ranks["b"].high} == {2}
 
 
 def test_backbones_are_compared_by_accuracy_where_there_is_a_truth():
@@ -177,11 +189,13 @@ def test_only_voxels_that_all_saw_twice_are_compared():
 
 
 def test_pairs_of_all_scenes_are_corrected_together_where_something_may_be_claimed():
-    found = compare_backbones(two_backbones(np.random.default_rng(4), 0.05, side=16))
+    tables, cells = two_backbones(np.random.default_rng(4), 0.05, side=16)
+    found = compare_backbones(tables, observations=cells)
     (p,) = (row.p_value for row in found.paired.differences if row.measure == found.paired.primary)
     unclaimed = tuple(dataclasses.replace(row, undecided="too few") for row in found.paired.differences)
     silent = dataclasses.replace(found, paired=dataclasses.replace(found.paired, differences=unclaimed))
     together = claimed_together([found, silent, found])
+    assert 0 < p < 1
     corrected = [
         row.p_holm for scene in together for row in scene.paired.differences if row.measure == found.paired.primary
     ]
@@ -196,6 +210,6 @@ def test_what_describes_says_what_its_interval_answers():
     logs = {name: log_of(rng.integers(0, 2, size=(256, 30)), K=2, index=grid(16)) for name in "ab"}
     result = paired({name: log.table() for name, log in logs.items()}, logs=logs)
     answers = {row.measure: row.scope for row in result.differences}
-    assert answers["psa"] == answers["alpha"] == answers["entropy"] == THIS_SCENE
+    assert answers["psa"] == answers["voxel_alpha"] == answers["entropy"] == THIS_SCENE
     assert answers["sbd"] == answers["vss"] == THESE_FRAMES
     assert all(row.difference.low < 0 < row.difference.high for row in result.differences)

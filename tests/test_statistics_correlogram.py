@@ -1,4 +1,4 @@
-"""Agreement by how far apart two looks are: against its definition, and on errors that are tied to the view."""
+"""Agreement by how far apart two observations are: against its definition, and on errors that are tied to the view."""
 
 from __future__ import annotations
 
@@ -6,21 +6,18 @@ import math
 
 import numpy as np
 import pytest
-from simulated_events import grid, log_of
+from simulated_events import cells_of, grid, log_of
 
 from semstab.core.types import THESE_FRAMES, THIS_SCENE
 from semstab.recording.voxel_maps import agreement_report
-from semstab.statistics import ObservationSample, Views, correlogram, describe, krippendorff_alpha
+from semstab.statistics import correlogram, describe, krippendorff_alpha
 
 SIDE = 20
 
 
 def sample_of(labels, centres, K=3):
-    """Labels (n, F) of a floor of voxels of 0.2 m, seen from cameras at (F, 3)."""
-    log = log_of(labels, K=K, index=grid(SIDE))
-    centres = np.asarray(centres, float)
-    views = Views(np.arange(len(centres)), centres, np.full(len(centres), math.nan))
-    return ObservationSample(log, *([np.zeros(0, int)] * 3), views, soft=False)
+    """Labels (n, F) of cells of 0.1 m on a floor, 0.2 m apart, seen from cameras at (F, 3)."""
+    return cells_of(labels, K=K, index=grid(SIDE), centres=centres, cell_size=0.1)
 
 
 def flown(step, frames=8, height=10.0):
@@ -60,7 +57,7 @@ def test_errors_that_last_show_as_agreement_that_falls_with_distance():
 
 def errs_by_view(rng, centres, sector=20.0):
     """Half of the places change their label, at random, each time the direction of view has turned by that much."""
-    place = 0.2 * (grid(SIDE)[:, 0] + 0.5)
+    place = 0.2 * (grid(SIDE)[:, 0] + 0.25)
     angle = np.degrees(np.arctan2(np.array(centres)[:, 0] - place[:, None], 10.0)) + rng.uniform(
         0, sector, (SIDE**2, 1)
     )
@@ -74,21 +71,21 @@ def test_at_the_stated_angle_two_flights_say_the_same_of_one_model():
     rng = np.random.default_rng(2)
     flights = [flown(step, 16) for step in (0.3, 2.0)]
     samples = [sample_of(errs_by_view(rng, centres), centres) for centres in flights]
-    near, far = (krippendorff_alpha(sample.seen.table()) for sample in samples)
+    near, far = (krippendorff_alpha(sample.observations().table()) for sample in samples)
     assert near - far > 0.15
     at_angle = [correlogram(sample).standard.alpha for sample in samples]
     assert at_angle[0].value == pytest.approx(at_angle[1].value, abs=0.05)
 
 
-def test_frames_of_one_look_have_no_correlogram_and_all_outputs_take_it():
+def test_observations_of_one_view_have_no_correlogram_and_all_outputs_take_it():
     once = np.where(np.arange(2) == 0, np.zeros((SIDE**2, 1), int), -1)
     found = correlogram(sample_of(once, flown(1.0, 2)))
     assert found.time == found.angle == ()
     assert (found.standard.pairs, math.isnan(found.standard.alpha.value)) == (0, True)
-    summary = describe(log_of(once).table(), observations=sample_of(once, flown(1.0, 2)))
+    summary = describe(log_of(once).table(), cells=sample_of(once, flown(1.0, 2)))
     assert "no verdict" in agreement_report(summary)
     labels = tied_to_the_view(np.random.default_rng(3))
-    report = agreement_report(describe(log_of(labels).table(), observations=sample_of(labels, flown(1.0))))
+    report = agreement_report(describe(log_of(labels).table(), cells=sample_of(labels, flown(1.0))))
     assert report.count("| for |") == 4
 
 

@@ -9,18 +9,18 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from compare_summaries import differences
-from simulated_events import grid, log_of
+from simulated_events import cells_of, grid, log_of
 
 from semstab.core.files import read_json, write_json
 from semstab.core.json_form import from_json, to_json
-from semstab.core.types import THIS_SCENE
+from semstab.core.types import THESE_FRAMES, THIS_SCENE
 from semstab.errors import ConfigError, DataError
 from semstab.metrics import sbd
 from semstab.model.contrast import BackboneComparison
 from semstab.model.statistics import (
     UNKNOWN,
-    CeilingShare,
-    ClassCeilingShare,
+    CellAgreement,
+    ClassAlpha,
     HeadlineStatistics,
     Interval,
     MapStatistics,
@@ -42,15 +42,25 @@ from semstab.statistics.verdict import LIMITS, level_probabilities
 SIDE, F = 24, 8
 
 
-def backbone(flicker, seed, place=0.0, seen=0.8):
-    """The log of a simulated model on a floor: labels that flicker, and places that are wrong in every frame."""
+def said(flicker, seed, place=0.0, seen=0.8):
+    """Labels of a simulated model on a floor, which flicker, and places that are wrong in every frame."""
     rng = np.random.default_rng(seed)
     true = np.random.default_rng(99).integers(0, 3, size=(SIDE**2, 1))
     stuck = rng.random((SIDE**2, 1)) < place
     noise = rng.random((SIDE**2, F)) < flicker
     labels = np.where(noise, rng.integers(0, 3, size=noise.shape), (true + stuck) % 3)
     labels[:, 1:][rng.random((SIDE**2, F - 1)) > seen] = -1
-    return log_of(labels, index=grid(SIDE))
+    return labels
+
+
+def backbone(*arguments, **options):
+    """The log of these labels."""
+    return log_of(said(*arguments, **options), index=grid(SIDE))
+
+
+def cells(*arguments, **options):
+    """The same of sampled cells."""
+    return cells_of(said(*arguments, **options), index=grid(SIDE))
 
 
 def ground_truth():
@@ -60,13 +70,15 @@ def ground_truth():
 @pytest.fixture(scope="module")
 def described():
     events = backbone(0.2, 0, place=0.2)
-    return analyse(MapSample.draw(events.table(), events, ground_truth()), name="sim")
+    return analyse(MapSample.draw(events.table(), events, ground_truth()), cells(0.2, 0, place=0.2), name="sim")
 
 
 def test_a_description_is_content_for_json_and_every_voxel_has_a_value(described, tmp_path):
     write_json(tmp_path / "statistics.json", described.summary)
     content = read_json(tmp_path / "statistics.json")
-    assert content["agreement"]["alpha"]["value"] == described.summary.agreement.alpha.value
+    assert content["schema"] == 2
+    assert content["agreement"]["voxel_alpha"]["value"] == described.summary.agreement.voxel_alpha.value
+    assert content["headline"]["alpha"]["value"] == described.summary.headline.alpha.value
     assert content["strata"][0]["psa"] is None
     assert math.isnan(described.summary.strata[0].psa)
     assert to_json(from_json(MapStatistics, content, "statistics.json")) == content
@@ -95,7 +107,15 @@ def test_a_description_holds_what_the_functions_say(described):
     table, summary = events.table(), described.summary
     repeated = table.op >= 2
     assert (summary.repeated.voxels, summary.repeated.share) == (repeated.sum(), pytest.approx(repeated.mean()))
-    assert summary.agreement.alpha.value == pytest.approx(krippendorff_alpha(table))
+    assert summary.agreement.voxel_alpha.value == pytest.approx(krippendorff_alpha(table))
+    assert summary.headline.alpha.value == pytest.approx(krippendorff_alpha(table))  # each cell is alone in its voxel
+    found = summary.cells
+    assert (found.cells, found.views, found.frames, found.cell_size) == (repeated.sum(), F, F, 0.125)
+    shares = table.evidence[:][repeated].sum(axis=0) / table.op[repeated].sum()
+    assert found.chance == pytest.approx((shares**2).sum(), abs=0.001)
+    assert (found.largest_class, found.largest_share) == (str(shares.argmax()), pytest.approx(shares.max()))
+    by_class = {row.name: row.voxel_alpha for row in summary.agreement.classes}
+    assert {row.name: row.alpha.value for row in found.classes} == pytest.approx(by_class)
     assert summary.drift.excess.value == pytest.approx(np.nanmean(sbd(table) - expected_sbd(table)))
     parts = summary.uncertainty
     assert parts.entropy.value == pytest.approx(parts.within.value + parts.between.value)
@@ -119,19 +139,30 @@ def test_the_same_seed_gives_the_same_description():
 
 def test_a_table_alone_is_described_as_far_as_it_goes():
     events = backbone(0.2, 0)
-    alone, logged = describe(events.table()), describe(events.table(), events)
+    observed = cells(0.2, 0)
+    alone, logged = describe(events.table(), cells=observed), describe(events.table(), events, cells=observed)
     assert alone.correctness is alone.geometry is alone.drift.trend is None
     assert to_json(alone.drift.null) == to_json(logged.drift.null)
     assert to_json(alone.agreement) == to_json(logged.agreement)
-    assert "for these frames alone (no log)" in alone.verdict.line
-    assert "for this scene flown again, from 8 frames" in logged.verdict.line
+    assert alone.headline.alpha == logged.headline.alpha
+    assert (alone.headline.psa.scope, logged.headline.psa.scope) == (THESE_FRAMES, THIS_SCENE)
+    for found in (alone, logged):
+        assert "for this scene flown again, from 8 frames" in found.verdict.line
+
+
+def test_without_cells_there_is_no_verdict_and_the_line_says_what_to_give():
+    events = backbone(0.2, 0)
+    found = describe(events.table(), events)
+    assert (found.cells, found.correlogram, found.verdict.level) == (None, None, "no verdict")
+    assert math.isnan(found.headline.alpha.value)
+    assert "no cells were sampled; give the observations of a `Sampler`" in found.verdict.line
 
 
 @pytest.mark.parametrize("labels", [np.zeros((0, 2), dtype=int), [[0, -1]], [[0, 0], [0, 0]]])
 def test_maps_that_say_nothing_are_described_too(labels):
     events = log_of(labels)
     table = events.table()
-    summary = describe(table, events, table, limit=table)
+    summary = describe(table, events, table, limit=table, cells=cells_of(labels))
     assert summary.verdict.level == "no verdict"
     assert "no verdict" in summary.verdict.line
 
@@ -144,9 +175,11 @@ def test_events_of_another_map_and_one_backbone_are_refused():
 
 
 def test_backbones_beside_each_other():
-    logs = {"steady": backbone(0.1, 5), "flickering": backbone(0.4, 6), "stuck": backbone(0.1, 7, place=0.3)}
+    models = {"steady": (0.1, 5), "flickering": (0.4, 6), "stuck": (0.1, 7, 0.3)}
+    logs = {name: backbone(*model, seen=1.0) for name, model in models.items()}
+    observed = {name: cells(*model, seen=1.0) for name, model in models.items()}
     tables = {name: log.table() for name, log in logs.items()}
-    content = compare_backbones(tables, logs, ground_truth())
+    content = compare_backbones(tables, logs, ground_truth(), observations=observed)
     read = json.loads(json.dumps(to_json(content)))
     assert to_json(from_json(BackboneComparison, read, "summary.json")) == read
     by_alpha = next(row for row in content.paired.rankings if row.measure == "alpha")
@@ -159,19 +192,22 @@ def between(low, high):
     return Interval((low + high) / 2, low, high, scope=THIS_SCENE, frames=60)
 
 
-def judged(low, high, wrong=UNKNOWN, voxels=5000, blocks=40, ceiling=None, classes=()):
-    """By alpha between frames as it is, or where there is a ceiling by the share of it that is reached."""
-    middle = between(low, high)
-    numbers = HeadlineStatistics(*[middle] * 5, wrong_of_stable=wrong)
-    reach = None if ceiling is None else CeilingShare(500, middle, between(ceiling, ceiling), middle, classes)
-    return verdict("net", headline=numbers, ceiling=reach, voxels=voxels, share=0.5, blocks=blocks)
+def judged(low, high, wrong=UNKNOWN, voxels=5000, blocks=40, **cells):
+    """By alpha in that interval, of observations as these are unless said otherwise."""
+    numbers = HeadlineStatistics(*[between(low, high)] * 5)
+    own = {
+        "cell_size": 0.125, "cells": 800, "frames": 60, "views": 60, "chance": 0.4, "largest_class": "grass",
+        "largest_share": 0.5, "labelled": 1.0, "classes": (),
+    } | cells  # fmt: skip
+    return verdict(
+        "net", headline=replace(numbers, wrong_of_stable=wrong), cells=CellAgreement(**own), voxels=voxels, share=0.5,
+        blocks=blocks,
+    )  # fmt: skip
 
 
 def of_class(name, low, high, *, matters=True):
-    share = between(low, high)
-    return ClassCeilingShare(
-        name, 200.0, matters, 0.5, 0.9, share, 1 - probability_above(share, LIMITS.usable, "agreement")
-    )
+    alpha = between(low, high)
+    return ClassAlpha(name, 200.0, matters, alpha, 1 - probability_above(alpha, LIMITS.usable, "agreement"))
 
 
 @pytest.mark.parametrize(("low", "high", "level"), [
@@ -182,46 +218,65 @@ def test_the_most_probable_level_is_the_verdict(low, high, level):
     assert judged(low, high).level == level
 
 
-def test_agreement_below_zero_stable_errors_and_few_places_are_said():
-    line = judged(-0.2, -0.1, ceiling=0.9, classes=(of_class("tree", -0.2, -0.1),)).line
-    assert "alpha between frames -0.15, no better than chance, is -15%" in line
-    assert "probably unstable: tree (100%)" in line
-    assert "chance" not in judged(0.1, 0.2, ceiling=0.9).line
+def test_agreement_below_zero_is_no_better_than_chance():
+    assert "alpha -0.15 (-0.20 to -0.10), no better than chance" in judged(-0.2, -0.1).line
+    assert "chance" not in judged(0.1, 0.2).line
+
+
+def test_stable_errors_are_misleading():
     wrong = judged(0.9, 0.95, Interval(0.2, 0.1, 0.3))
     assert wrong.level == "misleading"
     assert "20% of the stable locations are wrong (10% to 30%)" in wrong.line
     assert judged(0.9, 0.95, Interval(0.06, 0.04, 0.1)).level == "stable"
+
+
+def test_few_locations_have_no_verdict():
     assert judged(0.9, 0.95, voxels=99).level == judged(0.9, 0.95, blocks=15).level == "no verdict"
+    assert judged(0.9, 0.95, cells=0).level == "no verdict"
     assert "more overlap between frames" in judged(0.9, 0.95, voxels=99).line
-    assert "one class" in judged(math.nan, math.nan).line
+    assert judged(0.9, 0.95, voxels=100, blocks=16, cells=1).level == "stable"
+
+
+def test_a_camera_that_stood_still_has_no_verdict_and_a_single_frame_needs_more_overlap():
+    assert "no verdict, the camera stood still: all frames show one view;" in judged(0.9, 0.95, views=1).line
+    assert "stood still" not in judged(math.nan, math.nan, views=1, frames=1, cells=0).line
+
+
+def test_a_map_of_nearly_one_class_is_uninformative_whatever_its_alpha_is():
+    found = judged(0.9, 0.95, chance=0.9, largest_share=0.95)
+    assert found.level == "uninformative"
+    assert math.isnan(found.probability)
+    assert "95% of the observations are grass" in found.line
+    assert judged(0.1, 0.2, chance=0.9).level == "uninformative"
+    assert judged(0.9, 0.95, chance=0.89).level == "stable"
+
+
+def test_a_model_that_labels_little_is_at_most_usable():
+    found = judged(0.9, 0.95, labelled=0.85)
+    assert (found.level, found.probability > 0.99) == ("usable", True)
+    assert "15% of the locations have no label in most frames" in found.line
+    assert judged(0.9, 0.95, labelled=0.9).level == "stable"
+    assert judged(0.1, 0.2, labelled=0.1).level == "unstable"
 
 
 def test_probabilities_of_the_levels_sum_to_one_and_the_line_says_what_to_do_and_why():
     for low, high in ((0.5, 0.6), (0.7, 0.9), (0.81, 0.9)):
-        for scale in ("agreement", "plain"):
-            levels = level_probabilities(between(low, high), scale)
-            assert sum(levels.values()) == pytest.approx(1)
-            assert min(levels.values()) >= 0
-    half = level_probabilities(between(0.7, 0.9), "plain")
-    assert half["stable"] == pytest.approx(0.5)
+        levels = level_probabilities(between(low, high))
+        assert sum(levels.values()) == pytest.approx(1)
+        assert min(levels.values()) >= 0
+    assert level_probabilities(replace(between(0.7, 0.9), value=LIMITS.stable))["stable"] == pytest.approx(0.5)
     assert judged(0.5, 0.6).line == (
-        "net: unstable (100%), do not act on its labels: two frames agree at 55% of the locations (50% to 60%),"
-        " alpha between frames 0.55 (0.50 to 0.60), its ceiling not known; 5000 locations seen twice or more, 50% of"
-        " the map; for this scene flown again, from 60 frames"
+        "net: unstable (100%), do not act on its labels: alpha 0.55 (0.50 to 0.60), two frames agree at 55% of the"
+        " locations; 5000 locations seen twice or more, 50% of the map; for this scene flown again, from 60 frames"
     )
 
 
-def test_agreement_is_judged_against_its_ceiling_and_the_line_names_unstable_classes_the_most_probable_first():
-    found = judged(0.82, 0.9, ceiling=0.7)
-    assert found.level == "stable"
-    assert "alpha between frames 0.86 is 86% (82% to 90%) of its ceiling, 0.70" in found.line
-    assert judged(0.82, 0.9, ceiling=0.4).level == "too coarse"
-    assert judged(0.1, 0.2, ceiling=0.4).level == "unstable"
+def test_the_line_names_unstable_classes_the_most_probable_first():
     good, bad, worse = of_class("road", 0.9, 1.0), of_class("person", 0.3, 0.6), of_class("tree", -0.1, 0.1)
     rare, unknown = of_class("car", 0.1, 0.2, matters=False), of_class("sign", math.nan, math.nan)
-    found = judged(0.9, 1.0, ceiling=0.9, classes=(good, bad, worse, rare, unknown))
+    found = judged(0.9, 1.0, classes=(good, bad, worse, rare, unknown))
     assert found.level == "stable"
-    assert "probably unstable: tree (100%), person (100%)" in found.line
+    assert "alpha 0.95 (0.90 to 1.00), probably unstable: tree (100%), person (100%)," in found.line
 
 
 def test_voxels_seen_once_change_no_verdict():

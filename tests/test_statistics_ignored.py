@@ -1,4 +1,4 @@
-"""Backbones on the looks that all of them made: pixels that are left out, and labels beside scores."""
+"""Backbones on the observations that all of them made: pixels that are left out, and labels beside scores."""
 
 from __future__ import annotations
 
@@ -8,26 +8,26 @@ import math
 import numpy as np
 import pytest
 from simulated_events import grid, log_of_evidence
-from striped_floor import K, flight, sampler_of
+from striped_floor import K, flight, fused, sampled
 
-from semstab import backends
-from semstab.errors import DataError
 from semstab.model.contrast import ComparedObservations
-from semstab.statistics import CellObservations, compare_backbones, psa
+from semstab.statistics import compare_backbones
+from semstab.statistics.accumulate import sums_of_cells
+from semstab.statistics.cluster_sums import value
 from semstab.statistics.paired_differences import common_observations, psa_bounds, stratum_counts, thin_share
 
 SIZE = 0.2
 
 
 def compared(**flights):
-    """Backbones that made these frames, on common looks."""
-    tables, looks = {}, {}
-    for name, frames in flights.items():
-        backend = backends.create("numpy", voxel_size=SIZE, num_classes=K)
-        for frame in frames:
-            backend.integrate(frame)
-        tables[name], looks[name] = backend.table(), sampler_of(frames, SIZE).looks()
-    return compare_backbones(tables, looks=looks)
+    """Backbones that made these frames, on common observations."""
+    tables = {name: fused(frames, SIZE).table() for name, frames in flights.items()}
+    return compare_backbones(tables, observations={name: sampled(frames) for name, frames in flights.items()})
+
+
+def of_alpha(found):
+    (row,) = (row for row in found.paired.differences if row.measure == "alpha")
+    return row
 
 
 def without(frames, left_out):
@@ -37,126 +37,146 @@ def without(frames, left_out):
 
 def test_pixels_that_are_dropped_at_random_make_no_difference():
     rng = np.random.default_rng(0)
-    frames = list(flight(6, flicker=0.2, patch=10))
+    frames = list(flight(12, flicker=0.2, patch=10))
     half = without(frames, lambda frame: rng.random(frame.shape) < 0.5)
-    found = compared(whole=frames, half=half)
-    rows = {row.measure: row for row in found.paired.differences}
-    for measure in ("vss", "sbd", "entropy", "alpha_between"):
-        difference = rows[measure].difference
-        assert abs(difference.value) < 0.004
-    on_all_looks = compare_backbones(
-        {name: sampler_of(own, SIZE).looks().observations().table() for name, own in {"a": frames, "b": half}.items()}
-    )
-    apart = {row.measure: row.difference for row in on_all_looks.paired.differences}
-    assert apart["entropy"].low > 0
-    assert abs(apart["entropy"].value) > 5 * abs(rows["entropy"].difference.value)
+    row = of_alpha(compared(whole=frames, half=half))
+    assert abs(row.difference.value) < 0.004
+    assert row.difference.low < 0 < row.difference.high
+    assert row.p_value > 0.05
+
+
+def errs_silently(seed=1):
+    """A model that leaves out 60 % of its errors, patch by patch, and the share of all pixels that these are."""
+    frames, clean = list(flight(8, flicker=0.3, patch=10, seed=seed)), list(flight(8))
+    rng = np.random.default_rng(seed)
+    wrong = {f.index: f.labels != c.labels for f, c in zip(frames, clean, strict=True)}
+    silent = without(frames, lambda f: wrong[f.index] & (np.kron(rng.random((6, 8)), np.ones((10, 10))) < 0.6))
+    return silent, 0.6 * np.mean(list(wrong.values()))
 
 
 def test_the_order_is_said_to_depend_on_errors_that_were_left_out():
-    frames, clean = list(flight(8, flicker=0.3, patch=10, seed=1)), list(flight(8))
-    rng = np.random.default_rng(1)
-    wrong = {f.index: f.labels != c.labels for f, c in zip(frames, clean, strict=True)}
-    silent = without(frames, lambda f: wrong[f.index] & (np.kron(rng.random((6, 8)), np.ones((10, 10))) < 0.6))
-    better = list(flight(8, flicker=0.22, patch=10, seed=2))
-    found = compared(silent=silent, better=better)
-    looks = found.observations
-    missing = {row.backbone: row for row in looks.ignored}
-    assert looks.order[0] == "silent"
-    assert looks.depends
-    assert missing["silent"].missing == pytest.approx(0.6 * np.mean(list(wrong.values())), abs=0.03)
+    silent, share = errs_silently()
+    found = compared(silent=silent, better=list(flight(8, flicker=0.22, patch=10, seed=2))).observations
+    missing = {row.backbone: row for row in found.ignored}
+    assert found.order == ("silent", "better")
+    assert found.order_ignored == ("better", "silent")
+    assert found.depends
+    assert missing["silent"].missing == pytest.approx(share, abs=0.03)
     assert missing["better"].missing == 0
-    whole = compared(a=frames, b=frames).observations.ignored[0]
-    assert whole.psa_low == whole.psa_high
-    assert missing["silent"].psa_low < whole.psa_low < missing["silent"].psa_high
     assert missing["silent"].alpha < missing["better"].alpha
 
 
+def test_bounds_hold_the_agreement_that_there_is_where_nothing_is_left_out():
+    silent, _ = errs_silently()
+    whole = list(flight(8, flicker=0.3, patch=10, seed=1))
+    (full,) = (row for row in compared(a=whole, b=whole).observations.ignored if row.backbone == "a")
+    (some,) = (row for row in compared(silent=silent, whole=whole).observations.ignored if row.backbone == "silent")
+    assert full.psa_low == full.psa_high
+    assert some.psa_low < full.psa_low < some.psa_high
+
+
 def test_maps_that_left_nothing_out_have_an_order_that_depends_on_nothing():
-    found = compared(steady=list(flight(6, flicker=0.1, patch=10)), nervous=list(flight(6, flicker=0.4, patch=10)))
+    found = compared(steady=list(flight(8, flicker=0.1, patch=10)), nervous=list(flight(8, flicker=0.4, patch=10)))
     assert found.observations.order == ("steady", "nervous")
+    assert found.observations.bounded
     assert not found.observations.depends
-    assert not found.observations.decided
-    assert found.paired.primary == "alpha_between"
+    assert found.paired.primary == "alpha"
+    assert of_alpha(found).p_holm < 0.05
 
 
-def test_labels_and_scores_are_compared_by_what_they_decide():
-    frames = list(flight(6, flicker=0.2, patch=10))
+def test_scores_beside_labels_of_the_same_likeliest_class_make_no_difference_in_alpha():
+    frames = list(flight(8, flicker=0.2, patch=10))
     unsure = [dataclasses.replace(f, labels=None, scores=0.2 + 0.4 * np.eye(K)[f.labels]) for f in frames]
     found = compared(labels=frames, scores=unsure)
-    assert found.observations.decided
-    assert found.paired.primary == "alpha"
-    (row,) = (row for row in found.paired.differences if row.measure == "alpha")
-    assert row.difference.value == pytest.approx(0, abs=1e-12)
-    (proper,) = (row for row in found.paired.differences if row.measure == "alpha_between")
-    assert proper.difference.value != 0  # of the scores themselves
-    assert found.standardised.values == {}
+    assert of_alpha(found).difference.value == of_alpha(found).difference.low == of_alpha(found).difference.high == 0
+    (of_voxels,) = (row for row in found.paired.differences if row.measure == "voxel_alpha")
+    assert of_voxels.difference.value > 0.1
+    assert math.isnan(of_voxels.p_value)
 
 
-def test_bounds_of_agreement_by_hand_and_thin_strata():
-    """One place, three looks: class 0, class 0, left out. Of three pairs one agrees, of two nothing is known."""
-    looks = np.zeros((1, 3, 3))
-    looks[0, [0, 1, 2], [0, 0, 2]] = 1
-    assert psa_bounds(log_of_evidence(looks)) == (pytest.approx(1 / 3), pytest.approx(1))
-    assert all(map(math.isnan, psa_bounds(log_of_evidence(looks[:, :1]))))
-    seen = {"rarely": 2, "often": 8}
-    tables = {
-        name: log_of_evidence(np.tile(np.eye(3)[0], (400, op, 1)), index=grid(20)).table() for name, op in seen.items()
-    }
-    few = log_of_evidence(
-        np.tile(np.eye(3)[0], (400, 8, 1)), np.arange(8) < np.where(np.arange(400) < 20, 8, 2)[:, None], index=grid(20)
-    ).table()
-    found = compare_backbones({"a": tables["often"], "b": few})
-    assert found.standardised.thin == 1
-    same = {"a": tables["often"], "b": tables["often"]}
-    assert thin_share(stratum_counts(same), np.array([0, 0, 0, 0, 0, 1.0, 0, 0, 0, 0, 0])) == 0
+def across(frame):
+    """Metres (80,) along the floor of the columns of a frame."""
+    return (np.arange(80) - 40) / 50 * frame.depth + frame.T_wc[0, 3]
+
+
+def at_borders(frame):
+    """The pixels around the borders of stripes: 15 % of all, in cells that show easy pixels too."""
+    stripe = across(frame) / 0.9
+    return np.abs(stripe - np.round(stripe)) < 0.15 / 2
+
+
+def anew_in_each_frame(frame):
+    """Pixels that fill the cells that they are in: 15 % of all, others in each frame."""
+    strip = np.floor(across(frame) / 0.25).astype(int)
+    return np.random.default_rng(frame.index).random(200)[strip] < 0.15
+
+
+def bold_and_shy(hardest):
+    """Errors in the hardest pixels alone: the shy model says what the bold one says wherever it says something."""
+    rng = np.random.default_rng(3)
+    bold = []
+    for frame in flight(12, step=0.35):
+        drawn = np.where(rng.random(frame.shape) < 0.8, rng.integers(0, K, frame.shape), frame.labels)
+        labels = np.where(hardest(frame), drawn, frame.labels).astype(np.uint8)
+        bold.append(dataclasses.replace(frame, labels=labels))
+    return bold, without(bold, hardest)
+
+
+def test_a_model_that_leaves_the_hardest_out_is_not_more_stable():
+    bold, shy = bold_and_shy(anew_in_each_frame)
+    apart = [value(sums_of_cells(sampled(frames)), "alpha") for frames in (bold, shy)]
+    assert apart[1] - apart[0] > 0.05  # each on its own observations
+    found = compared(bold=bold, shy=shy)
+    row = of_alpha(found)
+    assert row.difference.value == row.difference.low == row.difference.high == 0
+    assert not row.p_holm <= 0.05
+    missing = {row.backbone: row for row in found.observations.ignored}
+    assert missing["shy"].alpha < missing["bold"].alpha
+
+
+@pytest.mark.parametrize("hardest", [at_borders, anew_in_each_frame])
+def test_that_a_model_leaves_the_hardest_out_is_said(hardest):
+    bold, shy = bold_and_shy(hardest)
+    found = compared(shy=shy, bold=bold).observations
+    missing = {row.backbone: row.missing for row in found.ignored}
+    assert missing["shy"] == pytest.approx(0.15, abs=0.02)
+    assert missing["bold"] == 0
+    assert found.depends
+
+
+def test_common_observations_have_as_many_pixels_as_the_model_with_fewest():
+    frames = list(flight(4, flicker=0.2))
+    rng = np.random.default_rng(4)
+    both = common_observations([sampled(frames), sampled(without(frames, lambda frame: rng.random(frame.shape) < 0.5))])
+    one, other = (own.observations() for own in both.shared)
+    np.testing.assert_array_equal(one.pixels, other.pixels)
+    np.testing.assert_array_equal(one.frame, other.frame)
+    assert both.missing[0] == 0
+    assert both.missing[1] == pytest.approx(0.5, abs=0.01)
+    every = [own.weight.sum() for own in both.ignoring]
+    assert every[0] == every[1] == sampled(frames).weight.sum()
+
+
+def test_models_without_common_frames_have_no_common_observations():
     apart = [dataclasses.replace(f, index=f.index + 10) for f in flight(4)]
     found = compared(a=list(flight(4)), b=apart)
     assert isinstance(found.observations, ComparedObservations)
-    assert (found.observations.voxels, found.paired.voxels) == (0, 0)
-    assert psa(compared(a=list(flight(2)), b=list(flight(2))) and log_of_evidence(np.eye(3)[None]).table()).shape == (
-        1,
-    )
+    assert (found.observations.cells, found.observations.observations) == (0, 0)
+    assert math.isnan(of_alpha(found).difference.value)
 
 
-def test_looks_come_back_from_their_file_and_stay_when_more_frames_come(tmp_path):
-    looks = sampler_of(flight(4, flicker=0.2), 0.4).looks(("a", "b", "c"))
-    looks.save(tmp_path / "looks.parquet")
-    back = CellObservations.load(tmp_path / "looks.parquet")
-    (a, b) = common_observations([looks, back]).logs
-    np.testing.assert_array_equal(a.evidence, b.evidence)
-    np.testing.assert_array_equal(looks.observations().frame, back.observations().frame)
-    assert back.classes == ("a", "b", "c")
-    np.testing.assert_array_equal(back.views.rows(), looks.views.rows())
-    (tmp_path / "other.parquet").write_bytes(b"no")
-    with pytest.raises(DataError, match="not a file of sampled looks"):
-        CellObservations.load(tmp_path / "other.parquet")
-    frames = list(flight(6, flicker=0.2))
-    sampler = sampler_of(frames[:3], 0.1, budget=6000)
-    before, share = sampler.looks(), sampler.looks().share
-    cells, seen = before.cell, sampler.sample().seen
-    for frame in frames[3:]:
-        sampler.add(frame)
-    assert sampler.looks().share < share
-    np.testing.assert_array_equal(before.cell, cells)
-    np.testing.assert_array_equal(before.sample().seen.evidence, seen.evidence)
+def test_bounds_of_agreement_by_hand():
+    """One place, three views: class 0, class 0, left out. Of three pairs one agrees, of two nothing is known."""
+    views = np.zeros((1, 3, 3))
+    views[0, [0, 1, 2], [0, 0, 2]] = 1
+    assert psa_bounds(log_of_evidence(views)) == (pytest.approx(1 / 3), pytest.approx(1))
+    assert all(map(math.isnan, psa_bounds(log_of_evidence(views[:, :1]))))
 
 
-def test_samples_of_other_voxels_are_refused_and_less_dense_ones_or_others_meet():
-    looks = sampler_of(flight(4), 0.4).looks()
-    with pytest.raises(DataError, match="fuse both alike"):
-        common_observations([looks, sampler_of(flight(4), 0.2).looks()])
-    thinned = sampler_of(flight(4), 0.4, budget=1500).looks()
-    assert thinned.share < looks.share
-    both = common_observations([looks, thinned])
-    assert both.missing == (0, 0)
-    assert len(both.logs[0]) == len(both.logs[1]) == len(thinned.observations())
-    frames = list(flight(6, flicker=0.2, step=0.5))
-    looks, back = sampler_of(frames, 0.1).looks(), sampler_of(frames[::-1], 0.1).looks()
-    assert looks.low != back.low
-    both = common_observations([looks, back])
-    assert both.missing == (0, 0)
-    np.testing.assert_array_equal(both.logs[0].evidence, both.logs[1].evidence)
-    np.testing.assert_array_equal(both.logs[0].evidence, looks.observations().evidence)
-    far = dataclasses.replace(back, low=(back.low[0], back.low[1] - (1 << 19), back.low[2]))
-    with pytest.raises(DataError, match="larger voxels"):
-        common_observations([looks, far])
+def test_strata_of_which_one_map_has_hardly_a_voxel_are_thin():
+    often = log_of_evidence(np.tile(np.eye(3)[0], (400, 8, 1)), index=grid(20)).table()
+    seldom = np.arange(8) < np.where(np.arange(400) < 20, 8, 2)[:, None]
+    few = log_of_evidence(np.tile(np.eye(3)[0], (400, 8, 1)), seldom, index=grid(20)).table()
+    assert compare_backbones({"a": often, "b": few}).standardised.thin == 1
+    same = stratum_counts({"a": often, "b": often})
+    assert thin_share(same, np.array([0, 0, 0, 0, 0, 1.0, 0, 0, 0, 0, 0])) == 0

@@ -2,14 +2,20 @@
 
 from __future__ import annotations
 
+import json
+from dataclasses import replace
+
 import numpy as np
+import pyarrow.parquet as pq
 import pytest
 from simulated_events import grid, log_of, log_of_evidence, soft
+from striped_floor import K, fused, sampled
+from striped_floor import flight as over_stripes
 
 from semstab.errors import DataError
 from semstab.metrics.agreement import rows_of
 from semstab.model.measures import dominant, entropy, sbd, vss
-from semstab.statistics.accumulate import cluster_sums_of
+from semstab.statistics.accumulate import cluster_sums_of, sums_of_cells
 from semstab.statistics.agreement import class_agreement, krippendorff_alpha, psa, stability_posterior
 from semstab.statistics.cluster_sums import ClusterSums, aligned, value
 from semstab.statistics.correctness import correctness
@@ -38,7 +44,7 @@ def test_the_sums_give_every_number_back(soft_evidence):
     stable = np.where(often, stability_posterior(table), 0.0)
     excess, known = sbd(table) - expected_sbd(table), correctness(table.evidence[again], truth[again])
     expected = {
-        "psa": psa(table)[again].mean(), "alpha": krippendorff_alpha(table), "vss": vss(table)[often].mean(),
+        "psa": psa(table)[again].mean(), "voxel_alpha": krippendorff_alpha(table), "vss": vss(table)[often].mean(),
         "entropy": entropy(table)[again].mean(), "accuracy": right[again].mean(),
         "look_accuracy": log.evidence[again[log.voxel], truth[log.voxel[again[log.voxel]]]].mean(),
         "wrong_of_stable": (stable * ~right).sum() / stable.sum(), "miou": known.miou, "ece": known.ece,
@@ -48,13 +54,110 @@ def test_the_sums_give_every_number_back(soft_evidence):
         sums = cluster_sums_of(table, given, truth, sbd_excess=excess)
         assert {key: value(sums, key) for key in expected} == pytest.approx(expected, abs=1e-12, nan_ok=True)
     sums = cluster_sums_of(table, log, truth)
-    by_class = [row.alpha for row in class_agreement(table, log)]
-    assert [value(sums, "alpha", k) for k in range(3)] == pytest.approx(by_class)
+    by_class = [row.voxel_alpha for row in class_agreement(table, log)]
+    assert [value(sums, "voxel_alpha", k) for k in range(3)] == pytest.approx(by_class)
     true_one = again & (truth == 1)
     assert value(sums, "accuracy", 1) == pytest.approx(right[true_one].mean())
     said_one = again & (dominant(table) == 1)
     assert value(sums, "precision", 1) == pytest.approx(right[said_one].mean())
     assert value(sums, "iou", 1) == pytest.approx((right & true_one).sum() / (true_one | said_one).sum())
+
+
+def stripes(voxel_size=0.3, **options):
+    """The sums of a flight over stripes, with those of its cells, and the cells."""
+    frames = list(over_stripes(8, flicker=0.3, patch=5, **options))
+    backend, cells = fused(frames, voxel_size), sampled(frames)
+    return cluster_sums_of(backend.table(), backend.events(), cells=cells), cells
+
+
+def test_the_sums_of_cells_give_alpha_back():
+    whole, cells = stripes()
+    fine, coarse = (cells.observations(times) for times in (1, 2))
+    expected = [krippendorff_alpha(log.table()) for log in (fine, coarse)]
+    assert [value(part, "voxel_alpha") for part in (whole.fine, whole.coarse)] == pytest.approx(expected)
+    assert value(whole, "alpha") == pytest.approx(2 * expected[0] - expected[1])
+    by_class = [[row.voxel_alpha for row in class_agreement(log.table(), log)] for log in (fine, coarse)]
+    for k in range(K):
+        assert value(whole, "alpha", k) == pytest.approx(2 * by_class[0][k] - by_class[1][k])
+    alone = sums_of_cells(cells)
+    assert value(alone, "alpha") == pytest.approx(value(whole, "alpha"))
+    assert np.isnan(value(alone, "psa"))
+
+
+def test_without_cells_there_is_no_alpha():
+    table, log, _ = flight()
+    sums = cluster_sums_of(table, log)
+    assert (sums.fine, sums.coarse) == (None, None)
+    assert np.isnan(value(sums, "alpha"))
+    assert not np.isnan(value(sums, "voxel_alpha"))
+
+
+def test_sums_of_cells_become_coarser_with_those_of_the_map():
+    whole, _ = stripes()
+    larger = whole.coarsened(2 * whole.edge, 4)
+    assert larger.fine.edge == larger.coarse.edge == larger.edge == 2 * whole.edge
+    assert larger.fine.cells < whole.fine.cells
+    assert larger.fine.step == whole.fine.step == 1
+    for key in ("alpha", "voxel_alpha"):
+        assert value(larger, key) == pytest.approx(value(whole, key))
+
+
+def test_sums_of_two_maps_are_aligned_with_their_cells():
+    """The frames of one map are not known, those of its cells are; the cubes of the other are larger."""
+    one, other = stripes()[0].coarsened(2.0, 2), stripes(seed=1)[0].coarsened(4.0, 1)
+    a, b = aligned(one.coarsened(2.0, 0), other)
+    assert (a.edge, a.step, b.edge, b.step) == (4.0, 0, 4.0, 0)
+    for part in (a.fine, a.coarse, b.fine, b.coarse):
+        assert (part.edge, part.step) == (4.0, 1)
+    assert [value(a, "alpha"), value(b, "alpha")] == pytest.approx([value(one, "alpha"), value(other, "alpha")])
+    without = cluster_sums_of(flight()[0]).coarsened(4.0, 0)
+    a, b = aligned(replace(without, voxel_size=0.3), other)
+    assert (a.fine, np.isnan(value(a, "alpha"))) == (None, True)
+    assert value(b, "alpha") == pytest.approx(value(other, "alpha"))
+
+
+def test_a_file_holds_a_map_and_its_fine_and_coarse_cells(tmp_path):
+    whole, _ = stripes()
+    whole.save(tmp_path / "sums.parquet")
+    back = ClusterSums.load(tmp_path / "sums.parquet")
+    for part, own in zip((back, back.fine, back.coarse), (whole, whole.fine, whole.coarse), strict=True):
+        for name in ("cell", "frame", "columns"):
+            np.testing.assert_array_equal(getattr(part, name), getattr(own, name))
+        for name in ("edge", "step", "voxel_size", "K", "classes", "truth", "fused"):
+            assert getattr(part, name) == getattr(own, name)
+    assert (back.voxel_size, back.fine.voxel_size, back.coarse.voxel_size) == (0.3, 0.125, 0.25)
+    assert value(back, "alpha") == value(whole, "alpha")
+
+
+@pytest.mark.parametrize("schema", [2, 3])
+def test_an_older_file_is_read_without_its_cells(tmp_path, schema):
+    """Parts 1 and 2 of schema 3 were of another sample; schema 2 had no frames that were fused."""
+    whole, _ = stripes()
+    whole.save(tmp_path / "sums.parquet")
+    content = pq.read_table(tmp_path / "sums.parquet")
+    about = json.loads(content.schema.metadata[b"semstab"])
+    about |= {name: about[name][0] for name in ("step", "voxel_size", "fused")}
+    about |= {"schema": schema, "kind": "InfluenceSums"}
+    if schema == 2:
+        about.pop("fused")
+    pq.write_table(content.replace_schema_metadata({"semstab": json.dumps(about)}), tmp_path / "old.parquet")
+    back = ClusterSums.load(tmp_path / "old.parquet")
+    assert (back.fine, back.coarse) == (None, None)
+    np.testing.assert_array_equal(back.columns, whole.columns)
+    assert (back.step, back.voxel_size, back.fused) == (1, 0.3, 0 if schema == 2 else 8)
+    assert value(back, "voxel_alpha") == value(whole, "voxel_alpha")
+    assert np.isnan(value(back, "alpha"))
+
+
+@pytest.mark.parametrize("change", [{"schema": 9}, {"kind": "InfluenceSums"}, {"step": [1, 1]}, {"step": [1, 3, 1]}])
+def test_a_file_of_another_kind_is_refused(tmp_path, change):
+    whole, _ = stripes()
+    whole.save(tmp_path / "sums.parquet")
+    content = pq.read_table(tmp_path / "sums.parquet")
+    about = json.loads(content.schema.metadata[b"semstab"]) | change
+    pq.write_table(content.replace_schema_metadata({"semstab": json.dumps(about)}), tmp_path / "other.parquet")
+    with pytest.raises(DataError, match="not a file of cluster sums"):
+        ClusterSums.load(tmp_path / "other.parquet")
 
 
 def test_sums_become_coarser_and_a_file_holds_them(tmp_path):
@@ -63,13 +166,13 @@ def test_sums_become_coarser_and_a_file_holds_them(tmp_path):
     coarse = whole.coarsened(4 * whole.edge, 2)
     assert (coarse.edge, coarse.step, coarse.frames) == (4 * whole.edge, 2, 5)
     assert coarse.cells < whole.cells
-    assert value(coarse, "alpha") == pytest.approx(value(whole, "alpha"))
+    assert value(coarse, "voxel_alpha") == pytest.approx(value(whole, "voxel_alpha"))
     whole.save(tmp_path / "sums.parquet")
     again = ClusterSums.load(tmp_path / "sums.parquet")
     assert np.array_equal(again.columns, whole.columns)
     assert (again.edge, again.step, again.truth) == (whole.edge, 1, True)
     assert aligned(again, coarse)[0].cells == coarse.cells
-    with pytest.raises(DataError, match="not a file of influence sums"):
+    with pytest.raises(DataError, match="not a file of cluster sums"):
         ClusterSums.load(__file__)
 
 
@@ -103,7 +206,7 @@ def test_a_series_over_frames_and_how_much_of_a_map_is_covered():
     assert not same_flight(whole, part)
     other = cluster_sums_of(table, log, 1 - truth)
     assert difference(whole, other, "accuracy").high > 0
-    nothing = difference(whole, other, "alpha")
+    nothing = difference(whole, other, "voxel_alpha")
     assert (nothing.value, nothing.low, nothing.high, nothing.decided) == (0.0, 0.0, 0.0, True)
     series = dict(enumerate(values))
     assert difference_over_frames(series, series | {99: 0.0}).high == 0.0
@@ -114,7 +217,7 @@ def test_a_map_of_which_nothing_was_seen_twice_has_no_numbers_and_a_large_one_fe
     table = (log := log_of(np.zeros((9, 1), dtype=int), index=grid(3))).table()
     for given in (log, None):
         sums = cluster_sums_of(table, given, np.zeros(9, dtype=np.int64), sbd_excess=np.full(9, np.nan))
-        assert np.isnan([value(sums, key) for key in ("alpha", "miou", "ece", "sbd_excess")]).all()
+        assert np.isnan([value(sums, key) for key in ("alpha", "voxel_alpha", "miou", "ece", "sbd_excess")]).all()
     labels = np.zeros((40 * 40, 150), dtype=int)
     log = log_of(labels, index=grid(40))
     sums = cluster_sums_of(log.table(), log)

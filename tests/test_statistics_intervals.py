@@ -10,7 +10,7 @@ import pytest
 from flights import Flight, fly, sums_of, world
 from intervals import trials
 from scipy import stats
-from simulated_events import grid, log_of
+from simulated_events import cells_of, grid, log_of
 
 from semstab.core.types import OTHER_SCENES, THESE_FRAMES, THIS_SCENE
 from semstab.model.statistics import Interval
@@ -30,8 +30,15 @@ from semstab.statistics.intervals import (
 
 
 def sums_from(labels, side, voxel_size=0.125):
-    log = log_of(labels, K=2, index=grid(side)[: len(labels)], voxel_size=voxel_size)
-    return cluster_sums_of(log.table(), log)
+    index = grid(side)[: len(labels)]
+    log = log_of(labels, K=2, index=index, voxel_size=voxel_size)
+    return cluster_sums_of(log.table(), log, cells=cells_of(labels, 2, index, cell_size=voxel_size / 2))
+
+
+def moved(sums, by):
+    """The same map, elsewhere."""
+    further = {name: part and moved(part, by) for name, part in (("fine", sums.fine), ("coarse", sums.coarse))}
+    return dataclasses.replace(sums, cell=sums.cell + np.array(by, np.int32), **further)
 
 
 def simulated(seed=0, **settings):
@@ -59,10 +66,12 @@ def test_no_error_seen_is_not_no_error_and_next_to_nothing_is_nowhere():
     """100 places in two frames that agree, of two classes: some disagreement may have been missed."""
     labels = np.tile((np.arange(100) % 10 < 5)[:, None], (1, 2)).astype(int)
     sums = sums_from(labels, 10)
-    alpha, psa = (estimate(sums, key, scope=THESE_FRAMES) for key in ("alpha", "psa"))
-    assert alpha.value == alpha.high == psa.high == 1
+    keys = ("alpha", "voxel_alpha", "psa")
+    alpha, of_voxels, psa = (estimate(sums, key, scope=THESE_FRAMES) for key in keys)
+    assert alpha.value == alpha.high == of_voxels.value == of_voxels.high == psa.high == 1
     assert psa.low == pytest.approx(0.025 ** (1 / 100))
-    assert alpha.low == pytest.approx(1 - (1 - psa.low) / 0.5, abs=0.01)
+    assert of_voxels.low == pytest.approx(1 - (1 - psa.low) / 0.5, abs=0.01)
+    assert alpha.low == pytest.approx(1 - 2 * (1 - of_voxels.low))  # that of fine cells counts twice
     # Of 150 classes so few voxels may be stable that the square of their number is none any more
     rng = np.random.default_rng(0)
     places = Cubes.of(log_of(np.zeros((32 * 32, 3), dtype=int), K=2, index=grid(32), voxel_size=0.125).table())
@@ -105,12 +114,13 @@ def test_every_number_has_an_interval_and_few_frames_say_so():
     sums = simulated(frames=6, looks=4)
     few = estimate(sums, "alpha")
     assert "take 8 or more" in few.undecided
-    without = estimate(sums.coarsened(sums.edge, 0), "alpha")
-    assert without.scope == THESE_FRAMES
-    assert without.value == pytest.approx(few.value)
+    without = sums.coarsened(sums.edge, 0)
+    assert estimate(without, "voxel_alpha").scope == THESE_FRAMES
+    assert estimate(without, "voxel_alpha").value == pytest.approx(value(sums, "voxel_alpha"))
+    assert estimate(without, "alpha") == few  # cells know their views though a map has no log
     sums = simulated(frames=64, looks=6, quality="uneven")
     keys = ("psa", "vss", "entropy", "accuracy", "look_accuracy", "wrong_of_stable")
-    for key, k in [*((key, None) for key in keys), ("alpha", 0), ("accuracy", 1)]:
+    for key, k in [*((key, None) for key in (*keys, "alpha")), ("alpha", 0), ("accuracy", 1)]:
         found = estimate(sums, key, k)
         assert found.low < found.value < found.high, key
         assert found.value == value(sums, key, k)
@@ -121,9 +131,8 @@ def test_numbers_asked_together_have_the_intervals_that_each_has_alone():
     labels = np.random.default_rng(0).integers(0, 2, (24 * 24, 4))
     labels[: 24 * 16] = 0
     labels[: 24 * 8, 2:] = -1  # seen twice
-    log = log_of(labels, K=2, index=grid(24), voxel_size=0.125)
-    sums = cluster_sums_of(log.table(), log)
-    elsewhere = dataclasses.replace(sums, cell=sums.cell + np.array([5, -3, 2], np.int32))
+    sums = sums_from(labels, 24)
+    elsewhere = moved(sums, [5, -3, 2])
     numbers = [("psa", None), ("alpha", None), ("vss", None), ("alpha", 1)]
     together = confidence_intervals(spec_of(sums, key, k) for key, k in numbers)
     assert len({found.locations for found in together}) > 1
@@ -151,7 +160,7 @@ def test_a_worse_map_differs_and_what_pairs_share_does_not_blur_it():
     pair = [sums_of(fly(flight, over, np.random.default_rng(1), ease=ease), over) for ease in (1.0, 0.8)]
     paired, apart = difference(*pair, "alpha"), difference(*pair, "alpha", same_frames=False)
     assert paired.high - paired.low < 0.7 * (apart.high - apart.low)
-    elsewhere = [dataclasses.replace(sums, cell=sums.cell + 1000 * i) for i, sums in enumerate(pair)]
+    elsewhere = [moved(sums, 1000 * i) for i, sums in enumerate(pair)]
     unpaired = difference(*elsewhere, "alpha", scope=THESE_FRAMES)
     both = [estimate(sums, "alpha", scope=THESE_FRAMES) for sums in pair]
     assert unpaired.high - unpaired.low > 0.8 * max(one.high - one.low for one in both)  # reaches differ

@@ -237,7 +237,7 @@ class ClusterSums:
         return len(self.index.cubes)
 
     def coarsened(self, edge: float, step: int) -> ClusterSums:
-        """Return the sums of larger cubes, or groups of frames; step 0 forgets the frames."""
+        """Return the sums of larger cubes, or groups of frames; step 0 forgets those of the map, not of its cells."""
         cell = _joined(self.cell, edge / self.edge)
         known = step and self.step
         frame = _joined(self.frame, step // self.step) if known else np.full(len(cell), -1)

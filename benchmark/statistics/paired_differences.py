@@ -23,7 +23,7 @@ from semstab.model.measures import ENTROPY, Quantity, mean, measures
 from semstab.model.statistics import UNDEFINED, UNKNOWN, Estimate, Interval
 from semstab.model.voxels import VoxelTable
 from semstab.statistics.accumulate import Cubes, CubeSums, cluster_sums_of, sums_of_cells
-from semstab.statistics.agreement import ALPHA, PSA, VOXEL_ALPHA, psa, ratio_of
+from semstab.statistics.agreement import ALPHA, ONE_HOT, PSA, VOXEL_ALPHA, psa, ratio_of
 from semstab.statistics.cluster_sums import ClusterSums, Statistic
 from semstab.statistics.cluster_sums import value as value_of
 from semstab.statistics.correctness import ACCURACY, join_truth
@@ -328,8 +328,8 @@ def psa_bounds(log: Events) -> tuple[float, float]:
         products: Float64 = ((total**2).sum(axis=1) - own)[again] / (T * (T - 1))[again]
         return products
 
-    low = pairs(text)
-    high = low + 1 - pairs(known[:, None])
+    low, unknown = pairs(text), 1 - pairs(known[:, None])
+    high = low + np.where(unknown > ONE_HOT, unknown, 0.0)  # rounding leaves nothing out
     return float(low.mean()), float(high.mean())
 
 
