@@ -1,7 +1,7 @@
 """Do thresholds from which labels are acted on keep what they promise?
 
-    python simulations/commit.py simulated [--trials 100] [--seed 0] [--precision 0.9]
-    python simulations/commit.py halves RUN [--precision 0.9]
+    python simulations/acceptance.py simulated [--trials 100] [--seed 0] [--precision 0.9]
+    python simulations/acceptance.py halves RUN [--precision 0.9]
 
 Simulated: thresholds are calibrated on one scene, and how often labels with so much evidence are right is counted over
 all other scenes of the same kind. Broken is the share of the thresholds that promise more than that; at most 1 -
@@ -38,7 +38,7 @@ def conditions() -> list[tuple[str, Flight]]:
 def scene(flight: Flight, rng: np.random.Generator) -> tuple[VoxelTable, Truth]:
     """The map of a flight over a scene, and what is right."""
     over: World = world(flight, rng)
-    log = log_of(fly(flight, over, rng), over.index)
+    log = log_of(fly(flight, over, rng), over, flight)
     made = table_of(log)
     table = VoxelTable(
         made.ix, made.iy, made.iz, op=made.op, evidence=made.evidence, pixels=made.pixels, self_sum=made.self_sum,

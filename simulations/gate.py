@@ -15,12 +15,12 @@ import dataclasses
 from collections.abc import Iterator
 
 import numpy as np
-from flights import Flight, World, fly, sums_of, world
+from flights import Flight, World, fly, number_of, sums_of, totals_of, world
 
 from semstab.comparison.gate import bounded, parse, verdict
 from semstab.core.types import OTHER_SCENES, THESE_FRAMES, THIS_SCENE, Scope
 from semstab.model.statistics import Interval
-from semstab.statistics.cluster_sums import FUNCTIONALS, ClusterSums
+from semstab.statistics.cluster_sums import ClusterSums
 
 EASES = (1.0, 1.0, 0.8)
 """How easy a scene is to the baseline and to two new models: as easy, harder."""
@@ -51,13 +51,13 @@ def models(flight: Flight, same: bool, rng: np.random.Generator) -> list[Cluster
 def rates(flight: Flight, trials: int, seed: int, scope: Scope = THIS_SCENE) -> list[float]:
     """The margin, then shares of trials: without a difference failed, passed; with it passed, failed, undecided."""
     found: list[list[Interval]] = []
-    totals = np.zeros((len(EASES), 3 + 2))
+    totals = 0.0
     for trial in range(trials):
         rng = np.random.default_rng([seed, trial])
         base, *new = own = models(flight, scope != OTHER_SCENES, rng)
-        totals += [each.of(FUNCTIONALS["alpha"].names).sum(axis=0) for each in own]
+        totals += np.array([totals_of(each, "alpha") for each in own])
         found.append([bounded(RULE, each, base, level=LEVEL, scope=scope) for each in new])
-    alphas = FUNCTIONALS["alpha"].of(totals)
+    alphas = number_of(totals, "alpha")
     margin = float(alphas[0] - alphas[2])
     rule = dataclasses.replace(RULE, limit=margin)
     said = [[verdict(rule, each) for each in column] for column in zip(*found, strict=True)]

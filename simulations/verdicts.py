@@ -2,9 +2,9 @@
 
     python simulations/verdicts.py [--trials 60] [--seed 0]
 
-Scenes with voxels at borders that hold two classes, as a sampler sees them, and models whose share of the ceiling lies
-near the thresholds of the verdict. A verdict is right where the share that eight flights over the same scene reach
-together is in its level. Prints two tables in Markdown: right verdicts by stated probability, and the mean probability
+Scenes with voxels at borders that hold two classes, as a sampler sees them, and models whose alpha lies near the
+thresholds of the verdict. A verdict is right where alpha of eight flights over the same scene together is in its
+level. Prints two tables in Markdown: right verdicts by stated probability, and the mean probability
 of the right level by the length of the flight.
 """
 
@@ -16,12 +16,11 @@ from collections import defaultdict
 from collections.abc import Iterator
 
 import numpy as np
-from flights import Flight, fly, sample_of, table_of, world
+from flights import Flight, fly, number_of, sample_of, table_of, totals_of, world
 
 from semstab.model.statistics import HeadlineStatistics, Level, StabilityVerdict
 from semstab.statistics.accumulate import cluster_sums_of
-from semstab.statistics.ceiling import ceiling_share
-from semstab.statistics.cluster_sums import FUNCTIONALS, sums_for
+from semstab.statistics.description import cell_agreement
 from semstab.statistics.intervals import confidence_intervals, headline_specs
 from semstab.statistics.verdict import LIMITS, level_probabilities, verdict
 
@@ -32,9 +31,9 @@ EASES = {"alike": (0.8, 1.0, 1.3), "bad": (1.2, 1.5, 1.8), "lasting": (0.9, 1.2,
 """Models near the thresholds, by how their frames differ."""
 
 
-def true_level(share: float) -> Level:
-    """Return the level of a share of the ceiling that is known."""
-    return "stable" if share >= LIMITS.stable else "usable" if share >= LIMITS.usable else "unstable"
+def true_level(alpha: float) -> Level:
+    """Return the level of an alpha that is known."""
+    return "stable" if alpha >= LIMITS.stable else "usable" if alpha >= LIMITS.usable else "unstable"
 
 
 def verdicts(flight: Flight, count: int, seed: int) -> Iterator[tuple[StabilityVerdict, Level, float]]:
@@ -44,15 +43,15 @@ def verdicts(flight: Flight, count: int, seed: int) -> Iterator[tuple[StabilityV
         over, total = world(flight, rng), []
         for _ in range(FLIGHTS):
             sample = sample_of(fly(flight, over, rng), over, flight, rng)
-            sums = cluster_sums_of(table_of(sample.seen), sample=sample)
-            total.append(sums_for(sums, "reached").sum(axis=0))
+            table = table_of(sample.observations(2))
+            sums = cluster_sums_of(table, cells=sample)
+            total.append(totals_of(sums, "alpha"))
             if len(total) == 1:
-                table = table_of(sample.seen)
-                share = ceiling_share(sample, table, sums)
+                cells = cell_agreement(sample, sums, table)
                 headline = HeadlineStatistics(*confidence_intervals(headline_specs(sums)))
-                said = verdict("net", headline=headline, ceiling=share, voxels=len(table), share=1.0, blocks=sums.cells)
-        level = true_level(float(FUNCTIONALS["reached"].of(sum(total))))
-        yield said, level, level_probabilities(share.share, "agreement")[level]
+                said = verdict("net", headline=headline, cells=cells, voxels=len(table), share=1.0, blocks=sums.cells)
+        level = true_level(float(number_of(sum(total), "alpha")))
+        yield said, level, level_probabilities(headline.alpha)[level]
 
 
 def main() -> None:

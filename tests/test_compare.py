@@ -84,7 +84,7 @@ def test_a_run_and_itself_do_not_differ_and_numbers_are_those_of_the_runs(runs, 
     assert found["psa"].base == pytest.approx(judged.psa.value, abs=1e-9)
     assert found["alpha"].base == pytest.approx(judged.alpha.value, abs=1e-9)
     assert found["accuracy"].base == pytest.approx(judged.accuracy.value, abs=1e-9)
-    assert found["reached"].base == pytest.approx(record.statistics.ceiling_share.share.value, abs=1e-9)
+    assert found["voxel_alpha"].base == pytest.approx(record.statistics.agreement.voxel_alpha.value, abs=1e-9)
     assert found["compensated_flicker_percent"].base == pytest.approx(record.image_space.compensated_flicker_percent)
     assert found["wrong_of_stable"].base == pytest.approx(right.quadrants.wrong_of_stable.value, abs=1e-9)
     assert {"sbd_excess", "miou", "ece", "entropy", "sbd", "margin"} <= found.keys()
@@ -94,10 +94,10 @@ def test_a_planted_fault_is_found_with_its_class_its_place_and_its_frames(fault)
     (own,) = fault.scenes[0].against
     assert fault.scenes[0].basis == "observations"
     found = rows(own)
-    assert found["alpha_between"].difference.value < -0.05
+    assert found["alpha"].difference.value < -0.05
     assert found["accuracy"].other < found["accuracy"].base
     assert found["coverage"].difference.value == 0
-    assert rows(own, "door")["alpha_between"].difference.value < rows(own, "wall")["alpha_between"].difference.value
+    assert rows(own, "door")["alpha"].difference.value < rows(own, "wall")["alpha"].difference.value
     assert own.areas
     assert {(area.of, area.confused_with) for area in own.areas} == {("door", "window")}
     assert {each.frame for area in own.areas for each in area.frames} <= set(FAULTY)
@@ -141,7 +141,7 @@ def test_the_columns_go_along_in_an_export(runs, fault, tmp_path):
 def test_runs_of_other_voxel_sizes_and_frames_of_reference_are_hardly_compared(runs):
     (scene,) = semstab.compare([runs / "old", runs / "coarse"]).scenes
     assert scene.basis == "cubes"
-    assert set(rows(scene.against[0])) == {"reached", "compensated_flicker_percent", "accuracy", "miou"}
+    assert set(rows(scene.against[0])) == {"alpha", "compensated_flicker_percent", "accuracy", "miou"}
     assert not scene.against[0].areas
     assert "voxels of 0.125 m and 0.25 m" in scene.notes[0]
     entries = [each.scenes["wall"] for each in open_runs([runs / "old", f"{runs}/new:net"])]
@@ -177,7 +177,7 @@ def test_a_terminal_of_80_columns_and_markdown_hold_it(fault):
     text = StringIO()
     print_comparison(fault, Console(file=text, width=80))
     assert max(map(len, text.getvalue().splitlines())) <= 80
-    for word in ("Over all classes", "Alpha between", "door", "window", "frames"):
+    for word in ("Over all classes", "Alpha", "door", "window", "frames"):
         assert word in text.getvalue()
     page = markdown(fault)
     assert page.startswith("## new against old\n")

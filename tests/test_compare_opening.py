@@ -89,7 +89,7 @@ def test_a_small_summary_holds_all_but_voxels(run, tmp_path):
     assert to_json(back.summary.statistics.agreement) == to_json(own.summary.statistics.agreement)
     assert to_json(back.image_space) == to_json(own.image_space)
     assert (back.up, back.flicker) == (own.up, own.flicker)
-    assert all(value(back.sums, key) == value(own.sums, key) for key in ("psa", "alpha_between", "reached", "vss"))
+    assert all(value(back.sums, key) == value(own.sums, key) for key in ("psa", "alpha", "voxel_alpha", "vss"))
     fails(
         DataError, re.escape(f"{file}: is a small summary, without the voxels that mIoU needs"), back.with_voxels,
         "mIoU",

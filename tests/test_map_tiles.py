@@ -25,7 +25,7 @@ from scipy.spatial.transform import Rotation
 
 import semstab
 from semstab import backends
-from semstab.comparison import pairing
+from semstab.statistics import model_comparison
 from semstab.comparison.calibration import calibrate_run
 from semstab.comparison.differences import find
 from semstab.core.json_form import to_json
@@ -214,7 +214,7 @@ def test_statistics_of_tiles_are_those_of_the_whole_map(judged) -> None:
     logs = one.events(), other.events()
     for name in ("ix", "iy", "iz", "voxel", "frame", "pixels", "evidence"):
         np.testing.assert_array_equal(*(np.asarray(getattr(log, name)) for log in logs))
-    sums = [ClusterSums.load(run.result.records[0].influence_file) for run in (one, other)]
+    sums = [ClusterSums.load(run.result.records[0].sums_file) for run in (one, other)]
     ordered = [
         own.columns[np.lexsort((own.frame, *own.cell.T))] for own in (own.coarsened(own.edge, own.step) for own in sums)
     ]
@@ -333,8 +333,8 @@ def test_backbones_are_compared_tile_by_tile(tmp_path) -> None:
 
 def test_evidence_is_calibrated_on_tiles_as_on_the_whole_map(judged, monkeypatch) -> None:
     """Also on the sample that stands for a large map."""
-    for most in (pairing.MOST, 100):
-        monkeypatch.setattr(pairing, "MOST", most)
+    for most in (model_comparison.MOST, 100):
+        monkeypatch.setattr(model_comparison, "MOST", most)
         one, other = (calibrate_run(folder, precision=0.6) for folder in judged)
         assert one == other
         assert ("1 in 4 of the locations" in one.calibrated_on) == (most == 100)

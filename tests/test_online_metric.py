@@ -21,7 +21,7 @@ from semstab.errors import ConfigError, DataError
 from semstab.online.metric import TemporalStability
 from semstab.online.summary import Summary
 
-EXACT = ("vss@3", "psa", "alpha", "ceiling_share", "op3_share")
+EXACT = ("vss@3", "psa", "alpha", "op3_share")
 """What is the same however frames are shared out among processes."""
 
 
@@ -180,17 +180,15 @@ def test_it_is_a_metric_of_torchmetrics(flights):
     from torchmetrics.aggregation import MeanMetric
 
     assert issubclass(semstab.TemporalStability, Metric)
-    collection = MetricCollection(
-        {"stability": semstab.TemporalStability(K, SIZE, ceiling=False), "mean": MeanMetric()}
-    )
+    collection = MetricCollection({"stability": semstab.TemporalStability(K, SIZE), "mean": MeanMetric()})
     metric = collection["stability"].clone()
-    plain = updated(TemporalStability(K, SIZE, ceiling=False), flights["scene0"]).compute()
+    plain = updated(TemporalStability(K, SIZE), flights["scene0"]).compute()
     for frame in flights["scene0"]:
         batch = metric(frame.labels, frame.depth, frame.intrinsics, frame.T_wc)
     assert batch["op3_share"] == 0  # of the last frame alone
     assert {name: float(value) for name, value in metric.compute().items()} == pytest.approx(plain, nan_ok=True)
     assert metric.by_sequence()[""].frames == 10
-    other = semstab.TemporalStability(K, SIZE, ceiling=False)
+    other = semstab.TemporalStability(K, SIZE)
     other.merge_state(metric)
     assert float(other.compute()["alpha"]) == pytest.approx(plain["alpha"])
     metric.reset()

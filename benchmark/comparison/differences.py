@@ -133,7 +133,7 @@ def _row(
     key = quantity.key
     before, after = value(base, key, k), value(other, key, k)
     if not (math.isnan(before) and math.isnan(after)):
-        scopes = [scope_of(sums, key=key) for sums in (base, other)]
+        scopes = [scope_of(sums, key=key, k=k) for sums in (base, other)]
         scope = THESE_FRAMES if THESE_FRAMES in scopes else common.scope
         apart = common.basis == "flights"
         change = sums_difference(key, other, base, k, scope=scope, same_frames=common.same_frames, apart=apart)

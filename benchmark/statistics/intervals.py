@@ -207,9 +207,9 @@ def spec_of_observations(
     return EstimateSpec(result, grid, THIS_SCENE if notes else THESE_FRAMES, "agreement", (-1.0, 1.0), level)
 
 
-def scope_of(sums: ClusterSums, wanted: Scope = THIS_SCENE, key: str = "alpha") -> Scope:
+def scope_of(sums: ClusterSums, wanted: Scope = THIS_SCENE, key: str = "alpha", k: int | None = None) -> Scope:
     """Return the scope of a number's interval: what is wanted if enough frames tell of it, else these frames."""
-    return wanted if frames_of(sums, key) >= LEAST_FRAMES else THESE_FRAMES
+    return wanted if frames_of(sums, key, k) >= LEAST_FRAMES else THESE_FRAMES
 
 
 def headline_specs(sums: ClusterSums, wanted: Scope = THIS_SCENE) -> Iterator[EstimateSpec]:
