@@ -10,11 +10,14 @@ from scipy.stats import norm
 from semstab.model.events import Events
 from semstab.model.voxels import VoxelTable
 from semstab.statistics.accumulate import cluster_sums_of
-from semstab.statistics.cluster_sums import ClusterSums
+from semstab.statistics.cluster_sums import FUNCTIONALS, ClusterSums, columns_of, parts_of
 from semstab.statistics.observations import CellObservations, Views, keys_of
 
 ROUGH = 0.5
 """How abruptly a place is one on which the model errs."""
+
+VOXEL, PIXELS = 0.125, 16
+"""Metres along the edge of a voxel, and the pixels of a frame that show it."""
 
 
 @dataclass(frozen=True)
@@ -153,7 +156,7 @@ def _by_object(over: World, frames: int, rng: np.random.Generator) -> np.ndarray
     return drawn[of.ravel()]
 
 
-def log_of(labels: np.ndarray, over: World, flight: Flight, voxel_size: float = 0.125) -> Events:
+def log_of(labels: np.ndarray, over: World, flight: Flight, voxel_size: float = VOXEL) -> Events:
     """The log of labels (n, F), or of scores for them."""
     some = (labels >= 0).any(axis=1)
     voxel, frame = np.nonzero(labels[some] >= 0)
@@ -175,30 +178,49 @@ def table_of(log: Events) -> VoxelTable:
     )  # fmt: skip
 
 
-def sums_of(labels: np.ndarray, over: World, flight: Flight = Flight()) -> ClusterSums:
-    """The sums of a flight, with the truth."""
+def sums_of(
+    labels: np.ndarray, over: World, flight: Flight = Flight(), rng: np.random.Generator | None = None
+) -> ClusterSums:
+    """The sums of a flight, with the truth, and with the cells that alpha is of; see `sample_of`."""
     log = log_of(labels, over, flight)
     some = (labels >= 0).any(axis=1)
-    return cluster_sums_of(table_of(log), log, over.truth[some], cells=sample_of(labels, over, flight))
+    return cluster_sums_of(table_of(log), log, over.truth[some], cells=sample_of(labels, over, flight, rng))
 
 
 def sample_of(
     labels: np.ndarray, over: World, flight: Flight, rng: np.random.Generator | None = None
 ) -> CellObservations:
-    """What a sampler takes of a flight: cells half as wide as a voxel, of which there is one in each voxel.
+    """What a sampler takes of a flight: likeliest classes of fine cells, half as wide as a voxel.
 
-    With an rng each frame sees at borders another part of the next class. A label that errs moves all that the frame
-    sees of a cell by as many classes.
+    A frame sees one cell of a voxel, with `rng` at borders also another one, of the next class, of which it sees more
+    or less. A label that errs moves both by as many classes.
     """
-    cell, view = np.nonzero(labels >= 0)
-    first, n, part = labels[cell, view], len(cell), np.zeros(len(cell))
+    voxel, frame = np.nonzero(labels >= 0)
+    first, pixels = labels[voxel, frame], np.zeros(len(voxel), int)
     if rng is not None:
-        mixed = over.mixed[cell]
-        part = np.where(mixed > 0, np.clip(mixed + 0.3 * rng.standard_normal(n), 0, 1), 0.0)
-    key, low = keys_of(2 * over.index.astype(np.int64))
-    label = np.concatenate([first, (first + 1) % flight.K]).astype(np.uint16)
-    weight, twice = np.concatenate([1 - part, part]), np.tile(np.arange(n), 2)
-    F = labels.shape[1]
-    views = Views(np.arange(F), np.zeros((F, 3)), np.full(F, np.nan), np.full(F, 0.0625))
-    entries = key[cell[twice]], view[twice].astype(np.int32), label, weight, np.zeros(2 * n, np.uint32)
-    return CellObservations(*entries, low, views, 0.0625, flight.K, frames=F).only(weight > 0)
+        mixed = over.mixed[voxel]
+        part = np.where(mixed > 0, np.clip(mixed + 0.3 * rng.standard_normal(len(voxel)), 0, 1), 0.0)
+        pixels = np.rint(part * PIXELS).astype(int)
+    keys, low = keys_of(np.concatenate([2 * over.index, 2 * over.index + [1, 0, 0]]))
+    frames, size = labels.shape[1], VOXEL / 2
+    along, middle = (np.arange(frames) + 0.5) / frames * flight.side * VOXEL, flight.side * VOXEL / 2
+    centres = np.stack([along, np.full(frames, middle), np.full(frames, 10.0)], axis=1)
+    views = Views(np.arange(frames), centres, np.full(frames, np.nan), np.full(frames, size))
+    cell = np.concatenate([voxel, voxel + len(over.index)])
+    label, weight = np.concatenate([first, (first + 1) % flight.K]), np.concatenate([PIXELS - pixels, pixels])
+    there = weight > 0
+    return CellObservations(
+        keys[cell][there], np.tile(frame, 2).astype(np.int32)[there], label.astype(np.uint16)[there],
+        weight.astype(np.float64)[there], np.zeros(there.sum(), np.uint32), low, views, size, flight.K, frames=frames,
+    )  # fmt: skip
+
+
+def totals_of(sums: ClusterSums, key: str) -> np.ndarray:
+    """What a number is of, (parts, C): it adds up over flights."""
+    return np.stack([columns_of(part, key).sum(axis=0) for part, _ in parts_of(sums, FUNCTIONALS[key])])
+
+
+def number_of(totals: np.ndarray, key: str) -> np.ndarray:
+    """The number (...,) of such totals (..., parts, C)."""
+    number = FUNCTIONALS[key]
+    return sum(weight * number.of(totals[..., part, :]) for part, (_, weight) in enumerate(number.parts))

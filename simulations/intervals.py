@@ -18,14 +18,12 @@ import math
 from collections.abc import Iterator, Sequence
 
 import numpy as np
-from flights import Flight, fly, sample_of, sums_of, world
+from flights import Flight, fly, number_of, sample_of, sums_of, totals_of, world
 
 from semstab.core.types import OTHER_SCENES, THESE_FRAMES, THIS_SCENE, Scope
 from semstab.model.statistics import Interval
-from semstab.statistics.cluster_sums import FUNCTIONALS
 from semstab.statistics.correlogram import correlogram
 from semstab.statistics.intervals import difference, estimate
-from semstab.statistics.observations import Views
 
 KEYS = ("alpha", "psa", "accuracy")
 
@@ -73,20 +71,19 @@ def trials(
     for trial in range(count):
         rng = np.random.default_rng([seed, trial])
         over = world(flight, rng)
-        flown = [sums_of(fly(flight, over, rng), over, flight) for _ in range(flights)]
+        flown = [sums_of(fly(flight, over, rng), over, flight, rng) for _ in range(flights)]
         for key in keys:
-            columns = [sums.of(FUNCTIONALS[key].names).sum(axis=0) for sums in flown]
+            columns = np.array([totals_of(sums, key) for sums in flown])
             intervals[key].append(estimate(flown[0], key, scope=scope))
-            values[key].append([float(FUNCTIONALS[key].of(own)) for own in columns])
-            totals[key].append(sum(columns))
+            values[key].append([*number_of(columns, key)])
+            totals[key].append(columns.sum(axis=0))
     rows = []
     for key in keys:
-        of, scenes = FUNCTIONALS[key].of, np.array(totals[key])
-        one = np.array(values[key])
+        scenes, one = np.array(totals[key]), np.array(values[key])
         if scope == THIS_SCENE:
-            targets, spread = of(scenes), math.sqrt(one.var(axis=1, ddof=1).mean())
+            targets, spread = number_of(scenes, key), math.sqrt(one.var(axis=1, ddof=1).mean())
         else:
-            targets, spread = np.full(count, float(of(scenes.sum(axis=0)))), float(one.std(ddof=1))
+            targets, spread = np.full(count, float(number_of(scenes.sum(axis=0), key))), float(one.std(ddof=1))
         rows.append(Row(name, key, spread, targets, tuple(intervals[key])))
     return rows
 
@@ -107,7 +104,7 @@ def these_frames(count: int, seed: int) -> Iterator[Row]:
     yield from trials(Flight(100, 2.0, coin=True), count, seed, THESE_FRAMES, KEYS, "floor 100 x 100, a coin")
     for soft, K in ((True, 2), (False, 5)):
         name = "floor 100 x 100, reach 2, " + ("scores" if soft else f"{K} classes")
-        flight, keys = Flight(100, 2.0, K=K, soft=soft), ("voxel_alpha", "accuracy")
+        flight, keys = Flight(100, 2.0, K=K, soft=soft), ("voxel_alpha" if soft else "alpha", "accuracy")
         yield from trials(flight, count, seed, THESE_FRAMES, keys, name)
     for ease in (2.0, 2.5, 3.0):
         yield from trials(
@@ -179,7 +176,7 @@ def _pairs(flight: Flight, count: int, seed: int, scope: Scope = THIS_SCENE, whe
         rng = np.random.default_rng([seed, trial])
         over = world(flight, rng)
         other = dataclasses.replace(over, hard=world(flight, rng).hard)
-        pair = [sums_of(fly(flight, scene, rng), scene, flight) for scene in (over, other)]
+        pair = [sums_of(fly(flight, scene, rng), scene, flight, rng) for scene in (over, other)]
         found["same frames"].append(difference(*pair, key, scope=scope, same_frames=True))
         found["two flights"].append(difference(*pair, key, scope=scope, same_frames=False))
     seen = "all see all" if flight.looks == flight.frames else "strips"
@@ -197,16 +194,13 @@ APART = (1, 2, 4)
 
 def correlograms(count: int, seed: int) -> Iterator[Row]:
     """Bands of the bins in time. The target is the mean of all trials."""
-    along = np.stack([np.linspace(0, 5.6, 40), np.full(40, 2.8), np.full(40, 10.0)], axis=1)
-    views = Views(np.arange(40), along, np.full(40, math.nan), np.full(40, 0.0625))
     for quality in ("alike", "uneven", "lasting"):
         flight = Flight(45, 2.0, 1.0, 40, 10, quality)
         found: dict[int, list[Interval]] = {apart: [] for apart in APART}
         for trial in range(count):
             rng = np.random.default_rng([seed, trial])
             over = world(flight, rng)
-            sample = sample_of(fly(flight, over, rng), over, flight, rng)
-            bins = correlogram(dataclasses.replace(sample, views=views)).time
+            bins = correlogram(sample_of(fly(flight, over, rng), over, flight, rng)).time
             for own, lag in zip(found.values(), bins, strict=False):
                 own.append(lag.alpha)
         for apart, own in found.items():
