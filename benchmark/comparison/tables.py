@@ -299,14 +299,12 @@ def _of_run(comparison: RunComparison, own: Against) -> Iterator[str]:
 
 
 def _stability(comparison: RunComparison, own: Against) -> str:
-    """Say how alpha differs, on which verdicts rest, or the first measure that is known."""
-    rows = {row.measure: row for row in own.contrasts}
-    quantity = next((each for each in HEADLINES if each.key in rows), ALPHA)
-    row = rows.get(quantity.key)
+    """Say how alpha differs, on which verdicts rest."""
+    row = next((row for row in own.contrasts if row.measure == ALPHA.key), None)
     if row is None:
-        return f"{own.other} and {comparison.base} have nothing that can be compared."
+        return f"Alpha of {own.other} or {comparison.base} is not known: run it with more overlap between frames."
     where = f" over {len(comparison.scenes)} scenes" if len(comparison.scenes) > 1 else ""
-    numbers = f"{quantity.word} {row.base:.3f} and {row.other:.3f}{where}"
+    numbers = f"{ALPHA.word} {row.base:.3f} and {row.other:.3f}{where}"
     if row.difference.value == row.difference.low == row.difference.high == 0:
         return f"{own.other} is as stable as {comparison.base}: {numbers}, the same everywhere."
     interval = f"{row.difference.value:+z.3f} ({row.difference.low:+z.3f} to {row.difference.high:+z.3f})"

@@ -68,7 +68,7 @@ def fuse(
     observers: Iterable[Observer] = (),
     **settings: Any,
 ) -> FusedResult:
-    """Fuse posed label maps, and return all that a run says of them: measures, strata, ceiling, verdict, intervals.
+    """Fuse posed label maps, and return all that a run says of them: measures, strata, alpha, verdict, intervals.
 
     - `frames`: `Frame`s, or mappings with labels (H, W) or scores (H, W, K), depth (H, W) in metres, intrinsics (3, 3),
       T_wc (4, 4) or (3, 4) camera to world; color, mask, timestamp and truth (H, W) where there are such. NumPy or

@@ -169,7 +169,7 @@ class TemporalStability:
         voxel_size: Metres.
         ignore_index: The label of pixels without one.
         soft: Fuse scores as they are; else the likeliest class of each pixel, as of label maps on disk.
-        alpha: Also sample the cells from which alpha, and a verdict, follow: a third of the time of an update.
+        alpha: Also sample the cells from which alpha, and a verdict, follow: half of the time of an update.
         max_voxels: Of a sequence; a larger map is sampled at random, and its memory stays bounded.
         backend: That fuses.
     """

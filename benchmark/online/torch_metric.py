@@ -29,7 +29,7 @@ class TemporalStability(Metric):
     full_state_update = False
 
     def __init__(self, num_classes: int, voxel_size: float = 0.1, **options: Any) -> None:
-        own = ("ignore_index", "soft", "ceiling", "max_voxels", "backend")
+        own = ("ignore_index", "soft", "alpha", "max_voxels", "backend")
         self._options = {name: options.pop(name) for name in own if name in options}
         super().__init__(**options)
         self.num_classes, self.voxel_size = num_classes, voxel_size

@@ -165,7 +165,7 @@ def analyse(
         seed: Of random orders.
         edges: Upper bounds of the strata of OP.
         critical: The classes that the verdict depends on; where none is named, all with enough locations.
-        scope: Of the headline and the share of the ceiling, where frames tell of it.
+        scope: Scope of the headline and of alpha by class, where views tell of it.
         limits: Of the verdict.
     """
     table, events = sample.table.measured(), sample.events

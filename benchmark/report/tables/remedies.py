@@ -20,7 +20,7 @@ COLUMNS = (
 )
 CAPTION = (
     "Flicker: of the places that two frames in a row see, those whose label changes (camera motion taken out). Alpha:"
-    " agreement between frames in the fused map; it rises with any memory of frames before, as frames that share one"
+    " agreement of two views at the same spot; it rises with any memory of frames before, as frames that share one"
     " are no longer independent: of a filter that remembers a high alpha says nothing. Next frame: of the places that"
     " the next frame sees, those whose label the unfiltered model gives them there; no filter has seen that frame, so"
     " what it merely repeats does not count. Accuracy and mean IoU: of the labelled pixels of single frames. Stable,"
