@@ -206,9 +206,7 @@ def correlograms(count: int, seed: int) -> Iterator[Row]:
         for apart, own in found.items():
             values = np.array([alpha.value for alpha in own])
             targets = np.full(count, values.mean())
-            yield Row(
-                f"40 frames, {quality}, strips, {apart} apart", "alpha", values.std(), targets, tuple(own)
-            )
+            yield Row(f"40 frames, {quality}, strips, {apart} apart", "alpha", values.std(), targets, tuple(own))
 
 
 # --- Table ------------------------------------------------------------------------------------------------------------

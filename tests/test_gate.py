@@ -14,7 +14,7 @@ import gate as simulation
 import numpy as np
 import pytest
 import tiny_scene
-from flights import Flight
+from flights import Flight, World, sample_of
 from posed_config import configure
 from posed_scene import fails
 from simulated_events import grid, log_of
@@ -43,7 +43,7 @@ from semstab.statistics.intervals import difference, same_flight, shares_of, wit
     ),
     ("flicker rise < 0.5%", "flicker", "rise", True, 0.5, None, None),
     ("stable-and-wrong rise < 1e-2", "wrong of stable", "rise", True, 0.01, None, None),
-    ("alpha between drop < -0.01", "alpha between", "drop", True, -0.01, None, None),
+    ("voxel alpha drop < -0.01", "voxel alpha", "drop", True, -0.01, None, None),
 ])  # fmt: skip
 def test_a_rule_is_read(text, key, change, below, limit, class_name, scene):
     rule = parse(text)
@@ -103,7 +103,13 @@ def models(frames=20, side=16, seed=0):
 
 def sums(labels, truth, side=16):
     log = log_of(labels, K=2, index=grid(side))
-    return cluster_sums_of(log.table(), log, truth)
+    return cluster_sums_of(log.table(), log, truth, cells=cells_of(labels, side))
+
+
+def cells_of(labels, side=16, K=2):
+    """A cell for each voxel of the floor."""
+    over = World(grid(side), *[np.zeros(side * side)] * 4)
+    return sample_of(labels, over, Flight(side, frames=labels.shape[1], K=K))
 
 
 def test_a_planted_fault_fails_itself_passes_and_three_frames_are_undecided():

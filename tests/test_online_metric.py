@@ -180,9 +180,7 @@ def test_it_is_a_metric_of_torchmetrics(flights):
     from torchmetrics.aggregation import MeanMetric
 
     assert issubclass(semstab.TemporalStability, Metric)
-    collection = MetricCollection(
-        {"stability": semstab.TemporalStability(K, SIZE), "mean": MeanMetric()}
-    )
+    collection = MetricCollection({"stability": semstab.TemporalStability(K, SIZE), "mean": MeanMetric()})
     metric = collection["stability"].clone()
     plain = updated(TemporalStability(K, SIZE), flights["scene0"]).compute()
     for frame in flights["scene0"]:

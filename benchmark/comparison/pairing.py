@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -162,9 +162,8 @@ def _by_voxels(entries: Sequence[Entry], regions: Regions) -> Common:
 
 def _with_observations(common: Common, names: Sequence[str], records: Sequence[Record]) -> Common:
     """With alpha of the observations that all made; of their own where one's were not kept, or cannot be paired."""
-    files = [file for record in records if (file := record.observations_file) is not None and file.is_file()]
-    there = [CellObservations.load(file) for file in files]
-    if len(there) < len(records) or not _same_frames(there):
+    there = _observations_of_the_same_frames(records)
+    if not there:
         return replace(common, notes=(OTHER_OBSERVATIONS, *common.notes), same_frames=False, frames_differ=True)
     shared = compared_observations(dict(zip(names, there, strict=True)))
     cells = shared.sums.values()
@@ -174,6 +173,34 @@ def _with_observations(common: Common, names: Sequence[str], records: Sequence[R
         common, basis="observations", notes=(*common.notes, *notes), sums=tuple(sums), logs=logs,
         observations=shared.compared, frames_differ=bool(notes),
     )  # fmt: skip
+
+
+def _observations_of_the_same_frames(records: Sequence[Record]) -> list[CellObservations]:
+    """The sampled observations of runs; none where one's were not kept, or are of other frames."""
+    files = [file for record in records if (file := record.observations_file) is not None and file.is_file()]
+    there = [CellObservations.load(file) for file in files]
+    return there if len(there) == len(records) and _same_frames(there) else []
+
+
+def on_common_observations(entries: Mapping[str, Entry]) -> tuple[list[Entry], ComparedObservations] | None:
+    """Entries of runs whose alpha is of the observations that all made, as `pair` has it, and what these are.
+
+    None where nothing can be paired on observations: alpha is then of each run's own.
+    """
+    own = [*entries.values()]
+    if _other_frame_of_reference(own) or _no_voxels(own):
+        return None
+    there = _observations_of_the_same_frames([entry.record for entry in own if entry.record is not None])
+    if not there:
+        return None
+    shared = compared_observations(dict(zip(entries, there, strict=True)))
+    if not shared.compared.observations:
+        return None
+    alike = [
+        replace(entry, small=(replace(entry.sums, fine=of.fine, coarse=of.coarse), entry.flicker))
+        for entry, of in zip(own, shared.sums.values(), strict=True)
+    ]
+    return alike, shared.compared
 
 
 def _apart(entries: Sequence[Entry], reason: str) -> Common:
