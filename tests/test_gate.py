@@ -22,8 +22,8 @@ from typer.testing import CliRunner
 
 import semstab
 from semstab.cli import app
+from semstab.comparison import differences, gate_report
 from semstab.comparison import gate as judging
-from semstab.comparison import gate_report
 from semstab.comparison.gate import GateResult, Judgement, gate, gate_config, parse
 from semstab.errors import ConfigError, DataError
 from semstab.model.statistics import Interval
@@ -180,7 +180,7 @@ def cli(*words):
 def run(tmp_path_factory):
     """A run of a wall with the label sources a and b, and ground truth."""
     base = tmp_path_factory.mktemp("gate")
-    tiny_scene.write(base / "wall", frames=9)
+    tiny_scene.write(base / "wall", frames=18)  # two frames, which lie a pixel apart, are one view
     semstab.run(configure(base / "wall", check=None), out=base / "run", report=False)
     return base / "run"
 
@@ -350,7 +350,10 @@ def test_frames_without_any_label_are_of_the_same_flight():
     assert not same_flight(new, base)
     assert within_a_flight(new, base)
     assert within_a_flight(new, base.coarsened(base.edge, 2))
-    assert not within_a_flight(new, base.coarsened(base.edge, 0))
+    unknown = dataclasses.replace(base.coarsened(base.edge, 0), fine=None, coarse=None)
+    assert not within_a_flight(new, unknown)
+    assert not within_a_flight(unknown, base)
+    assert within_a_flight(new, base.coarsened(base.edge, 0))  # by the views of its cells
     assert shares_of(new, base) == pytest.approx({"voxels": 1.0, "observations": 8 / 9})
     other = log_of(quiet[:, :4], K=2, index=grid(16), frames=[0, 1, 2, 20])
     assert not within_a_flight(cluster_sums_of(other.table(), other, truth), base)
@@ -399,20 +402,48 @@ def test_the_coverage_rule_sees_both_kinds_of_silence(run, quiet_models, name):
     assert gate(f"{run}:b", f"{run}:a", rules).exit_code == 0
 
 
+def test_a_change_of_alpha_is_what_a_comparison_says_of_the_same_runs(run, quiet_models, tmp_path, monkeypatch):
+    """Of observations that both labelled: a run that left out some does not gain or lose by which it left out."""
+    new, base = f"{quiet_models}:part", f"{run}:a"
+    monkeypatch.setattr(differences, "LEAST_VOXELS", 1)
+    (compared,) = semstab.compare([base, new]).overall
+    rules = ["alpha drop < 0.02", "class *: alpha rise < 0.02", "alpha > 0.1", "voxel alpha drop < 0.02"]
+    of_all, *of_classes, alone, voxels = gate(new, base, gate_config(rules=rules)).judgements
+    (found,) = (row for row in compared.contrasts if row.measure == "alpha")
+    assert (of_all.base, of_all.new, of_all.found.value) == (found.base, found.other, -found.difference.value)
+    listed = {row.of: row for row in compared.by_class if row.measure == "alpha"}
+    assert [row.rule.class_name for row in of_classes] == [*listed]
+    for row, own in zip(of_classes, listed.values(), strict=True):
+        assert (row.base, row.new, row.found.value) == (own.base, own.other, own.difference.value)
+    kept = {name: semstab.load_result(folder).record(backbone=own).statistics
+            for name, folder, own in (("new", quiet_models, "part"), ("base", run, "a"))}  # fmt: skip
+    assert alone.new == kept["new"].headline.alpha.value != of_all.new
+    assert voxels.new == pytest.approx(kept["new"].agreement.voxel_alpha.value)
+    (text,) = gate(new, base, gate_config(rules=rules[:1])).notes
+    assert re.fullmatch(r"wall: the run leaves 1\d\.\d% of the pixels without a label .* class of its own", text)
+    assert f"alpha {found.base:.3f} and {found.other:.3f}" in cli("compare", base, new).output
+    assert (
+        f"{found.base:.3f} to {found.other:.3f}, drop" in cli("gate", new, "--against", base, "--rule", rules[0]).output
+    )
+    cli("gate", base, "--save-baseline", str(small := tmp_path / "base.semstab"))
+    (own,) = gate(new, small, gate_config(rules=rules[:1])).judgements  # a small summary has no observations
+    assert (own.base, own.new) == (kept["base"].headline.alpha.value, kept["new"].headline.alpha.value)
+
+
 def test_a_plan_says_how_many_frames_a_rule_needs(run):
     """The standard error falls with the square root of the frames: half the margin takes four times as many."""
     rules = ["--rule", "alpha drop < 0.1", "--rule", "alpha drop < 0.05", "--rule", "coverage drop < 0.1"]
     done = cli("gate", f"{run}:a", "--against", f"{run}:b", "--plan", *rules)
     assert done.exit_code == 0
     wide, narrow = (
-        int(n.replace(",", "")) for n in re.findall(r"alpha drop < [\d.]+: ([\d,]+) \(9 now\)", done.output)
+        int(n.replace(",", "")) for n in re.findall(r"alpha drop < [\d.]+: ([\d,]+) \(\d+ now\)", done.output)
     )
     assert narrow == pytest.approx(4 * wide, rel=0.1)
     assert "coverage drop < 0.1: counted" in done.output
     result = gate(f"{run}:a", f"{run}:b", gate_config(rules=["alpha drop < 0.1"]))
     (each,) = result.judgements
     half = (each.found.high - each.found.low) / 2
-    assert wide == pytest.approx(9 * (half / 0.1) ** 2, rel=1.5)
+    assert wide == pytest.approx(18 * (half / 0.1) ** 2, rel=1.5)
 
 
 def test_the_documented_rules_are_rules():

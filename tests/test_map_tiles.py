@@ -25,7 +25,6 @@ from scipy.spatial.transform import Rotation
 
 import semstab
 from semstab import backends
-from semstab.statistics import model_comparison
 from semstab.comparison.calibration import calibrate_run
 from semstab.comparison.differences import find
 from semstab.core.json_form import to_json
@@ -39,6 +38,7 @@ from semstab.exports.relabel import Belief, relabel
 from semstab.model.frames import Frame, Intrinsics
 from semstab.model.parquet import Tile
 from semstab.model.voxels import Extent, VoxelTable
+from semstab.statistics import model_comparison
 from semstab.statistics.cluster_sums import ClusterSums
 from semstab.testing import random_frames
 from semstab.testing.builders import EXACT, SUMS, sight_line
