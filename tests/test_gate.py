@@ -431,6 +431,18 @@ def test_a_change_of_alpha_is_what_a_comparison_says_of_the_same_runs(run, quiet
     assert (own.base, own.new) == (kept["base"].headline.alpha.value, kept["new"].headline.alpha.value)
 
 
+def test_runs_of_other_strides_say_nothing_of_what_was_left_out(run, tmp_path):
+    """Of pixels of another size it was said that both runs left 40 % without a label."""
+    out = tmp_path / "strided"
+    semstab.run(configure(run.parent / "wall", check=None, backbones=["a"], pixel_stride=2), out=out, report=False)
+    (scene,) = semstab.compare([f"{run}:a", out]).scenes
+    assert scene.basis == "observations"
+    assert (scene.observations.ignored, scene.observations.depends) == ((), False)
+    (note,) = gate(out, f"{run}:a", gate_config(rules=["alpha drop < 0.02"])).notes
+    assert "the runs took other pixels of the frames (pixel_stride)" in note
+    assert note.removeprefix("wall: ") in scene.notes
+
+
 def test_a_plan_says_how_many_frames_a_rule_needs(run):
     """The standard error falls with the square root of the frames: half the margin takes four times as many."""
     rules = ["--rule", "alpha drop < 0.1", "--rule", "alpha drop < 0.05", "--rule", "coverage drop < 0.1"]

@@ -517,8 +517,8 @@ class _Runs:
             new, old = self.own.scenes[scene], base[scene]
             paired = on_common_observations({"the baseline": old, "the run": new})
             if paired is not None:
-                (old, new), compared = paired
-                notes += [f"{scene}: {text}" for text in left_out(compared)]
+                (old, new), compared, remarks = paired
+                notes += [f"{scene}: {text}" for text in (*left_out(compared), *remarks)]
             pairs[scene] = new, old
         return pairs, tuple(notes)
 
