@@ -18,7 +18,7 @@ from semstab.datasets.city.options import BACKBONES
 from semstab.report.narrative import warnings
 
 HEAD = (
-    "labeller", "alpha", "chance, %", "labelled, %", "edges met, %", "flicker, %", "verdict without truth", "warned of",
+    "labeller", "alpha", "labelled, %", "edges met, %", "flicker, %", "verdict without truth", "warned of",
     "verdict with truth", "wrong of stable, %", "accuracy, %",
 )  # fmt: skip
 REASONS = {
@@ -48,14 +48,14 @@ def rows(scene: str, frames: int, width: int) -> Iterator[list[str]]:
         plain, judged = results
         for name in names:
             (own,), (true,) = plain.select(backbone=name), judged.select(backbone=name)
-            found, right, cells = own.statistics, true.statistics, own.statistics.cells
+            found, right = own.statistics, true.statistics
             said = [text for text in warnings(plain) if name in text or text.startswith("stable says")]
             reasons = [
                 reason for part, reason in REASONS.items() if any(part in text and name in text for text in said)
             ]
             numbers = right.headline.wrong_of_stable.value, right.correctness.accuracy.value
             yield [
-                name, f"{found.headline.alpha.value:.2f}", f"{100 * cells.chance:.0f}", f"{100 * cells.labelled:.0f}",
+                name, f"{found.headline.alpha.value:.2f}", f"{100 * found.cells.labelled:.0f}",
                 f"{100 * own.image_space.edge_recall:.0f}", f"{own.image_space.compensated_flicker_percent:.1f}",
                 found.verdict.level, ", ".join(reasons), right.verdict.level, f"{100 * numbers[0]:.0f}",
                 f"{100 * numbers[1]:.0f}",

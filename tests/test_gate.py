@@ -14,7 +14,7 @@ import gate as simulation
 import numpy as np
 import pytest
 import tiny_scene
-from flights import Flight
+from flights import Flight, World, sample_of
 from posed_config import configure
 from posed_scene import fails
 from simulated_events import grid, log_of
@@ -22,8 +22,8 @@ from typer.testing import CliRunner
 
 import semstab
 from semstab.cli import app
+from semstab.comparison import differences, gate_report
 from semstab.comparison import gate as judging
-from semstab.comparison import gate_report
 from semstab.comparison.gate import GateResult, Judgement, gate, gate_config, parse
 from semstab.errors import ConfigError, DataError
 from semstab.model.statistics import Interval
@@ -43,7 +43,7 @@ from semstab.statistics.intervals import difference, same_flight, shares_of, wit
     ),
     ("flicker rise < 0.5%", "flicker", "rise", True, 0.5, None, None),
     ("stable-and-wrong rise < 1e-2", "wrong of stable", "rise", True, 0.01, None, None),
-    ("alpha between drop < -0.01", "alpha between", "drop", True, -0.01, None, None),
+    ("voxel alpha drop < -0.01", "voxel alpha", "drop", True, -0.01, None, None),
 ])  # fmt: skip
 def test_a_rule_is_read(text, key, change, below, limit, class_name, scene):
     rule = parse(text)
@@ -103,7 +103,13 @@ def models(frames=20, side=16, seed=0):
 
 def sums(labels, truth, side=16):
     log = log_of(labels, K=2, index=grid(side))
-    return cluster_sums_of(log.table(), log, truth)
+    return cluster_sums_of(log.table(), log, truth, cells=cells_of(labels, side))
+
+
+def cells_of(labels, side=16, K=2):
+    """A cell for each voxel of the floor."""
+    over = World(grid(side), *[np.zeros(side * side)] * 4)
+    return sample_of(labels, over, Flight(side, frames=labels.shape[1], K=K))
 
 
 def test_a_planted_fault_fails_itself_passes_and_three_frames_are_undecided():
@@ -174,7 +180,7 @@ def cli(*words):
 def run(tmp_path_factory):
     """A run of a wall with the label sources a and b, and ground truth."""
     base = tmp_path_factory.mktemp("gate")
-    tiny_scene.write(base / "wall", frames=9)
+    tiny_scene.write(base / "wall", frames=18)  # two frames, which lie a pixel apart, are one view
     semstab.run(configure(base / "wall", check=None), out=base / "run", report=False)
     return base / "run"
 
@@ -344,7 +350,10 @@ def test_frames_without_any_label_are_of_the_same_flight():
     assert not same_flight(new, base)
     assert within_a_flight(new, base)
     assert within_a_flight(new, base.coarsened(base.edge, 2))
-    assert not within_a_flight(new, base.coarsened(base.edge, 0))
+    unknown = dataclasses.replace(base.coarsened(base.edge, 0), fine=None, coarse=None)
+    assert not within_a_flight(new, unknown)
+    assert not within_a_flight(unknown, base)
+    assert within_a_flight(new, base.coarsened(base.edge, 0))  # by the views of its cells
     assert shares_of(new, base) == pytest.approx({"voxels": 1.0, "observations": 8 / 9})
     other = log_of(quiet[:, :4], K=2, index=grid(16), frames=[0, 1, 2, 20])
     assert not within_a_flight(cluster_sums_of(other.table(), other, truth), base)
@@ -393,20 +402,61 @@ def test_the_coverage_rule_sees_both_kinds_of_silence(run, quiet_models, name):
     assert gate(f"{run}:b", f"{run}:a", rules).exit_code == 0
 
 
+def test_a_change_of_alpha_is_what_a_comparison_says_of_the_same_runs(run, quiet_models, tmp_path, monkeypatch):
+    """Of observations that both labelled: a run that left out some does not gain or lose by which it left out."""
+    new, base = f"{quiet_models}:part", f"{run}:a"
+    monkeypatch.setattr(differences, "LEAST_VOXELS", 1)
+    (compared,) = semstab.compare([base, new]).overall
+    rules = ["alpha drop < 0.02", "class *: alpha rise < 0.02", "alpha > 0.1", "voxel alpha drop < 0.02"]
+    of_all, *of_classes, alone, voxels = gate(new, base, gate_config(rules=rules)).judgements
+    (found,) = (row for row in compared.contrasts if row.measure == "alpha")
+    assert (of_all.base, of_all.new, of_all.found.value) == (found.base, found.other, -found.difference.value)
+    listed = {row.of: row for row in compared.by_class if row.measure == "alpha"}
+    assert [row.rule.class_name for row in of_classes] == [*listed]
+    for row, own in zip(of_classes, listed.values(), strict=True):
+        assert (row.base, row.new, row.found.value) == (own.base, own.other, own.difference.value)
+    kept = {name: semstab.load_result(folder).record(backbone=own).statistics
+            for name, folder, own in (("new", quiet_models, "part"), ("base", run, "a"))}  # fmt: skip
+    assert alone.new == kept["new"].headline.alpha.value
+    assert of_all.base != kept["base"].headline.alpha.value
+    assert voxels.new == pytest.approx(kept["new"].agreement.voxel_alpha.value)
+    (text,) = gate(new, base, gate_config(rules=rules[:1])).notes
+    assert re.fullmatch(r"wall: the run leaves 1\d\.\d% of the pixels without a label .* class of its own", text)
+    assert f"alpha {found.base:.3f} and {found.other:.3f}" in cli("compare", base, new).output
+    assert (
+        f"{found.base:.3f} to {found.other:.3f}, drop" in cli("gate", new, "--against", base, "--rule", rules[0]).output
+    )
+    cli("gate", base, "--save-baseline", str(small := tmp_path / "base.semstab"))
+    (own,) = gate(new, small, gate_config(rules=rules[:1])).judgements  # a small summary has no observations
+    assert (own.base, own.new) == (kept["base"].headline.alpha.value, kept["new"].headline.alpha.value)
+
+
+def test_runs_of_other_strides_say_nothing_of_what_was_left_out(run, tmp_path):
+    """Of pixels of another size it was said that both runs left 40 % without a label."""
+    out = tmp_path / "strided"
+    semstab.run(configure(run.parent / "wall", check=None, backbones=["a"], pixel_stride=2), out=out, report=False)
+    (scene,) = semstab.compare([f"{run}:a", out]).scenes
+    assert scene.basis == "observations"
+    assert (scene.observations.ignored, scene.observations.depends) == ((), False)
+    (note,) = gate(out, f"{run}:a", gate_config(rules=["alpha drop < 0.02"])).notes
+    assert "the runs took other pixels of the frames (pixel_stride)" in note
+    assert note.removeprefix("wall: ") in scene.notes
+
+
 def test_a_plan_says_how_many_frames_a_rule_needs(run):
     """The standard error falls with the square root of the frames: half the margin takes four times as many."""
     rules = ["--rule", "alpha drop < 0.1", "--rule", "alpha drop < 0.05", "--rule", "coverage drop < 0.1"]
     done = cli("gate", f"{run}:a", "--against", f"{run}:b", "--plan", *rules)
     assert done.exit_code == 0
     wide, narrow = (
-        int(n.replace(",", "")) for n in re.findall(r"alpha drop < [\d.]+: ([\d,]+) \(9 now\)", done.output)
+        int(n.replace(",", "")) for n in re.findall(r"alpha drop < [\d.]+: ([\d,]+) \(\d+ now\)", done.output)
     )
     assert narrow == pytest.approx(4 * wide, rel=0.1)
     assert "coverage drop < 0.1: counted" in done.output
     result = gate(f"{run}:a", f"{run}:b", gate_config(rules=["alpha drop < 0.1"]))
     (each,) = result.judgements
     half = (each.found.high - each.found.low) / 2
-    assert wide == pytest.approx(9 * (half / 0.1) ** 2, rel=1.5)
+    assert wide == pytest.approx(18 * (half / 0.1) ** 2, rel=1.5)
 
 
 def test_the_documented_rules_are_rules():

@@ -304,9 +304,9 @@ def test_the_base_backbones_are_compared_where_statistics_are_wanted(root, tmp_p
     (found,) = result.comparisons
     maps = {record.unit.backbone: record.table() for record in result.select()}
     truth = maps.pop("gt")
-    looks = {record.unit.backbone: CellObservations.load(record.looks_file) for record in result.select()}
-    looks.pop("gt")
-    expected = compare_backbones(maps, truth=truth, looks=looks, scene="wall")
+    cells = {own.unit.backbone: CellObservations.load(own.observations_file) for own in result.select()}
+    cells.pop("gt")
+    expected = compare_backbones(maps, truth=truth, observations=cells, scene="wall")
     assert to_json(found) == to_json(expected)
     assert {row.measure for row in found.paired.differences} >= {"psa", "alpha", "accuracy"}
     for other in (load_result(tmp_path / "out"), run_study(config, tmp_path / "out")):  # read, kept

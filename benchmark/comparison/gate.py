@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import math
 import os
 import re
@@ -15,8 +16,19 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
 from semstab.comparison.differences import flicker_difference, sums_difference
+from semstab.comparison.pairing import on_common_observations
 from semstab.comparison.runs import Entry, RunHandle, open_run, shared_scenes
-from semstab.comparison.tables import COVERAGE, FLICKER, IOU, MISLEADING, PRECISION, RECALL, RECURRENT_VSS, SBD_EXCESS
+from semstab.comparison.tables import (
+    COVERAGE,
+    FLICKER,
+    IOU,
+    MISLEADING,
+    PRECISION,
+    RECALL,
+    RECURRENT_VSS,
+    SBD_EXCESS,
+    left_out,
+)
 from semstab.config import nearest, read_yaml, validated
 from semstab.config.settings import ScopeSetting
 from semstab.core.types import OTHER_SCENES, THESE_FRAMES, THIS_SCENE, Scope
@@ -412,20 +424,20 @@ def gate(new: str | os.PathLike[str], against: str | os.PathLike[str] | None, co
     own = open_run(new)
     base = None if against is None else open_run(against)
     scenes = tuple(own.scenes) if base is None else shared_scenes([base, own])
-    judged: list[Judgement] = []
+    runs, judged = _Runs(own, base, scenes), list[Judgement]()
     notes = list(_notes(own, base, scenes))
     for given in parsed:
         rules = given.of_each(own.scenes[scenes[0]].classes)
         for rule in rules:
             _check(rule, own, base, scenes)
         if given.class_name == ALL:
-            rules, absent = _with_a_value(rules, own, base, scenes)
+            rules, absent = _with_a_value(rules, runs)
             notes += [f"{given.text}: seen nowhere twice, and left out: {', '.join(absent)}"] if absent else []
         for rule in rules:
-            pairs = _pairs(rule, own, base, scenes)
+            pairs = runs.pairs(rule)
             _require_values(rule, pairs)
             judged.append(_judged(rule, pairs, config.level / len(rules), config.scope))
-            notes += _counts(judged[-1], pairs)
+            notes += [*_counts(judged[-1], pairs), *(runs.common[1] if runs.on_common(rule) else ())]
     judged_run, against_run = ("" if run is None else f"{run.backbone} ({run.source})" for run in (own, base))
     return GateResult(
         judged_run, against_run, scenes, config.level, config.undecided, tuple(judged), tuple(dict.fromkeys(notes))
@@ -483,19 +495,47 @@ def _k(rule: Rule, entry: Entry) -> int | None:
     return None if rule.class_name is None else entry.classes.index(rule.class_name)
 
 
-def _pairs(rule: Rule, own: RunHandle, base: RunHandle | None, scenes: Sequence[str]) -> list[Pair]:
-    """The runs on each scene that a rule is about; of a rule on a value the new one alone."""
-    named = [rule.scene] if rule.scene else scenes
-    return [(own.scenes[scene], base.scenes[scene] if base and rule.change else None) for scene in named]
+@dataclass(frozen=True, eq=False)
+class _Runs:
+    """The run that is judged, and its baseline, on the scenes of both."""
+
+    own: RunHandle
+    base: RunHandle | None
+    scenes: tuple[str, ...]
+
+    def on_common(self, rule: Rule) -> bool:
+        """Whether a rule is on a change of alpha, which is of the observations that both made, as in a comparison."""
+        return self.base is not None and rule.change is not None and rule.measure.quantity is ALPHA
+
+    @functools.cached_property
+    def common(self) -> tuple[Mapping[str, Pair], tuple[str, ...]]:
+        """The runs on each scene with the observations that both made, and which share of them one left out."""
+        pairs: dict[str, Pair] = {}
+        notes: list[str] = []
+        base = self.base.scenes if self.base is not None else {}
+        for scene in filter(base.get, self.scenes):
+            new, old = self.own.scenes[scene], base[scene]
+            paired = on_common_observations({"the baseline": old, "the run": new})
+            if paired is not None:
+                (old, new), compared, remarks = paired
+                notes += [f"{scene}: {text}" for text in (*left_out(compared), *remarks)]
+            pairs[scene] = new, old
+        return pairs, tuple(notes)
+
+    def pairs(self, rule: Rule) -> list[Pair]:
+        """The runs on each scene that a rule is about; of a rule on a value the new one alone."""
+        named = [rule.scene] if rule.scene else self.scenes
+        if self.on_common(rule):
+            return [self.common[0][scene] for scene in named]
+        base = self.base.scenes if self.base is not None and rule.change else {}
+        return [(self.own.scenes[scene], base.get(scene)) for scene in named]
 
 
-def _with_a_value(
-    rules: Sequence[Rule], own: RunHandle, base: RunHandle | None, scenes: Sequence[str]
-) -> tuple[tuple[Rule, ...], list[str]]:
+def _with_a_value(rules: Sequence[Rule], runs: _Runs) -> tuple[tuple[Rule, ...], list[str]]:
     """The rules of classes that some run has a value of, and the names of the other classes."""
 
     def has_value(rule: Rule) -> bool:
-        entries = (entry for pair in _pairs(rule, own, base, scenes) for entry in pair if entry is not None)
+        entries = (entry for pair in runs.pairs(rule) for entry in pair if entry is not None)
         return any(not math.isnan(_value(rule, entry)) for entry in entries)
 
     there = tuple(filter(has_value, rules))

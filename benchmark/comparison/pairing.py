@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Iterable, Iterator, Sequence
+import math
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -24,10 +25,13 @@ from semstab.statistics.correctness import join_truth
 from semstab.statistics.drift import expected_sbd
 from semstab.statistics.model_comparison import Region, Regions, common_voxels, coverage_of, held, share_of
 from semstab.statistics.observations import CellObservations
-from semstab.statistics.paired_differences import compared_observations
+from semstab.statistics.paired_differences import SharedObservations, compared_observations
 
 NEAR = 1e-3
 """Metres within which cameras of the same frame lie."""
+
+ALIKE = 1.25
+"""Ratio of the footprints of their pixels up to which runs took the same ones: depth may be filtered otherwise."""
 
 SAMPLED = "of {millions:.3g} million common voxels 1 in {n} is compared, by a hash of its location"
 SHOWN = "figures and the recording show the voxels that changed, and 1 in {n} of the others"
@@ -35,6 +39,7 @@ SHOWN = "figures and the recording show the voxels that changed, and 1 in {n} of
 FEW = 0.1
 """A part of a map's voxels below which it is said how few are in common."""
 
+OTHER_PIXELS = "the runs took other pixels of the frames (pixel_stride): what each left without a label is not compared"
 OTHER_OBSERVATIONS = "the runs are of other frames: nothing is paired on observations, and alpha is of each run's own"
 BY_CUBES = (
     "compared are sums in the same cubes of space, each map with all its voxels; what needs them voxel by voxel is"
@@ -162,18 +167,60 @@ def _by_voxels(entries: Sequence[Entry], regions: Regions) -> Common:
 
 def _with_observations(common: Common, names: Sequence[str], records: Sequence[Record]) -> Common:
     """With alpha of the observations that all made; of their own where one's were not kept, or cannot be paired."""
-    files = [file for record in records if (file := record.observations_file) is not None and file.is_file()]
-    there = [CellObservations.load(file) for file in files]
-    if len(there) < len(records) or not _same_frames(there):
+    there = _observations_of_the_same_frames(records)
+    if not there:
         return replace(common, notes=(OTHER_OBSERVATIONS, *common.notes), same_frames=False, frames_differ=True)
-    shared = compared_observations(dict(zip(names, there, strict=True)))
+    shared, pixels = _compared(names, there)
     cells = shared.sums.values()
     sums = (replace(own, fine=of.fine, coarse=of.coarse) for own, of in zip(common.sums, cells, strict=True))
     notes, logs = _fewer_frames(there), tuple(shared.logs.values())
     return replace(
-        common, basis="observations", notes=(*common.notes, *notes), sums=tuple(sums), logs=logs,
+        common, basis="observations", notes=(*common.notes, *notes, *pixels), sums=tuple(sums), logs=logs,
         observations=shared.compared, frames_differ=bool(notes),
     )  # fmt: skip
+
+
+def _observations_of_the_same_frames(records: Sequence[Record]) -> list[CellObservations]:
+    """The sampled observations of runs; none where one's were not kept, or are of other frames."""
+    files = [file for record in records if (file := record.observations_file) is not None and file.is_file()]
+    there = [CellObservations.load(file) for file in files]
+    return there if len(there) == len(records) and _same_frames(there) else []
+
+
+def _compared(names: Iterable[str], there: Sequence[CellObservations]) -> tuple[SharedObservations, tuple[str, ...]]:
+    """The observations that all runs made, and what has to be known of them.
+
+    Where their pixels are not of one size it cannot be told which of them a run left without a label.
+    """
+    shared = compared_observations(dict(zip(names, there, strict=True)))
+    footprints = [float(np.median(own.views.footprint)) if len(own.views) else math.nan for own in there]
+    if not max(footprints) > ALIKE * min(footprints):
+        return shared, ()
+    compared = replace(shared.compared, ignored=(), order_ignored=shared.compared.order, bounded=True)
+    return replace(shared, compared=compared), (OTHER_PIXELS,)
+
+
+def on_common_observations(
+    entries: Mapping[str, Entry],
+) -> tuple[list[Entry], ComparedObservations, tuple[str, ...]] | None:
+    """Entries of runs whose alpha is of the observations that all made, as `pair` has it, what these are, and notes.
+
+    None where nothing can be paired on observations: alpha is then of each run's own.
+    """
+    own = [*entries.values()]
+    if _other_frame_of_reference(own) or _no_voxels(own):
+        return None
+    there = _observations_of_the_same_frames([entry.record for entry in own if entry.record is not None])
+    if not there:
+        return None
+    shared, notes = _compared(entries, there)
+    if not shared.compared.observations:
+        return None
+    alike = [
+        replace(entry, small=(replace(entry.sums, fine=of.fine, coarse=of.coarse), entry.flicker))
+        for entry, of in zip(own, shared.sums.values(), strict=True)
+    ]
+    return alike, shared.compared, notes
 
 
 def _apart(entries: Sequence[Entry], reason: str) -> Common:

@@ -261,12 +261,12 @@ def remarks(comparison: RunComparison) -> list[str]:
         if scene.basis in ("observations", "voxels"):
             lines.append(f"{scene.scene}: {scene.voxels:,} voxels, {BASES[scene.basis]}.")
         if scene.observations is not None:
-            lines += [f"{scene.scene}: {text}." for text in _left_out(scene.observations)]
+            lines += [f"{scene.scene}: {text}." for text in left_out(scene.observations)]
         lines += [f"{scene.scene}: {note}." for note in scene.notes]
     return lines
 
 
-def _left_out(observations: ComparedObservations) -> Iterator[str]:
+def left_out(observations: ComparedObservations) -> Iterator[str]:
     """Say which share of the observations each run left out, and alpha where that counts against it."""
     for row in observations.ignored:
         if row.missing >= LEAST_LEFT_OUT:

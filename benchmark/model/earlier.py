@@ -13,22 +13,30 @@ SCHEMA = 2
 """The schema that is translated."""
 
 KEYS: Mapping[str, str] = {
-    "judged": "headline", "reach": "ceiling_share", "each_place": "voxel_weighted", "question": "scope",
-    "matters": "counts_for_verdict", "reached": "share", "foresight": "next_frame",
-    "foresight_by_frame": "next_frame_by_frame",
+    "judged": "headline", "question": "scope", "foresight": "next_frame", "foresight_by_frame": "next_frame_by_frame",
 }  # fmt: skip
 """Keys of schema 2, and what they are called now."""
 
-GONE = ("beyond_coin", "fusion_rules")
-"""Keys of schema 2 that are not read any more."""
+GONE = ("beyond_coin", "fusion_rules", "reach", "correlogram", "alpha_between", "each_place")
+"""Keys of schema 2 that are not read any more: its looks were at voxels, and alpha is of cells."""
+
+VOXEL_ALPHA = ({"psa", "kappa"}, {"voxel_size", "frames", "alpha"}, {"vss", "recurrent_vss"}, {"name", "kappa"})
+"""Keys beside which 'alpha' was that of voxels: of a map, of a size, of reduced scores, of a class."""
+
+JUDGED_BEFORE = "{model}: no verdict, run it again for alpha of cells: version 0.3 judged alpha of voxels by a ceiling, and said {level}"
+
+UNKNOWN = {"value": None, "low": None, "high": None}
 
 SCOPES: Mapping[str, str] = {"this map": "these frames", "the next flight": "other scenes"}
 
 
 def translated(content: Mapping[str, Any], path: str | Path) -> dict[str, Any]:
-    """Return the content of a summary.json of schema 2 under the names of today, with a warning that names the file."""
-    logger.warning("%s: written by version 0.3; its names are translated. Run it again before the next version", path)
-    return {key: _value(value) for key, value in content.items()}
+    """Return the content of a summary.json of schema 2 under the names of today, with a warning that names the file.
+
+    It has no alpha, and therefore neither a verdict nor a comparison of models, which rested on another number.
+    """
+    logger.warning("%s: written by version 0.3; without alpha and verdicts, which were of voxels. Run it again", path)
+    return {key: _value(value) for key, value in content.items() if key != "comparisons"}
 
 
 def _value(value: Any) -> Any:
@@ -40,13 +48,14 @@ def _value(value: Any) -> Any:
     if "scope" in named and "low" in named:  # an interval
         named["scope"] = SCOPES.get(named["scope"], named["scope"])
         named["locations"] = named.pop("places", 0)
-    if {"paired", "looks"} <= named.keys():  # a comparison of backbones
-        named["observations"] = named.pop("looks")
-    if "counts_for_verdict" in named:  # a class
-        named |= {"locations": named.pop("places", 0), "unstable": None}
+    if "alpha" in named and any(beside <= named.keys() for beside in VOXEL_ALPHA):
+        named["voxel_alpha"] = named.pop("alpha")
     if isinstance(named.get("blocks"), Mapping):  # statistics
         named["blocks"] = named["blocks"].get("count", 0)
+        named |= {"cells": None, "correlogram": None}
+        named["headline"] = {key: each for key, each in named["headline"].items() if key != "voxel_alpha"}
+        named["headline"]["alpha"] = UNKNOWN
     if {"level", "line"} == named.keys():  # a verdict
-        level = named["level"]
-        named |= {"level": "stable" if level == "partly stable" else level, "probability": None}
+        line = JUDGED_BEFORE.format(model=named["line"].partition(": ")[0], level=named["level"])
+        named |= {"level": "no verdict", "probability": None, "line": line}
     return named

@@ -16,7 +16,7 @@ from semstab.backends.numpy_reference import NumpyReference
 from semstab.core.process import available_bytes, group_bytes
 from semstab.errors import ConfigError
 from semstab.model.frames import Frame, Intrinsics
-from semstab.statistics.agreement import between_of
+from semstab.statistics.agreement import alpha_of
 from semstab.statistics.intervals import confidence_intervals, spec_of_observations
 
 SIDE, FRAMES = 160, 6
@@ -105,7 +105,7 @@ def test_thousands_of_classes_take_no_square_of_them() -> None:
     tracemalloc.start()
     try:
         NumpyReference(0.5, K).integrate(frame)
-        of_nine = np.arange(27).reshape(9, 3), np.arange(9), 1.0, 1, sums, sums[:, :2], between_of
+        of_nine = np.arange(27).reshape(9, 3), np.arange(9), 1.0, 1, sums, sums[:, :2], alpha_of
         assert confidence_intervals([spec_of_observations(*of_nine)])[0].value < 1
         assert tracemalloc.get_traced_memory()[1] < 1e8
     finally:

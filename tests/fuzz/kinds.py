@@ -224,8 +224,8 @@ def of_results(folder: Path) -> Iterator[Kind]:
     first: dict[str, Read] = {
         "voxels/*.parquet": VoxelTable.load,
         "events/*.parquet": Events.load,
-        "looks/*.parquet": CellObservations.load,
-        "influence/*.parquet": ClusterSums.load,
+        "observations/*.parquet": CellObservations.load,
+        "sums/*.parquet": ClusterSums.load,
         "overview/*.npz": Overview.load,
         "units/*.json": lambda file: from_json(UnitContent, read_json(file), file),
         "summary.json": lambda _: read_result(run),

@@ -208,7 +208,7 @@ def ignored_table(observations: Mapping[str, ComparedObservations]) -> Table:
         Column("backbone", "Backbone"),
         Column("missing_percent", "left out (%)", 1),
         Column("psa_low", "at least", 3, over="Agreement with these"),
-        Column("psa_high", "at most", 3, over="PSA with these"),
+        Column("psa_high", "at most", 3, over="Agreement with these"),
         Column("alpha_ignored", "Alpha, leaving out as a class", 3),
         Column("order", "Order depends on it"),
     )
