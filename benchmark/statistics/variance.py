@@ -16,7 +16,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 
@@ -26,11 +26,12 @@ from threadpoolctl import ThreadpoolController
 from semstab.core.types import THESE_FRAMES, THIS_SCENE, Float64, Int64, Scope
 from semstab.statistics.cluster_sums import ClusterIndex, Statistic
 
-LASTING = (0.0, 0.8)
-"""Correlations rho of the effects of successive frames."""
+LASTING = {0.0: 1.0, 0.8: 1.0}
+"""Correlations rho of the effects of successive frames, and their weights before the data."""
 
-REACHES = (0.0, 0.2)
-"""Correlation lengths of the effects of locations, as a share of the scene's extent."""
+REACHES = {0.0: 8.0, 0.2: 1.0}
+"""Correlation lengths of the effects of locations, as a share of the scene's extent, and their weights before the data: an
+effect that reaches as far as the scene cannot be told from none."""
 
 SIZES = 7
 """Variances of an effect that are tried, evenly spaced in their logarithm: more of them, or more correlations, cover no
@@ -109,7 +110,7 @@ NOTHING = Variances(np.ones(1), np.zeros(1))
 
 
 def variances(
-    effect: Float64, weight: Float64, noise: Float64, distance: Float64, ranges: Sequence[float]
+    effect: Float64, weight: Float64, noise: Float64, distance: Float64, ranges: Mapping[float, float]
 ) -> Variances:
     """Return what the variance of sum(weight * effect) may be if the effects (n,) are drawn anew.
 
@@ -118,7 +119,7 @@ def variances(
         weight: (n,) their weights.
         noise: (n, n) covariance of the errors of `effect`.
         distance: (n, n) between the effects, whose correlation is exp(-distance / range); range 0: independent.
-        ranges: Correlation lengths that are tried.
+        ranges: Correlation lengths that are tried, and their weights before the data.
     """
     from scipy import special
 
@@ -131,11 +132,11 @@ def variances(
     seen, largest = whiten @ effect, (n - 1) / special.chdtri(n - 1, 1 - UNLIKELY)
     sizes = effect.var() * n / (n - 1) * np.geomspace(SMALLEST, largest, SIZES)
     logs, result = [], []
-    for reach in ranges:
+    for reach, prior in ranges.items():
         alike = np.exp(-distance / reach) if reach > 0 else np.eye(n)
         own, vectors = np.linalg.eigh(whiten @ alike @ whiten.T)
         total = 1 + np.outer(sizes, np.maximum(own, 0.0))
-        logs.append(-0.5 * (np.log(total) + (vectors.T @ seen) ** 2 / total).sum(axis=1))
+        logs.append(math.log(prior) - 0.5 * (np.log(total) + (vectors.T @ seen) ** 2 / total).sum(axis=1))
         result.append(sizes * (weight @ alike @ weight))
     log = np.concatenate(logs)
     likely = np.exp(log - log.max())
@@ -289,13 +290,19 @@ class Effects:
         apart = np.linalg.norm(at[:, None] - at[None], axis=2)
         centre = weight @ at / weight.sum()
         extent = 2 * math.sqrt(float(weight @ ((at - centre) ** 2).sum(axis=1)) / float(weight.sum()))
-        return variances(effect / weight, weight, np.diag(self.unit / weight), apart, [own * extent for own in REACHES])
+        return variances(
+            effect / weight,
+            weight,
+            np.diag(self.unit / weight),
+            apart,
+            {own * extent: prior for own, prior in REACHES.items()},
+        )
 
 
 def _of_frames(effect: Float64, weight: Float64, noise: Float64, at: Float64) -> Variances:
     """Return the variances over new frames; `at` (F,) is when they were taken, ascending."""
     step = float(np.median(np.diff(at)))  # effects last for so many frames that were fused
-    ranges = [-step / math.log(rho) if rho > 0 else 0.0 for rho in LASTING]
+    ranges = {-step / math.log(rho) if rho > 0 else 0.0: prior for rho, prior in LASTING.items()}
     return variances(effect, weight, noise, np.abs(np.subtract.outer(at, at)), ranges)
 
 
