@@ -17,14 +17,7 @@ from semstab.core.types import THESE_FRAMES, THIS_SCENE
 from semstab.errors import ConfigError, DataError
 from semstab.metrics import sbd
 from semstab.model.contrast import BackboneComparison
-from semstab.model.statistics import (
-    UNKNOWN,
-    CellAgreement,
-    ClassAlpha,
-    HeadlineStatistics,
-    Interval,
-    MapStatistics,
-)
+from semstab.model.statistics import UNKNOWN, CellAgreement, ClassAlpha, HeadlineStatistics, Interval, MapStatistics
 from semstab.model.voxels import VoxelTable
 from semstab.statistics import (
     MapSample,

@@ -84,6 +84,12 @@ def test_maps_that_left_nothing_out_have_an_order_that_depends_on_nothing():
     assert of_alpha(found).p_holm < 0.05
 
 
+def test_the_order_of_a_model_and_itself_depends_on_nothing():
+    frames = list(flight(8, flicker=0.3, patch=10, seed=1))
+    found = compared(a=frames, b=frames).observations
+    assert (found.order, found.bounded, found.depends) == (("a", "b"), True, False)
+
+
 def test_scores_beside_labels_of_the_same_likeliest_class_make_no_difference_in_alpha():
     frames = list(flight(8, flicker=0.2, patch=10))
     unsure = [dataclasses.replace(f, labels=None, scores=0.2 + 0.4 * np.eye(K)[f.labels]) for f in frames]
