@@ -244,8 +244,7 @@ class CommonObservations:
     """Models of one scene, observed alike.
 
     Attributes:
-        shared: Of each: the observations of cells that all made, with as many pixels as the model with fewest has
-            there.
+        shared: Of each: the observations of cells in which all models labelled every pixel that any labelled.
         ignoring: Of each: the observations that any made, with one class more, the last, for what the model did not
             label.
         missing: Share of the pixels of these that the model did not label.
@@ -272,8 +271,7 @@ def common_observations(models: Sequence[CellObservations]) -> CommonObservation
     locations = CellObservations.joined(models).only(first)
     shared, ignoring = [], []
     for sample, own, seen in zip(models, of, pixels, strict=True):
-        weight = sample.weight * (least / np.where(seen > 0, seen, 1.0))[own]
-        shared.append(dataclasses.replace(sample, weight=weight).only(least[own] > 0))
+        shared.append(sample.only((least == most)[own]))
         ignoring.append(_filled(sample, locations, most - seen))
     total = most.sum()
     missing = tuple(float(1 - seen.sum() / total) if total else math.nan for seen in pixels)
