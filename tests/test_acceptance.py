@@ -99,7 +99,7 @@ def test_export_and_relabel_take_the_file(tmp_path):
         return done.output
 
     file = tmp_path / "commit.yaml"
-    text = cli("calibrate", tmp_path / "run", "--precision", 0.5, "--confidence", 0.6, "--out", file)
+    text = cli("calibrate", tmp_path / "run", "--precision", 0.8, "--confidence", 0.6, "--out", file)
     thresholds = semstab.AcceptanceThresholds.load(file)
     assert f"{thresholds.left:.1%} of the voxels are left" in text
     table = semstab.load(tmp_path / "run").table()

@@ -150,12 +150,14 @@ def test_that_a_model_leaves_the_hardest_out_is_said(hardest):
     assert found.depends
 
 
-def test_common_observations_have_as_many_pixels_as_the_model_with_fewest():
+def test_common_observations_are_of_cells_of_which_all_models_labelled_every_pixel():
     frames = list(flight(4, flicker=0.2))
     rng = np.random.default_rng(4)
     both = common_observations([sampled(frames), sampled(without(frames, lambda frame: rng.random(frame.shape) < 0.5))])
     one, other = (own.observations() for own in both.shared)
+    assert len(one) > 1000
     np.testing.assert_array_equal(one.pixels, other.pixels)
+    np.testing.assert_array_equal(one.evidence, other.evidence)
     np.testing.assert_array_equal(one.frame, other.frame)
     assert both.missing[0] == 0
     assert both.missing[1] == pytest.approx(0.5, abs=0.01)

@@ -163,12 +163,12 @@ def test_a_worse_map_differs_and_what_pairs_share_does_not_blur_it():
     elsewhere = [moved(sums, 1000 * i) for i, sums in enumerate(pair)]
     unpaired = difference(*elsewhere, "alpha", scope=THESE_FRAMES)
     both = [estimate(sums, "alpha", scope=THESE_FRAMES) for sums in pair]
-    assert unpaired.high - unpaired.low > 0.8 * max(one.high - one.low for one in both)  # reaches differ
+    assert unpaired.high - unpaired.low > 0.5 * max(one.high - one.low for one in both)  # reaches differ
 
 
 @pytest.mark.parametrize(("flight", "scope"), [
     (Flight(side=64, reach=2.0), THESE_FRAMES), (Flight(24, 1.5, 1.0, 40, 40, "bad"), THIS_SCENE),
-    (Flight(24, 1.5, 1.0, 40, 5, "regimes"), THIS_SCENE), (Flight(32, 2.0, 1.0, 40, 5, "lasting"), OTHER_SCENES),
+    (Flight(24, 1.5, 1.0, 40, 40, "lasting"), THIS_SCENE), (Flight(32, 2.0, 1.0, 40, 5, "lasting"), OTHER_SCENES),
 ])  # fmt: skip
 def test_intervals_hold_their_target(flight, scope):
     """So many of few intervals hold it that their level may be 95 %: 3 standard errors below."""

@@ -270,7 +270,7 @@ def left_out(observations: ComparedObservations) -> Iterator[str]:
     """Say which share of the observations each run left out, and alpha where that counts against it."""
     for row in observations.ignored:
         if row.missing >= LEAST_LEFT_OUT:
-            counted = f"alpha is {row.alpha:.3f} where leaving out counts as a class of its own"
+            counted = f"alpha is {row.alpha:.3f} if what it leaves out agrees as by chance"
             yield f"{row.backbone} leaves {row.missing:.1%} of the pixels without a label that others label; {counted}"
     if observations.depends and any(row.missing >= LEAST_LEFT_OUT for row in observations.ignored):
         yield "the order of the runs depends on what was left out"

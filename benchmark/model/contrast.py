@@ -127,7 +127,8 @@ class Ignored:
         missing: Share of their pixels.
         psa_low, psa_high: Bounds of the agreement of two views in a cell, whatever the missing observations would have
             said (Manski 1990): the worst case, and the best.
-        alpha: By the convention that to leave a location out is a class of its own.
+        alpha: By the convention that what is left out agrees as by chance: alpha of what it labelled, times the share
+            of pairs of views of which it labelled both.
     """
 
     backbone: str
@@ -144,7 +145,7 @@ class ComparedObservations:
     Attributes:
         cells, observations: Sampled ones that they are of.
         order: Order of the backbones by alpha on these observations, the best first.
-        order_ignored: The same where to leave a location out is a class of its own.
+        order_ignored: The same by that convention.
         bounded: Whether the bounds of the agreement keep the order of the backbones, whatever was left out.
     """
 

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from semstab.core.types import Float64, Int64
+from semstab.core.types import Float64, Int64, Mask
 from semstab.errors import ConfigError, DataError
 from semstab.metrics.agreement import observations, require_same_grid, rows_of
 from semstab.model.contrast import BackboneComparison, ComparedObservations, Ignored, PairedDifference
@@ -244,7 +244,7 @@ class CommonObservations:
     """Models of one scene, observed alike.
 
     Attributes:
-        shared: Of each: the observations of cells in which all models labelled every pixel that any labelled.
+        shared: Of each: the observations of cells of which all models labelled every pixel.
         ignoring: Of each: the observations that any made, with one class more, the last, for what the model did not
             label.
         missing: Share of the pixels of these that the model did not label.
@@ -264,15 +264,20 @@ def common_observations(models: Sequence[CellObservations]) -> CommonObservation
     if len({sample.K for sample in models}) > 1:
         raise DataError("samples of other classes cannot be compared; fuse both alike")
     size = max(sample.cell_size for sample in models)
-    models = _of_the_same_blocks([sample.labelled().coarsened(size) for sample in models])
+    models = _of_the_same_blocks([sample.coarsened(size) for sample in models])
     of, first = _numbered(models)
-    pixels = np.stack([np.bincount(own, sample.weight, len(first)) for own, sample in zip(of, models, strict=True)])
-    least, most = pixels.min(axis=0), pixels.max(axis=0)
+    pixels, silent = np.zeros((2, len(models), len(first)))
+    for k, (own, sample) in enumerate(zip(of, models, strict=True)):
+        labelled = sample.label < sample.K
+        pixels[k] = np.bincount(own, sample.weight * labelled, len(first))
+        silent[k] = np.bincount(own, sample.weight * ~labelled, len(first))
+    common: Mask = (pixels > 0).all(axis=0) & (silent == 0).all(axis=0)
+    most = pixels.max(axis=0)
     locations = CellObservations.joined(models).only(first)
     shared, ignoring = [], []
     for sample, own, seen in zip(models, of, pixels, strict=True):
-        shared.append(sample.only((least == most)[own]))
-        ignoring.append(_filled(sample, locations, most - seen))
+        shared.append(sample.only(common[own]))
+        ignoring.append(_filled(sample.labelled(), locations, most - seen))
     total = most.sum()
     missing = tuple(float(1 - seen.sum() / total) if total else math.nan for seen in pixels)
     return CommonObservations(tuple(shared), tuple(ignoring), missing)
@@ -312,23 +317,29 @@ def psa_bounds(log: Events) -> tuple[float, float]:
 
     Manski (1990, American Economic Review 80): pairs of observations of which one is missing agree never, or always.
     """
+    low, known = (_pairs(log, each) for each in (log.evidence[:, :-1], 1 - log.evidence[:, -1:]))
+    missing = 1 - known
+    high = low + np.where(missing > ONE_HOT, missing, 0.0)  # rounding leaves nothing out
+    return (float(low.mean()), float(high.mean())) if len(low) else (math.nan, math.nan)
+
+
+def pairs_labelled(log: Events) -> float:
+    """Return the share of the pairs of two views of a cell of which neither is the last class, cells by their views."""
+    op = np.bincount(log.voxel)
+    return (
+        float(np.average(_pairs(log, 1 - log.evidence[:, -1:]), weights=op[op >= 2])) if (op >= 2).any() else math.nan
+    )
+
+
+def _pairs(log: Events, shares: Float64) -> Float64:
+    """Return the mean of s . s' (v,) over the pairs of observations of each cell with two or more, shares (m, C)."""
     starts = log.starts
     T = np.diff(np.append(starts, len(log))).astype(np.float64)
     again = T >= 2
-    if not again.any():
-        return math.nan, math.nan
-    text = log.evidence[:, :-1]
-    known = text.sum(axis=1)
-
-    def pairs(values: Float64) -> Float64:
-        total = np.add.reduceat(values, starts, axis=0)
-        own = np.add.reduceat((values**2).sum(axis=1), starts)
-        products: Float64 = ((total**2).sum(axis=1) - own)[again] / (T * (T - 1))[again]
-        return products
-
-    low, unknown = pairs(text), 1 - pairs(known[:, None])
-    high = low + np.where(unknown > ONE_HOT, unknown, 0.0)  # rounding leaves nothing out
-    return float(low.mean()), float(high.mean())
+    total = np.add.reduceat(shares, starts, axis=0)[again] if len(T) else np.zeros((0, shares.shape[1]))
+    own = np.add.reduceat((shares**2).sum(axis=1), starts)[again] if len(T) else np.zeros(0)
+    products: Float64 = ((total**2).sum(axis=1) - own) / (T * (T - 1))[again]
+    return products
 
 
 @dataclass(frozen=True, eq=False)
@@ -349,17 +360,17 @@ def compared_observations(samples: Mapping[str, CellObservations]) -> SharedObse
     sums: dict[str, ClusterSums] = {}
     for name, own in shared.items():
         sums[name] = sums_of_cells(own, None if not sums else next(iter(sums.values())).edge)
-    ignored = tuple(
-        Ignored(name, missing, *psa_bounds(own.observations()), value_of(sums_of_cells(own), ALPHA.key))
-        for (name, own), missing in zip(ignoring.items(), both.missing, strict=True)
-    )
+    ignored = []
+    for name, missing in zip(names, both.missing, strict=True):
+        log, alpha = ignoring[name].observations(), value_of(sums_of_cells(samples[name]), ALPHA.key)
+        ignored.append(Ignored(name, missing, *psa_bounds(log), min(alpha, 1.0) * pairs_labelled(log)))
     first = next(iter(logs.values()))
     bounds = {row.backbone: (row.psa_low, row.psa_high) for row in ignored}
     by_psa = sorted(names, key=lambda name: -mean(psa(logs[name].table())))
     compared = ComparedObservations(
         cells=len(first.ix),
         observations=len(first),
-        ignored=ignored,
+        ignored=tuple(ignored),
         order=tuple(sorted(names, key=lambda name: -value_of(sums[name], ALPHA.key))),
         order_ignored=tuple(row.backbone for row in sorted(ignored, key=lambda row: -row.alpha)),
         bounded=all(bounds[better][0] >= bounds[worse][1] for better, worse in itertools.pairwise(by_psa)),

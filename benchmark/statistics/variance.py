@@ -30,8 +30,8 @@ LASTING = {0.0: 1.0, 0.8: 1.0}
 """Correlations rho of the effects of successive frames, and their weights before the data."""
 
 REACHES = {0.0: 8.0, 0.2: 1.0}
-"""Correlation lengths of the effects of locations, as a share of the scene's extent, and their weights before the data: an
-effect that reaches as far as the scene cannot be told from none."""
+"""Correlation lengths of the effects of locations, as a share of the scene's extent, and their weights before the data:
+an effect that reaches as far as the scene cannot be told from none."""
 
 SIZES = 7
 """Variances of an effect that are tried, evenly spaced in their logarithm: more of them, or more correlations, cover no

@@ -209,14 +209,14 @@ def ignored_table(observations: Mapping[str, ComparedObservations]) -> Table:
         Column("missing_percent", "left out (%)", 1),
         Column("psa_low", "at least", 3, over="Agreement with these"),
         Column("psa_high", "at most", 3, over="Agreement with these"),
-        Column("alpha_ignored", "Alpha, leaving out as a class", 3),
+        Column("alpha_ignored", "Alpha, left out as by chance", 3),
         Column("order", "Order depends on it"),
     )
     caption = (
         "The share of pixels that a backbone left without a label where another one gives one; the agreement of two"
-        " views in a cell had these pixels agreed never, or always (Manski); alpha by the convention that to leave a"
-        " cell out is a class of its own. The order depends on it where that alpha, or the agreement within its bounds,"
-        " would order the backbones otherwise."
+        " views in a cell had these pixels agreed never, or always (Manski); alpha by the convention that what is left"
+        " out agrees as by chance. The order depends on it where that alpha, or the agreement within its bounds, would"
+        " order the backbones otherwise."
     )
     groups = tuple(Group(scene, _ignored_rows(found)) for scene, found in observations.items())
     return Table("comparison_ignored", "What was left out", caption, columns, groups, "scene")
