@@ -36,6 +36,15 @@ import yaml
 
 RENAMED: dict[str, str | None] = {
     "statistics.judged": "headline",
+    # alpha is of cells, which are sampled and are not voxels; that of voxels has another name
+    "judged.alpha": None,
+    "agreement.alpha": "voxel_alpha",
+    "reduced.alpha": "voxel_alpha",
+    "sizes.alpha": "voxel_alpha",
+    "temporal_agreement.alpha": "voxel_alpha",
+    "alpha_between": None,
+    "each_place": None,
+    "looks/": None,
     # taken out: other rules of fusion, and what the paper's findings were tested on
     "statistics.beyond_coin": None,
     "statistics.fusion_rules": None,
@@ -44,7 +53,6 @@ RENAMED: dict[str, str | None] = {
     "sizes": None,  # of fewer frames and pixels
     "voxel_sizes": None,
     "advice": None,
-    "agreement.each_place": "voxel_weighted",
     "leave_own_out": "leave_one_out",
     "foresight": "next_frame",
     "foresight_by_frame": "next_frame_by_frame",
@@ -60,8 +68,6 @@ RENAMED: dict[str, str | None] = {
     "more.place": "area",
     "more.wrong_place": "wrong_area",
     "looks": "observations",
-    "class_agreement.alpha_between": None,
-    "rows.alpha_between": None,  # of the sample, which the truth no longer cuts
     "drift_p": None,  # no p-value of drift: no test of order holds its level
     "trend_p": None,
     "drift_q": None,

@@ -23,7 +23,10 @@ GONE = ("beyond_coin", "fusion_rules", "reach", "correlogram", "alpha_between", 
 VOXEL_ALPHA = ({"psa", "kappa"}, {"voxel_size", "frames", "alpha"}, {"vss", "recurrent_vss"}, {"name", "kappa"})
 """Keys beside which 'alpha' was that of voxels: of a map, of a size, of reduced scores, of a class."""
 
-JUDGED_BEFORE = "{model}: no verdict, run it again for alpha of cells: version 0.3 judged alpha of voxels by a ceiling, and said {level}"
+JUDGED_BEFORE = (
+    "{model}: no verdict, run it again for alpha of cells: version 0.3 judged alpha of voxels by a ceiling, and said"
+    " {level}"
+)
 
 UNKNOWN = {"value": None, "low": None, "high": None}
 
