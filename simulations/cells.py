@@ -3,8 +3,8 @@
     python simulations/cells.py [--frames 30] [--seed 0]
 
 A camera walks about a furnished room (tests/room_scene.py) whose classes are those of its furniture, or cubes of 17 cm.
-Blobs of labels are wrong, anew in each frame. Prints a table in Markdown: alpha of points of the true surfaces, which
-frames show in a pixel; alpha of sampled cells at strides of 1 to 8 pixels; and alpha of voxels of 1 to 8 cm.
+Blobs of labels are wrong, anew in each frame. Prints a table in Markdown: alpha of points of the true surface in the
+sampled cells; alpha of sampled cells at strides of 1 to 8 pixels; and alpha of voxels of 1 to 8 cm.
 """
 
 from __future__ import annotations
@@ -39,8 +39,8 @@ CONDITIONS = ((0.0, 0.1), (0.0, 0.25), (0.0, 0.4), (0.005, 0.25))
 """Noise of depth, relative, and the share of the labels that are wrong."""
 
 
-SPOT, VISIBLE = 0.03, 0.02
-"""Metres between points of surfaces, and how far depth may differ, relative, where a frame shows a point."""
+VISIBLE = 0.02
+"""How far depth may differ, relative, where a frame shows a point."""
 
 Seen = tuple[npt.NDArray[np.float64], npt.NDArray[np.float64], npt.NDArray[np.intp]]
 
@@ -57,28 +57,36 @@ def views(frames: int) -> Iterator[Seen]:
 ONES = np.ones((H, W))
 
 
-def spots(seen: list[Seen]) -> npt.NDArray[np.float64]:
-    """Points (n, 3) on the surfaces that some frame sees, one in each cube of SPOT metres."""
-    found = []
-    for T, depth, _ in seen:
-        v, u = np.mgrid[:H:2, :W:2].reshape(2, -1)
+def spots(seen: list[Seen]) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.bool_]]:
+    """A point (n, 3) of the true surface in each sampled cell, and the frames (n, F) that have a pixel in that cell."""
+    sampler, found = Sampler(K), []
+    for index, (T, depth, _) in enumerate(seen):
+        labels = np.full((H, W), index % K, np.uint8)
+        sampler.add(Frame(index, depth.astype(np.float32), CAMERA, T, labels))
+        v, u = np.mgrid[:H, :W].reshape(2, -1)
         rays = np.stack([(u - CAMERA.cx) / FOCAL, (v - CAMERA.cy) / FOCAL, np.ones(len(u))], axis=1)
         found.append(rays * depth[v, u, None] @ T[:3, :3].T + T[:3, 3])
-    points = np.concatenate(found)
-    _, first = np.unique(np.floor(points / SPOT), axis=0, return_index=True)
-    return points[first]
+    log, points = sampler.sample().observations(), np.concatenate(found)
+    cells, first = np.unique(np.floor(points / log.voxel_size).astype(int), axis=0, return_index=True)
+    sampled, shown = np.stack([log.ix, log.iy, log.iz], axis=1), np.zeros((len(log.ix), len(seen)), bool)
+    shown[log.voxel, log.frame] = True
+    _, of = np.unique(np.concatenate([cells, sampled]), axis=0, return_inverse=True)
+    _, point, cell = np.intersect1d(of[: len(cells)], of[len(cells) :], return_indices=True)
+    return points[first[point]], shown[cell]
 
 
-def at_the_same_spot(points: npt.NDArray[np.float64], seen: list[Seen], frames: list[Frame]) -> float:
+def at_the_same_spot(
+    points: npt.NDArray[np.float64], shown: npt.NDArray[np.bool_], seen: list[Seen], frames: list[Frame]
+) -> float:
     """Krippendorff's alpha with points as units: the label of the pixel that each frame shows a point in."""
     counts = np.zeros((len(points), K))
-    for (T, depth, _), frame in zip(seen, frames, strict=True):
+    for own, (T, depth, _), frame in zip(shown.T, seen, frames, strict=True):
         x, y, z = ((points - T[:3, 3]) @ T[:3, :3]).T
         z = np.maximum(z, 1e-9)
         u, v = (np.rint(FOCAL * a / z + c).astype(int) for a, c in ((x, CAMERA.cx), (y, CAMERA.cy)))
-        inside = np.flatnonzero((u >= 0) & (u < W) & (v >= 0) & (v < H))
-        shown = inside[np.abs(depth[v[inside], u[inside]] / z[inside] - 1) < VISIBLE]
-        counts[shown, frame.labels[v[shown], u[shown]]] += 1
+        inside = np.flatnonzero(own & (u >= 0) & (u < W) & (v >= 0) & (v < H))
+        seen_here = inside[np.abs(depth[v[inside], u[inside]] / z[inside] - 1) < VISIBLE]
+        counts[seen_here, frame.labels[v[seen_here], u[seen_here]]] += 1
     counts = counts[counts.sum(axis=1) >= 2]
     times, total = counts.sum(axis=1), counts.sum(axis=0)
     agreeing = (((counts**2).sum(axis=1) - times) / (times - 1)).sum() / times.sum()
@@ -124,11 +132,11 @@ def main() -> None:
     head = ["classes", "noise of depth, %", "wrong, %", "at the same spot", *strides, *sizes]
     print("|", " | ".join(head), "|\n|" + "---|" * len(head))
     seen = list(views(arguments.frames))
-    points = spots(seen)
+    points, shown = spots(seen)
     for which, name in enumerate(("furniture", "cubes")):
         for noise, wrong in CONDITIONS:
             frames = made(seen, which, noise, wrong, arguments.seed)
-            numbers = [at_the_same_spot(points, seen, frames)]
+            numbers = [at_the_same_spot(points, shown, seen, frames)]
             numbers += [of_cells(frames, stride) for stride in STRIDES]
             numbers += [of_voxels(frames, size) for size in SIZES]
             cells = [name, f"{100 * noise:g}", f"{100 * wrong:g}", *(f"{x:.3f}" for x in numbers)]

@@ -58,7 +58,8 @@ def temporal_agreement(result: Result) -> list[Table]:
     )
     caption = (
         "Alpha: agreement of two views at the same spot beyond chance, 1 perfect, 0 chance, of sampled cells that two"
-        " views saw, whatever the voxels are. The rest is of the voxels seen twice or more. PSA: share of pairs of frames that agree about a voxel;"
+        " views saw, whatever the voxels are. The rest is of the voxels seen twice or more."
+        " PSA: share of pairs of frames that agree about a voxel;"
         " kappa (Fleiss) and voxel alpha (Krippendorff): the same beyond chance; disagreement: the parts of 1 - PSA"
         " within a frame and between frames; flip rate: share of the steps from one observation to the next at which"
         f" the predicted class changes. {INTERVALS}"
