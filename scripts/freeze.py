@@ -132,7 +132,7 @@ EXACT = ("voxels", "truth", "observations", "frames")
 HASH = re.compile(r"[0-9a-f]{24,64}")
 """Values that are digests, whatever their key."""
 
-FOLDERS = (*EXACT, "influence", "columns")
+FOLDERS = (*EXACT, "influence", "sums", "columns")
 """Folders with a file for each unit, whose names are not of tables."""
 
 SAMPLED_FOLDERS = ("looks", "influence")
