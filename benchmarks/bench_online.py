@@ -44,9 +44,9 @@ def fused(frames: list[Frame], voxel_size: float) -> tuple[float, float]:
     return time.perf_counter() - began, 0.0
 
 
-def measured(frames: list[Frame], voxel_size: float, *, ceiling: bool) -> tuple[float, float]:
+def measured(frames: list[Frame], voxel_size: float, *, alpha: bool) -> tuple[float, float]:
     """Seconds of all updates, and of compute."""
-    metric = TemporalStability(K, voxel_size, ceiling=ceiling)
+    metric = TemporalStability(K, voxel_size, alpha=alpha)
     began = time.perf_counter()
     for frame in frames:
         metric.update(frame.labels, frame.depth, frame.intrinsics, frame.T_wc)
@@ -67,8 +67,8 @@ def main() -> None:
     os.sched_setaffinity(0, sorted(os.sched_getaffinity(0))[:1])
     ways = {
         "fusion alone": lambda: fused(frames, arguments.voxel_size),
-        "metric": lambda: measured(frames, arguments.voxel_size, ceiling=True),
-        "metric, ceiling=False": lambda: measured(frames, arguments.voxel_size, ceiling=False),
+        "metric": lambda: measured(frames, arguments.voxel_size, alpha=True),
+        "metric, alpha=False": lambda: measured(frames, arguments.voxel_size, alpha=False),
     }
     rows: dict[str, list[tuple[float, float]]] = {name: [] for name in ways}
     for run in range(arguments.runs + 1):  # the first one compiles

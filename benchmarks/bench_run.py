@@ -26,7 +26,7 @@ import semstab
 
 FUSION = "fuse numba"
 SAID = ("sample", "voxel sizes", "statistics")
-"""What is measured of a map beside its fusion: a sample of looks, other voxel sizes, and what the statistics say."""
+"""What is measured of a map beside its fusion: a sample of cells, other voxel sizes, and what the statistics say."""
 
 
 def stages(settings: dict[str, Any]) -> dict[str, float]:

@@ -126,13 +126,13 @@ SUMMED = re.compile(r"sbd_null|sbd_excess")
 SERIES = re.compile(r"drift|map_vss|map_entropy")
 """Columns of the series of a map in tiles: sums over tiles."""
 
-EXACT = ("voxels", "truth", "looks", "frames")
+EXACT = ("voxels", "truth", "observations", "frames")
 """Folders whose tables are compared bit by bit."""
 
 HASH = re.compile(r"[0-9a-f]{24,64}")
 """Values that are digests, whatever their key."""
 
-FOLDERS = (*EXACT, "influence", "columns")
+FOLDERS = (*EXACT, "influence", "sums", "columns")
 """Folders with a file for each unit, whose names are not of tables."""
 
 SAMPLED_FOLDERS = ("looks", "influence")
