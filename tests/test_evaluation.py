@@ -86,7 +86,7 @@ def test_the_verdict_on_each_backbone_is_printed(ran) -> None:
     _, printed, summary = ran
     for entry in summary["runs"]:
         assert entry["statistics"]["verdict"]["level"] in printed
-    screen = printed.partition("\n\nBackbones at a glance")[0]
+    screen = printed.partition("\n\nOverview")[0]
     assert max(len(line) for line in screen.splitlines()) <= 80
     assert len(screen.splitlines()) <= 24
 

@@ -382,6 +382,10 @@ class FigureFormat(StrEnum):
     svg = "svg"
 
 
+FORMER_TABLES = {"glance": "overview"}
+"""Names of tables in 0.3, and now: the old ones work for one version."""
+
+
 def show(
     run: Annotated[Path, typer.Argument(metavar="RUN", help="Folder of a finished run.")],
     what: Annotated[list[str] | None, typer.Argument(
@@ -407,7 +411,7 @@ def show(
         listed = f"tables  {', '.join(there)}"
         print_lines(textwrap.wrap(listed, 80, initial_indent="  ", subsequent_indent=" " * 10))
     for name in what or ():
-        matching = [table for key, table in there.items() if key.startswith(name)]
+        matching = [table for key, table in there.items() if key.startswith(FORMER_TABLES.get(name, name))]
         if not matching:
             raise ConfigError(f"{run}: no table '{name}'; there are {', '.join(there)}")
         print_lines(f"{to_terminal(table)}\n" for table in matching)

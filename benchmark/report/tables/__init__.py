@@ -17,7 +17,7 @@ from semstab.report.tables.stability import (
     cross_backbone,
     flicker,
     fusion,
-    glance,
+    overview,
     persistence,
     reduced,
     scenes,
@@ -42,7 +42,7 @@ __all__ = [
 ]
 
 BUILDERS = (
-    glance, verdicts, flicker, scenes, persistence, classes, temporal_agreement, correlogram, class_agreement, drift,
+    overview, verdicts, flicker, scenes, persistence, classes, temporal_agreement, correlogram, class_agreement, drift,
     uncertainty, ceiling, correctness, cross_backbone, comparison, sensitivity, voxel_sizes, reduced, fusion,
     compared, agreement,
 )  # fmt: skip

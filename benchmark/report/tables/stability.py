@@ -163,13 +163,14 @@ def _comparison_rows(records: Sequence[Record]) -> tuple[Row, ...]:
     )
 
 
-# The backbones at a glance: what all voxels say, what the recurrent ones say, and how many there are.
+# Overview of the backbones: alpha, what all voxels say, what the recurrent ones say, and how many there are.
 
 _HEADLINES = (VSS, SBD)
-"""The paper's two: a glance is no place for all."""
+"""The paper's two: an overview is no place for all."""
 
 _COLUMNS = (
     Column("backbone", "Backbone"),
+    Column.of(ALPHA),
     Column("once_percent", "Seen once (%)", 2),
     Column("recurrent_percent", "OP>=3 (%)", 2),
     *(Column.of(measure, over="All voxels") for measure in _HEADLINES),
@@ -179,23 +180,24 @@ _COLUMNS = (
 )
 
 
-def glance(result: Result) -> list[Table]:
+def overview(result: Result) -> list[Table]:
     """One row a backbone."""
     records = result.select()
     if not records:
         return []
     rows = tuple(_row(name, found) for name, found in by_backbone(records).items())
     caption = (
-        f"{settings(records)} Pooled over the voxels of all scenes; flicker is the macro mean of the scenes;"
+        f"{settings(records)} Pooled over the voxels of all scenes; alpha and flicker are macro means of the scenes;"
         f" pixel flicker has the camera's motion in it. {SBD_OVER}"
     )
-    return [Table("glance", "Backbones at a glance", caption, _COLUMNS, (Group("", rows),), by="")]
+    return [Table("overview", "Overview", caption, _COLUMNS, (Group("", rows),), by="")]
 
 
 def _row(backbone: str, records: Sequence[Record]) -> Row:
     voxels = pooled(records)
     return (
         backbone,
+        voxels.alpha.value,
         100 * voxels.once,
         100 * voxels.recurrent.share,
         *(voxels.every[measure] for measure in _HEADLINES),
