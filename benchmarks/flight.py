@@ -16,7 +16,7 @@ ALTITUDE, PITCH, STEP, WRONG = 45.0, np.radians(50), 1.5, 0.02
 
 
 def frame(index: int, width: int, height: int, K: int, at: tuple[float, float] | None = None) -> semstab.Frame:
-    """Frame `index` of the flight, labels in 0..K-1; taken over another place where one is given, metres."""
+    """Return frame `index` of the flight, labels in 0..K-1; taken over another place where one is given, metres."""
     f = width / (2 * np.tan(np.radians(30)))
     v, u = np.mgrid[:height, :width]
     R = np.array([[1, 0, 0], [0, -np.sin(PITCH), np.cos(PITCH)], [0, -np.cos(PITCH), -np.sin(PITCH)]])
@@ -48,7 +48,7 @@ STREET, EAVES, TREES = 14.0, 12.0, 40
 
 @functools.lru_cache(maxsize=3)
 def _street(index: int, width: int, height: int) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.uint8], Any]:
-    """Depth, 0 in the sky, labels 0 to 5, and the pose of a frame of `street`."""
+    """Return depth, 0 in the sky, labels 0 to 5, and the pose of a frame of `street`."""
     f = width / (2 * np.tan(np.radians(35)))
     v, u = np.mgrid[:height, :width].astype(np.float32)
     pitch = np.radians(12)
@@ -98,10 +98,12 @@ def _street(index: int, width: int, height: int) -> tuple[npt.NDArray[np.float32
 def street(
     index: int, width: int, height: int, K: int, *, noise: float = 0.0, salt: float = 0.0, clean: bool = False
 ) -> semstab.Frame:
-    """Frame `index` of a flight along a street: facades with windows, trees, roofs, ground, and sky without depth.
+    """Return frame `index` of a flight along a street.
 
-    noise  standard deviation of depth, as a share of it
-    salt   share of single pixels with a random label, beside 12 % of the blocks of 24x24 pixels; none if clean
+    Facades with windows, trees, roofs, ground, and sky without depth.
+
+    - `noise`: standard deviation of depth, as a share of it
+    - `salt`: share of single pixels with a random label, beside 12 % of the blocks of 24x24 pixels; none if clean
     """
     rng = np.random.default_rng(index)
     depth, label, T_wc = _street(index, width, height)
@@ -119,7 +121,7 @@ def street(
 
 
 def milliseconds(work: Callable[..., Any], *arguments: Any) -> float:
-    """Wall-clock time of one call."""
+    """Return wall-clock time of one call."""
     started = time.perf_counter()
     work(*arguments)
     return 1e3 * (time.perf_counter() - started)

@@ -92,13 +92,15 @@ class TestMine(BackendConformance):
 class Use:
     """What an extra is for.
 
-    shown     in the table
-    commands  each without the extra one line that names it, and with it the exit code 0; 'OUT' is a folder of its own
-    said      what the last command prints
-    prepare   code that makes what the commands need, run with the extra
-    proof     code that looks at what they wrote
-    files     that the commands need
-    over      another extra without which nothing would ask for this one
+    Attributes:
+        shown: In the table.
+        commands: Each without the extra one line that names it, and with it the exit code 0; 'OUT' is a folder of its
+            own.
+        said: What the last command prints.
+        prepare: Code that makes what the commands need, run with the extra.
+        proof: Code that looks at what they wrote.
+        files: That the commands need.
+        over: Another extra without which nothing would ask for this one.
     """
 
     shown: str
@@ -170,9 +172,10 @@ USES = {
 class Fresh:
     """A base install, and copies of it with an extra each; extras with the same requirements share one.
 
-    folder       where all of it lies, and where the commands run
-    wheel        of this source
-    constraints  a file for pip
+    Attributes:
+        folder: Where all of it lies, and where the commands run.
+        wheel: Of this source.
+        constraints: A file for pip.
     """
 
     folder: Path
@@ -205,7 +208,11 @@ def words_of(command: Sequence[str], out: str, presence: str) -> list[str]:
 
 
 def try_extra(name: str, there: Fresh) -> str:
-    """Return the extra's row of the table. Raises SystemExit where it does not do what it is for."""
+    """Return the extra's row of the table.
+
+    Raises:
+        SystemExit: If it does not do what it is for.
+    """
     use, folder = USES[name], there.folder
     python, without = there.with_extra(name), there.with_extra(use.over) if use.over else there.base
     before, after = fresh.sizes(there.base), fresh.sizes(python)

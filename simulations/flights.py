@@ -24,20 +24,21 @@ VOXEL, PIXELS = 0.125, 16
 class Flight:
     """How a model errs on a scene, and how it is flown over.
 
-    side     of the floor in voxels
-    reach    of errors, in voxels: the correlation of places d apart is exp(-d^2 / (2 reach^2))
-    ease     larger means fewer errors
-    frames   of the flight
-    looks    frames that see a place, on average; all of them where it is as many as frames
-    quality  of frames: 'alike', 'bad' (one in ten is much worse), 'uneven' (each its own), 'lasting' (AR(1) with 0.8),
-             'regimes' (good and bad stretches of 8 frames on average), 'heavy' (Student's t with 2 degrees of freedom),
-             'objects' (a square of 5 voxels errs as a whole, for 3 frames on average), 'view' (the farther from the
-             middle of the frame, the worse), 'direction' (each location is hard from a direction of its own, which
-             neighbours have in common)
-    city     whether the floor is one of boxes with walls, in three dimensions
-    coin     whether labels are drawn at random instead
-    K        classes
-    soft     whether frames give scores: as much for the label as the place is easy, the rest for all alike
+    Attributes:
+        side: Of the floor in voxels.
+        reach: Of errors, in voxels: the correlation of places d apart is exp(-d^2 / (2 reach^2)).
+        ease: Larger means fewer errors.
+        frames: Of the flight.
+        looks: Frames that see a place, on average; all of them where it is as many as frames.
+        quality: Of frames: 'alike', 'bad' (one in ten is much worse), 'uneven' (each its own), 'lasting' (AR(1) with
+            0.8), 'regimes' (good and bad stretches of 8 frames on average), 'heavy' (Student's t with 2 degrees of
+            freedom), 'objects' (a square of 5 voxels errs as a whole, for 3 frames on average), 'view' (the farther
+            from the middle of the frame, the worse), 'direction' (each location is hard from a direction of its own,
+            which neighbours have in common).
+        city: Whether the floor is one of boxes with walls, in three dimensions.
+        coin: Whether labels are drawn at random instead.
+        K: Classes.
+        soft: Whether frames give scores: as much for the label as the place is easy, the rest for all alike.
     """
 
     side: int = 48
@@ -53,7 +54,7 @@ class Flight:
 
 
 def field(side: int, reach: float, rng: np.random.Generator) -> np.ndarray:
-    """A Gaussian field (side, side), mean 0, variance 1, that does not know its border."""
+    """Return a Gaussian field (side, side), mean 0, variance 1, that does not know its border."""
     n = side + int(8 * reach) + 1
     wave = np.hypot(np.fft.fftfreq(n)[:, None], np.fft.fftfreq(n)[None])
     gain = np.exp(-((np.pi * reach * wave) ** 2))
@@ -62,7 +63,7 @@ def field(side: int, reach: float, rng: np.random.Generator) -> np.ndarray:
 
 
 def qualities(flight: Flight, rng: np.random.Generator) -> np.ndarray:
-    """How much worse each frame is than usual (F,)."""
+    """Return how much worse each frame is than usual (F,)."""
     steps = rng.standard_normal(flight.frames)
     if flight.quality == "bad":
         return np.where(rng.random(flight.frames) < 0.1, 2.0, 0.0)
@@ -80,7 +81,10 @@ def qualities(flight: Flight, rng: np.random.Generator) -> np.ndarray:
 
 
 def places(flight: Flight) -> np.ndarray:
-    """Voxel indices (n, 3): a floor, or blocks of houses 12 voxels wide and up to 8 high, with streets of 8 between."""
+    """Return voxel indices (n, 3).
+
+    A floor, or blocks of houses 12 voxels wide and up to 8 high, with streets of 8 between.
+    """
     x, y = (axis.ravel() for axis in np.indices((flight.side, flight.side)))
     if not flight.city:
         return np.stack([x, y, np.zeros_like(x)], axis=1)
@@ -95,9 +99,10 @@ def places(flight: Flight) -> np.ndarray:
 class World:
     """A scene as it is.
 
-    index  (n, 3) of its voxels, truth (n,) their class
-    hard   (n,) how hard each is, turned (n,) the direction in radians from which it is hardest
-    mixed  (n,) the part of a voxel that is of the next class, as at a border
+    Attributes:
+        index: (n, 3) of its voxels, truth (n,) their class.
+        hard: (n,) how hard each is, turned (n,) the direction in radians from which it is hardest.
+        mixed: (n,) the part of a voxel that is of the next class, as at a border.
     """
 
     index: np.ndarray
@@ -108,7 +113,7 @@ class World:
 
 
 def world(flight: Flight, rng: np.random.Generator) -> World:
-    """A scene of the kind that the flight says."""
+    """Return a scene of the kind that the flight says."""
     index = places(flight)
     x, y, z = index.T
     order = np.lexsort(index.T[::-1])
@@ -121,12 +126,12 @@ def world(flight: Flight, rng: np.random.Generator) -> World:
 
 
 def _largest(classes: np.ndarray) -> np.ndarray:
-    """The class (n,) whose field (K - 1, n) is highest; the last one where all are low."""
+    """Return the class (n,) whose field (K - 1, n) is highest; the last one where all are low."""
     return np.where(classes.max(axis=0) > 0, classes.argmax(axis=0), len(classes))
 
 
 def fly(flight: Flight, over: World, rng: np.random.Generator, ease: float | None = None) -> np.ndarray:
-    """Labels (n, F) of a flight over a scene; -1 where a frame does not see a place."""
+    """Return labels (n, F) of a flight over a scene; -1 where a frame does not see a place."""
     n, F = len(over.index), flight.frames
     off = over.index[:, :1] - (np.arange(F) + 0.5) / F * flight.side
     width = flight.side * flight.looks / F
@@ -147,7 +152,7 @@ def fly(flight: Flight, over: World, rng: np.random.Generator, ease: float | Non
 
 
 def _by_object(over: World, frames: int, rng: np.random.Generator) -> np.ndarray:
-    """Uniform numbers (n, F) that are one for a square of 5 x 5 voxels, and stay so for 3 frames on average."""
+    """Return uniform numbers (n, F) that are one for a square of 5 x 5 voxels, and stay so for 3 frames on average."""
     _, of = np.unique(over.index[:, :2] // 5, axis=0, return_inverse=True)
     drawn = rng.random((of.max() + 1, frames))
     for t in range(1, frames):
@@ -157,7 +162,7 @@ def _by_object(over: World, frames: int, rng: np.random.Generator) -> np.ndarray
 
 
 def log_of(labels: np.ndarray, over: World, flight: Flight, voxel_size: float = VOXEL) -> Events:
-    """The log of labels (n, F), or of scores for them."""
+    """Return the log of labels (n, F), or of scores for them."""
     some = (labels >= 0).any(axis=1)
     voxel, frame = np.nonzero(labels[some] >= 0)
     evidence = np.eye(flight.K)[labels[some][voxel, frame]]
@@ -168,7 +173,7 @@ def log_of(labels: np.ndarray, over: World, flight: Flight, voxel_size: float = 
 
 
 def table_of(log: Events) -> VoxelTable:
-    """The map of a log; nothing here asks for its drift."""
+    """Return the map of a log; nothing here asks for its drift."""
     op, scores = np.bincount(log.voxel), log.evidence[:]
     rest = {"drift_sum": np.zeros(len(op)), "frame_entropy_sum": np.zeros(len(op))}
     frames = {"first_frame": np.zeros(len(op)), "last_frame": np.zeros(len(op))}
@@ -181,7 +186,7 @@ def table_of(log: Events) -> VoxelTable:
 def sums_of(
     labels: np.ndarray, over: World, flight: Flight = Flight(), rng: np.random.Generator | None = None
 ) -> ClusterSums:
-    """The sums of a flight, with the truth, and with the cells that alpha is of; see `sample_of`."""
+    """Return the sums of a flight, with the truth, and with the cells that alpha is of; see `sample_of`."""
     log = log_of(labels, over, flight)
     some = (labels >= 0).any(axis=1)
     return cluster_sums_of(table_of(log), log, over.truth[some], cells=sample_of(labels, over, flight, rng))
@@ -190,7 +195,7 @@ def sums_of(
 def sample_of(
     labels: np.ndarray, over: World, flight: Flight, rng: np.random.Generator | None = None
 ) -> CellObservations:
-    """What a sampler takes of a flight: likeliest classes of fine cells, half as wide as a voxel.
+    """Return what a sampler takes of a flight: likeliest classes of fine cells, half as wide as a voxel.
 
     A frame sees one cell of a voxel, with `rng` at borders also another one, of the next class, of which it sees more
     or less. A label that errs moves both by as many classes.
@@ -216,11 +221,11 @@ def sample_of(
 
 
 def totals_of(sums: ClusterSums, key: str) -> np.ndarray:
-    """What a number is of, (parts, C): it adds up over flights."""
+    """Return what a number is of, (parts, C): it adds up over flights."""
     return np.stack([columns_of(part, key).sum(axis=0) for part, _ in parts_of(sums, FUNCTIONALS[key])])
 
 
 def number_of(totals: np.ndarray, key: str) -> np.ndarray:
-    """The number (...,) of such totals (..., parts, C)."""
+    """Return the number (...,) of such totals (..., parts, C)."""
     number = FUNCTIONALS[key]
     return sum(weight * number.of(totals[..., part, :]) for part, (_, weight) in enumerate(number.parts))

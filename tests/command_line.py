@@ -22,7 +22,10 @@ def environment(columns: int, **more: str) -> dict[str, str]:
 
 
 def command(words: Sequence[object], report: bool = False, recording: bool = False) -> list[str]:
-    """The command of these words; runs and studies draw and record nothing unless a test looks: most of their time."""
+    """Return the command of these words.
+
+    Runs and studies draw and record nothing unless a test looks: most of their time.
+    """
     said = {*map(str, words)}
     fuses = bool(words) and (str(words[0]) in ("run", "study") or str(words[0]).startswith("-"))
     fuses = fuses and not {"--help", "--version"} & said
@@ -36,8 +39,8 @@ def bench(
 ) -> subprocess.CompletedProcess[str]:  # fmt: skip
     """Return what a command in a terminal of so many columns prints; it ends with this code.
 
-    process   start the installed command: what it imports, its signals, plug-ins; the imports take seconds
-    more      of its environment
+    - `process`: start the installed command: what it imports, its signals, plug-ins; the imports take seconds
+    - `more`: of its environment
     """
     line, known = command(words, report, recording), environment(columns, **more)
     if process:
@@ -63,7 +66,7 @@ def _in_this_process(line: list[str], cwd: Path, known: dict[str, str]) -> subpr
 
 
 def started(*words: object, cwd: Path, columns: int = 80) -> subprocess.Popen[str]:
-    """The process at work."""
+    """Return the process at work."""
     return subprocess.Popen(
         command(words),
         cwd=cwd, env=environment(columns), stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
@@ -71,7 +74,7 @@ def started(*words: object, cwd: Path, columns: int = 80) -> subprocess.Popen[st
 
 
 def error_of(*words: object, cwd: Path) -> str:
-    """The one line that bad input leaves; exit code 2, no traceback."""
+    """Return the one line that bad input leaves; exit code 2, no traceback."""
     lines = bench(*words, cwd=cwd, code=2).stderr.strip().splitlines()
     assert len(lines) == 1, lines
     assert lines[0].startswith("error: ")

@@ -18,9 +18,12 @@ from semstab.statistics.model_comparison import in_share, share_of
 
 
 def calibrate_run(run: str | Path, *, precision: float = 0.95, confidence: float = 0.95) -> AcceptanceThresholds:
-    """Thresholds from all scenes of a run with ground truth; 'FOLDER:BACKBONE' selects one of several label sources.
+    """Return thresholds from all scenes of a run with ground truth.
 
-    Raises ConfigError and DataError as `open_run`, and for a scene whose ground truth was not fused.
+    'FOLDER:BACKBONE' selects one of several label sources.
+
+    Raises:
+        ConfigError, DataError: As `open_run`, and for a scene whose ground truth was not fused.
     """
     own = open_run(run)
     maps, sampled = [], 1.0
@@ -42,7 +45,7 @@ def calibrate_run(run: str | Path, *, precision: float = 0.95, confidence: float
 
 
 def _with_truth(record: Record, truth_file: Path) -> tuple[VoxelTable, Truth]:
-    """A map with its true classes; of a very large one a sample, by a hash of the location."""
+    """Return a map with its true classes; of a very large one a sample, by a hash of the location."""
     share, parts = share_of(record.summary.table.voxels), []
     files = [file for file in (record.voxels_file, truth_file) if file is not None]
     for table, truth in side_by_side([Tiles.open(file, VoxelTable) for file in files]):
@@ -54,7 +57,7 @@ def _with_truth(record: Record, truth_file: Path) -> tuple[VoxelTable, Truth]:
 
 
 def lines(result: AcceptanceThresholds) -> Iterator[str]:
-    """For the terminal."""
+    """Yield the thresholds in sentences for the terminal."""
     yield (
         f"labels that are right with a probability of {result.precision:g} or more, class by class at a confidence of"
         f" {result.confidence:g}; calibrated on {result.calibrated_on}"

@@ -61,13 +61,16 @@ LEVEL = 0.05
 
 
 def contrasts(common: Common, base: Entry, other: Entry, number: int) -> tuple[Contrast, ...]:
-    """All that is compared of a scene, in the order of `quantities`; `number` is the other run's among the runs."""
+    """Return all that is compared of a scene, in the order of `quantities`.
+
+    `number` is the other run's among the runs.
+    """
     result = {row.measure: row for row in _rows(common, base, other, number)}
     return tuple(result[quantity.key] for quantity in quantities() if quantity.key in result)
 
 
 def by_class(common: Common, base: Entry, number: int) -> tuple[Contrast, ...]:
-    """The same of each class: against all others, or of the locations of the class.
+    """Return the same of each class: against all others, or of the locations of the class.
 
     These are by the ground truth, or else by what all runs together say, so that none of them chooses its own.
     """
@@ -79,7 +82,7 @@ def by_class(common: Common, base: Entry, number: int) -> tuple[Contrast, ...]:
 
 
 def over_scenes(result: Sequence[Sequence[Contrast]]) -> tuple[Contrast, ...]:
-    """The macro mean of each measure (and class) over the scenes that have it."""
+    """Return the macro mean of each measure (and class) over the scenes that have it."""
     groups: dict[tuple[str, str], list[Contrast]] = {}
     for row in (row for rows in result for row in rows):
         groups.setdefault((row.measure, row.of), []).append(row)
@@ -91,7 +94,7 @@ def over_scenes(result: Sequence[Sequence[Contrast]]) -> tuple[Contrast, ...]:
 
 
 def corrected(lists: Sequence[Sequence[Contrast]]) -> list[tuple[Contrast, ...]]:
-    """Lists with p-values corrected for all that stand in them together, and what is said of each difference."""
+    """Return lists with p-values corrected for all that stand in them together, and what is said of each difference."""
     p_values = iter(holm([row.difference.p_value for rows in lists for row in rows]))
     better = {quantity.key: quantity.sign for quantity in (*quantities(), *BY_CLASS)}
     return [tuple(_said(row, next(p_values), better[row.measure]) for row in rows) for rows in lists]
@@ -153,9 +156,9 @@ def sums_difference(
 ) -> Interval:
     """Return a number of one run's sums less another's, or its coverage of the other's voxels, with its interval.
 
-    same_frames  False for another flight; where it is not given the sums tell
-    apart        the runs have nothing in common: each errs by itself
-    level        of the interval
+    - `same_frames`: False for another flight; where it is not given the sums tell
+    - `apart`: the runs have nothing in common: each errs by itself
+    - `level`: of the interval
     """
     if new.truth != base.truth:
         new, base = new.without_truth(), base.without_truth()
@@ -185,7 +188,7 @@ def _flicker(base: Flicker, other: Flicker, *, paired: bool) -> Contrast:
 
 
 def _of_voxels(measure: Measure, base: VoxelTable, other: VoxelTable, edge: float) -> Contrast:
-    """The mean of a measure over the voxels where it is defined, by its differences voxel by voxel."""
+    """Return the mean of a measure over the voxels where it is defined, by its differences voxel by voxel."""
     before, after = measure.of(base), measure.of(other)
     known = ~np.isnan(before) & ~np.isnan(after)
     if not known.any():
@@ -235,7 +238,10 @@ def _of_locations(common: Common, names: Sequence[str], number: int) -> Iterator
 
 
 def class_of_locations(common: Common) -> Int64:
-    """The class (n,) of each common location: the true one, or what all runs together say; -1 where it is not known."""
+    """Return the class (n,) of each common location: the true one, or what all runs together say.
+
+    -1 where it is not known.
+    """
     return common.label if common.label is not None else joint_class(common.tables)
 
 
@@ -253,8 +259,9 @@ Progress = Callable[[str], None]
 class ComparisonData:
     """What was found, and what figures and files show of it.
 
-    changes  in each voxel, by scene and run, where voxels could be paired
-    up       the up axis of each scene, where it is known
+    Attributes:
+        changes: In each voxel, by scene and run, where voxels could be paired.
+        up: The up axis of each scene, where it is known.
     """
 
     result: RunComparison
@@ -267,7 +274,8 @@ def find(
 ) -> ComparisonData:
     """Compare runs with the first one for a scope; `progress` is told what is done.
 
-    Raises ConfigError for fewer than two, and what `open_runs`, `shared_scenes` and `pair` raise.
+    Raises:
+        ConfigError: For fewer than two, and what `open_runs`, `shared_scenes` and `pair` raise.
     """
     if len(runs) < 2:
         raise ConfigError("there is nothing to compare it with; name two runs or more, the one to compare with first")
@@ -325,7 +333,7 @@ def _found(scene: str, common: Common, against: tuple[Against, ...]) -> SceneCom
 
 
 def _over_all(scenes: Sequence[SceneComparison]) -> tuple[Against, ...]:
-    """Macro means; of one scene what was found there."""
+    """Return macro means; of one scene what was found there."""
     if len(scenes) == 1:
         return tuple(Against(own.other, own.contrasts, own.by_class) for own in scenes[0].against)
     runs = list(zip(*(scene.against for scene in scenes), strict=True))

@@ -59,11 +59,12 @@ LOOK_ACCURACY = Quantity(key="look_accuracy", title="Accuracy of looks", better=
 class GateMeasure:
     """A number that rules know.
 
-    quantity  its key among influence sums, its title, which way is good
-    name      by which a rule calls it; `also` other names
-    of_all, of_class  where it has a value: of all classes, of one
-    only_change       it has none by itself
-    lacking   what to do where a run does not have it
+    Attributes:
+        quantity: Its key among influence sums, its title, which way is good.
+        name: By which a rule calls it; `also` other names.
+        of_all, of_class: Where it has a value: of all classes, of one.
+        only_change: It has none by itself.
+        lacking: What to do where a run does not have it.
     """
 
     quantity: Quantity
@@ -110,7 +111,11 @@ NAMED = {_plain(name): each for each in MEASURES for name in (each.name, each.qu
 
 
 def measure_named(name: str, where: str) -> GateMeasure:
-    """By any of its names. Raises ConfigError, which says where, for one that there is not."""
+    """Return a measure by any of its names.
+
+    Raises:
+        ConfigError: If there is no such measure; it says where the name stands.
+    """
     result = NAMED.get(_plain(name))
     if result is None:
         raise ConfigError(f"{where}: no measure '{name}'; {nearest(_plain(name), [each.name for each in MEASURES])}")
@@ -138,11 +143,13 @@ RULE = re.compile(
 class Rule:
     """What shall hold.
 
-    text     as it was given
-    change   of what: how far the measure fell from the baseline's ('drop'), or rose; its own value where none is named
-    below    whether that shall be below the limit, or above
-    limit    as the measure is given: shares from 0 to 1, flicker in percent
-    or_equal  whether it may be the limit itself, which counts alone can tell
+    Attributes:
+        text: As it was given.
+        change: Of what: how far the measure fell from the baseline's ('drop'), or rose; its own value where none is
+            named.
+        below: Whether that shall be below the limit, or above.
+        limit: As the measure is given: shares from 0 to 1, flicker in percent.
+        or_equal: Whether it may be the limit itself, which counts alone can tell.
     """
 
     text: str
@@ -155,7 +162,7 @@ class Rule:
     or_equal: bool = False
 
     def of_each(self, classes: Sequence[str]) -> tuple[Rule, ...]:
-        """The rules that it stands for: itself, or with 'class *' one for each class."""
+        """Return the rules that it stands for: itself, or with 'class *' one for each class."""
         if self.class_name != ALL:
             return (self,)
         return tuple(
@@ -164,13 +171,17 @@ class Rule:
 
     @property
     def bounds_a_loss(self) -> bool:
-        """Whether it says how much worse the measure may become."""
+        """Return whether it says how much worse the measure may become."""
         loss = "drop" if self.measure.quantity.better == "higher" else "rise"
         return self.below and self.change == loss
 
 
 def parse(text: str) -> Rule:
-    """A rule from its text. Raises ConfigError with the grammar where it is none."""
+    """Return a rule from its text.
+
+    Raises:
+        ConfigError: If it is none, with the grammar.
+    """
     result = RULE.fullmatch(text)
     if result is None:
         raise ConfigError(f"rule '{text}': not understood; write {GRAMMAR}, e.g. 'alpha drop < 0.02'")
@@ -207,7 +218,7 @@ Verdict = Literal["passes", "fails", "undecided"]
 
 
 def verdict(rule: Rule, interval: Interval) -> Verdict:
-    """What an interval, each of whose ends is passed with the gate's level, says of a rule.
+    """Return what an interval, each of whose ends is passed with the gate's level, says of a rule.
 
     Passes where the whole of it keeps to the limit. Fails where none of it does; a loss fails as soon as it is shown
     and not shown to be smaller than the limit. A number that is known is not undecided.
@@ -254,9 +265,11 @@ Undecided = Literal["report", "pass", "fail"]
 class GateConfig(BaseModel):
     """What stands in gate.yaml.
 
-    level   the probability with which a rule may fail that holds, or pass that does not
-    undecided  what a gate with undecided rules does: 'report' them, so that it neither passes nor fails; 'pass', 'fail'
-    scope   for which data rules are judged: 'this scene' flown again, 'these frames', or 'other scenes' like these
+    Attributes:
+        level: The probability with which a rule may fail that holds, or pass that does not.
+        undecided: What a gate with undecided rules does: 'report' them, so that it neither passes nor fails; 'pass',
+            'fail'.
+        scope: For which data rules are judged: 'this scene' flown again, 'these frames', or 'other scenes' like these.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
@@ -274,9 +287,10 @@ def gate_config(
     undecided: str | None = None,
     scope: str | None = None,
 ) -> GateConfig:
-    """From a YAML file, and what is given beside it, which counts more; rules are added to the file's.
+    """Build the settings from a YAML file and options, which count more; rules are added to the file's.
 
-    Raises ConfigError, which names the file and the setting.
+    Raises:
+        ConfigError: If a setting is wrong; it names the file and the setting.
     """
     given = {"level": level, "undecided": undecided, "scope": scope}
     options = {name: value for name, value in given.items() if value is not None}
@@ -299,8 +313,9 @@ POWER = 0.8
 class Judgement:
     """What became of a rule.
 
-    found    what it bounds: the change or the number itself, with one-sided ends at the gate's level
-    new, base  the numbers of both, NaN where there is none
+    Attributes:
+        found: What it bounds: the change or the number itself, with one-sided ends at the gate's level.
+        new, base: The numbers of both, NaN where there is none.
     """
 
     rule: Rule
@@ -331,7 +346,7 @@ class Judgement:
 
     @property
     def counted(self) -> bool:
-        """Whether it was counted, and is no estimate."""
+        """Return whether it was counted, and is no estimate."""
         return self.rule.measure.quantity is COVERAGE and self.found.decided and self.found.low == self.found.high
 
     @property
@@ -347,7 +362,7 @@ class Judgement:
         return self.found.undecided or "neither is shown, more frames may tell"
 
     def digits(self, value: float) -> str:
-        """A number of the rule's measure."""
+        """Return a number of the rule's measure."""
         measure: GateMeasure = self.rule.measure
         return "-" if math.isnan(value) else f"{value:z.{measure.quantity.digits[0]}f}"
 
@@ -373,9 +388,10 @@ EXIT_CODES: Mapping[Verdict, int] = {"passes": 0, "fails": 4, "undecided": 5}
 class GateResult:
     """Everything that a gate found.
 
-    new, against  what was judged, and the baseline, empty where there is none
-    undecided   what becomes of undecided rules, see `GateConfig`
-    notes       what a reader has to know beside
+    Attributes:
+        new, against: What was judged, and the baseline, empty where there is none.
+        undecided: What becomes of undecided rules, see `GateConfig`.
+        notes: What a reader has to know beside.
     """
 
     new: str
@@ -387,22 +403,22 @@ class GateResult:
     notes: tuple[str, ...] = ()
 
     def count(self, verdict: Verdict) -> int:
-        """How many rules came out so."""
+        """Return how many rules came out so."""
         return sum(each.verdict == verdict for each in self.judgements)
 
     @property
     def failed(self) -> bool:
-        """Whether a rule fails, or is undecided where that fails."""
+        """Return whether a rule fails, or is undecided where that fails."""
         return self.outcome == "fails"
 
     @property
     def passed(self) -> bool:
-        """Whether all rules pass, or are undecided where that passes: only then a baseline is saved."""
+        """Return whether all rules pass, or are undecided where that passes: only then a baseline is saved."""
         return self.outcome == "passes"
 
     @property
     def outcome(self) -> Verdict:
-        """Of all rules together; undecided rules count as `undecided` says."""
+        """Outcome of all rules together; undecided rules count as `undecided` says."""
         if self.count("fails"):
             return "fails"
         if not self.count("undecided") or self.undecided == "pass":
@@ -411,7 +427,7 @@ class GateResult:
 
     @property
     def exit_code(self) -> int:
-        """With which the command ends: 0 where the gate passes, 4 where it fails, 5 where it is undecided."""
+        """Exit code of the command: 0 where the gate passes, 4 where it fails, 5 where it is undecided."""
         return EXIT_CODES[self.outcome]
 
 
@@ -478,7 +494,7 @@ def _check(rule: Rule, own: RunHandle, base: RunHandle | None, scenes: Sequence[
 
 
 def _has(rule: Rule, entry: Entry) -> bool:
-    """Whether a run keeps what a measure is of."""
+    """Return whether a run keeps what a measure is of."""
     if rule.measure.quantity is FLICKER:
         return len(entry.flicker) > 1
     if rule.measure.quantity is COVERAGE:
@@ -504,7 +520,7 @@ class _Runs:
     scenes: tuple[str, ...]
 
     def on_common(self, rule: Rule) -> bool:
-        """Whether a rule is on a change of alpha, which is of the observations that both made, as in a comparison."""
+        """Return whether a rule is on a change of alpha, which is of common observations."""
         return self.base is not None and rule.change is not None and rule.measure.quantity is ALPHA
 
     @functools.cached_property
@@ -523,7 +539,7 @@ class _Runs:
         return pairs, tuple(notes)
 
     def pairs(self, rule: Rule) -> list[Pair]:
-        """The runs on each scene that a rule is about; of a rule on a value the new one alone."""
+        """Return the runs on each scene that a rule is about; of a rule on a value the new one alone."""
         named = [rule.scene] if rule.scene else self.scenes
         if self.on_common(rule):
             return [self.common[0][scene] for scene in named]
@@ -532,7 +548,7 @@ class _Runs:
 
 
 def _with_a_value(rules: Sequence[Rule], runs: _Runs) -> tuple[tuple[Rule, ...], list[str]]:
-    """The rules of classes that some run has a value of, and the names of the other classes."""
+    """Return the rules of classes that some run has a value of, and the names of the other classes."""
 
     def has_value(rule: Rule) -> bool:
         entries = (entry for pair in runs.pairs(rule) for entry in pair if entry is not None)
@@ -557,7 +573,7 @@ def _require_values(rule: Rule, pairs: Sequence[Pair]) -> None:
 
 
 def _judged(rule: Rule, pairs: Sequence[Pair], level: float, scope: Scope) -> Judgement:
-    """Over the mean of the scenes, which err by themselves, or in the one that the rule names."""
+    """Evaluate a rule over the mean of the scenes, which err by themselves, or in the one that it names."""
     result = mean_of([_found(rule, new, old, level, scope) for new, old in pairs], 1 - 2 * level)
     values = [[math.nan if entry is None else _value(rule, entry) for entry in pair] for pair in pairs]
     return Judgement(rule, verdict(rule, result), result, *(float(mean) for mean in np.mean(values, axis=0)))
@@ -589,12 +605,12 @@ def _found(rule: Rule, new: Entry, base: Entry | None, level: float, scope: Scop
 
 
 def _same_frames(new: Entry, base: Entry) -> bool:
-    """Whether both are of the same frames, in some of which a model may have given no label."""
+    """Return whether both are of the same frames, in some of which a model may have given no label."""
     return new.summary.frames == base.summary.frames and within_a_flight(new.sums, base.sums)
 
 
 def _covered(new: ClusterSums, base: ClusterSums) -> float:
-    """The change of the count that fell most: of voxels with OP >= 2, or of labelled observations in them.
+    """Return the change of the count that fell most: of voxels with OP >= 2, or of labelled observations in them.
 
     A model that gives some locations no label loses voxels; one that gives them a label in fewer frames observations.
     """
@@ -602,7 +618,7 @@ def _covered(new: ClusterSums, base: ClusterSums) -> float:
 
 
 def _counts(judged: Judgement, pairs: Sequence[Pair]) -> list[str]:
-    """What was counted for a rule on coverage."""
+    """Return what was counted for a rule on coverage."""
     if not judged.counted:
         return []
     shares = [shares_of(new.sums, base.sums) for new, base in pairs if base is not None]

@@ -24,12 +24,15 @@ SIGNS: Mapping[Verdict, str] = {"passes": "✅", "fails": "❌", "undecided": "�
 
 
 def headline(result: GateResult) -> str:
-    """The outcome, and which rules decided: the gate fails: 'alpha > 0.8' fails; 1 of 2 rules is undecided: ..."""
+    """Return the outcome, and which rules decided: the gate fails: 'alpha > 0.8' fails.
+
+    1 of 2 rules is undecided: ...
+    """
     return f"the gate {OUTCOMES[result.outcome]}: {'; '.join(decided_by(result))}"
 
 
 def decided_by(result: GateResult) -> tuple[str, ...]:
-    """Which rules decided on a gate, then the others."""
+    """Return which rules decided on a gate, then the others."""
     texts = {
         verdict: _said(result, verdict)
         for verdict in ("fails", "undecided", "passes")
@@ -41,7 +44,7 @@ def decided_by(result: GateResult) -> tuple[str, ...]:
 
 
 def _said(result: GateResult, verdict: Verdict) -> str:
-    """'2 of 4 rules are undecided: ...'."""
+    """Return '2 of 4 rules are undecided: ...'."""
     n, rules = result.count(verdict), len(result.judgements)
     if verdict == "fails":
         return f"{_named(result, verdict)} {'fails' if n == 1 else 'fail'}"
@@ -55,7 +58,7 @@ def _said(result: GateResult, verdict: Verdict) -> str:
 
 
 def _named(result: GateResult, verdict: Verdict, last: str = " and ") -> str:
-    """The rules of a verdict, the first ones by their text."""
+    """Return the rules of a verdict, the first ones by their text."""
     rules = [f"'{each.rule.text}'" for each in result.judgements if each.verdict == verdict]
     if len(rules) > MOST_NAMED:
         return f"{', '.join(rules[:MOST_NAMED])}{last}{len(rules) - MOST_NAMED} more"
@@ -63,7 +66,7 @@ def _named(result: GateResult, verdict: Verdict, last: str = " and ") -> str:
 
 
 def lines(result: GateResult, width: int = 80) -> Iterator[str]:
-    """For the terminal: the outcome, a line a rule, and why rules are undecided or fail."""
+    """Yield lines for the terminal: the outcome, a line a rule, and why rules are undecided or fail."""
     yield from _wrapped(headline(result), width, 2)
     against = f" against {result.against}" if result.against else ""
     yield from _wrapped(f"  {result.new}{against}, {_scenes(result)}; {_ends(result)}", width, 2)
@@ -81,7 +84,7 @@ def lines(result: GateResult, width: int = 80) -> Iterator[str]:
 
 
 def plan(result: GateResult) -> Iterator[str]:
-    """For the terminal: how many frames each rule needs, by the spread of these runs."""
+    """Yield lines for the terminal: how many frames each rule needs, by the spread of these runs."""
     yield f"frames from which on a rule is decided with a probability of {POWER:.0%}, by the spread of these runs"
     for each in result.judgements:
         needed, now = each.frames_needed(result.level), each.found.frames
@@ -106,7 +109,7 @@ def _scenes(result: GateResult) -> str:
 
 
 def markdown(result: GateResult) -> str:
-    """A summary for a pull request."""
+    """Return a summary for a pull request."""
     against = f" against {_code(result.against)}" if result.against else ""
     rows = [
         f"| {SIGNS[each.verdict]} {each.verdict} | {_code(each.rule.text)} | {each.values} | {_cell(each.reason)}"
@@ -129,7 +132,7 @@ def markdown(result: GateResult) -> str:
 
 
 def _plain(text: str) -> str:
-    """Text that Markdown takes for nothing else, as a rule may name any class."""
+    """Return text that Markdown takes for nothing else, as a rule may name any class."""
     return re.sub(r"([\\`*_{}\[\]<>|#])", r"\\\1", text)
 
 
@@ -142,7 +145,7 @@ def _code(text: str) -> str:
 
 
 def as_json(result: GateResult) -> str:
-    """For programs."""
+    """Return the result as JSON."""
     rows = [
         {
             "rule": each.rule.text, "verdict": each.verdict, "measure": each.rule.measure.name,
@@ -161,7 +164,7 @@ def as_json(result: GateResult) -> str:
 
 
 def junit(result: GateResult) -> str:
-    """JUnit XML: a test case a rule; one that is undecided is skipped, or a failure where that fails.
+    """Return JUnit XML: a test case a rule; one that is undecided is skipped, or a failure where that fails.
 
     Properties of the suite are the outcome of the gate and the exit code.
     """
@@ -187,7 +190,7 @@ def junit(result: GateResult) -> str:
 
 
 def _xml(text: str) -> str:
-    """Without what XML 1.0 has no way to write."""
+    """Return the text without characters that XML 1.0 cannot hold."""
     return re.sub(r"[^\t\n\r -\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]", "?", text)
 
 
@@ -202,5 +205,5 @@ def require_formats(files: Sequence[Path]) -> None:
 
 
 def write(result: GateResult, file: Path) -> None:
-    """In the format that the file's suffix names."""
+    """Write the result in the format that the file's suffix names."""
     write_text(file, WRITERS[file.suffix.lower()](result))

@@ -42,11 +42,12 @@ SHARE, MOST_FRAMES = 0.9, 8
 class Changed:
     """Voxel by voxel, of those that both maps saw twice or more.
 
-    table   (n,) the base's voxels
-    change  (n,) agreement between frames, the run's less the base's
-    label   (n,) the class that both maps together give
-    true    (n,) the true class, -1 where it is not known; None without ground truth
-    right   (n,) -1 where it was right and is wrong now, 1 the other way round, else 0; None without ground truth
+    Attributes:
+        table: (n,) the base's voxels.
+        change: (n,) agreement between frames, the run's less the base's.
+        label: (n,) the class that both maps together give.
+        true: (n,) the true class, -1 where it is not known; None without ground truth.
+        right: (n,) -1 where it was right and is wrong now, 1 the other way round, else 0; None without ground truth.
     """
 
     table: VoxelTable
@@ -57,7 +58,7 @@ class Changed:
 
     @classmethod
     def of(cls, base: VoxelTable, other: VoxelTable, truth: VoxelTable | None) -> Changed:
-        """Of two maps, or of what both have in one area."""
+        """Compare two maps, or parts of them, voxel by voxel."""
         rows = shared_rows(base, other)
         again = (base.op[rows[0]] >= 2) & (other.op[rows[1]] >= 2)
         base, other = (table.rows(own[again]) for table, own in zip((base, other), rows, strict=True))
@@ -76,13 +77,13 @@ class Changed:
         return much if self.right is None else much | (self.right != 0)
 
     def rows(self, where: Mask) -> Changed:
-        """Some of them (n,)."""
+        """Return some of them (n,)."""
         true, right = (None if own is None else own[where] for own in (self.true, self.right))
         return Changed(self.table.rows(where), self.change[where], self.label[where], true, right)
 
     @classmethod
     def joined(cls, parts: Sequence[Changed]) -> Changed:
-        """Of several areas."""
+        """Join the changes of several parts."""
         order = np.lexsort(np.concatenate([part.table.index for part in parts]).T[::-1])
 
         def column(name: str) -> Any:
@@ -97,9 +98,10 @@ class Changed:
 class Changes:
     """What changed between two maps; of a large one `shown` are those that matter, and some of the others.
 
-    compared, worse, better  how many voxels both saw twice or more, and how many changed by WORSE
-    area, wrong_area       (m,) number of the area that got worse, or is wrong now, of each of `shown`; 0 in none
-    parts                    all voxels with their changes, by name as a file has them, some after the others
+    Attributes:
+        compared, worse, better: How many voxels both saw twice or more, and how many changed by WORSE.
+        area, wrong_area: (m,) number of the area that got worse, or is wrong now, of each of `shown`; 0 in none.
+        parts: All voxels with their changes, by name as a file has them, some after the others.
     """
 
     shown: Changed
@@ -121,7 +123,7 @@ class Worse:
 
 
 def worse_areas(common: Common, number: int) -> Worse:
-    """Of a run against the base; the top contributing frames are known where the observations were kept."""
+    """Return the areas of a run that got worse than the base; frames are known where observations were kept."""
     compared = worse = better = 0
     left, shown = list[Changed](), list[Changed]()
     for own in _changed(common, number):
@@ -144,7 +146,7 @@ def worse_areas(common: Common, number: int) -> Worse:
         listed += _areas("truth", wrong_area, wrong_alike, loss, index, size, result.true, names, observations)
 
     def numbers(table: VoxelTable) -> tuple[Int64, Int64 | None]:
-        """The areas of some voxels (n,), which hold those that matter among them."""
+        """Return the areas of some voxels (n,), which hold those that matter among them."""
         own, theirs = voxel_keys(table.index, index)
         at = np.minimum(np.searchsorted(own, theirs), max(len(own) - 1, 0))
         there = own[at] == theirs if len(own) else np.zeros(len(theirs), np.bool_)
@@ -186,14 +188,17 @@ def _columns(own: Changed, area: Int64, wrong_area: Int64 | None) -> dict[str, n
 
 
 def _clusters(index: Int32, label: Int64, loss: Float64, least: float) -> tuple[Int64, Int64]:
-    """The number (n,) of each voxel's area, the largest loss first, 0 in none; and how many improved alike (m,)."""
+    """Return the number (n,) of each voxel's area, the largest loss first, 0 in none.
+
+    And how many improved alike (m,).
+    """
     area, mass = _connected(index, label, loss, loss >= least)
     _, others = _connected(index, label, -loss, loss <= -least)
     return area, np.array([np.count_nonzero(others >= own - 1e-9) for own in mass], dtype=np.int64)
 
 
 def _connected(index: Int32, label: Int64, loss: Float64, where: Mask) -> tuple[Int64, Float64]:
-    """The areas that voxels of one class make which touch each other, and the loss that each sums up to."""
+    """Return the areas that voxels of one class make which touch each other, and the loss that each sums up to."""
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
 
@@ -214,7 +219,7 @@ def _connected(index: Int32, label: Int64, loss: Float64, where: Mask) -> tuple[
 
 
 def _touching(index: Int32, label: Int64) -> tuple[Int64, Int64]:
-    """Pairs of voxels of one class that share a face, an edge or a corner."""
+    """Return pairs of voxels of one class that share a face, an edge or a corner."""
     low, size = index.min(axis=0).astype(np.int64) - 1, np.ptp(index, axis=0).astype(np.int64) + 3
     x, y, z = (index.astype(np.int64) - low).T
     key = (x * size[1] + y) * size[2] + z  # ascending, as the voxels are
@@ -263,8 +268,9 @@ def _areas(
 class Observations:
     """The observations of both maps at voxels: (m,) each.
 
-    voxel  row of the voxel; frame of the observation
-    base, other  (m, K) what they say; of the base its mean at the voxel where it saw nothing
+    Attributes:
+        voxel: Row of the voxel; frame of the observation.
+        base, other: (m, K) what they say; of the base its mean at the voxel where it saw nothing.
     """
 
     voxel: Int64
@@ -273,7 +279,7 @@ class Observations:
     other: Float64
 
     def among(self, where: Mask, label: Int64) -> Seen:
-        """Those at some of the voxels (n,), whose classes (n,) are what the observations should say."""
+        """Return the observations at some of the voxels (n,), with their classes (n,) as what they should say."""
         rows = where[self.voxel]
         k = label[self.voxel[rows]][:, None]
         base, other = self.base[rows], self.other[rows]
@@ -290,7 +296,7 @@ class Seen:
     says: Float64
 
     def confused_with(self, of: int, names: Sequence[str]) -> str:
-        """The class that stands where the area's own is missing."""
+        """Return the class that stands where the area's own is missing."""
         text = np.maximum(self.lost, 0) @ self.says if len(self.lost) else np.zeros(len(names))
         text[of] = 0
         return names[int(text.argmax())] if text.max(initial=0) > 0 else ""

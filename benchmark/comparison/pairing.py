@@ -58,18 +58,19 @@ LABELS_AND_SCORES = (
 class Common:
     """Runs on a scene, as far as they can be held against each other.
 
-    sums    of each run, of the common locations; for `cubes` and `flights` of its whole map
-    mixed   whether labels stand beside scores
-    tables  of the common locations; none for `cubes` and `flights`
-    logs    of the common observations of cells, where there are some
-    label   (n,) the true class of each of their voxels, -1 where it is not known; None without ground truth
-    observations   what the common observations are
-    regions where there are voxels of the same frames, all of labels or all of scores: the whole maps with the ground
-            truth
-    shown   the part of them that figures show beside those that changed
-    scope   of the intervals, where frames tell
-    sizes_differ, frames_differ  whether voxels do, and the frames of runs that are paired on observations
-    same_frames  whether frames are paired; None where the sums tell
+    Attributes:
+        sums: Of each run, of the common locations; for `cubes` and `flights` of its whole map.
+        mixed: Whether labels stand beside scores.
+        tables: Of the common locations; none for `cubes` and `flights`.
+        logs: Of the common observations of cells, where there are some.
+        label: (n,) the true class of each of their voxels, -1 where it is not known; None without ground truth.
+        observations: What the common observations are.
+        regions: Where there are voxels of the same frames, all of labels or all of scores: the whole maps with the
+            ground truth.
+        shown: The part of them that figures show beside those that changed.
+        scope: Of the intervals, where frames tell.
+        sizes_differ, frames_differ: Whether voxels do, and the frames of runs that are paired on observations.
+        same_frames: Whether frames are paired; None where the sums tell.
     """
 
     basis: Basis
@@ -89,13 +90,17 @@ class Common:
     scope: Scope = THIS_SCENE
 
     def among(self, where: Mask) -> tuple[ClusterSums, ...]:
-        """The sums of some of the common locations (n,)."""
+        """Return the sums of some of the common locations (n,)."""
         label = None if self.label is None else self.label[where]
         return tuple(_sums(rows_of(table, where), label) for table in self.tables)
 
 
 def pair(entries: Sequence[Entry], names: Sequence[str], scope: Scope = THIS_SCENE) -> Common:
-    """The most that all runs of a scene have in common. Raises DataError where a file of a run cannot be read."""
+    """Return the most that all runs of a scene have in common.
+
+    Raises:
+        DataError: If a file of a run cannot be read.
+    """
     result = _paired(entries, names)
     mixed = len({entry.summary.reduced is None for entry in entries}) > 1
     regions = None if mixed or result.frames_differ else result.regions
@@ -131,7 +136,7 @@ def _truth(records: Sequence[Record]) -> Tiles[VoxelTable] | None:
 def _regions(
     names: Sequence[str], maps: Sequence[Tiles[VoxelTable]], truth: Tiles[VoxelTable] | None
 ) -> Iterator[Region]:
-    """The maps of runs tile by tile, or whole, with the ground truth, where it is of their classes."""
+    """Yield the maps of runs tile by tile, or whole, with the ground truth, where it is of their classes."""
     for own in side_by_side([*maps, *([] if truth is None else [truth])]):
         tables, true = own[: len(maps)], own[len(maps) :]
         known = true[0] if true and true[0].classes == tables[0].classes else None
@@ -139,7 +144,7 @@ def _regions(
 
 
 def joint_class(tables: Iterable[VoxelTable]) -> Int64:
-    """The dominant class (n,) of the same voxels in several maps, each counting alike."""
+    """Return the dominant class (n,) of the same voxels in several maps, each counting alike."""
     first, *others = tables
     beliefs = first.evidence[:] / first.op[:, None]
     for other in others:
@@ -152,7 +157,7 @@ def joint_class(tables: Iterable[VoxelTable]) -> Int64:
 
 
 def _by_voxels(entries: Sequence[Entry], regions: Regions) -> Common:
-    """The voxels that all saw twice or more; of very many a sample. Alpha is of each run's own observations."""
+    """Return the voxels that all saw twice or more; of very many a sample. Alpha is of each run's own observations."""
     common = common_voxels(regions)
     tables, share = tuple(common.tables.values()), common.share
     label = None if common.truth is None else join_truth(tables[0], common.truth).label
@@ -166,7 +171,7 @@ def _by_voxels(entries: Sequence[Entry], regions: Regions) -> Common:
 
 
 def _with_observations(common: Common, names: Sequence[str], records: Sequence[Record]) -> Common:
-    """With alpha of the observations that all made; of their own where one's were not kept, or cannot be paired."""
+    """Add alpha of the observations that all made; of each run's own where they cannot be paired."""
     there = _observations_of_the_same_frames(records)
     if not there:
         return replace(common, notes=(OTHER_OBSERVATIONS, *common.notes), same_frames=False, frames_differ=True)
@@ -181,14 +186,14 @@ def _with_observations(common: Common, names: Sequence[str], records: Sequence[R
 
 
 def _observations_of_the_same_frames(records: Sequence[Record]) -> list[CellObservations]:
-    """The sampled observations of runs; none where one's were not kept, or are of other frames."""
+    """Return the sampled observations of runs; none where one's were not kept, or are of other frames."""
     files = [file for record in records if (file := record.observations_file) is not None and file.is_file()]
     there = [CellObservations.load(file) for file in files]
     return there if len(there) == len(records) and _same_frames(there) else []
 
 
 def _compared(names: Iterable[str], there: Sequence[CellObservations]) -> tuple[SharedObservations, tuple[str, ...]]:
-    """The observations that all runs made, and what has to be known of them.
+    """Return the observations that all runs made, and what has to be known of them.
 
     Where their pixels are not of one size it cannot be told which of them a run left without a label.
     """
@@ -203,7 +208,7 @@ def _compared(names: Iterable[str], there: Sequence[CellObservations]) -> tuple[
 def on_common_observations(
     entries: Mapping[str, Entry],
 ) -> tuple[list[Entry], ComparedObservations, tuple[str, ...]] | None:
-    """Entries of runs whose alpha is of the observations that all made, as `pair` has it, what these are, and notes.
+    """Return entries of runs whose alpha is of common observations, what these are, and notes.
 
     None where nothing can be paired on observations: alpha is then of each run's own.
     """
@@ -229,7 +234,7 @@ def _apart(entries: Sequence[Entry], reason: str) -> Common:
 
 
 def _of_whole_maps(basis: Basis, note: str, entries: Sequence[Entry]) -> Common:
-    """The sums of the runs' folders; of right and wrong only where all have them."""
+    """Return the sums of the runs' folders; of right and wrong only where all have them."""
     sums = tuple(entry.sums for entry in entries)
     without = [entry.where for entry in entries if not entry.sums.truth]
     if 0 < len(without) < len(entries):
@@ -244,7 +249,7 @@ def _sums(table: VoxelTable, label: Int64 | None) -> ClusterSums:
 
 
 def _same_frames(observations: Sequence[CellObservations]) -> bool:
-    """Whether frames of one index were taken from one location, and most of the shorter flight's are in the others."""
+    """Return whether frames of one index were taken from one place, and flights share most frames."""
     first, *others = (own.views for own in observations)
     for other in others:
         _, one, same = np.intersect1d(first.frame, other.frame, return_indices=True)
@@ -256,7 +261,7 @@ def _same_frames(observations: Sequence[CellObservations]) -> bool:
 
 
 def _fewer_frames(observations: Sequence[CellObservations]) -> tuple[str, ...]:
-    """Where a run left out frames that others have."""
+    """Return where a run left out frames that others have."""
     if len({own.frames for own in observations}) == 1:
         return ()
     both = len(functools.reduce(np.intersect1d, [own.views.frame for own in observations]))
@@ -268,7 +273,7 @@ def _fewer_frames(observations: Sequence[CellObservations]) -> tuple[str, ...]:
 
 
 def _other_frame_of_reference(entries: Sequence[Entry]) -> str:
-    """Why coordinates are not those of the same locations; empty where they are."""
+    """Return why coordinates are not those of the same locations; empty where they are."""
     first, *others = (entry.georeference for entry in entries)
     for entry, own in zip(entries[1:], others, strict=True):
         if (own is None) != (first is None):
@@ -281,7 +286,7 @@ def _other_frame_of_reference(entries: Sequence[Entry]) -> str:
 
 
 def _no_voxels(entries: Sequence[Entry]) -> str:
-    """Why there are no voxels to pair; empty where there are."""
+    """Return why there are no voxels to pair; empty where there are."""
     for entry in entries:
         if entry.record is None:
             return f"{entry.where} is a small summary, without voxels: {BY_CUBES}"

@@ -43,8 +43,9 @@ Flicker = Mapping[int, float]
 class EntryNumbers:
     """Numbers of a unit that is compared.
 
-    up    the scene's up axis, where it is known
-    seed  of a simulated scene
+    Attributes:
+        up: The scene's up axis, where it is known.
+        seed: Of a simulated scene.
     """
 
     summary: UnitSummary
@@ -58,9 +59,10 @@ class EntryNumbers:
 class Entry(EntryNumbers):
     """A unit that is compared: a label source on a scene.
 
-    where   the folder or the file that it comes from
-    record  what its folder holds of it; None of a small summary, which holds no voxels
-    small   sums and flicker of a small summary
+    Attributes:
+        where: The folder or the file that it comes from.
+        record: What its folder holds of it; None of a small summary, which holds no voxels.
+        small: Sums and flicker of a small summary.
     """
 
     where: Path
@@ -69,7 +71,11 @@ class Entry(EntryNumbers):
 
     @functools.cached_property
     def sums(self) -> ClusterSums:
-        """Its sums by frame and cube of space. Raises DataError where the run has none."""
+        """Its sums by frame and cube of space.
+
+        Raises:
+            DataError: If the run has none.
+        """
         if self.small is not None:
             return self.small[0]
         assert self.record is not None
@@ -115,8 +121,9 @@ class Entry(EntryNumbers):
 class RunHandle:
     """A label source with all scenes that it was fused in.
 
-    name    distinct among the runs that are compared: its backbone, its folder, or both
-    source  the folder, or the file of a small summary
+    Attributes:
+        name: Distinct among the runs that are compared: its backbone, its folder, or both.
+        source: The folder, or the file of a small summary.
     """
 
     name: str
@@ -128,7 +135,8 @@ class RunHandle:
 def open_runs(named: Sequence[str | os.PathLike[str]]) -> tuple[RunHandle, ...]:
     """Open folders of runs or studies, 'FOLDER:BACKBONE', and small summaries, under the shortest distinct names.
 
-    Raises ConfigError or DataError as `open_run` does.
+    Raises:
+        ConfigError, DataError: As `open_run` does.
     """
     runs = [open_run(each) for each in named]
     folders, backbones = [run.source.resolve().name for run in runs], [run.backbone for run in runs]
@@ -143,7 +151,9 @@ def open_runs(named: Sequence[str | os.PathLike[str]]) -> tuple[RunHandle, ...]:
 def open_run(named: str | os.PathLike[str]) -> RunHandle:
     """Open a run's only label source, or the one that 'FOLDER:BACKBONE' selects, at the base settings and backend.
 
-    Raises ConfigError where there is no such folder or label source, or several; DataError where it is damaged.
+    Raises:
+        ConfigError: If there is no such folder or label source, or several.
+        DataError: If it is damaged.
     """
     text = os.fspath(named)
     start, _, wanted = text.rpartition(":")
@@ -173,7 +183,8 @@ def open_run(named: str | os.PathLike[str]) -> RunHandle:
 def shared_scenes(runs: Sequence[RunHandle]) -> tuple[str, ...]:
     """Return the scenes that all runs have, in the order of the first one.
 
-    Raises DataError where there is none, where one was simulated with other seeds, or its classes differ.
+    Raises:
+        DataError: If there is none, where one was simulated with other seeds, or its classes differ.
     """
     first, *others = runs
     scenes = tuple(scene for scene in first.scenes if all(scene in other.scenes for other in others))
@@ -270,8 +281,10 @@ class _Content:
 def save_summary(run: RunHandle, path: str | Path, most: int = 1_000_000) -> None:
     """Write all that a later comparison needs but voxels into one file.
 
-    Its cubes of space and groups of frames are as fine as `most` bytes allow. Raises DataError where even the coarsest
-    take more.
+    Its cubes of space and groups of frames are as fine as `most` bytes allow.
+
+    Raises:
+        DataError: If even the coarsest take more.
     """
     scenes = tuple(
         _Scene(**_numbers(own), name=name, frames=(*own.flicker,), flicker=(*own.flicker.values(),))
@@ -289,7 +302,11 @@ def save_summary(run: RunHandle, path: str | Path, most: int = 1_000_000) -> Non
 
 
 def load_summary(path: str | Path) -> tuple[str, dict[str, Entry]]:
-    """Return the backbone and the scenes that `save_summary` wrote. Raises DataError for anything else."""
+    """Return the backbone and the scenes that `save_summary` wrote.
+
+    Raises:
+        DataError: For anything else.
+    """
     path = Path(path)
     try:
         with zipfile.ZipFile(io.BytesIO(read_limited(path, LARGEST))) as archive:

@@ -43,12 +43,12 @@ BY_CLASS = (ALPHA, VOXEL_ALPHA, PSA, RECURRENT_VSS, SBD_EXCESS, RECALL, PRECISIO
 
 
 def quantities() -> tuple[Quantity, ...]:
-    """All that is compared: the headlines, then the mean over voxels of each other measure of the register."""
+    """Return all that is compared: the headlines, then the mean over voxels of each other measure of the register."""
     return (*HEADLINES, *(measure for measure in measures() if measure is not VSS))
 
 
 def by_key(chosen: Sequence[Quantity]) -> Mapping[str, Quantity]:
-    """The same by their keys."""
+    """Return the same by their keys."""
     return {quantity.key: quantity for quantity in chosen}
 
 
@@ -73,7 +73,7 @@ ANSWERS = (
 
 
 def tables(comparison: RunComparison) -> list[Table]:
-    """All that there is something for."""
+    """Return all that there is something for."""
     covered = {scene.scene: scene.coverage for scene in comparison.scenes if scene.coverage}
     observations = {scene.scene: scene.observations for scene in comparison.scenes if scene.observations is not None}
     made = [_differences(comparison), _by_class(comparison), _areas(comparison), _frames(comparison)]
@@ -82,7 +82,7 @@ def tables(comparison: RunComparison) -> list[Table]:
 
 
 def scopes(comparison: RunComparison) -> Iterator[tuple[str, Against]]:
-    """Each run against the base: over all scenes where there are several, then scene by scene."""
+    """Yield each run against the base: over all scenes where there are several, then scene by scene."""
     if len(comparison.scenes) > 1:
         yield from ((ALL_SCENES, own) for own in comparison.overall)
     for scene in comparison.scenes:
@@ -90,12 +90,12 @@ def scopes(comparison: RunComparison) -> Iterator[tuple[str, Against]]:
 
 
 def heading(comparison: RunComparison, scope: str, own: Against) -> str:
-    """What stands above a run's differences."""
+    """Return what stands above a run's differences."""
     return f"{scope}: {own.other} less {comparison.base}"
 
 
 def scope(row: Contrast) -> str:
-    """What a difference answers, or why it claims nothing, in a word or two."""
+    """Return what a difference answers, or why it claims nothing, in a word or two."""
     return "undecided" if row.difference.undecided else row.difference.scope
 
 
@@ -191,7 +191,7 @@ def _area_row(area: Area) -> Row:
 
 
 def top_frames(frames: Sequence[FrameShare]) -> str:
-    """'13 (30%), 4 (26%)'."""
+    """Return '13 (30%), 4 (26%)'."""
     listed = ", ".join(f"{own.name or own.frame} ({own.share:.0%})" for own in frames[:NAMED_FRAMES])
     return listed + (", ..." if len(frames) > NAMED_FRAMES else "")
 
@@ -211,7 +211,7 @@ def _frames(comparison: RunComparison) -> Table:
 
 
 def everything(comparison: RunComparison) -> Table:
-    """All contrasts, one a row."""
+    """Return all contrasts, one a row."""
     columns = (
         Column("run", "Run"), Column("class", "Class"), Column("measure", "Measure"), Column("base", "Base", 6),
         Column("other", "The run", 6), Column("difference", "Difference", 6, signed=True),
@@ -245,17 +245,17 @@ BASES: dict[Basis, str] = {
 
 
 def sentences(comparison: RunComparison) -> list[str]:
-    """One run after the other, then what could not be compared."""
+    """Return one run after the other, then what could not be compared."""
     return [*answers(comparison), *remarks(comparison)]
 
 
 def answers(comparison: RunComparison) -> list[str]:
-    """What differs, run by run."""
+    """Return what differs, run by run."""
     return [sentence for own in comparison.overall for sentence in _of_run(comparison, own)]
 
 
 def remarks(comparison: RunComparison) -> list[str]:
-    """What was paired, and what could not be compared, scene by scene."""
+    """Return what was paired, and what could not be compared, scene by scene."""
     lines = []
     for scene in comparison.scenes:
         if scene.basis in ("observations", "voxels"):
@@ -322,7 +322,7 @@ def _stability(comparison: RunComparison, own: Against) -> str:
 
 
 def _changes(rows: Sequence[Contrast], known: Mapping[str, Quantity]) -> str:
-    """'worse in mIoU, recall; better in flicker'."""
+    """Return 'worse in mIoU, recall; better in flicker'."""
     listed = {
         change: [known[row.measure].word for row in rows if row.change == change and row.measure in known]
         for change in ("worse", "better")
@@ -355,7 +355,7 @@ SHOWN = {
 
 
 def print_comparison(comparison: RunComparison, console: Console, *, verbose: bool = False) -> None:
-    """The answer in sentences, the differences, and what was paired; verbose: also classes and areas."""
+    """Print the answer in sentences, the differences, and what was paired; verbose: also classes and areas."""
     for sentence in answers(comparison):
         console.print(sentence, highlight=False, markup=False)
     for table in tables(comparison):

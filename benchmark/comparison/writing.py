@@ -66,7 +66,7 @@ def charts(comparison: RunComparison) -> dict[str, list[dict[str, str]]]:
 
 
 def _changed(comparison: ComparisonData) -> Iterator[tuple[SceneComparison, Against, Changes]]:
-    """The scenes and runs of which is known what changed in each voxel."""
+    """Yield the scenes and runs of which is known what changed in each voxel."""
     for scene in comparison.result.scenes:
         for own in scene.against:
             if (changes := comparison.changes.get((scene.scene, own.other))) is not None:
@@ -114,13 +114,16 @@ def compare(
     scope: str = THIS_SCENE,
     progress: Progress = lambda what: None,
 ) -> RunComparison:
-    """What differs between runs and the first of them, by scene and over all scenes: by how much, how surely, where.
+    """Compare runs with the first of them, by scene and over all scenes: how much, how surely, where.
 
-    runs  folders of runs or studies, 'FOLDER:BACKBONE' where there are several label sources, or small summaries
-    scope 'this scene' flown again, 'these frames' or 'other scenes': what intervals and p-values are for
-    out   a folder for tables, figures, report.html, comparison.json and .md, columns of voxels, and a recording
+    Args:
+        runs: Folders of runs or studies, 'FOLDER:BACKBONE' where there are several label sources, or small summaries.
+        scope: 'this scene' flown again, 'these frames' or 'other scenes': what intervals and p-values are for.
+        out: A folder for tables, figures, report.html, comparison.json and .md, columns of voxels, and a recording.
+        progress: Function that is told the scene that is compared.
 
-    Raises ConfigError and DataError, in one line, for what cannot be opened, or has no scene or no classes in common.
+    Raises:
+        ConfigError, DataError: For what cannot be opened, or has no scene or no classes in common, in one line.
     """
     if out is not None:
         _require_own(Path(out))
@@ -131,7 +134,11 @@ def compare(
 
 
 def load_comparison(folder: str | Path) -> RunComparison:
-    """What `compare` wrote. Raises DataError where it is not there or damaged."""
+    """Return what `compare` wrote.
+
+    Raises:
+        DataError: If it is not there or damaged.
+    """
     path = Path(folder) / CONTENT
     return from_json(RunComparison, read_json(path), path)
 
@@ -153,7 +160,7 @@ def write(comparison: ComparisonData, out: str | Path) -> None:
 
 
 def markdown(comparison: RunComparison, made: Sequence[Table] | None = None) -> str:
-    """The comparison for a pull request: what was comparison, then the tables."""
+    """Return the comparison for a pull request: what was comparison, then the tables."""
     shown = [table for table in (made or tables(comparison)) if table.name != "comparison_all"]
     names = ", ".join(each.name for each in comparison.runs[1:])
     head = [f"## {names} against {comparison.base}", "", *(f"- {relations(s)}" for s in sentences(comparison)), ""]
@@ -161,7 +168,7 @@ def markdown(comparison: RunComparison, made: Sequence[Table] | None = None) -> 
 
 
 def page(comparison: RunComparison, made: Sequence[Table], drawn: Sequence[Figure], folder: Path) -> str:
-    """report.html."""
+    """Return report.html."""
     shown = [table for table in made if table.name != "comparison_all"]
     return filled(
         "comparison.html.j2",

@@ -63,7 +63,10 @@ def digest_of(folder: Path) -> str:
 def write_report(result: Result, folder: str | Path, above: Mapping[str, FromAbove] = MappingProxyType({})) -> Path:
     """Write FOLDER/report.html, from the result and the files that its run left in the folder; return its path.
 
-    above  of units, by their slugs, the voxels that are seen from above; those of the others are read
+    Args:
+        result: The result of the run or study.
+        folder: Its folder.
+        above: Of units, by their slugs, the voxels that are seen from above; those of the others are read.
     """
     from semstab.report.page import render
 

@@ -23,16 +23,17 @@ standard error is up to 0.5 / sqrt(1000) = 0.016, even if the voxels were indepe
 class Pooled:
     """Voxels of several units together: a mean runs over all of them, so that a scene counts by its voxels.
 
-    every      all voxels
-    recurrent  those with OP >= 3
-    strata     by OP, as the units have them
-    classes    by dominant class, in order of appearance
-    well_seen  the last stratum in parts, where most voxels are in it
-
     Of the voxels with OP >= 2, macro means over the units with 95 % intervals, NaN where none has statistics:
-    psa        pairwise semantic agreement
-    alpha      Krippendorff's alpha
-    drift      SBD, bits, and drift_null, that of the same observations in random order, where it is known
+
+    Attributes:
+        every: All voxels.
+        recurrent: Those with OP >= 3.
+        strata: By OP, as the units have them.
+        classes: By dominant class, in order of appearance.
+        well_seen: The last stratum in parts, where most voxels are in it.
+        psa: Pairwise semantic agreement.
+        alpha: Krippendorff's alpha.
+        drift: SBD, bits, and drift_null, that of the same observations in random order, where it is known.
     """
 
     voxels: int
@@ -95,7 +96,7 @@ def pooled(records: Sequence[Record]) -> Pooled:
 
 
 def _together(records: Sequence[Record], take: Callable[[MapStatistics], Estimate]) -> Estimate:
-    """The macro mean of an estimate with its interval, the units being independent."""
+    """Return the macro mean of an estimate with its interval, the units being independent."""
     found = [take(record.statistics) for record in records if record.statistics is not None]
     found = [estimate for estimate in found if not math.isnan(estimate.low)]
     if not found:
@@ -109,7 +110,7 @@ def _together(records: Sequence[Record], take: Callable[[MapStatistics], Estimat
 
 
 def _estimate(records: Sequence[Record], take: Callable[[MapStatistics], Estimate]) -> Estimate:
-    """As `_together`, of every unit that has a value; without an interval where one of them has none."""
+    """Return the mean over every unit that has a value; without an interval where one of them has none."""
     found = [take(record.statistics) for record in records if record.statistics is not None]
     if any(math.isnan(estimate.low) for estimate in found if not math.isnan(estimate.value)):
         return Estimate(macro_mean([estimate.value for estimate in found]), math.nan, math.nan)
@@ -117,17 +118,17 @@ def _estimate(records: Sequence[Record], take: Callable[[MapStatistics], Estimat
 
 
 def _macro(records: Sequence[Record], take: Callable[[MapStatistics], Estimate]) -> float:
-    """The macro mean of an estimate in the units' statistics; NaN where none has it."""
+    """Return the macro mean of an estimate in the units' statistics; NaN where none has it."""
     return macro_mean([take(record.statistics).value for record in records if record.statistics is not None])
 
 
 def over_all(measure: Measure) -> Callable[[Pooled], float]:
-    """Takes a measure's mean over all voxels."""
+    """Return a function that takes a measure's mean over all voxels."""
     return lambda pooled: pooled.every[measure]
 
 
 def over_recurrent(measure: Measure) -> Callable[[Pooled], float]:
-    """Takes a measure's mean over the voxels with OP >= 3."""
+    """Return a function that takes a measure's mean over the voxels with OP >= 3."""
     return lambda pooled: pooled.recurrent[measure]
 
 
@@ -141,7 +142,7 @@ class Spread:
 
     @classmethod
     def of(cls, values: Sequence[float]) -> Spread:
-        """Of the repeats where the value is defined."""
+        """Return the statistics of the repeats where the value is defined."""
         defined = [value for value in values if not math.isnan(value)]
         sd = statistics.stdev(defined) if len(defined) > 1 else math.nan
         return cls(macro_mean(defined), sd, len(defined))
@@ -155,22 +156,22 @@ class Level:
     repeats: tuple[Pooled, ...]
 
     def spread(self, measure: Callable[[Pooled], float]) -> Spread:
-        """A measure over the repeats."""
+        """Return a measure over the repeats."""
         return Spread.of([measure(repeat) for repeat in self.repeats])
 
     def mean(self, measure: Callable[[Pooled], float]) -> float:
-        """The measure's mean over the repeats."""
+        """Return the measure's mean over the repeats."""
         return self.spread(measure).mean
 
     def interval(self, estimate: Callable[[Pooled], Estimate]) -> Estimate:
-        """An estimate's mean over the repeats, and the mean of their intervals: they err alike, in the same scenes."""
+        """Return an estimate's mean over the repeats, and the mean of their intervals: they err alike."""
         found = [estimate(repeat) for repeat in self.repeats]
         value, low, high = (macro_mean(ends) for ends in zip(*((e.value, e.low, e.high) for e in found), strict=True))
         return Estimate(value, low, high)
 
     @property
     def judged(self) -> bool:
-        """Whether it has statistics that are defined."""
+        """Return whether it has statistics that are defined."""
         return not math.isnan(self.mean(lambda pooled: pooled.psa.value))
 
 
@@ -178,7 +179,8 @@ class Level:
 class Sweep:
     """How a swept setting is named, in a sentence and above a column, and its values printed: `{value * scale:g} unit`.
 
-    noise  whether it disturbs the geometry: then 0 leaves it as it is
+    Attributes:
+        noise: Whether it disturbs the geometry: then 0 leaves it as it is.
     """
 
     name: str
@@ -189,7 +191,7 @@ class Sweep:
     noise: bool = False
 
     def text(self, value: float) -> str:
-        """A value of it, without the unit."""
+        """Return a value of it, without the unit."""
         return f"{value * self.scale:.6g}"
 
 
@@ -206,7 +208,7 @@ _SWEEPS = (
 
 
 def describe(sweep: str) -> Sweep:
-    """The description of a sweep; one that is not known goes by its name."""
+    """Return the description of a sweep; one that is not known goes by its name."""
     return next((known for known in _SWEEPS if known.name == sweep), _unknown(sweep))
 
 
@@ -216,14 +218,14 @@ def _unknown(name: str) -> Sweep:
 
 
 def swept(result: Result) -> list[Sweep]:
-    """The sweeps of a study that have values, in a fixed order."""
+    """Return the sweeps of a study that have values, in a fixed order."""
     present = result.sweeps()
     known = [sweep for sweep in _SWEEPS if sweep.name in present]
     return [*known, *(describe(name) for name in present if describe(name) not in known)]
 
 
 def levels(result: Result, sweep: str, backbone: str, scene: str | None = None) -> tuple[Level, ...]:
-    """The values of a sweep, ascending, over the scenes that have all of them: else levels would differ by scenes."""
+    """Return the values of a sweep, ascending, over the scenes that have all of them."""
     scenes = complete_scenes(result, sweep, backbone)
     found: dict[float, dict[int, list[Record]]] = {}
     for record in result.select(sweep, backbone=backbone):
@@ -237,7 +239,7 @@ def levels(result: Result, sweep: str, backbone: str, scene: str | None = None) 
 
 
 def complete_scenes(result: Result, sweep: str, backbone: str) -> tuple[str, ...]:
-    """The scenes of a sweep that have each of its values and repeats."""
+    """Return the scenes of a sweep that have each of its values and repeats."""
     points: dict[str, set[Variation]] = {}
     for record in result.select(sweep, backbone=backbone):
         points.setdefault(record.unit.scene, set()).add(record.variation)
@@ -246,7 +248,7 @@ def complete_scenes(result: Result, sweep: str, backbone: str) -> tuple[str, ...
 
 
 def by_backbone(records: Iterable[Record]) -> dict[str, list[Record]]:
-    """The records of each backbone, in order."""
+    """Return the records of each backbone, in order."""
     groups: dict[str, list[Record]] = {}
     for record in records:
         groups.setdefault(record.unit.backbone, []).append(record)

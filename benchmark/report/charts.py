@@ -46,7 +46,7 @@ class Scale:
 
     @classmethod
     def over(cls, values: Sequence[float], first: float, last: float, *, zero: bool = False) -> Scale:
-        """Over the finite values, from 0 on where `zero` says so."""
+        """Build the axis over the finite values, from 0 on where `zero` says so."""
         known = [value for value in values if math.isfinite(value)] or [0.0, 1.0]
         low, high = min(0.0, *known) if zero else min(known), max(known)
         apart = high - low > 1e-9 * max(abs(low), abs(high), 1e-9)
@@ -152,7 +152,7 @@ def _frame(
     x: Scale, y: Scale, x_ticks: Mapping[float, str], y_ticks: Mapping[float, str], x_label: str, y_label: str,
     *, left: float = LEFT, height: float = HEIGHT,
 ) -> Iterator[str]:  # fmt: skip
-    """Grid, ticks and labels of both axes."""
+    """Yield grid, ticks and labels of both axes."""
     bottom = height - BOTTOM
     for value, text in y_ticks.items():
         if y_label:

@@ -73,7 +73,7 @@ def table_block(table: Table) -> dict[str, Any]:
 
 
 def _cell(text: str) -> str:
-    """A cell as typography has it: minus signs, a dash for what is undefined."""
+    """Return a cell as typography has it: minus signs, a dash for what is undefined."""
     if text == "--":
         return "\N{EN DASH}"
     is_number = text[-1:].isdigit() or re.fullmatch(r"[-+]?[\d.,]+ \([-+\d., ]+\)", text)

@@ -25,7 +25,8 @@ if TYPE_CHECKING:
 class Run:
     """A finished run or study; a unit is named by scene, backbone and backend as far as that is needed.
 
-    result  all that it found, typed
+    Attributes:
+        result: All that it found, typed.
     """
 
     folder: Path
@@ -37,20 +38,28 @@ class Run:
         return self.result.to_pandas()
 
     def table(self, *, scene: str | None = None, backbone: str | None = None, backend: str | None = None) -> VoxelTable:
-        """The voxels of a unit."""
+        """Return the voxels of a unit."""
         return self.result.record(scene=scene, backbone=backbone, backend=backend).table()
 
     def series(
         self, *, scene: str | None = None, backbone: str | None = None, backend: str | None = None
     ) -> pd.DataFrame:
-        """The time series of a unit: one row a frame. Raises DataError where its file cannot be read."""
+        """Return the time series of a unit: one row a frame.
+
+        Raises:
+            DataError: If its file cannot be read.
+        """
         file = self.result.record(scene=scene, backbone=backbone, backend=backend).series
         if file is None:
             raise DataError(f"{self.folder}: the run kept no series of this unit; run it again")
         return voxels.to_pandas(_columns(file))
 
     def events(self, *, scene: str | None = None, backbone: str | None = None, backend: str | None = None) -> Events:
-        """The log of a unit's observations. Raises ConfigError where the run kept none."""
+        """Return the log of a unit's observations.
+
+        Raises:
+            ConfigError: If the run kept none.
+        """
         file = self.result.record(scene=scene, backbone=backbone, backend=backend).events_file
         if file is None or not file.exists():
             raise ConfigError(f"{self.folder}: the run kept no log of observations; run it with --events")
@@ -61,14 +70,19 @@ class Run:
 
 
 def load(folder: str | Path) -> Run:
-    """A finished run from its folder. Raises DataError where it is not there or damaged."""
+    """Return a finished run from its folder.
+
+    Raises:
+        DataError: If it is not there or damaged.
+    """
     return Run(Path(folder), load_result(folder))
 
 
 def read_series(file: Path) -> dict[str, npt.NDArray[Any]]:
     """Read the time series in a file: by column (n,) values, one a frame, NaN or None where a value is missing.
 
-    Raises DataError where it cannot be read.
+    Raises:
+        DataError: If it cannot be read.
     """
     return {name: values_of(column) for name, column in _columns(file).items()}
 

@@ -30,7 +30,7 @@ ONE_CLASS = 0.9
 
 
 def warnings(result: Result) -> Iterator[str]:
-    """The facts without which a run would be misread, the weightiest first, with the command that mends each."""
+    """Yield the facts without which a run would be misread, the weightiest first, with the command that mends each."""
     runs = [record.summary for record in result.select()]
     for run in runs:
         if run.frames_left_out:
@@ -79,7 +79,7 @@ def warnings(result: Result) -> Iterator[str]:
 
 
 def _is_untested(record: Record) -> bool:
-    """Whether a verdict is stable, of a map that was not compared with the ground truth."""
+    """Return whether a verdict is stable, of a map that was not compared with the ground truth."""
     found = record.statistics
     return bool(
         found and found.verdict.level == "stable" and found.correctness is None and record.unit.backbone != GROUND_TRUTH
@@ -87,7 +87,7 @@ def _is_untested(record: Record) -> bool:
 
 
 def _suspicions(record: Record) -> Iterator[str]:
-    """Reasons for which frames may agree though the labels are worth little."""
+    """Yield reasons for which frames may agree though the labels are worth little."""
     found, recall = record.statistics, record.image_space.edge_recall
     if found is None or found.verdict.level not in ("stable", "usable"):
         return
@@ -110,7 +110,7 @@ def _name(run: UnitSummary, result: Result) -> str:
 
 
 def _size(scene: str, found: VoxelAdvice, result: Result) -> str:
-    """Where the voxel size does not suit the data; empty where it does."""
+    """Return where the voxel size does not suit the data; empty where it does."""
     where = f"{scene}: " if len(result.scenes) > 1 else ""
     if found.suggested is None:
         return (
@@ -124,17 +124,17 @@ def _size(scene: str, found: VoxelAdvice, result: Result) -> str:
 
 
 def _one_class(run: UnitSummary) -> bool:
-    """Whether one class covers most of the map, so that it makes most of the numbers."""
+    """Return whether one class covers most of the map, so that it makes most of the numbers."""
     return max(row.share for row in run.table.classes) >= ONE_CLASS
 
 
 def mixed(runs: Sequence[UnitSummary]) -> bool:
-    """Whether some are of hard labels, others of soft scores."""
+    """Return whether some are of hard labels, others of soft scores."""
     return len({run.reduced is None for run in runs}) > 1
 
 
 def notes(result: Result) -> Iterator[str]:
-    """The facts about several models, scenes or backends that no table says."""
+    """Yield the facts about several models, scenes or backends that no table says."""
     records = result.select()
     yield from _ranking(result)
     yield from _least_seen(records)
@@ -167,7 +167,7 @@ def _common_sums(records: Sequence[Record]) -> Mapping[str, ClusterSums]:
 
 
 def _ranking(result: Result) -> Iterator[str]:
-    """Does the order of the backbones change where only recurrent voxels count?"""
+    """Say whether the order of the backbones changes where only recurrent voxels count."""
     records = comparable(result)
     means = {name: pooled(rows) for name, rows in by_backbone(records).items()}
     if mixed([record.summary for record in result.select()]):
@@ -188,7 +188,7 @@ def _order(values: Mapping[str, float]) -> str:
 
 
 def _least_seen(records: Sequence[Record]) -> Iterator[str]:
-    """The paradox between scenes: the one that seems most stable may be the one seen least."""
+    """Yield the paradox between scenes: the one that seems most stable may be the one seen least."""
     for backbone, rows in by_backbone(records).items():
         tables = {row.unit.scene: row.summary.table for row in rows if row.summary.table.voxels}
         if len(tables) < 2:
@@ -202,7 +202,7 @@ def _least_seen(records: Sequence[Record]) -> Iterator[str]:
 
 
 def _implementations(result: Result) -> Iterator[str]:
-    """Which fusion implementations leave the base one's maps."""
+    """Yield which fusion implementations leave the base one's maps."""
     rows = {
         name: [row.agrees for row in result.agreement if row.backends == (result.backend, name)]
         for name in dict.fromkeys(row.backends[1] for row in result.agreement)

@@ -51,7 +51,11 @@ def render(
 ) -> str:
     """Return the page of the result whose files lie in the folder, with the digest of what it is made from.
 
-    above  of units, by their slugs, the voxels that are seen from above; those of the others are read
+    Args:
+        result: The result of the run or study.
+        folder: Its folder.
+        digest: Digest of the files that the page is made from.
+        above: Of units, by their slugs, the voxels that are seen from above; those of the others are read.
     """
     everything, result = result, of_interest(result)
     shown, views = list(_scenes(result, folder, above)), [table_block(table) for table in tables(everything)]
@@ -78,12 +82,12 @@ def render(
 
 
 def _script(content: Any) -> str:
-    """JSON that may stand in a script element."""
+    """Return JSON that may stand in a script element."""
     return json.dumps(content).replace("<", "\\u003c")
 
 
 def _legend(names: Sequence[str]) -> list[tuple[str, str]]:
-    """The names with the styles of their colours."""
+    """Return the names with the styles of their colours."""
     return [(name, f"c{k % SERIES}") for k, name in enumerate(names)]
 
 
@@ -91,7 +95,7 @@ def _legend(names: Sequence[str]) -> list[tuple[str, str]]:
 
 
 def _card(model: str, records: Sequence[Record]) -> dict[str, Any]:
-    """A model: the verdict on it in each scene, and the numbers that it rests on."""
+    """Return a model: the verdict on it in each scene, and the numbers that it rests on."""
     judged = [record.statistics for record in records if record.statistics is not None]
     one = judged[0] if len(judged) == 1 else None
     return {
@@ -115,7 +119,7 @@ def _scene_verdict(record: Record) -> dict[str, str]:
 def _numbers(
     records: Sequence[Record], judged: Sequence[MapStatistics], one: MapStatistics | None
 ) -> Iterator[tuple[str, str, str]]:
-    """Rows of a card: name, value, and its interval or unit; macro means over several scenes."""
+    """Yield rows of a card: name, value, and its interval or unit; macro means over several scenes."""
 
     def mean(values: Sequence[float], form: str, scale: float = 1.0) -> str:
         value = macro_mean(values)
@@ -180,7 +184,10 @@ def _scenes(result: Result, folder: Path, above: Mapping[str, FromAbove]) -> Ite
 
 
 def _map(record: Record, above: FromAbove, overview: Overview | None, most: int) -> dict[str, Any]:
-    """The map as the page's script paints it: images of numbers, and of the stability where there is no script."""
+    """Return the map as the page's script paints it.
+
+    Images of numbers, and of the stability where there is no script.
+    """
     step = max(1, math.ceil(math.sqrt(above.rows.size / CELLS)))
     table, names = above.table, above.table.classes or tuple(map(str, range(above.table.K)))
     with np.errstate(invalid="ignore"):
@@ -215,7 +222,7 @@ def _map(record: Record, above: FromAbove, overview: Overview | None, most: int)
 
 
 def _spread(rows: Any, values: UInt8) -> UInt8:
-    """The values (n, 3) of each cell's voxel (H, W, 3); (0, 0, UNKNOWN) where there is none."""
+    """Return the values (n, 3) of each cell's voxel (H, W, 3); (0, 0, UNKNOWN) where there is none."""
     image = values[rows]
     image[rows == EMPTY] = (0, 0, UNKNOWN)
     return image  # type: ignore[no-any-return]
@@ -227,7 +234,7 @@ def _reduced(image: UInt8, most: int) -> UInt8:
 
 
 def _timeline(records: Sequence[Record], colors: Mapping[str, int]) -> Iterator[dict[str, str]]:
-    """Flicker and drift by frame."""
+    """Yield flicker and drift by frame."""
     series = {r.unit.backbone: read_series(r.series) for r in records if r.series is not None and r.series.exists()}
     for column, title, unit in (
         ("compensated_flicker_percent", "Flicker", "flicker, % of the pixels"),
@@ -242,7 +249,7 @@ def _timeline(records: Sequence[Record], colors: Mapping[str, int]) -> Iterator[
 
 
 def _worst(record: Record, overview: Overview | None) -> Iterator[dict[str, Any]]:
-    """The frames with the most flicker as small images: the picture, its labels, and which of them changed."""
+    """Yield the frames with the most flicker as small images: the picture, its labels, and which of them changed."""
     if overview is None or overview.worst is None:
         return
     worst, K = overview.worst, len(overview.palette)
@@ -258,12 +265,12 @@ def _worst(record: Record, overview: Overview | None) -> Iterator[dict[str, Any]
 
 
 def _indexed(index: Int64, palette: UInt8) -> str:
-    """A PNG of indices (H, W) into colours."""
+    """Return a PNG of indices (H, W) into colours."""
     return png(index.astype(np.uint8), palette) if len(palette) <= 256 else png(palette[index])
 
 
 def _classes(records: Sequence[Record], colors: Mapping[str, int]) -> str:
-    """Each class that counts for the verdict, with its alpha."""
+    """Return each class that counts for the verdict, with its alpha."""
     rows: dict[str, list[tuple[int, str, Estimate]]] = {}
     for record in records:
         found, name = record.statistics, record.unit.backbone
@@ -278,7 +285,7 @@ def _classes(records: Sequence[Record], colors: Mapping[str, int]) -> str:
 
 
 def _distance(records: Sequence[Record], colors: Mapping[str, int]) -> Iterator[dict[str, str]]:
-    """Agreement by how far apart two observations are."""
+    """Yield agreement by how far apart two observations are."""
     for axis, title, unit in (
         ("time", "In time", "frames apart"),
         ("angle", "In angle", "degrees between the views"),
@@ -302,7 +309,7 @@ def _distance(records: Sequence[Record], colors: Mapping[str, int]) -> Iterator[
 
 
 def _by_op(result: Result) -> Iterator[dict[str, str]]:
-    """The measures by observation persistence."""
+    """Yield the measures by observation persistence."""
     together = {name: pooled(records) for name, records in by_backbone(result.select()).items()}
     for measure in (VSS, SBD):
         lines, names = [], list[str]()
@@ -334,7 +341,7 @@ def _sweeps(result: Result) -> Iterator[dict[str, str]]:
 
 
 def _title(result: Result) -> str:
-    """The name of a study; of a run, which has none, its scenes."""
+    """Return the name of a study; of a run, which has none, its scenes."""
     if result.sweeps():
         return result.name
     scenes = result.scenes
@@ -362,7 +369,7 @@ def _failure(failure: Failure) -> dict[str, str]:
 
 
 def _facts(manifest: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
-    """The manifest's short entries, by name."""
+    """Yield the manifest's short entries, by name."""
     for key, value in manifest.items():
         if isinstance(value, Mapping):
             short = len(value) <= 12 and not any(isinstance(item, Mapping | list) for item in value.values())

@@ -27,11 +27,12 @@ LEVEL = 0.002
 class Remedy:
     """A filter over a model: macro means over the scenes, shares 0 to 1, NaN where undefined; see `FrameQuality`.
 
-    filters   '' for the model itself
-    flicker   of places seen in two frames in a row, those whose label changes: motion-compensated
-    plain     the same at the same pixel, whatever it shows
-    alpha     as verdicts have it
-    better    in how many frames, of how many, the accuracy is above the model's; without truth the next frame's
+    Attributes:
+        filters: '' for the model itself.
+        flicker: Of places seen in two frames in a row, those whose label changes: motion-compensated.
+        plain: The same at the same pixel, whatever it shows.
+        alpha: As verdicts have it.
+        better: In how many frames, of how many, the accuracy is above the model's; without truth the next frame's.
     """
 
     filters: str
@@ -63,15 +64,15 @@ class Remedies:
 
     @property
     def has_truth(self) -> bool:
-        """Whether right and wrong are known."""
+        """Return whether right and wrong are known."""
         return not math.isnan(self.unfiltered.accuracy)
 
     def worth(self, row: Remedy) -> float:
-        """What a filter must not lower: accuracy; without ground truth next-frame consistency."""
+        """Return what a filter must not lower: accuracy; without ground truth next-frame consistency."""
         return row.accuracy if self.has_truth else row.next_frame
 
     def harmless(self, row: Remedy) -> bool:
-        """Whether it costs nothing that must not be lost, whatever it does for stability."""
+        """Return whether it costs nothing that must not be lost, whatever it does for stability."""
         base = self.unfiltered
         if row.coverage < LEAST_COVERAGE:
             return False
@@ -115,7 +116,7 @@ class Remedies:
 
 
 def remedies(result: Result) -> list[Remedies]:
-    """Each model of which filtered labels were judged beside its own; none in other results."""
+    """Return each model of which filtered labels were judged beside its own; none in other results."""
     groups: dict[str, dict[str, list[Record]]] = {}
     for record in result.select():
         if record.quality is not None:
@@ -130,7 +131,7 @@ def remedies(result: Result) -> list[Remedies]:
 
 
 def of_interest(result: Result) -> Result:
-    """The result for tables and figures of maps: of remedies the models, and the filters to use, alone."""
+    """Return the result for tables and figures of maps: of remedies the models, and the filters to use, alone."""
     found = {each.model: {"", each.best.filters if each.best else ""} for each in remedies(result)}
     if not found:
         return result
@@ -145,7 +146,7 @@ def of_interest(result: Result) -> Result:
 
 
 def advice(found: Remedies) -> Iterator[str]:
-    """What to use and why; what only seems to help; what cannot be known."""
+    """Yield what to use and why; what only seems to help; what cannot be known."""
     best, base = found.best, found.unfiltered
     if best is None:
         least = "accuracy, IoU, coverage or time to follow" if found.has_truth else "next-frame consistency or coverage"
@@ -170,7 +171,7 @@ def advice(found: Remedies) -> Iterator[str]:
 
 
 def typed(remedy: Remedy) -> str:
-    """The filters as they are typed after the first --filter."""
+    """Return the filters as they are typed after the first --filter."""
     return remedy.filters.replace("+", " --filter ")
 
 
@@ -229,7 +230,7 @@ def _row(records: Sequence[Record], unfiltered: Sequence[Record]) -> Remedy:
 
 
 def _better(records: Sequence[Record], unfiltered: Sequence[Record]) -> tuple[int, int]:
-    """In how many frames, of how many, the filtered labels are worth more."""
+    """Return in how many frames, of how many, the filtered labels are worth more."""
     before = {record.unit.scene: record.quality for record in unfiltered}
     pairs: list[tuple[float, float]] = []
     for record in records:

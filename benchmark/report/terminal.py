@@ -42,7 +42,7 @@ STAGE_NAMES = {"read": "reading", "reference": "check", "voxel sizes": "other vo
 def print_summary(
     result: Result, console: Console, *, out: Path | None = None, seconds: float | None = None, verbose: bool = False
 ) -> None:
-    """The answer first, then where to look; `verbose` adds every table of the run."""
+    """Print the answer first, then what to open; `verbose` adds every table of the run."""
     for line in screen(result, out=out, seconds=seconds):
         console.print(line, highlight=False, markup=False, soft_wrap=True)
     for table in tables(result) if verbose else ():
@@ -50,7 +50,10 @@ def print_summary(
 
 
 def screen(result: Result, *, out: Path | None = None, seconds: float | None = None) -> Iterator[str]:
-    """The lines of a run or a study: verdicts, least stable classes, warnings, the check, the time, where to look."""
+    """Yield the lines of a run or a study.
+
+    Verdicts, least stable classes, warnings, the check, the time, where to look.
+    """
     records = result.select()
     if len(records) == 1:
         yield from _one(result, records[0])
@@ -87,7 +90,7 @@ def _one(result: Result, record: Record) -> Iterator[str]:
 
 
 def _head(name: str, result: Result, runs: Sequence[UnitSummary]) -> str:
-    """What was fused: '40 frames, 7 classes, 0.2 m voxels', and whether depth and poses agree."""
+    """Return what was fused: '40 frames, 7 classes, 0.2 m voxels', and whether depth and poses agree."""
     first = runs[0]
     frames = sorted({run.frames for run in runs})
     counts = f"{frames[0]} to {frames[-1]}" if len(frames) > 1 else f"{frames[0]}"
@@ -111,7 +114,7 @@ def _geometry(result: Result) -> str:
 
 
 def _verdict(run: UnitSummary) -> Iterator[str]:
-    """The level, the number that it rests on, and what that number means."""
+    """Yield the level, the number that it rests on, and what that number means."""
     found = run.statistics
     assert found is not None
     level, alpha = found.verdict.level.upper(), found.headline.alpha
@@ -151,7 +154,7 @@ def _interval(found: Estimate, scale: float = 1.0) -> str:
 
 
 def _short(value: float) -> str:
-    """'.55' for 0.55."""
+    """Return '.55' for 0.55."""
     text = f"{value:.2f}"
     return text.replace("0.", ".", 1) if abs(value) < 1 else text
 
@@ -174,7 +177,7 @@ WIDTHS = (12, -15, -19, 6, 8, 6, 7, 5)
 
 
 def _several(result: Result, records: Sequence[Record]) -> Iterator[str]:
-    """A row a scene and model; the differences to the first model where they are known."""
+    """Yield a row a scene and model; the differences to the first model where they are known."""
     listed = ", ".join(result.scenes[:3]) + (", ..." if len(result.scenes) > 3 else "")
     yield _head(listed, result, [record.summary for record in records])
     yield ""
@@ -214,7 +217,7 @@ def _cells(record: Record) -> list[str]:
 
 
 def miou(record: Record) -> float:
-    """Of the fused labels seen twice or more; NaN without ground truth."""
+    """Return the mIoU of the fused labels seen twice or more; NaN without ground truth."""
     found = record.summary.statistics
     rows = [] if found is None or found.correctness is None else found.correctness.strata
     return rows[0].miou if rows else math.nan
@@ -228,7 +231,7 @@ def _number(value: float, digits: int) -> str:
 
 
 def _classes(records: Sequence[Record]) -> Iterator[str]:
-    """The classes on which frames agree least, of those that cover enough of the map."""
+    """Yield the classes on which frames agree least, of those that cover enough of the map."""
     names = list(dict.fromkeys(record.unit.backbone for record in records))
     most, alone = MOST_CLASSES.get(len(records), 1), len(names) == 1
     lines = []
@@ -257,7 +260,7 @@ def class_alphas(records: Sequence[Record]) -> dict[str, float]:
 
 
 def _class_shares(records: Sequence[Record]) -> dict[str, tuple[int, float]]:
-    """Voxels of each class, and their share of the map."""
+    """Return voxels of each class, and their share of the map."""
     voxels: dict[str, int] = {}
     for row in (row for record in records for row in record.summary.table.classes):
         voxels[row.name] = voxels.get(row.name, 0) + row.voxels
@@ -266,7 +269,7 @@ def _class_shares(records: Sequence[Record]) -> dict[str, tuple[int, float]]:
 
 
 def _checks(result: Result) -> Iterator[str]:
-    """How the backends agree with each other: one line a pair."""
+    """Yield how the backends agree with each other: one line a pair."""
     for pair in dict.fromkeys(row.backends for row in result.agreement):
         rows = [row for row in result.agreement if row.backends == pair]
         yield f"  {_check(pair, rows)}"
@@ -291,7 +294,7 @@ def _check(pair: tuple[str, str], rows: Sequence[Agreement]) -> str:
 
 
 def _where(result: Result, out: Path | None, seconds: float | None) -> Iterator[str]:
-    """How long it took, and what to open or type next."""
+    """Yield how long it took, and what to open or type next."""
     if seconds is not None:
         stages = {STAGE_NAMES.get(k, k): v for k, v in result.manifest.get("seconds", {}).items() if k != "all"}
         longest = sorted(stages, key=lambda name: -stages[name])[:3]
@@ -350,7 +353,7 @@ class ProgressBar(Observer):
             self.notes.append(f"{task.scene.name}: {verdict.text}")
 
     def advanced(self, frames: int, what: str) -> None:
-        """So many frames further."""
+        """Advance by so many frames."""
         self.bar.update(self.work, advance=frames, description=what[:40])
         if not self.bar.console.is_interactive and time.monotonic() - self._said > SECONDS_A_LINE:
             self._said = time.monotonic()
@@ -372,7 +375,7 @@ class ProgressBar(Observer):
 
 
 def failure_lines(result: Result) -> Iterator[str]:
-    """One line for what failed for the same reason."""
+    """Yield one line for what failed for the same reason."""
     reasons: dict[str, list[Failure]] = {}
     for failure in result.failures:
         reasons.setdefault(failure.message, []).append(failure)
@@ -389,7 +392,7 @@ def _first_of(names: Sequence[str]) -> str:
 
 
 def _named_task(failure: Failure) -> str:
-    """What was varied; nothing of a unit at the base settings."""
+    """Return what was varied; nothing of a unit at the base settings."""
     if failure.variation.sweep == BASE:
         return ""
     value = failure.variation.value
@@ -397,7 +400,7 @@ def _named_task(failure: Failure) -> str:
 
 
 def print_remedies(result: Result, console: Console) -> None:
-    """The filter to use for each model, then the table of all; '*' is the one to use, '!' makes labels worse."""
+    """Print the filter to use for each model, then the table of all; '*' marks it, '!' makes labels worse."""
     for found in remedies(result):
         for sentence in advice(found):
             console.print(sentence, highlight=False, markup=False)

@@ -45,7 +45,10 @@ def write_figures(result: Result, folder: str | Path, *, svg: bool = False) -> l
 
 
 def figures(result: Result, folder: str | Path) -> list[Figure]:
-    """Every figure in the paper's order, drawn only when it is saved; saved frames are taken from the study folder."""
+    """Return every figure in the paper's order, drawn only when it is saved.
+
+    Saved frames are taken from the study folder.
+    """
     views, result = Views(), of_interest(result)
     kept = [record for record in result.select() if record.voxels_file is not None]
     return [
@@ -57,7 +60,7 @@ def figures(result: Result, folder: str | Path) -> list[Figure]:
 
 
 def _overviews(result: Result, kept: list[Record], views: Views, folder: Path) -> Iterator[Figure]:
-    """One a backbone, of the first scene that has a saved frame."""
+    """Yield one a backbone, of the first scene that has a saved frame."""
     for backbone, records in by_backbone(kept).items():
         for record in records:
             path = folder / f"{slug(record.unit.scene, backbone)}.npz"
@@ -87,7 +90,7 @@ def _distributions(kept: list[Record], views: Views) -> Iterator[Figure]:
 
     @functools.cache
     def of_all() -> dict[str, dict[str, Histograms]]:
-        """By backbone and scene."""
+        """Draw the figure of each backbone and scene."""
         return {
             backbone: {record.unit.scene: views.sums(record) for record in records}
             for backbone, records in by_backbone(kept).items()

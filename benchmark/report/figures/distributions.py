@@ -30,7 +30,7 @@ BINS = 1000
 
 
 def _op_bounds() -> Int64:
-    """The lowest OP of each bin: single values up to 8, then steps of about a quarter."""
+    """Return the lowest OP of each bin: single values up to 8, then steps of about a quarter."""
     bounds = list(range(1, 10))
     while bounds[-1] < 2**31:
         bounds.append(max(bounds[-1] + 1, round(bounds[-1] * 1.25)))
@@ -53,7 +53,7 @@ class MeasureByOP:
 
     @classmethod
     def of(cls, values: Float64, bins: Int64, largest: float) -> MeasureByOP:
-        """The histogram of values (n,) in OP bins (n,); undefined values do not count."""
+        """Return the histogram of values (n,) in OP bins (n,); undefined values do not count."""
         defined = ~np.isnan(values)
         values, bins = values[defined], bins[defined]
         column = np.ceil(values / largest * BINS - 1e-6).clip(0, BINS).astype(np.int64)
@@ -76,18 +76,18 @@ class MeasureByOP:
         return total
 
     def ecdf(self, lowest_op: int = 1) -> Float64:
-        """(1 + BINS,) share of the voxels with at least that OP whose value is at most that of the bin."""
+        """Return (1 + BINS,) share of the voxels with at least that OP whose value is at most that of the bin."""
         counts = self.counts[np.searchsorted(OP_BOUNDS, lowest_op) :].sum(axis=0)
         share: Float64 = counts.cumsum() / max(1, counts.sum())
         return share
 
     def mean(self) -> Float64:
-        """(OP bins,) mean by OP; NaN where there are no voxels."""
+        """Return (OP bins,) mean by OP; NaN where there are no voxels."""
         mean: Float64 = np.where(self.voxels > 0, self.sums / np.maximum(1, self.voxels), np.nan)
         return mean
 
     def quantile(self, q: float) -> Float64:
-        """(OP bins,) the value that a share q of the voxels does not exceed, by OP; NaN where there are none."""
+        """Return (OP bins,) the value that a share q of the voxels does not exceed, by OP; NaN where there are none."""
         reached = self.counts.cumsum(axis=1) >= q * self.voxels[:, None]
         return np.where(self.voxels > 0, self.values[reached.argmax(axis=1)], np.nan)
 
@@ -97,23 +97,23 @@ Histograms = Mapping[str, MeasureByOP]
 
 
 def lacking(measure: Measure, value: Float64) -> Float64:
-    """How far values are from the best, and back."""
+    """Return how far values are from the best, and back."""
     return value if measure.better == "lower" else measure.largest - value
 
 
 def histograms(table: VoxelTable) -> Histograms:
-    """The histograms of a unit."""
+    """Return the histograms of a unit."""
     bins = np.searchsorted(OP_BOUNDS, op(table), side="right") - 1
     return {m.key: MeasureByOP.of(lacking(m, m.of(table)), bins, m.largest) for m in measures()}
 
 
 def together(units: Iterable[Histograms]) -> Histograms:
-    """The voxels of several units pooled."""
+    """Return the voxels of several units pooled."""
     return reduce(lambda a, b: {key: one + b[key] for key, one in a.items()}, units)
 
 
 def op_position() -> Float64:
-    """(OP bins,) where a bin stands on a logarithmic axis: the geometric mean of its OP."""
+    """Return (OP bins,) where a bin stands on a logarithmic axis: the geometric mean of its OP."""
     last = np.append(OP_BOUNDS[1:] - 1, OP_BOUNDS[-1])
     return np.sqrt(OP_BOUNDS * last.astype(np.float64))
 
@@ -125,7 +125,10 @@ INFORMATIVE = 0.99
 
 
 def draw_ecdf(scenes: Mapping[str, Histograms], ends: Mapping[str, float]) -> Figure:
-    """The ECDF of how much each measure lacks in each scene, and in all recurrent voxels; ends are those of x axes."""
+    """Return the ECDF of how much each measure lacks in each scene, and in all recurrent voxels.
+
+    Ends are those of x axes.
+    """
     shown = measures()
     figure = canvas(PAGE, 2.4 * math.ceil(len(shown) / 2))
     panels = figure.subplots(math.ceil(len(shown) / 2), 2, squeeze=False).ravel()
@@ -144,7 +147,7 @@ def draw_ecdf(scenes: Mapping[str, Histograms], ends: Mapping[str, float]) -> Fi
 
 
 def _draw_curves(axes: Axes, scenes: Mapping[str, MeasureByOP], everything: MeasureByOP) -> None:
-    """One curve a scene, and a dashed one of all recurrent voxels, where there are any."""
+    """Draw one curve a scene, and a dashed one of all recurrent voxels, where there are any."""
     for k, (name, found) in enumerate(scenes.items()):
         axes.step(found.values, found.ecdf(), where="post", color=color(k), label=f"{name}, all voxels")
     recurrent = everything.ecdf(RECURRENT)
@@ -160,7 +163,7 @@ def _draw_curves(axes: Axes, scenes: Mapping[str, MeasureByOP], everything: Meas
 
 
 def informative(units: Iterable[Histograms]) -> dict[str, float]:
-    """Where the x axis of each measure ends, so that every scene's curve is seen up to its last percent."""
+    """Return where the x axis of each measure ends, so that every scene's curve is seen up to its last percent."""
 
     def end(found: MeasureByOP) -> float:
         reached = found.ecdf() >= INFORMATIVE
@@ -174,7 +177,7 @@ def informative(units: Iterable[Histograms]) -> dict[str, float]:
 
 
 def draw_persistence(backbones: Mapping[str, Histograms]) -> Figure:
-    """Each measure against OP, mean and interquartile range, and the number of voxels; one column a backbone."""
+    """Return each measure against OP, mean and interquartile range, and the number of voxels; one column a backbone."""
     from matplotlib.lines import Line2D
     from matplotlib.patches import Patch
 
@@ -216,7 +219,7 @@ def _draw_column(rows: Panels, found: Histograms, shade: str) -> None:
 
 
 def mark_op(axes: Axes, largest: float) -> None:
-    """Ticks at round OP on the logarithmic axis."""
+    """Mark round OP on the logarithmic axis."""
     from matplotlib.ticker import FixedLocator, NullLocator, ScalarFormatter
 
     ticks = range(1, 9) if largest <= 8 else (1, 2, 3, 5, 10, 20, 50, 100, 200, 500, 1000, 2000, 5000)
@@ -236,7 +239,7 @@ good when low (SBD, entropy), and the recurrent share, stand on an axis from 0."
 
 
 def draw_sweep(sweep: Sweep, backbones: Mapping[str, tuple[Level, ...]]) -> Figure:
-    """The recurrent share and every measure along a sweep; the values stand at equal distances, in order."""
+    """Return the recurrent share and every measure along a sweep; the values stand at equal distances, in order."""
     shown = measures()
     rows = math.ceil((1 + len(shown)) / 3)
     figure = canvas(PAGE, 2.5 if rows == 1 else 2.1 * rows)
@@ -264,7 +267,7 @@ def draw_sweep(sweep: Sweep, backbones: Mapping[str, tuple[Level, ...]]) -> Figu
 
 
 def positions(values: Sequence[float], levels: Sequence[Level], k: int, series: int) -> list[float]:
-    """Where the k-th of so many series has its levels along the x axis."""
+    """Return where the k-th of so many series has its levels along the x axis."""
     return [values.index(level.value) + APART * (k - (series - 1) / 2) for level in levels]
 
 
@@ -283,7 +286,7 @@ def settle_scale(axes: Axes, *, from_zero: bool) -> None:
 
 
 def mark_values(axes: Axes, sweep: Sweep, values: Sequence[float]) -> None:
-    """The swept values along the x axis, at equal distances."""
+    """Mark the swept values along the x axis, at equal distances."""
     axes.set_xticks(range(len(values)), [sweep.text(value) for value in values])
     axes.set_xlim(-0.35, len(values) - 0.65)
     axes.margins(y=0.1)  # a point at an axis' end is seen whole
@@ -301,7 +304,7 @@ def draw_line(
     marker: str = "o",
     open_: bool = False,
 ) -> None:
-    """A measure along a sweep, with its interval, else the standard deviation over repeats; `open_` dashes it."""
+    """Draw a measure along a sweep, with its interval, else its deviation over repeats; `open_` dashes it."""
     means = [level.mean(measure) for level in levels]
     errors = [_error(level, measure, interval) for level in levels]
     axes.errorbar(
@@ -320,7 +323,7 @@ def draw_line(
 def _error(
     level: Level, measure: Callable[[Pooled], float], interval: Callable[[Pooled], Estimate] | None
 ) -> tuple[float, float]:
-    """How far the bar reaches below and above the mean; 0 where that is not known."""
+    """Return how far the bar reaches below and above the mean; 0 where that is not known."""
     if interval is None:
         sd = level.spread(measure).sd
         return (0.0, 0.0) if math.isnan(sd) else (sd, sd)

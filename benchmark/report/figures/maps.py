@@ -45,7 +45,7 @@ WIDE = 1.4
 
 
 def draw_stability(above: FromAbove) -> Figure:
-    """Stability category of the topmost voxels and the measures that have a panel, with a scale bar."""
+    """Return stability category of the topmost voxels and the measures that have a panel, with a scale bar."""
     table, rows = above.table, above.rows
     shown = [measure for measure in measures() if measure.panel]
     figure, (kind, *panels) = map_panels(rows, 1 + len(shown))
@@ -66,11 +66,12 @@ def draw_stability(above: FromAbove) -> Figure:
 class WorstFrames:
     """The frames of a sequence with the most flicker, the worst first, as small images.
 
-    frames   (n,) their indices
-    flicker  (n,) percent, camera motion removed
-    labels   (n, h, w) rows 0..K-1, and above where a pixel has none
-    changed  (n, h, w) pixels whose label differs from that of the frame before
-    color    (n, h, w, 3); None where the dataset has no images
+    Attributes:
+        frames: (n,) their indices.
+        flicker: (n,) percent, camera motion removed.
+        labels: (n, h, w) rows 0..K-1, and above where a pixel has none.
+        changed: (n, h, w) pixels whose label differs from that of the frame before.
+        color: (n, h, w, 3); None where the dataset has no images.
     """
 
     frames: Int64
@@ -84,11 +85,12 @@ class WorstFrames:
 class Overview:
     """What one frame showed to the camera and to the backbone.
 
-    frame      its index
-    labels     (H, W) predicted rows 0..K-1; K and above: ignored
-    color      (H, W, 3) the image; None where the dataset has none
-    palette    (K, 3) RGB of the classes
-    worst      the frames with the most flicker; None where no pixel changed
+    Attributes:
+        frame: Its index.
+        labels: (H, W) predicted rows 0..K-1; K and above: ignored.
+        color: (H, W, 3) the image; None where the dataset has none.
+        palette: (K, 3) RGB of the classes.
+        worst: The frames with the most flicker; None where no pixel changed.
     """
 
     frame: int
@@ -101,7 +103,8 @@ class Overview:
     def load(cls, path: Path) -> Overview:
         """Read SCENE__BACKBONE.npz with the arrays frame, labels, palette and, where there is one, color.
 
-        Raises DataError where the file is damaged or of another kind.
+        Raises:
+            DataError: If the file is damaged or of another kind.
         """
         try:
             data = read_bytes(path)
@@ -122,7 +125,7 @@ class Overview:
 
 
 def draw_overview(above: FromAbove, overview: Overview) -> Figure:
-    """Image, prediction and the fused map from above, in one palette."""
+    """Return image, prediction and the fused map from above, in one palette."""
     table, rows = above.table, above.rows
     palette: Colors = [(int(r), int(g), int(b)) for r, g, b in overview.palette]
     images = [] if overview.color is None else [("image", overview.color)]
@@ -151,13 +154,16 @@ def draw_overview(above: FromAbove, overview: Overview) -> Figure:
 
 
 def legend_columns(names: Sequence[str]) -> int:
-    """So many columns of a legend with these names fit the page."""
+    """Return how many columns of a legend with these names fit the page."""
     longest = max(len(name) for name in names)
     return max(1, min(len(names), int(PAGE / (LEGEND_KEY + LEGEND_LETTER * longest))))
 
 
 def map_panels(rows: Int64, n: int) -> tuple[Figure, Sequence[Axes]]:
-    """A figure for n maps: up to three side by side, or for wide maps beneath each other in one column of the page."""
+    """Return a figure for n maps.
+
+    Up to three side by side, or for wide maps beneath each other in one column of the page.
+    """
     height, width = rows.shape
     if width >= WIDE * height:
         figure = canvas(COLUMN, n * (max(0.3, COLUMN * height / width) + 0.5))
@@ -172,18 +178,18 @@ def map_panels(rows: Int64, n: int) -> tuple[Figure, Sequence[Axes]]:
 
 
 def _painted(rows: Int64, label: npt.NDArray[Any], colors: Colors) -> Image:
-    """The map in the colours of its voxels' labels (H, W, 3), blank where there are none."""
+    """Return the map in the colours of its voxels' labels (H, W, 3), blank where there are none."""
     return _colored(np.where(rows == EMPTY, EMPTY, label.astype(np.int64)[rows]), colors)
 
 
 def _colored(labels: Int64, colors: Colors) -> Image:
-    """A label map in colours (H, W, 3), blank where a label is EMPTY."""
+    """Return a label map in colours (H, W, 3), blank where a label is EMPTY."""
     image: Image = np.array([*colors, BLANK], dtype=np.uint8)[labels]
     return image
 
 
 def _draw_categories(figure: Figure, axes: Axes, rows: Int64, category: UInt8) -> None:
-    """The categories with their names on a colour bar."""
+    """Draw the categories with their names on a colour bar."""
     from matplotlib.cm import ScalarMappable
     from matplotlib.colors import BoundaryNorm, ListedColormap
 
@@ -198,7 +204,7 @@ def _draw_categories(figure: Figure, axes: Axes, rows: Int64, category: UInt8) -
 def _draw_measure(
     figure: Figure, axes: Axes, rows: Int64, values: Float64, ends: tuple[float, float], *, best_first: bool = True
 ) -> None:
-    """A measure in colour between two ends, with its colour bar; undefined values are grey, empty cells blank."""
+    """Draw a measure in colour between two ends, with its colour bar; undefined values are grey."""
     import matplotlib
     from matplotlib.cm import ScalarMappable
     from matplotlib.colors import Normalize
@@ -212,21 +218,21 @@ def _draw_measure(
 
 
 def _beyond(values: Float64, ends: tuple[float, float]) -> str:
-    """At which ends of a scale there are values beyond it: a colour bar has an arrow there."""
+    """Return at which ends of a scale there are values beyond it: a colour bar has an arrow there."""
     with np.errstate(invalid="ignore"):
         below, above = bool(np.any(values < ends[0] - 1e-9)), bool(np.any(values > ends[1] + 1e-9))
     return {(True, True): "both", (True, False): "min", (False, True): "max"}.get((below, above), "neither")
 
 
 def color_bar(figure: Figure, axes: Axes, colors: ScalarMappable, extend: str = "neither") -> Colorbar:
-    """Beneath a panel."""
+    """Draw a colour bar beneath a panel."""
     bar = figure.colorbar(colors, ax=axes, location="bottom", aspect=40, pad=0.03, extend=extend)
     bar.outline.set_linewidth(0.4)
     return bar
 
 
 def framed(axes: Axes) -> None:
-    """A thin frame and no ticks: the scale bar says the size."""
+    """Draw a thin frame and no ticks: the scale bar says the size."""
     axes.set(xticks=[], yticks=[], anchor="N")
     axes.grid(visible=False)
     for spine in axes.spines.values():
@@ -234,13 +240,13 @@ def framed(axes: Axes) -> None:
 
 
 def scale_length(width: float) -> float:
-    """A round length of at most a quarter of the width: 1, 2 or 5 times a power of ten."""
+    """Return a round length of at most a quarter of the width: 1, 2 or 5 times a power of ten."""
     power = 10.0 ** math.floor(math.log10(width / 4))
     return max(step * power for step in (1, 2, 5) if step * power <= width / 4)
 
 
 def scale_bar(axes: Axes, cells: int, cell: float) -> None:
-    """A bar of round length in the lower left corner."""
+    """Draw a bar of round length in the lower left corner."""
     from matplotlib.patheffects import withStroke
 
     length = scale_length(cells * cell)
@@ -277,7 +283,7 @@ class Views:
         return self._sums[slug]
 
     def above(self, record: Record, up: npt.ArrayLike) -> FromAbove:
-        """The unit's voxels that are seen from above."""
+        """Return the unit's voxels that are seen from above."""
         slug = record.unit.slug
         if self._last is None or self._last[0] != slug:
             large = record.in_tiles and record.summary.table.voxels > MOST
@@ -304,7 +310,7 @@ class Panel:
 
 
 def draw_changes(table: VoxelTable, up: npt.ArrayLike, panels: Sequence[Panel]) -> Figure:
-    """The largest change in each column of voxels, worse in orange, better in blue."""
+    """Return the largest change in each column of voxels, worse in orange, better in blue."""
     axis, view = best_view(table, up)[1:]
     seen = [top_down(table, axis, np.abs(panel.values)) for panel in panels]
     figure, axes = map_panels(seen[0][0], len(panels))
@@ -333,7 +339,7 @@ def _draw(figure: Figure, axes: Axes, panel: Panel, rows: Int64) -> None:
 
 
 def _number(axes: Axes, panel: Panel, table: VoxelTable, axis: Float64, height: int, cell: float) -> None:
-    """The numbers of the places, beside their centres."""
+    """Draw the numbers of the areas, beside their centres."""
     from matplotlib.patheffects import withStroke
 
     right, ahead, _ = level_axes(axis)

@@ -58,8 +58,9 @@ _STYLE: Any = {
 class Figure:
     """A figure of the study: the name of its files, what to write beside it, and what draws it.
 
-    alt   for readers who do not see it
-    unit  whose voxels it shows as a map; empty: it shows none
+    Attributes:
+        alt: For readers who do not see it.
+        unit: Whose voxels it shows as a map; empty: it shows none.
     """
 
     name: str
@@ -105,19 +106,19 @@ def _without_formulas(canvas: Canvas) -> None:
 
 
 def canvas(width: float, height: float) -> Canvas:
-    """An empty figure of this size in inches; it belongs to no window and no global state."""
+    """Return an empty figure of this size in inches; it belongs to no window and no global state."""
     from matplotlib.figure import Figure as Canvas
 
     return Canvas(figsize=(width, height), layout="constrained")
 
 
 def color(k: int) -> str:
-    """The k-th colour; they repeat after eight."""
+    """Return the k-th colour; they repeat after eight."""
     return COLORS[k % len(COLORS)]
 
 
 def legend_columns(names: Sequence[str], width: float) -> int:
-    """How many entries of a legend stand beside each other in a figure that wide (inches), so that none is cut."""
+    """Return how many entries of a legend fit side by side in a figure that wide (inches)."""
     widths = [0.55 + 0.06 * len(name) for name in names]
     return len(names) if sum(widths) <= width else max(1, int(width / max(widths)))
 
@@ -127,5 +128,5 @@ LETTERS = "abcdefghijklmnop"
 
 
 def mark_panel(axes: Axes, letter: str, title: str) -> None:
-    """Head a panel as the paper does: '(a) title'."""
+    """Title a panel as the paper does: '(a) title'."""
     axes.set_title(f"({letter}) {title}", loc="left")

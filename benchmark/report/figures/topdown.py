@@ -35,7 +35,10 @@ OUTLIERS = 0.01
 
 
 def level_axes(up: npt.ArrayLike) -> tuple[Float64, Float64, Float64]:
-    """Right-handed unit vectors (right, ahead, up): right is the world's x axis, or y where up is x, laid level."""
+    """Return right-handed unit vectors (right, ahead, up).
+
+    Right is the world's x axis, or y where up is x, laid level.
+    """
     up_axis = np.asarray(up, dtype=np.float64) / np.linalg.norm(up)
     along = np.eye(3)[0 if abs(up_axis[0]) < 0.9 else 1]
     right = along - (along @ up_axis) * up_axis
@@ -44,7 +47,7 @@ def level_axes(up: npt.ArrayLike) -> tuple[Float64, Float64, Float64]:
 
 
 def top_down(table: VoxelTable, up: npt.ArrayLike, rank: Float64 | None = None) -> tuple[Int64, float]:
-    """The row of the topmost voxel in each cell (H, W), EMPTY where there is none, and the edge of a cell in metres.
+    """Return the row of the topmost voxel in each cell (H, W), or EMPTY, and the edge of a cell in metres.
 
     rank (n,) says which voxel of a cell is shown instead of the topmost one: the highest.
 
@@ -69,7 +72,7 @@ def top_down(table: VoxelTable, up: npt.ArrayLike, rank: Float64 | None = None) 
 
 
 def covered(plane: Float64, up: Float64, voxel_size: float, cell: float) -> tuple[Int64, Int64]:
-    """The cells (m, 2) of an edge, and the voxel (m,) that covers each, by the voxels' centres (n, 2) in the plane.
+    """Return the cells (m, 2) of an edge, and the voxel (m,) that covers each, by centres (n, 2) in the plane.
 
     Where up is an axis of the world a cell is a column of voxels; else each voxel covers the cells that a level square
     of its size touches, where a cell is one voxel.
@@ -82,7 +85,7 @@ def covered(plane: Float64, up: Float64, voxel_size: float, cell: float) -> tupl
 
 
 def topmost(tiles: Iterable[VoxelTable], up: npt.ArrayLike) -> VoxelTable:
-    """Of a map that comes tile by tile the voxels that can be seen from above: a table that does not grow with it."""
+    """Return the voxels of a map in tiles that can be seen from above: a table that does not grow with it."""
     factor, parts = 1, list[VoxelTable]()
     for tile in tiles:
         parts.append(_tops(tile, up, factor))
@@ -93,7 +96,7 @@ def topmost(tiles: Iterable[VoxelTable], up: npt.ArrayLike) -> VoxelTable:
 
 
 def _tops(table: VoxelTable, up: npt.ArrayLike, factor: int) -> VoxelTable:
-    """The topmost voxel of each cell of so many voxels' width."""
+    """Return the topmost voxel of each cell of so many voxels' width."""
     right, ahead, up_axis = level_axes(up)
     cells = np.floor(table.centers @ np.stack([right, ahead], axis=1) / (factor * table.voxel_size)).astype(np.int64)
     order = np.lexsort([-(table.centers @ up_axis), cells[:, 1], cells[:, 0]])
@@ -102,7 +105,7 @@ def _tops(table: VoxelTable, up: npt.ArrayLike, factor: int) -> VoxelTable:
 
 
 def best_view(table: VoxelTable, up: npt.ArrayLike) -> tuple[Mask, Float64, str]:
-    """Which voxels (n,) to look at, against which axis (3,), and what that view is called."""
+    """Return which voxels (n,) to look at, against which axis (3,), and what that view is called."""
     right, ahead, up_axis = level_axes(up)
     every = np.ones(len(table), dtype=np.bool_)
     centers = table.centers
@@ -123,7 +126,7 @@ def best_view(table: VoxelTable, up: npt.ArrayLike) -> tuple[Mask, Float64, str]
 
 
 def _columns(centers: Float64, axis: Float64, voxel_size: float) -> Int64:
-    """A number (n,) for the column of cells along an axis that each voxel lies in."""
+    """Return a number (n,) for the column of cells along an axis that each voxel lies in."""
     right, ahead, _ = level_axes(axis)
     x, y = (np.floor(centers @ along / voxel_size).astype(np.int64) for along in (right, ahead))
     columns: Int64 = (x - x.min()) * (np.ptp(y) + 1) + (y - y.min())
@@ -131,7 +134,7 @@ def _columns(centers: Float64, axis: Float64, voxel_size: float) -> Int64:
 
 
 def _numbered(columns: Int64) -> tuple[Int64, int]:
-    """The same numbers without gaps (n,), and how many there are."""
+    """Return the same numbers without gaps (n,), and how many there are."""
     if columns.max() > SPARSE * len(columns):
         numbers, own = np.unique(columns, return_inverse=True)
         return own, len(numbers)
@@ -145,11 +148,12 @@ def _numbered(columns: Int64) -> tuple[Int64, int]:
 class FromAbove:
     """The voxels that are seen from above, or from where more of them shows.
 
-    table  these voxels alone
-    shown  (n,) whether a voxel of the map is one of them
-    rows   (H, W) the row of each cell's voxel in `table`, EMPTY where there is none
-    cell   the edge of a cell in metres
-    view   what the view is called
+    Attributes:
+        table: These voxels alone.
+        shown: (n,) whether a voxel of the map is one of them.
+        rows: (H, W) the row of each cell's voxel in `table`, EMPTY where there is none.
+        cell: The edge of a cell in metres.
+        view: What the view is called.
     """
 
     table: VoxelTable

@@ -50,7 +50,7 @@ BUILDERS = (
 
 
 def tables(result: Result) -> list[Table]:
-    """Every table that the study has records for, in the paper's order."""
+    """Return every table that the study has records for, in the paper's order."""
     shown = of_interest(result)
     return [*remedy_tables(result), *(table for build in BUILDERS for table in build(shown))]
 
@@ -61,7 +61,7 @@ def write_tables(result: Result, folder: str | Path) -> list[Path]:
 
 
 def save_tables(made: Sequence[Table], folder: str | Path) -> list[Path]:
-    """The same of tables that are made already."""
+    """Return the same of tables that are made already."""
     written = []
     for table in made:
         stem = Path(folder) / "tables" / table.name

@@ -22,7 +22,7 @@ RIGHT = (ACCURACY, MIOU, ECE, BRIER)
 
 
 def ceiling(result: Result) -> list[Table]:
-    """Disagreement that the ground truth's labels have too, and the rest."""
+    """Return disagreement that the ground truth's labels have too, and the rest."""
     columns = (
         Column("disagreement", "1 - PSA", 4, "lower"),
         Column("geometry", "geometry's", 4),
@@ -44,7 +44,7 @@ def ceiling(result: Result) -> list[Table]:
 
 
 def correctness(result: Result) -> list[Table]:
-    """Right beside stable: by stratum of OP, and the four quadrants."""
+    """Return right beside stable: by stratum of OP, and the four quadrants."""
     return [*_correct_by_stratum(result), *_quadrants(result)]
 
 
@@ -98,12 +98,12 @@ def _quadrants(result: Result) -> list[Table]:
 
 
 def _lost(take: Callable[[Losses], float | Estimate]) -> Number:
-    """A number of geometry's part; NaN where that is not known."""
+    """Return a number of geometry's part; NaN where that is not known."""
     return lambda found: math.nan if found.geometry is None else take(found.geometry)
 
 
 def _quadrant(take: Callable[[Quadrants], float | Estimate]) -> Number:
-    """A number of the quadrants; NaN without ground truth."""
+    """Return a number of the quadrants; NaN without ground truth."""
     return lambda found: math.nan if found.correctness is None else take(found.correctness.quadrants)
 
 
@@ -115,7 +115,7 @@ def _stratum_rows(strata: Sequence[Sequence[Correctness]]) -> tuple[Row, ...]:
 
 
 def _right(rows: Sequence[Correctness]) -> list[float]:
-    """The macro mean of each of RIGHT."""
+    """Return the macro mean of each of RIGHT."""
     values = [(row.accuracy, row.miou, row.ece, row.brier) for row in rows]
     return [macro_mean(column) for column in zip(*values, strict=True)]
 
@@ -131,7 +131,7 @@ _COMMON = (
 
 
 def comparison(result: Result) -> list[Table]:
-    """Paired differences, ranking, and what each map covers; one group a scene."""
+    """Return paired differences, ranking, and what each map covers; one group a scene."""
     if not result.comparisons:
         return []
     covered = coverage_table({found.scene: found.coverage for found in result.comparisons})
@@ -203,7 +203,7 @@ def _ranking_rows(found: BackboneComparison) -> tuple[Row, ...]:
 
 
 def ignored_table(observations: Mapping[str, ComparedObservations]) -> Table:
-    """What each backbone left out, by scene."""
+    """Return what each backbone left out, by scene."""
     columns = (
         Column("backbone", "Backbone"),
         Column("missing_percent", "left out (%)", 1),
@@ -230,7 +230,7 @@ def _ignored_rows(found: ComparedObservations) -> tuple[Row, ...]:
 
 
 def coverage_table(covered: Mapping[str, Sequence[MapCoverage]]) -> Table:
-    """What each map covers, by scene."""
+    """Return what each map covers, by scene."""
     columns = (
         Column("backbone", "Backbone"),
         Column("voxels", "Voxels", 0),
@@ -261,7 +261,7 @@ def _coverage_row(row: MapCoverage) -> Row:
 
 
 def correlogram(result: Result) -> list[Table]:
-    """Alpha where views differ by a stated angle, and for the nearest and the farthest observations."""
+    """Return alpha where views differ by a stated angle, and for the nearest and the farthest observations."""
     low, high = STANDARD
     stated = f"{low:g} to {high:g} degrees apart"
     columns = (

@@ -31,7 +31,7 @@ CAPTION = (
 
 
 def remedy_tables(result: Result) -> list[Table]:
-    """One table of all models, where filters were judged."""
+    """Return one table of all models, where filters were judged."""
     found = remedies(result)
     if not found:
         return []
@@ -43,7 +43,7 @@ def remedy_tables(result: Result) -> list[Table]:
 
 
 def row(remedy: Remedy) -> Row:
-    """Its cells."""
+    """Return its cells."""
     return (
         remedy.filters or "none",
         100 * remedy.flicker,
@@ -59,5 +59,5 @@ def row(remedy: Remedy) -> Row:
 
 
 def marked(found: Remedies, remedy: Remedy) -> str:
-    """'*' for the one to use, '!' for one that is steadier and worse."""
+    """Return '*' for the one to use, '!' for one that is steadier and worse."""
     return "*" if remedy == found.best else "!" if remedy in found.misleading else ""

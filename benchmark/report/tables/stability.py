@@ -32,12 +32,15 @@ SBD_OVER = "Means of SBD (bits) run over the voxels seen twice or more."
 
 
 def of_measures(*, compared: bool = False, prefix: str = "", over: str = "") -> list[Column]:
-    """A column a measure: the paper prints more decimals where it compares."""
+    """Return a column a measure: the paper prints more decimals where it compares."""
     return [Column.of(measure, compared=compared, prefix=prefix, over=over) for measure in measures()]
 
 
 def scenes(result: Result) -> list[Table]:
-    """The multi-scene table: each scene, then totals and macro means (paper, Multi-Scene Voxel-Level Stability)."""
+    """Return the multi-scene table.
+
+    Each scene, then totals and macro means (paper, Multi-Scene Voxel-Level Stability).
+    """
     records = result.select()
     if not records:
         return []
@@ -60,7 +63,7 @@ def scenes(result: Result) -> list[Table]:
 
 
 def persistence(result: Result) -> list[Table]:
-    """The persistence strata, the voxels of all scenes pooled (paper, Observation Persistence)."""
+    """Return the persistence strata, the voxels of all scenes pooled (paper, Observation Persistence)."""
     records = result.select()
     if not records:
         return []
@@ -80,7 +83,7 @@ def persistence(result: Result) -> list[Table]:
 
 
 def classes(result: Result) -> list[Table]:
-    """The dominant classes, the voxels of all scenes pooled (paper, Class-wise Stability)."""
+    """Return the dominant classes, the voxels of all scenes pooled (paper, Class-wise Stability)."""
     records = result.select()
     if not records:
         return []
@@ -97,7 +100,10 @@ def classes(result: Result) -> list[Table]:
 
 
 def cross_backbone(result: Result) -> list[Table]:
-    """The backbones in one taxonomy: all voxels and the recurrent ones (paper, Cross-Backbone Temporal Stability)."""
+    """Return the backbones in one taxonomy.
+
+    All voxels and the recurrent ones (paper, Cross-Backbone Temporal Stability).
+    """
     records = comparable(result)
     if not records:
         return []
@@ -111,14 +117,17 @@ def cross_backbone(result: Result) -> list[Table]:
 
 
 def comparable(result: Result) -> tuple[Record, ...]:
-    """Records of several backbones in one taxonomy: those fused for it, else the base ones where they share theirs."""
+    """Return records of several backbones in one taxonomy.
+
+    Those fused for it, else the base ones where they share theirs.
+    """
     records = result.select(SHARED) or result.select()
     several = len(by_backbone(records)) > 1
     return records if several and len({record.summary.taxonomy for record in records}) == 1 else ()
 
 
 def settings(records: Sequence[Record]) -> str:
-    """What the units have in common, as a sentence."""
+    """Return what the units have in common, as a sentence."""
     sizes = sorted({record.summary.table.voxel_size for record in records})
     spaces = dict.fromkeys(f"{record.summary.taxonomy} (K = {record.summary.table.K})" for record in records)
     return f"Voxels of {', '.join(f'{size:g}' for size in sizes)} m, taxonomy {', '.join(spaces)}."
@@ -141,7 +150,7 @@ def _scene_total(records: Sequence[Record]) -> Row:
 
 
 def _macro(tables: Sequence[TableSummary]) -> list[float]:
-    """The macro mean of each measure."""
+    """Return the macro mean of each measure."""
     return [macro_mean([table[measure] for table in tables]) for measure in measures()]
 
 
@@ -181,7 +190,7 @@ _COLUMNS = (
 
 
 def overview(result: Result) -> list[Table]:
-    """One row a backbone."""
+    """Return one row a backbone."""
     records = result.select()
     if not records:
         return []
@@ -211,7 +220,7 @@ def _row(backbone: str, records: Sequence[Record]) -> Row:
 
 
 def sensitivity(result: Result) -> list[Table]:
-    """One table a sweep (paper, Sensitivity to World-Space Association), and one with what thinning does not change."""
+    """Return one table a sweep (paper, Sensitivity to World-Space Association), and one with agreement."""
     found = [(_table(result, sweep), _agreement_table(result, sweep)) for sweep in swept(result)]
     return [table for pair in found for table in pair if table is not None]
 
@@ -241,7 +250,7 @@ def _table(result: Result, sweep: Sweep) -> Table:
 
 
 def _agreement_table(result: Result, sweep: Sweep) -> Table | None:
-    """None where the units have no statistics, as in studies of earlier versions."""
+    """Return the table of agreement; None where the units have no statistics."""
     columns = (
         Column("value", sweep.header),
         Column("mean_op", "Mean OP", 2),
@@ -316,7 +325,7 @@ _REGIONS = (
 
 
 def flicker(result: Result) -> list[Table]:
-    """Frame-wise flicker, macro means by backbone, and scene by scene (paper, Frame-wise Temporal Semantic Flicker)."""
+    """Return flicker by backbone, and scene by scene (paper, Frame-wise Temporal Semantic Flicker)."""
     methods = _by_method(result)
     if not methods:
         return []
@@ -336,7 +345,7 @@ def flicker(result: Result) -> list[Table]:
 
 
 def _by_method(result: Result) -> dict[str, dict[str, ImageSpace]]:
-    """By backbone and scene; regions without classes have flicker only."""
+    """Group by backbone and scene; regions without classes have flicker only."""
     methods: dict[str, dict[str, ImageSpace]] = {}
     for record in result.select():
         methods.setdefault(record.unit.backbone, {})[record.unit.scene] = record.image_space
@@ -366,7 +375,7 @@ LARGEST = "Largest difference"
 
 
 def fusion(result: Result) -> list[Table]:
-    """Each backend beside the base one, over the scenes that every backend fused."""
+    """Return each backend beside the base one, over the scenes that every backend fused."""
     groups = tuple(group for name in result.backbones if (group := _group(result, name)) is not None)
     if not groups:
         return []
@@ -389,7 +398,7 @@ def fusion(result: Result) -> list[Table]:
 
 
 def compared(result: Result) -> list[Table]:
-    """Where a backend that associates pixels and voxels in another way leaves the base one's map."""
+    """Return where a backend that associates pixels and voxels in another way leaves the base one's map."""
     if not result.compared:
         return []
     titles = {"op": "OP", **{measure.key: measure.title for measure in measures() if not measure.lowest_op > 1}}
@@ -420,7 +429,7 @@ def _compared_row(row: Agreement, names: Iterable[str]) -> Row:
 
 
 def agreement(result: Result) -> list[Table]:
-    """How far each backend's map agrees with the base one's, voxel by voxel."""
+    """Return how far each backend's map agrees with the base one's, voxel by voxel."""
     if not result.agreement:
         return []
     titles = {"op": "OP", **{measure.key: measure.title for measure in measures()}, "evidence": "Evidence"}
@@ -476,7 +485,7 @@ def _backend_row(backend: str, mean: Pooled, base: Pooled) -> Row:
 
 
 def reduced(result: Result) -> list[Table]:
-    """Soft scores reduced to each pixel's likeliest class, beside hard labels: what the two compare by."""
+    """Return soft scores reduced to each pixel's likeliest class, beside hard labels: what the two compare by."""
     records = result.select()
     if len({record.summary.reduced is None for record in records}) < 2:
         return []
@@ -506,7 +515,7 @@ def _reduced_row(record: Record) -> Row:
 
 
 def voxel_sizes(result: Result) -> list[Table]:
-    """Alpha at half, once and twice the voxel size, from some frames."""
+    """Return alpha at half, once and twice the voxel size, from some frames."""
     groups = tuple(
         Group(name, rows)
         for name, records in by_backbone(result.select()).items()

@@ -30,7 +30,7 @@ Number = Callable[[MapStatistics], float | Estimate]
 
 
 def temporal_agreement(result: Result) -> list[Table]:
-    """Alpha and what it rests on, and agreement at the voxels, which depends on their size."""
+    """Return alpha and what it rests on, and agreement at the voxels, which depends on their size."""
     columns = (
         Column.of(ALPHA),
         Column("cells", "Cells", 0),
@@ -67,7 +67,7 @@ def temporal_agreement(result: Result) -> list[Table]:
 
 
 def class_agreement(result: Result) -> list[Table]:
-    """Alpha of each class against all others; macro means over scenes."""
+    """Return alpha of each class against all others; macro means over scenes."""
     judged = judged_records(result)
     groups = tuple(Group(name, _class_rows([found for _, found in rows])) for name, rows in judged.items())
     if not any(group.rows for group in groups):
@@ -95,7 +95,7 @@ def class_agreement(result: Result) -> list[Table]:
 
 
 def drift(result: Result) -> list[Table]:
-    """SBD beside what a random order of the same observations gives, and what goes one way in time."""
+    """Return SBD beside what a random order of the same observations gives, and what goes one way in time."""
     columns = (
         Column("voxels", "Voxels", 0),
         Column("sbd", "observed", 4, over="SBD (bits)"),
@@ -128,7 +128,7 @@ def drift(result: Result) -> list[Table]:
 
 
 def uncertainty(result: Result) -> list[Table]:
-    """The entropy of the belief, within frames and between them."""
+    """Return the entropy of the belief, within frames and between them."""
     columns = (
         Column.of(ENTROPY),
         Column("within", "within frames", 4, "lower"),
@@ -154,7 +154,7 @@ def uncertainty(result: Result) -> list[Table]:
 
 
 def verdicts(result: Result) -> list[Table]:
-    """What the evidence says of each backbone on each scene, and what to do."""
+    """Return what the evidence says of each backbone on each scene, and what to do."""
     judged = judged_records(result)
     if not judged:
         return []
@@ -187,7 +187,7 @@ def verdicts(result: Result) -> list[Table]:
 def by_scene(
     result: Result, name: str, title: str, caption: str, columns: Sequence[Column], numbers: Sequence[Number]
 ) -> list[Table]:
-    """One row a scene, and the macro mean of several; columns and units that have no number are left out."""
+    """Return one row a scene, and the macro mean of several; columns and units that have no number are left out."""
     cells = {
         backbone: {record.unit.scene: [take(found) for take in numbers] for record, found in rows}
         for backbone, rows in judged_records(result).items()
@@ -213,7 +213,7 @@ def by_scene(
 
 
 def judged_records(result: Result) -> dict[str, list[tuple[Record, MapStatistics]]]:
-    """The base units that have statistics, with these, by backbone."""
+    """Return the base units that have statistics, with these, by backbone."""
     judged = {
         backbone: [(record, record.statistics) for record in records if record.statistics is not None]
         for backbone, records in by_backbone(result.select()).items()
@@ -222,12 +222,12 @@ def judged_records(result: Result) -> dict[str, list[tuple[Record, MapStatistics
 
 
 def ordered(take: Callable[[DriftStatistics], float | Estimate]) -> Number:
-    """A number of drift beside random order; NaN where too few places tell what that gives."""
+    """Return a number of drift beside random order; NaN where too few places tell what that gives."""
     return lambda found: take(found.drift) if found.order_known else math.nan
 
 
 def of_cells(take: Callable[[CellAgreement], float]) -> Number:
-    """A number of the sampled cells; NaN where there are none."""
+    """Return a number of the sampled cells; NaN where there are none."""
     return lambda found: math.nan if found.cells is None else take(found.cells)
 
 
@@ -241,17 +241,17 @@ def _says(cell: Cell) -> bool:
 
 
 def _known(row: Sequence[float | Estimate]) -> list[int]:
-    """Which of the numbers are defined."""
+    """Return which of the numbers are defined."""
     return [k for k, cell in enumerate(row) if not math.isnan(_value(cell))]
 
 
 def _means(rows: Sequence[Sequence[float | Estimate]]) -> list[float]:
-    """The macro mean of each column."""
+    """Return the macro mean of each column."""
     return [macro_mean([_value(cell) for cell in column]) for column in zip(*rows, strict=True)]
 
 
 def grouped(rows: Iterable[T], name: Callable[[T], str]) -> dict[str, list[T]]:
-    """The rows of several units by their name, in order of appearance."""
+    """Return the rows of several units by their name, in order of appearance."""
     found: dict[str, list[T]] = {}
     for row in rows:
         found.setdefault(name(row), []).append(row)
@@ -278,7 +278,7 @@ def _class_rows(judged: Sequence[MapStatistics]) -> tuple[Row, ...]:
 
 
 def _one_or_mean(values: Sequence[Estimate]) -> float | Estimate:
-    """The one, with its interval; of several scenes the macro mean, which has none."""
+    """Return the one, with its interval; of several scenes the macro mean, which has none."""
     return values[0] if len(values) == 1 else macro_mean([found.value for found in values])
 
 

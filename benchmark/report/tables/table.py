@@ -29,10 +29,11 @@ Row = tuple[Cell, ...]
 class Column:
     """A column: its key in CSV and JSON, its header in print, the decimals of its numbers (None: text).
 
-    better      which way is good
-    signed      a positive number has its sign as well
-    scientific  in powers of ten: '2e-16'
-    over        the heading that it shares with its neighbours
+    Attributes:
+        better: Which way is good.
+        signed: A positive number has its sign as well.
+        scientific: In powers of ten: '2e-16'.
+        over: The heading that it shares with its neighbours.
     """
 
     key: str
@@ -45,12 +46,12 @@ class Column:
 
     @classmethod
     def of(cls, quantity: Quantity, *, compared: bool = False, prefix: str = "", over: str = "") -> Column:
-        """Of a measure: with the decimals of a summary, or of a comparison."""
+        """Return the column of a measure: with the decimals of a summary, or of a comparison."""
         digits = quantity.digits[compared]
         return cls(prefix + quantity.key, quantity.title, digits, quantity.better, over=over)
 
     def number(self, value: float) -> str:
-        """The rounded number; UNDEFINED where there is none."""
+        """Return the rounded number; UNDEFINED where there is none."""
         if math.isnan(value):
             return UNDEFINED
         if self.scientific and value:
@@ -59,7 +60,10 @@ class Column:
         return f"{rounded:{'+' if self.signed and rounded else ''},.{self.digits}f}"
 
     def text(self, cell: Cell) -> str:
-        """The cell in print: 'road', '286,565', '0.957', '0.957 ± 0.002' over repeats, '0.957 (0.951, 0.962)'."""
+        """Return the cell in print.
+
+        'road', '286,565', '0.957', '0.957 ± 0.002' over repeats, '0.957 (0.951, 0.962)'.
+        """
         if isinstance(cell, str):
             return cell
         if isinstance(cell, Estimate):
@@ -84,9 +88,10 @@ class Group:
 class Table:
     """A table of the study.
 
-    name     of its files
-    caption  what the numbers are, and over what the means run
-    by       what the groups are ('backbone'), the leading column of CSV and JSON; '' for one group without a name
+    Attributes:
+        name: Of its files.
+        caption: What the numbers are, and over what the means run.
+        by: What the groups are ('backbone'), the leading column of CSV and JSON; '' for one group without a name.
     """
 
     name: str
@@ -97,7 +102,7 @@ class Table:
     by: str = "backbone"
 
     def only(self, *keys: str) -> Table:
-        """The same with these columns alone."""
+        """Return the same with these columns alone."""
         at = [k for k, column in enumerate(self.columns) if column.key in keys]
 
         def cut(row: Row) -> Row:
@@ -107,7 +112,7 @@ class Table:
         return dataclasses.replace(self, columns=tuple(self.columns[k] for k in at), groups=groups)
 
     def rows(self) -> Iterator[tuple[str, Row]]:
-        """Each row, totals too, with the name of its group."""
+        """Yield each row, totals too, with the name of its group."""
         for group in self.groups:
             for row in (*group.rows, *([group.total] if group.total else [])):
                 yield group.name, row
@@ -126,7 +131,7 @@ LATEX_WIDTHS = (
 
 
 def to_csv(table: Table) -> str:
-    """Comma-separated, rounded, without thousands separators; an undefined number is an empty field."""
+    """Return comma-separated, rounded, without thousands separators; an undefined number is an empty field."""
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     parts = [_csv_parts([row[k] for _, row in table.rows()]) for k in range(len(table.columns))]
@@ -139,7 +144,7 @@ def to_csv(table: Table) -> str:
 
 
 def to_markdown(table: Table) -> str:
-    """A GitHub table under its title, the caption beneath."""
+    """Return a GitHub table under its title, the caption beneath."""
     headers = [_markdown(" ".join(filter(None, (c.over, c.header, ARROWS[c.better])))) for c in table.columns]
     rule = ["---" if column.digits is None else "---:" for column in table.columns]
     lines = [f"### {_markdown(table.title)}", "", _pipes(headers), _pipes(rule)]
@@ -151,7 +156,7 @@ def to_markdown(table: Table) -> str:
 
 
 def to_latex(table: Table) -> str:
-    """A float with booktabs rules (needs the package booktabs), laid out as the paper's tables."""
+    """Return a float with booktabs rules (needs the package booktabs), laid out as the paper's tables."""
     width = _width(table)
     fitting = [kind[1:] for kind in LATEX_WIDTHS if width <= kind[0]]
     environment, size = fitting[0] if fitting else ("table*", r"\footnotesize")
@@ -183,7 +188,7 @@ def to_latex(table: Table) -> str:
 
 
 def to_terminal(table: Table, width: int = 0) -> str:
-    """For a terminal: the title, the rows, the caption; as wide as the rows need, or folded to `width` columns."""
+    """Render for a terminal: title, rows, caption; as wide as the rows need, or folded to `width` columns."""
     from rich.box import SIMPLE_HEAD
     from rich.console import Console
     from rich.markup import escape
@@ -209,7 +214,10 @@ def to_terminal(table: Table, width: int = 0) -> str:
 
 
 def to_json(table: Table) -> dict[str, Any]:
-    """The JSON object, in full precision: {mean, sd, repeats} over repeats, {value, low, high} with an interval."""
+    """Return the JSON object, in full precision.
+
+    {mean, sd, repeats} over repeats, {value, low, high} with an interval.
+    """
     return {
         "name": table.name,
         "title": table.title,
@@ -223,7 +231,10 @@ def to_json(table: Table) -> dict[str, Any]:
 
 
 def sections(table: Table) -> Iterator[tuple[str, list[list[str]]]]:
-    """What lies between two rules: the rows of a group under its name, then its total; one group needs no heading."""
+    """Yield what lies between two rules: the rows of a group under its name, then its total.
+
+    One group needs no heading.
+    """
 
     def cells(row: tuple[Cell, ...]) -> list[str]:
         return [column.text(cell) for column, cell in zip(table.columns, row, strict=True)]
@@ -239,12 +250,15 @@ def _json_cell(cell: Cell) -> Any:
 
 
 def _leading(table: Table, cell: str) -> list[str]:
-    """The leading column, where the groups have names."""
+    """Return the leading column, where the groups have names."""
     return [csv_text(cell)] if table.by else []
 
 
 def _csv_parts(cells: Sequence[Cell]) -> list[str]:
-    """The fields of a column: beside its own that of the standard deviation over repeats, or those of the interval."""
+    """Return the fields of a column.
+
+    Beside its own that of the standard deviation over repeats, or those of the interval.
+    """
     if any(isinstance(cell, Spread) for cell in cells):
         return ["", "_sd"]
     return ["", "_low", "_high"] if any(isinstance(cell, Estimate) for cell in cells) else [""]
@@ -269,18 +283,18 @@ def _pipes(cells: list[str]) -> str:
 
 
 def _markdown(text: str) -> str:
-    """Text that Markdown shows as it is."""
+    """Return text that Markdown shows as it is."""
     text = re.sub(r"([\\`*_\[\]|#~])", r"\\\1", relations(" ".join(text.split())))
     return text.replace("&", "&amp;").replace("<", "&lt;").replace(">", "&gt;")
 
 
 def relations(text: str) -> str:
-    """Text with the signs for 'at most' and 'at least', where a format has them."""
+    """Return text with the signs for 'at most' and 'at least', where a format has them."""
     return text.replace("<=", "≤").replace(">=", "≥")
 
 
 def _width(table: Table) -> int:
-    """Characters of the widest line, two for the space between columns."""
+    """Return characters of the widest line, two for the space between columns."""
     cells = [
         [column.header, *(column.text(row[k]) for _, row in table.rows())] for k, column in enumerate(table.columns)
     ]
@@ -288,7 +302,7 @@ def _width(table: Table) -> int:
 
 
 def _latex_headers(table: Table) -> list[str]:
-    """The headers, under a line of those that columns share, where there are any."""
+    """Return the headers, under a line of those that columns share, where there are any."""
     headers = " & ".join(_latex(f"{column.header} {ARROWS[column.better]}") for column in table.columns) + r" \\"
     if not any(column.over for column in table.columns):
         return [headers]
@@ -310,7 +324,7 @@ _LATEX = {
 
 
 def _latex(text: str) -> str:
-    """Text that LaTeX shows as it is; the hyphen that leads a number is a minus sign, and ± stands close."""
+    """Return text that LaTeX shows as it is; the hyphen that leads a number is a minus sign, and ± stands close."""
     text = re.sub(r"(?<=\d) ± (?=\d)", "±", relations(" ".join(text.split())))
     text = re.sub(r"(^|(?<=\d )\(|, )-(?=\d)", "\\1\N{MINUS SIGN}", text)
     return "".join(_LATEX.get(character, character) for character in text)
