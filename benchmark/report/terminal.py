@@ -78,8 +78,8 @@ def _one(result: Result, record: Record) -> Iterator[str]:
         yield from _verdict(run)
     recurrent, shares = run.table.recurrent, run.table.categories
     if shares:
-        low, drifting, contested, stable = (_percent(shares[name]) for name in CATEGORIES)
-        yield f"  map  {stable} stable  {contested} contested  {drifting} drifting  {low} seen less than 3 times"
+        low, drifting, uncertain, stable = (_percent(shares[name]) for name in CATEGORIES)
+        yield f"  map  {stable} stable  {uncertain} uncertain  {drifting} drifting  {low} seen less than 3 times"
     yield from _flicker(record)
     yield from _classes([record])
     if run.worst_frames:
