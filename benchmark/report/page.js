@@ -39,7 +39,7 @@ const shade = (ramp, share) => {
   const at = Math.max(0, Math.min(1, share)) * (ramp.length - 1), low = Math.floor(at), high = Math.ceil(at), part = at - low;
   return ramp[low].map((channel, k) => Math.round(channel + (ramp[high][k] - channel) * part));
 };
-const NAMES = ["seen less than 3 times", "drifting", "contested", "stable"];
+const NAMES = ["seen less than 3 times", "drifting", "uncertain", "stable"];
 const MOST_OP = 20;
 
 const pixels = source => new Promise((resolve, reject) => {
