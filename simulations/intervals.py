@@ -25,7 +25,7 @@ from semstab.model.statistics import Interval
 from semstab.statistics.correlogram import correlogram
 from semstab.statistics.intervals import difference, estimate
 
-KEYS = ("alpha", "psa", "accuracy")
+KEYS = ("voxel_alpha", "psa", "accuracy")
 
 
 FLIGHTS = 8
@@ -95,16 +95,16 @@ def these_frames(count: int, seed: int) -> Iterator[Row]:
     """Floors of 2,000 to 50,000 voxels and a city, errors reaching half a voxel to twenty, all sorts of alpha."""
     for side in (45, 100, 224):
         for reach in (0.5, 2.0, 5.0, 10.0, 20.0):
-            flight = Flight(side=side, reach=reach)
-            yield from trials(flight, count, seed, THESE_FRAMES, ("alpha",), f"floor {side} x {side}, reach {reach:g}")
+            flight, name = Flight(side=side, reach=reach), f"floor {side} x {side}, reach {reach:g}"
+            yield from trials(flight, count, seed, THESE_FRAMES, ("voxel_alpha",), name)
     for reach in (0.5, 2.0, 5.0):
         yield from trials(
-            Flight(80, reach, city=True), count, seed, THESE_FRAMES, ("alpha",), f"city 80 x 80, reach {reach:g}"
+            Flight(80, reach, city=True), count, seed, THESE_FRAMES, ("voxel_alpha",), f"city 80 x 80, reach {reach:g}"
         )
     yield from trials(Flight(100, 2.0, coin=True), count, seed, THESE_FRAMES, KEYS, "floor 100 x 100, a coin")
     for soft, K in ((True, 2), (False, 5)):
         name = "floor 100 x 100, reach 2, " + ("scores" if soft else f"{K} classes")
-        flight, keys = Flight(100, 2.0, K=K, soft=soft), ("voxel_alpha" if soft else "alpha", "accuracy")
+        flight, keys = Flight(100, 2.0, K=K, soft=soft), ("voxel_alpha", "accuracy")
         yield from trials(flight, count, seed, THESE_FRAMES, keys, name)
     for ease in (2.0, 2.5, 3.0):
         yield from trials(
@@ -149,7 +149,7 @@ def _flown(count: int, seed: int, scope: Scope) -> Iterator[Row]:
 
 
 def _of_frames(
-    flight: Flight, count: int, seed: int, scope: Scope, where: str = "", key: str = "alpha"
+    flight: Flight, count: int, seed: int, scope: Scope, where: str = "", key: str = "voxel_alpha"
 ) -> Iterator[Row]:
     seen = "all see all" if flight.looks == flight.frames else "strips"
     name = ", ".join(filter(None, (f"{flight.frames} frames", flight.quality, seen, where)))
@@ -170,7 +170,7 @@ def differences(count: int, seed: int) -> Iterator[Row]:
 
 
 def _pairs(flight: Flight, count: int, seed: int, scope: Scope = THIS_SCENE, where: str = "") -> Iterator[Row]:
-    key = "voxel_alpha" if flight.soft else "alpha"
+    key = "voxel_alpha"
     found: dict[str, list[Interval]] = {"same frames": [], "two flights": []}
     for trial in range(count):
         rng = np.random.default_rng([seed, trial])
