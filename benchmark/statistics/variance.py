@@ -29,7 +29,7 @@ from semstab.statistics.cluster_sums import ClusterIndex, Statistic
 LASTING = {0.0: 1.0, 0.8: 1.0}
 """Correlations rho of the effects of successive frames, and their weights before the data."""
 
-REACHES = {0.0: 8.0, 0.2: 1.0}
+REACHES = {0.0: 4.0, 0.08: 1.0}
 """Correlation lengths of the effects of locations, as a share of the scene's extent, and their weights before the data:
 an effect that reaches as far as the scene cannot be told from none."""
 
