@@ -26,7 +26,7 @@ from threadpoolctl import ThreadpoolController
 from semstab.core.types import THESE_FRAMES, THIS_SCENE, Float64, Int64, Scope
 from semstab.statistics.cluster_sums import ClusterIndex, Statistic
 
-LASTING = {0.0: 1.0, 0.8: 1.0}
+LASTING = {0.0: 4.0, 0.8: 1.0}
 """Correlations rho of the effects of successive frames, and their weights before the data."""
 
 REACHES = {0.0: 4.0, 0.08: 1.0}
