@@ -40,7 +40,9 @@ FEW = 0.1
 """A part of a map's voxels below which it is said how few are in common."""
 
 OTHER_PIXELS = "the runs took other pixels of the frames (pixel_stride): what each left without a label is not compared"
-OTHER_OBSERVATIONS = "the runs are of other frames: nothing is paired on observations, and alpha is of each run's own"
+OTHER_OBSERVATIONS = (
+    "the runs are of other frames, or one kept no observations: alpha is of each run's own, and not paired"
+)
 BY_CUBES = (
     "compared are sums in the same cubes of space, each map with all its voxels; what needs them voxel by voxel is"
 )

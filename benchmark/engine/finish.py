@@ -20,7 +20,7 @@ from semstab.core.types import Float64, Mask
 from semstab.datasets import Scene
 from semstab.datasets.formats.disk import file_digest
 from semstab.engine.series import Series
-from semstab.engine.streams import ImageSpaceMeter, LiveMap, Stream, alpha_sums
+from semstab.engine.streams import ImageSpaceMeter, LiveMap, Stream
 from semstab.engine.tiles import TILE_OBSERVATIONS, TileResult
 from semstab.engine.work import Outcome, Start
 from semstab.errors import DataError
@@ -36,7 +36,7 @@ from semstab.model.records import EVENTS, FRAMES, OBSERVATIONS, OVERVIEW, SUMS, 
 from semstab.model.results import RECURRENT, STAGES, Agreement, FrameDrift, ReducedScores, UnitSummary, slug
 from semstab.model.voxels import VoxelTable
 from semstab.statistics import Analysis, CellObservations, MapSample, analyse
-from semstab.statistics.agreement import alpha_of, ratio_of
+from semstab.statistics.agreement import alpha_of, alpha_sums, ratio_of
 from semstab.statistics.verdict import Limits
 from semstab.task import Task, read
 

@@ -39,9 +39,9 @@ from semstab.model.frames import Frame
 from semstab.model.measures import mean
 from semstab.model.records import ImageSpace
 from semstab.model.results import FrameReport, SizeAlpha, Unit
-from semstab.model.voxels import Extent, VoxelTable
+from semstab.model.voxels import Extent
 from semstab.statistics import Sampler
-from semstab.statistics.agreement import alpha_columns, alpha_of
+from semstab.statistics.agreement import krippendorff_alpha
 from semstab.statistics.observations import CellObservations
 from semstab.task import Task, prepare, tasks_of, truth_task
 
@@ -427,10 +427,4 @@ class SizeSample:
         backend = create("numba", voxel_size=voxel_size, num_classes=self._K)
         for frame in frames:
             backend.integrate(frame)
-        return SizeAlpha(voxel_size, len(self._indices), float(alpha_of(alpha_sums(backend.table()))))
-
-
-def alpha_sums(table: VoxelTable) -> Float64:
-    """Return the sums over voxels from which Krippendorff's alpha of a map follows."""
-    sums = (alpha_columns(table.rows(some)).sum(axis=0) for some in table.evidence.chunks())
-    return sum(sums, np.zeros(3 + table.K))
+        return SizeAlpha(voxel_size, len(self._indices), krippendorff_alpha(backend.table()))

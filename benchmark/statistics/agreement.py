@@ -104,14 +104,10 @@ def kappa_of(sums: Float64) -> Float64:
     return _beyond_chance(observed, expected)
 
 
-def alpha_columns(table: VoxelTable, weights: Float64 | None = None) -> Float64:
-    """Return (n, 3 + K): what Krippendorff's alpha is a function of by its sums over voxels.
-
-    weights (n,) count voxels by themselves instead of by their OP: the same ones for several flights make their alphas
-    comparable where these saw some places more often than others.
-    """
+def alpha_columns(table: VoxelTable) -> Float64:
+    """Return (n, 3 + K): the columns whose sums over voxels, each counting by its OP, give Krippendorff's alpha."""
     again = table.op >= 2
-    w = np.where(again, table.op if weights is None else weights, 0.0)
+    w = np.where(again, table.op, 0.0)
     agreeing, own = w * np.where(again, psa(table), 0.0), w * table.self_sum / table.op
     return np.concatenate([np.stack([agreeing, w, own], axis=1), (w / table.op)[:, None] * table.evidence], axis=1)
 
