@@ -16,8 +16,8 @@ from pydantic import BaseModel
 from semstab.config import validated
 from semstab.core.registry import Entry, Registry
 from semstab.core.types import Float32, UInt8, UInt16
-from semstab.model.frames import Frame
-from semstab.model.labels import IGNORE_8BIT, LabelSpace
+from semstab.data.frames import Frame
+from semstab.data.labels import IGNORE_8BIT, LabelSpace
 
 SEGMENTER, SAM = "semstab.backbones.segmenter:Segmenter", "semstab.backbones.sam:"
 WITH_SEGFORMER, WITH_SAM = "pip install 'semstab[segformer]'", "pip install 'semstab[sam]'"

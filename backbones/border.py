@@ -12,9 +12,9 @@ import numpy.typing as npt
 
 from semstab.backbones import Backbone, Image, Prediction, Streamed, ask
 from semstab.core.types import Float32
+from semstab.data.frames import Frame
+from semstab.data.labels import LabelSpace, ignore_id
 from semstab.errors import ConfigError, DataError
-from semstab.model.frames import Frame
-from semstab.model.labels import LabelSpace, ignore_id
 
 # A backbone around another one: what filters, taxonomies and votes are made of.
 

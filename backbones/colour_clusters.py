@@ -14,8 +14,8 @@ from pydantic import BaseModel, Field
 from semstab.backbones import Backbone, Image, Prediction
 from semstab.config import Settings
 from semstab.core.types import Float32
+from semstab.data.labels import IGNORE_8BIT, LabelSpace
 from semstab.errors import ConfigError
-from semstab.model.labels import IGNORE_8BIT, LabelSpace
 
 Features = Float32
 

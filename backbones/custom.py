@@ -24,9 +24,9 @@ from pydantic import BaseModel, ConfigDict, Field
 from semstab.backbones import Backbone, Image, Labels, Prediction, content_digest, narrowed
 from semstab.backbones.border import Wrapped
 from semstab.backbones.names import class_names
+from semstab.data.frames import Frame
+from semstab.data.labels import IGNORE_8BIT, IGNORE_16BIT, LabelSpace
 from semstab.errors import ConfigError, DataError, MissingDependencyError, summarize_error
-from semstab.model.frames import Frame
-from semstab.model.labels import IGNORE_8BIT, IGNORE_16BIT, LabelSpace
 
 # Code that a user names: `FILE.py:NAME` or `package.module:NAME`, imported, and known by its content.
 

@@ -18,9 +18,9 @@ from semstab.backbones import Backbone, Image, Prediction, Streamed
 from semstab.backbones.border import Wrapped
 from semstab.core.files import MAX_YAML_BYTES, parse_yaml, read_limited
 from semstab.core.types import Float32, Mask
+from semstab.data.frames import Frame
+from semstab.data.labels import LEFT_OUT, LabelMapping, LabelSpace, ignore_id, name_key
 from semstab.errors import ConfigError, summarize_error
-from semstab.model.frames import Frame
-from semstab.model.labels import LEFT_OUT, LabelMapping, LabelSpace, ignore_id, name_key
 
 logger = logging.getLogger("semstab")
 

@@ -19,8 +19,8 @@ from semstab.backbones import Backbone, Image, Prediction, content_digest, narro
 from semstab.backbones.names import class_names
 from semstab.config import Settings
 from semstab.core.types import Float32, Int64
+from semstab.data.labels import IGNORE_8BIT, LabelSpace
 from semstab.errors import ConfigError, DataError, MissingDependencyError, summarize_error
-from semstab.model.labels import IGNORE_8BIT, LabelSpace
 
 # What runs a network that lies in a file: ONNX Runtime, or torch for TorchScript and exported programs.
 

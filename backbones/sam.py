@@ -26,9 +26,9 @@ from semstab.backbones.checkpoint import Checkpoint, ImageModelOptions, bilinear
 from semstab.config import Settings, read_yaml, validated
 from semstab.core.files import content_key, read_arrays, write_arrays
 from semstab.core.types import Float64, Mask, UInt8, UInt16
+from semstab.data.frames import Frame
+from semstab.data.labels import LabelSpace, ignore_id
 from semstab.errors import ConfigError, DataError
-from semstab.model.frames import Frame
-from semstab.model.labels import LabelSpace, ignore_id
 
 # The kinds of Segment Anything, which differ in their preprocessing.
 

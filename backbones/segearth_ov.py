@@ -18,8 +18,8 @@ from semstab.backbones import Backbone, Image, Prediction, content_digest, narro
 from semstab.backbones.checkpoint import Checkpoint, ModelOptions, bilinear
 from semstab.config import Settings, read_yaml, validated
 from semstab.core.types import Float32
+from semstab.data.labels import LabelSpace
 from semstab.errors import ConfigError, DataError, summarize_error
-from semstab.model.labels import LabelSpace
 
 # CLIP as a dense feature extractor: its last block lets each patch look at its like (Li et al. 2025, CVPR).
 

@@ -14,8 +14,8 @@ from semstab.backbones import Backbone, Image, Prediction, Streamed, narrowed
 from semstab.backbones.checkpoint import Checkpoint, SegmenterOptions, bilinear
 from semstab.backbones.heads import load_head
 from semstab.core.types import Float32
+from semstab.data.labels import IGNORE_8BIT, IGNORE_16BIT, LabelSpace
 from semstab.errors import ConfigError
-from semstab.model.labels import IGNORE_8BIT, IGNORE_16BIT, LabelSpace
 
 CHUNK_BYTES = 1 << 26
 """Memory for upsampled maps at a time."""

@@ -12,11 +12,11 @@ import numpy.typing as npt
 
 from semstab.core.registry import Entry, Registry
 from semstab.core.types import Float32, Float64, Int64, UInt16
+from semstab.data.events import Events
+from semstab.data.frames import Frame
+from semstab.data.results import FrameReport
+from semstab.data.voxels import Extent, VoxelTable
 from semstab.errors import ConfigError
-from semstab.model.events import Events
-from semstab.model.frames import Frame
-from semstab.model.results import FrameReport
-from semstab.model.voxels import Extent, VoxelTable
 
 OPEN3D_LIBRARIES = "libusb-1.0-0 libegl1 libgl1 libx11-6 libudev1 libidn2-0 libgomp1"
 

@@ -36,12 +36,12 @@ from semstab.backends.shared.observations import Change, MapTotal, Observed, Obs
 from semstab.backends.shared.score_loops import LANES
 from semstab.core.compiled import is_kept, settings
 from semstab.core.types import Float64, Int32, Int64, UInt16
+from semstab.data.events import Events
+from semstab.data.evidence import Evidence
+from semstab.data.frames import Frame, Intrinsics
+from semstab.data.results import FrameReport
+from semstab.data.voxels import Extent, VoxelTable
 from semstab.errors import ConfigError
-from semstab.model.events import Events
-from semstab.model.evidence import Evidence
-from semstab.model.frames import Frame, Intrinsics
-from semstab.model.results import FrameReport
-from semstab.model.voxels import Extent, VoxelTable
 
 # The log of observations that the numba backend keeps on request.
 

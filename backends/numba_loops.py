@@ -16,7 +16,7 @@ from semstab.backends.shared.beliefs import js_term, observe_row, plogp
 from semstab.backends.shared.keys import PARTITIONS, mix
 from semstab.backends.shared.pixel_keys import AHEAD, touch
 from semstab.core.compiled import compiled, parallel, serial
-from semstab.model.results import RECURRENT
+from semstab.data.results import RECURRENT
 
 ALONE, DENSE = -1, -2
 

@@ -20,11 +20,11 @@ from semstab.backends.shared.association import (
 )
 from semstab.backends.shared.observations import Change, MapTotal
 from semstab.core.types import Int32, Int64, Mask
-from semstab.model.events import Events
-from semstab.model.evidence import Evidence
-from semstab.model.frames import Frame
-from semstab.model.results import FrameReport
-from semstab.model.voxels import Extent, VoxelTable, index_columns
+from semstab.data.events import Events
+from semstab.data.evidence import Evidence
+from semstab.data.frames import Frame
+from semstab.data.results import FrameReport
+from semstab.data.voxels import Extent, VoxelTable, index_columns
 
 ONE_IN, MOST = 16, 10_000
 """One voxel in `ONE_IN` is in the sample; one in twice as many, and so on, where the map has more than `MOST` allow."""

@@ -21,11 +21,11 @@ from semstab.backends.shared.association import check_depth, check_frame, check_
 from semstab.backends.shared.columns import blocks_of, update_rows
 from semstab.backends.shared.observations import Change, MapTotal, Observed, ObservedScores
 from semstab.core.types import Int64
+from semstab.data.evidence import Evidence
+from semstab.data.frames import Frame
+from semstab.data.results import FrameReport
+from semstab.data.voxels import Extent, VoxelTable, index_columns
 from semstab.errors import ConfigError
-from semstab.model.evidence import Evidence
-from semstab.model.frames import Frame
-from semstab.model.results import FrameReport
-from semstab.model.voxels import Extent, VoxelTable, index_columns
 
 INITIAL_BYTES = 32 * 2**20
 """Memory for attributes that a new map takes at once: small maps never grow."""

@@ -22,9 +22,9 @@ from semstab.backends.shared.association import check_depth, check_frame
 from semstab.backends.shared.keys import PARTITIONS
 from semstab.backends.shared.observations import Observed
 from semstab.core.types import Int64
+from semstab.data.frames import Frame
+from semstab.data.labels import IGNORE_8BIT
 from semstab.errors import ConfigError
-from semstab.model.frames import Frame
-from semstab.model.labels import IGNORE_8BIT
 
 MARGIN = 1.25
 """Voxels beyond the band in which blocks are visited, from the centres of the voxels that hold a pixel's point: half a

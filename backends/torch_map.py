@@ -41,11 +41,11 @@ from semstab.backends.torch_storage import (
     evidence_of,
     on_device,
 )
+from semstab.data.evidence import Evidence
+from semstab.data.frames import Frame, Intrinsics
+from semstab.data.results import FrameReport
+from semstab.data.voxels import VoxelTable
 from semstab.errors import ConfigError, DataError
-from semstab.model.evidence import Evidence
-from semstab.model.frames import Frame, Intrinsics
-from semstab.model.results import FrameReport
-from semstab.model.voxels import VoxelTable
 
 
 def device_of(name: str | None) -> torch.device:

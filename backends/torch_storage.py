@@ -18,9 +18,9 @@ import torch
 from torch.utils.dlpack import from_dlpack
 
 from semstab.core.types import Float64
+from semstab.data.frames import Frame, Intrinsics
+from semstab.data.labels import IGNORE_8BIT, IGNORE_16BIT
 from semstab.errors import DataError, summarize_error
-from semstab.model.frames import Frame, Intrinsics
-from semstab.model.labels import IGNORE_8BIT, IGNORE_16BIT
 
 GB = 1e9
 

@@ -11,14 +11,14 @@ if TYPE_CHECKING:
     from semstab.comparison.gate import GateConfig, gate
     from semstab.comparison.writing import compare
     from semstab.config import Config
+    from semstab.data.events import Events
+    from semstab.data.frames import Frame, Intrinsics
+    from semstab.data.labels import LabelSpace
+    from semstab.data.voxels import VoxelTable
     from semstab.engine.folder import load_result
     from semstab.errors import ConfigError, DataError, MissingDependencyError, SemstabError
     from semstab.exports import export
     from semstab.exports.relabel import Belief, relabel
-    from semstab.model.events import Events
-    from semstab.model.frames import Frame, Intrinsics
-    from semstab.model.labels import LabelSpace
-    from semstab.model.voxels import VoxelTable
     from semstab.online import FusedResult, TemporalStability, fuse
     from semstab.report.loaded import load
     from semstab.settings import load_config, load_study
@@ -35,9 +35,9 @@ __all__ = [
 
 _HOMES = {
     "AcceptanceThresholds": "statistics.acceptance", "Belief": "exports.relabel", "Config": "config",
-    "ConfigError": "errors", "DataError": "errors", "Events": "model.events", "Frame": "model.frames",
-    "GateConfig": "comparison.gate", "Intrinsics": "model.frames", "LabelSpace": "model.labels",
-    "MissingDependencyError": "errors", "SemstabError": "errors", "VoxelTable": "model.voxels",
+    "ConfigError": "errors", "DataError": "errors", "Events": "data.events", "Frame": "data.frames",
+    "GateConfig": "comparison.gate", "Intrinsics": "data.frames", "LabelSpace": "data.labels",
+    "MissingDependencyError": "errors", "SemstabError": "errors", "VoxelTable": "data.voxels",
     "FusedResult": "online", "TemporalStability": "online", "compare": "comparison.writing", "fuse": "online",
     "export": "exports", "gate": "comparison.gate", "load": "report.loaded",
     "load_config": "settings", "load_result": "engine.folder", "load_study": "settings", "relabel": "exports.relabel",

@@ -7,10 +7,10 @@ from pathlib import Path
 from typing import Any
 
 from semstab.config import Config
+from semstab.data.records import Result
 from semstab.engine import Executor, Observer
 from semstab.engine.execution import run as execute
 from semstab.engine.execution import run_study as execute_study
-from semstab.model.records import Result
 from semstab.report import Reporting
 from semstab.settings import as_config
 

@@ -30,6 +30,9 @@ from semstab.core.files import (
 )
 from semstab.core.prefetch import prefetch
 from semstab.core.types import Float32, Float64, UInt16
+from semstab.data.frames import Frame, Intrinsics
+from semstab.data.labels import LabelSpace
+from semstab.data.results import slug
 from semstab.datasets import Scene, open_dataset
 from semstab.datasets.files.labels import LABEL_SPACE_FILE
 from semstab.datasets.formats.disk import read_intrinsics
@@ -37,9 +40,6 @@ from semstab.datasets.formats.images import MILLIMETRES
 from semstab.datasets.geometry.cameras import UP_AXES
 from semstab.datasets.posed_folder import SETTINGS_FILE
 from semstab.errors import ConfigError, DataError
-from semstab.model.frames import Frame, Intrinsics
-from semstab.model.labels import LabelSpace
-from semstab.model.results import slug
 from semstab.task import frame_indices, selected
 
 __all__ = ["Converted", "convert", "convert_scene"]

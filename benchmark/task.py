@@ -11,12 +11,12 @@ import numpy as np
 
 from semstab.config import Config, Exclusion, Part, Perturbation, as_range, nearest
 from semstab.core.types import Mask
+from semstab.data.frames import Frame
+from semstab.data.labels import LabelMapping, LabelSpace
+from semstab.data.results import Unit
 from semstab.datasets import GROUND_TRUTH, Scene
 from semstab.datasets.scene import Selected, select_frames
 from semstab.errors import ConfigError, DataError
-from semstab.model.frames import Frame
-from semstab.model.labels import LabelMapping, LabelSpace
-from semstab.model.results import Unit
 from semstab.pixels.preparation import keep_largest, leave_out, perturb
 
 

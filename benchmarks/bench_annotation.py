@@ -18,10 +18,10 @@ import numpy as np
 
 import semstab
 from semstab.backends.shared.association import back_project
+from semstab.data.information import entropy_bits
 from semstab.exports.annotation import annotation_tasks
 from semstab.exports.relabel import task_of
 from semstab.exports.voxels import Chosen
-from semstab.model.information import entropy_bits
 from semstab.task import read, truth_task
 
 NONE = -1

@@ -24,8 +24,8 @@ from embreex.mesh_construction import TriangleMesh
 from embreex.rtcore_scene import EmbreeScene
 
 from semstab.core.files import write_json
+from semstab.data.frames import Intrinsics
 from semstab.datasets.files.surfaces import Surface, View
-from semstab.model.frames import Intrinsics
 
 HEIGHT = 45.0
 

@@ -14,7 +14,7 @@ from statistics import median
 
 import numpy as np
 
-from semstab.model.frames import Frame, Intrinsics
+from semstab.data.frames import Frame, Intrinsics
 from semstab.predict.filters import REGISTRY, Shown, parse
 
 

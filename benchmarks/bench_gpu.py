@@ -27,8 +27,8 @@ from semstab import backends
 from semstab.backends.torch_map import TorchMap, TorchMaps
 from semstab.backends.torch_storage import Columns, TensorPrediction
 from semstab.core.files import write_json
+from semstab.data.results import Unit
 from semstab.metrics import compare
-from semstab.model.results import Unit
 
 VOXEL_SIZE, APART, WARM_UP, BACKBONES = 0.2, 200.0, 5, 3
 

@@ -25,8 +25,8 @@ import numpy as np
 
 import semstab
 from semstab.core.files import write_json
+from semstab.data.voxels import VoxelTable
 from semstab.engine.memory import GB, map_bytes, process_bytes
-from semstab.model.voxels import VoxelTable
 
 HERE = Path(__file__).resolve().parent
 sys.path.insert(0, str(HERE.parent / "tests"))

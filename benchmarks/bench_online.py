@@ -21,7 +21,7 @@ from rich.console import Console
 from rich.table import Table
 
 from semstab.backends import create
-from semstab.model.frames import Frame
+from semstab.data.frames import Frame
 from semstab.online.metric import TemporalStability
 
 K, SHRINK = 41, 0.5

@@ -31,10 +31,10 @@ from semstab import Frame, statistics
 from semstab.backends import create
 from semstab.core.files import write_json
 from semstab.core.process import configure_process
+from semstab.data.events import Events
+from semstab.data.voxels import VoxelTable
 from semstab.datasets import open_dataset
 from semstab.metrics import flicker_percent, summarise
-from semstab.model.events import Events
-from semstab.model.voxels import VoxelTable
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
 

@@ -25,7 +25,7 @@ import flight
 import numpy as np
 
 from semstab.core.files import write_json
-from semstab.model.voxels import VoxelTable
+from semstab.data.voxels import VoxelTable
 
 HERE = Path(__file__).resolve().parent
 sys.path.insert(0, str(HERE.parent / "tests"))

@@ -28,7 +28,7 @@ import bench_tiles
 import numpy as np
 
 from semstab.core.files import write_json
-from semstab.model.voxels import VoxelTable
+from semstab.data.voxels import VoxelTable
 
 ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS"), "1")
 UNWATCHED = {"DASK_DISTRIBUTED__WORKER__PROFILE__ENABLED": "False"}

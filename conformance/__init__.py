@@ -23,10 +23,10 @@ import numpy.typing as npt
 
 from semstab.config import nearest
 from semstab.core.files import read_limited, write_text
+from semstab.data.frames import Frame, Intrinsics
+from semstab.data.measures import measures
+from semstab.data.voxels import VoxelTable
 from semstab.errors import ConfigError, DataError, summarize_error
-from semstab.model.frames import Frame, Intrinsics
-from semstab.model.measures import measures
-from semstab.model.voxels import VoxelTable
 
 TOLERANCE = 1e-9
 """Largest difference of a sum or a measure; counts are equal."""

@@ -13,6 +13,7 @@ from typing import Literal
 from pydantic import BaseModel, Field
 
 from semstab.core.files import open_file
+from semstab.data.georeference import Georeference
 from semstab.datasets.files import options as opt
 from semstab.datasets.files.depth import HEADER_BYTES, dmap_header
 from semstab.datasets.files.labels import SceneEntry
@@ -25,7 +26,6 @@ from semstab.datasets.geometry.lenses import Lens
 from semstab.datasets.opensfm import Shot, read_reconstruction
 from semstab.datasets.placing import Place, Positions, place_of
 from semstab.errors import DataError
-from semstab.model.georeference import Georeference
 
 # The files of a project of OpenDroneMap or OpenSfM: its poses, images, surfaces and depth maps, and their names.
 

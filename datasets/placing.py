@@ -15,10 +15,10 @@ from typing import Any
 import numpy as np
 
 from semstab.core.types import Float64
+from semstab.data.georeference import Georeference, Linear, wkt
 from semstab.datasets.formats.disk import number, read_content, read_object, read_text
 from semstab.datasets.geometry.cameras import Poses
 from semstab.errors import DataError
-from semstab.model.georeference import Georeference, Linear, wkt
 
 logger = logging.getLogger("semstab")
 

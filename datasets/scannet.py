@@ -13,6 +13,7 @@ import numpy as np
 from pydantic import BaseModel, Field
 
 from semstab.core.types import UInt16
+from semstab.data.labels import IGNORE_16BIT
 from semstab.datasets import GROUND_TRUTH
 from semstab.datasets.files import options as opt
 from semstab.datasets.files.labels import NO_ID
@@ -21,7 +22,6 @@ from semstab.datasets.files.reader import FileDataset, frames_of
 from semstab.datasets.formats.disk import MAX_TABLE_BYTES, files_named, read_intrinsics, read_text
 from semstab.datasets.geometry.cameras import Camera
 from semstab.errors import DataError
-from semstab.model.labels import IGNORE_16BIT
 
 Which = Literal["depth", "color"]
 

@@ -16,11 +16,11 @@ from pydantic import BaseModel
 
 from semstab.config import FrameSelection
 from semstab.core.types import Float32, Float64, UInt8
+from semstab.data.frames import Frame, Intrinsics
+from semstab.data.georeference import Georeference
+from semstab.data.labels import LabelSpace
 from semstab.datasets.geometry.lenses import Labels, Scores, at_image, fitted
 from semstab.errors import DataError
-from semstab.model.frames import Frame, Intrinsics
-from semstab.model.georeference import Georeference
-from semstab.model.labels import LabelSpace
 
 GROUND_TRUTH = "gt"
 """The name under which a scene's ground truth labels are selected like a backbone's."""

@@ -10,11 +10,11 @@ from pathlib import Path
 
 from pydantic import BaseModel
 
+from semstab.data.frames import Intrinsics
 from semstab.datasets.files.options import DepthScale, FileOptions, FourIntrinsics, FrameSource, InvalidDepth, Size
 from semstab.datasets.files.reader import FileDataset, frames_of
 from semstab.datasets.formats.disk import files_named, read_intrinsics
 from semstab.datasets.geometry.cameras import Camera, camera_of
-from semstab.model.frames import Intrinsics
 
 IMAGE_SIZE = (640, 480)
 INTRINSICS_FILE = "camera-intrinsics.txt"

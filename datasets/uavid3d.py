@@ -12,6 +12,7 @@ from typing import Any, Literal
 
 from pydantic import BaseModel, Field
 
+from semstab.data.frames import Intrinsics
 from semstab.datasets.colmap import has_model, read_model
 from semstab.datasets.files import options as opt
 from semstab.datasets.files.options import FileOptions, Folders, FrameSource, Template, inside
@@ -21,7 +22,6 @@ from semstab.datasets.formats.images import COLOR_SUFFIXES, DEPTH_SUFFIXES
 from semstab.datasets.geometry.cameras import Camera, Poses
 from semstab.datasets.transforms_json import read_transforms
 from semstab.errors import ConfigError
-from semstab.model.frames import Intrinsics
 
 TAXONOMY = "uavid8"
 """Taxonomy of the label maps, unless the options say otherwise: the colours of UAVid's ground truth."""

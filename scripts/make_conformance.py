@@ -13,7 +13,7 @@ from semstab.conformance import EXPECTED, write_case
 from semstab.conformance.fuse import fuse
 from semstab.core.files import write_text
 from semstab.core.types import Float64
-from semstab.model.frames import Frame, Intrinsics
+from semstab.data.frames import Frame, Intrinsics
 
 Case = tuple[float, int, list[Frame]]
 """Voxel size in metres, number of classes, frames."""

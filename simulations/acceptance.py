@@ -17,9 +17,9 @@ import numpy as np
 from flights import Flight, World, fly, log_of, table_of, world
 
 from semstab.comparison.runs import open_run
+from semstab.data.measures import dominant
+from semstab.data.voxels import VoxelTable
 from semstab.metrics.agreement import rows_of
-from semstab.model.measures import dominant
-from semstab.model.voxels import VoxelTable
 from semstab.statistics.acceptance import EVIDENCE, AcceptanceThresholds, calibrate
 from semstab.statistics.correctness import Truth, join_truth
 

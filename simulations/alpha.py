@@ -18,7 +18,7 @@ import numpy as np
 from pictures import KINDS, K, Views, frames, predicted, scene
 
 from semstab import backends
-from semstab.model.statistics import Level
+from semstab.data.statistics import Level
 from semstab.statistics import Sampler, describe
 from semstab.statistics.accumulate import sums_of_cells
 from semstab.statistics.cluster_sums import ClusterSums, value

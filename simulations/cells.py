@@ -19,7 +19,7 @@ import numpy as np
 import numpy.typing as npt
 
 from semstab import backends
-from semstab.model.frames import Frame, Intrinsics
+from semstab.data.frames import Frame, Intrinsics
 from semstab.statistics import Sampler, krippendorff_alpha
 from semstab.statistics.accumulate import sums_of_cells
 from semstab.statistics.cluster_sums import value

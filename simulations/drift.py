@@ -23,8 +23,8 @@ import numpy.typing as npt
 from scipy import ndimage
 from scipy.stats import norm
 
-from semstab.model.events import Events
-from semstab.model.statistics import Interval
+from semstab.data.events import Events
+from semstab.data.statistics import Interval
 from semstab.statistics.accumulate import Cubes
 from semstab.statistics.agreement import ratio_of
 from semstab.statistics.drift import trends

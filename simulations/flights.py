@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.stats import norm
 
-from semstab.model.events import Events
-from semstab.model.voxels import VoxelTable
+from semstab.data.events import Events
+from semstab.data.voxels import VoxelTable
 from semstab.statistics.accumulate import cluster_sums_of
 from semstab.statistics.cluster_sums import FUNCTIONALS, ClusterSums, columns_of, parts_of
 from semstab.statistics.observations import CellObservations, Views, keys_of

@@ -19,7 +19,7 @@ from flights import Flight, World, fly, number_of, sums_of, totals_of, world
 
 from semstab.comparison.gate import bounded, parse, verdict
 from semstab.core.types import OTHER_SCENES, THESE_FRAMES, THIS_SCENE, Scope
-from semstab.model.statistics import Interval
+from semstab.data.statistics import Interval
 from semstab.statistics.cluster_sums import ClusterSums
 
 EASES = (1.0, 1.0, 0.8)

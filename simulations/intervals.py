@@ -21,7 +21,7 @@ import numpy as np
 from flights import Flight, fly, number_of, sample_of, sums_of, totals_of, world
 
 from semstab.core.types import OTHER_SCENES, THESE_FRAMES, THIS_SCENE, Scope
-from semstab.model.statistics import Interval
+from semstab.data.statistics import Interval
 from semstab.statistics.correlogram import correlogram
 from semstab.statistics.intervals import difference, estimate
 

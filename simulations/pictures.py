@@ -10,7 +10,7 @@ import numpy.typing as npt
 from scipy import ndimage
 from scipy.stats import norm
 
-from semstab.model.frames import Frame, Intrinsics
+from semstab.data.frames import Frame, Intrinsics
 
 K = 6
 TOP, WALL = 4, 5

@@ -15,9 +15,9 @@ from posed_writer import write_posed
 from scipy.spatial.transform import Rotation
 
 from semstab.backends import create
+from semstab.data.frames import Frame
+from semstab.data.voxels import VoxelTable
 from semstab.datasets import open_dataset
-from semstab.model.frames import Frame
-from semstab.model.voxels import VoxelTable
 
 W, H, COUNT, SHRUNK = 48, 32, 4, 10
 CLASSES = ["clutter", "building", "road", "static car", "tree", "low vegetation", "human", "moving car"]

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from semstab.data.labels import LabelSpace
 from semstab.datasets.formats.images import PNG_SIGNATURE
 from semstab.errors import DataError
-from semstab.model.labels import LabelSpace
 
 SHAPE = (6, 8)
 METRES = np.random.default_rng(7).uniform(0.1, 60, SHAPE).astype(np.float32)

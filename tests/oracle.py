@@ -9,9 +9,9 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from semstab.data.results import FrameReport
+from semstab.data.voxels import VoxelTable
 from semstab.errors import ConfigError, DataError
-from semstab.model.results import FrameReport
-from semstab.model.voxels import VoxelTable
 
 
 @dataclass

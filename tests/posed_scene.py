@@ -8,8 +8,8 @@ import yaml
 from PIL import Image
 from posed_writer import write_posed
 
+from semstab.data.frames import Frame, Intrinsics
 from semstab.datasets import open_dataset
-from semstab.model.frames import Frame, Intrinsics
 
 H, W, K = 6, 8, 3
 SETTINGS = {"classes": ["a", "b", "c"], "up_axis": "z"}

@@ -8,7 +8,7 @@ from pathlib import Path
 import yaml
 
 from semstab.convert import CONVERSION_FILE, DepthFormat, SceneFolder
-from semstab.model.frames import Frame
+from semstab.data.frames import Frame
 
 
 def write_posed(

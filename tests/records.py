@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 
 from semstab.config import BASE
+from semstab.data.records import Record, Result, Variation
+from semstab.data.results import Unit, UnitSummary
+from semstab.data.voxels import VoxelTable
 from semstab.metrics import summarise
-from semstab.model.records import Record, Result, Variation
-from semstab.model.results import Unit, UnitSummary
-from semstab.model.voxels import VoxelTable
 
 CLASSES = ("a", "b", "c")
 

@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 from posed_writer import write_posed
 
+from semstab.data.frames import Frame, Intrinsics
+from semstab.data.labels import LabelSpace
 from semstab.datasets import Scene, open_dataset
-from semstab.model.frames import Frame, Intrinsics
-from semstab.model.labels import LabelSpace
 
 WIDTH, HEIGHT, FOCAL = 96, 72, 80.0
 CAMERA = Intrinsics(FOCAL, FOCAL, (WIDTH - 1) / 2, (HEIGHT - 1) / 2)

@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from semstab.model.events import Events
+from semstab.data.events import Events
 from semstab.statistics import CellObservations, Views
 from semstab.statistics.observations import keys_of
 

@@ -7,7 +7,7 @@ import dataclasses
 import numpy as np
 
 from semstab import backends
-from semstab.model.frames import Frame, Intrinsics
+from semstab.data.frames import Frame, Intrinsics
 from semstab.statistics import Sampler
 
 K = 3

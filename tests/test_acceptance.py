@@ -14,9 +14,9 @@ from typer.testing import CliRunner
 
 import semstab
 from semstab.cli import app
+from semstab.data.measures import dominant, vss
+from semstab.data.voxels import VoxelTable
 from semstab.errors import ConfigError, DataError
-from semstab.model.measures import dominant, vss
-from semstab.model.voxels import VoxelTable
 from semstab.statistics.acceptance import AcceptanceThresholds, calibrate
 from semstab.statistics.correctness import Truth
 

@@ -18,11 +18,11 @@ from posed_writer import write_posed
 from pycocotools.coco import COCO
 
 import semstab
+from semstab.data.frames import Frame, Intrinsics
 from semstab.datasets import open_dataset
 from semstab.errors import ConfigError, DataError
 from semstab.exports.annotation import outlined
 from semstab.exports.annotation_formats import FORMATS
-from semstab.model.frames import Frame, Intrinsics
 
 pytestmark = pytest.mark.filterwarnings("ignore:__array__ implementation:DeprecationWarning")
 

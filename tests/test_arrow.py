@@ -40,5 +40,5 @@ def test_pandas_is_not_imported_for_a_column(tmp_path: Path) -> None:
     """Neither for one that is made, nor for one that is read."""
     pq.write_table(pa.table({"op": [1, 2]}), tmp_path / "map.parquet")
     code = "import sys, numpy; from semstab.core.arrays import column; column(numpy.ones(3))"
-    code += f"; from semstab.model.voxels import parquet; parquet.columns({str(tmp_path / 'map.parquet')!r}, ['op'])"
+    code += f"; from semstab.data.voxels import parquet; parquet.columns({str(tmp_path / 'map.parquet')!r}, ['op'])"
     subprocess.run([sys.executable, "-c", f"{code}; assert 'pandas' not in sys.modules"], check=True)

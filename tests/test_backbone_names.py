@@ -6,8 +6,8 @@ import tiny_models
 
 from semstab.backbones import Backbone, Prediction
 from semstab.backbones.names import InTaxonomy, class_mapping, vocabularies
+from semstab.data.labels import LabelSpace
 from semstab.errors import ConfigError
-from semstab.model.labels import LabelSpace
 
 UAVID = LabelSpace.load("uavid-one-car")
 CITYSCAPES = LabelSpace("model", tiny_models.CITYSCAPES)

@@ -17,8 +17,8 @@ from typer.testing import CliRunner
 from semstab.backbones import Backbone, Prediction, create
 from semstab.backbones.border import Checked
 from semstab.cli import app
+from semstab.data.labels import LabelSpace
 from semstab.errors import ConfigError, DataError, MissingDependencyError
-from semstab.model.labels import LabelSpace
 from semstab.predict.predictor import PredictorConfig, load_predictor, parse_predictor
 
 IMAGE = blobs()
@@ -110,7 +110,7 @@ def test_a_backbone_of_ones_own(tmp_path):
     text = """
 from semstab.backbones import Backbone, Prediction
 from semstab.config import Settings
-from semstab.model.labels import LabelSpace
+from semstab.data.labels import LabelSpace
 import numpy as np
 
 class Options(Settings):

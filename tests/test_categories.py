@@ -7,9 +7,9 @@ import pytest
 from hypothesis import given
 
 from semstab import backends
+from semstab.data.information import entropy_bits, normalise
 from semstab.errors import ConfigError
 from semstab.metrics import CATEGORIES, CATEGORY_COLORS, CategoryThresholds, categories, category_shares, sbd
-from semstab.model.information import entropy_bits, normalise
 from semstab.testing import SEQUENCES, as_frames, checks, sight_line
 
 

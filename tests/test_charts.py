@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from semstab.model.statistics import Estimate
+from semstab.data.statistics import Estimate
 from semstab.report.charts import POINTS, Line, Scale, dot_chart, line_chart, thinned
 
 NAN = math.nan

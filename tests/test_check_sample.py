@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 import semstab
 from semstab.backends import numpy_reference
 from semstab.backends.numpy_reference import NumpyReference, NumpySample, in_sample
-from semstab.model.voxels import Extent
+from semstab.data.voxels import Extent
 
 K = 5
 

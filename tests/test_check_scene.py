@@ -24,9 +24,9 @@ from semstab.check.coverage import SIZES, plane_residuals
 from semstab.check.reprojection import View
 from semstab.check.scene_check import Tally
 from semstab.cli import app
+from semstab.data.frames import Frame
+from semstab.data.labels import LabelSpace
 from semstab.errors import ConfigError, DataError
-from semstab.model.frames import Frame
-from semstab.model.labels import LabelSpace
 from semstab.settings import load_config, resolve
 
 DATA = Path(os.environ.get("SEMSTAB_DATA", Path(__file__).parents[1] / "../shared/data"))

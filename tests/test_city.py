@@ -10,13 +10,13 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
+from semstab.data.frames import Frame
 from semstab.datasets import GROUND_TRUTH, open_dataset
 from semstab.datasets.city import City, CityScene, SimulatedBackbone
 from semstab.datasets.city.labellers import LABELLERS
 from semstab.datasets.city.mesh import Surface
 from semstab.datasets.city.simulation import Caster, Simulation, View
 from semstab.errors import ConfigError, DataError
-from semstab.model.frames import Frame
 
 SMALL = {"width": 96, "height": 54, "frames": 3}
 ONE_WRONG_CLASS = {

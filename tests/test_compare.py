@@ -22,11 +22,11 @@ from semstab.comparison.pairing import pair
 from semstab.comparison.runs import open_runs
 from semstab.comparison.tables import print_comparison
 from semstab.comparison.writing import load_comparison, markdown
+from semstab.data.contrast import Against, Contrast, RunComparison
+from semstab.data.frames import Frame, Intrinsics
+from semstab.data.georeference import Georeference
+from semstab.data.statistics import Interval
 from semstab.errors import ConfigError, DataError
-from semstab.model.contrast import Against, Contrast, RunComparison
-from semstab.model.frames import Frame, Intrinsics
-from semstab.model.georeference import Georeference
-from semstab.model.statistics import Interval
 
 FAULTY = (2, 5, 8)
 CLASSES = ["wall", "door", "window", "floor"]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from semstab.model.display import NOWHERE, ONCE, WIDTH, from_above
+from semstab.data.display import NOWHERE, ONCE, WIDTH, from_above
 
 DARK, BRIGHT = (tuple(cv2.applyColorMap(np.uint8([[v]]), cv2.COLORMAP_VIRIDIS)[0, 0, ::-1].tolist()) for v in (0, 255))
 

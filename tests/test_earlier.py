@@ -10,8 +10,8 @@ from command_line import bench
 
 import semstab
 from semstab.core.json_form import to_json
+from semstab.data.earlier import KEYS
 from semstab.errors import DataError
-from semstab.model.earlier import KEYS
 from semstab.report.tables import tables
 
 NOW = {new: old for old, new in KEYS.items()}

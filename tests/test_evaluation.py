@@ -17,11 +17,11 @@ from records import record, study, voxels
 
 import semstab
 from semstab.core.json_form import to_json
+from semstab.data.events import Events
+from semstab.data.voxels import VoxelTable
 from semstab.engine import Observer, load_result, run_study
 from semstab.engine.memory import map_bytes
 from semstab.errors import ConfigError, DataError
-from semstab.model.events import Events
-from semstab.model.voxels import VoxelTable
 from semstab.report.tables import tables
 from semstab.report.tables.table import to_json as table_content
 from semstab.report.terminal import print_summary

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from simulated_events import log_of
 
+from semstab.data.evidence import Evidence, row_chunks
+from semstab.data.measures import Rows, margin
+from semstab.data.voxels import VoxelTable
 from semstab.metrics import dominant, entropy, vss
-from semstab.model.evidence import Evidence, row_chunks
-from semstab.model.measures import Rows, margin
-from semstab.model.voxels import VoxelTable
 from semstab.statistics import describe
 
 RNG = np.random.default_rng(0)

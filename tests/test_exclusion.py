@@ -14,11 +14,11 @@ from hypothesis import strategies as st
 from posed_config import configure
 
 import semstab
+from semstab.data.frames import Frame, Intrinsics
+from semstab.data.labels import LabelSpace
+from semstab.data.measures import dominant
 from semstab.engine.units import make_plan
 from semstab.errors import ConfigError, DataError
-from semstab.model.frames import Frame, Intrinsics
-from semstab.model.labels import LabelSpace
-from semstab.model.measures import dominant
 from semstab.pixels.preparation import leave_out
 from semstab.settings import load_config
 from semstab.statistics import describe

@@ -25,13 +25,13 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 import semstab
+from semstab.data.georeference import Georeference
 from semstab.errors import ConfigError, DataError, MissingDependencyError
 from semstab.exports import export, maps
 from semstab.exports.clouds import codes
 from semstab.exports.maps import seen_from_above
 from semstab.exports.voxels import Column, Voxels
 from semstab.metrics import categories, dominant, vss
-from semstab.model.georeference import Georeference
 
 CRS, OFFSET = "EPSG:32615", (576714, 5188162, 200)
 CLASSES = ["wall", "door", "window"]

@@ -11,9 +11,9 @@ import pytest
 
 from semstab.backbones import Backbone, Prediction
 from semstab.backends.shared.association import observe
+from semstab.data.frames import Frame, Intrinsics
+from semstab.data.labels import LabelSpace
 from semstab.errors import ConfigError
-from semstab.model.frames import Frame, Intrinsics
-from semstab.model.labels import LabelSpace
 from semstab.pixels.warp import carry
 from semstab.predict.filters import REGISTRY, Filtered, Shown, parse
 

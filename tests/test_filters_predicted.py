@@ -12,10 +12,10 @@ from typer.testing import CliRunner
 
 from semstab.backbones import Backbone, Prediction
 from semstab.cli import app
+from semstab.data.labels import LabelSpace
 from semstab.datasets import open_dataset
 from semstab.datasets.formats.images import read_labels
 from semstab.errors import ConfigError, DataError
-from semstab.model.labels import LabelSpace
 from semstab.predict.filters import REGISTRY, parse
 from semstab.predict.predictor import Kept, PredictorConfig, load_predictor, parse_predictor, stored_labels
 from semstab.predict.sequence import SequenceOptions, predict_sequence

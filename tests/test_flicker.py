@@ -9,9 +9,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from semstab import datasets
+from semstab.data.frames import Frame, Intrinsics
 from semstab.errors import ConfigError
 from semstab.metrics import CompensatedFlicker, compensated_flicker, flicker_percent
-from semstab.model.frames import Frame, Intrinsics
 from semstab.pixels.warp import correspond, warp
 from semstab.testing import checks, random_frames
 

@@ -5,8 +5,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from semstab.data.frames import Frame, Intrinsics
 from semstab.errors import DataError
-from semstab.model.frames import Frame, Intrinsics
 from semstab.testing import checks
 
 CAMERA = Intrinsics(fx=2, fy=3, cx=1, cy=0.5)

@@ -25,8 +25,8 @@ from semstab.cli import app
 from semstab.comparison import differences, gate_report
 from semstab.comparison import gate as judging
 from semstab.comparison.gate import GateResult, Judgement, gate, gate_config, parse
+from semstab.data.statistics import Interval
 from semstab.errors import ConfigError, DataError
-from semstab.model.statistics import Interval
 from semstab.statistics.accumulate import cluster_sums_of
 from semstab.statistics.cluster_sums import value
 from semstab.statistics.intervals import difference, same_flight, shares_of, within_a_flight

@@ -9,9 +9,9 @@ from posed_scene import fails
 
 import semstab
 from semstab.convert import convert
+from semstab.data.georeference import Georeference, wkt
 from semstab.datasets import open_dataset
 from semstab.errors import ConfigError, MissingDependencyError
-from semstab.model.georeference import Georeference, wkt
 
 pyproj = pytest.importorskip("pyproj")
 

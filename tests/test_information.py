@@ -8,7 +8,7 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from semstab.model.information import entropy_bits, js_divergence, normalise
+from semstab.data.information import entropy_bits, js_divergence, normalise
 from semstab.testing import checks
 
 

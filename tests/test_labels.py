@@ -3,8 +3,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from semstab.data.labels import LabelSpace, shipped_taxonomies
 from semstab.errors import ConfigError, DataError
-from semstab.model.labels import LabelSpace, shipped_taxonomies
 from semstab.testing import checks
 
 UAVID8, UAVID7, UAVID3 = (LabelSpace.load(name) for name in ("uavid8", "uavid7", "uavid3"))

@@ -28,6 +28,9 @@ from semstab import backends
 from semstab.comparison.calibration import calibrate_run
 from semstab.comparison.differences import find
 from semstab.core.json_form import to_json
+from semstab.data.frames import Frame, Intrinsics
+from semstab.data.parquet import Tile
+from semstab.data.voxels import Extent, VoxelTable
 from semstab.engine import InProcess, LocalProcesses
 from semstab.engine.memory import Sizing
 from semstab.engine.observer import Observer
@@ -35,9 +38,6 @@ from semstab.engine.tiles import tiles_met
 from semstab.errors import ConfigError, DataError, OutgrownError
 from semstab.exports import export, maps
 from semstab.exports.relabel import Belief, relabel
-from semstab.model.frames import Frame, Intrinsics
-from semstab.model.parquet import Tile
-from semstab.model.voxels import Extent, VoxelTable
 from semstab.statistics import model_comparison
 from semstab.statistics.cluster_sums import ClusterSums
 from semstab.testing import random_frames

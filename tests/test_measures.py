@@ -15,10 +15,10 @@ from posed_config import configure
 from rich.console import Console
 
 import semstab
+from semstab.data.measures import VSS, Measure, measures, register, registered
+from semstab.data.voxels import VoxelTable
 from semstab.engine import load_result, run_study
 from semstab.errors import ConfigError
-from semstab.model.measures import VSS, Measure, measures, register, registered
-from semstab.model.voxels import VoxelTable
 from semstab.recording import Recording, color_modes
 from semstab.recording.voxel_maps import defaults
 from semstab.report.averages import describe, levels

@@ -14,10 +14,10 @@ import semstab
 from semstab.backends import create, expected_bytes
 from semstab.config import Config
 from semstab.core.process import available_bytes
+from semstab.data.frames import Frame, Intrinsics
 from semstab.engine import memory
 from semstab.engine.units import Plan, make_plan
 from semstab.errors import ConfigError
-from semstab.model.frames import Frame, Intrinsics
 
 FRAMES = 30
 

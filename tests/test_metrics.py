@@ -9,6 +9,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from semstab import backends
+from semstab.data.frames import Frame, Intrinsics
+from semstab.data.measures import ENTROPY, SBD, VSS, margin, measures
+from semstab.data.results import Means, MeasureMeans, Unit
+from semstab.data.voxels import VoxelTable
 from semstab.errors import DataError
 from semstab.metrics import (
     compare,
@@ -23,10 +27,6 @@ from semstab.metrics import (
     summarise,
     vss,
 )
-from semstab.model.frames import Frame, Intrinsics
-from semstab.model.measures import ENTROPY, SBD, VSS, margin, measures
-from semstab.model.results import Means, MeasureMeans, Unit
-from semstab.model.voxels import VoxelTable
 from semstab.testing import JS_HALF, SEQUENCES, as_frames, checks, sight_line
 
 

@@ -105,7 +105,7 @@ def test_a_study_writes_frame_series_and_where_asked_a_recording_of_its_base_uni
 
 def test_a_kept_unit_that_gained_a_measure_is_computed_again(root, tmp_path) -> None:
     """What a unit has is part of its key."""
-    from semstab.model.measures import Measure, registered
+    from semstab.data.measures import Measure, registered
 
     config, out = load_config(overrides=settings(root, backends=["numpy"])), tmp_path / "run"
     semstab.engine.run(config, out=out)

@@ -16,12 +16,12 @@ from posed_config import configure
 import semstab
 from semstab import metrics
 from semstab.core.json_form import to_json
+from semstab.data.measures import ENTROPY, SBD, VSS
+from semstab.data.records import Result
+from semstab.data.results import STAGES, Unit
 from semstab.datasets.formats import disk
 from semstab.engine import Observer, load_result
 from semstab.errors import ConfigError, DataError
-from semstab.model.measures import ENTROPY, SBD, VSS
-from semstab.model.records import Result
-from semstab.model.results import STAGES, Unit
 from semstab.settings import load_config
 
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from semstab.model.kernels import count_changed, has_other, mark_valid
-from semstab.model.labels import flat
+from semstab.data.kernels import count_changed, has_other, mark_valid
+from semstab.data.labels import flat
 
 DEPTHS = np.array([0.0, -0.0, -1.0, np.nan, np.inf, -np.inf, 1e-45, 3.4e38, 1.0], dtype=np.float32)
 

@@ -17,11 +17,11 @@ from records import record, study, voxels
 from wall_study import BACKBONES, drawn_walls, wall_study
 
 from semstab import backends
+from semstab.data.labels import palette
+from semstab.data.measures import SBD_MAX, VSS, measures
+from semstab.data.voxels import VoxelTable
 from semstab.errors import DataError
 from semstab.metrics import CATEGORY_COLORS, categories, dominant, op, sbd, vss
-from semstab.model.labels import palette
-from semstab.model.measures import SBD_MAX, VSS, measures
-from semstab.model.voxels import VoxelTable
 from semstab.report.averages import ENOUGH, describe, levels
 from semstab.report.figures import figures, topdown
 from semstab.report.figures.distributions import (

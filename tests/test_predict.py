@@ -22,14 +22,14 @@ from semstab.backbones.border import Checked
 from semstab.backbones.names import InTaxonomy
 from semstab.config import Config, DatasetConfig, FrameSelection
 from semstab.core.files import FolderLock
+from semstab.data.labels import LabelSpace
+from semstab.data.measures import ENTROPY
 from semstab.datasets import open_dataset
 from semstab.datasets.formats.images import read_labels
 from semstab.datasets.scene import select_frames
 from semstab.engine import run
 from semstab.errors import ConfigError, DataError
 from semstab.metrics import matched_region_flicker
-from semstab.model.labels import LabelSpace
-from semstab.model.measures import ENTROPY
 from semstab.pixels.warp import warp
 from semstab.predict.command import ImageFiles, file_job, scene_jobs
 from semstab.predict.predictor import PredictorConfig, load_predictor, parse_predictor

@@ -14,11 +14,11 @@ from posed_config import dataset_of
 from semstab.backbones import Backbone, Prediction
 from semstab.backbones.names import InTaxonomy
 from semstab.config import Config, FrameSelection
+from semstab.data.labels import LabelSpace
 from semstab.datasets import open_dataset
 from semstab.datasets.formats.images import read_labels
 from semstab.engine import run
 from semstab.errors import ConfigError, DataError
-from semstab.model.labels import LabelSpace
 from semstab.predict.command import ImageFiles
 from semstab.predict.predictor import PredictorConfig
 from semstab.predict.sequence import SequenceOptions, predict_sequence

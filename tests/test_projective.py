@@ -12,9 +12,9 @@ from hypothesis import strategies as st
 from oracle import Oracle
 
 from semstab import backends
+from semstab.data.frames import Frame, Intrinsics
 from semstab.errors import ConfigError, DataError
 from semstab.metrics import entropy, sbd, vss
-from semstab.model.frames import Frame, Intrinsics
 from semstab.testing import EXACT, SUMS, assert_same_map, checks, random_frames, voxels
 
 NAME = "open3d-projective"

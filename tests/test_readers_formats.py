@@ -19,11 +19,11 @@ from pydantic import ValidationError
 
 from semstab.config import Config, FrameSelection
 from semstab.core.files import parse_yaml
+from semstab.data.labels import shipped_taxonomies
 from semstab.datasets import REGISTRY, open_dataset, options_model
 from semstab.datasets.files.options import Folders
 from semstab.datasets.scene import select_frames
 from semstab.errors import DataError
-from semstab.model.labels import shipped_taxonomies
 
 
 @pytest.fixture(scope="module", params=ds.FORMATS)

@@ -11,13 +11,13 @@ from hypothesis import strategies as st
 from posed_scene import fails
 from scipy import ndimage
 
+from semstab.data.frames import Intrinsics
 from semstab.datasets.files.labels import SceneEntry, find_sources
 from semstab.datasets.files.options import FileOptions, Folders, FrameSource
 from semstab.datasets.geometry.cameras import Camera
 from semstab.datasets.geometry.lenses import fit
 from semstab.datasets.scannet import read_class_table
 from semstab.errors import ConfigError, DataError
-from semstab.model.frames import Intrinsics
 
 FORM = ds.FORMATS["hololens"]
 SCANNET = ds.FORMATS["scannet"]

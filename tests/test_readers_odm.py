@@ -19,9 +19,9 @@ from PIL import Image
 from posed_scene import fails
 from scipy.spatial.transform import Rotation
 
+from semstab.data.georeference import Georeference, wkt
 from semstab.datasets import open_dataset
 from semstab.errors import ConfigError, DataError
-from semstab.model.georeference import Georeference, wkt
 
 pytest.importorskip("pyproj")
 

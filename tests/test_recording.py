@@ -21,16 +21,16 @@ import semstab
 from semstab import backends, metrics
 from semstab.backends.numba_hash import NumbaHash
 from semstab.config import Config
+from semstab.data.frames import Frame, Intrinsics
+from semstab.data.labels import LabelSpace
+from semstab.data.measures import measures
+from semstab.data.records import Record, Result, UnitContent, Variation
+from semstab.data.results import Unit, UnitSummary
+from semstab.data.voxels import VoxelTable
 from semstab.engine import Observer
 from semstab.engine.series import FrameRow
 from semstab.engine.units import Plan, PlannedUnit, make_plan
 from semstab.errors import ConfigError, DataError
-from semstab.model.frames import Frame, Intrinsics
-from semstab.model.labels import LabelSpace
-from semstab.model.measures import measures
-from semstab.model.records import Record, Result, UnitContent, Variation
-from semstab.model.results import Unit, UnitSummary
-from semstab.model.voxels import VoxelTable
 from semstab.recording import (
     SERIES,
     Recording,

@@ -23,11 +23,11 @@ from test_recording import config_of, grid, notes, read, series, verify
 import semstab
 from semstab import backends, metrics
 from semstab.backends.numba_hash import NumbaHash
+from semstab.data.frames import Frame, Intrinsics
+from semstab.data.labels import LabelSpace
+from semstab.data.measures import SBD_MAX
 from semstab.engine.units import make_plan
 from semstab.errors import DataError
-from semstab.model.frames import Frame, Intrinsics
-from semstab.model.labels import LabelSpace
-from semstab.model.measures import SBD_MAX
 from semstab.recording import Recording, camera, color_modes, drift, lacks_pictures, record_finished, voxel_maps
 from semstab.recording.drift import DriftLog, View
 from semstab.recording.timeline import Clock

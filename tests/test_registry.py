@@ -113,7 +113,7 @@ def test_the_package_imports_nothing_heavy():
 
 
 @pytest.mark.parametrize(
-    "module", ["semstab.backends", "semstab.model.frames", "semstab.metrics", "semstab.model.voxels"]
+    "module", ["semstab.backends", "semstab.data.frames", "semstab.metrics", "semstab.data.voxels"]
 )
 def test_the_data_model_needs_numpy_alone(module):
     heavy = ("open3d", "rerun", "matplotlib", "pyarrow", "cv2", "trimesh", "hypothesis", "pytest")

@@ -16,12 +16,12 @@ from posed_config import configure, dataset_of
 from posed_scene import fails
 
 import semstab
+from semstab.data.frames import Frame, Intrinsics
+from semstab.data.labels import LabelSpace
+from semstab.data.tiles import Tiles
 from semstab.errors import ConfigError, DataError
 from semstab.exports.relabel import UNSEEN, UNSTABLE, Belief, FusedLabels, relabel
 from semstab.metrics import CATEGORIES, categories
-from semstab.model.frames import Frame, Intrinsics
-from semstab.model.labels import LabelSpace
-from semstab.model.tiles import Tiles
 from semstab.statistics import psa
 
 R, K = 0.25, 3

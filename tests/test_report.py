@@ -17,10 +17,10 @@ from records import record, study, voxels
 from wall_study import CLASSES, drawn_walls, wall_study
 
 from semstab.config import BASE, SHARED
+from semstab.data.measures import dominant
+from semstab.data.records import Failure, Variation
+from semstab.data.results import Agreement, Unit
 from semstab.metrics import categories, vss
-from semstab.model.measures import dominant
-from semstab.model.records import Failure, Variation
-from semstab.model.results import Agreement, Unit
 from semstab.report import write_report
 from semstab.report.averages import ENOUGH
 from semstab.report.figures.topdown import EMPTY, FromAbove

@@ -12,8 +12,8 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from semstab.data.results import FrameReport
 from semstab.engine.series import FRAME_COLUMNS, FrameRow, Series
-from semstab.model.results import FrameReport
 
 counts, numbers = st.integers(0, 2**53), st.floats()
 reports = st.builds(

@@ -11,10 +11,10 @@ from simulated_events import cells_of, grid, log_of
 from statsmodels.stats.multitest import multipletests
 
 from semstab.core.types import THESE_FRAMES, THIS_SCENE
+from semstab.data.measures import VSS
 from semstab.errors import ConfigError, DataError
 from semstab.metrics import vss
 from semstab.metrics.agreement import shared_rows
-from semstab.model.measures import VSS
 from semstab.statistics import claimed_together, compare_backbones, coverage, paired, psa, standardised
 from semstab.statistics.agreement import PSA
 from semstab.statistics.paired_differences import EDGES, common_weights, holm, stratum_counts

@@ -9,8 +9,8 @@ import pytest
 from simulated_events import grid, log_of, log_of_evidence
 from sklearn.metrics import accuracy_score, jaccard_score
 
+from semstab.data.information import normalise
 from semstab.errors import DataError
-from semstab.model.information import normalise
 from semstab.statistics import correctness, join_truth, quadrants, reliability, stable_wrong
 from semstab.statistics.accumulate import Cubes
 from semstab.statistics.agreement import stability_posterior

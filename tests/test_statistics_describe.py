@@ -14,11 +14,11 @@ from simulated_events import cells_of, grid, log_of
 from semstab.core.files import read_json, write_json
 from semstab.core.json_form import from_json, to_json
 from semstab.core.types import THESE_FRAMES, THIS_SCENE
+from semstab.data.contrast import BackboneComparison
+from semstab.data.statistics import UNKNOWN, CellAgreement, ClassAlpha, HeadlineStatistics, Interval, MapStatistics
+from semstab.data.voxels import VoxelTable
 from semstab.errors import ConfigError, DataError
 from semstab.metrics import sbd
-from semstab.model.contrast import BackboneComparison
-from semstab.model.statistics import UNKNOWN, CellAgreement, ClassAlpha, HeadlineStatistics, Interval, MapStatistics
-from semstab.model.voxels import VoxelTable
 from semstab.statistics import (
     MapSample,
     analyse,
@@ -87,7 +87,7 @@ def test_how_many_voxels_are_summed_at_a_time_does_not_matter(monkeypatch, soft)
     table = backbone(0.2, 0, place=0.2).table()
     table = replace(table, self_sum=np.where(np.arange(len(table)) == 7, 0.9, 1.0) * table.self_sum) if soft else table
     whole = analyse(MapSample.draw(table))
-    monkeypatch.setattr("semstab.model.evidence.STRETCH", 50)
+    monkeypatch.setattr("semstab.data.evidence.STRETCH", 50)
     parts = analyse(MapSample.draw(table))
     assert differences(to_json(whole.summary), to_json(parts.summary), tolerance=1e-12) == []
     for name in ("class_own", "sbd_excess"):

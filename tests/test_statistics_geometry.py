@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from semstab import backends
+from semstab.data.frames import Frame, Intrinsics
 from semstab.errors import DataError
-from semstab.model.frames import Frame, Intrinsics
 from semstab.statistics import ceiling, losses, psa, rendered
 from semstab.testing import sight_line
 

@@ -10,7 +10,7 @@ import pytest
 from simulated_events import grid, log_of_evidence
 from striped_floor import K, flight, fused, sampled
 
-from semstab.model.contrast import ComparedObservations
+from semstab.data.contrast import ComparedObservations
 from semstab.statistics import compare_backbones
 from semstab.statistics.accumulate import sums_of_cells
 from semstab.statistics.cluster_sums import value

@@ -12,9 +12,9 @@ from simulated_events import grid, log_of, log_of_evidence, soft
 from striped_floor import K, fused, sampled
 from striped_floor import flight as over_stripes
 
+from semstab.data.measures import dominant, entropy, sbd, vss
 from semstab.errors import DataError
 from semstab.metrics.agreement import rows_of
-from semstab.model.measures import dominant, entropy, sbd, vss
 from semstab.statistics.accumulate import cluster_sums_of, sums_of_cells
 from semstab.statistics.agreement import class_agreement, krippendorff_alpha, psa, stability_posterior
 from semstab.statistics.cluster_sums import ClusterSums, aligned, value

@@ -13,7 +13,7 @@ from scipy import stats
 from simulated_events import cells_of, grid, log_of
 
 from semstab.core.types import OTHER_SCENES, THESE_FRAMES, THIS_SCENE
-from semstab.model.statistics import Interval
+from semstab.data.statistics import Interval
 from semstab.statistics.accumulate import Cubes, cluster_sums_of
 from semstab.statistics.agreement import ratio_of
 from semstab.statistics.cluster_sums import value

@@ -17,9 +17,9 @@ import semstab
 from semstab.backends.numba_hash import NumbaHash
 from semstab.check import check
 from semstab.config import read_yaml
+from semstab.data.frames import Frame, Intrinsics
 from semstab.errors import DataError
 from semstab.metrics import split_last, summarise
-from semstab.model.frames import Frame, Intrinsics
 from semstab.report.narrative import notes
 from semstab.report.tables import tables
 from semstab.report.terminal import print_summary

@@ -17,6 +17,7 @@ from tiny_study import Counting, Interrupting, configure, summary
 import semstab
 from semstab.config import BACKENDS, Config
 from semstab.core.json_form import to_json
+from semstab.data.records import Variation
 from semstab.datasets.files.scene import FileScene
 from semstab.engine import load_result, run_study
 from semstab.engine.folder import Folder
@@ -25,7 +26,6 @@ from semstab.engine.units import make_plan
 from semstab.engine.work import Start, Work, jobs_of
 from semstab.errors import ConfigError, DataError
 from semstab.metrics import SelfConsistency, VideoConsistency, compare, compensated_flicker, flicker_percent, summarise
-from semstab.model.records import Variation
 from semstab.settings import resolve
 from semstab.statistics import CellObservations, compare_backbones
 from semstab.task import read

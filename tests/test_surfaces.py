@@ -27,12 +27,12 @@ from rich.console import Console
 import semstab
 from semstab.check import check, quick_check
 from semstab.check.display import print_check
+from semstab.data.frames import Intrinsics
+from semstab.data.georeference import Georeference, wkt
 from semstab.datasets import open_dataset
 from semstab.datasets.files import surfaces
 from semstab.datasets.files.surfaces import Surface, View
 from semstab.errors import ConfigError, DataError, MissingDependencyError
-from semstab.model.frames import Intrinsics
-from semstab.model.georeference import Georeference, wkt
 
 pytest.importorskip("laspy")
 

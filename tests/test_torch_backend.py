@@ -19,8 +19,8 @@ from semstab.backends import torch_map, torch_operations, torch_storage  # noqa:
 from semstab.backends.shared.association import back_project  # noqa: E402
 from semstab.backends.torch_map import TorchMap, TorchMaps  # noqa: E402
 from semstab.backends.torch_storage import EMPTY, DepthView, MapGrid, TensorPrediction, VoxelHash, slots_for  # noqa: E402
+from semstab.data.frames import Frame, Intrinsics  # noqa: E402
 from semstab.errors import ConfigError, DataError  # noqa: E402
-from semstab.model.frames import Frame, Intrinsics  # noqa: E402
 from semstab.testing import EXACT, SUMS, BackendConformance, assert_same_map, checks, random_frames, sight_line, voxels  # noqa: E402
 
 CPU = torch.device("cpu")

@@ -14,7 +14,7 @@ GONE = (
     "Suspect", "Survey", "Votes", "first look", "foresight", "forensics", "frames to blame", "give_back", "judged_by",
     "least steady", "one_line", "rivals", "same looks", "settling", "tell_apart", "this map'",
 )  # fmt: skip
-TRANSLATED = ROOT / "benchmark/model/earlier.py"
+TRANSLATED = ROOT / "benchmark/data/earlier.py"
 """What reads summaries of earlier versions, and so knows their words."""
 
 

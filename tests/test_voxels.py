@@ -13,10 +13,10 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from semstab import backends
+from semstab.data.events import Events
+from semstab.data.voxels import VoxelTable
 from semstab.errors import DataError
 from semstab.metrics import entropy, vss
-from semstab.model.events import Events
-from semstab.model.voxels import VoxelTable
 from semstab.testing import EXACT, SEQUENCES, SUMS, as_frames, assert_same_map, checks, sight_line, voxels
 
 

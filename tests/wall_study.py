@@ -10,9 +10,9 @@ import numpy as np
 from posed_config import configure
 from posed_writer import write_posed
 
+from semstab.data.frames import Frame, Intrinsics
+from semstab.data.records import Result
 from semstab.engine import run_study
-from semstab.model.frames import Frame, Intrinsics
-from semstab.model.records import Result
 from semstab.report.figures import write_figures
 
 WIDTH, HEIGHT, FOCAL, FRAMES = 96, 64, 64.0, 9

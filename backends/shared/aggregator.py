@@ -16,9 +16,9 @@ from semstab.backends.shared.pixel_keys import columns_of, frame_terms
 from semstab.backends.shared.score_loops import LANES
 from semstab.backends.shared.tile_loops import NEAR, REACH
 from semstab.core.types import Float64, Int32, Int64, UInt8
-from semstab.model.frames import Frame
-from semstab.model.labels import fixed
-from semstab.model.voxels import Extent
+from semstab.data.frames import Frame
+from semstab.data.labels import fixed
+from semstab.data.voxels import Extent
 
 FIRST_VOXELS = 1 << 12
 """Voxels that a band of scores has room for at first."""

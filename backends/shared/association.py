@@ -14,11 +14,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from semstab.core.types import Float32, Float64, Int64, Mask
+from semstab.data.events import Events
+from semstab.data.frames import Frame
+from semstab.data.results import FrameReport
+from semstab.data.voxels import Extent, VoxelTable
 from semstab.errors import ConfigError, DataError
-from semstab.model.events import Events
-from semstab.model.frames import Frame
-from semstab.model.results import FrameReport
-from semstab.model.voxels import Extent, VoxelTable
 
 if TYPE_CHECKING:
     from semstab.backends import FusionBackend

@@ -13,7 +13,7 @@ from semstab.backends.shared.observations import Change, Observed
 from semstab.backends.shared.pixel_keys import AHEAD, touch
 from semstab.core.compiled import parallel, serial
 from semstab.core.types import Int32, Int64
-from semstab.model.results import RECURRENT
+from semstab.data.results import RECURRENT
 
 
 def update_rows(rows: Int64, seen: Observed, frame: int, **columns: Any) -> Change:

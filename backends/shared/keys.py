@@ -10,9 +10,9 @@ import numpy.typing as npt
 from semstab.backends.shared.association import back_project, voxel_index
 from semstab.core.compiled import serial
 from semstab.core.types import Int64
+from semstab.data.frames import Frame
+from semstab.data.voxels import INDEX
 from semstab.errors import DataError
-from semstab.model.frames import Frame
-from semstab.model.voxels import INDEX
 
 HALF = 1 << 20
 """A map reaches that many voxels to either side of its origin."""

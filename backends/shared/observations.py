@@ -12,8 +12,8 @@ import numpy as np
 import numpy.typing as npt
 
 from semstab.core.types import Float64, Int64, Mask, UInt16
-from semstab.model.information import entropy_bits, js_divergence, normalise
-from semstab.model.results import RECURRENT, FrameReport
+from semstab.data.information import entropy_bits, js_divergence, normalise
+from semstab.data.results import RECURRENT, FrameReport
 
 
 @dataclass(frozen=True, eq=False)

@@ -8,9 +8,9 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
+from semstab.data.frames import Frame
 from semstab.datasets import Scene
 from semstab.datasets.geometry.cameras import CAMERA_AXES
-from semstab.model.frames import Frame
 
 Size = tuple[int, int]
 Ratio = tuple[float, float]

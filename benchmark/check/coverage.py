@@ -14,8 +14,8 @@ import numpy.typing as npt
 from semstab.backends import create
 from semstab.check.reprojection import Pair, Sample, View
 from semstab.core.types import Float64, Int64, Mask
-from semstab.model.frames import Frame
-from semstab.model.labels import IGNORE_8BIT
+from semstab.data.frames import Frame
+from semstab.data.labels import IGNORE_8BIT
 
 CONSISTENT = 0.05
 """A point that is seen again is taken for the same surface where the two depths differ by at most this share."""

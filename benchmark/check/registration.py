@@ -14,9 +14,9 @@ from semstab.check.conventions import OPTION, Reading
 from semstab.check.geometry import Verdict
 from semstab.check.reprojection import Pair, View, evenly
 from semstab.core.types import Float32, Float64, Mask, UInt8
+from semstab.data.frames import Intrinsics
 from semstab.datasets import Scene
 from semstab.errors import DataError
-from semstab.model.frames import Intrinsics
 
 JUMP = 0.05
 """An edge of depth is where it changes by this share from pixel to pixel."""

@@ -12,9 +12,9 @@ import numpy.typing as npt
 
 from semstab.check.conventions import Convention
 from semstab.core.types import Float32, Float64, Int64, Mask
+from semstab.data.frames import Frame, Intrinsics
 from semstab.datasets import GROUND_TRUTH, Scene
 from semstab.datasets.geometry.cameras import CAMERA_AXES, ray_lengths
-from semstab.model.frames import Frame, Intrinsics
 
 # Which frames and pixels a check looks at, and what it keeps of them: bounded at any length and image size.
 

@@ -31,11 +31,11 @@ from semstab.check.reprojection import Sample, View, clusters, evenly, label_sou
 from semstab.config import Config
 from semstab.core.json_form import to_json
 from semstab.core.prefetch import prefetch
+from semstab.data.frames import Frame
+from semstab.data.labels import IGNORE_8BIT, IGNORE_16BIT, LabelSpace
+from semstab.data.results import VoxelAdvice
 from semstab.datasets import Scene, open_dataset
 from semstab.errors import DataError
-from semstab.model.frames import Frame
-from semstab.model.labels import IGNORE_8BIT, IGNORE_16BIT, LabelSpace
-from semstab.model.results import VoxelAdvice
 from semstab.task import frame_indices, selected
 
 # Which classes a label source predicts, how often, and which ids no class has.

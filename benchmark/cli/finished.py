@@ -233,8 +233,8 @@ def list_() -> None:
     from rich.table import Table
 
     from semstab import backbones, backends, datasets
+    from semstab.data.labels import LabelSpace, shipped_taxonomies
     from semstab.errors import MissingDependencyError
-    from semstab.model.labels import LabelSpace, shipped_taxonomies
     from semstab.predict import filters
     from semstab.settings import load_study, shipped_studies
 

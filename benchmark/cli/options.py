@@ -50,7 +50,7 @@ def _label_sources(ctx: Any) -> Iterable[str]:
 
 backends, datasets, models = _listed("backends"), _listed("datasets"), _listed("backbones")
 filters = _listed("predict.filters")
-taxonomies, studies = _listed("model.labels", "shipped_taxonomies"), _listed("settings", "shipped_studies")
+taxonomies, studies = _listed("data.labels", "shipped_taxonomies"), _listed("settings", "shipped_studies")
 scenes, label_sources = _beginning(lambda ctx: [*_opened(ctx).scenes, "all"]), _beginning(_label_sources)
 
 

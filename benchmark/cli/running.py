@@ -121,7 +121,7 @@ def study(
     verbose: opt.Verbose = False,
 ) -> None:  # fmt: skip
     """Run everything that the paper reports: scenes x backbones x backends x variations. Resumes where it was."""
-    from semstab.model.results import slug
+    from semstab.data.results import slug
     from semstab.settings import load_study
 
     config = load_study(file, chosen({"check_geometry": False if trust_geometry else None}, settings, options))

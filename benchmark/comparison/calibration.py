@@ -8,10 +8,10 @@ from pathlib import Path
 import numpy as np
 
 from semstab.comparison.runs import open_run
+from semstab.data.records import Record
+from semstab.data.tiles import Tiles, side_by_side
+from semstab.data.voxels import VoxelTable
 from semstab.errors import ConfigError, DataError
-from semstab.model.records import Record
-from semstab.model.tiles import Tiles, side_by_side
-from semstab.model.voxels import VoxelTable
 from semstab.statistics.acceptance import AcceptanceThresholds, calibrate
 from semstab.statistics.correctness import Truth, join_truth
 from semstab.statistics.model_comparison import in_share, share_of

@@ -27,13 +27,13 @@ from semstab.comparison.tables import (
     quantities,
 )
 from semstab.core.types import THESE_FRAMES, THIS_SCENE, Int64, Scope
+from semstab.data.contrast import Against, Compared, Contrast, RunComparison, SceneComparison
+from semstab.data.measures import Measure, Quantity, mean
+from semstab.data.results import slug
+from semstab.data.statistics import UNKNOWN, Interval
+from semstab.data.voxels import VoxelTable
 from semstab.errors import ConfigError
 from semstab.metrics import macro_mean
-from semstab.model.contrast import Against, Compared, Contrast, RunComparison, SceneComparison
-from semstab.model.measures import Measure, Quantity, mean
-from semstab.model.results import slug
-from semstab.model.statistics import UNKNOWN, Interval
-from semstab.model.voxels import VoxelTable
 from semstab.statistics.accumulate import Cubes
 from semstab.statistics.agreement import ALPHA, ratio_of
 from semstab.statistics.cluster_sums import ClusterSums, functional, of_space_alone, value

@@ -32,9 +32,9 @@ from semstab.comparison.tables import (
 from semstab.config import nearest, read_yaml, validated
 from semstab.config.settings import ScopeSetting
 from semstab.core.types import OTHER_SCENES, THESE_FRAMES, THIS_SCENE, Scope
+from semstab.data.measures import ENTROPY, Quantity
+from semstab.data.statistics import Interval
 from semstab.errors import ConfigError, DataError
-from semstab.model.measures import ENTROPY, Quantity
-from semstab.model.statistics import Interval
 from semstab.statistics.agreement import ALPHA, PSA, VOXEL_ALPHA
 from semstab.statistics.cluster_sums import ClusterSums, columns_of, functional, of_space_alone, parts_of, value
 from semstab.statistics.correctness import ACCURACY, ECE, MIOU

@@ -16,11 +16,11 @@ import numpy.typing as npt
 
 from semstab.comparison.pairing import Common, joint_class
 from semstab.core.types import Float64, Int32, Int64, Mask
+from semstab.data.contrast import Area, FrameShare
+from semstab.data.events import Events
+from semstab.data.measures import dominant
+from semstab.data.voxels import VoxelTable
 from semstab.metrics.agreement import shared_rows, voxel_keys
-from semstab.model.contrast import Area, FrameShare
-from semstab.model.events import Events
-from semstab.model.measures import dominant
-from semstab.model.voxels import VoxelTable
 from semstab.statistics.agreement import disagreement
 from semstab.statistics.correctness import join_truth
 from semstab.statistics.model_comparison import in_share

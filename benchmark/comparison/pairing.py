@@ -12,13 +12,13 @@ import numpy as np
 
 from semstab.comparison.runs import Entry
 from semstab.core.types import THIS_SCENE, Int64, Mask, Scope
+from semstab.data.contrast import Basis, ComparedObservations, MapCoverage
+from semstab.data.events import Events
+from semstab.data.measures import sbd
+from semstab.data.records import Record
+from semstab.data.tiles import Tiles, side_by_side
+from semstab.data.voxels import VoxelTable
 from semstab.metrics.agreement import rows_of
-from semstab.model.contrast import Basis, ComparedObservations, MapCoverage
-from semstab.model.events import Events
-from semstab.model.measures import sbd
-from semstab.model.records import Record
-from semstab.model.tiles import Tiles, side_by_side
-from semstab.model.voxels import VoxelTable
 from semstab.statistics.accumulate import cluster_sums_of
 from semstab.statistics.cluster_sums import ClusterSums
 from semstab.statistics.correctness import join_truth

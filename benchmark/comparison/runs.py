@@ -25,14 +25,14 @@ import numpy as np
 from semstab.config import nearest
 from semstab.core.files import atomic_path, parse_json, read_limited
 from semstab.core.json_form import from_json, to_json
+from semstab.data import earlier
+from semstab.data.contrast import FrameShare
+from semstab.data.georeference import Georeference
+from semstab.data.records import ImageSpace, Record
+from semstab.data.results import UnitSummary
 from semstab.datasets import GROUND_TRUTH
 from semstab.engine.folder import load_result
 from semstab.errors import ConfigError, DataError, summarize_error
-from semstab.model import earlier
-from semstab.model.contrast import FrameShare
-from semstab.model.georeference import Georeference
-from semstab.model.records import ImageSpace, Record
-from semstab.model.results import UnitSummary
 from semstab.statistics.cluster_sums import ClusterSums
 
 Flicker = Mapping[int, float]

@@ -10,9 +10,9 @@ from collections.abc import Iterator, Mapping, Sequence
 from rich.console import Console
 
 from semstab.comparison.locations import MOST
-from semstab.model.contrast import Against, Area, Basis, ComparedObservations, Contrast, FrameShare, RunComparison
-from semstab.model.measures import ENTROPY, VSS, Quantity, measures
-from semstab.model.statistics import Interval
+from semstab.data.contrast import Against, Area, Basis, ComparedObservations, Contrast, FrameShare, RunComparison
+from semstab.data.measures import ENTROPY, VSS, Quantity, measures
+from semstab.data.statistics import Interval
 from semstab.report.tables.correctness import coverage_table, ignored_table
 from semstab.report.tables.table import Column, Group, Row, Table, to_terminal
 from semstab.report.terminal import WIDTH

@@ -15,11 +15,11 @@ from semstab.config.settings import ScopeOption, validated
 from semstab.core.files import keep_only, read_json, write_json, write_text
 from semstab.core.json_form import from_json
 from semstab.core.types import THIS_SCENE
+from semstab.data import parquet
+from semstab.data.contrast import Against, RunComparison, SceneComparison
+from semstab.data.results import slug
+from semstab.data.statistics import Estimate
 from semstab.errors import ConfigError
-from semstab.model import parquet
-from semstab.model.contrast import Against, RunComparison, SceneComparison
-from semstab.model.results import slug
-from semstab.model.statistics import Estimate
 from semstab.report.charts import SERIES, dot_chart
 from semstab.report.figures.maps import Panel, draw_changes
 from semstab.report.figures.style import Figure

@@ -15,6 +15,7 @@ from pathlib import Path
 from semstab.check import Verdict, advise, quick_look, refuse_unsound, with_voxel_size
 from semstab.config import Config
 from semstab.core.process import trim_malloc
+from semstab.data.records import Result
 from semstab.engine.executors import Executor, InProcess
 from semstab.engine.folder import Folder, require_file_names
 from semstab.engine.memory import planned_sizes
@@ -25,7 +26,6 @@ from semstab.engine.tiled_units import TiledUnit
 from semstab.engine.units import Plan, PlannedUnit, make_plan
 from semstab.engine.work import Job, Outcome, Start, Work, jobs_of
 from semstab.errors import ConfigError, DataError
-from semstab.model.records import Result
 from semstab.settings import resolve
 
 logger = logging.getLogger("semstab")

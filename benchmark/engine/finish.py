@@ -17,6 +17,14 @@ from semstab.config import Config
 from semstab.core.files import atomic_path
 from semstab.core.process import Stopwatch, trim_malloc
 from semstab.core.types import Float64, Mask
+from semstab.data.events import Events
+from semstab.data.evidence import stretches
+from semstab.data.frames import LeftOut
+from semstab.data.measures import dominant, mean, measures, vss
+from semstab.data.parquet import Tile
+from semstab.data.records import EVENTS, FRAMES, OBSERVATIONS, OVERVIEW, SUMS, TRUTH, VOXELS, FrameQuality, UnitContent
+from semstab.data.results import RECURRENT, STAGES, Agreement, FrameDrift, ReducedScores, UnitSummary, slug
+from semstab.data.voxels import VoxelTable
 from semstab.datasets import Scene
 from semstab.datasets.formats.disk import file_digest
 from semstab.engine.series import Series
@@ -27,14 +35,6 @@ from semstab.errors import DataError
 from semstab.metrics import compare
 from semstab.metrics.agreement import rows_of
 from semstab.metrics.summary import TableSums
-from semstab.model.events import Events
-from semstab.model.evidence import stretches
-from semstab.model.frames import LeftOut
-from semstab.model.measures import dominant, mean, measures, vss
-from semstab.model.parquet import Tile
-from semstab.model.records import EVENTS, FRAMES, OBSERVATIONS, OVERVIEW, SUMS, TRUTH, VOXELS, FrameQuality, UnitContent
-from semstab.model.results import RECURRENT, STAGES, Agreement, FrameDrift, ReducedScores, UnitSummary, slug
-from semstab.model.voxels import VoxelTable
 from semstab.statistics import Analysis, CellObservations, MapSample, analyse
 from semstab.statistics.agreement import alpha_of, alpha_sums, ratio_of
 from semstab.statistics.verdict import Limits

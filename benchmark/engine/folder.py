@@ -20,13 +20,9 @@ from semstab.backends import keeps_log
 from semstab.config import Config, read_yaml
 from semstab.core.files import TEMPORARY, FolderLock, atomic_path, read_json, remove_leftovers, write_json, write_text
 from semstab.core.json_form import from_json, to_json
-from semstab.datasets.formats.disk import file_digest
-from semstab.engine.units import PlannedUnit
-from semstab.engine.work import TILES, Outcome, Start
-from semstab.errors import ConfigError, DataError
-from semstab.model import earlier
-from semstab.model.measures import measures
-from semstab.model.records import (
+from semstab.data import earlier
+from semstab.data.measures import measures
+from semstab.data.records import (
     EVENTS,
     FRAMES,
     OBSERVATIONS,
@@ -40,7 +36,11 @@ from semstab.model.records import (
     Result,
     UnitContent,
 )
-from semstab.model.results import SCHEMA, Unit, slug
+from semstab.data.results import SCHEMA, Unit, slug
+from semstab.datasets.formats.disk import file_digest
+from semstab.engine.units import PlannedUnit
+from semstab.engine.work import TILES, Outcome, Start
+from semstab.errors import ConfigError, DataError
 
 logger = logging.getLogger("semstab")
 

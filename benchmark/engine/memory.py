@@ -15,9 +15,9 @@ from semstab.config import Config
 from semstab.core.prefetch import default_threads
 from semstab.core.process import available_bytes, resident_bytes, trim_malloc
 from semstab.core.types import Int64
+from semstab.data.frames import Frame
 from semstab.engine.units import PlannedUnit
 from semstab.errors import ConfigError, DataError, OutgrownError
-from semstab.model.frames import Frame
 from semstab.pixels.preparation import perturb
 from semstab.statistics.cluster_sums import distinct_rows
 from semstab.task import Task, read

@@ -9,12 +9,12 @@ if TYPE_CHECKING:
     from semstab.backends import FusionBackend
     from semstab.check import Verdict
     from semstab.config import Config
+    from semstab.data.frames import Frame
+    from semstab.data.records import Result, UnitContent
+    from semstab.data.results import Unit
+    from semstab.data.voxels import VoxelTable
     from semstab.engine.series import FrameRow
     from semstab.engine.units import Plan, PlannedUnit
-    from semstab.model.frames import Frame
-    from semstab.model.records import Result, UnitContent
-    from semstab.model.results import Unit
-    from semstab.model.voxels import VoxelTable
     from semstab.task import Task
 
 

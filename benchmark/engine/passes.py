@@ -15,6 +15,8 @@ import numpy as np
 
 from semstab.core.prefetch import Fetched, prefetch
 from semstab.core.process import Stopwatch
+from semstab.data.frames import Frame
+from semstab.data.records import RegionFlicker, UnitContent
 from semstab.datasets import GROUND_TRUTH, Dataset, Scene, open_dataset
 from semstab.engine.finish import finish
 from semstab.engine.memory import MemoryBudget
@@ -23,8 +25,6 @@ from semstab.engine.streams import Decoded, LiveMap, frame_order, streams_of
 from semstab.engine.work import Job, Outcome, Work, failed
 from semstab.errors import DataError
 from semstab.metrics import macro_mean, matched_region_flicker
-from semstab.model.frames import Frame
-from semstab.model.records import RegionFlicker, UnitContent
 from semstab.pixels.preparation import leave_out, perturb
 from semstab.pixels.warp import correspond
 from semstab.task import frame_indices

@@ -15,17 +15,17 @@ from typing import Any
 from semstab.check import Verdict
 from semstab.config import BACKENDS, BASE, Config
 from semstab.core.process import Stopwatch
+from semstab.data.events import Events
+from semstab.data.records import REGIONS, Failure, Record, Result, Tables, UnitContent
+from semstab.data.results import Agreement, VoxelAdvice
+from semstab.data.tiles import Tiles, side_by_side
+from semstab.data.voxels import VoxelTable
 from semstab.datasets import GROUND_TRUTH
 from semstab.engine.folder import Folder
 from semstab.engine.units import Plan, must_agree
 from semstab.engine.work import Outcome
 from semstab.metrics import compare
 from semstab.metrics.agreement import together
-from semstab.model.events import Events
-from semstab.model.records import REGIONS, Failure, Record, Result, Tables, UnitContent
-from semstab.model.results import Agreement, VoxelAdvice
-from semstab.model.tiles import Tiles, side_by_side
-from semstab.model.voxels import VoxelTable
 from semstab.statistics import BackboneComparison, CellObservations, claimed_together
 from semstab.statistics.model_comparison import Region, Regions, compare_regions
 

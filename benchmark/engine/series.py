@@ -15,7 +15,7 @@ import numpy.typing as npt
 from semstab.core.arrays import Rows
 from semstab.core.files import atomic_path
 from semstab.core.types import Float64
-from semstab.model.results import STAGES, FrameReport
+from semstab.data.results import STAGES, FrameReport
 
 FRAME_COLUMNS = (
     "frame", "timestamp", "points", "voxels", "new_voxels", "drift", "flicker_percent",

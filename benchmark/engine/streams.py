@@ -21,6 +21,11 @@ from semstab.core.arrays import Rows
 from semstab.core.prefetch import Fetched
 from semstab.core.process import Stopwatch
 from semstab.core.types import Float64, Int32, Mask, UInt8, UInt16
+from semstab.data.frames import Frame
+from semstab.data.measures import mean
+from semstab.data.records import ImageSpace
+from semstab.data.results import FrameReport, SizeAlpha, Unit
+from semstab.data.voxels import Extent
 from semstab.datasets import Scene
 from semstab.engine.observer import Observers
 from semstab.engine.series import FrameRow, Series
@@ -35,11 +40,6 @@ from semstab.metrics import (
     compensated_flicker,
     flicker_percent,
 )
-from semstab.model.frames import Frame
-from semstab.model.measures import mean
-from semstab.model.records import ImageSpace
-from semstab.model.results import FrameReport, SizeAlpha, Unit
-from semstab.model.voxels import Extent
 from semstab.statistics import Sampler
 from semstab.statistics.agreement import krippendorff_alpha
 from semstab.statistics.observations import CellObservations

@@ -11,6 +11,9 @@ from pathlib import Path
 import numpy as np
 
 from semstab.core.types import Float64
+from semstab.data.parquet import tile_of
+from semstab.data.records import TRUTH, VOXELS, UnitContent
+from semstab.data.voxels import VoxelTable
 from semstab.engine.finish import (
     Savers,
     analyse_sample,
@@ -28,9 +31,6 @@ from semstab.engine.work import Job, Outcome, Start, TileTask, Work, failed
 from semstab.errors import SemstabError
 from semstab.metrics.agreement import together
 from semstab.metrics.summary import TableSums
-from semstab.model.parquet import tile_of
-from semstab.model.records import TRUTH, VOXELS, UnitContent
-from semstab.model.voxels import VoxelTable
 from semstab.statistics import Analysis, CellObservations, MapSample
 from semstab.statistics.sample import MOST_VOXELS
 

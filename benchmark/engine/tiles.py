@@ -15,11 +15,11 @@ import numpy as np
 from semstab.core.files import parse_json, read_arrays, write_arrays
 from semstab.core.json_form import from_json, to_json
 from semstab.core.types import Float64, Int32
+from semstab.data.frames import Frame
+from semstab.data.records import FrameQuality
+from semstab.data.results import Agreement, SizeAlpha
 from semstab.engine.series import NUMBERS, Series
 from semstab.errors import DataError
-from semstab.model.frames import Frame
-from semstab.model.records import FrameQuality
-from semstab.model.results import Agreement, SizeAlpha
 
 TILE_OBSERVATIONS = "observations.parquet"
 """File of the sample of observations of all frames."""

@@ -25,12 +25,12 @@ from semstab.config import (
     Perturbation,
     Sweeps,
 )
+from semstab.data.labels import LabelSpace
+from semstab.data.measures import measures
+from semstab.data.records import REGIONS, Variation
+from semstab.data.results import Unit
 from semstab.datasets import Scene, open_dataset
 from semstab.errors import ConfigError
-from semstab.model.labels import LabelSpace
-from semstab.model.measures import measures
-from semstab.model.records import REGIONS, Variation
-from semstab.model.results import Unit
 from semstab.task import Task, applies, frame_indices, selected, tasks_of
 
 logger = logging.getLogger("semstab")

@@ -9,10 +9,10 @@ from pathlib import Path
 
 from semstab.config import Config, FrameSelection, as_range
 from semstab.core.files import TEMPORARY
+from semstab.data.records import UnitContent
+from semstab.data.voxels import Extent, VoxelTable
 from semstab.engine.units import PlannedUnit
 from semstab.errors import OUT_OF_MEMORY, OutgrownError, SemstabError, summarize_error
-from semstab.model.records import UnitContent
-from semstab.model.voxels import Extent, VoxelTable
 
 TILES = "tiles"
 """Folder of the results of single tiles, unit by unit, until the unit is whole."""

@@ -17,13 +17,13 @@ from scipy.spatial import cKDTree
 from semstab.backends.shared.association import back_project
 from semstab.core.prefetch import prefetch
 from semstab.core.types import Float64, Int64, Mask
+from semstab.data.frames import Frame
+from semstab.data.measures import bits, dominant
+from semstab.data.voxels import VoxelTable
 from semstab.errors import ConfigError, DataError
 from semstab.exports.join import NONE, VoxelLookup
 from semstab.exports.voxels import Chosen
 from semstab.metrics import CATEGORIES, categories
-from semstab.model.frames import Frame
-from semstab.model.measures import bits, dominant
-from semstab.model.voxels import VoxelTable
 from semstab.statistics import psa
 from semstab.task import Task
 

@@ -12,9 +12,9 @@ import cv2
 
 from semstab.config import nearest
 from semstab.core.files import atomic_path, write_json, write_text
+from semstab.data.labels import LabelSpace
 from semstab.errors import ConfigError
 from semstab.exports.annotation import AnnotationTask
-from semstab.model.labels import LabelSpace
 from semstab.task import Task
 
 MOST = 50

@@ -16,10 +16,10 @@ import numpy.typing as npt
 from semstab.config import nearest, read_yaml
 from semstab.core.files import atomic_path
 from semstab.core.types import UInt8
+from semstab.data.georeference import INSTALL
+from semstab.data.labels import name_key
 from semstab.errors import ConfigError, DataError, MissingDependencyError, summarize_error
 from semstab.exports.voxels import Voxels, crs_name
-from semstab.model.georeference import INSTALL
-from semstab.model.labels import name_key
 
 if TYPE_CHECKING:
     import laspy

@@ -16,13 +16,13 @@ import numpy.typing as npt
 from semstab.core.files import atomic_path
 from semstab.core.prefetch import SizedCache
 from semstab.core.types import Float64, Int64
+from semstab.data.tiles import AT_HAND, Place
+from semstab.data.voxels import VoxelTable
 from semstab.datasets.files.surfaces import open_las, points_at_once
 from semstab.errors import ConfigError, DataError
 from semstab.exports import clouds
 from semstab.exports.voxels import Chosen, Voxels
 from semstab.metrics.agreement import voxel_keys
-from semstab.model.tiles import AT_HAND, Place
-from semstab.model.voxels import VoxelTable
 
 if TYPE_CHECKING:
     import laspy

@@ -13,12 +13,12 @@ import numpy.typing as npt
 
 from semstab.core.files import atomic_path
 from semstab.core.types import Float64, Int64
+from semstab.data.georeference import INSTALL
+from semstab.data.information import normalise
+from semstab.data.tiles import Place
 from semstab.errors import ConfigError, MissingDependencyError
 from semstab.exports.voxels import Chosen, Column, Voxels, crs_name, together
 from semstab.metrics import CATEGORIES, categories
-from semstab.model.georeference import INSTALL
-from semstab.model.information import normalise
-from semstab.model.tiles import Place
 from semstab.report.figures.topdown import covered, level_axes
 
 RASTER_MEASURES = ("vss", "entropy", "op")

@@ -16,19 +16,19 @@ from semstab.config import nearest
 from semstab.core.files import write_json
 from semstab.core.prefetch import SizedCache, prefetch
 from semstab.core.types import Float64, Int64, Mask, UInt8, UInt16
+from semstab.data.evidence import Evidence
+from semstab.data.frames import Frame
+from semstab.data.labels import IGNORE_8BIT, IGNORE_16BIT
+from semstab.data.measures import dominant
+from semstab.data.records import Record
+from semstab.data.tiles import AT_HAND, Place, Tiles
+from semstab.data.voxels import VoxelTable
 from semstab.engine.folder import SETTINGS, load_result
 from semstab.engine.units import make_plan
 from semstab.errors import ConfigError, DataError
 from semstab.exports.join import NONE, VoxelLookup
 from semstab.metrics import CATEGORIES, categories
 from semstab.metrics.agreement import rows_of
-from semstab.model.evidence import Evidence
-from semstab.model.frames import Frame
-from semstab.model.labels import IGNORE_8BIT, IGNORE_16BIT
-from semstab.model.measures import dominant
-from semstab.model.records import Record
-from semstab.model.tiles import AT_HAND, Place, Tiles
-from semstab.model.voxels import VoxelTable
 from semstab.predict.folder import PredictionFolder
 from semstab.settings import load_config
 from semstab.statistics import psa

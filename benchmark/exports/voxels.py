@@ -18,19 +18,19 @@ from semstab.config import nearest
 from semstab.core.files import atomic_path
 from semstab.core.prefetch import SizedCache
 from semstab.core.types import Float64, UInt8
+from semstab.data import labels as colors
+from semstab.data import parquet
+from semstab.data.georeference import IDENTITY, Georeference
+from semstab.data.labels import name_key
+from semstab.data.measures import dominant, measures
+from semstab.data.parquet import files_of
+from semstab.data.records import OVERVIEW, Record, Result
+from semstab.data.results import slug
+from semstab.data.tiles import AT_HAND, Place
+from semstab.data.voxels import VoxelTable
 from semstab.errors import ConfigError, DataError
 from semstab.metrics import CATEGORIES, categories
 from semstab.metrics.agreement import rows_of, voxel_keys
-from semstab.model import labels as colors
-from semstab.model import parquet
-from semstab.model.georeference import IDENTITY, Georeference
-from semstab.model.labels import name_key
-from semstab.model.measures import dominant, measures
-from semstab.model.parquet import files_of
-from semstab.model.records import OVERVIEW, Record, Result
-from semstab.model.results import slug
-from semstab.model.tiles import AT_HAND, Place
-from semstab.model.voxels import VoxelTable
 from semstab.report.figures.maps import Overview
 from semstab.statistics import psa
 from semstab.statistics.acceptance import AcceptanceThresholds

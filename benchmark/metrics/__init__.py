@@ -1,5 +1,6 @@
 """The paper's measures as pure functions of a voxel table, and measures in the image."""
 
+from semstab.data.measures import dominant, entropy, op, sbd, vss
 from semstab.metrics.agreement import compare
 from semstab.metrics.flicker import (
     CompensatedFlicker,
@@ -24,7 +25,6 @@ from semstab.metrics.summary import (
     strata,
     summarise,
 )
-from semstab.model.measures import dominant, entropy, op, sbd, vss
 
 __all__ = [
     "CATEGORIES",

@@ -13,11 +13,11 @@ import numpy as np
 import numpy.typing as npt
 
 from semstab.core.types import Float64, Int32, Int64, Mask
+from semstab.data.events import Events
+from semstab.data.measures import dominant, measures
+from semstab.data.results import Agreement, Deviation, Unit
+from semstab.data.voxels import VoxelTable
 from semstab.errors import DataError
-from semstab.model.events import Events
-from semstab.model.measures import dominant, measures
-from semstab.model.results import Agreement, Deviation, Unit
-from semstab.model.voxels import VoxelTable
 
 # The same voxels in several maps.
 

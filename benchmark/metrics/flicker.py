@@ -10,10 +10,10 @@ import numpy as np
 import numpy.typing as npt
 
 from semstab.core.types import Int64, Mask
+from semstab.data.frames import Frame
+from semstab.data.information import entropy_bits
+from semstab.data.labels import flat
 from semstab.errors import ConfigError, DataError
-from semstab.model.frames import Frame
-from semstab.model.information import entropy_bits
-from semstab.model.labels import flat
 from semstab.pixels.warp import DEPTH_TOLERANCE, correspond
 
 
@@ -30,7 +30,7 @@ def flicker_percent(previous: Frame, current: Frame) -> float:
         raise DataError(
             f"{current.where('depth')}: frames {previous.index} and {current.index} differ in size ({sizes})"
         )
-    from semstab.model.kernels import count_changed
+    from semstab.data.kernels import count_changed
 
     images = (previous.valid, previous.predicted, current.valid, current.predicted)
     both, changed = count_changed(*(flat(image) for image in images))
@@ -62,7 +62,7 @@ def compensated_flicker(
     Raises:
         ConfigError: If depth_tolerance is not above 0 and below 1.
     """
-    from semstab.model.kernels import count_changed_at
+    from semstab.data.kernels import count_changed_at
 
     seen = correspond(current, previous, depth_tolerance=depth_tolerance).pixel
     images = (seen, current.valid, current.predicted, previous.valid, previous.predicted)

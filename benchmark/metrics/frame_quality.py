@@ -9,8 +9,8 @@ import numpy as np
 import numpy.typing as npt
 
 from semstab.core.types import Mask
-from semstab.model.frames import Frame
-from semstab.model.records import FrameQuality
+from semstab.data.frames import Frame
+from semstab.data.records import FrameQuality
 from semstab.pixels.warp import Correspondence, correspond
 
 HORIZON = 8

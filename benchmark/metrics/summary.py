@@ -11,12 +11,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from semstab.core.types import Float64, Int32, Int64, UInt8
+from semstab.data.evidence import stretches
+from semstab.data.information import by_group
+from semstab.data.measures import MeasureMeans, Voxels, bits, dominant, mean, measures, sbd
+from semstab.data.results import RECURRENT, Means, TableSummary
+from semstab.data.voxels import VoxelTable
 from semstab.errors import ConfigError
-from semstab.model.evidence import stretches
-from semstab.model.information import by_group
-from semstab.model.measures import MeasureMeans, Voxels, bits, dominant, mean, measures, sbd
-from semstab.model.results import RECURRENT, Means, TableSummary
-from semstab.model.voxels import VoxelTable
 
 STRATA = (1, 2, 5)
 """Upper edges of the paper's strata: OP=1, OP=2, 3<=OP<=5, OP>5."""

@@ -17,10 +17,10 @@ import numpy.typing as npt
 from pydantic import BaseModel
 
 from semstab.core.types import Float64
+from semstab.data.frames import Frame
+from semstab.data.labels import LabelSpace
 from semstab.datasets.scene import GROUND_TRUTH, Dataset, Scene
 from semstab.errors import DataError
-from semstab.model.frames import Frame
-from semstab.model.labels import LabelSpace
 
 FIELDS = "labels", "scores", "depth", "intrinsics", "T_wc", "color", "mask", "timestamp", "truth"
 """Of a posed label map that is given as a mapping; see `Frame`. truth (H, W) has the true labels."""

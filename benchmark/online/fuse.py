@@ -10,11 +10,11 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
+from semstab.data.frames import Frame
+from semstab.data.records import Result
 from semstab.engine import Observer
 from semstab.engine.execution import run
 from semstab.errors import ConfigError
-from semstab.model.frames import Frame
-from semstab.model.records import Result
 from semstab.online.frames import Frames, OwnFolder, Sequence
 from semstab.online.summary import Summary
 from semstab.report import Reporting, write_report

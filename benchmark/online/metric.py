@@ -15,13 +15,13 @@ from semstab.backends import FusionBackend, create
 from semstab.backends.numpy_reference import ODD, in_sample
 from semstab.backends.shared.pixel_keys import drawn_pixels
 from semstab.core.types import Float64, Int64
+from semstab.data.evidence import Evidence
+from semstab.data.frames import Frame, Intrinsics
+from semstab.data.labels import IGNORE_8BIT, IGNORE_16BIT
+from semstab.data.measures import SBD, VSS, mean
+from semstab.data.voxels import VoxelTable, index_columns
 from semstab.errors import ConfigError, DataError
 from semstab.metrics import compensated_flicker, summarise
-from semstab.model.evidence import Evidence
-from semstab.model.frames import Frame, Intrinsics
-from semstab.model.labels import IGNORE_8BIT, IGNORE_16BIT
-from semstab.model.measures import SBD, VSS, mean
-from semstab.model.voxels import VoxelTable, index_columns
 from semstab.online.frames import as_array
 from semstab.online.summary import Summary
 from semstab.statistics import CellObservations, MapSample, Sampler, Views, analyse, psa

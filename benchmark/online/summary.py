@@ -5,9 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import ClassVar
 
-from semstab.model.measures import ENTROPY, SBD, VSS
-from semstab.model.results import TableSummary
-from semstab.model.statistics import MapStatistics
+from semstab.data.measures import ENTROPY, SBD, VSS
+from semstab.data.results import TableSummary
+from semstab.data.statistics import MapStatistics
 
 
 @dataclass(frozen=True)

@@ -11,8 +11,8 @@ import numpy as np
 
 from semstab.config import Perturbation
 from semstab.core.types import Float32, Float64, Mask
-from semstab.model.frames import Frame, LeftOut
-from semstab.model.labels import flat
+from semstab.data.frames import Frame, LeftOut
+from semstab.data.labels import flat
 from semstab.pixels.kernels import CHUNKS, cut
 
 

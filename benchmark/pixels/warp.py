@@ -10,9 +10,9 @@ import numpy as np
 import numpy.typing as npt
 
 from semstab.core.types import Float32, Float64, Int32, Mask
+from semstab.data.frames import Frame
+from semstab.data.labels import fixed
 from semstab.errors import ConfigError
-from semstab.model.frames import Frame
-from semstab.model.labels import fixed
 
 DEPTH_TOLERANCE = 0.01
 """Two views see the same surface where the depths that they give it differ by at most this share of its distance."""

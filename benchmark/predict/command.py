@@ -18,13 +18,13 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
 
 from semstab.backbones import Backbone, Image
 from semstab.config import DatasetConfig, FrameSelection, validated
+from semstab.data.frames import Frame
 from semstab.datasets import Scene, open_dataset, options_model
 from semstab.datasets.formats.disk import natural
 from semstab.datasets.formats.images import COLOR_SUFFIXES, read_color
 from semstab.datasets.geometry.lenses import Labels, Scores
 from semstab.datasets.scene import select_frames
 from semstab.errors import ConfigError, DataError
-from semstab.model.frames import Frame
 from semstab.predict.images import ImageSequence
 from semstab.predict.predictor import NAME as STORED
 from semstab.predict.predictor import PredictorConfig, load_predictor, stored_labels

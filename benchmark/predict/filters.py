@@ -17,9 +17,9 @@ from semstab.backbones import Backbone, Image, Labels, Prediction, narrowed
 from semstab.backbones.border import Wrapped
 from semstab.core.registry import Entry, Registry
 from semstab.core.types import Float32, UInt16
+from semstab.data.frames import Frame
+from semstab.data.labels import LabelSpace, ignore_id
 from semstab.errors import ConfigError
-from semstab.model.frames import Frame
-from semstab.model.labels import LabelSpace, ignore_id
 from semstab.pixels.warp import carry, warp
 
 Belief = Float32

@@ -16,12 +16,12 @@ import numpy.typing as npt
 from semstab.core.files import FolderLock, atomic_path, content_key, read_json, write_json, write_png, write_stack
 from semstab.core.json_form import from_json
 from semstab.core.types import Float32
+from semstab.data.labels import LabelSpace
 from semstab.datasets.files.labels import LABEL_SPACE_FILE
 from semstab.datasets.files.options import inside
 from semstab.datasets.formats.images import LABEL_SUFFIXES, SCORE_SUFFIXES
 from semstab.datasets.geometry.lenses import fitted
 from semstab.errors import ConfigError, DataError
-from semstab.model.labels import LabelSpace
 
 SCHEMA = 1
 """Version of predictions.json."""

@@ -11,9 +11,9 @@ from typing import Protocol
 import numpy as np
 
 from semstab.backbones import Backbone, Image, image_digest
+from semstab.data.frames import Frame
 from semstab.datasets.geometry.lenses import Labels, Scores
 from semstab.errors import ConfigError
-from semstab.model.frames import Frame
 
 
 class ImageSequence(Protocol):

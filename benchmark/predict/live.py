@@ -17,12 +17,12 @@ from pydantic import BaseModel, Field, field_validator
 from semstab.backbones import Backbone, Image, Prediction, ask, create
 from semstab.config import DatasetConfig, FrameSelection, Settings
 from semstab.core.types import Float64, UInt8
+from semstab.data.frames import Frame
+from semstab.data.labels import LabelSpace
 from semstab.datasets import GROUND_TRUTH, Dataset, Filtering, Scene, open_dataset, resolved
 from semstab.datasets.geometry.lenses import Labels, Scores
 from semstab.datasets.scene import select_frames
 from semstab.errors import ConfigError
-from semstab.model.frames import Frame
-from semstab.model.labels import LabelSpace
 from semstab.predict.filters import Filtered, parse
 from semstab.predict.images import ImageSequence, first_images, geometry_of
 from semstab.predict.predictor import NAME as STORED

@@ -11,7 +11,7 @@ import numpy as np
 from semstab.backends.shared.keys import HALF
 from semstab.core.compiled import serial
 from semstab.core.types import Int32
-from semstab.model.frames import Frame
+from semstab.data.frames import Frame
 from semstab.predict.filters import Belief, Filter, Parameter, Shown, normalised
 
 MOST_CERTAIN = 0.8

@@ -20,11 +20,11 @@ from semstab.backbones.names import InTaxonomy
 from semstab.backbones.network import is_network
 from semstab.config import Settings, validated
 from semstab.core.files import content_key, parse_yaml, read_arrays, write_arrays
+from semstab.data.frames import Frame
+from semstab.data.labels import LabelSpace, ignore_id
 from semstab.datasets import GROUND_TRUTH, Scene
 from semstab.datasets.geometry.lenses import Scores, require_same_view
 from semstab.errors import ConfigError
-from semstab.model.frames import Frame
-from semstab.model.labels import LabelSpace, ignore_id
 from semstab.predict.filters import Filtered, parse
 from semstab.predict.images import ImageSequence, geometry_of, shown_digest
 

@@ -14,11 +14,11 @@ import numpy as np
 import rerun as rr
 
 from semstab.core.types import Float64, Int64
+from semstab.data.frames import Frame, Intrinsics
+from semstab.data.labels import IGNORE_8BIT, IGNORE_16BIT, LabelSpace
+from semstab.data.voxels import VoxelTable
 from semstab.errors import DataError
 from semstab.metrics import dominant
-from semstab.model.frames import Frame, Intrinsics
-from semstab.model.labels import IGNORE_8BIT, IGNORE_16BIT, LabelSpace
-from semstab.model.voxels import VoxelTable
 from semstab.recording import drift
 from semstab.recording.layout import Legend, SceneBounds
 from semstab.recording.timeline import Background, path

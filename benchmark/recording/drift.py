@@ -16,9 +16,9 @@ from semstab.backends.numba_hash import NumbaHash
 from semstab.backends.shared.association import back_project, voxel_index
 from semstab.backends.shared.keys import HALF
 from semstab.core.types import Float32, Float64, Int64, Mask, UInt8, UInt16
-from semstab.model.frames import Frame, Intrinsics
-from semstab.model.labels import GLOW, LabelSpace, between
-from semstab.model.measures import SBD_MAX, mean_drift
+from semstab.data.frames import Frame, Intrinsics
+from semstab.data.labels import GLOW, LabelSpace, between
+from semstab.data.measures import SBD_MAX, mean_drift
 from semstab.recording.timeline import LINE_COLORS, Clock, path
 
 # The pictures: levels of drift, in colours that no class is given, and labels that contradict the map.

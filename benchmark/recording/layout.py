@@ -16,10 +16,10 @@ import rerun.blueprint as rrb
 
 from semstab.backends import REGISTRY
 from semstab.core.types import Float64, UInt8
+from semstab.data.labels import Color, LabelSpace
+from semstab.data.results import Unit
+from semstab.data.voxels import VoxelTable
 from semstab.engine.units import Plan
-from semstab.model.labels import Color, LabelSpace
-from semstab.model.results import Unit
-from semstab.model.voxels import VoxelTable
 from semstab.recording.drift import PICTURES
 from semstab.recording.target import Target
 from semstab.recording.timeline import SERIES, entity, path

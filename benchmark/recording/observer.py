@@ -19,18 +19,18 @@ from semstab.config import BACKENDS, BASE, Config
 from semstab.core.prefetch import prefetch
 from semstab.core.process import available_bytes
 from semstab.core.types import Float64, Int64
+from semstab.data.frames import Frame
+from semstab.data.labels import LabelSpace
+from semstab.data.measures import measures
+from semstab.data.records import Result, UnitContent
+from semstab.data.results import Unit, UnitSummary
+from semstab.data.voxels import VoxelTable
 from semstab.datasets import Scene
 from semstab.engine.folder import load_result
 from semstab.engine.observer import Observer
 from semstab.engine.series import FrameRow
 from semstab.engine.units import Plan, PlannedUnit, make_plan
 from semstab.errors import ConfigError, SemstabError, summarize_error
-from semstab.model.frames import Frame
-from semstab.model.labels import LabelSpace
-from semstab.model.measures import measures
-from semstab.model.records import Result, UnitContent
-from semstab.model.results import Unit, UnitSummary
-from semstab.model.voxels import VoxelTable
 from semstab.recording import timeline
 from semstab.recording.camera import COARSE_SIDE, SceneLog, over_camera, stride_of
 from semstab.recording.drift import DriftLog

@@ -11,10 +11,10 @@ from typing import Any
 
 import rerun as rr
 
+from semstab.data.measures import ENTROPY, VSS
+from semstab.data.results import RECURRENT, Unit
 from semstab.engine.units import Plan
 from semstab.errors import DataError, summarize_error
-from semstab.model.measures import ENTROPY, VSS
-from semstab.model.results import RECURRENT, Unit
 from semstab.task import Task
 
 FIRST_DATE, LAST_DATE = 1e8, 9e9

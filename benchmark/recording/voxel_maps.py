@@ -19,16 +19,16 @@ from rerun.blueprint.encodings import ComponentSourceKind, VisualizerComponentMa
 
 from semstab.backends import GrowingMap
 from semstab.core.types import Float64, Int32, Int64, UInt32
+from semstab.data.evidence import Evidence
+from semstab.data.labels import LabelSpace
+from semstab.data.measures import Voxels, bits, measures, sbd
+from semstab.data.records import Record
+from semstab.data.results import RECURRENT
+from semstab.data.statistics import LagBin, MapStatistics
+from semstab.data.voxels import VoxelTable
 from semstab.metrics import CATEGORY_COLORS, dominant, vss
 from semstab.metrics.agreement import shared_rows
 from semstab.metrics.summary import categorise
-from semstab.model.evidence import Evidence
-from semstab.model.labels import LabelSpace
-from semstab.model.measures import Voxels, bits, measures, sbd
-from semstab.model.records import Record
-from semstab.model.results import RECURRENT
-from semstab.model.statistics import LagBin, MapStatistics
-from semstab.model.voxels import VoxelTable
 
 
 @dataclass(frozen=True)

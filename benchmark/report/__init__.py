@@ -10,13 +10,13 @@ from types import MappingProxyType
 from typing import TYPE_CHECKING
 
 from semstab.core.files import write_text
+from semstab.data.records import Result, UnitContent
 from semstab.engine.observer import Observer
-from semstab.model.records import Result, UnitContent
 from semstab.report.tables import write_tables
 
 if TYPE_CHECKING:
+    from semstab.data.voxels import VoxelTable
     from semstab.engine.units import PlannedUnit
-    from semstab.model.voxels import VoxelTable
     from semstab.report.figures.topdown import FromAbove
 
 __all__ = ["Reporting", "write_report"]

@@ -8,11 +8,11 @@ import statistics
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 
+from semstab.data.measures import Measure
+from semstab.data.records import Record, Result, Variation
+from semstab.data.results import Means
+from semstab.data.statistics import UNDEFINED, Estimate, MapStatistics
 from semstab.metrics import macro_mean, pool, split_last
-from semstab.model.measures import Measure
-from semstab.model.records import Record, Result, Variation
-from semstab.model.results import Means
-from semstab.model.statistics import UNDEFINED, Estimate, MapStatistics
 
 ENOUGH = 1000
 """Voxels from which on a mean is taken at its word. Below, chance alone moves a mean VSS in its second digit: its

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from semstab.model.statistics import Estimate
+from semstab.data.statistics import Estimate
 
 WIDTH, HEIGHT = 520, 230
 LEFT, RIGHT, TOP, BOTTOM = 68, 12, 12, 42

@@ -9,12 +9,12 @@ from typing import TYPE_CHECKING, Any
 import numpy.typing as npt
 
 from semstab.core.arrays import values_of
+from semstab.data import voxels
+from semstab.data.events import Events
+from semstab.data.records import Result
+from semstab.data.voxels import VoxelTable
 from semstab.engine.folder import load_result
 from semstab.errors import ConfigError, DataError, summarize_error
-from semstab.model import voxels
-from semstab.model.events import Events
-from semstab.model.records import Result
-from semstab.model.voxels import VoxelTable
 
 if TYPE_CHECKING:
     import pandas as pd

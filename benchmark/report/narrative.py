@@ -5,11 +5,11 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping, Sequence
 
+from semstab.data.measures import VSS
+from semstab.data.records import Record, Result
+from semstab.data.results import UnitSummary, VoxelAdvice
 from semstab.datasets import GROUND_TRUTH
 from semstab.metrics import macro_mean
-from semstab.model.measures import VSS
-from semstab.model.records import Record, Result
-from semstab.model.results import UnitSummary, VoxelAdvice
 from semstab.report.averages import ENOUGH, by_backbone, pooled
 from semstab.report.tables.stability import comparable
 from semstab.statistics.agreement import ALPHA

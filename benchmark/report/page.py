@@ -12,11 +12,11 @@ from typing import Any
 import numpy as np
 
 from semstab.core.types import Int64, UInt8
+from semstab.data.measures import SBD, VSS, dominant
+from semstab.data.records import OVERVIEW, Failure, Record, Result
+from semstab.data.results import slug
+from semstab.data.statistics import Estimate, MapStatistics
 from semstab.metrics import CATEGORIES, CATEGORY_COLORS, categories, macro_mean
-from semstab.model.measures import SBD, VSS, dominant
-from semstab.model.records import OVERVIEW, Failure, Record, Result
-from semstab.model.results import slug
-from semstab.model.statistics import Estimate, MapStatistics
 from semstab.report.averages import by_backbone, describe, levels, over_recurrent, pooled, swept
 from semstab.report.charts import SERIES, Line, dot_chart, line_chart
 from semstab.report.figures.maps import Overview, Views

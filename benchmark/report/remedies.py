@@ -7,8 +7,8 @@ import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
+from semstab.data.records import Record, Result
 from semstab.metrics import macro_mean
-from semstab.model.records import Record, Result
 
 MOST_LAG = 1.0
 """Frames by which a recommended filter may follow a change late, in the mean."""

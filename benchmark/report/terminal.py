@@ -13,14 +13,14 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from semstab.check import Verdict
 from semstab.config import BASE
+from semstab.data.measures import measures
+from semstab.data.records import Failure, Record, Result, UnitContent
+from semstab.data.results import Agreement, UnitSummary
+from semstab.data.statistics import Estimate, StabilityVerdict
 from semstab.engine.executors import InProcess
 from semstab.engine.observer import Observer
 from semstab.engine.units import Plan
 from semstab.metrics import CATEGORIES, macro_mean
-from semstab.model.measures import measures
-from semstab.model.records import Failure, Record, Result, UnitContent
-from semstab.model.results import Agreement, UnitSummary
-from semstab.model.statistics import Estimate, StabilityVerdict
 from semstab.report.narrative import differences, warnings
 from semstab.report.remedies import advice, remedies
 from semstab.report.tables import tables

@@ -4,8 +4,8 @@ Pure functions of a VoxelTable and its Events. `describe` says everything about 
 several; docs/metrics.md derives each measure.
 """
 
-from semstab.model.contrast import BackboneComparison
-from semstab.model.statistics import Estimate, Reliability
+from semstab.data.contrast import BackboneComparison
+from semstab.data.statistics import Estimate, Reliability
 from semstab.statistics.agreement import class_agreement, decompose, disagreement, fleiss_kappa, krippendorff_alpha, psa
 from semstab.statistics.correctness import correctness, join_truth, quadrants, reliability, stable_wrong
 from semstab.statistics.correlogram import correlogram

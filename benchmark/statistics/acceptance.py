@@ -15,9 +15,9 @@ from pydantic import BaseModel, ConfigDict, Field
 from semstab.config import read_yaml, validated
 from semstab.core.files import write_text
 from semstab.core.types import Float64, Int32, Int64, Mask
+from semstab.data.measures import Beliefs, dominant, margin, vss
+from semstab.data.voxels import VoxelTable
 from semstab.errors import ConfigError, DataError
-from semstab.model.measures import Beliefs, dominant, margin, vss
-from semstab.model.voxels import VoxelTable
 from semstab.statistics.agreement import ratio_of
 from semstab.statistics.cluster_sums import cubes_of
 from semstab.statistics.correctness import Truth

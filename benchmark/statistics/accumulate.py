@@ -11,13 +11,13 @@ import numpy as np
 import numpy.typing as npt
 
 from semstab.core.types import Float64, Int32, Int64, Mask
-from semstab.model.events import Events
-from semstab.model.evidence import Evidence
-from semstab.model.information import by_group
-from semstab.model.measures import dominant, entropy, vss
-from semstab.model.results import RECURRENT
-from semstab.model.statistics import Interval
-from semstab.model.voxels import VoxelTable
+from semstab.data.events import Events
+from semstab.data.evidence import Evidence
+from semstab.data.information import by_group
+from semstab.data.measures import dominant, entropy, vss
+from semstab.data.results import RECURRENT
+from semstab.data.statistics import Interval
+from semstab.data.voxels import VoxelTable
 from semstab.statistics.agreement import one_hot_where, psa, ratio_of, stability_posterior
 from semstab.statistics.cluster_sums import (
     BINS,

@@ -14,11 +14,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from semstab.core.types import Float64, Int64, Mask
-from semstab.model.events import Events
-from semstab.model.evidence import Evidence
-from semstab.model.measures import Quantity, entropy, vss
-from semstab.model.statistics import ClassAgreement
-from semstab.model.voxels import VoxelTable
+from semstab.data.events import Events
+from semstab.data.evidence import Evidence
+from semstab.data.measures import Quantity, entropy, vss
+from semstab.data.statistics import ClassAgreement
+from semstab.data.voxels import VoxelTable
 
 PSA = Quantity(key="psa", title="PSA", better="higher")
 KAPPA = Quantity(key="kappa", title="Kappa", better="higher", digits=(2, 4))

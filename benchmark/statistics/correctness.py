@@ -10,14 +10,14 @@ from typing import Any
 import numpy as np
 
 from semstab.core.types import Float64, Int32, Int64, Mask
+from semstab.data.evidence import Evidence
+from semstab.data.measures import Quantity, dominant
+from semstab.data.results import RECURRENT
+from semstab.data.statistics import UNKNOWN, Correctness, Quadrants, Reliability
+from semstab.data.voxels import VoxelTable
 from semstab.metrics import strata
 from semstab.metrics.agreement import require_same_grid, same_voxels, shared_rows
 from semstab.metrics.summary import groups_of
-from semstab.model.evidence import Evidence
-from semstab.model.measures import Quantity, dominant
-from semstab.model.results import RECURRENT
-from semstab.model.statistics import UNKNOWN, Correctness, Quadrants, Reliability
-from semstab.model.voxels import VoxelTable
 from semstab.statistics.accumulate import Cubes, CubeSums
 from semstab.statistics.agreement import LIKELY, STABLE, ratio_of, stability_posterior
 

@@ -13,9 +13,9 @@ from typing import Any
 import numpy as np
 
 from semstab.core.types import Float64, Int64
-from semstab.model.events import Events
-from semstab.model.evidence import Evidence
-from semstab.model.statistics import UNKNOWN, Correlogram, LagBin
+from semstab.data.events import Events
+from semstab.data.evidence import Evidence
+from semstab.data.statistics import UNKNOWN, Correlogram, LagBin
 from semstab.statistics.agreement import alpha_of
 from semstab.statistics.cluster_sums import MOST_GROUPS, cubes_of
 from semstab.statistics.intervals import confidence_intervals, spec_of_observations

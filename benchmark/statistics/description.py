@@ -9,13 +9,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from semstab.core.types import THIS_SCENE, Float64, Scope
-from semstab.metrics.agreement import shared_rows
-from semstab.metrics.summary import STRATA, groups_of
-from semstab.model.events import Events
-from semstab.model.information import by_group
-from semstab.model.measures import SBD, dominant
-from semstab.model.results import TableSummary
-from semstab.model.statistics import (
+from semstab.data.events import Events
+from semstab.data.information import by_group
+from semstab.data.measures import SBD, dominant
+from semstab.data.results import TableSummary
+from semstab.data.statistics import (
     CellAgreement,
     ClassAgreement,
     ClassAlpha,
@@ -31,7 +29,9 @@ from semstab.model.statistics import (
     StratumStatistics,
     Trend,
 )
-from semstab.model.voxels import VoxelTable
+from semstab.data.voxels import VoxelTable
+from semstab.metrics.agreement import shared_rows
+from semstab.metrics.summary import STRATA, groups_of
 from semstab.statistics.accumulate import Cubes, CubeSums, cluster_sums_of
 from semstab.statistics.agreement import class_agreement_of, class_sums, ratio_of, shares_of, stability_posterior
 from semstab.statistics.cluster_sums import MOST_CLASSES, ClusterSums

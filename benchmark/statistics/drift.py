@@ -13,9 +13,9 @@ from typing import Any
 import numpy as np
 
 from semstab.core.types import Float64, Int64, UInt64
-from semstab.model.events import Events
-from semstab.model.measures import Quantity
-from semstab.model.voxels import VoxelTable
+from semstab.data.events import Events
+from semstab.data.measures import Quantity
+from semstab.data.voxels import VoxelTable
 from semstab.statistics.agreement import ONE_HOT
 
 FLIP_RATE = Quantity(key="flip_rate", title="Flip rate", better="lower", needs="events")

@@ -16,13 +16,13 @@ import numpy.typing as npt
 from semstab.backends import FusionBackend
 from semstab.backends.shared.association import back_project, voxel_index
 from semstab.core.types import Int64
+from semstab.data.frames import Frame
+from semstab.data.labels import IGNORE_8BIT, IGNORE_16BIT
+from semstab.data.statistics import Losses
+from semstab.data.voxels import VoxelTable
 from semstab.errors import DataError
 from semstab.metrics import dominant
 from semstab.metrics.agreement import shared_rows, voxel_keys
-from semstab.model.frames import Frame
-from semstab.model.labels import IGNORE_8BIT, IGNORE_16BIT
-from semstab.model.statistics import Losses
-from semstab.model.voxels import VoxelTable
 from semstab.statistics.accumulate import Cubes, CubeSums
 from semstab.statistics.agreement import psa, ratio_of
 

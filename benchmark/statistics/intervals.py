@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from semstab.core.types import THESE_FRAMES, THIS_SCENE, Float64, Int64, Scope
-from semstab.model.statistics import UNKNOWN, HeadlineStatistics, Interval
+from semstab.data.statistics import UNKNOWN, HeadlineStatistics, Interval
 from semstab.statistics.agreement import ratio_of
 from semstab.statistics.cluster_sums import (
     MOST_GROUPS,

@@ -9,14 +9,14 @@ from dataclasses import dataclass
 import numpy as np
 
 from semstab.core.types import Float64, Int64, Mask
+from semstab.data.contrast import BackboneComparison, MapCoverage, Paired, Rank, Ranking, Standardised
+from semstab.data.events import Events
+from semstab.data.measures import Quantity, dominant, measures
+from semstab.data.results import RECURRENT
+from semstab.data.statistics import UNDEFINED, Estimate
+from semstab.data.voxels import VoxelTable
 from semstab.errors import ConfigError
 from semstab.metrics.agreement import require_same_grid, shared_rows
-from semstab.model.contrast import BackboneComparison, MapCoverage, Paired, Rank, Ranking, Standardised
-from semstab.model.events import Events
-from semstab.model.measures import Quantity, dominant, measures
-from semstab.model.results import RECURRENT
-from semstab.model.statistics import UNDEFINED, Estimate
-from semstab.model.voxels import VoxelTable
 from semstab.statistics.accumulate import CubeSums
 from semstab.statistics.agreement import ALPHA, PSA, VOXEL_ALPHA, alpha_columns, alpha_of, ratio_of
 from semstab.statistics.cluster_sums import CELLS, ClusterSums, Statistic, columns_of, distinct_rows

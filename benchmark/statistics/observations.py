@@ -16,11 +16,11 @@ import numpy.typing as npt
 from semstab.core import arrays
 from semstab.core.files import atomic_path, parse_json
 from semstab.core.types import Float64, Int32, Int64, UInt16, UInt32
+from semstab.data.events import Events
+from semstab.data.evidence import Evidence
+from semstab.data.measures import dominant, mean
+from semstab.data.voxels import index_columns
 from semstab.errors import DataError, summarize_error
-from semstab.model.events import Events
-from semstab.model.evidence import Evidence
-from semstab.model.measures import dominant, mean
-from semstab.model.voxels import index_columns
 from semstab.statistics.loops import CELLS, SHIFTS, SPAN, WITHIN
 
 Voxel = tuple[int, int, int]

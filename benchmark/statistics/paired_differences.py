@@ -14,14 +14,14 @@ from dataclasses import dataclass
 import numpy as np
 
 from semstab.core.types import Float64, Int64, Mask
+from semstab.data.contrast import BackboneComparison, ComparedObservations, Ignored, PairedDifference
+from semstab.data.events import Events
+from semstab.data.information import by_group
+from semstab.data.measures import ENTROPY, Quantity, mean, measures
+from semstab.data.statistics import UNDEFINED, UNKNOWN, Estimate, Interval
+from semstab.data.voxels import VoxelTable
 from semstab.errors import ConfigError, DataError
 from semstab.metrics.agreement import observations, require_same_grid, rows_of
-from semstab.model.contrast import BackboneComparison, ComparedObservations, Ignored, PairedDifference
-from semstab.model.events import Events
-from semstab.model.information import by_group
-from semstab.model.measures import ENTROPY, Quantity, mean, measures
-from semstab.model.statistics import UNDEFINED, UNKNOWN, Estimate, Interval
-from semstab.model.voxels import VoxelTable
 from semstab.statistics.accumulate import Cubes, CubeSums, cluster_sums_of, sums_of_cells
 from semstab.statistics.agreement import ALPHA, ONE_HOT, PSA, VOXEL_ALPHA, psa, ratio_of
 from semstab.statistics.cluster_sums import ClusterSums, Statistic

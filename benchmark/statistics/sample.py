@@ -13,11 +13,11 @@ import numpy as np
 from semstab.core.arrays import from_arrays, to_arrays
 from semstab.core.files import read_arrays, write_arrays
 from semstab.core.types import Int64
+from semstab.data.events import Events
+from semstab.data.voxels import VoxelTable
 from semstab.errors import DataError
 from semstab.metrics.agreement import require_same_grid, require_same_map, shared_rows
 from semstab.metrics.summary import STRATA, TableSums
-from semstab.model.events import Events
-from semstab.model.voxels import VoxelTable
 from semstab.statistics.drift import lowest, streams
 
 MOST_VOXELS = 500_000

@@ -16,8 +16,8 @@ import numpy.typing as npt
 
 from semstab.core.arrays import Rows
 from semstab.core.types import Float64, Int64, UInt16, UInt32
-from semstab.model.frames import Frame
-from semstab.model.labels import fixed
+from semstab.data.frames import Frame
+from semstab.data.labels import fixed
 from semstab.statistics.loops import CELLS, SPAN
 from semstab.statistics.observations import VIEW, CellObservations, Views
 

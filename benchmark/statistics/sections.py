@@ -11,9 +11,9 @@ import numpy as np
 import numpy.typing as npt
 
 from semstab.core.types import Float64
-from semstab.model.measures import sbd, vss
-from semstab.model.statistics import Flipping, Interval
-from semstab.model.voxels import VoxelTable
+from semstab.data.measures import sbd, vss
+from semstab.data.statistics import Flipping, Interval
+from semstab.data.voxels import VoxelTable
 from semstab.statistics.accumulate import Cubes, CubeSums, Mean
 from semstab.statistics.agreement import alpha_of, decompose, disagreement, kappa_of, psa
 from semstab.statistics.drift import flips, trends

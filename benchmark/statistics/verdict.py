@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 from semstab.core.types import THIS_SCENE
-from semstab.model.statistics import CellAgreement, Flipping, HeadlineStatistics, Interval, Level, StabilityVerdict
+from semstab.data.statistics import CellAgreement, Flipping, HeadlineStatistics, Interval, Level, StabilityVerdict
 from semstab.statistics.intervals import LEAST_FRAMES, probability_above
 
 

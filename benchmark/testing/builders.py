@@ -14,10 +14,10 @@ from scipy.spatial.transform import Rotation
 
 from semstab.backends import FusionBackend
 from semstab.core.types import Float64
+from semstab.data.frames import Frame, Intrinsics
+from semstab.data.measures import SBD_MAX
+from semstab.data.voxels import VoxelTable
 from semstab.metrics import entropy, sbd, vss
-from semstab.model.frames import Frame, Intrinsics
-from semstab.model.measures import SBD_MAX
-from semstab.model.voxels import VoxelTable
 
 Voxel = tuple[int, int, int]
 Label = int | Sequence[float]

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 from hypothesis import given
 
+from semstab.data.frames import Frame
+from semstab.data.results import RECURRENT, FrameReport
+from semstab.data.voxels import VoxelTable
 from semstab.errors import ConfigError, DataError
 from semstab.metrics import entropy, vss
-from semstab.model.frames import Frame
-from semstab.model.results import RECURRENT, FrameReport
-from semstab.model.voxels import VoxelTable
 from semstab.testing.builders import (
     JS_HALF,
     SEQUENCES,

@@ -12,9 +12,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from semstab import backends
+from semstab.data.frames import Frame, Intrinsics
 from semstab.errors import DataError
 from semstab.metrics import dominant, entropy, sbd, vss
-from semstab.model.frames import Frame, Intrinsics
 from semstab.testing.builders import (
     H_THIRD,
     HITS,

@@ -17,6 +17,8 @@ from pydantic import BaseModel
 
 from semstab.config import nearest
 from semstab.core.types import Float64, UInt8
+from semstab.data.frames import Frame, Intrinsics
+from semstab.data.labels import LabelSpace
 from semstab.datasets.city.labellers import relabelled
 from semstab.datasets.city.mesh import uavid8
 from semstab.datasets.city.options import FLIGHTS, CityOptions, SimulatedBackbone
@@ -24,8 +26,6 @@ from semstab.datasets.city.simulation import Caster, Rendered, Simulation, View,
 from semstab.datasets.city.world import World, build_world
 from semstab.datasets.scene import GROUND_TRUTH, Dataset, Scene
 from semstab.errors import ConfigError, DataError
-from semstab.model.frames import Frame, Intrinsics
-from semstab.model.labels import LabelSpace
 
 __all__ = ["GENERATOR_VERSION", "City", "CityOptions", "CityScene", "SimulatedBackbone"]
 

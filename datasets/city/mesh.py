@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from semstab.core.types import Float64, Int64, Mask, UInt8
-from semstab.model.labels import LabelSpace
+from semstab.data.labels import LabelSpace
 
 Color = tuple[float, float, float]
 

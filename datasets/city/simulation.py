@@ -10,10 +10,10 @@ import cv2
 import numpy as np
 
 from semstab.core.types import Float32, Float64, Int64, Mask, UInt8, UInt64
+from semstab.data.frames import Intrinsics
+from semstab.data.labels import IGNORE_8BIT
 from semstab.datasets.city.mesh import BUILDING, CLUTTER, LOW_VEGETATION, ROAD, TREE, Surface, uavid8
 from semstab.datasets.city.options import CONFUSION, SimulatedBackbone
-from semstab.model.frames import Intrinsics
-from semstab.model.labels import IGNORE_8BIT
 
 # Random numbers that are a function of integers: the same place, view or frame always draws the same number.
 

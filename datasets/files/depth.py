@@ -13,12 +13,12 @@ from typing import Any
 import numpy as np
 
 from semstab.core.types import Float32
+from semstab.data.frames import Intrinsics
 from semstab.datasets.files.options import FileOptions, FrameSource
 from semstab.datasets.formats.disk import AGAIN, read_bytes
 from semstab.datasets.formats.images import MAX_PIXELS, MILLIMETRES, Read, color_size, read_depth
 from semstab.datasets.geometry.cameras import planar
 from semstab.errors import DataError
-from semstab.model.frames import Intrinsics
 
 # Depth maps of multi-view stereo programs: MVE's .mvei, OpenMVS's .dmap, COLMAP's .bin.
 #

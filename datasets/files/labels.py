@@ -13,13 +13,13 @@ import numpy as np
 
 from semstab.config import nearest
 from semstab.core.types import UInt16
+from semstab.data.labels import IGNORE_16BIT, LabelSpace, ignore_id
 from semstab.datasets.files.options import FileOptions, Folders, FrameSource, Template, inside, matching_folders
 from semstab.datasets.formats import images
 from semstab.datasets.formats.images import Read, Size
 from semstab.datasets.geometry.lenses import Labels, Scores
 from semstab.datasets.scene import GROUND_TRUTH, listed
 from semstab.errors import ConfigError, DataError
-from semstab.model.labels import IGNORE_16BIT, LabelSpace, ignore_id
 
 logger = logging.getLogger("semstab")
 

@@ -10,6 +10,7 @@ from typing import Generic, TypeVar
 
 from semstab.config import nearest
 from semstab.core.types import UInt16
+from semstab.data.georeference import Georeference
 from semstab.datasets.files.labels import SceneEntry
 from semstab.datasets.files.options import FileOptions, Folders, FrameSource, inside
 from semstab.datasets.files.scene import FileScene
@@ -19,7 +20,6 @@ from semstab.datasets.formats.images import COLOR_SUFFIXES
 from semstab.datasets.geometry.cameras import Camera, Poses
 from semstab.datasets.scene import Dataset
 from semstab.errors import ConfigError, DataError
-from semstab.model.georeference import Georeference
 
 DEEPEST = 3
 """Levels of folders below root that are searched for scenes."""

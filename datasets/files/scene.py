@@ -13,6 +13,8 @@ import numpy as np
 
 from semstab.core.prefetch import prefetch
 from semstab.core.types import Float32, Float64, UInt8, UInt16
+from semstab.data.frames import Frame, Intrinsics
+from semstab.data.labels import LabelSpace
 from semstab.datasets.files.depth import shape_of, stored_depth, stored_scale
 from semstab.datasets.files.labels import LabelMaps, SceneEntry, label_paths
 from semstab.datasets.files.options import FileOptions, Folders, FrameSource
@@ -24,8 +26,6 @@ from semstab.datasets.geometry.cameras import UP_AXES, Camera, Poses, to_camera_
 from semstab.datasets.geometry.lenses import Labels, Pixels, Scores, at_image, fit, fitted, undistorted
 from semstab.datasets.scene import Scene
 from semstab.errors import ConfigError, DataError
-from semstab.model.frames import Frame, Intrinsics
-from semstab.model.labels import LabelSpace
 
 PLACES = {
     "root", "labels_root", "incomplete", "taxonomy", "taxonomies", "classes", "class_table", "crs", "offset", "surface",

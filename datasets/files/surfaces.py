@@ -19,10 +19,10 @@ import numpy as np
 
 from semstab.core.files import atomic_path
 from semstab.core.types import Float32, Float64, Int32
+from semstab.data.frames import Intrinsics
+from semstab.data.georeference import INSTALL, Georeference
 from semstab.datasets.formats.disk import file_digest
 from semstab.errors import ConfigError, DataError, MissingDependencyError, SemstabError, summarize_error
-from semstab.model.frames import Intrinsics
-from semstab.model.georeference import INSTALL, Georeference
 
 # Heights on a grid over x and y: of a raster file, and of the points of a cloud.
 

@@ -19,9 +19,9 @@ import numpy.typing as npt
 
 from semstab.core.files import open_file, parse_json, read_limited
 from semstab.core.types import Float64
+from semstab.data.frames import Intrinsics
 from semstab.datasets.geometry.cameras import Poses
 from semstab.errors import DataError, summarize_error
-from semstab.model.frames import Intrinsics
 
 AGAIN = "copy or export it again"
 MAX_BYTES = 2**32

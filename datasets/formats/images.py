@@ -22,10 +22,10 @@ import numpy as np
 import numpy.typing as npt
 
 from semstab.core.types import Float32, Mask, UInt8, UInt16, UInt32
+from semstab.data.labels import IGNORE_8BIT, IGNORE_16BIT, LabelSpace
 from semstab.datasets.formats.disk import AGAIN, decode_array, read_bytes
 from semstab.datasets.geometry.lenses import Labels
 from semstab.errors import ConfigError, DataError, summarize_error
-from semstab.model.labels import IGNORE_8BIT, IGNORE_16BIT, LabelSpace
 
 if TYPE_CHECKING:
     from PIL.ImageFile import ImageFile

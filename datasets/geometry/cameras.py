@@ -11,8 +11,8 @@ import numpy as np
 import numpy.typing as npt
 
 from semstab.core.types import Float32, Float64
+from semstab.data.frames import Intrinsics
 from semstab.errors import DataError
-from semstab.model.frames import Intrinsics
 
 LARGEST = 1e9
 FxFyCxCy = tuple[float, float, float, float]

@@ -13,10 +13,10 @@ import numpy as np
 import numpy.typing as npt
 
 from semstab.core.types import Float32, Float64, Mask, UInt8, UInt16
+from semstab.data.frames import Frame, Intrinsics
+from semstab.data.labels import ignore_id
 from semstab.datasets.geometry.cameras import Camera
 from semstab.errors import DataError
-from semstab.model.frames import Frame, Intrinsics
-from semstab.model.labels import ignore_id
 
 # Label maps and scores brought to the pixels of the depth image: nearest for ids, linear for scores.
 

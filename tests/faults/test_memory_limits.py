@@ -14,8 +14,8 @@ from posed_writer import write_posed
 import semstab
 from semstab.backends.numpy_reference import NumpyReference
 from semstab.core.process import available_bytes, group_bytes
+from semstab.data.frames import Frame, Intrinsics
 from semstab.errors import ConfigError
-from semstab.model.frames import Frame, Intrinsics
 from semstab.statistics.agreement import alpha_of
 from semstab.statistics.intervals import confidence_intervals, spec_of_observations
 

@@ -14,9 +14,9 @@ from typer.testing import CliRunner
 
 import semstab
 from semstab.cli import app
+from semstab.data.results import Unit, slug
 from semstab.engine.folder import require_file_names
 from semstab.errors import ConfigError
-from semstab.model.results import Unit, slug
 
 HORRORS = (
     "a b", "a-b", "x", "x__y", "-rf", "[/bold]", "$x^{", "<b>&amp;", "ä" * 100, "new\nline", "\u202e",

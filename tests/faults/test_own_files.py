@@ -19,9 +19,9 @@ import semstab
 from semstab.convert import convert
 from semstab.core.files import read_json
 from semstab.core.json_form import from_json
+from semstab.data.records import UnitContent
 from semstab.engine import load_result
 from semstab.errors import LONGEST_LINE, SemstabError
-from semstab.model.records import UnitContent
 from semstab.predict.folder import PredictionFolder
 from semstab.report.tables import tables
 from semstab.report.terminal import print_summary

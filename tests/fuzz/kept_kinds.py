@@ -18,15 +18,15 @@ from semstab.backbones import Backbone, Prediction
 from semstab.backbones.names import class_names
 from semstab.comparison.writing import compare, load_comparison
 from semstab.conformance import case_folder, compared
+from semstab.data.frames import Intrinsics
+from semstab.data.labels import LabelSpace
+from semstab.data.voxels import VoxelTable
 from semstab.datasets import open_dataset
 from semstab.datasets.files.surfaces import Casts, View
 from semstab.engine.series import NUMBERS
 from semstab.engine.tiles import TileResult
 from semstab.engine.units import make_plan
 from semstab.errors import DataError
-from semstab.model.frames import Intrinsics
-from semstab.model.labels import LabelSpace
-from semstab.model.voxels import VoxelTable
 from semstab.predict.filters import parse
 from semstab.predict.predictor import Kept
 from semstab.recording import Recording

@@ -32,6 +32,12 @@ from semstab.comparison.runs import open_run, open_runs, save_summary, shared_sc
 from semstab.convert import convert
 from semstab.core.files import read_json
 from semstab.core.json_form import from_json
+from semstab.data.events import Events
+from semstab.data.frames import Frame, Intrinsics
+from semstab.data.georeference import Georeference, wkt
+from semstab.data.labels import LabelSpace
+from semstab.data.records import UnitContent
+from semstab.data.voxels import VoxelTable
 from semstab.datasets import open_dataset
 from semstab.datasets.files.depth import read_depth_map, read_dmap, read_mvei
 from semstab.datasets.files.surfaces import Surface
@@ -47,12 +53,6 @@ from semstab.datasets.formats.images import (
 from semstab.datasets.scannet import read_class_table
 from semstab.engine import load_result
 from semstab.exports import export
-from semstab.model.events import Events
-from semstab.model.frames import Frame, Intrinsics
-from semstab.model.georeference import Georeference, wkt
-from semstab.model.labels import LabelSpace
-from semstab.model.records import UnitContent
-from semstab.model.voxels import VoxelTable
 from semstab.predict.folder import PredictionFolder
 from semstab.report.figures.maps import Overview
 from semstab.report.tables import tables

@@ -18,14 +18,14 @@ from image_files import npy_bytes, npz_bytes
 from semstab.backbones.names import class_names
 from semstab.backbones.segearth_ov import read_prompts
 from semstab.core.files import parse_json
+from semstab.data.georeference import wkt
+from semstab.data.voxels import VoxelTable
 from semstab.datasets import open_dataset
 from semstab.datasets.files.surfaces import Surface, open_las
 from semstab.datasets.formats.disk import natural
 from semstab.engine.tiles import TileResult
 from semstab.errors import ConfigError, DataError, summarize_error
 from semstab.exports.clouds import Header
-from semstab.model.georeference import wkt
-from semstab.model.voxels import VoxelTable
 from semstab.report.figures.maps import Overview
 from semstab.report.loaded import read_series
 from semstab.settings import load_config, resolve

@@ -10,9 +10,9 @@ import numpy as np
 from semstab import backends
 from semstab.core.files import write_json, write_text
 from semstab.core.json_form import to_json
+from semstab.data.frames import Frame, Intrinsics
+from semstab.data.measures import measures
 from semstab.metrics import summarise
-from semstab.model.frames import Frame, Intrinsics
-from semstab.model.measures import measures
 from semstab.report.tables import tables
 from semstab.report.tables.table import to_csv, to_latex, to_markdown
 

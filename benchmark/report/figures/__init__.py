@@ -9,9 +9,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from semstab.core.files import keep_only
-from semstab.model.measures import measures
-from semstab.model.records import OVERVIEW, Record, Result
-from semstab.model.results import slug
+from semstab.data.measures import measures
+from semstab.data.records import OVERVIEW, Record, Result
+from semstab.data.results import slug
 from semstab.report.averages import ENOUGH, by_backbone, complete_scenes, levels, swept
 from semstab.report.figures.distributions import (
     Histograms,

@@ -11,10 +11,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from semstab.core.types import Float64, Int64
-from semstab.model.measures import Measure, measures, op
-from semstab.model.results import RECURRENT
-from semstab.model.statistics import Estimate
-from semstab.model.voxels import VoxelTable
+from semstab.data.measures import Measure, measures, op
+from semstab.data.results import RECURRENT
+from semstab.data.statistics import Estimate
+from semstab.data.voxels import VoxelTable
 from semstab.report.averages import ENOUGH, Level, Pooled, Sweep, over_all, over_recurrent
 from semstab.report.figures.style import COLUMN, FAINT, INK, LETTERS, PAGE, canvas, color, legend_columns, mark_panel
 

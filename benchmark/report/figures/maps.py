@@ -14,12 +14,12 @@ import numpy as np
 import numpy.typing as npt
 
 from semstab.core.types import Float64, Int64, Mask, UInt8
+from semstab.data.measures import dominant, measures
+from semstab.data.records import Record, Tables
+from semstab.data.voxels import VoxelTable
 from semstab.datasets.formats.disk import decode_array, read_bytes
 from semstab.errors import DataError, summarize_error
 from semstab.metrics import CATEGORIES, CATEGORY_COLORS, categories
-from semstab.model.measures import dominant, measures
-from semstab.model.records import Record, Tables
-from semstab.model.voxels import VoxelTable
 from semstab.report.figures.distributions import Histograms, histograms, together
 from semstab.report.figures.style import COLORS, COLUMN, FAINT, INK, LETTERS, PAGE, canvas, mark_panel
 from semstab.report.figures.topdown import EMPTY, MOST, OUTLIERS, FromAbove, best_view, level_axes, top_down, topmost

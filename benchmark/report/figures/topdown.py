@@ -10,8 +10,8 @@ import numpy as np
 import numpy.typing as npt
 
 from semstab.core.types import Float64, Int64, Mask
+from semstab.data.voxels import VoxelTable
 from semstab.metrics.agreement import rows_of
-from semstab.model.voxels import VoxelTable
 
 EMPTY = -1
 LARGEST = 2000

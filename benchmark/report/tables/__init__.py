@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from semstab.core.files import keep_only, write_json, write_text
-from semstab.model.records import Result
+from semstab.data.records import Result
 from semstab.report.remedies import of_interest
 from semstab.report.tables.correctness import ceiling, comparison, correctness, correlogram
 from semstab.report.tables.remedies import remedy_tables

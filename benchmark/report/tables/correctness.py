@@ -5,10 +5,10 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 
+from semstab.data.contrast import BackboneComparison, ComparedObservations, MapCoverage
+from semstab.data.records import Result
+from semstab.data.statistics import Correctness, Correlogram, Estimate, LagBin, Losses, MapStatistics, Quadrants
 from semstab.metrics import macro_mean
-from semstab.model.contrast import BackboneComparison, ComparedObservations, MapCoverage
-from semstab.model.records import Result
-from semstab.model.statistics import Correctness, Correlogram, Estimate, LagBin, Losses, MapStatistics, Quadrants
 from semstab.report.tables.stability import settings
 from semstab.report.tables.statistics import INTERVALS, Number, by_scene, grouped, judged_records
 from semstab.report.tables.table import Column, Group, Row, Table

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from semstab.model.records import Result
+from semstab.data.records import Result
 from semstab.report.remedies import Remedies, Remedy, remedies
 from semstab.report.tables.table import Column, Group, Row, Table
 

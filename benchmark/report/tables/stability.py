@@ -6,10 +6,10 @@ import math
 from collections.abc import Iterable, Sequence
 
 from semstab.config import BACKENDS, SHARED
+from semstab.data.measures import SBD, VSS, measures
+from semstab.data.records import ImageSpace, Record, Result
+from semstab.data.results import Agreement, Means, TableSummary
 from semstab.metrics import macro_mean, split_last
-from semstab.model.measures import SBD, VSS, measures
-from semstab.model.records import ImageSpace, Record, Result
-from semstab.model.results import Agreement, Means, TableSummary
 from semstab.report.averages import (
     ENOUGH,
     Level,

@@ -6,10 +6,10 @@ import math
 from collections.abc import Callable, Iterable, Sequence
 from typing import TypeVar
 
+from semstab.data.measures import ENTROPY, VSS
+from semstab.data.records import Record, Result
+from semstab.data.statistics import UNDEFINED, CellAgreement, ClassAlpha, DriftStatistics, Estimate, MapStatistics
 from semstab.metrics import macro_mean
-from semstab.model.measures import ENTROPY, VSS
-from semstab.model.records import Record, Result
-from semstab.model.statistics import UNDEFINED, CellAgreement, ClassAlpha, DriftStatistics, Estimate, MapStatistics
 from semstab.report.averages import by_backbone
 from semstab.report.tables.table import Cell, Column, Group, Row, Table
 from semstab.statistics.agreement import ALPHA, KAPPA, PSA, VOXEL_ALPHA

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 from semstab.core.files import csv_text
-from semstab.model.measures import Quantity
+from semstab.data.measures import Quantity
 from semstab.report.averages import Spread
 from semstab.statistics import Estimate
 

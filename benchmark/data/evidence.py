@@ -11,7 +11,7 @@ import numpy.typing as npt
 from numpy.lib.mixins import NDArrayOperatorsMixin
 
 from semstab.core.types import Float64, Int64, UInt16
-from semstab.model.information import Concentration
+from semstab.data.information import Concentration
 
 CHUNK_VALUES = 1 << 18
 """Rows are made dense so many values at a time: what fits into a core's cache costs no new memory."""
@@ -123,7 +123,7 @@ class Evidence(NDArrayOperatorsMixin):
             starts = self.starts[first : max(first, last) + 1]
             entries = slice(starts[0], starts[-1])
             return Evidence(starts - starts[0], self.label[entries], self.weight[entries], self.K, known=known)
-        from semstab.model.kernels import copy_rows
+        from semstab.data.kernels import copy_rows
 
         first, end = self.starts[:-1][rows], self.starts[1:][rows]
         starts = np.concatenate([[0], np.cumsum(end - first)])

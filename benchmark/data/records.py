@@ -10,15 +10,15 @@ from typing import TYPE_CHECKING, Any
 
 from semstab.config import BACKENDS, BASE, nearest
 from semstab.core.json_form import INLINE
+from semstab.data import voxels
+from semstab.data.contrast import BackboneComparison
+from semstab.data.display import as_figure
+from semstab.data.georeference import Georeference
+from semstab.data.measures import measures
+from semstab.data.results import Agreement, Unit, UnitSummary, VoxelAdvice
+from semstab.data.statistics import MapStatistics
+from semstab.data.voxels import VoxelTable
 from semstab.errors import ConfigError
-from semstab.model import voxels
-from semstab.model.contrast import BackboneComparison
-from semstab.model.display import as_figure
-from semstab.model.georeference import Georeference
-from semstab.model.measures import measures
-from semstab.model.results import Agreement, Unit, UnitSummary, VoxelAdvice
-from semstab.model.statistics import MapStatistics
-from semstab.model.voxels import VoxelTable
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -14,11 +14,11 @@ import numpy.typing as npt
 
 from semstab.core.process import available_bytes
 from semstab.core.types import Float64, Int32, Int64, Mask, UInt8
+from semstab.data import parquet
+from semstab.data.display import as_figure, from_above
+from semstab.data.evidence import Evidence
+from semstab.data.measures import MeasureMeans, dominant, measures, vss
 from semstab.errors import DataError, MissingDependencyError
-from semstab.model import parquet
-from semstab.model.display import as_figure, from_above
-from semstab.model.evidence import Evidence
-from semstab.model.measures import MeasureMeans, dominant, measures, vss
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -249,7 +249,7 @@ class VoxelTable:
         return table + (as_figure(self.image(), CAPTION) if len(self) else "")
 
     def image(self, up: npt.ArrayLike | None = None) -> UInt8:
-        """Return VSS of the topmost voxels, (H, W, 3) RGB; see `semstab.model.display.from_above`."""
+        """Return VSS of the topmost voxels, (H, W, 3) RGB; see `semstab.data.display.from_above`."""
         return from_above(self.index, np.where(self.op > 1, vss(self), np.nan), up)
 
     def save(

@@ -17,9 +17,9 @@ import numpy.typing as npt
 
 from semstab.core.json_form import number
 from semstab.core.types import Float64, Int32, Int64, Mask
+from semstab.data.evidence import Evidence, row_chunks
+from semstab.data.information import Concentration, entropy_bits, normalise
 from semstab.errors import ConfigError
-from semstab.model.evidence import Evidence, row_chunks
-from semstab.model.information import Concentration, entropy_bits, normalise
 
 Values = TypeVar("Values", bound=npt.NDArray[Any])
 

@@ -15,8 +15,8 @@ import numpy.typing as npt
 
 from semstab.core.arrays import column, values_of
 from semstab.core.files import atomic_path, parse_json
+from semstab.data.evidence import Evidence
 from semstab.errors import DataError, summarize_error
-from semstab.model.evidence import Evidence
 
 if TYPE_CHECKING:
     import pyarrow as pa

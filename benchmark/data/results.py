@@ -9,9 +9,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 from semstab.core.json_form import INLINE
-from semstab.model.frames import LeftOut
-from semstab.model.measures import Measure, MeasureMeans
-from semstab.model.statistics import MapStatistics
+from semstab.data.frames import LeftOut
+from semstab.data.measures import Measure, MeasureMeans
+from semstab.data.statistics import MapStatistics
 
 SCHEMA = 3
 """Version of summary.json."""

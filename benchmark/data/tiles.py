@@ -11,9 +11,9 @@ import numpy as np
 
 from semstab.core.prefetch import SizedCache
 from semstab.core.types import Float64, Int64
-from semstab.model import parquet
-from semstab.model.events import Events
-from semstab.model.voxels import VoxelTable
+from semstab.data import parquet
+from semstab.data.events import Events
+from semstab.data.voxels import VoxelTable
 
 AT_HAND = 1 << 22
 """Voxels of tiles that stay in memory."""

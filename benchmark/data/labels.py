@@ -269,7 +269,7 @@ class LabelMapping:
 
     def _keeps(self, labels: npt.NDArray[Any]) -> bool:
         """Return whether the map stays as it is: its 8-bit ids are the rows already, or the ignore id."""
-        from semstab.model.kernels import has_other
+        from semstab.data.kernels import has_other
 
         K = len(self.target)
         same = self.source.ids == self.rows == tuple(range(K)) and labels.dtype == np.uint8 and K < IGNORE_8BIT

@@ -92,7 +92,7 @@ class Concentration:
     @classmethod
     def of(cls, starts: Int64, label: UInt16, weight: Float64) -> Concentration:
         """Compute it of entries as `Evidence` has them."""
-        from semstab.model.kernels import concentrate
+        from semstab.data.kernels import concentrate
 
         largest, lead, bits, squares = np.empty((4, len(starts) - 1))
         dominant = np.empty(len(starts) - 1, np.uint16)
@@ -110,7 +110,7 @@ def by_group(
     groups: int,
 ) -> tuple[Float64, Float64]:
     """Return (groups, C) sums of C values (n,) by group (n,), and how often they are defined; -1 is no group."""
-    from semstab.model.kernels import add_by_group
+    from semstab.data.kernels import add_by_group
 
     wide = -(-len(values) // TOGETHER) * TOGETHER
     sums, defined = np.zeros((2, wide, groups))

@@ -11,7 +11,7 @@ from typing import Literal
 
 from semstab.core.json_form import INLINE
 from semstab.core.types import THESE_FRAMES, Scope
-from semstab.model.measures import MeasureMeans
+from semstab.data.measures import MeasureMeans
 
 # --- Parts ------------------------------------------------------------------------------------------------------------
 

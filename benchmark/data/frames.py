@@ -12,8 +12,8 @@ import numpy as np
 import numpy.typing as npt
 
 from semstab.core.types import Float32, Float64, Mask, UInt8, UInt16
+from semstab.data.labels import IGNORE_8BIT, IGNORE_16BIT, flat, ignore_id
 from semstab.errors import DataError
-from semstab.model.labels import IGNORE_8BIT, IGNORE_16BIT, flat, ignore_id
 
 RIGID_TOLERANCE = 1e-3
 
@@ -136,7 +136,7 @@ class Frame:
     def valid(self) -> Mask:
         """(H, W): depth is valid, and the label is not ignored or the scores are finite and sum to more than 0."""
         if self.labels is not None:
-            from semstab.model.kernels import mark_valid
+            from semstab.data.kernels import mark_valid
 
             valid = np.empty(self.shape, dtype=np.bool_)
             mark_valid(flat(self.depth), flat(self.labels), self.ignore_id, valid.reshape(-1))

@@ -12,11 +12,11 @@ import numpy as np
 import numpy.typing as npt
 
 from semstab.core.types import Float64, Int32, Int64
+from semstab.data import parquet
+from semstab.data.evidence import Evidence
+from semstab.data.information import entropy_bits, js_divergence, normalise
+from semstab.data.voxels import INDEX, OF_EVENTS, OF_VOXELS, VoxelTable, freeze, in_order, require_memory
 from semstab.errors import DataError
-from semstab.model import parquet
-from semstab.model.evidence import Evidence
-from semstab.model.information import entropy_bits, js_divergence, normalise
-from semstab.model.voxels import INDEX, OF_EVENTS, OF_VOXELS, VoxelTable, freeze, in_order, require_memory
 
 COMPUTED = [name for name in OF_VOXELS if name not in (*INDEX, "evidence")]
 """The columns of a voxel's row that its observations give."""
@@ -64,7 +64,7 @@ class Events:
     @cached_property
     def bounds(self) -> Int64:
         """(n + 1,) first row of each voxel, then how many rows there are."""
-        from semstab.model.kernels import bound_groups
+        from semstab.data.kernels import bound_groups
 
         bounds = np.zeros(len(self.ix) + 1, np.int64)
         bound_groups(self.voxel, bounds)

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from semstab.model.measures import Quantity
-from semstab.model.statistics import UNDEFINED, Estimate, Interval
+from semstab.data.measures import Quantity
+from semstab.data.statistics import UNDEFINED, Estimate, Interval
 
 ByBackbone = Mapping[str, Estimate]
 
