@@ -1,4 +1,4 @@
-"""Backend `torch`: the whole of fusion on an accelerator, or on a CPU, and several backbones over the same depth.
+"""Backend `torch`: the whole of fusion on an accelerator, or on a CPU, and several models over the same depth.
 
 Frames may be tensors that are on the device already: the logits of a model go into the map without a copy to memory.
 """
@@ -76,9 +76,9 @@ COPIED_ROWS = 1 << 20
 
 
 class TorchMaps:
-    """Maps of several backbones over the same depth: one association and one hash, and evidence of each backbone.
+    """Maps of several models over the same depth: one association and one hash, and evidence of each model.
 
-    num_classes has K of each backbone by its name; the other settings are those of `TorchMap`.
+    num_classes has K of each model by its name; the other settings are those of `TorchMap`.
     """
 
     def __init__(
@@ -91,7 +91,7 @@ class TorchMaps:
         reserve: int = 0,
     ) -> None:
         if not num_classes:
-            raise ConfigError("num_classes names no backbone; give K of each by its name")
+            raise ConfigError("num_classes names no model; give K of each by its name")
         for K in num_classes.values():
             check_settings(voxel_size, K)
         if precision not in ("float64", "float32"):
@@ -124,7 +124,7 @@ class TorchMaps:
         *,
         index: int,
     ) -> dict[str, FrameReport]:
-        """Fuse what some of the backbones say of one view; a report for each.
+        """Fuse what some of the models say of one view; a report for each.
 
         Raises:
             DataError: If one of them cannot be fused, with all maps unchanged.
@@ -141,7 +141,7 @@ class TorchMaps:
     @torch.no_grad()
     @torch.inference_mode(False)
     def fuse(self, view: DepthView, predicted: Mapping[str, Labels | Scores], started: float) -> dict[str, FrameReport]:
-        """Fuse a view that is on the device, with predictions of some backbones; timed from `started`."""
+        """Fuse a view that is on the device, with predictions of some models; timed from `started`."""
         grid = self._grid or self._first_grid(view)
         seen = associate(view, grid)
         evidence = {name: self._evidence(seen, image, name, view) for name, image in predicted.items()}
@@ -160,7 +160,7 @@ class TorchMaps:
         }
 
     def table(self, name: str) -> VoxelTable:
-        """Return the map of a backbone so far, brought to memory.
+        """Return the map of a model so far, brought to memory.
 
         Raises:
             ConfigError: For an unknown name.
@@ -236,7 +236,7 @@ class TorchMaps:
 
 
 def _where(view: DepthView, kind: str, name: str) -> str:
-    """Return the name of a backbone's labels, scores or logits in an error."""
+    """Return the name of a model's labels, scores or logits in an error."""
     return view.camera.where(kind) + (f" of '{name}'" if name else "")
 
 

@@ -44,11 +44,11 @@ class Association:
 
 @dataclass(frozen=True, eq=False)
 class ViewEvidence:
-    """The evidence of one backbone for the n voxels of a view: s_bar = sums / (scale * pixels).
+    """The evidence of one model for the n voxels of a view: s_bar = sums / (scale * pixels).
 
     Attributes:
         sums: (K, n) integer.
-        pixels: (n,) int64 pixels that count; 0 in voxels that the backbone does not see.
+        pixels: (n,) int64 pixels that count; 0 in voxels that the model does not see.
         flags: (3,) int64 what is wrong: the highest label id that a pixel which counts has, where that is no class,
             else -1 or a class; whether such a pixel is out of reach; whether a score is below 0.
     """

@@ -109,7 +109,7 @@ def slots_for(voxels: int) -> int:
 
 
 class Columns:
-    """One backbone's columns of a VoxelTable by name, (N,) or (N, K), with room for more rows; 0 where never seen."""
+    """One model's columns of a VoxelTable by name, (N,) or (N, K), with room for more rows; 0 where never seen."""
 
     TYPES: ClassVar = {
         "op": torch.int32, "drift_sum": torch.float64, "pixels": torch.int64, "first_frame": torch.int32,
@@ -141,7 +141,7 @@ class Columns:
 
 
 class Storage:
-    """The hash, and the columns of each backbone, which share its rows; both grow within a bound on their memory."""
+    """The hash, and the columns of each model, which share its rows; both grow within a bound on their memory."""
 
     def __init__(
         self, num_classes: Mapping[str, int], evidence: torch.dtype, device: torch.device, memory_gb: float | None
@@ -223,7 +223,7 @@ Image = torch.Tensor | npt.NDArray[Any]
 
 @dataclass(frozen=True, eq=False)
 class TensorPrediction:
-    """The prediction of a backbone for each pixel of a view: one of the three. A batch dimension of 1 is left away.
+    """The prediction of a model for each pixel of a view: one of the three. A batch dimension of 1 is left away.
 
     Attributes:
         labels: (H, W) integer class ids. Ignored are 255 in uint8 and 65535 in uint16; in other types every negative
@@ -327,7 +327,7 @@ class Scores:
 
 
 def evidence_of(prediction: TensorPrediction, view: DepthView, num_classes: int, where: str) -> Labels | Scores:
-    """Return the prediction of a backbone for the view's pixels, on the view's device; `where` is its name in errors.
+    """Return the prediction of a model for the view's pixels, on the view's device; `where` is its name in errors.
 
     Raises:
         DataError: If the image does not fit the depth image, or is of a wrong type.

@@ -1,4 +1,4 @@
-"""semstab: how stable are a segmentation backbone's predictions at the same physical place?"""
+"""semstab: how stable are a segmentation model's predictions at the same physical place?"""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from semstab import backbones, backends, datasets, engine, metrics, statistics
+    from semstab import backends, datasets, engine, metrics, models, statistics
     from semstab.api import run, run_study
     from semstab.comparison.gate import GateConfig, gate
     from semstab.comparison.writing import compare
@@ -27,10 +27,38 @@ if TYPE_CHECKING:
 __version__ = "0.4.0"
 
 __all__ = [
-    "AcceptanceThresholds", "Belief", "Config", "ConfigError", "DataError", "Events", "Frame", "FusedResult",
-    "GateConfig", "Intrinsics", "LabelSpace", "MissingDependencyError", "SemstabError", "TemporalStability",
-    "VoxelTable", "backbones", "backends", "compare", "datasets", "engine", "export", "fuse", "gate", "load",
-    "load_config", "load_result", "load_study", "metrics", "relabel", "run", "run_study", "statistics",
+    "AcceptanceThresholds",
+    "Belief",
+    "Config",
+    "ConfigError",
+    "DataError",
+    "Events",
+    "Frame",
+    "FusedResult",
+    "GateConfig",
+    "Intrinsics",
+    "LabelSpace",
+    "MissingDependencyError",
+    "SemstabError",
+    "TemporalStability",
+    "VoxelTable",
+    "backends",
+    "compare",
+    "datasets",
+    "engine",
+    "export",
+    "fuse",
+    "gate",
+    "load",
+    "load_config",
+    "load_result",
+    "load_study",
+    "metrics",
+    "models",
+    "relabel",
+    "run",
+    "run_study",
+    "statistics",
 ]  # fmt: skip
 
 _HOMES = {

@@ -162,13 +162,13 @@ class SceneFolder:
         assert self.form is not None
         return (self.path / "depth" / f"{name}{self.form.suffix}").exists()
 
-    def has_labels(self, name: str, backbone: str) -> bool:
+    def has_labels(self, name: str, model: str) -> bool:
         """Return whether a frame's labels or scores are there."""
-        return any(self._label_path(name, backbone, soft).exists() for soft in (False, True))
+        return any(self._label_path(name, model, soft).exists() for soft in (False, True))
 
-    def is_soft(self, backbone: str) -> bool:
-        """Return whether the backbone's scores were written, not labels."""
-        labels, scores = (self._label_path("", backbone, soft).parent for soft in (False, True))
+    def is_soft(self, model: str) -> bool:
+        """Return whether the model's scores were written, not labels."""
+        labels, scores = (self._label_path("", model, soft).parent for soft in (False, True))
         return scores.is_dir() and not labels.is_dir()
 
     def write_geometry(self, name: str, frame: Frame) -> None:
@@ -194,9 +194,9 @@ class SceneFolder:
         else:
             write_png(path, stored)
 
-    def write_labels(self, name: str, frame: Frame, backbone: str) -> None:
+    def write_labels(self, name: str, frame: Frame, model: str) -> None:
         """Write a frame's label ids, or its scores."""
-        path = self._label_path(name, backbone, frame.scores is not None)
+        path = self._label_path(name, model, frame.scores is not None)
         if frame.scores is None:
             assert frame.labels is not None
             write_png(path, frame.labels)
@@ -204,18 +204,18 @@ class SceneFolder:
             with atomic_path(path) as temporary:
                 np.savez_compressed(temporary, scores=frame.scores.transpose(2, 0, 1))
 
-    def write_classes(self, backbone: str, space: LabelSpace) -> None:
-        """Write the classes of a backbone next to its maps."""
-        space.save(self._label_path("", backbone, self.is_soft(backbone)).parent / LABEL_SPACE_FILE)
+    def write_classes(self, model: str, space: LabelSpace) -> None:
+        """Write the classes of a model next to its maps."""
+        space.save(self._label_path("", model, self.is_soft(model)).parent / LABEL_SPACE_FILE)
 
-    def read_as(self, backbone: str) -> str:
-        """Return the name of the backbone as posed_folder reads it."""
-        return f"{_bare(backbone)}{SCORES_SUFFIX}" if self.is_soft(backbone) else folder_name(backbone)
+    def read_as(self, model: str) -> str:
+        """Return the name of the model as posed_folder reads it."""
+        return f"{_bare(model)}{SCORES_SUFFIX}" if self.is_soft(model) else folder_name(model)
 
-    def _label_path(self, name: str, backbone: str, soft: bool) -> Path:
+    def _label_path(self, name: str, model: str, soft: bool) -> Path:
         if soft:
-            return self.path / "scores" / _bare(backbone) / f"{name}.npz"
-        return self.path / "labels" / folder_name(backbone) / f"{name}.png"
+            return self.path / "scores" / _bare(model) / f"{name}.npz"
+        return self.path / "labels" / folder_name(model) / f"{name}.png"
 
     def _require_same_camera(self, frame: Frame) -> None:
         """Check that one intrinsics.txt serves all frames."""
@@ -262,9 +262,9 @@ def matrix_text(matrix: Float64) -> str:
     return "".join(" ".join(f"{value:.17g}" for value in row) + "\n" for row in matrix)
 
 
-def _bare(backbone: str) -> str:
+def _bare(model: str) -> str:
     """Return the folder below scores/: posed_folder adds the suffix to its name."""
-    return folder_name(backbone.removesuffix(SCORES_SUFFIX))
+    return folder_name(model.removesuffix(SCORES_SUFFIX))
 
 
 PROBED_FRAMES = 3
@@ -314,17 +314,17 @@ def convert(
 
 def convert_scene(scene: Scene, config: Config, path: Path, depth_error: float, progress: Reporter) -> Converted:
     """Write one scene; see `convert`."""
-    known = (*scene.backbones, *scene.by_name)
-    backbones = selected(config.backbones, known, (), "backbone", scene.name)
-    indices = frame_indices(scene, config, backbones)
+    known = (*scene.models, *scene.by_name)
+    models = selected(config.models, known, (), "model", scene.name)
+    indices = frame_indices(scene, config, models)
     dataset = config.dataset.model_dump(mode="json")
     folder = SceneFolder(path, {"dataset": dataset, "scene": scene.name, "depth_error": depth_error}, depth_error)
     if others := folder.frames - set(map(_name, indices)):
         raise ConfigError(f"{path}: holds frame {min(others)}, which is not selected now; choose another --out")
-    folders = [folder_name(name) for name in backbones]
-    if repeated := [name for name in backbones if folders.count(folder_name(name)) > 1]:
-        raise ConfigError(f"{scene.name}: {' and '.join(repeated)} would get one folder; choose with --backbone")
-    work = _Work(scene, indices, backbones, folder, progress)
+    folders = [folder_name(name) for name in models]
+    if repeated := [name for name in models if folders.count(folder_name(name)) > 1]:
+        raise ConfigError(f"{scene.name}: {' and '.join(repeated)} would get one folder; choose with --model")
+    work = _Work(scene, indices, models, folder, progress)
     settings: dict[str, Any] = {"pose_convention": "camera_to_world", "camera_axes": "opencv"}
     if up := _up_axis(scene):
         settings["up_axis"] = up
@@ -345,7 +345,7 @@ def convert_scene(scene: Scene, config: Config, path: Path, depth_error: float, 
         frames=len(indices),
         written=written,
         depth=str(folder.form),
-        renamed={name: folder.read_as(name) for name in backbones if folder.read_as(name) != name},
+        renamed={name: folder.read_as(name) for name in models if folder.read_as(name) != name},
         lost=tuple(work.lost()),
     )
 
@@ -356,7 +356,7 @@ class _Work:
 
     scene: Scene
     indices: Sequence[int]
-    backbones: Sequence[str]
+    models: Sequence[str]
     folder: SceneFolder
     progress: Reporter
     timed: bool = False
@@ -364,13 +364,13 @@ class _Work:
 
     def probe(self) -> list[Float32]:
         """Return the depth of some frames."""
-        read = reader(self.scene, self.backbones[0] if self.backbones else None)
+        read = reader(self.scene, self.models[0] if self.models else None)
         return [read(self.indices[position]).depth for position in evenly(len(self.indices), PROBED_FRAMES)]
 
     def write(self) -> int:
         """Write the files that are missing, and return how many frames were not complete."""
         written = set()
-        for source in self.backbones or (None,):
+        for source in self.models or (None,):
             missing = [index for index in self.indices if not self._has(index, source)]
             written.update(missing)
             for done, fetched in enumerate(prefetch(self._reading(source), missing), start=1):
@@ -407,8 +407,8 @@ class _Work:
         if not self.folder.has_geometry(name):
             self.folder.write_geometry(name, frame)
         if source is not None and not self.folder.has_labels(name, source):
-            if frame.scores is not None and f"{source}{SCORES_SUFFIX}" in self.backbones:
-                raise ConfigError(f"{source} and {source}{SCORES_SUFFIX} would get one folder; choose with --backbone")
+            if frame.scores is not None and f"{source}{SCORES_SUFFIX}" in self.models:
+                raise ConfigError(f"{source} and {source}{SCORES_SUFFIX} would get one folder; choose with --model")
             self.folder.write_labels(name, frame, source)
 
 

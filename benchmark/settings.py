@@ -37,6 +37,10 @@ def as_config(settings: Config | Mapping[str, Any] | str | Path) -> Config:
     return settings if isinstance(settings, Config) else load_config(settings)
 
 
+FORMER_STUDIES = {"remedies": "filters"}
+"""Names of shipped studies in 0.3, and now: the old ones work for one version."""
+
+
 def load_study(study: str | Path, overrides: Mapping[str, Any] | None = None) -> Config:
     """Return the configuration of a study's file, or of a shipped study by its name.
 
@@ -45,6 +49,7 @@ def load_study(study: str | Path, overrides: Mapping[str, Any] | None = None) ->
     Raises:
         ConfigError: For an unknown study.
     """
+    study = FORMER_STUDIES.get(str(study), study)
     path = _shipped("studies") / f"{study}.yaml" if str(study) in shipped_studies() else Path(study)
     if path.suffix not in (".yaml", ".yml"):
         raise ConfigError(
@@ -73,14 +78,14 @@ def predicted_config(
 ) -> Config:
     """Return the configuration of a file with overrides on top, its dataset's labels replaced by predictions.
 
-    Without a list of backbones in `overrides` all predictors are used.
+    Without a list of models in `overrides` all predictors are used.
     """
     content = _over(_of_file(path), overrides)
     inner = content.pop("dataset", {"name": "city"})
-    content["backbones"] = overrides.get("backbones")
+    content["models"] = overrides.get("models")
     content["dataset"] = {
         "name": PREDICTED,
-        "options": {"dataset": inner, "backbones": [predictor.model_dump(mode="json") for predictor in predictors]},
+        "options": {"dataset": inner, "models": [predictor.model_dump(mode="json") for predictor in predictors]},
     }
     return load_config(None, content)
 
@@ -93,22 +98,22 @@ def filtered_config(filters: Sequence[str], path: str | Path | None, overrides: 
     config = resolve(load_config(path, overrides))
     dataset = open_dataset(config.dataset.name, config.dataset.options)
     scene = dataset.scene((config.scenes or dataset.scenes)[0])
-    names = config.backbones or [name for name in scene.backbones if name not in config.region_maps]
+    names = config.models or [name for name in scene.models if name not in config.region_maps]
     predictors = []
     for name in names:
         if name != GROUND_TRUTH:
             scores = StoredSequence(scene, name, False).has_scores
-            stored = {"backbone": STORED, "options": {"source": name}, "scores": scores, "filters": filters}
+            stored = {"model": STORED, "options": {"source": name}, "scores": scores, "filters": filters}
             predictors.append(validated(PredictorConfig, stored))
     content = merge(dataset_defaults({"dataset": config.dataset.model_dump()}), _over(_of_file(path), overrides))
     selected = [*(predictor.source_name for predictor in predictors), *(name for name in names if name == GROUND_TRUTH)]
-    return predicted_config(predictors, None, {**content, "backbones": selected})
+    return predicted_config(predictors, None, {**content, "models": selected})
 
 
 def resolve(config: Config) -> Config:
     """Return the configuration with every default of its dataset's options filled in, paths absolute.
 
-    Sequential backbones that predict in a run are shown the frames that it selects.
+    Sequential models that predict in a run are shown the frames that it selects.
     """
     dataset = config.dataset
     if dataset.name == PREDICTED:

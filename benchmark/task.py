@@ -1,4 +1,4 @@
-"""A backbone on a scene: its frames, how its labels become rows of evidence, and a frame of it, ready to fuse."""
+"""A model on a scene: its frames, how its labels become rows of evidence, and a frame of it, ready to fuse."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from semstab.pixels.preparation import keep_largest, leave_out, perturb
 
 @dataclass(frozen=True, eq=False)
 class Task:
-    """A backbone on a scene: which frames, and how its labels become rows of evidence.
+    """A model on a scene: which frames, and how its labels become rows of evidence.
 
     Attributes:
         indices: Indices of the frames, ascending; a range where they are evenly spaced.
@@ -31,7 +31,7 @@ class Task:
     """
 
     scene: Scene
-    backbone: str
+    model: str
     indices: Sequence[int]
     mapping: LabelMapping
     backends: tuple[str, ...]
@@ -43,28 +43,28 @@ class Task:
     @property
     def units(self) -> list[Unit]:
         """Return one unit for each backend."""
-        return [Unit(self.scene.name, self.backbone, backend) for backend in self.backends]
+        return [Unit(self.scene.name, self.model, backend) for backend in self.backends]
 
     @cached_property
     def digest(self) -> str:
         """Return a hash of the input behind it."""
-        return self.scene.digest([*self.indices], self.backbone)
+        return self.scene.digest([*self.indices], self.model)
 
 
 def tasks_of(scene: Scene, config: Config, beside: Sequence[str] = ()) -> Iterator[Task]:
-    """Yield the configuration's backbones on an open scene, checked; no image is read.
+    """Yield the configuration's models on an open scene, checked; no image is read.
 
     Frames are those that have labels of all of them, and of the label sources `beside` them: what is compared is fused
     from the same frames.
     """
-    names = selected(config.backbones, scene.backbones, scene.by_name, "backbone", scene.name)
+    names = selected(config.models, scene.models, scene.by_name, "model", scene.name)
     if not names:
         searched = f"searched {', '.join(scene.label_paths)}; " if scene.label_paths else ""
         raise DataError(f"{scene.name}: there are no label maps; {searched}add them, or choose with --scene")
     frames = _chosen_frames(scene, config, [*dict.fromkeys((*names, *beside))])
     indices = as_range(frames.indices)
-    for backbone in names:
-        source = scene.label_space(backbone)
+    for model in names:
+        source = scene.label_space(model)
         target = source if config.taxonomy is None else LabelSpace.load(config.taxonomy)
         mapping = source.mapping_to(target)
         predicted = [*dict.fromkeys((*source.classes, *target.classes))]
@@ -72,16 +72,16 @@ def tasks_of(scene: Scene, config: Config, beside: Sequence[str] = ()) -> Iterat
             for name in getattr(config.exclude, setting):
                 if name not in known and not (setting == "predicted_classes" and mapping.named([name])):
                     raise ConfigError(f"{scene.name}: exclude.{setting}: no class '{name}'; {nearest(name, known)}")
-        fused_by = tuple(backend.name for backend in config.fused_by() if applies(backend, scene.name, backbone))
+        fused_by = tuple(backend.name for backend in config.fused_by() if applies(backend, scene.name, model))
         yield Task(
-            scene, backbone, indices, mapping, fused_by, config.perturbation, config.exclude, config.top_k,
+            scene, model, indices, mapping, fused_by, config.perturbation, config.exclude, config.top_k,
             frames.left_out,
         )  # fmt: skip
 
 
-def applies(part: Part, scene: str, backbone: str) -> bool:
-    """Return whether a part of the configuration takes in that backbone on that scene."""
-    return scene in (part.scenes or [scene]) and backbone in (part.backbones or [backbone])
+def applies(part: Part, scene: str, model: str) -> bool:
+    """Return whether a part of the configuration takes in that model on that scene."""
+    return scene in (part.scenes or [scene]) and model in (part.models or [model])
 
 
 def _chosen_frames(scene: Scene, config: Config, sources: Sequence[str]) -> Selected:
@@ -112,7 +112,7 @@ def selected(
 
 def read(task: Task, index: int, pixel_stride: int = 1, *, color: bool = False) -> Frame:
     """Return a frame of the task, ready to fuse; colour only where it is wanted."""
-    return prepare(task, task.scene.frame(index, task.backbone, color=color), pixel_stride)
+    return prepare(task, task.scene.frame(index, task.model, color=color), pixel_stride)
 
 
 def prepare(task: Task, frame: Frame, pixel_stride: int = 1) -> Frame:
@@ -151,10 +151,10 @@ def _in_label_space(mapping: LabelMapping, frame: Frame) -> Frame:
 
 def truth_task(task: Task) -> Task | None:
     """Return the ground truth in the unit's label space; None where there is none, or where it does not map to that."""
-    if not task.scene.ground_truth or task.backbone == GROUND_TRUTH:
+    if not task.scene.ground_truth or task.model == GROUND_TRUTH:
         return None
     try:
         mapping = task.scene.label_space(GROUND_TRUTH).mapping_to(task.mapping.target)
     except ConfigError:
         return None
-    return dataclasses.replace(task, backbone=GROUND_TRUTH, mapping=mapping)
+    return dataclasses.replace(task, model=GROUND_TRUTH, mapping=mapping)

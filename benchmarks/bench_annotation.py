@@ -1,6 +1,6 @@
 """True errors that the first tasks of `export --format` hold, beside as many regions chosen without a map.
 
-    python benchmarks/bench_annotation.py RUN --backbone fcn --scores fcn-scores     # a run of shared/data/apc_shelf
+    python benchmarks/bench_annotation.py RUN --model fcn --scores fcn-scores     # a run of shared/data/apc_shelf
 
 The others are windows as large as the tasks, pixel by pixel the same budget: where the scores of a single image have
 the highest entropy (without windows that overlap in one image), at random, and at random on an edge between two
@@ -99,12 +99,12 @@ def main():
     """Print the table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("run", type=Path)
-    parser.add_argument("--backbone", required=True)
+    parser.add_argument("--model", required=True)
     parser.add_argument("--scores", required=True, help="label source with scores of the same model")
     parser.add_argument("--most", type=int, default=50)
     options = parser.parse_args()
     result = semstab.load_result(options.run)
-    record, soft = (result.record(backbone=name) for name in (options.backbone, options.scores))
+    record, soft = (result.record(model=name) for name in (options.model, options.scores))
     (task, _), (scores, _) = (task_of(options.run, own, result.manifest["inputs"]) for own in (record, soft))
     tasks = annotation_tasks(Chosen(result, record, columns=("op",)), task, options.most)
     images = Images(task, scores, Chosen(result, record, columns=("op",)).first.table.voxel_size)

@@ -4,7 +4,7 @@
                                    [--voxels 1000000 20000000] [--rounds 50] [--logits float16]
 
 The map grows by one view fused at ever new places; then places chosen at random are fused again, as ids, as logits, and
-as ids of three backbones at once. Medians of `rounds` frames by CUDA events, after a warm-up. The floor is the bytes
+as ids of three models at once. Medians of `rounds` frames by CUDA events, after a warm-up. The floor is the bytes
 that must move (depth, ids or logits, and the rows of the touched voxels, read and written) over the bandwidth of a copy
 on the device. At the end the maps of torch and numba are compared, voxel by voxel.
 """
@@ -30,7 +30,7 @@ from semstab.core.files import write_json
 from semstab.data.results import Unit
 from semstab.metrics import compare
 
-VOXEL_SIZE, APART, WARM_UP, BACKBONES = 0.2, 200.0, 5, 3
+VOXEL_SIZE, APART, WARM_UP, MODELS = 0.2, 200.0, 5, 3
 
 
 @dataclasses.dataclass
@@ -84,7 +84,7 @@ def copy_bandwidth(device: torch.device, megabytes: int) -> float:
 
 
 def measure(case: Case, K: int, voxels: int, arguments: argparse.Namespace) -> list[dict[str, Any]]:
-    """Rows of the table for one map: ids, logits, and ids of several backbones on a map of the first size."""
+    """Rows of the table for one map: ids, logits, and ids of several models on a map of the first size."""
     backend = TorchMap(VOXEL_SIZE, K, device=arguments.device, reserve=voxels + voxels // 5)
     places = seen = 0
     while seen < voxels:
@@ -98,10 +98,10 @@ def measure(case: Case, K: int, voxels: int, arguments: argparse.Namespace) -> l
     def fuse(place: int, **said: torch.Tensor) -> None:
         backend.integrate_tensors(*case.view(place), index=place, **said)
 
-    several = TorchMaps(VOXEL_SIZE, dict.fromkeys("abc"[:BACKBONES], K), device=arguments.device)
+    several = TorchMaps(VOXEL_SIZE, dict.fromkeys("abc"[:MODELS], K), device=arguments.device)
 
     def fuse_several(place: int) -> None:
-        said = {name: TensorPrediction(labels=case.ids) for name in "abc"[:BACKBONES]}
+        said = {name: TensorPrediction(labels=case.ids) for name in "abc"[:MODELS]}
         several.integrate_tensors(*case.view(place % 4), said, index=place)
 
     works: dict[str, tuple[Callable[[int], None], int]] = {
@@ -112,7 +112,7 @@ def measure(case: Case, K: int, voxels: int, arguments: argparse.Namespace) -> l
         ),
     }
     if voxels == min(arguments.voxels):
-        works[f"ids x{BACKBONES}"] = (fuse_several, pixels * (4 + BACKBONES) + BACKBONES * of_rows)
+        works[f"ids x{MODELS}"] = (fuse_several, pixels * (4 + MODELS) + MODELS * of_rows)
     return [
         {"voxels": seen, "input": name, "seconds": seconds(work, visits, backend.device), "bytes": size}
         for name, (work, size) in works.items()

@@ -87,9 +87,9 @@ def measured(scene: Path, out: Path, backend: str, K: int, kind: str, most_gb: f
         return
     found, stage = taken(stages(scene, out, backend, VOXEL_SIZE, "--set", "memory_gb=1000", "--tile-size", "off"))
     (summary,) = semstab.load_result(out).runs
-    voxels, looks = summary.table.voxels, summary.table.observations
+    voxels, observations = summary.table.voxels, summary.table.observations
     own = {"backend": backend, "K": K, "kind": kind, "voxels": voxels}
-    whole = estimate(voxels, looks)
+    whole = estimate(voxels, observations)
     yield {
         **own,
         "run": "whole",
@@ -99,7 +99,7 @@ def measured(scene: Path, out: Path, backend: str, K: int, kind: str, most_gb: f
     }
     limit, out = whole / 3 / GB, out.with_name(f"{backend}-tiles")
     found, stage = taken(stages(scene, out, backend, VOXEL_SIZE, "--set", f"memory_gb={limit}"))
-    tile, voxels = largest_tile(out, estimate, looks / voxels)
+    tile, voxels = largest_tile(out, estimate, observations / voxels)
     yield {
         **own,
         "run": "tiles",

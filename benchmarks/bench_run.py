@@ -58,7 +58,7 @@ def main() -> None:
     parser.add_argument("--size", default="640x480")
     parser.add_argument("--voxel-size", type=float, default=0.05, help="metres")
     parser.add_argument("--data", help="a posed folder, instead of the room")
-    parser.add_argument("--backbone", help="of that folder")
+    parser.add_argument("--model", help="of that folder")
     parser.add_argument("--runs", type=int, default=5)
     arguments = parser.parse_args()
     width, height = (int(side) for side in arguments.size.split("x"))
@@ -67,8 +67,8 @@ def main() -> None:
         root = arguments.data or str(written(Path(there), arguments.frames, frames, 7))
         settings = {"dataset": {"name": "posed_folder", "options": {"root": root}}, "voxel_size": arguments.voxel_size}
         settings |= {"check": None, "backends": ["numba"]}
-        if arguments.backbone:
-            settings["backbones"] = [arguments.backbone]
+        if arguments.model:
+            settings["models"] = [arguments.model]
         for options in ({}, {"statistics": True}):
             first, found = measure(settings | options, arguments.runs)
             print("with --statistics" if options else "as it is", f"median of {arguments.runs} runs", sep=", ")

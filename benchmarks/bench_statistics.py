@@ -136,7 +136,7 @@ def fused(watch: Watch, folder: Path, voxel_size: float, K: int) -> Any:
     """The map of the frames of a folder, with its history."""
     fusion = create("numba", voxel_size=voxel_size, num_classes=K, history=True)
     scene = open_dataset("posed_folder", {"root": str(folder)}).scene("scene")
-    (name,), before = scene.backbones, None
+    (name,), before = scene.models, None
     for index in range(len(scene)):
         frame = watch("reading", lambda index=index: scene.frame(index, name))
         if before is not None:
@@ -202,7 +202,7 @@ def main() -> None:
     found = measure(arguments)
     n, m, fusion = found["voxels"], found["observations"], found["seconds"]["fusion"]
     loop = sum(found["seconds"][name] for name in LOOP)
-    print(f"{found['frames']} frames, {m:,} observations of {n:,} voxels ({m / n:.1f} looks each), K = {found['K']}")
+    print(f"{found['frames']} frames, {m:,} observations of {n:,} voxels ({m / n:.1f} each), K = {found['K']}")
     print(f"{'step':<24}{'CPU s':>9}{'us/observation':>16}{'of fusion':>11}{'of loop':>9}{'peak bytes/voxel':>18}")
     for name, seconds in found["seconds"].items():
         row = f"{name:<24}{seconds:9.2f}{1e6 * seconds / m:16.3f}{seconds / fusion:11.2f}{seconds / loop:9.2f}"

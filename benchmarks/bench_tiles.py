@@ -36,7 +36,7 @@ from posed_writer import write_posed  # noqa: E402
 WIDTH, HEIGHT, K = 640, 480, 7
 STAGES = {"fuse": "fuse numba", "table": "table", "statistics": "statistics", "summary": "measure", "Parquet": "write"}
 LEG, BESIDE, STEP = 10, 40.0, 30.0
-CITY = ["--scene", "scene0", "--backbone", "sim-flicker", "--frames", ":40"]
+CITY = ["--scene", "scene0", "--model", "sim-flicker", "--frames", ":40"]
 COLUMNS = ("ix", "iy", "iz", "op", "drift_sum", "pixels", "first_frame", "last_frame", "self_sum", "frame_entropy_sum",
            "vss", "sbd", "entropy", "margin", "label")  # fmt: skip
 

@@ -1,4 +1,4 @@
-"""Datasets behind one base class: a dataset has scenes, a scene yields frames with the labels of a backbone."""
+"""Datasets behind one base class: a dataset has scenes, a scene yields frames with the labels of a model."""
 
 from __future__ import annotations
 
@@ -35,11 +35,11 @@ REGISTRY = Registry(
         "frames": Entry("semstab.online.frames:Frames", "frames that a Python program gives to `semstab.fuse`"),
         "city": Entry(
             "semstab.datasets.city:City",
-            "the built-in scene: a simulated UAV flight over a procedural city, with simulated backbones",
+            "the built-in scene: a simulated UAV flight over a procedural city, with simulated models",
         ),
         "posed_folder": Entry(
             "semstab.datasets.posed_folder:PosedFolder",
-            "folders depth/, pose/, labels/BACKBONE/ and intrinsics.txt, one file a frame",
+            "folders depth/, pose/, labels/MODEL/ and intrinsics.txt, one file a frame",
         ),
         "uavid3d": Entry(
             "semstab.datasets.uavid3d:Uavid3d",

@@ -1,4 +1,4 @@
-"""Posed images in plain folders: depth/, pose/, labels/BACKBONE/, scores/BACKBONE/, intrinsics.txt, scene.yaml."""
+"""Posed images in plain folders: depth/, pose/, labels/MODEL/, scores/MODEL/, intrinsics.txt, scene.yaml."""
 
 from __future__ import annotations
 

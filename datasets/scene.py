@@ -23,7 +23,7 @@ from semstab.datasets.geometry.lenses import Labels, Scores, at_image, fitted
 from semstab.errors import DataError
 
 GROUND_TRUTH = "gt"
-"""The name under which a scene's ground truth labels are selected like a backbone's."""
+"""The name under which a scene's ground truth labels are selected like a model's."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -44,12 +44,12 @@ class Filtering:
 class Scene(ABC):
     """One sequence. Opening it reads no image; what reads one may be called from several threads at once.
 
-    A dataset has to give `name`, `backbones`, and the four methods that are abstract; the rest are defaults for what a
+    A dataset has to give `name`, `models`, and the four methods that are abstract; the rest are defaults for what a
     scene may lack, or slower ways to get what `frame` holds too.
 
     Attributes:
         name: The scene's name, usable in a file name.
-        backbones: Names of the label sources, without the ground truth.
+        models: Names of the label sources, without the ground truth.
         ground_truth: Whether `frame(i, "gt")` works too.
         further: Label sources that are read by name only, none of 'all'.
         regions: Maps of regions without classes, which `frame` reads by name and nothing fuses.
@@ -57,7 +57,7 @@ class Scene(ABC):
         georeference: Place on Earth, or None where that is not known.
         placed: How that was found and how well it fits, in words, or None.
         folder: Folder of its files, where label maps are looked for, or None where it has none.
-        label_paths: Paths where the first frame's label maps are looked for, with BACKBONE for any name.
+        label_paths: Paths where the first frame's label maps are looked for, with MODEL for any name.
         settings_file: The file that says what no option says, or None where there is no such file.
         labels_like_depth: Whether its label maps have the pixels of the depth, not those of the colour images.
         surface: The file of the surface that depth is cast at, or None where it is not cast.
@@ -67,7 +67,7 @@ class Scene(ABC):
     """
 
     name: str
-    backbones: tuple[str, ...]
+    models: tuple[str, ...]
     ground_truth: bool = False
     further: Sequence[str] = ()
     regions: tuple[str, ...] = ()
@@ -88,12 +88,12 @@ class Scene(ABC):
         """Return the number of frames of the sequence, those that lack a file or a pose among them."""
 
     @abstractmethod
-    def label_space(self, backbone: str) -> LabelSpace:
-        """Return the classes of that backbone's label maps or scores."""
+    def label_space(self, model: str) -> LabelSpace:
+        """Return the classes of that model's label maps or scores."""
 
     @abstractmethod
-    def frame(self, index: int, backbone: str, *, color: bool = True) -> Frame:
-        """Return frame 0 <= index < len, with that backbone's labels or scores in its own label space.
+    def frame(self, index: int, model: str, *, color: bool = True) -> Frame:
+        """Return frame 0 <= index < len, with that model's labels or scores in its own label space.
 
         Without `color` a scene may leave colour out, where that saves time.
 
@@ -102,7 +102,7 @@ class Scene(ABC):
         """
 
     @abstractmethod
-    def digest(self, indices: list[int], backbone: str) -> str:
+    def digest(self, indices: list[int], model: str) -> str:
         """Return a hash of the content behind those frames: the same digest means the same numbers."""
 
     @property
@@ -137,9 +137,9 @@ class Scene(ABC):
         """Return what people know a frame by: its files' name, else its index."""
         return str(index)
 
-    def filtering(self, backbone: str) -> Filtering:
+    def filtering(self, model: str) -> Filtering:
         """Return the filters of a label source."""
-        return Filtering(backbone)
+        return Filtering(model)
 
     def geometry(self, index: int, *, color: bool = False) -> Frame:
         """Return the frame but for its labels: all pixels are of class 0.
@@ -147,7 +147,7 @@ class Scene(ABC):
         Raises:
             DataError: If that fails; the message names the file.
         """
-        sources = (*((GROUND_TRUTH,) if self.ground_truth else ()), *self.backbones[:1])
+        sources = (*((GROUND_TRUTH,) if self.ground_truth else ()), *self.models[:1])
         for source in sources:  # the ground truth is the cheapest, but may be sparse
             try:
                 frame = self.frame(index, source, color=color)

@@ -128,10 +128,10 @@ USES = {
         (("-m", "semstab", "--backend", "torch", "--frames", "::8", "--check", "numpy", "--out", "OUT"),),
         "checked torch against numpy on ",
     ),
-    "segformer": predicting("segformer", "segformer,model=segformer"),
-    "sam": predicting("sam", f"sam-heuristic,model=sam,{SAM}"),
-    "segearth": predicting("clip", "segearth-ov,model=clip"),
-    "torchvision": predicting("segformer", "segformer,model=segformer,processor=torchvision", over="segformer"),
+    "segformer": predicting("segformer", "segformer,checkpoint=segformer"),
+    "sam": predicting("sam", f"sam-heuristic,checkpoint=sam,{SAM}"),
+    "segearth": predicting("clip", "segearth-ov,checkpoint=clip"),
+    "torchvision": predicting("segformer", "segformer,checkpoint=segformer,processor=torchvision", over="segformer"),
     "onnx": predicting("onnx", "net.onnx", "--classes", "building,road,tree,car"),
     "geo": Use(
         "a run with `crs`, `export` to .laz and .tif",
@@ -255,7 +255,7 @@ def main() -> None:
         there.constraints.write_text("\n".join(options.constraint))
         there.install(fresh.make_venv(folder / "venv-base"), str(there.wheel))
         semstab = (str(there.base), "-m", "semstab")
-        fresh.run([*semstab, "convert", "--scene", "scene0", "--backbone", "sim-flicker", "--out", "scene"], folder)
+        fresh.run([*semstab, "convert", "--scene", "scene0", "--model", "sim-flicker", "--out", "scene"], folder)
         fresh.run([*semstab, *SCENE, "--out", "base"], folder)
         print("| extra | what was run | result | packages, MB added | seconds |\n|---|---|---|---|---|", flush=True)
         failed = False

@@ -107,7 +107,7 @@ SECONDS = 900  # after which a command is given up
 IGNORED = re.compile(
     r"schema|key|command|seconds|milliseconds|.*_ms|.*_ms_per_frame|seconds_.*|.*_seconds|fps|.*memory.*|peak_.*|version|semstab|date|created"
     r"|root|path|source|.*_file|digest|identity|inputs|sha256|model_hash"
-    r"|line|title|caption|advice|undecided|remarks|reason|about|text|calibrated_on"
+    r"|line|title|caption|advice|undecided|notes|reason|about|text|calibrated_on"
     r"|low|high|.*_low|.*_high|degrees|block_size|blocks|places|question|p|p_value|p_holm|level|verdict|answers|change"
     r"|matters|worst_.*|tests|worse|better|gate|exit_codes"
 )
@@ -136,7 +136,7 @@ FOLDERS = (*EXACT, "influence", "sums", "columns")
 """Folders with a file for each unit, whose names are not of tables."""
 
 SAMPLED_FOLDERS = ("looks", "influence")
-SAMPLED_COLUMNS = re.compile(r"stable|stable_wrong|flip_rate|frames_since_flip|sbd_(null|excess)")
+SAMPLED_COLUMNS = re.compile(r"consistent|consistent_wrong|flip_rate|frames_since_flip|sbd_(null|excess)")
 """What a sampled case does not compare: draws of observations, and what statistics add to voxels of the sample."""
 
 
@@ -146,7 +146,7 @@ MACROS = {
     "quiet": "--rerun off --report off --quiet",
     "drawn": "--rerun off --report on --quiet",
     "small": "--scene scene0 --option width=96 --option height=64 --option frames=60 --frames 0:20 --voxel-size 0.4",
-    "clusters": "--predict colour-clusters --backbone colour-clusters",
+    "clusters": "--predict colour-clusters --model colour-clusters",
     "shelf": "--data {data}/apc_shelf",
 }
 
@@ -208,9 +208,9 @@ def cases() -> list[Case]:
                         "export r --to few.csv --min-op 3 --measure vss --measure psa --quiet",
                         "export r --to coarse.tif --cell 4 --measure entropy --quiet",
                         "export r --onto m.las --to onto.las --radius 2 --quiet"]),
-        Case("filters", ["remedies {shelf} -m fcn --filter ema-warped:0.6 --filter vote:3 --voxel-size 0.02 "
+        Case("filters", ["filters {shelf} -m fcn --filter ema-warped:0.6 --filter vote:3 --voxel-size 0.02 "
                          "--frames ::2 --out r --report off --quiet"]),
-        Case("predict", ["predict --backbone colour-clusters {shelf} --frames ::5 --scores --out p --quiet"]),
+        Case("predict", ["predict --model colour-clusters {shelf} --frames ::5 --scores --out p --quiet"]),
         Case("convert", ["convert {shelf} --frames ::5 --out c --quiet",
                          "convert --dataset tum --config {inputs}/tum.yaml --data {inputs}/tum --out t --quiet"]),
         Case("check", ["check {shelf} --json c.json --quiet"]),
@@ -242,10 +242,10 @@ for name, step in wall_study.STEPS.items():
     wall_study.write_wall(out / "walls" / name, step)
 posed = {"dataset": {"name": "posed_folder"}}
 sweeps = {"voxel_size": [0.0625, 0.125], "depth_noise": {"values": [0, 0.01], "repeats": 2}}
-settings("study", {**posed, "name": "walls", "backbones": ["nervous"], "voxel_size": 0.0625, "sweeps": sweeps,
+settings("study", {**posed, "name": "walls", "models": ["nervous"], "voxel_size": 0.0625, "sweeps": sweeps,
                    "statistics": True, "backends": ["numpy", {"name": "numba", "scenes": ["often"]}]})
 
-tiny_study.write(out / "wall", backbones=("a",), frames=4)
+tiny_study.write(out / "wall", models=("a",), frames=4)
 (out / "wall/labels/regions").mkdir()
 for i in range(4):
     ids = np.where(np.arange(8) + i < 5, 200 + 2 * i, 300 - i).astype(np.uint16)

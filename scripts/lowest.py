@@ -22,7 +22,7 @@ COMMANDS = (
     "compare run:sim-steady run:sim-flicker --out compared",
     "gate run:sim-steady --against run:sim-flicker --rule alpha>0",
     "show run --figures png",
-    "export run --scene scene0 --backbone sim-flicker --to map.ply --to map.csv --to map.parquet",
+    "export run --scene scene0 --model sim-flicker --to map.ply --to map.csv --to map.parquet",
 )
 
 HEAD = """# The lowest versions that setup.cfg declares for the base install: pip install -c constraints/lowest.txt .

@@ -26,7 +26,7 @@ CORE = (
 """Equations, settings, what a fresh machine has, a run, the command line, backends: in this order."""
 
 FOLDERS = {"benchmark": "semstab"} | {
-    name: f"semstab.{name}" for name in ("backends", "backbones", "datasets", "configs", "conformance")
+    name: f"semstab.{name}" for name in ("backends", "models", "datasets", "configs", "conformance")
 }
 
 

@@ -65,4 +65,4 @@ if [ "$installed" != "$wanted $extras" ] && [ "$installed" != "$wanted [dev]" ];
 fi
 
 # As pip does for what it copies: Python itself does not where PYTHONDONTWRITEBYTECODE is set, and each start would compile.
-.venv/bin/python -m compileall -q benchmark backends backbones datasets configs conformance
+.venv/bin/python -m compileall -q benchmark backends models datasets configs conformance

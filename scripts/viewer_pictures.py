@@ -29,7 +29,7 @@ WINDOW, BAR, WIDTH = (1500, 850), 38, 1200
 PORT, ATTEMPTS, PATIENCE_S = 9911, 12, 12
 
 CITY = ["--scene", "scene0", "--check", "none"]
-SHELF = ["--voxel-size", "0.01", "--backbone", "fcn", "--backend", "numba", "--backend", "open3d-projective",
+SHELF = ["--voxel-size", "0.01", "--model", "fcn", "--backend", "numba", "--backend", "open3d-projective",
          "--check", "none"]  # fmt: skip
 
 

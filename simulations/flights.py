@@ -29,7 +29,7 @@ class Flight:
         reach: Of errors, in voxels: the correlation of places d apart is exp(-d^2 / (2 reach^2)).
         ease: Larger means fewer errors.
         frames: Of the flight.
-        looks: Frames that see a place, on average; all of them where it is as many as frames.
+        observations: Frames that see a place, on average; all of them where it is as many as frames.
         quality: Of frames: 'alike', 'bad' (one in ten is much worse), 'uneven' (each its own), 'lasting' (AR(1) with
             0.8), 'regimes' (good and bad stretches of 8 frames on average), 'heavy' (Student's t with 2 degrees of
             freedom), 'objects' (a square of 5 voxels errs as a whole, for 3 frames on average), 'view' (the farther
@@ -45,7 +45,7 @@ class Flight:
     reach: float = 2.0
     ease: float = 1.0
     frames: int = 4
-    looks: int = 4
+    observations: int = 4
     quality: str = "alike"
     city: bool = False
     coin: bool = False
@@ -134,8 +134,8 @@ def fly(flight: Flight, over: World, rng: np.random.Generator, ease: float | Non
     """Return labels (n, F) of a flight over a scene; -1 where a frame does not see a place."""
     n, F = len(over.index), flight.frames
     off = over.index[:, :1] - (np.arange(F) + 0.5) / F * flight.side
-    width = flight.side * flight.looks / F
-    seen = np.ones((n, F), bool) if flight.looks >= F else np.abs(off) <= width / 2
+    width = flight.side * flight.observations / F
+    seen = np.ones((n, F), bool) if flight.observations >= F else np.abs(off) <= width / 2
     voxel, frame = np.nonzero(seen)
     off = off[seen] / width
     harder = over.hard[voxel] - (flight.ease if ease is None else ease) + qualities(flight, rng)[frame]

@@ -32,9 +32,9 @@ LEVEL = 0.05
 def conditions() -> Iterator[tuple[str, Flight]]:
     """Yield name and flight."""
     for frames, side in ((15, 32), (30, 32), (15, 64), (64, 32)):
-        looks = frames if frames < 64 else 16
+        observations = frames if frames < 64 else 16
         for quality in ("alike", "bad", "uneven", "lasting"):
-            yield f"{frames} frames, {side} x {side}, {quality}", Flight(side, 1.5, 1.0, frames, looks, quality)
+            yield f"{frames} frames, {side} x {side}, {quality}", Flight(side, 1.5, 1.0, frames, observations, quality)
 
 
 def models(flight: Flight, same: bool, rng: np.random.Generator) -> list[ClusterSums]:

@@ -151,7 +151,7 @@ def _flown(count: int, seed: int, scope: Scope) -> Iterator[Row]:
 def _of_frames(
     flight: Flight, count: int, seed: int, scope: Scope, where: str = "", key: str = "voxel_alpha"
 ) -> Iterator[Row]:
-    seen = "all see all" if flight.looks == flight.frames else "strips"
+    seen = "all see all" if flight.observations == flight.frames else "strips"
     name = ", ".join(filter(None, (f"{flight.frames} frames", flight.quality, seen, where)))
     yield from trials(flight, count, seed, scope, (key,), name)
 
@@ -161,9 +161,9 @@ def _of_frames(
 
 def differences(count: int, seed: int) -> Iterator[Row]:
     """Two models that err equally often, on the same scene: in the same frames, or in two flights."""
-    for side, looks in ((32, 60), (45, 5)):
+    for side, observations in ((32, 60), (45, 5)):
         for quality in ("alike", "bad", "uneven", "lasting"):
-            yield from _pairs(Flight(side, 1.5, 1.0, 60, looks, quality), count, seed)
+            yield from _pairs(Flight(side, 1.5, 1.0, 60, observations, quality), count, seed)
     yield from _pairs(Flight(32, 1.5, 1.0, 15, 5, "alike"), count, seed, THESE_FRAMES, "these frames")
     yield from _pairs(Flight(45, 1.5, 1.0, 40, 5, "uneven", K=5), count, seed, where="five classes")
     yield from _pairs(Flight(45, 1.5, 1.0, 40, 5, "uneven", soft=True), count, seed, where="scores")
@@ -179,7 +179,7 @@ def _pairs(flight: Flight, count: int, seed: int, scope: Scope = THIS_SCENE, whe
         pair = [sums_of(fly(flight, scene, rng), scene, flight, rng) for scene in (over, other)]
         found["same frames"].append(difference(*pair, key, scope=scope, same_frames=True))
         found["two flights"].append(difference(*pair, key, scope=scope, same_frames=False))
-    seen = "all see all" if flight.looks == flight.frames else "strips"
+    seen = "all see all" if flight.observations == flight.frames else "strips"
     for flights, intervals in found.items():
         parts = (f"{flight.side} x {flight.side}, {flight.frames} frames", flight.quality, seen, where, flights)
         spread = float(np.std([interval.value for interval in intervals]))
@@ -189,7 +189,7 @@ def _pairs(flight: Flight, count: int, seed: int, scope: Scope = THIS_SCENE, whe
 # --- Correlogram ------------------------------------------------------------------------------------------------------
 
 APART = (1, 2, 4)
-"""Frames that two looks are apart."""
+"""Frames that two observations are apart."""
 
 
 def correlograms(count: int, seed: int) -> Iterator[Row]:

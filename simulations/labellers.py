@@ -14,12 +14,12 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import semstab
-from semstab.datasets.city.options import BACKBONES
+from semstab.datasets.city.options import MODELS
 from semstab.report.narrative import warnings
 
 HEAD = (
     "labeller", "alpha", "labelled, %", "edges met, %", "flicker, %", "verdict without truth", "warned of",
-    "verdict with truth", "wrong of stable, %", "accuracy, %",
+    "verdict with truth", "wrong of consistent, %", "accuracy, %",
 )  # fmt: skip
 REASONS = {
     "no label": "no labels",
@@ -32,7 +32,7 @@ REASONS = {
 
 def rows(scene: str, frames: int, width: int) -> Iterator[list[str]]:
     """Yield the cells of each labeller."""
-    names = [name for name in BACKBONES if name != "sim-soft"]
+    names = [name for name in MODELS if name != "sim-soft"]
     options = {"frames": frames, "width": width, "height": round(width * 9 / 16)}
     settings = {"dataset": {"name": "city", "options": options}, "scenes": [scene], "check": None}
     with tempfile.TemporaryDirectory() as folder:
@@ -40,20 +40,20 @@ def rows(scene: str, frames: int, width: int) -> Iterator[list[str]]:
         for statistics in (False, True):
             out = Path(folder) / str(statistics)
             semstab.run(
-                semstab.load_config(overrides={**settings, "backbones": names, "statistics": statistics}),
+                semstab.load_config(overrides={**settings, "models": names, "statistics": statistics}),
                 out=out,
                 report=False,
             )
             results.append(semstab.load_result(out))
         plain, judged = results
         for name in names:
-            (own,), (true,) = plain.select(backbone=name), judged.select(backbone=name)
+            (own,), (true,) = plain.select(model=name), judged.select(model=name)
             found, right = own.statistics, true.statistics
             said = [text for text in warnings(plain) if name in text or text.startswith("stable says")]
             reasons = [
                 reason for part, reason in REASONS.items() if any(part in text and name in text for text in said)
             ]
-            numbers = right.headline.wrong_of_stable.value, right.correctness.accuracy.value
+            numbers = right.headline.wrong_of_consistent.value, right.correctness.accuracy.value
             yield [
                 name, f"{found.headline.alpha.value:.2f}", f"{100 * found.cells.labelled:.0f}",
                 f"{100 * own.image_space.edge_recall:.0f}", f"{own.image_space.compensated_flicker_percent:.1f}",

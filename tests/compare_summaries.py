@@ -10,7 +10,7 @@ from typing import Any
 IGNORED = frozenset({"key", "input", "digest", "schema"})
 """Keys that are no result; so are those that hold _ms, such as `fuse_ms_per_frame`, or end in _seconds."""
 
-NAMED_BY = ("scene", "backbone", "backend", "backends", "variation", "name", "rule", "measure", "a", "b")
+NAMED_BY = ("scene", "model", "backend", "backends", "variation", "name", "rule", "measure", "a", "b")
 """Keys that tell the entries of a list apart, whatever their order."""
 
 

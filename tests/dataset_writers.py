@@ -27,7 +27,7 @@ SIDES = {"opencv": ([0, 1, 2], [1, 1, 1]), "opengl": ([0, 1, 2], [1, -1, -1]), "
 
 @functools.cache
 def city() -> tuple[Frame, ...]:
-    """Neighbouring frames of the city, a tenth of its size, with labels of a backbone that errs, and colour."""
+    """Neighbouring frames of the city, a tenth of its size, with labels of a model that errs, and colour."""
     scene = open_dataset("city", {"width": W, "height": H, "frames": 15 * COUNT}).scene("scene0")
     return tuple(shrunk(scene.frame(index, "sim-flicker")) for index in range(COUNT))
 

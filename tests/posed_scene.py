@@ -57,8 +57,8 @@ def opened(folder: Path, **options):
     return dataset.scene(dataset.scenes[0])
 
 
-def first_frame(folder: Path, backbone="net", **options):
-    return opened(folder, **options).frame(0, backbone)
+def first_frame(folder: Path, model="net", **options):
+    return opened(folder, **options).frame(0, model)
 
 
 def fails(kind, match, action, *args, **options) -> None:

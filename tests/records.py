@@ -26,9 +26,9 @@ def voxels(*groups, r=0.2):
     )  # fmt: skip
 
 
-def record(table, sweep=BASE, value=None, repeat=0, scene="s", backbone="m", backend="numpy", **more):
+def record(table, sweep=BASE, value=None, repeat=0, scene="s", model="m", backend="numpy", **more):
     """The record of a unit that left this map."""
-    unit = Unit(scene, backbone, backend)
+    unit = Unit(scene, model, backend)
     summary = UnitSummary(unit, "abc", 4, summarise(table), 10.0, fuse_ms_per_frame=5.0)
     return Record(unit.slug, Variation(sweep, value, repeat), summary, **more)
 

@@ -100,24 +100,24 @@ class Room(Scene):
     ) -> None:  # fmt: skip
         self.poses = walk() if poses is None else poses
         self.told_pose, self.told_depth, self.camera, self.noise, self.soft = told_pose, told_depth, camera, noise, soft
-        self.backbones, self.ground_truth = ("net",), True
+        self.models, self.ground_truth = ("net",), True
         self.read = []
 
     def __len__(self) -> int:
         return len(self.poses)
 
-    def label_space(self, backbone) -> LabelSpace:
+    def label_space(self, model) -> LabelSpace:
         return LabelSpace("room", CLASSES)
 
-    def digest(self, indices, backbone) -> str:
+    def digest(self, indices, model) -> str:
         return ""
 
-    def frame(self, index, backbone, *, color=True) -> Frame:
-        self.read.append((index, backbone))
+    def frame(self, index, model, *, color=True) -> Frame:
+        self.read.append((index, model))
         rng = np.random.default_rng(index)
         z, seen = render(self.poses[index])
         z = z * (1 + self.noise * rng.standard_normal(z.shape))
-        wrong = (rng.random(seen.shape) < 0.1) & (backbone != "gt")
+        wrong = (rng.random(seen.shape) < 0.1) & (model != "gt")
         labels = np.where(wrong, (seen + 1) % len(CLASSES), seen).astype(np.uint8)
         scores = np.eye(len(CLASSES), dtype=np.float32)[labels] * 0.5 + 0.1 if self.soft else None
         return Frame(

@@ -90,7 +90,7 @@ def test_a_file_keeps_it_and_another_kind_of_map_is_refused(commit, tmp_path):
 
 
 def test_export_and_relabel_take_the_file(tmp_path):
-    tiny_scene.write(tmp_path / "wall", backbones=("a",), frames=6)
+    tiny_scene.write(tmp_path / "wall", models=("a",), frames=6)
     semstab.run(configure(tmp_path / "wall", check=None, statistics=True), out=tmp_path / "run", report=False)
 
     def cli(*words):

@@ -226,7 +226,7 @@ def test_tasks_hold_more_errors_than_their_images(tmp_path):
     """On the city: pixels whose class is not the truth, in the outlines and in all of the image."""
     config = {
         "dataset": {"name": "city", "options": {"width": 128, "height": 72, "frames": 24}}, "scenes": ["scene0"],
-        "backbones": ["sim-flicker"], "voxel_size": 0.5, "taxonomy": None, "check": None,
+        "models": ["sim-flicker"], "voxel_size": 0.5, "taxonomy": None, "check": None,
     }  # fmt: skip
     semstab.run(config, out=tmp_path / "run")
     coco = opened(written(tmp_path / "run", tmp_path, "coco", most=100))

@@ -281,33 +281,33 @@ def test_the_quick_check_reads_four_frames_and_more_only_before_it_refuses():
     right, wrong = Room(), Room(told_pose=np.linalg.inv)
     checked(right)
     assert len(right.read) == 4
-    assert {backbone for _, backbone in right.read} == {"gt"}  # no model need predict for it
+    assert {model for _, model in right.read} == {"gt"}  # no model need predict for it
     checked(wrong)
     assert 4 < len({index for index, _ in wrong.read}) <= 12
 
 
 def test_an_unreadable_frame_is_passed_over():
     class Damaged(Room):
-        def frame(self, index, backbone, *, color=True):
+        def frame(self, index, model, *, color=True):
             if index % 2:
                 raise DataError("damaged")
-            return super().frame(index, backbone, color=color)
+            return super().frame(index, model, color=color)
 
     assert checked(Damaged()).state == "sound"
 
     class AllDamaged(Room):
-        def frame(self, index, backbone, *, color=True):
+        def frame(self, index, model, *, color=True):
             raise DataError("damaged")
 
     assert checked(AllDamaged()).state == "unclear"
 
 
-def test_frames_without_ground_truth_are_read_with_the_backbone():
+def test_frames_without_ground_truth_are_read_with_the_model():
     class Sparse(Room):
-        def frame(self, index, backbone, *, color=True):
-            if backbone == "gt":
+        def frame(self, index, model, *, color=True):
+            if model == "gt":
                 raise DataError("no ground truth here")
-            return super().frame(index, backbone, color=color)
+            return super().frame(index, model, color=color)
 
     assert checked(Sparse()).state == "sound"
 

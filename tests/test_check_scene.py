@@ -33,7 +33,7 @@ DATA = Path(os.environ.get("SEMSTAB_DATA", Path(__file__).parents[1] / "../share
 
 
 def of_memory(room: Room, **content):
-    return check_scene(room, resolve(load_config(None, {"backbones": None, "taxonomy": None} | content)))
+    return check_scene(room, resolve(load_config(None, {"models": None, "taxonomy": None} | content)))
 
 
 def bench(*arguments, width=80):
@@ -75,7 +75,7 @@ def test_motion_is_that_of_the_poses(sound):
 
 def test_persistence_is_that_of_the_run(folder, sound):
     """All 12 frames are fused, so that OP is the run's own."""
-    (run,) = semstab.engine.run(configure(folder, voxel_size=0.1, backbones=["gt"])).runs
+    (run,) = semstab.engine.run(configure(folder, voxel_size=0.1, models=["gt"])).runs
     row = next(row for row in sound.persistence if row.voxel_size == 0.1)
     assert sound.fused_frames == 12
     assert (row.voxels, row.mean_op) == (run.table.voxels, pytest.approx(run.table.mean_op))
@@ -190,12 +190,12 @@ def test_maps_without_a_label_are_a_problem():
     assert tallied(None, np.array([[3, 3, 255, 1]], np.uint8)).classes == {"1": 0.25, "3": 0.5}
 
 
-def test_every_backbone_is_counted(tmp_path):
+def test_every_model_is_counted(tmp_path):
     folder = tiny_scene.write(tmp_path / "wall")
     (checked,) = check(configure(folder))
-    assert [labels.backbone for labels in checked.labels] == ["a", "b"]
-    (checked,) = check(configure(folder, backbones=["gt"]))
-    assert [labels.backbone for labels in checked.labels] == ["gt"]
+    assert [labels.model for labels in checked.labels] == ["a", "b"]
+    (checked,) = check(configure(folder, models=["gt"]))
+    assert [labels.model for labels in checked.labels] == ["gt"]
     assert sum(checked.labels[0].classes.values()) == pytest.approx(1)
 
 
@@ -221,7 +221,7 @@ def test_a_scene_without_labels_is_checked_by_its_depth(tmp_path):
 
 def test_a_dataset_that_yields_nothing_without_labels_says_so():
     room = Room()
-    room.backbones, room.ground_truth = (), False
+    room.models, room.ground_truth = (), False
     with pytest.raises(DataError, match="without any this dataset yields no depth"):
         of_memory(room)
 
@@ -229,7 +229,7 @@ def test_a_dataset_that_yields_nothing_without_labels_says_so():
 def test_a_selection_that_does_not_fit_is_refused(folder):
     for content, message in (
         ({"scenes": ["rom"]}, "did you mean 'room'"),
-        ({"backbones": ["nat"]}, "did you mean 'net'"),
+        ({"models": ["nat"]}, "did you mean 'net'"),
         ({"taxonomy": "uavid7"}, "no class takes"),
         ({"frames": {"start": 20}}, "leaves none of its 12"),
     ):
@@ -252,7 +252,7 @@ def test_the_tables_fit_80_columns_and_the_numbers_go_to_a_file(folder, tmp_path
     assert len(plain.splitlines()) <= 24
     content = json.loads(file.read_text(), parse_constant=lambda text: pytest.fail(f"{text} in JSON"))
     (scene,) = content["scenes"]
-    assert (content["schema"], scene["sound"], scene["problems"]) == (1, True, [])
+    assert (content["schema"], scene["sound"], scene["problems"]) == (2, True, [])
     assert {row["name"] for row in scene["verdict"]["fits"]} >= {"as configured", "camera_axes: opengl"}
     assert scene["persistence"][1]["voxel_size"] == 0.1
     assert scene["overlaps"][0]["error"] < 0.01
@@ -357,7 +357,7 @@ def test_a_file_that_cannot_be_written_is_one_line(folder, tmp_path):
 
 def test_a_run_refuses_unsound_data_unless_told_otherwise(tmp_path):
     folder = write(tmp_path / "room", Room(walk(5), told_pose=np.linalg.inv))
-    config = configure(folder, backbones=["net"], check=None)
+    config = configure(folder, models=["net"], check=None)
     with pytest.raises(DataError, match=r"room: depth reprojects .* pose_convention: world_to_camera"):
         semstab.engine.run(config, out=tmp_path / "run")
     assert not list((tmp_path / "run").rglob("*.parquet"))
@@ -376,7 +376,7 @@ def test_a_study_refuses_unsound_data_unless_told_otherwise(tmp_path):
     folder = write(tmp_path / "room", Room(walk(5), told_pose=np.linalg.inv))
     content = {"dataset": dataset_of(folder), "backends": ["numpy"]}
     file = tmp_path / "room.yaml"
-    file.write_text(yaml.safe_dump(content | {"backbones": ["net"]}))
+    file.write_text(yaml.safe_dump(content | {"models": ["net"]}))
     refused = bench("study", file, "--out", tmp_path / "study", "-q")
     assert refused.exit_code == 2
     assert "pose_convention: world_to_camera" in refused.stderr
@@ -393,13 +393,13 @@ def test_the_manifest_says_what_was_found_and_what_it_cost(folder, tmp_path):
         def geometry_checked(self, task, verdict):
             seen.append((task.scene.name, verdict.state))
 
-    config = configure(folder, backbones=["net", "gt"])
+    config = configure(folder, models=["net", "gt"])
     semstab.engine.run(config, out=tmp_path / "run", observers=[Watching()])
     manifest = json.loads((tmp_path / "run/manifest.json").read_text())
     assert manifest["geometry"]["room"]["state"] == "sound"
     assert manifest["geometry"]["room"]["frames"] == 4
     assert manifest["seconds"]["check"] > 0
-    assert seen == [("room", "sound")]  # once a scene, not once a backbone
+    assert seen == [("room", "sound")]  # once a scene, not once a model
     semstab.engine.run(config, out=tmp_path / "run", observers=[Watching()])
     assert len(seen) == 1  # what is kept is not checked again
 
@@ -469,7 +469,7 @@ def test_the_dictionary_is_plain_json(sound):
     assert json.loads(json.dumps(content, allow_nan=True, default=str))["verdict"]["state"] == "sound"
     assert set(dataclasses.asdict(sound)) <= set(content)
     assert re.fullmatch(r"depth reprojects with [\d.]+% median error, \d+% co-visible", content["verdict"]["text"])
-    assert [row["backbone"] for row in content["labels"]] == ["net"]
+    assert [row["model"] for row in content["labels"]] == ["net"]
     assert set(content["labels"][0]["classes"]) == set(CLASSES)
 
 

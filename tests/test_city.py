@@ -12,7 +12,7 @@ from pydantic import ValidationError
 
 from semstab.data.frames import Frame
 from semstab.datasets import GROUND_TRUTH, open_dataset
-from semstab.datasets.city import City, CityScene, SimulatedBackbone
+from semstab.datasets.city import City, CityScene, SimulatedModel
 from semstab.datasets.city.labellers import LABELLERS
 from semstab.datasets.city.mesh import Surface
 from semstab.datasets.city.simulation import Caster, Simulation, View
@@ -67,7 +67,7 @@ def view_of(scene: CityScene, index: int, *, as_frame: int | None = None) -> Vie
 
 
 def simulated(scene: CityScene, seen: View, **model: Any) -> np.ndarray:
-    return Simulation(SimulatedBackbone(**model), 0, "test", scene.name).labels(seen)
+    return Simulation(SimulatedModel(**model), 0, "test", scene.name).labels(seen)
 
 
 def test_frames_depend_on_the_seed_and_not_on_the_order_of_calls(small) -> None:
@@ -170,7 +170,7 @@ def test_more_frames_sample_the_same_flight_and_a_utm_origin_shifts_the_voxels(s
     assert np.array_equal(few.frame(1, GROUND_TRUTH).T_wc, many.frame(2, GROUND_TRUTH).T_wc)
     assert few.frame(2, GROUND_TRUTH).timestamp == many.frame(4, GROUND_TRUTH).timestamp
     assert city(frames=1).scene("scene0").frame(0, GROUND_TRUTH).timestamp == 0.0
-    origin = (480_000.0, 5_400_000.0, 120.0)  # whole numbers of voxels and of the backbone's cells
+    origin = (480_000.0, 5_400_000.0, 120.0)  # whole numbers of voxels and of the model's cells
     near, far = small.scene("scene0"), city(origin=origin).scene("scene0")
     a, b = near.frame(1, "sim-flicker"), far.frame(1, "sim-flicker")
     assert np.array_equal(a.depth, b.depth)
@@ -196,10 +196,10 @@ def test_memory_of_large_frames_and_of_the_cache_is_bounded() -> None:
     assert 0 < sum(r.nbytes for r in scene.rendered.values()) <= 1_000_000
 
 
-def test_scenes_and_backbones_and_unknown_names(small) -> None:
+def test_scenes_and_models_and_unknown_names(small) -> None:
     assert small.scenes == ("scene0", "scene1", "scene2", "scene3", "scene4")
     scene = small.scene("scene2")
-    assert scene.backbones == ("sim-steady", "sim-flicker", "sim-soft")
+    assert scene.models == ("sim-steady", "sim-flicker", "sim-soft")
     assert scene.further == tuple(f"trick-{name}" for name in LABELLERS)
     assert scene.ground_truth
     assert np.array_equal(scene.up, [0, 0, 1])
@@ -212,7 +212,7 @@ def test_scenes_and_backbones_and_unknown_names(small) -> None:
         small.scene("scene0").frame(0, "sim-stedy")
     with pytest.raises(DataError, match="there is no frame 3"):
         small.scene("scene0").frame(3, GROUND_TRUTH)
-    scene = city(backbones={"perfect": {}}).scene("scene0")
+    scene = city(models={"perfect": {}}).scene("scene0")
     for index in range(3):
         truth = small.scene("scene0").frame(index, GROUND_TRUTH).labels
         assert np.array_equal(scene.frame(index, "perfect").labels, truth)
@@ -224,7 +224,7 @@ def test_digest_tells_contents_apart_without_rendering() -> None:
         scene.digest([0, 1], "sim-steady"), scene.digest([0, 2], "sim-steady"), scene.digest([0, 1], "sim-flicker"),
         scene.digest([0, 1], GROUND_TRUTH), city(seed=1).scene("scene0").digest([0, 1], "sim-steady"),
         city().scene("scene1").digest([0, 1], "sim-steady"),
-        city(backbones={"sim-steady": {"flicker": 0.5}}).scene("scene0").digest([0, 1], "sim-steady"),
+        city(models={"sim-steady": {"flicker": 0.5}}).scene("scene0").digest([0, 1], "sim-steady"),
     }  # fmt: skip
     assert len(digests) == 7
     assert city(cache_megabytes=1).scene("scene0").digest([0, 1], "sim-steady") in digests
@@ -234,11 +234,11 @@ def test_digest_tells_contents_apart_without_rendering() -> None:
 @pytest.mark.parametrize(("options", "message"), [
     ({"width": 4000}, "less than or equal to 3840"), ({"frames": 0}, "greater than or equal to 1"),
     ({"origin": [float("nan"), 0, 0]}, "finite"), ({"wdith": 10}, "Extra inputs"),
-    ({"backbones": {"mine": {"place": 1.5}}}, "less than or equal to 1"),
-    ({"backbones": {"gt": {}}}, "cannot name a backbone"), ({"backbones": {"a/b": {}}}, "cannot name a backbone"),
-    ({"backbones": {"mine": {"difficulty": {"lorry": 2}}}}, "class 'lorry' is not known"),
-    ({"backbones": {"mine": {"confusion": {"road": {"road": 1}}}}}, "mistaken for itself"),
-    ({"backbones": {"mine": {"confusion": {"road": {"tree": 0}}}}}, "sum to more than 0"),
+    ({"models": {"mine": {"place": 1.5}}}, "less than or equal to 1"),
+    ({"models": {"gt": {}}}, "cannot name a model"), ({"models": {"a/b": {}}}, "cannot name a model"),
+    ({"models": {"mine": {"difficulty": {"lorry": 2}}}}, "class 'lorry' is not known"),
+    ({"models": {"mine": {"confusion": {"road": {"road": 1}}}}}, "mistaken for itself"),
+    ({"models": {"mine": {"confusion": {"road": {"tree": 0}}}}}, "sum to more than 0"),
 ])  # fmt: skip
 def test_bad_options(options: dict[str, Any], message: str) -> None:
     with pytest.raises(ValidationError, match=message):
@@ -345,13 +345,13 @@ def test_border_errors_stay_at_borders_and_difficulty_scales_rates() -> None:
 
 def test_soft_scores_sum_to_one_and_keep_the_class(small: City) -> None:
     model = {"place": 0.1, "flicker": 0.1, "border": 1.0}
-    scene = city(backbones={"soft": model | {"softness": 0.4}}).scene("scene0")
+    scene = city(models={"soft": model | {"softness": 0.4}}).scene("scene0")
     frame = scene.frame(1, "soft")
     assert frame.labels is None
     assert frame.scores.dtype == np.float32
     assert frame.scores.shape == (54, 96, 8)
     np.testing.assert_allclose(frame.scores.sum(axis=2), 1, atol=1e-6)
-    hard = Simulation(SimulatedBackbone(**model), 0, "soft", "scene0").labels(view_of(scene, 1))
+    hard = Simulation(SimulatedModel(**model), 0, "soft", "scene0").labels(view_of(scene, 1))
     assert np.array_equal(frame.predicted, hard)
     best = frame.scores.max(axis=2)
     assert 0.6 <= best.min() < 0.7 < best.max() <= 1

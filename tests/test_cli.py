@@ -46,11 +46,11 @@ def test_list_names_what_there_is(tmp_path) -> None:
     text = bench("list", cwd=tmp_path, columns=200).stdout
     assert {"open3d", "numpy", "city", "posed_folder", "uavid7", "ready"} <= set(text.split())
     studies = [line.split() for line in text.splitlines() if line.split()[:1] == ["study"]]
-    assert [row[2] for row in studies] == ["city", "remedies", "uavid3d"]
+    assert [row[2] for row in studies] == ["city", "filters", "uavid3d"]
 
 
 def test_a_run_on_a_folder(wall, tmp_path) -> None:
-    arguments = ("--backend", "open3d", "--data", wall, "--backbone", "a", "--voxel-size", "0.25", "--out", "run")
+    arguments = ("--backend", "open3d", "--data", wall, "--model", "a", "--voxel-size", "0.25", "--out", "run")
     text = bench(*arguments, cwd=tmp_path, report=True, recording=True, process=True).stdout
     for words in (
         "wall", "no verdict", "checked open3d against numpy on", "semstab-bench view run", "semstab-bench show run",
@@ -66,16 +66,16 @@ def test_a_run_on_a_folder(wall, tmp_path) -> None:
     assert cv2.imread(str(tmp_path / "run/figures/persistence.png")).shape[1] in (3.4 * style.DPI, 7 * style.DPI)
     assert 'id="table-scenes"' in (tmp_path / "run/report.html").read_text()
     runs = json.loads((tmp_path / "run" / "summary.json").read_text())["runs"]
-    assert {(run["backbone"], run["backend"]) for run in runs} == {("a", "open3d")}
+    assert {(run["model"], run["backend"]) for run in runs} == {("a", "open3d")}
 
 
 def test_options_reach_the_run(wall, tmp_path) -> None:
-    arguments = ("--backend", "numpy", "--check", "none", "--backbone", "gt", "--frames", ":2", "--pixel-stride", "2")
+    arguments = ("--backend", "numpy", "--check", "none", "--model", "gt", "--frames", ":2", "--pixel-stride", "2")
     more = ("--set", "strata=[1, 4]", "--set", "voxel_size=0.25", "--rerun", "off", "--quiet", "--events")
     result = bench("run", *arguments, *more, "--data", wall, "--out", "run", cwd=tmp_path)
     assert (result.stdout, result.stderr) == ("", "")
     (run,) = json.loads((tmp_path / "run" / "summary.json").read_text())["runs"]
-    assert (run["frames"], run["points"], run["backbone"]) == (2, 24, "gt")
+    assert (run["frames"], run["points"], run["model"]) == (2, 24, "gt")
     assert [row["name"] for row in run["strata"]] == ["OP=1", "2<=OP<=4", "OP>4"]
     assert not (tmp_path / "run" / "recording.rrd").exists()
     assert (tmp_path / "run" / "events" / "wall__gt__numpy.parquet").exists()
@@ -95,7 +95,7 @@ def test_a_lost_pose_is_left_out_and_said_and_the_default_folder_is_new(wall, tm
     ("--config bad.yaml", "unknown setting 'voxel_sise'; did you mean 'voxel_size'?"),
     ("--data wall --voxel-size 0", "voxel_size: input should be greater than"),
     ("--data wall --backend opn3d", "did you mean 'open3d'?"),
-    ("--data wall --backbone c", "no backbone 'c'; known: a, b, gt"), ("--data wall --frames 3", "--frames 3"),
+    ("--data wall --model c", "no model 'c'; known: a, b, gt"), ("--data wall --frames 3", "--frames 3"),
     ("--data wall --set x", "write KEY=VALUE"), ("--data wall --device CUDA:7", "CUDA"),
     ("--data wall --backend numpy --device CPU:0", "none of numpy runs on a device"),
     ("--data wall --seed 1", "unknown setting 'seed'"), ("--data wall --out wall", "is not empty and holds no run"),
@@ -144,7 +144,7 @@ def test_damaged_data_is_one_line_that_names_the_file(wall, tmp_path, damage, me
     damage(wall)
     result = bench("--data", wall, "--backend", "numpy", "--rerun", "off", "--out", "run", cwd=tmp_path, code=2)
     lines = [line for line in result.stderr.splitlines() if line.strip()]
-    assert all(line.startswith("error: ") for line in lines)  # one for each backbone that it concerns
+    assert all(line.startswith("error: ") for line in lines)  # one for each model that it concerns
     assert message in lines[0]
     assert not list((tmp_path / "run").rglob("wall__a*"))
 
@@ -172,7 +172,7 @@ def test_disagreement_is_exit_3_after_everything_is_written(wall, tmp_path) -> N
 
 
 def test_ctrl_c_is_exit_130_and_the_same_command_goes_on(tmp_path) -> None:
-    wall = tiny_scene.write(tmp_path / "wall", backbones=("a", "b"), frames=200)
+    wall = tiny_scene.write(tmp_path / "wall", models=("a", "b"), frames=200)
     arguments = ("--data", wall, "--backend", "numpy", "--voxel-size", "0.05", "--rerun", "off", "--out", "run")
     process = started(*arguments, cwd=tmp_path)
     units = tmp_path / "run" / "units"

@@ -78,7 +78,7 @@ def test_a_run_and_itself_do_not_differ_and_numbers_are_those_of_the_runs(runs, 
     assert {row.difference.value for row in (*own.contrasts, *own.by_class)} == {0.0}
     assert {row.change for row in (*own.contrasts, *own.by_class)} == {""}
     assert all(row.difference.low == row.difference.high == 0 for row in own.contrasts)
-    record = semstab.load_result(runs / "old").record(backbone="net")
+    record = semstab.load_result(runs / "old").record(model="net")
     found = rows(fault.overall[0])
     judged, right = record.statistics.headline, record.statistics.correctness
     assert found["psa"].base == pytest.approx(judged.psa.value, abs=1e-9)
@@ -86,7 +86,7 @@ def test_a_run_and_itself_do_not_differ_and_numbers_are_those_of_the_runs(runs, 
     assert found["accuracy"].base == pytest.approx(judged.accuracy.value, abs=1e-9)
     assert found["voxel_alpha"].base == pytest.approx(record.statistics.agreement.voxel_alpha.value, abs=1e-9)
     assert found["compensated_flicker_percent"].base == pytest.approx(record.image_space.compensated_flicker_percent)
-    assert found["wrong_of_stable"].base == pytest.approx(right.quadrants.wrong_of_stable.value, abs=1e-9)
+    assert found["wrong_of_consistent"].base == pytest.approx(right.quadrants.wrong_of_consistent.value, abs=1e-9)
     assert {"sbd_excess", "miou", "ece", "entropy", "sbd", "margin"} <= found.keys()
 
 

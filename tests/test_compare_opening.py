@@ -35,7 +35,7 @@ def run(tmp_path_factory):
 
 def test_a_label_source_is_selected_behind_a_colon_and_names_are_the_shortest(run, tmp_path):
     found = open_run(f"{run}:b")
-    assert (found.backbone, list(found.scenes), found.source) == ("b", ["wall"], run)
+    assert (found.model, list(found.scenes), found.source) == ("b", ["wall"], run)
     entry = found.scenes["wall"]
     assert entry.classes == entry.with_voxels("").table().classes
     assert value(entry.sums, "psa") == pytest.approx(entry.summary.statistics.agreement.psa.value)
@@ -53,7 +53,7 @@ def test_a_label_source_is_selected_behind_a_colon_and_names_are_the_shortest(ru
 
 
 @pytest.mark.parametrize(("named", "line"), [
-    ("{run}", "holds several label sources (a, b); name one: {run}:a"), ("{run}:q", "no backbone 'q'; known: a, b"),
+    ("{run}", "holds several label sources (a, b); name one: {run}:a"), ("{run}:q", "no model 'q'; known: a, b"),
     ("{run}/nothing", "there is no such folder"), ("{run}/units", "summary.json: cannot be read"),
     ("{run}/config.yaml", "neither a run's folder nor a small summary"),
 ])  # fmt: skip
@@ -84,7 +84,7 @@ def test_a_small_summary_holds_all_but_voxels(run, tmp_path):
     one, file = open_run(f"{run}:a"), tmp_path / "kept.semstab"
     save_summary(one, file)
     kept = open_run(file)
-    assert (kept.backbone, list(kept.scenes)) == ("a", ["wall"])
+    assert (kept.model, list(kept.scenes)) == ("a", ["wall"])
     own, back = one.scenes["wall"], kept.scenes["wall"]
     assert to_json(back.summary.statistics.agreement) == to_json(own.summary.statistics.agreement)
     assert to_json(back.image_space) == to_json(own.image_space)

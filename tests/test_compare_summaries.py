@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 from compare_summaries import differences
 
-RUN = {"scene": "street", "backbone": "a", "backend": "numba", "vss": 0.9, "sbd": None, "fuse_ms_per_frame": 3.0}
+RUN = {"scene": "street", "model": "a", "backend": "numba", "vss": 0.9, "sbd": None, "fuse_ms_per_frame": 3.0}
 SUMMARY: dict[str, Any] = {
     "schema": 1,
     "runs": [

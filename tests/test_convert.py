@@ -35,23 +35,23 @@ CITY = {
     "height": 27,
     "frames": 4,
     "origin": [4e5, 5e6, 30],
-    "backbones": {"hard": {"flicker": 0.1}, "soft": {"softness": 0.3}},
+    "models": {"hard": {"flicker": 0.1}, "soft": {"softness": 0.3}},
 }
 
 
 def of_city(name="city", options=CITY, **content) -> Config:
     """Of the city, or of another dataset."""
-    base = {"dataset": {"name": name, "options": options}, "backbones": None, "taxonomy": None}
+    base = {"dataset": {"name": name, "options": options}, "models": None, "taxonomy": None}
     return resolve(load_config(None, base | content))
 
 
-def fused(scene, backbone, voxel_size=0.5):
-    K = len(scene.label_space(backbone))
+def fused(scene, model, voxel_size=0.5):
+    K = len(scene.label_space(model))
     backend = create("numpy", voxel_size=voxel_size, num_classes=K)
-    space = scene.label_space(backbone)
+    space = scene.label_space(model)
     mapping = space.mapping_to(space)
     for index in range(len(scene)):
-        frame = scene.frame(index, backbone)
+        frame = scene.frame(index, model)
         if frame.labels is not None:
             frame = dataclasses.replace(frame, labels=mapping.labels(frame.labels, ""))
         backend.integrate(frame)
@@ -74,7 +74,7 @@ def test_the_city_gives_the_same_voxels(tmp_path):
     assert converted.renamed == {"soft": "soft-scores"}
     assert converted.lost == ("time stamps",)
     source, scene = open_dataset("city", config.dataset.options).scene("scene0"), opened(tmp_path)
-    assert (scene.name, scene.backbones, scene.ground_truth) == ("scene0", ("hard", "soft-scores"), True)
+    assert (scene.name, scene.models, scene.ground_truth) == ("scene0", ("hard", "soft-scores"), True)
     assert scene.up.tolist() == source.up.tolist()
     for there, here in (("hard", "hard"), ("soft", "soft-scores"), (GROUND_TRUTH, GROUND_TRUTH)):
         assert scene.label_space(here) == source.label_space(there)
@@ -97,8 +97,8 @@ def test_a_folder_of_millimetres_stays_one(tmp_path):
     assert converted.depth == "16-bit PNG, 1000 units a metre"
     source, scene = opened(root), opened(tmp_path / "out/wall")
     assert (scene.options.pose_convention, scene.options.camera_axes) == ("camera_to_world", "opencv")
-    for backbone in ("a", "b", "gt"):
-        assert_same_map(fused(scene, backbone, 0.025), fused(source, backbone, 0.025), 0.0)
+    for model in ("a", "b", "gt"):
+        assert_same_map(fused(scene, model, 0.025), fused(source, model, 0.025), 0.0)
 
 
 def test_frames_keep_their_number(tmp_path):
@@ -109,14 +109,14 @@ def test_frames_keep_their_number(tmp_path):
 
 
 def test_label_sources_and_scenes_are_selected(tmp_path):
-    done = list(convert(of_city(scenes=["scene0", "scene2"], backbones=["hard"]), tmp_path))
+    done = list(convert(of_city(scenes=["scene0", "scene2"], models=["hard"]), tmp_path))
     assert [converted.scene for converted in done] == ["scene0", "scene2"]
     scene = open_dataset("posed_folder", {"root": tmp_path}).scene("scene2")
-    assert (scene.backbones, scene.ground_truth) == (("hard",), False)
+    assert (scene.models, scene.ground_truth) == (("hard",), False)
     with pytest.raises(ConfigError, match="no scene 'scene9'"):
         list(convert(of_city(scenes=["scene9"]), tmp_path))
-    with pytest.raises(ConfigError, match="no backbone 'hart'; did you mean 'hard'"):
-        list(convert(of_city(backbones=["hart"]), tmp_path))
+    with pytest.raises(ConfigError, match="no model 'hart'; did you mean 'hard'"):
+        list(convert(of_city(models=["hart"]), tmp_path))
 
 
 # --- going on
@@ -131,7 +131,7 @@ def test_what_is_there_is_kept(tmp_path):
     assert again.written == 1
     now = snapshot(tmp_path)
     assert {path for path, at in images.items() if now[path] != at} == {tmp_path / "scene0/labels/hard/000002.png"}
-    (more,) = convert(config.model_copy(update={"backbones": ["hard"]}), tmp_path)
+    (more,) = convert(config.model_copy(update={"models": ["hard"]}), tmp_path)
     assert more.written == 0
 
 
@@ -152,9 +152,9 @@ def test_an_interrupted_conversion_goes_on(tmp_path):
     (converted,) = convert(config, tmp_path / "out")
     assert converted.written == 4  # of each the ground truth was missing
     list(convert(config, tmp_path / "whole"))
-    for backbone in ("hard", "soft-scores", "gt"):
+    for model in ("hard", "soft-scores", "gt"):
         assert_same_map(
-            fused(opened(tmp_path / "out/scene0"), backbone), fused(opened(tmp_path / "whole/scene0"), backbone), 0.0
+            fused(opened(tmp_path / "out/scene0"), model), fused(opened(tmp_path / "whole/scene0"), model), 0.0
         )
 
 
@@ -199,8 +199,8 @@ def test_depth_that_does_not_fit_later_is_stored_as_floats(tmp_path):
     """The first and last frames are whole millimetres, one between them is not."""
 
     class Late(Room):
-        def frame(self, index, backbone, *, color=True):
-            frame = super().frame(index, backbone, color=color)
+        def frame(self, index, model, *, color=True):
+            frame = super().frame(index, model, color=color)
             depth = np.round(frame.depth, 3) + np.float32(1e-4 * (index == 4))
             return dataclasses.replace(frame, depth=depth.astype(np.float32))
 
@@ -290,8 +290,8 @@ def test_matrices_read_back_to_the_same_numbers(matrix):
 
 def test_two_cameras_are_refused(tmp_path):
     class Zooming(Room):
-        def frame(self, index, backbone, *, color=True):
-            frame = super().frame(index, backbone, color=color)
+        def frame(self, index, model, *, color=True):
+            frame = super().frame(index, model, color=color)
             camera = Intrinsics(CAMERA.fx + (index == 2), CAMERA.fy, CAMERA.cx, CAMERA.cy)
             return dataclasses.replace(frame, intrinsics=camera)
 
@@ -301,14 +301,14 @@ def test_two_cameras_are_refused(tmp_path):
 
 def test_two_sources_of_one_folder_are_refused(tmp_path):
     room = Room(walk(2), soft=True)
-    room.backbones = ("net", "net-scores")
-    with pytest.raises(ConfigError, match="net and net-scores would get one folder; choose with --backbone"):
+    room.models = ("net", "net-scores")
+    with pytest.raises(ConfigError, match="net and net-scores would get one folder; choose with --model"):
         of_memory(room, tmp_path)
 
 
 def test_sources_keep_their_names_where_a_folder_can_be_called_so(tmp_path):
     room = Room(walk(2), soft=False)
-    room.backbones = ("a b", "a-b", "../x")
+    room.models = ("a b", "a-b", "../x")
     assert list(of_memory(room, tmp_path).renamed) == ["../x"]
     assert {"a b", "a-b"} < {path.name for path in (tmp_path / "out" / "labels").iterdir()}
     assert not (tmp_path / "out" / "x").exists()
@@ -318,7 +318,7 @@ def test_an_oblique_up_direction_and_unknown_classes_are_said_to_be_lost(tmp_pat
     class Odd(Room):
         up = np.array([0.0, 0.6, 0.8])
 
-        def label_space(self, backbone) -> LabelSpace:
+        def label_space(self, model) -> LabelSpace:
             raise DataError("not known")
 
     converted = of_memory(Odd(walk(2)), tmp_path)
@@ -345,7 +345,7 @@ def test_a_scene_without_labels_keeps_depth_poses_colour_and_masks(tmp_path):
     np.testing.assert_array_equal(scene.depth(2), source.depth(2))
     np.testing.assert_array_equal(scene.T_wc(2), source.T_wc(2))
     assert scene.color(2).tolist() == source.color(2).tolist()
-    assert scene.backbones == ()
+    assert scene.models == ()
     assert [path.name for path in (tmp_path / "out/room/mask").iterdir()] == ["000001.png"]
 
 
@@ -404,7 +404,7 @@ def test_every_format_gives_the_same_voxels(tmp_path, name):
     config = of_city(form.dataset, {"root": str(tmp_path / "data"), "classes": FORMAT_CLASSES, **needed})
     (converted,) = convert(config, tmp_path / "out")
     reader, scene = dataset_writers.opened(form, tmp_path / "data"), opened(converted.folder)
-    assert scene.backbones == reader.backbones == ("net",)
+    assert scene.models == reader.models == ("net",)
     table = fused(scene, "net", 0.1)
     assert len(table) > 500
     assert_same_map(table, fused(reader, "net", 0.1), 0.0)

@@ -11,7 +11,7 @@ from pathlib import Path
 STUDY = """
 dataset: {name: city}
 scenes: [scene0]
-backbones: [sim-flicker]
+models: [sim-flicker]
 frames: {spacing: even, count: 5}
 voxel_size: 0.4
 sweeps: {voxel_size: [0.4, 0.8]}
@@ -29,7 +29,7 @@ def frame(k):
 result = semstab.fuse(map(frame, range(9)), voxel_size=0.5, backend="open3d")
 result.report("fused.html")
 assert result.record().table().to_arrow().num_rows > 0
-assert semstab.load("a").table(scene="scene0", backbone="sim-flicker").op.max() > 1
+assert semstab.load("a").table(scene="scene0", model="sim-flicker").op.max() > 1
 try:
     semstab.load("a").summary
 except semstab.SemstabError as error:
@@ -52,7 +52,7 @@ def test_every_command_runs_with_the_declared_packages_alone(tmp_path: Path) -> 
         ["show", "a", "verdicts", "--figures", "png"],
         ["view", "a"],
         ["study", "study.yaml", "--out", "s"],
-        ["export", "a", "--backbone", "sim-flicker", "--to", "m.ply", "--to", "m.csv", "--to", "m.parquet"],
+        ["export", "a", "--model", "sim-flicker", "--to", "m.ply", "--to", "m.csv", "--to", "m.parquet"],
         ["python", PYTHON],
     ]
     script = Path(__file__).with_name("declared_only.py")

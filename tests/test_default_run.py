@@ -14,9 +14,9 @@ def test_the_built_in_city_from_the_command_line(tmp_path) -> None:
     result = bench("--backend", "open3d", *small, cwd=tmp_path)
     (folder,) = (tmp_path / "runs").iterdir()
     summary = json.loads((folder / "summary.json").read_text())
-    units = {(run["scene"], run["backbone"], run["backend"]) for run in summary["runs"]}
-    backbones, backends = ("sim-steady", "sim-flicker"), ("open3d",)
-    assert units == {(s, m, b) for s in ("scene0", "scene3") for m in backbones for b in backends}
+    units = {(run["scene"], run["model"], run["backend"]) for run in summary["runs"]}
+    models, backends = ("sim-steady", "sim-flicker"), ("open3d",)
+    assert units == {(s, m, b) for s in ("scene0", "scene3") for m in models for b in backends}
     assert len(summary["agreement"]) == len(units)
     assert all(row["agrees"] and row["only_in"] == [0, 0] for row in summary["agreement"])
     assert {run["K"] for run in summary["runs"]} == {7}

@@ -54,7 +54,7 @@ def as_in_0_3(value):
 def old_run(tmp_path):
     """A run whose folder is as that of version 0.3, and its result."""
     options = {"width": 48, "height": 32, "frames": 8}
-    scene = {"dataset": {"options": options}, "scenes": ["scene0"], "backbones": ["sim-soft", "sim-steady"]}
+    scene = {"dataset": {"options": options}, "scenes": ["scene0"], "models": ["sim-soft", "sim-steady"]}
     config = semstab.load_config(scene | {"check": None, "voxel_size": 0.8})
     out = tmp_path / "run"
     result = semstab.run(config, out=out, report=False)

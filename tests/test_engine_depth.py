@@ -14,7 +14,7 @@ from semstab.engine import Observer, passes
 
 
 def test_integrate_is_nine_calls_below_run_in_seven_files(tmp_path, monkeypatch) -> None:
-    config = configure(tiny_scene.write(tmp_path / "wall", backbones=("a",)))
+    config = configure(tiny_scene.write(tmp_path / "wall", models=("a",)))
     integrate, stacks = NumpyReference.integrate, []
 
     def watched(self, frame):

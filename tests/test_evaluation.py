@@ -28,7 +28,7 @@ from semstab.report.terminal import print_summary
 from semstab.statistics import CellObservations, MapSample, analyse, describe
 from semstab.statistics.correctness import ACCURACY
 
-BACKBONES = ("a", "b", "gt")
+MODELS = ("a", "b", "gt")
 
 
 # --- A run ------------------------------------------------------------------------------------------------------------
@@ -39,7 +39,7 @@ def ran(tmp_path_factory):
     """A run from the command line with all statistics: its folder, what it printed, its summary."""
     base = tmp_path_factory.mktemp("ran")
     tiny_scene.write(base / "wall", frames=6)
-    chosen = [word for name in BACKBONES for word in ("-m", name)]
+    chosen = [word for name in MODELS for word in ("-m", name)]
     printed = bench(
         "--data", "wall", "-b", "numpy", *chosen, "--voxel-size", "0.25", "--check", "none", "--rerun", "off",
         "--statistics", "--events", "--set", "strata=[1, 3]", "-v", "--out", "run", cwd=base, columns=80,
@@ -47,8 +47,8 @@ def ran(tmp_path_factory):
     return base / "run", printed, json.loads((base / "run" / "summary.json").read_text())
 
 
-def saved(run: Path, backbone: str) -> tuple[VoxelTable, Events, CellObservations]:
-    name = f"wall__{backbone}__numpy.parquet"
+def saved(run: Path, model: str) -> tuple[VoxelTable, Events, CellObservations]:
+    name = f"wall__{model}__numpy.parquet"
     cells = CellObservations.load(run / "observations" / name)
     return VoxelTable.load(run / "voxels" / name), Events.load(run / "events" / name), cells
 
@@ -57,7 +57,7 @@ def test_a_runs_statistics_are_those_of_its_saved_maps_and_events(ran) -> None:
     run, _, summary = ran
     truth, *_ = saved(run, "gt")
     for entry in summary["runs"]:
-        name = entry["backbone"]
+        name = entry["model"]
         table, events, cells = saved(run, name)
         true = None if name == "gt" else truth
         expected = analyse(MapSample.draw(table, events, true, edges=(1, 3)), cells, name=name, edges=(1, 3))
@@ -65,7 +65,7 @@ def test_a_runs_statistics_are_those_of_its_saved_maps_and_events(ran) -> None:
         columns = pq.read_table(run / "voxels" / f"wall__{name}__numpy.parquet")
         for column, values in expected.columns(table).items():
             np.testing.assert_array_equal(columns.column(column).to_numpy(), values)
-    by_name = {entry["backbone"]: entry["statistics"] for entry in summary["runs"]}
+    by_name = {entry["model"]: entry["statistics"] for entry in summary["runs"]}
     assert by_name["gt"]["agreement"]["psa"]["value"] == 1.0
     assert by_name["a"]["agreement"]["psa"]["value"] < 0.9
     assert by_name["a"]["correctness"]["accuracy"]["value"] > 0.6
@@ -76,13 +76,13 @@ def test_a_runs_statistics_are_those_of_its_saved_maps_and_events(ran) -> None:
 def test_all_that_was_found_is_printed_where_it_was_asked_for(ran) -> None:
     _, printed, summary = ran
     assert len(summary["runs"]) == 3
-    for words in ("Agreement of the frames", "Order of the backbones", "Stable and right"):
+    for words in ("Agreement of the frames", "Order of the models", "Stable and right"):
         assert words in printed
     (found,) = summary["comparisons"]
     assert found["paired"]["values"]["accuracy"].keys() == {"a", "b"}
 
 
-def test_the_verdict_on_each_backbone_is_printed(ran) -> None:
+def test_the_verdict_on_each_model_is_printed(ran) -> None:
     _, printed, summary = ran
     for entry in summary["runs"]:
         assert entry["statistics"]["verdict"]["level"] in printed
@@ -114,10 +114,10 @@ def test_a_summary_with_ranks_but_not_their_values_is_refused(ran, tmp_path) -> 
 
 
 class Interrupting(Observer):
-    """Ctrl-C when the second backbone is to be fused."""
+    """Ctrl-C when the second model is to be fused."""
 
     def frame_fused(self, task, frame, rows) -> None:
-        if task.backbone == "b":
+        if task.model == "b":
             raise KeyboardInterrupt
 
 
@@ -163,7 +163,7 @@ def test_no_ground_truth_no_judgement(tmp_path) -> None:
     assert entry.statistics.drift.trend is not None
 
 
-def test_backbones_of_different_classes_are_not_compared(tmp_path) -> None:
+def test_models_of_different_classes_are_not_compared(tmp_path) -> None:
     root = tiny_scene.write(tmp_path / "wall")
     (root / "labels/b/label_space.yaml").write_text("name: other\nclasses: [wall, door, window, sky]\n")
     assert semstab.engine.run(configure(root, statistics=True)).comparisons == ()
@@ -205,35 +205,35 @@ def studied(tmp_path_factory):
     base = tmp_path_factory.mktemp("studied")
     root = tiny_study.write(base / "wall", frames=8)
     noise = {"depth_noise": {"values": [0, 0.05], "repeats": 2}}
-    settings = {"backbones": list(BACKBONES), "backends": ["numpy"], "statistics": True, "frames": {}, "sweeps": noise}
+    settings = {"models": list(MODELS), "backends": ["numpy"], "statistics": True, "frames": {}, "sweeps": noise}
     run_study(tiny_study.configure(root, **settings), base / "out")
     return load_result(base / "out"), base / "out"
 
 
 def test_the_tables_of_a_study_have_the_numbers_of_its_units(studied) -> None:
     found, _ = studied
-    base = {record.unit.backbone: record.statistics for record in found.select()}
+    base = {record.unit.model: record.statistics for record in found.select()}
     for row in rows_of(found, "temporal_agreement"):
-        own = base[row["backbone"]]
+        own = base[row["model"]]
         assert row["psa"] == pytest.approx(dataclasses.asdict(own.agreement.psa), nan_ok=True)
         assert row["flip_rate"] == own.drift.flips.rate.value
     for row in rows_of(found, "drift"):
-        trend = base[row["backbone"]].drift.trend
+        trend = base[row["model"]].drift.trend
         assert row["trend_voxels"] == trend.voxels
         assert row["trend_percent"]["value"] == pytest.approx(100 * trend.share.value, nan_ok=True)
         assert row["sbd"] - row["sbd_null"] == pytest.approx(row["sbd_excess"]["value"])
     for row in rows_of(found, "ceiling"):
         assert row["disagreement"]["value"] == pytest.approx(row["geometry"]["value"] + row["model"]["value"])
     quadrants = rows_of(found, "quadrants")
-    assert [row["backbone"] for row in quadrants] == ["a", "b"]
+    assert [row["model"] for row in quadrants] == ["a", "b"]
     for row in quadrants:
         parts = [row[f"{name}_percent"]["value"] for name in
-                 ("stable_right", "stable_wrong", "unstable_right", "unstable_wrong")]  # fmt: skip
+                 ("consistent_right", "consistent_wrong", "inconsistent_right", "inconsistent_wrong")]  # fmt: skip
         assert sum(parts) == pytest.approx(100)
-    strata = [row for row in rows_of(found, "correctness") if row["backbone"] == "a"]
+    strata = [row for row in rows_of(found, "correctness") if row["model"] == "a"]
     assert strata[0]["voxels"] == sum(row["voxels"] for row in strata[1:])
     (difference,) = (row for row in rows_of(found, "comparison") if row["measure"] == "accuracy")
-    values = {row["backbone"]: row["value"]["value"] for row in rows_of(found, "comparison_ranking")
+    values = {row["model"]: row["value"]["value"] for row in rows_of(found, "comparison_ranking")
               if row["measure"] == "accuracy"}  # fmt: skip
     assert difference["difference"]["value"] == pytest.approx(values["a"] - values["b"])
     assert {row["verdict"] for row in rows_of(found, "verdicts")} == {"no verdict"}
@@ -241,8 +241,8 @@ def test_the_tables_of_a_study_have_the_numbers_of_its_units(studied) -> None:
 
 def test_agreement_stands_beside_the_sweep(studied) -> None:
     found, _ = studied
-    rows = [row for row in rows_of(found, "sensitivity_agreement_depth_noise") if row["backbone"] == "a"]
-    (still,), noisy = (found.select("depth_noise", backbone="a", value=value) for value in (0, 0.05))
+    rows = [row for row in rows_of(found, "sensitivity_agreement_depth_noise") if row["model"] == "a"]
+    (still,), noisy = (found.select("depth_noise", model="a", value=value) for value in (0, 0.05))
     assert rows[0]["psa"] == still.statistics.agreement.psa.value
     alphas = [record.statistics.headline.alpha.value for record in noisy]
     assert rows[1]["alpha"]["mean"] == pytest.approx(np.mean(alphas))

@@ -35,7 +35,7 @@ def frame_of(labels=None, **fields) -> Frame:
 
 @pytest.fixture
 def root(tmp_path):
-    return tiny_scene.write(tmp_path / "wall", backbones=("a",))
+    return tiny_scene.write(tmp_path / "wall", models=("a",))
 
 
 def write_masks(root, mask) -> None:

@@ -39,7 +39,7 @@ CLASSES = ["wall", "door", "window"]
 
 @pytest.fixture(scope="module")
 def fused(tmp_path_factory):
-    """A run of two backbones with a georeference, and one without; its folder."""
+    """A run of two models with a georeference, and one without; its folder."""
     folder = tmp_path_factory.mktemp("runs")
     tiny_scene.write(folder / "scene")
     for name, options in (("run", {"crs": CRS, "offset": OFFSET}), ("nowhere", {})):
@@ -50,11 +50,11 @@ def fused(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def table(fused):
-    return semstab.load_result(fused / "run").record(backbone="a").table()
+    return semstab.load_result(fused / "run").record(model="a").table()
 
 
 def written(fused, file, run="run", **options):
-    export(fused / run, fused / file, **{"backbone": "a", **options})
+    export(fused / run, fused / file, **{"model": "a", **options})
     return fused / file
 
 
@@ -160,7 +160,7 @@ def test_a_cell_of_several_voxels_sums_the_beliefs_of_the_topmost():
 
 
 def test_without_a_georeference_coordinates_are_the_scenes_which_is_said(fused, table):
-    (done,) = export(fused / "nowhere", fused / "plain.laz", backbone="a")
+    (done,) = export(fused / "nowhere", fused / "plain.laz", model="a")
     assert "no georeference" in done.content
     cloud = laspy.read(fused / "plain.laz")
     np.testing.assert_allclose(cloud.xyz, table.centers, atol=5.1e-4)
@@ -179,8 +179,8 @@ def test_what_is_exported_can_be_chosen(fused, table):
         ("no column 'drift_p'; did you mean 'drift", {"measures": ["drift_p"]}),
         ("no class 'dor'; did you mean 'door'", {"classes": ["dor"]}),
         (r"no voxel with OP >= 9; OP goes up to 3", {"min_op": 9}),
-        ("2 units fit .scene of a, scene of b.; choose", {"backbone": None}),
-        ("no backbone 'c'", {"backbone": "c"}),
+        ("2 units fit .scene of a, scene of b.; choose", {"model": None}),
+        ("no model 'c'", {"model": "c"}),
         ("no class 'dor' in the run", {"asprs": "wrong.yaml"}),
         ("300 is no ASPRS code", {"asprs": "large.yaml"}),
     ],
@@ -256,7 +256,7 @@ def las_cloud(path, points, point_format=7, crs=CRS):
 @pytest.mark.parametrize("point_format", [3, 7])
 def test_a_las_cloud_is_classified_and_keeps_its_fields(fused, table, points, point_format):
     cloud = las_cloud(fused / f"cloud{point_format}.laz", points, point_format)
-    (done,) = export(fused / "run", fused / "onto.laz", backbone="a", classify=cloud, radius=0.3)
+    (done,) = export(fused / "run", fused / "onto.laz", model="a", classify=cloud, radius=0.3)
     before, after = laspy.read(cloud), laspy.read(fused / "onto.laz")
     for name in (*before.point_format.dimension_names,):
         assert (after["classification_before" if name == "classification" else name] == before[name]).all(), name
@@ -267,7 +267,7 @@ def test_a_las_cloud_is_classified_and_keeps_its_fields(fused, table, points, po
     np.testing.assert_allclose(after.vss, [*vss(table), vss(table)[-1], 0], rtol=1e-6)
     assert [vlr.user_id for vlr in after.evlrs or ()] == ["surveyor"] * (point_format > 5)
     assert done.content == f"{len(points)} points, {(len(points) - 1) / len(points):.1%} of them classified"
-    export(fused / "run", fused / "none.laz", backbone="a", classify=fused / "onto.laz", radius=0)
+    export(fused / "run", fused / "none.laz", model="a", classify=fused / "onto.laz", radius=0)
     again = laspy.read(fused / "none.laz")
     assert again["class"].tolist() == [*expected, 0, 0]
     assert (again["classification_before"] == 2).all()
@@ -294,7 +294,7 @@ def test_a_ply_cloud_is_classified_in_chunks(fused, table, points, monkeypatch):
     monkeypatch.setattr(join, "CHUNK", 7)
     for order in "<>":
         cloud = ply_cloud(fused / "cloud.ply", points, order)
-        export(fused / "run", fused / "onto.ply", backbone="a", classify=cloud, measures=["vss"], radius=0.3)
+        export(fused / "run", fused / "onto.ply", model="a", classify=cloud, measures=["vss"], radius=0.3)
         after = o3d.t.io.read_point_cloud(str(fused / "onto.ply"))
         np.testing.assert_array_equal(after.point.positions.numpy(), points)
         assert (after.point["gray"].numpy().ravel() == np.arange(len(points))).all()
@@ -305,12 +305,12 @@ def test_a_ply_cloud_is_classified_in_chunks(fused, table, points, monkeypatch):
 
 def test_clouds_that_cannot_be_classified(fused, points):
     def classify(cloud, to="never.laz"):
-        export(fused / "run", fused / to, backbone="a", classify=cloud)
+        export(fused / "run", fused / to, model="a", classify=cloud)
 
     there = las_cloud(fused / "there.laz", points[-1:] + 1000)
     fails(DataError, "no point lies in the map: it spans .* m, the map .*; mend the cloud", classify, there)
     beside = fused / "nowhere", fused / "never.laz"
-    fails(DataError, "give the run's dataset a georeference", export, *beside, backbone="a", classify=there)
+    fails(DataError, "give the run's dataset a georeference", export, *beside, model="a", classify=there)
     elsewhere = las_cloud(fused / "elsewhere.laz", points, crs="EPSG:32616")
     fails(DataError, "is in EPSG:32616, the run in EPSG:32615; reproject", classify, elsewhere)
     fails(ConfigError, "stays what it is; write .*never.las", classify, las_cloud(fused / "c.las", points), "never.ply")
@@ -423,7 +423,7 @@ def test_a_cloud_in_the_projection_is_classified_by_a_turned_run(fused, table, t
     run, linear = turned
     points = table.centers @ linear.T + OFFSET
     cloud = ply_cloud(fused / "tc.ply", points)
-    (done,) = export(fused / run, fused / "td.ply", backbone="a", classify=cloud, radius=0)
+    (done,) = export(fused / run, fused / "td.ply", model="a", classify=cloud, radius=0)
     assert "100.0%" in done.content
     after = o3d.t.io.read_point_cloud(str(fused / "td.ply"))
     assert (after.point["class"].numpy().ravel() == dominant(table) + 1).all()
@@ -434,7 +434,7 @@ def test_few_points_that_are_met_are_warned_of(fused, table, caplog):
 
     def classify(cloud, **options):
         caplog.clear()
-        export(fused / "run", fused / "few.ply", backbone="a", classify=ply_cloud(fused / "f.ply", cloud), **options)
+        export(fused / "run", fused / "few.ply", model="a", classify=ply_cloud(fused / "f.ply", cloud), **options)
         return caplog.text
 
     assert classify(points) == ""

@@ -1,4 +1,4 @@
-"""Filters over a backbone: each against its definition, the chain, and what it says where it cannot be used."""
+"""Filters over a model: each against its definition, the chain, and what it says where it cannot be used."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ import numpy as np
 import predicted_scene
 import pytest
 
-from semstab.backbones import Backbone, Prediction
 from semstab.backends.shared.association import observe
 from semstab.data.frames import Frame, Intrinsics
 from semstab.data.labels import LabelSpace
 from semstab.errors import ConfigError
+from semstab.models import Model, Prediction
 from semstab.pixels.warp import carry
 from semstab.predict.filters import REGISTRY, Filtered, Shown, parse
 
@@ -193,7 +193,7 @@ def test_what_is_hidden_or_says_nothing_is_not_carried():
 # --- The chain --------------------------------------------------------------------------------------------------------
 
 
-class Fixed(Backbone):
+class Fixed(Model):
     """Says what it is given, in ids of its own."""
 
     label_space = LabelSpace("four", ("a", "b", "c", "d"), ids=(3, 5, 7, 9))

@@ -10,12 +10,12 @@ import pytest
 from posed_config import dataset_of
 from typer.testing import CliRunner
 
-from semstab.backbones import Backbone, Prediction
 from semstab.cli import app
 from semstab.data.labels import LabelSpace
 from semstab.datasets import open_dataset
 from semstab.datasets.formats.images import read_labels
 from semstab.errors import ConfigError, DataError
+from semstab.models import Model, Prediction
 from semstab.predict.filters import REGISTRY, parse
 from semstab.predict.predictor import Kept, PredictorConfig, load_predictor, parse_predictor, stored_labels
 from semstab.predict.sequence import SequenceOptions, predict_sequence
@@ -51,7 +51,7 @@ def scene(tmp_path):
 
 def predictor(scene, text="", **more):
     filters = [] if not text else text.split("+")
-    return PredictorConfig(backbone=f"{scene.parent}/model.py:Noisy", name="noisy", filters=filters, **more).resolved()
+    return PredictorConfig(model=f"{scene.parent}/model.py:Noisy", name="noisy", filters=filters, **more).resolved()
 
 
 def to_disk(scene, config, name="noisy", indices=range(6), scores=False, **options):
@@ -66,7 +66,7 @@ def stored(scene, name="noisy"):
 
 def live(config):
     opened = open_dataset("predicted", resolve(config).dataset.options).scene("flight")
-    (name,) = opened.backbones
+    (name,) = opened.models
     return [opened.frame(k, name).labels for k in (2, 0, 1, 3, 5, 4)], opened.digest([0, 1], name)
 
 
@@ -91,9 +91,9 @@ def test_over_labels_that_are_there_they_say_what_they_say_over_the_model(scene,
     source = "noisy-scores" if scores else "noisy"
     for text in FILTERS if scores else ["ema:0.6", "vote-warped:3", "map-prior:0.2"]:
         filters = text.split("+")
-        config = resolve(filtered_config(filters, None, {"dataset": dataset_of(scene), "backbones": [source]}))
+        config = resolve(filtered_config(filters, None, {"dataset": dataset_of(scene), "models": [source]}))
         opened = open_dataset("predicted", config.dataset.options).scene("flight")
-        (name,) = opened.backbones
+        (name,) = opened.models
         assert name == "-".join(["noisy", *filters]).replace(":", "-") + "-scores" * scores
         if scores:
             images, frames = zip(
@@ -102,7 +102,7 @@ def test_over_labels_that_are_there_they_say_what_they_say_over_the_model(scene,
             wanted = load_predictor(predictor(scene, text)).predict(images, geometry=frames)
             for k in range(6):
                 np.testing.assert_array_equal(opened.frame(k, name).predicted, wanted[k].labels, err_msg=text)
-        on_disk = PredictorConfig(backbone="stored", options={"source": source}, filters=filters)
+        on_disk = PredictorConfig(model="stored", options={"source": source}, filters=filters)
         shown, model = stored_labels(on_disk, open_dataset("posed_folder", {"root": str(scene)}).scene("flight"))
         predict_sequence(shown, model, range(6), scene, SequenceOptions("out", overwrite=True, batch=2))
         for k, labels in enumerate(stored(scene, "out")):
@@ -130,7 +130,7 @@ def test_the_filters_are_part_of_what_a_unit_depends_on(scene):
 
 def test_labels_that_change_on_disk_are_filtered_again(scene):
     to_disk(scene, predictor(scene))
-    config = {"dataset": dataset_of(scene), "backbones": ["noisy"]}
+    config = {"dataset": dataset_of(scene), "models": ["noisy"]}
     before = live(filtered_config(["ema:0.6"], None, config))[1]
     assert live(filtered_config(["ema:0.6"], None, config))[1] == before
     from PIL import Image
@@ -140,7 +140,7 @@ def test_labels_that_change_on_disk_are_filtered_again(scene):
 
 
 def test_what_is_kept_on_disk_is_asked_once(tmp_path):
-    class Counted(Backbone):
+    class Counted(Model):
         label_space = LabelSpace("two", ("a", "b"))
         gives_scores = True
         asked = 0
@@ -180,7 +180,7 @@ def bench(*words):
 def test_a_chain_from_the_command_line(scene):
     to_disk(scene, predictor(scene))
     chain = ("--filter", "vote:3", "--filter", "threshold:0.5")
-    result = bench("predict", "--backbone", "stored", "--set", "source=noisy", *chain, "--data", scene, "--quiet")
+    result = bench("predict", "--model", "stored", "--set", "source=noisy", *chain, "--data", scene, "--quiet")
     assert result.exit_code == 0, result.output
     said = json.loads((scene / "labels/noisy-vote-3-threshold-0.5/predictions.json").read_text())
     assert said["settings"]["filters"] == ["vote:3", "threshold:0.5"]
@@ -190,9 +190,9 @@ def test_a_chain_from_the_command_line(scene):
 @pytest.mark.parametrize(
     ("words", "said"),
     [
-        (("--backbone", "noisy", "--filter", "threshold"), "it needs scores, and 'noisy' gives labels alone"),
-        (("--backbone", "noisy", "--filter", "smooth"), "filter 'smooth' is not known"),
-        (("--predict", "stored,source=nosy", "--filter", "ema"), "backbone 'nosy' is not there; did you mean 'noisy'"),
+        (("--model", "noisy", "--filter", "threshold"), "it needs scores, and 'noisy' gives labels alone"),
+        (("--model", "noisy", "--filter", "smooth"), "filter 'smooth' is not known"),
+        (("--predict", "stored,source=nosy", "--filter", "ema"), "model 'nosy' is not there; did you mean 'noisy'"),
         (("--predict", "stored,filters=[ema]"), "source"),
     ],
 )

@@ -36,7 +36,7 @@ def test_who_is_right_and_steady():
     maps = [wall(k) for k in range(5)]
     found = judged(maps, truth=maps)
     assert (found.accuracy, found.miou, found.next_frame, found.coverage) == (1, 1, 1, 1)
-    assert (found.stable_wrong, found.changes) == (0, 0)
+    assert (found.consistent_wrong, found.changes) == (0, 0)
     assert np.isnan(found.lag)
     assert (found.model, found.filters, found.milliseconds) == ("net", "ema:0.6", 1.5)
 
@@ -48,7 +48,7 @@ def test_what_is_stable_and_wrong_is_told_from_what_is_right():
     share = np.mean([labels == 2 for labels in maps])
     assert found.accuracy == pytest.approx(1 - share)
     assert found.miou == pytest.approx((1 / 2 + 1 + 0) / 3, abs=0.02)
-    assert found.stable_wrong == pytest.approx(share, abs=0.02)
+    assert found.consistent_wrong == pytest.approx(share, abs=0.02)
     assert found.next_frame == 1
 
 

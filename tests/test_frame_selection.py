@@ -164,8 +164,8 @@ def test_the_city_s_frames_can_be_chosen_by_time() -> None:
 
 def test_label_maps_that_were_not_asked_for_neither_break_nor_change_a_run(tmp_path):
     """A second model predicted every other frame only, and its classes cannot be read."""
-    root = tiny_scene.write(tmp_path / "wall", backbones=("a",), frames=6)
-    settings = {"voxel_size": 0.25, "backends": ["numpy"], "check": None, "backbones": ["a"]}
+    root = tiny_scene.write(tmp_path / "wall", models=("a",), frames=6)
+    settings = {"voxel_size": 0.25, "backends": ["numpy"], "check": None, "models": ["a"]}
     before = run_of(root, settings)
     partial = root / "labels/partial"
     partial.mkdir()
@@ -178,16 +178,16 @@ def test_label_maps_that_were_not_asked_for_neither_break_nor_change_a_run(tmp_p
 
 
 def test_frames_are_selected_on_the_sequence_and_what_lacks_a_file_is_counted(tmp_path):
-    root = tiny_scene.write(tmp_path / "wall", backbones=("a", "partial"), frames=12)
+    root = tiny_scene.write(tmp_path / "wall", models=("a", "partial"), frames=12)
     for k in set(range(12)) - {0, 3, 6, 9}:
         (root / f"labels/partial/{k:04d}.png").unlink()
-    every_third = {"backbones": ["partial"], "frames": {"stride": 3}}
+    every_third = {"models": ["partial"], "frames": {"stride": 3}}
     assert [*plan_of(root, every_third).tasks[0].indices] == [0, 3, 6, 9]
     (task,) = plan_of(root, every_third, incomplete="skip").tasks  # the stride is not applied to what is left
     assert ([*task.indices], task.left_out) == ([0, 3, 6, 9], 0)
     with pytest.raises(DataError, match=r"4 missing: .*labels/partial/0002\.png"):
-        plan_of(root, {"backbones": ["partial"], "frames": {"stride": 2}})
-    (task,) = plan_of(root, {"backbones": ["partial"], "frames": {"stride": 2}}, incomplete="skip").tasks
+        plan_of(root, {"models": ["partial"], "frames": {"stride": 2}})
+    (task,) = plan_of(root, {"models": ["partial"], "frames": {"stride": 2}}, incomplete="skip").tasks
     assert ([*task.indices], task.left_out) == ([0, 6], 4)
 
 

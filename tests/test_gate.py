@@ -42,7 +42,7 @@ from semstab.statistics.intervals import difference, same_flight, shares_of, wit
         "street 1",
     ),
     ("flicker rise < 0.5%", "flicker", "rise", True, 0.5, None, None),
-    ("stable-and-wrong rise < 1e-2", "wrong of stable", "rise", True, 0.01, None, None),
+    ("stable-and-wrong rise < 1e-2", "wrong of consistent", "rise", True, 0.01, None, None),
     ("voxel alpha drop < -0.01", "voxel alpha", "drop", True, -0.01, None, None),
 ])  # fmt: skip
 def test_a_rule_is_read(text, key, change, below, limit, class_name, scene):
@@ -143,7 +143,7 @@ def test_a_rule_of_each_class_shares_the_level_and_voxel_sizes_must_be_the_same(
     closer = gate(f"{run}:a", None, gate_config(rules=["class wall: alpha > 0.1"], level=0.02)).judgements[0]
     assert closer.found.low == pytest.approx(each[0].found.low)
     data = run.parent / "wall"
-    semstab.run(configure(data, check=None, voxel_size=0.4, backbones=["a"]), out=tmp_path / "large", report=False)
+    semstab.run(configure(data, check=None, voxel_size=0.4, models=["a"]), out=tmp_path / "large", report=False)
     fails(
         DataError, "run it with --voxel-size", gate, tmp_path / "large", f"{run}:a", gate_config(rules=["psa drop < 1"])
     )
@@ -157,7 +157,7 @@ def test_a_class_that_is_nowhere_has_no_value_and_ends_are_one_sided():
     assert judging.verdict(parse("class c: recall > 0.5"), found) == "undecided"
     (labels, truth), (other, _) = models(), models(seed=1)
     new, base = sums(labels, truth), sums(other, truth)
-    for key in ("alpha", "look_accuracy"):
+    for key in ("alpha", "observation_accuracy"):
         found = judging.bounded(parse(f"{key.replace('_', ' ')} rise < 1"), new, base)
         both = difference(new, base, key, same_frames=True, level=0.9)
         assert (found.value, found.low, found.high) == (both.value, both.low, both.high)
@@ -380,7 +380,7 @@ def quiet_models(run):
             (wall / "labels" / name).mkdir(exist_ok=True)
             cv2.imwrite(str(wall / "labels" / name / file.name), image)
     out = run.parent / "quiet"
-    semstab.run(configure(wall, check=None, backbones=["part", "frames", "places"]), out=out, report=False)
+    semstab.run(configure(wall, check=None, models=["part", "frames", "places"]), out=out, report=False)
     return out
 
 
@@ -392,7 +392,7 @@ def test_the_coverage_rule_sees_both_kinds_of_silence(run, quiet_models, name):
     assert (result.exit_code, each.reason, each.found.low) == (4, "counted", each.found.high)
     voxels, observations = map(float, re.findall(r"([\d.]+) % of", *result.notes))
     assert 100 * (1 - each.found.value) == pytest.approx(min(voxels, observations), abs=0.051)
-    table = {run_: semstab.load_result(run_).record(backbone=own).table().op
+    table = {run_: semstab.load_result(run_).record(model=own).table().op
              for run_, own in ((quiet_models, name), (run, "a"))}  # fmt: skip
     new, base = (op[op >= 2].astype(int) for op in table.values())
     assert voxels == pytest.approx(100 * len(new) / len(base), abs=0.051)
@@ -415,7 +415,7 @@ def test_a_change_of_alpha_is_what_a_comparison_says_of_the_same_runs(run, quiet
     assert [row.rule.class_name for row in of_classes] == [*listed]
     for row, own in zip(of_classes, listed.values(), strict=True):
         assert (row.base, row.new, row.found.value) == (own.base, own.other, own.difference.value)
-    kept = {name: semstab.load_result(folder).record(backbone=own).statistics
+    kept = {name: semstab.load_result(folder).record(model=own).statistics
             for name, folder, own in (("new", quiet_models, "part"), ("base", run, "a"))}  # fmt: skip
     assert alone.new == kept["new"].headline.alpha.value
     assert of_all.base != kept["base"].headline.alpha.value
@@ -435,7 +435,7 @@ def test_a_change_of_alpha_is_what_a_comparison_says_of_the_same_runs(run, quiet
 def test_runs_of_other_strides_say_nothing_of_what_was_left_out(run, tmp_path):
     """Of pixels of another size it was said that both runs left 40 % without a label."""
     out = tmp_path / "strided"
-    semstab.run(configure(run.parent / "wall", check=None, backbones=["a"], pixel_stride=2), out=out, report=False)
+    semstab.run(configure(run.parent / "wall", check=None, models=["a"], pixel_stride=2), out=out, report=False)
     (scene,) = semstab.compare([f"{run}:a", out]).scenes
     assert scene.basis == "observations"
     assert (scene.observations.ignored, scene.observations.depends) == ((), False)

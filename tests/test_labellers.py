@@ -19,15 +19,15 @@ def result(tmp_path_factory):
     return labelled(tmp_path_factory.mktemp("labellers"), ["sim-steady", *NAMES])
 
 
-def labelled(folder, backbones, **settings):
+def labelled(folder, models, **settings):
     city = {"name": "city", "options": {"frames": 10, "width": 192, "height": 108}}
     fixed = {"dataset": city, "scenes": ["scene0"], "check": None, "voxel_size": 0.4, "backends": ["numba"]}
-    semstab.run(semstab.load_config(overrides={**fixed, "backbones": backbones, **settings}), out=folder, report=False)
+    semstab.run(semstab.load_config(overrides={**fixed, "models": models, **settings}), out=folder, report=False)
     return semstab.load_result(folder)
 
 
 def of(result, name):
-    (record,) = result.select(backbone=name)
+    (record,) = result.select(model=name)
     return record.statistics
 
 
@@ -47,7 +47,7 @@ def test_what_is_left_out_counts_and_caps_the_verdict(result):
 
 
 def test_coarse_labels_meet_few_edges(result):
-    recall = {name: result.select(backbone=name)[0].image_space.edge_recall for name in ("sim-steady", *NAMES)}
+    recall = {name: result.select(model=name)[0].image_space.edge_recall for name in ("sim-steady", *NAMES)}
     assert recall["sim-steady"] > 0.9
     assert max(recall[f"trick-{name}"] for name in ("constant", "blur-81", "coarse-48", "by-row")) < 0.4
     assert recall["trick-blur-31"] < recall["sim-steady"] - 0.2

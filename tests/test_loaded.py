@@ -26,18 +26,18 @@ def run(tmp_path_factory):
 
 
 def test_the_summary_has_a_row_a_unit_and_a_unit_series_and_events(run):
-    assert list(run.summary["backbone"]) == ["a", "b"]
+    assert list(run.summary["model"]) == ["a", "b"]
     for (_, row), summary in zip(run.summary.iterrows(), run.result.runs, strict=True):
         assert row["vss"] == summary.table.means.value["vss"]
         assert row["recurrent_entropy"] == summary.table.recurrent.means.value["entropy"]
         assert row["voxels"] == summary.table.voxels
-    assert list(run.series(backbone="b")["frame"]) == [0, 1, 2]
-    assert len(run.events(backbone="b")) == run.table(backbone="b").op.sum()
+    assert list(run.series(model="b")["frame"]) == [0, 1, 2]
+    assert len(run.events(model="b")) == run.table(model="b").op.sum()
     fails(ConfigError, "2 units fit", run.table)
 
 
 def test_a_table_has_every_voxel_and_its_classes_by_name(run):
-    table = run.table(backbone="a")
+    table = run.table(model="a")
     frame = table.to_pandas()
     np.testing.assert_array_equal(frame[["x", "y", "z"]], table.centers)
     np.testing.assert_array_equal(frame["sbd"], sbd(table))
@@ -54,7 +54,7 @@ def test_what_a_notebook_shows(run):
     assert "<td>scene</td><td>a</td><td>numpy</td>" in shown
     assert f"<td>{run.result.records[0].statistics.verdict.level}</td></tr>" in shown
     assert shown == run.result._repr_html_()
-    table = run.table(backbone="a")
+    table = run.table(model="a")
     assert f"{len(table)} voxels of 0.25 m, 3 classes" in table._repr_html_()
     assert f"<td>all</td><td>{len(table)}</td><td>{vss(table).mean():.3f}</td>" in table._repr_html_()
     assert table.image().shape[2] == 3
@@ -70,4 +70,4 @@ def test_what_is_missing_is_told(run, tmp_path, monkeypatch):
     fails(ConfigError, "with --events", bare.events)
     fails(DataError, "s__m__numpy.csv: cannot be read", bare.series)
     monkeypatch.setitem(sys.modules, "pandas", None)
-    fails(MissingDependencyError, r"pip install 'semstab\[pandas\]'", run.table(backbone="a").to_pandas)
+    fails(MissingDependencyError, r"pip install 'semstab\[pandas\]'", run.table(model="a").to_pandas)

@@ -124,7 +124,7 @@ class Counting(InProcess):
 
 @pytest.fixture(scope="module")
 def wall(tmp_path_factory):
-    return tiny_scene.write(tmp_path_factory.mktemp("scene") / "wall", backbones=("a",), frames=30)
+    return tiny_scene.write(tmp_path_factory.mktemp("scene") / "wall", models=("a",), frames=30)
 
 
 @pytest.fixture(scope="module")
@@ -193,7 +193,7 @@ def test_so_it_does_with_soft_scores_and_other_backends(scene, backend, tmp_path
 @pytest.fixture(scope="module")
 def judged(wall, tmp_path_factory):
     """The same of a run with all statistics and its log."""
-    settings = SETTINGS | {"statistics": True, "events": True, "backbones": ["a"]}
+    settings = SETTINGS | {"statistics": True, "events": True, "models": ["a"]}
     return run_both(wall, tmp_path_factory.mktemp("judged"), **settings)
 
 
@@ -320,7 +320,7 @@ def test_backends_are_held_against_each_other_tile_by_tile(wall, tmp_path) -> No
     assert all(row["agrees"] for row in other)
 
 
-def test_backbones_are_compared_tile_by_tile(tmp_path) -> None:
+def test_models_are_compared_tile_by_tile(tmp_path) -> None:
     """Coverage, means at a common OP, common looks: with logs and ground truth."""
     root, found = tiny_scene.write(tmp_path / "wall", frames=8), []
     for size in (None, 8):

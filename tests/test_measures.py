@@ -98,8 +98,8 @@ def test_the_terminal_shows_it(run) -> None:
 
 def test_tables_and_the_comparison_have_it(study) -> None:
     found = {table.name: list(csv.DictReader(io.StringIO(to_csv(table)))) for table in tables(study[0])}
-    base = {record.unit.backbone: record.summary.table for record in study[0].select()}
-    for name in ("scenes", "persistence", "classes", "cross_backbone", "fusion", "sensitivity_voxel_size"):
+    base = {record.unit.model: record.summary.table for record in study[0].select()}
+    for name in ("scenes", "persistence", "classes", "cross_model", "fusion", "sensitivity_voxel_size"):
         assert all("rival" in row for row in found[name]), name
     assert [float(row["rival"]) for row in found["scenes"]] == [round(t[RIVAL], 2) for t in base.values()]
     assert all(float(row["max_rival"]) < 1e-9 for row in found["agreement"])

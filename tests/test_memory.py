@@ -24,7 +24,7 @@ FRAMES = 30
 
 @pytest.fixture(scope="module")
 def root(tmp_path_factory):
-    return tiny_scene.write(tmp_path_factory.mktemp("scene") / "wall", backbones=("a",), frames=FRAMES)
+    return tiny_scene.write(tmp_path_factory.mktemp("scene") / "wall", models=("a",), frames=FRAMES)
 
 
 def planned(root, **settings) -> tuple[Plan, Config]:
@@ -34,7 +34,7 @@ def planned(root, **settings) -> tuple[Plan, Config]:
 
 def test_the_estimate_holds_for_a_flight_and_saturates_over_one_place(tmp_path) -> None:
     """From a few pairs of frames; frames that see nothing new add observations only."""
-    root = tiny_scene.write(tmp_path / "wall", backbones=("a",), frames=60)
+    root = tiny_scene.write(tmp_path / "wall", models=("a",), frames=60)
     plan, config = planned(root, voxel_size=0.05, pixel_stride=1)
     table = semstab.engine.run(config).runs[0].table
     size = memory.map_size(plan.tasks[0], plan.units[0].config)

@@ -275,7 +275,7 @@ TABLE = voxel_table(op=[1, 2, 4], evidence=[[1, 0], [1, 1], [3, 1]], drift_sum=[
 def test_a_map_agrees_with_itself():
     row = compare(TABLE, TABLE, UNITS)
     assert row.agrees
-    assert (row.scene, row.backbone, row.backends) == ("s", "b", ("numpy", "open3d"))
+    assert (row.scene, row.model, row.backends) == ("s", "b", ("numpy", "open3d"))
     assert (row.voxels, row.only_in) == ((3, 3), (0, 0))
     assert {name: (d.max, d.mean) for name, d in row.differences.items()} == dict.fromkeys(
         ["op", *(measure.key for measure in measures()), "evidence", "label"], (0, 0)

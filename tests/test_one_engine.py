@@ -88,7 +88,7 @@ def test_a_study_writes_frame_series_and_where_asked_a_recording_of_its_base_uni
     content = settings(root, sweeps={"voxel_size": [0.5]}, name="tiny")
     out = tmp_path / "study"
     semstab.engine.run_study(load_config(overrides=content), out, observers=[Recording(Target(out / "recording.rrd"))])
-    slugs = {f"wall__{backbone}__{backend}" for backbone in "ab" for backend in ("numba", "numpy")}
+    slugs = {f"wall__{model}__{backend}" for model in "ab" for backend in ("numba", "numpy")}
     assert {file.stem for file in (out / "frames").iterdir()} == slugs
     result = load_result(out)
     (base, *_) = result.select()
@@ -96,10 +96,10 @@ def test_a_study_writes_frame_series_and_where_asked_a_recording_of_its_base_uni
     assert len(rows) == 6
     assert int(rows[-1]["map_voxels"]) == base.summary.table.voxels
     logged = set(read(out / "recording.rrd"))
-    for backbone in "ab":
-        assert f"/wall/series/map_vss/{backbone}/numba" in logged
-        assert f"/wall/series/map_vss/{backbone}/numpy" in logged
-        assert f"/wall/camera/{backbone}/labels" in logged
+    for model in "ab":
+        assert f"/wall/series/map_vss/{model}/numba" in logged
+        assert f"/wall/series/map_vss/{model}/numpy" in logged
+        assert f"/wall/camera/{model}/labels" in logged
     assert [record.unit.backend for record in result.select(BACKENDS)] == ["numpy", "numpy"]
 
 
@@ -127,13 +127,13 @@ def test_a_backend_of_ones_own_that_breaks_leaves_its_trace(root, tmp_path, monk
     monkeypatch.setattr(NumpyReference, "integrate", broken)
     out = tmp_path / "run"
     with pytest.raises(ZeroDivisionError):
-        semstab.engine.run(load_config(overrides=settings(root, backbones=["a"])), out=out)
+        semstab.engine.run(load_config(overrides=settings(root, models=["a"])), out=out)
     log = (out / "failures.log").read_text()
     assert log.startswith("ZeroDivisionError: by zero\nTraceback")
     assert load_result(out).failures[0].message == "ZeroDivisionError: by zero"
     assert [run.unit.backend for run in load_result(out).runs] == ["numba"]
     monkeypatch.undo()
-    semstab.engine.run(load_config(overrides=settings(root, backbones=["a"])), out=out)
+    semstab.engine.run(load_config(overrides=settings(root, models=["a"])), out=out)
     assert not (out / "failures.log").exists()
 
 

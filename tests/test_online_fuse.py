@@ -26,13 +26,13 @@ def city():
 
 @pytest.fixture(scope="module")
 def classes(city):
-    return city.label_space(city.backbones[0]).classes
+    return city.label_space(city.models[0]).classes
 
 
-def frames_of(city, backbone, *, truth=False):
+def frames_of(city, model, *, truth=False):
     """The frames of a label source as a program has them: arrays, and poses of three rows."""
     for i in range(len(city)):
-        frame = city.frame(i, backbone)
+        frame = city.frame(i, model)
         given = {"labels": frame.labels, "depth": frame.depth, "intrinsics": frame.intrinsics.matrix,
                  "T_wc": frame.T_wc[:3], "color": frame.color}  # fmt: skip
         yield given | ({"truth": city.frame(i, GROUND_TRUTH).labels} if truth else {})
@@ -45,7 +45,7 @@ def steady(city, classes):
 
 def test_a_generator_gives_what_a_run_gives(steady, city):
     run = semstab.run({
-        "dataset": {"name": "city", "options": OPTIONS}, "scenes": ["scene0"], "backbones": ["sim-steady"],
+        "dataset": {"name": "city", "options": OPTIONS}, "scenes": ["scene0"], "models": ["sim-steady"],
         "voxel_size": SIZE, "taxonomy": None, "exclude": {},
     })  # fmt: skip
     own, other = steady.record(), run.record()

@@ -38,7 +38,7 @@ def test_it_says_what_the_command_says(flights):
         updated(metric, [second], "scene3")
     run = semstab.run({
         "dataset": {"name": "city", "options": FLIGHT}, "frames": {"stop": FRAMES}, "scenes": ["scene0", "scene3"],
-        "backbones": ["sim-flicker"],
+        "models": ["sim-flicker"],
         "voxel_size": SIZE, "taxonomy": None, "check": None,
     })  # fmt: skip
     rows = [

@@ -21,7 +21,7 @@ from fresh import needed
 SOURCE = Path(__file__).parents[1]
 PACKAGES = {
     "benchmark": "semstab",
-    **{folder: f"semstab/{folder}" for folder in ("backends", "backbones", "datasets", "configs", "conformance")},
+    **{folder: f"semstab/{folder}" for folder in ("backends", "models", "datasets", "configs", "conformance")},
 }
 Done = subprocess.CompletedProcess[str]
 BUILD = "import sys; from setuptools import build_meta; print(getattr(build_meta, sys.argv[1])(sys.argv[2]))"
@@ -126,8 +126,8 @@ def test_an_installed_wheel_does_its_main_job_in_any_folder(elsewhere, installed
 @pytest.mark.parametrize(
     ("words", "extra"),
     [
-        (("export", "run", "--scene", "scene0", "--backbone", "sim-flicker", "--to", "map.laz"), "geo"),
-        (("export", "run", "--scene", "scene0", "--backbone", "sim-flicker", "--to", "map.tif"), "geo"),
+        (("export", "run", "--scene", "scene0", "--model", "sim-flicker", "--to", "map.laz"), "geo"),
+        (("export", "run", "--scene", "scene0", "--model", "sim-flicker", "--to", "map.tif"), "geo"),
         (("--predict", "segformer", "--out", "predicted"), "segformer"),
         (("--predict", "model.pt", "--out", "predicted"), "torch"),
         (("--predict", "model.onnx", "--out", "predicted"), "onnx"),

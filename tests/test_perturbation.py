@@ -1,4 +1,4 @@
-"""Noise on depth and poses: the same for every backbone and in any order, of the size that is asked for, or none."""
+"""Noise on depth and poses: the same for every model and in any order, of the size that is asked for, or none."""
 
 from __future__ import annotations
 
@@ -138,7 +138,7 @@ def config(tmp_path):
 NOISE = {"depth_noise": 0.003, "translation_noise": 0.01, "rotation_drift": 0.5}
 
 
-def test_every_backbone_and_any_order_sees_the_same_geometry(config) -> None:
+def test_every_model_and_any_order_sees_the_same_geometry(config) -> None:
     a, b = make_plan(config(perturbation=NOISE, seed=3)).tasks
     with ThreadPoolExecutor(4) as pool:
         backwards = dict(zip(range(3, -1, -1), pool.map(lambda i: read(b, i), range(3, -1, -1)), strict=True))
@@ -155,7 +155,7 @@ def test_noise_is_of_the_pixel_and_none_changes_nothing(config) -> None:
     assert zero.model_copy(update={"seed": 0}) == plain
     assert zero.perturbation is None
     task = make_plan(plain).tasks[0]
-    original = task.scene.frame(1, task.backbone)
+    original = task.scene.frame(1, task.model)
     np.testing.assert_array_equal(read(task, 1).depth, original.depth)
     np.testing.assert_array_equal(read(task, 1).T_wc, original.T_wc)
 

@@ -42,7 +42,7 @@ class Watching(Observer):
 
     def run_started(self, plan, finished) -> None:
         self.seen.append(f"start {len(plan.tasks)}")
-        self.seen += [f"kept {each.unit.backbone}" for each in plan.units if each.identity in finished]
+        self.seen += [f"kept {each.unit.model}" for each in plan.units if each.identity in finished]
 
     def frame_fused(self, task, frame, rows) -> None:
         self.seen += [f"{unit.slug} {row.report.frame}" for unit, row in rows.items()]
@@ -56,7 +56,7 @@ class Watching(Observer):
 
 def test_ground_truth_of_a_static_wall_is_perfectly_stable(root) -> None:
     """Pixels are as large as voxels here, and the truth is tied to the wall: every voxel keeps one label."""
-    (run,) = semstab.engine.run(configure(root, backbones=["gt"])).runs
+    (run,) = semstab.engine.run(configure(root, models=["gt"])).runs
     # 8 columns, and one more a frame; 6 rows
     assert run.table.voxels == (8 + 2) * 6
     assert run.table.points == run.table.observations == 3 * 48
@@ -68,9 +68,9 @@ def test_ground_truth_of_a_static_wall_is_perfectly_stable(root) -> None:
     assert run.flicker_percent == pytest.approx(25.0)
 
 
-def test_observers_see_everything_and_every_backbone_goes_through_every_backend(root) -> None:
+def test_observers_see_everything_and_every_model_goes_through_every_backend(root) -> None:
     watching = Watching()
-    semstab.engine.run(configure(root, backbones=["a"]), observers=[watching])
+    semstab.engine.run(configure(root, models=["a"]), observers=[watching])
     unit = "wall__a__numpy"
     assert watching.seen == ["start 1", f"{unit} 0", f"{unit} 1", f"{unit} 2", f"{unit} done 60", "finished"]
     result = semstab.engine.run(configure(root, backends=["open3d"]))
@@ -86,10 +86,10 @@ def test_the_run_folder_holds_what_the_design_promises(root, tmp_path) -> None:
     result = semstab.engine.run(configure(root, events=True), out=out, command=["semstab-bench", "--x"])
     summary = json.loads((out / "summary.json").read_text())
     assert summary == json.loads(json.dumps(summary))
-    assert summary["schema"] == 3
+    assert summary["schema"] == 4
     first = summary["runs"][0]
     for key in (
-        "scene", "backbone", "backend", "K", "voxel_size", "frames", "points", "observations", "voxels", "mean_op",
+        "scene", "model", "backend", "K", "voxel_size", "frames", "points", "observations", "voxels", "mean_op",
         "vss", "sbd", "entropy", "strata", "recurrent", "classes", "flicker_percent", "fuse_ms_per_frame",
     ):  # fmt: skip
         assert key in first
@@ -121,7 +121,7 @@ def test_the_frame_series_ends_where_the_table_is(root, tmp_path) -> None:
     """The map's running means, kept frame by frame, equal those of the final table."""
     for backend in ("numpy", "open3d"):
         out = tmp_path / backend
-        (run,) = semstab.engine.run(configure(root, backbones=["b"], backends=[backend], check=None), out=out).runs
+        (run,) = semstab.engine.run(configure(root, models=["b"], backends=[backend], check=None), out=out).runs
         text = (out / "frames" / f"{run.unit.slug}.csv").read_text().splitlines()
         last = dict(zip(text[0].split(","), text[-1].split(","), strict=True))
         assert int(last["map_voxels"]) == run.table.voxels
@@ -165,7 +165,7 @@ def test_a_folder_that_a_killed_start_began_or_whose_unit_is_damaged_is_taken_ov
     out = tmp_path / "run"
     (out / "units").mkdir(parents=True)
     (out / ".semstab-ab12cd34.yaml").write_text("half")
-    semstab.engine.run(configure(root, backbones=["a"]), out=out)
+    semstab.engine.run(configure(root, models=["a"]), out=out)
     assert not list(out.rglob(".*"))
     out, config = tmp_path / "run", configure(root)
     whole = semstab.engine.run(config, out=out)
@@ -184,7 +184,7 @@ def test_an_observer_that_fails_costs_nothing_else_and_is_told_at_the_end(root, 
 
     watching, out = Watching(), tmp_path / "run"
     with pytest.raises(OSError, match="No space left"):
-        semstab.engine.run(configure(root, backbones=["a"]), out=out, observers=[Failing(), watching])
+        semstab.engine.run(configure(root, models=["a"]), out=out, observers=[Failing(), watching])
     assert watching.seen[-1] == "finished"
     assert load_result(out).runs[0].table.voxels == 60
 
@@ -195,7 +195,7 @@ def test_disagreement_is_reported_after_everything_is_written(root, tmp_path, mo
     table = NumpyReference.table
     late = {"first_frame": np.full(60, 7), "last_frame": np.full(60, 8)}
     monkeypatch.setattr(NumpyReference, "table", lambda self: dataclasses.replace(table(self), **late))
-    agreeing = semstab.engine.run(configure(root, backbones=["a"], backends=["open3d"]))
+    agreeing = semstab.engine.run(configure(root, models=["a"], backends=["open3d"]))
     assert agreeing.agrees  # frame numbers are not compared, evidence is
 
     def half(self):
@@ -203,14 +203,14 @@ def test_disagreement_is_reported_after_everything_is_written(root, tmp_path, mo
         return dataclasses.replace(whole, evidence=whole.evidence / 2)
 
     monkeypatch.setattr(NumpyReference, "table", half)
-    result = semstab.engine.run(configure(root, backbones=["a"], backends=["open3d"]), out=tmp_path / "run")
+    result = semstab.engine.run(configure(root, models=["a"], backends=["open3d"]), out=tmp_path / "run")
     assert not result.agrees
     assert result.agreement[0].differences["evidence"].max > 0.1
     assert json.loads((tmp_path / "run" / "summary.json").read_text())["agreement"][0]["agrees"] is False
 
 
 @pytest.mark.parametrize(("settings", "message"), [
-    ({"backbones": ["c"]}, "wall: no backbone 'c'; known: a, b, gt"),
+    ({"models": ["c"]}, "wall: no model 'c'; known: a, b, gt"),
     ({"scenes": ["wal"]}, "posed_folder: no scene 'wal'; did you mean 'wall'"),
     ({"frames": {"start": 9}}, "wall: the selection of frames leaves none of its 3"),
     ({"backends": ["open4d"]}, "backend 'open4d' is not known; did you mean 'open3d'"),
@@ -228,12 +228,12 @@ def test_a_selection_that_does_not_fit_is_refused_before_anything_is_read(root, 
 
 
 def test_pixel_stride_keeps_every_nth_pixel_and_a_taxonomy_file_merges_classes(root, tmp_path) -> None:
-    (run,) = semstab.engine.run(configure(root, backbones=["gt"], pixel_stride=2)).runs
+    (run,) = semstab.engine.run(configure(root, models=["gt"], pixel_stride=2)).runs
     assert run.table.points == 3 * 4 * 3
     assert run.table[VSS] == 1.0
     path = tmp_path / "two.yaml"
     path.write_text(yaml.safe_dump({"classes": ["wall", {"name": "opening", "members": ["door", "window"]}]}))
-    (run,) = semstab.engine.run(configure(root, backbones=["gt"], taxonomy=str(path))).runs
+    (run,) = semstab.engine.run(configure(root, models=["gt"], taxonomy=str(path))).runs
     assert (run.taxonomy, run.table.K) == ("two", 2)
     assert [row.name for row in run.table.classes] == ["wall", "opening"]
 
@@ -250,12 +250,12 @@ def test_the_number_of_threads_changes_no_number(root, tmp_path) -> None:
 
 
 def test_the_time_of_a_frame_is_told_by_stage(root, tmp_path) -> None:
-    (run,) = semstab.engine.run(configure(root, backbones=["a"]), out=tmp_path / "run").runs
+    (run,) = semstab.engine.run(configure(root, models=["a"]), out=tmp_path / "run").runs
     assert tuple(run.stages_ms) == STAGES
     assert all(run.stages_ms[stage] >= 0 for stage in ("decode", "wait", "flicker", "logging"))
     summary = json.loads((tmp_path / "run" / "summary.json").read_text())
     assert summary["runs"][0]["stages_ms"]["association"] is None  # numpy does not tell its parts apart
-    (kept,) = semstab.engine.run(configure(root, backbones=["a"]), out=tmp_path / "run").runs
+    (kept,) = semstab.engine.run(configure(root, models=["a"]), out=tmp_path / "run").runs
     assert kept.stages_ms["decode"] == run.stages_ms["decode"]
     header, first, *_ = (tmp_path / "run" / "frames" / "wall__a__numpy.csv").read_text().splitlines()
     row = dict(zip(header.split(","), first.split(","), strict=True))
@@ -273,9 +273,9 @@ def test_colour_is_decoded_only_for_observers_that_want_it(root) -> None:
         def frame_fused(self, task, frame, rows) -> None:
             seen.append(frame.color is not None)
 
-    semstab.engine.run(configure(root, backbones=["a"]), observers=[Painting()])
+    semstab.engine.run(configure(root, models=["a"]), observers=[Painting()])
     Painting.wants_color = True
-    semstab.engine.run(configure(root, backbones=["a"]), observers=[Painting()])
+    semstab.engine.run(configure(root, models=["a"]), observers=[Painting()])
     assert seen == [False] * 3 + [True] * 3
 
 
@@ -285,7 +285,7 @@ def test_each_image_is_read_once(root, tmp_path, monkeypatch) -> None:
     monkeypatch.setattr(
         disk, "file_digest", lambda path, digest=disk.file_digest: (read.append(path.name), digest(path))[1]
     )
-    config = configure(root, backbones=["a"])
+    config = configure(root, models=["a"])
     semstab.engine.run(config, out=tmp_path / "run")
     assert not [name for name in read if name.endswith(".png")]
     watching = Watching()

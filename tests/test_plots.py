@@ -14,7 +14,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from PIL import Image
 from records import record, study, voxels
-from wall_study import BACKBONES, drawn_walls, wall_study
+from wall_study import MODELS, drawn_walls, wall_study
 
 from semstab import backends
 from semstab.data.labels import palette
@@ -67,7 +67,7 @@ def test_the_bins_of_op_widen_and_a_long_legend_takes_more_lines():
     assert (steps <= 0.25 * OP_BOUNDS[8:-1] + 0.5).all()
     assert OP_BOUNDS[-1] >= 2**31
     assert op_position()[:8] == pytest.approx(range(1, 9))
-    names = [f"a backbone with a long name {k}" for k in range(8)]
+    names = [f"a model with a long name {k}" for k in range(8)]
     assert legend_columns(names, PAGE) < legend_columns(["a", "b", "c", "d", "e", "f", "g", "h"], PAGE) == 8
 
 
@@ -218,7 +218,7 @@ def test_the_overview_is_in_one_palette():
 
 
 def test_a_sweep_shows_all_voxels_and_recurrent_ones(walls):
-    found = {name: levels(walls, "depth_noise", name) for name in BACKBONES}
+    found = {name: levels(walls, "depth_noise", name) for name in MODELS}
     share, stability, *_ = draw_sweep(describe("depth_noise"), found).axes
     lines = [container.lines[0].get_ydata() for container in stability.containers]
     expected = [

@@ -29,7 +29,7 @@ def folder(tmp_path) -> Path:
 
 def test_a_frame_holds_what_the_files_hold(folder):
     scene = opened(folder)
-    assert (scene.name, len(scene), scene.backbones, scene.ground_truth) == ("scene0", 3, ("net", "net-scores"), True)
+    assert (scene.name, len(scene), scene.models, scene.ground_truth) == ("scene0", 3, ("net", "net-scores"), True)
     assert scene.up.tolist() == [0, 0, 1]
     assert scene.label_space("net").classes == scene.label_space("gt").classes == ("a", "b", "c")
     frame = scene.frame(2, "net")
@@ -89,15 +89,15 @@ def test_a_scene_without_labels_still_has_depth_and_poses(folder):
     (folder / "labels").rename(folder / "other labels")
     (folder / "scores").rename(folder / "other scores")
     scene = opened(folder)
-    assert (scene.backbones, scene.ground_truth, len(scene)) == ((), False, 3)
+    assert (scene.models, scene.ground_truth, len(scene)) == ((), False, 3)
     assert scene.depth(1).shape == (H, W)
     np.testing.assert_array_equal(scene.T_wc(1), pose(1))
     for name in ("net", "gt"):
-        message = f"backbone '{name}' is not there; put its label maps into labels/NAME/"
+        message = f"model '{name}' is not there; put its label maps into labels/NAME/"
         fails(ConfigError, message, scene.frame, 0, name)
 
 
-def test_an_unknown_backbone_or_frame_is_named(folder):
+def test_an_unknown_model_or_frame_is_named(folder):
     scene = opened(folder)
     message = r"'net-score' is not there; did you mean 'net-scores'\?$"
     fails(ConfigError, message, scene.label_space, "net-score")
@@ -135,15 +135,15 @@ def test_an_incomplete_frame_is_an_error_or_left_out(folder, missing, caplog):
     (folder / missing).unlink()
     scene, every = opened(folder), FrameSelection()
     message = f"1 missing: .*{re.escape(missing)}; add them, or set incomplete: skip"
-    fails(DataError, message, select_frames, scene, every, scene.backbones)
+    fails(DataError, message, select_frames, scene, every, scene.models)
     scene = opened(folder, incomplete="skip")
     with caplog.at_level(logging.WARNING, logger="semstab"):
-        chosen = select_frames(scene, every, scene.backbones)
+        chosen = select_frames(scene, every, scene.models)
     assert missing in caplog.text
     assert "1 of 3 frames left out" in caplog.text
     assert (len(scene), chosen.indices, chosen.incomplete, chosen.left_out) == (3, [0, 2], (1,), 1)
-    for backbone in scene.backbones:
-        files = [scene.frame(k, backbone).files["depth"] for k in chosen.indices]
+    for model in scene.models:
+        files = [scene.frame(k, model).files["depth"] for k in chosen.indices]
         assert files == [f"{folder}/depth/frame1.png", f"{folder}/depth/frame10.png"]
 
 
@@ -219,10 +219,10 @@ def reprojection_errors(scene, a, b):
 def test_apc_shelf():
     scene = real("apc_shelf")
     assert (scene.name, len(scene), scene.ground_truth) == ("apc_shelf", 15, True)
-    assert scene.backbones == ("fcn", "fcn-scores")
+    assert scene.models == ("fcn", "fcn-scores")
     assert scene.label_space("fcn").classes[1] == "chenille_stems"
     assert np.mean([(scene.depth(k) > 0).mean() for k in range(15)]) == pytest.approx(0.27, abs=0.02)
-    hard, soft, truth = (scene.frame(4, backbone) for backbone in ("fcn", "fcn-scores", "gt"))
+    hard, soft, truth = (scene.frame(4, model) for model in ("fcn", "fcn-scores", "gt"))
     assert hard.shape == soft.shape == (480, 640)
     assert soft.scores.shape == (480, 640, 5)
     assert set(np.unique(truth.labels)) <= set(range(5))
@@ -233,7 +233,7 @@ def test_apc_shelf():
 
 def test_hololens():
     scene = real("hololens")
-    assert (len(scene), scene.backbones, scene.ground_truth) == (96, (), False)
+    assert (len(scene), scene.models, scene.ground_truth) == (96, (), False)
     pairs = [(k, k + 5) for k in range(0, 90, 10)]
     errors = [np.median(reprojection_errors(scene, *pair)) for pair in pairs]
     assert 0.002 < np.median(errors) < 0.006

@@ -17,9 +17,6 @@ from command_line import bench, error_of
 from PIL import Image
 from posed_config import configure, dataset_of
 
-from semstab.backbones import Backbone, Prediction, Streamed, create
-from semstab.backbones.border import Checked
-from semstab.backbones.names import InTaxonomy
 from semstab.config import Config, DatasetConfig, FrameSelection
 from semstab.core.files import FolderLock
 from semstab.data.labels import LabelSpace
@@ -30,6 +27,9 @@ from semstab.datasets.scene import select_frames
 from semstab.engine import run
 from semstab.errors import ConfigError, DataError
 from semstab.metrics import matched_region_flicker
+from semstab.models import Model, Prediction, Streamed, create
+from semstab.models.border import Checked
+from semstab.models.names import InTaxonomy
 from semstab.pixels.warp import warp
 from semstab.predict.command import ImageFiles, file_job, scene_jobs
 from semstab.predict.predictor import PredictorConfig, load_predictor, parse_predictor
@@ -53,17 +53,17 @@ def clusters(**options):
     return create("colour-clusters", **{**CLUSTERS, **options})
 
 
-def predict(folder: Path, backbone=None, indices=range(6), out=None, observers=(), **options):
+def predict(folder: Path, model=None, indices=range(6), out=None, observers=(), **options):
     options = SequenceOptions(**{"name": "clusters", **options})
-    return predict_sequence(images_of(folder), backbone or clusters(), indices, out or folder, options, observers)
+    return predict_sequence(images_of(folder), model or clusters(), indices, out or folder, options, observers)
 
 
 def manifest(folder: Path) -> dict:
     return json.loads((folder / "predictions.json").read_text())
 
 
-class Shifting(Backbone):
-    """A backbone with known output: the label is the column modulo 3; scores say so; it counts what it sees."""
+class Shifting(Model):
+    """A model with known output: the label is the column modulo 3; scores say so; it counts what it sees."""
 
     label_space = LabelSpace("thirds", ("a", "b", "c"))
     gives_scores = True
@@ -97,7 +97,7 @@ def test_labels_lie_where_a_run_reads_them(scene):
     assert (report.predicted, report.kept, report.sequence) == (6, 0, "flight")
     assert report.folders == (scene / "labels" / "clusters",)
     opened = open_dataset("posed_folder", {"root": scene}).scene("flight")
-    assert opened.backbones == ("clusters",)
+    assert opened.models == ("clusters",)
     assert opened.label_space("clusters").classes == ("cluster 0", "cluster 1", "cluster 2", "cluster 3")
     fitted = clusters().fit([predicted_scene.image(k) for k in range(2)])
     for k in range(6):
@@ -219,17 +219,17 @@ def test_the_first_frames_of_the_sequence_make_the_codebook_whatever_is_selected
 
 @pytest.mark.parametrize(("batch", "sizes"), [(1, [1] * 6), (4, [4, 2]), (10, [6])])
 def test_batches(scene, batch, sizes):
-    backbone = Shifting()
-    predict(scene, backbone, batch=batch)
-    assert backbone.seen == sizes
+    model = Shifting()
+    predict(scene, model, batch=batch)
+    assert model.seen == sizes
 
 
 def test_a_batch_has_images_of_one_size(tmp_path):
     for k, width in enumerate((8, 8, 9, 9, 9, 8)):
         Image.fromarray(np.zeros((6, width, 3), dtype=np.uint8)).save(tmp_path / f"{k}.png")
-    backbone = Shifting()
-    predict_sequence(ImageFiles(str(tmp_path / "*.png")), backbone, range(6), tmp_path, SequenceOptions("x", batch=4))
-    assert backbone.seen == [2, 3, 1]
+    model = Shifting()
+    predict_sequence(ImageFiles(str(tmp_path / "*.png")), model, range(6), tmp_path, SequenceOptions("x", batch=4))
+    assert model.seen == [2, 3, 1]
     assert read_labels(tmp_path / "labels/x/2.png").shape == (6, 9)
 
 
@@ -238,9 +238,9 @@ def test_a_batch_has_images_of_one_size(tmp_path):
 
 def test_finished_frames_are_kept(scene):
     predict(scene, Shifting(), indices=range(4))
-    backbone = Shifting()
-    report = predict(scene, backbone)
-    assert (report.predicted, report.kept, backbone.seen) == (2, 4, [1, 1])
+    model = Shifting()
+    report = predict(scene, model)
+    assert (report.predicted, report.kept, model.seen) == (2, 4, [1, 1])
 
 
 def test_what_was_finished_before_an_error_is_kept(scene):
@@ -441,7 +441,7 @@ def test_readers_of_other_formats_show_their_images_without_labels(tmp_path, sce
     assert stored.label_space("thirds").classes == ("a", "b", "c")
     predict_sequence(job.sequence, Tiles(), job.indices, job.out, SequenceOptions("tiles"))
     stored = open_dataset("hololens", dataset.options).scene(opened.scenes[0])
-    assert (stored.backbones, stored.regions) == (("thirds",), ("tiles",))
+    assert (stored.models, stored.regions) == (("thirds",), ("tiles",))
     assert stored.frame(3, "tiles").labels[0, :8].tolist() == [1] * 5 + [2] * 3
     with pytest.raises(ConfigError, match="'tiles' holds regions without classes"):
         stored.label_space("tiles")
@@ -497,13 +497,13 @@ def test_regions_are_read_by_name_and_never_fused(scene):
     predict(scene, Tiles(), name="tiles")
     predict(scene, Shifting(), name="thirds")
     opened = open_dataset("posed_folder", {"root": scene}).scene("flight")
-    assert (opened.backbones, opened.regions) == (("thirds",), ("tiles",))
+    assert (opened.models, opened.regions) == (("thirds",), ("tiles",))
     np.testing.assert_array_equal(opened.frame(2, "tiles").labels, read_labels(scene / "regions/tiles/002.png"))
     with pytest.raises(ConfigError, match="'tiles' holds regions without classes, which cannot be fused"):
         opened.label_space("tiles")
     dataset = DatasetConfig(name="posed_folder", options={"root": str(scene)})
     (found,) = run(Config(dataset=dataset, voxel_size=0.25, check=None)).runs
-    assert found.unit.backbone == "thirds"
+    assert found.unit.model == "thirds"
     predict(scene, Shifting(), name="tiles")
     with pytest.raises(DataError, match=r"regions/tiles: .*labels/tiles is called 'tiles' too; rename one"):
         open_dataset("posed_folder", {"root": scene}).scene("flight")
@@ -524,8 +524,8 @@ def test_a_study_measures_regions_by_name(scene):
     predict(scene, Tiles(), name="tiles")
     predict(scene, Shifting(), name="thirds")
     grid = make_plan(configure(scene, region_maps=["tiles"]))
-    assert [cell.unit.backbone for cell in grid.regions] == ["tiles"]
-    assert {cell.unit.backbone for cell in grid.units} == {"thirds"}
+    assert [cell.unit.model for cell in grid.regions] == ["tiles"]
+    assert {cell.unit.model for cell in grid.units} == {"thirds"}
 
 
 def test_regions_of_single_images_have_no_camera(scene, tmp_path):
@@ -540,9 +540,9 @@ def test_regions_of_single_images_have_no_camera(scene, tmp_path):
 
 
 def test_a_predictor_in_one_word():
-    found = parse_predictor("segformer,model=models/b0,image_size=[512, 896],name=b0,scores=true,taxonomy=uavid3")
-    assert (found.backbone, found.label_name, found.scores, found.taxonomy) == ("segformer", "b0", True, "uavid3")
-    assert found.options == {"model": "models/b0", "image_size": [512, 896]}
+    found = parse_predictor("segformer,checkpoint=models/b0,image_size=[512, 896],name=b0,scores=true,taxonomy=uavid3")
+    assert (found.model, found.label_name, found.scores, found.taxonomy) == ("segformer", "b0", True, "uavid3")
+    assert found.options == {"checkpoint": "models/b0", "image_size": [512, 896]}
     assert parse_predictor("colour-clusters").label_name == "colour-clusters"
 
 
@@ -561,20 +561,20 @@ def test_predictors_that_cannot_be_used(text, message):
         parse_predictor(text)
 
 
-def test_scores_of_a_backbone_without_any_are_refused(monkeypatch):
+def test_scores_of_a_model_without_any_are_refused(monkeypatch):
     monkeypatch.setattr("semstab.predict.predictor.create", lambda name, **options: Tiles())
     with pytest.raises(ConfigError, match="'x' gives labels, no scores"):
-        load_predictor(PredictorConfig(backbone="x", scores=True))
+        load_predictor(PredictorConfig(model="x", scores=True))
 
 
 def test_every_option_of_a_predictor_is_filled_in(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "weights").mkdir()
-    found = PredictorConfig(backbone="segformer", options={"model": "weights"}).resolved()
-    assert found.options["model"] == str(tmp_path / "weights")
+    found = PredictorConfig(model="segformer", options={"checkpoint": "weights"}).resolved()
+    assert found.options["checkpoint"] == str(tmp_path / "weights")
     assert found.options["dtype"] == "float32"
-    with pytest.raises(ConfigError, match="unknown setting 'modle'; did you mean 'model'"):
-        PredictorConfig(backbone="segformer", options={"model": "x", "modle": "x"}).resolved()
+    with pytest.raises(ConfigError, match="unknown setting 'chekpoint'; did you mean 'checkpoint'"):
+        PredictorConfig(model="segformer", options={"checkpoint": "x", "chekpoint": "x"}).resolved()
 
 
 # --- Inside a run -----------------------------------------------------------------------------------------------------
@@ -594,7 +594,7 @@ def test_model_to_voxels_is_the_same_as_by_way_of_the_disk(scene):
     predict(scene, clusters())
     dataset = DatasetConfig(name="posed_folder", options={"root": str(scene)})
     (stored,) = run(Config(dataset=dataset, voxel_size=0.25, check=None)).runs
-    assert live.unit.backbone == "colour-clusters"
+    assert live.unit.model == "colour-clusters"
     assert live.table == stored.table
     assert live.flicker_percent == stored.flicker_percent
     assert not [path for path in before if "labels" in path.parts]
@@ -613,7 +613,7 @@ def test_a_run_with_predictions_is_kept_and_reproduced(scene, tmp_path):
 
 def test_labels_and_scores_of_several_models(scene):
     found = run(live_config(scene, PREDICTOR, f"{PREDICTOR},scores=true", f"{PREDICTOR},seed=3,name=other"))
-    assert [unit.unit.backbone for unit in found.runs] == ["colour-clusters", "colour-clusters-scores", "other"]
+    assert [unit.unit.model for unit in found.runs] == ["colour-clusters", "colour-clusters-scores", "other"]
     hard, soft, _ = (unit.table for unit in found.runs)
     assert soft[ENTROPY] > hard[ENTROPY]
 
@@ -628,14 +628,14 @@ def test_the_ground_truth_stays_what_it_is(scene):
     np.testing.assert_array_equal(predicted.frame(2, "gt").labels, truth.frame(2, "gt").labels)
     assert predicted.label_space("gt") == truth.label_space("gt")
     assert predicted.digest([2], "gt") == truth.digest([2], "gt")
-    assert (predicted.backbones, predicted.ground_truth, len(predicted)) == (("colour-clusters",), True, 6)
+    assert (predicted.models, predicted.ground_truth, len(predicted)) == (("colour-clusters",), True, 6)
 
 
 def test_the_digest_is_of_model_and_images(scene):
     def digest(*predictors):
         dataset = open_dataset("predicted", live_config(scene, *predictors).dataset.options)
         opened = dataset.scene("flight")
-        return opened.digest([0, 1], opened.backbones[0])
+        return opened.digest([0, 1], opened.models[0])
 
     usual = digest(PREDICTOR)
     assert digest(PREDICTOR) == usual
@@ -656,31 +656,31 @@ def test_frames_have_colour_where_it_is_wanted(scene):
 
 
 def test_a_frame_that_is_asked_for_again_is_predicted_once(scene, monkeypatch):
-    backbone = Shifting()
-    monkeypatch.setattr("semstab.predict.live.create", lambda name, **options: backbone)
+    model = Shifting()
+    monkeypatch.setattr("semstab.predict.live.create", lambda name, **options: model)
     dataset = open_dataset("predicted", live_config(scene, PREDICTOR).dataset.options)
     opened = dataset.scene("flight")
     for index in (0, 1, 0, 1):
         opened.frame(index, "colour-clusters")
-    assert len(backbone.seen) == 2
+    assert len(model.seen) == 2
     monkeypatch.setattr("semstab.predict.live.KEPT_BYTES", 48 * 80)
     opened = dataset.scene("flight")
     for index in (0, 1, 0, 1):
         opened.frame(index, "colour-clusters")
-    assert len(backbone.seen) == 2 + 3
+    assert len(model.seen) == 2 + 3
 
 
 def test_the_built_in_city_with_a_model():
     settings = {"dataset": {"name": "city", "options": {"width": 64, "height": 36, "frames": 2}}}
     config = predicted_config([parse_predictor(PREDICTOR)], None, {**settings, "scenes": ["scene0"], "check": None})
     (found,) = run(config).runs
-    assert (found.unit.scene, found.unit.backbone, found.taxonomy) == ("scene0", "colour-clusters", "colour clusters")
+    assert (found.unit.scene, found.unit.model, found.taxonomy) == ("scene0", "colour-clusters", "colour clusters")
 
 
 @pytest.mark.parametrize(
     ("predictors", "message"),
     [
-        ((PREDICTOR, PREDICTOR), "two backbones are called 'colour-clusters'; give one a name"),
+        ((PREDICTOR, PREDICTOR), "two models are called 'colour-clusters'; give one a name"),
         (("colour-clusters,clusters=1",), "clusters: input should be greater"),
         (("colourclusters",), "did you mean 'colour-clusters'"),
     ],
@@ -699,7 +699,7 @@ def test_regions_cannot_be_fused(scene, monkeypatch):
 # --- label_space.yaml -------------------------------------------------------------------------------------------------
 
 
-def test_each_backbone_of_a_posed_folder_can_have_classes_of_its_own(scene):
+def test_each_model_of_a_posed_folder_can_have_classes_of_its_own(scene):
     (scene / "scene.yaml").write_text("classes: [left, right]\n")
     predict(scene, Shifting(), name="thirds")
     (scene / "labels/plain").mkdir()
@@ -735,7 +735,7 @@ def test_predict_and_run_from_the_command_line(scene, tmp_path):
     words = command.removeprefix("fuse them: semstab-bench ").split()
     bench(*words, "--rerun", "off", "--voxel-size", "0.25", "-q", "--out", "run", cwd=tmp_path)
     runs = json.loads((tmp_path / "run/summary.json").read_text())["runs"]
-    assert {(unit["backbone"], unit["K"], unit["frames"]) for unit in runs} == {("three", 3, 4)}
+    assert {(unit["model"], unit["K"], unit["frames"]) for unit in runs} == {("three", 3, 4)}
 
 
 def test_run_with_a_model_from_the_command_line(scene, tmp_path):
@@ -751,7 +751,7 @@ def test_run_with_a_model_from_the_command_line(scene, tmp_path):
         (("-m", "colour-clusters"), "--images GLOB, or --data FOLDER, or --dataset NAME"),
         (("-m", "colour-clusters", "--images", "*.png", "--data", "flight"), "--images GLOB, or --data FOLDER"),
         (("-m", "colour-clusters", "--images", "*.png", "--out", "x"), "*.png: no image of .png"),
-        (("-m", "colour-clusters", "--data", "flight", "--model", "x"), "unknown setting 'model'"),
+        (("-m", "colour-clusters", "--data", "flight", "--checkpoint", "x"), "unknown setting 'checkpoint'"),
         (
             ("-m", "colour-clusters", "--data", "flight", "--image-size", "big"),
             "--image-size big: write the shorter side",
@@ -759,7 +759,7 @@ def test_run_with_a_model_from_the_command_line(scene, tmp_path):
         (("-m", "colour-clusters", "--data", "flight", "--name", ".."), "name: it names a folder"),
         (("-m", "colour-clusters", "--data", "flight", "--option", "depth_skale=2"), "did you mean 'depth_scale'"),
         (
-            ("-m", "segformer", "--data", "flight", "--model", "nowhere/at/all"),
+            ("-m", "segformer", "--data", "flight", "--checkpoint", "nowhere/at/all"),
             "nowhere/at/all: there is no such folder",
         ),
     ],

@@ -1,4 +1,4 @@
-"""Backbones whose labels depend on the frames before: shown the selected frames in order, on disk and inside a run."""
+"""Models whose labels depend on the frames before: shown the selected frames in order, on disk and inside a run."""
 
 from __future__ import annotations
 
@@ -11,21 +11,21 @@ import pytest
 from PIL import Image
 from posed_config import dataset_of
 
-from semstab.backbones import Backbone, Prediction
-from semstab.backbones.names import InTaxonomy
 from semstab.config import Config, FrameSelection
 from semstab.data.labels import LabelSpace
 from semstab.datasets import open_dataset
 from semstab.datasets.formats.images import read_labels
 from semstab.engine import run
 from semstab.errors import ConfigError, DataError
+from semstab.models import Model, Prediction
+from semstab.models.names import InTaxonomy
 from semstab.predict.command import ImageFiles
 from semstab.predict.predictor import PredictorConfig
 from semstab.predict.sequence import SequenceOptions, predict_sequence
 from semstab.settings import predicted_config, resolve
 
 
-class Average(Backbone):
+class Average(Model):
     """Dark, middle or bright by the average of all images so far, in which the last one counts half."""
 
     label_space = LabelSpace("brightness", ("dark", "middle", "bright"))
@@ -61,9 +61,9 @@ def expected(frames, images=predicted_scene.image):
     return {k: model.predict([images(k)])[0].labels for k in frames}
 
 
-def predict(folder, backbone, indices=range(6), **options):
+def predict(folder, model, indices=range(6), **options):
     opened = open_dataset("posed_folder", {"root": str(folder)}).scene("flight")
-    return predict_sequence(opened, backbone, indices, folder, SequenceOptions("average", **options))
+    return predict_sequence(opened, model, indices, folder, SequenceOptions("average", **options))
 
 
 def assert_stored(folder, labels):
@@ -158,7 +158,7 @@ def test_single_images_have_no_depth(scene, tmp_path):
         predict_sequence(files, Looking(), range(6), tmp_path / "out", SequenceOptions("x"))
 
 
-def test_a_taxonomy_leaves_a_backbone_sequential():
+def test_a_taxonomy_leaves_a_model_sequential():
     model = InTaxonomy(Looking(), LabelSpace("two", ("dark", "bright"), members=(("middle",), ())), "strict")
     model = model.fit([])
     assert (model.sequential, model.wants_geometry) == (True, True)
@@ -186,7 +186,7 @@ def live(monkeypatch):
 
 def live_config(root, **settings) -> Config:
     settings = {"dataset": dataset_of(root), "voxel_size": 0.25, "backends": ["numpy"], "check": None, **settings}
-    return predicted_config([PredictorConfig(backbone="colour-clusters", name="average")], None, settings)
+    return predicted_config([PredictorConfig(model="colour-clusters", name="average")], None, settings)
 
 
 def test_whichever_frame_is_asked_for(scene, live):
@@ -218,7 +218,7 @@ def test_scenes_share_a_model_but_no_memory(tmp_path, monkeypatch, live):
 def test_a_frame_that_it_is_not_shown_cannot_be_asked_for(scene, live):
     opened = live(scene, frames={"stride": 2})
     for asked in (lambda: opened.frame(3, "average"), lambda: opened.digest([0, 3], "average")):
-        with pytest.raises(ConfigError, match="frame 3 is not among the 3 frames that a sequential backbone is shown"):
+        with pytest.raises(ConfigError, match="frame 3 is not among the 3 frames that a sequential model is shown"):
             asked()
 
 
@@ -253,5 +253,5 @@ def test_a_run_says_what_it_was_shown(scene, live, tmp_path):
     said["frames"] = {**said["frames"], "stride": 3}
     again = Config.build({key: value for key, value in said.items() if key != "schema"})
     (found,) = run(again, out=tmp_path / "run").runs
-    assert found.unit.backbone == "average"
+    assert found.unit.model == "average"
     assert json.loads((tmp_path / "run/summary.json").read_text())["runs"][0]["frames"] == 2

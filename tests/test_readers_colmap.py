@@ -294,7 +294,7 @@ def test_each_format_of_poses_gives_the_voxels_of_the_source(tmp_path, kind):
     scenes = uavid(tmp_path, pose_format=kind)
     assert [scene.name for scene in scenes] == ["scene0", "scene1"]
     scene = scenes[0]
-    assert (len(scene), scene.backbones, scene.ground_truth) == (ds.COUNT, ("net",), True)
+    assert (len(scene), scene.models, scene.ground_truth) == (ds.COUNT, ("net",), True)
     found = [scene.frame(k, "net") for k in range(ds.COUNT)]
     np.testing.assert_allclose(found[1].depth, ds.source()[1].depth, rtol=1e-6)
     if kind != "transforms":  # whose depth is rounded to float millimetres

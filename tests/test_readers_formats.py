@@ -49,7 +49,7 @@ def copied(written, tmp_path):
 def test_files_give_the_voxels_of_their_source(form, written):
     folder, names, frames = written
     scene = ds.opened(form, folder.parents[1])
-    assert (scene.name, len(scene), scene.backbones) == ("room-seq 1", ds.COUNT, ("net",))
+    assert (scene.name, len(scene), scene.models) == ("room-seq 1", ds.COUNT, ("net",))
     assert scene.label_space("net").classes == tuple(ds.CLASSES)
     found = [scene.frame(index, "net") for index in range(ds.COUNT)]
     for ours, theirs, name in zip(found, frames, names, strict=True):

@@ -38,9 +38,9 @@ def scene(tmp_path):
     ("template", "file"),
     [
         (None, "room/net/{}.png"),
-        ("{scene}/{backbone}/{name}.png", "room/net/{}.png"),
-        ("{backbone}/{scene}_{name}", "net/room_{}.npy"),
-        ("runs of {backbone} (2)/pred-{name}-ids.npz", "runs of net (2)/pred-{}-ids.npz"),
+        ("{scene}/{model}/{name}.png", "room/net/{}.png"),
+        ("{model}/{scene}_{name}", "net/room_{}.npy"),
+        ("runs of {model} (2)/pred-{name}-ids.npz", "runs of net (2)/pred-{}-ids.npz"),
         ({"net": "a/{scene}/b/{name}"}, "a/room/b/{}.png"),
     ],
 )
@@ -54,32 +54,32 @@ def test_a_folder_of_their_own_with_a_template(scene, tmp_path, template, file):
         else:
             ds.save(path, frame.labels)
     found = ds.opened(FORM, root, labels_root=tmp_path / "predictions", labels=template)
-    assert found.backbones == ("net",)
+    assert found.models == ("net",)
     ds.assert_same_voxels([found.frame(k, "net") for k in range(ds.COUNT)], frames)
 
 
 @pytest.mark.parametrize(
     ("option", "template", "message"),
     [
-        ("labels", "../predictions/{backbone}/{name}.png", "labels: '../predictions/.*leaves its folder.*labels_root"),
-        ("labels", "a/{backbone}/../../{name}.png", "leaves its folder"),
-        ("labels", "/etc/{backbone}/{name}", "leaves its folder"),
+        ("labels", "../predictions/{model}/{name}.png", "labels: '../predictions/.*leaves its folder.*labels_root"),
+        ("labels", "a/{model}/../../{name}.png", "leaves its folder"),
+        ("labels", "/etc/{model}/{name}", "leaves its folder"),
         ("labels", {"net": "../{name}.png"}, r"labels\.net: .*leaves its folder"),
-        ("scores", "/{backbone}/{name}", "scores: .*leaves its folder"),
+        ("scores", "/{model}/{name}", "scores: .*leaves its folder"),
         ("ground_truth", "../gt/{name}.png", "ground_truth: .*leaves its folder"),
         (
             "labels",
-            "{backbone}/{name.__class__}",
-            r"unknown \{name.__class__\}; known: \{scene\}, \{backbone\}, \{name\}",
+            "{model}/{name.__class__}",
+            r"unknown \{name.__class__\}; known: \{scene\}, \{model\}, \{name\}",
         ),
-        ("labels", "{backbone}/{root}/{name}", r"unknown \{root\}"),
-        ("labels", "labels/{name}.png", r"needs \{backbone\}"),
-        ("labels", "labels/{backbone}/x.png", r"needs \{name\}"),
-        ("labels", "labels/{backbone}/{name", "a brace is not closed|needs"),
-        ("labels", "labels/{name}/{backbone}.png", "must be in the name of a folder"),
-        ("labels", "{name}/{backbone}/x.png", "must be in the name of a folder, before the other"),
+        ("labels", "{model}/{root}/{name}", r"unknown \{root\}"),
+        ("labels", "labels/{name}.png", r"needs \{model\}"),
+        ("labels", "labels/{model}/x.png", r"needs \{name\}"),
+        ("labels", "labels/{model}/{name", "a brace is not closed|needs"),
+        ("labels", "labels/{name}/{model}.png", "must be in the name of a folder"),
+        ("labels", "{name}/{model}/x.png", "must be in the name of a folder, before the other"),
         ("labels", "", "needs"),
-        ("labels", "{backbone}/{name}\n", "leaves its folder"),
+        ("labels", "{model}/{name}\n", "leaves its folder"),
     ],
 )
 def test_a_template_that_cannot_be_is_one_line(scene, option, template, message):
@@ -106,14 +106,14 @@ def test_labels_and_scores_side_by_side(scene):
             root / f"room/scores/net/{name}.npz", scores=np.eye(8, dtype=np.float16)[frame.labels].transpose(2, 0, 1)
         )
     found = ds.opened(FORM, root)
-    assert (found.backbones, found.ground_truth) == (("net", "net-scores"), True)
+    assert (found.models, found.ground_truth) == (("net", "net-scores"), True)
     soft, hard = found.frame(2, "net-scores"), found.frame(2, "net")
     np.testing.assert_array_equal(soft.predicted, hard.labels)
     assert soft.files["scores"].endswith(f"room/scores/net/{names[2]}.npz")
     np.testing.assert_array_equal(found.frame(2, "gt").labels, hard.labels)
-    fails(ConfigError, "backbone 'nets' is not there; did you mean 'net'", found.frame, 0, "nets")
+    fails(ConfigError, "model 'nets' is not there; did you mean 'net'", found.frame, 0, "nets")
     named = ds.opened(FORM, root, scores={"soft": "scores/net/{name}"}, labels={"hard": "labels/net/{name}"})
-    assert named.backbones == ("hard", "soft")
+    assert named.models == ("hard", "soft")
 
 
 def test_two_sources_of_one_name_are_refused(scene):
@@ -127,7 +127,7 @@ def test_a_folder_without_labels_of_the_scene_is_left_out_and_said(scene, caplog
     root, names, frames = scene
     ds.write_labels(root / "room", names, frames)
     ds.write_labels(root / "room", ["other"], frames[:1], "labels/old/{}.png")
-    assert ds.opened(FORM, root).backbones == ("net",)
+    assert ds.opened(FORM, root).models == ("net",)
     assert f"old: no file of any frame, such as {root}/room/labels/old/00003.png; left out" in caplog.text
 
 
@@ -137,12 +137,12 @@ def test_a_labels_root_that_is_wrong_is_said(scene, tmp_path, caplog):
         ConfigError, "nowhere: there is no such folder; mend labels_root", ds.opened, FORM, root,
         labels_root=tmp_path / "nowhere",
     )  # fmt: skip
-    assert ds.opened(FORM, root, labels_root=tmp_path).backbones == ()
+    assert ds.opened(FORM, root, labels_root=tmp_path).models == ()
     assert f"room: no label maps in {tmp_path} fit the options labels and scores" in caplog.text
-    assert f"expected {tmp_path}/room/BACKBONE/00003.png" in caplog.text
-    said = {"labels_root": tmp_path, "labels": "{backbone}/{scene}_{name}", "scores": {"x": "soft/{name}.npy"}}
+    assert f"expected {tmp_path}/room/MODEL/00003.png" in caplog.text
+    said = {"labels_root": tmp_path, "labels": "{model}/{scene}_{name}", "scores": {"x": "soft/{name}.npy"}}
     assert ds.opened(FORM, root, **said).label_paths == (
-        f"{tmp_path}/BACKBONE/room_00003.png",
+        f"{tmp_path}/MODEL/room_00003.png",
         f"{tmp_path}/soft/00003.npy",
     )
 

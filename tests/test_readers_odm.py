@@ -170,7 +170,7 @@ def test_a_project_of_opensfm_alone_and_a_mesh_beside_it(tmp_path) -> None:
         folder,
         surface=tmp_path / "all/odm_meshing/odm_25dmesh.ply",
         labels_root=tmp_path / "all/labels",
-        labels="{backbone}/{name}",
+        labels="{model}/{name}",
     )
     assert scene.depth_from.startswith("rays cast at")
     np.testing.assert_allclose(scene.frame(1, "net").depth, down.plane_depth(down.pose(0)), atol=2e-5)

@@ -43,7 +43,7 @@ from semstab.recording import (
     voxel_maps,
 )
 from semstab.recording.layout import Legend, SceneBounds, direction, fit
-from semstab.recording.timeline import OF_THE_BACKBONE, Clock, log_file
+from semstab.recording.timeline import OF_THE_MODEL, Clock, log_file
 from semstab.task import Task
 
 NANOSECONDS = 1_000_000_000
@@ -55,7 +55,7 @@ def config_of(root: Path, backend: str = "numpy") -> Config:
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory):
-    """A run folder with a recording: two backbones on a wall that three frames see."""
+    """A run folder with a recording: two models on a wall that three frames see."""
     folder = tmp_path_factory.mktemp("recording")
     root = tiny_scene.write(folder / "data" / "wall")
     out = folder / "run"
@@ -138,17 +138,17 @@ def verify(path: Path) -> None:
     assert done.returncode == 0, done.stderr
 
 
-@pytest.mark.parametrize("backbone", ["a", "b"])
-def test_every_series_is_a_column_of_the_frame_csv(run, backbone) -> None:
+@pytest.mark.parametrize("model", ["a", "b"])
+def test_every_series_is_a_column_of_the_frame_csv(run, model) -> None:
     rows = read(run / "recording.rrd")
-    with (run / "frames" / f"wall__{backbone}__numpy.csv").open() as file:
+    with (run / "frames" / f"wall__{model}__numpy.csv").open() as file:
         frames = list(csv.DictReader(file))
     for row in frames:
         row["updated_voxels"] = str(int(row["voxels"]) - int(row["new_voxels"]))
     for column in SERIES:
-        backend = "" if column in OF_THE_BACKBONE else "/numpy"
+        backend = "" if column in OF_THE_MODEL else "/numpy"
         defined = {int(row["frame"]): float(row[column]) for row in frames if row[column]}
-        assert series(rows, f"/wall/series/{column}/{backbone}{backend}") == defined
+        assert series(rows, f"/wall/series/{column}/{model}{backend}") == defined
         in_all_but = {"drift": 1, "flicker_percent": 1, "compensated_flicker_percent": 1}
         in_all_but |= {"association_ms": 3, "update_ms": 3}  # numpy tells no parts apart
         assert len(defined) == 3 - in_all_but.get(column, 0)
@@ -163,11 +163,11 @@ def test_lines_are_named_and_have_distinct_colours(run) -> None:
     assert colors[0] != colors[1] == colors[2]
 
 
-@pytest.mark.parametrize("backbone", ["a", "b"])
-def test_the_final_voxels_are_those_of_the_run(run, backbone) -> None:
+@pytest.mark.parametrize("model", ["a", "b"])
+def test_the_final_voxels_are_those_of_the_run(run, model) -> None:
     rows = read(run / "recording.rrd")
-    table = VoxelTable.load(run / "voxels" / f"wall__{backbone}__numpy.parquet")
-    voxels = grid(rows, f"/wall/map/{backbone}/numpy")
+    table = VoxelTable.load(run / "voxels" / f"wall__{model}__numpy.parquet")
+    voxels = grid(rows, f"/wall/map/{model}/numpy")
     assert voxels["frame"] == 2
     np.testing.assert_array_equal(voxels["voxel_indices"], table.index)
     np.testing.assert_allclose(voxels["voxel_size"], [[0.25] * 3])
@@ -200,16 +200,16 @@ def test_the_legend_of_many_classes_is_two_lines_and_a_tab() -> None:
     assert [name for name, _ in legend.entries[:3]] == ["class number 7", "class number 3", "class number 0"]
 
 
-def test_the_blueprint_shows_every_series_and_every_backbone(run) -> None:
-    maps = {f"{backbone}: {title}" for backbone in "ab" for title in (mode.title for mode in color_modes().values())}
-    pictures = {f"{backbone}: {what}" for backbone in "ab" for what in ("labels", *drift.PICTURES.values())}
+def test_the_blueprint_shows_every_series_and_every_model(run) -> None:
+    maps = {f"{model}: {title}" for model in "ab" for title in (mode.title for mode in color_modes().values())}
+    pictures = {f"{model}: {what}" for model in "ab" for what in ("labels", *drift.PICTURES.values())}
     for views in read_blueprints(run / "recording.rrd"):
         names = {row["ViewBlueprint:display_name"][0] for row in views if "ViewBlueprint:display_name" in row}
         assert names >= {*SERIES.values(), *maps, *pictures, "Classes", "Notes", "Depth", "Top contributing frames"}
 
 
 def test_every_map_is_seen_from_above(run) -> None:
-    blueprints = read_blueprints(run / "recording.rrd")  # one when the run starts, one when a backbone is fused
+    blueprints = read_blueprints(run / "recording.rrd")  # one when the run starts, one when a model is fused
     eyes = [row for rows in blueprints for row in rows if "EyeControls3D:look_target" in row]
     assert len(blueprints) == 3
     assert len(eyes) == 2 * 2 * len(color_modes())
@@ -291,7 +291,7 @@ def test_a_start_that_finds_everything_kept_leaves_the_recording_alone(run) -> N
 def test_a_resumed_run_says_what_it_does_not_show(tmp_path) -> None:
     class Interrupting(Observer):
         def frame_fused(self, task, frame, rows) -> None:
-            if task.backbone == "b":
+            if task.model == "b":
                 raise KeyboardInterrupt
 
     config = config_of(tiny_scene.write(tmp_path / "data" / "wall"))
@@ -312,10 +312,10 @@ def test_a_resumed_run_says_what_it_does_not_show(tmp_path) -> None:
     kept, fused_now = sorted(notes(rows))
     assert kept.startswith("a, numpy: 60 voxels")
     assert fused_now.startswith("b, numpy: 60 voxels")
-    for backbone in "ab":
-        assert len(series(rows, f"/wall/series/updated_voxels/{backbone}/numpy")) == 3
-        table = VoxelTable.load(path.parent / "voxels" / f"wall__{backbone}__numpy.parquet")
-        np.testing.assert_array_equal(grid(rows, f"/wall/map/{backbone}/numpy")["op"], table.op)
+    for model in "ab":
+        assert len(series(rows, f"/wall/series/updated_voxels/{model}/numpy")) == 3
+        table = VoxelTable.load(path.parent / "voxels" / f"wall__{model}__numpy.parquet")
+        np.testing.assert_array_equal(grid(rows, f"/wall/map/{model}/numpy")["op"], table.op)
     assert "/wall/camera/b/labels" in rows
     assert not [row for row in rows["/wall/camera/a/labels"] if "SegmentationImage:buffer" in row]
     assert lacks_pictures(path.parent, path)
@@ -325,7 +325,7 @@ def test_a_resumed_run_says_what_it_does_not_show(tmp_path) -> None:
 
 @pytest.mark.parametrize(("fused_by", "own"), [("numba", 0), ("numpy", 2)])
 def test_a_map_of_the_run_is_followed_where_that_is_possible(tmp_path, monkeypatch, fused_by, own) -> None:
-    """Else each backbone is fused a second time. The recorded drift is the same."""
+    """Else each model is fused a second time. The recorded drift is the same."""
     made = []
     monkeypatch.setattr(drift, "NumbaHash", lambda *settings: made.append(settings) or NumbaHash(*settings))
     config = config_of(tiny_scene.write(tmp_path / "wall"), fused_by)
@@ -365,7 +365,7 @@ class Scene:
     """A camera 2 m above a floor, which looks down on it."""
 
     name = "floor 1"
-    backbones = ("net/x",)
+    models = ("net/x",)
     ground_truth = False
     up = np.array([0.0, 0.1, 0.99])
 

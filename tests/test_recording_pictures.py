@@ -45,9 +45,9 @@ def config_with(root: Path, *names: str) -> Any:
 
 @pytest.fixture(scope="module")
 def compared(tmp_path_factory):
-    """A run of one backbone with colour, through two backends that differ by design."""
+    """A run of one model with colour, through two backends that differ by design."""
     folder = tmp_path_factory.mktemp("compared")
-    root = tiny_scene.write(folder / "data" / "wall", backbones=("a",))
+    root = tiny_scene.write(folder / "data" / "wall", models=("a",))
     (root / "color").mkdir()
     for i in range(tiny_scene.FRAMES):
         picture = np.full((8 * tiny_scene.HEIGHT, 8 * tiny_scene.WIDTH, 3), (10, 20, 200), np.uint8)
@@ -370,7 +370,7 @@ def test_500_frames_of_4k_stay_below_the_size_that_is_stated() -> None:
 
 def test_a_killed_run_leaves_a_recording_that_optimize_makes_whole(tmp_path) -> None:
     """Without its footer `verify` complains of that alone; `rerun rrd optimize` writes one."""
-    root = tiny_scene.write(tmp_path / "data" / "wall", backbones=("a",))
+    root = tiny_scene.write(tmp_path / "data" / "wall", models=("a",))
     path = tmp_path / "killed.rrd"
     program = f"""
 import os, signal, time, semstab

@@ -150,7 +150,7 @@ def test_a_run_is_streamed_to_a_viewer_and_into_its_file(tmp_path) -> None:
     port, saved = unused_port(), tmp_path / "received.rrd"
     with viewer_at(port, saved):
         watched = Target(tmp_path / "own.rrd", f"rerun+http://127.0.0.1:{port}/proxy")
-        root = tiny_scene.write(tmp_path / "data" / "wall", backbones=("a",))
+        root = tiny_scene.write(tmp_path / "data" / "wall", models=("a",))
         semstab.run(config_of(root, "numba"), observers=[Recording(watched)])
         time.sleep(1)
     verify(tmp_path / "own.rrd")

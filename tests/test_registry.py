@@ -63,19 +63,19 @@ def test_an_import_that_fails_inside_is_a_missing_dependency(monkeypatch, error)
 
 
 def test_the_list_says_what_is_not_ready(monkeypatch, capsys):
-    from semstab import backbones
+    from semstab import models
     from semstab.cli.finished import list_
 
     original = registry.importlib.import_module
 
     def import_module(name, package=None):
-        if name.startswith("semstab.back"):
+        if name.startswith(("semstab.backends", "semstab.models")):
             raise RuntimeError("operator torchvision::nms does not exist")
         return original(name, package)
 
     monkeypatch.setattr(registry.importlib, "import_module", import_module)
     monkeypatch.setenv("COLUMNS", "300")
-    assert "sam-raw" in backbones.REGISTRY.entries()
+    assert "sam-raw" in models.REGISTRY.entries()
     list_()
     (line,) = [line for line in capsys.readouterr().out.splitlines() if "sam-raw" in line]
     assert "torchvision::nms does not exist" in line

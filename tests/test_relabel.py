@@ -31,7 +31,7 @@ R, K = 0.25, 3
 def fused(tmp_path_factory):
     """A scene with some depth missing, and a run of it."""
     folder = tmp_path_factory.mktemp("relabel")
-    tiny_scene.write(folder / "scene", backbones=("a",), frames=4, noise=0.3)
+    tiny_scene.write(folder / "scene", models=("a",), frames=4, noise=0.3)
     file = folder / "scene/depth/0001.png"
     depth = cv2.imread(str(file), cv2.IMREAD_UNCHANGED)
     depth[0] = 0
@@ -142,9 +142,9 @@ def test_a_run_reads_what_was_relabelled(fused, tmp_path):
     assert "accuracy 0." in done.stdout
     assert "a verdict on these maps means nothing" in done.stdout
     assert LabelSpace.load(tmp_path / "labels/a-fused/label_space.yaml").classes == ("wall", "door", "window")
-    found = dataset_of(fused / "scene", labels_root=tmp_path, labels="labels/{backbone}/{name}")
+    found = dataset_of(fused / "scene", labels_root=tmp_path, labels="labels/{model}/{name}")
     again = semstab.run(configure(fused / "scene", dataset=found, check=None))
-    assert again.backbones == ("a-fused",)
+    assert again.models == ("a-fused",)
     assert again.record().summary.table.means.value["vss"] == 1.0
     other = "holds predictions with other settings .min_op: 1 there, 2 here."
     fails(ConfigError, other, relabel, fused / "run", tmp_path, belief=Belief(min_op=2))

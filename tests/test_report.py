@@ -71,7 +71,7 @@ def page_of(result, folder):
 
 @pytest.fixture(scope="module")
 def walls(tmp_path_factory):
-    """The study with both walls, one backbone, its figures, and a failure."""
+    """The study with both walls, one model, its figures, and a failure."""
     calm, folder, _ = drawn_walls(tmp_path_factory.getbasetemp())
     failure = Failure(Unit("often", "calm", "numpy"), Variation("voxel_size", 0.001), f"out of memory {EVIL}")
     result = dataclasses.replace(calm, failures=(failure,))
@@ -128,7 +128,7 @@ def test_the_map_of_the_page_has_the_numbers_of_the_voxels(walls):
     """Two images without loss: class and category, then VSS, OP and SBD of the topmost voxel of each cell."""
     result, text = walls[0], (walls[1] / "report.html").read_text()
     maps = json.loads(re.search(r'id="maps">(.*?)</script>', text, re.DOTALL)[1])
-    assert [(m["scene"], m["model"]) for m in maps] == [(r.unit.scene, r.unit.backbone) for r in result.select()]
+    assert [(m["scene"], m["model"]) for m in maps] == [(r.unit.scene, r.unit.model) for r in result.select()]
     for own, each in zip(maps, result.select(), strict=True):
         above = FromAbove.of(each.table(), result.up[each.unit.scene])
         first, second = (np.asarray(pixels(source)) for source in own["numbers"])
@@ -165,7 +165,7 @@ def test_the_page_says_units_failures_and_where_the_numbers_come_from(walls, tmp
     result, text = walls[0], plain(walls[2].text)
     _, folder = wall_study(tmp_path_factory.getbasetemp())
     units = json.loads((folder / "manifest.json").read_text())["units"]["units"]
-    assert f"{units // 2} units" in text  # those of one of the two backbones
+    assert f"{units // 2} units" in text  # those of one of the two models
     for line in ("1 failed", 'out of memory <script>alert("x")</script>', "voxel size 0.001, repeat 0"):
         assert line in text
     assert result.manifest["python"] in text
@@ -220,7 +220,7 @@ def test_a_study_of_sweeps_has_their_charts_and_one_in_which_everything_failed_h
 
 
 def test_names_are_shown_as_they_are_whatever_they_are(tmp_path):
-    found = study(*(record(voxels((5, 2, SURE)), scene=EVIL, backbone=name) for name in (EVIL, "b")), failures=())
+    found = study(*(record(voxels((5, 2, SURE)), scene=EVIL, model=name) for name in (EVIL, "b")), failures=())
     named = dataclasses.replace(found, name=EVIL, manifest={"command": [EVIL], EVIL: EVIL})
     page = page_of(named, tmp_path)
     assert not any("alert" in content for content in page.scripts)
@@ -232,17 +232,17 @@ def read(result):
     return list(notes(result))
 
 
-def backbone(name, once, recurrent, sweep=BASE):
-    return record(voxels((ENOUGH, 1, once), (ENOUGH, 4, recurrent)), sweep, backbone=name)
+def model(name, once, recurrent, sweep=BASE):
+    return record(voxels((ENOUGH, 1, once), (ENOUGH, 4, recurrent)), sweep, model=name)
 
 
-def test_the_order_of_the_backbones_may_change_where_voxels_recur_and_the_shared_taxonomy_decides():
-    found = study(backbone("x", [1, 0, 0], [6, 4, 0]), backbone("y", [6, 4, 0], [8, 2, 0]))
+def test_the_order_of_the_models_may_change_where_voxels_recur_and_the_shared_taxonomy_decides():
+    found = study(model("x", [1, 0, 0], [6, 4, 0]), model("y", [6, 4, 0], [8, 2, 0]))
     assert "In one taxonomy (abc) the order by VSS is x > y over all voxels, but y > x for OP>=3." in read(found)
-    same = [backbone("x", SURE, SURE), backbone("y", SURE, SPLIT)]
+    same = [model("x", SURE, SURE), model("y", SURE, SPLIT)]
     line = "In one taxonomy (abc) the order by VSS is x > y, over all voxels and for OP>=3 alike."
     assert line in read(study(*same))
-    shared = [backbone("x", SURE, SPLIT, SHARED), backbone("y", SURE, SURE, SHARED)]
+    shared = [model("x", SURE, SPLIT, SHARED), model("y", SURE, SURE, SHARED)]
     assert any("the order by VSS is y > x" in sentence for sentence in read(study(*same, *shared)))
 
 

@@ -6,7 +6,7 @@ import shutil
 
 import numpy as np
 import pytest
-from wall_study import BACKBONES, wall_study
+from wall_study import MODELS, wall_study
 
 from semstab.report.page import render
 
@@ -65,7 +65,7 @@ def test_switches_change_the_map_and_the_hover_reads_it(page) -> None:
 
 
 def test_models_stand_side_by_side_or_alone_and_scenes_take_turns(page) -> None:
-    _, nervous = BACKBONES
+    _, nervous = MODELS
     maps = page.locator(".scene").first.locator("figure.map")
     assert [maps.nth(k).is_visible() for k in range(2)] == [True, True]
     page.get_by_role("button", name=nervous).first.click()

@@ -13,7 +13,7 @@ import lowest
 import pytest
 
 SOURCE = Path(__file__).parents[1]
-PRODUCT = ("benchmark", "backends", "backbones", "datasets")
+PRODUCT = ("benchmark", "backends", "models", "datasets")
 BROUGHT_BY = {
     "PIL": "pillow",
     "cv2": "opencv-python-headless",

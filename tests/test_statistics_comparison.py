@@ -1,4 +1,4 @@
-"""Comparison of backbones: standardisation, paired differences, tests and ranks, on simulated maps."""
+"""Comparison of models: standardisation, paired differences, tests and ranks, on simulated maps."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from semstab.data.measures import VSS
 from semstab.errors import ConfigError, DataError
 from semstab.metrics import vss
 from semstab.metrics.agreement import shared_rows
-from semstab.statistics import claimed_together, compare_backbones, coverage, paired, psa, standardised
+from semstab.statistics import claimed_together, compare_models, coverage, paired, psa, standardised
 from semstab.statistics.agreement import PSA
 from semstab.statistics.paired_differences import EDGES, common_weights, holm, stratum_counts
 
@@ -103,8 +103,8 @@ def test_standardised_value_by_hand():
     assert math.isnan(standardised({"a": a, "b": never}, PSA)["a"].value)
 
 
-def two_backbones(rng, gap, side=32, F=8):
-    """Two backbones that err block by block of 4 x 4 voxels, the second more by `gap`: their maps, and their cells."""
+def two_models(rng, gap, side=32, F=8):
+    """Two models that err block by block of 4 x 4 voxels, the second more by `gap`: their maps, and their cells."""
     blocks = rng.beta(2, 6, size=(side // 4, side // 4))
     error = np.kron(blocks, np.ones((4, 4))).ravel()
     shift = np.kron(rng.normal(0, 0.05, size=blocks.shape), np.ones((4, 4))).ravel()
@@ -117,13 +117,13 @@ def two_backbones(rng, gap, side=32, F=8):
 
 
 def pair_of(rng, gap, **options):
-    """What is compared of two backbones."""
-    tables, cells = two_backbones(rng, gap, **options)
-    return compare_backbones(tables, observations=cells).paired
+    """What is compared of two models."""
+    tables, cells = two_models(rng, gap, **options)
+    return compare_models(tables, observations=cells).paired
 
 
 def test_paired_differences_cover_and_their_test_keeps_its_level():
-    """Two backbones of the same quality, 15 times: the interval holds 0, and the test says so, 14 times."""
+    """Two models of the same quality, 15 times: the interval holds 0, and the test says so, 14 times."""
     rng = np.random.default_rng(1)
     held, rejected = 0, 0
     for _ in range(15):
@@ -135,7 +135,7 @@ def test_paired_differences_cover_and_their_test_keeps_its_level():
     assert rejected <= 3
 
 
-def test_a_worse_backbone_is_found_by_difference_test_and_rank():
+def test_a_worse_model_is_found_by_difference_test_and_rank():
     result = pair_of(np.random.default_rng(2), 0.15)
     by_measure = {row.measure: row for row in result.differences}
     assert by_measure["psa"].difference.low > 0
@@ -145,21 +145,21 @@ def test_a_worse_backbone_is_found_by_difference_test_and_rank():
     assert by_measure[result.primary].p_value < 0.001
     assert math.isnan(by_measure["psa"].p_value)  # it describes
     for ranking in result.rankings:
-        assert [rank.backbone for rank in ranking.ranks] == ["a", "b"]
+        assert [rank.model for rank in ranking.ranks] == ["a", "b"]
         assert ranking.ranks[0].best > 0.95
     rng = np.random.default_rng(3)
-    twins, worst = two_backbones(rng, 0.0), two_backbones(rng, 0.4)
+    twins, worst = two_models(rng, 0.0), two_models(rng, 0.4)
     tables, cells = (own | {"worst": other["b"]} for own, other in zip(twins, worst, strict=True))
-    rankings = {own.measure: own for own in compare_backbones(tables, observations=cells).paired.rankings}
+    rankings = {own.measure: own for own in compare_models(tables, observations=cells).paired.rankings}
     for measure in ("alpha", "psa"):
-        ranks = {rank.backbone: rank for rank in rankings[measure].ranks}
+        ranks = {rank.model: rank for rank in rankings[measure].ranks}
         assert ranks["worst"].rank == ranks["worst"].low == 3
         assert ranks["a"].best + ranks["b"].best == pytest.approx(1, abs=0.01)
         assert {ranks["a"].low, ranks["b"].low} == {1}
         assert {ranks["a"].high, ranks["b"].high} == {2}
 
 
-def test_backbones_are_compared_by_accuracy_where_there_is_a_truth():
+def test_models_are_compared_by_accuracy_where_there_is_a_truth():
     rng = np.random.default_rng(5)
     true = rng.integers(0, 3, size=(SIDE**2, 1))
     wrong = rng.random((SIDE**2, 1)) < 0.2
@@ -189,8 +189,8 @@ def test_only_voxels_that_all_saw_twice_are_compared():
 
 
 def test_pairs_of_all_scenes_are_corrected_together_where_something_may_be_claimed():
-    tables, cells = two_backbones(np.random.default_rng(4), 0.05, side=16)
-    found = compare_backbones(tables, observations=cells)
+    tables, cells = two_models(np.random.default_rng(4), 0.05, side=16)
+    found = compare_models(tables, observations=cells)
     (p,) = (row.p_value for row in found.paired.differences if row.measure == found.paired.primary)
     unclaimed = tuple(dataclasses.replace(row, undecided="too few") for row in found.paired.differences)
     silent = dataclasses.replace(found, paired=dataclasses.replace(found.paired, differences=unclaimed))

@@ -11,9 +11,9 @@ from sklearn.metrics import accuracy_score, jaccard_score
 
 from semstab.data.information import normalise
 from semstab.errors import DataError
-from semstab.statistics import correctness, join_truth, quadrants, reliability, stable_wrong
+from semstab.statistics import consistent_wrong, correctness, join_truth, quadrants, reliability
 from semstab.statistics.accumulate import Cubes
-from semstab.statistics.agreement import stability_posterior
+from semstab.statistics.agreement import consistency_posterior
 from semstab.statistics.correctness import Predictions, by_stratum
 
 
@@ -99,17 +99,17 @@ def test_quadrants_by_hand():
     truth = join_truth(table, log_of([[0], [0], [0], [1], [0]]).table())
     found = quadrants(table, truth, Cubes.of(table, where=table.op > 0))
     assert found.voxels == 4
-    shares = (found.stable_right, found.stable_wrong, found.unstable_right, found.unstable_wrong)
+    shares = (found.consistent_right, found.consistent_wrong, found.inconsistent_right, found.inconsistent_wrong)
     assert [share.value for share in shares] == pytest.approx([0.25, 0.25, 0.25, 0.25], abs=0.01)
-    assert found.wrong_of_stable.value == pytest.approx(0.5, abs=0.01)
-    assert stable_wrong(table, truth).tolist() == [False, True, False, False, False, False]
+    assert found.wrong_of_consistent.value == pytest.approx(0.5, abs=0.01)
+    assert consistent_wrong(table, truth).tolist() == [False, True, False, False, False, False]
     table = log_of([[0] * 90 + [1] * 10, [0] * 80 + [1] * 20]).table()
     truth = join_truth(table, log_of([[1], [1]]).table())
-    assert stable_wrong(table, truth).tolist() == [True, False]
+    assert consistent_wrong(table, truth).tolist() == [True, False]
     table = log_of([[0, 0]]).table()
     found = quadrants(table, join_truth(table, table), Cubes.of(table, where=table.op > 0))
     assert found.voxels == 0
-    assert math.isnan(found.stable_wrong.value)
+    assert math.isnan(found.consistent_wrong.value)
     assert math.isnan(correctness(np.zeros((0, 3)), np.zeros(0, dtype=int)).accuracy)
 
 
@@ -119,7 +119,7 @@ def test_the_share_of_stable_places_does_not_depend_on_how_often_they_were_seen(
     rng = np.random.default_rng(7)
     T = np.repeat([3, 5, 10, 30], 400)
     wrong = (rng.random((len(T), 30)) > q).astype(int)
-    likely = stability_posterior(log_of(np.where(np.arange(30) < T[:, None], wrong, -1), K=2).table())
+    likely = consistency_posterior(log_of(np.where(np.arange(30) < T[:, None], wrong, -1), K=2).table())
     shares = [likely[t == T].mean() for t in (3, 5, 10, 30)]
     assert max(abs(share - (q > 0.9)) for share in shares) < 0.05
 
@@ -129,7 +129,7 @@ def test_half_of_the_places_are_stable_at_any_op():
     T = np.repeat([3, 5, 10, 30], 600)
     right = np.where(rng.random(len(T)) < 0.5, 0.98, 0.75)[:, None]
     wrong = (rng.random((len(T), 30)) > right).astype(int)
-    likely = stability_posterior(log_of(np.where(np.arange(30) < T[:, None], wrong, -1), K=2).table())
+    likely = consistency_posterior(log_of(np.where(np.arange(30) < T[:, None], wrong, -1), K=2).table())
     assert [likely[t == T].mean() for t in (3, 5, 10, 30)] == pytest.approx([0.5] * 4, abs=0.06)
 
 
@@ -144,5 +144,5 @@ def test_a_model_that_errs_the_same_way_in_every_view_is_stable_and_wrong():
     table = log_of(labels, index=grid(side)).table()
     truth = join_truth(table, log_of(true, index=grid(side)).table())
     found = quadrants(table, truth, Cubes.of(table, where=table.op > 0))
-    assert found.wrong_of_stable.low <= place.mean() <= found.wrong_of_stable.high
-    assert stable_wrong(table, truth)[~place[:, 0]].mean() < 0.01
+    assert found.wrong_of_consistent.low <= place.mean() <= found.wrong_of_consistent.high
+    assert consistent_wrong(table, truth)[~place[:, 0]].mean() < 0.01

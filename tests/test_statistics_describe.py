@@ -14,20 +14,12 @@ from simulated_events import cells_of, grid, log_of
 from semstab.core.files import read_json, write_json
 from semstab.core.json_form import from_json, to_json
 from semstab.core.types import THESE_FRAMES, THIS_SCENE
-from semstab.data.contrast import BackboneComparison
+from semstab.data.contrast import ModelComparison
 from semstab.data.statistics import UNKNOWN, CellAgreement, ClassAlpha, HeadlineStatistics, Interval, MapStatistics
 from semstab.data.voxels import VoxelTable
 from semstab.errors import ConfigError, DataError
 from semstab.metrics import sbd
-from semstab.statistics import (
-    MapSample,
-    analyse,
-    compare_backbones,
-    describe,
-    expected_sbd,
-    krippendorff_alpha,
-    verdict,
-)
+from semstab.statistics import MapSample, analyse, compare_models, describe, expected_sbd, krippendorff_alpha, verdict
 from semstab.statistics.agreement import PSA
 from semstab.statistics.intervals import probability_above
 from semstab.statistics.verdict import LIMITS, level_probabilities
@@ -46,7 +38,7 @@ def said(flicker, seed, place=0.0, seen=0.8):
     return labels
 
 
-def backbone(*arguments, **options):
+def model(*arguments, **options):
     """The log of these labels."""
     return log_of(said(*arguments, **options), index=grid(SIDE))
 
@@ -57,12 +49,12 @@ def cells(*arguments, **options):
 
 
 def ground_truth():
-    return backbone(0.0, 1, seen=1.0).table()
+    return model(0.0, 1, seen=1.0).table()
 
 
 @pytest.fixture(scope="module")
 def described():
-    events = backbone(0.2, 0, place=0.2)
+    events = model(0.2, 0, place=0.2)
     return analyse(MapSample.draw(events.table(), events, ground_truth()), cells(0.2, 0, place=0.2), name="sim")
 
 
@@ -75,16 +67,16 @@ def test_a_description_is_content_for_json_and_every_voxel_has_a_value(described
     assert content["strata"][0]["psa"] is None
     assert math.isnan(described.summary.strata[0].psa)
     assert to_json(from_json(MapStatistics, content, "statistics.json")) == content
-    columns = described.columns(backbone(0.2, 0, place=0.2).table())
+    columns = described.columns(model(0.2, 0, place=0.2).table())
     assert {len(values) for values in columns.values()} == {SIDE**2}
-    assert {"psa", "sbd_excess", "trend", "entropy_within", "entropy_between", "stable_wrong"} <= set(columns)
+    assert {"psa", "sbd_excess", "trend", "entropy_within", "entropy_between", "consistent_wrong"} <= set(columns)
     assert 0 <= np.nanmin(columns["stable"]) < np.nanmax(columns["stable"]) <= 1
 
 
 @pytest.mark.parametrize("soft", [False, True])
 def test_how_many_voxels_are_summed_at_a_time_does_not_matter(monkeypatch, soft):
     """All numbers to 1e-12, also the ends of intervals, and which sums by class are known."""
-    table = backbone(0.2, 0, place=0.2).table()
+    table = model(0.2, 0, place=0.2).table()
     table = replace(table, self_sum=np.where(np.arange(len(table)) == 7, 0.9, 1.0) * table.self_sum) if soft else table
     whole = analyse(MapSample.draw(table))
     monkeypatch.setattr("semstab.data.evidence.STRETCH", 50)
@@ -96,7 +88,7 @@ def test_how_many_voxels_are_summed_at_a_time_does_not_matter(monkeypatch, soft)
 
 
 def test_a_description_holds_what_the_functions_say(described):
-    events = backbone(0.2, 0, place=0.2)
+    events = model(0.2, 0, place=0.2)
     table, summary = events.table(), described.summary
     repeated = table.op >= 2
     assert (summary.repeated.voxels, summary.repeated.share) == (repeated.sum(), pytest.approx(repeated.mean()))
@@ -116,13 +108,13 @@ def test_a_description_holds_what_the_functions_say(described):
     assert geometry.geometry.value == 0
     assert geometry.total.value == pytest.approx(1 - summary.agreement.psa.value)
     found = summary.correctness.quadrants
-    parts_of_all = (found.stable_right, found.stable_wrong, found.unstable_right, found.unstable_wrong)
+    parts_of_all = (found.consistent_right, found.consistent_wrong, found.inconsistent_right, found.inconsistent_wrong)
     assert sum(share.value for share in parts_of_all) == pytest.approx(1)
     assert summary.drift.trend.share.low < 0 < summary.drift.trend.share.high
 
 
 def test_the_same_seed_gives_the_same_description():
-    events = backbone(0.2, 3)
+    events = model(0.2, 3)
     a, b, other = (describe(events.table(), events, seed=seed) for seed in (4, 4, 5))
     assert to_json(a) == to_json(b)
     assert (a.seed, other.seed) == (4, 5)
@@ -131,7 +123,7 @@ def test_the_same_seed_gives_the_same_description():
 
 
 def test_a_table_alone_is_described_as_far_as_it_goes():
-    events = backbone(0.2, 0)
+    events = model(0.2, 0)
     observed = cells(0.2, 0)
     alone, logged = describe(events.table(), cells=observed), describe(events.table(), events, cells=observed)
     assert alone.correctness is alone.geometry is alone.drift.trend is None
@@ -144,7 +136,7 @@ def test_a_table_alone_is_described_as_far_as_it_goes():
 
 
 def test_without_cells_there_is_no_verdict_and_the_line_says_what_to_give():
-    events = backbone(0.2, 0)
+    events = model(0.2, 0)
     found = describe(events.table(), events)
     assert (found.cells, found.correlogram, found.verdict.level) == (None, None, "no verdict")
     assert math.isnan(found.headline.alpha.value)
@@ -160,23 +152,23 @@ def test_maps_that_say_nothing_are_described_too(labels):
     assert "no verdict" in summary.verdict.line
 
 
-def test_events_of_another_map_and_one_backbone_are_refused():
+def test_events_of_another_map_and_one_model_are_refused():
     with pytest.raises(DataError, match="take both from one backend"):
         describe(log_of([[0, 1]]).table(), log_of([[0, -1]]))
     with pytest.raises(ConfigError, match="give two or more"):
-        compare_backbones({"a": ground_truth()})
+        compare_models({"a": ground_truth()})
 
 
-def test_backbones_beside_each_other():
-    models = {"steady": (0.1, 5), "flickering": (0.4, 6), "stuck": (0.1, 7, 0.3)}
-    logs = {name: backbone(*model, seen=1.0) for name, model in models.items()}
-    observed = {name: cells(*model, seen=1.0) for name, model in models.items()}
+def test_models_beside_each_other():
+    made = {"steady": (0.1, 5), "flickering": (0.4, 6), "stuck": (0.1, 7, 0.3)}
+    logs = {name: model(*errors, seen=1.0) for name, errors in made.items()}
+    observed = {name: cells(*errors, seen=1.0) for name, errors in made.items()}
     tables = {name: log.table() for name, log in logs.items()}
-    content = compare_backbones(tables, logs, ground_truth(), observations=observed)
+    content = compare_models(tables, logs, ground_truth(), observations=observed)
     read = json.loads(json.dumps(to_json(content)))
-    assert to_json(from_json(BackboneComparison, read, "summary.json")) == read
+    assert to_json(from_json(ModelComparison, read, "summary.json")) == read
     by_alpha = next(row for row in content.paired.rankings if row.measure == "alpha")
-    assert by_alpha.ranks[-1].backbone == "flickering"
+    assert by_alpha.ranks[-1].model == "flickering"
     assert len(content.paired.differences) == 3 * 8
     assert content.standardised.of(PSA, "steady").value > 0.8
 
@@ -193,8 +185,8 @@ def judged(low, high, wrong=UNKNOWN, voxels=5000, blocks=40, **cells):
         "largest_share": 0.5, "labelled": 1.0, "classes": (),
     } | cells  # fmt: skip
     return verdict(
-        "net", headline=replace(numbers, wrong_of_stable=wrong), cells=CellAgreement(**own), voxels=voxels, share=0.5,
-        blocks=blocks,
+        "net", headline=replace(numbers, wrong_of_consistent=wrong), cells=CellAgreement(**own), voxels=voxels,
+        share=0.5, blocks=blocks,
     )  # fmt: skip
 
 
@@ -273,7 +265,7 @@ def test_the_line_names_unstable_classes_the_most_probable_first():
 
 
 def test_voxels_seen_once_change_no_verdict():
-    events = backbone(0.3, 8, seen=0.3)
+    events = model(0.3, 8, seen=0.3)
     table = events.table()
     again = table.op >= 2
     columns = ("ix", "iy", "iz", "op", "evidence", "drift_sum", "pixels", "first_frame", "last_frame", "self_sum",

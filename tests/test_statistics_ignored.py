@@ -1,4 +1,4 @@
-"""Backbones on the observations that all of them made: pixels that are left out, and labels beside scores."""
+"""Models on the observations that all of them made: pixels that are left out, and labels beside scores."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from simulated_events import grid, log_of_evidence
 from striped_floor import K, flight, fused, sampled
 
 from semstab.data.contrast import ComparedObservations
-from semstab.statistics import compare_backbones
+from semstab.statistics import compare_models
 from semstab.statistics.accumulate import sums_of_cells
 from semstab.statistics.cluster_sums import value
 from semstab.statistics.paired_differences import common_observations, psa_bounds, stratum_counts, thin_share
@@ -20,9 +20,9 @@ SIZE = 0.2
 
 
 def compared(**flights):
-    """Backbones that made these frames, on common observations."""
+    """Models that made these frames, on common observations."""
     tables = {name: fused(frames, SIZE).table() for name, frames in flights.items()}
-    return compare_backbones(tables, observations={name: sampled(frames) for name, frames in flights.items()})
+    return compare_models(tables, observations={name: sampled(frames) for name, frames in flights.items()})
 
 
 def of_alpha(found):
@@ -60,7 +60,7 @@ def errs_silently(seed=1):
 def test_the_order_is_said_to_depend_on_errors_that_were_left_out():
     silent, share = errs_silently()
     found = compared(silent=silent, better=list(flight(8, flicker=0.22, patch=10, seed=2))).observations
-    missing = {row.backbone: row for row in found.ignored}
+    missing = {row.model: row for row in found.ignored}
     assert found.order == ("silent", "better")
     assert found.order_ignored == ("better", "silent")
     assert found.depends
@@ -72,8 +72,8 @@ def test_the_order_is_said_to_depend_on_errors_that_were_left_out():
 def test_bounds_hold_the_agreement_that_there_is_where_nothing_is_left_out():
     silent, _ = errs_silently()
     whole = list(flight(8, flicker=0.3, patch=10, seed=1))
-    (full,) = (row for row in compared(a=whole, b=whole).observations.ignored if row.backbone == "a")
-    (some,) = (row for row in compared(silent=silent, whole=whole).observations.ignored if row.backbone == "silent")
+    (full,) = (row for row in compared(a=whole, b=whole).observations.ignored if row.model == "a")
+    (some,) = (row for row in compared(silent=silent, whole=whole).observations.ignored if row.model == "silent")
     assert full.psa_low == full.psa_high
     assert some.psa_low < full.psa_low < some.psa_high
 
@@ -140,7 +140,7 @@ def test_a_model_that_leaves_the_hardest_out_is_not_more_stable(hardest):
     row = of_alpha(found)
     assert row.difference.value == row.difference.low == row.difference.high == 0
     assert not row.p_holm <= 0.05
-    missing = {row.backbone: row for row in found.observations.ignored}
+    missing = {row.model: row for row in found.observations.ignored}
     assert missing["shy"].alpha < missing["bold"].alpha
 
 
@@ -148,7 +148,7 @@ def test_a_model_that_leaves_the_hardest_out_is_not_more_stable(hardest):
 def test_that_a_model_leaves_the_hardest_out_is_said(hardest):
     bold, shy = bold_and_shy(hardest)
     found = compared(shy=shy, bold=bold).observations
-    missing = {row.backbone: row.missing for row in found.ignored}
+    missing = {row.model: row.missing for row in found.ignored}
     assert missing["shy"] == pytest.approx(0.15, abs=0.02)
     assert missing["bold"] == 0
     assert found.depends
@@ -189,6 +189,6 @@ def test_strata_of_which_one_map_has_hardly_a_voxel_are_thin():
     often = log_of_evidence(np.tile(np.eye(3)[0], (400, 8, 1)), index=grid(20)).table()
     seldom = np.arange(8) < np.where(np.arange(400) < 20, 8, 2)[:, None]
     few = log_of_evidence(np.tile(np.eye(3)[0], (400, 8, 1)), seldom, index=grid(20)).table()
-    assert compare_backbones({"a": often, "b": few}).standardised.thin == 1
+    assert compare_models({"a": often, "b": few}).standardised.thin == 1
     same = stratum_counts({"a": often, "b": often})
     assert thin_share(same, np.array([0, 0, 0, 0, 0, 1.0, 0, 0, 0, 0, 0])) == 0

@@ -119,7 +119,7 @@ def test_every_number_has_an_interval_and_few_frames_say_so():
     assert estimate(without, "voxel_alpha").value == pytest.approx(value(sums, "voxel_alpha"))
     assert estimate(without, "alpha") == few  # cells know their views though a map has no log
     sums = simulated(frames=64, looks=6, quality="uneven")
-    keys = ("psa", "vss", "entropy", "accuracy", "look_accuracy", "wrong_of_stable")
+    keys = ("psa", "vss", "entropy", "accuracy", "observation_accuracy", "wrong_of_consistent")
     for key, k in [*((key, None) for key in (*keys, "alpha")), ("alpha", 0), ("accuracy", 1)]:
         found = estimate(sums, key, k)
         assert found.low < found.value < found.high, key

@@ -39,7 +39,7 @@ def scene(tmp_path_factory):
 
 
 def test_frames_in_which_nothing_is_seen_are_counted(tmp_path) -> None:
-    folder = tiny_scene.write(tmp_path / "scene", backbones=("a",))
+    folder = tiny_scene.write(tmp_path / "scene", models=("a",))
     (folder / "depth/0001.png").unlink()
     np.save(folder / "depth/0001.npy", np.full((tiny_scene.HEIGHT, tiny_scene.WIDTH), np.nan, np.float32))
     result = semstab.run(configure(folder))
@@ -75,14 +75,14 @@ def test_the_sample_finds_a_backend_that_is_wrong(tmp_path, monkeypatch) -> None
         return dataclasses.replace(table, evidence=table.evidence + (table.ix[:, None] % 10 == 0) * [1.0, 0, 0])
 
     monkeypatch.setattr(NumbaHash, "table", wrong)
-    folder = tiny_scene.write(tmp_path / "scene", backbones=("a",), frames=40)
+    folder = tiny_scene.write(tmp_path / "scene", models=("a",), frames=40)
     result = semstab.run(configure(folder, backends=["numba"], check="sample", voxel_size=0.05))
     assert not result.agrees
     assert "DISAGREE" in printed(result)
 
 
 def test_compared_backends_have_a_line(scene, tmp_path) -> None:
-    config = configure(scene, backends=["numba", "open3d-projective"], check=None, backbones=["a"], voxel_size=0.25)
+    config = configure(scene, backends=["numba", "open3d-projective"], check=None, models=["a"], voxel_size=0.25)
     result = semstab.run(config, out=tmp_path / "run", report=False)
     (row,) = result.compared
     assert row.backends == ("numba", "open3d-projective")

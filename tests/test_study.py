@@ -27,7 +27,7 @@ from semstab.engine.work import Start, Work, jobs_of
 from semstab.errors import ConfigError, DataError
 from semstab.metrics import SelfConsistency, VideoConsistency, compare, compensated_flicker, flicker_percent, summarise
 from semstab.settings import resolve
-from semstab.statistics import CellObservations, compare_backbones
+from semstab.statistics import CellObservations, compare_models
 from semstab.task import read
 
 
@@ -74,7 +74,7 @@ def test_every_unit_has_the_numbers_of_a_run_with_its_settings(root, tmp_path) -
             assert compare(record.table(), voxels, (record.unit, record.unit), tolerance=0).agrees
 
 
-def test_the_grid_goes_through_every_sweep_scene_and_backbone(root) -> None:
+def test_the_grid_goes_through_every_sweep_scene_and_model(root) -> None:
     cells = make_plan(configure(root, seed=7)).units
     assert [(cell.variation.sweep, cell.variation.value, cell.variation.repeat) for cell in cells[::2]][:7] == [
         ("base", None, 0), ("voxel_size", 0.25, 0), ("voxel_size", 0.5, 0), ("depth_noise", 0.0, 0),
@@ -83,14 +83,14 @@ def test_the_grid_goes_through_every_sweep_scene_and_backbone(root) -> None:
     noisy = [cell.config.perturbation for cell in cells if cell.variation.value == 0.05]
     assert [(noise.depth_noise, noise.seed) for noise in noisy] == [(0.05, 7), (0.05, 7), (0.05, 8), (0.05, 8)]
     counted = [cell for cell in cells if cell.variation.sweep == "frame_count"]
-    assert [(cell.unit.backbone, len(cell.task.indices)) for cell in counted] == [("a", 5), ("a", 10)]
+    assert [(cell.unit.model, len(cell.task.indices)) for cell in counted] == [("a", 5), ("a", 10)]
     assert counted[0].task.indices == [0, 2, 4, 7, 9]
     assert [cell.unit.backend for cell in cells if cell.variation.sweep == BACKENDS] == ["numba", "numba"]
 
 
 def test_a_point_at_the_base_settings_is_the_base_unit(finished) -> None:
     out, result, counting = finished
-    of_a = [record for record in result.records if record.unit.backbone == "a"]
+    of_a = [record for record in result.records if record.unit.model == "a"]
     base = of_a[0]
     twins = [record.variation for record in of_a[1:] if record.key == base.key]
     assert twins == [
@@ -98,7 +98,7 @@ def test_a_point_at_the_base_settings_is_the_base_unit(finished) -> None:
         Variation("pixel_stride", 1),
     ]  # fmt: skip
     assert all(record.summary == base.summary for record in of_a if record.key == base.key)
-    # base, voxel 0.5, two noisy ones, stride 2 and backend numba for each backbone; ten frames for a
+    # base, voxel 0.5, two noisy ones, stride 2 and backend numba for each model; ten frames for a
     assert counting.units == len(counting.computed) == 2 * 6 + 1
     assert len(list((out / "units").iterdir())) == 13
     assert {record.voxels_file is None for record in of_a if record.variation.sweep in ("base", "backends")} == {False}
@@ -111,15 +111,15 @@ def decoded(monkeypatch) -> list[tuple[int, str]]:
     pairs: list[tuple[int, str]] = []
     frame = FileScene.frame
 
-    def counted(self, index, backbone, *, color=True):
-        pairs.append((index, backbone))
-        return frame(self, index, backbone, color=color)
+    def counted(self, index, model, *, color=True):
+        pairs.append((index, model))
+        return frame(self, index, model, color=color)
 
     monkeypatch.setattr(FileScene, "frame", counted)
     return pairs
 
 
-def test_frames_are_decoded_once_for_all_units_of_a_backbone(root, tmp_path, decoded) -> None:
+def test_frames_are_decoded_once_for_all_units_of_a_model(root, tmp_path, decoded) -> None:
     run_study(configure(root), tmp_path / "out")
     predicted = [pair for pair in decoded if pair[1] != "gt"]
     # a's ten frames for the sweep of frame_count, b's five
@@ -205,8 +205,8 @@ def test_a_failing_unit_is_reported_and_the_others_finish(root, tmp_path) -> Non
     result = run_study(configure(root), out, observers=[counting])
     assert len(counting.failed) == 1 + 6
     assert len(counting.computed) == 6
-    assert {failure.unit.backbone for failure in result.failures} == {"a", "b"}
-    (of_a,) = [failure for failure in result.failures if failure.unit.backbone == "a"]
+    assert {failure.unit.model for failure in result.failures} == {"a", "b"}
+    (of_a,) = [failure for failure in result.failures if failure.unit.model == "a"]
     assert of_a.variation == Variation("frame_count", 10)
     assert "depth/0003.png: not a PNG image" in of_a.message
     assert all("labels/b/0002.png" in failure.message for failure in result.failures if failure is not of_a)
@@ -228,7 +228,7 @@ def test_the_result_is_read_back_from_its_folder(finished, out, tmp_path) -> Non
     assert set(again.manifest["inputs"]) == {"wall/a", "wall/b"}
     assert again.up == {"wall": (0.0, -1.0, 0.0)}
     assert summarise(again.select()[0].table()) == again.select()[0].summary.table
-    assert (again.scenes, again.backbones) == (("wall",), ("a", "b"))
+    assert (again.scenes, again.models) == (("wall",), ("a", "b"))
     with pytest.raises(DataError, match=r"summary\.json: cannot be read"):
         load_result(tmp_path)
     content = json.loads((out / "summary.json").read_text())
@@ -245,7 +245,7 @@ def test_stability_in_image_space_is_that_of_the_base_frames(root, tmp_path) -> 
     result = run_study(config, tmp_path / "out")
     (task, _) = [cell.task for cell in make_plan(config).units][:2]
     frames = [read(task, i) for i in range(10)]
-    truth = [read(dataclasses.replace(task, backbone="gt"), i) for i in range(10)]
+    truth = [read(dataclasses.replace(task, model="gt"), i) for i in range(10)]
     pairs = list(itertools.pairwise(frames))
     compensated = [compensated_flicker(*pair) for pair in pairs]
     self_vc8, vc8 = SelfConsistency(8), VideoConsistency(8)
@@ -263,22 +263,22 @@ def test_stability_in_image_space_is_that_of_the_base_frames(root, tmp_path) -> 
 
 
 def test_ground_truth_is_consistent_and_frames_without_it_are_in_no_clip(root, tmp_path) -> None:
-    config = configure(root, frames={}, backbones=["gt", "a"], sweeps={}, backends=["numpy"])
+    config = configure(root, frames={}, models=["gt", "a"], sweeps={}, backends=["numpy"])
     gt, a = run_study(config, tmp_path / "out").select()
     assert np.isnan(gt.image_space.vc8)  # nothing to compare it with
     assert gt.image_space.compensated_flicker_percent == 0
     assert a.image_space.compensated_flicker_percent > 0
     (root / "labels/gt/0005.png").unlink()
-    config = configure(root, frames={}, backbones=["a"], sweeps={}, backends=["numpy"])
+    config = configure(root, frames={}, models=["a"], sweeps={}, backends=["numpy"])
     (a,) = run_study(config, tmp_path / "out").select()
     assert np.isnan(a.image_space.vc8)
     assert a.image_space.self_vc8 >= 0
 
 
 def test_statistics_come_with_every_unit_and_all_of_them_where_they_are_wanted(root, tmp_path) -> None:
-    config = configure(root, sweeps={"voxel_size": [0.5]}, backends=["numpy"], backbones=["a", "gt"])
+    config = configure(root, sweeps={"voxel_size": [0.5]}, backends=["numpy"], models=["a", "gt"])
     before = run_study(config, tmp_path / "out").records
-    wanted = configure(root, sweeps={"voxel_size": [0.5]}, backends=["numpy"], backbones=["a", "gt"], statistics=True)
+    wanted = configure(root, sweeps={"voxel_size": [0.5]}, backends=["numpy"], models=["a", "gt"], statistics=True)
     assert len(count(wanted, tmp_path / "out").computed) == 4
     result = run_study(wanted, tmp_path / "out")
     settings = make_plan(resolve(wanted)).units[0].config.model_copy(update={"events": True})
@@ -296,17 +296,17 @@ def test_statistics_come_with_every_unit_and_all_of_them_where_they_are_wanted(r
     assert to_json([record.statistics for record in again]) == to_json([record.statistics for record in before])
 
 
-def test_the_base_backbones_are_compared_where_statistics_are_wanted(root, tmp_path) -> None:
-    settings = {"sweeps": {}, "backends": ["numpy"], "backbones": ["a", "b", "gt"]}
+def test_the_base_models_are_compared_where_statistics_are_wanted(root, tmp_path) -> None:
+    settings = {"sweeps": {}, "backends": ["numpy"], "models": ["a", "b", "gt"]}
     assert run_study(configure(root, **settings), tmp_path / "plain").comparisons == ()
     config = configure(root, **settings, statistics=True)
     result = run_study(config, tmp_path / "out")
     (found,) = result.comparisons
-    maps = {record.unit.backbone: record.table() for record in result.select()}
+    maps = {record.unit.model: record.table() for record in result.select()}
     truth = maps.pop("gt")
-    cells = {own.unit.backbone: CellObservations.load(own.observations_file) for own in result.select()}
+    cells = {own.unit.model: CellObservations.load(own.observations_file) for own in result.select()}
     cells.pop("gt")
-    expected = compare_backbones(maps, truth=truth, observations=cells, scene="wall")
+    expected = compare_models(maps, truth=truth, observations=cells, scene="wall")
     assert to_json(found) == to_json(expected)
     assert {row.measure for row in found.paired.differences} >= {"psa", "alpha", "accuracy"}
     for other in (load_result(tmp_path / "out"), run_study(config, tmp_path / "out")):  # read, kept
@@ -331,7 +331,7 @@ def test_units_fused_by_another_backend_are_checked_unless_they_differ_by_design
     assert [run.unit.backend for run in result.runs][:3] == ["numpy", "numba", "open3d-projective"]
 
 
-def test_backbones_are_compared_in_the_shared_taxonomy(root, tmp_path) -> None:
+def test_models_are_compared_in_the_shared_taxonomy(root, tmp_path) -> None:
     path = tmp_path / "two.yaml"
     path.write_text("classes: [wall, {name: opening, members: [door, window]}]\n")
     result = run_study(configure(root, sweeps={}, backends=["numpy"], shared_taxonomy=str(path)), tmp_path / "out")
@@ -347,7 +347,7 @@ def test_backbones_are_compared_in_the_shared_taxonomy(root, tmp_path) -> None:
 
 def test_a_scene_can_have_frames_of_its_own(tmp_path) -> None:
     for name in ("long", "short"):
-        tiny_study.write(tmp_path / "data" / name, backbones=("a",))
+        tiny_study.write(tmp_path / "data" / name, models=("a",))
     frames = {"long": {"stop": 8, "stride": 4}}
     sweeps = {"frame_count": {"values": [2, 8], "scenes": ["long"]}}
     config = configure(tmp_path / "data", frames={}, scene_frames=frames, sweeps=sweeps, backends=["numpy"])
@@ -362,10 +362,10 @@ def test_a_scene_can_have_frames_of_its_own(tmp_path) -> None:
 @pytest.mark.parametrize(("settings", "message"), [
     ({"scene_frames": {"hall": {}}}, "scene_frames: 'hall' is not among wall"),
     ({"sweeps": {"voxel_size": {"values": [1], "scenes": ["x"]}}}, "voxel_size.scenes: 'x' is not among wall"),
-    ({"backends": ["numpy", {"name": "numba", "backbones": ["x"]}]}, "backends.backbones: 'x' is not among a, b"),
+    ({"backends": ["numpy", {"name": "numba", "models": ["x"]}]}, "backends.models: 'x' is not among a, b"),
     ({"sweeps": {"frame_count": [11]}}, "frame_count: wall has 10 frames over the extent of the base ones, not 11"),
     ({"backends": [{"name": "numpy", "options": {"x": 1}}]}, "backend 'numpy' has no option 'x'"),
-    ({"shared_taxonomy": "uavid3"}, "no class takes 'wall, door, window'"), ({"backbones": ["c"]}, "no backbone 'c'"),
+    ({"shared_taxonomy": "uavid3"}, "no class takes 'wall, door, window'"), ({"models": ["c"]}, "no model 'c'"),
 ])  # fmt: skip
 def test_what_does_not_fit_together_is_refused_before_anything_is_read(root, tmp_path, settings, message) -> None:
     with pytest.raises((ConfigError, DataError), match=message):
@@ -374,7 +374,7 @@ def test_what_does_not_fit_together_is_refused_before_anything_is_read(root, tmp
 
 
 def test_a_worker_that_does_not_see_the_folder_sends_the_voxels_back_and_a_job_fails_as_a_whole(root, tmp_path) -> None:
-    config = resolve(configure(root, sweeps={}, backends=["numpy"], backbones=["a"]))
+    config = resolve(configure(root, sweeps={}, backends=["numpy"], models=["a"]))
     (cell,) = make_plan(config).units
     elsewhere = tmp_path / "elsewhere"
     (outcome,) = run_job((Work.of(cell, Start("start", elsewhere)),))
@@ -386,7 +386,7 @@ def test_a_worker_that_does_not_see_the_folder_sends_the_voxels_back_and_a_job_f
     result = run_study(config, tmp_path / "out", observers=[counting])
     assert counting.kept == 1
     assert summarise(result.select()[0].table()) == result.select()[0].summary.table
-    config = resolve(configure(root, sweeps={"voxel_size": [0.5]}, backends=["numpy"], backbones=["a"]))
+    config = resolve(configure(root, sweeps={"voxel_size": [0.5]}, backends=["numpy"], models=["a"]))
     start = Start("start", tmp_path)
     works = [dataclasses.replace(Work.of(cell, start), scene="hall") for cell in make_plan(config).units]
     outcomes = [*run_job(tuple(works))]
@@ -394,9 +394,9 @@ def test_a_worker_that_does_not_see_the_folder_sends_the_voxels_back_and_a_job_f
     assert "scene 'hall' is not there" in outcomes[0].error
 
 
-def works(backbone: str, identities: str, kept: str = "") -> list[Work]:
+def works(model: str, identities: str, kept: str = "") -> list[Work]:
     start = Start("", Path())
-    return [Work(start, "s", backbone, name, Config(), kept=name in kept) for name in identities]
+    return [Work(start, "s", model, name, Config(), kept=name in kept) for name in identities]
 
 
 def names(job: tuple[Work, ...]) -> str:

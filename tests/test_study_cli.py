@@ -20,7 +20,7 @@ from semstab.engine import run_study
 
 @pytest.fixture
 def root(tmp_path):
-    return tiny_study.write(tmp_path / "wall", backbones=("a", "b", "c"))
+    return tiny_study.write(tmp_path / "wall", models=("a", "b", "c"))
 
 
 @pytest.fixture
@@ -65,7 +65,7 @@ def test_a_study_interrupted_and_killed_at_random_moments_ends_with_the_same_sum
 
 
 def test_what_it_prints_fits_into_80_columns(file, tmp_path) -> None:
-    arguments = (file, "--set", "backends=[numpy, numba]", "--set", "backbones=[a]", "--only", "backends")
+    arguments = (file, "--set", "backends=[numpy, numba]", "--set", "models=[a]", "--only", "backends")
     out, _ = study(*arguments, "--set", "statistics=true", cwd=tmp_path, report=True)
     files = ("report.html", "manifest.json", "config.yaml", "tables/scenes.csv")
     for name in (*files, "tables/quadrants.csv", "tables/verdicts.tex"):
@@ -86,7 +86,7 @@ def test_what_it_prints_fits_into_80_columns(file, tmp_path) -> None:
 def test_failing_units_are_one_line_each_and_the_others_are_reported(root, file, tmp_path) -> None:
     (root / "labels/b/0002.png").write_bytes(b"no image")
     (root / "depth/0003.png").write_bytes(b"no image")
-    arguments = (file, "--out", "out", "--set", "backbones=[a, b]", "--only", "frame_count", "--only", "voxel_size")
+    arguments = (file, "--out", "out", "--set", "models=[a, b]", "--only", "frame_count", "--only", "voxel_size")
     out, errors = study(*arguments, cwd=tmp_path, code=2)
     of_b, of_a = (line for line in errors.splitlines() if line.startswith("error: "))  # others tell of progress
     assert of_b.startswith(f"error: wall, b: voxel_size 0.25 and 1 more: {root}/labels/b/0002.png: not a PNG image")
@@ -105,7 +105,7 @@ def test_nothing_but_failures_is_still_a_summary(root, file, tmp_path) -> None:
 
 
 def test_backends_that_disagree_end_with_their_own_code(file, tmp_path) -> None:
-    settings = ("backends=[numpy, numba]", "backbones=[a]", "tolerance=0", "voxel_size=0.7")
+    settings = ("backends=[numpy, numba]", "models=[a]", "tolerance=0", "voxel_size=0.7")
     arguments = [word for setting in settings for word in ("--set", setting)]
     _, errors = study(file, *arguments, "--only", "backends", "--quiet", cwd=tmp_path, code=3)
     assert errors == "error: the backends disagree; the agreement in studies/tiny/summary.json says where\n"

@@ -49,10 +49,10 @@ def test_a_run_is_a_study_without_sweeps(tmp_path) -> None:
 
 
 def test_units_have_the_base_settings_as_a_run_of_their_own() -> None:
-    settings = {"strata": [1, 3], "seed": 4, "perturbation": {"depth_noise": 0.01}, "backbones": ["sim-soft"]}
+    settings = {"strata": [1, 3], "seed": 4, "perturbation": {"depth_noise": 0.01}, "models": ["sim-soft"]}
     plan = make_plan(resolve(load_study("city", {**settings, "scene_frames": {"scene0": {"stop": 3}}})).only([]))
     base, other, *_ = (each.config for each in plan.units)
-    assert (base.strata, base.scenes, base.check, base.backbones) == ([1, 3], ["scene0"], None, ["sim-soft"])
+    assert (base.strata, base.scenes, base.check, base.models) == ([1, 3], ["scene0"], None, ["sim-soft"])
     assert (base.frames.stop, other.frames.stop) == (3, None)
     assert base.perturbation is not None
     assert base.perturbation.seed == 4
@@ -60,7 +60,7 @@ def test_units_have_the_base_settings_as_a_run_of_their_own() -> None:
 
 def test_every_setting_is_in_the_key_of_a_unit_or_has_a_reason_not_to_be() -> None:
     """A new one must be thought of."""
-    selects = {"dataset", "scenes", "backbones", "region_maps", "backends", "taxonomy", "frames", "scene_frames"}
+    selects = {"dataset", "scenes", "models", "region_maps", "backends", "taxonomy", "frames", "scene_frames"}
     plans = {"name", "description", "check", "tolerance", "shared_taxonomy", "sweeps", "seed", "events"}
     plans |= {"frame_quality"}  # with the label source that it compares with
     elsewhere = {"check_geometry", "threads", "memory_gb", "tile_size"}
@@ -82,7 +82,7 @@ def test_every_setting_is_in_the_key_of_a_unit_or_has_a_reason_not_to_be() -> No
         ({"backends": ["numpy", "numpy"]}, "backends: each backend can be named once"),
         ({"backends": [{"name": "numpy", "scenes": ["s"]}]}, "backends: the first backend fuses every unit"),
         ({"perturbation": {"seed": 3}}, "perturbation: leave its seed out; 'seed' counts"),
-        ({"region_maps": ["x"], "backbones": ["x"]}, "region_maps: 'x' is named among the backbones too"),
+        ({"region_maps": ["x"], "models": ["x"]}, "region_maps: 'x' is named among the models too"),
         ({"strata": [2, 1]}, "strata: edges must be ascending"),
         ({"frames": {"spacing": "even"}}, "spacing: even needs count"),
     ],
@@ -95,7 +95,7 @@ def test_bad_settings_are_one_line_that_names_the_setting(tmp_path, content, mes
 
 
 def test_the_shipped_studies_fit_together() -> None:
-    assert shipped_studies() == ("city", "remedies", "uavid3d")
+    assert shipped_studies() == ("city", "filters", "uavid3d")
     assert all(load_study(name).description for name in shipped_studies())
     grid = make_plan(resolve(load_study("city")))
     assert {cell.variation.sweep for cell in grid.units} == {
@@ -122,7 +122,7 @@ def test_a_part_of_a_study(tmp_path) -> None:
 
 
 def test_perturbed_base_units_are_varied_on_top(tmp_path) -> None:
-    root = tiny_study.write(tmp_path / "wall", backbones=("a",))
+    root = tiny_study.write(tmp_path / "wall", models=("a",))
     study = tiny_study.configure(
         root, seed=2, perturbation={"translation_noise": 0.01}, sweeps={"depth_noise": [0, 0.1]}, backends=["numpy"]
     )

@@ -20,12 +20,12 @@ from semstab.engine.units import make_plan
 from semstab.engine.work import Start, Work
 from semstab.errors import ConfigError, MissingDependencyError
 
-BACKBONES = ("a", "b", "c", "d")
+MODELS = ("a", "b", "c", "d")
 
 
 @pytest.fixture(scope="module")
 def root(tmp_path_factory):
-    return tiny_study.write(tmp_path_factory.mktemp("scene") / "wall", backbones=BACKBONES)
+    return tiny_study.write(tmp_path_factory.mktemp("scene") / "wall", models=MODELS)
 
 
 @pytest.fixture(scope="module")
@@ -99,7 +99,7 @@ class Deadly(Work):
 
 
 def test_a_job_that_kills_its_process_fails_and_the_others_finish(root, tmp_path) -> None:
-    config = tiny_study.configure(root, sweeps={}, backends=["numpy"], backbones=["a", "b"])
+    config = tiny_study.configure(root, sweeps={}, backends=["numpy"], models=["a", "b"])
     start = Start("start", tmp_path)
     fine = [Work.of(cell, start) for cell in make_plan(config).units]
     jobs = iter([(fine[0],), (Deadly(start, "wall", "x", "deadly", config),), *((work,) for work in fine[1:])])

@@ -21,7 +21,7 @@ FRAMES = 4
 @pytest.fixture
 def root(tmp_path):
     """Two regions tied to the wall, which moves by a pixel a frame; their ids change from frame to frame."""
-    root = tiny_study.write(tmp_path / "wall", backbones=("a",), frames=FRAMES)
+    root = tiny_study.write(tmp_path / "wall", models=("a",), frames=FRAMES)
     (root / "labels/regions").mkdir()
     for i, labels in enumerate(regions()):
         cv2.imwrite(str(root / f"labels/regions/{i:04d}.png"), labels)
@@ -38,11 +38,11 @@ def test_regions_are_matched_by_where_they_are(root, tmp_path) -> None:
     result = run_study(config, tmp_path / "out")
     (found,) = result.regions
     pairs = [matched_region_flicker(*pair).flicker_percent for pair in itertools.pairwise(regions())]
-    assert (found.scene, found.backbone) == ("wall", "regions")
+    assert (found.scene, found.model) == ("wall", "regions")
     assert found.flicker_percent == pytest.approx(np.mean(pairs)) == 12.5  # one of eight columns changes its region
     assert found.compensated_flicker_percent == 0  # the regions are tied to the wall
     assert found.compensated_share == pytest.approx(7 / 8)
-    assert [record.unit.backbone for record in result.records] == ["a"]  # by default all but these
+    assert [record.unit.model for record in result.records] == ["a"]  # by default all but these
     assert load_result(tmp_path / "out").regions == result.regions
     assert set(result.manifest["inputs"]) == {"wall/a", "wall/regions"}
 
@@ -77,7 +77,7 @@ def test_a_source_of_regions_that_fails_is_a_failure(root, tmp_path) -> None:
     config = configure(root, frames={}, region_maps=["regions"], sweeps={}, backends=["numpy"])
     result = run_study(config, tmp_path / "out")
     assert result.regions == ()
-    assert [failure.unit.backbone for failure in result.failures] == ["regions"]
+    assert [failure.unit.model for failure in result.failures] == ["regions"]
     assert len(result.records) == 1
 
 

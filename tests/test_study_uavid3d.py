@@ -38,7 +38,7 @@ def models(tmp_path_factory):
     tiny_models.segformer(folder / "segformer", tiny_models.CITYSCAPES)
     for kind in ("clip", "sam"):
         (folder / kind).symlink_to(tiny(kind))
-    prompts = yaml.safe_load((CONFIGS / "backbones" / "segearth_uavid.yaml").read_text())
+    prompts = yaml.safe_load((CONFIGS / "models" / "segearth_uavid.yaml").read_text())
     prompts |= {"prob_threshold": 0.0, "templates": prompts["templates"][:2]}  # of random weights nothing is likely
     (folder / "prompts.yaml").write_text(yaml.safe_dump(prompts))
     return folder
@@ -62,16 +62,16 @@ def test_from_images_to_numbers_by_the_documented_commands(data, models, tmp_pat
         words[:] = [word.replace("DATA", str(data)).replace("MODELS", str(models)) for word in words]
     for words in predictions:
         more = {"segearth-ov": ["--set", f"prompts={models / 'prompts.yaml'}"], "segformer": []}
-        called([*words, *more.get(words[words.index("--backbone") + 1], TINY_SAM), "-q"])
+        called([*words, *more.get(words[words.index("--model") + 1], TINY_SAM), "-q"])
     small = ["scenes=[scene0]", "scene_frames={}", "frames={stop: 3}", "pixel_stride=2", "backends=[numpy]"]
     settings = [part for setting in small for part in ("--set", setting)]
     parts = ["--only", "shared_taxonomy", "--report", "off"]
     called([*study, *settings, *parts, "--out", str(tmp_path / "study"), "-q"])
     result = load_result(tmp_path / "study")
-    units = {(record.variation.sweep, record.unit.backbone): record.summary for record in result.records}
-    backbones = load_study("uavid3d").backbones or []
-    assert set(units) == {(sweep, name) for sweep in ("base", "shared_taxonomy") for name in backbones}
+    units = {(record.variation.sweep, record.unit.model): record.summary for record in result.records}
+    names = load_study("uavid3d").models or []
+    assert set(units) == {(sweep, name) for sweep in ("base", "shared_taxonomy") for name in names}
     classes = {(sweep, summary.table.K) for (sweep, _), summary in units.items()}
     assert classes == {("base", 6), ("shared_taxonomy", 3)}
     assert all(summary.frames == 3 for summary in units.values())
-    assert [each.backbone for each in result.regions] == ["sam-raw"]
+    assert [each.model for each in result.regions] == ["sam-raw"]

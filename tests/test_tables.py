@@ -18,7 +18,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from records import record, study, voxels
-from wall_study import BACKBONES, STEPS, wall_study
+from wall_study import MODELS, STEPS, wall_study
 
 from semstab.config import BACKENDS, SHARED
 from semstab.core.files import write_text
@@ -59,7 +59,7 @@ def test_the_walls_tables_are_as_in_the_golden_file(walls, suffix):
 def test_a_study_of_everything_has_every_table(walls):
     assert [table.name for table in tables(walls)] == [
         "overview", "verdicts", "flicker", "flicker_by_scene", "scenes", "persistence", "classes", "temporal_agreement",
-        "correlogram", "class_agreement", "drift", "uncertainty", "cross_backbone", "sensitivity_voxel_size",
+        "correlogram", "class_agreement", "drift", "uncertainty", "cross_model", "sensitivity_voxel_size",
         "sensitivity_agreement_voxel_size", "sensitivity_depth_noise", "sensitivity_agreement_depth_noise",
         "sensitivity_frame_count", "sensitivity_agreement_frame_count", "voxel_sizes", "fusion", "agreement",
     ]  # fmt: skip
@@ -87,20 +87,20 @@ def test_drift_that_few_places_tell_of_is_not_shown(walls):
     assert math.isnan(pooled(rows).drift.value)
 
 
-def voxels_of(walls, backbone):
-    """All voxels of a backbone, straight from the maps: OP, VSS, SBD, entropy."""
-    maps = [row.table() for row in walls.select(backbone=backbone)]
+def voxels_of(walls, model):
+    """All voxels of a model, straight from the maps: OP, VSS, SBD, entropy."""
+    maps = [row.table() for row in walls.select(model=model)]
     return [np.concatenate([measure(table) for table in maps]) for measure in (op, vss, sbd, entropy)]
 
 
-@pytest.mark.parametrize("backbone", BACKBONES)
-def test_the_strata_pool_the_voxels_of_all_scenes(walls, backbone):
-    seen, *measures = voxels_of(walls, backbone)
+@pytest.mark.parametrize("model", MODELS)
+def test_the_strata_pool_the_voxels_of_all_scenes(walls, model):
+    seen, *measures = voxels_of(walls, model)
     inside = {
         "OP=1": seen == 1, "OP=2": seen == 2, "3<=OP<=5": (seen >= 3) & (seen <= 5), "OP>5": seen > 5,
         "OP>=3": seen >= 3,
     }  # fmt: skip
-    rows = [row for row in rows_of(walls, "persistence") if row["backbone"] == backbone]
+    rows = [row for row in rows_of(walls, "persistence") if row["model"] == model]
     assert [row["persistence"] for row in rows] == list(inside)
     for row in rows:
         where = inside[row["persistence"]]
@@ -111,11 +111,11 @@ def test_the_strata_pool_the_voxels_of_all_scenes(walls, backbone):
         assert [row["vss"], row["sbd"], row["entropy"]] == pytest.approx(expected, nan_ok=True)
 
 
-@pytest.mark.parametrize("backbone", BACKBONES)
-def test_the_scenes_have_their_own_means_and_a_macro_mean(walls, backbone):
-    rows = [row for row in rows_of(walls, "scenes") if row["backbone"] == backbone]
+@pytest.mark.parametrize("model", MODELS)
+def test_the_scenes_have_their_own_means_and_a_macro_mean(walls, model):
+    rows = [row for row in rows_of(walls, "scenes") if row["model"] == model]
     assert [row["scene"] for row in rows] == [*STEPS, "Total / Mean"]
-    for row, unit in zip(rows, walls.select(backbone=backbone), strict=False):
+    for row, unit in zip(rows, walls.select(model=model), strict=False):
         table = unit.table()
         assert row["vss"] == pytest.approx(vss(table).mean())
         assert row["sbd"] == pytest.approx(np.nanmean(sbd(table)))
@@ -128,28 +128,26 @@ def test_the_scenes_have_their_own_means_and_a_macro_mean(walls, backbone):
         assert total[key] == pytest.approx(statistics.mean(row[key] for row in scenes))
 
 
-@pytest.mark.parametrize("backbone", BACKBONES)
-def test_the_comparison_has_macro_and_pooled_means(walls, backbone):
-    macro, every, recurrent = (row for row in rows_of(walls, "cross_backbone") if row["backbone"] == backbone)
-    seen, stability, drift, _ = voxels_of(walls, backbone)
+@pytest.mark.parametrize("model", MODELS)
+def test_the_comparison_has_macro_and_pooled_means(walls, model):
+    macro, every, recurrent = (row for row in rows_of(walls, "cross_model") if row["model"] == model)
+    seen, stability, drift, _ = voxels_of(walls, model)
     assert every["vss"] == pytest.approx(stability.mean())
     assert every["sbd"] == pytest.approx(np.nanmean(drift))
     assert recurrent["vss"] == pytest.approx(stability[seen >= 3].mean())
     assert recurrent["share_percent"] == pytest.approx(100 * (seen >= 3).mean())
-    assert macro["vss"] == pytest.approx(
-        statistics.mean(vss(r.table()).mean() for r in walls.select(backbone=backbone))
-    )
+    assert macro["vss"] == pytest.approx(statistics.mean(vss(r.table()).mean() for r in walls.select(model=model)))
     assert macro["vss"] != pytest.approx(every["vss"])
 
 
-def test_a_comparison_needs_one_taxonomy_and_two_backbones():
-    a, b = (record(voxels((5, 2, SURE)), backbone=name) for name in "ab")
-    assert "cross_backbone" in [table.name for table in tables(study(a, b))]
-    assert "cross_backbone" not in [table.name for table in tables(study(a))]
+def test_a_comparison_needs_one_taxonomy_and_two_models():
+    a, b = (record(voxels((5, 2, SURE)), model=name) for name in "ab")
+    assert "cross_model" in [table.name for table in tables(study(a, b))]
+    assert "cross_model" not in [table.name for table in tables(study(a))]
     other = dataclasses.replace(b, summary=dataclasses.replace(b.summary, taxonomy="other"))
-    assert "cross_backbone" not in [table.name for table in tables(study(a, other))]
-    shared = [record(voxels((7, 2, SURE)), SHARED, backbone=name) for name in "ab"]
-    rows = rows_of(study(a, other, *shared), "cross_backbone")
+    assert "cross_model" not in [table.name for table in tables(study(a, other))]
+    shared = [record(voxels((7, 2, SURE)), SHARED, model=name) for name in "ab"]
+    rows = rows_of(study(a, other, *shared), "cross_model")
     assert {row["voxels"] for row in rows[::3]} == {7}
 
 
@@ -172,7 +170,7 @@ def test_flicker_is_the_macro_mean_of_the_scenes_and_regions_stand_in_its_tables
     assert math.isnan(row["vc8"])
     assert "raw SAM" in table_of(found, "flicker").caption
     assert [row["scene"] for row in rows_of(found, "flicker_by_scene")] == ["s", "s", "t"]
-    assert "raw SAM" not in {row["backbone"] for row in rows_of(found, "scenes")}
+    assert "raw SAM" not in {row["model"] for row in rows_of(found, "scenes")}
 
 
 def noisy(once, repeat, value=0.01, scene="s"):
@@ -231,7 +229,7 @@ def test_other_backends_are_compared_with_the_base_one_on_the_scenes_that_all_fu
 def test_the_agreement_says_who_agrees(walls):
     rows = rows_of(walls, "agreement")
     assert {row["verdict"] for row in rows} == {"agree"}
-    assert [(row["scene"], row["backbone"]) for row in rows] == [("often", backbone) for backbone in BACKBONES]
+    assert [(row["scene"], row["model"]) for row in rows] == [("often", model) for model in MODELS]
     assert all(0 <= row["max_sbd"] < 1e-9 for row in rows)
     odd = dataclasses.replace(walls, agreement=(dataclasses.replace(walls.agreement[0], agrees=False),))
     assert [row["verdict"] for row in rows_of(odd, "agreement")] == ["disagree"]

@@ -75,7 +75,7 @@ def test_a_belief_changes_by_at_most_the_share_that_is_left_out(k) -> None:
 def test_a_run_tells_what_its_flag_left_out(tmp_path) -> None:
     """Of random scores much: the summary has the mean and the bound, the terminal says them; of all of them nothing."""
     scene = write_scene(tmp_path / "scene")
-    words = ("--data", scene, "--backbone", "net-scores", "--top-k", 1, "--check", "none", "--rerun", "off")
+    words = ("--data", scene, "--model", "net-scores", "--top-k", 1, "--check", "none", "--rerun", "off")
     told = bench(*words, "--out", tmp_path / "cut", cwd=tmp_path).stdout
     (run,) = json.loads((tmp_path / "cut/summary.json").read_text())["runs"]
     frames = [posed_frame(k, "net-scores").scores.astype(float) for k in range(3)]

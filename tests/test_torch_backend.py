@@ -291,10 +291,10 @@ def test_an_ignored_pixel_may_be_out_of_reach():
     assert (report.points, report.map_voxels) == (1, 1)
 
 
-# --- Several backbones ------------------------------------------------------------------------------------------------
+# --- Several models ------------------------------------------------------------------------------------------------
 
 
-def test_maps_of_several_backbones_are_as_if_made_alone():
+def test_maps_of_several_models_are_as_if_made_alone():
     """Each ignores other pixels, one has other classes, and one is silent at times."""
     frames = random_frames(8, count=5)
     rng = np.random.default_rng(0)
@@ -320,7 +320,7 @@ def test_maps_of_several_backbones_are_as_if_made_alone():
         assert_equal(torch_map.table(name), backend.table())
 
 
-def test_one_backbone_that_cannot_be_fused_leaves_all_maps_as_they_were():
+def test_one_model_that_cannot_be_fused_leaves_all_maps_as_they_were():
     frame = random_frames(9, count=1)[0]
     torch_map = TorchMaps(0.4, {"good": K, "bad": 2}, device="CPU:0")
     view = (frame.depth, frame.intrinsics, frame.T_wc)
@@ -332,7 +332,7 @@ def test_one_backbone_that_cannot_be_fused_leaves_all_maps_as_they_were():
         torch_map.integrate_tensors(*view, {"other": said["good"]}, index=0)
     with pytest.raises(ConfigError, match="no map of 'other'"):
         torch_map.table("other")
-    with pytest.raises(ConfigError, match="names no backbone"):
+    with pytest.raises(ConfigError, match="names no model"):
         TorchMaps(0.4, {})
 
 

@@ -8,14 +8,22 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parents[1]
-FOLDERS = ("benchmark", "backends", "backbones", "datasets", "configs", "conformance", "docs")
+FOLDERS = ("benchmark", "backends", "models", "datasets", "configs", "conformance", "docs")
 GONE = (
-    "AtHand", "Arrangement", "BeyondCoin", "Contender", "FrameJudge", "MapLog", "Portion", "Scenery", "Sights",
-    "Suspect", "Survey", "Votes", "first look", "foresight", "forensics", "frames to blame", "give_back", "judged_by",
-    "least steady", "one_line", "rivals", "same looks", "settling", "tell_apart", "this map'",
+    "AtHand", "Arrangement", "backbone", "backbones", "BeyondCoin", "Contender", "FrameJudge", "MapLog", "Portion",
+    "Scenery", "Sights", "Suspect", "Survey", "Votes", "first look", "foresight", "forensics", "frames to blame",
+    "give_back", "judged_by", "least steady", "one_line", "remedies", "rivals", "same looks", "settling",
+    "stable_wrong", "tell_apart", "this map'", "wrong_of_stable",
 )  # fmt: skip
-TRANSLATED = ROOT / "benchmark/data/earlier.py"
-"""What reads summaries of earlier versions, and so knows their words."""
+TRANSLATED = {
+    ROOT / name
+    for name in (
+        "benchmark/backbones.py", "benchmark/cli/__init__.py", "benchmark/cli/running.py",
+        "benchmark/config/settings.py", "benchmark/core/registry.py", "benchmark/data/earlier.py",
+        "benchmark/settings.py", "datasets/files/options.py",
+    )
+}  # fmt: skip
+"""What reads summaries, settings and command lines of earlier versions, and so knows their words."""
 
 
 @pytest.mark.parametrize("word", GONE)
@@ -24,5 +32,5 @@ def test_a_word_that_is_gone_stays_gone(word):
     pages = (
         path for folder in FOLDERS for path in (ROOT / folder).rglob("*") if path.suffix in (".py", ".md", ".yaml")
     )
-    there = [path for path in pages if path != TRANSLATED and pattern.search(path.read_text(encoding="utf-8"))]
+    there = [path for path in pages if path not in TRANSLATED and pattern.search(path.read_text(encoding="utf-8"))]
     assert there == []

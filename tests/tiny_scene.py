@@ -13,15 +13,15 @@ WIDTH, HEIGHT, FRAMES = 8, 6, 3
 FOCAL = 8.0
 
 
-def write(root: Path, backbones: tuple[str, ...] = ("a", "b"), frames: int = FRAMES, noise: float = 0.25) -> Path:
+def write(root: Path, models: tuple[str, ...] = ("a", "b"), frames: int = FRAMES, noise: float = 0.25) -> Path:
     """Write a scene: a camera that looks along z at a wall 2 m away, moving 0.25 m (one pixel) to the right a frame."""
     rng = np.random.default_rng(7)
     truth = [np.tile(((np.arange(WIDTH) + i) // 4 % 3).astype(np.uint8), (HEIGHT, 1)) for i in range(frames)]
-    sources = {"gt": truth, **{name: [] for name in backbones}}
+    sources = {"gt": truth, **{name: [] for name in models}}
     for labels in truth:
-        for backbone in backbones:
+        for model in models:
             wrong = rng.random(labels.shape) < noise
-            sources[backbone].append(np.where(wrong, (labels + 1) % 3, labels).astype(np.uint8))
+            sources[model].append(np.where(wrong, (labels + 1) % 3, labels).astype(np.uint8))
     seen = {name: [frame(i, labels) for i, labels in enumerate(maps)] for name, maps in sources.items()}
     names = [f"{i:04d}" for i in range(frames)]
     return write_posed(root, names, seen, classes=["wall", "door", "window"], up_axis="-y")

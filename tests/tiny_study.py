@@ -1,4 +1,4 @@
-"""A study small enough for a test: two backbones on a wall, several sweeps, and its numbers without times."""
+"""A study small enough for a test: two models on a wall, several sweeps, and its numbers without times."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ TIMES = ("fuse_ms_per_frame", "stages_ms")
 
 SWEEPS = {
     "voxel_size": [0.25, 0.5], "depth_noise": {"values": [0, 0.05], "repeats": 2},
-    "frame_count": {"values": [5, 10], "backbones": ["a"]}, "pixel_stride": [1, 2],
+    "frame_count": {"values": [5, 10], "models": ["a"]}, "pixel_stride": [1, 2],
 }  # fmt: skip
 
 

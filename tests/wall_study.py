@@ -18,14 +18,14 @@ from semstab.report.figures import write_figures
 WIDTH, HEIGHT, FOCAL, FRAMES = 96, 64, 64.0, 9
 STEPS = {"often": 0.25, "rarely": 1.0}
 """How far the camera moves from frame to frame, metres, along a wall of which it sees 3 m."""
-BACKBONES = {"calm": 0.05, "nervous": 0.25}
+MODELS = {"calm": 0.05, "nervous": 0.25}
 """How much of the wall each of them gets wrong, anew in every frame."""
 CLASSES = ["wall", "door_1", "window & <sill>", "ghost"]
 
 
 def write_wall(folder: Path, step: float) -> None:
     """A camera that looks along z at a wall 2.03 m away and moves to the right; blocks of 4 x 4 pixels err together."""
-    seen: dict[str, list[Frame]] = {"gt": [], **{backbone: [] for backbone in BACKBONES}}
+    seen: dict[str, list[Frame]] = {"gt": [], **{model: [] for model in MODELS}}
     camera = Intrinsics(FOCAL, FOCAL, WIDTH / 2, HEIGHT / 2)
     depth = np.full((HEIGHT, WIDTH), 2.03, np.float32)
     for i in range(FRAMES):
@@ -35,10 +35,10 @@ def write_wall(folder: Path, step: float) -> None:
         pose[:3, 3] = [step * i + 0.003, 0.003, 0.0]
         color = np.repeat(truth[..., None] * 80, 3, axis=2).astype(np.uint8)
         seen["gt"].append(Frame(i, depth, camera, pose, labels=truth, color=color))
-        for k, (backbone, share) in enumerate(BACKBONES.items()):
+        for k, (model, share) in enumerate(MODELS.items()):
             wrong = np.random.default_rng([k, i]).random((HEIGHT // 4, WIDTH // 4)) < share
             labels = np.where(np.kron(wrong, np.ones((4, 4), bool)), (truth + 1) % 3, truth).astype(np.uint8)
-            seen[backbone].append(Frame(i, depth, camera, pose, labels=labels, color=color))
+            seen[model].append(Frame(i, depth, camera, pose, labels=labels, color=color))
     write_posed(folder, [f"{i:04d}" for i in range(FRAMES)], seen, classes=CLASSES, up_axis="-y")
 
 
@@ -71,9 +71,9 @@ def wall_study(base: Path) -> tuple[Result, Path]:
 
 @functools.cache
 def drawn_walls(base: Path) -> tuple[Result, Path, list[Path]]:
-    """The part of one backbone, with a saved frame of one scene; a folder with its figures, and their paths."""
+    """The part of one model, with a saved frame of one scene; a folder with its figures, and their paths."""
     result, _ = wall_study(base)
-    calm = dataclasses.replace(result, records=tuple(r for r in result.records if r.unit.backbone == "calm"))
+    calm = dataclasses.replace(result, records=tuple(r for r in result.records if r.unit.model == "calm"))
     folder = base / "drawn walls"
     (folder / "overview").mkdir(parents=True)
     frame = {"frame": 3, "labels": np.zeros((6, 8), np.uint8), "palette": np.zeros((len(CLASSES), 3), np.uint8)}

@@ -34,8 +34,8 @@ def print_check(checked: SceneCheck, console: Console, *, verbose: bool = False)
     say(f"  {state.upper()}  {_conclusion(checked)}", 4, STATES[state])
     if checked.placed is not None:
         say(f"  place    {checked.placed}", 11)
-    for remark in checked.remarks:
-        say(f"  look: {remark}", 4, "yellow")
+    for note in checked.notes:
+        say(f"  note: {note}", 4, "yellow")
     tables = _tables(checked)
     wrong_labels = any(labels.problem for labels in checked.labels)
     wanted = "labels" if wrong_labels else "overlap" if state == "sound" else "conventions"
@@ -110,7 +110,7 @@ def _persistence_table(checked: SceneCheck) -> Table:
 
 
 def _label_table(checked: SceneCheck) -> Table:
-    table = _table(("class",), [escape(labels.backbone) for labels in checked.labels])
+    table = _table(("class",), [escape(labels.model) for labels in checked.labels])
     names = dict.fromkeys(name for labels in checked.labels for name in labels.classes)
     for name in names:
         table.add_row(escape(name), *(_percent(labels.classes.get(name, math.nan), 2) for labels in checked.labels))

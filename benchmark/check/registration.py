@@ -382,8 +382,8 @@ REGISTERED_FRAMES = 16
 """Frames in which the edges of labels are compared with those of depth."""
 
 
-def remarks(scene: Scene, views: Sequence[View], how: Reading, backbone: str) -> Iterator[str]:
-    """Yield one line each; the views have the labels of `backbone`, or none."""
+def notes(scene: Scene, views: Sequence[View], how: Reading, model: str) -> Iterator[str]:
+    """Yield one line each; the views have the labels of `model`, or none."""
     if how.convention.depth == "planar" and (
         found := find_sentinel((view.depth for view in views), how.depth_scale or 1)
     ):
@@ -391,7 +391,7 @@ def remarks(scene: Scene, views: Sequence[View], how: Reading, backbone: str) ->
         yield f"{found}; set {how.change('invalid_depth', '[' + ', '.join(f'{value:.15g}' for value in values) + ']')}"
     some = [views[k] for k in evenly(len(views), REGISTERED_FRAMES)]
     if (offset := find_offset(list(_edges(scene, some)))) is not None:
-        what = "the images" if some[0].labels is None else f"labels of {backbone}"
+        what = "the images" if some[0].labels is None else f"labels of {model}"
         mend = "register them to the depth"
         if "color_intrinsics" in scene.settings:
             mend = f"set {OPTION}color_intrinsics: [fx, fy, cx, cy], or {mend}"

@@ -108,15 +108,15 @@ def pairs_within(groups: Sequence[Sequence[int]]) -> list[Pair]:
 
 
 def label_source(scene: Scene) -> str | None:
-    """Return the backbone with which frames are read where none is named; the ground truth where there is no other."""
-    return scene.backbones[0] if scene.backbones else GROUND_TRUTH if scene.ground_truth else None
+    """Return the model with which frames are read where none is named; the ground truth where there is no other."""
+    return scene.models[0] if scene.models else GROUND_TRUTH if scene.ground_truth else None
 
 
-def reader(scene: Scene, backbone: str | None, *, color: bool = False) -> Callable[[int], Frame]:
-    """Return how a frame is read: with a backbone's labels, or where there are none, with all pixels class 0."""
-    if backbone is None:
+def reader(scene: Scene, model: str | None, *, color: bool = False) -> Callable[[int], Frame]:
+    """Return how a frame is read: with a model's labels, or where there are none, with all pixels class 0."""
+    if model is None:
         return lambda index: scene.geometry(index, color=color)
-    return lambda index: scene.frame(index, backbone, color=color)
+    return lambda index: scene.frame(index, model, color=color)
 
 
 @dataclass(frozen=True, eq=False)

@@ -26,7 +26,7 @@ from semstab.check.coverage import (
     suggested_size,
 )
 from semstab.check.geometry import Verdict, judge, shifts_and_turns
-from semstab.check.registration import judge_surface, match_images, remarks
+from semstab.check.registration import judge_surface, match_images, notes
 from semstab.check.reprojection import Sample, View, clusters, evenly, label_source, pairs_within, reader
 from semstab.config import Config
 from semstab.core.json_form import to_json
@@ -45,7 +45,7 @@ MOST_IDS = 5
 
 @dataclass(frozen=True)
 class Histogram:
-    """The labels of a backbone in some frames.
+    """The labels of a model in some frames.
 
     Attributes:
         space: Its taxonomy's name, or None where none is known.
@@ -56,7 +56,7 @@ class Histogram:
         problem: The fault, or None.
     """
 
-    backbone: str
+    model: str
     space: str | None
     pixels: int
     classes: Mapping[str, float]
@@ -66,10 +66,10 @@ class Histogram:
 
 
 class Tally:
-    """The labels of a backbone, counted frame by frame."""
+    """The labels of a model, counted frame by frame."""
 
-    def __init__(self, backbone: str) -> None:
-        self.backbone = backbone
+    def __init__(self, model: str) -> None:
+        self.model = model
         self._ids: Counter[int] = Counter()
         self._ignored = 0
         self._widths: set[int] = set()
@@ -93,7 +93,7 @@ class Tally:
             classes = {name: ids[i] / total for name, i in zip(space.classes, space.ids, strict=True)}
             unknown = {i: n / total for i, n in sorted(ids.items()) if i not in space.ids}
         return Histogram(
-            backbone=self.backbone,
+            model=self.model,
             space=None if space is None else space.name,
             pixels=self._ignored + ids.total(),
             classes=classes,
@@ -116,17 +116,17 @@ class Tally:
     def _problem(self, space: LabelSpace | None, unknown: Mapping[int, float], labelled: int) -> str | None:
         if space is not None and self._widths - {len(space)}:
             widths = ", ".join(map(str, sorted(self._widths)))
-            return f"scores of {self.backbone} hold {widths} classes, {space.name} has {len(space)}"
+            return f"scores of {self.model} hold {widths} classes, {space.name} has {len(space)}"
         if space is not None and unknown:
             listed = ", ".join(map(str, list(unknown)[:MOST_IDS])) + (", ..." if len(unknown) > MOST_IDS else "")
             return (
-                f"labels of {self.backbone}: id {listed} ({sum(unknown.values()):.2%} of the pixels) is outside the"
+                f"labels of {self.model}: id {listed} ({sum(unknown.values()):.2%} of the pixels) is outside the"
                 f" taxonomy {space.name} (ids {min(space.ids)} to {max(space.ids)})"
             )
-        return None if labelled else f"labels of {self.backbone}: no pixel has a label"
+        return None if labelled else f"labels of {self.model}: no pixel has a label"
 
 
-SCHEMA = 1
+SCHEMA = 2
 """Version of the file that --json writes."""
 
 CLUSTERS = 4
@@ -139,7 +139,7 @@ CONFIRMING_CLUSTERS = 3
 """The quick check looks at one place with so many points, and before it refuses data at so many places."""
 
 LABELLED_FRAMES = 8
-"""Frames in which the labels of every backbone but the first are counted."""
+"""Frames in which the labels of every model but the first are counted."""
 
 VOXEL_FACTORS = (0.5, 1.0, 2.0)
 """Voxel sizes for which the distribution of OP is told, relative to the configured or the suggested one."""
@@ -167,7 +167,7 @@ class Motion:
 class SceneCheck:
     """All that is known about a scene from its sample; `verdict` alone is about geometry.
 
-    `remarks` are what looks wrong, but may be right: values that mean 'no depth', labels that are not registered.
+    `notes` are what looks wrong, but may be right: values that mean 'no depth', labels that are not registered.
     `depth_from` says where depth comes from, where that is not a file a frame;
     `placed` how its georeference was found and how well it fits.
     Where the geometry is unsound nothing is said about overlap, noise and voxels.
@@ -187,7 +187,7 @@ class SceneCheck:
     fused_stride: int = 1
     persistence: tuple[Persistence, ...] = ()
     suggestion: Suggestion | None = None
-    remarks: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()
     depth_from: str | None = None
     placed: str | None = None
 
@@ -218,27 +218,31 @@ def check(config: Config) -> Iterator[SceneCheck]:
 
 
 def check_scene(scene: Scene, config: Config) -> SceneCheck:
-    """Check one scene under the configuration's selection of frames, backbones, taxonomy, voxel size and stride."""
-    backbones = list(selected(config.backbones, scene.backbones, scene.by_name, "backbone", scene.name))
-    indices = frame_indices(scene, config, backbones)
-    first = backbones[0] if backbones else label_source(scene)
-    look = Look(scene, indices, first, clusters(len(indices), CLUSTERS), POINTS, fused=FUSED_FRAMES, with_color=True)
-    sample, how = look.sample(config.dataset.options), look.reading(config.dataset.options)
-    verdict = look.verdict(config.dataset.options, thorough=True)
+    """Check one scene under the configuration's selection of frames, models, taxonomy, voxel size and stride."""
+    models = list(selected(config.models, scene.models, scene.by_name, "model", scene.name))
+    indices = frame_indices(scene, config, models)
+    first = models[0] if models else label_source(scene)
+    inspection = Inspection(
+        scene, indices, first, clusters(len(indices), CLUSTERS), POINTS, fused=FUSED_FRAMES, with_color=True
+    )
+    sample, how = inspection.sample(config.dataset.options), inspection.reading(config.dataset.options)
+    verdict = inspection.verdict(config.dataset.options, thorough=True)
     checked = SceneCheck(
         scene=scene.name,
         frames=len(scene),
         selected=len(indices),
         size=how.size,
-        depth=look.depth(),
+        depth=inspection.depth(),
         motion=_motion(sample),
         verdict=verdict,
         depth_from=scene.depth_from,
         placed=scene.placed,
-        labels=tuple(_labels(scene, name, indices, config, look) for name in backbones),
-        remarks=tuple(remarks(scene, [look.views[at] for at in sorted(look.views)], how, look.tally.backbone)),
+        labels=tuple(_labels(scene, name, indices, config, inspection) for name in models),
+        notes=tuple(
+            notes(scene, [inspection.views[at] for at in sorted(inspection.views)], how, inspection.tally.model)
+        ),
     )
-    return checked if verdict.state == "unsound" else _with_coverage(checked, look, sample, config)
+    return checked if verdict.state == "unsound" else _with_coverage(checked, inspection, sample, config)
 
 
 def quick_check(scene: Scene, indices: Sequence[int], options: Mapping[str, Any] | None = None) -> Verdict:
@@ -246,20 +250,22 @@ def quick_check(scene: Scene, indices: Sequence[int], options: Mapping[str, Any]
 
     `options` are the dataset's, for the advice. A frame that cannot be read is passed over: whoever needs it says so.
     """
-    return quick_look(scene, indices, options)[0]
+    return quick_sample(scene, indices, options)[0]
 
 
-def quick_look(
+def quick_sample(
     scene: Scene, indices: Sequence[int], options: Mapping[str, Any] | None = None
 ) -> tuple[Verdict, Sample | None]:
     """Return the verdict of `quick_check`, and the frames that it looked at; None where there are not two."""
     verdict, sample = Verdict("unclear", "it takes two frames to tell whether depth and poses agree"), None
     for count in (1, CONFIRMING_CLUSTERS):
-        look = Look(scene, indices, None, clusters(len(indices), count), count * QUICK_POINTS, passing_over=True)
-        if len(look.views) < 2:
+        inspection = Inspection(
+            scene, indices, None, clusters(len(indices), count), count * QUICK_POINTS, passing_over=True
+        )
+        if len(inspection.views) < 2:
             continue
-        sample = look.sample(options or {})
-        verdict = look.verdict(options or {}, thorough=False)
+        sample = inspection.sample(options or {})
+        verdict = inspection.verdict(options or {}, thorough=False)
         if verdict.state != "unsound":
             break
     return verdict, sample
@@ -284,7 +290,7 @@ def refuse_unsound(scene: str, verdict: Verdict) -> None:
         )
 
 
-class Look:
+class Inspection:
     """The frames of a scene that a check reads, thinned as they come in.
 
     Attributes:
@@ -293,7 +299,7 @@ class Look:
         points: About how many points are reprojected in all.
         fused: Number of frames, evenly spaced, that are kept for fusing, too.
         passing_over: Leave out frames that cannot be read, instead of raising what reading them raises.
-        with_color: Whether to look also at the size of a colour image: intrinsics may be for that.
+        with_color: Whether to read also the size of a colour image: intrinsics may be for that.
     """
 
     def __init__(
@@ -364,12 +370,12 @@ class Look:
         return Depth(float(np.mean(valid)), float(p5), float(p50), float(p95))
 
 
-def _with_coverage(checked: SceneCheck, look: Look, sample: Sample, config: Config) -> SceneCheck:
+def _with_coverage(checked: SceneCheck, inspection: Inspection, sample: Sample, config: Config) -> SceneCheck:
     """Return what can be said about overlap, noise and voxels, where depth and poses may agree."""
     coverage = Coverage(sample)
     overlaps = coverage.overlaps()
     noise = coverage.noise() if overlaps and any(row.covisible > 0 for row in overlaps) else None
-    views = [look.views[position] for position in look.fused]
+    views = [inspection.views[position] for position in inspection.fused]
     stride = fused_stride(checked.size, config.pixel_stride)
     suggestion = None if noise is None else suggest(coverage, overlaps, config.frames.stride)
     size = config.voxel_size
@@ -408,16 +414,16 @@ def _motion(sample: Sample) -> Motion | None:
     return Motion((float(shifts.min()), float(shifts.max())), (float(turns.min()), float(turns.max())))
 
 
-def _labels(scene: Scene, backbone: str, indices: Sequence[int], config: Config, look: Look) -> Histogram:
-    """Return the labels of a backbone: of the frames that were read already, or of a few read for it."""
-    tally = look.tally
-    if backbone != tally.backbone:
-        tally = Tally(backbone)
+def _labels(scene: Scene, model: str, indices: Sequence[int], config: Config, inspection: Inspection) -> Histogram:
+    """Return the labels of a model: of the frames that were read already, or of a few read for it."""
+    tally = inspection.tally
+    if model != tally.model:
+        tally = Tally(model)
         chosen = [indices[position] for position in evenly(len(indices), LABELLED_FRAMES)]
-        for fetched in prefetch(reader(scene, backbone), chosen):
+        for fetched in prefetch(reader(scene, model), chosen):
             tally.add(fetched.item)
     try:
-        space = scene.label_space(backbone)
+        space = scene.label_space(model)
     except DataError as error:
         return tally.histogram(None, str(error))
     if config.taxonomy is not None:
@@ -467,9 +473,9 @@ def advise(sample: Sample | None, config: Config) -> VoxelAdvice | None:
 
 def _coverage(config: Config, scene: Scene) -> Coverage | None:
     """Return what a scene's frames share; None where they cannot be read: whoever needs them says so."""
-    backbones = selected(config.backbones, scene.backbones, scene.by_name, "backbone", scene.name)
+    models = selected(config.models, scene.models, scene.by_name, "model", scene.name)
     with contextlib.suppress(DataError):
-        indices = frame_indices(scene, config, backbones)
-        look = Look(scene, indices, None, clusters(len(indices), CLUSTERS), POINTS, passing_over=True)
-        return Coverage(look.sample(config.dataset.options)) if len(look.views) > 1 else None
+        indices = frame_indices(scene, config, models)
+        inspection = Inspection(scene, indices, None, clusters(len(indices), CLUSTERS), POINTS, passing_over=True)
+        return Coverage(inspection.sample(config.dataset.options)) if len(inspection.views) > 1 else None
     return None

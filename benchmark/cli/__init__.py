@@ -19,7 +19,7 @@ from typer.core import TyperCommand, TyperGroup
 from semstab import __version__
 from semstab.cli.finished import calibrate, compare, conform, export, gate, list_, relabel
 from semstab.cli.options import say
-from semstab.cli.running import check, convert, predict, remedies, run, show, study, view
+from semstab.cli.running import check, convert, filters, predict, run, show, study, view
 from semstab.core.process import configure_process
 from semstab.errors import OUT_OF_MEMORY, SemstabError, summarize_error
 
@@ -78,19 +78,26 @@ OF_PATHS = ("run", "check", "predict")
 """Commands whose first word may be a folder: --data."""
 
 EARLIER = {
-    "commit": "calibrate", "--commit": "--thresholds", "--onto": "--classify", "--beside": "--join",
-    "--leave-own-out": "--leave-one-out", "--trust-geometry": "--no-geometry-check",
+    "commit": "calibrate", "remedies": "filters", "--commit": "--thresholds", "--onto": "--classify",
+    "--beside": "--join", "--leave-own-out": "--leave-one-out", "--trust-geometry": "--no-geometry-check",
+    "--backbone": "--model",
 }  # fmt: skip
 """Names of version 0.3, which work for one version."""
 
 
-def _of_today(word: str, position: int) -> str:
-    """Return a word of the command line under its name of today, and warn; a command is the first word."""
-    name, equals, value = word.partition("=")
-    if name not in EARLIER or (not name.startswith("-") and position > 0):
-        return word
-    say(f"warning: {name} is now called {EARLIER[name]}; the next version will not know the old name")
-    return EARLIER[name] + equals + value
+def _of_today(args: list[str]) -> list[str]:
+    """Return a command line under the names of today, and warn; a command is the first word."""
+    known = dict(EARLIER)
+    if args[:1] == ["predict"] and any(word.startswith(("-m", "--backbone")) for word in args):
+        known["--model"] = "--checkpoint"
+    named = []
+    for position, word in enumerate(args):
+        name, equals, value = word.partition("=")
+        if name in known and (name.startswith("-") or position == 0):
+            say(f"warning: {name} is now called {known[name]}; the next version will not know the old name")
+            name = known[name]
+        named.append(name + equals + value)
+    return named
 
 
 class Group(TyperGroup):
@@ -109,7 +116,7 @@ class Group(TyperGroup):
             args = ["run", "--data", *args]
         if args[0] in OF_PATHS and len(args) > 1 and not args[1].startswith("-"):
             args = [args[0], "--data", *args[1:]]
-        return super().parse_args(ctx, [_of_today(word, k) for k, word in enumerate(args)])
+        return super().parse_args(ctx, _of_today(args))
 
     def format_help(self, ctx: Any, formatter: Any) -> None:
         """Write the group's own help, with the options of `run` in it."""
@@ -148,7 +155,7 @@ app = typer.Typer(
     invoke_without_command=True,
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},
-    help="How stable are a segmentation backbone's predictions at the same physical place?\n\n"
+    help="How stable are a segmentation model's predictions at the same physical place?\n\n"
     "Fuses label maps by depth and pose into metric voxels and measures VSS, SBD, OP and entropy. Without a command it "
     "runs; with no option either, on the built-in city.",
 )
@@ -171,7 +178,7 @@ def root(
 
 for command, name in (
     (run, "run"), (study, "study"), (predict, "predict"), (check, "check"), (convert, "convert"), (compare, "compare"),
-    (remedies, "remedies"), (gate, "gate"), (calibrate, "calibrate"), (export, "export"), (relabel, "relabel"),
+    (filters, "filters"), (gate, "gate"), (calibrate, "calibrate"), (export, "export"), (relabel, "relabel"),
     (conform, "conform"), (show, "show"), (view, "view"), (list_, "list"),
 ):  # fmt: skip
     app.command(name, cls=Command)(command)

@@ -12,7 +12,7 @@ from semstab.cli.options import Quiet, ScopeOption, Verbose, print_lines, say
 
 def compare(
     runs: Annotated[list[str], typer.Argument(
-        metavar="RUN...", help="Folders of runs or studies, the one to compare with first; RUN:BACKBONE.")],
+        metavar="RUN...", help="Folders of runs or studies, the one to compare with first; RUN:MODEL.")],
     out: Annotated[Path | None, typer.Option(
         "--out", "-o", help="Folder for report.html, tables, figures, JSON, Markdown.")] = None,
     scope: ScopeOption = None,
@@ -44,7 +44,7 @@ def compare(
 
 # The commands gate and calibrate: quality gates, and thresholds from which labels may be acted on.
 
-REMEDY = {
+NEXT_STEP = {
     "undecided": "take more frames (--plan says how many), or accept undecided rules with --undecided pass",
     "fails": "mend the model, or keep it regardless with --save-baseline alone, without rules",
 }
@@ -52,7 +52,7 @@ REMEDY = {
 
 
 def gate(
-    new: Annotated[str, typer.Argument(metavar="NEW", help="Folder of a finished run, or FOLDER:BACKBONE.")],
+    new: Annotated[str, typer.Argument(metavar="NEW", help="Folder of a finished run, or FOLDER:MODEL.")],
     against: Annotated[str | None, typer.Option(
         metavar="BASE", help="The baseline: a folder likewise, or a small summary.")] = None,
     rule: Annotated[list[str] | None, typer.Option(
@@ -88,7 +88,7 @@ def gate(
         if save_baseline is not None and not result.passed:
             say(
                 f"{save_baseline}: no baseline is saved, as the gate {gate_report.OUTCOMES[result.outcome]};"
-                f" {REMEDY[result.outcome]}"
+                f" {NEXT_STEP[result.outcome]}"
             )
         if not (result.passed or plan):
             raise typer.Exit(result.exit_code)
@@ -100,7 +100,7 @@ def gate(
 
 
 def calibrate(
-    run: Annotated[str, typer.Argument(metavar="RUN", help="Folder of a run with ground truth, or FOLDER:BACKBONE.")],
+    run: Annotated[str, typer.Argument(metavar="RUN", help="Folder of a run with ground truth, or FOLDER:MODEL.")],
     out: Annotated[Path, typer.Option("--out", "-o", metavar="FILE", help="YAML file to write.")],
     precision: Annotated[float, typer.Option(help="How often a label that is acted on shall be right.")] = 0.95,
     confidence: Annotated[float, typer.Option(help="With which this is to hold, class by class.")] = 0.95,
@@ -145,7 +145,7 @@ def conform(
 
 Run = Annotated[Path, typer.Argument(metavar="RUN", help="Folder of a finished run.")]
 Scene = Annotated[str | None, typer.Option("--scene", "-s", help="Scene; needed where the run has several.")]
-Backbone = Annotated[str | None, typer.Option("--backbone", "-m", help="Label source; needed where there are several.")]
+Model = Annotated[str | None, typer.Option("--model", "-m", help="Label source; needed where there are several.")]
 Thresholds = Annotated[Path | None, typer.Option(
     "--thresholds", metavar="FILE", help="Only labels above the thresholds of `semstab-bench calibrate`.")]  # fmt: skip
 Backend = Annotated[str | None, typer.Option("--backend", "-b", help="Whose map; the run's first backend by default.")]
@@ -156,7 +156,7 @@ def export(
     to: Annotated[list[Path], typer.Option(
         "--to", metavar="FILE", help=".ply .las .laz .tif .glb .parquet .csv; or tasks, see --format; repeatable.")],
     scene: Scene = None,
-    backbone: Backbone = None,
+    model: Model = None,
     backend: Backend = None,
     measure: Annotated[list[str] | None, typer.Option(
         help="Column that goes along: vss, sbd, entropy, margin, op, ...; repeatable.")] = None,
@@ -181,7 +181,7 @@ def export(
     from semstab.exports import export as write
 
     for file in write(
-        run, to, scene=scene, backbone=backbone, backend=backend, measures=measure, min_op=min_op,
+        run, to, scene=scene, model=model, backend=backend, measures=measure, min_op=min_op,
         classes=classes or (), thresholds=thresholds, cell=cell, asprs=asprs, radius=radius, classify=classify,
         join=join, task_format=task_format, most=most,
     ):  # fmt: skip
@@ -192,9 +192,9 @@ def relabel(
     run: Run,
     out: Annotated[Path, typer.Option("--out", "-o", help="Folder above labels/; the scene's own, to run it at once.")],
     scene: Scene = None,
-    backbone: Backbone = None,
+    model: Model = None,
     backend: Backend = None,
-    name: Annotated[str | None, typer.Option(help="Name of the new maps; BACKBONE-fused by default.")] = None,
+    name: Annotated[str | None, typer.Option(help="Name of the new maps; MODEL-fused by default.")] = None,
     min_op: Annotated[int, typer.Option(min=1, help="Ignore pixels of voxels that fewer frames saw.")] = 1,
     min_psa: Annotated[float, typer.Option(help="Ignore pixels of voxels on which fewer pairs of frames agree.")] = 0.0,
     category: Annotated[list[str] | None, typer.Option(
@@ -217,7 +217,7 @@ def relabel(
     belief = Belief(min_op, min_psa, tuple(category or ()), leave_one_out, loaded)
     with frame_bar(Console(stderr=True, quiet=quiet)) as bar:
         report = write(
-            run, out, belief=belief, scene=scene, backbone=backbone, backend=backend, name=name, overwrite=overwrite,
+            run, out, belief=belief, scene=scene, model=model, backend=backend, name=name, overwrite=overwrite,
             progress=bar,
         )  # fmt: skip
     print_lines(report.lines(), quiet=quiet)
@@ -227,12 +227,12 @@ def relabel(
 
 
 def list_() -> None:
-    """List backends, datasets, backbones, filters, taxonomies and studies, each with 'ready' or what to install."""
+    """List backends, datasets, models, filters, taxonomies and studies, each with 'ready' or what to install."""
     from rich.console import Console
     from rich.markup import escape
     from rich.table import Table
 
-    from semstab import backbones, backends, datasets
+    from semstab import backends, datasets, models
     from semstab.data.labels import LabelSpace, shipped_taxonomies
     from semstab.errors import MissingDependencyError
     from semstab.predict import filters
@@ -241,7 +241,7 @@ def list_() -> None:
     table = Table(show_edge=False)
     for name in ("kind", "name", "", "what it is"):
         table.add_column(name)
-    for registry in (backends.REGISTRY, datasets.REGISTRY, backbones.REGISTRY, filters.REGISTRY):
+    for registry in (backends.REGISTRY, datasets.REGISTRY, models.REGISTRY, filters.REGISTRY):
         for name, entry in sorted(registry.entries().items()):
             try:
                 registry.load(name)  # an entry is ready where all that is behind its name imports

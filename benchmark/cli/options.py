@@ -12,7 +12,7 @@ import typer
 
 from semstab.errors import ConfigError, SemstabError, sanitize
 
-# Names that the shell completes: of backends, datasets, backbones, taxonomies, studies, scenes and label sources.
+# Names that the shell completes: of backends, datasets, models, taxonomies, studies, scenes and label sources.
 
 Complete = Callable[[Any, str], list[str]]
 
@@ -45,10 +45,10 @@ def _opened(ctx: Any) -> Any:
 
 def _label_sources(ctx: Any) -> Iterable[str]:
     opened = _opened(ctx)
-    return [*(name for scene in opened.scenes[:1] for name in opened.scene(scene).backbones), "gt", "all"]
+    return [*(name for scene in opened.scenes[:1] for name in opened.scene(scene).models), "gt", "all"]
 
 
-backends, datasets, models = _listed("backends"), _listed("datasets"), _listed("backbones")
+backends, datasets, predictors = _listed("backends"), _listed("datasets"), _listed("models")
 filters = _listed("predict.filters")
 taxonomies, studies = _listed("data.labels", "shipped_taxonomies"), _listed("settings", "shipped_studies")
 scenes, label_sources = _beginning(lambda ctx: [*_opened(ctx).scenes, "all"]), _beginning(_label_sources)
@@ -71,10 +71,10 @@ DatasetName = Annotated[str | None, typer.Option(
     autocompletion=datasets)]
 Scenes = Annotated[list[str] | None, typer.Option(
     "--scene", "-s", help="Scene; repeatable; or 'all'.", show_default="all", autocompletion=scenes)]
-Backbones = Annotated[list[str] | None, typer.Option(
-    "--backbone", "-m", help="Label source; repeatable; or 'all'; 'gt': truth.", show_default="all",
-    autocompletion=label_sources)]
 Models = Annotated[list[str] | None, typer.Option(
+    "--model", "-m", help="Label source; repeatable; or 'all'; 'gt': truth.", show_default="all",
+    autocompletion=label_sources)]
+Predicted = Annotated[list[str] | None, typer.Option(
     "--predict", metavar="NAME[,KEY=VALUE...]",
     help="Model that makes the labels, nothing on disk: a name of `list`, FILE.py:NAME; repeatable.")]
 Classes = Annotated[str | None, typer.Option(

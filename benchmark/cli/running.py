@@ -1,4 +1,4 @@
-"""The commands that compute: run, study, remedies, check, predict, convert; and show and view of what they left."""
+"""The commands that compute: run, study, filters, check, predict, convert; and show and view of what they left."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def run(
     data: opt.DataFolder = None,
     dataset: opt.DatasetName = None,
     scene: opt.Scenes = None,
-    backbone: opt.Backbones = None,
+    model: opt.Models = None,
     taxonomy: Annotated[str | None, typer.Option(
         help="Taxonomy to fuse in: a name or a YAML file.", show_default="the dataset's; city: uavid7",
         autocompletion=opt.taxonomies, rich_help_panel=opt.SETTINGS)] = None,
@@ -61,7 +61,7 @@ def run(
     events: Annotated[bool | None, typer.Option("--events", help="Also write the log of observations.",
     rich_help_panel=opt.SETTINGS)] = None,
     statistics: Annotated[bool | None, typer.Option(
-        "--statistics", help="Also measure drift, judge by ground truth, compare backbones; takes longer.")] = None,
+        "--statistics", help="Also measure drift, judge by ground truth, compare models; takes longer.")] = None,
     scope: opt.ScopeOption = None,
     out: Annotated[Path | None, typer.Option("--out", "-o", help="Run folder.", show_default="runs/TIME")] = None,
     rerun: opt.Rerun = None,
@@ -69,20 +69,20 @@ def run(
     jobs: opt.Jobs = 1,
     scheduler: opt.Scheduler = None,
     tile_size: opt.TileSize = None,
-    predict: opt.Models = None,
+    predict: opt.Predicted = None,
     classes: opt.Classes = None,
     filters: opt.Filters = None,
     quiet: opt.Quiet = False,
     verbose: opt.Verbose = False,
 ) -> None:  # fmt: skip
-    """Fuse every selected backbone with every selected backend, measure, compare. This is the default command."""
+    """Fuse every selected model with every selected backend, measure, compare. This is the default command."""
     from datetime import datetime
 
     from semstab.predict.predictor import parse_predictor
     from semstab.settings import filtered_config, load_config, predicted_config
 
     named = {
-        "backends": backend, "scenes": scene, "backbones": backbone, "taxonomy": taxonomy, "voxel_size": voxel_size,
+        "backends": backend, "scenes": scene, "models": model, "taxonomy": taxonomy, "voxel_size": voxel_size,
         "pixel_stride": pixel_stride, "top_k": top_k, "check": check, "events": events, "statistics": statistics,
         "scope": scope, "check_geometry": False if trust_geometry else None,
         "tile_size": tile_size if tile_size is None or not tile_size.isdigit() else int(tile_size),
@@ -120,7 +120,7 @@ def study(
     quiet: opt.Quiet = False,
     verbose: opt.Verbose = False,
 ) -> None:  # fmt: skip
-    """Run everything that the paper reports: scenes x backbones x backends x variations. Resumes where it was."""
+    """Run everything that the paper reports: scenes x models x backends x variations. Resumes where it was."""
     from semstab.data.results import slug
     from semstab.settings import load_study
 
@@ -130,21 +130,21 @@ def study(
     execute(config, out, executor_of(jobs, scheduler), rerun, report, quiet=quiet, verbose=verbose)
 
 
-def remedies(
+def filters(
     data: opt.DataFolder = None,
     dataset: opt.DatasetName = None,
     scene: opt.Scenes = None,
-    backbone: opt.Backbones = None,
-    predict: opt.Models = None,
+    model: opt.Models = None,
+    predict: opt.Predicted = None,
     classes: opt.Classes = None,
-    filters: opt.Filters = None,
+    filter_: opt.Filters = None,
     frames: opt.Frames = None,
     voxel_size: opt.VoxelSize = None,
     taxonomy: Annotated[str | None, typer.Option(help="Taxonomy to fuse and judge in: a name or a file.")] = None,
     settings: opt.DatasetSettings = None,
     options: opt.DatasetOptions = None,
     trust_geometry: opt.TrustGeometry = False,
-    out: Annotated[Path, typer.Option("--out", "-o", help="Study folder.")] = Path("studies/remedies"),
+    out: Annotated[Path, typer.Option("--out", "-o", help="Study folder.")] = Path("studies/filters"),
     report: opt.Report = "on",
     jobs: opt.Jobs = 1,
     quiet: opt.Quiet = False,
@@ -153,15 +153,15 @@ def remedies(
 
     --filter tries others than the usual ones; chains are written with a plus sign, ema-warped:0.6+threshold:0.5.
     """
+    from semstab.filter_study import filter_study_config
     from semstab.predict.predictor import parse_predictor
-    from semstab.remedies import remedies_config
 
     named: dict[str, Any] = {"scenes": scene, "voxel_size": voxel_size, "taxonomy": taxonomy}
     named["check_geometry"] = False if trust_geometry else None
     models = [parse_predictor(text, {} if classes is None else {"classes": classes}) for text in predict or []]
     content = chosen(named, settings, options, dataset, data, frames)
-    config, left_out = remedies_config(
-        models, backbone or [], filters or [], content, kept=out.absolute() / "predictions"
+    config, left_out = filter_study_config(
+        models, model or [], filter_ or [], content, kept=out.absolute() / "predictions"
     )
     for line in left_out if not quiet else ():
         say(line)
@@ -176,8 +176,8 @@ def execute(
     from rich.console import Console
 
     from semstab.api import run_study
-    from semstab.report.remedies import remedies
-    from semstab.report.terminal import ProgressBar, failure_lines, print_remedies, print_summary
+    from semstab.report.filter_study import filter_studies
+    from semstab.report.terminal import ProgressBar, failure_lines, print_filter_study, print_summary
 
     if report not in ("on", "off"):
         raise ConfigError(f"--report {report}: write on or off")
@@ -194,8 +194,8 @@ def execute(
         result = run_study(config, out, executor=executor, observers=observers, command=sys.argv, report=report == "on")
         for line in failure_lines(result):
             say(f"error: {line}")
-        if remedies(result) and not quiet:
-            print_remedies(result, Console())
+        if filter_studies(result) and not quiet:
+            print_filter_study(result, Console())
         elif result.select() and not quiet:
             print_summary(result, Console(), out=out, seconds=time.monotonic() - began, verbose=verbose)
         else:
@@ -248,7 +248,7 @@ def check(
     data: opt.DataFolder = None,
     dataset: opt.DatasetName = None,
     scene: opt.Scenes = None,
-    backbone: opt.Backbones = None,
+    model: opt.Models = None,
     voxel_size: opt.VoxelSize = None,
     frames: opt.Frames = None,
     settings: opt.DatasetSettings = None,
@@ -266,7 +266,7 @@ def check(
     from semstab.core.files import write_json
     from semstab.settings import load_config, resolve
 
-    named = {"scenes": scene, "backbones": backbone, "voxel_size": voxel_size}
+    named = {"scenes": scene, "models": model, "voxel_size": voxel_size}
     selected = resolve(load_config(config, chosen(named, settings, options, dataset, data, frames)))
     console, results = Console(quiet=quiet), []
     for checked in check_scenes(selected):
@@ -280,9 +280,9 @@ def check(
 
 
 def predict(
-    backbone: Annotated[str, typer.Option(
-        "--backbone", "-m", help="Model, as named by `list`; or FILE.py:NAME, package.module:NAME.",
-        autocompletion=opt.models,
+    model: Annotated[str, typer.Option(
+        "--model", "-m", help="Model, as named by `list`; or FILE.py:NAME, package.module:NAME.",
+        autocompletion=opt.predictors,
     )],
     images: Annotated[str | None, typer.Option(metavar="GLOB", help="Image files, quoted; or choose scenes.")] = None,
     data: opt.DataFolder = None,
@@ -292,7 +292,7 @@ def predict(
     out: Annotated[Path | None, typer.Option(
         "--out", "-o", help="Folder above labels/ and scores/.", show_default="the scene's own")] = None,
     name: Annotated[str | None, typer.Option(help="Name of the predictions.", show_default="the model's name")] = None,
-    model: Annotated[str | None, typer.Option(help="Folder that save_pretrained wrote, or a hub id.")] = None,
+    checkpoint: Annotated[str | None, typer.Option(help="Folder that save_pretrained wrote, or a hub id.")] = None,
     revision: Annotated[str | None, typer.Option(help="Branch, tag or commit on the hub.")] = None,
     device: Annotated[str | None, typer.Option(help="cpu, cuda, cuda:1, mps.", show_default="cpu")] = None,
     dtype: Annotated[str | None, typer.Option(help="float32, bfloat16 or float16.", show_default="float32")] = None,
@@ -325,8 +325,8 @@ def predict(
             raise ConfigError(f"--image-size {image_size}: write the shorter side, for example 512, or HEIGHTxWIDTH")
         size = int(sides[0]) if len(sides) == 1 else [int(side) for side in sides]
     named = {
-        "model": model, "revision": revision, "device": device, "dtype": dtype, "threads": threads, "classes": classes,
-        "image_size": size,
+        "checkpoint": checkpoint, "revision": revision, "device": device, "dtype": dtype, "threads": threads,
+        "classes": classes, "image_size": size,
     }  # fmt: skip
     content = chosen(named, settings, options, dataset, data, frames)
     indices, group = content.pop("frames", {}), content.pop("dataset", None)
@@ -334,7 +334,7 @@ def predict(
         raise ConfigError("--option says how a dataset is read; choose one with --data or --dataset")
     given = {"name": name, "taxonomy": taxonomy, "mapping": mapping, "scores": scores, "filters": filters}
     command.run(
-        predictor={"backbone": backbone, **{key: value for key, value in given.items() if value is not None}},
+        predictor={"model": model, **{key: value for key, value in given.items() if value is not None}},
         options=content,
         images=images,
         dataset=None if group is None else resolve(load_config(None, {"dataset": group})).dataset,
@@ -354,7 +354,7 @@ def convert(
     data: opt.DataFolder = None,
     dataset: opt.DatasetName = None,
     scene: opt.Scenes = None,
-    backbone: opt.Backbones = None,
+    model: opt.Models = None,
     frames: opt.Frames = None,
     settings: opt.DatasetSettings = None,
     options: opt.DatasetOptions = None,
@@ -368,7 +368,7 @@ def convert(
     from semstab.convert import convert, frame_bar, print_converted
     from semstab.settings import load_config, resolve
 
-    content = chosen({"scenes": scene, "backbones": backbone}, settings, options, dataset, data, frames)
+    content = chosen({"scenes": scene, "models": model}, settings, options, dataset, data, frames)
     selected, console = resolve(load_config(config, content)), Console(quiet=quiet, markup=False)
     with frame_bar(Console(stderr=True, quiet=quiet)) as bar:
         for converted in convert(selected, out, depth_error=depth_error, progress=bar):
@@ -382,7 +382,7 @@ class FigureFormat(StrEnum):
     svg = "svg"
 
 
-FORMER_TABLES = {"glance": "overview"}
+FORMER_TABLES = {"glance": "overview", "remedies": "filters"}
 """Names of tables in 0.3, and now: the old ones work for one version."""
 
 

@@ -20,7 +20,7 @@ from semstab.statistics.model_comparison import in_share, share_of
 def calibrate_run(run: str | Path, *, precision: float = 0.95, confidence: float = 0.95) -> AcceptanceThresholds:
     """Return thresholds from all scenes of a run with ground truth.
 
-    'FOLDER:BACKBONE' selects one of several label sources.
+    'FOLDER:MODEL' selects one of several label sources.
 
     Raises:
         ConfigError, DataError: As `open_run`, and for a scene whose ground truth was not fused.
@@ -39,7 +39,7 @@ def calibrate_run(run: str | Path, *, precision: float = 0.95, confidence: float
     for table, _ in maps[1:]:
         if (table.classes, table.voxel_size) != (first.classes, first.voxel_size):
             raise DataError(f"{own.source}: its scenes differ in classes or voxel size; calibrate on one at a time")
-    on = f"{own.backbone} on {', '.join(own.scenes)}"
+    on = f"{own.model} on {', '.join(own.scenes)}"
     on += f", 1 in {round(1 / sampled)} of the locations of a large map" if sampled < 1 else ""
     return calibrate(maps, precision=precision, confidence=confidence, on=on)
 

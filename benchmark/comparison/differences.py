@@ -290,7 +290,7 @@ def find(
     result = RunComparison(
         schema=SCHEMA,
         base=handles[0].name,
-        runs=tuple(Compared(each.name, each.source, each.backbone) for each in handles),
+        runs=tuple(Compared(each.name, each.source, each.model) for each in handles),
         overall=_over_all(scenes),
         scenes=tuple(scenes),
     )

@@ -52,7 +52,9 @@ from semstab.statistics.intervals import (
 # What a rule may be about: the numbers that follow from the sums of a run, and what to run for those it lacks.
 
 TRUTH = "run it with --statistics, on a scene with ground truth"
-LOOK_ACCURACY = Quantity(key="look_accuracy", title="Accuracy of looks", better="higher", needs="truth")
+OBSERVATION_ACCURACY = Quantity(
+    key="observation_accuracy", title="Accuracy of observations", better="higher", needs="truth"
+)
 
 
 @dataclass(frozen=True)
@@ -60,7 +62,7 @@ class GateMeasure:
     """A number that rules know.
 
     Attributes:
-        quantity: Its key among influence sums, its title, which way is good.
+        quantity: Its key among cluster sums, its title, which way is good.
         name: By which a rule calls it; `also` other names.
         of_all, of_class: Where it has a value: of all classes, of one.
         only_change: It has none by itself.
@@ -86,10 +88,10 @@ MEASURES = (
     GateMeasure(FLICKER, "flicker", lacking="run it again with two frames or more"),
     GateMeasure(COVERAGE, "coverage", only_change=True),
     GateMeasure(ACCURACY, "accuracy", lacking=TRUTH),
-    GateMeasure(LOOK_ACCURACY, "look accuracy", lacking=TRUTH),
+    GateMeasure(OBSERVATION_ACCURACY, "observation accuracy", ("look accuracy",), lacking=TRUTH),
     GateMeasure(MIOU, "miou", lacking=TRUTH),
     GateMeasure(ECE, "ece", lacking=TRUTH),
-    GateMeasure(MISLEADING, "wrong of stable", ("stable-and-wrong",), lacking=TRUTH),
+    GateMeasure(MISLEADING, "wrong of consistent", ("wrong of stable", "stable-and-wrong"), lacking=TRUTH),
     GateMeasure(RECALL, "recall", of_all=False, of_class=True, lacking=TRUTH),
     GateMeasure(PRECISION, "precision", of_all=False, of_class=True, lacking=TRUTH),
     GateMeasure(IOU, "iou", of_all=False, of_class=True, lacking=TRUTH),
@@ -432,7 +434,7 @@ class GateResult:
 
 
 def gate(new: str | os.PathLike[str], against: str | os.PathLike[str] | None, config: GateConfig) -> GateResult:
-    """Judge a run, or 'FOLDER:BACKBONE', by rules; those on a drop or a rise need a baseline, a run or a small summary.
+    """Judge a run, or 'FOLDER:MODEL', by rules; those on a drop or a rise need a baseline, a run or a small summary.
 
     Raises ConfigError and DataError, each with the rule or the folder, and what to do.
     """
@@ -454,7 +456,7 @@ def gate(new: str | os.PathLike[str], against: str | os.PathLike[str] | None, co
             _require_values(rule, pairs)
             judged.append(_judged(rule, pairs, config.level / len(rules), config.scope))
             notes += [*_counts(judged[-1], pairs), *(runs.common[1] if runs.on_common(rule) else ())]
-    judged_run, against_run = ("" if run is None else f"{run.backbone} ({run.source})" for run in (own, base))
+    judged_run, against_run = ("" if run is None else f"{run.model} ({run.source})" for run in (own, base))
     return GateResult(
         judged_run, against_run, scenes, config.level, config.undecided, tuple(judged), tuple(dict.fromkeys(notes))
     )
@@ -533,8 +535,8 @@ class _Runs:
             new, old = self.own.scenes[scene], base[scene]
             paired = on_common_observations({"the baseline": old, "the run": new})
             if paired is not None:
-                (old, new), compared, remarks = paired
-                notes += [f"{scene}: {text}" for text in (*left_out(compared), *remarks)]
+                (old, new), compared, of_pairing = paired
+                notes += [f"{scene}: {text}" for text in (*left_out(compared), *of_pairing)]
             pairs[scene] = new, old
         return pairs, tuple(notes)
 

@@ -14,7 +14,7 @@ from semstab.core.files import write_text
 from semstab.core.json_form import to_json
 from semstab.errors import ConfigError
 
-SCHEMA = 1
+SCHEMA = 2
 INDENT = 10
 MOST_NAMED = 4
 """Rules that the headline names, of each verdict."""

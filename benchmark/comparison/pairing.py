@@ -299,7 +299,7 @@ def _no_voxels(entries: Sequence[Entry]) -> str:
 
 def _notes(covered: Sequence[MapCoverage]) -> list[str]:
     return [
-        f"only {row.common_share:.1%} of the voxels of {row.backbone} are in all maps: are the frames of reference the"
+        f"only {row.common_share:.1%} of the voxels of {row.model} are in all maps: are the frames of reference the"
         " same?"
         for row in covered
         if row.common_share < FEW

@@ -122,34 +122,34 @@ class RunHandle:
     """A label source with all scenes that it was fused in.
 
     Attributes:
-        name: Distinct among the runs that are compared: its backbone, its folder, or both.
+        name: Distinct among the runs that are compared: its model, its folder, or both.
         source: The folder, or the file of a small summary.
     """
 
     name: str
     source: Path
-    backbone: str
+    model: str
     scenes: Mapping[str, Entry]
 
 
 def open_runs(named: Sequence[str | os.PathLike[str]]) -> tuple[RunHandle, ...]:
-    """Open folders of runs or studies, 'FOLDER:BACKBONE', and small summaries, under the shortest distinct names.
+    """Open folders of runs or studies, 'FOLDER:MODEL', and small summaries, under the shortest distinct names.
 
     Raises:
         ConfigError, DataError: As `open_run` does.
     """
     runs = [open_run(each) for each in named]
-    folders, backbones = [run.source.resolve().name for run in runs], [run.backbone for run in runs]
-    both = [f"{folder}:{backbone}" for folder, backbone in zip(folders, backbones, strict=True)]
-    names = [f"{run.source}:{run.backbone}" for run in runs]
-    names = next((short for short in (backbones, folders, both) if len({*short}) == len({*names})), names)
+    folders, models = [run.source.resolve().name for run in runs], [run.model for run in runs]
+    both = [f"{folder}:{model}" for folder, model in zip(folders, models, strict=True)]
+    names = [f"{run.source}:{run.model}" for run in runs]
+    names = next((short for short in (models, folders, both) if len({*short}) == len({*names})), names)
     times = [names[: i + 1].count(name) for i, name in enumerate(names)]
     names = [name if nth == 1 else f"{name} ({nth})" for name, nth in zip(names, times, strict=True)]
     return tuple(replace(run, name=name) for run, name in zip(runs, names, strict=True))
 
 
 def open_run(named: str | os.PathLike[str]) -> RunHandle:
-    """Open a run's only label source, or the one that 'FOLDER:BACKBONE' selects, at the base settings and backend.
+    """Open a run's only label source, or the one that 'FOLDER:MODEL' selects, at the base settings and backend.
 
     Raises:
         ConfigError: If there is no such folder or label source, or several.
@@ -161,23 +161,23 @@ def open_run(named: str | os.PathLike[str]) -> RunHandle:
         start, wanted = text, ""
     path = Path(start)
     if not path.exists():
-        raise ConfigError(f"{path}: there is no such folder; give the folder of a run, or FOLDER:BACKBONE")
+        raise ConfigError(f"{path}: there is no such folder; give the folder of a run, or FOLDER:MODEL")
     if path.is_file():
-        backbone, scenes = load_summary(path)
-        _chosen(path, [backbone], wanted)
-        return RunHandle(backbone, path, backbone, scenes)
+        model, scenes = load_summary(path)
+        _chosen(path, [model], wanted)
+        return RunHandle(model, path, model, scenes)
     result = load_result(path)
-    backbone = _chosen(path, result.backbones, wanted)
+    model = _chosen(path, result.models, wanted)
     seed = result.manifest.get("seed")
     scenes = {
         scene: Entry(
             summary=record.summary, image_space=record.image_space, georeference=result.georeference.get(scene),
             up=result.up.get(scene), seed=seed if isinstance(seed, int) else None, where=path, record=record,
         )
-        for record in result.select(backbone=backbone)
+        for record in result.select(model=model)
         for scene in [record.unit.scene]
     }  # fmt: skip
-    return RunHandle(backbone, path, backbone, scenes)
+    return RunHandle(model, path, model, scenes)
 
 
 def shared_scenes(runs: Sequence[RunHandle]) -> tuple[str, ...]:
@@ -220,7 +220,7 @@ def _require_same_scene(scene: str, one: Entry, other: Entry) -> None:
 def _chosen(path: Path, there: Sequence[str], wanted: str) -> str:
     if wanted:
         if wanted not in there:
-            raise ConfigError(f"{path}: no backbone '{wanted}'; {nearest(wanted, there)}")
+            raise ConfigError(f"{path}: no model '{wanted}'; {nearest(wanted, there)}")
         return wanted
     own = [name for name in there if name != GROUND_TRUTH] or list(there)
     if not own:
@@ -252,7 +252,7 @@ def _valid(frames: Iterable[int], percents: Iterable[float]) -> bool:
 
 # --- Small summaries --------------------------------------------------------------------------------------------------
 
-SCHEMA, KIND = 2, "semstab small summary"
+SCHEMA, KIND = 3, "semstab small summary"
 CONTENT = "summary.json"
 LARGEST = 100_000_000
 """Bytes of a file that is opened, and of its content unpacked."""
@@ -274,7 +274,7 @@ class _Scene(EntryNumbers):
 
 @dataclass(frozen=True)
 class _Content:
-    backbone: str
+    model: str
     scenes: tuple[_Scene, ...] = field(default=())
 
 
@@ -290,7 +290,7 @@ def save_summary(run: RunHandle, path: str | Path, most: int = 1_000_000) -> Non
         _Scene(**_numbers(own), name=name, frames=(*own.flicker,), flicker=(*own.flicker.values(),))
         for name, own in run.scenes.items()
     )
-    content = json.dumps({"kind": KIND, "schema": SCHEMA, **to_json(_Content(run.backbone, scenes))})
+    content = json.dumps({"kind": KIND, "schema": SCHEMA, **to_json(_Content(run.model, scenes))})
     sums = [own.sums for own in run.scenes.values()]
     while len(data := _archive(content, sums)) > most:
         coarser = [_coarser(own) for own in sums]
@@ -302,7 +302,7 @@ def save_summary(run: RunHandle, path: str | Path, most: int = 1_000_000) -> Non
 
 
 def load_summary(path: str | Path) -> tuple[str, dict[str, Entry]]:
-    """Return the backbone and the scenes that `save_summary` wrote.
+    """Return the model and the scenes that `save_summary` wrote.
 
     Raises:
         DataError: For anything else.
@@ -313,7 +313,7 @@ def load_summary(path: str | Path) -> tuple[str, dict[str, Entry]]:
             if sum(member.file_size for member in archive.infolist()) > LARGEST:
                 raise DataError(f"{path}: unpacks to more than {LARGEST // 10**6} MB; write the summary again")
             text = parse_json(archive.read(CONTENT))
-            if isinstance(text, dict) and text.get("schema") == SCHEMA - 1:
+            if isinstance(text, dict) and text.get("schema") == earlier.SMALL:
                 text = earlier.translated(text, path) | {"schema": SCHEMA}
             if not isinstance(text, dict) or (text.get("kind"), text.get("schema")) != (KIND, SCHEMA):
                 raise DataError("of another kind or version")
@@ -334,7 +334,7 @@ def load_summary(path: str | Path) -> tuple[str, dict[str, Entry]]:
                 raise DataError(f"{path}: the sums of {own.name} are damaged; write the summary again") from error
             flicker = dict(zip(own.frames, own.flicker, strict=True))
             scenes[own.name] = Entry(**_numbers(own), where=path, small=(sums, flicker))
-    return content.backbone, scenes
+    return content.model, scenes
 
 
 def _numbers(own: EntryNumbers) -> dict[str, Any]:

@@ -27,7 +27,7 @@ SBD_EXCESS = Quantity(key="sbd_excess", title="SBD excess", unit="bits", better=
 FLICKER = Quantity(key="compensated_flicker_percent", title="Flicker", unit="%", better="lower", digits=(2, 2))
 COVERAGE = Quantity(key="coverage", title="Coverage", better="higher")
 MISLEADING = Quantity(
-    key="wrong_of_stable", title="Stable and wrong", short="stable, wrong", better="lower", needs="truth"
+    key="wrong_of_consistent", title="Consistent but wrong", short="consistent, wrong", better="lower", needs="truth"
 )
 RECALL = Quantity(key="accuracy", title="Recall", better="higher", needs="truth")
 PRECISION = Quantity(key="precision", title="Precision", better="higher", needs="truth")
@@ -246,7 +246,7 @@ BASES: dict[Basis, str] = {
 
 def sentences(comparison: RunComparison) -> list[str]:
     """Return one run after the other, then what could not be compared."""
-    return [*answers(comparison), *remarks(comparison)]
+    return [*answers(comparison), *notes(comparison)]
 
 
 def answers(comparison: RunComparison) -> list[str]:
@@ -254,7 +254,7 @@ def answers(comparison: RunComparison) -> list[str]:
     return [sentence for own in comparison.overall for sentence in _of_run(comparison, own)]
 
 
-def remarks(comparison: RunComparison) -> list[str]:
+def notes(comparison: RunComparison) -> list[str]:
     """Return what was paired, and what could not be compared, scene by scene."""
     lines = []
     for scene in comparison.scenes:
@@ -271,7 +271,7 @@ def left_out(observations: ComparedObservations) -> Iterator[str]:
     for row in observations.ignored:
         if row.missing >= LEAST_LEFT_OUT:
             counted = f"alpha is {row.alpha:.3f} if what it leaves out agrees as by chance"
-            yield f"{row.backbone} leaves {row.missing:.1%} of the pixels without a label that others label; {counted}"
+            yield f"{row.model} leaves {row.missing:.1%} of the pixels without a label that others label; {counted}"
     if observations.depends and any(row.missing >= LEAST_LEFT_OUT for row in observations.ignored):
         yield "the order of the runs depends on what was left out"
 
@@ -362,7 +362,7 @@ def print_comparison(comparison: RunComparison, console: Console, *, verbose: bo
         if table.name == "comparison" or (verbose and table.name in SHOWN):
             text = to_terminal(dataclasses.replace(table.only(*SHOWN[table.name]), caption=""), WIDTH)
             console.print(f"\n{text}", highlight=False, markup=False, soft_wrap=True)
-    for sentence in remarks(comparison):
+    for sentence in notes(comparison):
         wrapped = textwrap.wrap(f"  {sentence}", console.width, subsequent_indent="    ")
         console.print("\n".join(wrapped), highlight=False, markup=False)
     if not verbose:

@@ -117,7 +117,7 @@ def compare(
     """Compare runs with the first of them, by scene and over all scenes: how much, how surely, where.
 
     Args:
-        runs: Folders of runs or studies, 'FOLDER:BACKBONE' where there are several label sources, or small summaries.
+        runs: Folders of runs or studies, 'FOLDER:MODEL' where there are several label sources, or small summaries.
         scope: 'this scene' flown again, 'these frames' or 'other scenes': what intervals and p-values are for.
         out: A folder for tables, figures, report.html, comparison.json and .md, columns of voxels, and a recording.
         progress: Function that is told the scene that is compared.

@@ -80,7 +80,7 @@ class Exclusion(Settings):
 
     classes: tuple[str, ...] = Field((), description="locations whose fused class is one of these, in the taxonomy")
     predicted_classes: tuple[str, ...] = Field(
-        (), description="pixels predicted as one of these moving things, by a name of the backbone's or of the taxonomy"
+        (), description="pixels predicted as one of these moving things, by a name of the model's or of the taxonomy"
     )
     masks: bool = Field(True, description="pixels under the masks of the dataset, where it has some")
 
@@ -95,13 +95,13 @@ class VerdictSettings(Settings):
 
 
 class Config(Settings):
-    """Settings that determine the numbers of a run or a study: scenes x backbones x backends x variations."""
+    """Settings that determine the numbers of a run or a study: scenes x models x backends x variations."""
 
     name: str = Field("run", min_length=1, description="the title of the report; a study's is its file's by default")
     description: str = Field("", description="one line")
     dataset: DatasetConfig = DatasetConfig()
     scenes: list[str] | None = Field(None, description="scenes of the dataset; all of them where not given")
-    backbones: list[str] | None = Field(None, description="label sources; all but the ground truth where not given")
+    models: list[str] | None = Field(None, description="label sources; all but the ground truth where not given")
     region_maps: list[str] = Field([], description="label sources whose ids mean nothing across frames (raw SAM)")
     backends: list[BackendConfig] = Field(
         [BackendConfig(name="numba")], min_length=1, description="the first fuses every unit, others the base units"
@@ -111,7 +111,7 @@ class Config(Settings):
     )
     tolerance: float = Field(1e-9, ge=0, description="largest difference at which two backends agree")
     taxonomy: str | None = Field(None, description="label space to fuse in; the dataset's own where not given")
-    shared_taxonomy: str | None = Field(None, description="label space in which backbones are compared; null: none")
+    shared_taxonomy: str | None = Field(None, description="label space in which models are compared; null: none")
     voxel_size: float = Field(
         0.2, ge=1e-9, le=1e9, description="edge, metres; where not given, the suggestion of `check` for data of files"
     )
@@ -157,7 +157,7 @@ class Config(Settings):
     def _a_name_is_a_dataset(cls, value: Any) -> Any:
         return {"name": value} if isinstance(value, str) else value
 
-    @field_validator("scenes", "backbones", mode="before")
+    @field_validator("scenes", "models", mode="before")
     @classmethod
     def _one_is_a_list(cls, value: Any) -> Any:
         return [value] if isinstance(value, str) else value
@@ -174,8 +174,8 @@ class Config(Settings):
     def _one_fuses_everything(cls, value: list[BackendConfig]) -> list[BackendConfig]:
         if len({backend.name for backend in value}) < len(value):
             raise ValueError("each backend can be named once")
-        if value[0].scenes is not None or value[0].backbones is not None:
-            raise ValueError("the first backend fuses every unit; leave out its scenes and backbones")
+        if value[0].scenes is not None or value[0].models is not None:
+            raise ValueError("the first backend fuses every unit; leave out its scenes and models")
         return value
 
     @field_validator("perturbation")
@@ -189,8 +189,8 @@ class Config(Settings):
     @field_validator("region_maps")
     @classmethod
     def _regions_are_not_fused(cls, value: list[str], info: ValidationInfo) -> list[str]:
-        if both := [name for name in value if name in (info.data.get("backbones") or ())]:
-            raise ValueError(f"'{both[0]}' is named among the backbones too; use one of the two")
+        if both := [name for name in value if name in (info.data.get("models") or ())]:
+            raise ValueError(f"'{both[0]}' is named among the models too; use one of the two")
         return value
 
     @field_validator("tile_size", mode="wrap")

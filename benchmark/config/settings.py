@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import logging
 import math
 import operator
 import re
@@ -17,14 +18,37 @@ from semstab.core.files import MAX_YAML_BYTES, parse_yaml, read_limited
 from semstab.core.types import THIS_SCENE, Scope
 from semstab.errors import ConfigError, nearest, summarize_error
 
+logger = logging.getLogger("semstab")
+
 Model = TypeVar("Model", bound=BaseModel)
 V = TypeVar("V")
+
+
+EARLIER: Mapping[str, str] = {
+    "backbones": "models",
+    "backbone": "model",
+    "model": "checkpoint",
+    "remedies": "try_filters",
+}
+"""Settings of version 0.3, and what they are called now: the old names work for one version."""
 
 
 class Settings(BaseModel):
     """A group of settings: frozen, and closed to unknown keys."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
+
+    @model_validator(mode="before")
+    @classmethod
+    def _under_names_of_today(cls, content: Any) -> Any:
+        if not isinstance(content, dict):
+            return content
+        named = dict(content)
+        for earlier, today in EARLIER.items():
+            if earlier in named and earlier not in cls.model_fields and today in {*cls.model_fields} - {*named}:
+                logger.warning("setting '%s' is now called '%s'; the next version will not know it", earlier, today)
+                named[today] = named.pop(earlier)
+        return named
 
 
 def read_yaml(path: str | Path) -> dict[str, Any]:
@@ -105,10 +129,10 @@ Deviation = Annotated[float, Field(ge=0, le=1e9)]
 
 
 class Part(Settings):
-    """One of the things that are varied, on all scenes and backbones of the configuration or on some."""
+    """One of the things that are varied, on all scenes and models of the configuration or on some."""
 
     scenes: list[str] | None = Field(None, min_length=1, description="some of the scenes; all where not given")
-    backbones: list[str] | None = Field(None, min_length=1, description="some of the backbones; all where not given")
+    models: list[str] | None = Field(None, min_length=1, description="some of the models; all where not given")
 
 
 class Values(Part, Generic[V]):

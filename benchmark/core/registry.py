@@ -1,7 +1,7 @@
 """Names on the command line: a table from name to class, imported on first use.
 
 Built-in entries are one line each; other packages add theirs with the entry point groups
-`semstab.backends`, `semstab.datasets`, `semstab.backbones` and `semstab.filters`.
+`semstab.backends`, `semstab.datasets`, `semstab.models` and `semstab.filters`.
 """
 
 from __future__ import annotations
@@ -14,6 +14,9 @@ from importlib.metadata import entry_points
 from typing import Any
 
 from semstab.errors import ConfigError, MissingDependencyError, nearest, summarize_error
+
+EARLIER: Mapping[str, str] = {"model": "backbone"}
+"""Kinds, and what they were called in version 0.3: entry points of the old group work for one version."""
 
 
 @dataclass(frozen=True)
@@ -38,7 +41,9 @@ class Registry:
 
     @functools.cached_property
     def _plugins(self) -> dict[str, Entry]:
-        points = entry_points(group=f"semstab.{self.kind}s")  # read once: it looks through all that is installed
+        kinds = [kind for kind in (EARLIER.get(self.kind), self.kind) if kind]
+        # read once: it looks through all that is installed
+        points = [point for kind in kinds for point in entry_points(group=f"semstab.{kind}s")]
         return {
             point.name: Entry(point.value, f"from the package {point.dist.name if point.dist else point.module}")
             for point in points

@@ -1,4 +1,4 @@
-"""The comparison that `semstab.statistics` makes of several backbones' maps of one scene; in JSON as the fields say."""
+"""The comparison that `semstab.statistics` makes of several models' maps of one scene; in JSON as the fields say."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ from typing import Literal
 from semstab.data.measures import Quantity
 from semstab.data.statistics import UNDEFINED, Estimate, Interval
 
-ByBackbone = Mapping[str, Estimate]
+ByModel = Mapping[str, Estimate]
 
 
 @dataclass(frozen=True)
 class MapCoverage:
-    """The coverage of a backbone's map: `repeated` is OP >= 2, `recurrent` OP >= 3, `alone` voxels in no other map."""
+    """The coverage of a model's map: `repeated` is OP >= 2, `recurrent` OP >= 3, `alone` voxels in no other map."""
 
-    backbone: str
+    model: str
     voxels: int
     observations: int
     mean_op: float
@@ -29,7 +29,7 @@ class MapCoverage:
 
 @dataclass(frozen=True)
 class Standardised:
-    """Means at a common distribution of OP, by the key of what is compared and backbone.
+    """Means at a common distribution of OP, by the key of what is compared and model.
 
     Attributes:
         edges: Upper edges of the strata of OP.
@@ -40,16 +40,16 @@ class Standardised:
     edges: tuple[int, ...]
     weights: tuple[float, ...]
     thin: float
-    values: Mapping[str, ByBackbone]
+    values: Mapping[str, ByModel]
 
-    def of(self, quantity: Quantity, backbone: str) -> Estimate:
-        """Return a backbone's mean; undefined for what is no mean over voxels."""
-        return self.values.get(quantity.key, {}).get(backbone, UNDEFINED)
+    def of(self, quantity: Quantity, model: str) -> Estimate:
+        """Return a model's mean; undefined for what is no mean over voxels."""
+        return self.values.get(quantity.key, {}).get(model, UNDEFINED)
 
 
 @dataclass(frozen=True)
 class PairedDifference:
-    """A measure of backbone a minus that of b on the voxels that all saw twice or more.
+    """A measure of model a minus that of b on the voxels that all saw twice or more.
 
     Attributes:
         p_value: P-value of no difference in the primary measure; p_holm corrects it for all pairs, and all scenes of a
@@ -71,12 +71,12 @@ class PairedDifference:
 
 @dataclass(frozen=True)
 class Rank:
-    """A backbone's rank, 1 being the best, with the range that holds 95 % of the resamples.
+    """A model's rank, 1 being the best, with the range that holds 95 % of the resamples.
 
     best is the share of the resamples in which it is first.
     """
 
-    backbone: str
+    model: str
     value: float
     rank: int
     low: int
@@ -86,7 +86,7 @@ class Rank:
 
 @dataclass(frozen=True)
 class Ranking:
-    """The backbones by one measure on common voxels, the best first."""
+    """The models by one measure on common voxels, the best first."""
 
     measure: str
     ranks: tuple[Rank, ...]
@@ -94,34 +94,34 @@ class Ranking:
 
 @dataclass(frozen=True)
 class Paired:
-    """Backbones on the voxels that every one of them observed at least twice.
+    """Models on the voxels that every one of them observed at least twice.
 
     Attributes:
         primary: The key of what is tested.
-        values: Values that are `compared`, by its key and backbone.
+        values: Values that are `compared`, by its key and model.
     """
 
     primary: str
     voxels: int
     blocks: int
-    values: Mapping[str, ByBackbone]
+    values: Mapping[str, ByModel]
     differences: tuple[PairedDifference, ...]
     rankings: tuple[Ranking, ...]
 
     def __post_init__(self) -> None:
         for ranking in self.rankings:
             for rank in ranking.ranks:
-                if rank.backbone not in self.values.get(ranking.measure, {}):
-                    raise ValueError(f"ranks {rank.backbone} by {ranking.measure} without a value")
+                if rank.model not in self.values.get(ranking.measure, {}):
+                    raise ValueError(f"ranks {rank.model} by {ranking.measure} without a value")
 
-    def of(self, quantity: Quantity) -> ByBackbone:
-        """Return the values of what is compared, by backbone."""
+    def of(self, quantity: Quantity) -> ByModel:
+        """Return the values of what is compared, by model."""
         return self.values[quantity.key]
 
 
 @dataclass(frozen=True)
 class Ignored:
-    """The observations that a backbone left out of those that any backbone labelled, and what that may be worth.
+    """The observations that a model left out of those that any model labelled, and what that may be worth.
 
     Attributes:
         missing: Share of their pixels.
@@ -131,7 +131,7 @@ class Ignored:
             of pairs of views of which it labelled both.
     """
 
-    backbone: str
+    model: str
     missing: float
     psa_low: float
     psa_high: float
@@ -140,13 +140,13 @@ class Ignored:
 
 @dataclass(frozen=True)
 class ComparedObservations:
-    """The compared observations: the cells that all backbones labelled in a view, each with the same weight.
+    """The compared observations: the cells that all models labelled in a view, each with the same weight.
 
     Attributes:
         cells, observations: Sampled ones that they are of.
-        order: Order of the backbones by alpha on these observations, the best first.
+        order: Order of the models by alpha on these observations, the best first.
         order_ignored: The same by that convention.
-        bounded: Whether the bounds of the agreement keep the order of the backbones, whatever was left out.
+        bounded: Whether the bounds of the agreement keep the order of the models, whatever was left out.
     """
 
     cells: int
@@ -163,13 +163,13 @@ class ComparedObservations:
 
 
 @dataclass(frozen=True)
-class BackboneComparison:
-    """Several backbones' maps of one scene beside each other."""
+class ModelComparison:
+    """Several models' maps of one scene beside each other."""
 
     scene: str
     schema: int
     seed: int
-    backbones: tuple[str, ...]
+    models: tuple[str, ...]
     coverage: tuple[MapCoverage, ...]
     standardised: Standardised
     paired: Paired
@@ -291,7 +291,7 @@ class Compared:
 
     name: str
     source: Path
-    backbone: str
+    model: str
 
 
 @dataclass(frozen=True)

@@ -9,11 +9,14 @@ from typing import Any
 
 logger = logging.getLogger("semstab")
 
-SCHEMA = 2
-"""The schema that is translated."""
+SCHEMA, SMALL = 2, 1
+"""The schemas of a run's summary and of a small summary that are translated."""
 
 KEYS: Mapping[str, str] = {
-    "judged": "headline", "question": "scope", "foresight": "next_frame", "foresight_by_frame": "next_frame_by_frame",
+    "backbone": "model", "backbones": "models", "judged": "headline", "question": "scope", "foresight": "next_frame",
+    "foresight_by_frame": "next_frame_by_frame", "wrong_of_stable": "wrong_of_consistent",
+    "stable_right": "consistent_right", "stable_wrong": "consistent_wrong", "unstable_right": "inconsistent_right",
+    "unstable_wrong": "inconsistent_wrong",
 }  # fmt: skip
 """Keys of schema 2, and what they are called now."""
 

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 from semstab.config import BACKENDS, BASE, nearest
 from semstab.core.json_form import INLINE
 from semstab.data import voxels
-from semstab.data.contrast import BackboneComparison
+from semstab.data.contrast import ModelComparison
 from semstab.data.display import as_figure
 from semstab.data.georeference import Georeference
 from semstab.data.measures import measures
@@ -26,9 +26,9 @@ if TYPE_CHECKING:
 
 UNITS, VOXELS, TRUTH, EVENTS, FRAMES, OVERVIEW = "units", "voxels", "truth", "events", "frames", "overview"
 OBSERVATIONS, SUMS = "observations", "sums"
-"""Folders of what is kept of units: what their numbers are; the voxel tables SCENE__BACKBONE__BACKEND.parquet; those of
+"""Folders of what is kept of units: what their numbers are; the voxel tables SCENE__MODEL__BACKEND.parquet; those of
 the ground truth of the same frames; logs of observations; time series; and the frames that figures show,
-SCENE__BACKBONE.npz with the arrays frame (its index), labels (H, W) rows 0..K-1 or the ignore id, palette (K, 3) and,
+SCENE__MODEL.npz with the arrays frame (its index), labels (H, W) rows 0..K-1 or the ignore id, palette (K, 3) and,
 where the dataset has it, color (H, W, 3). Beside them sums by frame and cube of space, `ClusterSums`."""
 
 SUMS_BEFORE = "influence"
@@ -95,7 +95,7 @@ class FrameQuality:
         next_frame: Share of the pixels seen again by the next frame whose label the model gives that place then. No
             filter saw that frame: what it only repeats does not count for it.
         accuracy: Share of the labelled pixels that are right; miou the mean over classes of intersection over union.
-        stable_wrong: Share of the pixels seen again that keep a label that is wrong.
+        consistent_wrong: Share of the pixels seen again that keep a label that is wrong.
         lag: Frames by which labels follow a true change later than the model, see `semstab.metrics.frame_quality`;
             changes: the pixels that it was counted on.
         milliseconds: CPU time that the filters took for a frame, in the median.
@@ -108,7 +108,7 @@ class FrameQuality:
     next_frame: float = math.nan
     accuracy: float = math.nan
     miou: float = math.nan
-    stable_wrong: float = math.nan
+    consistent_wrong: float = math.nan
     lag: float = math.nan
     changes: int = 0
     milliseconds: float = 0.0
@@ -122,7 +122,7 @@ class Record:
 
     Attributes:
         key: Hash of its inputs and settings, under which it is kept.
-        summary: Its report: unit (scene, backbone, backend), means, strata, classes, times, and what
+        summary: Its report: unit (scene, model, backend), means, strata, classes, times, and what
             `semstab.statistics` says of the map.
         image_space: Image-space measures of the 'base' units; all NaN elsewhere.
         quality: Quality of the labels of single frames, where `frame_quality` asked for it.
@@ -146,7 +146,7 @@ class Record:
 
     @property
     def unit(self) -> Unit:
-        """Its scene, backbone and backend."""
+        """Its scene, model and backend."""
         return self.summary.unit
 
     def table(self) -> VoxelTable:
@@ -217,7 +217,7 @@ class RegionFlicker:
     """
 
     scene: str
-    backbone: str
+    model: str
     flicker_percent: float
     compensated_flicker_percent: float
     compensated_share: float
@@ -263,13 +263,13 @@ class Result:
     Attributes:
         backend: The base backend: that of every unit but those of the 'backends' variation.
         records: Records in the order of the plan.
-        agreement: Agreement of each pair of backends that must agree, on each scene and backbone that both fused.
+        agreement: Agreement of each pair of backends that must agree, on each scene and model that both fused.
         up: (x, y, z) unit vector of the world's up axis by scene, where it is known or could be estimated.
         georeference: Place on Earth by scene, where that is known.
         regions: Flicker of the label sources that are regions without classes.
         compared: The same of each other backend and the base one, which need not agree.
         advice: Advice on the voxel size, scene by scene, for data of files.
-        comparisons: The backbones, with `statistics`, of each scene beside each other, as `compare_backbones` says it.
+        comparisons: The models, with `statistics`, of each scene beside each other, as `compare_models` says it.
     """
 
     name: str
@@ -281,35 +281,35 @@ class Result:
     georeference: Mapping[str, Georeference] = field(default_factory=dict)
     manifest: Mapping[str, Any] = field(default_factory=dict)
     regions: tuple[RegionFlicker, ...] = ()
-    comparisons: tuple[BackboneComparison, ...] = ()
+    comparisons: tuple[ModelComparison, ...] = ()
     compared: tuple[Agreement, ...] = ()
     advice: Mapping[str, VoxelAdvice] = field(default_factory=dict)
 
     def __repr__(self) -> str:
-        models, units = ", ".join(self.backbones), len(self.records)
+        models, units = ", ".join(self.models), len(self.records)
         return f"<Result '{self.name}': {models} on {', '.join(self.scenes)}; {units} units, {self.backend}>"
 
     def select(
-        self, sweep: str = BASE, *, scene: str | None = None, backbone: str | None = None, value: float | None = None
+        self, sweep: str = BASE, *, scene: str | None = None, model: str | None = None, value: float | None = None
     ) -> tuple[Record, ...]:
-        """Return the records of a sweep, of one scene, one backbone, one value where given."""
+        """Return the records of a sweep, of one scene, one model, one value where given."""
         return tuple(
             record
             for record in self.records
             if record.variation.sweep == sweep
             and scene in (None, record.unit.scene)
-            and backbone in (None, record.unit.backbone)
+            and model in (None, record.unit.model)
             and value in (None, record.variation.value)
         )
 
-    def record(self, *, scene: str | None = None, backbone: str | None = None, backend: str | None = None) -> Record:
-        """Return the record at the base settings of that scene, backbone and backend, the base backend if not given.
+    def record(self, *, scene: str | None = None, model: str | None = None, backend: str | None = None) -> Record:
+        """Return the record at the base settings of that scene, model and backend, the base backend if not given.
 
         Raises:
             ConfigError: If there is none, or several, with what there is.
         """
         kept = (*self.select(), *self.select(BACKENDS))
-        asked = {"scene": scene, "backbone": backbone, "backend": backend or self.backend}
+        asked = {"scene": scene, "model": model, "backend": backend or self.backend}
         for what, name in asked.items():
             there = list(dict.fromkeys(getattr(record.unit, what) for record in kept))
             if name is not None and name not in there:
@@ -319,9 +319,9 @@ class Result:
         ]
         if len(found) == 1:
             return found[0]
-        units = ", ".join(f"{record.unit.scene} of {record.unit.backbone}" for record in found[:4])
+        units = ", ".join(f"{record.unit.scene} of {record.unit.model}" for record in found[:4])
         raise ConfigError(
-            f"{self.name}: {len(found)} units fit" + (f" ({units}); choose with scene and backbone" if found else "")
+            f"{self.name}: {len(found)} units fit" + (f" ({units}); choose with scene and model" if found else "")
         )
 
     @property
@@ -330,9 +330,9 @@ class Result:
         return _distinct([record.unit.scene for record in self.select()])
 
     @property
-    def backbones(self) -> tuple[str, ...]:
-        """Names of the backbones of the base units, in order."""
-        return _distinct([record.unit.backbone for record in self.select()])
+    def models(self) -> tuple[str, ...]:
+        """Names of the models of the base units, in order."""
+        return _distinct([record.unit.model for record in self.select()])
 
     def sweeps(self) -> dict[str, tuple[float, ...]]:
         """Return the swept values, ascending, of each sweep that has values."""
@@ -344,10 +344,10 @@ class Result:
 
     @property
     def runs(self) -> tuple[UnitSummary, ...]:
-        """The summaries of the units at the base settings by every backend, a scene and backbone after the other."""
+        """The summaries of the units at the base settings by every backend, a scene and model after the other."""
         units = (*self.select(), *self.select(BACKENDS))
-        groups = dict.fromkeys((record.unit.scene, record.unit.backbone) for record in units)
-        return tuple(r.summary for group in groups for r in units if (r.unit.scene, r.unit.backbone) == group)
+        groups = dict.fromkeys((record.unit.scene, record.unit.model) for record in units)
+        return tuple(r.summary for group in groups for r in units if (r.unit.scene, r.unit.model) == group)
 
     def to_arrow(self) -> pa.Table:
         """Return one row a unit: what it is, how much there is, the mean of every measure, of recurrent voxels too."""
@@ -373,13 +373,13 @@ class Result:
             means = (voxels.number(table[measure], measure.digits[0]) for measure in measures())
             seen = voxels.number(table.mean_op, 2), *means, voxels.number(100 * table.recurrent.share, 2)
             verdict = "" if run.statistics is None else run.statistics.verdict.level
-            rows.append([unit.scene, unit.backbone, unit.backend, table.voxels, *seen, verdict])
+            rows.append([unit.scene, unit.model, unit.backend, table.voxels, *seen, verdict])
         titles = [measure.title for measure in measures()]
-        headers = ["scene", "backbone", "backend", "voxels", "mean OP", *titles, "OP>=3 %", "verdict"]
+        headers = ["scene", "model", "backend", "voxels", "mean OP", *titles, "OP>=3 %", "verdict"]
         base = [record for record in self.select() if record.unit.backend == self.backend]
         there = [record for record in base if record.voxels_file is not None and record.voxels_file.is_file()][:MAPS]
         maps = [
-            as_figure(own.table().image(self.up.get(own.unit.scene)), f"{own.unit.scene}, {own.unit.backbone}")
+            as_figure(own.table().image(self.up.get(own.unit.scene)), f"{own.unit.scene}, {own.unit.model}")
             for own in there
         ]
         legend = f"<div>{voxels.CAPTION}</div>" if maps else ""

@@ -13,7 +13,7 @@ from semstab.data.frames import LeftOut
 from semstab.data.measures import Measure, MeasureMeans
 from semstab.data.statistics import MapStatistics
 
-SCHEMA = 3
+SCHEMA = 4
 """Version of summary.json."""
 
 STAGES = ("decode", "wait", "flicker", "association", "update", "logging")
@@ -29,16 +29,16 @@ RECURRENT = 3
 
 @dataclass(frozen=True)
 class Unit:
-    """One cell of a run: a backbone's labels on a scene, fused by a backend."""
+    """One cell of a run: a model's labels on a scene, fused by a backend."""
 
     scene: str
-    backbone: str
+    model: str
     backend: str
 
     @property
     def slug(self) -> str:
-        """SCENE__BACKBONE__BACKEND, usable as a file name."""
-        return slug(self.scene, self.backbone, self.backend)
+        """SCENE__MODEL__BACKEND, usable as a file name."""
+        return slug(self.scene, self.model, self.backend)
 
 
 def slug(*names: str) -> str:
@@ -184,7 +184,7 @@ class UnitSummary:
         """Return a row: what it is, how much there is, the mean of every measure, also of recurrent voxels alone."""
         table, unit = self.table, self.unit
         return {
-            "scene": unit.scene, "backbone": unit.backbone, "backend": unit.backend, "taxonomy": self.taxonomy,
+            "scene": unit.scene, "model": unit.model, "backend": unit.backend, "taxonomy": self.taxonomy,
             "K": table.K, "voxel_size": table.voxel_size, "frames": self.frames, "points": table.points,
             "observations": table.observations, "voxels": table.voxels, "mean_op": table.mean_op,
             **table.means.value, "recurrent_share": table.recurrent.share,
@@ -262,7 +262,7 @@ class Agreement:
     """
 
     scene: str
-    backbone: str
+    model: str
     backends: tuple[str, str]
     voxels: tuple[int, int]
     only_in: tuple[int, int]

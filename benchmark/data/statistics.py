@@ -74,7 +74,7 @@ Level = Literal[
 
 @dataclass(frozen=True)
 class StabilityVerdict:
-    """A backbone on a scene.
+    """A model on a scene.
 
     Attributes:
         level: See ADVICE.
@@ -229,7 +229,7 @@ class HeadlineStatistics:
     psa: Interval
     vss: Interval
     accuracy: Interval
-    wrong_of_stable: Interval
+    wrong_of_consistent: Interval
 
 
 @dataclass(frozen=True)
@@ -238,8 +238,8 @@ class Flipping:
 
     Attributes:
         share: Of these places, each counting by how likely it is one, for these frames.
-        seen: The part of them that four frames or more saw: of fewer looks it cannot be told whether errors come again
-            at the same places.
+        seen: The part of them that four frames or more saw: of fewer observations it cannot be told whether errors
+            come again at the same places.
         a, b: The two classes between which most of them flip, with the part of all flips that is between these.
     """
 
@@ -339,22 +339,22 @@ class Correctness:
 
 @dataclass(frozen=True)
 class Quadrants:
-    """Shares of the voxels with OP >= 3 and a true class that are stable or not, right or wrong.
+    """Shares of the voxels with OP >= 3 and a true class that are consistent or not, right or wrong.
 
-    wrong_of_stable is the share of the stable voxels that are wrong: what to expect where the map looks safe.
+    wrong_of_consistent is the share of the consistent voxels that are wrong: what to expect where the map looks safe.
     """
 
     voxels: int
-    stable_right: Interval
-    stable_wrong: Interval
-    unstable_right: Interval
-    unstable_wrong: Interval
-    wrong_of_stable: Interval
+    consistent_right: Interval
+    consistent_wrong: Interval
+    inconsistent_right: Interval
+    inconsistent_wrong: Interval
+    wrong_of_consistent: Interval
 
 
 @dataclass(frozen=True)
 class CorrectnessStatistics:
-    """Right beside stable; strata has all voxels with a true class first, then each stratum of OP."""
+    """Stability vs. accuracy; strata has all voxels with a true class first, then each stratum of OP."""
 
     accuracy: Interval
     strata: tuple[Correctness, ...]

@@ -12,7 +12,7 @@ from collections import deque
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from semstab.check import Verdict, advise, quick_look, refuse_unsound, with_voxel_size
+from semstab.check import Verdict, advise, quick_sample, refuse_unsound, with_voxel_size
 from semstab.config import Config
 from semstab.core.process import trim_malloc
 from semstab.data.records import Result
@@ -180,7 +180,7 @@ class _Execution:
         if not in_tiles:
             units.add_seconds(outcome)
             if self._executor.elsewhere or each.regions:
-                name = f"{each.unit.scene} · {each.unit.backbone}"
+                name = f"{each.unit.scene} · {each.unit.model}"
                 self._observers.tell(lambda observer: observer.advanced(each.frames, name))
         self._observers.tell(lambda observer: observer.unit_finished(each, content, outcome.table, outcome.error))
 
@@ -190,7 +190,7 @@ class _Execution:
         verdicts: dict[str, Verdict] = {}
         for task in reversed(tasks.values()):
             with contextlib.suppress(DataError):
-                verdicts[task.scene.name], sample = quick_look(task.scene, task.indices, config.dataset.options)
+                verdicts[task.scene.name], sample = quick_sample(task.scene, task.indices, config.dataset.options)
                 if (advice := advise(sample, config)) is not None:
                     self.units.advice[task.scene.name] = advice
         for scene, verdict in verdicts.items():

@@ -137,7 +137,7 @@ def _left(live: LiveMap, table: VoxelTable, events: Events | None = None) -> tup
 def analyse_sample(task: Task, config: Config, sample: MapSample, observations: CellObservations | None) -> Analysis:
     """Return the statistics of a map; its true labels are right, and bound how far geometry lets labels agree."""
     return analyse(
-        sample, observations, name=task.backbone, edges=config.strata, critical=config.critical_classes,
+        sample, observations, name=task.model, edges=config.strata, critical=config.critical_classes,
         scope=config.scope, limits=Limits(**config.verdict.model_dump()),
     )  # fmt: skip
 
@@ -145,7 +145,7 @@ def analyse_sample(task: Task, config: Config, sample: MapSample, observations: 
 def _quality(stream: Stream) -> FrameQuality | None:
     if stream.quality is None:
         return None
-    made = stream.task.scene.filtering(stream.task.backbone)
+    made = stream.task.scene.filtering(stream.task.model)
     return stream.quality.result(made.model, made.filters, made.milliseconds)
 
 
@@ -155,7 +155,7 @@ def no_voxels(task: Task, config: Config) -> DataError:
     depth = np.mean(np.isfinite(frame.depth) & (frame.depth > 0))
     labelled = np.mean(frame.predicted != frame.ignore_id)
     return DataError(
-        f"{task.scene.name}, {task.backbone}: no pixel of {len(task.indices)} frames is valid (first frame: depth in"
+        f"{task.scene.name}, {task.model}: no pixel of {len(task.indices)} frames is valid (first frame: depth in"
         f" {depth:.0%} of the pixels, a label in {labelled:.0%}); check depth_scale, the ignore id and the taxonomy"
     )
 
@@ -248,7 +248,7 @@ def _savers(
     """
     work, config, unit, tile, savers = live.work, live.work.config, live.unit, live.work.tile, Savers()
     if work.image_space and stream.overview:
-        savers[f"{OVERVIEW}/{slug(unit.scene, unit.backbone)}.npz"] = partial(_save_overview, stream)
+        savers[f"{OVERVIEW}/{slug(unit.scene, unit.model)}.npz"] = partial(_save_overview, stream)
     if tile is not None and observations is not None:
         savers[f"{tile.folder}/{tile.size}_{TILE_OBSERVATIONS}"] = observations.save
     if tile is None and work.kept:

@@ -64,9 +64,7 @@ def require_file_names(out: Path, units: Iterable[Unit]) -> None:
     for unit in units:
         other = named.setdefault(unit.slug, unit)
         if other != unit:
-            raise ConfigError(
-                f"{other} and {unit} would be written to one file, {unit.slug}; rename a scene or backbone"
-            )
+            raise ConfigError(f"{other} and {unit} would be written to one file, {unit.slug}; rename a scene or model")
         if len(os.fsencode(unit.slug)) > longest:
             raise ConfigError(f"{there}: its file system takes no name as long as {unit.slug}; choose another --out")
 
@@ -211,7 +209,7 @@ class Folder:
             wanted.append(f"{SUMS}/{unit.slug}.parquet")
         if planned.kept and planned.config.events and keeps_log(planned.unit.backend):
             wanted += _in_tiles(unit, content, EVENTS) or [f"{EVENTS}/{unit.slug}.parquet"]
-        return wanted + ([f"{OVERVIEW}/{slug(unit.scene, unit.backbone)}.npz"] if planned.image_space else [])
+        return wanted + ([f"{OVERVIEW}/{slug(unit.scene, unit.model)}.npz"] if planned.image_space else [])
 
 
 def _in_tiles(unit: Unit, content: UnitContent, of: str = VOXELS) -> list[str]:
@@ -296,7 +294,7 @@ def _is_earlier(folder: Path, layouts: Collection[str] = (LAYOUT,)) -> bool:
 
 
 def _first_change(old: Mapping[str, Any], new: Mapping[str, Any], prefix: str = "") -> str | None:
-    left_out = {"name", "description", "scenes", "backbones", "backends", "sweeps"}
+    left_out = {"name", "description", "scenes", "models", "backends", "sweeps"}
     for key in (key for key in old if key in new and key not in left_out):
         there, here = old[key], new[key]
         if isinstance(there, dict) and isinstance(here, dict):

@@ -112,7 +112,7 @@ def planned_sizes(config: Config, missing: Iterable[PlannedUnit], width: int) ->
     sizing, together = Sizing(), dict[object, list[PlannedUnit]]()
     for each in missing:
         if not each.regions:  # watched units of a sequence are in memory together; others can be put off
-            key = (each.unit.scene, each.unit.backbone) if each.kept else each.identity
+            key = (each.unit.scene, each.unit.model) if each.kept else each.identity
             together.setdefault(key, []).append(each)
     for group in together.values():
         try:
@@ -147,7 +147,7 @@ def _plan_sizes(config: Config, group: Sequence[PlannedUnit], width: int, sizing
     if needed <= free:
         return
     takes = (
-        f"{task.scene.name}, {task.backbone}: about {size.voxels / 1e6:.2g} million voxels of {settings.voxel_size:g} m"
+        f"{task.scene.name}, {task.model}: about {size.voxels / 1e6:.2g} million voxels of {settings.voxel_size:g} m"
         f" would take {needed / GB:.2g} GB"
     )
     if why is not None:
@@ -297,7 +297,7 @@ class MemoryBudget:
         which = "are free" if self._limit is None else "is left of memory_gb"
         size = f"a smaller --tile-size than {tile.size}" if tile is not None else "tiles (--tile-size 256)"
         return OutgrownError(
-            f"{unit.scene}, {unit.backbone}, {unit.backend}: after {len(live.rows)} of {len(live.frames)} frames"
+            f"{unit.scene}, {unit.model}, {unit.backend}: after {len(live.rows)} of {len(live.frames)} frames"
             f" the map has {voxels / 1e6:.2g} million voxels of {config.voxel_size:g} m, of which its table"
             f" {'and statistics' if config.statistics else 'alone'} would take {end_bytes(live) / GB:.2g} GB, and"
             f" {max(0, self._left) / GB:.2g} GB {which}; use {size}, larger voxels (voxel_size), fewer frames (frames),"

@@ -110,15 +110,15 @@ class Fusion:
     def _decode(self, index: int) -> Decoded:
         """Decode a frame in a worker thread; an error fails the units that need the frame, not those that do not."""
         scene, wanting = self._scene, [stream for stream in self.streams if index in stream.frames]
-        backbone = wanting[0].task.backbone
+        model = wanting[0].task.model
         try:
             color = self._observers.want_color or any(stream.shown == index for stream in self.streams)
-            frame = scene.frame(index, backbone, color=color)
+            frame = scene.frame(index, model, color=color)
             truth = _ground_truth(scene, index) if any(stream.truth_task is not None for stream in wanting) else None
             measures_quality = any(stream.quality is not None for stream in wanting)
-            name = scene.filtering(backbone).model if measures_quality else backbone  # without filters
-            model = None if name == backbone else scene.frame(index, name, color=False)
-            return Decoded(index, frame, truth, model)
+            name = scene.filtering(model).model if measures_quality else model  # without filters
+            unfiltered = None if name == model else scene.frame(index, name, color=False)
+            return Decoded(index, frame, truth, unfiltered)
         except Exception as error:  # noqa: BLE001 - raised again by `Stream.prepare`
             return Decoded(index, error=error)
 
@@ -200,17 +200,17 @@ def _measured_regions(scene: Scene, work: Work) -> Outcome:
         rows = [_compared(*pair) for pair in itertools.pairwise(_region_frames(scene, work))]
         flicker, compensated, share = zip(*rows, strict=True) if rows else ((), (), ())
         means = macro_mean(flicker), macro_mean(compensated), macro_mean(share)
-        digest = scene.digest(frame_indices(scene, work.config, [work.backbone]), work.backbone)
+        digest = scene.digest(frame_indices(scene, work.config, [work.model]), work.model)
     except Exception as error:  # noqa: BLE001 - a failing unit is reported, and the others continue
         return failed([work], error)[0]
-    return Outcome(work.identity, UnitContent(digest, regions=RegionFlicker(work.scene, work.backbone, *means)))
+    return Outcome(work.identity, UnitContent(digest, regions=RegionFlicker(work.scene, work.model, *means)))
 
 
 def _region_frames(scene: Scene, work: Work) -> Iterator[Frame]:
     config = work.config
 
     def decode(index: int) -> Frame:
-        frame = scene.frame(index, work.backbone, color=False)
+        frame = scene.frame(index, work.model, color=False)
         if frame.labels is None:
             raise DataError(f"{frame.where('scores')}: regions are label maps of ids, not scores")
         frame = leave_out(frame, masks=config.exclude.masks)
@@ -218,7 +218,7 @@ def _region_frames(scene: Scene, work: Work) -> Iterator[Frame]:
             frame = perturb(frame, config.perturbation, work.scene)
         return frame.every(config.pixel_stride)
 
-    indices = frame_indices(scene, config, [work.backbone])
+    indices = frame_indices(scene, config, [work.model])
     fetched = prefetch(decode, indices, threads=work.start.threads, size=lambda frame: frame.nbytes)
     with contextlib.closing(fetched):
         for each in fetched:

@@ -26,7 +26,7 @@ from semstab.engine.units import Plan, must_agree
 from semstab.engine.work import Outcome
 from semstab.metrics import compare
 from semstab.metrics.agreement import together
-from semstab.statistics import BackboneComparison, CellObservations, claimed_together
+from semstab.statistics import CellObservations, ModelComparison, claimed_together
 from semstab.statistics.model_comparison import Region, Regions, compare_regions
 
 
@@ -49,7 +49,7 @@ class UnitResults:
 
 
 def result_of(plan: Plan, folder: Folder, units: UnitResults) -> Result:
-    """Return the result of all units that there are: how they agree, and how backbones compare."""
+    """Return the result of all units that there are: how they agree, and how models compare."""
     contents, errors, config = units.contents, units.errors, plan.config
     records = tuple(folder.record(each, contents[each.identity]) for each in plan.units if each.identity in contents)
     tables = Tables(most=len({record.unit.backend for record in records}))
@@ -59,7 +59,7 @@ def result_of(plan: Plan, folder: Folder, units: UnitResults) -> Result:
         compared = tuple(_agreements(config, records, tables, must=False))
     with units.watch("comparisons"):
         comparisons = claimed_together(tuple(_comparisons(config, records, tables)) if config.statistics else ())
-    up: dict[str, tuple[float, float, float]] = {}  # of the first backbone whose base unit has it
+    up: dict[str, tuple[float, float, float]] = {}  # of the first model whose base unit has it
     for each in plan.units:
         own = contents.get(each.identity)
         if each.variation.sweep == BASE and own is not None and own.up is not None:
@@ -92,7 +92,7 @@ def advice_of(plan: Plan, contents: Mapping[str, UnitContent]) -> dict[str, Voxe
 
 
 def _agreements(config: Config, records: Sequence[Record], tables: Tables, *, must: bool) -> Iterator[Agreement]:
-    """Yield how far backends agree on each scene and backbone that both fused.
+    """Yield how far backends agree on each scene and model that both fused.
 
     Args:
         config: The settings of the run.
@@ -105,7 +105,7 @@ def _agreements(config: Config, records: Sequence[Record], tables: Tables, *, mu
     groups: dict[tuple[str, str], list[Record]] = {}
     for record in records:
         if record.variation.sweep in (BASE, BACKENDS):  # those of the first backend come first
-            groups.setdefault((record.unit.scene, record.unit.backbone), []).append(record)
+            groups.setdefault((record.unit.scene, record.unit.model), []).append(record)
     for group in groups.values():
         for a, b in itertools.combinations(group, 2) if must else zip(group[:1] * len(group), group[1:], strict=False):
             if must == ({a.unit.backend, b.unit.backend} <= checked):
@@ -120,13 +120,13 @@ def _alike(config: Config, a: Record, b: Record, tables: Tables) -> Agreement:
     return together([compare(one, other, units, tolerance=config.tolerance) for one, other in side_by_side(maps)])
 
 
-def _comparisons(config: Config, records: Sequence[Record], tables: Tables) -> Iterator[BackboneComparison]:
+def _comparisons(config: Config, records: Sequence[Record], tables: Tables) -> Iterator[ModelComparison]:
     """Yield the comparison of each scene's base units; with accuracy where there is ground truth."""
-    base = [record for record in records if record.variation.sweep == BASE and record.unit.backbone != GROUND_TRUTH]
+    base = [record for record in records if record.variation.sweep == BASE and record.unit.model != GROUND_TRUTH]
     for scene in dict.fromkeys(record.unit.scene for record in base):
         there = [record for record in base if record.unit.scene == scene]
         if len(there) > 1:
-            files = {record.unit.backbone: record.observations_file for record in there}
+            files = {record.unit.model: record.observations_file for record in there}
             loaded = {name: CellObservations.load(file) for name, file in files.items() if file and file.exists()}
             regions, observations = _regions_of(there, config, tables), loaded if len(loaded) == len(there) else None
             mixed = len({record.summary.reduced is None for record in there}) > 1
@@ -136,7 +136,7 @@ def _comparisons(config: Config, records: Sequence[Record], tables: Tables) -> I
 
 def _compared_maps(
     scene: str, regions: Regions, observations: Mapping[str, CellObservations] | None, *, mixed: bool
-) -> BackboneComparison | None:
+) -> ModelComparison | None:
     """Return the comparison of a scene's maps; None where there are not two or more of them in one label space.
 
     With the samples of all, on matched observations.
@@ -153,7 +153,7 @@ def _compared_maps(
 
 def _regions_of(there: Sequence[Record], config: Config, tables: Tables) -> Regions:
     """Yield the maps of a scene's units tile by tile, or whole, with their logs and the ground truth."""
-    names = [record.unit.backbone for record in there]
+    names = [record.unit.model for record in there]
     in_tiles = any(record.in_tiles for record in there)
     files = [record.events_file for record in there if config.events]
     logs: list[Tiles[Any]] = [Tiles.open(file, Events) for file in files if file is not None and file.exists()]
@@ -196,7 +196,7 @@ def manifest(plan: Plan, units: UnitResults, executor: str, command: Sequence[st
         "command": list(command),
         "seed": plan.config.dataset.options.get("seed"),
         "inputs": {
-            f"{each.unit.scene}/{each.unit.backbone}": contents[each.identity].input
+            f"{each.unit.scene}/{each.unit.model}": contents[each.identity].input
             for each in computed
             if each.variation.sweep in (BASE, REGIONS)
         },

@@ -99,7 +99,7 @@ class LiveMap:
 
     @property
     def unit(self) -> Unit:
-        """Its scene, backbone and backend."""
+        """Its scene, model and backend."""
         return self.task.units[0]
 
     def integrate(self, prepared: Prepared, watch: Stopwatch) -> FrameReport:
@@ -267,7 +267,7 @@ class Stream:
             live.rows.append(dataclasses.replace(row, logging_seconds=seconds) if live.work.watched else row)
             if live.work.tile is None:
                 unit = live.unit
-                what = f"{unit.scene} · {unit.backbone} · {unit.backend}"
+                what = f"{unit.scene} · {unit.model} · {unit.backend}"
                 self._observers.tell(lambda observer, what=what: observer.advanced(1, what))  # type: ignore[misc]
 
 
@@ -367,7 +367,7 @@ class ImageSpaceMeter:
         flicker, frames, labels, changed = zip(*self._worst, strict=True)
         arrays = {"worst_frames": np.array(frames), "worst_flicker": np.array(flicker)}
         arrays |= {"worst_labels": np.stack(labels), "worst_changed": np.stack(changed)}
-        images = [task.scene.frame(index, task.backbone, color=True).color for index in frames] if color else []
+        images = [task.scene.frame(index, task.model, color=True).color for index in frames] if color else []
         known = [image[_thumbnail(image.shape)] for image in images if image is not None]
         return arrays | ({"worst_color": np.stack(known)} if known and len(known) == len(frames) else {})
 

@@ -67,7 +67,7 @@ class TiledUnit:
     def name(self) -> str:
         """Its name in the progress."""
         unit = self.planned.unit
-        return f"{unit.scene} · {unit.backbone} · {unit.backend}"
+        return f"{unit.scene} · {unit.model} · {unit.backend}"
 
     def next_job(self) -> Job | None:
         """Return the next tile; None where there is none, until the pass over the frames tells them."""

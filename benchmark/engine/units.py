@@ -1,4 +1,4 @@
-"""The plan: scenes x backbones x backends x variations, which unit each is, and what its numbers depend on."""
+"""The plan: scenes x models x backends x variations, which unit each is, and what its numbers depend on."""
 
 from __future__ import annotations
 
@@ -50,10 +50,10 @@ NOISES = tuple(name for name in Perturbation.model_fields if name != "seed")
 
 @dataclass(frozen=True, eq=False)
 class PlannedUnit:
-    """A backbone on a scene, fused by a backend under one variation, and what is wanted of it.
+    """A model on a scene, fused by a backend under one variation, and what is wanted of it.
 
     Attributes:
-        config: Its settings as those of a run of its own: one scene, one backbone, one backend.
+        config: Its settings as those of a run of its own: one scene, one model, one backend.
         task: The unit, opened and checked.
         identity: Hash of the settings that its numbers depend on; what shares it is computed once.
         image_space: Whether its stability in image coordinates is wanted.
@@ -73,7 +73,7 @@ class PlannedUnit:
 
     @property
     def unit(self) -> Unit:
-        """Its scene, backbone and backend."""
+        """Its scene, model and backend."""
         return self.task.units[0]
 
     @property
@@ -115,13 +115,13 @@ class Plan:
 
     @cached_property
     def tasks(self) -> tuple[Task, ...]:
-        """Each backbone on each scene at the base settings, with all backends that fuse it so."""
+        """Each model on each scene at the base settings, with all backends that fuse it so."""
         backends: dict[tuple[str, str], list[str]] = {}
         for each in self.units:
             if each.variation.sweep in (BASE, BACKENDS):
-                backends.setdefault((each.unit.scene, each.unit.backbone), []).append(each.unit.backend)
+                backends.setdefault((each.unit.scene, each.unit.model), []).append(each.unit.backend)
         return tuple(
-            dataclasses.replace(each.task, backends=tuple(backends[each.unit.scene, each.unit.backbone]))
+            dataclasses.replace(each.task, backends=tuple(backends[each.unit.scene, each.unit.model]))
             for each in self.units
             if each.variation.sweep == BASE
         )
@@ -149,12 +149,12 @@ def make_plan(config: Config) -> Plan:
     return Plan(config, scenes, units, tuple(_planned_regions(config, scenes)))
 
 
-def _base_settings(config: Config, scene: str, backbones: list[str] | None) -> Config:
+def _base_settings(config: Config, scene: str, models: list[str] | None) -> Config:
     noise = config.perturbation
     return config.model_copy(
         update={
             "scenes": [scene],
-            "backbones": backbones,
+            "models": models,
             "frames": config.scene_frames.get(scene, config.frames),
             "backends": config.backends[:1],
             "check": None,
@@ -167,13 +167,13 @@ def _base_settings(config: Config, scene: str, backbones: list[str] | None) -> C
 
 def _base_units(config: Config, scenes: Mapping[str, Scene]) -> Iterator[PlannedUnit]:
     for name, scene in scenes.items():
-        fused = config.backbones
+        fused = config.models
         if fused is None:
-            fused = [backbone for backbone in scene.backbones if backbone not in config.region_maps]
+            fused = [model for model in scene.models if model not in config.region_maps]
         settings = _base_settings(config, name, fused)
         for task in tasks_of(scene, settings):
             _check_classes(config.critical_classes, task)
-            one = settings.model_copy(update={"backbones": [task.backbone]})
+            one = settings.model_copy(update={"models": [task.model]})
             sampled = _is_sampled(config, config.backends[0])
             yield PlannedUnit(
                 Variation(BASE), one, task, identity(one, task), image_space=True, kept=True, sampled=sampled
@@ -201,19 +201,19 @@ def _check_classes(critical: Sequence[str], task: Task) -> None:
 def _planned_regions(config: Config, scenes: Mapping[str, Scene]) -> Iterator[PlannedUnit]:
     space = LabelSpace("regions", ("region", "none"))  # regions have no classes, but a label space has two
     for name, scene in scenes.items():
-        for backbone in selected(config.region_maps, scene.backbones, scene.regions, "region map", name):
-            settings = _base_settings(config, name, [backbone])
-            frames = frame_indices(scene, settings, [backbone])
-            task = Task(scene, backbone, frames, space.mapping_to(space), ("none",))
+        for model in selected(config.region_maps, scene.models, scene.regions, "region map", name):
+            settings = _base_settings(config, name, [model])
+            frames = frame_indices(scene, settings, [model])
+            task = Task(scene, model, frames, space.mapping_to(space), ("none",))
             fused_only = {"voxel_size", "strata", "statistics", "critical_classes", "scope", "verdict"}
-            key = _hash(settings, {"regions": [name, backbone], "frames": frames}, fused_only)
+            key = _hash(settings, {"regions": [name, model], "frames": frames}, fused_only)
             yield PlannedUnit(Variation(REGIONS), settings, task, key, image_space=False, kept=False)
 
 
 def _varied_units(config: Config, base: Sequence[PlannedUnit], scenes: Mapping[str, Scene]) -> Iterator[PlannedUnit]:
     compared: dict[str, list[str]] = {}
     for each in base:
-        compared.setdefault(each.unit.scene, []).append(each.unit.backbone)
+        compared.setdefault(each.unit.scene, []).append(each.unit.model)
     for variation, part, value in _variations(config):
         for each in _restricted(base, part, variation.sweep):
             varied = each.config.model_copy(update=_changed_settings(config, variation, value, each.config))
@@ -278,7 +278,7 @@ def _check_count(variation: Variation, task: Task) -> None:
 
 def identity(config: Config, task: Task) -> str:
     """Hash of the settings that a unit's numbers depend on, beside its input."""
-    mapping, filtering = task.mapping, task.scene.filtering(task.backbone)
+    mapping, filtering = task.mapping, task.scene.filtering(task.model)
     content = {
         "unit": dataclasses.asdict(task.units[0]),
         "options": config.backends[0].options,
@@ -297,8 +297,8 @@ def _hash(config: Config, content: Mapping[str, Any], without: Iterable[str] = (
 
 def _restricted(base: Sequence[PlannedUnit], part: Part, name: str) -> list[PlannedUnit]:
     _check_names(part.scenes, [each.unit.scene for each in base], f"{name}.scenes")
-    _check_names(part.backbones, [each.unit.backbone for each in base], f"{name}.backbones")
-    return [each for each in base if applies(part, each.unit.scene, each.unit.backbone)]
+    _check_names(part.models, [each.unit.model for each in base], f"{name}.models")
+    return [each for each in base if applies(part, each.unit.scene, each.unit.model)]
 
 
 def _check_names(wanted: Iterable[str] | None, known: Sequence[str], where: str) -> None:

@@ -91,7 +91,7 @@ class Work:
 
     start: Start
     scene: str
-    backbone: str
+    model: str
     identity: str
     config: Config
     image_space: bool = False
@@ -107,7 +107,7 @@ class Work:
         """Return the whole of a planned unit."""
         unit, wanted = planned.unit, (planned.image_space, planned.kept, planned.judged, planned.sampled)
         config = planned.config.model_copy(update={"frames": FrameSelection.of(planned.task.indices)})
-        own = (unit.scene, unit.backbone, planned.identity, config)
+        own = (unit.scene, unit.model, planned.identity, config)
         return cls(start, *own, *wanted, planned.task.left_out, planned.regions)
 
     def in_tile(self, tile: TileTask, frames: Sequence[int] | None = None) -> Work:
@@ -192,7 +192,7 @@ def jobs_of(works: Iterable[Work], width: int) -> list[Job]:
     """
     sequences: dict[tuple[str, str], list[Work]] = {}
     for work in works:
-        sequences.setdefault((work.scene, work.backbone), []).append(work)
+        sequences.setdefault((work.scene, work.model), []).append(work)
     jobs: list[Job] = [tuple(sequence) for sequence in sequences.values()]
     while len(jobs) < width:
         divisible = [k for k, job in enumerate(jobs) if all(_halves(job))]

@@ -68,7 +68,7 @@ def export(
     to: str | Path | Sequence[str | Path],
     *,
     scene: str | None = None,
-    backbone: str | None = None,
+    model: str | None = None,
     backend: str | None = None,
     measures: Sequence[str] | None = None,
     min_op: int = 1,
@@ -91,7 +91,7 @@ def export(
         run: Folder of the run.
         to: Files to write, one or several.
         scene: Scene of the unit; may be left out where there is one.
-        backbone: Backbone of the unit; may be left out where there is one.
+        model: Model of the unit; may be left out where there is one.
         backend: Backend of the unit, the base backend where not given.
         measures: Columns that go along: measures, op, category, psa, or what the run's Parquet file has.
         min_op: Only voxels seen that often are written.
@@ -123,7 +123,7 @@ def export(
         elif file.suffix.lower() not in SUFFIXES:
             raise ConfigError(f"{file}: format '{file.suffix}' is not known; {nearest(file.suffix, SUFFIXES)}")
     result = load_result(run)
-    record = result.record(scene=scene, backbone=backbone, backend=backend)
+    record = result.record(scene=scene, model=model, backend=backend)
     settings = Settings(cell, None if asprs is None else Path(asprs))
     classify, join, thresholds = classify or onto, join or beside, thresholds or commit
     accepted = None if thresholds is None else AcceptanceThresholds.load(thresholds)
@@ -138,7 +138,7 @@ def export(
     if task_format is not None:
         task, _ = task_of(Path(run), record, result.manifest["inputs"])
         tasks = annotation_tasks(chosen(("op",)), task, most)
-        named = task.mapping.target, task.scene.name, task.backbone
+        named = task.mapping.target, task.scene.name, task.model
         return [_tasks_written(TaskFile(tasks, *named, file), task_format, task) for file in files]
     if classify is not None:
         return [_classified(chosen(joining.MEASURES), Path(classify), file, radius, settings) for file in files]

@@ -199,7 +199,7 @@ class Relabelled:
     """
 
     scene: str
-    backbone: str
+    model: str
     name: str
     folder: str
     frames: int
@@ -284,7 +284,7 @@ def relabel(
     *,
     belief: Belief | None = None,
     scene: str | None = None,
-    backbone: str | None = None,
+    model: str | None = None,
     backend: str | None = None,
     name: str | None = None,
     overwrite: bool = False,
@@ -297,9 +297,9 @@ def relabel(
         out: Folder that gets labels/NAME.
         belief: The criteria of a voxel; other pixels are ignored, as are those without depth.
         scene: Scene of the unit; may be left out where there is one.
-        backbone: Backbone of the unit; may be left out where there is one.
+        model: Model of the unit; may be left out where there is one.
         backend: Backend of the unit, the base backend where not given.
-        name: Name of the new source, BACKBONE-fused where not given; its classes are in its folder.
+        name: Name of the new source, MODEL-fused where not given; its classes are in its folder.
         overwrite: Whether other predictions in the folder are replaced.
         progress: Called with what is done, how much of it is done, and how much there is.
 
@@ -311,9 +311,9 @@ def relabel(
             pixels.
     """
     result = load_result(run)
-    record = result.record(scene=scene, backbone=backbone, backend=backend)
+    record = result.record(scene=scene, model=model, backend=backend)
     task, pixel_stride = task_of(Path(run), record, result.manifest["inputs"])
-    chosen, name = belief or Belief(), name or f"{record.unit.backbone}-fused"
+    chosen, name = belief or Belief(), name or f"{record.unit.model}-fused"
     settings = {"unit": record.key, "backend": record.unit.backend, **chosen.settings()}
     space = task.mapping.target
     folder = PredictionFolder(
@@ -345,7 +345,7 @@ def relabel(
         progress(f"{task.scene.name} · {name}", done, len(task.indices))
     folder.save()
     report = Relabelled(
-        task.scene.name, task.backbone, name, str(folder.path), len(task.indices), **tally.counts,
+        task.scene.name, task.model, name, str(folder.path), len(task.indices), **tally.counts,
         leave_one_out=chosen.leave_one_out, correctness=tally.correctness(),
     )  # fmt: skip
     write_json(folder.path / REPORT, {**dataclasses.asdict(report), "belief": chosen.settings()})
@@ -359,8 +359,8 @@ def task_of(run: Path, record: Record, fused: Mapping[str, str]) -> tuple[Task, 
         DataError: If its data has changed since.
     """
     plan = make_plan(load_config(run / SETTINGS))
-    scene, backbone = record.unit.scene, record.unit.backbone
-    task = next((task for task in plan.tasks if (task.scene.name, task.backbone) == (scene, backbone)), None)
-    if task is None or task.digest != fused.get(f"{scene}/{backbone}"):
-        raise DataError(f"{run}: the data of {scene}, {backbone} is not what was fused; run it again")
+    scene, model = record.unit.scene, record.unit.model
+    task = next((task for task in plan.tasks if (task.scene.name, task.model) == (scene, model)), None)
+    if task is None or task.digest != fused.get(f"{scene}/{model}"):
+        raise DataError(f"{run}: the data of {scene}, {model} is not what was fused; run it again")
     return task, plan.config.pixel_stride

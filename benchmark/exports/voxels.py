@@ -196,13 +196,13 @@ class Chosen:
         columns = {
             name: further.get(name) or _column(name, table, file) for name in self._columns or (*usual(), *further)
         }
-        scene, backbone = record.unit.scene, record.unit.backbone
+        scene, model = record.unit.scene, record.unit.model
         georeference = self._result.georeference.get(scene)
         return Voxels(
             rows_of(table, keep),
             {name: replace(column, values=column.values[keep]) for name, column in columns.items()},
             names,
-            _colors(record.voxels_file.parents[1] / OVERVIEW / f"{slug(scene, backbone)}.npz", table.K),
+            _colors(record.voxels_file.parents[1] / OVERVIEW / f"{slug(scene, model)}.npz", table.K),
             record.summary.taxonomy,
             self._result.up.get(scene) if georeference is None else (0.0, 0.0, 1.0),
             georeference,

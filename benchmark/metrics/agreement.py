@@ -129,7 +129,7 @@ def compare(
     same_values = all(not d.max > tolerance for name, d in differences.items() if name != LABEL)
     return Agreement(
         scene=units[0].scene,
-        backbone=units[0].backbone,
+        model=units[0].model,
         backends=(units[0].backend, units[1].backend),
         voxels=(len(a), len(b)),
         only_in=only_in,

@@ -60,7 +60,7 @@ class FrameQualityMeter:
             next_frame=_share(foreseen, met),
             accuracy=_share(right.sum(), self._confusion.sum()),
             miou=float(np.mean(right[there] / union[there])) if there.any() else math.nan,
-            stable_wrong=_share(stale, compared),
+            consistent_wrong=_share(stale, compared),
             lag=self._lag.mean,
             changes=self._lag.changes,
             milliseconds=milliseconds,

@@ -247,7 +247,7 @@ class CategoryThresholds:
 
     Attributes:
         min_op: Fewer observations are low persistence; the paper calls a voxel recurrent from OP = 3 on.
-        drifting_bits: SBD from which on the belief is still on the move. The paper's backbones have 0.041 and 0.019
+        drifting_bits: SBD from which on the belief is still on the move. The paper's models have 0.041 and 0.019
             bits on average over recurrent voxels. One dissent among three labels has 0.095 bits or more; one among four
             0.046 if it comes last, 0.113 if it comes second.
         uncertain_bits: Entropy of the belief from which on it is ambiguous. In bits, because the normalised entropy of

@@ -155,7 +155,7 @@ class FramesScene(Scene):
 
     def __init__(self, sequence: Sequence, options: FramesOptions) -> None:
         self._sequence = sequence
-        self.name, self.backbones, self.ground_truth = options.scene, (options.model,), sequence.has_truth
+        self.name, self.models, self.ground_truth = options.scene, (options.model,), sequence.has_truth
         classes = options.classes or tuple(f"class {k}" for k in range(max(2, sequence.classes)))
         if len(classes) < sequence.classes:
             raise DataError(f"{self.name}: there are labels up to {sequence.classes - 1}, and {len(classes)} classes")
@@ -164,20 +164,18 @@ class FramesScene(Scene):
     def __len__(self) -> int:
         return self._sequence.count
 
-    def label_space(self, backbone: str) -> LabelSpace:
+    def label_space(self, model: str) -> LabelSpace:
         """Return the same of the model and of the truth."""
         return self._space
 
-    def frame(self, index: int, backbone: str, *, color: bool = True) -> Frame:
+    def frame(self, index: int, model: str, *, color: bool = True) -> Frame:
         """Return a frame with the model's labels, or with the true ones."""
         frame, truth = self._sequence.frame(index)
-        return frame if backbone != GROUND_TRUTH or truth is None else truth
+        return frame if model != GROUND_TRUTH or truth is None else truth
 
-    def digest(self, indices: list[int], backbone: str) -> str:
+    def digest(self, indices: list[int], model: str) -> str:
         """Return a hash of all frames and of which of them are meant."""
-        return (
-            f"{self._sequence.digest}-{backbone}-{hashlib.blake2b(repr(indices).encode(), digest_size=8).hexdigest()}"
-        )
+        return f"{self._sequence.digest}-{model}-{hashlib.blake2b(repr(indices).encode(), digest_size=8).hexdigest()}"
 
     @property
     def timestamps(self) -> Float64 | None:

@@ -49,7 +49,7 @@ DEPTH, POSE, WALK = range(3)
 def perturb(frame: Frame, noise: Perturbation, scene: str) -> Frame:
     """Return the frame with noise on its depth and its pose.
 
-    Every number depends on the seed, the scene's name, the frame's index and the pixel only: all backbones and backends
+    Every number depends on the seed, the scene's name, the frame's index and the pixel only: all models and backends
     see the same disturbed geometry, in whatever order frames are read and whichever are sampled.
 
     - depth: d (1 + depth_noise n), with n drawn for each pixel; a depth that falls to 0 or below is invalid

@@ -16,7 +16,6 @@ from typing import Any
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
 
-from semstab.backbones import Backbone, Image
 from semstab.config import DatasetConfig, FrameSelection, validated
 from semstab.data.frames import Frame
 from semstab.datasets import Scene, open_dataset, options_model
@@ -25,6 +24,7 @@ from semstab.datasets.formats.images import COLOR_SUFFIXES, read_color
 from semstab.datasets.geometry.lenses import Labels, Scores
 from semstab.datasets.scene import select_frames
 from semstab.errors import ConfigError, DataError
+from semstab.models import Image, Model
 from semstab.predict.images import ImageSequence
 from semstab.predict.predictor import NAME as STORED
 from semstab.predict.predictor import PredictorConfig, load_predictor, stored_labels
@@ -246,13 +246,13 @@ def run(
 
     Args:
         predictor: Settings of `PredictorConfig` without options.
-        options: Options of the backbone.
+        options: Options of the model.
         images: Folder or files of images, None where they are those of scenes.
         dataset: Resolved settings of the dataset, where the images are those of scenes.
         scenes: Names of the scenes; all where None.
         frames: Settings of `FrameSelection`.
         out: Folder of the predictions; the scene's own where None.
-        batch: Images that the backbone is given together.
+        batch: Images that the model is given together.
         overwrite: Whether other predictions in the folder are replaced.
         quiet: Whether nothing is printed.
         top_k: Number of scores that a pixel keeps; None for all.
@@ -274,8 +274,8 @@ def run(
     reports = []
     try:
         for job in jobs:
-            sequence, backbone = load(job)
-            reports.append(predict_sequence(sequence, backbone, job.indices, job.out, sequence_options, [bar]))
+            sequence, model = load(job)
+            reports.append(predict_sequence(sequence, model, job.indices, job.out, sequence_options, [bar]))
     finally:
         bar.close()
     for report in reports:
@@ -286,14 +286,14 @@ def run(
     return reports
 
 
-def _loader(config: PredictorConfig) -> Callable[[Job], tuple[ImageSequence, Backbone]]:
+def _loader(config: PredictorConfig) -> Callable[[Job], tuple[ImageSequence, Model]]:
     """Return what gives the images of a job and who predicts on them: one model for all, or each scene's own labels."""
-    if config.backbone != STORED:
-        backbone = load_predictor(config)
-        return lambda job: (job.sequence, backbone)
+    if config.model != STORED:
+        model = load_predictor(config)
+        return lambda job: (job.sequence, model)
 
     @functools.cache
-    def of_scene(job: Job) -> tuple[ImageSequence, Backbone]:
+    def of_scene(job: Job) -> tuple[ImageSequence, Model]:
         if not isinstance(job.sequence, Scene) or not job.sequence.labels_like_depth:
             raise ConfigError(
                 f"{job.sequence.name}: its own labels are filtered inside a run (--filter, no --predict), or on disk"
@@ -320,10 +320,10 @@ def _next_command(
         words += ["--option", f"{key}={json.dumps(value)}" if not isinstance(value, str) else f"{key}={value}"]
     if out is not None:
         words += ["--option", f"labels_root={out}"]
-        words += ["--option", f"labels={'{scene}/' if several else ''}labels/{{backbone}}/{{name}}"]
+        words += ["--option", f"labels={'{scene}/' if several else ''}labels/{{model}}/{{name}}"]
     for scene in scenes or ():
         words += ["--scene", scene]
-    words += ["--backbone", predictor.label_name]
+    words += ["--model", predictor.label_name]
     if frames != FrameSelection():
         words += ["--frames", f"{frames.start or ''}:{frames.stop or ''}:{frames.stride}"]
     return f"fuse them: {shlex.join(words)}"

@@ -1,4 +1,4 @@
-"""Filters that steady a model's labels: `parse("ema:0.6")` makes one, `Filtered` puts some over a backbone."""
+"""Filters that steady a model's labels: `parse("ema:0.6")` makes one, `Filtered` puts some over a model."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from typing import Any, ClassVar, cast
 import numpy as np
 import numpy.typing as npt
 
-from semstab.backbones import Backbone, Image, Labels, Prediction, narrowed
-from semstab.backbones.border import Wrapped
 from semstab.core.registry import Entry, Registry
 from semstab.core.types import Float32, UInt16
 from semstab.data.frames import Frame
 from semstab.data.labels import LabelSpace, ignore_id
 from semstab.errors import ConfigError
+from semstab.models import Image, Labels, Model, Prediction, narrowed
+from semstab.models.border import Wrapped
 from semstab.pixels.warp import carry, warp
 
 Belief = Float32
@@ -159,19 +159,19 @@ def normalised(belief: Belief) -> Belief:
     return belief
 
 
-# A chain of filters over a backbone, which is a backbone again.
+# A chain of filters over a model, which is a model again.
 
 
 class Filtered(Wrapped):
-    """A backbone behind filters in their order. Where it says nothing, nothing is said.
+    """A model behind filters in their order. Where it says nothing, nothing is said.
 
     Filters see its scores where it has any; else its labels count as certain.
 
     Raises:
-        ConfigError: For a backbone without classes, and for one without scores where the first filter needs them.
+        ConfigError: For a model without classes, and for one without scores where the first filter needs them.
     """
 
-    def __init__(self, inner: Backbone, filters: Sequence[FilterSpec], name: str) -> None:
+    def __init__(self, inner: Model, filters: Sequence[FilterSpec], name: str) -> None:
         super().__init__(inner)
         if inner.label_space is None:
             raise ConfigError(f"--filter {filters[0]}: '{name}' finds regions without classes; leave the filter out")
@@ -197,13 +197,13 @@ class Filtered(Wrapped):
     def predict(
         self, images: Sequence[Image], *, scores: bool = False, geometry: Sequence[Frame] = ()
     ) -> list[Prediction]:
-        """See `Backbone`; an image of another size begins anew."""
+        """See `Model`; an image of another size begins anew."""
         found = self.ask(images, self.inner.gives_scores, geometry)
         frames: Sequence[Frame | None] = geometry or [None] * len(images)
         return [self._filtered(*each, scores) for each in zip(found, images, frames, strict=True)]
 
     def identity(self) -> dict[str, Any]:
-        """Return the identity of the inner backbone, and the filters."""
+        """Return the identity of the inner model, and the filters."""
         return {**self.inner.identity(), "filters": [str(spec) for spec in self.filters]}
 
     def _begin(self, shape: tuple[int, ...]) -> None:

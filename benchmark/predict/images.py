@@ -10,10 +10,10 @@ from typing import Protocol
 
 import numpy as np
 
-from semstab.backbones import Backbone, Image, image_digest
 from semstab.data.frames import Frame
 from semstab.datasets.geometry.lenses import Labels, Scores
 from semstab.errors import ConfigError
+from semstab.models import Image, Model, image_digest
 
 
 class ImageSequence(Protocol):
@@ -78,14 +78,14 @@ class Picture:
         return self.pixels.nbytes + sum(frame.nbytes for frame in self.geometry)
 
 
-def picture(sequence: ImageSequence, index: int, backbone: Backbone) -> Picture:
-    """Return what the backbone is shown of an index.
+def picture(sequence: ImageSequence, index: int, model: Model) -> Picture:
+    """Return what the model is shown of an index.
 
     Raises:
         DataError: If that fails; the message names the file, and as `geometry_of`.
     """
     pixels = sequence.image(index)
-    geometry = geometry_of(sequence, index, pixels, backbone)
+    geometry = geometry_of(sequence, index, pixels, model)
     return Picture(index, sequence.image_name(index), pixels, geometry, shown_digest(pixels, geometry))
 
 
@@ -101,13 +101,13 @@ def shown_digest(pixels: Image, geometry: Sequence[Frame]) -> str:
     return digest
 
 
-def geometry_of(sequence: ImageSequence, index: int, pixels: Image, backbone: Backbone) -> tuple[Frame, ...]:
-    """Return the frame's depth and pose at the image's pixels for a backbone that wants it; else nothing.
+def geometry_of(sequence: ImageSequence, index: int, pixels: Image, model: Model) -> tuple[Frame, ...]:
+    """Return the frame's depth and pose at the image's pixels for a model that wants it; else nothing.
 
     Raises:
         ConfigError: If there is none.
     """
-    if not backbone.wants_geometry:
+    if not model.wants_geometry:
         return ()
     frame = sequence.view(index, (pixels.shape[0], pixels.shape[1]))
     if frame is None:

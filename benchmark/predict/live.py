@@ -14,7 +14,6 @@ from typing import Any
 import numpy as np
 from pydantic import BaseModel, Field, field_validator
 
-from semstab.backbones import Backbone, Image, Prediction, ask, create
 from semstab.config import DatasetConfig, FrameSelection, Settings
 from semstab.core.types import Float64, UInt8
 from semstab.data.frames import Frame
@@ -23,6 +22,7 @@ from semstab.datasets import GROUND_TRUTH, Dataset, Filtering, Scene, open_datas
 from semstab.datasets.geometry.lenses import Labels, Scores
 from semstab.datasets.scene import select_frames
 from semstab.errors import ConfigError
+from semstab.models import Image, Model, Prediction, ask, create
 from semstab.predict.filters import Filtered, parse
 from semstab.predict.images import ImageSequence, first_images, geometry_of
 from semstab.predict.predictor import NAME as STORED
@@ -38,16 +38,16 @@ class PredictedOptions(Settings):
     """The dataset whose images are predicted on, and who predicts."""
 
     dataset: DatasetConfig = Field(description="a dataset with its options")
-    backbones: list[PredictorConfig] = Field(min_length=1, description="each predicts every frame")
+    models: list[PredictorConfig] = Field(min_length=1, description="each predicts every frame")
     frames: FrameSelection = Field(
-        FrameSelection(), description="what sequential backbones are shown, in order; those of the run by default"
+        FrameSelection(), description="what sequential models are shown, in order; those of the run by default"
     )
     scene_frames: dict[str, FrameSelection] = Field(
         default_factory=dict, description="frames of single scenes, instead of `frames`"
     )
 
-    remedies: list[str] = Field(
-        default_factory=list, description="filters, each put over each of the backbones and named beside it"
+    try_filters: list[str] = Field(
+        default_factory=list, description="filters, each put over each of the models and named beside it"
     )
     kept: Path | None = Field(None, description="folder in which predictions of models are kept; in memory by default")
 
@@ -56,17 +56,17 @@ class PredictedOptions(Settings):
     def _with_every_option(cls, value: DatasetConfig) -> DatasetConfig:
         return resolved(value)
 
-    @field_validator("remedies")
+    @field_validator("try_filters")
     @classmethod
     def _filters_with_numbers(cls, value: list[str]) -> list[str]:
-        return ["+".join(str(parse(text)) for text in remedy.split("+")) for remedy in value]
+        return ["+".join(str(parse(text)) for text in chain.split("+")) for chain in value]
 
-    @field_validator("backbones")
+    @field_validator("models")
     @classmethod
     def _names_of_their_own(cls, value: list[PredictorConfig]) -> list[PredictorConfig]:
         names = [predictor.source_name for predictor in value]
         if repeated := [name for name in names if names.count(name) > 1]:
-            raise ValueError(f"two backbones are called '{repeated[0]}'; give one a name")
+            raise ValueError(f"two models are called '{repeated[0]}'; give one a name")
         return [predictor.resolved() for predictor in value]
 
 
@@ -81,10 +81,10 @@ class PredictedDataset(Dataset):
 
     def __init__(self, options: PredictedOptions) -> None:
         self._dataset = open_dataset(options.dataset.name, options.dataset.options)
-        self._configs = {predictor.source_name: predictor for predictor in _with_remedies(options)}
+        self._configs = {predictor.source_name: predictor for predictor in _with_filters(options)}
         self._options = options
-        self._loaded: dict[str, Backbone] = {}
-        self._models: dict[str, Backbone] = {}
+        self._loaded: dict[str, Model] = {}
+        self._models: dict[str, Model] = {}
         self._shown_by: dict[str, object] = {}
         self.lock = threading.RLock()
 
@@ -102,30 +102,30 @@ class PredictedDataset(Dataset):
         """The predictors by label source."""
         return self._configs
 
-    def model(self, source: str) -> Backbone:
+    def model(self, source: str) -> Model:
         """Return the model behind a label source.
 
         Raises:
             ConfigError: If there is none of that name.
         """
         if source not in self._configs:
-            raise ConfigError(f"backbone '{source}' does not predict here; there is {', '.join(self._configs)}")
+            raise ConfigError(f"model '{source}' does not predict here; there is {', '.join(self._configs)}")
         with self.lock:
             if source not in self._loaded:
                 config = self._configs[source]
                 self._loaded[source] = completed(config, self._shared(config), self._options.kept)
             return self._loaded[source]
 
-    def _shared(self, config: PredictorConfig) -> Backbone:
+    def _shared(self, config: PredictorConfig) -> Model:
         """Return the model itself, loaded once for all that is put around it, unless it remembers what it was shown."""
-        what = json.dumps([config.backbone, config.options], sort_keys=True)
-        model = self._models.get(what) or create(config.backbone, **config.options)
+        what = json.dumps([config.model, config.options], sort_keys=True)
+        model = self._models.get(what) or create(config.model, **config.options)
         if not getattr(model, "sequential", False):
             self._models[what] = model
         return model
 
     def frames_of(self, scene: Scene, source: str) -> list[int]:
-        """Return what a sequential backbone is shown of a scene: the selected frames that have what it looks at."""
+        """Return what a sequential model is shown of a scene: the selected frames that have what it looks at."""
         selection = self._options.scene_frames.get(scene.name, self._options.frames)
         return select_frames(scene, selection, **self._configs[source].looks_at).indices
 
@@ -138,12 +138,12 @@ class PredictedDataset(Dataset):
 class PredictedScene(Scene):
     """One scene of another dataset, with predicted labels.
 
-    A sequential backbone is shown the dataset's `frames` of the scene in order, whichever of them is asked for.
+    A sequential model is shown the dataset's `frames` of the scene in order, whichever of them is asked for.
     """
 
     def __init__(self, inner: Scene, dataset: PredictedDataset) -> None:
         self.name = inner.name
-        self.backbones = tuple(dataset.predictors)
+        self.models = tuple(dataset.predictors)
         self.ground_truth = inner.ground_truth
         self.up = inner.up
         self.georeference = inner.georeference
@@ -155,13 +155,13 @@ class PredictedScene(Scene):
         self.skips_incomplete = inner.skips_incomplete
         self._inner = inner
         self._dataset = dataset
-        self._fitted: dict[str, Backbone] = {}
+        self._fitted: dict[str, Model] = {}
         self._digests: dict[int, bytes] = {}
         self._kept: dict[tuple[str, int], Prediction] = {}
         self._room = KEPT_BYTES
         self._lock = dataset.lock
         self._in_order: dict[str, InOrder] = {}
-        self._of_labels: dict[str, tuple[StoredSequence, Backbone]] = {}
+        self._of_labels: dict[str, tuple[StoredSequence, Model]] = {}
 
     def __len__(self) -> int:
         """Return the number of frames."""
@@ -182,20 +182,20 @@ class PredictedScene(Scene):
 
     def missing(self, index: int, sources: Sequence[str] = (), *, color: bool = False) -> list[str]:
         """Return files that the frame lacks; it needs its colour where a model is among the sources."""
-        wanted = [self._dataset.predictors[source].looks_at for source in sources if source in self.backbones]
+        wanted = [self._dataset.predictors[source].looks_at for source in sources if source in self.models]
         stored = [*{source: None for each in wanted for source in each["sources"]}]
         truth = [source for source in sources if source == GROUND_TRUTH]
         return self._inner.missing(index, [*stored, *truth], color=color or any(each["color"] for each in wanted))
 
-    def filtering(self, backbone: str) -> Filtering:
+    def filtering(self, model: str) -> Filtering:
         """Return what was done to a label source before it is read."""
-        if backbone == GROUND_TRUTH:
-            return Filtering(backbone)
-        known, one = self._dataset.predictors, self._dataset.predictors[backbone]
+        if model == GROUND_TRUTH:
+            return Filtering(model)
+        known, one = self._dataset.predictors, self._dataset.predictors[model]
         same = (name for name, other in known.items() if other.model_copy(update={"name": None}) == one.unfiltered)
-        model = self._fitted.get(backbone)
-        took = model.seconds if isinstance(model, Filtered) else []
-        return Filtering(next(same, backbone), "+".join(one.filters), 1e3 * float(np.median(took)) if took else 0.0)
+        predictor = self._fitted.get(model)
+        took = predictor.seconds if isinstance(predictor, Filtered) else []
+        return Filtering(next(same, model), "+".join(one.filters), 1e3 * float(np.median(took)) if took else 0.0)
 
     @property
     def settings(self) -> Mapping[str, Any]:
@@ -227,30 +227,30 @@ class PredictedScene(Scene):
         """Return what the frame's files are called."""
         return self._inner.image_name(index)
 
-    def label_space(self, backbone: str) -> LabelSpace:
+    def label_space(self, model: str) -> LabelSpace:
         """Return the classes that the model predicts.
 
         Raises:
             ConfigError: For a model without classes.
         """
-        if backbone == GROUND_TRUTH:
+        if model == GROUND_TRUTH:
             space: LabelSpace | None = self._inner.label_space(GROUND_TRUTH)
         else:
-            space = self._unfitted(backbone).label_space
+            space = self._unfitted(model).label_space
         if space is None:
-            raise ConfigError(f"backbone '{backbone}' finds regions without classes, which cannot be fused")
+            raise ConfigError(f"model '{model}' finds regions without classes, which cannot be fused")
         return space
 
-    def frame(self, index: int, backbone: str, *, color: bool = True) -> Frame:
+    def frame(self, index: int, model: str, *, color: bool = True) -> Frame:
         """Return the frame with what the model says about its image.
 
         Raises what the inner scene and the model raise.
         """
-        if backbone == GROUND_TRUTH:
-            return self._inner.frame(index, backbone, color=color)
-        sequence = self._sequence(backbone)
+        if model == GROUND_TRUTH:
+            return self._inner.frame(index, model, color=color)
+        sequence = self._sequence(model)
         image = sequence.image(index)
-        prediction = self._predict(index, backbone, image)
+        prediction = self._predict(index, model, image)
         labels = prediction.labels if prediction.scores is None else None
         frame = sequence.predicted(index, labels=labels, scores=prediction.scores)
         assert frame is not None
@@ -261,7 +261,7 @@ class PredictedScene(Scene):
         shown = self._inner.color(index) if color and self._inner.on_photographs else image
         return dataclasses.replace(frame, color=shown if color else None)
 
-    def digest(self, indices: list[int], backbone: str) -> str:
+    def digest(self, indices: list[int], model: str) -> str:
         """Return a hash of the model, its settings, and the image, depth and pose of those frames.
 
         A sequential model's is of all frames that it is shown.
@@ -269,15 +269,15 @@ class PredictedScene(Scene):
         Raises:
             ConfigError: For a frame that is not.
         """
-        if backbone == GROUND_TRUTH:
-            return self._inner.digest(indices, backbone)
+        if model == GROUND_TRUTH:
+            return self._inner.digest(indices, model)
         with self._lock:
-            model = self._model(backbone)
-            shown = self._ordered(backbone, model).shown_for(indices) if model.sequential else None
-        config = self._dataset.predictors[backbone]
-        about = [model.identity(), config.scores, *([] if shown is None else [shown])]
+            predictor = self._predictor(model)
+            shown = self._ordered(model, predictor).shown_for(indices) if predictor.sequential else None
+        config = self._dataset.predictors[model]
+        about = [predictor.identity(), config.scores, *([] if shown is None else [shown])]
         digest = hashlib.blake2b(json.dumps(about, sort_keys=True).encode(), digest_size=16)
-        if config.backbone == STORED:
+        if config.model == STORED:
             digest.update(self._inner.digest(shown or indices, config.options["source"]).encode())
             if not config.wants_color:
                 return digest.hexdigest()
@@ -289,66 +289,66 @@ class PredictedScene(Scene):
             digest.update(self._digests[index])
         return digest.hexdigest()
 
-    def _predict(self, index: int, backbone: str, image: Image) -> Prediction:
+    def _predict(self, index: int, model: str, image: Image) -> Prediction:
         """Return what the model says about a frame; scores where they are wanted."""
         with self._lock:
-            model = self._model(backbone)
-            if model.sequential:
-                return self._ordered(backbone, model).at(index)
-            if (backbone, index) in self._kept:
-                return self._kept[backbone, index]
-            geometry = geometry_of(self._sequence(backbone), index, image, model)
-            scores = self._dataset.predictors[backbone].scores
-            (prediction,) = ask(model, [image], scores=scores, geometry=geometry)
+            predictor = self._predictor(model)
+            if predictor.sequential:
+                return self._ordered(model, predictor).at(index)
+            if (model, index) in self._kept:
+                return self._kept[model, index]
+            geometry = geometry_of(self._sequence(model), index, image, predictor)
+            scores = self._dataset.predictors[model].scores
+            (prediction,) = ask(predictor, [image], scores=scores, geometry=geometry)
             if (size := size_of(prediction)) <= self._room:
-                self._kept[backbone, index] = prediction
+                self._kept[model, index] = prediction
                 self._room -= size
             return prediction
 
-    def _ordered(self, backbone: str, model: Backbone) -> InOrder:
-        if backbone not in self._in_order:
+    def _ordered(self, model: str, predictor: Model) -> InOrder:
+        if model not in self._in_order:
             while len(self._in_order) > 1:  # what the others remember takes memory, and their turn is over
                 over = next(iter(self._in_order))
                 del self._in_order[over], self._fitted[over]
-            scores = self._dataset.predictors[backbone].scores
-            shown = self._dataset.frames_of(self._inner, backbone)
-            self._in_order[backbone] = InOrder(
-                model, self._sequence(backbone), shown, scores, partial(self._dataset.claim, backbone)
+            scores = self._dataset.predictors[model].scores
+            shown = self._dataset.frames_of(self._inner, model)
+            self._in_order[model] = InOrder(
+                predictor, self._sequence(model), shown, scores, partial(self._dataset.claim, model)
             )
-        return self._in_order[backbone]
+        return self._in_order[model]
 
-    def _model(self, backbone: str) -> Backbone:
+    def _predictor(self, model: str) -> Model:
         """Return the model, fitted to this sequence's first images."""
-        if backbone not in self._fitted:
-            model = self._unfitted(backbone)
-            self._fitted[backbone] = model.fit(first_images(self._inner, model.fit_frames))
-        return self._fitted[backbone]
+        if model not in self._fitted:
+            predictor = self._unfitted(model)
+            self._fitted[model] = predictor.fit(first_images(self._inner, predictor.fit_frames))
+        return self._fitted[model]
 
-    def _unfitted(self, backbone: str) -> Backbone:
+    def _unfitted(self, model: str) -> Model:
         """Return the model as it is loaded; the scene's own labels are a model of this scene alone."""
-        return self._stored(backbone)[1] if self._takes_stored(backbone) else self._dataset.model(backbone)
+        return self._stored(model)[1] if self._takes_stored(model) else self._dataset.model(model)
 
-    def _sequence(self, backbone: str) -> ImageSequence:
+    def _sequence(self, model: str) -> ImageSequence:
         """Return what the model is shown."""
-        return self._stored(backbone)[0] if self._takes_stored(backbone) else self._inner
+        return self._stored(model)[0] if self._takes_stored(model) else self._inner
 
-    def _takes_stored(self, backbone: str) -> bool:
-        config = self._dataset.predictors.get(backbone)
-        return config is not None and config.backbone == STORED
+    def _takes_stored(self, model: str) -> bool:
+        config = self._dataset.predictors.get(model)
+        return config is not None and config.model == STORED
 
-    def _stored(self, backbone: str) -> tuple[StoredSequence, Backbone]:
+    def _stored(self, model: str) -> tuple[StoredSequence, Model]:
         with self._lock:
-            if backbone not in self._of_labels:
-                self._of_labels[backbone] = stored_labels(self._dataset.predictors[backbone], self._inner)
-            return self._of_labels[backbone]
+            if model not in self._of_labels:
+                self._of_labels[model] = stored_labels(self._dataset.predictors[model], self._inner)
+            return self._of_labels[model]
 
 
-def _with_remedies(options: PredictedOptions) -> Iterator[PredictorConfig]:
-    """Yield the backbones, each followed by itself behind each of the remedies."""
-    for predictor in options.backbones:
+def _with_filters(options: PredictedOptions) -> Iterator[PredictorConfig]:
+    """Yield the models, each followed by itself behind each of the filters to try."""
+    for predictor in options.models:
         yield predictor
-        for remedy in options.remedies:
-            filters = remedy.split("+")
+        for chain in options.try_filters:
+            filters = chain.split("+")
             name = (
                 None if predictor.name is None else "-".join([predictor.name, *(f.replace(":", "-") for f in filters)])
             )

@@ -1,4 +1,4 @@
-"""A backbone as a user asks for it: its options, the name of its predictions, the taxonomy they are given in."""
+"""A model as a user asks for it: its options, the name of its predictions, the taxonomy they are given in."""
 
 from __future__ import annotations
 
@@ -13,11 +13,6 @@ from typing import Any, Literal, Self
 import numpy as np
 from pydantic import BaseModel, Field, field_validator, model_validator
 
-from semstab.backbones import Backbone, Image, Labels, Prediction, ask, create, image_digest, narrowed, options_model
-from semstab.backbones.border import Checked, Wrapped
-from semstab.backbones.custom import absolute, is_path
-from semstab.backbones.names import InTaxonomy
-from semstab.backbones.network import is_network
 from semstab.config import Settings, validated
 from semstab.core.files import content_key, parse_yaml, read_arrays, write_arrays
 from semstab.data.frames import Frame
@@ -25,6 +20,11 @@ from semstab.data.labels import LabelSpace, ignore_id
 from semstab.datasets import GROUND_TRUTH, Scene
 from semstab.datasets.geometry.lenses import Scores, require_same_view
 from semstab.errors import ConfigError
+from semstab.models import Image, Labels, Model, Prediction, ask, create, image_digest, narrowed, options_model
+from semstab.models.border import Checked, Wrapped
+from semstab.models.custom import absolute, is_path
+from semstab.models.names import InTaxonomy
+from semstab.models.network import is_network
 from semstab.predict.filters import Filtered, parse
 from semstab.predict.images import ImageSequence, geometry_of, shown_digest
 
@@ -32,18 +32,18 @@ from semstab.predict.images import ImageSequence, geometry_of, shown_digest
 
 
 class Kept(Wrapped):
-    """A backbone that looks its predictions up in a folder, by its identity and the image, and leaves new ones there.
+    """A model that looks its predictions up in a folder, by its identity and the image, and leaves new ones there.
 
     It has no memory of images before (`sequential`). Files of one folder may be read and written by several processes.
     """
 
-    def __init__(self, inner: Backbone, folder: Path) -> None:
+    def __init__(self, inner: Model, folder: Path) -> None:
         super().__init__(inner)
         self._folder = folder
         self._fitted_to: list[str] = []
 
     def fit(self, images: Sequence[Image]) -> Self:
-        """See `Backbone`."""
+        """See `Model`."""
         fitted = super().fit(images)
         fitted._fitted_to = [image_digest(image) for image in images]
         return fitted
@@ -51,7 +51,7 @@ class Kept(Wrapped):
     def predict(
         self, images: Sequence[Image], *, scores: bool = False, geometry: Sequence[Frame] = ()
     ) -> list[Prediction]:
-        """See `Backbone`."""
+        """See `Model`."""
         frames = [[frame] for frame in geometry] or [[]] * len(images)
         return [self._one(image, scores, frame) for image, frame in zip(images, frames, strict=True)]
 
@@ -86,8 +86,8 @@ class StoredOptions(Settings):
     source: str = Field(min_length=1, description="a label source of the scene: a folder of labels/, NAME-scores, ...")
 
 
-class Stored(Backbone):
-    """A backbone that gives the scene's own labels or scores of each frame; `StoredSequence` shows it its images.
+class Stored(Model):
+    """A model that gives the scene's own labels or scores of each frame; `StoredSequence` shows it its images.
 
     gives_scores is that of the scene's first frame that has such labels.
 
@@ -100,7 +100,7 @@ class Stored(Backbone):
 
     def __init__(self, options: StoredOptions, sequence: StoredSequence | None = None) -> None:
         if sequence is None:
-            raise ConfigError(f"backbone '{NAME}' takes the labels of a scene; choose one with --data or --dataset")
+            raise ConfigError(f"model '{NAME}' takes the labels of a scene; choose one with --data or --dataset")
         self.label_space = sequence.scene.label_space(options.source)
         self.gives_scores = sequence.has_scores
         self._source = options.source
@@ -108,7 +108,7 @@ class Stored(Backbone):
     def predict(
         self, images: Sequence[Image], *, scores: bool = False, geometry: Sequence[Frame] = ()
     ) -> list[Prediction]:
-        """See `Backbone`."""
+        """See `Model`."""
         return [Prediction(self._labels(frame), shares(frame) if scores else None) for frame in geometry]
 
     def _labels(self, frame: Frame) -> Labels:
@@ -134,11 +134,11 @@ class StoredSequence:
     labels_like_depth = True
 
     def __init__(self, scene: Scene, source: str, color: bool) -> None:
-        if source not in (*scene.backbones, *scene.by_name):
-            known = ", ".join(scene.backbones) or "none"
+        if source not in (*scene.models, *scene.by_name):
+            known = ", ".join(scene.models) or "none"
             raise ConfigError(f"{scene.name}: there are no labels '{source}' for filters to take; there is {known}")
         self.scene, self.source, self.name, self._color = scene, source, scene.name, color
-        self._frame = functools.lru_cache(maxsize=NEAR)(partial(scene.frame, backbone=source, color=False))
+        self._frame = functools.lru_cache(maxsize=NEAR)(partial(scene.frame, model=source, color=False))
 
     def __len__(self) -> int:
         return len(self.scene)
@@ -192,11 +192,11 @@ def shares(frame: Frame) -> Any:
 
 
 class PredictorConfig(Settings):
-    """The settings that name a backbone, and say how its predictions are called and given."""
+    """The settings that name a model, and say how its predictions are called and given."""
 
-    backbone: str = Field(description="a name from `semstab-bench list`; or FILE.py:NAME, net.onnx")
-    name: str | None = Field(None, description="what its predictions are called; the backbone's name by default")
-    options: dict[str, Any] = Field(default_factory=dict, description="options of that backbone")
+    model: str = Field(description="a name from `semstab-bench list`; or FILE.py:NAME, net.onnx")
+    name: str | None = Field(None, description="what its predictions are called; the model's name by default")
+    options: dict[str, Any] = Field(default_factory=dict, description="options of that model")
     scores: bool = Field(False, description="soft scores, not labels alone")
     taxonomy: str | None = Field(None, description="give labels in this taxonomy; the model's own classes by default")
     mapping: Literal["strict", "lenient"] = Field(
@@ -230,8 +230,8 @@ class PredictorConfig(Settings):
         """Return what its label maps are called."""
         if self.name is not None:
             return self.name
-        stem = Path(self.backbone).stem if is_network(self.backbone) else self.backbone.rpartition(":")[2]
-        if self.backbone == NAME:
+        stem = Path(self.model).stem if is_network(self.model) else self.model.rpartition(":")[2]
+        if self.model == NAME:
             source = str(self.options.get("source", stem))
             stem = source.removesuffix("-scores") if self.scores else source
         return "-".join([stem, *(text.replace(":", "-") for text in self.filters)])
@@ -254,71 +254,71 @@ class PredictorConfig(Settings):
     @property
     def looks_at(self) -> dict[str, Any]:
         """Return what of a scene's frames must be there, as `select_frames` takes it."""
-        stored = self.backbone == NAME
+        stored = self.model == NAME
         return {"sources": [self.options["source"]] if stored else [], "color": not stored or self.wants_color}
 
     def resolved(self) -> PredictorConfig:
-        """Return the settings with every default of the backbone's options, and absolute paths.
+        """Return the settings with every default of the model's options, and absolute paths.
 
         Raises ConfigError for an option that cannot be used, MissingDependencyError.
         """
-        options = validated(options_model(self.backbone), self.options, f"backbone '{self.backbone}': ")
-        network = is_network(self.backbone)
-        backbone = str(Path(self.backbone).expanduser().absolute()) if network else absolute(self.backbone)
-        full = {"backbone": backbone, "options": _absolute(options).model_dump(mode="json")}
+        options = validated(options_model(self.model), self.options, f"model '{self.model}': ")
+        network = is_network(self.model)
+        model = str(Path(self.model).expanduser().absolute()) if network else absolute(self.model)
+        full = {"model": model, "options": _absolute(options).model_dump(mode="json")}
         return self.model_copy(update=full)
 
 
-def load_predictor(config: PredictorConfig) -> Backbone:
-    """Return the backbone, in its taxonomy where one is named, behind its filters. Raises what `create` raises.
+def load_predictor(config: PredictorConfig) -> Model:
+    """Return the model, in its taxonomy where one is named, behind its filters. Raises what `create` raises.
 
     Raises:
-        ConfigError: If scores are wanted of a backbone that has none, or classes map nowhere.
+        ConfigError: If scores are wanted of a model that has none, or classes map nowhere.
     """
-    return completed(config, create(config.backbone, **config.options))
+    return completed(config, create(config.model, **config.options))
 
 
-def stored_labels(config: PredictorConfig, scene: Scene) -> tuple[StoredSequence, Backbone]:
+def stored_labels(config: PredictorConfig, scene: Scene) -> tuple[StoredSequence, Model]:
     """Return the same of a scene's own labels, and the frames that it is shown.
 
     Raises:
         ConfigError: If there are none.
     """
-    options = validated(StoredOptions, config.options, f"backbone '{config.backbone}': ")
+    options = validated(StoredOptions, config.options, f"model '{config.model}': ")
     sequence = StoredSequence(scene, options.source, config.wants_color)
     return sequence, completed(config, Stored(options, sequence))
 
 
-def completed(config: PredictorConfig, model: Backbone, kept: Path | None = None) -> Backbone:
+def completed(config: PredictorConfig, inner: Model, kept: Path | None = None) -> Model:
     """Return a model with all that is asked for around it.
 
     What it said of an image is looked up in the folder `kept`.
     """
-    backbone: Backbone = Checked(model, config.label_name)
-    if kept is not None and not backbone.sequential:
-        backbone = Kept(backbone, kept)
+    model: Model = Checked(inner, config.label_name)
+    if kept is not None and not model.sequential:
+        model = Kept(model, kept)
     if config.taxonomy is not None:
-        backbone = InTaxonomy(backbone, LabelSpace.load(config.taxonomy), config.mapping)
+        model = InTaxonomy(model, LabelSpace.load(config.taxonomy), config.mapping)
     if config.filters:
-        backbone = Filtered(backbone, [parse(text) for text in config.filters], config.unfiltered.label_name)
-    if config.scores and not backbone.gives_scores:
-        raise ConfigError(f"backbone '{config.unfiltered.label_name}' gives labels, no scores; leave scores out")
-    return backbone
+        model = Filtered(model, [parse(text) for text in config.filters], config.unfiltered.label_name)
+    if config.scores and not model.gives_scores:
+        raise ConfigError(f"model '{config.unfiltered.label_name}' gives labels, no scores; leave scores out")
+    return model
 
 
 OWN = ("name", "scores", "taxonomy", "mapping", "filters")
-"""Settings of a predictor, which are not its backbone's options."""
+"""Settings of a predictor, which are not its model's options."""
 
 
 def parse_predictor(text: str, more: Mapping[str, Any] | None = None, filters: Sequence[str] = ()) -> PredictorConfig:
-    """Parse 'segformer,model=FOLDER,taxonomy=uavid3': the backbone, then settings of the predictor, or its own options.
+    """Parse 'segformer,checkpoint=FOLDER,taxonomy=uavid3': the model, then settings of the predictor or the model.
 
     `more` are options, and `filters` come after its own, that are said elsewhere.
 
     Raises:
         ConfigError: For anything else.
     """
-    backbone, *settings = re.split(r",(?![^\[{]*[\]}])", text)  # not at the commas of a list
+    model, *settings = re.split(r",(?![^\[{]*[\]}])", text)  # not at the commas of a list
     own: dict[str, Any] = {}
     options: dict[str, Any] = {**(more or {})}
     for setting in settings:
@@ -328,20 +328,20 @@ def parse_predictor(text: str, more: Mapping[str, Any] | None = None, filters: S
         group = own if key in OWN else options
         group[key] = parse_yaml(value, f"--predict {text}")
     own["filters"] = [*own.get("filters", ()), *filters]
-    return validated(PredictorConfig, {"backbone": backbone, "options": options, **own}, f"--predict {text}: ")
+    return validated(PredictorConfig, {"model": model, "options": options, **own}, f"--predict {text}: ")
 
 
 def _absolute(options: BaseModel) -> BaseModel:
     """Return paths, what names a file, and a model that is a folder, from the root of the file system."""
     paths: dict[str, Any] = {key: value.absolute() for key, value in options if isinstance(value, Path)}
     paths |= {key: str(Path(value).expanduser().absolute()) for key, value in options if is_path(value)}
-    model = getattr(options, "model", None)
-    if isinstance(model, str) and Path(model).expanduser().is_dir():
-        paths["model"] = str(Path(model).expanduser().absolute())
+    checkpoint = getattr(options, "checkpoint", None)
+    if isinstance(checkpoint, str) and Path(checkpoint).expanduser().is_dir():
+        paths["checkpoint"] = str(Path(checkpoint).expanduser().absolute())
     return options.model_copy(update=paths)
 
 
-# A sequential backbone inside a run: whichever frame is asked for, it has seen the sequence up to it.
+# A sequential model inside a run: whichever frame is asked for, it has seen the sequence up to it.
 
 KEPT_BYTES = 1 << 28
 """Memory for the latest predictions: frames are asked for nearly, not quite in order."""
@@ -350,26 +350,26 @@ LEAST_KEPT = 4
 
 
 class InOrder:
-    """The predictions of a sequential backbone, shown a sequence in order, whatever is asked for when.
+    """The predictions of a sequential model, shown a sequence in order, whatever is asked for when.
 
-    Where a prediction is no longer at hand, the backbone is shown the sequence from its first frame again.
+    Where a prediction is no longer at hand, the model is shown the sequence from its first frame again.
 
     Attributes:
         indices: The frames that it is shown.
-        claim: A function that is told whose the backbone is now, and says whether it was somebody else's: then it
+        claim: A function that is told whose the model is now, and says whether it was somebody else's: then it
             begins again.
     """
 
     def __init__(
         self,
-        backbone: Backbone,
+        model: Model,
         sequence: ImageSequence,
         indices: Sequence[int],
         scores: bool,
         claim: Callable[[InOrder], bool],
     ) -> None:
         self.indices = indices
-        self._backbone, self._sequence, self._scores, self._claim = backbone, sequence, scores, claim
+        self._model, self._sequence, self._scores, self._claim = model, sequence, scores, claim
         self._place = {index: place for place, index in enumerate(indices)}
         self._next = 0
         self._kept: dict[int, Prediction] = {}
@@ -378,19 +378,19 @@ class InOrder:
         """Return the prediction of a frame.
 
         Raises:
-            ConfigError: For a frame that the backbone is not shown.
+            ConfigError: For a frame that the model is not shown.
         """
         place = self._placed(index)
         if index not in self._kept:
             if self._claim(self) or place < self._next:
-                self._backbone.reset()
+                self._model.reset()
                 self._next = 0
             for shown in self.indices[self._next : place + 1]:
                 self._show(shown)
         return self._kept[index]
 
     def shown_for(self, indices: Sequence[int]) -> list[int]:
-        """Return the frames that the backbone is shown for the sake of these: its labels depend on all of them.
+        """Return the frames that the model is shown for the sake of these: its labels depend on all of them.
 
         Raises:
             ConfigError: For a frame that is not among them.
@@ -401,14 +401,14 @@ class InOrder:
         if index not in self._place:
             raise ConfigError(
                 f"{self._sequence.name}: frame {index} is not among the {len(self.indices)} frames that a sequential"
-                " backbone is shown; its labels depend on these, so a sweep can only leave some of them out"
+                " model is shown; its labels depend on these, so a sweep can only leave some of them out"
             )
         return self._place[index]
 
     def _show(self, index: int) -> None:
         image = self._sequence.image(index)
-        geometry = geometry_of(self._sequence, index, image, self._backbone)
-        (prediction,) = ask(self._backbone, [image], scores=self._scores, geometry=geometry)
+        geometry = geometry_of(self._sequence, index, image, self._model)
+        (prediction,) = ask(self._model, [image], scores=self._scores, geometry=geometry)
         self._kept[index] = prediction
         self._next += 1
         while len(self._kept) > LEAST_KEPT and sum(map(size_of, self._kept.values())) > KEPT_BYTES:

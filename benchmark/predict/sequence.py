@@ -15,11 +15,11 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from semstab.backbones import Backbone, Streamed, ask, streamed
 from semstab.core.files import content_key, csv_text, write_text
 from semstab.core.prefetch import prefetch
 from semstab.datasets.formats.images import read_labels
 from semstab.metrics import RegionChange, macro_mean, matched_region_flicker
+from semstab.models import Model, Streamed, ask, streamed
 from semstab.pixels.warp import warp
 from semstab.predict.folder import Kind, PredictionFolder, ScoreType, largest_only, resized
 from semstab.predict.images import ImageSequence, Picture, first_images, picture
@@ -85,7 +85,7 @@ REPORTED_PACKAGES = ("numpy", "opencv-python-headless", "torch", "transformers",
 
 
 SCORE_BYTES = 1 << 28
-"""Memory for the scores of an image; more are taken class by class, where a backbone gives them so."""
+"""Memory for the scores of an image; more are taken class by class, where a model gives them so."""
 
 
 @dataclass(frozen=True)
@@ -149,7 +149,7 @@ class PredictionObserver:
 
 def predict_sequence(
     sequence: ImageSequence,
-    backbone: Backbone,
+    model: Model,
     indices: Sequence[int],
     out: Path,
     options: SequenceOptions,
@@ -157,8 +157,8 @@ def predict_sequence(
 ) -> SequenceReport:
     """Predict the images of these indices into out/labels/NAME, and out/scores/NAME; regions into out/regions/NAME.
 
-    A backbone that adapts to a sequence is fitted to the sequence's first images. Frames that an earlier start of the
-    same finished are kept; an image whose content changed is predicted again. A sequential backbone that lacks a frame
+    A model that adapts to a sequence is fitted to the sequence's first images. Frames that an earlier start of the
+    same finished are kept; an image whose content changed is predicted again. A sequential model that lacks a frame
     is shown all of them again from the first one.
 
     Raises:
@@ -168,16 +168,16 @@ def predict_sequence(
     for observer in observers:
         observer.sequence_started(sequence.name, len(indices))
     started = time.perf_counter()
-    backbone = backbone.fit(first_images(sequence, backbone.fit_frames))
-    work = _Work(sequence, backbone, indices, out, options, observers)
+    model = model.fit(first_images(sequence, model.fit_frames))
+    work = _Work(sequence, model, indices, out, options, observers)
     with contextlib.closing(work):
-        anew = backbone.sequential and not all(work.kept(picture) for picture in work.pictures())
+        anew = model.sequential and not all(work.kept(picture) for picture in work.pictures())
         for picture in work.pictures():
             work.take(picture, anew)
         work.flush()
     seconds = time.perf_counter() - started
     series = None
-    if backbone.label_space is None:
+    if model.label_space is None:
         series = region_series(sequence, indices, work.folders[0].file)
         series.write(work.folders[0].path / "changes.csv")
     return work.report(seconds, series)
@@ -189,15 +189,15 @@ class _Work:
     def __init__(
         self,
         sequence: ImageSequence,
-        backbone: Backbone,
+        model: Model,
         indices: Sequence[int],
         out: Path,
         options: SequenceOptions,
         observers: Sequence[PredictionObserver],
     ) -> None:
-        self.sequence, self.backbone, self.options, self.observers = sequence, backbone, options, observers
+        self.sequence, self.model, self.options, self.observers = sequence, model, options, observers
         self.indices = indices
-        self.folders = _folders(sequence, backbone, indices, out, options)
+        self.folders = _folders(sequence, model, indices, out, options)
         self._waiting: list[Picture] = []
         self._predicted = self._kept = 0
         self._model_seconds = 0.0
@@ -207,16 +207,16 @@ class _Work:
 
         What a sequential one says depends on all that it was shown before.
         """
-        if self.backbone.sequential:
-            self.backbone.reset()
+        if self.model.sequential:
+            self.model.reset()
         so_far = ""
-        read = partial(picture, self.sequence, backbone=self.backbone)
+        read = partial(picture, self.sequence, model=self.model)
         with contextlib.closing(
             prefetch(read, self.indices, threads=self.options.threads, size=lambda item: item.nbytes)
         ) as ahead:
             for fetched in ahead:
                 item = fetched.item
-                if self.backbone.sequential:
+                if self.model.sequential:
                     so_far = content_key({"after": so_far, "shown": item.digest})
                     item = dataclasses.replace(item, digest=so_far)
                 yield item
@@ -246,11 +246,11 @@ class _Work:
         geometry = [frame for picture in pictures for frame in picture.geometry]
         images = [picture.pixels for picture in pictures]
         if self._too_large(pictures[0]):
-            found = [self.backbone.stream(image) for image in images]
+            found = [self.model.stream(image) for image in images]
         else:
             found = [
                 streamed(prediction)
-                for prediction in ask(self.backbone, images, scores=self.options.scores, geometry=geometry)
+                for prediction in ask(self.model, images, scores=self.options.scores, geometry=geometry)
             ]
         seconds = time.perf_counter() - started
         self._model_seconds += seconds
@@ -272,9 +272,9 @@ class _Work:
         )
 
     def _too_large(self, picture: Picture) -> bool:
-        """Return whether all scores of an image take too much memory, and the backbone can give them one by one."""
-        size = 4 * picture.pixels.shape[0] * picture.pixels.shape[1] * len(self.backbone.label_space or ())
-        return self.options.scores and self.backbone.streams and size > SCORE_BYTES
+        """Return whether all scores of an image take too much memory, and the model can give them one by one."""
+        size = 4 * picture.pixels.shape[0] * picture.pixels.shape[1] * len(self.model.label_space or ())
+        return self.options.scores and self.model.streams and size > SCORE_BYTES
 
     def _write(self, picture: Picture, found: Streamed, seconds: float) -> None:
         """Write a prediction at the pixels that the scene's label files have."""
@@ -295,10 +295,10 @@ class _Work:
 
 
 def _folders(
-    sequence: ImageSequence, backbone: Backbone, indices: Sequence[int], out: Path, options: SequenceOptions
+    sequence: ImageSequence, model: Model, indices: Sequence[int], out: Path, options: SequenceOptions
 ) -> list[PredictionFolder]:
-    space, settings = backbone.label_space, backbone.identity()
-    if backbone.sequential:
+    space, settings = model.label_space, model.identity()
+    if model.sequential:
         settings = {**settings, "frames": _selection([sequence.image_name(index) for index in indices])}
     about = {"command": list(options.command), "packages": _versions(), "batch": options.batch}
     kinds: list[Kind] = ["regions"] if space is None else ["labels"]
@@ -320,7 +320,7 @@ def _folders(
 
 
 def _selection(names: Sequence[str]) -> str:
-    """Return which frames a sequential backbone saw, in a few words that are equal where all of them are."""
+    """Return which frames a sequential model saw, in a few words that are equal where all of them are."""
     digest = content_key({"names": list(names)})[:8]
     return f"{len(names)} from {names[0]} to {names[-1]} ({digest})" if names else "none"
 

@@ -3,19 +3,19 @@
 Entities, all below the scene's name:
 
 - `camera`, `camera/color`: Transform3D and Pinhole; EncodedImage (JPEG)
-- `camera/BACKBONE/labels`: SegmentationImage: classes
-- `camera/BACKBONE/contradictions`: the same: where labels are not the dominant class of the map before the frame
-- `camera/BACKBONE/drift`: the same: drift that the frame caused at each pixel's voxel. A Transform3D spreads each
+- `camera/MODEL/labels`: SegmentationImage: classes
+- `camera/MODEL/contradictions`: the same: where labels are not the dominant class of the map before the frame
+- `camera/MODEL/drift`: the same: drift that the frame caused at each pixel's voxel. A Transform3D spreads each
   picture over the camera's image
 - `depth`, `trajectory`: DepthImage; LineStrips3D
-- `map/BACKBONE/BACKEND/CHUNK`: VoxelGridMap, coloured by class; components category:colors, op:values and KEY:values of
+- `map/MODEL/BACKEND/CHUNK`: VoxelGridMap, coloured by class; components category:colors, op:values and KEY:values of
   each measure, which the views map to its own
-- `series/NAME/BACKBONE/BACKEND`: Scalars: a series of `SERIES`
-- `flips/BACKBONE/voxel_N`: StateChange: the dominant class of the voxels that drifted most
-- `flips_report/BACKBONE`, `flips_at/...`: TextDocument: the top contributing frames; Points3D: where those voxels are
-- `camera/BACKBONE/flips`: Points2D: those voxels in the frame, where their numbers lie inside its image
-- `difference/BACKBONE/A and B/PART`: VoxelGridMap: voxels where two backends differ
-- `difference_report/BACKBONE/A and B`: TextDocument: how many they are
+- `series/NAME/MODEL/BACKEND`: Scalars: a series of `SERIES`
+- `flips/MODEL/voxel_N`: StateChange: the dominant class of the voxels that drifted most
+- `flips_report/MODEL`, `flips_at/...`: TextDocument: the top contributing frames; Points3D: where those voxels are
+- `camera/MODEL/flips`: Points2D: those voxels in the frame, where their numbers lie inside its image
+- `difference/MODEL/A and B/PART`: VoxelGridMap: voxels where two backends differ
+- `difference_report/MODEL/A and B`: TextDocument: how many they are
 - `legend`, `all_classes`: Points2D: the classes and their colours, those with the most voxels first
 - `log`: TextLog: each unit's final numbers
 

@@ -58,7 +58,7 @@ ORIGIN_STEP = 1000.0
 class SceneLog:
     """A scene of a plan: its axes, its legend, the origin of its maps, and its camera.
 
-    The camera's pictures are logged once a frame, whichever backbones and backends fuse it.
+    The camera's pictures are logged once a frame, whichever models and backends fuse it.
 
     Attributes:
         origin: (3,) voxels, None before anything of the scene is logged.
@@ -84,7 +84,7 @@ class SceneLog:
         self.legend.log(stream, self.name)
         for task in self._tasks:
             for name, context in {"labels": label_context(task.mapping.target), **drift.contexts()}.items():
-                stream.log(path(self.name, "camera", task.backbone, name), context, static=True)
+                stream.log(path(self.name, "camera", task.model, name), context, static=True)
 
     def begin(self, stream: rr.RecordingStream, position: Float64, voxel_size: float) -> Int64:
         """Return the origin of the scene's maps, near the first camera position (3,), metres, that is known."""

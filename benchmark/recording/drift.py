@@ -104,12 +104,12 @@ class FrameChanges:
 # The voxels that drifted most, and the frames that contributed most to that.
 
 SHOWN = 10
-"""Voxels that are shown of a backbone on a scene, at least APART voxels apart: one of each location that drifts."""
+"""Voxels that are shown of a model on a scene, at least APART voxels apart: one of each location that drifts."""
 
 APART, CANDIDATES = 5, 20_000
 
 MAX_MOVES = 2_000_000
-"""Moves that are remembered of a backbone on a scene; past them, those of the voxels that drifted least are dropped."""
+"""Moves that are remembered of a model on a scene; past them, those of the voxels that drifted least are dropped."""
 
 MOVED_BITS = 0.05
 """Drift from which on a frame is listed, also where the dominant class stays: that of a drifting voxel."""
@@ -187,7 +187,7 @@ class DriftLog:
         self,
         stream: rr.RecordingStream,
         scene: str,
-        backbone: str,
+        model: str,
         classes: LabelSpace,
         translation: npt.NDArray[np.floating[Any]],
         clock: Clock,
@@ -200,7 +200,7 @@ class DriftLog:
         bits, first_frame, op = (self.map.column(name, rows) for name in ("drift_sum", "first_frame", "op"))
         dominant, sbd = self.map.evidence_of(rows).argmax(axis=1), mean_drift(bits, op)
         every = np.concatenate([np.zeros(0, dtype=MOVE), *self._moves])
-        lines = [f"**{backbone}**: the voxels with the largest drift, and the frames that moved them", ""]
+        lines = [f"**{model}**: the voxels with the largest drift, and the frames that moved them", ""]
         lines += [] if len(rows) else ["No voxel drifted."]
         lanes = rr.StateConfiguration(values=names, labels=names, colors=[(*color, 255) for color in classes.colors])
         for i, row in enumerate(rows):
@@ -211,7 +211,7 @@ class DriftLog:
                 f"- **voxel {i + 1}** at ({x:.2f}, {y:.2f}, {z:.2f}) m: OP {op[i]}, drift {bits[i]:.3f} bits in all,"
                 f" SBD {sbd[i]:.4f} bits; {names[first]} in frame {first_frame[i]}"
             )
-            lane = path(scene, "flips", backbone, f"voxel_{i + 1}")
+            lane = path(scene, "flips", model, f"voxel_{i + 1}")
             stream.log(lane, lanes, static=True)
             clock.set(stream, int(first_frame[i]), self._views[int(first_frame[i])].timestamp)
             stream.log(lane, rr.StateChange(state=names[first]))
@@ -223,14 +223,14 @@ class DriftLog:
                     stream.log(lane, rr.StateChange(state=names[after]))
                 lines.append(f"    - frame {frame}{f' ({view.file})' if view.file else ''}: {change}, {moved:.4f} bits")
         report = rr.TextDocument("\n".join(lines) + "\n", media_type=rr.MediaType.MARKDOWN)
-        stream.log(path(scene, "flips_report", backbone), report, static=True)
+        stream.log(path(scene, "flips_report", model), report, static=True)
         if not len(rows):
             return
         labels, colors = [f"{i + 1}" for i in range(len(rows))], COLORS[: len(rows)]
         points = rr.Points3D(
             centers - translation, labels=labels, colors=colors, radii=rr.Radius.ui_points(5.0), show_labels=True
         )
-        stream.log(path(scene, "flips_at", backbone), points, static=True)
+        stream.log(path(scene, "flips_at", model), points, static=True)
         for index, view in self._views.items():  # in the view of an image 3D points would stand beside it as well
             pixels, inside = view.project(centers)
             clock.set(stream, index, view.timestamp)
@@ -241,4 +241,4 @@ class DriftLog:
                 radii=rr.Radius.ui_points(4.0),
                 show_labels=True,
             )
-            stream.log(path(scene, "camera", backbone, "flips"), numbers)
+            stream.log(path(scene, "camera", model, "flips"), numbers)

@@ -248,13 +248,13 @@ def _legend(scene: str, entity: str, name: str, height: float) -> rrb.Spatial2DV
 
 
 def _maps(name: str, tasks: list[Task], bounds: SceneBounds | None, height: float) -> rrb.Container:
-    """Return the maps of all backbones, coloured by a measure."""
+    """Return the maps of all models, coloured by a measure."""
     mode = color_modes()[name]
     apart = len(tasks) > SIDE_BY_SIDE
     columns = 1 if apart else min(len(tasks), 2)
     rows = 1 if apart else math.ceil(len(tasks) / columns)
     aspect = LEFT[0] / columns / ((height - TITLE * apart) / rows - TITLE)
-    views = [_map(f"{task.backbone}: {mode.title}", task, drawn(task), bounds, aspect, name) for task in tasks]
+    views = [_map(f"{task.model}: {mode.title}", task, drawn(task), bounds, aspect, name) for task in tasks]
     return rrb.Tabs(*views, name=mode.tab) if apart else rrb.Grid(*views, grid_columns=columns, name=mode.tab)
 
 
@@ -262,28 +262,28 @@ def _map(
     title: str, task: Task, backend: str, bounds: SceneBounds | None, aspect: float, name: str = "class"
 ) -> rrb.Spatial3DView:
     """Return a backend's map; coloured other than by class, the views say so of each of its chunks."""
-    scene, backbone = task.scene.name, task.backbone
-    entity = path(scene, "map", backbone, backend)
-    around = [path(scene, "camera"), path(scene, "trajectory"), path(scene, "flips_at", backbone)]
+    scene, model = task.scene.name, task.model
+    entity = path(scene, "map", model, backend)
+    around = [path(scene, "camera"), path(scene, "trajectory"), path(scene, "flips_at", model)]
     chunks = [] if name == "class" else [chunk(entity, number) for number in range(CHUNKS)]
     coloring = {"defaults": defaults(name), "overrides": dict.fromkeys(chunks, visualizer(name))}
     return view_3d(scene, [f"{entity}/**", *around], title, bounds, aspect, **coloring)
 
 
 def _cameras(scene: str, tasks: list[Task], picture: str) -> rrb.Container:
-    """Return the labels of each backbone next to a picture of the frame."""
-    rows = [rrb.Horizontal(*_camera(scene, task, picture), name=task.backbone) for task in tasks]
+    """Return the labels of each model next to a picture of the frame."""
+    rows = [rrb.Horizontal(*_camera(scene, task, picture), name=task.model) for task in tasks]
     return (rrb.Vertical if len(rows) < SIDE_BY_SIDE else rrb.Tabs)(*rows, name=picture.capitalize())
 
 
 def _camera(scene: str, task: Task, picture: str) -> list[rrb.View]:
     origin, color = path(scene, "camera"), path(scene, "camera", "color")
-    labels, shown, flips = (path(scene, "camera", task.backbone, name) for name in ("labels", picture, "flips"))
+    labels, shown, flips = (path(scene, "camera", task.model, name) for name in ("labels", picture, "flips"))
     seen_through: Any = {labels: rr.SegmentationImage.from_fields(opacity=0.6).visualizer()}
-    title = f"{task.backbone}: {PICTURES[picture]}"
+    title = f"{task.model}: {PICTURES[picture]}"
     return [
         rrb.Spatial2DView(
-            origin=origin, contents=[color, labels], overrides=seen_through, name=f"{task.backbone}: labels"
+            origin=origin, contents=[color, labels], overrides=seen_through, name=f"{task.model}: labels"
         ),
         rrb.Spatial2DView(origin=origin, contents=[color, shown, flips], name=title),
     ]
@@ -292,9 +292,7 @@ def _camera(scene: str, task: Task, picture: str) -> list[rrb.View]:
 def _below(scene: str, tasks: list[Task]) -> rrb.Container:
     more = [name for name in SERIES if name not in OVERVIEW and not name.endswith("_ms")]
     times = [name for name in SERIES if name.endswith("_ms")]
-    agreement = [
-        rrb.TextDocumentView(origin=path(scene, "agreement", task.backbone), name=task.backbone) for task in tasks
-    ]
+    agreement = [rrb.TextDocumentView(origin=path(scene, "agreement", task.model), name=task.model) for task in tasks]
     return rrb.Tabs(
         rrb.Horizontal(*(_plot(scene, name, tasks) for name in OVERVIEW), name="Time series"),
         rrb.Horizontal(*agreement, name="Agreement of frames"),
@@ -305,9 +303,9 @@ def _below(scene: str, tasks: list[Task]) -> rrb.Container:
 
 
 def _plot(scene: str, name: str, tasks: list[Task]) -> rrb.TimeSeriesView:
-    """Return a series of all backbones; of backends that fuse alike one line is drawn, but for their times."""
+    """Return a series of all models; of backends that fuse alike one line is drawn, but for their times."""
     lines = [
-        entity(name, Unit(scene, task.backbone, backend))
+        entity(name, Unit(scene, task.model, backend))
         for task in tasks
         for backend in task.backends
         if name.endswith("_ms") or backend == drawn(task) or not is_pointwise(backend)
@@ -321,24 +319,24 @@ def _plot(scene: str, name: str, tasks: list[Task]) -> rrb.TimeSeriesView:
 def _flips(scene: str, task: Task) -> rrb.Container:
     """Return the voxels that drifted most and their top contributing frames, next to the camera."""
     lanes = rrb.StateTimelineView(
-        origin=path(scene, "flips", task.backbone), name="Dominant class of the voxels that drifted most"
+        origin=path(scene, "flips", task.model), name="Dominant class of the voxels that drifted most"
     )
-    frames = rrb.TextDocumentView(origin=path(scene, "flips_report", task.backbone), name="Top contributing frames")
+    frames = rrb.TextDocumentView(origin=path(scene, "flips_report", task.model), name="Top contributing frames")
     pictures = rrb.Vertical(*_camera(scene, task, "drift"))
-    return rrb.Horizontal(rrb.Vertical(lanes, frames), pictures, column_shares=[5, 4], name=f"Flips: {task.backbone}")
+    return rrb.Horizontal(rrb.Vertical(lanes, frames), pictures, column_shares=[5, 4], name=f"Flips: {task.model}")
 
 
 def _comparison(task: Task, first: str, second: str, bounds: SceneBounds | None) -> rrb.Container:
     """Return two backends: their maps and where these differ, and their series in the same plots."""
-    scene, backbone, pair = task.scene.name, task.backbone, f"{first} and {second}"
+    scene, model, pair = task.scene.name, task.model, f"{first} and {second}"
     difference = view_3d(
         scene,
-        [path(scene, "difference", backbone, pair, part) for part in DIFFERENCE],
+        [path(scene, "difference", model, pair, part) for part in DIFFERENCE],
         f"Where they differ: orange in {first} only, blue in {second} only, else |VSS difference| (0 to 0.5)",
         bounds,
         DIFFERENCE_ASPECT,
     )
-    report = rrb.TextDocumentView(origin=path(scene, "difference_report", backbone, pair), name="Difference")
+    report = rrb.TextDocumentView(origin=path(scene, "difference_report", model, pair), name="Difference")
     maps = rrb.Horizontal(
         _map(f"{first}: dominant class", task, first, bounds, COMPARED_ASPECT),
         _map(f"{second}: dominant class, at the end", task, second, bounds, COMPARED_ASPECT),
@@ -346,14 +344,14 @@ def _comparison(task: Task, first: str, second: str, bounds: SceneBounds | None)
     plots = [
         rrb.TimeSeriesView(
             origin=path(scene, "series", name),
-            contents=[entity(name, Unit(scene, backbone, backend)) for backend in (first, second)],
+            contents=[entity(name, Unit(scene, model, backend)) for backend in (first, second)],
             name=SERIES[name],
         )
         for name in COMPARED
     ]
     left = rrb.Vertical(report, difference, maps, row_shares=[1, 5, 4])
     right = rrb.Grid(*plots, grid_columns=2)
-    return rrb.Horizontal(left, right, column_shares=[5, 4], name=f"{backbone}: {pair}")
+    return rrb.Horizontal(left, right, column_shares=[5, 4], name=f"{model}: {pair}")
 
 
 # Changes between two maps: each voxel by how much, the locations that got worse by number.

@@ -48,7 +48,7 @@ BYTES_A_VOXEL = 120
 
 
 class GroupLog:
-    """The recording of one backbone on a scene.
+    """The recording of one model on a scene.
 
     Attributes:
         live: A map that is being fused and can be followed; without it the recording fuses one of its own.
@@ -85,7 +85,7 @@ class GroupLog:
                 pictures |= {name: (picture, coarse) for name, picture in changes.pictures(coarse).items()}
             for name, (picture, every) in pictures.items():
                 image = rr.SegmentationImage(picture, draw_order=-10)
-                stream.log(path(self._scene, "camera", self.task.backbone, name), image, over_camera(every))
+                stream.log(path(self._scene, "camera", self.task.model, name), image, over_camera(every))
             for log_chunk in jobs:
                 log_chunk()
 
@@ -108,30 +108,30 @@ class GroupLog:
         note = self._map(unit.backend).finish(stream, table, factor)
         means = (f"{m.symbol} {summary.table[m]:.{m.digits[0]}f} {m.unit}".rstrip() for m in measures())
         text = (
-            f"{unit.backbone}, {unit.backend}: {summary.table.voxels:,} voxels, mean OP {summary.table.mean_op:.2f},"
+            f"{unit.model}, {unit.backend}: {summary.table.voxels:,} voxels, mean OP {summary.table.mean_op:.2f},"
             f" {', '.join(means)} (K = {summary.table.K}){note}"
         )
         stream.log(path(unit.scene, "log"), rr.TextLog(text))
         if summary.statistics is not None:
             document = rr.TextDocument(agreement_report(summary.statistics), media_type=rr.MediaType.MARKDOWN)
-            stream.log(path(unit.scene, "agreement", unit.backbone), document, static=True)
+            stream.log(path(unit.scene, "agreement", unit.model), document, static=True)
 
     def log_flips(self, stream: rr.RecordingStream, clock: Clock) -> None:
         """Log the voxels that drifted most, and the frames that contributed most."""
         if self.drift is not None:
-            self.drift.log(stream, self._scene, self.task.backbone, self._classes, self.origin * self._size, clock)
+            self.drift.log(stream, self._scene, self.task.model, self._classes, self.origin * self._size, clock)
 
     def _log_difference(self, stream: rr.RecordingStream, first: str, second: str, tolerance: float) -> None:
-        backbone, pair = self.task.backbone, f"{first} and {second}"
+        model, pair = self.task.model, f"{first} and {second}"
         tables = {name: self._tables[name] for name in (first, second)}
-        text = log_difference(stream, path(self._scene, "difference", backbone, pair), tables, self.origin, tolerance)
-        stream.log(path(self._scene, "log"), rr.TextLog(f"{backbone}: {text}"))
+        text = log_difference(stream, path(self._scene, "difference", model, pair), tables, self.origin, tolerance)
+        stream.log(path(self._scene, "log"), rr.TextLog(f"{model}: {text}"))
         report = rr.TextDocument(f"{text}.", media_type=rr.MediaType.MARKDOWN)
-        stream.log(path(self._scene, "difference_report", backbone, pair), report, static=True)
+        stream.log(path(self._scene, "difference_report", model, pair), report, static=True)
 
     def _map(self, backend: str) -> VoxelLogger:
         if backend not in self._maps:
-            entity = path(self._scene, "map", self.task.backbone, backend)
+            entity = path(self._scene, "map", self.task.model, backend)
             self._maps[backend] = VoxelLogger(entity, self._classes, self.origin, len(self.task.indices))
         return self._maps[backend]
 
@@ -158,7 +158,7 @@ class Recording(Observer):
         self._background: Background | None = None
         self._clock = Clock()
         self._live: GrowingMap | None = None
-        self._group: GroupLog | None = None  # the backbone on a scene that is being fused
+        self._group: GroupLog | None = None  # the model on a scene that is being fused
         self._unfinished: set[Unit] = set()  # of the group
         self._logged: set[Unit] = set()
         self._sent = 0
@@ -213,11 +213,11 @@ class Recording(Observer):
         """Log what the run's folder has of the units that are not logged yet; with pictures read frames again."""
         stream, background = self._opened()
         for task in self._plan.tasks:
-            scene, backbone = task.scene.name, task.backbone
+            scene, model = task.scene.name, task.model
             records = [
                 each
                 for sweep in (BASE, BACKENDS)
-                for each in result.select(sweep, scene=scene, backbone=backbone)
+                for each in result.select(sweep, scene=scene, model=model)
                 if each.unit not in self._logged
             ]
             if not records:
@@ -226,7 +226,7 @@ class Recording(Observer):
                 if pictures and not isinstance(task.scene, _ClosedScene):
                     self._replay_frames(task, records[0].summary)
             except (SemstabError, OSError) as error:
-                logger.warning("%s, %s: recorded without pictures (%s)", scene, backbone, error)
+                logger.warning("%s, %s: recorded without pictures (%s)", scene, model, error)
             background.drain()
             self._clock.set(stream, task.indices[-1])
             group = self._group or self._begin(task, followed=False)
@@ -283,13 +283,13 @@ class Recording(Observer):
         return self._stream, self._background
 
     def _begin(self, task: Task, position: Float64 | None = None, *, followed: bool = True) -> GroupLog:
-        """Begin the log of a backbone on a scene, with all backends of the plan."""
+        """Begin the log of a model on a scene, with all backends of the plan."""
         stream, _ = self._opened()
         scene, voxel_size = self._scenes[task.scene.name], self._plan.config.voxel_size
         if position is None:
             position = task.scene.T_wc(task.indices[0])[:3, 3]
         origin = scene.begin(stream, position, voxel_size)
-        own = next(each for each in self._plan.tasks if (each.scene.name, each.backbone) == (scene.name, task.backbone))
+        own = next(each for each in self._plan.tasks if (each.scene.name, each.model) == (scene.name, task.model))
         self._group = GroupLog(own, voxel_size, origin, self._live, followed=followed)
         self._live = None
         return self._group
@@ -308,7 +308,7 @@ class Recording(Observer):
                     self._begin(task, each.item.T_wc[:3, 3], followed=fits)
                 self.frame_fused(task, each.item, {})
         if not fits:
-            text = f"{task.backbone}: drift of frames is left out, the map would not fit into memory a second time"
+            text = f"{task.model}: drift of frames is left out, the map would not fit into memory a second time"
             self._opened()[0].log(path(scene, "log"), rr.TextLog(text))
 
     def _log_unit(self, group: GroupLog, summary: UnitSummary, table: VoxelTable, factor: int = 1) -> None:
@@ -353,7 +353,7 @@ def lacks_pictures(run: Path, file: Path) -> bool:
         return True
     columns = rr.chunk.RrdReader(file).store().schema().column_names()
     units = [record.unit for record in load_result(run).select()]
-    labels = [path(unit.scene, "camera", unit.backbone, "labels") for unit in units]
+    labels = [path(unit.scene, "camera", unit.model, "labels") for unit in units]
     return any(f"{entity}:SegmentationImage:buffer" not in columns for entity in labels)
 
 
@@ -371,7 +371,7 @@ class _ClosedScene:
     """A scene of which only the run folder is there."""
 
     name: str
-    backbones: tuple[str, ...]
+    models: tuple[str, ...]
     up: Float64 | None
 
     def T_wc(self, index: int) -> Float64:
@@ -388,7 +388,7 @@ def _plan_of(run: Path, config: Config, result: Result) -> Plan:
     units = []
     for record in (*result.select(), *result.select(BACKENDS)):
         unit, up = record.unit, result.up.get(record.unit.scene)
-        scene = _ClosedScene(unit.scene, result.backbones, None if up is None else np.array(up))
+        scene = _ClosedScene(unit.scene, result.models, None if up is None else np.array(up))
         classes = next(record.tiles()).classes
         space = LabelSpace(record.summary.taxonomy, classes)
         if config.taxonomy is not None:
@@ -396,6 +396,6 @@ def _plan_of(run: Path, config: Config, result: Result) -> Plan:
                 space = LabelSpace.load(config.taxonomy)
         assert record.series is not None
         frames = [frame for frame, *_ in timeline.read_rows(record.series)]
-        task = Task(cast(Scene, scene), unit.backbone, frames, space.mapping_to(space), (unit.backend,))
+        task = Task(cast(Scene, scene), unit.model, frames, space.mapping_to(space), (unit.backend,))
         units.append(PlannedUnit(record.variation, config, task, record.key, image_space=False, kept=True))
     return Plan(config, {}, tuple(units), ())

@@ -101,7 +101,7 @@ SERIES = {
 """Time series by name, and the titles of their plots. All but updated_voxels (voxels - new_voxels) are columns of the
 CSV."""
 
-OF_THE_BACKBONE = ("flicker_percent", "compensated_flicker_percent", "decode_ms", "wait_ms")
+OF_THE_MODEL = ("flicker_percent", "compensated_flicker_percent", "decode_ms", "wait_ms")
 """Series that are the same for all backends; they are logged with the first one."""
 
 # Okabe and Ito's colours without black: distinct with any colour vision, and on the viewer's dark ground.
@@ -112,13 +112,13 @@ LINE_COLORS = (
 
 def entity(name: str, unit: Unit) -> str:
     """Return the entity of a series."""
-    backend = () if name in OF_THE_BACKBONE else (unit.backend,)
-    return path(unit.scene, "series", name, unit.backbone, *backend)
+    backend = () if name in OF_THE_MODEL else (unit.backend,)
+    return path(unit.scene, "series", name, unit.model, *backend)
 
 
 def columns(unit: Unit, task: Task) -> list[str]:
     """Return the names of the unit's series."""
-    return [name for name in SERIES if name not in OF_THE_BACKBONE or unit.backend == task.backends[0]]
+    return [name for name in SERIES if name not in OF_THE_MODEL or unit.backend == task.backends[0]]
 
 
 def log_row(stream: rr.RecordingStream, unit: Unit, task: Task, cells: Mapping[str, Any]) -> None:
@@ -165,13 +165,13 @@ def _damaged(file: Path, error: Exception) -> DataError:
 
 def log_styles(stream: rr.RecordingStream, plan: Plan) -> None:
     """Log names, colours and widths of all lines."""
-    units = list(dict.fromkeys((unit.backbone, unit.backend) for task in plan.tasks for unit in task.units))
+    units = list(dict.fromkeys((unit.model, unit.backend) for task in plan.tasks for unit in task.units))
     for task in plan.tasks:
         for unit in task.units:
-            color = LINE_COLORS[units.index((unit.backbone, unit.backend)) % len(LINE_COLORS)]
+            color = LINE_COLORS[units.index((unit.model, unit.backend)) % len(LINE_COLORS)]
             # Where backends agree their lines coincide; the viewer draws them by name, so each one is thinner.
             width = 2.0 + 2.5 * sum(backend > unit.backend for backend in task.backends)
             for name in columns(unit, task):
-                label = unit.backbone if name in OF_THE_BACKBONE else f"{unit.backbone}, {unit.backend}"
+                label = unit.model if name in OF_THE_MODEL else f"{unit.model}, {unit.backend}"
                 line = rr.SeriesLines(colors=color, names=label, widths=width)
                 stream.log(entity(name, unit), line, static=True)

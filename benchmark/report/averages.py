@@ -224,11 +224,11 @@ def swept(result: Result) -> list[Sweep]:
     return [*known, *(describe(name) for name in present if describe(name) not in known)]
 
 
-def levels(result: Result, sweep: str, backbone: str, scene: str | None = None) -> tuple[Level, ...]:
+def levels(result: Result, sweep: str, model: str, scene: str | None = None) -> tuple[Level, ...]:
     """Return the values of a sweep, ascending, over the scenes that have all of them."""
-    scenes = complete_scenes(result, sweep, backbone)
+    scenes = complete_scenes(result, sweep, model)
     found: dict[float, dict[int, list[Record]]] = {}
-    for record in result.select(sweep, backbone=backbone):
+    for record in result.select(sweep, model=model):
         value, repeat = record.variation.value, record.variation.repeat
         if value is not None and record.unit.scene in scenes and scene in (None, record.unit.scene):
             found.setdefault(value, {}).setdefault(repeat, []).append(record)
@@ -238,18 +238,18 @@ def levels(result: Result, sweep: str, backbone: str, scene: str | None = None) 
     )
 
 
-def complete_scenes(result: Result, sweep: str, backbone: str) -> tuple[str, ...]:
+def complete_scenes(result: Result, sweep: str, model: str) -> tuple[str, ...]:
     """Return the scenes of a sweep that have each of its values and repeats."""
     points: dict[str, set[Variation]] = {}
-    for record in result.select(sweep, backbone=backbone):
+    for record in result.select(sweep, model=model):
         points.setdefault(record.unit.scene, set()).add(record.variation)
     wanted = set().union(*points.values())
     return tuple(scene for scene, there in points.items() if there == wanted)
 
 
-def by_backbone(records: Iterable[Record]) -> dict[str, list[Record]]:
-    """Return the records of each backbone, in order."""
+def by_model(records: Iterable[Record]) -> dict[str, list[Record]]:
+    """Return the records of each model, in order."""
     groups: dict[str, list[Record]] = {}
     for record in records:
-        groups.setdefault(record.unit.backbone, []).append(record)
+        groups.setdefault(record.unit.model, []).append(record)
     return groups

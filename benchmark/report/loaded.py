@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Run:
-    """A finished run or study; a unit is named by scene, backbone and backend as far as that is needed.
+    """A finished run or study; a unit is named by scene, model and backend as far as that is needed.
 
     Attributes:
         result: All that it found, typed.
@@ -37,30 +37,28 @@ class Run:
         """One row a unit: what it is, and the mean of every measure."""
         return self.result.to_pandas()
 
-    def table(self, *, scene: str | None = None, backbone: str | None = None, backend: str | None = None) -> VoxelTable:
+    def table(self, *, scene: str | None = None, model: str | None = None, backend: str | None = None) -> VoxelTable:
         """Return the voxels of a unit."""
-        return self.result.record(scene=scene, backbone=backbone, backend=backend).table()
+        return self.result.record(scene=scene, model=model, backend=backend).table()
 
-    def series(
-        self, *, scene: str | None = None, backbone: str | None = None, backend: str | None = None
-    ) -> pd.DataFrame:
+    def series(self, *, scene: str | None = None, model: str | None = None, backend: str | None = None) -> pd.DataFrame:
         """Return the time series of a unit: one row a frame.
 
         Raises:
             DataError: If its file cannot be read.
         """
-        file = self.result.record(scene=scene, backbone=backbone, backend=backend).series
+        file = self.result.record(scene=scene, model=model, backend=backend).series
         if file is None:
             raise DataError(f"{self.folder}: the run kept no series of this unit; run it again")
         return voxels.to_pandas(_columns(file))
 
-    def events(self, *, scene: str | None = None, backbone: str | None = None, backend: str | None = None) -> Events:
+    def events(self, *, scene: str | None = None, model: str | None = None, backend: str | None = None) -> Events:
         """Return the log of a unit's observations.
 
         Raises:
             ConfigError: If the run kept none.
         """
-        file = self.result.record(scene=scene, backbone=backbone, backend=backend).events_file
+        file = self.result.record(scene=scene, model=model, backend=backend).events_file
         if file is None or not file.exists():
             raise ConfigError(f"{self.folder}: the run kept no log of observations; run it with --events")
         return Events.load(file)

@@ -1,4 +1,4 @@
-"""Warnings and remarks on a result, in sentences; one that has no numbers to stand on is left out."""
+"""Warnings and notes on a result, in sentences; one that has no numbers to stand on is left out."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from semstab.data.records import Record, Result
 from semstab.data.results import UnitSummary, VoxelAdvice
 from semstab.datasets import GROUND_TRUTH
 from semstab.metrics import macro_mean
-from semstab.report.averages import ENOUGH, by_backbone, pooled
+from semstab.report.averages import ENOUGH, by_model, pooled
 from semstab.report.tables.stability import comparable
 from semstab.statistics.agreement import ALPHA
 from semstab.statistics.cluster_sums import ClusterSums
@@ -63,7 +63,7 @@ def warnings(result: Result) -> Iterator[str]:
     yield from dict.fromkeys(text for scene, found in result.advice.items() if (text := _size(scene, found, result)))
     stable = [record for record in result.select() if _is_untested(record)]
     if stable:
-        names = ", ".join(dict.fromkeys(record.unit.backbone for record in stable))
+        names = ", ".join(dict.fromkeys(record.unit.model for record in stable))
         yield f"stable says that frames of {names} agree, not that they are right: no ground truth was compared"
     if mixed(runs):
         yield "labels and soft scores do not compare by VSS, entropy or voxel alpha: semstab-bench show RUN reduced"
@@ -82,7 +82,7 @@ def _is_untested(record: Record) -> bool:
     """Return whether a verdict is stable, of a map that was not compared with the ground truth."""
     found = record.statistics
     return bool(
-        found and found.verdict.level == "stable" and found.correctness is None and record.unit.backbone != GROUND_TRUTH
+        found and found.verdict.level == "stable" and found.correctness is None and record.unit.model != GROUND_TRUTH
     )
 
 
@@ -94,7 +94,7 @@ def _suspicions(record: Record) -> Iterator[str]:
     if found.cells is not None and found.cells.labelled < LIMITS.labelled:
         missing = f"{1 - found.cells.labelled:.0%} of the locations have no label in most frames"
         yield f"{missing}; what is left out cannot flicker"
-    if recall < LEAST_RECALL and record.unit.backbone != GROUND_TRUTH:
+    if recall < LEAST_RECALL and record.unit.model != GROUND_TRUTH:
         yield (
             f"only {recall:.0%} of the edges of depth have a border of labels near them: are labels coarse, blurred, or"
             " of few things?"
@@ -106,7 +106,7 @@ def _seen_once(run: UnitSummary) -> int:
 
 
 def _name(run: UnitSummary, result: Result) -> str:
-    return f"{run.unit.scene}, {run.unit.backbone}" if len(result.scenes) > 1 else run.unit.backbone
+    return f"{run.unit.scene}, {run.unit.model}" if len(result.scenes) > 1 else run.unit.model
 
 
 def _size(scene: str, found: VoxelAdvice, result: Result) -> str:
@@ -143,8 +143,8 @@ def notes(result: Result) -> Iterator[str]:
 
 def differences(result: Result) -> Iterator[str]:
     """Say which models are more or less stable than the first, by alpha of the observations that all of them made."""
-    records = [record for record in result.select() if record.unit.backbone != GROUND_TRUTH]
-    first, *others = by_backbone(records) or [""]
+    records = [record for record in result.select() if record.unit.model != GROUND_TRUTH]
+    first, *others = by_model(records) or [""]
     sums = [_common_sums([r for r in records if r.unit.scene == scene]) for scene in result.scenes] if others else []
     for name in others:
         each = [difference(own[name], own[first], ALPHA.key) for own in sums if {name, first} <= own.keys()]
@@ -160,16 +160,16 @@ def differences(result: Result) -> Iterator[str]:
 
 def _common_sums(records: Sequence[Record]) -> Mapping[str, ClusterSums]:
     """Return the sums of the observations that all models of a scene made; none where they were not kept."""
-    files = {record.unit.backbone: record.observations_file for record in records}
+    files = {record.unit.model: record.observations_file for record in records}
     there = {name: CellObservations.load(file) for name, file in files.items() if file is not None and file.is_file()}
     same = len({own.classes for own in there.values()}) == 1
     return compared_observations(there).sums if 1 < len(there) == len(files) and same else {}
 
 
 def _ranking(result: Result) -> Iterator[str]:
-    """Say whether the order of the backbones changes where only recurrent voxels count."""
+    """Say whether the order of the models changes where only recurrent voxels count."""
     records = comparable(result)
-    means = {name: pooled(rows) for name, rows in by_backbone(records).items()}
+    means = {name: pooled(rows) for name, rows in by_model(records).items()}
     if mixed([record.summary for record in result.select()]):
         return
     if not means or any(voxels.recurrent.voxels < ENOUGH for voxels in means.values()):
@@ -189,14 +189,14 @@ def _order(values: Mapping[str, float]) -> str:
 
 def _least_seen(records: Sequence[Record]) -> Iterator[str]:
     """Yield the paradox between scenes: the one that seems most stable may be the one seen least."""
-    for backbone, rows in by_backbone(records).items():
+    for model, rows in by_model(records).items():
         tables = {row.unit.scene: row.summary.table for row in rows if row.summary.table.voxels}
         if len(tables) < 2:
             continue
         steadiest = max(tables, key=lambda name: tables[name][VSS])
         if steadiest == min(tables, key=lambda name: tables[name].mean_op):
             yield (
-                f"{backbone} is most stable in {steadiest} (VSS {tables[steadiest][VSS]:.3f}), which is also the scene"
+                f"{model} is most stable in {steadiest} (VSS {tables[steadiest][VSS]:.3f}), which is also the scene"
                 f" seen least often: {tables[steadiest].mean_op:.2f} frames a voxel."
             )
 

@@ -17,14 +17,14 @@ from semstab.data.records import OVERVIEW, Failure, Record, Result
 from semstab.data.results import slug
 from semstab.data.statistics import Estimate, MapStatistics
 from semstab.metrics import CATEGORIES, CATEGORY_COLORS, categories, macro_mean
-from semstab.report.averages import by_backbone, describe, levels, over_recurrent, pooled, swept
+from semstab.report.averages import by_model, describe, levels, over_recurrent, pooled, swept
 from semstab.report.charts import SERIES, Line, dot_chart, line_chart
 from semstab.report.figures.maps import Overview, Views
 from semstab.report.figures.topdown import EMPTY, FromAbove
+from semstab.report.filter_study import advice, filter_studies, of_interest
 from semstab.report.html import filled, jpeg, png, table_block
 from semstab.report.loaded import read_series
 from semstab.report.narrative import differences, notes, warnings
-from semstab.report.remedies import advice, of_interest, remedies
 from semstab.report.tables import tables
 from semstab.report.tables.table import relations
 from semstab.report.terminal import miou
@@ -65,9 +65,9 @@ def render(
         digest=digest,
         title=_title(result),
         subtitle=_subtitle(result),
-        models=_legend(result.backbones),
-        cards=[_card(name, records) for name, records in by_backbone(result.select()).items()],
-        advice=[sentence for each in remedies(everything) for sentence in advice(each)],
+        models=_legend(result.models),
+        cards=[_card(name, records) for name, records in by_model(result.select()).items()],
+        advice=[sentence for each in filter_studies(everything) for sentence in advice(each)],
         warnings=[relations(text) for text in warnings(result)],
         notes=[relations(text) for text in (*differences(result), *notes(result))],
         scenes=shown,
@@ -143,8 +143,8 @@ def _numbers(
     yield "VSS", mean([together.recurrent[VSS]], "{:.3f}"), "OP ≥ 3"
     yield "SBD", mean([together.recurrent[SBD]], "{:.4f}"), "bits, OP ≥ 3"
     yield "mIoU", mean([miou(record) for record in records], "{:.1f} %", 100), "of the fused labels"
-    wrong = [found.headline.wrong_of_stable.value for found in judged]
-    yield "stable and wrong", mean(wrong, "{:.1f} %", 100), "of the stable locations"
+    wrong = [found.headline.wrong_of_consistent.value for found in judged]
+    yield "consistent but wrong", mean(wrong, "{:.1f} %", 100), "of the consistent locations"
 
 
 # --- A scene: the map, the time line, the classes ---------------------------------------------------------------------
@@ -158,10 +158,10 @@ def _scenes(result: Result, folder: Path, above: Mapping[str, FromAbove]) -> Ite
         records = result.select(scene=scene)
         overviews = {}
         for record in records:
-            path = folder / OVERVIEW / f"{slug(scene, record.unit.backbone)}.npz"
+            path = folder / OVERVIEW / f"{slug(scene, record.unit.model)}.npz"
             if path.exists():
-                overviews[record.unit.backbone] = Overview.load(path)
-        up, colors = result.up.get(scene), {name: k for k, name in enumerate(result.backbones)}
+                overviews[record.unit.model] = Overview.load(path)
+        up, colors = result.up.get(scene), {name: k for k, name in enumerate(result.models)}
         drawn = [] if up is None else [record for record in records if record.voxels_file is not None]
         yield {
             "name": scene,
@@ -169,15 +169,15 @@ def _scenes(result: Result, folder: Path, above: Mapping[str, FromAbove]) -> Ite
                 _map(
                     record,
                     above.get(record.unit.slug) or views.above(record, result.up[scene]),
-                    overviews.get(record.unit.backbone),
+                    overviews.get(record.unit.model),
                     share,
                 )
                 for record in drawn
             ],
             "unknown_up": up is None,
-            "models": _legend(result.backbones) if len(result.backbones) > 1 else [],
+            "models": _legend(result.models) if len(result.models) > 1 else [],
             "timeline": list(_timeline(records, colors)),
-            "worst": [row for record in records for row in _worst(record, overviews.get(record.unit.backbone))],
+            "worst": [row for record in records for row in _worst(record, overviews.get(record.unit.model))],
             "classes": _classes(records, colors),
             "distance": list(_distance(records, colors)),
         }
@@ -207,7 +207,7 @@ def _map(record: Record, above: FromAbove, overview: Overview | None, most: int)
     palette = palette if overview is None else overview.palette
     cell = step * above.cell
     return {
-        "model": record.unit.backbone,
+        "model": record.unit.model,
         "scene": record.unit.scene,
         "size": [rows.shape[1], rows.shape[0]],
         "text": f"{rows.shape[1] * cell:.3g} m by {rows.shape[0] * cell:.3g} m, seen {above.view}",
@@ -235,7 +235,7 @@ def _reduced(image: UInt8, most: int) -> UInt8:
 
 def _timeline(records: Sequence[Record], colors: Mapping[str, int]) -> Iterator[dict[str, str]]:
     """Yield flicker and drift by frame."""
-    series = {r.unit.backbone: read_series(r.series) for r in records if r.series is not None and r.series.exists()}
+    series = {r.unit.model: read_series(r.series) for r in records if r.series is not None and r.series.exists()}
     for column, title, unit in (
         ("compensated_flicker_percent", "Flicker", "flicker, % of the pixels"),
         ("drift", "Drift", "drift, bits a voxel"),
@@ -261,7 +261,7 @@ def _worst(record: Record, overview: Overview | None) -> Iterator[dict[str, Any]
         pictures = [] if worst.color is None else [("image", jpeg(worst.color[k]))]
         pictures.append(("labels", _indexed(labels, palette)))
         pictures.append(("changed", _indexed(np.where(worst.changed[k], K + 1, labels), changed)))
-        yield {"title": f"{record.unit.backbone}, frame {frame}: {flicker:.1f} % flicker", "pictures": pictures}
+        yield {"title": f"{record.unit.model}, frame {frame}: {flicker:.1f} % flicker", "pictures": pictures}
 
 
 def _indexed(index: Int64, palette: UInt8) -> str:
@@ -273,7 +273,7 @@ def _classes(records: Sequence[Record], colors: Mapping[str, int]) -> str:
     """Return each class that counts for the verdict, with its alpha."""
     rows: dict[str, list[tuple[int, str, Estimate]]] = {}
     for record in records:
-        found, name = record.statistics, record.unit.backbone
+        found, name = record.statistics, record.unit.model
         for own in () if found is None or found.cells is None else found.cells.classes:
             if own.counts_for_verdict and not math.isnan(own.alpha.value):
                 rows.setdefault(own.name, []).append((colors[name], name, own.alpha))
@@ -296,7 +296,7 @@ def _distance(records: Sequence[Record], colors: Mapping[str, int]) -> Iterator[
             found = record.statistics and record.statistics.correlogram
             bins = getattr(found, axis) if found else ()
             if bins:
-                name, alphas = record.unit.backbone, [own.alpha for own in bins]
+                name, alphas = record.unit.model, [own.alpha for own in bins]
                 ends = [(alpha.low, alpha.high) for alpha in alphas]
                 lines.append(
                     Line(name, [own.mean for own in bins], [alpha.value for alpha in alphas], ends, colors[name])
@@ -310,7 +310,7 @@ def _distance(records: Sequence[Record], colors: Mapping[str, int]) -> Iterator[
 
 def _by_op(result: Result) -> Iterator[dict[str, str]]:
     """Yield the measures by observation persistence."""
-    together = {name: pooled(records) for name, records in by_backbone(result.select()).items()}
+    together = {name: pooled(records) for name, records in by_model(result.select()).items()}
     for measure in (VSS, SBD):
         lines, names = [], list[str]()
         for k, (model, own) in enumerate(together.items()):
@@ -329,7 +329,7 @@ def _sweeps(result: Result) -> Iterator[dict[str, str]]:
     for sweep in swept(result):
         for title, take in (("alpha", lambda p: p.alpha.value), ("VSS, OP ≥ 3", over_recurrent(VSS))):
             lines = []
-            for k, model in enumerate(result.backbones):
+            for k, model in enumerate(result.models):
                 if own := levels(result, sweep.name, model):
                     spread = [level.spread(take) for level in own]
                     ends = [(s.mean - s.sd, s.mean + s.sd) for s in spread]
@@ -350,7 +350,7 @@ def _title(result: Result) -> str:
 
 def _subtitle(result: Result) -> str:
     units = {record.key for record in result.records}  # a sweep shares some with the base, as the manifest counts them
-    counts = [(len(result.scenes), "scene"), (len(result.backbones), "model"), (len(units), "unit")]
+    counts = [(len(result.scenes), "scene"), (len(result.models), "model"), (len(units), "unit")]
     parts = [f"{n:,} {name}{'' if n == 1 else 's'}" for n, name in counts]
     if records := result.select():
         run = records[0].summary
@@ -362,7 +362,7 @@ def _failure(failure: Failure) -> dict[str, str]:
     unit, variation = failure.unit, failure.variation
     value = "" if variation.value is None else f" {describe(variation.sweep).text(variation.value)}"
     return {
-        "unit": f"{unit.scene}, {unit.backbone}, {unit.backend}",
+        "unit": f"{unit.scene}, {unit.model}, {unit.backend}",
         "variation": f"{describe(variation.sweep).title}{value}, repeat {variation.repeat}",
         "message": failure.message,
     }

@@ -21,8 +21,8 @@ from semstab.engine.executors import InProcess
 from semstab.engine.observer import Observer
 from semstab.engine.units import Plan
 from semstab.metrics import CATEGORIES, macro_mean
+from semstab.report.filter_study import advice, filter_studies
 from semstab.report.narrative import differences, warnings
-from semstab.report.remedies import advice, remedies
 from semstab.report.tables import tables
 from semstab.report.tables.table import to_terminal
 from semstab.statistics.verdict import LIMITS
@@ -72,7 +72,7 @@ def screen(result: Result, *, out: Path | None = None, seconds: float | None = N
 
 def _one(result: Result, record: Record) -> Iterator[str]:
     run, found = record.summary, record.summary.statistics
-    yield _head(f"{run.unit.scene} / {run.unit.backbone}", result, [run])
+    yield _head(f"{run.unit.scene} / {run.unit.model}", result, [run])
     yield ""
     if found is not None:
         yield from _verdict(run)
@@ -129,9 +129,9 @@ def _verdict(run: UnitSummary) -> Iterator[str]:
         yield f"  act on labels from alpha {_short(LIMITS.stable)} on, with care from {_short(LIMITS.usable)}"
     psa = found.headline.psa.value
     yield f"  two frames see the same class at {_percent(psa)} of the locations"
-    wrong = found.headline.wrong_of_stable
+    wrong = found.headline.wrong_of_consistent
     if not math.isnan(wrong.value):
-        yield f"  {_percent(wrong.value)}{_interval(wrong, 100)} of the stable locations are wrong"
+        yield f"  {_percent(wrong.value)}{_interval(wrong, 100)} of the consistent locations are wrong"
     yield ""
 
 
@@ -213,7 +213,7 @@ def _cells(record: Record) -> list[str]:
     vss, sbd = (run.table.recurrent[m] for m in measures()[:2])
     flicker = record.image_space.compensated_flicker_percent
     numbers = ((agree, 0), (flicker, 1), (vss, 3), (sbd, 4), (100 * miou(record), 1))
-    return [run.unit.backbone, level, alpha, *(_number(value, digits) for value, digits in numbers)]
+    return [run.unit.model, level, alpha, *(_number(value, digits) for value, digits in numbers)]
 
 
 def miou(record: Record) -> float:
@@ -232,13 +232,13 @@ def _number(value: float, digits: int) -> str:
 
 def _classes(records: Sequence[Record]) -> Iterator[str]:
     """Yield the classes on which frames agree least, of those that cover enough of the map."""
-    names = list(dict.fromkeys(record.unit.backbone for record in records))
+    names = list(dict.fromkeys(record.unit.model for record in records))
     most, alone = MOST_CLASSES.get(len(records), 1), len(names) == 1
     lines = []
     for name in names:
-        alphas = class_alphas([record for record in records if record.unit.backbone == name])
-        shares = _class_shares([record for record in records if record.unit.backbone == name])
-        others = {k: v for r in records if r.unit.backbone == name for k, v in r.summary.table.confused_with.items()}
+        alphas = class_alphas([record for record in records if record.unit.model == name])
+        shares = _class_shares([record for record in records if record.unit.model == name])
+        others = {k: v for r in records if r.unit.model == name for k, v in r.summary.table.confused_with.items()}
         common = [key for key, (voxels, _) in shares.items() if voxels >= RARE and key in alphas]
         for key in sorted(common, key=alphas.__getitem__)[:most]:
             label, taken = key if alone else f"{name}: {key}", others.get(key, "")
@@ -288,7 +288,7 @@ def _check(pair: tuple[str, str], rows: Sequence[Agreement]) -> str:
     measure = max(row.differences, key=lambda name: row.differences[name].max)
     only = f", {sum(row.only_in):,} voxels in one only" if any(row.only_in) else ""
     return (
-        f"{checked} and {reference} DISAGREE in {len(bad)} of {len(rows)} maps: {row.scene}, {row.backbone}: {measure}"
+        f"{checked} and {reference} DISAGREE in {len(bad)} of {len(rows)} maps: {row.scene}, {row.model}: {measure}"
         f" differs by {row.differences[measure].max:.1e}{only}"
     )
 
@@ -380,7 +380,7 @@ def failure_lines(result: Result) -> Iterator[str]:
     for failure in result.failures:
         reasons.setdefault(failure.message, []).append(failure)
     for message, failures in reasons.items():
-        places = list(dict.fromkeys(f"{failure.unit.scene}, {failure.unit.backbone}" for failure in failures))
+        places = list(dict.fromkeys(f"{failure.unit.scene}, {failure.unit.model}" for failure in failures))
         varied = [name for failure in failures if (name := _named_task(failure))]
         where = "" if message.startswith(places[0]) else f"{_first_of(places)}: "
         what = f"{_first_of(varied)}: " if varied else ""
@@ -399,11 +399,11 @@ def _named_task(failure: Failure) -> str:
     return f"{failure.variation.sweep} {failure.unit.backend if value is None else f'{value:g}'}"
 
 
-def print_remedies(result: Result, console: Console) -> None:
+def print_filter_study(result: Result, console: Console) -> None:
     """Print the filter to use for each model, then the table of all; '*' marks it, '!' makes labels worse."""
-    for found in remedies(result):
+    for found in filter_studies(result):
         for sentence in advice(found):
             console.print(sentence, highlight=False, markup=False)
     for table in tables(result):
-        if table.name.startswith("remedies"):
+        if table.name.startswith("filters"):
             console.print(f"\n{to_terminal(table)}", highlight=False, markup=False, soft_wrap=True)

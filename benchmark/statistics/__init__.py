@@ -1,18 +1,18 @@
-"""Stability whatever the number of observations, its null models, its uncertainty, and right beside stable.
+"""Stability whatever the number of observations, its null models, its uncertainty, and whether the consistent is right.
 
-Pure functions of a VoxelTable and its Events. `describe` says everything about one map, `compare_backbones` about
+Pure functions of a VoxelTable and its Events. `describe` says everything about one map, `compare_models` about
 several; docs/metrics.md derives each measure.
 """
 
-from semstab.data.contrast import BackboneComparison
+from semstab.data.contrast import ModelComparison
 from semstab.data.statistics import Estimate, Reliability
 from semstab.statistics.agreement import class_agreement, decompose, disagreement, fleiss_kappa, krippendorff_alpha, psa
-from semstab.statistics.correctness import correctness, join_truth, quadrants, reliability, stable_wrong
+from semstab.statistics.correctness import consistent_wrong, correctness, join_truth, quadrants, reliability
 from semstab.statistics.correlogram import correlogram
 from semstab.statistics.description import Analysis, analyse, describe
 from semstab.statistics.drift import expected_sbd, flips, trends
 from semstab.statistics.geometry import ceiling, losses, rendered
-from semstab.statistics.model_comparison import compare_backbones, coverage, paired
+from semstab.statistics.model_comparison import compare_models, coverage, paired
 from semstab.statistics.observations import CellObservations, Views
 from semstab.statistics.paired_differences import claimed_together, standardised
 from semstab.statistics.sample import MapSample
@@ -21,10 +21,10 @@ from semstab.statistics.verdict import verdict
 
 __all__ = [
     "Analysis",
-    "BackboneComparison",
     "CellObservations",
     "Estimate",
     "MapSample",
+    "ModelComparison",
     "Reliability",
     "Sampler",
     "Views",
@@ -32,7 +32,8 @@ __all__ = [
     "ceiling",
     "claimed_together",
     "class_agreement",
-    "compare_backbones",
+    "compare_models",
+    "consistent_wrong",
     "correctness",
     "correlogram",
     "coverage",
@@ -50,7 +51,6 @@ __all__ = [
     "quadrants",
     "reliability",
     "rendered",
-    "stable_wrong",
     "standardised",
     "trends",
     "verdict",

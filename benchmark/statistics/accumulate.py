@@ -18,7 +18,7 @@ from semstab.data.measures import dominant, entropy, vss
 from semstab.data.results import RECURRENT
 from semstab.data.statistics import Interval
 from semstab.data.voxels import VoxelTable
-from semstab.statistics.agreement import one_hot_where, psa, ratio_of, stability_posterior
+from semstab.statistics.agreement import consistency_posterior, one_hot_where, psa, ratio_of
 from semstab.statistics.cluster_sums import (
     BINS,
     DRIFT,
@@ -187,7 +187,7 @@ def cluster_sums_of(
     sbd_excess: Float64 | None = None,
     edge: float | None = None,
     cubes: Cubes | None = None,
-    stable: Float64 | None = None,
+    consistent: Float64 | None = None,
 ) -> ClusterSums:
     """Return the sums of a map.
 
@@ -200,10 +200,14 @@ def cluster_sums_of(
         edge: Of the cubes in metres, a power of 2, where several maps are to have the same; else the smallest that
             leaves at most MOST_CELLS.
         cubes: The cubes, where they are known already.
-        stable: (n,) the stability posterior, where it is known already.
+        consistent: (n,) the stability posterior, where it is known already.
     """
     cubes = Cubes.of(table, edge) if cubes is None else cubes
-    likely = None if true_label is None else np.nan_to_num(stability_posterior(table) if stable is None else stable)
+    likely = (
+        None
+        if true_label is None
+        else np.nan_to_num(consistency_posterior(table) if consistent is None else consistent)
+    )
     if events is None:
         whole = _sums_of_table(table, cubes, true_label, likely)
     else:
@@ -262,10 +266,10 @@ def _sums_of_log(
     longest = int((events.ends - events.starts).max(initial=0))
     own = np.zeros(0, np.int64) if fused is None else fused
     label = np.zeros(0, np.int64) if true_label is None else true_label
-    stable = np.zeros(0) if likely is None else likely
+    consistent = np.zeros(0) if likely is None else likely
     in_chunks(
         add_influences, order, bounds, (events.starts, events.ends), longest, events.evidence.entries, K, group, own,
-        label, stable, K <= MOST_CLASSES, truth, len(groups), sums,
+        label, consistent, K <= MOST_CLASSES, truth, len(groups), sums,
     )  # fmt: skip
     rows = np.flatnonzero(sums[:, layout(K, truth=False)["observations"].start])
     cell, frame = np.divmod(rows, max(len(groups), 1))
@@ -350,12 +354,12 @@ def _sums_with_truth(
     evidence, predicted, T = table.evidence, dominant(table), table.op
     of = np.repeat(np.arange(len(table)), np.diff(evidence.starts))
     hit = evidence.label == label[of]
-    looks_right = np.bincount(of[hit], weights=evidence.weight[hit], minlength=len(table))
+    observed_right = np.bincount(of[hit], weights=evidence.weight[hit], minlength=len(table))
     known, right = label >= 0, label == predicted
-    stable, counted = known * likely, known & (cubes.at >= 0)
+    consistent, counted = known * likely, known & (cubes.at >= 0)
     values: dict[str, npt.NDArray[Any]] = {
-        "known": known, "right": known & right, "looks": known * T, "looks_right": known * looks_right,
-        "stable": stable, "stable_wrong": stable * ~right,
+        "known": known, "right": known & right, "observed": known * T, "observed_right": known * observed_right,
+        "consistent": consistent, "consistent_wrong": consistent * ~right,
     }  # fmt: skip
 
     def by_class(which: Int64, where: Mask) -> Float64:

@@ -28,8 +28,8 @@ ALPHA = Quantity(key="alpha", title="Alpha", better="higher", digits=(3, 4))
 VOXEL_ALPHA = Quantity(key="voxel_alpha", title="Voxel alpha", better="higher", digits=(3, 4))
 """Krippendorff's alpha of the voxels of a map, which depends on their size."""
 
-STABLE = 0.8
-"""A voxel is stable where PSA >= 0.8: of ten frames at most one disagrees."""
+CONSISTENT = 0.8
+"""A voxel is consistent where PSA >= 0.8: of ten frames at most one disagrees."""
 
 ONE_HOT = 1e-9
 """Evidence whose squared norm is this near to 1 is one-hot."""
@@ -228,19 +228,19 @@ def decompose(table: VoxelTable) -> Uncertainty:
     return Uncertainty(np.minimum(within, total), np.maximum(total - within, 0.0), total)
 
 
-# Is a location stable? A probability, because a few frames that agree say less than many.
+# Is a location consistent? A probability, because a few frames that agree say less than many.
 #
 # Frames agree or not by chance: of locations that all err in one frame of ten, those that three frames saw look perfect
 # more often than those that thirty saw. So a location borrows from what all locations of its map are like.
 
 LIKELY = 0.5
-"""A place is called stable from this probability on."""
+"""A place is called consistent from this probability on."""
 
 STEPS, ROUNDS = 80, 200
 """Shares of the dominant class that a place may have, between 1/2 and 1, and rounds to find how many have which."""
 
 
-def stable_share(agreement: float = STABLE) -> float:
+def consistent_share(agreement: float = CONSISTENT) -> float:
     """Return the share p of the dominant class from which two frames agree with that probability: p^2 + (1 - p)^2."""
     return (1 + math.sqrt(2 * agreement - 1)) / 2
 
@@ -256,8 +256,10 @@ def shares_of(table: VoxelTable) -> Float64:
     return share
 
 
-def stability_posterior(table: VoxelTable, shares: Float64 | None = None, *, stable: float = STABLE) -> Float64:
-    """Return (n,) the probability that a location is stable, given its frames and all locations; NaN where OP < 2.
+def consistency_posterior(
+    table: VoxelTable, shares: Float64 | None = None, *, consistent: float = CONSISTENT
+) -> Float64:
+    """Return (n,) the probability that a location is consistent, given its frames and all locations; NaN where OP < 2.
 
     Of T frames m vote for the dominant class, which happens with the probability b(m; T, p) + b(T - m; T, p) where its
     share is p. How many locations have which p is estimated from all of them without any form of its distribution
@@ -268,7 +270,7 @@ def stability_posterior(table: VoxelTable, shares: Float64 | None = None, *, sta
     posterior = _likelihood(seen, most) * (shares_of(table) if shares is None else shares)
     posterior /= posterior.sum(axis=1, keepdims=True)
     likely = np.full(len(table), np.nan)
-    likely[table.op >= 2] = posterior[:, stable_share(stable) <= STEPS_OF_P].sum(axis=1)[of]
+    likely[table.op >= 2] = posterior[:, consistent_share(consistent) <= STEPS_OF_P].sum(axis=1)[of]
     return likely
 
 

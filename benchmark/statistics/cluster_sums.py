@@ -37,7 +37,7 @@ PLAIN = (
     "voxels", "psa", "observations", "agreeing", "own", "twice", "twice_agreeing", "recurrent", "vss", "entropy",
 )  # fmt: skip
 DRIFT = ("sbd_excess", "sbd_known")
-WITH_TRUTH = ("known", "right", "looks", "looks_right", "stable", "stable_wrong")
+WITH_TRUTH = ("known", "right", "observed", "observed_right", "consistent", "consistent_wrong")
 BY_TRUE_CLASS = ("class_known", "class_right", "class_predicted")
 WITHOUT_FRAMES = (*DRIFT, "judged", "gap")
 """Sums that belong to no frame: they stand in rows whose frame is -1."""
@@ -446,16 +446,16 @@ FUNCTIONALS: Mapping[str, Functional] = {
     "vss": Functional(("vss", "recurrent"), ratio_of),
     "entropy": Functional(("entropy", "voxels"), ratio_of),
     "accuracy": Functional(("right", "known"), ratio_of),
-    "look_accuracy": Functional(("looks_right", "looks"), ratio_of),
-    "wrong_of_stable": Functional(("stable_wrong", "stable"), ratio_of),
+    "observation_accuracy": Functional(("observed_right", "observed"), ratio_of),
+    "wrong_of_consistent": Functional(("consistent_wrong", "consistent"), ratio_of),
     "sbd_excess": Functional(("sbd_excess", "sbd_known"), ratio_of, -1.0, 1.0, "plain"),
     "miou": Functional(("known", "known", "class_right", "class_known", "class_predicted"), miou_of, scale="plain"),
     "ece": Functional(("judged", "judged", "gap"), ece_of, scale="plain"),
 }
 """By key: alpha, of cells that two views saw or more; PSA, Krippendorff's alpha of voxels and entropy at OP >= 2, VSS
 at OP >= 3, SBD less that in random order where that is known; with ground truth the accuracy of the fused labels at
-OP >= 2 and of single observations, the wrong among the stable locations at OP >= 3, mean intersection over union and
-expected calibration error at OP >= 2."""
+OP >= 2 and of single observations, the wrong among the consistent locations at OP >= 3, mean intersection over union
+and expected calibration error at OP >= 2."""
 
 BY_CLASS: Mapping[str, Functional] = {
     "alpha": Functional(CLASS_SUMS, class_alpha_of, -1.0, 1.0, "agreement", parts=CELLS),

@@ -1,4 +1,4 @@
-"""Right beside stable: accuracy and calibration of fused labels where ground truth exists, and what is stably wrong."""
+"""Stability vs. accuracy: are fused labels right and calibrated where ground truth exists, and what is always wrong?"""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from semstab.metrics import strata
 from semstab.metrics.agreement import require_same_grid, same_voxels, shared_rows
 from semstab.metrics.summary import groups_of
 from semstab.statistics.accumulate import Cubes, CubeSums
-from semstab.statistics.agreement import LIKELY, STABLE, ratio_of, stability_posterior
+from semstab.statistics.agreement import CONSISTENT, LIKELY, consistency_posterior, ratio_of
 
 ACCURACY = Quantity(key="accuracy", title="Accuracy", better="higher", needs="truth")
 MIOU = Quantity(key="miou", title="mIoU", better="higher", needs="truth")
@@ -165,48 +165,48 @@ def by_stratum(judged: Predictions, op: Int32, known: Mask, edges: Sequence[int]
     return tuple(correctness_of(own, name) for own, name in zip([sums.sum(axis=0), *sums], names, strict=True))
 
 
-def quadrants(table: VoxelTable, truth: Truth, cubes: Cubes, *, stable: float = STABLE) -> Quadrants:
+def quadrants(table: VoxelTable, truth: Truth, cubes: Cubes, *, consistent: float = CONSISTENT) -> Quadrants:
     """Count voxels by stability and correctness, never those with OP < 3: two frames agree by chance too easily.
 
-    A voxel counts as stable by the probability that it is (`steady`), so that the shares do not depend on how often
-    places were seen. `cubes` are those of all of the table's voxels.
+    A voxel counts as consistent by the probability that it is (`consistency_posterior`), so that the shares do not
+    depend on how often locations were seen. `cubes` are those of all of the table's voxels.
     """
-    return quadrants_of(quadrant_sums(table, truth, stability_posterior(table, stable=stable), cubes.edge))
+    return quadrants_of(quadrant_sums(table, truth, consistency_posterior(table, consistent=consistent), cubes.edge))
 
 
-QUADRANTS = ("stable_right", "stable_wrong", "unstable_right", "unstable_wrong")
+QUADRANTS = ("consistent_right", "consistent_wrong", "inconsistent_right", "inconsistent_wrong")
 
 
-def quadrant_sums(table: VoxelTable, truth: Truth, stable: Float64, edge: float) -> CubeSums:
+def quadrant_sums(table: VoxelTable, truth: Truth, consistent: Float64, edge: float) -> CubeSums:
     """Return the sums for `quadrants_of` over cubes of that edge, by the stability posterior (n,)."""
-    counted, likely, right = _masks(table, truth, stable)
+    counted, likely, right = _masks(table, truth, consistent)
     cubes = Cubes.of(table, edge, where=counted)
     parts = (likely * right, likely * ~right, (1 - likely) * right, (1 - likely) * ~right)
     sums = cubes.means(dict(zip(QUADRANTS, parts, strict=True)))
-    wrong, every = sums["stable_wrong"][:, 0], sums["stable_right"][:, 0] + sums["stable_wrong"][:, 0]
-    return CubeSums(cubes.cell, edge, sums | {"wrong_of_stable": np.stack([wrong, every], axis=1)})
+    wrong, every = sums["consistent_wrong"][:, 0], sums["consistent_right"][:, 0] + sums["consistent_wrong"][:, 0]
+    return CubeSums(cubes.cell, edge, sums | {"wrong_of_consistent": np.stack([wrong, every], axis=1)})
 
 
 def quadrants_of(sums: CubeSums) -> Quadrants:
     """Return the shares, from `quadrant_sums`."""
-    voxels = int(sums["stable_right"][1])
+    voxels = int(sums["consistent_right"][1])
     if not voxels:
         return Quadrants(0, *[UNKNOWN] * 5)
-    return Quadrants(voxels, *(sums.estimate(name, ratio_of) for name in (*QUADRANTS, "wrong_of_stable")))
+    return Quadrants(voxels, *(sums.estimate(name, ratio_of) for name in (*QUADRANTS, "wrong_of_consistent")))
 
 
-def stable_wrong(table: VoxelTable, truth: Truth, *, stable: float = STABLE) -> Mask:
-    """Return (n,) the dangerous voxels: OP >= 3, more likely stable than not, and wrong."""
-    return wrong_of_steady(table, truth, stability_posterior(table, stable=stable))
+def consistent_wrong(table: VoxelTable, truth: Truth, *, consistent: float = CONSISTENT) -> Mask:
+    """Return (n,) the dangerous voxels: OP >= 3, more likely consistent than not, and wrong."""
+    return wrong_where_consistent(table, truth, consistency_posterior(table, consistent=consistent))
 
 
-def wrong_of_steady(table: VoxelTable, truth: Truth, stable: Float64) -> Mask:
-    """Return the same, by the probability (n,) that each is stable."""
-    counted, likely, right = _masks(table, truth, stable)
+def wrong_where_consistent(table: VoxelTable, truth: Truth, consistent: Float64) -> Mask:
+    """Return the same, by the probability (n,) that each is consistent."""
+    counted, likely, right = _masks(table, truth, consistent)
     return counted & (likely >= LIKELY) & ~right
 
 
-def _masks(table: VoxelTable, truth: Truth, stable: Float64) -> tuple[Mask, Float64, Mask]:
+def _masks(table: VoxelTable, truth: Truth, consistent: Float64) -> tuple[Mask, Float64, Mask]:
     """Return (n,) which voxels count, their stability posterior (0 where unknown), and which are right."""
     counted = truth.known & (table.op >= RECURRENT)
-    return counted, np.nan_to_num(stable), dominant(table) == truth.label
+    return counted, np.nan_to_num(consistent), dominant(table) == truth.label

@@ -33,7 +33,7 @@ from semstab.data.voxels import VoxelTable
 from semstab.metrics.agreement import shared_rows
 from semstab.metrics.summary import STRATA, groups_of
 from semstab.statistics.accumulate import Cubes, CubeSums, cluster_sums_of
-from semstab.statistics.agreement import class_agreement_of, class_sums, ratio_of, shares_of, stability_posterior
+from semstab.statistics.agreement import class_agreement_of, class_sums, consistency_posterior, ratio_of, shares_of
 from semstab.statistics.cluster_sums import MOST_CLASSES, ClusterSums
 from semstab.statistics.correctness import (
     Predictions,
@@ -44,7 +44,7 @@ from semstab.statistics.correctness import (
     quadrant_sums,
     quadrants_of,
     reliability_of,
-    wrong_of_steady,
+    wrong_where_consistent,
 )
 from semstab.statistics.correlogram import correlogram
 from semstab.statistics.drift import expected_sbd
@@ -77,7 +77,7 @@ class Analysis:
         table: Means of the measures over all voxels.
         sums: Sums by frame and cube of space, from which intervals and differences follow without voxels.
         sample: The voxels that the statistics rest on.
-        shares: How often the dominant class is seen, over all locations: see `steady`.
+        shares: How often the dominant class is seen, over all locations: see `consistency_posterior`.
         drawn: Columns (n,) of the voxels of the sample that need its log or its true labels.
     """
 
@@ -102,13 +102,13 @@ class Analysis:
         null = expected_sbd(table)
         if "sbd_null" in spread:
             null[rows] = spread.pop("sbd_null")[rows]
-        stable = stability_posterior(table, self.shares)
+        consistent = consistency_posterior(table, self.shares)
         columns = row_columns(table, null) | spread
         if truth is not None:
             columns["true_label"] = join_truth(table, truth).label
-        columns["stable"] = stable
+        columns["consistent"] = consistent
         if (label := columns.get("true_label")) is not None:
-            columns["stable_wrong"] = wrong_of_steady(table, Truth(label >= 0, label), stable)
+            columns["consistent_wrong"] = wrong_where_consistent(table, Truth(label >= 0, label), consistent)
         return columns
 
 
@@ -172,7 +172,7 @@ def analyse(
     truth = None if sample.truth is None else join_truth(table, sample.truth)
     limit = sample.truth if limit is None else limit
     shares = shares_of(table)
-    stable = stability_posterior(table, shares)
+    consistent = consistency_posterior(table, shares)
     null = expected_sbd(table, events, seed=seed)
     columns = row_columns(table, null)
     cubes = Cubes.of(table)
@@ -184,15 +184,15 @@ def analyse(
         cells=cells,
         sbd_excess=columns["sbd_excess"],
         cubes=cubes,
-        stable=stable,
+        consistent=consistent,
     )
-    flipping = FlippingSums.of(table, stable, cubes)
+    flipping = FlippingSums.of(table, consistent, cubes)
     drawn, log = log_sums(sample, cubes)
     if log is not None:
         drawn["sbd_null"] = null
     if truth is not None:
         drawn["true_label"] = truth.label
-    (unsteady,) = confidence_intervals(flipping.specs())
+    (inconsistent,) = confidence_intervals(flipping.specs())
     of_flips = [] if log is None else confidence_intervals(log.places.specs(OF_FLIPS))
     means = dict(zip(MEANS, confidence_intervals(of_places.specs(MEANS)), strict=True))
     whole = sample.summary.summary(table.voxel_size, table.classes, edges)
@@ -200,7 +200,7 @@ def analyse(
     agreeing = None if cells is None else cell_agreement(cells, influence, table, scope, critical, limits)
     repeats = whole.means.voxels[SBD.key]
     repeated = Repeated(repeats, repeats / whole.voxels if whole.voxels else math.nan)
-    flips_of_map = flipping.flipping(unsteady, table.classes)
+    flips_of_map = flipping.flipping(inconsistent, table.classes)
     summary = MapStatistics(
         schema=SCHEMA,
         name=name,
@@ -229,7 +229,7 @@ def analyse(
         drift=_drift(repeats, means, of_places, log, of_flips),
         uncertainty=EntropyParts(means["entropy"], means["entropy_within"], means["entropy_between"]),
         geometry=None if limit is None else losses(table, limit),
-        correctness=None if truth is None else _correctness(table, truth, stable, cubes, edges),
+        correctness=None if truth is None else _correctness(table, truth, consistent, cubes, edges),
         strata=_strata(whole, table, columns, edges),
     )
     return Analysis(summary, whole, influence, sample, shares, drawn)
@@ -311,7 +311,7 @@ def _drift(
 
 
 def _correctness(
-    table: VoxelTable, truth: Truth, stable: Float64, cubes: Cubes, edges: Sequence[int]
+    table: VoxelTable, truth: Truth, consistent: Float64, cubes: Cubes, edges: Sequence[int]
 ) -> CorrectnessStatistics:
     judged = Predictions.of(table.evidence, truth.label)
     right = cubes.means({"right": np.where(truth.known, judged.right, np.nan)})
@@ -319,7 +319,7 @@ def _correctness(
         accuracy=CubeSums(cubes.cell, cubes.edge, right).estimate("right", ratio_of),
         strata=by_stratum(judged, table.op, truth.known, edges),
         reliability=reliability_of(judged_sums(judged, truth.known & (table.op >= 2))),
-        quadrants=quadrants_of(quadrant_sums(table, truth, stable, cubes.edge)),
+        quadrants=quadrants_of(quadrant_sums(table, truth, consistent, cubes.edge)),
     )
 
 

@@ -20,7 +20,7 @@ from semstab.statistics.agreement import ONE_HOT
 
 FLIP_RATE = Quantity(key="flip_rate", title="Flip rate", better="lower", needs="events")
 
-ENOUGH_LOOKS = 6
+ENOUGH_OBSERVATIONS = 6
 """Lowest OP of the voxels that tell of a trend: three observations in each half."""
 
 
@@ -41,7 +41,7 @@ class Flips:
 
 @dataclass(frozen=True, eq=False)
 class Trends:
-    """How far a voxel's observations move one way in time (n,); NaN where OP < ENOUGH_LOOKS, or where all agree.
+    """How far a voxel's observations move one way in time (n,); NaN where OP < ENOUGH_OBSERVATIONS, or where all agree.
 
     Odd and even observations have a slope over time each. Their product is 0 in the mean for errors that are
     independent between frames, however much each frame errs.
@@ -97,17 +97,17 @@ def trends(events: Events) -> Trends:
     T, m = events.ends - events.starts, len(events)
     number = np.arange(m) - events.starts[events.voxel]
     half = 2 * events.voxel.astype(np.int64) + number % 2
-    looks = np.bincount(half, minlength=2 * len(T)).astype(np.float64)
+    count = np.bincount(half, minlength=2 * len(T)).astype(np.float64)
     starts, label, weight = events.evidence.entries
     evidence = csr_array((weight, label.astype(np.int32), starts), shape=(m, events.K))
-    lengths = np.sqrt(looks * (looks * looks - 1) / 12)
-    age = (number // 2 - 0.5 * (looks[half] - 1)) / np.where(lengths > 0, lengths, np.inf)[half]
+    lengths = np.sqrt(count * (count * count - 1) / 12)
+    age = (number // 2 - 0.5 * (count[half] - 1)) / np.where(lengths > 0, lengths, np.inf)[half]
     moments, sums = (csr_array((by, (half, np.arange(m))), (2 * len(T), m)) @ evidence for by in (age, np.ones(m)))
     common = 2 * np.asarray(moments[0::2].multiply(moments[1::2]).sum(axis=1)).ravel()
     squares = np.bincount(np.repeat(half, np.diff(starts)), weights=weight * weight, minlength=2 * len(T))
-    of_means = np.asarray(sums.multiply(sums).sum(axis=1)).ravel() / np.maximum(looks, 1)
+    of_means = np.asarray(sums.multiply(sums).sum(axis=1)).ravel() / np.maximum(count, 1)
     variation = (squares - of_means).reshape(-1, 2).sum(axis=1)
-    tells = (T >= ENOUGH_LOOKS) & (variation > ONE_HOT * T)
+    tells = (T >= ENOUGH_OBSERVATIONS) & (variation > ONE_HOT * T)
     return Trends(np.where(tells, common, np.nan), np.where(tells, variation, np.nan))
 
 

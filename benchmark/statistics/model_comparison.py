@@ -1,4 +1,4 @@
-"""Several backbones' maps of one scene beside each other."""
+"""Several models' maps of one scene beside each other."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from semstab.core.types import Float64, Int64, Mask
-from semstab.data.contrast import BackboneComparison, MapCoverage, Paired, Rank, Ranking, Standardised
+from semstab.data.contrast import MapCoverage, ModelComparison, Paired, Rank, Ranking, Standardised
 from semstab.data.events import Events
 from semstab.data.measures import Quantity, dominant, measures
 from semstab.data.results import RECURRENT
@@ -39,11 +39,11 @@ from semstab.statistics.paired_differences import (
     voxelwise,
 )
 
-# Which backbone is more stable? Compared on the same places, at the same number of observations, with intervals.
+# Which model is more stable? Compared on the same places, at the same number of observations, with intervals.
 
 
 def coverage(tables: Tables) -> tuple[MapCoverage, ...]:
-    """Return coverage of each backbone's map; common_share is the part of its voxels that all maps hold."""
+    """Return coverage of each model's map; common_share is the part of its voxels that all maps hold."""
     return coverage_of(tuple(tables), [held(tables)])
 
 
@@ -64,7 +64,7 @@ def coverage_of(names: Sequence[str], parts: Sequence[Int64]) -> tuple[MapCovera
     """Return coverage of the maps by what their parts have, see `held`."""
     return tuple(
         MapCoverage(
-            backbone=name,
+            model=name,
             voxels=n,
             observations=observations,
             mean_op=observations / n if n else math.nan,
@@ -103,7 +103,7 @@ def paired(
     cells: Mapping[str, ClusterSums] | None = None,
     seed: int = 0,
 ) -> Paired:
-    """Compare backbones by alpha of common observations, and voxel by voxel where all of them observed at least twice.
+    """Compare models by alpha of common observations, and voxel by voxel where all of them observed at least twice.
 
     Only alpha is tested, for this scene flown again; the other differences describe. Ranks come from resamples of the
     cubes of space, the same ones for every measure.
@@ -112,7 +112,7 @@ def paired(
         tables: The maps.
         truth: The map of the ground truth labels; without it there is no accuracy.
         logs: The logs of the tables: with them other numbers are for this scene flown again, else for these frames.
-        cells: Sums of each backbone's common observations; without them there is no alpha.
+        cells: Sums of each model's common observations; without them there is no alpha.
         seed: Of the resamples.
     """
     rows = repeated_rows(tables)
@@ -164,7 +164,7 @@ def _alpha_of_cells(sums: Float64) -> Float64:
 def _columns(
     tables: Tables, rows: Sequence[Int64], truth: VoxelTable | None
 ) -> tuple[dict[Quantity, dict[str, Float64]], dict[Quantity, Statistic]]:
-    """Return by measure of voxels each backbone's columns on the common ones, and the statistic of their sums."""
+    """Return by measure of voxels each model's columns on the common ones, and the statistic of their sums."""
     quantities = [quantity for quantity in compared(truth=truth is not None) if quantity is not ALPHA]
     statistics: dict[Quantity, Statistic] = {
         quantity: alpha_of if quantity is VOXEL_ALPHA else ratio_of for quantity in quantities
@@ -187,7 +187,7 @@ def _columns(
 
 
 def _ranking(measure: Quantity, statistic: Statistic, sums: Mapping[str, Float64], seed: int) -> Ranking:
-    """Return the ranking by the sums (G, C) of each backbone over cubes, and by resamples of these."""
+    """Return the ranking by the sums (G, C) of each model over cubes, and by resamples of these."""
     count, drawn = len(next(iter(sums.values()))), np.zeros((1, 0))
     if count:
         drawn = np.random.default_rng(seed).multinomial(count, np.full(count, 1 / count), size=REPLICATES).astype(float)
@@ -205,7 +205,7 @@ def _ranking(measure: Quantity, statistic: Statistic, sums: Mapping[str, Float64
     return Ranking(measure.key, tuple(rows))
 
 
-SCHEMA = 1
+SCHEMA = 2
 
 REPLICATES = 2000
 """Resamples of the cubes of space that ranks come from."""
@@ -213,7 +213,7 @@ REPLICATES = 2000
 
 @dataclass(frozen=True, eq=False)
 class Region:
-    """Several backbones' maps of a scene, or a part of it, their logs, and the ground truth; share: of all voxels."""
+    """Several models' maps of a scene, or a part of it, their logs, and the ground truth; share: of all voxels."""
 
     tables: Tables
     events: Mapping[str, Events] | None = None
@@ -225,7 +225,7 @@ Regions = Callable[[], Iterable[Region]]
 """Those that make up a scene, as often as they are asked for: none is kept."""
 
 
-def compare_backbones(
+def compare_models(
     tables: Tables,
     events: Mapping[str, Events] | None = None,
     truth: VoxelTable | None = None,
@@ -233,8 +233,8 @@ def compare_backbones(
     observations: Mapping[str, CellObservations] | None = None,
     scene: str = "",
     seed: int = 0,
-) -> BackboneComparison:
-    """Compare several backbones' maps of one scene; at least two.
+) -> ModelComparison:
+    """Compare several models' maps of one scene; at least two.
 
     - `coverage`: what each map holds
     - `standardised`: means at a common distribution of OP, each map with all its voxels; none of labels beside scores
@@ -247,7 +247,7 @@ def compare_backbones(
         DataError: If they differ in K or voxel size.
     """
     if len(tables) < 2:
-        raise ConfigError(f"there are {len(tables)} backbones to compare; give two or more")
+        raise ConfigError(f"there are {len(tables)} models to compare; give two or more")
     whole = Region(tables, events, truth)
     return compare_regions(lambda: [whole], observations=observations, scene=scene, seed=seed)
 
@@ -259,8 +259,8 @@ def compare_regions(
     mixed: bool = False,
     scene: str = "",
     seed: int = 0,
-) -> BackboneComparison:
-    """Compare maps region by region, see `compare_backbones`; mixed: some are of labels and some of scores."""
+) -> ModelComparison:
+    """Compare maps region by region, see `compare_models`; mixed: some are of labels and some of scores."""
     first = next(iter(regions()))
     names = tuple(first.tables)
     require_same_grid(*first.tables.values())
@@ -276,11 +276,11 @@ def compare_regions(
     means = {name: standardised_of(CubeSums.merged(parts), weights) for name, parts in strata.items()}
     keys = () if mixed else voxelwise()  # means of labels beside means of scores would say nothing
     everywhere = {quantity.key: {name: own[quantity.key] for name, own in means.items()} for quantity in keys}
-    return BackboneComparison(
+    return ModelComparison(
         scene=scene,
         schema=SCHEMA,
         seed=seed,
-        backbones=names,
+        models=names,
         coverage=coverage_of(names, held_there),
         standardised=Standardised(EDGES, tuple(weights.tolist()), thin_share(observed, weights), everywhere),
         paired=_paired(regions, shared, seed),

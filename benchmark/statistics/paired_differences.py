@@ -1,4 +1,4 @@
-"""Values of backbones on the places that all saw twice, and their differences, with intervals and what these answer.
+"""Values of models on the places that all saw twice, and their differences, with intervals and what these answer.
 
 What the sums by frame and cube of space know is said for this scene flown again; the rest, as SBD, for these frames.
 """
@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from semstab.core.types import Float64, Int64, Mask
-from semstab.data.contrast import BackboneComparison, ComparedObservations, Ignored, PairedDifference
+from semstab.data.contrast import ComparedObservations, Ignored, ModelComparison, PairedDifference
 from semstab.data.events import Events
 from semstab.data.information import by_group
 from semstab.data.measures import ENTROPY, Quantity, mean, measures
@@ -38,7 +38,7 @@ SUMMED = (VOXEL_ALPHA, PSA, ENTROPY, ACCURACY)
 
 @dataclass(frozen=True, eq=False)
 class OnCommonLocations:
-    """Backbones on the same places (n, 3): the sums of each map there, and the cubes of space that hold them.
+    """Models on the same places (n, 3): the sums of each map there, and the cubes of space that hold them.
 
     Attributes:
         known: What the sums of these maps tell.
@@ -68,14 +68,14 @@ class OnCommonLocations:
         return cls(sums, cubes, frozenset(SUMMED) - ({ACCURACY} if truth is None else set()))
 
     def value(self, measure: Quantity, name: str, columns: Float64, statistic: Statistic) -> Estimate:
-        """Return the value of one backbone; columns (n, C) are those that the statistic is of."""
+        """Return the value of one model; columns (n, C) are those that the statistic is of."""
         if measure in self.known:
             sums = self.sums[name]
             return estimate(sums, measure.key, scope=scope_of(sums, key=measure.key)).ends
         return self.cubes.estimate(columns, statistic).ends
 
     def difference(self, measure: Quantity, a: str, b: str, columns: Mapping[str, Float64], of: Statistic) -> Interval:
-        """Return the difference of backbone a less backbone b."""
+        """Return the difference of model a less model b."""
         if measure in self.known:
             scope = scope_of(self.sums[a], key=measure.key)
             return difference(self.sums[a], self.sums[b], measure.key, scope=scope)
@@ -90,7 +90,7 @@ def differences(
     common: OnCommonLocations | None,
     cells: Mapping[str, ClusterSums],
 ) -> tuple[PairedDifference, ...]:
-    """Return the differences of each measure and pair of backbones; only alpha is tested, from the sums of cells."""
+    """Return the differences of each measure and pair of models; only alpha is tested, from the sums of cells."""
     result = [
         _row(ALPHA, a, b, difference(cells[a], cells[b], ALPHA.key), tested=True)
         for a, b in itertools.combinations(cells, 2)
@@ -110,7 +110,7 @@ def _row(measure: Quantity, a: str, b: str, interval: Interval, *, tested: bool)
 # --- What is claimed --------------------------------------------------------------------------------------------------
 
 
-def claimed_together(comparisons: Sequence[BackboneComparison]) -> tuple[BackboneComparison, ...]:
+def claimed_together(comparisons: Sequence[ModelComparison]) -> tuple[ModelComparison, ...]:
     """Return scenes of one study: p-values of all that may be claimed in any of them, corrected together."""
     rows = _claimed([row for result in comparisons for row in result.paired.differences])
     ends = np.cumsum([0, *(len(result.paired.differences) for result in comparisons)])
@@ -365,14 +365,14 @@ def compared_observations(samples: Mapping[str, CellObservations]) -> SharedObse
         log, alpha = ignoring[name].observations(), value_of(sums_of_cells(samples[name]), ALPHA.key)
         ignored.append(Ignored(name, missing, *psa_bounds(log), min(alpha, 1.0) * pairs_labelled(log)))
     first = next(iter(logs.values()))
-    bounds = {row.backbone: (row.psa_low, row.psa_high) for row in ignored}
+    bounds = {row.model: (row.psa_low, row.psa_high) for row in ignored}
     by_psa = sorted(names, key=lambda name: -mean(psa(logs[name].table())))
     compared = ComparedObservations(
         cells=len(first.ix),
         observations=len(first),
         ignored=tuple(ignored),
         order=tuple(sorted(names, key=lambda name: -value_of(sums[name], ALPHA.key))),
-        order_ignored=tuple(row.backbone for row in sorted(ignored, key=lambda row: -row.alpha)),
+        order_ignored=tuple(row.model for row in sorted(ignored, key=lambda row: -row.alpha)),
         bounded=all(bounds[better][0] >= bounds[worse][1] for better, worse in itertools.pairwise(by_psa)),
     )
     return SharedObservations(sums, logs, compared)

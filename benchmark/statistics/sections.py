@@ -109,10 +109,10 @@ class FlippingSums:
     """Locations of a map that flip, as sums over its locations with OP >= 2.
 
     Attributes:
-        share: Over the cubes: how likely places are not stable, and how many there are.
+        share: Over the cubes: how likely places are not consistent, and how many there are.
         often: How many were seen ENOUGH times.
-        together: (K, K), above the diagonal: how often two looks at one place are of two classes, where it is not
-            stable.
+        together: (K, K), above the diagonal: how often two observations of one location are of two classes, where
+            it is not consistent.
     """
 
     share: CubeSums
@@ -120,14 +120,14 @@ class FlippingSums:
     together: Float64
 
     @classmethod
-    def of(cls, table: VoxelTable, stable: Float64, cubes: Cubes) -> FlippingSums:
+    def of(cls, table: VoxelTable, consistent: Float64, cubes: Cubes) -> FlippingSums:
         """Return the sums of a table by the stability posterior (n,), over the cubes of its voxels with OP >= 2."""
-        unsteady = np.round((1 - stable) / UNIT) * UNIT
-        share = CubeSums(cubes.cell, cubes.edge, cubes.means({"": unsteady}))
-        return cls(share, int(np.count_nonzero(table.op >= ENOUGH)), _together(table, unsteady))
+        inconsistent = np.round((1 - consistent) / UNIT) * UNIT
+        share = CubeSums(cubes.cell, cubes.edge, cubes.means({"": inconsistent}))
+        return cls(share, int(np.count_nonzero(table.op >= ENOUGH)), _together(table, inconsistent))
 
     def specs(self) -> Iterator[EstimateSpec]:
-        """Yield the share of the locations that are not stable, for `confidence_intervals`."""
+        """Yield the share of the locations that are not consistent, for `confidence_intervals`."""
         return self.share.specs({"": Mean("")})
 
     def flipping(self, share: Interval, classes: Sequence[str] = ()) -> Flipping:
@@ -142,11 +142,11 @@ class FlippingSums:
         return Flipping(share, seen, names[int(a)], names[int(b)], float(self.together[a, b]) / total)
 
 
-def _together(table: VoxelTable, unsteady: Float64) -> Float64:
-    """Return (K, K) of voxels that are unsteady with that probability (n,), NaN for those that do not count."""
+def _together(table: VoxelTable, inconsistent: Float64) -> Float64:
+    """Return (K, K) of voxels that are inconsistent with that probability (n,), NaN for those that do not count."""
     starts, label, weight = table.evidence.entries
     of = np.repeat(np.arange(len(table)), np.diff(starts))
-    share, counts, pairs = weight / table.op[of], np.nan_to_num(unsteady)[of], np.zeros((table.K, table.K))
+    share, counts, pairs = weight / table.op[of], np.nan_to_num(inconsistent)[of], np.zeros((table.K, table.K))
     for ahead in range(1, int(np.diff(starts).max(initial=1))):
         first = np.flatnonzero(of[ahead:] == of[:-ahead])
         np.add.at(pairs, (label[first], label[first + ahead]), counts[first] * share[first] * share[first + ahead])

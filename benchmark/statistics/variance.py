@@ -210,7 +210,7 @@ def influences(
     everything = np.abs(index.by_cube(columns[:, 1]))
     some = everything > TINY * everything.sum()
     if some.sum() < 2 or everything.sum() < TINY or not np.isfinite(gradient).all():
-        return None  # of 150 classes hardly any voxel may count as stable: 1e-112 of all of them
+        return None  # of 150 classes hardly any voxel may count as consistent: 1e-112 of all of them
     own: Float64 = columns @ gradient
     shared = own if halves is None else own + gradient[0] * (halves[:, 0] - total[0] / total[1] * halves[:, 1])
     by_frame, size = index.by_both(shared), index.by_both(np.abs(columns[:, 1]))

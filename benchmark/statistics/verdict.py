@@ -41,7 +41,7 @@ MOST_CHANCE = 0.9
 are one class, any two agree at 90 % of the spots, whatever the labels are worth."""
 
 DANGEROUS = 0.05
-"""Largest share of the stable locations that may be wrong."""
+"""Largest share of the consistent locations that may be wrong."""
 
 LEAST_VOXELS, LEAST_BLOCKS = 100, 16
 """Voxels seen twice or more, and blocks of them, below which there is no verdict."""
@@ -104,12 +104,12 @@ def verdict(
     silent = cells.labelled < limits.labelled
     if silent and level == "stable":
         level, probability = "usable", probabilities["usable"] + probability
-    psa, wrong = headline.psa, headline.wrong_of_stable
+    psa, wrong = headline.psa, headline.wrong_of_consistent
     parts = [_alpha(headline.alpha, cells), f"two frames agree at {psa.value:.0%} of the locations"]
     if level == "uninformative":
         parts.insert(0, f"{cells.largest_share:.0%} of the observations are {cells.largest_class}")
     if not math.isnan(wrong.low):
-        parts.append(f"{wrong.value:.0%} of the stable locations are wrong ({wrong.low:.0%} to {wrong.high:.0%})")
+        parts.append(f"{wrong.value:.0%} of the consistent locations are wrong ({wrong.low:.0%} to {wrong.high:.0%})")
     if silent:
         parts.append(f"{1 - cells.labelled:.0%} of the locations have no label in most frames")
     if flips is not None and level in ACTED_ON:
@@ -137,7 +137,7 @@ def _level(
     level = max(probabilities, key=lambda name: probabilities[name])
     if math.isnan(probabilities[level]):
         return "no verdict", math.nan
-    if headline.wrong_of_stable.low > DANGEROUS and level != "unstable":
+    if headline.wrong_of_consistent.low > DANGEROUS and level != "unstable":
         return "misleading", math.nan
     return level if probabilities[level] >= DECIDED else "undecided", probabilities[level]
 

@@ -1,8 +1,8 @@
-"""The built-in dataset `city`: a simulated UAV flight over a procedural town, with simulated backbones.
+"""The built-in dataset `city`: a simulated UAV flight over a procedural town, with simulated models.
 
 Five towns (scene0 to scene4) with roads, buildings, trees, gardens, cars and people, every face of a uavid8 class.
 Depth is exact: the rays' triangles are found with embree, their planes are cut in float64. Errors of the
-backbones are set by `CityOptions.backbones`; `SimulatedBackbone` documents the error model.
+models are set by `CityOptions.models`; `SimulatedModel` documents the error model.
 """
 
 from __future__ import annotations
@@ -21,20 +21,20 @@ from semstab.data.frames import Frame, Intrinsics
 from semstab.data.labels import LabelSpace
 from semstab.datasets.city.labellers import relabelled
 from semstab.datasets.city.mesh import uavid8
-from semstab.datasets.city.options import FLIGHTS, CityOptions, SimulatedBackbone
+from semstab.datasets.city.options import FLIGHTS, CityOptions, SimulatedModel
 from semstab.datasets.city.simulation import Caster, Rendered, Simulation, View, render
 from semstab.datasets.city.world import World, build_world
 from semstab.datasets.scene import GROUND_TRUTH, Dataset, Scene
 from semstab.errors import ConfigError, DataError
 
-__all__ = ["GENERATOR_VERSION", "City", "CityOptions", "CityScene", "SimulatedBackbone"]
+__all__ = ["GENERATOR_VERSION", "City", "CityOptions", "CityScene", "SimulatedModel"]
 
 GENERATOR_VERSION = 1
 """Part of every digest: raise it with any change of the towns, the flights, the rendering or the error model."""
 
 
 class City(Dataset):
-    """The dataset. It keeps the scene that was opened last, so that its backbones share what is rendered."""
+    """The dataset. It keeps the scene that was opened last, so that its models share what is rendered."""
 
     Options: type[BaseModel] = CityOptions
 
@@ -67,8 +67,8 @@ class CityScene(Scene):
 
     def __init__(self, name: str, options: CityOptions) -> None:
         self.name = name
-        self.backbones = tuple(name for name, model in options.backbones.items() if not model.labeller)
-        self.further = tuple(name for name in options.backbones if name not in self.backbones)
+        self.models = tuple(name for name, model in options.models.items() if not model.labeller)
+        self.further = tuple(name for name in options.models if name not in self.models)
         self.up = np.array([0.0, 0.0, 1.0])
         self._options = options
         self._flight = FLIGHTS[name]
@@ -92,33 +92,35 @@ class CityScene(Scene):
         f = W / (2 * np.tan(np.deg2rad(self._options.field_of_view) / 2))
         return Intrinsics(f, f, (W - 1) / 2, (H - 1) / 2)
 
-    def label_space(self, backbone: str) -> LabelSpace:
-        """Return uavid8, for every backbone.
+    def label_space(self, model: str) -> LabelSpace:
+        """Return uavid8, for every model.
 
         Raises:
             ConfigError: For an unknown one.
         """
-        self._model(backbone)
+        self._simulated(model)
         return uavid8()
 
-    def frame(self, index: int, backbone: str, *, color: bool = True) -> Frame:
-        """Render frame 0 <= index < len with a backbone's labels or scores; colour comes with it.
+    def frame(self, index: int, model: str, *, color: bool = True) -> Frame:
+        """Render frame 0 <= index < len with a model's labels or scores; colour comes with it.
 
         Raises:
             DataError: For a frame.
-            ConfigError: For a backbone that does not exist.
+            ConfigError: For a model that does not exist.
         """
-        model = self._model(backbone)
+        simulated = self._simulated(model)
         T = self._pose(index)
         T_wc = T.copy()
         T_wc[:3, 3] += self.origin
         rendered = self._render(index, T)
         labels: UInt8 | None = rendered.classes
         scores = None
-        if model is not None:
+        if simulated is not None:
             view = View(index, rendered, self.camera, T_wc, self.origin)
-            simulation = Simulation(model, self._options.seed, backbone, self.name)
-            labels, scores = (None, simulation.scores(view)) if model.softness else (relabelled(simulation, view), None)
+            simulation = Simulation(simulated, self._options.seed, model, self.name)
+            labels, scores = (
+                (None, simulation.scores(view)) if simulated.softness else (relabelled(simulation, view), None)
+            )
         where = f"city/{self.name}/frame {index}"
         return Frame(
             index=index,
@@ -132,16 +134,16 @@ class CityScene(Scene):
             files={what: f"{where}, {what}" for what in ("depth", "pose", "labels", "scores", "color")},
         )
 
-    def digest(self, indices: list[int], backbone: str) -> str:
+    def digest(self, indices: list[int], model: str) -> str:
         """Return a hash of all settings that the frames depend on; nothing is rendered."""
-        model = self._model(backbone)
+        simulated = self._simulated(model)
         content = {
             "generator": GENERATOR_VERSION,
-            "options": self._options.model_dump(mode="json", exclude={"backbones", "cache_megabytes"}),
+            "options": self._options.model_dump(mode="json", exclude={"models", "cache_megabytes"}),
             "scene": self.name,
             "indices": [int(index) for index in indices],
-            "backbone": backbone,
-            "model": None if model is None else model.model_dump(mode="json"),
+            "model": model,
+            "simulated": None if simulated is None else simulated.model_dump(mode="json"),
         }
         return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
 
@@ -183,11 +185,11 @@ class CityScene(Scene):
                 self.rendered[index] = rendered
             return rendered
 
-    def _model(self, backbone: str) -> SimulatedBackbone | None:
-        """Return the error model of a backbone, None for the ground truth."""
-        if backbone == GROUND_TRUTH:
+    def _simulated(self, model: str) -> SimulatedModel | None:
+        """Return the errors of a simulated model, None for the ground truth."""
+        if model == GROUND_TRUTH:
             return None
-        if backbone not in self._options.backbones:
-            known = (*self.backbones, *self.by_name)
-            raise ConfigError(f"city: backbone '{backbone}' is not known; {nearest(backbone, known)}")
-        return self._options.backbones[backbone]
+        if model not in self._options.models:
+            known = (*self.models, *self.by_name)
+            raise ConfigError(f"city: model '{model}' is not known; {nearest(model, known)}")
+        return self._options.models[model]

@@ -1,4 +1,4 @@
-"""Labellers that agree with themselves for the wrong reasons, as simulated backbones: no verdict may be bought so."""
+"""Labellers that agree with themselves for the wrong reasons, as simulated models: no verdict may be bought so."""
 
 from __future__ import annotations
 

@@ -149,5 +149,5 @@ CLUTTER, BUILDING, ROAD, STATIC_CAR, TREE, LOW_VEGETATION, HUMAN, MOVING_CAR = r
 
 @cache
 def uavid8() -> LabelSpace:
-    """Return the label space of the town's ground truth and of every simulated backbone."""
+    """Return the label space of the town's ground truth and of every simulated model."""
     return LabelSpace.load("uavid8")

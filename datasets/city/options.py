@@ -1,4 +1,4 @@
-"""Settings of the city: the camera, the flight, and the error model of each simulated backbone."""
+"""Settings of the city: the camera, the flight, and the error model of each simulated model."""
 
 from __future__ import annotations
 
@@ -46,10 +46,10 @@ Labeller = Literal[
 ]  # fmt: skip
 
 
-class SimulatedBackbone(Settings):
-    """The errors of one simulated backbone, by what each is drawn for.
+class SimulatedModel(Settings):
+    """The errors of one simulated model, by what each is drawn for.
 
-    Each draw is a function of the seed, the backbone's and the scene's name, and of that.
+    Each draw is a function of the seed, the model's and the scene's name, and of that.
 
     A cell is floor(x_w / cell). View errors have the probability
     view * min(1, 2 (1 - cos a)) * min(1, d / view_distance)
@@ -61,7 +61,7 @@ class SimulatedBackbone(Settings):
     frame; the rest goes to the true class where the prediction is wrong, else to the class's row of `confusion`.
 
     Attributes:
-        place: The world cell: the same mistake in every view and frame (stable but wrong).
+        place: The world cell: the same mistake in every view and frame (consistent but wrong).
         view: The world cell and the quantised direction and distance it is seen from.
         flicker: The world cell and the frame's index: anew in every frame.
         border: The pixel and the frame's index: a smooth random field displaces the label map.
@@ -102,8 +102,8 @@ class SimulatedBackbone(Settings):
 
 _SMALL_THINGS = {"human": 3.0, "static car": 1.6, "moving car": 1.6, "clutter": 1.4}
 
-BACKBONES = {
-    name: SimulatedBackbone(place=place, view=view, flicker=flicker, border=border, cell=cell, softness=softness,
+MODELS = {
+    name: SimulatedModel(place=place, view=view, flicker=flicker, border=border, cell=cell, softness=softness,
                             difficulty=_SMALL_THINGS)
     for name, place, view, flicker, border, cell, softness in (
         ("sim-steady", 0.07, 0.05, 0.015, 0.8, 2.0, 0.0),
@@ -111,11 +111,11 @@ BACKBONES = {
         ("sim-soft", 0.04, 0.06, 0.05, 1.2, 1.6, 0.4),
     )
 } | {
-    f"trick-{name}": SimulatedBackbone(view=0.08, flicker=0.11, border=2.0, cell=1.2, difficulty=_SMALL_THINGS,
+    f"trick-{name}": SimulatedModel(view=0.08, flicker=0.11, border=2.0, cell=1.2, difficulty=_SMALL_THINGS,
                                        labeller=name)
     for name in get_args(Labeller) if name
 }  # fmt: skip
-"""The simulated backbones, and labellers that a verdict must not fall for (`labellers`)."""
+"""The simulated models, and labellers that a verdict must not fall for (`labellers`)."""
 
 
 class CityOptions(Settings):
@@ -130,10 +130,10 @@ class CityOptions(Settings):
     )
     altitude: float = Field(45.0, ge=30, le=120, description="of the camera above the mean ground, metres")
     field_of_view: float = Field(60.0, ge=20, le=100, description="horizontal, degrees")
-    cache_megabytes: int = Field(256, ge=0, description="rendered frames that an open scene keeps for its backbones")
-    backbones: dict[str, SimulatedBackbone] = Field(
-        default_factory=lambda: dict(BACKBONES),
-        description="the simulated backbones by name, instead of the built-in ones",
+    cache_megabytes: int = Field(256, ge=0, description="rendered frames that an open scene keeps for its models")
+    models: dict[str, SimulatedModel] = Field(
+        default_factory=lambda: dict(MODELS),
+        description="the simulated models by name, instead of the built-in ones",
     )
 
     @field_validator("origin")
@@ -143,15 +143,15 @@ class CityOptions(Settings):
             raise ValueError("origin must be finite and within 1e8 m")
         return origin
 
-    @field_validator("backbones")
+    @field_validator("models")
     @classmethod
-    def _usable_names(cls, backbones: dict[str, SimulatedBackbone]) -> dict[str, SimulatedBackbone]:
-        for name in backbones:
+    def _usable_names(cls, models: dict[str, SimulatedModel]) -> dict[str, SimulatedModel]:
+        for name in models:
             if name == GROUND_TRUTH or not _NAME.fullmatch(name):
                 raise ValueError(
-                    f"'{name}' cannot name a backbone: use letters, digits, '.', '-', single '_'; not '{GROUND_TRUTH}'"
+                    f"'{name}' cannot name a model: use letters, digits, '.', '-', single '_'; not '{GROUND_TRUTH}'"
                 )
-        return backbones
+        return models
 
 
 # The flights: five scenes whose frames overlap as differently as those of UAVid-3D in the paper's scene table.

@@ -13,7 +13,7 @@ from semstab.core.types import Float32, Float64, Int64, Mask, UInt8, UInt64
 from semstab.data.frames import Intrinsics
 from semstab.data.labels import IGNORE_8BIT
 from semstab.datasets.city.mesh import BUILDING, CLUTTER, LOW_VEGETATION, ROAD, TREE, Surface, uavid8
-from semstab.datasets.city.options import CONFUSION, SimulatedBackbone
+from semstab.datasets.city.options import CONFUSION, SimulatedModel
 
 # Random numbers that are a function of integers: the same place, view or frame always draws the same number.
 
@@ -76,7 +76,7 @@ GRAIN[BUILDING] = 0.06, 0.04
 
 @dataclass(frozen=True)
 class Rendered:
-    """The image that the camera sees, shared by all backbones of a scene.
+    """The image that the camera sees, shared by all models of a scene.
 
     Attributes:
         depth: (H, W) float32, planar z in metres; 0 where a ray hits nothing.
@@ -211,7 +211,7 @@ def _noise(points: Float64, cell: float) -> Float64:
     return 2 * uniform(hash_integers(17, x, y, z)) - 1
 
 
-# Simulated backbones: the true label map with errors tied to places, views, frames and class borders.
+# Simulated models: the true label map with errors tied to places, views, frames and class borders.
 
 Labels = UInt8
 Scores = Float32
@@ -219,7 +219,7 @@ Scores = Float32
 
 @dataclass(frozen=True)
 class View:
-    """One frame as a backbone is given it.
+    """One frame as a model is given it.
 
     Attributes:
         frame: Index, what flicker and border errors are drawn for.
@@ -243,9 +243,9 @@ class View:
 
 
 class Simulation:
-    """A simulated backbone in one scene: predicts label maps, or soft scores where its softness is above 0."""
+    """A simulated model in one scene: predicts label maps, or soft scores where its softness is above 0."""
 
-    def __init__(self, model: SimulatedBackbone, seed: int, name: str, scene: str) -> None:
+    def __init__(self, model: SimulatedModel, seed: int, name: str, scene: str) -> None:
         self.model = model
         self._salts = {kind: salt(seed, name, scene, kind) for kind in ("place", "view", "flicker", "border", "soft")}
         names, rows = uavid8().classes, CONFUSION | model.confusion

@@ -30,12 +30,12 @@ SUFFIXES: Mapping[Kind, tuple[str, ...]] = {
     "scores": images.SCORE_SUFFIXES,
     "masks": images.MASK_SUFFIXES,
 }
-DEFAULTS: Mapping[Kind, str] = {"labels": "labels/{backbone}/{name}", "scores": "scores/{backbone}/{name}"}
-REGIONS = "regions/{backbone}/{name}"
+DEFAULTS: Mapping[Kind, str] = {"labels": "labels/{model}/{name}", "scores": "scores/{model}/{name}"}
+REGIONS = "regions/{model}/{name}"
 LABEL_SPACE_FILE = "label_space.yaml"
 """A taxonomy file in a folder of label maps or scores: their classes, where they are not the scene's."""
 
-SEPARATE = "{scene}/{backbone}/{name}"
+SEPARATE = "{scene}/{model}/{name}"
 """The template of label maps in a folder of their own."""
 
 
@@ -90,7 +90,7 @@ def find_sources(
 ) -> dict[str, LabelSource]:
     """Return the label sources of a scene with these frames; `gt` is the ground truth.
 
-    labels of X are the backbone X, scores of X found by a template are X-scores, so that neither name depends on what
+    labels of X are the model X, scores of X found by a template are X-scores, so that neither name depends on what
     else is there. A folder without a file of any frame is left out with a warning.
 
     Raises:
@@ -103,12 +103,12 @@ def find_sources(
         raise ConfigError(f"{base}: there is no such folder; mend labels_root")
     for kind in KINDS:
         templates: dict[str, str] = {}
-        for backbone, template in _stated(kind, options).items():
-            if backbone is not None:
-                templates[backbone] = template.filled(scene=entry.below_root)
+        for model, template in _stated(kind, options).items():
+            if model is not None:
+                templates[model] = template.filled(scene=entry.below_root)
                 continue
             suffix = "-scores" if kind == "scores" else ""
-            folders_of = matching_folders(base, template, "backbone", scene=entry.below_root)
+            folders_of = matching_folders(base, template, "model", scene=entry.below_root)
             templates |= {f"{name}{suffix}": filled for name, filled in folders_of.items()}
         for name, filled in templates.items():
             source = LabelSource.of(kind, base, filled, frames, folders)
@@ -131,8 +131,8 @@ def find_sources(
 
 
 def label_paths(options: FileOptions, entry: SceneEntry, frames: Sequence[FrameSource]) -> list[str]:
-    """Return the paths of label maps and scores of the first frame, with BACKBONE for any name."""
-    values = {"scene": entry.below_root, "backbone": "BACKBONE", "name": frames[0].name if frames else "NAME"}
+    """Return the paths of label maps and scores of the first frame, with MODEL for any name."""
+    values = {"scene": entry.below_root, "model": "MODEL", "name": frames[0].name if frames else "NAME"}
     base = options.labels_root or entry.folder
     return [
         _with_suffix(base / template.filled(**values), kind)
@@ -142,7 +142,7 @@ def label_paths(options: FileOptions, entry: SceneEntry, frames: Sequence[FrameS
 
 
 def _stated(kind: Kind, options: FileOptions) -> dict[str | None, Template]:
-    """Return the template of each backbone that has one of its own, or that of all, under None."""
+    """Return the template of each model that has one of its own, or that of all, under None."""
     stated = options.labels if kind == "labels" else options.scores
     if isinstance(stated, dict):
         return {key: Template(f"{kind}.{key}", text, ("scene", "name"), ("name",)) for key, text in stated.items()}
@@ -150,7 +150,7 @@ def _stated(kind: Kind, options: FileOptions) -> dict[str | None, Template]:
         return {}
     if stated is None:
         stated = DEFAULTS[kind] if options.labels_root is None else SEPARATE
-    return {None: Template(kind, stated, ("scene", "backbone", "name"), ("backbone", "name"))}
+    return {None: Template(kind, stated, ("scene", "model", "name"), ("model", "name"))}
 
 
 def _with_suffix(path: Path, kind: Kind) -> str:
@@ -181,15 +181,15 @@ class LabelMaps:
         folders: Folders,
     ) -> None:
         labels, base = find_sources(options, entry, frames, folders), options.labels_root or entry.folder
-        template = Template("regions", REGIONS, ("backbone", "name"), ("backbone", "name"))
+        template = Template("regions", REGIONS, ("model", "name"), ("model", "name"))
         regions = {
             name: LabelSource.of("labels", base, filled, frames, folders)
-            for name, filled in matching_folders(base, template, "backbone", scene=entry.below_root).items()
+            for name, filled in matching_folders(base, template, "model", scene=entry.below_root).items()
         }
         if both := next((name for name in regions if name in labels), None):
             raise DataError(f"{base / 'regions' / both}: labels/{both} is called '{both}' too; rename one")
         regions = {name: source for name, source in regions.items() if source.first is not None}
-        self.backbones = tuple(name for name in labels if name != GROUND_TRUTH)
+        self.models = tuple(name for name in labels if name != GROUND_TRUTH)
         self.ground_truth = GROUND_TRUTH in labels
         self.regions = tuple(regions)
         self.class_ids = class_ids
@@ -203,27 +203,25 @@ class LabelMaps:
             self._masks = LabelSource("masks", entry.folder, masks, folders)
         self._spaces: dict[str, LabelSpace | None] = {}
 
-    def source(self, backbone: str) -> LabelSource:
+    def source(self, model: str) -> LabelSource:
         """Return the files of a label source.
 
         Raises:
             ConfigError: If there is none of that name.
         """
         known = self._sources
-        if backbone not in known:
-            hint = (
-                nearest(backbone, [*known]) if known else "put its label maps into labels/NAME/, or set option labels"
-            )
-            raise ConfigError(f"{self._folder}: backbone '{backbone}' is not there; {hint}")
-        return known[backbone]
+        if model not in known:
+            hint = nearest(model, [*known]) if known else "put its label maps into labels/NAME/, or set option labels"
+            raise ConfigError(f"{self._folder}: model '{model}' is not there; {hint}")
+        return known[model]
 
-    def file(self, frame: FrameSource, backbone: str) -> Path:
+    def file(self, frame: FrameSource, model: str) -> Path:
         """Return the file of a frame.
 
         Raises:
             DataError: If it is not there.
         """
-        source = self.source(backbone)
+        source = self.source(model)
         if (file := source.file(frame)) is None:
             lost = [path for each in self._frames for path in source.missing(each)]
             raise DataError(
@@ -231,7 +229,7 @@ class LabelMaps:
             )
         return file
 
-    def space(self, backbone: str) -> LabelSpace | None:
+    def space(self, model: str) -> LabelSpace | None:
         """Return the classes of a label source, read once; None for regions, and where nothing says them.
 
         They are those of option taxonomies, else of a label_space.yaml next to its maps, else of the scene.
@@ -239,15 +237,15 @@ class LabelMaps:
         Raises:
             ConfigError: For one that cannot be used.
         """
-        if backbone not in self._spaces:
-            source = self.source(backbone)
-            self._spaces[backbone] = None if backbone in self.regions else self._stated_space(backbone, source)
-        return self._spaces[backbone]
+        if model not in self._spaces:
+            source = self.source(model)
+            self._spaces[model] = None if model in self.regions else self._stated_space(model, source)
+        return self._spaces[model]
 
-    def _stated_space(self, backbone: str, source: LabelSource) -> LabelSpace | None:
+    def _stated_space(self, model: str, source: LabelSource) -> LabelSpace | None:
         options = self._options
-        if backbone in options.taxonomies:
-            return LabelSpace.load(options.taxonomies[backbone])
+        if model in options.taxonomies:
+            return LabelSpace.load(options.taxonomies[model])
         assert source.first is not None
         frame, file = source.first
         for parent in file.parents[: 1 + frame.count("/")]:  # a frame's name may be a path: cam0/0001
@@ -260,48 +258,48 @@ class LabelMaps:
         except ConfigError as error:
             raise ConfigError(f"{self._folder}: {error}") from error
 
-    def label_space(self, backbone: str, where: Path) -> LabelSpace:
+    def label_space(self, model: str, where: Path) -> LabelSpace:
         """Return the same; raises DataError with `where` where nothing says them, ConfigError where it has none."""
-        source = self.source(backbone)
-        if backbone in self.regions:
-            raise ConfigError(f"{self._folder}: '{backbone}' holds regions without classes, which cannot be fused")
-        space = self.space(backbone)
+        source = self.source(model)
+        if model in self.regions:
+            raise ConfigError(f"{self._folder}: '{model}' holds regions without classes, which cannot be fused")
+        space = self.space(model)
         if space is None:
             assert source.first is not None
             folder = source.first[1].parent
             raise DataError(
-                f"{where}: the classes of '{backbone}' are not known; set classes: [name, ...] in id order, taxonomy:"
-                f" NAME, or taxonomies: {{{backbone}: NAME}}, or put a {LABEL_SPACE_FILE} into {folder}"
+                f"{where}: the classes of '{model}' are not known; set classes: [name, ...] in id order, taxonomy:"
+                f" NAME, or taxonomies: {{{model}: NAME}}, or put a {LABEL_SPACE_FILE} into {folder}"
             )
         return space
 
-    def labels(self, backbone: str, path: Path, read: Read) -> Labels:
+    def labels(self, model: str, path: Path, read: Read) -> Labels:
         """Return ids (H, W) of one file, whose bytes `read` gives.
 
         Raises:
             DataError: If that fails; the message names it.
         """
-        labels = images.read_labels(path, self.space(backbone), read)
-        if backbone in self.class_ids:
-            ids: Labels = self.class_ids[backbone][labels]
+        labels = images.read_labels(path, self.space(model), read)
+        if model in self.class_ids:
+            ids: Labels = self.class_ids[model][labels]
             if (unknown := ids == NO_ID).any():
                 raise DataError(
                     f"{path}: the id {labels[unknown][0]} is not in the table of classes; is it the right table?"
                 )
             labels = ids
-        if void := self._options.void_ids.get(backbone):
+        if void := self._options.void_ids.get(model):
             labels = np.where(np.isin(labels, void), labels.dtype.type(ignore_id(labels)), labels)
         return labels
 
-    def scores(self, backbone: str, path: Path, size: Size, read: Read) -> Scores:
+    def scores(self, model: str, path: Path, size: Size, read: Read) -> Scores:
         """Return scores (H, W, K) of one file; `size` is (H, W) of the depth.
 
         Raises:
             DataError: If that fails; the message names it.
         """
         scores = images.read_scores(path, self._options.scores_layout or "KHW", size, read)
-        if void := self._options.void_ids.get(backbone):
-            space = self.space(backbone)
+        if void := self._options.void_ids.get(model):
+            space = self.space(model)
             ids = range(scores.shape[2]) if space is None else space.ids
             ignored = np.isin(scores.argmax(axis=2), [row for row, class_id in enumerate(ids) if class_id in void])
             scores = np.where(ignored[..., None], scores.dtype.type(0), scores)

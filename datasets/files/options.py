@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import os
 import re
 from collections.abc import Collection
@@ -17,6 +18,8 @@ from semstab.datasets.formats.disk import natural, subfolders
 from semstab.datasets.geometry.cameras import Camera, Poses
 from semstab.datasets.geometry.lenses import Lens
 from semstab.errors import ConfigError, DataError
+
+logger = logging.getLogger("semstab")
 
 Positive = Annotated[float, Field(gt=0, le=1e30)]
 Finite = Annotated[float, Field(allow_inf_nan=False)]
@@ -59,15 +62,15 @@ ZERO_IS_VOID: dict[str, tuple[int, ...]] = {GROUND_TRUTH: (0,)}
 class FileSettings(Settings):
     """The settings by which files are read; a reader replaces the defaults that its format fixes.
 
-    Templates hold {scene} (the scene's folder below root), {backbone} and {name} (the frame's name); without a suffix
+    Templates hold {scene} (the scene's folder below root), {model} and {name} (the frame's name); without a suffix
     they find any that can be read.
     """
 
     labels: str | dict[str, str] | None = Field(
-        None, description="template of label maps, or one for each backbone: labels/{backbone}/{name} by default"
+        None, description="template of label maps, or one for each model: labels/{model}/{name} by default"
     )
     scores: str | dict[str, str] | None = Field(
-        None, description="the same of soft scores: scores/{backbone}/{name}; none in a labels_root unless given"
+        None, description="the same of soft scores: scores/{model}/{name}; none in a labels_root unless given"
     )
     scores_layout: ScoresLayout = "KHW"
     ground_truth: GroundTruth = None
@@ -120,7 +123,7 @@ class FileOptions(FileSettings):
     )
 
 
-# Path templates such as 'labels/{backbone}/{name}.png', and paths that stay inside a folder.
+# Path templates such as 'labels/{model}/{name}.png', and paths that stay inside a folder.
 
 LONGEST = 400
 """Characters of a path inside a dataset."""
@@ -141,6 +144,9 @@ class Template:
     required: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
+        if "model" in self.known and "{backbone}" in self.text:
+            logger.warning("%s: {backbone} is now called {model}; the next version will not know it", self.option)
+            object.__setattr__(self, "text", self.text.replace("{backbone}", "{model}"))
         names, where = PLACEHOLDER.findall(self.text), f"{self.option}: {self.text[:200]!r}"
         known = ", ".join(f"{{{name}}}" for name in self.known)
         if unknown := next((name for name in names if name not in self.known), None):

@@ -65,7 +65,7 @@ class FileScene(Scene):
         self._frames = frames
         self._folders = Folders()
         self._maps = LabelMaps(options, entry, frames, class_ids or {}, self._folders)
-        self.backbones = self._maps.backbones
+        self.models = self._maps.models
         self.ground_truth = self._maps.ground_truth
         self.regions = self._maps.regions
         self.label_paths = tuple(label_paths(options, entry, frames))
@@ -122,31 +122,31 @@ class FileScene(Scene):
         """Return units of its stored depth in a metre: the option, else the usual scale of its kind of file."""
         return stored_scale(self._frames[0], self.options) if self._surface is None else None
 
-    def label_space(self, backbone: str) -> LabelSpace:
+    def label_space(self, model: str) -> LabelSpace:
         """Return the classes of that label source.
 
         Raises:
             DataError: If nothing says them.
             ConfigError: If there is no such source, or it has none.
         """
-        return self._maps.label_space(backbone, self.settings_file or self.folder)
+        return self._maps.label_space(model, self.settings_file or self.folder)
 
-    def frame(self, index: int, backbone: str, *, color: bool = True) -> Frame:
+    def frame(self, index: int, model: str, *, color: bool = True) -> Frame:
         """Return frame 0 <= index < len with that source's labels or scores, and colour where it has any.
 
         Labels of another size than the depth are brought to its pixels.
 
         Raises:
             DataError: If that fails; the message names the file.
-            ConfigError: If there is no such frame or backbone.
+            ConfigError: If there is no such frame or model.
         """
-        file, kind = self._maps.file(self._frame(index), backbone), self._maps.source(backbone).kind
-        read = self._reader(index, LABELS + backbone)
+        file, kind = self._maps.file(self._frame(index), model), self._maps.source(model).kind
+        read = self._reader(index, LABELS + model)
         depth, labels, scores = self.depth(index), None, None
         if kind == "labels":
-            labels = self._stored(index, self._maps.labels(backbone, file, read), depth.shape, file, "labels are")
+            labels = self._stored(index, self._maps.labels(model, file, read), depth.shape, file, "labels are")
         else:
-            stored = self._maps.scores(backbone, file, (depth.shape[0], depth.shape[1]), read)
+            stored = self._maps.scores(model, file, (depth.shape[0], depth.shape[1]), read)
             scores = self._stored(index, stored, depth.shape, file, "scores are")
         return self._framed(index, depth, labels, scores, color=color, files={kind: file})
 
@@ -249,18 +249,18 @@ class FileScene(Scene):
         convention, axes = options.pose_convention or "camera_to_world", options.camera_axes or "opencv"
         return to_camera_to_world(stored, convention, axes, str(source.pose_file))
 
-    def digest(self, indices: Sequence[int], backbone: str) -> str:
+    def digest(self, indices: Sequence[int], model: str) -> str:
         """Return a hash of the settings, the classes, and the depth, poses and labels of those frames.
 
         Of the images it is the content that `frame` read, where it did; others are read for it.
         """
-        space = self._maps.space(backbone)
+        space = self._maps.space(model)
         settings = self.options.model_dump(mode="json", exclude=PLACES)
         digest = hashlib.blake2b(digest_size=16)
         digest.update(json.dumps([settings, space.to_dict() if space else None]).encode())
-        if (table := self._maps.class_ids.get(backbone)) is not None:
+        if (table := self._maps.class_ids.get(model)) is not None:
             digest.update(table.tobytes())
-        files = [self._images(index, backbone) for index in indices]
+        files = [self._images(index, model) for index in indices]
         unread = [k for k, own in enumerate(files) if own.keys() - self._digests.keys()]
         for fetched in prefetch(lambda k: {key: disk.file_digest(path) for key, path in files[k].items()}, unread):
             self._digests = fetched.item | self._digests
@@ -273,12 +273,12 @@ class FileScene(Scene):
                 digest.update(self._digests[key])
         return digest.hexdigest()
 
-    def _images(self, index: int, backbone: str) -> dict[tuple[int, str], Path]:
+    def _images(self, index: int, model: str) -> dict[tuple[int, str], Path]:
         """Return the files that a frame is made of, but for its pose: depth where it is stored, labels, a mask."""
         source = self._frame(index)
         depth = source.depth if self._surface is None else None
-        labels, mask = self._maps.file(source, backbone), self._maps.mask_file(source)
-        files = {DEPTH: depth, LABELS + backbone: labels, MASK: mask}
+        labels, mask = self._maps.file(source, model), self._maps.mask_file(source)
+        files = {DEPTH: depth, LABELS + model: labels, MASK: mask}
         return {(index, what): path for what, path in files.items() if path is not None}
 
     def _view(self, index: int) -> View:

@@ -104,7 +104,7 @@ def of_files(out: Path) -> Any:
 
 def kinds(base: Path) -> dict[str, tuple[Callable[[Path], Words], Callable[[Path], Any]]]:
     """What is killed: its words for a folder, and what is compared of that."""
-    wall = tiny_scene.write(base / "wall", backbones=("a", "b"), frames=20)
+    wall = tiny_scene.write(base / "wall", models=("a", "b"), frames=20)
     flight = predicted_scene.write(base / "flight")
     study = base / "tiny.yaml"
     study.write_text(yaml.safe_dump(tiny_study.content(tiny_study.write(base / "walls"), backends=["numpy"])))

@@ -26,7 +26,7 @@ def test_a_recording_that_finds_no_room_costs_no_result(tmp_path, monkeypatch) -
         raise RuntimeError("File-writer thread shut down prematurely")  # what rerun says of a full disk
 
     monkeypatch.setattr("rerun.RecordingStream.flush", full)
-    config, out = configure(tiny_scene.write(tmp_path / "wall", backbones=("a",)), check=None), tmp_path / "out"
+    config, out = configure(tiny_scene.write(tmp_path / "wall", models=("a",)), check=None), tmp_path / "out"
     recording = Recording(out / "recording.rrd")
     with pytest.raises(ConfigError, match=r"recording\.rrd: the recording is not whole .*is the disk full"):
         semstab.engine.run(config, out=out, observers=[recording])

@@ -29,7 +29,7 @@ SETTINGS = (
     "dataset=1", "dataset=[1]", "dataset=null", "dataset.options=3", "threads=abc", f"threads={LONG}",
     f"voxel_size={LONG}", "voxel_size=1e-320", "voxel_size=1e300", f"seed={LONG}", f"frames.stop={LONG}",
     "frames.list=[99999999999999999999]", f"strata=[{LONG}]", "tolerance=.nan", "backends=[[1]]", r'backends=["\n"]',
-    r'scenes=["\0"]', r'backbones=["a\n b"]', r'exclude.classes=["\n[/x]"]', "perturbation.depth_noise=1e300",
+    r'scenes=["\0"]', r'models=["a\n b"]', r'exclude.classes=["\n[/x]"]', "perturbation.depth_noise=1e300",
     "dataset.options.depth_scale=1e300", f"dataset.options.depth_scale={LONG}", f"dataset.options.{'a' * 5000}=1",
     "a.b.c=1", "=1", "..a=1", "x=[[[[", "x=!!python/object:os.system", 'taxonomy="[/x]"', 'taxonomy="[/x].yaml"',
     f'taxonomy="{"a" * 5000}.yaml"', "scene_frames.wall=1", "x=2020-13-45", 'dataset.options.classes=["a","a","b"]',
@@ -37,7 +37,7 @@ SETTINGS = (
 
 OPTIONS = (
     ("--frames", "²:"), ("--frames", "٣:"), ("--frames", "²"), ("--frames", "9" * 5000), ("--frames", f"{'9' * 5000}:"),
-    ("--scene", "a\nb"), ("--scene", "[/x]"), ("--backbone", "[/x]"), ("--taxonomy", "[/x]"), ("--check", "\udcff"),
+    ("--scene", "a\nb"), ("--scene", "[/x]"), ("--model", "[/x]"), ("--taxonomy", "[/x]"), ("--check", "\udcff"),
     ("--config", "/dev/zero"), ("--config", "."), ("--predict", "x,,="), ("--scheduler", "tcp://[::"),
     ("--predict", f"colour-clusters,clusters={LONG}"), ("--out", "a" * 300), ("--out", "/proc/x"),
 )  # fmt: skip
@@ -53,7 +53,7 @@ COMMANDS = (
 
 @pytest.fixture(scope="module")
 def wall(tmp_path_factory):
-    return tiny_scene.write(tmp_path_factory.mktemp("horrors") / "wall", backbones=("a",))
+    return tiny_scene.write(tmp_path_factory.mktemp("horrors") / "wall", models=("a",))
 
 
 WORDS = [*(("--set", setting) for setting in SETTINGS), *OPTIONS, *COMMANDS]
@@ -93,7 +93,7 @@ def test_a_message_keeps_its_ends_and_a_dollar_begins_no_formula_in_a_figure(tmp
 
 @pytest.mark.parametrize("name", [b"\xff", b"a\nb"])
 def test_a_label_source_whose_name_is_no_text_is_refused(tmp_path, name) -> None:
-    root = tiny_scene.write(tmp_path / "wall", backbones=("a",))
+    root = tiny_scene.write(tmp_path / "wall", models=("a",))
     (root / "labels" / "a").rename(root / "labels" / os.fsdecode(name))
     with pytest.raises(DataError, match="cannot be the path of a file"):
         open_dataset("posed_folder", {"root": str(root)}).scene("wall")

@@ -41,7 +41,7 @@ def growing(tmp_path):
 def test_a_map_that_outgrows_the_memory_is_given_up_in_one_line(growing, tmp_path) -> None:
     """Though its first frame promised little; what was finished before is kept."""
     settings = {"backends": ["numba"], "check": None, "voxel_size": 0.0125, "check_geometry": False}
-    small = configure(growing, backbones=["a"], frames={"stop": 2}, **settings)
+    small = configure(growing, models=["a"], frames={"stop": 2}, **settings)
     semstab.engine.run(small, out=tmp_path / "out")
     large = configure(growing, memory_gb=0.012, tile_size="off", **settings)
     with pytest.raises(ConfigError, match=r"wall, a, numba: after \d of 6 frames the map has .* million voxels"):

@@ -52,10 +52,10 @@ def test_names_that_share_a_file_are_refused_and_usual_ones_stay(tmp_path) -> No
 
 def test_every_hostile_name_gets_results_of_its_own(tmp_path) -> None:
     """Scenes and label sources: as many files as there are, all within OUT, and a second start finds them again."""
-    tiny_scene.write(tmp_path / "scenes" / "plain", backbones=("z", "y__z"), frames=1)
+    tiny_scene.write(tmp_path / "scenes" / "plain", models=("z", "y__z"), frames=1)
     for name in HORRORS:
         shutil.copytree(tmp_path / "scenes" / "plain", tmp_path / "scenes" / name)
-    config = configure(tmp_path / "scenes", backbones=["z", "y__z"], check=None, voxel_size=1.0)
+    config = configure(tmp_path / "scenes", models=["z", "y__z"], check=None, voxel_size=1.0)
     result = semstab.engine.run(config, out=tmp_path / "out")
     files = [record.voxels_file for record in result.records]
     assert len(set(files)) == len(files) == 2 * (len(HORRORS) + 1)
@@ -68,7 +68,7 @@ def test_a_study_is_kept_below_studies_whatever_its_name(tmp_path, monkeypatch) 
     monkeypatch.chdir(tmp_path)
     tiny_scene.write(tmp_path / "wall")
     content = {"name": "../../escape", "dataset": {"name": "posed_folder", "options": {"root": "wall"}}}
-    (tmp_path / "study.yaml").write_text(yaml.safe_dump({**content, "backends": ["numpy"], "backbones": ["a"]}))
+    (tmp_path / "study.yaml").write_text(yaml.safe_dump({**content, "backends": ["numpy"], "models": ["a"]}))
     done = CliRunner().invoke(app, ["study", "study.yaml", "--report", "off", "--quiet"])
     assert done.exit_code == 0, done.stderr
     assert len(list((tmp_path / "studies").iterdir())) == 1

@@ -26,7 +26,7 @@ def root(tmp_path):
 
 @pytest.mark.parametrize("damage", ["cut", "gone"])
 def test_a_recording_cut_by_a_kill_is_made_again_where_all_else_is_kept(root, tmp_path, damage) -> None:
-    config, out = configure(root, backbones=["a"], check=None), tmp_path / "out"
+    config, out = configure(root, models=["a"], check=None), tmp_path / "out"
     file = out / "recording.rrd"
     semstab.engine.run(config, out=out, observers=[Recording(file)])
     size, before = file.stat().st_size, file.stat().st_mtime_ns
@@ -55,7 +55,7 @@ class FirstFrame:
 
 
 def test_a_conversion_killed_at_its_birth_goes_on(root, tmp_path, monkeypatch) -> None:
-    config, out = configure(root, backbones=["a"]), tmp_path / "out"
+    config, out = configure(root, models=["a"]), tmp_path / "out"
     with monkeypatch.context() as patch:
         patch.setattr("semstab.convert.write_json", stop)
         with pytest.raises(Killed):
@@ -78,7 +78,7 @@ def stop(*_: object) -> None:
 
 
 def test_a_folder_of_a_conversion_or_of_predictions_belongs_to_one_process(root, tmp_path) -> None:
-    config, out = configure(root, backbones=["a"]), tmp_path / "out"
+    config, out = configure(root, models=["a"]), tmp_path / "out"
     list(convert(config, out))
     held = FolderLock(out / "wall")
     with pytest.raises(ConfigError, match="wall: another process works on it"):

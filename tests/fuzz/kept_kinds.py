@@ -14,8 +14,6 @@ from kind import Kind
 from posed_config import configure
 
 import semstab
-from semstab.backbones import Backbone, Prediction
-from semstab.backbones.names import class_names
 from semstab.comparison.writing import compare, load_comparison
 from semstab.conformance import case_folder, compared
 from semstab.data.frames import Intrinsics
@@ -27,6 +25,8 @@ from semstab.engine.series import NUMBERS
 from semstab.engine.tiles import TileResult
 from semstab.engine.units import make_plan
 from semstab.errors import DataError
+from semstab.models import Model, Prediction
+from semstab.models.names import class_names
 from semstab.predict.filters import parse
 from semstab.predict.predictor import Kept
 from semstab.recording import Recording
@@ -65,19 +65,19 @@ def of_kept(folder: Path) -> Iterator[Kind]:
     yield from of_text(folder)
 
 
-class Halves(Backbone):
+class Halves(Model):
     """A model that is as sure of each of two classes."""
 
     label_space = LabelSpace("two", ("a", "b"))
     gives_scores = True
 
     def predict(self, images, *, scores=False):
-        """See `Backbone`."""
+        """See `Model`."""
         half = np.full((*images[0].shape[:2], 2), 0.5, np.float32)
         return [Prediction(image[..., 0] % 2, half if scores else None) for image in images]
 
     def identity(self):
-        """See `Backbone`."""
+        """See `Model`."""
         return {"halves": 1}
 
 
@@ -90,9 +90,9 @@ def of_text(folder: Path) -> Iterator[Kind]:
     chains.write_text("ema:0.6\nvote-warped:5\nguided:4\nthreshold:0.5\nmap-prior:0.1\n")
     yield Kind("filters", (chains,), read_filters)
     flight = predicted_scene.write(folder / "flight", frames=2)
-    model = {"backbone": "colour-clusters", "filters": ["ema:0.6", "threshold:0.5"]}
+    model = {"model": "colour-clusters", "filters": ["ema:0.6", "threshold:0.5"]}
     inner = {"name": "posed_folder", "options": {"root": str(flight)}}
-    content = {"dataset": {"name": "predicted", "options": {"dataset": inner, "backbones": [model]}}, "top_k": 2}
+    content = {"dataset": {"name": "predicted", "options": {"dataset": inner, "models": [model]}}, "top_k": 2}
     (folder / "predicted.yaml").write_text(yaml.safe_dump(content))
     yield Kind("predicted.yaml", (folder / "predicted.yaml",), open_predicted)
     case = case_folder("drift")
@@ -111,7 +111,7 @@ def open_predicted(file: Path) -> None:
     """The scene and its labels' names."""
     dataset = resolve(load_config(file)).dataset
     opened = open_dataset(dataset.name, dataset.options)
-    opened.scene(opened.scenes[0]).backbones  # noqa: B018
+    opened.scene(opened.scenes[0]).models  # noqa: B018
 
 
 def read_table(case: Path, file: Path) -> None:

@@ -23,8 +23,6 @@ from posed_config import configure
 from rich.console import Console
 
 import semstab
-from semstab.backbones.sam import read_rules
-from semstab.backbones.segearth_ov import read_prompts
 from semstab.comparison.differences import contrasts
 from semstab.comparison.gate import gate_config, parse
 from semstab.comparison.pairing import pair
@@ -53,6 +51,8 @@ from semstab.datasets.formats.images import (
 from semstab.datasets.scannet import read_class_table
 from semstab.engine import load_result
 from semstab.exports import export
+from semstab.models.sam import read_rules
+from semstab.models.segearth_ov import read_prompts
 from semstab.predict.folder import PredictionFolder
 from semstab.report.figures.maps import Overview
 from semstab.report.tables import tables
@@ -210,7 +210,7 @@ def read_frames(dataset: str, options: dict[str, Any]) -> None:
     for name in opened.scenes[:2]:
         scene = opened.scene(name)
         for index in range(min(len(scene), 1)):
-            scene.frame(index, scene.backbones[0] if scene.backbones else None)
+            scene.frame(index, scene.models[0] if scene.models else None)
 
 
 def of_results(folder: Path) -> Iterator[Kind]:
@@ -230,7 +230,7 @@ def of_results(folder: Path) -> Iterator[Kind]:
         "units/*.json": lambda file: from_json(UnitContent, read_json(file), file),
         "summary.json": lambda _: read_result(run),
         "manifest.json": lambda _: read_result(run),
-        "frames/*.csv": lambda _: semstab.load(run).series(backbone="a"),
+        "frames/*.csv": lambda _: semstab.load(run).series(model="a"),
     }
     for pattern, read in first.items():
         if found := sorted(run.glob(pattern)):
@@ -241,7 +241,7 @@ def of_results(folder: Path) -> Iterator[Kind]:
     conversion = folder / "converted/wall/conversion.json"
     yield Kind("conversion.json", (conversion,), lambda _: list(convert(config, folder / "converted")))
     yield Kind("predictions.json", (folder / "labels/net/predictions.json",), lambda _: predict(folder))
-    onto = functools.partial(export, run, backbone="a", radius=0.3)
+    onto = functools.partial(export, run, model="a", radius=0.3)
     table = VoxelTable.load(min(run.glob("voxels/a*.parquet"), default=min(run.glob("voxels/*.parquet"))))
     for cloud in (small_cloud(folder / "cloud.ply", table.centers), las_at(folder / "cloud.laz", table.centers),
                   las_at(folder / "cloud.las", table.centers)):  # fmt: skip

@@ -15,8 +15,6 @@ import pytest
 import yaml
 from image_files import npy_bytes, npz_bytes
 
-from semstab.backbones.names import class_names
-from semstab.backbones.segearth_ov import read_prompts
 from semstab.core.files import parse_json
 from semstab.data.georeference import wkt
 from semstab.data.voxels import VoxelTable
@@ -26,6 +24,8 @@ from semstab.datasets.formats.disk import natural
 from semstab.engine.tiles import TileResult
 from semstab.errors import ConfigError, DataError, summarize_error
 from semstab.exports.clouds import Header
+from semstab.models.names import class_names
+from semstab.models.segearth_ov import read_prompts
 from semstab.report.figures.maps import Overview
 from semstab.report.loaded import read_series
 from semstab.settings import load_config, resolve

@@ -12,7 +12,7 @@ from semstab.core.files import keep_only
 from semstab.data.measures import measures
 from semstab.data.records import OVERVIEW, Record, Result
 from semstab.data.results import slug
-from semstab.report.averages import ENOUGH, by_backbone, complete_scenes, levels, swept
+from semstab.report.averages import ENOUGH, by_model, complete_scenes, levels, swept
 from semstab.report.figures.distributions import (
     Histograms,
     draw_ecdf,
@@ -23,7 +23,7 @@ from semstab.report.figures.distributions import (
 )
 from semstab.report.figures.maps import Overview, Views, draw_overview, draw_stability
 from semstab.report.figures.style import Figure
-from semstab.report.remedies import of_interest
+from semstab.report.filter_study import of_interest
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure as Canvas
@@ -60,24 +60,24 @@ def figures(result: Result, folder: str | Path) -> list[Figure]:
 
 
 def _overviews(result: Result, kept: list[Record], views: Views, folder: Path) -> Iterator[Figure]:
-    """Yield one a backbone, of the first scene that has a saved frame."""
-    for backbone, records in by_backbone(kept).items():
+    """Yield one a model, of the first scene that has a saved frame."""
+    for model, records in by_model(kept).items():
         for record in records:
-            path = folder / f"{slug(record.unit.scene, backbone)}.npz"
+            path = folder / f"{slug(record.unit.scene, model)}.npz"
             if record.unit.scene in result.up and path.exists():
                 yield _overview(record, result.up[record.unit.scene], views, path)
                 break
 
 
 def _overview(record: Record, up: tuple[float, float, float], views: Views, path: Path) -> Figure:
-    scene, backbone = record.unit.scene, record.unit.backbone
+    scene, model = record.unit.scene, record.unit.model
     return Figure(
-        slug("overview", scene, backbone),
-        f"Overview: {scene}, {backbone}",
+        slug("overview", scene, model),
+        f"Overview: {scene}, {model}",
         "A frame, its prediction, and the map that all sampled frames were fused into, seen from above, beneath a"
         " ceiling where there is one, or from the side where more of it shows: the dominant"
         " class of the topmost voxels, in the prediction's colours.",
-        f"A camera image of {scene}, the classes that {backbone} predicts for it, and the fused map from above in the"
+        f"A camera image of {scene}, the classes that {model} predicts for it, and the fused map from above in the"
         " same colours.",
         lambda: draw_overview(views.above(record, up), Overview.load(path)),
         unit=record.unit.slug,
@@ -90,33 +90,33 @@ def _distributions(kept: list[Record], views: Views) -> Iterator[Figure]:
 
     @functools.cache
     def of_all() -> dict[str, dict[str, Histograms]]:
-        """Draw the figure of each backbone and scene."""
+        """Draw the figure of each model and scene."""
         return {
-            backbone: {record.unit.scene: views.sums(record) for record in records}
-            for backbone, records in by_backbone(kept).items()
+            model: {record.unit.scene: views.sums(record) for record in records}
+            for model, records in by_model(kept).items()
         }
 
-    def ecdf(backbone: str) -> Canvas:
+    def ecdf(model: str) -> Canvas:
         ends = informative(found for scenes in of_all().values() for found in scenes.values())
-        return draw_ecdf(of_all()[backbone], ends)
+        return draw_ecdf(of_all()[model], ends)
 
-    for backbone in by_backbone(kept):
+    for model in by_model(kept):
         yield Figure(
-            slug("ecdf", backbone),
-            f"The measures by scene: {backbone}",
+            slug("ecdf", model),
+            f"The measures by scene: {model}",
             "Empirical distributions over the voxels of each scene, of measures of which more is better as what they"
             " lack: 1 - VSS is disagreement. SBD is that of the voxels seen twice or more. Dashed: the recurrent voxels"
-            " of all scenes. The x axes are the same for each backbone and end where 99% of the voxels of every scene"
+            " of all scenes. The x axes are the same for each model and end where 99% of the voxels of every scene"
             " are reached.",
-            f"A panel a measure of cumulative curves, one a scene, for {backbone}: how many voxels have how much.",
-            partial(ecdf, backbone),
+            f"A panel a measure of cumulative curves, one a scene, for {model}: how many voxels have how much.",
+            partial(ecdf, model),
         )
     yield Figure(
         "persistence",
         "The measures against observation persistence",
         "Mean and interquartile range over the voxels of all scenes with that OP (above 8 in bins that widen by a"
         " quarter), and their number. Where more than three quarters of the voxels agree fully, the range is a line.",
-        "For each backbone, every measure as a curve against OP on a logarithmic axis, and the number of voxels.",
+        "For each model, every measure as a curve against OP on a logarithmic axis, and the number of voxels.",
         lambda: draw_persistence({name: together(scenes.values()) for name, scenes in of_all().items()}),
     )
 
@@ -124,15 +124,15 @@ def _distributions(kept: list[Record], views: Views) -> Iterator[Figure]:
 def _maps(result: Result, kept: list[Record], views: Views) -> Iterator[Figure]:
     panels = " and ".join(measure.title for measure in measures() if measure.panel)
     for record in kept:
-        scene, backbone = record.unit.scene, record.unit.backbone
+        scene, model = record.unit.scene, record.unit.model
         if scene in result.up:
             yield Figure(
-                slug("stability_map", scene, backbone),
-                f"Stability from above: {scene}, {backbone}",
+                slug("stability_map", scene, model),
+                f"Stability from above: {scene}, {model}",
                 "The topmost voxel of each column along the up axis, beneath a ceiling where there is one, or of a wall"
                 f" the foremost: (a) its stability category, then {panels}; grey: seen once, which says nothing. Values"
                 " beyond a scale, which has an arrow there, look like its end.",
-                f"Maps of {scene} from above with the stability category, {panels} of {backbone}'s voxels.",
+                f"Maps of {scene} from above with the stability category, {panels} of {model}'s voxels.",
                 partial(_draw_map, record, result.up[scene], views),
                 unit=record.unit.slug,
             )
@@ -144,8 +144,8 @@ def _draw_map(record: Record, up: tuple[float, float, float], views: Views) -> C
 
 def _sweeps(result: Result) -> Iterator[Figure]:
     for sweep in swept(result):
-        backbones = [name for name in result.backbones if complete_scenes(result, sweep.name, name)]
-        if backbones:
+        models = [name for name in result.models if complete_scenes(result, sweep.name, name)]
+        if models:
             yield Figure(
                 f"sensitivity_{sweep.name}",
                 f"Sensitivity to {sweep.title}",
@@ -155,5 +155,5 @@ def _sweeps(result: Result) -> Iterator[Figure]:
                 " with (a): which voxels there are to average changes along the sweep.",
                 f"Panels against {sweep.title}: the recurrent share and each measure, for all voxels and for the"
                 " recurrent ones.",
-                partial(draw_sweep, sweep, {name: levels(result, sweep.name, name) for name in backbones}),
+                partial(draw_sweep, sweep, {name: levels(result, sweep.name, name) for name in models}),
             )

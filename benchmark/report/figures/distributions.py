@@ -176,16 +176,16 @@ def informative(units: Iterable[Histograms]) -> dict[str, float]:
     return ends
 
 
-def draw_persistence(backbones: Mapping[str, Histograms]) -> Figure:
-    """Return each measure against OP, mean and interquartile range, and the number of voxels; one column a backbone."""
+def draw_persistence(models: Mapping[str, Histograms]) -> Figure:
+    """Return each measure against OP, mean and interquartile range, and the number of voxels; one column a model."""
     from matplotlib.lines import Line2D
     from matplotlib.patches import Patch
 
-    columns, shown = len(backbones), measures()
+    columns, shown = len(models), measures()
     figure = canvas(COLUMN if columns == 1 else PAGE, 1.2 + 1.5 * len(shown))
     ratios = (*[3.0] * len(shown), 1.6)
     grid = figure.subplots(len(ratios), columns, sharex=True, sharey="row", squeeze=False, height_ratios=ratios)
-    for k, (name, histogram) in enumerate(backbones.items()):
+    for k, (name, histogram) in enumerate(models.items()):
         _draw_column(grid[:, k], histogram, color(k))
         grid[0, k].set_title(name)
         grid[-1, k].set_xlabel("OP (frames)")
@@ -238,18 +238,18 @@ LEAST_SPAN = 0.1
 good when low (SBD, entropy), and the recurrent share, stand on an axis from 0."""
 
 
-def draw_sweep(sweep: Sweep, backbones: Mapping[str, tuple[Level, ...]]) -> Figure:
+def draw_sweep(sweep: Sweep, models: Mapping[str, tuple[Level, ...]]) -> Figure:
     """Return the recurrent share and every measure along a sweep; the values stand at equal distances, in order."""
     shown = measures()
     rows = math.ceil((1 + len(shown)) / 3)
     figure = canvas(PAGE, 2.5 if rows == 1 else 2.1 * rows)
     share, *panels = figure.subplots(rows, 3, squeeze=False).ravel()
-    values = sorted({level.value for levels in backbones.values() for level in levels})
-    for k, levels in enumerate(backbones.values()):
-        x = positions(values, levels, k, len(backbones))
+    values = sorted({level.value for levels in models.values() for level in levels})
+    for k, levels in enumerate(models.values()):
+        x = positions(values, levels, k, len(models))
         draw_line(share, x, levels, lambda p: 100 * p.recurrent.share, color(k), marker="s")
         enough = [level for level in levels if level.mean(lambda p: p.recurrent.voxels) >= ENOUGH]
-        at = positions(values, enough, k, len(backbones))
+        at = positions(values, enough, k, len(models))
         for axes, measure in zip(panels, shown, strict=False):
             draw_line(axes, x, levels, over_all(measure), color(k))
             draw_line(axes, at, enough, over_recurrent(measure), color(k), open_=True)
@@ -261,8 +261,8 @@ def draw_sweep(sweep: Sweep, backbones: Mapping[str, tuple[Level, ...]]) -> Figu
         axes.set_axis_off()
     for axes, better in zip((share, *panels), ("lower", *(m.better for m in shown)), strict=False):
         settle_scale(axes, from_zero=better == "lower")
-    columns = legend_columns([*backbones, "all voxels", "OP ≥ 3"], PAGE)
-    figure.legend(handles=_legend(list(backbones)), loc="outside lower center", ncols=columns)
+    columns = legend_columns([*models, "all voxels", "OP ≥ 3"], PAGE)
+    figure.legend(handles=_legend(list(models)), loc="outside lower center", ncols=columns)
     return figure
 
 
@@ -333,9 +333,9 @@ def _error(
     return max(found.value - found.low, 0.0), max(found.high - found.value, 0.0)
 
 
-def _legend(backbones: list[str]) -> list[object]:
+def _legend(models: list[str]) -> list[object]:
     from matplotlib.lines import Line2D
 
     every = Line2D([], [], color=INK, marker="o", label="all voxels")
     recurrent = Line2D([], [], color=INK, marker="o", linestyle="--", markerfacecolor="white", label="OP ≥ 3")
-    return [*(Line2D([], [], color=color(k), label=name) for k, name in enumerate(backbones)), every, recurrent]
+    return [*(Line2D([], [], color=color(k), label=name) for k, name in enumerate(models)), every, recurrent]

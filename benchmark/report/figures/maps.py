@@ -83,7 +83,7 @@ class WorstFrames:
 
 @dataclass(frozen=True, eq=False)
 class Overview:
-    """What one frame showed to the camera and to the backbone.
+    """What one frame showed to the camera and to the model.
 
     Attributes:
         frame: Its index.
@@ -101,7 +101,7 @@ class Overview:
 
     @classmethod
     def load(cls, path: Path) -> Overview:
-        """Read SCENE__BACKBONE.npz with the arrays frame, labels, palette and, where there is one, color.
+        """Read SCENE__MODEL.npz with the arrays frame, labels, palette and, where there is one, color.
 
         Raises:
             DataError: If the file is damaged or of another kind.

@@ -7,14 +7,14 @@ from pathlib import Path
 
 from semstab.core.files import keep_only, write_json, write_text
 from semstab.data.records import Result
-from semstab.report.remedies import of_interest
+from semstab.report.filter_study import of_interest
 from semstab.report.tables.correctness import ceiling, comparison, correctness, correlogram
-from semstab.report.tables.remedies import remedy_tables
+from semstab.report.tables.filters import filter_tables
 from semstab.report.tables.stability import (
     agreement,
     classes,
     compared,
-    cross_backbone,
+    cross_model,
     flicker,
     fusion,
     overview,
@@ -43,7 +43,7 @@ __all__ = [
 
 BUILDERS = (
     overview, verdicts, flicker, scenes, persistence, classes, temporal_agreement, correlogram, class_agreement, drift,
-    uncertainty, ceiling, correctness, cross_backbone, comparison, sensitivity, voxel_sizes, reduced, fusion,
+    uncertainty, ceiling, correctness, cross_model, comparison, sensitivity, voxel_sizes, reduced, fusion,
     compared, agreement,
 )  # fmt: skip
 """In the paper's order, the statistics with what they belong to; each makes none where the study has nothing for it."""
@@ -52,7 +52,7 @@ BUILDERS = (
 def tables(result: Result) -> list[Table]:
     """Return every table that the study has records for, in the paper's order."""
     shown = of_interest(result)
-    return [*remedy_tables(result), *(table for build in BUILDERS for table in build(shown))]
+    return [*filter_tables(result), *(table for build in BUILDERS for table in build(shown))]
 
 
 def write_tables(result: Result, folder: str | Path) -> list[Path]:

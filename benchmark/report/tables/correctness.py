@@ -1,11 +1,11 @@
-"""Right beside stable where ground truth tells: geometry's part, correctness, quadrants."""
+"""Stability vs. accuracy where ground truth tells: geometry's part, correctness, quadrants."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
 
-from semstab.data.contrast import BackboneComparison, ComparedObservations, MapCoverage
+from semstab.data.contrast import ComparedObservations, MapCoverage, ModelComparison
 from semstab.data.records import Result
 from semstab.data.statistics import Correctness, Correlogram, Estimate, LagBin, Losses, MapStatistics, Quadrants
 from semstab.metrics import macro_mean
@@ -44,7 +44,7 @@ def ceiling(result: Result) -> list[Table]:
 
 
 def correctness(result: Result) -> list[Table]:
-    """Return right beside stable: by stratum of OP, and the four quadrants."""
+    """Return stability vs. accuracy: by stratum of OP, and the four quadrants."""
     return [*_correct_by_stratum(result), *_quadrants(result)]
 
 
@@ -66,29 +66,29 @@ def _correct_by_stratum(result: Result) -> list[Table]:
         " it. ECE: expected calibration error of the largest belief; Brier: 0 to 2. Macro means: each scene counts"
         " once; voxels are those of all scenes."
     )
-    return [Table("correctness", "Right beside stable, by observation persistence", caption, columns, groups)]
+    return [Table("correctness", "Stability vs. accuracy, by observation persistence", caption, columns, groups)]
 
 
 def _quadrants(result: Result) -> list[Table]:
     columns = (
         Column("voxels", "Voxels", 0),
-        Column("stable_right_percent", "right", 1, "higher", over="Stable (%)"),
-        Column("stable_wrong_percent", "wrong", 1, "lower", over="Stable (%)"),
-        Column("unstable_right_percent", "right", 1, over="Unstable (%)"),
-        Column("unstable_wrong_percent", "wrong", 1, "lower", over="Unstable (%)"),
-        Column("wrong_of_stable_percent", "False-stable rate (%)", 1, "lower"),
+        Column("consistent_right_percent", "right", 1, "higher", over="Consistent (%)"),
+        Column("consistent_wrong_percent", "wrong", 1, "lower", over="Consistent (%)"),
+        Column("inconsistent_right_percent", "right", 1, over="Inconsistent (%)"),
+        Column("inconsistent_wrong_percent", "wrong", 1, "lower", over="Inconsistent (%)"),
+        Column("wrong_of_consistent_percent", "Wrong of consistent (%)", 1, "lower"),
     )
     numbers = (
         _quadrant(lambda found: found.voxels),
-        _quadrant(lambda found: found.stable_right.percent),
-        _quadrant(lambda found: found.stable_wrong.percent),
-        _quadrant(lambda found: found.unstable_right.percent),
-        _quadrant(lambda found: found.unstable_wrong.percent),
-        _quadrant(lambda found: found.wrong_of_stable.percent),
+        _quadrant(lambda found: found.consistent_right.percent),
+        _quadrant(lambda found: found.consistent_wrong.percent),
+        _quadrant(lambda found: found.inconsistent_right.percent),
+        _quadrant(lambda found: found.inconsistent_wrong.percent),
+        _quadrant(lambda found: found.wrong_of_consistent.percent),
     )
     caption = (
         "Over the voxels with OP>=3 and a true class. Stable: PSA >= 0.8, of ten frames one may disagree; right: the"
-        " dominant class is the true one. Stable and wrong is the dangerous one: no second look reveals it."
+        " dominant class is the true one. Consistent but wrong is the dangerous one: no further observation reveals it."
         f" {INTERVALS}"
     )
     return by_scene(result, "quadrants", "Stable and right", caption, columns, numbers)
@@ -120,7 +120,7 @@ def _right(rows: Sequence[Correctness]) -> list[float]:
     return [macro_mean(column) for column in zip(*values, strict=True)]
 
 
-# The backbones beside each other, on the same places and at the same number of observations.
+# The models beside each other, on the same places and at the same number of observations.
 
 THIN = 0.1
 """Part of the weight in strata that hardly overlap, from which on the table says it."""
@@ -141,8 +141,8 @@ def comparison(result: Result) -> list[Table]:
 
 def _differences(result: Result) -> Table:
     columns = (
-        Column("a", "Backbone"),
-        Column("b", "less backbone"),
+        Column("a", "Model"),
+        Column("b", "less model"),
         Column("measure", "Measure"),
         Column("difference", "Difference", 4, signed=True),
         Column("p_holm", "p (Holm)", 4),
@@ -156,7 +156,7 @@ def _differences(result: Result) -> Table:
     return Table("comparison", "Differences on the same places", caption, columns, groups, "scene")
 
 
-def _difference_rows(found: BackboneComparison) -> tuple[Row, ...]:
+def _difference_rows(found: ModelComparison) -> tuple[Row, ...]:
     words = {quantity.key: quantity.word for quantity in compared(truth=True)}
     rows = sorted(found.paired.differences, key=lambda row: row.measure != found.paired.primary)
     return tuple(
@@ -168,7 +168,7 @@ def _ranking(result: Result) -> Table:
     columns = (
         Column("measure", "Measure"),
         Column("rank", "Rank", 0),
-        Column("backbone", "Backbone"),
+        Column("model", "Model"),
         Column("range", "95% of resamples"),
         Column("best_percent", "first in (%)", 0),
         Column("value", "In common", 4),
@@ -182,20 +182,20 @@ def _ranking(result: Result) -> Table:
     if thin > THIN:
         caption += f" {thin:.0%} of the weight is in strata of OP that hardly overlap."
     groups = tuple(Group(found.scene, _ranking_rows(found)) for found in result.comparisons)
-    return Table("comparison_ranking", "Order of the backbones", caption, columns, groups, "scene")
+    return Table("comparison_ranking", "Order of the models", caption, columns, groups, "scene")
 
 
-def _ranking_rows(found: BackboneComparison) -> tuple[Row, ...]:
+def _ranking_rows(found: ModelComparison) -> tuple[Row, ...]:
     quantities = {quantity.key: quantity for quantity in compared(truth=True)}
     return tuple(
         (
             quantities[ranking.measure].word,
             rank.rank,
-            rank.backbone,
+            rank.model,
             f"{rank.low} to {rank.high}",
             100 * rank.best,
-            found.paired.of(quantities[ranking.measure])[rank.backbone],
-            found.standardised.of(quantities[ranking.measure], rank.backbone),
+            found.paired.of(quantities[ranking.measure])[rank.model],
+            found.standardised.of(quantities[ranking.measure], rank.model),
         )
         for ranking in found.paired.rankings
         for rank in ranking.ranks
@@ -203,9 +203,9 @@ def _ranking_rows(found: BackboneComparison) -> tuple[Row, ...]:
 
 
 def ignored_table(observations: Mapping[str, ComparedObservations]) -> Table:
-    """Return what each backbone left out, by scene."""
+    """Return what each model left out, by scene."""
     columns = (
-        Column("backbone", "Backbone"),
+        Column("model", "Model"),
         Column("missing_percent", "left out (%)", 1),
         Column("psa_low", "at least", 3, over="Agreement with these"),
         Column("psa_high", "at most", 3, over="Agreement with these"),
@@ -213,10 +213,10 @@ def ignored_table(observations: Mapping[str, ComparedObservations]) -> Table:
         Column("order", "Order depends on it"),
     )
     caption = (
-        "The share of pixels that a backbone left without a label where another one gives one; the agreement of two"
+        "The share of pixels that a model left without a label where another one gives one; the agreement of two"
         " views in a cell had these pixels agreed never, or always (Manski); alpha by the convention that what is left"
         " out agrees as by chance. The order depends on it where that alpha, or the agreement within its bounds, would"
-        " order the backbones otherwise."
+        " order the models otherwise."
     )
     groups = tuple(Group(scene, _ignored_rows(found)) for scene, found in observations.items())
     return Table("comparison_ignored", "What was left out", caption, columns, groups, "scene")
@@ -224,15 +224,13 @@ def ignored_table(observations: Mapping[str, ComparedObservations]) -> Table:
 
 def _ignored_rows(found: ComparedObservations) -> tuple[Row, ...]:
     depends = "yes" if found.depends else "no"
-    return tuple(
-        (row.backbone, 100 * row.missing, row.psa_low, row.psa_high, row.alpha, depends) for row in found.ignored
-    )
+    return tuple((row.model, 100 * row.missing, row.psa_low, row.psa_high, row.alpha, depends) for row in found.ignored)
 
 
 def coverage_table(covered: Mapping[str, Sequence[MapCoverage]]) -> Table:
     """Return what each map covers, by scene."""
     columns = (
-        Column("backbone", "Backbone"),
+        Column("model", "Model"),
         Column("voxels", "Voxels", 0),
         Column("mean_op", "Mean OP", 2),
         Column("repeated", "OP>=2", 0),
@@ -240,14 +238,14 @@ def coverage_table(covered: Mapping[str, Sequence[MapCoverage]]) -> Table:
         Column("common_percent", "in all maps (%)", 1),
         Column("alone", "in no other", 0),
     )
-    caption = "A backbone that ignores hard pixels covers less, and is compared on easier places."
+    caption = "A model that ignores hard pixels covers less, and is compared on easier places."
     groups = tuple(Group(scene, tuple(map(_coverage_row, found))) for scene, found in covered.items())
     return Table("comparison_coverage", "What each map covers", caption, columns, groups, "scene")
 
 
 def _coverage_row(row: MapCoverage) -> Row:
     return (
-        row.backbone,
+        row.model,
         row.voxels,
         row.mean_op,
         row.repeated,

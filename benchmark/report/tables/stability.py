@@ -1,4 +1,4 @@
-"""Stability in the world: by scene, by persistence, by class, and of the backbones in one taxonomy."""
+"""Stability in the world: by scene, by persistence, by class, and of the models in one taxonomy."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from semstab.report.averages import (
     Level,
     Pooled,
     Sweep,
-    by_backbone,
+    by_model,
     complete_scenes,
     levels,
     over_all,
@@ -53,7 +53,7 @@ def scenes(result: Result) -> list[Table]:
     )
     groups = tuple(
         Group(name, tuple(_scene_row(record) for record in rows), _scene_total(rows) if len(rows) > 1 else None)
-        for name, rows in by_backbone(records).items()
+        for name, rows in by_model(records).items()
     )
     caption = (
         f"{settings(records)} A scene's numbers are means over its voxels. Total / Mean: total voxels and points,"
@@ -69,7 +69,7 @@ def persistence(result: Result) -> list[Table]:
         return []
     columns = (Column("persistence", "Persistence"), VOXELS, SHARE, *of_measures())
     groups = []
-    for name, own in by_backbone(records).items():
+    for name, own in by_model(records).items():
         together = pooled(own)
         rows = (*together.strata, *together.well_seen)
         groups.append(Group(name, tuple(_means_row(row) for row in rows), _means_row(together.recurrent)))
@@ -77,7 +77,7 @@ def persistence(result: Result) -> list[Table]:
         f"{settings(records)} Pooled: the means run over the voxels of all scenes together. The last row is the"
         " recurrent voxels. A voxel seen once has no SBD, and where its pixels agree VSS = 1 and no entropy."
     )
-    if any(split_last([record.summary.table for record in own]) for own in by_backbone(records).values()):
+    if any(split_last([record.summary.table for record in own]) for own in by_model(records).values()):
         caption += " Where most voxels are in the last stratum, it follows in parts."
     return [Table("persistence", "Stability by observation persistence", caption, columns, tuple(groups))]
 
@@ -89,8 +89,7 @@ def classes(result: Result) -> list[Table]:
         return []
     columns = (Column("class", "Class"), VOXELS, *of_measures(), Column("note", "Note"))
     groups = tuple(
-        Group(name, tuple(_class_row(row) for row in pooled(rows).classes))
-        for name, rows in by_backbone(records).items()
+        Group(name, tuple(_class_row(row) for row in pooled(rows).classes)) for name, rows in by_model(records).items()
     )
     caption = (
         f"{settings(records)} Pooled: the means run over the voxels of all scenes that the class dominates."
@@ -99,30 +98,30 @@ def classes(result: Result) -> list[Table]:
     return [Table("classes", "Stability by dominant class", caption, columns, groups)]
 
 
-def cross_backbone(result: Result) -> list[Table]:
-    """Return the backbones in one taxonomy.
+def cross_model(result: Result) -> list[Table]:
+    """Return the models in one taxonomy.
 
-    All voxels and the recurrent ones (paper, Cross-Backbone Temporal Stability).
+    All voxels and the recurrent ones (paper, Cross-Model Temporal Stability).
     """
     records = comparable(result)
     if not records:
         return []
     columns = (Column("over", "Means over"), VOXELS, SHARE, *of_measures(compared=True))
-    groups = tuple(Group(name, _comparison_rows(rows)) for name, rows in by_backbone(records).items())
+    groups = tuple(Group(name, _comparison_rows(rows)) for name, rows in by_model(records).items())
     caption = (
         f"{settings(records)} Macro: each scene counts once. Pooled: the voxels of all scenes together; compare the"
-        f" recurrent voxels (OP>=3) with the pooled row, and their share between backbones. {SBD_OVER}"
+        f" recurrent voxels (OP>=3) with the pooled row, and their share between models. {SBD_OVER}"
     )
-    return [Table("cross_backbone", "Backbones in one taxonomy", caption, columns, groups)]
+    return [Table("cross_model", "Models in one taxonomy", caption, columns, groups)]
 
 
 def comparable(result: Result) -> tuple[Record, ...]:
-    """Return records of several backbones in one taxonomy.
+    """Return records of several models in one taxonomy.
 
     Those fused for it, else the base ones where they share theirs.
     """
     records = result.select(SHARED) or result.select()
-    several = len(by_backbone(records)) > 1
+    several = len(by_model(records)) > 1
     return records if several and len({record.summary.taxonomy for record in records}) == 1 else ()
 
 
@@ -172,13 +171,13 @@ def _comparison_rows(records: Sequence[Record]) -> tuple[Row, ...]:
     )
 
 
-# Overview of the backbones: alpha, what all voxels say, what the recurrent ones say, and how many there are.
+# Overview of the models: alpha, what all voxels say, what the recurrent ones say, and how many there are.
 
 _HEADLINES = (VSS, SBD)
 """The paper's two: an overview is no place for all."""
 
 _COLUMNS = (
-    Column("backbone", "Backbone"),
+    Column("model", "Model"),
     Column.of(ALPHA),
     Column("once_percent", "Seen once (%)", 2),
     Column("recurrent_percent", "OP>=3 (%)", 2),
@@ -190,11 +189,11 @@ _COLUMNS = (
 
 
 def overview(result: Result) -> list[Table]:
-    """Return one row a backbone."""
+    """Return one row a model."""
     records = result.select()
     if not records:
         return []
-    rows = tuple(_row(name, found) for name, found in by_backbone(records).items())
+    rows = tuple(_row(name, found) for name, found in by_model(records).items())
     caption = (
         f"{settings(records)} Pooled over the voxels of all scenes; alpha and flicker are macro means of the scenes;"
         f" pixel flicker has the camera's motion in it. {SBD_OVER}"
@@ -202,10 +201,10 @@ def overview(result: Result) -> list[Table]:
     return [Table("overview", "Overview", caption, _COLUMNS, (Group("", rows),), by="")]
 
 
-def _row(backbone: str, records: Sequence[Record]) -> Row:
+def _row(model: str, records: Sequence[Record]) -> Row:
     voxels = pooled(records)
     return (
-        backbone,
+        model,
         voxels.alpha.value,
         100 * voxels.once,
         100 * voxels.recurrent.share,
@@ -236,11 +235,11 @@ def _table(result: Result, sweep: Sweep) -> Table:
         *of_measures(compared=True, prefix="recurrent_", over="OP>=3"),
         Column("note", "Note"),
     )
-    backbones = [name for name in result.backbones if complete_scenes(result, sweep.name, name)]
+    models = [name for name in result.models if complete_scenes(result, sweep.name, name)]
     groups = tuple(
-        Group(name, tuple(_sweep_row(sweep, level) for level in levels(result, sweep.name, name))) for name in backbones
+        Group(name, tuple(_sweep_row(sweep, level) for level in levels(result, sweep.name, name))) for name in models
     )
-    scenes = dict.fromkeys(scene for name in backbones for scene in complete_scenes(result, sweep.name, name))
+    scenes = dict.fromkeys(scene for name in models for scene in complete_scenes(result, sweep.name, name))
     caption = (
         f"Pooled: the means run over the voxels of all scenes together ({', '.join(scenes)}); ± is the standard"
         f" deviation over the repeats, each with a seed of its own. {SBD_OVER} Few: fewer than {ENOUGH:,} recurrent"
@@ -258,8 +257,8 @@ def _agreement_table(result: Result, sweep: Sweep) -> Table | None:
         *(Column.of(quantity, compared=True) for quantity in (SBD, PSA, ALPHA)),
         Column("sbd_excess", "SBD excess", 4, signed=True),
     )
-    by_backbone = {name: levels(result, sweep.name, name) for name in result.backbones}
-    found = {name: rows for name, rows in by_backbone.items() if any(level.judged for level in rows)}
+    by_model = {name: levels(result, sweep.name, name) for name in result.models}
+    found = {name: rows for name, rows in by_model.items() if any(level.judged for level in rows)}
     if not found:
         return None
     groups = tuple(Group(name, tuple(_agreement_row(sweep, level) for level in rows)) for name, rows in found.items())
@@ -325,11 +324,11 @@ _REGIONS = (
 
 
 def flicker(result: Result) -> list[Table]:
-    """Return flicker by backbone, and scene by scene (paper, Frame-wise Temporal Semantic Flicker)."""
+    """Return flicker by model, and scene by scene (paper, Frame-wise Temporal Semantic Flicker)."""
     methods = _by_method(result)
     if not methods:
         return []
-    regions = dict.fromkeys(row.backbone for row in result.regions)
+    regions = dict.fromkeys(row.model for row in result.regions)
     what = _WHAT + (_REGIONS.format(names=", ".join(regions)) if regions else "")
     macro = tuple((name, *_numbers(scenes.values())) for name, scenes in methods.items())
     columns, caption = (Column("method", "Method"), *_NUMBERS), f"{what} Macro means: each scene counts once."
@@ -345,13 +344,13 @@ def flicker(result: Result) -> list[Table]:
 
 
 def _by_method(result: Result) -> dict[str, dict[str, ImageSpace]]:
-    """Group by backbone and scene; regions without classes have flicker only."""
+    """Group by model and scene; regions without classes have flicker only."""
     methods: dict[str, dict[str, ImageSpace]] = {}
     for record in result.select():
-        methods.setdefault(record.unit.backbone, {})[record.unit.scene] = record.image_space
+        methods.setdefault(record.unit.model, {})[record.unit.scene] = record.image_space
     for row in result.regions:
         found = ImageSpace(row.flicker_percent, row.compensated_flicker_percent, row.compensated_share)
-        methods.setdefault(row.backbone, {})[row.scene] = found
+        methods.setdefault(row.model, {})[row.scene] = found
     return methods
 
 
@@ -376,7 +375,7 @@ LARGEST = "Largest difference"
 
 def fusion(result: Result) -> list[Table]:
     """Return each backend beside the base one, over the scenes that every backend fused."""
-    groups = tuple(group for name in result.backbones if (group := _group(result, name)) is not None)
+    groups = tuple(group for name in result.models if (group := _group(result, name)) is not None)
     if not groups:
         return []
     columns = (
@@ -404,7 +403,7 @@ def compared(result: Result) -> list[Table]:
     titles = {"op": "OP", **{measure.key: measure.title for measure in measures() if not measure.lowest_op > 1}}
     columns = (
         Column("scene", "Scene"),
-        Column("backbone", "Backbone"),
+        Column("model", "Model"),
         Column("first_only_percent", "in the first only (%)", 1, over="Voxels"),
         Column("other_only_percent", "in the other only (%)", 1, over="Voxels"),
         Column("relabelled_percent", "Other label (%)", 2),
@@ -425,7 +424,7 @@ def compared(result: Result) -> list[Table]:
 def _compared_row(row: Agreement, names: Iterable[str]) -> Row:
     shares = (100 * only / max(1, n) for only, n in zip(row.only_in, row.voxels, strict=True))
     means = (row.differences[name].mean for name in names)
-    return row.scene, row.backbone, *shares, 100 * row.differences["label"].mean, *means
+    return row.scene, row.model, *shares, 100 * row.differences["label"].mean, *means
 
 
 def agreement(result: Result) -> list[Table]:
@@ -435,7 +434,7 @@ def agreement(result: Result) -> list[Table]:
     titles = {"op": "OP", **{measure.key: measure.title for measure in measures()}, "evidence": "Evidence"}
     columns = (
         Column("scene", "Scene"),
-        Column("backbone", "Backbone"),
+        Column("model", "Model"),
         Column("only_in_one", "Voxels in one only", 0),
         *(Column(f"max_{name}", header, 0, scientific=True, over=LARGEST) for name, header in titles.items()),
         Column("verdict", "Verdict"),
@@ -451,20 +450,20 @@ def agreement(result: Result) -> list[Table]:
 
 def _backend_agreement_row(row: Agreement, names: Iterable[str]) -> Row:
     largest = (row.differences[name].max for name in names)
-    return row.scene, row.backbone, sum(row.only_in), *largest, "agree" if row.agrees else "disagree"
+    return row.scene, row.model, sum(row.only_in), *largest, "agree" if row.agrees else "disagree"
 
 
-def _group(result: Result, backbone: str) -> Group | None:
-    others = result.select(BACKENDS, backbone=backbone)
+def _group(result: Result, model: str) -> Group | None:
+    others = result.select(BACKENDS, model=model)
     by_backend: dict[str, dict[str, Record]] = {}
-    for record in (*result.select(backbone=backbone), *others):
+    for record in (*result.select(model=model), *others):
         by_backend.setdefault(record.unit.backend, {})[record.unit.scene] = record
     scenes = set.intersection(*(set(rows) for rows in by_backend.values()))
     if not others or not scenes:
         return None
     found = {name: pooled([row for scene, row in rows.items() if scene in scenes]) for name, rows in by_backend.items()}
     base = found[result.backend]
-    return Group(backbone, tuple(_backend_row(name, mean, base) for name, mean in found.items()))
+    return Group(model, tuple(_backend_row(name, mean, base) for name, mean in found.items()))
 
 
 def _backend_row(backend: str, mean: Pooled, base: Pooled) -> Row:
@@ -496,7 +495,7 @@ def reduced(result: Result) -> list[Table]:
         Column.of(VOXEL_ALPHA),
     )
     groups = tuple(
-        Group(name, tuple(_reduced_row(record) for record in rows)) for name, rows in by_backbone(records).items()
+        Group(name, tuple(_reduced_row(record) for record in rows)) for name, rows in by_model(records).items()
     )
     caption = (
         "Hard labels and soft scores do not compare by VSS, entropy or voxel alpha, because scores spread their"
@@ -518,7 +517,7 @@ def voxel_sizes(result: Result) -> list[Table]:
     """Return alpha at half, once and twice the voxel size, from some frames."""
     groups = tuple(
         Group(name, rows)
-        for name, records in by_backbone(result.select()).items()
+        for name, records in by_model(result.select()).items()
         if (
             rows := tuple(
                 (r.unit.scene, s.voxel_size, s.frames, s.voxel_alpha) for r in records for s in r.summary.sizes

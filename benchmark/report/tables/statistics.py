@@ -10,7 +10,7 @@ from semstab.data.measures import ENTROPY, VSS
 from semstab.data.records import Record, Result
 from semstab.data.statistics import UNDEFINED, CellAgreement, ClassAlpha, DriftStatistics, Estimate, MapStatistics
 from semstab.metrics import macro_mean
-from semstab.report.averages import by_backbone
+from semstab.report.averages import by_model
 from semstab.report.tables.table import Cell, Column, Group, Row, Table
 from semstab.statistics.agreement import ALPHA, KAPPA, PSA, VOXEL_ALPHA
 from semstab.statistics.drift import FLIP_RATE
@@ -154,7 +154,7 @@ def uncertainty(result: Result) -> list[Table]:
 
 
 def verdicts(result: Result) -> list[Table]:
-    """Return what the evidence says of each backbone on each scene, and what to do."""
+    """Return what the evidence says of each model on each scene, and what to do."""
     judged = judged_records(result)
     if not judged:
         return []
@@ -164,7 +164,7 @@ def verdicts(result: Result) -> list[Table]:
         Column("probability_percent", "Probability (%)", 0),
         Column.of(ALPHA),
         Column("labelled_percent", "Labelled (%)", 0, "higher"),
-        Column("wrong_of_stable_percent", "False-stable rate (%)", 0, "lower"),
+        Column("wrong_of_consistent_percent", "Wrong of consistent (%)", 0, "lower"),
         REPEATED,
         Column("repeated_percent", "of the map (%)", 0),
         Column("advice", "Recommendation"),
@@ -173,7 +173,7 @@ def verdicts(result: Result) -> list[Table]:
     caption = (
         "The verdict is the most probable level of alpha for the same scene flown again: stable from"
         f" {LIMITS.stable:g} on, usable from {LIMITS.usable:.3g}, unstable below; undecided where no level has"
-        f" {DECIDED:.0%}; misleading where more than {DANGEROUS:.0%} of the stable locations are wrong, which only"
+        f" {DECIDED:.0%}; misleading where more than {DANGEROUS:.0%} of the consistent locations are wrong, which only"
         f" ground truth tells; uninformative where two observations from anywhere agree at {MOST_CHANCE:.0%}. Labelled:"
         f" locations that have a label in half of their observations or more; below {LIMITS.labelled:.0%} a model is at"
         f" most usable. Voxels: seen twice or more. {INTERVALS}"
@@ -189,10 +189,10 @@ def by_scene(
 ) -> list[Table]:
     """Return one row a scene, and the macro mean of several; columns and units that have no number are left out."""
     cells = {
-        backbone: {record.unit.scene: [take(found) for take in numbers] for record, found in rows}
-        for backbone, rows in judged_records(result).items()
+        model: {record.unit.scene: [take(found) for take in numbers] for record, found in rows}
+        for model, rows in judged_records(result).items()
     }
-    cells = {backbone: {scene: row for scene, row in rows.items() if _known(row)} for backbone, rows in cells.items()}
+    cells = {model: {scene: row for scene, row in rows.items() if _known(row)} for model, rows in cells.items()}
     known = sorted({k for rows in cells.values() for row in rows.values() for k in _known(row)})
     if not known:
         return []
@@ -202,23 +202,23 @@ def by_scene(
 
     groups = tuple(
         Group(
-            backbone,
+            model,
             tuple(row(scene, own) for scene, own in rows.items()),
             row("Mean", _means(list(rows.values()))) if len(rows) > 1 else None,
         )
-        for backbone, rows in cells.items()
+        for model, rows in cells.items()
         if rows
     )
     return [Table(name, title, caption, (SCENE, *(columns[k] for k in known)), groups)]
 
 
 def judged_records(result: Result) -> dict[str, list[tuple[Record, MapStatistics]]]:
-    """Return the base units that have statistics, with these, by backbone."""
+    """Return the base units that have statistics, with these, by model."""
     judged = {
-        backbone: [(record, record.statistics) for record in records if record.statistics is not None]
-        for backbone, records in by_backbone(result.select()).items()
+        model: [(record, record.statistics) for record in records if record.statistics is not None]
+        for model, records in by_model(result.select()).items()
     }
-    return {backbone: rows for backbone, rows in judged.items() if rows}
+    return {model: rows for model, rows in judged.items() if rows}
 
 
 def ordered(take: Callable[[DriftStatistics], float | Estimate]) -> Number:
@@ -290,7 +290,7 @@ def _verdict_row(record: Record, found: MapStatistics) -> Row:
         100 * found.verdict.probability,
         found.headline.alpha.ends,
         math.nan if found.cells is None else 100 * found.cells.labelled,
-        UNDEFINED if right is None else right.quadrants.wrong_of_stable.percent,
+        UNDEFINED if right is None else right.quadrants.wrong_of_consistent.percent,
         found.repeated.voxels,
         100 * found.repeated.share,
         ADVICE[found.verdict.level],

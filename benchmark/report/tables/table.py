@@ -91,7 +91,7 @@ class Table:
     Attributes:
         name: Of its files.
         caption: What the numbers are, and over what the means run.
-        by: What the groups are ('backbone'), the leading column of CSV and JSON; '' for one group without a name.
+        by: What the groups are ('model'), the leading column of CSV and JSON; '' for one group without a name.
     """
 
     name: str
@@ -99,7 +99,7 @@ class Table:
     caption: str
     columns: tuple[Column, ...]
     groups: tuple[Group, ...]
-    by: str = "backbone"
+    by: str = "model"
 
     def only(self, *keys: str) -> Table:
         """Return the same with these columns alone."""

@@ -12,7 +12,7 @@ from semstab.core.compiled import CHUNKS, serial
 DRIFT = 2
 """How many columns of drift follow those."""
 
-(KNOWN, RIGHT, LOOKS, LOOKS_RIGHT, STABLE, STABLE_WRONG) = range(6)
+(KNOWN, RIGHT, OBSERVED, OBSERVED_RIGHT, CONSISTENT, CONSISTENT_WRONG) = range(6)
 """The columns with ground truth, counted from the first of them."""
 
 TIE = 1e-12
@@ -20,12 +20,12 @@ TIE = 1e-12
 
 
 @serial
-def _looks(log, first, T, number, active, x, total, squares, own):
+def _observations(log, first, T, number, active, x, total, squares, own):
     """Return a voxel's observations by the classes that it ever saw, which are returned as how many they are.
 
-    log is (starts, label, weight) of all observations. x (T * A,) takes the evidence by look and class, active (A,) the
-    classes, ascending, total and squares (A,) the sums of evidence and of its squares, own (T,) those of each look's
-    squares; number (K,) is work space, all -1.
+    log is (starts, label, weight) of all observations. x (T * A,) takes the evidence by observation and class, active
+    (A,) the classes, ascending, total and squares (A,) the sums of evidence and of its squares, own (T,) those of each
+    observation's squares; number (K,) is work space, all -1.
     """
     at, label, weight = log
     A = 0
@@ -71,11 +71,11 @@ def _label(total, active, A, fused):
 
 
 @serial
-def _label_without(total, x, look, A):
+def _label_without(total, x, observation, A):
     """Return which is the dominant class of the other observations."""
-    best, top = 0, total[0] - x[look]
+    best, top = 0, total[0] - x[observation]
     for j in range(1, A):
-        rest = total[j] - x[look + j]
+        rest = total[j] - x[observation + j]
         more = rest > top + TIE
         best, top = (j if more else best), (rest if more else top)
     return best
@@ -107,12 +107,12 @@ def _add_truth(sums, base, x, first, T, group, truth, likely, total, active, A, 
             own = (right + (T - 1) * (mean[true] - (without[t] == true))) * share
         sums[r, column + KNOWN] += share
         sums[r, column + RIGHT] += own
-        sums[r, column + LOOKS] += 1.0
+        sums[r, column + OBSERVED] += 1.0
         if true >= 0:
-            sums[r, column + LOOKS_RIGHT] += x[t * A + true]
+            sums[r, column + OBSERVED_RIGHT] += x[t * A + true]
         if T > 2:
-            sums[r, column + STABLE] += likely * share
-            sums[r, column + STABLE_WRONG] += likely * (1.0 - right) * share
+            sums[r, column + CONSISTENT] += likely * share
+            sums[r, column + CONSISTENT_WRONG] += likely * (1.0 - right) * share
         if K:
             sums[r, column + 6 + truth] += share
             sums[r, column + 6 + K + truth] += own
@@ -147,7 +147,8 @@ def add_influences(
 
     order (r,) has the voxels by cell, bounds (cells + 1,) where each cell's begin; rows (starts (n,) and ends) bound a
     voxel's rows of the log, `longest` at most; group (m,) is that of each row's frame. fused (n,) is its dominant class
-    in the map, (0,) where that is not known; truth (n,) is its true class or -1, likely (n,) how likely it is stable.
+    in the map, (0,) where that is not known; truth (n,) is its true class or -1, likely (n,) that it is
+    consistent.
     The pairwise agreement P of a location is shared out as P + 2 (T - 1) / (T - 2) (a_t - P), a_t being frame t's mean
     agreement with the others: what is left of a frame is then its own quality, free of that of the frames it was
     compared with, and the shares add up to T P.
@@ -160,8 +161,8 @@ def add_influences(
     for cell in range(chunk, bounds.shape[0] - 1, CHUNKS):
         for at in range(bounds[cell], bounds[cell + 1]):
             i = order[at]
-            first, T, steady = starts[i], ends[i] - starts[i], likely[i] if likely.shape[0] else 0.0
-            A = _looks(log, first, T, number, active, x, total, squares, own)
+            first, T, consistent = starts[i], ends[i] - starts[i], likely[i] if likely.shape[0] else 0.0
+            A = _observations(log, first, T, number, active, x, total, squares, own)
             agreed, label = (
                 _agreement(total, squares, T, A, certain, surprise, apart),
                 _label(total, active, A, fused[i] if fused.shape[0] else -1),
@@ -196,6 +197,6 @@ def add_influences(
                     sums[r, VSS] += x[t * A + label] * part
             if with_truth and truth[i] >= 0:
                 _add_truth(
-                    sums, cell * groups, x, first, T, group, truth[i], steady, total, active, A, label, without,
+                    sums, cell * groups, x, first, T, group, truth[i], consistent, total, active, A, label, without,
                     mean, first_truth, K if by_class else 0,
                 )  # fmt: skip

@@ -1,11 +1,11 @@
-"""Backbone `colour-clusters`: a codebook a sequence, the same ids in every frame, the same result every time."""
+"""Model `colour-clusters`: a codebook a sequence, the same ids in every frame, the same result every time."""
 
 import numpy as np
 import pytest
 from pictures import blobs
 
-from semstab.backbones import create
 from semstab.errors import ConfigError
+from semstab.models import create
 
 IMAGES = [blobs(shift=4 * k) for k in range(4)]
 
@@ -27,8 +27,8 @@ def test_a_label_and_scores_a_pixel(fitted):
 def test_flat_colours_become_clusters_by_lightness():
     colours = np.array([[250, 250, 250], [10, 10, 10], [30, 120, 60]], dtype=np.uint8)  # light, dark, green
     image = np.repeat(np.repeat(colours[[0, 1, 2]][None], 40, axis=0), 40, axis=1)
-    backbone = create("colour-clusters", clusters=3, scale=0.5).fit([image])
-    labels = backbone.predict([image])[0].labels
+    model = create("colour-clusters", clusters=3, scale=0.5).fit([image])
+    labels = model.predict([image])[0].labels
     assert [labels[20, x] for x in (20, 60, 100)] == [2, 0, 1]
     assert (labels[:, 5:35] == 2).all()
     assert (labels[:, 85:115] == 1).all()
@@ -42,7 +42,7 @@ def test_ids_stay_when_the_camera_moves(fitted):
 
 def test_labels_are_the_nearest_centres(fitted):
     """Brute force over pixels and centres, from the features up."""
-    from semstab.backbones.colour_clusters import pixel_features
+    from semstab.models.colour_clusters import pixel_features
 
     book, features = fitted.codebook, pixel_features(IMAGES[2], 2.0)
     labels = fitted.predict([IMAGES[2]])[0].labels

@@ -1,4 +1,4 @@
-"""Backbone of a network in a file: `net.onnx`, TorchScript (`net.pt`) or an exported program (`net.pt2`)."""
+"""Model of a network in a file: `net.onnx`, TorchScript (`net.pt`) or an exported program (`net.pt2`)."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ import numpy.typing as npt
 import PIL.Image
 from pydantic import Field, PositiveInt
 
-from semstab.backbones import Backbone, Image, Prediction, content_digest, narrowed
-from semstab.backbones.names import class_names
 from semstab.config import Settings
 from semstab.core.types import Float32, Int64
 from semstab.data.labels import IGNORE_8BIT, LabelSpace
 from semstab.errors import ConfigError, DataError, MissingDependencyError, summarize_error
+from semstab.models import Image, Model, Prediction, content_digest, narrowed
+from semstab.models.names import class_names
 
 # What runs a network that lies in a file: ONNX Runtime, or torch for TorchScript and exported programs.
 
@@ -75,7 +75,7 @@ class TorchFile:
         try:
             import torch
 
-            from semstab.backbones.checkpoint import checked_device
+            from semstab.models.checkpoint import checked_device
         except ImportError as error:
             raise MissingDependencyError(
                 f"{path}: needs torch ({summarize_error(error)}); pip install 'semstab[torch]'"
@@ -179,7 +179,7 @@ class NetworkOptions(Settings):
     threads: int | None = Field(None, ge=1, description="threads on a CPU")
 
 
-class NetworkFile(Backbone):
+class NetworkFile(Model):
     """The class of the largest output, upsampled bilinearly to the image; images are resized by Pillow, bilinearly."""
 
     gives_scores = True
@@ -199,7 +199,7 @@ class NetworkFile(Backbone):
         self._digest = content_digest(path)
 
     def predict(self, images: Sequence[Image], *, scores: bool = False) -> list[Prediction]:
-        """See `Backbone`.
+        """See `Model`.
 
         Raises:
             DataError: For an output that is none of these classes.
@@ -293,7 +293,7 @@ class NetworkFile(Backbone):
 
 
 def is_network(name: str) -> bool:
-    """Return whether a backbone's name is a network's file."""
+    """Return whether a model's name is a network's file."""
     return Path(name).suffix in FORMATS
 
 

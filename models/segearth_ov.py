@@ -1,4 +1,4 @@
-"""Backbone `segearth-ov`: CLIP as an open-vocabulary segmenter without training (Li et al. 2025, CVPR, SegEarth-OV)."""
+"""Model `segearth-ov`: CLIP as an open-vocabulary segmenter without training (Li et al. 2025, CVPR, SegEarth-OV)."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ from pydantic import BaseModel, Field, field_validator, model_validator
 from torch import nn
 from transformers import AutoTokenizer, CLIPModel
 
-from semstab.backbones import Backbone, Image, Prediction, content_digest, narrowed
-from semstab.backbones.checkpoint import Checkpoint, ModelOptions, bilinear
 from semstab.config import Settings, read_yaml, validated
 from semstab.core.types import Float32
 from semstab.data.labels import LabelSpace
 from semstab.errors import ConfigError, DataError, summarize_error
+from semstab.models import Image, Model, Prediction, content_digest, narrowed
+from semstab.models.checkpoint import Checkpoint, ModelOptions, bilinear
 
 # CLIP as a dense feature extractor: its last block lets each patch look at its like (Li et al. 2025, CVPR).
 
@@ -67,11 +67,11 @@ def self_self_attention(attention: Any, tokens: torch.Tensor) -> torch.Tensor:
 
 # What an open-vocabulary model is asked: classes, their other names, and sentences around them.
 
-SHIPPED = importlib.resources.files("semstab.configs") / "backbones" / "segearth_uavid.yaml"
+SHIPPED = importlib.resources.files("semstab.configs") / "models" / "segearth_uavid.yaml"
 
 
 class Prompts(Settings):
-    """The prompts of each class; see configs/backbones/segearth_uavid.yaml."""
+    """The prompts of each class; see configs/models/segearth_uavid.yaml."""
 
     name: str = Field("prompts", description="of the taxonomy that the classes make")
     classes: list[str] = Field(min_length=2, description="a class an entry; after commas its other names")
@@ -290,7 +290,7 @@ class SegEarthOptions(ModelOptions):
     """The settings that name a CLIP and its prompts, and say how the image is shown to it."""
 
     model: str = Field("openai/clip-vit-base-patch16", description="a CLIP folder, or an id on the Hugging Face hub")
-    prompts: Path | None = Field(None, description="YAML file like configs/backbones/segearth_uavid.yaml, the default")
+    prompts: Path | None = Field(None, description="YAML file like configs/models/segearth_uavid.yaml, the default")
     upsampler: Path | None = Field(
         None, description="a SimFeatUp checkpoint (jbu_one); where not given, features are upsampled bilinearly"
     )
@@ -301,7 +301,7 @@ class SegEarthOptions(ModelOptions):
     sharpness: float = Field(50.0, gt=0, description="factor of the likeness before the softmax")
 
 
-class SegEarthOV(Backbone):
+class SegEarthOV(Model):
     """Likeness of each patch's feature to each class's sentences, in windows, averaged, softmaxed, thresholded.
 
     Without SimFeatUp's weights patches are upsampled bilinearly, which blurs small things.
@@ -329,7 +329,7 @@ class SegEarthOV(Backbone):
 
     @torch.inference_mode()
     def predict(self, images: Sequence[Image], *, scores: bool = False) -> list[Prediction]:
-        """See `Backbone`. Scores know nothing of the threshold below which a label is background."""
+        """See `Model`. Scores know nothing of the threshold below which a label is background."""
         return [self._prediction(image, scores) for image in images]
 
     def identity(self) -> dict[str, Any]:

@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 import tiny_models
 
-from semstab.backbones import Backbone, Prediction
-from semstab.backbones.names import InTaxonomy, class_mapping, vocabularies
 from semstab.data.labels import LabelSpace
 from semstab.errors import ConfigError
+from semstab.models import Model, Prediction
+from semstab.models.names import InTaxonomy, class_mapping, vocabularies
 
 UAVID = LabelSpace.load("uavid-one-car")
 CITYSCAPES = LabelSpace("model", tiny_models.CITYSCAPES)
@@ -95,8 +95,8 @@ def test_vocabularies_name_classes_of_uavid_once():
         assert len(names) == len(set(names))
 
 
-class FourPixels(Backbone):
-    """A backbone with known labels and scores."""
+class FourPixels(Model):
+    """A model with known labels and scores."""
 
     label_space = LabelSpace("model", ("tree", "grass", "road"))
     gives_scores = True
@@ -118,13 +118,13 @@ GREEN = LabelSpace("green", ("road", "green"), ids=(7, 3), members=((), ("tree",
 
 
 def test_predictions_come_in_the_taxonomy_with_rows_as_ids():
-    backbone = InTaxonomy(FourPixels(), GREEN, "strict").fit([])
-    (prediction,) = backbone.predict([None], scores=True)
+    model = InTaxonomy(FourPixels(), GREEN, "strict").fit([])
+    (prediction,) = model.predict([None], scores=True)
     assert prediction.labels.tolist() == [[1, 1, 0, 255]]
     np.testing.assert_allclose(prediction.scores[0], [[0.2, 0.8], [0.7, 0.3], [1, 0], [0, 0]], atol=1e-6)
-    assert (backbone.label_space.classes, backbone.label_space.ids) == (("road", "green"), (0, 1))
-    assert backbone.predict([None])[0].scores is None
-    assert backbone.fit_frames == 2
+    assert (model.label_space.classes, model.label_space.ids) == (("road", "green"), (0, 1))
+    assert model.predict([None])[0].scores is None
+    assert model.fit_frames == 2
 
 
 def test_identity_has_the_mapping():
@@ -135,7 +135,7 @@ def test_identity_has_the_mapping():
 
 
 def test_regions_have_no_taxonomy():
-    backbone = FourPixels()
-    backbone.label_space = None
+    model = FourPixels()
+    model.label_space = None
     with pytest.raises(ConfigError, match="regions without classes cannot be brought into a taxonomy"):
-        InTaxonomy(backbone, GREEN, "strict")
+        InTaxonomy(model, GREEN, "strict")

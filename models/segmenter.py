@@ -1,4 +1,4 @@
-"""Backbone `transformers`: checkpoints that segment into classes, whatever their kind; once called `segformer`."""
+"""Model `transformers`: checkpoints that segment into classes, whatever their kind; once called `segformer`."""
 
 from __future__ import annotations
 
@@ -10,18 +10,18 @@ import torch
 import transformers
 from pydantic import BaseModel
 
-from semstab.backbones import Backbone, Image, Prediction, Streamed, narrowed
-from semstab.backbones.checkpoint import Checkpoint, SegmenterOptions, bilinear
-from semstab.backbones.heads import load_head
 from semstab.core.types import Float32
 from semstab.data.labels import IGNORE_8BIT, IGNORE_16BIT, LabelSpace
 from semstab.errors import ConfigError
+from semstab.models import Image, Model, Prediction, Streamed, narrowed
+from semstab.models.checkpoint import Checkpoint, SegmenterOptions, bilinear
+from semstab.models.heads import load_head
 
 CHUNK_BYTES = 1 << 26
 """Memory for upsampled maps at a time."""
 
 
-class Segmenter(Backbone):
+class Segmenter(Model):
     """The class of the largest value that the checkpoint gives a pixel, its maps upsampled bilinearly to the image.
 
     Its classes are those of the checkpoint's id2label, or the prompts. What the values are: see `heads`.
@@ -42,7 +42,7 @@ class Segmenter(Backbone):
 
     @torch.inference_mode()
     def predict(self, images: Sequence[Image], *, scores: bool = False) -> list[Prediction]:
-        """See `Backbone`."""
+        """See `Model`."""
         predictions = []
         for maps in self.head.maps(images):
             each = self._streamed(maps, images[0].shape[:2])
@@ -56,7 +56,7 @@ class Segmenter(Backbone):
 
     @torch.inference_mode()
     def stream(self, image: Image) -> Streamed:
-        """See `Backbone`."""
+        """See `Model`."""
         (maps,) = self.head.maps([image])
         return self._streamed(maps, image.shape[:2])
 

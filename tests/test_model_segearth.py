@@ -12,8 +12,9 @@ from model_folders import KINDS, folder_of, tiny
 from pictures import blobs
 from transformers import AutoTokenizer, CLIPModel
 
-from semstab.backbones import create
-from semstab.backbones.segearth_ov import (
+from semstab.errors import ConfigError, DataError
+from semstab.models import create
+from semstab.models.segearth_ov import (
     CLIP_MEAN,
     CLIP_STD,
     JointBilateralUpsampler,
@@ -25,7 +26,6 @@ from semstab.backbones.segearth_ov import (
     slide,
     starts,
 )
-from semstab.errors import ConfigError, DataError
 from semstab.testing import checks
 
 IMAGES = [blobs(shift=k) for k in range(2)]
@@ -187,12 +187,12 @@ def test_weights_that_are_none(tmp_path):
     bad = tmp_path / "bad.ckpt"
     bad.write_bytes(b"no")
     with pytest.raises(DataError, match="no SimFeatUp weights for 12 channels"):
-        create("segearth-ov", model=str(tiny("clip")), upsampler=bad)
+        create("segearth-ov", checkpoint=str(tiny("clip")), upsampler=bad)
     checkpoint(tmp_path / "other.ckpt", channels=8)
     with pytest.raises(DataError, match="no SimFeatUp weights for 12 channels"):
-        create("segearth-ov", model=str(tiny("clip")), upsampler=tmp_path / "other.ckpt")
+        create("segearth-ov", checkpoint=str(tiny("clip")), upsampler=tmp_path / "other.ckpt")
     with pytest.raises(DataError, match="there is no SimFeatUp checkpoint"):
-        create("segearth-ov", model=str(tiny("clip")), upsampler=tmp_path / "nowhere.ckpt")
+        create("segearth-ov", checkpoint=str(tiny("clip")), upsampler=tmp_path / "nowhere.ckpt")
 
 
 # --- Windows ----------------------------------------------------------------------------------------------------------
@@ -265,16 +265,16 @@ def test_prompts_that_cannot_be_used(tmp_path, content, message):
 
 @pytest.fixture(params=KINDS, scope="module")
 def options(request):
-    return {"model": str(folder_of(request.param, "clip")), **({"resize": 64} if request.param == "tiny" else {})}
+    return {"checkpoint": str(folder_of(request.param, "clip")), **({"resize": 64} if request.param == "tiny" else {})}
 
 
 @pytest.fixture(scope="module")
-def backbone(options):
+def model(options):
     return create("segearth-ov", **options)
 
 
-def test_a_label_and_scores_a_pixel(backbone):
-    for prediction in backbone.predict(IMAGES, scores=True):
+def test_a_label_and_scores_a_pixel(model):
+    for prediction in model.predict(IMAGES, scores=True):
         assert (prediction.labels.dtype, prediction.labels.shape) == (np.uint8, (48, 80))
         assert prediction.labels.max() < 7
         assert (prediction.scores.dtype, prediction.scores.shape) == (np.float32, (48, 80, 7))
@@ -287,9 +287,9 @@ def test_a_label_and_scores_a_pixel(backbone):
 def test_text_features_are_means_over_sentences(clip, tmp_path):
     file = tmp_path / "prompts.yaml"
     file.write_text(yaml.safe_dump({"classes": ["car, van", "tree"], "templates": ["a {}.", "one big {}"]}))
-    backbone = create("segearth-ov", model=str(tiny("clip")), prompts=file)
+    model = create("segearth-ov", checkpoint=str(tiny("clip")), prompts=file)
     tokenizer = AutoTokenizer.from_pretrained(tiny("clip"))
-    for row, name in zip(backbone.queries, ("car", "van", "tree"), strict=True):
+    for row, name in zip(model.queries, ("car", "van", "tree"), strict=True):
         features = []
         for sentence in (f"a {name}.", f"one big {name}"):
             found = clip.get_text_features(**tokenizer([sentence], return_tensors="pt")).pooler_output[0]
@@ -302,7 +302,7 @@ def test_the_likeliest_name_of_a_class_counts_and_unlikely_pixels_are_background
     file = tmp_path / "prompts.yaml"
     names = {"classes": ["ground", "car, van", "tree"], "background": "ground", "prob_threshold": 0.5}
     file.write_text(yaml.safe_dump(names))
-    backbone = create("segearth-ov", model=str(tiny("clip")), prompts=file, resize=32, sharpness=1.0)
+    model = create("segearth-ov", checkpoint=str(tiny("clip")), prompts=file, resize=32, sharpness=1.0)
     probability = torch.tensor([[0.1, 0.2, 0.6, 0.1], [0.3, 0.25, 0.2, 0.25], [0.1, 0.3, 0.0, 0.6]])  # car, car, tree
 
     def window_logits(window):
@@ -310,8 +310,8 @@ def test_the_likeliest_name_of_a_class_counts_and_unlikely_pixels_are_background
         column = torch.linspace(0, 2.999, window.shape[2]).long()
         return probability.log().clamp(min=-30)[column].T[:, None].expand(4, window.shape[1], -1)
 
-    monkeypatch.setattr(backbone, "window_logits", window_logits)
-    (prediction,) = backbone.predict([np.zeros((32, 32, 3), dtype=np.uint8)], scores=True)
+    monkeypatch.setattr(model, "window_logits", window_logits)
+    (prediction,) = model.predict([np.zeros((32, 32, 3), dtype=np.uint8)], scores=True)
     labels, scores = prediction.labels[0], prediction.scores[0]
     assert labels[[2, 16, 29]].tolist() == [1, 0, 2]
     np.testing.assert_allclose(scores[2], np.array([0.1, 0.6, 0.1]) / 0.8, atol=1e-5)
@@ -320,13 +320,13 @@ def test_the_likeliest_name_of_a_class_counts_and_unlikely_pixels_are_background
 
 @torch.inference_mode()
 def test_logits_are_cosines_with_the_images_own_taken_off(clip):
-    backbone = create("segearth-ov", model=str(tiny("clip")), bias=-0.3)
+    model = create("segearth-ov", checkpoint=str(tiny("clip")), bias=-0.3)
     window = random(3, 32, 32)
     whole, patches = dense_features(clip, window[None])
-    found = backbone.window_logits(window)
+    found = model.window_logits(window)
     assert found.shape == (7, 32, 32)
     expected = np.zeros((7, 4, 4))
-    for q, query in enumerate(backbone.queries):
+    for q, query in enumerate(model.queries):
         for y in range(4):
             for x in range(4):
                 patch = patches[0, :, y, x]
@@ -337,24 +337,24 @@ def test_logits_are_cosines_with_the_images_own_taken_off(clip):
 
 def test_with_simfeatup(tmp_path):
     checkpoint(tmp_path / "jbu_one.ckpt")
-    options = {"model": str(tiny("clip")), "resize": 48}
+    options = {"checkpoint": str(tiny("clip")), "resize": 48}
     plain, sharp = (
         create("segearth-ov", **options),
         create("segearth-ov", **options, upsampler=tmp_path / "jbu_one.ckpt"),
     )
     assert plain.identity()["upsampler"] == "bilinear"
     assert len(sharp.identity()["upsampler"]) == 32
-    a, b = (backbone.predict(IMAGES[:1], scores=True)[0].scores for backbone in (plain, sharp))
+    a, b = (model.predict(IMAGES[:1], scores=True)[0].scores for model in (plain, sharp))
     assert a.shape == b.shape == (48, 80, 7)
     assert np.abs(a - b).max() > 0.01
 
 
 def test_a_stride_that_leaves_gaps_is_refused():
     with pytest.raises(ConfigError, match="stride 40 leaves gaps between windows of 32 pixels"):
-        create("segearth-ov", model=str(tiny("clip")), stride=40)
+        create("segearth-ov", checkpoint=str(tiny("clip")), stride=40)
 
 
 @pytest.mark.parametrize("option", [{"resize": 40}, {"bias": 0.0}, {"stride": 8}])
 def test_identity_has_the_settings(option):
-    usual, other = (create("segearth-ov", model=str(tiny("clip")), **more).identity() for more in ({}, option))
+    usual, other = (create("segearth-ov", checkpoint=str(tiny("clip")), **more).identity() for more in ({}, option))
     assert usual != other

@@ -1,9 +1,9 @@
-"""Filters over a model beside each other: how steady, how right, how late, what is left, what it costs."""
+"""Filters over a model beside each other: how stable, how right, how late, what is left, what it costs."""
 
 from __future__ import annotations
 
 from semstab.data.records import Result
-from semstab.report.remedies import Remedies, Remedy, remedies
+from semstab.report.filter_study import FilterResult, FilterStudy, filter_studies
 from semstab.report.tables.table import Column, Group, Row, Table
 
 COLUMNS = (
@@ -13,7 +13,7 @@ COLUMNS = (
     Column("next_frame_percent", "Next frame (%)", 2, "higher", over="Right?"),
     Column("accuracy_percent", "Accuracy (%)", 2, "higher", over="Right?"),
     Column("miou_percent", "mIoU (%)", 2, "higher", over="Right?"),
-    Column("stable_wrong_percent", "Stable, wrong (%)", 2, "lower", over="Right?"),
+    Column("consistent_wrong_percent", "Consistent, wrong (%)", 2, "lower", over="Right?"),
     Column("lag_frames", "Lag (frames)", 2, "lower", over="Price"),
     Column("coverage_percent", "Coverage (%)", 1, over="Price"),
     Column("milliseconds", "ms", 1, "lower", over="Price"),
@@ -30,34 +30,41 @@ CAPTION = (
 )
 
 
-def remedy_tables(result: Result) -> list[Table]:
+def filter_tables(result: Result) -> list[Table]:
     """Return one table of all models, where filters were judged."""
-    found = remedies(result)
+    found = filter_studies(result)
     if not found:
         return []
     groups = tuple(Group(each.model, tuple(map(row, [each.unfiltered, *each.filtered]))) for each in found)
     best = [f"{each.best.filters} over {each.model}" if each.best else f"none over {each.model}" for each in found]
     return [
-        Table("remedies", "What steadies the labels", f"{CAPTION} To use: {', '.join(best)}.", COLUMNS, groups, "model")
+        Table(
+            "filters",
+            "Which filter makes the labels more stable",
+            f"{CAPTION} To use: {', '.join(best)}.",
+            COLUMNS,
+            groups,
+            "model",
+        )
     ]
 
 
-def row(remedy: Remedy) -> Row:
+def row(result: FilterResult) -> Row:
     """Return its cells."""
     return (
-        remedy.filters or "none",
-        100 * remedy.flicker,
-        remedy.alpha,
-        100 * remedy.next_frame,
-        100 * remedy.accuracy,
-        100 * remedy.miou,
-        100 * remedy.stable_wrong,
-        remedy.lag,
-        100 * remedy.coverage,
-        remedy.milliseconds,
+        result.filters or "none",
+        100 * result.flicker,
+        result.alpha,
+        100 * result.next_frame,
+        100 * result.accuracy,
+        100 * result.miou,
+        100 * result.consistent_wrong,
+        result.lag,
+        100 * result.coverage,
+        result.milliseconds,
     )
 
 
-def marked(found: Remedies, remedy: Remedy) -> str:
+def marked(found: FilterStudy, result: FilterResult) -> str:
     """Return '*' for the one to use, '!' for one that is steadier and worse."""
-    return "*" if remedy == found.best else "!" if remedy in found.misleading else ""
+    return "*" if result == found.best else "!" if result in found.misleading else ""

@@ -1,4 +1,4 @@
-"""Backbone `colour-clusters`: k-means of colour and texture with one codebook a sequence; no weights, no training."""
+"""Model `colour-clusters`: k-means of colour and texture with one codebook a sequence; no weights, no training."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ import cv2
 import numpy as np
 from pydantic import BaseModel, Field
 
-from semstab.backbones import Backbone, Image, Prediction
 from semstab.config import Settings
 from semstab.core.types import Float32
 from semstab.data.labels import IGNORE_8BIT, LabelSpace
 from semstab.errors import ConfigError
+from semstab.models import Image, Model, Prediction
 
 Features = Float32
 
@@ -48,7 +48,7 @@ class Codebook:
     variance: float
 
 
-class ColourClusters(Backbone):
+class ColourClusters(Model):
     """Each pixel is the nearest cluster centre of its smoothed colour and local texture.
 
     Features are the CIE Lab colour smoothed by a Gaussian window, and the standard deviation of lightness in it. The
@@ -67,7 +67,7 @@ class ColourClusters(Backbone):
         self.codebook = codebook
 
     def fit(self, images: Sequence[Image]) -> ColourClusters:
-        """Return the backbone with the codebook of these images.
+        """Return the model with the codebook of these images.
 
         Raises:
             ConfigError: If they have fewer pixels than clusters.
@@ -82,7 +82,7 @@ class ColourClusters(Backbone):
         return ColourClusters(self.options, _codebook(np.concatenate(drawn), self.options))
 
     def predict(self, images: Sequence[Image], *, scores: bool = False) -> list[Prediction]:
-        """See `Backbone`.
+        """See `Model`.
 
         Raises:
             ConfigError: If `fit` was not called.

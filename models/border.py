@@ -1,4 +1,4 @@
-"""Backbones around others; the predictions of each are checked here once."""
+"""Models around others; the predictions of each are checked here once."""
 
 from __future__ import annotations
 
@@ -10,23 +10,23 @@ from typing import Any, Self
 import numpy as np
 import numpy.typing as npt
 
-from semstab.backbones import Backbone, Image, Prediction, Streamed, ask
 from semstab.core.types import Float32
 from semstab.data.frames import Frame
 from semstab.data.labels import LabelSpace, ignore_id
 from semstab.errors import ConfigError, DataError
+from semstab.models import Image, Model, Prediction, Streamed, ask
 
-# A backbone around another one: what filters, taxonomies and votes are made of.
+# A model around another one: what filters, taxonomies and votes are made of.
 
 
-class Wrapped(Backbone):
-    """Another backbone, with something done to what it says; all that is not overridden is the inner one's.
+class Wrapped(Model):
+    """Another model, with something done to what it says; all that is not overridden is the inner one's.
 
     Where it leaves scores as they are, it may set `streams` to the inner one's. What a sequence leaves behind belongs
     into attributes that `reset` makes anew: copies for other sequences (`fit`) share them until then.
     """
 
-    def __init__(self, inner: Backbone) -> None:
+    def __init__(self, inner: Model) -> None:
         self.inner = inner
         self.label_space = inner.label_space
         self.gives_scores = inner.gives_scores
@@ -35,7 +35,7 @@ class Wrapped(Backbone):
         self.wants_geometry = inner.wants_geometry
 
     def fit(self, images: Sequence[Image]) -> Self:
-        """Return a copy around the inner backbone adapted to the sequence."""
+        """Return a copy around the inner model adapted to the sequence."""
         fitted = copy.copy(self)
         fitted.inner = self.inner.fit(images)
         return fitted
@@ -48,16 +48,16 @@ class Wrapped(Backbone):
     def predict(
         self, images: Sequence[Image], *, scores: bool = False, geometry: Sequence[Frame] = ()
     ) -> list[Prediction]:
-        """See `Backbone`."""
+        """See `Model`."""
         return self.ask(images, scores, geometry)
 
     def ask(self, images: Sequence[Image], scores: bool, geometry: Sequence[Frame]) -> list[Prediction]:
-        """Return the predictions of the inner backbone, which gets the geometry where it wants it."""
+        """Return the predictions of the inner model, which gets the geometry where it wants it."""
         inner = geometry if self.inner.wants_geometry else ()
         return ask(self.inner, images, scores=scores, geometry=inner)
 
     def identity(self) -> dict[str, Any]:
-        """Return the identity of the inner backbone."""
+        """Return the identity of the inner model."""
         return self.inner.identity()
 
 
@@ -71,37 +71,37 @@ SUM_TOLERANCE = 0.01
 
 
 class Checked(Wrapped):
-    """A backbone whose predictions are checked: one line says what is wrong with them.
+    """A model whose predictions are checked: one line says what is wrong with them.
 
     Raises:
-        ConfigError: For a class that is no backbone.
+        ConfigError: For a class that is no model.
         DataError: For predictions that are none of these images.
     """
 
-    def __init__(self, backbone: Any, name: str) -> None:
+    def __init__(self, model: Any, name: str) -> None:
         self.name = name
-        if lacks := [member for member in MEMBERS if not hasattr(backbone, member)]:
+        if lacks := [member for member in MEMBERS if not hasattr(model, member)]:
             raise ConfigError(
-                f"backbone '{name}': a {type(backbone).__name__} has no {', '.join(lacks)}; derive its class from"
-                " semstab.backbones.Backbone"
+                f"model '{name}': a {type(model).__name__} has no {', '.join(lacks)}; derive its class from"
+                " semstab.models.Model"
             )
-        super().__init__(backbone)
-        self.streams = backbone.streams
+        super().__init__(model)
+        self.streams = model.streams
         if not isinstance(self.label_space, LabelSpace | None):
             what = type(self.label_space).__name__
-            raise ConfigError(f"backbone '{name}': label_space is a {what}; make it a semstab.LabelSpace, or None")
+            raise ConfigError(f"model '{name}': label_space is a {what}; make it a semstab.LabelSpace, or None")
 
     def fit(self, images: Sequence[Image]) -> Self:
-        """Return the backbone adapted to a sequence."""
+        """Return the model adapted to a sequence."""
         fitted = super().fit(images)
         if not hasattr(fitted.inner, "predict"):
-            raise ConfigError(f"backbone '{self.name}': fit gave {_kind(fitted.inner)}; let it return the backbone")
+            raise ConfigError(f"model '{self.name}': fit gave {_kind(fitted.inner)}; let it return the model")
         return fitted
 
     def predict(
         self, images: Sequence[Image], *, scores: bool = False, geometry: Sequence[Frame] = ()
     ) -> list[Prediction]:
-        """See `Backbone`; scores that were not asked for are left out."""
+        """See `Model`; scores that were not asked for are left out."""
         answer = self.ask(images, scores, geometry)
         if not isinstance(answer, Sequence) or len(answer) != len(images):
             what = f"{len(answer)} predictions" if isinstance(answer, Sequence) else _kind(answer)
@@ -109,27 +109,27 @@ class Checked(Wrapped):
         return [self._checked(prediction, image, scores) for prediction, image in zip(answer, images, strict=True)]
 
     def stream(self, image: Image) -> Streamed:
-        """See `Backbone`."""
+        """See `Model`."""
         answer = self.inner.stream(image)
         self._check_labels(answer.labels, image.shape[:2])
         return Streamed(answer.labels, lambda: self._maps(answer, image.shape[:2]))
 
     def identity(self) -> dict[str, Any]:
-        """Return the identity of the backbone, which JSON must hold."""
+        """Return the identity of the model, which JSON must hold."""
         identity: Any = self.inner.identity()
         try:
             json.dumps(identity, allow_nan=False)
         except (TypeError, ValueError) as error:
             raise ConfigError(
-                f"backbone '{self.name}': identity() is not for JSON ({error}); use texts, numbers, lists"
+                f"model '{self.name}': identity() is not for JSON ({error}); use texts, numbers, lists"
             ) from error
         if not isinstance(identity, dict):
-            raise ConfigError(f"backbone '{self.name}': identity() gave {_kind(identity)}; give a dict of settings")
+            raise ConfigError(f"model '{self.name}': identity() gave {_kind(identity)}; give a dict of settings")
         return identity
 
     def _checked(self, prediction: Any, image: Image, wants_scores: bool) -> Prediction:
         if not isinstance(prediction, Prediction):
-            raise self._wrong(f"gave {_kind(prediction)}; give a semstab.backbones.Prediction")
+            raise self._wrong(f"gave {_kind(prediction)}; give a semstab.models.Prediction")
         self._check_labels(prediction.labels, image.shape[:2])
         if not wants_scores:
             return Prediction(prediction.labels)
@@ -172,7 +172,7 @@ class Checked(Wrapped):
             raise self._wrong("gave scores that are no shares: they must be 0 or more and sum to 1; apply a softmax")
 
     def _wrong(self, what: str) -> DataError:
-        return DataError(f"backbone '{self.name}' {what}")
+        return DataError(f"model '{self.name}' {what}")
 
 
 def _add_up(scores: npt.NDArray[np.floating[Any]]) -> bool:

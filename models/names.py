@@ -14,13 +14,13 @@ from typing import Any, Literal
 
 import numpy as np
 
-from semstab.backbones import Backbone, Image, Prediction, Streamed
-from semstab.backbones.border import Wrapped
 from semstab.core.files import MAX_YAML_BYTES, parse_yaml, read_limited
 from semstab.core.types import Float32, Mask
 from semstab.data.frames import Frame
 from semstab.data.labels import LEFT_OUT, LabelMapping, LabelSpace, ignore_id, name_key
 from semstab.errors import ConfigError, summarize_error
+from semstab.models import Image, Model, Prediction, Streamed
+from semstab.models.border import Wrapped
 
 logger = logging.getLogger("semstab")
 
@@ -29,7 +29,7 @@ Leniency = Literal["strict", "lenient"]
 
 @dataclass(frozen=True)
 class Vocabulary:
-    """The names that one family of models has for the classes of UAVid; see configs/backbones/class_names.yaml.
+    """The names that one family of models has for the classes of UAVid; see configs/models/class_names.yaml.
 
     Attributes:
         recognised_by: Names that only this vocabulary has, and always has.
@@ -57,7 +57,7 @@ class Vocabulary:
 @functools.cache
 def vocabularies() -> Mapping[str, Vocabulary]:
     """Return the vocabularies that ship, by name."""
-    file = importlib.resources.files("semstab.configs") / "backbones" / "class_names.yaml"
+    file = importlib.resources.files("semstab.configs") / "models" / "class_names.yaml"
     content = parse_yaml(file.read_text(encoding="utf-8"), file.name)
     return {name: Vocabulary(**entry) for name, entry in content.items()}
 
@@ -100,26 +100,26 @@ def _candidates(name: str, vocabulary: Vocabulary | None, leniency: Leniency) ->
 
 
 class InTaxonomy(Wrapped):
-    """A backbone whose labels and scores are given in the classes of a taxonomy, ids 0 to K - 1.
+    """A model whose labels and scores are given in the classes of a taxonomy, ids 0 to K - 1.
 
     Labels are the mapped classes of the model's own decision; scores of classes that fall together are added up.
 
     Raises:
-        ConfigError: For a backbone without classes, and what `class_mapping` raises.
+        ConfigError: For a model without classes, and what `class_mapping` raises.
     """
 
-    def __init__(self, backbone: Backbone, target: LabelSpace, leniency: Leniency) -> None:
-        if backbone.label_space is None:
+    def __init__(self, model: Model, target: LabelSpace, leniency: Leniency) -> None:
+        if model.label_space is None:
             raise ConfigError("regions without classes cannot be brought into a taxonomy; leave it out")
-        super().__init__(backbone)
-        self.streams = backbone.streams
-        self._mapping = class_mapping(backbone.label_space, target, leniency)
+        super().__init__(model)
+        self.streams = model.streams
+        self._mapping = class_mapping(model.label_space, target, leniency)
         self.label_space = dataclasses.replace(target, ids=tuple(range(len(target))))
 
     def predict(
         self, images: Sequence[Image], *, scores: bool = False, geometry: Sequence[Frame] = ()
     ) -> list[Prediction]:
-        """See `Backbone`."""
+        """See `Model`."""
         predictions = []
         for each in self.ask(images, scores, geometry):
             labels, mapped = self._mapping.labels(each.labels, "prediction"), None
@@ -130,13 +130,13 @@ class InTaxonomy(Wrapped):
         return predictions
 
     def stream(self, image: Image) -> Streamed:
-        """See `Backbone`; the target's maps are in memory at once."""
+        """See `Model`; the target's maps are in memory at once."""
         streamed = self.inner.stream(image)
         labels = self._mapping.labels(streamed.labels, "prediction")
         return Streamed(labels, lambda: self._maps(streamed, labels != ignore_id(labels)))
 
     def identity(self) -> dict[str, Any]:
-        """Return the identity of the inner backbone, and where each class goes."""
+        """Return the identity of the inner model, and where each class goes."""
         rows = list(self._mapping.rows)
         return {**self.inner.identity(), "taxonomy": self._mapping.target.to_dict(), "rows": rows}
 

@@ -36,7 +36,7 @@ HUB_TIMEOUT = 10.0
 class ModelOptions(Settings):
     """The settings that name a pretrained model and say how it runs."""
 
-    model: str = Field(description="a folder that save_pretrained wrote, or an id on the Hugging Face hub")
+    checkpoint: str = Field(description="a folder that save_pretrained wrote, or an id on the Hugging Face hub")
     revision: str | None = Field(None, description="branch, tag or commit on the hub; the newest where not given")
     device: str = Field("cpu", description="cpu, cuda, cuda:1, mps")
     dtype: Literal["float32", "bfloat16", "float16"] = Field(
@@ -46,7 +46,7 @@ class ModelOptions(Settings):
 
     def identity(self) -> dict[str, Any]:
         """Return the options that its output depends on; the model itself is named by `Checkpoint.revision`."""
-        return self.model_dump(mode="json", exclude={"model", "revision", "threads"})
+        return self.model_dump(mode="json", exclude={"checkpoint", "revision", "threads"})
 
 
 @dataclass(frozen=True)
@@ -76,16 +76,16 @@ class Checkpoint:
             DataError: If the model is in none of them.
             ConfigError: For a name that is no model's.
         """
-        folder = Path(options.model).expanduser()
+        folder = Path(options.checkpoint).expanduser()
         if folder.is_dir():
             if options.revision is not None:
                 raise ConfigError(f"{folder}: a folder has no revision '{options.revision}'; leave it out")
             _require_model(folder)
             return cls(str(folder), folder, _digest(folder))
-        if not HUB_ID.fullmatch(options.model) or folder.exists():
+        if not HUB_ID.fullmatch(options.checkpoint) or folder.exists():
             raise DataError(f"{folder}: there is no such folder; name one that save_pretrained wrote, or a hub id")
         fetched = _cached(options) or _download(options)
-        return cls(options.model, fetched, fetched.name)
+        return cls(options.checkpoint, fetched, fetched.name)
 
     def preprocessing(self) -> dict[str, Any]:
         """Return the content of preprocessor_config.json, empty where it is not there.
@@ -181,7 +181,7 @@ def _cached(options: ModelOptions) -> Path | None:
     """Return the folder of the hub's cache, where an earlier download left the whole model there."""
     try:
         folder = Path(
-            str(huggingface_hub.snapshot_download(options.model, revision=options.revision, local_files_only=True))
+            str(huggingface_hub.snapshot_download(options.checkpoint, revision=options.revision, local_files_only=True))
         )
         _require_model(folder)
     except (OSError, ValueError):  # DataError is a ValueError: a part of a model
@@ -190,7 +190,7 @@ def _cached(options: ModelOptions) -> Path | None:
 
 
 def _download(options: ModelOptions) -> Path:
-    name, revision = options.model, options.revision
+    name, revision = options.checkpoint, options.revision
     try:
         # Asked first, because it fails at once where there is no network; the download would try for half a minute.
         about = huggingface_hub.HfApi().model_info(name, revision=revision, timeout=HUB_TIMEOUT)
@@ -283,7 +283,7 @@ def load_processor(checkpoint: Checkpoint, processing: Processing, **settings: A
     return processor
 
 
-# Settings of the backbone `transformers`.
+# Settings of the model `transformers`.
 
 
 class SegmenterOptions(ImageModelOptions):

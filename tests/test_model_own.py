@@ -14,11 +14,11 @@ import pytest
 from pictures import blobs
 from typer.testing import CliRunner
 
-from semstab.backbones import Backbone, Prediction, create
-from semstab.backbones.border import Checked
 from semstab.cli import app
 from semstab.data.labels import LabelSpace
 from semstab.errors import ConfigError, DataError, MissingDependencyError
+from semstab.models import Model, Prediction, create
+from semstab.models.border import Checked
 from semstab.predict.predictor import PredictorConfig, load_predictor, parse_predictor
 
 IMAGE = blobs()
@@ -62,7 +62,7 @@ WANTED = (IMAGE.mean(axis=2) > 128).astype(np.uint8)
 
 @pytest.fixture
 def file(tmp_path):
-    path = tmp_path / "models.py"
+    path = tmp_path / "own.py"
     path.write_text(MODEL)
     return path
 
@@ -98,17 +98,17 @@ def test_a_function_in_a_file(file):
 
 def test_a_class_of_a_package(file, monkeypatch):
     monkeypatch.chdir(file.parent)
-    np.testing.assert_array_equal(labels_of(create("models:Bright")), WANTED)
+    np.testing.assert_array_equal(labels_of(create("own:Bright")), WANTED)
 
 
 def test_files_beside_it_can_be_imported(file, tmp_path):
-    other = written(tmp_path, "from models import Bright\nclass Best(Bright): pass\n")
+    other = written(tmp_path, "from own import Bright\nclass Best(Bright): pass\n")
     np.testing.assert_array_equal(labels_of(create(f"{other}:Best")), WANTED)
 
 
-def test_a_backbone_of_ones_own(tmp_path):
+def test_a_model_of_ones_own(tmp_path):
     text = """
-from semstab.backbones import Backbone, Prediction
+from semstab.models import Model, Prediction
 from semstab.config import Settings
 from semstab.data.labels import LabelSpace
 import numpy as np
@@ -116,7 +116,7 @@ import numpy as np
 class Options(Settings):
     id: int = 0
 
-class One(Backbone):
+class One(Model):
     Options = Options
     label_space = LabelSpace("two", ("a", "b"))
     def __init__(self, options):
@@ -140,7 +140,7 @@ def test_scores(file):
     np.testing.assert_allclose(found.scores[..., 1], IMAGE.mean(axis=2) / 255, rtol=1e-6)
     np.testing.assert_array_equal(found.labels, found.scores.argmax(axis=2))
     assert labels_of(create(f"{file}:Sure")).dtype == np.uint8
-    with pytest.raises(DataError, match=r"models.py:Bright: gives labels, no scores"):
+    with pytest.raises(DataError, match=r"own.py:Bright: gives labels, no scores"):
         create(f"{file}:Bright").predict([IMAGE], scores=True)
 
 
@@ -201,10 +201,10 @@ def test_identity_is_of_the_code_and_of_what_options_name(file, tmp_path):
 def test_a_predictor_is_called_as_its_class_and_found_from_anywhere(file, monkeypatch):
     monkeypatch.chdir(file.parent)
     (file.parent / "table.csv").write_text("1")
-    found = parse_predictor("models.py:Bright,table=table.csv,above=3")
+    found = parse_predictor("own.py:Bright,table=table.csv,above=3")
     assert found.label_name == "Bright"
     resolved = found.resolved()
-    assert resolved.backbone == f"{file}:Bright"
+    assert resolved.model == f"{file}:Bright"
     assert resolved.options == {"classes": None, "table": str(file.parent / "table.csv"), "above": 3}
 
 
@@ -215,16 +215,16 @@ def test_a_predictor_is_called_as_its_class_and_found_from_anywhere(file, monkey
     ("name", "options", "message"),
     [
         ("nowhere.py:Bright", {}, "nowhere.py: there is no such file"),
-        ("models.py", {}, "write FILE.py:NAME"),
-        ("models.py:", {}, "write FILE.py:NAME"),
+        ("own.py", {}, "write FILE.py:NAME"),
+        ("own.py:", {}, "write FILE.py:NAME"),
         ("a b:Bright", {}, "write FILE.py:NAME"),
-        ("models.py:Brihgt", {}, "has no 'Brihgt'; did you mean 'Bright'"),
-        ("models.py:NUMBER", {}, "is a int; name a class"),
-        ("models.py:Bright", {"abvoe": 3}, "unexpected keyword argument 'abvoe'"),
-        ("models.py:bright", {"classes": "a,b", "abvoe": 3}, "unexpected keyword argument 'abvoe'"),
-        ("models.py:bright", {}, "its classes are not known; .*--classes a,b,c"),
-        ("models.py:bright", {"classes": ","}, "holds no name"),
-        ("models.py:np", {}, "is a module; name a class"),
+        ("own.py:Brihgt", {}, "has no 'Brihgt'; did you mean 'Bright'"),
+        ("own.py:NUMBER", {}, "is a int; name a class"),
+        ("own.py:Bright", {"abvoe": 3}, "unexpected keyword argument 'abvoe'"),
+        ("own.py:bright", {"classes": "a,b", "abvoe": 3}, "unexpected keyword argument 'abvoe'"),
+        ("own.py:bright", {}, "its classes are not known; .*--classes a,b,c"),
+        ("own.py:bright", {"classes": ","}, "holds no name"),
+        ("own.py:np", {}, "is a module; name a class"),
     ],
 )
 def test_names_and_options_that_cannot_be_used(file, monkeypatch, name, options, message):
@@ -274,13 +274,13 @@ def test_from_the_command_line(file, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     scene = str(predicted_scene.write(tmp_path / "flight", frames=2))
     options = ("--classes", "dark,bright", "--set", "above=100.0")
-    done = CliRunner().invoke(app, ["predict", "-m", "models.py:bright", "--data", scene, *options])
+    done = CliRunner().invoke(app, ["predict", "-m", "own.py:bright", "--data", scene, *options])
     assert done.exit_code == 0, done.output
     said = json.loads((tmp_path / "flight/labels/bright/predictions.json").read_text())
     assert said["settings"]["classes"] == ["dark", "bright"]
-    done = CliRunner().invoke(app, ["--predict", "models.py:light", "--data", scene])
+    done = CliRunner().invoke(app, ["--predict", "own.py:light", "--data", scene])
     assert (done.exit_code, done.output.count("\n")) == (2, 1)
-    assert "models.py: has no 'light'; did you mean 'bright'?" in done.output
+    assert "own.py: has no 'light'; did you mean 'bright'?" in done.output
     done = CliRunner().invoke(app, ["--classes", "a,b", "--data", scene])
     assert done.output == "error: --classes names what a model predicts; say which one with --predict\n"
 
@@ -288,7 +288,7 @@ def test_from_the_command_line(file, tmp_path, monkeypatch):
 # --- The border -------------------------------------------------------------------------------------------------------
 
 
-class Plugin(Backbone):
+class Plugin(Model):
     label_space = LabelSpace("two", ("a", "b"), ids=(3, 9))
     gives_scores = True
 
@@ -312,7 +312,7 @@ SOFT = np.full((48, 80, 2), 0.5, np.float32)
         (None, "gave nothing for 1 images"),
         ([], "gave 0 predictions for 1 images; give a list with one each"),
         ([Prediction(FINE)] * 2, "gave 2 predictions for 1 images"),
-        ([FINE], "gave a ndarray of uint8; give a semstab.backbones.Prediction"),
+        ([FINE], "gave a ndarray of uint8; give a semstab.models.Prediction"),
         ([Prediction(FINE.astype(int))], "gave labels that are a ndarray of int64"),
         ([Prediction(FINE[1:])], r"gave labels of shape \(47, 80\) for an image of \(48, 80\)"),
         ([Prediction(FINE - 9)], "gave the id 0, which is none of its 2 classes"),
@@ -324,7 +324,7 @@ SOFT = np.full((48, 80, 2), 0.5, np.float32)
     ],
 )
 def test_predictions_are_looked_at_once(gives, message):
-    with pytest.raises(DataError, match=rf"^backbone 'mine' {message}"):
+    with pytest.raises(DataError, match=rf"^model 'mine' {message}"):
         Checked(Plugin(gives), "mine").predict([IMAGE], scores=True)
 
 
@@ -347,17 +347,15 @@ def test_what_is_right_passes():
     ],
 )
 def test_an_identity_is_for_json(identity, message):
-    with pytest.raises(ConfigError, match=f"^backbone 'mine': identity.*{message}"):
+    with pytest.raises(ConfigError, match=f"^model 'mine': identity.*{message}"):
         Checked(Plugin(identity=identity), "mine").identity()
 
 
-def test_a_class_that_is_no_backbone(monkeypatch):
+def test_a_class_that_is_no_model(monkeypatch):
     half = SimpleNamespace(label_space=None, predict=None, gives_scores=False)
     monkeypatch.setattr("semstab.predict.predictor.create", lambda name, **options: half)
-    with pytest.raises(
-        ConfigError, match=r"^backbone 'x': a SimpleNamespace has no fit_frames, .*stream, identity; der"
-    ):
-        load_predictor(PredictorConfig(backbone="x"))
+    with pytest.raises(ConfigError, match=r"^model 'x': a SimpleNamespace has no fit_frames, .*stream, identity; der"):
+        load_predictor(PredictorConfig(model="x"))
 
 
 def test_a_label_space_and_a_fit_that_are_none():
@@ -371,13 +369,13 @@ def test_a_label_space_and_a_fit_that_are_none():
         def fit(self, images):
             pass
 
-    with pytest.raises(ConfigError, match="fit gave nothing; let it return the backbone"):
+    with pytest.raises(ConfigError, match="fit gave nothing; let it return the model"):
         Checked(Forgetful(), "mine").fit([])
 
 
-# --- The examples of docs/backbones.md --------------------------------------------------------------------------------
+# --- The examples of docs/models.md --------------------------------------------------------------------------------
 
-DOCS = Path(__file__).parents[1] / "docs" / "backbones.md"
+DOCS = Path(__file__).parents[1] / "docs" / "models.md"
 
 
 def examples() -> dict[str, str]:

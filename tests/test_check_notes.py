@@ -22,9 +22,9 @@ from semstab.datasets import open_dataset
 DATA = Path(os.environ.get("SEMSTAB_DATA", Path(__file__).parents[1] / "../shared/data"))
 
 
-def remarks(root, **options):
+def notes(root, **options):
     (checked,) = check(configure(root, dataset=dataset_of(root, **options), check_geometry=False))
-    return checked.remarks
+    return checked.notes
 
 
 # --- no depth
@@ -40,16 +40,16 @@ def test_65535_in_16_bits_is_pointed_out(tmp_path):
     room = Room(walk(6), told_depth=with_gaps)
     sources = {name: [room.frame(i, name) for i in range(6)] for name in ("net", "gt")}
     folder = write_posed(tmp_path / "room", [f"{i:03d}" for i in range(6)], sources, classes=list(CLASSES))
-    (remark,) = remarks(folder)
-    assert "2.9% of the pixels with depth have the value 65535 (65.54 m), and nothing lies between it and " in remark
-    assert remark.endswith(f"it means 'no depth'; set invalid_depth: [65535] (set it in {folder}/scene.yaml)")
-    assert remarks(folder, invalid_depth=[65535]) == ()
+    (note,) = notes(folder)
+    assert "2.9% of the pixels with depth have the value 65535 (65.54 m), and nothing lies between it and " in note
+    assert note.endswith(f"it means 'no depth'; set invalid_depth: [65535] (set it in {folder}/scene.yaml)")
+    assert notes(folder, invalid_depth=[65535]) == ()
     result = CliRunner().invoke(app, ["check", "--data", str(folder)], env={"COLUMNS": "80", "NO_COLOR": "1"})
     assert "look: 2.9% of the pixels with depth have the value 65535" in result.stdout
 
 
 def test_far_walls_and_noise_are_depth(tmp_path):
-    assert remarks(write(tmp_path / "room", Room(walk(6)))) == ()
+    assert notes(write(tmp_path / "room", Room(walk(6)))) == ()
     rng = np.random.default_rng(0)
     assert find_sentinel([rng.uniform(1, 9, (50, 60)).astype(np.float32)], 1.0) is None
     assert find_sentinel([np.full((5, 6), 2, np.float32)], 1000.0) is None
@@ -73,21 +73,21 @@ class Unregistered(Room):
         super().__init__(walk(12))
         self.change = (scale, x)
 
-    def frame(self, index, backbone, *, color=True):
+    def frame(self, index, model, *, color=True):
         frame = super().frame(index, "gt", color=color)
         return dataclasses.replace(frame, labels=zoomed(np.array(frame.labels), *self.change))
 
 
 @pytest.mark.parametrize(("scale", "x"), [(525 / 585, 0), (585 / 525, 0), (1, 6), (1, -7)])
 def test_labels_that_are_not_registered_are_pointed_out(tmp_path, scale, x):
-    (remark,) = remarks(write(tmp_path / "room", Unregistered(scale, x)))
-    assert remark.startswith("labels of net look as if they were not registered to the depth: their edges lie on")
-    enlarged = float(remark.partition("enlarged ")[2].split()[0])
+    (note,) = notes(write(tmp_path / "room", Unregistered(scale, x)))
+    assert note.startswith("labels of net look as if they were not registered to the depth: their edges lie on")
+    enlarged = float(note.partition("enlarged ")[2].split()[0])
     assert enlarged == pytest.approx(1 / scale, abs=0.05)
 
 
 def test_labels_that_are_registered_are_not(tmp_path):
-    assert remarks(write(tmp_path / "room", Unregistered(1))) == ()
+    assert notes(write(tmp_path / "room", Unregistered(1))) == ()
 
 
 def test_edges_that_have_nothing_to_do_with_each_other_are_not():
@@ -103,7 +103,7 @@ def test_edges_that_have_nothing_to_do_with_each_other_are_not():
 def test_real_data_are_registered_and_have_no_such_values(name):
     if not (DATA / name).is_dir():
         pytest.skip(f"no {DATA / name}; set SEMSTAB_DATA to the folder that holds {name}/")
-    assert remarks(DATA / name) == ()
+    assert notes(DATA / name) == ()
 
 
 def test_real_images_of_another_focal_length_are_pointed_out():

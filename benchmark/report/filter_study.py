@@ -1,4 +1,4 @@
-"""What steadied a model, at what price, and which filter to use: from the records of `remedies`."""
+"""Which filter made a model more stable, at what price, and which one to use."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ LEVEL = 0.002
 
 
 @dataclass(frozen=True)
-class Remedy:
+class FilterResult:
     """A filter over a model: macro means over the scenes, shares 0 to 1, NaN where undefined; see `FrameQuality`.
 
     Attributes:
@@ -42,7 +42,7 @@ class Remedy:
     next_frame: float
     accuracy: float
     miou: float
-    stable_wrong: float
+    consistent_wrong: float
     lag: float
     coverage: float
     milliseconds: float
@@ -55,23 +55,23 @@ class Remedy:
 
 
 @dataclass(frozen=True)
-class Remedies:
+class FilterStudy:
     """A model and the filters over it."""
 
     model: str
-    unfiltered: Remedy
-    filtered: tuple[Remedy, ...]
+    unfiltered: FilterResult
+    filtered: tuple[FilterResult, ...]
 
     @property
     def has_truth(self) -> bool:
         """Return whether right and wrong are known."""
         return not math.isnan(self.unfiltered.accuracy)
 
-    def worth(self, row: Remedy) -> float:
+    def worth(self, row: FilterResult) -> float:
         """Return what a filter must not lower: accuracy; without ground truth next-frame consistency."""
         return row.accuracy if self.has_truth else row.next_frame
 
-    def harmless(self, row: Remedy) -> bool:
+    def harmless(self, row: FilterResult) -> bool:
         """Return whether it costs nothing that must not be lost, whatever it does for stability."""
         base = self.unfiltered
         if row.coverage < LEAST_COVERAGE:
@@ -81,7 +81,7 @@ class Remedies:
         return row.accuracy >= base.accuracy and row.miou >= base.miou and not row.lag > MOST_LAG
 
     @property
-    def best(self) -> Remedy | None:
+    def best(self) -> FilterResult | None:
         """The filter to use: harmless, steadier than the model, and worth most; of those alike the steadiest.
 
         Stability alone chooses nothing: a label that never changes is as steady as can be.
@@ -89,40 +89,40 @@ class Remedies:
         return self._best_of(self.filtered)
 
     @property
-    def best_whole(self) -> Remedy | None:
+    def best_whole(self) -> FilterResult | None:
         """The same of the filters that leave every label."""
         return self._best_of([row for row in self.filtered if row.coverage >= 1 - ALIKE])
 
-    def _best_of(self, rows: Sequence[Remedy]) -> Remedy | None:
+    def _best_of(self, rows: Sequence[FilterResult]) -> FilterResult | None:
         able = [row for row in rows if row.flicker < self.unfiltered.flicker and self.harmless(row)]
         most = max(map(self.worth, able), default=math.nan)
         return min((row for row in able if self.worth(row) >= most - LEVEL), key=lambda row: row.flicker, default=None)
 
     @property
-    def misleading(self) -> list[Remedy]:
+    def misleading(self) -> list[FilterResult]:
         """Filters that steady the labels, of places or of pixels, and make them worse; the worst first."""
         base = self.unfiltered
         worse = [row for row in self.filtered if self.worth(row) < self.worth(base) - ALIKE]
         return sorted((r for r in worse if r.flicker < base.flicker or r.plain < base.plain), key=self.worth)
 
     @property
-    def front(self) -> list[Remedy]:
+    def front(self) -> list[FilterResult]:
         """The rows that no other one beats in both flicker and worth, from the steadiest on."""
-        found: list[Remedy] = []
+        found: list[FilterResult] = []
         for row in sorted([self.unfiltered, *self.filtered], key=lambda row: (row.flicker, -self.worth(row))):
             if not found or self.worth(row) > self.worth(found[-1]):
                 found.append(row)
         return found
 
 
-def remedies(result: Result) -> list[Remedies]:
+def filter_studies(result: Result) -> list[FilterStudy]:
     """Return each model of which filtered labels were judged beside its own; none in other results."""
     groups: dict[str, dict[str, list[Record]]] = {}
     for record in result.select():
         if record.quality is not None:
             groups.setdefault(record.quality.model, {}).setdefault(record.quality.filters, []).append(record)
     return [
-        Remedies(
+        FilterStudy(
             model, _row(rows[""], rows[""]), tuple(_row(found, rows[""]) for filters, found in rows.items() if filters)
         )
         for model, rows in groups.items()
@@ -131,8 +131,8 @@ def remedies(result: Result) -> list[Remedies]:
 
 
 def of_interest(result: Result) -> Result:
-    """Return the result for tables and figures of maps: of remedies the models, and the filters to use, alone."""
-    found = {each.model: {"", each.best.filters if each.best else ""} for each in remedies(result)}
+    """Return the result for tables and figures of maps: of a filter study the models, and the filters to use, alone."""
+    found = {each.model: {"", each.best.filters if each.best else ""} for each in filter_studies(result)}
     if not found:
         return result
 
@@ -140,12 +140,12 @@ def of_interest(result: Result) -> Result:
         quality = record.quality
         return quality is None or quality.filters in found.get(quality.model, {quality.filters})
 
-    names = {record.unit.backbone for record in result.select() if shown(record)}
-    records = tuple(record for record in result.records if record.unit.backbone in names)
+    names = {record.unit.model for record in result.select() if shown(record)}
+    records = tuple(record for record in result.records if record.unit.model in names)
     return dataclasses.replace(result, records=records)
 
 
-def advice(found: Remedies) -> Iterator[str]:
+def advice(found: FilterStudy) -> Iterator[str]:
     """Yield what to use and why; what only seems to help; what cannot be known."""
     best, base = found.best, found.unfiltered
     if best is None:
@@ -170,12 +170,12 @@ def advice(found: Remedies) -> Iterator[str]:
         yield "Nothing changes in what is seen here: how late labels follow is not known."
 
 
-def typed(remedy: Remedy) -> str:
+def typed(result: FilterResult) -> str:
     """Return the filters as they are typed after the first --filter."""
-    return remedy.filters.replace("+", " --filter ")
+    return result.filters.replace("+", " --filter ")
 
 
-def _why(found: Remedies, best: Remedy) -> str:
+def _why(found: FilterStudy, best: FilterResult) -> str:
     base, (better, frames) = found.unfiltered, best.better
     parts = [f"flicker falls from {100 * base.flicker:.1f} to {100 * best.flicker:.1f} %"]
     if found.has_truth:
@@ -195,7 +195,7 @@ def _why(found: Remedies, best: Remedy) -> str:
     return f"{', '.join(parts)}, for {best.milliseconds:.0f} ms a frame"
 
 
-def _harm(found: Remedies, row: Remedy) -> str:
+def _harm(found: FilterStudy, row: FilterResult) -> str:
     base = found.unfiltered
     steady = f"has {100 * row.flicker:.1f} % flicker ({100 * base.flicker:.1f} % without)"
     if row.flicker >= base.flicker:
@@ -204,26 +204,26 @@ def _harm(found: Remedies, row: Remedy) -> str:
         return f"{steady}, but foresees {100 * row.next_frame:.1f} % of the next labels ({100 * base.next_frame:.1f} %)"
     late = f", and it follows changes {row.lag:.1f} frames late" if math.isfinite(row.lag) else ""
     return (
-        f"{steady}, but {100 * row.stable_wrong:.0f} % of what it shows is stable and wrong"
-        f" ({100 * base.stable_wrong:.0f} %){late}"
+        f"{steady}, but {100 * row.consistent_wrong:.0f} % of what it shows is consistent but wrong"
+        f" ({100 * base.consistent_wrong:.0f} %){late}"
     )
 
 
-def _row(records: Sequence[Record], unfiltered: Sequence[Record]) -> Remedy:
+def _row(records: Sequence[Record], unfiltered: Sequence[Record]) -> FilterResult:
     qualities = [record.quality for record in records if record.quality is not None]
     judged = [record.statistics.headline for record in records if record.statistics is not None]
 
     def mean(name: str) -> float:
         return macro_mean([getattr(quality, name) for quality in qualities])
 
-    return Remedy(
+    return FilterResult(
         filters=qualities[0].filters,
         flicker=macro_mean([record.image_space.compensated_flicker_percent for record in records]) / 100,
         plain=macro_mean([record.image_space.flicker_percent for record in records]) / 100,
         alpha=macro_mean([row.alpha.value for row in judged]),
         **{
             name: mean(name)
-            for name in ("next_frame", "accuracy", "miou", "stable_wrong", "lag", "coverage", "milliseconds")
+            for name in ("next_frame", "accuracy", "miou", "consistent_wrong", "lag", "coverage", "milliseconds")
         },
         better=_better(records, unfiltered),
     )

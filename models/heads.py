@@ -13,10 +13,10 @@ import transformers
 from transformers import AutoModelForSemanticSegmentation, AutoModelForUniversalSegmentation, AutoTokenizer
 from transformers.models.auto.modeling_auto import MODEL_FOR_SEMANTIC_SEGMENTATION_MAPPING_NAMES as SEMANTIC
 
-from semstab.backbones import Image
-from semstab.backbones.checkpoint import Checkpoint, ModelOptions, SegmenterOptions, bilinear, load_processor
 from semstab.core.files import atomic_path, cache_folder, content_key
 from semstab.errors import ConfigError, DataError, MissingDependencyError, summarize_error
+from semstab.models import Image
+from semstab.models.checkpoint import Checkpoint, ModelOptions, SegmenterOptions, bilinear, load_processor
 
 logger = logging.getLogger("semstab")
 

@@ -1,4 +1,4 @@
-"""Backbone `transformers` on each kind of checkpoint, tiny ones, against transformers' own post-processing."""
+"""Model `transformers` on each kind of checkpoint, tiny ones, against transformers' own post-processing."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ import transformers
 from model_folders import tiny
 from pictures import blobs
 
-from semstab.backbones import create
-from semstab.backbones.sam import SamOptions, SamProposer
 from semstab.errors import ConfigError, DataError, MissingDependencyError
+from semstab.models import create
+from semstab.models.sam import SamOptions, SamProposer
 
 WIDE = [blobs(shift=k) for k in range(2)]
 TALL = [np.ascontiguousarray(image.transpose(1, 0, 2)) for image in WIDE]
@@ -29,13 +29,13 @@ def loaded(kind, cls):
 
 @pytest.fixture(scope="module", params=UNIVERSAL)
 def universal(request):
-    return request.param, create("transformers", model=str(tiny(request.param)))
+    return request.param, create("transformers", checkpoint=str(tiny(request.param)))
 
 
 @pytest.mark.parametrize("images", [WIDE, TALL], ids=["wide", "tall"])
 @torch.inference_mode()
 def test_universal_segmentation_is_that_of_transformers(universal, images):
-    kind, backbone = universal
+    kind, model = universal
     more = {"class_info_file": None} if kind == "oneformer" else {}
     processor = transformers.AutoImageProcessor.from_pretrained(tiny(kind), backend="pil", **more)
     if kind == "oneformer":
@@ -51,15 +51,15 @@ def test_universal_segmentation_is_that_of_transformers(universal, images):
     sizes = [image.shape[:2] for image in images]
     theirs = processor.post_process_semantic_segmentation(output, sizes, return_segmentation_scores=True)
     seen = set()
-    for prediction, wanted in zip(backbone.predict(images, scores=True), theirs, strict=True):
+    for prediction, wanted in zip(model.predict(images, scores=True), theirs, strict=True):
         values = wanted.segmentation_scores
         np.testing.assert_array_equal(prediction.labels, wanted.segmentation)
         np.testing.assert_allclose(prediction.scores, (values / values.sum(0)).permute(1, 2, 0), atol=2e-6)
         seen |= set(np.unique(prediction.labels))
-    streamed = np.stack(list(backbone.stream(images[0]).maps()), axis=2)
-    np.testing.assert_array_equal(streamed, backbone.predict(images[:1], scores=True)[0].scores)
+    streamed = np.stack(list(model.stream(images[0]).maps()), axis=2)
+    np.testing.assert_array_equal(streamed, model.predict(images[:1], scores=True)[0].scores)
     assert len(seen) > 1
-    assert backbone.label_space.classes == tuple(tiny_models.NAMES.values())
+    assert model.label_space.classes == tuple(tiny_models.NAMES.values())
 
 
 def test_padding_of_eomt_is_not_stretched_over_the_image(tmp_path):
@@ -69,8 +69,8 @@ def test_padding_of_eomt_is_not_stretched_over_the_image(tmp_path):
     transformers.EomtImageProcessorPil(size=size, do_pad=True).save_pretrained(folder)
     square = np.zeros((80, 80, 3), np.uint8)
     square[:48] = WIDE[0]
-    backbone = create("transformers", model=str(folder))
-    (padded,), (cut,) = backbone.predict([square], scores=True), backbone.predict([WIDE[0]], scores=True)
+    model = create("transformers", checkpoint=str(folder))
+    (padded,), (cut,) = model.predict([square], scores=True), model.predict([WIDE[0]], scores=True)
     inner = np.s_[:30]  # further down the resize mixes padding in
     assert (padded.labels[inner] == cut.labels[inner]).mean() > 0.9
 
@@ -78,19 +78,19 @@ def test_padding_of_eomt_is_not_stretched_over_the_image(tmp_path):
 @torch.inference_mode()
 def test_prompts_of_clipseg():
     prompts = ["road", "a tree"]
-    backbone = create("transformers", model=str(tiny("clipseg")), prompts=prompts)
-    assert backbone.label_space.classes == ("road", "a tree")
-    model = loaded("clipseg", transformers.CLIPSegForImageSegmentation)
+    model = create("transformers", checkpoint=str(tiny("clipseg")), prompts=prompts)
+    assert model.label_space.classes == ("road", "a tree")
+    network = loaded("clipseg", transformers.CLIPSegForImageSegmentation)
     processor = transformers.AutoImageProcessor.from_pretrained(tiny("clipseg"), backend="pil")
     pixels = processor(images=WIDE[:1], return_tensors="pt")["pixel_values"].expand(2, -1, -1, -1)
     tokens = tiny_models.tokenizer()(prompts, padding=True, return_tensors="pt")
-    logits = model(**tokens, pixel_values=pixels).logits
+    logits = network(**tokens, pixel_values=pixels).logits
     full = torch.nn.functional.interpolate(logits[None], size=(48, 80), mode="bilinear")[0]
-    (found,) = backbone.predict(WIDE[:1], scores=True)
+    (found,) = model.predict(WIDE[:1], scores=True)
     np.testing.assert_array_equal(found.labels, full.argmax(0))
     np.testing.assert_allclose(found.scores, full.softmax(0).permute(1, 2, 0), atol=1e-6)
     threshold = float(full.sigmoid().amax(0).median())
-    unsure = create("transformers", model=str(tiny("clipseg")), prompts="road, a tree", threshold=threshold)
+    unsure = create("transformers", checkpoint=str(tiny("clipseg")), prompts="road, a tree", threshold=threshold)
     (some,) = unsure.predict(WIDE[:1], scores=True)
     ignored = (full.sigmoid().amax(0) < threshold).numpy()
     assert 0 < ignored.mean() < 1
@@ -101,9 +101,9 @@ def test_prompts_of_clipseg():
 @pytest.mark.parametrize("kind", ["dpt", "data2vec"])
 @torch.inference_mode()
 def test_models_of_squares_see_squares_and_say_so(kind, caplog):
-    backbone = create("transformers", model=str(tiny(kind)))
+    model = create("transformers", checkpoint=str(tiny(kind)))
     assert "sees squares: images are squeezed into 64x64" in caplog.text
-    (found,) = backbone.predict(WIDE[:1])
+    (found,) = model.predict(WIDE[:1])
     processor = transformers.AutoImageProcessor.from_pretrained(tiny(kind), backend="pil")
     square = {"height": 64, "width": 64}
     more = {"keep_aspect_ratio": False} if kind == "dpt" else {}
@@ -112,13 +112,13 @@ def test_models_of_squares_see_squares_and_say_so(kind, caplog):
     full = torch.nn.functional.interpolate(logits, size=(48, 80), mode="bilinear")[0]
     np.testing.assert_array_equal(found.labels, full.argmax(0))
     with pytest.raises(ConfigError, match=r"image_size: a '.*' model sees squares; give one number, 64 for example"):
-        create("transformers", model=str(tiny(kind)), image_size=[64, 96])
+        create("transformers", checkpoint=str(tiny(kind)), image_size=[64, 96])
 
 
 def test_a_size_that_a_model_cannot_see_is_one_line():
-    backbone = create("transformers", model=str(tiny("data2vec")), image_size=96)
+    model = create("transformers", checkpoint=str(tiny("data2vec")), image_size=96)
     with pytest.raises(ConfigError, match=r"cannot see 96x96 .*; give the size that it was made for") as caught:
-        backbone.predict(WIDE[:1])
+        model.predict(WIDE[:1])
     assert "\n" not in str(caught.value)
 
 
@@ -134,14 +134,14 @@ def test_a_size_that_a_model_cannot_see_is_one_line():
 )
 def test_options_that_do_not_fit(kind, options, message):
     with pytest.raises(ConfigError, match=message):
-        create("transformers", model=str(tiny(kind)), **options)
+        create("transformers", checkpoint=str(tiny(kind)), **options)
 
 
 def test_without_torchvision_it_is_said_what_to_install(monkeypatch):
     there = importlib.util.find_spec
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None if name == "torchvision" else there(name))
     with pytest.raises(MissingDependencyError, match=r"leave it out, or pip install 'semstab\[torchvision\]'$"):
-        create("transformers", model=str(tiny("segformer")), processor="torchvision")
+        create("transformers", checkpoint=str(tiny("segformer")), processor="torchvision")
 
 
 # --- The preprocessing's library --------------------------------------------------------------------------------------
@@ -157,10 +157,10 @@ def test_the_library_that_resizes_does_not_depend_on_what_is_installed(monkeypat
         return original(folder, **options)
 
     monkeypatch.setattr(transformers.AutoImageProcessor, "from_pretrained", from_pretrained)
-    backbone = create("transformers", model=str(tiny("segformer")))
+    model = create("transformers", checkpoint=str(tiny("segformer")))
     assert asked == ["pil"]
-    assert backbone.identity()["processor"] == "pil"
-    assert SamProposer(SamOptions(model=str(tiny("sam")))).identity()["processor"] == "pil"
+    assert model.identity()["processor"] == "pil"
+    assert SamProposer(SamOptions(checkpoint=str(tiny("sam")))).identity()["processor"] == "pil"
     assert asked == ["pil", "pil"]
 
 
@@ -172,7 +172,7 @@ def test_another_library_than_the_one_asked_for_is_refused(monkeypatch):
         transformers.AutoImageProcessor, "from_pretrained", lambda folder, **options: SegformerImageProcessor()
     )
     with pytest.raises(DataError, match="cannot do its work by pil; set processor: torchvision"):
-        create("transformers", model=str(tiny("segformer")))
+        create("transformers", checkpoint=str(tiny("segformer")))
 
 
 # --- Segment Anything's later kinds -----------------------------------------------------------------------------------
@@ -183,7 +183,7 @@ EVERY = {"points_per_side": 2, "pred_iou": 0, "stability": 0, "nms_iou": 1, "min
 @pytest.mark.parametrize("kind", ["sam2", "sam_hq"])
 @torch.inference_mode()
 def test_later_kinds_of_sam_propose(kind):
-    proposer = SamProposer(SamOptions(model=str(tiny(kind)), **EVERY))
+    proposer = SamProposer(SamOptions(checkpoint=str(tiny(kind)), **EVERY))
     found = proposer.propose(WIDE[0])
     model = loaded(kind, transformers.AutoModelForMaskGeneration)
     grid = torch.tensor([[0.25, 0.25], [0.75, 0.25], [0.25, 0.75], [0.75, 0.75]])
@@ -213,8 +213,8 @@ def test_later_kinds_of_sam_propose(kind):
 
 
 def test_a_sam_of_another_kind(tmp_path, monkeypatch):
-    from semstab.backbones import sam
+    from semstab.models import sam
 
     monkeypatch.setattr(sam, "KINDS", ())
     with pytest.raises(DataError, match="a 'sam' model; name one of sam, sam_hq, sam2"):
-        SamProposer(SamOptions(model=str(tiny("sam"))))
+        SamProposer(SamOptions(checkpoint=str(tiny("sam"))))

@@ -16,9 +16,9 @@ from huggingface_hub.errors import (
 )
 from model_folders import tiny
 
-from semstab.backbones import create
-from semstab.backbones.checkpoint import Checkpoint, ModelOptions
 from semstab.errors import ConfigError, DataError
+from semstab.models import create
+from semstab.models.checkpoint import Checkpoint, ModelOptions
 
 
 def fails(kind, match, name="segformer", **options):
@@ -38,43 +38,52 @@ def test_a_folder_that_is_not_there(tmp_path):
     fails(
         DataError,
         r"nowhere: there is no such folder; name one that save_pretrained wrote",
-        model=str(tmp_path / "nowhere"),
+        checkpoint=str(tmp_path / "nowhere"),
     )
 
 
 def test_a_folder_without_a_model(tmp_path):
-    fails(DataError, "holds no config.json, so no model", model=str(tmp_path))
+    fails(DataError, "holds no config.json, so no model", checkpoint=str(tmp_path))
 
 
 def test_a_model_without_weights(folder):
     (folder / "model.safetensors").unlink()
-    fails(DataError, "holds no weights", model=str(folder))
+    fails(DataError, "holds no weights", checkpoint=str(folder))
 
 
 def test_damaged_weights(folder):
     weights = folder / "model.safetensors"
     weights.write_bytes(weights.read_bytes()[:1000])
-    fails(DataError, "AutoModelForSemanticSegmentation cannot load it", model=str(folder))
+    fails(DataError, "AutoModelForSemanticSegmentation cannot load it", checkpoint=str(folder))
 
 
 def test_a_damaged_configuration(folder):
     (folder / "config.json").write_text("{")
-    fails(DataError, "cannot load it", model=str(folder))
+    fails(DataError, "cannot load it", checkpoint=str(folder))
 
 
 def test_damaged_preprocessing(folder):
     (folder / "preprocessor_config.json").write_text("{")
-    fails(DataError, r"preprocessor_config\.json: ", model=str(folder))
+    fails(DataError, r"preprocessor_config\.json: ", checkpoint=str(folder))
     (folder / "preprocessor_config.json").write_text("[1]")
-    fails(DataError, "is no JSON object", model=str(folder))
+    fails(DataError, "is no JSON object", checkpoint=str(folder))
     (folder / "preprocessor_config.json").write_text('{"image_processor_type": 1}')
-    fails(DataError, "AutoImageProcessor cannot load it", model=str(folder))
+    fails(DataError, "AutoImageProcessor cannot load it", checkpoint=str(folder))
 
 
 def test_a_model_of_another_kind():
-    fails(DataError, "a 'clip' model does not segment into classes; name one of: .*segf.*eomt", model=str(tiny("clip")))
-    fails(DataError, "AutoModelForMaskGeneration cannot load it", "sam-raw", model=str(tiny("segformer")))
-    fails(DataError, "weights are missing, .*: it was not trained as CLIPModel", "segearth-ov", model=str(tiny("sam")))
+    fails(
+        DataError,
+        "a 'clip' model does not segment into classes; name one of: .*segf.*eomt",
+        checkpoint=str(tiny("clip")),
+    )
+    fails(DataError, "AutoModelForMaskGeneration cannot load it", "sam-raw", checkpoint=str(tiny("segformer")))
+    fails(
+        DataError,
+        "weights are missing, .*: it was not trained as CLIPModel",
+        "segearth-ov",
+        checkpoint=str(tiny("sam")),
+    )
 
 
 def test_weights_that_are_missing_are_not_made_up(folder):
@@ -82,28 +91,35 @@ def test_weights_that_are_missing_are_not_made_up(folder):
     config = transformers.SegformerConfig.from_pretrained(folder)
     transformers.SegformerForImageClassification(config).save_pretrained(folder)
     message = "weights are missing, among them decode_head.*: it was not trained as SegformerForSemanticSegmentation"
-    fails(DataError, message, model=str(folder))
+    fails(DataError, message, checkpoint=str(folder))
 
 
 def test_weights_of_other_shapes(folder):
     config = json.loads((folder / "config.json").read_text())
     (folder / "config.json").write_text(json.dumps(config | {"decoder_hidden_size": 24}))
-    fails(DataError, "AutoModelForSemanticSegmentation cannot load it", model=str(folder))
+    fails(DataError, "AutoModelForSemanticSegmentation cannot load it", checkpoint=str(folder))
 
 
 def test_a_folder_has_no_revision(folder):
-    fails(ConfigError, "a folder has no revision 'main'", model=str(folder), revision="main")
+    fails(ConfigError, "a folder has no revision 'main'", checkpoint=str(folder), revision="main")
 
 
 @pytest.mark.parametrize("device", ["cuda:99", "tpu"])
 def test_a_device_that_is_not_there(folder, device):
-    fails(ConfigError, rf"^device {device}: torch cannot use it \(.*\); use cpu$", model=str(folder), device=device)
+    fails(
+        ConfigError, rf"^device {device}: torch cannot use it \(.*\); use cpu$", checkpoint=str(folder), device=device
+    )
 
 
 def test_unknown_options_and_values(folder):
-    fails(ConfigError, r"^backbone 'segformer': unknown setting 'modle'; did you mean 'model'\?$", model="m", modle="m")
-    fails(ConfigError, "^backbone 'segformer': dtype: ", model=str(folder), dtype="float8")
-    fails(ConfigError, r"^backbone 'segfomer' is not known; did you mean 'segformer'\?$", "segfomer", model="m")
+    fails(
+        ConfigError,
+        r"^model 'segformer': unknown setting 'chekpoint'; did you mean 'checkpoint'\?$",
+        checkpoint="m",
+        chekpoint="m",
+    )
+    fails(ConfigError, "^model 'segformer': dtype: ", checkpoint=str(folder), dtype="float8")
+    fails(ConfigError, r"^model 'segfomer' is not known; did you mean 'segformer'\?$", "segfomer", checkpoint="m")
 
 
 # --- The hub ----------------------------------------------------------------------------------------------------------
@@ -133,7 +149,7 @@ def test_the_hub_says_no(monkeypatch, error, message):
 
     monkeypatch.setattr(huggingface_hub, "snapshot_download", no_cache)
     monkeypatch.setattr(huggingface_hub.HfApi, "model_info", model_info)
-    fails(DataError, message, model="a/model", revision="v2")
+    fails(DataError, message, checkpoint="a/model", revision="v2")
 
 
 def test_a_model_in_the_cache_needs_no_network(monkeypatch, tmp_path):
@@ -144,7 +160,7 @@ def test_a_model_in_the_cache_needs_no_network(monkeypatch, tmp_path):
         return str(cached)
 
     monkeypatch.setattr(huggingface_hub, "snapshot_download", snapshot_download)
-    found = Checkpoint.find(ModelOptions(model="a/model"))
+    found = Checkpoint.find(ModelOptions(checkpoint="a/model"))
     assert (found.revision, found.title) == ("0123abc", "a/model")
 
 
@@ -161,4 +177,4 @@ def test_a_part_of_a_model_in_the_cache_is_completed(monkeypatch, tmp_path):
 
     monkeypatch.setattr(huggingface_hub, "snapshot_download", snapshot_download)
     monkeypatch.setattr(huggingface_hub.HfApi, "model_info", lambda self, name, **options: about)
-    assert Checkpoint.find(ModelOptions(model="a/model")).revision == "5678def"
+    assert Checkpoint.find(ModelOptions(checkpoint="a/model")).revision == "5678def"

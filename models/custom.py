@@ -21,12 +21,12 @@ import numpy as np
 import numpy.typing as npt
 from pydantic import BaseModel, ConfigDict, Field
 
-from semstab.backbones import Backbone, Image, Labels, Prediction, content_digest, narrowed
-from semstab.backbones.border import Wrapped
-from semstab.backbones.names import class_names
 from semstab.data.frames import Frame
 from semstab.data.labels import IGNORE_8BIT, IGNORE_16BIT, LabelSpace
 from semstab.errors import ConfigError, DataError, MissingDependencyError, summarize_error
+from semstab.models import Image, Labels, Model, Prediction, content_digest, narrowed
+from semstab.models.border import Wrapped
+from semstab.models.names import class_names
 
 # Code that a user names: `FILE.py:NAME` or `package.module:NAME`, imported, and known by its content.
 
@@ -62,9 +62,7 @@ class Code:
         place, _, name = text.rpartition(":")
         in_file = place.endswith(".py")
         if not name.isidentifier() or not (in_file or MODULE.fullmatch(place)):
-            raise ConfigError(
-                f"backbone '{text}': write FILE.py:NAME or package.module:NAME, NAME a class or a function"
-            )
+            raise ConfigError(f"model '{text}': write FILE.py:NAME or package.module:NAME, NAME a class or a function")
         if not in_file:
             _may_import_from(Path.cwd())
         module = guarded(text, lambda: _of_file(Path(place)) if in_file else importlib.import_module(place))
@@ -101,7 +99,7 @@ class Code:
 
 
 def is_code(name: str) -> bool:
-    """Return whether a backbone's name says where code is, and is none of a registry."""
+    """Return whether a model's name says where code is, and is none of a registry."""
     return ":" in name or name.endswith(".py")
 
 
@@ -168,20 +166,20 @@ class OwnOptions(BaseModel):
     )
 
 
-def own_maker(text: str) -> tuple[type[BaseModel], Callable[[Any], Backbone]]:
-    """Return the options of a user's class or function, and what makes a backbone of it with them.
+def own_maker(text: str) -> tuple[type[BaseModel], Callable[[Any], Model]]:
+    """Return the options of a user's class or function, and what makes a model of it with them.
 
     Both raise ConfigError, DataError, MissingDependencyError, each in one line.
     """
     code = Code.load(text)
     cls: Any = code.target
-    if not (isinstance(cls, type) and Backbone in cls.__mro__):
+    if not (isinstance(cls, type) and Model in cls.__mro__):
         return OwnOptions, lambda options: OwnModel(code, dict(options.model_extra or {}), options.classes)
     own = getattr(cls, "Options", None)
     if isinstance(own, type) and issubclass(own, BaseModel):
         return own, lambda options: OfCode(guarded(text, lambda: cls(options)), code, {})
 
-    def make(options: BaseModel) -> Backbone:
+    def make(options: BaseModel) -> Model:
         extra = dict(options.model_extra or {})
         code.accepts(extra)
         return OfCode(guarded(text, lambda: cls(**extra)), code, extra)
@@ -190,9 +188,9 @@ def own_maker(text: str) -> tuple[type[BaseModel], Callable[[Any], Backbone]]:
 
 
 class OfCode(Wrapped):
-    """A backbone of a user's own class: its file is part of what its predictions are kept under."""
+    """A model of a user's own class: its file is part of what its predictions are kept under."""
 
-    def __init__(self, inner: Backbone, code: Code, options: Mapping[str, Any]) -> None:
+    def __init__(self, inner: Model, code: Code, options: Mapping[str, Any]) -> None:
         super().__init__(inner)
         self._about = {"code": code.digest, "options": contents(options)}
 
@@ -201,7 +199,7 @@ class OfCode(Wrapped):
         return {**self.inner.identity(), **self._about}
 
 
-class OwnModel(Backbone):
+class OwnModel(Model):
     """A function of an image (H, W, 3) uint8 RGB, or an object with such a method `predict`, or that is called so.
 
     It gives labels (H, W), whole numbers in the order of its classes, 255 (of more than 255 classes 65535) or less than
@@ -237,7 +235,7 @@ class OwnModel(Backbone):
     def predict(
         self, images: Sequence[Image], *, scores: bool = False, geometry: Sequence[Frame] = ()
     ) -> list[Prediction]:
-        """See `Backbone`.
+        """See `Model`.
 
         Raises:
             DataError: For an answer that is neither labels nor scores.

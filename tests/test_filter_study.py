@@ -13,27 +13,27 @@ from typer.testing import CliRunner
 
 from semstab.cli import app
 from semstab.engine.folder import load_result
-from semstab.report.remedies import Remedies, Remedy, advice, remedies
+from semstab.report.filter_study import FilterResult, FilterStudy, advice, filter_studies
 
 NAN = float("nan")
 
 
-def remedy(filters="", flicker=0.2, worth=0.8, **more):
+def result_of(filters="", flicker=0.2, worth=0.8, **more):
     known = {
         "plain": flicker,
         "alpha": 0.5,
         "next_frame": worth,
         "accuracy": worth,
         "miou": worth,
-        "stable_wrong": 0.05,
+        "consistent_wrong": 0.05,
     }
-    return Remedy(filters, flicker, **{**known, "lag": 0.0, "coverage": 1.0, "milliseconds": 2.0, **more})
+    return FilterResult(filters, flicker, **{**known, "lag": 0.0, "coverage": 1.0, "milliseconds": 2.0, **more})
 
 
 def study(*rows, truth=True):
-    unknown = {"accuracy": NAN, "miou": NAN, "stable_wrong": NAN, "lag": NAN}
-    rows = [row if truth else dataclasses.replace(row, **unknown) for row in (remedy(), *rows)]
-    return Remedies("net", rows[0], tuple(rows[1:]))
+    unknown = {"accuracy": NAN, "miou": NAN, "consistent_wrong": NAN, "lag": NAN}
+    rows = [row if truth else dataclasses.replace(row, **unknown) for row in (result_of(), *rows)]
+    return FilterStudy("net", rows[0], tuple(rows[1:]))
 
 
 def said(found):
@@ -42,8 +42,8 @@ def said(found):
 
 @pytest.mark.parametrize("truth", [True, False])
 def test_the_steadiest_is_not_the_best(truth):
-    frozen = remedy("ema:0.98", flicker=0.001, worth=0.4, alpha=0.99)
-    good = remedy("ema-warped:0.6", flicker=0.08, worth=0.9, alpha=0.8)
+    frozen = result_of("ema:0.98", flicker=0.001, worth=0.4, alpha=0.99)
+    good = result_of("ema-warped:0.6", flicker=0.08, worth=0.9, alpha=0.8)
     found = study(frozen, good, truth=truth)
     assert found.best.filters == "ema-warped:0.6"
     assert [row.filters for row in found.misleading] == ["ema:0.98"]
@@ -53,35 +53,40 @@ def test_the_steadiest_is_not_the_best(truth):
 
 
 def test_the_best_is_the_steadier_one_of_those_alike_and_alpha_alone_chooses_nothing():
-    found = study(remedy("ema:0.9", worth=0.79, alpha=0.99, flicker=0.01))
+    found = study(result_of("ema:0.9", worth=0.79, alpha=0.99, flicker=0.01))
     assert found.best is None
     assert said(found).startswith("Use none of these filters over net: none steadies it without a loss of accuracy")
-    found = study(remedy("ema:0.98", flicker=0.3, worth=0.4, plain=0.001, stable_wrong=0.4, lag=4.5))
+    found = study(result_of("ema:0.98", flicker=0.3, worth=0.4, plain=0.001, consistent_wrong=0.4, lag=4.5))
     assert found.best is None
     assert (
         "Steadier and worse: ema:0.98. ema:0.98 has 0.1 % flicker at the same pixel (20.0 % without), but 40 %"
         in said(found)
     )
     assert "it follows changes 4.5 frames late" in said(found)
-    rows = remedy("vote:3", 0.1, 0.9), remedy("vote:5", 0.05, 0.899), remedy("vote:9", 0.01, 0.88)
+    rows = result_of("vote:3", 0.1, 0.9), result_of("vote:5", 0.05, 0.899), result_of("vote:9", 0.01, 0.88)
     assert study(*rows).best.filters == "vote:5"
-    rows = remedy("a:1", 0.1, 0.9), remedy("b:1", 0.15, 0.85), remedy("c:1", 0.05, 0.5), remedy("d:1", 0.3, 0.95)
+    rows = (
+        result_of("a:1", 0.1, 0.9),
+        result_of("b:1", 0.15, 0.85),
+        result_of("c:1", 0.05, 0.5),
+        result_of("d:1", 0.3, 0.95),
+    )
     assert [row.filters for row in study(*rows).front] == ["c:1", "a:1", "d:1"]
-    assert "Use --filter ema:0.6 --filter guided:8 over net" in said(study(remedy("ema:0.6+guided:8", 0.1, 0.9)))
+    assert "Use --filter ema:0.6 --filter guided:8 over net" in said(study(result_of("ema:0.6+guided:8", 0.1, 0.9)))
 
 
 @pytest.mark.parametrize(
     "loss", [{"lag": 1.2}, {"coverage": 0.9}, {"miou": 0.7}, {"accuracy": 0.79}, {"flicker": 0.25}], ids=str
 )
 def test_what_a_filter_must_not_cost(loss):
-    found = study(dataclasses.replace(remedy("vote:9", flicker=0.05, worth=0.9), **loss))
+    found = study(dataclasses.replace(result_of("vote:9", flicker=0.05, worth=0.9), **loss))
     assert found.best is None
 
 
 @pytest.fixture(scope="module")
 def done(tmp_path_factory):
     """Labels of a wall that flicker, with the truth, through the command to the end."""
-    folder = tmp_path_factory.mktemp("remedies")
+    folder = tmp_path_factory.mktemp("filters")
     scene = predicted_scene.write(folder / "flight", frames=8)
     (scene / "scene.yaml").write_text("classes: [dark, bright, blue]\n")
     rng = np.random.default_rng(0)
@@ -93,7 +98,7 @@ def done(tmp_path_factory):
         for name, labels in (("gt", truth), ("net", noisy)):
             Image.fromarray(labels).save(scene / f"labels/{name}/{k:03d}.png")
     filters = [w for f in ("ema:0.98", "vote-warped:5", "threshold", "vote:3+threshold:0.5") for w in ("--filter", f)]
-    words = ["remedies", "--data", scene, "--backbone", "net", *filters, "--voxel-size", "0.1", "--out", folder / "out"]
+    words = ["filters", "--data", scene, "--model", "net", *filters, "--voxel-size", "0.1", "--out", folder / "out"]
     result = CliRunner().invoke(app, [str(word) for word in words])
     assert result.exit_code == 0, result.output
     return folder, result.output
@@ -106,21 +111,21 @@ def test_the_folder_and_the_terminal_hold_what_to_use(done):
     table = text[text.index("Use --filter") :]
     assert "vote-warped:5" in table
     folder, _ = done
-    rows = json.loads((folder / "out/tables/remedies.json").read_text())
+    rows = json.loads((folder / "out/tables/filters.json").read_text())
     page = (folder / "out/report.html").read_text()
     assert "Use --filter vote-warped:5 over net" in page
-    (found,) = remedies(load_result(folder / "out"))
+    (found,) = filter_studies(load_result(folder / "out"))
     assert [row.filters for row in found.filtered] == ["ema:0.98", "vote-warped:5", "vote:3+threshold:0.5"]
     best, frozen = found.best, found.filtered[0]
     assert best.accuracy > found.unfiltered.accuracy + 0.05
-    assert frozen.stable_wrong > 0.2
+    assert frozen.consistent_wrong > 0.2
     assert len(rows["rows"]) == 4
 
 
 def test_a_second_start_computes_nothing(done):
     folder, _ = done
     filters = ["--filter", "ema:0.98", "--filter", "vote-warped:5", "--filter", "vote:3+threshold:0.5"]
-    words = ["remedies", "--data", folder / "flight", "--backbone", "net", *filters, "--voxel-size", "0.1"]
+    words = ["filters", "--data", folder / "flight", "--model", "net", *filters, "--voxel-size", "0.1"]
     result = CliRunner().invoke(app, [str(w) for w in (*words, "--out", folder / "out", "--report", "off")])
     assert result.exit_code == 0, result.output
     units = json.loads((folder / "out/manifest.json").read_text())["units"]
@@ -128,13 +133,13 @@ def test_a_second_start_computes_nothing(done):
 
 
 @pytest.mark.parametrize(("words", "said"), [
-    (("--backbone", "nut"), "there are no labels 'nut' for filters to take; there is net"),
-    (("--backbone", "net", "--filter", "ema:0.6+smooth"), "filter 'smooth' is not known"),
-    (("--predict", "nothing"), "backbone 'nothing' is not known"),
+    (("--model", "nut"), "there are no labels 'nut' for filters to take; there is net"),
+    (("--model", "net", "--filter", "ema:0.6+smooth"), "filter 'smooth' is not known"),
+    (("--predict", "nothing"), "model 'nothing' is not known"),
 ])  # fmt: skip
 def test_bad_input_is_one_line(done, words, said):
     folder, _ = done
-    command = ["remedies", "--data", folder / "flight", *words, "--voxel-size", "0.1", "--out", folder / "bad"]
+    command = ["filters", "--data", folder / "flight", *words, "--voxel-size", "0.1", "--out", folder / "bad"]
     result = CliRunner().invoke(app, [str(word) for word in command])
     assert result.exit_code == 2
     assert said in result.output

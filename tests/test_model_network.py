@@ -12,8 +12,8 @@ import torch
 from onnx import TensorProto, helper, numpy_helper
 from pictures import blobs
 
-from semstab.backbones import create
 from semstab.errors import ConfigError, DataError
+from semstab.models import create
 from semstab.predict.predictor import parse_predictor
 
 IMAGE = blobs()
@@ -153,7 +153,7 @@ def test_a_predictor_is_called_as_its_file(folder, monkeypatch):
     found = parse_predictor("net.onnx,size=[32, 64]", {"classes": CLASSES})
     assert found.label_name == "net"
     resolved = found.resolved()
-    assert (resolved.backbone, resolved.label_name) == (str(folder / "net.onnx"), "net")
+    assert (resolved.model, resolved.label_name) == (str(folder / "net.onnx"), "net")
     assert resolved.options["size"] == [32, 64]
 
 

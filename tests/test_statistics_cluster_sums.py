@@ -16,7 +16,7 @@ from semstab.data.measures import dominant, entropy, sbd, vss
 from semstab.errors import DataError
 from semstab.metrics.agreement import rows_of
 from semstab.statistics.accumulate import cluster_sums_of, sums_of_cells
-from semstab.statistics.agreement import class_agreement, krippendorff_alpha, psa, stability_posterior
+from semstab.statistics.agreement import class_agreement, consistency_posterior, krippendorff_alpha, psa
 from semstab.statistics.cluster_sums import ClusterSums, aligned, value
 from semstab.statistics.correctness import correctness
 from semstab.statistics.drift import expected_sbd
@@ -41,13 +41,13 @@ def test_the_sums_give_every_number_back(soft_evidence):
     table, log, truth = flight(soft_evidence=soft_evidence)
     again, often = table.op >= 2, table.op >= 3
     right = dominant(table) == truth
-    stable = np.where(often, stability_posterior(table), 0.0)
+    consistent = np.where(often, consistency_posterior(table), 0.0)
     excess, known = sbd(table) - expected_sbd(table), correctness(table.evidence[again], truth[again])
     expected = {
         "psa": psa(table)[again].mean(), "voxel_alpha": krippendorff_alpha(table), "vss": vss(table)[often].mean(),
         "entropy": entropy(table)[again].mean(), "accuracy": right[again].mean(),
-        "look_accuracy": log.evidence[again[log.voxel], truth[log.voxel[again[log.voxel]]]].mean(),
-        "wrong_of_stable": (stable * ~right).sum() / stable.sum(), "miou": known.miou, "ece": known.ece,
+        "observation_accuracy": log.evidence[again[log.voxel], truth[log.voxel[again[log.voxel]]]].mean(),
+        "wrong_of_consistent": (consistent * ~right).sum() / consistent.sum(), "miou": known.miou, "ece": known.ece,
         "sbd_excess": np.nan if soft_evidence else np.nanmean(excess[again]),
     }  # fmt: skip
     for given in (log, None):

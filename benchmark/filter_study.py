@@ -1,4 +1,4 @@
-"""The study of what would steady a model: the shipped grid of filters over any model and scene."""
+"""The study of filters that make a model more stable: the shipped grid of filters over any model and scene."""
 
 from __future__ import annotations
 
@@ -6,26 +6,26 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from semstab.backbones import create
 from semstab.check import with_voxel_size
 from semstab.config import Config, merge
 from semstab.datasets import Scene, open_dataset
+from semstab.models import create
 from semstab.predict.filters import parse
 from semstab.predict.predictor import NAME as STORED
 from semstab.predict.predictor import PredictorConfig, StoredSequence
 from semstab.settings import dataset_defaults, load_config, load_study, predicted_config, resolve
 
-STUDY = "remedies"
+STUDY = "filters"
 
 
-def remedies_config(
+def filter_study_config(
     models: Sequence[PredictorConfig],
     sources: Sequence[str],
     filters: Sequence[str],
     content: Mapping[str, Any],
     kept: Path | None = None,
 ) -> tuple[Config, list[str]]:
-    """Return the study `remedies` with these models, and filters over the scenes' label sources, as dataset settings.
+    """Return the study `filters` with these models, and filters over the scenes' label sources, as dataset settings.
 
     Without models or sources all sources are taken; without filters those of the shipped study, its map prior in voxels
     of the run. What a model says is kept in a folder. Also says which filters are left out, as no scores are there.
@@ -35,18 +35,18 @@ def remedies_config(
         DataError: For a scene that cannot be read.
     """
     content = merge(dataset_defaults(content), content)
-    config = resolve(load_config(None, {key: value for key, value in content.items() if key != "backbones"}))
+    config = resolve(load_config(None, {key: value for key, value in content.items() if key != "models"}))
     dataset = open_dataset(config.dataset.name, config.dataset.options)
     scene = dataset.scene((config.scenes or dataset.scenes)[0])
-    names = sources or ([] if models else config.backbones or scene.backbones)
-    predictors = [*models, *(PredictorConfig(backbone=STORED, options={"source": name}) for name in names)]
+    names = sources or ([] if models else config.models or scene.models)
+    predictors = [*models, *(PredictorConfig(model=STORED, options={"source": name}) for name in names)]
     config, _ = with_voxel_size(config)
-    shipped = load_study(STUDY).dataset.options["remedies"]
+    shipped = load_study(STUDY).dataset.options["try_filters"]
     grid = [_in_voxels(text, config.voxel_size) for text in filters or shipped]
     able, left_out = _able(grid, predictors, scene)
     settings = {**content, "voxel_size": config.voxel_size, "frame_quality": True, "check": None, "name": STUDY}
-    study = predicted_config(predictors, None, {**settings, "backbones": None})
-    more = {"remedies": able, "kept": None if kept is None else str(kept)}
+    study = predicted_config(predictors, None, {**settings, "models": None})
+    more = {"try_filters": able, "kept": None if kept is None else str(kept)}
     dataset_config = study.dataset.model_copy(update={"options": {**study.dataset.options, **more}})
     return study.model_copy(update={"dataset": dataset_config}), left_out
 
@@ -68,6 +68,6 @@ def _able(grid: Sequence[str], predictors: Sequence[PredictorConfig], scene: Sce
 
 
 def _gives_scores(predictor: PredictorConfig, scene: Scene) -> bool:
-    if predictor.backbone == STORED:
+    if predictor.model == STORED:
         return StoredSequence(scene, predictor.options["source"], False).has_scores
-    return create(predictor.backbone, **predictor.resolved().options).gives_scores
+    return create(predictor.model, **predictor.resolved().options).gives_scores

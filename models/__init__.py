@@ -1,4 +1,4 @@
-"""Segmentation models behind one protocol: `create("segformer", model="models/segformer-b0")`."""
+"""Segmentation models behind one protocol: `create("segformer", checkpoint="models/segformer-b0")`."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ from semstab.core.types import Float32, UInt8, UInt16
 from semstab.data.frames import Frame
 from semstab.data.labels import IGNORE_8BIT, LabelSpace
 
-SEGMENTER, SAM = "semstab.backbones.segmenter:Segmenter", "semstab.backbones.sam:"
+SEGMENTER, SAM = "semstab.models.segmenter:Segmenter", "semstab.models.sam:"
 WITH_SEGFORMER, WITH_SAM = "pip install 'semstab[segformer]'", "pip install 'semstab[sam]'"
 
 REGISTRY = Registry(
-    "backbone",
+    "model",
     {
         "colour-clusters": Entry(
-            "semstab.backbones.colour_clusters:ColourClusters",
+            "semstab.models.colour_clusters:ColourClusters",
             "k-means of colour and texture, one codebook a sequence: a baseline without weights",
         ),
         "transformers": Entry(
@@ -43,11 +43,11 @@ REGISTRY = Registry(
         ),
         "sam-vote": Entry(
             SAM + "SamVote",
-            "another backbone's labels, by majority inside Segment Anything's proposals",
+            "another model's labels, by majority inside Segment Anything's proposals",
             install=WITH_SAM,
         ),
         "segearth-ov": Entry(
-            "semstab.backbones.segearth_ov:SegEarthOV",
+            "semstab.models.segearth_ov:SegEarthOV",
             "SegEarth-OV: CLIP as an open-vocabulary segmenter, for views from above, without training",
             install="pip install 'semstab[segearth]'",
         ),
@@ -63,15 +63,15 @@ Image = UInt8
 Labels = UInt8 | UInt16
 
 UNASSIGNED = 0
-"""The id of a pixel without a region, in the maps of backbones without classes."""
+"""The id of a pixel without a region, in the maps of models without classes."""
 
 
 @dataclass(frozen=True, eq=False)
 class Prediction:
-    """The prediction of a backbone for one image.
+    """The prediction of a model for one image.
 
     Attributes:
-        labels: (H, W) uint8 or uint16: ids of its label space, 255 (65535) where it says nothing; of a backbone without
+        labels: (H, W) uint8 or uint16: ids of its label space, 255 (65535) where it says nothing; of a model without
             classes, region ids from 1, `UNASSIGNED` where there is no region.
         scores: (H, W, K) float32 that sum to 1 over the classes, or None where only labels are wanted.
     """
@@ -93,7 +93,7 @@ class Streamed:
     maps: Callable[[], Iterator[Float32]]
 
 
-class Backbone(Protocol):
+class Model(Protocol):
     """Images in, label maps or scores out. Its class has `Options`, a pydantic model, and is made with one of it.
 
     Attributes:
@@ -114,8 +114,8 @@ class Backbone(Protocol):
     wants_geometry: bool = False
     streams: bool = False
 
-    def fit(self, images: Sequence[Image]) -> Backbone:
-        """Return the backbone adapted to a sequence by its first `fit_frames` images; itself where that is nothing.
+    def fit(self, images: Sequence[Image]) -> Model:
+        """Return the model adapted to a sequence by its first `fit_frames` images; itself where that is nothing.
 
         Called once a sequence, before the first `predict`, whatever frames are predicted later.
         """
@@ -152,11 +152,11 @@ def streamed(prediction: Prediction) -> Streamed:
 
 
 def ask(
-    backbone: Backbone, images: Sequence[Image], *, scores: bool = False, geometry: Sequence[Frame] = ()
+    model: Model, images: Sequence[Image], *, scores: bool = False, geometry: Sequence[Frame] = ()
 ) -> list[Prediction]:
-    """Return the predictions of a backbone, which gets the geometry of the images where it wants it."""
-    more = {"geometry": geometry} if backbone.wants_geometry else {}
-    return backbone.predict(images, scores=scores, **more)
+    """Return the predictions of a model, which gets the geometry of the images where it wants it."""
+    more = {"geometry": geometry} if model.wants_geometry else {}
+    return model.predict(images, scores=scores, **more)
 
 
 def content_digest(path: Path) -> str:
@@ -181,8 +181,8 @@ def narrowed(ids: npt.NDArray[Any], classes: int) -> Labels:
     return ids.astype(np.uint8) if classes <= IGNORE_8BIT else ids.astype(np.uint16)
 
 
-def maker(name: str) -> tuple[type[BaseModel], Callable[[Any], Backbone]]:
-    """Return the options of backbones of that name, and their constructor, which takes them.
+def maker(name: str) -> tuple[type[BaseModel], Callable[[Any], Model]]:
+    """Return the options of models of that name, and their constructor, which takes them.
 
     A name is that of a registered class, of a user's code (FILE.py:NAME, package.module:NAME), or of a network's file
     (net.onnx).
@@ -190,8 +190,8 @@ def maker(name: str) -> tuple[type[BaseModel], Callable[[Any], Backbone]]:
     Raises:
         ConfigError, DataError, MissingDependencyError: If it cannot be loaded.
     """
-    from semstab.backbones.custom import is_code, own_maker
-    from semstab.backbones.network import NetworkFile, NetworkOptions, is_network
+    from semstab.models.custom import is_code, own_maker
+    from semstab.models.network import NetworkFile, NetworkOptions, is_network
 
     if is_network(name):
         return NetworkOptions, partial(NetworkFile, Path(name).expanduser())
@@ -202,12 +202,12 @@ def maker(name: str) -> tuple[type[BaseModel], Callable[[Any], Backbone]]:
 
 
 def options_model(name: str) -> type[BaseModel]:
-    """Return the pydantic model of a backbone's options. Raises what `maker` raises."""
+    """Return the pydantic model of a model's options. Raises what `maker` raises."""
     return maker(name)[0]
 
 
-def create(name: str, **options: Any) -> Backbone:
-    """Load a backbone by name with its options.
+def create(name: str, **options: Any) -> Model:
+    """Load a model by name with its options.
 
     Raises:
         ConfigError: For an unknown name or option.
@@ -215,4 +215,4 @@ def create(name: str, **options: Any) -> Backbone:
         MissingDependencyError: If its packages are not installed.
     """
     model, make = maker(name)
-    return make(validated(model, options, f"backbone '{name}': "))
+    return make(validated(model, options, f"model '{name}': "))

@@ -1,4 +1,4 @@
-"""Backbones `sam-raw`, `sam-heuristic` and `sam-vote`: Segment Anything's proposals as regions, by rules, by votes.
+"""Models `sam-raw`, `sam-heuristic` and `sam-vote`: Segment Anything's proposals as regions, by rules, by votes.
 
 Segment Anything (Kirillov et al. 2023) rates masks at a grid of points; the stable ones stay, each once (section 5 and
 appendix B, without crops). The pipeline of transformers needs torchvision, and all masks of a batch at full size.
@@ -20,15 +20,15 @@ import torch
 from pydantic import BaseModel, Field, model_validator
 from transformers import AutoModelForMaskGeneration
 
-from semstab.backbones import UNASSIGNED, Backbone, Image, Labels, Prediction, create, image_digest
-from semstab.backbones.border import Checked, Wrapped
-from semstab.backbones.checkpoint import Checkpoint, ImageModelOptions, bilinear, load_processor
 from semstab.config import Settings, read_yaml, validated
 from semstab.core.files import content_key, read_arrays, write_arrays
 from semstab.core.types import Float64, Mask, UInt8, UInt16
 from semstab.data.frames import Frame
 from semstab.data.labels import LabelSpace, ignore_id
 from semstab.errors import ConfigError, DataError
+from semstab.models import UNASSIGNED, Image, Labels, Model, Prediction, create, image_digest
+from semstab.models.border import Checked, Wrapped
+from semstab.models.checkpoint import Checkpoint, ImageModelOptions, bilinear, load_processor
 
 # The kinds of Segment Anything, which differ in their preprocessing.
 
@@ -222,10 +222,10 @@ def stability_score(logits: torch.Tensor, offset: float) -> float:
     return int((logits > offset).sum()) / larger if larger else 0.0
 
 
-# Backbone `sam-raw`: the proposals as regions without classes.
+# Model `sam-raw`: the proposals as regions without classes.
 
 
-class SamRaw(Backbone):
+class SamRaw(Model):
     """Regions 1, 2, ... from the largest mask to the smallest, smaller ones over larger ones, 0 where there is none.
 
     Ids mean nothing across frames: `semstab.metrics.matched_region_flicker` compares such maps.
@@ -237,7 +237,7 @@ class SamRaw(Backbone):
         self.proposer = SamProposer(options)
 
     def predict(self, images: Sequence[Image], *, scores: bool = False) -> list[Prediction]:
-        """See `Backbone`; there are no scores."""
+        """See `Model`; there are no scores."""
         min_area = self.proposer.options.min_area
         return [Prediction(self._labels(image, self.proposer.propose(image).by_area(min_area))) for image in images]
 
@@ -257,7 +257,7 @@ def region_map(masks: Iterable[Mask], shape: tuple[int, ...]) -> UInt16:
     return regions
 
 
-# Backbone `sam-heuristic`: the proposals with classes from rules on colour, size and shape.
+# Model `sam-heuristic`: the proposals with classes from rules on colour, size and shape.
 
 HUES = 180
 """OpenCV's hue runs from 0 to 180."""
@@ -284,7 +284,7 @@ class Range(Settings):
 
 
 class Rule(Settings):
-    """A class, and the limits of its masks' features; see configs/backbones/sam_heuristic.yaml."""
+    """A class, and the limits of its masks' features; see configs/models/sam_heuristic.yaml."""
 
     name: str
     hue: Range = Range()
@@ -324,7 +324,7 @@ class Rules(Settings):
 class SamHeuristicOptions(SamOptions):
     """The proposals and the rules."""
 
-    rules: Path | None = Field(None, description="YAML file like configs/backbones/sam_heuristic.yaml, the default")
+    rules: Path | None = Field(None, description="YAML file like configs/models/sam_heuristic.yaml, the default")
 
 
 class SamHeuristic(SamRaw):
@@ -373,18 +373,18 @@ def read_rules(path: Path | None) -> Rules:
     Raises:
         ConfigError: If that fails; the message names file and setting.
     """
-    shipped = importlib.resources.files("semstab.configs") / "backbones" / "sam_heuristic.yaml"
+    shipped = importlib.resources.files("semstab.configs") / "models" / "sam_heuristic.yaml"
     path = path or Path(str(shipped))
     return validated(Rules, read_yaml(path), f"{path}: ")
 
 
-# Backbone `sam-vote`: another backbone's labels, made one inside each of Segment Anything's proposals by majority.
+# Model `sam-vote`: another model's labels, made one inside each of Segment Anything's proposals by majority.
 
 
 class SamVoteOptions(SamOptions):
     """The proposals, and who votes."""
 
-    voter: str = Field(description="the backbone whose labels vote, e.g. segformer")
+    voter: str = Field(description="the model whose labels vote, e.g. segformer")
     voter_options: dict[str, Any] = Field(default_factory=dict, description="its options, e.g. {model: FOLDER}")
 
 
@@ -410,7 +410,7 @@ class SamVote(Wrapped):
     def predict(
         self, images: Sequence[Image], *, scores: bool = False, geometry: Sequence[Frame] = ()
     ) -> list[Prediction]:
-        """See `Backbone`; there are no scores."""
+        """See `Model`; there are no scores."""
         min_area = self.proposer.options.min_area
         return [
             Prediction(majority(vote.labels, self.proposer.propose(image).by_area(min_area)))

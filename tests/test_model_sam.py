@@ -11,9 +11,9 @@ import yaml
 from model_folders import KINDS, folder_of, tiny
 from pictures import blobs
 
-from semstab.backbones import create
-from semstab.backbones.sam import Proposals, SamOptions, SamProposer, majority, mask_features, read_rules, region_map
 from semstab.errors import ConfigError
+from semstab.models import create
+from semstab.models.sam import Proposals, SamOptions, SamProposer, majority, mask_features, read_rules, region_map
 
 IMAGE = blobs()
 TINY = {
@@ -29,7 +29,7 @@ REAL = {**TINY, "points_per_side": 2}
 
 @pytest.fixture(params=KINDS, scope="module")
 def options(request):
-    return {"model": str(folder_of(request.param, "sam")), **(TINY if request.param == "tiny" else REAL)}
+    return {"checkpoint": str(folder_of(request.param, "sam")), **(TINY if request.param == "tiny" else REAL)}
 
 
 @pytest.fixture(scope="module")
@@ -67,7 +67,7 @@ def test_proposals_are_the_same_again_and_in_other_batches(options, proposer):
 def test_proposals_are_those_of_the_article(options, proposer):
     """All points at once, every mask at full size, the rules one after the other."""
     model, settings = proposer.model, proposer.options
-    inputs = transformers.AutoImageProcessor.from_pretrained(options["model"], backend="pil")(
+    inputs = transformers.AutoImageProcessor.from_pretrained(options["checkpoint"], backend="pil")(
         IMAGE, return_tensors="pt"
     )
     height, width = inputs["reshaped_input_sizes"][0].tolist()
@@ -167,13 +167,13 @@ def test_smaller_masks_are_painted_over_larger_ones():
 
 
 def test_raw_proposals_have_no_classes(options):
-    backbone = create("sam-raw", **options)
-    assert backbone.label_space is None
-    (prediction,) = backbone.predict([IMAGE])
+    model = create("sam-raw", **options)
+    assert model.label_space is None
+    (prediction,) = model.predict([IMAGE])
     assert prediction.labels.dtype == np.uint16
     assert prediction.labels.shape == (48, 80)
     ids = np.unique(prediction.labels)
-    assert 0 < ids.max() <= len(backbone.proposer.propose(IMAGE))
+    assert 0 < ids.max() <= len(model.proposer.propose(IMAGE))
 
 
 # --- sam-heuristic ----------------------------------------------------------------------------------------------------
@@ -216,13 +216,13 @@ def test_the_first_rule_that_holds(look, name):
 
 
 def test_masks_become_classes(monkeypatch):
-    backbone = create("sam-heuristic", model=str(tiny("sam")), **{**TINY, "min_area": 1})
+    model = create("sam-heuristic", checkpoint=str(tiny("sam")), **{**TINY, "min_area": 1})
     image = np.concatenate([colour(0, 20, 120), colour(60, 200, 120), colour(150, 200, 120)], axis=1)
     halves = np.zeros((3, 4, 12), dtype=bool)
     for k in range(3):
         halves[k, :, 4 * k : 4 * k + 3] = True
-    monkeypatch.setattr(backbone.proposer, "propose", lambda image: proposals_of(*halves))
-    names = np.array(backbone.label_space.classes)[backbone.predict([image])[0].labels]
+    monkeypatch.setattr(model.proposer, "propose", lambda image: proposals_of(*halves))
+    names = np.array(model.label_space.classes)[model.predict([image])[0].labels]
     assert names[0].tolist() == [*["road"] * 3, "clutter", *["vegetation"] * 3, "clutter", *["building"] * 3, "clutter"]
 
 
@@ -268,19 +268,19 @@ def test_a_tie_goes_to_the_lowest_id_and_smaller_masks_vote_last():
     assert majority(labels, proposals.by_area(3)).tolist() == [[1, 1, 1, 1, 5]]
 
 
-def test_the_vote_of_another_backbone(options):
+def test_the_vote_of_another_model(options):
     voter = create("colour-clusters", clusters=4).fit([IMAGE])
-    backbone = create("sam-vote", **options, voter="colour-clusters", voter_options={"clusters": 4}).fit([IMAGE])
-    assert backbone.label_space == voter.label_space
-    (prediction,) = backbone.predict([IMAGE])
-    proposals = backbone.proposer.propose(IMAGE)
+    model = create("sam-vote", **options, voter="colour-clusters", voter_options={"clusters": 4}).fit([IMAGE])
+    assert model.label_space == voter.label_space
+    (prediction,) = model.predict([IMAGE])
+    proposals = model.proposer.propose(IMAGE)
     (vote,) = voter.predict([IMAGE])
-    expected = majority(vote.labels, proposals.by_area(backbone.proposer.options.min_area))
+    expected = majority(vote.labels, proposals.by_area(model.proposer.options.min_area))
     np.testing.assert_array_equal(prediction.labels, expected)
-    assert backbone.identity()["voter_options"] == voter.identity()
+    assert model.identity()["voter_options"] == voter.identity()
 
 
 def test_regions_cannot_vote():
-    raw = {"model": str(tiny("sam")), **TINY}
+    raw = {"checkpoint": str(tiny("sam")), **TINY}
     with pytest.raises(ConfigError, match="the voter 'sam-raw' has no classes"):
         create("sam-vote", **raw, voter="sam-raw", voter_options=raw)
