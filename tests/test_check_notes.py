@@ -45,7 +45,7 @@ def test_65535_in_16_bits_is_pointed_out(tmp_path):
     assert note.endswith(f"it means 'no depth'; set invalid_depth: [65535] (set it in {folder}/scene.yaml)")
     assert notes(folder, invalid_depth=[65535]) == ()
     result = CliRunner().invoke(app, ["check", "--data", str(folder)], env={"COLUMNS": "80", "NO_COLOR": "1"})
-    assert "look: 2.9% of the pixels with depth have the value 65535" in result.stdout
+    assert "note: 2.9% of the pixels with depth have the value 65535" in result.stdout
 
 
 def test_far_walls_and_noise_are_depth(tmp_path):

@@ -70,7 +70,7 @@ def test_a_description_is_content_for_json_and_every_voxel_has_a_value(described
     columns = described.columns(model(0.2, 0, place=0.2).table())
     assert {len(values) for values in columns.values()} == {SIDE**2}
     assert {"psa", "sbd_excess", "trend", "entropy_within", "entropy_between", "consistent_wrong"} <= set(columns)
-    assert 0 <= np.nanmin(columns["stable"]) < np.nanmax(columns["stable"]) <= 1
+    assert 0 <= np.nanmin(columns["consistent"]) < np.nanmax(columns["consistent"]) <= 1
 
 
 @pytest.mark.parametrize("soft", [False, True])
@@ -211,7 +211,7 @@ def test_agreement_below_zero_is_no_better_than_chance():
 def test_stable_errors_are_misleading():
     wrong = judged(0.9, 0.95, Interval(0.2, 0.1, 0.3))
     assert wrong.level == "misleading"
-    assert "20% of the stable locations are wrong (10% to 30%)" in wrong.line
+    assert "20% of the consistent locations are wrong (10% to 30%)" in wrong.line
     assert judged(0.9, 0.95, Interval(0.06, 0.04, 0.1)).level == "stable"
 
 

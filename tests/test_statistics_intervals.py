@@ -93,7 +93,7 @@ def test_few_places_and_places_that_err_alike_leave_a_wide_interval_and_one_cube
 
 
 def test_bad_frames_widen_the_interval_of_another_flight():
-    sums = simulated(frames=64, looks=64, quality="bad", side=32)
+    sums = simulated(frames=64, observations=64, quality="bad", side=32)
     here, again, elsewhere = (
         estimate(sums, "alpha", scope=scope) for scope in (THESE_FRAMES, THIS_SCENE, OTHER_SCENES)
     )
@@ -102,23 +102,25 @@ def test_bad_frames_widen_the_interval_of_another_flight():
 
 
 def test_the_interval_is_narrow_where_frames_are_alike_and_wide_where_their_quality_lasts():
-    sums = simulated(frames=64, looks=64, side=32)
+    sums = simulated(frames=64, observations=64, side=32)
     here, again = estimate(sums, "alpha", scope=THESE_FRAMES), estimate(sums, "alpha")
     assert again.high - again.low < 0.2 * (here.high - here.low)
-    alike, lasting = (simulated(6, frames=32, looks=32, quality=quality, side=24) for quality in ("alike", "lasting"))
+    alike, lasting = (
+        simulated(6, frames=32, observations=32, quality=quality, side=24) for quality in ("alike", "lasting")
+    )
     one, other = (estimate(sums, "alpha") for sums in (alike, lasting))
     assert other.high - other.low > 5 * (one.high - one.low)
 
 
 def test_every_number_has_an_interval_and_few_frames_say_so():
-    sums = simulated(frames=6, looks=4)
+    sums = simulated(frames=6, observations=4)
     few = estimate(sums, "alpha")
     assert "take 8 or more" in few.undecided
     without = sums.coarsened(sums.edge, 0)
     assert estimate(without, "voxel_alpha").scope == THESE_FRAMES
     assert estimate(without, "voxel_alpha").value == pytest.approx(value(sums, "voxel_alpha"))
     assert estimate(without, "alpha") == few  # cells know their views though a map has no log
-    sums = simulated(frames=64, looks=6, quality="uneven")
+    sums = simulated(frames=64, observations=6, quality="uneven")
     keys = ("psa", "vss", "entropy", "accuracy", "observation_accuracy", "wrong_of_consistent")
     for key, k in [*((key, None) for key in (*keys, "alpha")), ("alpha", 0), ("accuracy", 1)]:
         found = estimate(sums, key, k)
@@ -144,18 +146,18 @@ def test_numbers_asked_together_have_the_intervals_that_each_has_alone():
 
 
 def test_a_worse_map_differs_and_what_pairs_share_does_not_blur_it():
-    sums = simulated(frames=64, looks=64, side=32)
+    sums = simulated(frames=64, observations=64, side=32)
     same = difference(sums, sums, "psa")
     assert same.low == same.value == same.high == 0
     rng = np.random.default_rng(0)
-    flight = Flight(frames=64, looks=64, side=32)
+    flight = Flight(frames=64, observations=64, side=32)
     over = world(flight, rng)
     worse = sums_of(fly(flight, over, rng, ease=0.4), over)
     found = difference(sums, worse, "alpha")
     assert found.low > 0
     assert found.p_value < 0.001
     # One scene and the same bad frames for both: what they share does not blur the difference
-    flight = Flight(frames=64, looks=64, side=32, quality="bad")
+    flight = Flight(frames=64, observations=64, side=32, quality="bad")
     over = world(flight, np.random.default_rng(0))
     pair = [sums_of(fly(flight, over, np.random.default_rng(1), ease=ease), over) for ease in (1.0, 0.8)]
     paired, apart = difference(*pair, "alpha"), difference(*pair, "alpha", same_frames=False)
