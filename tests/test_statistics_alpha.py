@@ -231,7 +231,7 @@ def test_places_that_flip_between_two_common_classes_are_said_beside_the_verdict
     assert (found.flipping.a, found.flipping.b) == ("0", "1")
     assert found.flipping.part > 0.9
     assert found.verdict.level == "stable"
-    assert "not to act on: 1.9% of the locations of this map flip" in found.verdict.line
+    assert "1.9% of the locations of this map flip" in found.verdict.line
     assert "of that between 0 and 1" in found.verdict.line
     labels = np.repeat(own, 2, axis=1)
     twice = describe(log_of(labels, index=grid(102)).table(), cells=cells_of(labels, index=grid(102)))
