@@ -293,13 +293,13 @@ class Seen:
 
     frame: Int64
     lost: Float64
-    says: Float64
+    shares: Float64
 
     def confused_with(self, of: int, names: Sequence[str]) -> str:
         """Return the class that replaces the area's own."""
-        text = np.maximum(self.lost, 0) @ self.says if len(self.lost) else np.zeros(len(names))
-        text[of] = 0
-        return names[int(text.argmax())] if text.max(initial=0) > 0 else ""
+        missing = np.maximum(self.lost, 0) @ self.shares if len(self.lost) else np.zeros(len(names))
+        missing[of] = 0
+        return names[int(missing.argmax())] if missing.max(initial=0) > 0 else ""
 
 
 def _top_frames(seen: Seen) -> tuple[FrameShare, ...]:

@@ -178,13 +178,13 @@ def _by_voxels(entries: Sequence[Entry], regions: Regions) -> Common:
 
 def _with_observations(common: Common, names: Sequence[str], records: Sequence[Record]) -> Common:
     """Add alpha of the observations that all made, or of each run's own where they cannot be paired."""
-    there = _observations_of_the_same_frames(records)
-    if not there:
+    samples = _observations_of_the_same_frames(records)
+    if not samples:
         return replace(common, notes=(OTHER_OBSERVATIONS, *common.notes), same_frames=False, frames_differ=True)
-    shared, pixels = _compared(names, there)
+    shared, pixels = _compared(names, samples)
     cells = shared.sums.values()
     sums = (replace(own, fine=of.fine, coarse=of.coarse) for own, of in zip(common.sums, cells, strict=True))
-    notes, logs = _fewer_frames(there), tuple(shared.logs.values())
+    notes, logs = _fewer_frames(samples), tuple(shared.logs.values())
     return replace(
         common, basis="observations", notes=(*common.notes, *notes, *pixels), sums=tuple(sums), logs=logs,
         observations=shared.compared, frames_differ=bool(notes),
@@ -194,17 +194,17 @@ def _with_observations(common: Common, names: Sequence[str], records: Sequence[R
 def _observations_of_the_same_frames(records: Sequence[Record]) -> list[CellObservations]:
     """Return the sampled observations of runs; none where one run has none, or other frames."""
     files = [file for record in records if (file := record.observations_file) is not None and file.is_file()]
-    there = [CellObservations.load(file) for file in files]
-    return there if len(there) == len(records) and _same_frames(there) else []
+    samples = [CellObservations.load(file) for file in files]
+    return samples if len(samples) == len(records) and _same_frames(samples) else []
 
 
-def _compared(names: Iterable[str], there: Sequence[CellObservations]) -> tuple[SharedObservations, tuple[str, ...]]:
+def _compared(names: Iterable[str], samples: Sequence[CellObservations]) -> tuple[SharedObservations, tuple[str, ...]]:
     """Return the observations that all runs made, and notes on them.
 
     Where their pixels have different sizes, the pixels that a run left without a label are unknown.
     """
-    shared = compared_observations(dict(zip(names, there, strict=True)))
-    footprints = [float(np.median(own.views.footprint)) if len(own.views) else math.nan for own in there]
+    shared = compared_observations(dict(zip(names, samples, strict=True)))
+    footprints = [float(np.median(own.views.footprint)) if len(own.views) else math.nan for own in samples]
     if not max(footprints) > ALIKE * min(footprints):
         return shared, ()
     compared = replace(shared.compared, ignored=(), order_ignored=shared.compared.order, bounded=True)
@@ -221,10 +221,10 @@ def on_common_observations(
     own = [*entries.values()]
     if _other_frame_of_reference(own) or _no_voxels(own):
         return None
-    there = _observations_of_the_same_frames([entry.record for entry in own if entry.record is not None])
-    if not there:
+    samples = _observations_of_the_same_frames([entry.record for entry in own if entry.record is not None])
+    if not samples:
         return None
-    shared, notes = _compared(entries, there)
+    shared, notes = _compared(entries, samples)
     if not shared.compared.observations:
         return None
     alike = [

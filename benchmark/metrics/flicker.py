@@ -82,7 +82,7 @@ def changed_pixels(previous: Frame, current: Frame, *, depth_tolerance: float = 
     return changed
 
 
-# Video consistency: how many pixels keep their label over clips of n frames (Miao et al. 2021, CVPR, VSPW).
+# Video consistency: the share of pixels that keep their label over clips of n frames (Miao et al. 2021, CVPR, VSPW).
 
 Labels = npt.NDArray[np.integer[Any]]
 
@@ -90,12 +90,12 @@ Labels = npt.NDArray[np.integer[Any]]
 class VideoConsistency:
     """VC_n with ground truth, as in VSPW: 1 is a prediction that never changes where the truth does not.
 
-    Of the pixels whose ground truth is the same in all n frames of a clip, the share whose prediction is the same in
-    all of them, right or wrong; `value` is the mean over all clips of n consecutive frames, the last one included.
+    A clip has the share of the pixels with constant ground truth in its n frames whose prediction is constant too,
+    right or wrong; `value` is the mean over all clips of n consecutive frames, the last one included.
     Frames are added one by one, and none stays in memory. Clips do not reach across a change of the image size.
 
     Attributes:
-        n: Frames a clip, at least 2; VSPW reports 8 and 16.
+        n: Frames per clip, at least 2; VSPW reports 8 and 16.
     """
 
     def __init__(self, n: int) -> None:

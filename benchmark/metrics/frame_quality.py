@@ -108,7 +108,7 @@ class Lag:
         self._age: npt.NDArray[np.int16] | None = None
 
     def add(self, where: Correspondence, now: Frame, model: Frame, truth: Frame, truth_now: Frame) -> None:
-        """Add the next frame; `where` its pixels lay in the frame before, whose truth is `truth`."""
+        """Add the next frame; `where` has the positions of its pixels in the frame before, whose truth is `truth`."""
         if self._age is None:
             self._age = np.full(truth.shape, NONE, dtype=np.int16)
         true = truth_now.predicted

@@ -252,7 +252,7 @@ def shares_of(table: VoxelTable) -> Float64:
     count, likelihood, share = np.bincount(of), _likelihood(seen, most), np.full(STEPS, 1 / STEPS)
     if not len(seen):
         return share
-    for _ in range(ROUNDS):  # how often each share is so, a posteriori
+    for _ in range(ROUNDS):  # probability of each share, a posteriori
         share = share * ((count / (likelihood @ share)) @ likelihood) / count.sum()
     return share
 

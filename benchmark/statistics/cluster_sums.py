@@ -187,7 +187,7 @@ class ClusterSums:
             `observations`; its pairwise agreement is shared out among them in `psa` and `agreeing`.
         edge: Metres, a power of 2.
         step: Frames of a group, a power of 2; 0 where they are unknown.
-        fused: How many frames they come from.
+        fused: Number of frames that they come from.
         truth: True if sums of ground truth are included.
         fine, coarse: The same of sampled cells, which are units instead of voxels and views instead of frames, and of
             cells twice as wide, where there are `CellObservations`.
@@ -452,10 +452,10 @@ FUNCTIONALS: Mapping[str, Functional] = {
     "miou": Functional(("known", "known", "class_right", "class_known", "class_predicted"), miou_of, scale="plain"),
     "ece": Functional(("calibrated", "calibrated", "gap"), ece_of, scale="plain"),
 }
-"""By key: alpha, of cells that two views saw or more; PSA, Krippendorff's alpha of voxels and entropy at OP >= 2, VSS
-at OP >= 3, SBD less that in random order where that is known; with ground truth the accuracy of the fused labels at
-OP >= 2 and of single observations, the wrong among the consistent locations at OP >= 3, mean intersection over union
-and expected calibration error at OP >= 2."""
+"""Numbers by key: alpha, of cells that two views saw or more; PSA, Krippendorff's alpha of voxels and entropy at
+OP >= 2, VSS at OP >= 3, SBD less that in random order where that is known; with ground truth the accuracy of the fused
+labels at OP >= 2 and of single observations, the wrong among the consistent locations at OP >= 3, mean intersection
+over union and expected calibration error at OP >= 2."""
 
 BY_CLASS: Mapping[str, Functional] = {
     "alpha": Functional(CLASS_SUMS, class_alpha_of, -1.0, 1.0, "agreement", parts=CELLS),

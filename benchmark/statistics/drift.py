@@ -107,8 +107,8 @@ def trends(events: Events) -> Trends:
     squares = np.bincount(np.repeat(half, np.diff(starts)), weights=weight * weight, minlength=2 * len(T))
     of_means = np.asarray(sums.multiply(sums).sum(axis=1)).ravel() / np.maximum(count, 1)
     variation = (squares - of_means).reshape(-1, 2).sum(axis=1)
-    tells = (T >= ENOUGH_OBSERVATIONS) & (variation > ONE_HOT * T)
-    return Trends(np.where(tells, common, np.nan), np.where(tells, variation, np.nan))
+    enough = (T >= ENOUGH_OBSERVATIONS) & (variation > ONE_HOT * T)
+    return Trends(np.where(enough, common, np.nan), np.where(enough, variation, np.nan))
 
 
 def flips(events: Events) -> Flips:

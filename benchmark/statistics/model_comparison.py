@@ -89,7 +89,7 @@ def compared(*, truth: bool) -> tuple[Quantity, ...]:
 
 
 def repeated_rows(tables: Tables) -> list[Int64]:
-    """Return rows of the voxels that every map saw twice or more, one array a map, in the same order of voxels."""
+    """Return rows of the voxels that every map saw twice or more, one array per map, in the same order of voxels."""
     rows = shared_rows(*tables.values())
     again = np.all([table.op[r] >= 2 for table, r in zip(tables.values(), rows, strict=True)], axis=0)
     return [r[again] for r in rows]

@@ -31,7 +31,7 @@ LASTING = {0.0: 4.0, 0.8: 1.0}
 
 REACHES = {0.0: 4.0, 0.08: 1.0}
 """Correlation lengths of the effects of locations, as a share of the scene's extent, and their weights before the data:
-an effect that reaches as far as the scene cannot be told from none."""
+an effect that reaches as far as the scene cannot be separated from none."""
 
 SIZES = 7
 """Variances of an effect that are tried, evenly spaced in their logarithm: more of them, or more correlations, cover no

@@ -125,7 +125,7 @@ def grouped(cell, label, drawn, pixels):
         while (cell[there] != own) | (label[there] != its_label):
             slot = (slot + 1) & mask
             there = table[slot] if table[slot] >= 0 else i
-        cell[n], label[n], drawn[n], pixels[n] = own, its_label, drawn[i], 0.0  # of the next one, should it be new
+        cell[n], label[n], drawn[n], pixels[n] = own, its_label, drawn[i], 0.0  # the next pair, if it is new
         new = table[slot] < 0
         number = n if new else there
         table[slot] = number

@@ -106,7 +106,7 @@ def _shuffle(order, T, state):
 
 @serial
 def mean_drifts(chunk, voxels, first, T, log, K, entries, seeds, null):
-    """Write the mean drift a step in TURNS orders, turns of one random order, of these voxels (r,) to null (n,).
+    """Write the mean drift per step in TURNS orders, turns of one random order, of these voxels (r,) to null (n,).
 
     first, T (n,) are the voxels' rows of the log, seeds (n,) their random streams; `entries` is the most that one has.
     """
