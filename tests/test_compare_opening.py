@@ -91,7 +91,7 @@ def test_a_small_summary_holds_all_but_voxels(run, tmp_path):
     assert (back.up, back.flicker) == (own.up, own.flicker)
     assert all(value(back.sums, key) == value(own.sums, key) for key in ("psa", "alpha", "voxel_alpha", "vss"))
     fails(
-        DataError, re.escape(f"{file}: is a small summary, without the voxels that mIoU needs"), back.with_voxels,
+        DataError, re.escape(f"{file}: it is a small summary, without the voxels that mIoU needs"), back.with_voxels,
         "mIoU",
     )  # fmt: skip
 
@@ -105,7 +105,7 @@ def test_a_small_summary_becomes_coarser_until_it_fits(run, tmp_path):
     coarse, fine = open_run(file).scenes["wall"].sums, one.scenes["wall"].sums
     assert coarse.edge > fine.edge
     assert value(coarse, "alpha") == pytest.approx(value(fine, "alpha"))
-    fails(DataError, re.escape("keep fewer scenes"), save_summary, one, file, 100)
+    fails(DataError, re.escape("use fewer scenes"), save_summary, one, file, 100)
     sums = open_run(f"{run}:a").scenes["wall"].sums
     assert sums.cells > 8
     wide = sums.coarsened(2.0**62, 2**30 if sums.step else 0)
@@ -126,7 +126,7 @@ def test_a_damaged_small_summary_is_one_line(run, tmp_path):
     with zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as archive:
         archive.writestr("summary.json", b" " * (LARGEST + 1))
     assert file.stat().st_size < 200_000
-    fails(DataError, re.escape(f"{file}: unpacks to more than 100 MB"), open_run, file)
+    fails(DataError, re.escape(f"{file}: it unpacks to more than 100 MB"), open_run, file)
 
 
 @pytest.mark.parametrize(("field", "number", "line"), [

@@ -55,7 +55,7 @@ def test_a_rule_is_read(text, key, change, below, limit, class_name, scene):
     ("alpha", "write [scene NAME:] [class NAME|*:] MEASURE [drop|rise] <|> NUMBER[%]"),
     ("alpha drop 0.02", "not understood"), ("alpha < 1e999", "too large"),
     ("alhpa drop < 0.02", "no measure 'alhpa'; did you mean 'alpha'?"),
-    ("recall > 0.6", "recall is of a class; write 'class NAME: recall > 0.6'"),
+    ("recall > 0.6", "recall is of one class; write 'class NAME: recall > 0.6'"),
     ("class car: ece < 0.1", "ece is of all classes; leave 'class car:' out"),
     ("coverage > 0.9", "coverage is relative to a baseline"),
 ])  # fmt: skip
@@ -139,9 +139,9 @@ def test_a_rule_of_each_class_shares_the_level_and_voxel_sizes_must_be_the_same(
     rules = gate_config(rules=["class *: alpha > 0.1", "class wall: alpha > 0.1"], level=0.06)
     *each, alone = gate(f"{run}:a", None, rules).judgements
     assert [row.rule.text for row in each] == [f"class {name}: alpha > 0.1" for name in ("wall", "door", "window")]
-    assert each[0].found.low < alone.found.low
+    assert each[0].interval.low < alone.interval.low
     closer = gate(f"{run}:a", None, gate_config(rules=["class wall: alpha > 0.1"], level=0.02)).judgements[0]
-    assert closer.found.low == pytest.approx(each[0].found.low)
+    assert closer.interval.low == pytest.approx(each[0].interval.low)
     data = run.parent / "wall"
     semstab.run(configure(data, check=None, voxel_size=0.4, models=["a"]), out=tmp_path / "large", report=False)
     fails(
@@ -211,10 +211,10 @@ def test_the_command_says_what_came_of_each_rule(run, tmp_path):
 
 
 @pytest.mark.parametrize(("arguments", "line"), [
-    (["--rule", "alpha drop < 0.02"], "a drop is from a baseline; give --against RUN"),
+    (["--rule", "alpha drop < 0.02"], "a drop needs a baseline; give --against RUN"),
     (["--rule", "class q: alpha > 0.1"], "no class 'q'"),
     (["--rule", "scene q: alpha > 0.1"], "no scene 'q'; known: wall"),
-    (["--rule", "flicker < 99", "--scope", "other-scenes"], "flicker is known by frame alone"),
+    (["--rule", "flicker < 99", "--scope", "other-scenes"], "flicker is known only by frame"),
     (["--rule", "alpha > 0.1", "--scope", "some"], "scope"),
     (["--rule", "class door: recall > 0.1"], "has no recall of wall; run it with --statistics"),
     (["--rule", "accuracy > 0.1"], "has no accuracy of wall; run it with --statistics"),
@@ -389,9 +389,9 @@ def test_the_coverage_rule_sees_both_kinds_of_silence(run, quiet_models, name):
     rules = gate_config(rules=["coverage drop < 0.05"])
     result = gate(f"{quiet_models}:{name}", f"{run}:a", rules)
     (each,) = result.judgements
-    assert (result.exit_code, each.reason, each.found.low) == (4, "counted", each.found.high)
+    assert (result.exit_code, each.reason, each.interval.low) == (4, "counted", each.interval.high)
     voxels, observations = map(float, re.findall(r"([\d.]+) % of", *result.notes))
-    assert 100 * (1 - each.found.value) == pytest.approx(min(voxels, observations), abs=0.051)
+    assert 100 * (1 - each.interval.value) == pytest.approx(min(voxels, observations), abs=0.051)
     table = {run_: semstab.load_result(run_).record(model=own).table().op
              for run_, own in ((quiet_models, name), (run, "a"))}  # fmt: skip
     new, base = (op[op >= 2].astype(int) for op in table.values())
@@ -410,18 +410,18 @@ def test_a_change_of_alpha_is_what_a_comparison_says_of_the_same_runs(run, quiet
     rules = ["alpha drop < 0.02", "class *: alpha rise < 0.02", "alpha > 0.1", "voxel alpha drop < 0.02"]
     of_all, *of_classes, alone, voxels = gate(new, base, gate_config(rules=rules)).judgements
     (found,) = (row for row in compared.contrasts if row.measure == "alpha")
-    assert (of_all.base, of_all.new, of_all.found.value) == (found.base, found.other, -found.difference.value)
+    assert (of_all.base, of_all.new, of_all.interval.value) == (found.base, found.other, -found.difference.value)
     listed = {row.of: row for row in compared.by_class if row.measure == "alpha"}
     assert [row.rule.class_name for row in of_classes] == [*listed]
     for row, own in zip(of_classes, listed.values(), strict=True):
-        assert (row.base, row.new, row.found.value) == (own.base, own.other, own.difference.value)
+        assert (row.base, row.new, row.interval.value) == (own.base, own.other, own.difference.value)
     kept = {name: semstab.load_result(folder).record(model=own).statistics
             for name, folder, own in (("new", quiet_models, "part"), ("base", run, "a"))}  # fmt: skip
     assert alone.new == kept["new"].headline.alpha.value
     assert of_all.base != kept["base"].headline.alpha.value
     assert voxels.new == pytest.approx(kept["new"].agreement.voxel_alpha.value)
     text, *_ = gate(new, base, gate_config(rules=rules[:1])).notes
-    assert re.fullmatch(r"wall: the run leaves 1\d\.\d% of the pixels without a label .* agrees as by chance", text)
+    assert re.fullmatch(r"wall: the run gives no label to 1\d\.\d% of the pixels .* agree as by chance", text)
     said = " ".join(cli("compare", base, new).output.split())
     assert f"alpha {found.base:.3f} and {found.other:.3f}" in said
     assert (
@@ -456,7 +456,7 @@ def test_a_plan_says_how_many_frames_a_rule_needs(run):
     assert "coverage drop < 0.1: counted" in done.output
     result = gate(f"{run}:a", f"{run}:b", gate_config(rules=["alpha drop < 0.1"]))
     (each,) = result.judgements
-    half = (each.found.high - each.found.low) / 2
+    half = (each.interval.high - each.interval.low) / 2
     assert wide == pytest.approx(18 * (half / 0.1) ** 2, rel=1.5)
 
 

@@ -231,8 +231,8 @@ def test_places_that_flip_between_two_common_classes_are_said_beside_the_verdict
     assert (found.flipping.a, found.flipping.b) == ("0", "1")
     assert found.flipping.part > 0.9
     assert found.verdict.level == "stable"
-    assert "not to act on: 1.9% of the locations of this map flip" in found.verdict.line
-    assert "of that between 0 and 1" in found.verdict.line
+    assert "1.9% of the locations of this map flip" in found.verdict.line
+    assert "of them between 0 and 1" in found.verdict.line
     labels = np.repeat(own, 2, axis=1)
     twice = describe(log_of(labels, index=grid(102)).table(), cells=cells_of(labels, index=grid(102)))
     assert "seen too seldom to tell which of them flip" in twice.verdict.line
@@ -404,7 +404,7 @@ def test_samples_that_span_too_much_or_differ_in_classes_are_refused():
     far = dataclasses.replace(cells, low=(cells.low[0], cells.low[1] - (1 << 19), cells.low[2]))
     with pytest.raises(DataError, match="leave out far depth"):
         common_observations([cells, far])
-    with pytest.raises(DataError, match="other classes cannot be compared"):
+    with pytest.raises(DataError, match="different classes cannot be compared"):
         common_observations([cells, dataclasses.replace(cells, K=4)])
 
 

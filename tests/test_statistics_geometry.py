@@ -102,7 +102,7 @@ def test_voxels_in_one_map_only_or_seen_once_do_not_count_and_views_that_do_not_
     assert nothing.voxels == 0
     assert math.isnan(nothing.share.value)
     world = fused(flight())
-    with pytest.raises(DataError, match="frame 1: needs a view of its size to see labels from; there is none"):
+    with pytest.raises(DataError, match="frame 1: it needs a view of its size to see labels from; there is none"):
         list(rendered(flight(), world, views=list(flight())[:1]))
     with pytest.raises(DataError, match="it is 2x1"):
         list(rendered(flight(), world, views=[sight_line(0, [(0.1, 0), (0.2, 0)])]))

@@ -18,7 +18,7 @@ from semstab.statistics.accumulate import Cubes, cluster_sums_of
 from semstab.statistics.agreement import ratio_of
 from semstab.statistics.cluster_sums import value
 from semstab.statistics.intervals import (
-    NO_PLACES,
+    NO_LOCATIONS,
     confidence_intervals,
     difference,
     estimate,
@@ -77,7 +77,7 @@ def test_no_error_seen_is_not_no_error_and_next_to_nothing_is_nowhere():
     places = Cubes.of(log_of(np.zeros((32 * 32, 3), dtype=int), K=2, index=grid(32), voxel_size=0.125).table())
     columns = np.stack([rng.random(32 * 32) < 0.3, np.ones(32 * 32)], axis=1)
     assert places.estimate(columns, ratio_of).decided
-    assert places.estimate(1e-112 * columns, ratio_of).undecided == NO_PLACES
+    assert places.estimate(1e-112 * columns, ratio_of).undecided == NO_LOCATIONS
 
 
 def test_few_places_and_places_that_err_alike_leave_a_wide_interval_and_one_cube_none():

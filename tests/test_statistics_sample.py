@@ -70,5 +70,5 @@ def test_a_small_map_is_its_own_sample_and_a_damaged_file_is_refused(log, tmp_pa
     assert len(sample.table) == SIDE**2
     assert to_json(analyse(sample).summary) == to_json(describe(log.table(), log))
     (tmp_path / "part.npz").write_bytes(b"no arrays")
-    with pytest.raises(DataError, match=r"part\.npz: not a sample of a map"):
+    with pytest.raises(DataError, match=r"part\.npz: it is missing, damaged or not a sample of a map"):
         MapSample.load(tmp_path / "part.npz")

@@ -1,1 +1,1 @@
-"""Runs side by side: what differs between them, how surely, and where."""
+"""Comparison of runs: their differences, with probabilities and locations."""

@@ -1,4 +1,4 @@
-"""Acceptance thresholds from a run with ground truth, and what they say in the terminal."""
+"""Acceptance thresholds from a run with ground truth, and their text for the terminal."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def calibrate_run(run: str | Path, *, precision: float = 0.95, confidence: float
     'FOLDER:MODEL' selects one of several label sources.
 
     Raises:
-        ConfigError, DataError: As `open_run`, and for a scene whose ground truth was not fused.
+        ConfigError, DataError: As `open_run` does, and for a scene whose ground truth was not fused.
     """
     own = open_run(run)
     maps, sampled = [], 1.0
@@ -45,7 +45,7 @@ def calibrate_run(run: str | Path, *, precision: float = 0.95, confidence: float
 
 
 def _with_truth(record: Record, truth_file: Path) -> tuple[VoxelTable, Truth]:
-    """Return a map with its true classes; of a very large one a sample, by a hash of the location."""
+    """Return a map with its true classes, or a sample of a very large map by a hash of the location."""
     share, parts = share_of(record.summary.table.voxels), []
     files = [file for file in (record.voxels_file, truth_file) if file is not None]
     for table, truth in side_by_side([Tiles.open(file, VoxelTable) for file in files]):
@@ -59,18 +59,18 @@ def _with_truth(record: Record, truth_file: Path) -> tuple[VoxelTable, Truth]:
 def lines(result: AcceptanceThresholds) -> Iterator[str]:
     """Yield the thresholds in sentences for the terminal."""
     yield (
-        f"labels that are right with a probability of {result.precision:g} or more, class by class at a confidence of"
-        f" {result.confidence:g}; calibrated on {result.calibrated_on}"
+        f"these labels are right with a probability of {result.precision:g} or more, each class at a confidence of"
+        f" {result.confidence:g}; they were calibrated on {result.calibrated_on}"
     )
     width = min(max(map(len, result.classes), default=0), 20)
     for name, own in result.classes.items():
         right = f"{own.by:<6} >= {own.at_least:<5.3g} right in {own.precision:.3f}, at least {own.low:.3f}"
         if not own.voxels:
-            yield f"  {name[:width]:<{width}}  never: no label of it has a known truth"
+            yield f"  {name[:width]:<{width}}  never: no label of this class has a known truth"
         elif own.never:
             yield f"  {name[:width]:<{width}}  never; best {right} ({own.voxels:,} voxels)"
         else:
             yield f"  {name[:width]:<{width}}  {right}: {own.left:.0%} left"
     yield f"{result.left:.1%} of the voxels are left"
     if any(own.never for own in result.classes.values()):
-        yield "more locations, in other scenes, show more: errors near each other count as few"
+        yield "more locations in other scenes may show more: errors near each other count as few"

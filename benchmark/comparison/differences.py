@@ -1,4 +1,4 @@
-"""By how much runs differ: each measure with its interval, the scope that this answers, and its p-value."""
+"""Differences between runs: each measure with its interval, the scope of the interval, and its p-value."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ LEVEL = 0.05
 
 
 def contrasts(common: Common, base: Entry, other: Entry, number: int) -> tuple[Contrast, ...]:
-    """Return all that is compared of a scene, in the order of `quantities`.
+    """Return all contrasts of a scene, in the order of `quantities`.
 
     `number` is the other run's among the runs.
     """
@@ -70,9 +70,9 @@ def contrasts(common: Common, base: Entry, other: Entry, number: int) -> tuple[C
 
 
 def by_class(common: Common, base: Entry, number: int) -> tuple[Contrast, ...]:
-    """Return the same of each class: against all others, or of the locations of the class.
+    """Return the contrasts of each class: against all others, or of the locations of the class.
 
-    These are by the ground truth, or else by what all runs together say, so that none of them chooses its own.
+    The locations follow from the ground truth, or else from all runs together, so that no run chooses its own.
     """
     names = base.classes or tuple(str(k) for k in range(base.sums.K))
     own = list(_of_locations(common, names, number)) if common.tables else []
@@ -94,19 +94,19 @@ def over_scenes(result: Sequence[Sequence[Contrast]]) -> tuple[Contrast, ...]:
 
 
 def corrected(lists: Sequence[Sequence[Contrast]]) -> list[tuple[Contrast, ...]]:
-    """Return lists with p-values corrected for all that stand in them together, and what is said of each difference."""
+    """Return lists with p-values corrected for all contrasts in them together, and the change that each shows."""
     p_values = iter(holm([row.difference.p_value for rows in lists for row in rows]))
     better = {quantity.key: quantity.sign for quantity in (*quantities(), *BY_CLASS)}
-    return [tuple(_said(row, next(p_values), better[row.measure]) for row in rows) for rows in lists]
+    return [tuple(_with_change(row, next(p_values), better[row.measure]) for row in rows) for rows in lists]
 
 
-def _said(row: Contrast, p_holm: float, sign: float) -> Contrast:
+def _with_change(row: Contrast, p_holm: float, sign: float) -> Contrast:
     shown = p_holm < LEVEL and row.difference.decided
     gain = -sign * row.difference.value
     return dataclasses.replace(row, p_holm=p_holm, change=("better" if gain > 0 else "worse") if shown else "")
 
 
-# --- Of a scene -------------------------------------------------------------------------------------------------------
+# --- One scene --------------------------------------------------------------------------------------------------------
 
 
 def _rows(common: Common, base: Entry, other: Entry, number: int) -> Iterator[Contrast]:
@@ -126,7 +126,7 @@ def _rows(common: Common, base: Entry, other: Entry, number: int) -> Iterator[Co
 
 
 def _comparable(quantity: Quantity, common: Common) -> bool:
-    """Return whether voxels of all sizes, and labels and scores, gain alike by a quantity, where they are compared."""
+    """Return whether a quantity is fair to the voxel sizes, and to the labels and scores, that are compared."""
     return quantity in OF_ANY_SIZE or not (common.sizes_differ or common.mixed)
 
 
@@ -156,9 +156,9 @@ def sums_difference(
 ) -> Interval:
     """Return a number of one run's sums less another's, or its coverage of the other's voxels, with its interval.
 
-    - `same_frames`: False for another flight; where it is not given the sums tell
-    - `apart`: the runs have nothing in common: each errs by itself
-    - `level`: of the interval
+    - `same_frames`: False for another flight; by default the sums show it
+    - `apart`: the runs have nothing in common: their errors are independent
+    - `level`: level of the interval
     """
     if new.truth != base.truth:
         new, base = new.without_truth(), base.without_truth()
@@ -221,7 +221,7 @@ def _against_all(common: Common, names: Sequence[str], number: int) -> Iterator[
             continue
         for k, name in enumerate(names):
             seen = before["observations"].sum() / max(before["voxels"].sum(), 1e-9)
-            if before["evidence"][:, k].sum() >= LEAST_VOXELS * seen:  # of evidence that is worth so many voxels
+            if before["evidence"][:, k].sum() >= LEAST_VOXELS * seen:  # the evidence amounts to so many voxels
                 yield from _row(quantity, before, after, common, k, name)
 
 
@@ -238,18 +238,15 @@ def _of_locations(common: Common, names: Sequence[str], number: int) -> Iterator
 
 
 def class_of_locations(common: Common) -> Int64:
-    """Return the class (n,) of each common location: the true one, or what all runs together say.
-
-    -1 where it is not known.
-    """
+    """Return the class (n,) of each common location: the true one, or that of all runs together; -1 if unknown."""
     return common.label if common.label is not None else joint_class(common.tables)
 
 
-# Runs beside the first one, scene by scene and over all scenes.
+# Each run is compared with the first one, scene by scene and over all scenes.
 
 SCHEMA = 2
 COLUMNS = "columns"
-"""Folder of the files SCENE__BASE__RUN.parquet: what changed in each voxel."""
+"""Folder of the files SCENE__BASE__RUN.parquet: the changes in each voxel."""
 
 Up = tuple[float, float, float]
 Progress = Callable[[str], None]
@@ -257,10 +254,10 @@ Progress = Callable[[str], None]
 
 @dataclass(frozen=True, eq=False)
 class ComparisonData:
-    """What was found, and what figures and files show of it.
+    """The result of a comparison, and the data of its figures and files.
 
     Attributes:
-        changes: In each voxel, by scene and run, where voxels could be paired.
+        changes: Changes in each voxel, by scene and run, where voxels could be paired.
         up: The up axis of each scene, where it is known.
     """
 
@@ -272,13 +269,13 @@ class ComparisonData:
 def find(
     runs: Sequence[str | os.PathLike[str]], progress: Progress = lambda what: None, scope: Scope = THIS_SCENE
 ) -> ComparisonData:
-    """Compare runs with the first one for a scope; `progress` is told what is done.
+    """Compare runs with the first one for a scope; `progress` is called with each step.
 
     Raises:
-        ConfigError: For fewer than two, and what `open_runs`, `shared_scenes` and `pair` raise.
+        ConfigError: For fewer than two, and as `open_runs`, `shared_scenes` and `pair` do.
     """
     if len(runs) < 2:
-        raise ConfigError("there is nothing to compare it with; name two runs or more, the one to compare with first")
+        raise ConfigError("there is nothing to compare the run with; name two runs or more, the base first")
     handles = open_runs(runs)
     scenes: list[SceneComparison] = []
     changes: dict[tuple[str, str], Changes] = {}
@@ -320,10 +317,10 @@ def _scene(scene: str, runs: Sequence[RunHandle], scope: Scope) -> tuple[SceneCo
                 columns=Path(COLUMNS) / f"{slug(scene, names[0], names[n])}.parquet",
             )
         against.append(result)
-    return _found(scene, common, tuple(against)), changes
+    return _scene_comparison(scene, common, tuple(against)), changes
 
 
-def _found(scene: str, common: Common, against: tuple[Against, ...]) -> SceneComparison:
+def _scene_comparison(scene: str, common: Common, against: tuple[Against, ...]) -> SceneComparison:
     frames = min((sums.frame_count for sums in common.sums), default=0)
     voxels = len(common.tables[0]) if common.tables else 0
     voxels = int((common.tables[0].op >= 2).sum()) if voxels else 0
@@ -333,7 +330,7 @@ def _found(scene: str, common: Common, against: tuple[Against, ...]) -> SceneCom
 
 
 def _over_all(scenes: Sequence[SceneComparison]) -> tuple[Against, ...]:
-    """Return macro means; of one scene what was found there."""
+    """Return macro means; for one scene its own results."""
     if len(scenes) == 1:
         return tuple(Against(own.other, own.contrasts, own.by_class) for own in scenes[0].against)
     runs = list(zip(*(scene.against for scene in scenes), strict=True))

@@ -1,4 +1,4 @@
-"""May a new model ship? Rules, judged by what the data show: each passes, fails, or is undecided."""
+"""Gates, which decide if a new model may ship: each rule passes, fails, or is undecided by the data."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ from semstab.statistics.intervals import (
     within_a_flight,
 )
 
-# What a rule may be about: the numbers that follow from the sums of a run, and what to run for those it lacks.
+# Rules are about the numbers that follow from the sums of a run; each has advice for runs that do not have it.
 
 TRUTH = "run it with --statistics, on a scene with ground truth"
 OBSERVATION_ACCURACY = Quantity(
@@ -59,14 +59,14 @@ OBSERVATION_ACCURACY = Quantity(
 
 @dataclass(frozen=True)
 class GateMeasure:
-    """A number that rules know.
+    """A number that rules may name.
 
     Attributes:
-        quantity: Its key among cluster sums, its title, which way is good.
-        name: By which a rule calls it; `also` other names.
-        of_all, of_class: Where it has a value: of all classes, of one.
-        only_change: It has none by itself.
-        lacking: What to do where a run does not have it.
+        quantity: Its key among cluster sums, its title, and its better direction.
+        name: Its name in rules; `also` has other names.
+        of_all, of_class: True if it has a value of all classes, or of one class.
+        only_change: True if it has no value by itself.
+        if_missing: Advice where a run does not have it.
     """
 
     quantity: Quantity
@@ -75,7 +75,7 @@ class GateMeasure:
     of_all: bool = True
     of_class: bool = False
     only_change: bool = False
-    lacking: str = "run it again with more overlap between frames"
+    if_missing: str = "run it again with more overlap between frames"
 
 
 MEASURES = (
@@ -84,25 +84,25 @@ MEASURES = (
     GateMeasure(RECURRENT_VSS, "vss"),
     GateMeasure(VOXEL_ALPHA, "voxel alpha", of_class=True),
     GateMeasure(ENTROPY, "entropy"),
-    GateMeasure(SBD_EXCESS, "sbd excess", lacking="run it with --statistics, which keeps the order of observations"),
-    GateMeasure(FLICKER, "flicker", lacking="run it again with two frames or more"),
+    GateMeasure(SBD_EXCESS, "sbd excess", if_missing="run it with --statistics, which keeps the order of observations"),
+    GateMeasure(FLICKER, "flicker", if_missing="run it again with two frames or more"),
     GateMeasure(COVERAGE, "coverage", only_change=True),
-    GateMeasure(ACCURACY, "accuracy", lacking=TRUTH),
-    GateMeasure(OBSERVATION_ACCURACY, "observation accuracy", ("look accuracy",), lacking=TRUTH),
-    GateMeasure(MIOU, "miou", lacking=TRUTH),
-    GateMeasure(ECE, "ece", lacking=TRUTH),
-    GateMeasure(MISLEADING, "wrong of consistent", ("wrong of stable", "stable-and-wrong"), lacking=TRUTH),
-    GateMeasure(RECALL, "recall", of_all=False, of_class=True, lacking=TRUTH),
-    GateMeasure(PRECISION, "precision", of_all=False, of_class=True, lacking=TRUTH),
-    GateMeasure(IOU, "iou", of_all=False, of_class=True, lacking=TRUTH),
+    GateMeasure(ACCURACY, "accuracy", if_missing=TRUTH),
+    GateMeasure(OBSERVATION_ACCURACY, "observation accuracy", ("look accuracy",), if_missing=TRUTH),
+    GateMeasure(MIOU, "miou", if_missing=TRUTH),
+    GateMeasure(ECE, "ece", if_missing=TRUTH),
+    GateMeasure(MISLEADING, "wrong of consistent", ("wrong of stable", "stable-and-wrong"), if_missing=TRUTH),
+    GateMeasure(RECALL, "recall", of_all=False, of_class=True, if_missing=TRUTH),
+    GateMeasure(PRECISION, "precision", of_all=False, of_class=True, if_missing=TRUTH),
+    GateMeasure(IOU, "iou", of_all=False, of_class=True, if_missing=TRUTH),
 )
-"""In the order in which they are listed."""
+"""Measures in the order of lists."""
 
-NOTHING = "nothing that it is of was seen twice"
+NOTHING = "no location that it needs was seen twice"
 SCORES = "one run has labels and the other scores, which spread their evidence; run both as labels"
 
 OF_EVIDENCE = (PSA, VOXEL_ALPHA, RECURRENT_VSS, ENTROPY, SBD_EXCESS, ECE)
-"""What depends on whether a model gives labels or scores."""
+"""Measures that depend on the output of a model: labels or scores."""
 
 
 def _plain(name: str) -> str:
@@ -116,7 +116,7 @@ def measure_named(name: str, where: str) -> GateMeasure:
     """Return a measure by any of its names.
 
     Raises:
-        ConfigError: If there is no such measure; it says where the name stands.
+        ConfigError: If there is no such measure; the message starts with `where`.
     """
     result = NAMED.get(_plain(name))
     if result is None:
@@ -129,7 +129,7 @@ def measure_named(name: str, where: str) -> GateMeasure:
 Change = Literal["drop", "rise"]
 
 ALL = "*"
-"""Instead of a class' name: a rule of each class."""
+"""The name instead of a class' name for a rule of each class."""
 
 GRAMMAR = "[scene NAME:] [class NAME|*:] MEASURE [drop|rise] <|> NUMBER[%]"
 
@@ -143,15 +143,14 @@ RULE = re.compile(
 
 @dataclass(frozen=True)
 class Rule:
-    """What shall hold.
+    """A condition on a measure.
 
     Attributes:
-        text: As it was given.
-        change: Of what: how far the measure fell from the baseline's ('drop'), or rose; its own value where none is
-            named.
-        below: Whether that shall be below the limit, or above.
-        limit: As the measure is given: shares from 0 to 1, flicker in percent.
-        or_equal: Whether it may be the limit itself, which counts alone can tell.
+        text: The rule as it was written.
+        change: The change from the baseline that is limited, a 'drop' or a 'rise'; None for the value itself.
+        below: True for a number below the limit, false for one above.
+        limit: The limit in the unit of the measure: shares from 0 to 1, flicker in percent.
+        or_equal: True if the number may be the limit itself, which only counts can show.
     """
 
     text: str
@@ -164,7 +163,7 @@ class Rule:
     or_equal: bool = False
 
     def of_each(self, classes: Sequence[str]) -> tuple[Rule, ...]:
-        """Return the rules that it stands for: itself, or with 'class *' one for each class."""
+        """Return the rules that this one stands for: itself, or with 'class *' one for each class."""
         if self.class_name != ALL:
             return (self,)
         return tuple(
@@ -173,7 +172,7 @@ class Rule:
 
     @property
     def bounds_a_loss(self) -> bool:
-        """Return whether it says how much worse the measure may become."""
+        """Return whether the rule limits how much worse the measure may become."""
         loss = "drop" if self.measure.quantity.better == "higher" else "rise"
         return self.below and self.change == loss
 
@@ -182,7 +181,7 @@ def parse(text: str) -> Rule:
     """Return a rule from its text.
 
     Raises:
-        ConfigError: If it is none, with the grammar.
+        ConfigError: If the text is no rule; the message has the grammar.
     """
     result = RULE.fullmatch(text)
     if result is None:
@@ -207,23 +206,23 @@ def _check_rule(rule: Rule) -> None:
     if not math.isfinite(rule.limit):
         raise ConfigError(f"rule '{rule.text}': its number is too large")
     if rule.class_name is None and not rule.measure.of_all:
-        raise ConfigError(f"rule '{rule.text}': {name} is of a class; write 'class NAME: {rule.text}'")
+        raise ConfigError(f"rule '{rule.text}': {name} is of one class; write 'class NAME: {rule.text}'")
     if rule.class_name is not None and not rule.measure.of_class:
         raise ConfigError(f"rule '{rule.text}': {name} is of all classes; leave 'class {rule.class_name}:' out")
     if rule.change is None and rule.measure.only_change:
         raise ConfigError(f"rule '{rule.text}': {name} is relative to a baseline; write '{name} drop < 0.05'")
 
 
-# One rule on one scene, or over all: what the data show of it, and what follows.
+# The verdict on one rule, for one scene or over all.
 
 Verdict = Literal["passes", "fails", "undecided"]
 
 
 def verdict(rule: Rule, interval: Interval) -> Verdict:
-    """Return what an interval, each of whose ends is passed with the gate's level, says of a rule.
+    """Return the verdict on a rule from an interval, each end of which is missed with the gate's level.
 
-    Passes where the whole of it keeps to the limit. Fails where none of it does; a loss fails as soon as it is shown
-    and not shown to be smaller than the limit. A number that is known is not undecided.
+    A rule passes where the whole interval is within the limit, and fails where none of it is; a loss fails as soon as
+    it is shown and not shown to be smaller than the limit. A number that is known is not undecided.
     """
     if interval.undecided or math.isnan(interval.low) or math.isnan(interval.high):
         return "undecided"
@@ -245,7 +244,7 @@ def bounded(
     level: float = 0.05,
     scope: Scope = THIS_SCENE,
 ) -> Interval:
-    """Return what a rule bounds, from sums: a value, a drop or a rise; each end is missed with probability `level`."""
+    """Return the value, drop or rise that a rule bounds, from sums; each end is missed with probability `level`."""
     key, both = rule.measure.quantity.key, 1 - 2 * level
     if base is None or rule.change is None:
         return estimate(new, key, k, THESE_FRAMES if of_space_alone(key, k) else scope, both)
@@ -259,19 +258,20 @@ def negative(interval: Interval) -> Interval:
     return dataclasses.replace(interval, value=0.0 - interval.value, low=0.0 - interval.high, high=0.0 - interval.low)
 
 
-# The settings of a gate: its rules, the level, what is to become of what is undecided.
+# The settings of a gate: its rules, the level, and the outcome of undecided rules.
 
 Undecided = Literal["report", "pass", "fail"]
 
 
 class GateConfig(BaseModel):
-    """What stands in gate.yaml.
+    """The content of gate.yaml.
 
     Attributes:
-        level: The probability with which a rule may fail that holds, or pass that does not.
-        undecided: What a gate with undecided rules does: 'report' them, so that it neither passes nor fails; 'pass',
-            'fail'.
-        scope: For which data rules are judged: 'this scene' flown again, 'these frames', or 'other scenes' like these.
+        level: Largest probability that a rule that holds fails, or that one that does not hold passes.
+        undecided: The outcome of a gate with undecided rules: 'report' them, so that it neither passes nor fails;
+            'pass', 'fail'.
+        scope: The data for which rules are assessed: 'this scene' flown again, 'these frames', or 'other scenes' like
+            these.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
@@ -289,7 +289,7 @@ def gate_config(
     undecided: str | None = None,
     scope: str | None = None,
 ) -> GateConfig:
-    """Build the settings from a YAML file and options, which count more; rules are added to the file's.
+    """Build the settings from a YAML file and options, which have priority; rules are added to the file's.
 
     Raises:
         ConfigError: If a setting is wrong; it names the file and the setting.
@@ -304,64 +304,66 @@ def gate_config(
     return config
 
 
-# What a gate found: rule by rule, and whether the new run may pass.
+# The result of a gate, rule by rule and for the new run as a whole.
 
 
 POWER = 0.8
-"""How probable it is to be that a rule is decided, where frames are planned."""
+"""Probability of a decision on a rule for which frames are planned."""
 
 
 @dataclass(frozen=True)
 class Judgement:
-    """What became of a rule.
+    """The verdict on a rule.
 
     Attributes:
-        found: What it bounds: the change or the number itself, with one-sided ends at the gate's level.
-        new, base: The numbers of both, NaN where there is none.
+        interval: The change, or the number itself, that the rule bounds, with one-sided ends at the gate's level.
+        new, base: The numbers of both runs, NaN where there is none.
     """
 
     rule: Rule
     verdict: Verdict
-    found: Interval
+    interval: Interval
     new: float
     base: float
 
     @property
     def about(self) -> str:
         """The scope of the interval: what varies."""
-        return self.found.scope
+        return self.interval.scope
 
     def frames_needed(self, level: float) -> int | None:
-        """Return from how many frames on the rule is decided with a probability of POWER; None where none tell.
+        """Return the number of frames that decide the rule with a probability of POWER; None where no number does.
 
-        A rule on a change is to pass where nothing changed; one on a value where the value is what was found. The
+        A rule on a change has to pass where nothing changed; one on a value where the value is the measured one. The
         standard error falls with the square root of the frames of this scene.
         """
         from scipy import special
 
-        error = standard_error(self.found, 1 - 2 * level)
-        margin = abs(self.rule.limit - (0.0 if self.rule.change else self.found.value))
-        if self.found.scope == THESE_FRAMES or not (error > 0 and margin > 0):
+        error = standard_error(self.interval, 1 - 2 * level)
+        margin = abs(self.rule.limit - (0.0 if self.rule.change else self.interval.value))
+        if self.interval.scope == THESE_FRAMES or not (error > 0 and margin > 0):
             return None
         z = float(special.ndtri(1 - level) + special.ndtri(POWER))
-        return max(LEAST_FRAMES, math.ceil(self.found.frames * (z * error / margin) ** 2))
+        return max(LEAST_FRAMES, math.ceil(self.interval.frames * (z * error / margin) ** 2))
 
     @property
     def counted(self) -> bool:
-        """Return whether it was counted, and is no estimate."""
-        return self.rule.measure.quantity is COVERAGE and self.found.decided and self.found.low == self.found.high
+        """Return whether the number was counted, and is no estimate."""
+        return (
+            self.rule.measure.quantity is COVERAGE and self.interval.decided and self.interval.low == self.interval.high
+        )
 
     @property
     def reason(self) -> str:
-        """Why, in a few words."""
+        """The reason of the verdict, in a few words."""
         if self.counted:
             return "counted"
         if self.verdict == "passes":
             return "shown"
         if self.verdict == "fails":
-            bounded = self.rule.bounds_a_loss and self.found.low <= self.rule.limit
-            return "a loss is shown, and not that it is within the limit" if bounded else "the contrary is shown"
-        return self.found.undecided or "neither is shown, more frames may tell"
+            bounded = self.rule.bounds_a_loss and self.interval.low <= self.rule.limit
+            return "a loss is shown, but not that it is within the limit" if bounded else "the contrary is shown"
+        return self.interval.undecided or "neither is shown; more frames may decide"
 
     def digits(self, value: float) -> str:
         """Return a number of the rule's measure."""
@@ -371,29 +373,29 @@ class Judgement:
     @property
     def values(self) -> str:
         """'0.481 to 0.462, drop 0.019 [0.012, 0.026]'."""
-        ends = f"[{self.digits(self.found.low)}, {self.digits(self.found.high)}]"
+        ends = f"[{self.digits(self.interval.low)}, {self.digits(self.interval.high)}]"
         if self.counted:
-            return f"{self.rule.change} {self.digits(self.found.value)}"
+            return f"{self.rule.change} {self.digits(self.interval.value)}"
         if self.rule.change is None:
-            return f"{self.digits(self.found.value)} {ends}"
-        change = f"{self.rule.change} {self.digits(self.found.value)} {ends}"
+            return f"{self.digits(self.interval.value)} {ends}"
+        change = f"{self.rule.change} {self.digits(self.interval.value)} {ends}"
         if math.isnan(self.base):
             return change
         return f"{self.digits(self.base)} to {self.digits(self.new)}, {change}"
 
 
 EXIT_CODES: Mapping[Verdict, int] = {"passes": 0, "fails": 4, "undecided": 5}
-"""Of the command, by the outcome."""
+"""Exit codes of the command, by the outcome."""
 
 
 @dataclass(frozen=True)
 class GateResult:
-    """Everything that a gate found.
+    """The whole result of a gate.
 
     Attributes:
-        new, against: What was judged, and the baseline, empty where there is none.
-        undecided: What becomes of undecided rules, see `GateConfig`.
-        notes: What a reader has to know beside.
+        new, against: The run, and the baseline, empty where there is none.
+        undecided: The outcome of undecided rules, see `GateConfig`.
+        notes: Further remarks for the reader.
     """
 
     new: str
@@ -405,7 +407,7 @@ class GateResult:
     notes: tuple[str, ...] = ()
 
     def count(self, verdict: Verdict) -> int:
-        """Return how many rules came out so."""
+        """Return how many rules have this verdict."""
         return sum(each.verdict == verdict for each in self.judgements)
 
     @property
@@ -420,7 +422,7 @@ class GateResult:
 
     @property
     def outcome(self) -> Verdict:
-        """Outcome of all rules together; undecided rules count as `undecided` says."""
+        """Outcome of all rules together; undecided rules count by the setting `undecided`."""
         if self.count("fails"):
             return "fails"
         if not self.count("undecided") or self.undecided == "pass":
@@ -434,7 +436,7 @@ class GateResult:
 
 
 def gate(new: str | os.PathLike[str], against: str | os.PathLike[str] | None, config: GateConfig) -> GateResult:
-    """Judge a run, or 'FOLDER:MODEL', by rules; those on a drop or a rise need a baseline, a run or a small summary.
+    """Assess a run, or 'FOLDER:MODEL', by rules; those on a drop or a rise need a baseline, a run or a small summary.
 
     Raises ConfigError and DataError, each with the rule or the folder, and what to do.
     """
@@ -442,7 +444,7 @@ def gate(new: str | os.PathLike[str], against: str | os.PathLike[str] | None, co
     own = open_run(new)
     base = None if against is None else open_run(against)
     scenes = tuple(own.scenes) if base is None else shared_scenes([base, own])
-    runs, judged = _Runs(own, base, scenes), list[Judgement]()
+    runs, judgements = _Runs(own, base, scenes), list[Judgement]()
     notes = list(_notes(own, base, scenes))
     for given in parsed:
         rules = given.of_each(own.scenes[scenes[0]].classes)
@@ -450,31 +452,31 @@ def gate(new: str | os.PathLike[str], against: str | os.PathLike[str] | None, co
             _check(rule, own, base, scenes)
         if given.class_name == ALL:
             rules, absent = _with_a_value(rules, runs)
-            notes += [f"{given.text}: seen nowhere twice, and left out: {', '.join(absent)}"] if absent else []
+            notes += [f"{given.text}: these classes were seen nowhere twice: {', '.join(absent)}"] if absent else []
         for rule in rules:
             pairs = runs.pairs(rule)
             _require_values(rule, pairs)
-            judged.append(_judged(rule, pairs, config.level / len(rules), config.scope))
-            notes += [*_counts(judged[-1], pairs), *(runs.common[1] if runs.on_common(rule) else ())]
-    judged_run, against_run = ("" if run is None else f"{run.model} ({run.source})" for run in (own, base))
+            judgements.append(_assess(rule, pairs, config.level / len(rules), config.scope))
+            notes += [*_counts(judgements[-1], pairs), *(runs.common[1] if runs.on_common(rule) else ())]
+    new_run, against_run = ("" if run is None else f"{run.model} ({run.source})" for run in (own, base))
     return GateResult(
-        judged_run, against_run, scenes, config.level, config.undecided, tuple(judged), tuple(dict.fromkeys(notes))
+        new_run, against_run, scenes, config.level, config.undecided, tuple(judgements), tuple(dict.fromkeys(notes))
     )
 
 
 def _notes(own: RunHandle, base: RunHandle | None, scenes: Sequence[str]) -> list[str]:
     left = [scene for scene in own.scenes if scene not in scenes]
     missing = [scene for scene in (base.scenes if base else ()) if scene not in scenes]
-    text = [f"not in the baseline, and not compared: {', '.join(left)}"] if left else []
-    return text + ([f"of the baseline alone, and not compared: {', '.join(missing)}"] if missing else [])
+    text = [f"only the run has these scenes, which are left out: {', '.join(left)}"] if left else []
+    return text + ([f"only the baseline has these scenes, which are left out: {', '.join(missing)}"] if missing else [])
 
 
-# --- Before anything is judged ----------------------------------------------------------------------------------------
+# --- Checks before any rule is assessed -------------------------------------------------------------------------------
 
 
 def _check(rule: Rule, own: RunHandle, base: RunHandle | None, scenes: Sequence[str]) -> None:
     if rule.change is not None and base is None:
-        raise ConfigError(f"rule '{rule.text}': a {rule.change} is from a baseline; give --against RUN")
+        raise ConfigError(f"rule '{rule.text}': a {rule.change} needs a baseline; give --against RUN")
     if rule.scene is not None and rule.scene not in scenes:
         raise ConfigError(f"rule '{rule.text}': no scene '{rule.scene}'; {nearest(rule.scene, scenes)}")
     for scene in [rule.scene] if rule.scene else scenes:
@@ -486,17 +488,19 @@ def _check(rule: Rule, own: RunHandle, base: RunHandle | None, scenes: Sequence[
         for entry in entries:
             if not _has(rule, entry):
                 name = rule.measure.name
-                raise ConfigError(f"rule '{rule.text}': {entry.where} has no {name} of {scene}; {rule.measure.lacking}")
+                raise ConfigError(
+                    f"rule '{rule.text}': {entry.where} has no {name} of {scene}; {rule.measure.if_missing}"
+                )
         if len({entry.sums.voxel_size for entry in entries}) > 1:
             sizes = [entry.sums.voxel_size for entry in entries]
             raise DataError(
-                f"{own.source}: voxels of {sizes[0]:g} m, the baseline's are of {sizes[1]:g} m; run it with"
+                f"{own.source}: its voxels have {sizes[0]:g} m, those of the baseline {sizes[1]:g} m; run it with"
                 f" --voxel-size {sizes[1]:g}"
             )
 
 
 def _has(rule: Rule, entry: Entry) -> bool:
-    """Return whether a run keeps what a measure is of."""
+    """Return whether a run has the data of a measure."""
     if rule.measure.quantity is FLICKER:
         return len(entry.flicker) > 1
     if rule.measure.quantity is COVERAGE:
@@ -515,7 +519,7 @@ def _k(rule: Rule, entry: Entry) -> int | None:
 
 @dataclass(frozen=True, eq=False)
 class _Runs:
-    """The run that is judged, and its baseline, on the scenes of both."""
+    """The new run and its baseline, on the scenes of both."""
 
     own: RunHandle
     base: RunHandle | None
@@ -527,7 +531,7 @@ class _Runs:
 
     @functools.cached_property
     def common(self) -> tuple[Mapping[str, Pair], tuple[str, ...]]:
-        """The runs on each scene with the observations that both made, and which share of them one left out."""
+        """The runs on each scene with the observations that both made, and notes on the share that one left out."""
         pairs: dict[str, Pair] = {}
         notes: list[str] = []
         base = self.base.scenes if self.base is not None else {}
@@ -541,7 +545,7 @@ class _Runs:
         return pairs, tuple(notes)
 
     def pairs(self, rule: Rule) -> list[Pair]:
-        """Return the runs on each scene that a rule is about; of a rule on a value the new one alone."""
+        """Return the runs on each scene that a rule is about; for a rule on a value only the new one."""
         named = [rule.scene] if rule.scene else self.scenes
         if self.on_common(rule):
             return [self.common[0][scene] for scene in named]
@@ -550,7 +554,7 @@ class _Runs:
 
 
 def _with_a_value(rules: Sequence[Rule], runs: _Runs) -> tuple[tuple[Rule, ...], list[str]]:
-    """Return the rules of classes that some run has a value of, and the names of the other classes."""
+    """Return the rules of classes for which some run has a value, and the names of the other classes."""
 
     def has_value(rule: Rule) -> bool:
         entries = (entry for pair in runs.pairs(rule) for entry in pair if entry is not None)
@@ -561,22 +565,22 @@ def _with_a_value(rules: Sequence[Rule], runs: _Runs) -> tuple[tuple[Rule, ...],
 
 
 def _require_values(rule: Rule, pairs: Sequence[Pair]) -> None:
-    """Raise ConfigError for a rule that cannot be evaluated, with what it takes."""
+    """Raise ConfigError for a rule that cannot be evaluated, with advice."""
     for new, old in pairs:
         for entry in (new, old):
             if entry is not None and rule.measure.quantity is not COVERAGE and math.isnan(_value(rule, entry)):
                 named = f"{rule.measure.name} of {rule.class_name}" if rule.class_name else rule.measure.name
                 raise ConfigError(
-                    f"rule '{rule.text}': {entry.where} has no {named}: {NOTHING}; {rule.measure.lacking}"
+                    f"rule '{rule.text}': {entry.where} has no {named}: {NOTHING}; {rule.measure.if_missing}"
                 )
         mixed = old is not None and (new.summary.reduced is None) != (old.summary.reduced is None)
         if mixed and rule.measure.quantity in OF_EVIDENCE:
             raise ConfigError(f"rule '{rule.text}': {SCORES}")
 
 
-def _judged(rule: Rule, pairs: Sequence[Pair], level: float, scope: Scope) -> Judgement:
-    """Evaluate a rule over the mean of the scenes, which err by themselves, or in the one that it names."""
-    result = mean_of([_found(rule, new, old, level, scope) for new, old in pairs], 1 - 2 * level)
+def _assess(rule: Rule, pairs: Sequence[Pair], level: float, scope: Scope) -> Judgement:
+    """Assess a rule by the mean of the scenes, whose errors are independent, or in the scene that it names."""
+    result = mean_of([_interval_of(rule, new, old, level, scope) for new, old in pairs], 1 - 2 * level)
     values = [[math.nan if entry is None else _value(rule, entry) for entry in pair] for pair in pairs]
     return Judgement(rule, verdict(rule, result), result, *(float(mean) for mean in np.mean(values, axis=0)))
 
@@ -589,14 +593,14 @@ def _value(rule: Rule, entry: Entry) -> float:
     return value(entry.sums, rule.measure.quantity.key, _k(rule, entry))
 
 
-def _found(rule: Rule, new: Entry, base: Entry | None, level: float, scope: Scope) -> Interval:
+def _interval_of(rule: Rule, new: Entry, base: Entry | None, level: float, scope: Scope) -> Interval:
     if rule.measure.quantity is COVERAGE and base is not None and _same_frames(new, base):
         change = counted(_covered(new.sums, base.sums), new.sums)
         return change if rule.change == "rise" else negative(change)
     if rule.measure.quantity is not FLICKER:
         return bounded(rule, new.sums, None if base is None else base.sums, k=_k(rule, new), level=level, scope=scope)
     if scope == OTHER_SCENES:
-        raise ConfigError(f"rule '{rule.text}': flicker is known by frame alone; judge it with --scope this-scene")
+        raise ConfigError(f"rule '{rule.text}': flicker is known only by frame; assess it with --scope this-scene")
     if base is None:
         return mean_over_frames(np.array([*new.flicker]), np.array([*new.flicker.values()]), 1 - 2 * level)
     result = flicker_difference(new.flicker, base.flicker, level=1 - 2 * level)
@@ -619,13 +623,13 @@ def _covered(new: ClusterSums, base: ClusterSums) -> float:
     return min(shares_of(new, base).values()) - 1
 
 
-def _counts(judged: Judgement, pairs: Sequence[Pair]) -> list[str]:
-    """Return what was counted for a rule on coverage."""
-    if not judged.counted:
+def _counts(judgement: Judgement, pairs: Sequence[Pair]) -> list[str]:
+    """Return the counts for a rule on coverage."""
+    if not judgement.counted:
         return []
     shares = [shares_of(new.sums, base.sums) for new, base in pairs if base is not None]
     voxels, observations = (float(np.mean([own[name] for own in shares])) for name in ("voxels", "observations"))
-    where = f" of {judged.rule.scene}" if judged.rule.scene else ""
+    where = f" of {judgement.rule.scene}" if judgement.rule.scene else ""
     return [
         f"coverage{where}: {100 * voxels:.1f} % of the baseline's voxels with OP >= 2,"
         f" {100 * observations:.1f} % of its labelled observations in such voxels"

@@ -1,4 +1,4 @@
-"""What a gate found, for people and programs: lines, Markdown for a pull request, JSON, JUnit XML."""
+"""The result of a gate for people and programs: lines, Markdown for a pull request, JSON, JUnit XML."""
 
 from __future__ import annotations
 
@@ -17,24 +17,24 @@ from semstab.errors import ConfigError
 SCHEMA = 2
 INDENT = 10
 MOST_NAMED = 4
-"""Rules that the headline names, of each verdict."""
+"""Most rules of each verdict that the headline names."""
 
 OUTCOMES: Mapping[Verdict, str] = {"passes": "passes", "fails": "fails", "undecided": "is undecided"}
 SIGNS: Mapping[Verdict, str] = {"passes": "✅", "fails": "❌", "undecided": "❔"}
 
 
 def headline(result: GateResult) -> str:
-    """Return the outcome, and which rules decided: the gate fails: 'alpha > 0.8' fails.
+    """Return the outcome and the rules that decided.
 
-    1 of 2 rules is undecided: ...
+    An example is "the gate fails: 'alpha > 0.8' fails; 1 of 2 rules is undecided: ...".
     """
     return f"the gate {OUTCOMES[result.outcome]}: {'; '.join(decided_by(result))}"
 
 
 def decided_by(result: GateResult) -> tuple[str, ...]:
-    """Return which rules decided on a gate, then the others."""
+    """Return sentences on the rules that decided a gate, then on the others."""
     texts = {
-        verdict: _said(result, verdict)
+        verdict: _summary_of(result, verdict)
         for verdict in ("fails", "undecided", "passes")
         if result.count(verdict) and not (verdict == "passes" and result.count("fails"))
     }
@@ -43,7 +43,7 @@ def decided_by(result: GateResult) -> tuple[str, ...]:
     return tuple(texts.values())
 
 
-def _said(result: GateResult, verdict: Verdict) -> str:
+def _summary_of(result: GateResult, verdict: Verdict) -> str:
     """Return '2 of 4 rules are undecided: ...'."""
     n, rules = result.count(verdict), len(result.judgements)
     if verdict == "fails":
@@ -66,7 +66,7 @@ def _named(result: GateResult, verdict: Verdict, last: str = " and ") -> str:
 
 
 def lines(result: GateResult, width: int = 80) -> Iterator[str]:
-    """Yield lines for the terminal: the outcome, a line a rule, and why rules are undecided or fail."""
+    """Yield lines for the terminal: the outcome, a line per rule, and why rules are undecided or fail."""
     yield from _wrapped(headline(result), width, 2)
     against = f" against {result.against}" if result.against else ""
     yield from _wrapped(f"  {result.new}{against}, {_scenes(result)}; {_ends(result)}", width, 2)
@@ -85,10 +85,10 @@ def lines(result: GateResult, width: int = 80) -> Iterator[str]:
 
 def plan(result: GateResult) -> Iterator[str]:
     """Yield lines for the terminal: how many frames each rule needs, by the spread of these runs."""
-    yield f"frames from which on a rule is decided with a probability of {POWER:.0%}, by the spread of these runs"
+    yield f"frames that decide a rule with a probability of {POWER:.0%}, by the spread of these runs"
     for each in result.judgements:
-        needed, now = each.frames_needed(result.level), each.found.frames
-        text = f"{needed:,} ({now} now)" if needed else "counted" if each.counted else "no number of frames tells"
+        needed, now = each.frames_needed(result.level), each.interval.frames
+        text = f"{needed:,} ({now} now)" if needed else "counted" if each.counted else "no number of frames decides it"
         yield f"  {each.rule.text}: {text}"
 
 
@@ -132,7 +132,7 @@ def markdown(result: GateResult) -> str:
 
 
 def _plain(text: str) -> str:
-    """Return text that Markdown takes for nothing else, as a rule may name any class."""
+    """Return text that Markdown prints as it is, as a rule may name any class."""
     return re.sub(r"([\\`*_{}\[\]<>|#])", r"\\\1", text)
 
 
@@ -150,7 +150,7 @@ def as_json(result: GateResult) -> str:
         {
             "rule": each.rule.text, "verdict": each.verdict, "measure": each.rule.measure.name,
             "class": each.rule.class_name, "scene": each.rule.scene, "change": each.rule.change,
-            "limit": each.rule.limit, "new": each.new, "base": each.base, "found": each.found, "reason": each.reason,
+            "limit": each.rule.limit, "new": each.new, "base": each.base, "found": each.interval, "reason": each.reason,
             "about": each.about,
         }
         for each in result.judgements
@@ -164,7 +164,7 @@ def as_json(result: GateResult) -> str:
 
 
 def junit(result: GateResult) -> str:
-    """Return JUnit XML: a test case a rule; one that is undecided is skipped, or a failure where that fails.
+    """Return JUnit XML with a test case per rule; an undecided one is skipped, or a failure where that fails.
 
     Properties of the suite are the outcome of the gate and the exit code.
     """

@@ -1,6 +1,6 @@
-"""Which areas got worse: neighbouring voxels whose frames agree less, or that are wrong now; and which frames did it.
+"""Areas that got worse: neighbouring voxels whose frames agree less, or that are wrong now; and the frames behind it.
 
-Chance makes areas worse and better alike where nothing changed. So beside each area stands how many others improved
+Chance makes areas worse and better alike where nothing changed. So each area has the number of others that improved
 by as much: its `improved_alike`.
 """
 
@@ -29,10 +29,10 @@ WORSE = 0.2
 """A voxel got worse where so much of its agreement is lost: of ten observations, one turned to another class."""
 
 LEAST = 4
-"""Neighbouring voxels that make an area."""
+"""Least neighbouring voxels that make an area."""
 
 MOST = 20
-"""Places that are told of, the largest loss first."""
+"""Most areas that are reported, the largest loss first."""
 
 SHARE, MOST_FRAMES = 0.9, 8
 """The frames that account for this share of an area's loss, so many at most."""
@@ -40,13 +40,13 @@ SHARE, MOST_FRAMES = 0.9, 8
 
 @dataclass(frozen=True, eq=False)
 class Changed:
-    """Voxel by voxel, of those that both maps saw twice or more.
+    """Changes voxel by voxel, for those that both maps saw twice or more.
 
     Attributes:
         table: (n,) the base's voxels.
         change: (n,) agreement between frames, the run's less the base's.
         label: (n,) the class that both maps together give.
-        true: (n,) the true class, -1 where it is not known; None without ground truth.
+        true: (n,) the true class, -1 where it is unknown; None without ground truth.
         right: (n,) -1 where it was right and is wrong now, 1 the other way round, else 0; None without ground truth.
     """
 
@@ -72,7 +72,7 @@ class Changed:
 
     @property
     def matters(self) -> Mask:
-        """(n,) which may be part of an area, or of its `improved_alike`."""
+        """(n,) true for voxels that may be part of an area, or of its `improved_alike`."""
         much: Mask = np.abs(self.change) >= WORSE
         return much if self.right is None else much | (self.right != 0)
 
@@ -96,10 +96,10 @@ class Changed:
 
 @dataclass(frozen=True, eq=False)
 class Changes:
-    """What changed between two maps; of a large one `shown` are those that matter, and some of the others.
+    """Changes between two maps; of a large map `shown` has those that matter, and some of the others.
 
     Attributes:
-        compared, worse, better: How many voxels both saw twice or more, and how many changed by WORSE.
+        compared, worse, better: Number of voxels that both saw twice or more, and that changed by WORSE.
         area, wrong_area: (m,) number of the area that got worse, or is wrong now, of each of `shown`; 0 in none.
         parts: All voxels with their changes, by name as a file has them, some after the others.
     """
@@ -115,7 +115,7 @@ class Changes:
 
 @dataclass(frozen=True, eq=False)
 class Worse:
-    """The areas that got worse, the frames that contribute most, and what changed in each voxel."""
+    """The areas that got worse, the frames that contribute most, and the changes in each voxel."""
 
     areas: tuple[Area, ...]
     top_frames: tuple[FrameShare, ...]
@@ -123,7 +123,7 @@ class Worse:
 
 
 def worse_areas(common: Common, number: int) -> Worse:
-    """Return the areas of a run that got worse than the base; frames are known where observations were kept."""
+    """Return the areas of a run that got worse than the base; frames are known where observations were stored."""
     compared = worse = better = 0
     left, shown = list[Changed](), list[Changed]()
     for own in _changed(common, number):
@@ -184,13 +184,13 @@ def _columns(own: Changed, area: Int64, wrong_area: Int64 | None) -> dict[str, n
     return columns
 
 
-# --- Places -----------------------------------------------------------------------------------------------------------
+# --- Areas ------------------------------------------------------------------------------------------------------------
 
 
 def _clusters(index: Int32, label: Int64, loss: Float64, least: float) -> tuple[Int64, Int64]:
     """Return the number (n,) of each voxel's area, the largest loss first, 0 in none.
 
-    And how many improved alike (m,).
+    The second array (m,) counts the areas that improved alike.
     """
     area, mass = _connected(index, label, loss, loss >= least)
     _, others = _connected(index, label, -loss, loss <= -least)
@@ -198,7 +198,7 @@ def _clusters(index: Int32, label: Int64, loss: Float64, least: float) -> tuple[
 
 
 def _connected(index: Int32, label: Int64, loss: Float64, where: Mask) -> tuple[Int64, Float64]:
-    """Return the areas that voxels of one class make which touch each other, and the loss that each sums up to."""
+    """Return the areas of voxels of one class that touch each other, and the loss that each sums up to."""
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
 
@@ -222,7 +222,7 @@ def _touching(index: Int32, label: Int64) -> tuple[Int64, Int64]:
     """Return pairs of voxels of one class that share a face, an edge or a corner."""
     low, size = index.min(axis=0).astype(np.int64) - 1, np.ptp(index, axis=0).astype(np.int64) + 3
     x, y, z = (index.astype(np.int64) - low).T
-    key = (x * size[1] + y) * size[2] + z  # ascending, as the voxels are
+    key = (x * size[1] + y) * size[2] + z  # ascending like the voxels
     result: list[tuple[Int64, Int64]] = []
     for dx, dy, dz in itertools.product((0, 1), (-1, 0, 1), (-1, 0, 1)):
         if (step := (dx * size[1] + dy) * size[2] + dz) > 0:
@@ -270,7 +270,7 @@ class Observations:
 
     Attributes:
         voxel: Row of the voxel; frame of the observation.
-        base, other: (m, K) what they say; of the base its mean at the voxel where it saw nothing.
+        base, other: (m, K) shares of the classes; where the base saw nothing, its mean at the voxel.
     """
 
     voxel: Int64
@@ -279,7 +279,7 @@ class Observations:
     other: Float64
 
     def among(self, where: Mask, label: Int64) -> Seen:
-        """Return the observations at some of the voxels (n,), with their classes (n,) as what they should say."""
+        """Return the observations at some of the voxels (n,), with their classes (n,) as the expected ones."""
         rows = where[self.voxel]
         k = label[self.voxel[rows]][:, None]
         base, other = self.base[rows], self.other[rows]
@@ -289,17 +289,17 @@ class Observations:
 
 @dataclass(frozen=True, eq=False)
 class Seen:
-    """Observations of an area: frame (m,), what each lost of the area's class (m,), and what it says (m, K)."""
+    """Observations of an area: frame (m,), loss of the area's class (m,), and shares of the classes (m, K)."""
 
     frame: Int64
     lost: Float64
-    says: Float64
+    shares: Float64
 
     def confused_with(self, of: int, names: Sequence[str]) -> str:
-        """Return the class that stands where the area's own is missing."""
-        text = np.maximum(self.lost, 0) @ self.says if len(self.lost) else np.zeros(len(names))
-        text[of] = 0
-        return names[int(text.argmax())] if text.max(initial=0) > 0 else ""
+        """Return the class that replaces the area's own."""
+        missing = np.maximum(self.lost, 0) @ self.shares if len(self.lost) else np.zeros(len(names))
+        missing[of] = 0
+        return names[int(missing.argmax())] if missing.max(initial=0) > 0 else ""
 
 
 def _top_frames(seen: Seen) -> tuple[FrameShare, ...]:
@@ -324,7 +324,7 @@ def _observations(common: Common, number: int, index: Int32, voxel_size: float) 
 
 
 def _rows_of(log: Events, index: Int32, voxel_size: float) -> tuple[Int64, Int64, Float64]:
-    """Return of each observation the row of the voxel that holds its cell, or -1, its frame and its shares."""
+    """Return for each observation the row of the voxel that holds its cell, or -1, its frame and its shares."""
     centre = (np.stack([log.ix, log.iy, log.iz], axis=1) + 0.5) * log.voxel_size
     own, wanted = voxel_keys(np.floor(centre / voxel_size).astype(np.int32), index)
     at = np.minimum(np.searchsorted(wanted, own), max(len(wanted) - 1, 0))

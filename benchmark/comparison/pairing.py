@@ -1,4 +1,4 @@
-"""What runs have in common on a scene: observations, voxels, cubes of space, or nothing; and what that leaves out."""
+"""The common data of runs on a scene: observations, voxels, cubes of space, or nothing; and the data left out."""
 
 from __future__ import annotations
 
@@ -28,51 +28,55 @@ from semstab.statistics.observations import CellObservations
 from semstab.statistics.paired_differences import SharedObservations, compared_observations
 
 NEAR = 1e-3
-"""Metres within which cameras of the same frame lie."""
+"""Largest distance in metres between cameras of the same frame."""
 
 ALIKE = 1.25
-"""Ratio of the footprints of their pixels up to which runs took the same ones: depth may be filtered otherwise."""
+"""Largest ratio of the footprints of runs that took the same pixels: depth may be filtered in another way."""
 
-SAMPLED = "of {millions:.3g} million common voxels 1 in {n} is compared, by a hash of its location"
+SAMPLED = "1 in {n} of the {millions:.3g} million common voxels is compared, chosen by a hash of its location"
 SHOWN = "figures and the recording show the voxels that changed, and 1 in {n} of the others"
 
 FEW = 0.1
-"""A part of a map's voxels below which it is said how few are in common."""
+"""Share of common voxels of a map below which a note reports it."""
 
-OTHER_PIXELS = "the runs took other pixels of the frames (pixel_stride): what each left without a label is not compared"
+OTHER_PIXELS = (
+    "the runs took other pixels of the frames (pixel_stride): the pixels that each left without a label are not"
+    " compared"
+)
 OTHER_OBSERVATIONS = (
-    "the runs are of other frames, or one kept no observations: alpha is of each run's own, and not paired"
+    "the runs are of other frames, or one stored no observations: alpha is of each run's own observations, and not"
+    " paired"
 )
 BY_CUBES = (
-    "compared are sums in the same cubes of space, each map with all its voxels; what needs them voxel by voxel is"
+    "sums in the same cubes of space are compared, each map with all its voxels; numbers that need pairs of voxels are"
 )
-BY_CUBES += " left out: the locations that got worse"
-OTHER_SIZES = f"voxels of {{sizes}}: {BY_CUBES}, and what depends on their size (PSA, VSS, SBD, coverage, ECE)"
+BY_CUBES += " left out: the areas that got worse"
+OTHER_SIZES = f"voxels of {{sizes}}: {BY_CUBES}, and measures that depend on their size (PSA, VSS, SBD, coverage, ECE)"
 
 
 LABELS_AND_SCORES = (
-    "labels stand beside scores: alpha, and what is right of the fused labels, are of the likeliest classes; the rest,"
-    " which spreads the evidence of scores, is left out"
+    "labels are compared with scores: alpha, and numbers of right fused labels, are of the likeliest classes; other"
+    " measures, which depend on how scores spread their evidence, are left out"
 )
 
 
 @dataclass(frozen=True, eq=False)
 class Common:
-    """Runs on a scene, as far as they can be held against each other.
+    """Runs on a scene, as far as they can be compared.
 
     Attributes:
-        sums: Of each run, of the common locations; for `cubes` and `flights` of its whole map.
-        mixed: Whether labels stand beside scores.
-        tables: Of the common locations; none for `cubes` and `flights`.
-        logs: Of the common observations of cells, where there are some.
-        label: (n,) the true class of each of their voxels, -1 where it is not known; None without ground truth.
-        observations: What the common observations are.
-        regions: Where there are voxels of the same frames, all of labels or all of scores: the whole maps with the
-            ground truth.
-        shown: The part of them that figures show beside those that changed.
-        scope: Of the intervals, where frames tell.
-        sizes_differ, frames_differ: Whether voxels do, and the frames of runs that are paired on observations.
-        same_frames: Whether frames are paired; None where the sums tell.
+        sums: Sums of each run for the common locations; for `cubes` and `flights` of its whole map.
+        mixed: True if labels are compared with scores.
+        tables: Tables of the common locations; none for `cubes` and `flights`.
+        logs: Logs of the common observations of cells, where there are some.
+        label: (n,) the true class of each of their voxels, -1 where it is unknown; None without ground truth.
+        observations: The comparison of the common observations.
+        regions: The whole maps with the ground truth, where there are voxels of the same frames, all of labels or all
+            of scores.
+        shown: The share of the unchanged voxels that figures show with those that changed.
+        scope: Scope of the intervals, where there are enough frames for it.
+        sizes_differ, frames_differ: True if voxel sizes differ, or the frames of runs that are paired on observations.
+        same_frames: True if frames are paired; None where the sums show it.
     """
 
     basis: Basis
@@ -98,7 +102,7 @@ class Common:
 
 
 def pair(entries: Sequence[Entry], names: Sequence[str], scope: Scope = THIS_SCENE) -> Common:
-    """Return the most that all runs of a scene have in common.
+    """Return the largest common data of all runs of a scene.
 
     Raises:
         DataError: If a file of a run cannot be read.
@@ -123,7 +127,7 @@ def _paired(entries: Sequence[Entry], names: Sequence[str]) -> Common:
     regions = partial(_regions, names, maps, _truth(records))
     covered = coverage_of(names, [held(region.tables) for region in regions()])
     if not any(row.common_share for row in covered):
-        return _apart(entries, "the maps have no voxel in common: other locations, or other frames of reference")
+        return _apart(entries, "the maps have no voxel in common: their locations or frames of reference differ")
     result = _with_observations(_by_voxels(entries, regions), names, records)
     shown = share_of(min(row.voxels for row in covered))
     notes = (*result.notes, *_notes(covered), *((SHOWN.format(n=round(1 / shown)),) if shown < 1 else ()))
@@ -155,11 +159,11 @@ def joint_class(tables: Iterable[VoxelTable]) -> Int64:
     return label
 
 
-# --- What is in common ------------------------------------------------------------------------------------------------
+# --- Common data ------------------------------------------------------------------------------------------------------
 
 
 def _by_voxels(entries: Sequence[Entry], regions: Regions) -> Common:
-    """Return the voxels that all saw twice or more; of very many a sample. Alpha is of each run's own observations."""
+    """Return the voxels that all saw twice or more, or a sample of very many. Alpha is of each run's own cells."""
     common = common_voxels(regions)
     tables, share = tuple(common.tables.values()), common.share
     label = None if common.truth is None else join_truth(tables[0], common.truth).label
@@ -173,14 +177,14 @@ def _by_voxels(entries: Sequence[Entry], regions: Regions) -> Common:
 
 
 def _with_observations(common: Common, names: Sequence[str], records: Sequence[Record]) -> Common:
-    """Add alpha of the observations that all made; of each run's own where they cannot be paired."""
-    there = _observations_of_the_same_frames(records)
-    if not there:
+    """Add alpha of the observations that all made, or of each run's own where they cannot be paired."""
+    samples = _observations_of_the_same_frames(records)
+    if not samples:
         return replace(common, notes=(OTHER_OBSERVATIONS, *common.notes), same_frames=False, frames_differ=True)
-    shared, pixels = _compared(names, there)
+    shared, pixels = _compared(names, samples)
     cells = shared.sums.values()
     sums = (replace(own, fine=of.fine, coarse=of.coarse) for own, of in zip(common.sums, cells, strict=True))
-    notes, logs = _fewer_frames(there), tuple(shared.logs.values())
+    notes, logs = _fewer_frames(samples), tuple(shared.logs.values())
     return replace(
         common, basis="observations", notes=(*common.notes, *notes, *pixels), sums=tuple(sums), logs=logs,
         observations=shared.compared, frames_differ=bool(notes),
@@ -188,19 +192,19 @@ def _with_observations(common: Common, names: Sequence[str], records: Sequence[R
 
 
 def _observations_of_the_same_frames(records: Sequence[Record]) -> list[CellObservations]:
-    """Return the sampled observations of runs; none where one's were not kept, or are of other frames."""
+    """Return the sampled observations of runs; none where one run has none, or other frames."""
     files = [file for record in records if (file := record.observations_file) is not None and file.is_file()]
-    there = [CellObservations.load(file) for file in files]
-    return there if len(there) == len(records) and _same_frames(there) else []
+    samples = [CellObservations.load(file) for file in files]
+    return samples if len(samples) == len(records) and _same_frames(samples) else []
 
 
-def _compared(names: Iterable[str], there: Sequence[CellObservations]) -> tuple[SharedObservations, tuple[str, ...]]:
-    """Return the observations that all runs made, and what has to be known of them.
+def _compared(names: Iterable[str], samples: Sequence[CellObservations]) -> tuple[SharedObservations, tuple[str, ...]]:
+    """Return the observations that all runs made, and notes on them.
 
-    Where their pixels are not of one size it cannot be told which of them a run left without a label.
+    Where their pixels have different sizes, the pixels that a run left without a label are unknown.
     """
-    shared = compared_observations(dict(zip(names, there, strict=True)))
-    footprints = [float(np.median(own.views.footprint)) if len(own.views) else math.nan for own in there]
+    shared = compared_observations(dict(zip(names, samples, strict=True)))
+    footprints = [float(np.median(own.views.footprint)) if len(own.views) else math.nan for own in samples]
     if not max(footprints) > ALIKE * min(footprints):
         return shared, ()
     compared = replace(shared.compared, ignored=(), order_ignored=shared.compared.order, bounded=True)
@@ -210,17 +214,17 @@ def _compared(names: Iterable[str], there: Sequence[CellObservations]) -> tuple[
 def on_common_observations(
     entries: Mapping[str, Entry],
 ) -> tuple[list[Entry], ComparedObservations, tuple[str, ...]] | None:
-    """Return entries of runs whose alpha is of common observations, what these are, and notes.
+    """Return entries of runs whose alpha is of common observations, their comparison, and notes.
 
     None where nothing can be paired on observations: alpha is then of each run's own.
     """
     own = [*entries.values()]
     if _other_frame_of_reference(own) or _no_voxels(own):
         return None
-    there = _observations_of_the_same_frames([entry.record for entry in own if entry.record is not None])
-    if not there:
+    samples = _observations_of_the_same_frames([entry.record for entry in own if entry.record is not None])
+    if not samples:
         return None
-    shared, notes = _compared(entries, there)
+    shared, notes = _compared(entries, samples)
     if not shared.compared.observations:
         return None
     alike = [
@@ -231,18 +235,18 @@ def on_common_observations(
 
 
 def _apart(entries: Sequence[Entry], reason: str) -> Common:
-    note = f"{reason}: nothing can be paired; each map's own numbers stand beside each other"
+    note = f"{reason}: nothing can be paired; the numbers of each map are shown side by side"
     return replace(_of_whole_maps("flights", note, entries), same_frames=False)
 
 
 def _of_whole_maps(basis: Basis, note: str, entries: Sequence[Entry]) -> Common:
-    """Return the sums of the runs' folders; of right and wrong only where all have them."""
+    """Return the sums of the runs' folders; sums of right and wrong only where all have them."""
     sums = tuple(entry.sums for entry in entries)
     without = [entry.where for entry in entries if not entry.sums.truth]
     if 0 < len(without) < len(entries):
         sums = tuple(own.without_truth() for own in sums)
-        untold = f"{without[0]} holds no ground truth (run it with --statistics): nothing about right and wrong"
-        return Common(basis, (note, untold), sums)
+        missing = f"{without[0]} holds no ground truth (run it with --statistics): correctness is not compared"
+        return Common(basis, (note, missing), sums)
     return Common(basis, (note,), sums)
 
 
@@ -251,7 +255,7 @@ def _sums(table: VoxelTable, label: Int64 | None) -> ClusterSums:
 
 
 def _same_frames(observations: Sequence[CellObservations]) -> bool:
-    """Return whether frames of one index were taken from one place, and flights share most frames."""
+    """Return whether frames of one index were taken from one position, and flights share most frames."""
     first, *others = (own.views for own in observations)
     for other in others:
         _, one, same = np.intersect1d(first.frame, other.frame, return_indices=True)
@@ -263,7 +267,7 @@ def _same_frames(observations: Sequence[CellObservations]) -> bool:
 
 
 def _fewer_frames(observations: Sequence[CellObservations]) -> tuple[str, ...]:
-    """Return where a run left out frames that others have."""
+    """Return a note where a run left out frames that others have."""
     if len({own.frames for own in observations}) == 1:
         return ()
     both = len(functools.reduce(np.intersect1d, [own.views.frame for own in observations]))
@@ -271,19 +275,19 @@ def _fewer_frames(observations: Sequence[CellObservations]) -> tuple[str, ...]:
     return (f"the runs fused {listed} frames: alpha is of the {both} views that all have; flicker is left out",)
 
 
-# --- What is not ------------------------------------------------------------------------------------------------------
+# --- Reasons against pairing ------------------------------------------------------------------------------------------
 
 
 def _other_frame_of_reference(entries: Sequence[Entry]) -> str:
-    """Return why coordinates are not those of the same locations; empty where they are."""
+    """Return why coordinates do not show the same locations; empty where they do."""
     first, *others = (entry.georeference for entry in entries)
     for entry, own in zip(entries[1:], others, strict=True):
         if (own is None) != (first is None):
             without = entry if own is None else entries[0]
             return f"{without.where} has no georeference, and the other has one"
         if own is not None and first is not None and own != first:
-            what = "coordinate reference systems" if own.crs != first.crs else "frames of the coordinates"
-            return f"the {what} of {entries[0].where} and {entry.where} differ"
+            differing = "coordinate reference systems" if own.crs != first.crs else "frames of the coordinates"
+            return f"the {differing} of {entries[0].where} and {entry.where} differ"
     return ""
 
 
@@ -293,7 +297,7 @@ def _no_voxels(entries: Sequence[Entry]) -> str:
         if entry.record is None:
             return f"{entry.where} is a small summary, without voxels: {BY_CUBES}"
         if entry.record.voxels_file is None or not entry.record.voxels_file.exists():
-            return f"{entry.where} kept no voxels: {BY_CUBES}"
+            return f"{entry.where} has no voxels: {BY_CUBES}"
     return ""
 
 

@@ -1,6 +1,6 @@
-"""Runs that are compared: run folders, a label source of them, and small summaries; opened, named, matched by scene.
+"""Runs that are compared: run folders, one label source of a folder, and small summaries; matched by scene.
 
-A small summary holds what a later comparison needs but voxels, in one file that a repository can keep.
+A small summary holds all data of a later comparison except voxels, in one file that a repository can store.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ class EntryNumbers:
 
     Attributes:
         up: The scene's up axis, where it is known.
-        seed: Of a simulated scene.
+        seed: The seed of a simulated scene.
     """
 
     summary: UnitSummary
@@ -61,7 +61,7 @@ class Entry(EntryNumbers):
 
     Attributes:
         where: The folder or the file that it comes from.
-        record: What its folder holds of it; None of a small summary, which holds no voxels.
+        record: Its record in the folder; None for a small summary, which holds no voxels.
         small: Sums and flicker of a small summary.
     """
 
@@ -81,7 +81,7 @@ class Entry(EntryNumbers):
         assert self.record is not None
         file = self.record.sums_file
         if file is None or not file.is_file():
-            raise DataError(f"{self.where}: has no sums by frame and cube of {self.record.unit.slug}; run it again")
+            raise DataError(f"{self.where}: it has no sums by frame and cube of {self.record.unit.slug}; run it again")
         try:
             return ClusterSums.load(file)
         except DataError as error:
@@ -96,7 +96,7 @@ class Entry(EntryNumbers):
         return _flicker(self.record.series)
 
     def named(self, frames: Sequence[FrameShare]) -> tuple[FrameShare, ...]:
-        """Return frames under the names of their files, where the run kept them."""
+        """Return frames with the names of their files, where the run stored them."""
         if self.record is None or self.record.series is None:
             return tuple(frames)
         with self.record.series.open(encoding="utf-8", newline="") as lines:
@@ -109,10 +109,10 @@ class Entry(EntryNumbers):
         return self.sums.classes
 
     def with_voxels(self, purpose: str) -> Record:
-        """Return the record with its voxels. Raises DataError, which names what needs them, where there are none."""
+        """Return the record with its voxels. Raises DataError, which names the purpose, where there are none."""
         if self.record is None:
             raise DataError(
-                f"{self.where}: is a small summary, without the voxels that {purpose} needs; give the folder"
+                f"{self.where}: it is a small summary, without the voxels that {purpose} needs; give the folder"
             )
         return self.record
 
@@ -224,10 +224,10 @@ def _chosen(path: Path, there: Sequence[str], wanted: str) -> str:
         return wanted
     own = [name for name in there if name != GROUND_TRUTH] or list(there)
     if not own:
-        raise ConfigError(f"{path}: holds no finished unit")
+        raise ConfigError(f"{path}: it holds no finished unit")
     if len(own) > 1:
         listed = ", ".join(own[:4]) + (", ..." if len(own) > 4 else "")
-        raise ConfigError(f"{path}: holds several label sources ({listed}); name one: {path}:{own[0]}")
+        raise ConfigError(f"{path}: it holds several label sources ({listed}); name one: {path}:{own[0]}")
     return own[0]
 
 
@@ -255,10 +255,10 @@ def _valid(frames: Iterable[int], percents: Iterable[float]) -> bool:
 SCHEMA, KIND = 3, "semstab small summary"
 CONTENT = "summary.json"
 LARGEST = 100_000_000
-"""Bytes of a file that is opened, and of its content unpacked."""
+"""Most bytes of a file, and of its unpacked content."""
 
 MANY_GROUPS = 32
-"""Groups of frames down to which these are joined, before cubes are."""
+"""Number of groups of frames above which these are joined, before cubes are."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -279,12 +279,12 @@ class _Content:
 
 
 def save_summary(run: RunHandle, path: str | Path, most: int = 1_000_000) -> None:
-    """Write all that a later comparison needs but voxels into one file.
+    """Write all data of a later comparison except voxels into one file.
 
     Its cubes of space and groups of frames are as fine as `most` bytes allow.
 
     Raises:
-        DataError: If even the coarsest take more.
+        DataError: If even the coarsest sums need more.
     """
     scenes = tuple(
         _Scene(**_numbers(own), name=name, frames=(*own.flicker,), flicker=(*own.flicker.values(),))
@@ -295,7 +295,7 @@ def save_summary(run: RunHandle, path: str | Path, most: int = 1_000_000) -> Non
     while len(data := _archive(content, sums)) > most:
         coarser = [_coarser(own) for own in sums]
         if all(np.array_equal(a.cell, b.cell) and a.step == b.step for a, b in zip(coarser, sums, strict=True)):
-            raise DataError(f"{path}: a summary of {len(sums)} scenes takes {len(data)} bytes; keep fewer scenes")
+            raise DataError(f"{path}: a summary of {len(sums)} scenes takes {len(data)} bytes; use fewer scenes")
         sums = coarser
     with atomic_path(path) as temporary:
         temporary.write_bytes(data)
@@ -305,24 +305,26 @@ def load_summary(path: str | Path) -> tuple[str, dict[str, Entry]]:
     """Return the model and the scenes that `save_summary` wrote.
 
     Raises:
-        DataError: For anything else.
+        DataError: For any other file.
     """
     path = Path(path)
     try:
         with zipfile.ZipFile(io.BytesIO(read_limited(path, LARGEST))) as archive:
             if sum(member.file_size for member in archive.infolist()) > LARGEST:
-                raise DataError(f"{path}: unpacks to more than {LARGEST // 10**6} MB; write the summary again")
+                raise DataError(f"{path}: it unpacks to more than {LARGEST // 10**6} MB; write the summary again")
             text = parse_json(archive.read(CONTENT))
             if isinstance(text, dict) and text.get("schema") == earlier.SMALL:
                 text = earlier.translated(text, path) | {"schema": SCHEMA}
             if not isinstance(text, dict) or (text.get("kind"), text.get("schema")) != (KIND, SCHEMA):
-                raise DataError("of another kind or version")
+                raise DataError("it is of another kind or version")
             content = from_json(_Content, text, path)
             files = [archive.read(f"{i}.parquet") for i in range(len(content.scenes))]
     except (OSError, zipfile.BadZipFile, zlib.error, LookupError, ValueError, RuntimeError, EOFError) as error:
         if isinstance(error, DataError) and str(path) in str(error):
             raise
-        raise DataError(f"{path}: neither a run's folder nor a small summary ({summarize_error(error)})") from error
+        raise DataError(
+            f"{path}: it is neither a run's folder nor a small summary ({summarize_error(error)})"
+        ) from error
     scenes = {}
     with tempfile.TemporaryDirectory() as folder:
         part = Path(folder) / "sums.parquet"

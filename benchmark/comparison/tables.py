@@ -20,7 +20,7 @@ from semstab.statistics.agreement import ALPHA, PSA, VOXEL_ALPHA
 from semstab.statistics.correctness import ACCURACY, ECE, MIOU
 from semstab.statistics.intervals import LEAST_FRAMES
 
-# What is compared, in the order of the tables.
+# The compared measures, in the order of the tables.
 
 RECURRENT_VSS = Quantity(key="vss", title="VSS at OP>=3", better="higher", digits=VSS.digits)
 SBD_EXCESS = Quantity(key="sbd_excess", title="SBD excess", unit="bits", better="lower", digits=(4, 4))
@@ -36,44 +36,44 @@ IOU = Quantity(key="iou", title="IoU", better="higher", needs="truth")
 HEADLINES = (
     ALPHA, PSA, RECURRENT_VSS, SBD_EXCESS, FLICKER, COVERAGE, ACCURACY, MIOU, ECE, MISLEADING, VOXEL_ALPHA,
 )  # fmt: skip
-"""What every table shows; the first row is what verdicts rest on."""
+"""Measures that every table shows; verdicts rest on the first."""
 
 BY_CLASS = (ALPHA, VOXEL_ALPHA, PSA, RECURRENT_VSS, SBD_EXCESS, RECALL, PRECISION, IOU, ECE, MISLEADING)
-"""What is compared class by class."""
+"""Measures that are compared class by class."""
 
 
 def quantities() -> tuple[Quantity, ...]:
-    """Return all that is compared: the headlines, then the mean over voxels of each other measure of the register."""
+    """Return all compared measures: the headlines, then the mean over voxels of each other measure of the register."""
     return (*HEADLINES, *(measure for measure in measures() if measure is not VSS))
 
 
 def by_key(chosen: Sequence[Quantity]) -> Mapping[str, Quantity]:
-    """Return the same by their keys."""
+    """Return the measures by their keys."""
     return {quantity.key: quantity for quantity in chosen}
 
 
 IN_SUMS = (ALPHA, VOXEL_ALPHA, PSA, RECURRENT_VSS, SBD_EXCESS, ENTROPY, ACCURACY, MIOU, ECE, MISLEADING)
-"""Of these the sums by frame and location tell all."""
+"""Measures that follow from the sums by frame and location alone."""
 
 ONE_AGAINST_ALL = (ALPHA, VOXEL_ALPHA, RECALL, PRECISION, IOU)
-"""By class: of that class against all others; the rest is of the locations of that class."""
+"""Measures of a class against all others; others by class are of the locations of that class."""
 
 
 ALL_SCENES = "all scenes"
 NAMED_FRAMES = 5
 
 IN_CLASSES = (ALPHA, PSA, RECALL, IOU)
-"""What the table of classes has beside each other."""
+"""Measures that the table of classes shows side by side."""
 
 ANSWERS = (
-    f"In brackets: intervals at 95%, for this scene flown again where there are {LEAST_FRAMES} frames or more, else for"
-    " these frames: other locations in these very frames. p (Holm): that there is no difference, corrected for all that"
-    " is compared in the scene, or over all scenes."
+    f"Brackets hold intervals at 95%, for this scene flown again where there are {LEAST_FRAMES} frames or more, else"
+    " for these frames, that is, for other locations in the same frames. p (Holm) is the p-value of no difference,"
+    " corrected for all comparisons of the scene, or of all scenes together."
 )
 
 
 def tables(comparison: RunComparison) -> list[Table]:
-    """Return all that there is something for."""
+    """Return all tables that have rows."""
     covered = {scene.scene: scene.coverage for scene in comparison.scenes if scene.coverage}
     observations = {scene.scene: scene.observations for scene in comparison.scenes if scene.observations is not None}
     made = [_differences(comparison), _by_class(comparison), _areas(comparison), _frames(comparison)]
@@ -90,12 +90,12 @@ def scopes(comparison: RunComparison) -> Iterator[tuple[str, Against]]:
 
 
 def heading(comparison: RunComparison, scope: str, own: Against) -> str:
-    """Return what stands above a run's differences."""
+    """Return the heading of a run's differences."""
     return f"{scope}: {own.other} less {comparison.base}"
 
 
 def scope(row: Contrast) -> str:
-    """Return what a difference answers, or why it claims nothing, in a word or two."""
+    """Return the scope of a difference, or why it claims nothing, in a word or two."""
     return "undecided" if row.difference.undecided else row.difference.scope
 
 
@@ -111,9 +111,10 @@ def _differences(comparison: RunComparison) -> Table:
     groups = tuple(Group(heading(comparison, scope, own), _rows(own, HEADLINES)) for scope, own in scopes(comparison))
     macro = " Over all scenes each scene counts once." if len(comparison.scenes) > 1 else ""
     caption = (
-        "Alpha is of the observations that all runs made, the rest of the voxels that all saw twice or more; coverage"
-        " is of each run's whole map, flicker of its images. Coverage is the number of voxels seen twice or more, for"
-        " each one of the base. Undecided: too few frames, or errors reach as far as the scene."
+        "Alpha is of the observations that all runs made, and other measures are of the voxels that all saw twice or"
+        " more; coverage is of each run's whole map, and flicker is of its images. Coverage is the number of voxels"
+        " seen twice or more, divided by that of the base. A difference is undecided where there are too few frames, or"
+        " where errors reach as far as the scene."
         f" {ANSWERS}{macro}"
     )
     return Table("comparison", "Differences", caption, columns, groups, "scope")
@@ -140,9 +141,9 @@ def _by_class(comparison: RunComparison) -> Table:
     worse = Column("worse", "Worse"), Column("better", "Better")
     groups = tuple(Group(heading(comparison, scope, own), _class_rows(own, shown)) for scope, own in scopes(comparison))
     caption = (
-        "Differences of each class: agreement of the class against all others, PSA of its locations (by the"
-        " ground truth, else by what all runs together say), recall and IoU. Worse, better: what differs where the"
-        f" p-values are corrected for all measures and classes. {ANSWERS}"
+        "The measures are alpha of the class against all others, PSA of its locations (by the ground truth, or else by"
+        " all runs together), recall and IoU. Worse and better list the measures that differ when the p-values are"
+        f" corrected for all measures and classes. {ANSWERS}"
     )
     return Table("comparison_classes", "By class", caption, (columns[0], *worse, *columns[1:]), groups, "scope")
 
@@ -174,11 +175,11 @@ def _areas(comparison: RunComparison) -> Table:
         for own in scene.against
     )
     caption = (
-        "Neighbouring voxels of one class that got worse. Agreement: a fifth or more of the agreement between frames is"
-        " lost; truth: right in the base, and wrong now. Loss: its mean. Confused with: what these frames say. Improved"
-        " alike:"
-        " areas that got better by as much; where nothing changed there are as many. Top contributing frames: those"
-        " whose observations turned away from the class, with their share."
+        "An area is neighbouring voxels of one class that got worse: by agreement, they lost a fifth or more of the"
+        " agreement between frames; by truth, they were right in the base and are wrong now. Loss is the mean loss."
+        " 'Confused with' is the class that these frames show instead. 'Improved alike' counts the areas that improved"
+        " by as much; where nothing changed there are as many. Top contributing frames are those whose observations"
+        " turned away from the class, with their share."
     )
     return Table("comparison_areas", "Areas that got worse", caption, columns, groups, "scope")
 
@@ -206,12 +207,12 @@ def _frames(comparison: RunComparison) -> Table:
         for scene in comparison.scenes
         for own in scene.against
     )
-    caption = "Of all areas whose frames agree less, together."
+    caption = "The shares are of all areas together whose frames agree less."
     return Table("comparison_frames", "Top contributing frames", caption, columns, groups, "scope")
 
 
 def everything(comparison: RunComparison) -> Table:
-    """Return all contrasts, one a row."""
+    """Return all contrasts, one per row."""
     columns = (
         Column("run", "Run"), Column("class", "Class"), Column("measure", "Measure"), Column("base", "Base", 6),
         Column("other", "The run", 6), Column("difference", "Difference", 6, signed=True),
@@ -219,7 +220,7 @@ def everything(comparison: RunComparison) -> Table:
         Column("change", "Change"), Column("undecided", "Undecided"),
     )  # fmt: skip
     groups = tuple(Group(scope, tuple(_all_rows(own))) for scope, own in scopes(comparison))
-    return Table("comparison_all", "All that was compared", ANSWERS, columns, groups, "scope")
+    return Table("comparison_all", "All comparisons", ANSWERS, columns, groups, "scope")
 
 
 def _all_rows(own: Against) -> Iterator[Row]:
@@ -231,10 +232,10 @@ def _all_rows(own: Against) -> Iterator[Row]:
         )  # fmt: skip
 
 
-# What a comparison found, in sentences: on the terminal, in Markdown and above the report.
+# The results of a comparison in sentences, for the terminal, Markdown and the top of the report.
 
 MOST_CLASSES = 4
-"""Classes that are told of in a sentence."""
+"""Most classes that a sentence names."""
 
 BASES: dict[Basis, str] = {
     "observations": "paired; alpha is of the observations (a cell in a view) that all runs made, with the same weights",
@@ -245,17 +246,17 @@ BASES: dict[Basis, str] = {
 
 
 def sentences(comparison: RunComparison) -> list[str]:
-    """Return one run after the other, then what could not be compared."""
+    """Return the results of one run after the other, then notes on data that could not be compared."""
     return [*answers(comparison), *notes(comparison)]
 
 
 def answers(comparison: RunComparison) -> list[str]:
-    """Return what differs, run by run."""
+    """Return the differences, run by run."""
     return [sentence for own in comparison.overall for sentence in _of_run(comparison, own)]
 
 
 def notes(comparison: RunComparison) -> list[str]:
-    """Return what was paired, and what could not be compared, scene by scene."""
+    """Return the paired data, and notes on data that could not be compared, scene by scene."""
     lines = []
     for scene in comparison.scenes:
         if scene.basis in ("observations", "voxels"):
@@ -267,17 +268,17 @@ def notes(comparison: RunComparison) -> list[str]:
 
 
 def left_out(observations: ComparedObservations) -> Iterator[str]:
-    """Say which share of the observations each run left out, and alpha where that counts against it."""
+    """Yield the share of the observations that each run left out, and alpha where that counts against it."""
     for row in observations.ignored:
         if row.missing >= LEAST_LEFT_OUT:
-            counted = f"alpha is {row.alpha:.3f} if what it leaves out agrees as by chance"
-            yield f"{row.model} leaves {row.missing:.1%} of the pixels without a label that others label; {counted}"
+            counted = f"alpha is {row.alpha:.3f} if the pixels that it leaves out agree as by chance"
+            yield f"{row.model} gives no label to {row.missing:.1%} of the pixels that others label; {counted}"
     if observations.depends and any(row.missing >= LEAST_LEFT_OUT for row in observations.ignored):
-        yield "the order of the runs depends on what was left out"
+        yield "the order of the runs depends on the pixels that were left out"
 
 
 LEAST_LEFT_OUT = 0.005
-"""Share of the pixels left without a label from which on it is said."""
+"""Least share of pixels left without a label that is reported."""
 
 
 def _of_run(comparison: RunComparison, own: Against) -> Iterator[str]:
@@ -299,7 +300,7 @@ def _of_run(comparison: RunComparison, own: Against) -> Iterator[str]:
 
 
 def _stability(comparison: RunComparison, own: Against) -> str:
-    """Say how alpha differs, on which verdicts rest."""
+    """Return the difference of alpha, on which verdicts rest."""
     row = next((row for row in own.contrasts if row.measure == ALPHA.key), None)
     if row is None:
         return f"Alpha of {own.other} or {comparison.base} is not known: run it with more overlap between frames."
@@ -316,7 +317,7 @@ def _stability(comparison: RunComparison, own: Against) -> str:
         )
     why = f"; undecided: {row.difference.undecided}" if row.difference.undecided else ""
     return (
-        f"Over all classes no difference in stability between {own.other} and {comparison.base} is shown: {numbers},"
+        f"Over all classes, no difference in stability between {own.other} and {comparison.base} is shown: {numbers},"
         f" {interval}{p}, for {row.difference.scope}{why}."
     )
 
@@ -355,7 +356,7 @@ SHOWN = {
 
 
 def print_comparison(comparison: RunComparison, console: Console, *, verbose: bool = False) -> None:
-    """Print the answer in sentences, the differences, and what was paired; verbose: also classes and areas."""
+    """Print the answer in sentences, the differences and the notes; verbose: also classes and areas."""
     for sentence in answers(comparison):
         console.print(sentence, highlight=False, markup=False)
     for table in tables(comparison):

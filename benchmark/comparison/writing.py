@@ -1,4 +1,4 @@
-"""The folder of a comparison: numbers for programs, pages for people, and what changed in each voxel."""
+"""The folder of a comparison: numbers for programs, pages for people, and the changes in each voxel."""
 
 from __future__ import annotations
 
@@ -33,17 +33,17 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure as Canvas
 
 
-# The charts and maps of a comparison: differences with their intervals, by scene and by class, and where they lie.
+# The charts and maps of a comparison: differences with their intervals, by scene and by class, and their locations.
 
 Panels = dict[str, dict[str, list[tuple[int, str, Estimate]]]]
-"""By measure, by scene or class: the colour of each run, its name, and its difference from the base."""
+"""The colour of each run, its name and its difference from the base, by measure, then by scene or class."""
 
 MOST_NUMBERS = 9
-"""Places that have their number in a map."""
+"""Most areas that have their number in a map."""
 
 
 def charts(comparison: RunComparison) -> dict[str, list[dict[str, str]]]:
-    """Return charts of the differences with their intervals, by the name of the table that they stand beneath."""
+    """Return charts of the differences with their intervals, by the name of the table above them."""
     colors = {own.name: k for k, own in enumerate(comparison.runs[1:])}
     shown, panels, by_class = by_key(HEADLINES), Panels(), Panels()
     for scope, against in scopes(comparison):
@@ -66,7 +66,7 @@ def charts(comparison: RunComparison) -> dict[str, list[dict[str, str]]]:
 
 
 def _changed(comparison: ComparisonData) -> Iterator[tuple[SceneComparison, Against, Changes]]:
-    """Yield the scenes and runs of which is known what changed in each voxel."""
+    """Yield the scenes and runs with known changes in each voxel."""
     for scene in comparison.result.scenes:
         for own in scene.against:
             if (changes := comparison.changes.get((scene.scene, own.other))) is not None:
@@ -74,15 +74,15 @@ def _changed(comparison: ComparisonData) -> Iterator[tuple[SceneComparison, Agai
 
 
 def maps(comparison: ComparisonData) -> Iterator[Figure]:
-    """Yield a map of each scene and run of which is known what changed where."""
+    """Yield a map of each scene and run with known changes."""
     for scene, own, changes in _changed(comparison):
         if scene.scene in comparison.up:
             yield Figure(
                 slug("comparison_map", scene.scene, own.other),
-                f"Where it changed: {scene.scene}, {own.other} less {comparison.result.base}",
-                "The largest change in each column of voxels that both saw twice or more: agreement between frames,"
-                " and where ground truth is known what is wrong now or right now. Numbers are those of the areas"
-                " that got worse.",
+                f"Changes: {scene.scene}, {own.other} less {comparison.result.base}",
+                "The map shows the largest change in each column of voxels that both saw twice or more: of agreement"
+                " between frames and, where there is ground truth, of correctness. Numbers name the areas that got"
+                " worse.",
                 f"Maps of {scene.scene} from above: orange where {own.other} is worse, blue where it is better.",
                 partial(_draw, changes, comparison.up[scene.scene], own),
                 unit=slug(scene.scene, own.other),
@@ -104,7 +104,7 @@ def _numbers(own: Against, what: str) -> tuple[list[int], list[tuple[float, floa
 
 CONTENT, PAGE, REPORT, RECORDING = "comparison.json", "comparison.md", "report.html", "recording.rrd"
 KIND = "Changes"
-"""Of the files with a row a voxel."""
+"""Kind of the files with a row per voxel."""
 
 
 def compare(
@@ -114,16 +114,16 @@ def compare(
     scope: str = THIS_SCENE,
     progress: Progress = lambda what: None,
 ) -> RunComparison:
-    """Compare runs with the first of them, by scene and over all scenes: how much, how surely, where.
+    """Compare runs with the first of them, by scene and over all scenes: amounts, p-values and locations.
 
     Args:
         runs: Folders of runs or studies, 'FOLDER:MODEL' where there are several label sources, or small summaries.
-        scope: 'this scene' flown again, 'these frames' or 'other scenes': what intervals and p-values are for.
+        scope: 'this scene' flown again, 'these frames' or 'other scenes': the scope of intervals and p-values.
         out: A folder for tables, figures, report.html, comparison.json and .md, columns of voxels, and a recording.
-        progress: Function that is told the scene that is compared.
+        progress: Function that is called with each compared scene.
 
     Raises:
-        ConfigError, DataError: For what cannot be opened, or has no scene or no classes in common, in one line.
+        ConfigError, DataError: For runs that cannot be opened, or have no scene or no classes in common, in one line.
     """
     if out is not None:
         _require_own(Path(out))
@@ -134,7 +134,7 @@ def compare(
 
 
 def load_comparison(folder: str | Path) -> RunComparison:
-    """Return what `compare` wrote.
+    """Return the comparison that `compare` wrote.
 
     Raises:
         DataError: If it is not there or damaged.
@@ -144,7 +144,7 @@ def load_comparison(folder: str | Path) -> RunComparison:
 
 
 def write(comparison: ComparisonData, out: str | Path) -> None:
-    """Write the folder; of an earlier comparison nothing is left in it."""
+    """Write the folder; nothing of an earlier comparison is left in it."""
     folder, made, drawn = Path(out), tables(comparison.result), list(maps(comparison))
     _require_own(folder)
     write_json(folder / CONTENT, comparison.result)
@@ -160,7 +160,7 @@ def write(comparison: ComparisonData, out: str | Path) -> None:
 
 
 def markdown(comparison: RunComparison, made: Sequence[Table] | None = None) -> str:
-    """Return the comparison for a pull request: what was comparison, then the tables."""
+    """Return the comparison for a pull request: sentences, then the tables."""
     shown = [table for table in (made or tables(comparison)) if table.name != "comparison_all"]
     names = ", ".join(each.name for each in comparison.runs[1:])
     head = [f"## {names} against {comparison.base}", "", *(f"- {relations(s)}" for s in sentences(comparison)), ""]
@@ -184,10 +184,10 @@ def page(comparison: RunComparison, made: Sequence[Table], drawn: Sequence[Figur
 # --- Parts ------------------------------------------------------------------------------------------------------------
 
 TOPICS = (
-    ("differences", "What differs", ("comparison",)),
+    ("differences", "Differences", ("comparison",)),
     ("classes", "By class", ("comparison_classes",)),
     ("where", "Where", ("comparison_areas", "comparison_frames", "comparison_map")),
-    ("compared", "What was compared", ("comparison_coverage", "comparison_ignored")),
+    ("compared", "Compared data", ("comparison_coverage", "comparison_ignored")),
 )
 
 
@@ -221,8 +221,8 @@ def _recorded(comparison: ComparisonData) -> Iterator[tuple[tuple[str, str], tup
 
 
 def _require_own(folder: Path) -> None:
-    """Raise ConfigError where the folder holds something else than a comparison: a run's is not written into."""
+    """Raise ConfigError where the folder holds something else than a comparison, as a run."""
     if folder.is_file():
-        raise ConfigError(f"{folder}: is a file; name a folder")
+        raise ConfigError(f"{folder}: it is a file; name a folder")
     if folder.is_dir() and any(folder.iterdir()) and not (folder / CONTENT).exists():
-        raise ConfigError(f"{folder}: is not empty and holds no comparison; choose another folder")
+        raise ConfigError(f"{folder}: it is not empty and holds no comparison; choose another folder")

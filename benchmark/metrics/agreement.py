@@ -1,4 +1,4 @@
-"""Do two fusion implementations leave the same map?"""
+"""Agreement of the maps of two fusion implementations."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from semstab.errors import DataError
 
 
 def voxel_keys(*indices: npt.NDArray[np.integer]) -> list[Int64]:
-    """Return one int64 key a voxel of each index array (n, 3), ascending with (ix, iy, iz), the same for all arrays.
+    """Return one int64 key per voxel of each index array (n, 3), ascending with (ix, iy, iz), the same for all arrays.
 
     Raises:
         DataError: If the voxels span more than 2^63 cells together.
@@ -44,7 +44,7 @@ def voxel_keys(*indices: npt.NDArray[np.integer]) -> list[Int64]:
 
 
 def shared_rows(*tables: VoxelTable) -> list[Int64]:
-    """Return rows of the voxels that all tables hold, one array a table, in the same order of voxels.
+    """Return rows of the voxels that all tables hold, one array per table, in the same order of voxels.
 
     Raises:
         DataError: If the tables differ in K or voxel size.
@@ -101,7 +101,7 @@ CHUNK = 1 << 14
 """Voxels that are compared at a time: they stay in the processor's cache."""
 
 LABEL = "label"
-"""The share of voxels with another dominant class; no disagreement by itself, for a tie hangs on the last bit."""
+"""The share of voxels with another dominant class; it alone is no disagreement, as a tie depends on the last bit."""
 
 TOLERANCE = 1e-9
 """Largest difference allowed between float64 backends in any quantity of any voxel."""
@@ -113,7 +113,7 @@ def compare(
     """Compare two maps of the same frames, voxel by voxel.
 
     They agree where no quantity differs by more than `tolerance`, and where at most `voxel_share` of the voxels are in
-    one map only. An SBD that is undefined in one map only counts as a difference of 1, its range.
+    only one map. An SBD that is undefined in one map only counts as a difference of 1, its range.
 
     Raises:
         DataError: If the maps differ in K or voxel size.
@@ -139,7 +139,7 @@ def compare(
 
 
 def together(parts: Sequence[Agreement]) -> Agreement:
-    """Return the agreement on a map, from that on each of its parts."""
+    """Return the agreement on a map from that on each of its parts."""
     shared = [part.voxels[0] - part.only_in[0] for part in parts]
     return replace(
         parts[0],

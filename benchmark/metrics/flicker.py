@@ -43,7 +43,7 @@ class CompensatedFlicker:
 
     Attributes:
         flicker_percent: Percentage of the co-visible pixels whose label differs; NaN where no pixel is co-visible.
-        share: co-visible pixels, of the current frame's valid ones, 0 to 1; NaN where none is valid.
+        share: Share of the current frame's valid pixels that are co-visible, 0 to 1; NaN where none is valid.
     """
 
     flicker_percent: float
@@ -82,7 +82,7 @@ def changed_pixels(previous: Frame, current: Frame, *, depth_tolerance: float = 
     return changed
 
 
-# Video consistency: how many pixels keep their label over clips of n frames (Miao et al. 2021, CVPR, VSPW).
+# Video consistency: the share of pixels that keep their label over clips of n frames (Miao et al. 2021, CVPR, VSPW).
 
 Labels = npt.NDArray[np.integer[Any]]
 
@@ -90,12 +90,12 @@ Labels = npt.NDArray[np.integer[Any]]
 class VideoConsistency:
     """VC_n with ground truth, as in VSPW: 1 is a prediction that never changes where the truth does not.
 
-    Of the pixels whose ground truth is the same in all n frames of a clip, the share whose prediction is the same in
-    all of them, right or wrong; `value` is the mean over all clips of n consecutive frames, the last one included.
+    A clip has the share of the pixels with constant ground truth in its n frames whose prediction is constant too,
+    right or wrong; `value` is the mean over all clips of n consecutive frames, the last one included.
     Frames are added one by one, and none stays in memory. Clips do not reach across a change of the image size.
 
     Attributes:
-        n: Frames a clip, at least 2; VSPW reports 8 and 16.
+        n: Frames per clip, at least 2; VSPW reports 8 and 16.
     """
 
     def __init__(self, n: int) -> None:
@@ -108,7 +108,7 @@ class VideoConsistency:
 
         Args:
             labels: (H, W) predicted ids.
-            valid: (H, W) pixels that count: neither prediction nor truth is to be ignored; a pixel counts in a clip
+            valid: (H, W) pixels that count: neither prediction nor truth is ignored; a pixel counts in a clip
                 where it counts in all of its frames.
             truth: (H, W) ground truth ids.
 
@@ -118,9 +118,9 @@ class VideoConsistency:
         return self._clips.add(self._prediction.add(labels, valid), self._truth.add(truth, valid))
 
     def skip(self) -> float:
-        """Return the next frame has no ground truth, and is in no clip: where its truth stays the same is not known.
+        """Skip the next frame, which has no ground truth and so is in no clip; return NaN.
 
-        NaN.
+        Without its truth nobody knows where the truth stays the same.
         """
         self._prediction.end()
         self._truth.end()
@@ -172,12 +172,12 @@ class _Run:
         self._labels: Labels = np.zeros((0, 0), dtype=np.uint8)
 
     def add(self, labels: Labels, valid: Mask) -> npt.NDArray[np.int16]:
-        """Take the next frame in; of each pixel for how many frames its label has been the same and has counted."""
+        """Add the next frame; return for how many frames the label of each pixel has been the same and has counted."""
         from semstab.pixels.kernels import lengthen
 
         if labels.shape != valid.shape:
             sizes = " and ".join(f"{W}x{H}" for H, W in (labels.shape, valid.shape))
-            raise DataError(f"labels and the mask of what counts differ in size ({sizes})")
+            raise DataError(f"labels and the mask of pixels that count differ in size ({sizes})")
         if labels.shape != self._labels.shape:
             self._length, self._labels = np.zeros(labels.shape, np.int16), np.zeros_like(labels)
         lengthen(flat(labels), flat(self._labels), flat(valid), self.n, self._length.reshape(-1))
@@ -210,7 +210,7 @@ class _Clips:
         return self._sum / self._count if self._count else math.nan
 
 
-# Regions without classes: how much of a segmentation changes between two frames, whatever its ids are.
+# Regions without classes: the change of a segmentation between two frames, whatever its ids are.
 
 Regions = npt.NDArray[np.integer[Any]]
 
@@ -227,9 +227,9 @@ class RegionChange:
 
     Attributes:
         flicker_percent: Percentage of the pixels valid in both that left their region; NaN where there are none.
-        matched: Regions in both frames.
-        births, deaths: Regions of the current frame that are new, of the previous one that are gone.
-        variation_of_information: Between the two partitions, bits, the unassigned pixels being one part; NaN likewise.
+        matched: Number of regions in both frames.
+        births, deaths: Number of new regions of the current frame, and of lost ones of the previous frame.
+        variation_of_information: Bits between the two partitions, the unassigned pixels being one part; NaN likewise.
     """
 
     flicker_percent: float
@@ -249,7 +249,7 @@ def matched_region_flicker(
     """Return the flicker of region maps whose ids mean nothing across frames, such as Segment Anything's proposals.
 
     Regions are matched one to one so that the sum of their IoUs over the valid pixels is largest (Hungarian method);
-    pairs with an IoU of at most iou_threshold come apart again. flicker = 1 - (pixels in both regions of a pair +
+    pairs with an IoU of at most iou_threshold are separated again. flicker = 1 - (pixels in both regions of a pair +
     pixels unassigned in both) / valid pixels. To leave out camera motion, warp the previous map first
     (`semstab.pixels.warp.warp`) and count where that is defined.
 
@@ -267,7 +267,7 @@ def matched_region_flicker(
         raise ConfigError(f"iou_threshold = {iou_threshold:g}: use a share from 0 to below 1")
     if previous.shape != current.shape:
         sizes = " and ".join(f"{W}x{H}" for H, W in (previous.shape, current.shape))
-        raise DataError(f"region maps differ in size ({sizes}); bring them to one")
+        raise DataError(f"region maps differ in size ({sizes}); bring them to one size")
     counted = slice(None) if valid is None else valid
     table = _Contingency.of(previous[counted].ravel(), current[counted].ravel())
     pairs = table.pairs(iou_threshold)
@@ -283,7 +283,7 @@ def matched_region_flicker(
 
 @dataclass(frozen=True, eq=False)
 class _Contingency:
-    """(P, Q) pixels that the p-th region of the previous and the q-th of the current map share, 0 being one of them."""
+    """Pixels (P, Q) that the p-th region of the previous and the q-th of the current map share, region 0 included."""
 
     previous_ids: Regions
     current_ids: Regions
@@ -318,7 +318,7 @@ class _Contingency:
         return [(int(rows[i]), int(columns[j])) for i, j in matched if iou[i, j] > iou_threshold]
 
     def variation_of_information(self) -> float:
-        """Return h(previous | current) + H(current | previous) = 2 H(both) - H(previous) - H(current).
+        """Return H(previous | current) + H(current | previous) = 2 H(both) - H(previous) - H(current).
 
         Meila 2007, JMVA 98.
         """

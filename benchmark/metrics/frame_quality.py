@@ -20,7 +20,7 @@ NONE = -1
 
 
 class FrameQualityMeter:
-    """The quality of frames taken in order, each as a filter left it, as the model said it, and as it truly is.
+    """The quality of frames in order, from the labels of a filter, of the model, and of the ground truth.
 
     All have labels in one label space of K classes and one size; the truth may be missing.
     """
@@ -48,7 +48,7 @@ class FrameQualityMeter:
         self._before = frame, model, truth
 
     def result(self, model: str, filters: str, milliseconds: float) -> FrameQuality:
-        """Return the quality so far of filters over a model, which took so many milliseconds a frame."""
+        """Return the quality so far of filters over a model, which took so many milliseconds per frame."""
         labelled, sayable, foreseen, met, stale, compared = self._counts
         right = np.diag(self._confusion)
         union = self._confusion.sum(axis=0) + self._confusion.sum(axis=1) - right
@@ -94,12 +94,12 @@ class FrameQualityMeter:
 
 
 class Lag:
-    """Frames from a true change of what is seen in a direction until the labels follow, where the model does at once.
+    """Frames from a true change in a direction until the labels follow, where the model follows at once.
 
-    Each pixel is followed back to where its point lay in the frame before, whether it was hidden there or not: a car
-    that leaves uncovers the road. It changed where its true class was not within a pixel of that place. Estimated by
-    Kaplan and Meier's product, as pixels leave the view or change again before their label followed: the mean over
-    `HORIZON` frames, one who never follows has `HORIZON`.
+    Each pixel is followed back to the position of its point in the frame before, even if it was hidden there: a car
+    that leaves uncovers the road. It changed where its true class was not within a pixel of that position. The mean
+    over `HORIZON` frames is estimated by Kaplan and Meier's product, as pixels leave the view or change again before
+    their label follows; a pixel that never follows has `HORIZON`.
     """
 
     def __init__(self) -> None:
@@ -108,7 +108,7 @@ class Lag:
         self._age: npt.NDArray[np.int16] | None = None
 
     def add(self, where: Correspondence, now: Frame, model: Frame, truth: Frame, truth_now: Frame) -> None:
-        """Add the next frame; `where` its pixels lay in the frame before, whose truth is `truth`."""
+        """Add the next frame; `where` has the positions of its pixels in the frame before, whose truth is `truth`."""
         if self._age is None:
             self._age = np.full(truth.shape, NONE, dtype=np.int16)
         true = truth_now.predicted
@@ -140,7 +140,7 @@ class Lag:
 
 
 def _near(truth: Frame, where: Correspondence, true: npt.NDArray[Any]) -> Mask:
-    """Return pixels whose class was seen within a pixel of where they lay before."""
+    """Return pixels whose class was seen within a pixel of their position in the frame before."""
     padded = np.pad(truth.predicted, 1, mode="edge")
     H, W = truth.shape
     near = np.zeros(true.shape, dtype=np.bool_)

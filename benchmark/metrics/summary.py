@@ -27,22 +27,22 @@ STEPS = tuple(m * 10**e for e in range(6) for m in (1, 2, 5))
 LOW_PERSISTENCE, DRIFTING, UNCERTAIN, STABLE = range(4)
 
 CATEGORIES = ("low persistence", "drifting", "uncertain", "stable")
-"""Names by id, in the order in which they are decided."""
+"""Names by id, in the order in which they are assigned."""
 
 CATEGORY_COLORS = ((153, 153, 153), (240, 228, 66), (213, 94, 0), (0, 114, 178))
 """RGB by id: grey, and yellow, vermillion and blue of the colour-blind safe palette by Okabe and Ito (2008)."""
 
 MOST_CONFUSED = 1024
-"""Classes of a taxonomy of which is summed up which are taken for which."""
+"""Most classes of a taxonomy whose confusions are summed up."""
 
 CROWDED, PARTS = 0.5, 3
-"""A last stratum that holds more than this share of the voxels is split into so many about equal parts."""
+"""A last stratum that holds more than this share of the voxels is split into so many parts of about equal size."""
 
 
 def summarise(table: VoxelTable, edges: Sequence[int] = STRATA) -> TableSummary:
     """Summarise a table (paper, tables of multi-scene, persistence-stratified and class-wise stability).
 
-    edges are the strata's upper bounds of OP, ascending; a last stratum holds what lies above. Each mean runs over the
+    edges are the strata's upper bounds of OP, ascending; a last stratum holds the voxels above. Each mean runs over the
     voxels where its measure is defined; over no voxel it is NaN.
     """
     return TableSums.of(table, edges).summary(table.voxel_size, table.classes, edges)
@@ -96,12 +96,12 @@ class TableSums:
         return cls(np.array(total, dtype=np.float64), sums[0], sums[1], sums[2], sums[3], category, confusion)
 
     def arrays(self) -> dict[str, Float64]:
-        """Return all of it by name, as `read` takes it."""
+        """Return all arrays by name, as `read` takes them."""
         return {f"table {name}": value for name, value in vars(self).items()}
 
     @classmethod
     def read(cls, arrays: Mapping[str, Float64]) -> TableSums:
-        """Read it from its arrays, among others."""
+        """Read the sums from arrays, which may contain others."""
         return cls(**{field.name: arrays[f"table {field.name}"] for field in dataclasses.fields(cls)})
 
     def __add__(self, other: TableSums) -> TableSums:
@@ -151,8 +151,8 @@ def _steps(edges: Sequence[int]) -> list[int]:
 def _by_group(values: Sequence[Float64], op: Int32, group: Int64, groups: int) -> Float64:
     """Return (1 + 3 M, groups) of the values (n,) of M measures.
 
-    The first row counts voxels; then come of each measure its sum, how often it is defined, and how often OP is high
-    enough for it.
+    The first row counts voxels; then each measure has its sum, the number of voxels where it is defined, and the
+    number whose OP is high enough for it.
     """
     levels = sorted({1, *(measure.lowest_op for measure in measures())})
     enough = [np.where(op >= level, 1.0, np.nan) for level in levels]
@@ -165,7 +165,7 @@ def _by_group(values: Sequence[Float64], op: Int32, group: Int64, groups: int) -
 
 
 def groups_of(op: Int32, edges: Sequence[int]) -> Int64:
-    """Return which stratum of OP (n,) each voxel is in: how many of the edges lie below its OP."""
+    """Return the stratum of OP (n,) of each voxel: the number of edges below its OP."""
     group: Int64 = np.searchsorted(edges, np.arange(int(op.max(initial=0)) + 1))[op]
     return group
 
@@ -184,7 +184,7 @@ def strata(edges: Sequence[int]) -> list[tuple[str, int, int]]:
 def split_last(tables: Sequence[TableSummary]) -> list[Means]:
     """Return the last stratum of several tables together in about equal parts, where most of their voxels are in it.
 
-    In addition to the strata, whose edges are the paper's: `well_seen` names the finer ones.
+    They add to the strata, whose edges are the paper's: `well_seen` names the finer ones.
     """
     voxels = sum(table.voxels for table in tables)
     steps: dict[str, list[Means]] = {}
@@ -247,7 +247,7 @@ class CategoryThresholds:
 
     Attributes:
         min_op: Fewer observations are low persistence; the paper calls a voxel recurrent from OP = 3 on.
-        drifting_bits: SBD from which on the belief is still on the move. The paper's models have 0.041 and 0.019
+        drifting_bits: SBD from which on the belief still moves. The paper's models have 0.041 and 0.019
             bits on average over recurrent voxels. One dissent among three labels has 0.095 bits or more; one among four
             0.046 if it comes last, 0.113 if it comes second.
         uncertain_bits: Entropy of the belief from which on it is ambiguous. In bits, because the normalised entropy of
@@ -273,7 +273,7 @@ class CategoryThresholds:
 def categories(table: VoxelTable, thresholds: CategoryThresholds | None = None) -> UInt8:
     """Return the category of each voxel (n,), an index into CATEGORIES; the first of these that applies.
 
-    - low persistence: OP < min_op, too few observations to tell
+    - low persistence: OP < min_op, too few observations
     - drifting: SBD >= drifting_bits, observations still move the belief
     - uncertain: entropy >= uncertain_bits, the belief has settled on no clear answer
     - stable: a clear answer, and little movement

@@ -1,7 +1,7 @@
-"""Stability whatever the number of observations, its null models, its uncertainty, and whether the consistent is right.
+"""Stability at any number of observations, its null models, its uncertainty, and the accuracy of consistent voxels.
 
-Pure functions of a VoxelTable and its Events. `describe` says everything about one map, `compare_models` about
-several; docs/metrics.md derives each measure.
+Pure functions of a VoxelTable and its Events. `describe` returns all statistics of one map, `compare_models`
+compares several; docs/metrics.md derives each measure.
 """
 
 from semstab.data.contrast import ModelComparison

@@ -1,4 +1,4 @@
-"""When may a map's label be acted on? For each class the least evidence at which labels are right often enough."""
+"""Thresholds from which a map's labels are acted on: for each class the evidence that makes them right often enough."""
 
 from __future__ import annotations
 
@@ -31,24 +31,24 @@ EVIDENCE: Mapping[Evidence, Callable[[Beliefs], npt.NDArray[np.generic]]] = {
     "belief": vss,
     "margin": margin,
 }
-"""What may be asked for: frames that saw the voxel, the dominant class' share of the belief, its lead over the next."""
+"""Kinds of evidence: frames that saw the voxel, the dominant class' share of the belief, its lead over the next."""
 
 STEPS = 8
-"""Thresholds that are tried of each, at equal shares of a class' voxels."""
+"""Thresholds that are tried for each kind of evidence, at equal shares of a class' voxels."""
 
 FEW_CUBES = 3
-"""In no more cubes with an error it is not seen how far errors reach."""
+"""So few cubes with an error do not show how far errors reach."""
 
 NEVER = -1
-"""Instead of a class: the label is not acted on."""
+"""The value instead of a class for a label that is not acted on."""
 
 
 class Threshold(BaseModel):
-    """From where on the labels of a class are acted on, and what the calibration showed of them.
+    """The threshold from which the labels of a class are acted on, with the results of its calibration.
 
     Attributes:
-        by, at_least: The evidence that is asked for.
-        never: That no threshold is shown to reach the precision: labels are not acted on; the rest is of the best.
+        by, at_least: The evidence that is required.
+        never: True if no threshold is shown to reach the precision: labels are not acted on; the rest is of the best.
         precision, low: Share of such labels that are right, and the lower end of its one-sided interval.
         voxels, left: Labels of the class with a known truth that were counted; share of all its labels that is left.
     """
@@ -65,11 +65,11 @@ class Threshold(BaseModel):
 
 
 class AcceptanceThresholds(BaseModel):
-    """Which labels of a map may be acted on, as a YAML file keeps it.
+    """The labels of a map that may be acted on, as a YAML file stores them.
 
     Attributes:
-        precision, confidence: Labels of a class that are acted on are right with at least this probability; that a
-            class' threshold promises too much has at most the probability 1 - confidence.
+        precision, confidence: Labels of a class that are acted on are right with at least this probability; a class'
+            threshold promises too much with a probability of at most 1 - confidence.
         left: Share of the calibration's voxels whose label is acted on.
     """
 
@@ -85,7 +85,7 @@ class AcceptanceThresholds(BaseModel):
 
     @classmethod
     def load(cls, path: str | Path) -> AcceptanceThresholds:
-        """Read what `save` wrote. Raises ConfigError, which names the file and the setting."""
+        """Read a file that `save` wrote. Raises ConfigError, which names the file and the setting."""
         result = validated(cls, read_yaml(path), f"{path}: ")
         if result.schema_ != SCHEMA:
             raise ConfigError(f"{path}: schema {result.schema_}, this version reads {SCHEMA}; calibrate again")
@@ -97,9 +97,7 @@ class AcceptanceThresholds(BaseModel):
         write_text(Path(path), yaml.safe_dump(content, sort_keys=False, allow_unicode=True))
 
     def decide(self, table: VoxelTable) -> Int64:
-        """Return (n,) the class of each voxel whose label may be acted on, by its row in the table's classes.
-
-        -1 elsewhere.
+        """Return (n,) the class of each voxel whose label may be acted on, by its row in the table's classes, else -1.
 
         Raises:
             DataError: For a map of other classes, or voxels of another size.
@@ -120,37 +118,39 @@ class AcceptanceThresholds(BaseModel):
         """Raise DataError where a map is not of the kind that was calibrated."""
         if not table.classes or set(table.classes) != set(self.classes):
             raise DataError(
-                f"thresholds of the classes {_few(self.classes)}, a map of {_few(table.classes)}; calibrate on a run"
-                " with its taxonomy"
+                f"the thresholds are of the classes {_few(self.classes)}, the map is of {_few(table.classes)};"
+                " calibrate on a run with its taxonomy"
             )
         if not math.isclose(table.voxel_size, self.voxel_size, rel_tol=1e-6):
             raise DataError(
-                f"thresholds of voxels of {self.voxel_size:g} m, a map of {table.voxel_size:g} m; calibrate on a run"
-                f" with --voxel-size {table.voxel_size:g}"
+                f"the thresholds are of voxels of {self.voxel_size:g} m, the map is of {table.voxel_size:g} m;"
+                f" calibrate on a run with --voxel-size {table.voxel_size:g}"
             )
 
 
 def calibrate(
     maps: Sequence[tuple[VoxelTable, Truth]], *, precision: float = 0.95, confidence: float = 0.95, on: str = ""
 ) -> AcceptanceThresholds:
-    """Return for each class the thresholds of OP, belief and margin that keep most labels at that precision.
+    """Return for each class the threshold of OP, belief or margin that retains most labels at that precision.
 
     STEPS thresholds of each evidence are tried. One is taken where the lower end of the share of right labels is at
     least the precision, at the error 1 - confidence divided by all that are tried (Bonferroni; as in Angelopoulos et
-    al. 2021, Learn then Test). The end is Clopper and Pearson's, for as many labels as these are worth (Korn and
+    al. 2021, Learn then Test). The end is Clopper and Pearson's, at the effective number of labels (Korn and
     Graubard 1998): the variance is that of cubes of space, with errors that reach as far as the data show. Where errors
     are too few for that, cubes are counted instead of labels.
 
     Args:
-        maps: Of scenes with the same classes and voxel size, with the true class of their voxels; they err by
-            themselves.
+        maps: Maps of scenes with the same classes and voxel size, with the true class of their voxels; their errors
+            are independent.
         precision: Share of right labels that each class is to reach.
-        confidence: Probability with which it reaches it.
+        confidence: Probability with which it reaches that share.
         on: Name of the data, for messages.
     """
     tables = [table for table, _ in maps]
     if not 0 < precision < 1 or not 0.5 <= confidence < 1:
-        raise ConfigError(f"precision {precision:g}, confidence {confidence:g}: both lie between 0 and 1, from 0.5 on")
+        raise ConfigError(
+            f"precision {precision:g}, confidence {confidence:g}: use more than 0 and 0.5 or more, both below 1"
+        )
     index = np.concatenate([table.index + np.array([i << 20, 0, 0]) for i, table in enumerate(tables)]).astype(np.int32)
     label = np.concatenate([dominant(table) for table in tables])
     true = np.concatenate([truth.label for _, truth in maps])
@@ -175,7 +175,7 @@ def calibrate(
 
 
 class _Labels:
-    """The labels of one class: where they are (n, 3), whether right (n,), and their evidence (n,) of each kind."""
+    """The labels of one class: their location (n, 3), their correctness (n,), and their evidence (n,) of each kind."""
 
     def __init__(self, index: Int32, right: Mask, evidence: Mapping[Evidence, Float64], size: float) -> None:
         self._right, self._evidence = right, evidence
@@ -183,7 +183,7 @@ class _Labels:
             self._cell, self._of, self._edge = cubes_of((index[:, 0], index[:, 1], index[:, 2]), size)
 
     def least(self, precision: float, error: float) -> Threshold:
-        """Return the threshold that leaves most of them."""
+        """Return the threshold that retains most of them."""
         tried, left = self._tried()
         best = Threshold(never=True)
         for by, at in sorted(tried, key=lambda pair: -left[pair]):
@@ -195,7 +195,7 @@ class _Labels:
         return best
 
     def _tried(self) -> tuple[list[tuple[Evidence, float]], dict[tuple[Evidence, float], int]]:
-        """Return thresholds that keep different labels, chosen without the truth, and how many each keeps."""
+        """Return thresholds that retain different labels, chosen without the truth, and how many each retains."""
         tried: dict[bytes, tuple[Evidence, float]] = {}
         left = {}
         for by, values in self._evidence.items() if len(self._right) else ():

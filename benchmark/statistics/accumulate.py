@@ -1,4 +1,4 @@
-"""From a map and its log to the sums by frame and cube of space, in one pass."""
+"""Sums by frame and cube of space, from a map and its log in one pass."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ class Cubes:
 
     Attributes:
         cell: (G, 3) int32 the cubes, sorted.
-        at: (n,) int32 which of them each voxel is in, -1 for those that are left out.
+        at: (n,) int32 row of the cube that holds each voxel, -1 for those that are left out.
         edge: Metres, a power of 2.
     """
 
@@ -79,11 +79,11 @@ class Cubes:
         return len(self.cell)
 
     def sums(self, columns: Float64) -> Float64:
-        """Return (G, C) over the voxels of each cube of columns (n, C), of what is not NaN."""
+        """Return the sums (G, C) of columns (n, C) over the voxels of each cube, without NaN."""
         return by_group(self.at, columns.astype(np.float64, copy=False).T, self.count)[0]
 
     def means(self, values: Mapping[str, npt.NDArray[Any]]) -> dict[str, Float64]:
-        """Return (G, 2) by name: over the voxels of each cube where values (n,) are defined their sum, and how many."""
+        """Return (G, 2) by name: the sum and the count of the values (n,) that are defined in each cube."""
         both = by_group(self.at, [*values.values()], self.count)
         return {name: np.stack(own, axis=1) for name, *own in zip(values, both[0].T, both[1].T, strict=True)}
 
@@ -111,7 +111,7 @@ class Cubes:
 class Mean:
     """A statistic of sums (..., C) by name, the second of which counts: a mean, or any other.
 
-    Where no scale is given, what goes from 0 to 1 is a share.
+    Where no scale is given, a number from 0 to 1 is a share.
     """
 
     sums: str
@@ -127,11 +127,11 @@ class Mean:
 
 @dataclass(frozen=True, eq=False)
 class CubeSums:
-    """Sums by name over the voxels of cubes; those of a map in parts follow from the parts'.
+    """Sums by name over the voxels of cubes; those of a map follow from those of its parts.
 
     Attributes:
         cell: (G, 3) int32 the cubes, of an edge in metres, a power of 2.
-        sums: (G, C) of each name.
+        sums: (G, C) sums of each name.
     """
 
     cell: Int32
@@ -153,7 +153,7 @@ class CubeSums:
         return confidence_intervals(self.specs({name: Mean(name, statistic, bounds, scale)}))[0]
 
     def specs(self, means: Mapping[str, Mean]) -> Iterator[EstimateSpec]:
-        """Yield what `confidence_intervals` takes of several means."""
+        """Yield the specs of several means for `confidence_intervals`."""
         for own in means.values():
             yield spec_of_cubes(self._index, self.sums[own.sums], own.of, own.kind, own.bounds)
 
@@ -193,12 +193,12 @@ def cluster_sums_of(
 
     Args:
         table: The map.
-        events: Its log; without it a location counts as a whole, and the frames are not known.
+        events: Its log; without it a location counts as a whole, and the frames are unknown.
         true_label: (n,) the true class of each voxel, -1 where it is not known.
         cells: The labels of sampled cells, from which alpha follows.
         sbd_excess: (n,) SBD of each voxel less that in random order, NaN where that is not known.
-        edge: Of the cubes in metres, a power of 2, where several maps are to have the same; else the smallest that
-            leaves at most MOST_CELLS.
+        edge: Edge of the cubes in metres, a power of 2, where several maps must have the same; the smallest that
+            leaves at most MOST_CELLS by default.
         cubes: The cubes, where they are known already.
         consistent: (n,) the stability posterior, where it is known already.
     """
@@ -218,7 +218,7 @@ def cluster_sums_of(
 
 
 def with_cells(whole: ClusterSums, cells: CellObservations) -> ClusterSums:
-    """Return the sums with those of sampled cells: fine ones, and coarse ones twice as wide."""
+    """Return the sums with those of sampled cells: fine cells, and coarse cells twice as wide."""
     parts = []
     for times in (1, 2):
         log = cells.observations(times * cells.coarsening)
@@ -290,7 +290,7 @@ def _sums_of_log(
 def _with_frameless_sums(
     sums: ClusterSums, table: VoxelTable, cubes: Cubes, true_label: Int64 | None, sbd_excess: Float64 | None
 ) -> ClusterSums:
-    """Return the sums with rows for those of no frame: SBD less that in random order, and how far beliefs are right."""
+    """Return the sums with rows that belong to no frame: SBD less that in random order, and calibration of beliefs."""
     columns, own = np.zeros((cubes.count, sums.columns.shape[1])), layout(sums.K, truth=sums.truth)
     if sbd_excess is not None:
         for name, values in zip(DRIFT, cubes.means({"": sbd_excess})[""].T, strict=True):
@@ -298,10 +298,10 @@ def _with_frameless_sums(
     if true_label is not None:
         confidence, right = vss(table), dominant(table) == true_label
         bins = np.clip(np.ceil(confidence * BINS - 1e-9).astype(np.int64) - 1, 0, BINS - 1)
-        judged = np.where((cubes.at >= 0) & (true_label >= 0), cubes.at * BINS + bins, -1)
-        gap, known = by_group(judged, [right - confidence], cubes.count * BINS)
+        group = np.where((cubes.at >= 0) & (true_label >= 0), cubes.at * BINS + bins, -1)
+        gap, known = by_group(group, [right - confidence], cubes.count * BINS)
         columns[:, own["gap"]] = gap.reshape(-1, BINS)
-        columns[:, own["judged"]] = known.reshape(-1, BINS).sum(axis=1, keepdims=True)
+        columns[:, own["calibrated"]] = known.reshape(-1, BINS).sum(axis=1, keepdims=True)
     some = columns.any(axis=1)
     return replace(
         sums,
@@ -313,7 +313,7 @@ def _with_frameless_sums(
 
 
 def _sums_of_table(table: VoxelTable, cubes: Cubes, true_label: Int64 | None, likely: Float64 | None) -> ClusterSums:
-    """Return the sums of the locations of a table: each counts as a whole, frames are not known.
+    """Return the sums of the locations of a table: each counts as a whole, and frames are unknown.
 
     Sums by class are NaN for evidence that is not one-hot.
     """
@@ -349,7 +349,7 @@ def _sums_with_truth(
 ) -> tuple[dict[str, npt.NDArray[Any]], dict[str, Float64]]:
     """Return the part of `_sums_of_table` that needs true classes (n,).
 
-    Values (n,) of voxels, and sums by class (G, K).
+    These are values (n,) of voxels, and sums by class (G, K).
     """
     evidence, predicted, T = table.evidence, dominant(table), table.op
     of = np.repeat(np.arange(len(table)), np.diff(evidence.starts))

@@ -1,4 +1,4 @@
-"""Do the frames agree about a place? Measures whose expectation does not depend on how many frames saw it.
+"""Agreement of frames at a location, by measures whose expectation does not depend on how many frames saw it.
 
 Voxels are the units and frames the raters. Evidence that is not one-hot counts by its expected value: s_t . s_u is the
 probability that a class drawn from s_t equals one drawn from s_u.
@@ -50,7 +50,7 @@ def fleiss_kappa(table: VoxelTable) -> float:
     """Return Fleiss' kappa of the voxels with OP >= 2, each counting once (Fleiss 1971, Psychological Bulletin 76).
 
     1 - (1 - mean PSA) / (1 - ||p||^2) with p the mean belief. OP may vary from voxel to voxel: where it does not, this
-    is Fleiss' own definition. NaN where no two frames saw one place, or only one class was predicted.
+    is Fleiss' own definition. NaN where no two frames saw one location, or only one class was predicted.
     """
     return float(kappa_of(_sums(kappa_columns, table)))
 
@@ -61,13 +61,14 @@ def krippendorff_alpha(table: VoxelTable) -> float:
     12).
 
     1 - (1 - A) / (1 - A_e): A is the mean of PSA weighted by OP, and A_e is the same agreement between all
-    observations, as if they were of one voxel. NaN where no two frames saw one place, or only one class was predicted.
+    observations, as if they were of one voxel. NaN where no two frames saw one location, or only one class was
+    predicted.
     """
     return float(alpha_of(alpha_sums(table)))
 
 
 def alpha_sums(table: VoxelTable) -> Float64:
-    """Return (3 + K,) what Krippendorff's alpha of a map is a function of; those of its parts add up."""
+    """Return the sums (3 + K,) that give Krippendorff's alpha of a map; those of its parts add up."""
     return _sums(alpha_columns, table)
 
 
@@ -77,7 +78,7 @@ def _sums(columns: Callable[[VoxelTable], Float64], table: VoxelTable) -> Float6
 
 
 def psa_columns(table: VoxelTable) -> Float64:
-    """Return (n, 2): what a mean of PSA is a function of by its sum over voxels."""
+    """Return (n, 2): the columns whose sums over voxels give the mean of PSA."""
     again = table.op >= 2
     return np.stack([np.where(again, psa(table), 0.0), again], axis=1)
 
@@ -90,7 +91,7 @@ def ratio_of(sums: Float64) -> Float64:
 
 
 def kappa_columns(table: VoxelTable) -> Float64:
-    """Return (n, 2 + K): what Fleiss' kappa is a function of by its sum over voxels."""
+    """Return (n, 2 + K): the columns whose sums over voxels give Fleiss' kappa."""
     again = (table.op >= 2)[:, None]
     belief = np.where(again, table.evidence / table.op[:, None], 0.0)
     return np.concatenate([psa_columns(table), belief], axis=1)
@@ -123,8 +124,8 @@ def alpha_of(sums: Float64) -> Float64:
 def disagreement(table: VoxelTable) -> tuple[Float64, Float64]:
     """Return 1 - PSA of each voxel as a sum (n,), (n,): within a frame, and between frames; NaN where OP < 2.
 
-    Within: 1 - ||s_t||^2 averaged, two pixels of one frame. Between: half the mean ||s_t - s_u||^2 of two frames. The
-    expectation of neither depends on OP where frames are independent draws.
+    The part within is the mean of 1 - ||s_t||^2, of two pixels of one frame; the part between is half the mean
+    ||s_t - s_u||^2 of two frames. The expectation of neither depends on OP where frames are independent draws.
     """
     agreement = psa(table)
     again = table.op >= 2
@@ -135,15 +136,15 @@ def disagreement(table: VoxelTable) -> tuple[Float64, Float64]:
 def class_agreement(table: VoxelTable, events: Events | None = None) -> tuple[ClassAgreement, ...]:
     """Return kappa and alpha of each class, every observation reduced to (s_k, 1 - s_k).
 
-    Without events only one-hot evidence tells how the frames agree on a class: NaN where other evidence is there.
+    Without events, only one-hot evidence shows how the frames agree on a class: the result is NaN for other evidence.
     """
     return class_agreement_of(class_sums(table, events), table.classes)
 
 
 def class_sums(table: VoxelTable, events: Events | None = None) -> Float64:
-    """Return (7, K) what `class_agreement_of` is a function of: sums over the voxels with OP >= 2.
+    """Return the sums (7, K) over the voxels with OP >= 2 that `class_agreement_of` takes.
 
-    Evidence, that / OP, disagreement, that * OP, and squares of single observations; then voxels and observations.
+    They are evidence, that / OP, disagreement, that * OP, squares of single observations, voxels and observations.
     """
     K, again, T = table.K, table.op >= 2, table.op.astype(np.float64)
     one_hot, known = table.self_sum == table.op, True
@@ -200,7 +201,7 @@ def _beyond_chance(observed: Float64, expected: Float64) -> Float64:
     return beyond
 
 
-# Where the entropy of a voxel's belief comes from: from within each frame, or from disagreement between frames.
+# The entropy of a voxel's belief comes from within each frame, or from disagreement between frames.
 
 
 @dataclass(frozen=True, eq=False)
@@ -228,16 +229,16 @@ def decompose(table: VoxelTable) -> Uncertainty:
     return Uncertainty(np.minimum(within, total), np.maximum(total - within, 0.0), total)
 
 
-# Is a location consistent? A probability, because a few frames that agree say less than many.
+# The consistency of a location is a probability, because a few frames that agree show less than many.
 #
 # Frames agree or not by chance: of locations that all err in one frame of ten, those that three frames saw look perfect
-# more often than those that thirty saw. So a location borrows from what all locations of its map are like.
+# more often than those that thirty saw. So a location borrows from all locations of its map.
 
 LIKELY = 0.5
-"""A place is called consistent from this probability on."""
+"""A location is called consistent from this probability on."""
 
 STEPS, ROUNDS = 80, 200
-"""Shares of the dominant class that a place may have, between 1/2 and 1, and rounds to find how many have which."""
+"""Shares of the dominant class that a location may have, between 1/2 and 1, and rounds of the EM algorithm."""
 
 
 def consistent_share(agreement: float = CONSISTENT) -> float:
@@ -251,7 +252,7 @@ def shares_of(table: VoxelTable) -> Float64:
     count, likelihood, share = np.bincount(of), _likelihood(seen, most), np.full(STEPS, 1 / STEPS)
     if not len(seen):
         return share
-    for _ in range(ROUNDS):  # how often each share is so, a posteriori
+    for _ in range(ROUNDS):  # probability of each share, a posteriori
         share = share * ((count / (likelihood @ share)) @ likelihood) / count.sum()
     return share
 
@@ -264,7 +265,7 @@ def consistency_posterior(
     Of T frames m vote for the dominant class, which happens with the probability b(m; T, p) + b(T - m; T, p) where its
     share is p. How many locations have which p is estimated from all of them without any form of its distribution
     (Kiefer and Wolfowitz 1956, Annals of Mathematical Statistics 27; by the EM algorithm), then Bayes' theorem is
-    applied. `shares` are those of the whole map, where the table has but some of its locations.
+    applied. `shares` are those of the whole map, where the table has only some of its locations.
     """
     seen, most, of = _votes(table)
     posterior = _likelihood(seen, most) * (shares_of(table) if shares is None else shares)
@@ -287,9 +288,9 @@ def _likelihood(seen: Int64, most: Int64) -> Float64:
 
 
 def _votes(table: VoxelTable) -> tuple[Int64, Int64, Int64]:
-    """Return frames that saw a location and votes for its class, each pair once (v,).
+    """Return each pair of frames that saw a location and votes for its class once (v,), (v,).
 
-    Which pair each with OP >= 2 has.
+    The third array has the pair of each location with OP >= 2.
     """
     again = table.op >= 2
     T = table.op[again].astype(np.int64)

@@ -28,10 +28,10 @@ from semstab.statistics.agreement import ONE_HOT, alpha_of, ratio_of
 # --- Columns ----------------------------------------------------------------------------------------------------------
 
 MOST_CLASSES = 64
-"""Sums by class are kept up to so many classes."""
+"""Sums by class are stored up to so many classes."""
 
 BINS = 15
-"""Of the reliability diagram: voxels whose largest belief lies in (b / BINS, (b + 1) / BINS]."""
+"""Bins of the reliability diagram; bin b has voxels whose largest belief lies in (b / BINS, (b + 1) / BINS]."""
 
 PLAIN = (
     "voxels", "psa", "observations", "agreeing", "own", "twice", "twice_agreeing", "recurrent", "vss", "entropy",
@@ -39,13 +39,13 @@ PLAIN = (
 DRIFT = ("sbd_excess", "sbd_known")
 WITH_TRUTH = ("known", "right", "observed", "observed_right", "consistent", "consistent_wrong")
 BY_TRUE_CLASS = ("class_known", "class_right", "class_predicted")
-WITHOUT_FRAMES = (*DRIFT, "judged", "gap")
+WITHOUT_FRAMES = (*DRIFT, "calibrated", "gap")
 """Sums that belong to no frame: they stand in rows whose frame is -1."""
 
 
 @functools.lru_cache(maxsize=16)
 def layout(K: int, *, truth: bool) -> Mapping[str, slice]:
-    """Return which columns of the sums each name stands for; those by class have K columns, `gap` one for each bin."""
+    """Return the columns of the sums for each name; those by class have K columns, `gap` one for each bin."""
     by_class = K <= MOST_CLASSES
     widths = [(name, 1) for name in PLAIN] + [("evidence", K)]
     widths += [(name, K) for name in ("class_apart", "class_own")] if by_class else []
@@ -53,7 +53,7 @@ def layout(K: int, *, truth: bool) -> Mapping[str, slice]:
     if truth:
         widths += [(name, 1) for name in WITH_TRUTH]
         widths += [(name, K) for name in BY_TRUE_CLASS] if by_class else []
-        widths += [("judged", 1), ("gap", BINS)]
+        widths += [("calibrated", 1), ("gap", BINS)]
     ends = np.cumsum([width for _, width in widths])
     slices = {name: slice(int(end) - width, int(end)) for (name, width), end in zip(widths, ends, strict=True)}
     return MappingProxyType(slices)
@@ -79,7 +79,7 @@ def iou_of(sums: Float64) -> Float64:
 def miou_of(sums: Float64) -> Float64:
     """Return its mean (...,) over the classes that are true or predicted anywhere.
 
-    A count twice, then the same three.
+    The sums are a count twice, then the same three.
     """
     right, true, predicted = np.split(sums[..., 2:], 3, axis=-1)
     union = true + predicted - right
@@ -105,9 +105,9 @@ class ClusterIndex:
     """The cube of space and the group of frames of rows (m,), some of which belong to no frame.
 
     Attributes:
-        cubes: (G, 3) sorted, of an edge in metres; row (m,) which of them each row is in.
-        frames: (F,) the groups of frames, sorted, of so many each on average (per_group, 0 where they are not known).
-        known: (r,) the rows that belong to one, column (r,) which of them.
+        cubes: (G, 3) sorted, of an edge in metres; row (m,) the cube of each row.
+        frames: (F,) the groups of frames, sorted, of so many each on average (per_group, 0 where they are unknown).
+        known: (r,) the rows that belong to a group, column (r,) that group.
     """
 
     cubes: Int64
@@ -163,10 +163,10 @@ SCHEMA = 4
 WITHOUT_CELLS = 2, 3
 """Versions of files whose samples had no cells: only the sums of their maps are read."""
 MOST_CELLS, MOST_GROUPS = 256, 64
-"""Cubes of space and groups of frames that are kept apart, at most."""
+"""Most cubes of space and groups of frames that are kept apart."""
 
 MOST_SUMS = 2**24
-"""Numbers in the sums, at most: of thousands of classes fewer groups of frames are kept apart."""
+"""Most numbers in the sums: with thousands of classes fewer groups of frames are kept apart."""
 
 
 def most_groups(K: int) -> int:
@@ -179,16 +179,16 @@ class ClusterSums:
     """Sums over the observations in voxels with OP >= 2, a row for each cube of space and group of frames.
 
     Attributes:
-        cell: (m, 3) int32 which cube: floor(voxel centre / edge), so that the cubes of all maps of a scene are the
+        cell: (m, 3) int32 cube: floor(voxel centre / edge), so that the cubes of all maps of a scene are the
             same.
-        frame: (m,) int32 which group: frame index // step; -1 where the frames are not known, for want of a log, and
+        frame: (m,) int32 group: frame index // step; -1 where the frames are unknown, without a log, and
             for sums that belong to none (`WITHOUT_FRAMES`).
-        columns: (m, C) float64, see `layout`. A place counts 1 / T for each of its T frames in `voxels`, 1 in
+        columns: (m, C) float64, see `layout`. A location counts 1 / T for each of its T frames in `voxels`, 1 in
             `observations`; its pairwise agreement is shared out among them in `psa` and `agreeing`.
         edge: Metres, a power of 2.
-        step: Frames of a group, a power of 2; 0 where they are not known.
-        fused: How many frames they come from.
-        truth: Whether ground truth is in it.
+        step: Frames of a group, a power of 2; 0 where they are unknown.
+        fused: Number of frames that they come from.
+        truth: True if sums of ground truth are included.
         fine, coarse: The same of sampled cells, which are units instead of voxels and views instead of frames, and of
             cells twice as wide, where there are `CellObservations`.
     """
@@ -223,12 +223,12 @@ class ClusterSums:
 
     @property
     def frames(self) -> int:
-        """Return how many groups of frames there are; 0 where they are not known."""
+        """Return how many groups of frames there are; 0 where they are unknown."""
         return len(self.index.frames) if self.step else 0
 
     @property
     def frame_count(self) -> int:
-        """Return how many frames they come from, about; 0 where they are not known."""
+        """Return how many frames they come from, about; 0 where they are unknown."""
         return round(self.frames * self.index.per_group)
 
     @property
@@ -287,7 +287,7 @@ class ClusterSums:
 
     @classmethod
     def load(cls, path: str | Path) -> ClusterSums:
-        """Read what `save` wrote.
+        """Read a file that `save` wrote.
 
         Raises:
             DataError: If the file is missing, damaged or of another kind.
@@ -302,7 +302,7 @@ class ClusterSums:
             kind, version = about.pop("kind"), about.pop("schema")
             old = (kind, version) in (("InfluenceSums", each) for each in WITHOUT_CELLS)
             if not old and (kind, version) != ("ClusterSums", SCHEMA):
-                raise DataError("of another kind or version")
+                raise DataError("it is of another kind or version")
             if old:
                 about |= {name: [about.get(name, 0)] for name in ("step", "voxel_size", "fused")}
             meta = from_json(SumsMeta, about, path)
@@ -311,7 +311,7 @@ class ClusterSums:
             if columns.shape[1] != width(meta.K, truth=meta.truth):
                 raise DataError(f"{columns.shape[1]} columns of sums for {meta.K} classes")
             if np.any(np.abs(columns) > LARGEST**2):
-                raise DataError("a sum is larger than a map can have it")
+                raise DataError("a sum is larger than any map can have")
             parts: list[ClusterSums] = []
             for number, (step, voxel_size, fused) in enumerate(
                 zip(meta.step, meta.voxel_size, meta.fused, strict=True)
@@ -332,7 +332,7 @@ KEYS = ("part", "ix", "iy", "iz", "frame")
 
 
 LARGEST = 2.0**30
-"""Of edges in metres and groups of frames; its square of sums: larger numbers are damage."""
+"""Largest edge in metres and group of frames; its square is the largest sum. Larger numbers are damage."""
 
 
 @dataclass(frozen=True)
@@ -355,20 +355,20 @@ class SumsMeta:
         if not (sizes and self.K > 0 and len(self.classes) in (0, self.K)):
             raise DataError(f"{self.K} classes, {len(self.classes)} names, voxels of {self.voxel_size[0]:g} m")
         if not (0 < self.edge <= LARGEST and math.frexp(self.edge)[0] == 0.5):
-            raise DataError(f"cubes of {self.edge:g} m, which is no power of 2 of that size")
+            raise DataError(f"the edge of cubes is {self.edge:g} m, which is not a power of 2 in range")
         for step in self.step:
             if not 0 <= step <= LARGEST or step & (step - 1):
-                raise DataError(f"groups of {step} frames, which is no power of 2 of that size")
+                raise DataError(f"groups have {step} frames, which is not a power of 2 in range")
 
 
 def _joined(index: Int32, times: float) -> Int64:
-    """Return which cubes, or groups of frames, these are where so many are one; -1 of frames stays."""
+    """Return the larger cubes, or groups of frames, that join so many of these; -1 of frames stays."""
     wide: Int64 = index.astype(np.int64) // round(min(times, 2.0**40))
     return wide
 
 
 def _key(values: npt.NDArray[Any], name: str) -> npt.NDArray[Any]:
-    """Return a column of whole numbers that fit; raises DataError where it is not."""
+    """Return a column of whole numbers that fit; raises DataError where they do not."""
     if values.dtype.kind not in "iu" or not np.array_equal(values, values.astype(np.int32)):
         raise DataError(f"a number of column '{name}' is out of range")
     return values
@@ -378,10 +378,10 @@ def aligned(*parts: ClusterSums) -> tuple[ClusterSums, ...]:
     """Return the sums at the finest cubes and groups of frames that all of them have, those of cells alike.
 
     Raises:
-        DataError: If they differ in what their columns are.
+        DataError: If they have different columns.
     """
     if len({(part.K, part.classes, part.truth) for part in parts}) > 1:
-        raise DataError("sums of maps of different classes, or with and without ground truth, do not fit together")
+        raise DataError("the sums do not fit together: their maps differ in classes, or only some have ground truth")
     edge, steps = max(part.edge for part in parts), [part.step for part in parts]
     step = max(steps) if all(steps) else 0
     same = [part if (part.edge, part.step) == (edge, step) else part.coarsened(edge, step) for part in parts]
@@ -392,7 +392,7 @@ def aligned(*parts: ClusterSums) -> tuple[ClusterSums, ...]:
     return tuple(dataclasses.replace(part, fine=one, coarse=two) for part, one, two in cells)
 
 
-# --- What follows from the sums ---------------------------------------------------------------------------------------
+# --- Numbers that follow from the sums --------------------------------------------------------------------------------
 
 
 Part = Literal["map", "fine", "coarse"]
@@ -402,16 +402,16 @@ Part = Literal["map", "fine", "coarse"]
 class Functional:
     """A number that is a smooth function of sums over a map.
 
-    The second sum counts what the first is a sum of.
+    The second sum counts the terms of the first.
 
     Attributes:
-        names: Of the sums.
+        names: Names of the sums.
         of: The number (...,) from these sums (..., C).
         low, high: Its range.
-        scale: Of its interval: a 'share' or mean of numbers from 0 to 1, an 'agreement', at most 1, or 'plain'.
-        parts: The sums that it is of, each with its weight: of a map, or of sampled cells.
-        pairs: The first sum is of pairwise agreement, which of a place that two frames saw neither has for itself
-            alone.
+        scale: Scale of its interval: a 'share' or mean of numbers from 0 to 1, an 'agreement', at most 1, or 'plain'.
+        parts: The parts that its sums come from, each with its weight: a map, or sampled cells.
+        pairs: The first sum is of pairwise agreement; at a location that two frames saw, neither frame has it for
+            itself alone.
     """
 
     names: tuple[str, ...]
@@ -424,7 +424,7 @@ class Functional:
 
 
 CELLS: tuple[tuple[Part, float], ...] = (("fine", 2.0), ("coarse", -1.0))
-"""2 alpha(h) - alpha(2 h): alpha falls with the size of cells, to first order linearly, by what they mix."""
+"""2 alpha(h) - alpha(2 h): alpha falls with the size of cells, to first order linearly, as they mix more surfaces."""
 
 
 def class_alpha_of(sums: Float64) -> Float64:
@@ -450,12 +450,12 @@ FUNCTIONALS: Mapping[str, Functional] = {
     "wrong_of_consistent": Functional(("consistent_wrong", "consistent"), ratio_of),
     "sbd_excess": Functional(("sbd_excess", "sbd_known"), ratio_of, -1.0, 1.0, "plain"),
     "miou": Functional(("known", "known", "class_right", "class_known", "class_predicted"), miou_of, scale="plain"),
-    "ece": Functional(("judged", "judged", "gap"), ece_of, scale="plain"),
+    "ece": Functional(("calibrated", "calibrated", "gap"), ece_of, scale="plain"),
 }
-"""By key: alpha, of cells that two views saw or more; PSA, Krippendorff's alpha of voxels and entropy at OP >= 2, VSS
-at OP >= 3, SBD less that in random order where that is known; with ground truth the accuracy of the fused labels at
-OP >= 2 and of single observations, the wrong among the consistent locations at OP >= 3, mean intersection over union
-and expected calibration error at OP >= 2."""
+"""Numbers by key: alpha, of cells that two views saw or more; PSA, Krippendorff's alpha of voxels and entropy at
+OP >= 2, VSS at OP >= 3, SBD less that in random order where that is known; with ground truth the accuracy of the fused
+labels at OP >= 2 and of single observations, the wrong among the consistent locations at OP >= 3, mean intersection
+over union and expected calibration error at OP >= 2."""
 
 BY_CLASS: Mapping[str, Functional] = {
     "alpha": Functional(CLASS_SUMS, class_alpha_of, -1.0, 1.0, "agreement", parts=CELLS),
@@ -464,22 +464,22 @@ BY_CLASS: Mapping[str, Functional] = {
     "precision": Functional(("class_right", "class_predicted"), ratio_of),
     "iou": Functional(("class_right", "known", "class_known", "class_predicted"), iou_of),
 }
-"""Of one class: alphas against all others, accuracy where it is the true one (recall) and where it is predicted
-(precision), and intersection over union."""
+"""Numbers of one class by key: alphas against all others, accuracy where it is the true one (recall) and where it is
+predicted (precision), and intersection over union."""
 
 
 def of_space_alone(key: str, k: int | None = None) -> bool:
-    """Return whether a number says nothing of frames, so that its intervals are for these frames."""
+    """Return whether a number does not depend on frames, so that its intervals are for these frames."""
     return set(functional(key, k).names) <= set(WITHOUT_FRAMES)
 
 
 def functional(key: str, k: int | None = None) -> Functional:
-    """Return what a key stands for: of all classes, or of class k."""
+    """Return the number that a key stands for: of all classes, or of class k."""
     return FUNCTIONALS[key] if k is None else BY_CLASS[key]
 
 
 def parts_of(sums: ClusterSums, number: Functional) -> tuple[tuple[ClusterSums, float], ...]:
-    """Return the sums that a number is of, each with its weight; none where they are not there."""
+    """Return the sums that a number is of, each with its weight; none where they are missing."""
     of = {"map": sums, "fine": sums.fine, "coarse": sums.coarse}
     there = [(part, weight) for name, weight in number.parts if (part := of[name]) is not None]
     known = all(set(number.names) <= set(layout(part.K, truth=part.truth)) for part, _ in there)
@@ -503,7 +503,7 @@ def value(sums: ClusterSums, key: str, k: int | None = None) -> float:
 
 
 def frames_of(sums: ClusterSums, key: str, k: int | None = None) -> int:
-    """Return how many frames, or views, a number is of, about; 0 where they are not known."""
+    """Return how many frames, or views, a number is of, about; 0 where they are unknown."""
     parts = parts_of(sums, functional(key, k))
     return parts[0][0].frame_count if parts else 0
 
@@ -511,7 +511,7 @@ def frames_of(sums: ClusterSums, key: str, k: int | None = None) -> int:
 def cubes_of(
     index: tuple[Int32, Int32, Int32], voxel_size: float, edge: float | None = None, some: Mask | None = None
 ) -> tuple[Int32, Int32, float]:
-    """Return the cubes (G, 3) that hold voxels of index columns (n,), which of them each is in (n,), and their edge.
+    """Return the cubes (G, 3) that hold voxels of index columns (n,), the cube (n,) of each voxel, and their edge.
 
     A cube is floor(voxel centre / edge). Only `some` (n,) of the voxels count, the others are in -1. The edge, unless
     it is given, is the smallest power of 2 metres, no smaller than a voxel, that leaves at most MOST_CELLS cubes.

@@ -1,4 +1,4 @@
-"""Stability vs. accuracy: are fused labels right and calibrated where ground truth exists, and what is always wrong?"""
+"""Stability vs. accuracy: correctness and calibration of fused labels with ground truth, and lasting errors."""
 
 from __future__ import annotations
 
@@ -27,8 +27,8 @@ ECE = Quantity(key="ece", title="ECE", better="lower", needs="truth")
 BRIER = Quantity(key="brier", title="Brier", better="lower", needs="truth")
 
 PURE = 0.5 + 1e-9
-"""A voxel has a true class where more than this share of its ground truth evidence is of one class: not where it is a
-half, however that is rounded."""
+"""A voxel has a true class where more than this share of its ground truth evidence is of one class: exactly a half
+is not enough, however it is rounded."""
 
 BINS = 15
 
@@ -38,8 +38,8 @@ class Truth:
     """The true class of a map's voxels.
 
     Attributes:
-        known: (n,) whether the ground truth saw the voxel and has a majority there.
-        label: (n,) the true class; -1 where it is not known.
+        known: (n,) true where the ground truth saw the voxel and has a majority there.
+        label: (n,) the true class; -1 where it is unknown.
     """
 
     known: Mask
@@ -64,7 +64,7 @@ def join_truth(table: VoxelTable, truth: VoxelTable) -> Truth:
 
 @dataclass(frozen=True, eq=False)
 class Predictions:
-    """Beliefs beside the true classes, (n,) each.
+    """Beliefs with the true classes, (n,) each.
 
     Attributes:
         label, predicted: The true and the most likely class.
@@ -81,7 +81,7 @@ class Predictions:
 
     @classmethod
     def of(cls, evidence: Float64 | Evidence, label: Int64) -> Predictions:
-        """Return beliefs as evidence (n, K), up to a factor; what is said where the label is -1 means nothing."""
+        """Return predictions from evidence (n, K), up to a factor; they mean nothing where the label is -1."""
         evidence = Evidence.of(evidence)
         spread, of = evidence.concentration, np.repeat(np.arange(len(evidence)), np.diff(evidence.starts))
         total = np.bincount(of, weights=evidence.weight, minlength=len(evidence))
@@ -92,31 +92,36 @@ class Predictions:
 
     @property
     def right(self) -> Mask:
-        """(n,) whether the most likely class is the true one."""
+        """(n,) true where the most likely class is the true one."""
         same: Mask = self.predicted == self.label
         return same
 
 
 def correctness(belief: Float64 | Evidence, label: Int64, name: str = "all") -> Correctness:
     """Return accuracy and calibration of beliefs (n, K) whose true classes are (n,)."""
-    return correctness_of(judged_sums(Predictions.of(belief, label), label >= 0), name)
+    return correctness_of(prediction_sums(Predictions.of(belief, label), label >= 0), name)
 
 
-def judged_sums(judged: Predictions, where: Mask) -> Float64:
-    """Return (3 + 3 BINS + 3 K,) what `correctness_of` is a function of, over the voxels for which `where` (n,) holds.
+def prediction_sums(predictions: Predictions, where: Mask) -> Float64:
+    """Return the sums (3 + 3 BINS + 3 K,) that `correctness_of` takes, over the voxels for which `where` (n,) holds.
 
-    Voxels, right ones and errors; by bin of confidence voxels, confidence and right ones; by class right, true and
-    predicted ones.
+    They are voxels, right ones and errors; by bin of confidence voxels, confidence and right ones; by class right,
+    true and predicted ones.
     """
-    sums: Float64 = _judged_by_group(judged, where - np.int64(1), 1)[0]
+    sums: Float64 = _prediction_sums_by_group(predictions, where - np.int64(1), 1)[0]
     return sums
 
 
-def _judged_by_group(judged: Predictions, group: Int64, groups: int) -> Float64:
-    """Return (G, ...) `judged_sums` of each group; -1 is none."""
-    some, K = np.flatnonzero(group >= 0), judged.K
-    of, label, predicted, confidence = group[some], judged.label[some], judged.predicted[some], judged.confidence[some]
-    right = judged.right[some].astype(np.float64)
+def _prediction_sums_by_group(predictions: Predictions, group: Int64, groups: int) -> Float64:
+    """Return (G, ...) `prediction_sums` of each group; -1 is none."""
+    some, K = np.flatnonzero(group >= 0), predictions.K
+    of, label, predicted, confidence = (
+        group[some],
+        predictions.label[some],
+        predictions.predicted[some],
+        predictions.confidence[some],
+    )
+    right = predictions.right[some].astype(np.float64)
     bins = np.clip(np.ceil(confidence * BINS - 1e-9).astype(np.int64) - 1, 0, BINS - 1)
 
     def sums(width: int, within: Any, weights: Any = None) -> Float64:
@@ -124,14 +129,14 @@ def _judged_by_group(judged: Predictions, group: Int64, groups: int) -> Float64:
         return result.astype(np.float64).reshape(groups, width)
 
     return np.hstack([
-        sums(1, 0), sums(1, 0, right), sums(1, 0, judged.error[some]),
+        sums(1, 0), sums(1, 0, right), sums(1, 0, predictions.error[some]),
         sums(BINS, bins), sums(BINS, bins, confidence), sums(BINS, bins, right),
         sums(K, label, right), sums(K, label), sums(K, predicted),
     ])  # fmt: skip
 
 
 def correctness_of(sums: Float64, name: str = "all") -> Correctness:
-    """Return what is said of voxels of these sums, see `judged_sums`."""
+    """Return the correctness of voxels with these sums, see `prediction_sums`."""
     n, right, error = sums[:3]
     if not n:
         return Correctness(name, 0, math.nan, math.nan, math.nan, math.nan)
@@ -143,7 +148,7 @@ def correctness_of(sums: Float64, name: str = "all") -> Correctness:
 
 
 def reliability_of(sums: Float64) -> tuple[Reliability, ...]:
-    """Return the bins of the reliability diagram of voxels of these sums, see `judged_sums`."""
+    """Return the bins of the reliability diagram of voxels with these sums, see `prediction_sums`."""
     count, confidence, right = sums[3 : 3 + 3 * BINS].reshape(3, BINS)
     with np.errstate(invalid="ignore"):
         confidence, accuracy = confidence / count, right / count
@@ -155,12 +160,12 @@ def reliability_of(sums: Float64) -> tuple[Reliability, ...]:
 
 def reliability(belief: Float64 | Evidence, label: Int64) -> tuple[Reliability, ...]:
     """Return the bins of the reliability diagram (Guo et al. 2017, ICML) of beliefs (n, K) and true classes (n,)."""
-    return reliability_of(judged_sums(Predictions.of(belief, label), label >= 0))
+    return reliability_of(prediction_sums(Predictions.of(belief, label), label >= 0))
 
 
-def by_stratum(judged: Predictions, op: Int32, known: Mask, edges: Sequence[int]) -> tuple[Correctness, ...]:
+def by_stratum(predictions: Predictions, op: Int32, known: Mask, edges: Sequence[int]) -> tuple[Correctness, ...]:
     """Return the correctness of all voxels whose true class is known (n,), then of each stratum of OP (n,)."""
-    sums = _judged_by_group(judged, np.where(known, groups_of(op, edges), -1), len(edges) + 1)
+    sums = _prediction_sums_by_group(predictions, np.where(known, groups_of(op, edges), -1), len(edges) + 1)
     names = ["all", *(name for name, _, _ in strata(edges))]
     return tuple(correctness_of(own, name) for own, name in zip([sums.sum(axis=0), *sums], names, strict=True))
 
@@ -207,6 +212,6 @@ def wrong_where_consistent(table: VoxelTable, truth: Truth, consistent: Float64)
 
 
 def _masks(table: VoxelTable, truth: Truth, consistent: Float64) -> tuple[Mask, Float64, Mask]:
-    """Return (n,) which voxels count, their stability posterior (0 where unknown), and which are right."""
+    """Return (n,) the voxels that count, the consistency posterior (0 where unknown), and the right voxels."""
     counted = truth.known & (table.op >= RECURRENT)
     return counted, np.nan_to_num(consistent), dominant(table) == truth.label

@@ -1,6 +1,6 @@
-"""Agreement beyond chance of two observations of a cell, by how far apart they are: time, angle, range and baseline.
+"""Agreement beyond chance of two observations of a cell by their distance: time, angle, range and baseline.
 
-One number of a map averages over all pairs of frames, so that it says as much about the flight as about the model.
+One number of a map averages over all pairs of frames, so that it depends on the flight as much as on the model.
 """
 
 from __future__ import annotations
@@ -25,10 +25,10 @@ STANDARD = (5.0, 15.0)
 """Degrees between the viewing directions at which alpha is stated: a baseline of a tenth to a quarter of the range."""
 
 LEAST_PAIRS, LEAST_CUBES = 100, 8
-"""Below so many pairs, or cubes that hold them, a bin is left out."""
+"""A bin with fewer pairs, or fewer cubes that hold them, is left out."""
 
 MOST_CUBES, MOST_SUMS = 160, 2**17
-"""Of cubes, and of the sums of a bin: of many classes fewer groups of frames are kept apart."""
+"""Most cubes, and most sums of a bin: with many classes fewer groups of frames are kept apart."""
 
 EDGES: dict[str, tuple[float, ...]] = {
     "time": (1, 2, 3, 5, 9, 17, 33, 65, 129, 1e9),
@@ -47,12 +47,12 @@ BINS = tuple((axis, *edges) for axis, own in AXES.items() for edges in itertools
 def correlogram(cells: CellObservations) -> Correlogram:
     """Return alpha of fine cells in bins of the distance of two observations.
 
-    Of a cell's observations those that are 1, 2, 4, 8, ... apart are paired, so that the cost is linear. Chance is that
-    of the pairs in the bin. Bands are at 95 %, for this scene flown again where the frames of a bin tell of it, else
+    Observations of a cell that are 1, 2, 4, 8, ... apart are paired, so that the cost is linear. Chance is that of
+    the pairs in the bin. Bands are at 95 %, for this scene flown again where the bin has enough frames for that, else
     for these frames.
     """
     seen = cells.observations()
-    labels = np.unique(seen.evidence.label)  # of the others nothing changes
+    labels = np.unique(seen.evidence.label)  # the other classes change nothing
     cubes, of, edge = _cubes(seen)
     step, most = 1, min(MOST_GROUPS, max(1, MOST_SUMS // (max(len(cubes), 1) * (3 + len(labels)))))
     while len(frames := np.unique(seen.frame // step)) > most:
@@ -73,7 +73,7 @@ def correlogram(cells: CellObservations) -> Correlogram:
         if len(np.unique(cube[some])) < LEAST_CUBES:
             continue
         own = sums.total[k, some]
-        halves = own[:, :2]  # of its agreement with the other one, neither observation has half for itself alone
+        halves = own[:, :2]  # neither observation has half of its agreement with the other one for itself alone
         where = cubes[cube[some]], frames[group[some]], edge, step
         specs.append(spec_of_observations(*where, own, halves, alpha_of))
         rows.append((k, float(distance[k] / pairs[k]), int(pairs[k])))
@@ -94,9 +94,9 @@ def _cubes(seen: Events) -> tuple[Any, Any, float]:
 
 
 def _pairs(cells: CellObservations, seen: Events) -> Iterator[tuple[Int64, Int64, Float64]]:
-    """Yield the pairs (m,) of observations that are 1, 2, 4, ...
+    """Yield the pairs (m,) of observations with lags of 1, 2, 4 and so on.
 
-    apart, lag by lag, and how far (m, 5), along `AXES`.
+    Lag by lag, the third array has their distance (m, 5) along `AXES`.
     """
     rank, centre = cells.views.rank(seen.frame), cells.views.centre
     index = np.stack([seen.ix, seen.iy, seen.iz], axis=1)
@@ -126,7 +126,7 @@ def _bins(apart: Float64) -> Int64:
 class _BinSums:
     """Sums of pairs of observations by bin and cluster (bins + 1, C, 3 + K), of which `alpha_of` is a function.
 
-    Of s . s' with the other observation, of observations, of ||s||^2, and of s.
+    They are sums of s . s' with the other observation, of observations, of ||s||^2, and of s.
     """
 
     def __init__(self, evidence: Evidence, clusters: int) -> None:

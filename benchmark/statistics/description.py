@@ -40,7 +40,7 @@ from semstab.statistics.correctness import (
     Truth,
     by_stratum,
     join_truth,
-    judged_sums,
+    prediction_sums,
     quadrant_sums,
     quadrants_of,
     reliability_of,
@@ -59,8 +59,8 @@ from semstab.statistics.sections import (
     Columns,
     FlippingSums,
     LogSums,
+    location_sums,
     log_sums,
-    place_sums,
     row_columns,
 )
 from semstab.statistics.verdict import LIMITS, Limits, verdict
@@ -77,7 +77,7 @@ class Analysis:
         table: Means of the measures over all voxels.
         sums: Sums by frame and cube of space, from which intervals and differences follow without voxels.
         sample: The voxels that the statistics rest on.
-        shares: How often the dominant class is seen, over all locations: see `consistency_posterior`.
+        shares: Number of locations with each share of the dominant class: see `consistency_posterior`.
         drawn: Columns (n,) of the voxels of the sample that need its log or its true labels.
     """
 
@@ -89,10 +89,10 @@ class Analysis:
     drawn: Columns
 
     def columns(self, table: VoxelTable, truth: VoxelTable | None = None) -> Columns:
-        """Return one value a voxel (n,) by name for the map or any part of it, NaN where undefined.
+        """Return one value per voxel (n,) by name for the map or any part of it, NaN where undefined.
 
-        Columns that need the log are NaN for voxels that were not drawn. True labels are known of the drawn voxels
-        (-1 elsewhere), and of all where `truth`, the true labels' map of the part, is given.
+        Columns that need the log are NaN for voxels that were not drawn. True labels are known for the drawn voxels
+        (-1 elsewhere), and for all where `truth`, the true labels' map of the part, is given.
         """
         rows, drawn = shared_rows(table, self.sample.table)
         spread: Columns = {}
@@ -127,7 +127,7 @@ def describe(
     """Return all statistics of one map: a `MapSample` is drawn and analysed.
 
     - `events`: the log behind the table; without it there is no trend and no flip rate
-    - `truth`: the map of the ground truth labels of the same frames; without it correctness is not known
+    - `truth`: the map of the ground truth labels of the same frames; without it correctness is unknown
     - `limit`: the map of view-independent labels (`ceiling`), from which geometry's part of the disagreement follows
 
     The other arguments are those of `analyse`.
@@ -161,12 +161,12 @@ def analyse(
         cells: Labels of sampled cells, taken of the same frames by a `Sampler`; without them there is no alpha and no
             verdict.
         limit: The map of view-independent labels; the ground truth's where it is not given.
-        name: Of the model, for the verdict.
-        seed: Of random orders.
+        name: Name of the model, for the verdict.
+        seed: Seed of random orders.
         edges: Upper bounds of the strata of OP.
         critical: The classes that the verdict depends on; where none is named, all with enough locations.
-        scope: Scope of the headline and of alpha by class, where views tell of it.
-        limits: Of the verdict.
+        scope: Scope of the headline and of alpha by class, where there are enough views for it.
+        limits: Limits of the verdict.
     """
     table, events = sample.table.measured(), sample.events
     truth = None if sample.truth is None else join_truth(table, sample.truth)
@@ -176,7 +176,7 @@ def analyse(
     null = expected_sbd(table, events, seed=seed)
     columns = row_columns(table, null)
     cubes = Cubes.of(table)
-    of_places = place_sums(table, columns, cubes)
+    of_locations = location_sums(table, columns, cubes)
     influence = cluster_sums_of(
         table,
         events,
@@ -193,8 +193,8 @@ def analyse(
     if truth is not None:
         drawn["true_label"] = truth.label
     (inconsistent,) = confidence_intervals(flipping.specs())
-    of_flips = [] if log is None else confidence_intervals(log.places.specs(OF_FLIPS))
-    means = dict(zip(MEANS, confidence_intervals(of_places.specs(MEANS)), strict=True))
+    of_flips = [] if log is None else confidence_intervals(log.sums.specs(OF_FLIPS))
+    means = dict(zip(MEANS, confidence_intervals(of_locations.specs(MEANS)), strict=True))
     whole = sample.summary.summary(table.voxel_size, table.classes, edges)
     headline, count = HeadlineStatistics(*confidence_intervals(headline_specs(influence, scope))), len(cubes.cell)
     agreeing = None if cells is None else cell_agreement(cells, influence, table, scope, critical, limits)
@@ -226,7 +226,7 @@ def analyse(
         headline=headline,
         cells=agreeing,
         correlogram=None if cells is None else correlogram(cells),
-        drift=_drift(repeats, means, of_places, log, of_flips),
+        drift=_drift(repeats, means, of_locations, log, of_flips),
         uncertainty=EntropyParts(means["entropy"], means["entropy_within"], means["entropy_between"]),
         geometry=None if limit is None else losses(table, limit),
         correctness=None if truth is None else _correctness(table, truth, consistent, cubes, edges),
@@ -243,13 +243,13 @@ def cell_agreement(
     critical: Sequence[str] = (),
     limits: Limits = LIMITS,
 ) -> CellAgreement:
-    """Return alpha of each class, and what the observations are that alpha rests on.
+    """Return alpha of each class, with the observations that alpha rests on.
 
     Args:
         cells: Labels of sampled cells.
         sums: Sums of the map with these cells.
         table: The map, by which locations of a class are counted.
-        scope: Scope of the intervals, where views tell of it.
+        scope: Scope of the intervals, where there are enough views for it.
         critical: Classes that the verdict depends on; where none is named, those with enough locations.
         limits: Limits of the verdict.
     """
@@ -293,10 +293,10 @@ def _agreement(means: Mapping[str, Interval], classes: tuple[ClassAgreement, ...
 def _drift(
     repeats: int, means: Mapping[str, Interval], locations: CubeSums, log: LogSums | None, of_flips: Sequence[Interval]
 ) -> DriftStatistics:
-    """Return SBD beside its null; without a log only for one-hot evidence, and without flips and trend."""
+    """Return SBD and its null; without a log only for one-hot evidence, and without flips and trend."""
     trend, rates, sampled = None, None, locations["psa"][1]
     if log is not None:
-        since, share = confidence_intervals(log.places.specs(OF_CHANGES))
+        since, share = confidence_intervals(log.sums.specs(OF_CHANGES))
         trend = Trend(share, log.telling)
         rate, null, beyond = of_flips
         rates = FlipRates(rate, null, beyond, since)
@@ -313,12 +313,12 @@ def _drift(
 def _correctness(
     table: VoxelTable, truth: Truth, consistent: Float64, cubes: Cubes, edges: Sequence[int]
 ) -> CorrectnessStatistics:
-    judged = Predictions.of(table.evidence, truth.label)
-    right = cubes.means({"right": np.where(truth.known, judged.right, np.nan)})
+    predictions = Predictions.of(table.evidence, truth.label)
+    right = cubes.means({"right": np.where(truth.known, predictions.right, np.nan)})
     return CorrectnessStatistics(
         accuracy=CubeSums(cubes.cell, cubes.edge, right).estimate("right", ratio_of),
-        strata=by_stratum(judged, table.op, truth.known, edges),
-        reliability=reliability_of(judged_sums(judged, truth.known & (table.op >= 2))),
+        strata=by_stratum(predictions, table.op, truth.known, edges),
+        reliability=reliability_of(prediction_sums(predictions, truth.known & (table.op >= 2))),
         quadrants=quadrants_of(quadrant_sums(table, truth, consistent, cubes.edge)),
     )
 

@@ -1,8 +1,8 @@
-"""How beliefs move with time: drift beside that of random order, flips, and what of the disagreement goes one way.
+"""Movement of beliefs with time: drift against random order, flips, and the part of disagreement that goes one way.
 
 SBD is never 0 where observations disagree, and falls with OP whatever the model does: later observations move a mean
-less. So it stands beside what a random order of the very same observations gives. None of these sizes tells drift of
-the model from errors that depend on the view, or that last over frames: both are ordered in time along a flight.
+less. So it is reported with the drift of a random order of the same observations. None of these numbers separates drift
+of the model from errors that depend on the view, or that last over frames: both are ordered in time along a flight.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from semstab.statistics.agreement import ONE_HOT
 FLIP_RATE = Quantity(key="flip_rate", title="Flip rate", better="lower", needs="events")
 
 ENOUGH_OBSERVATIONS = 6
-"""Lowest OP of the voxels that tell of a trend: three observations in each half."""
+"""Lowest OP of the voxels that can show a trend: three observations in each half."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,14 +41,14 @@ class Flips:
 
 @dataclass(frozen=True, eq=False)
 class Trends:
-    """How far a voxel's observations move one way in time (n,); NaN where OP < ENOUGH_OBSERVATIONS, or where all agree.
+    """Movement of a voxel's observations one way in time (n,); NaN where OP < ENOUGH_OBSERVATIONS, or where all agree.
 
     Odd and even observations have a slope over time each. Their product is 0 in the mean for errors that are
     independent between frames, however much each frame errs.
 
     Attributes:
         common: The product of both slopes, summed over classes, as variation: that of observations on such lines.
-        variation: Of the odd and of the even observations about their own means: sums of ||s_t - mean||^2.
+        variation: Sums of ||s_t - mean||^2 of the odd and of the even observations about their own means.
     """
 
     common: Float64
@@ -56,7 +56,7 @@ class Trends:
 
     @property
     def share(self) -> Float64:
-        """Return what part (n,) of the variation goes one way in time, -1 to 1; of one voxel it is noisy."""
+        """Return the part (n,) of the variation that goes one way in time, -1 to 1; it is noisy for one voxel."""
         return self.common / self.variation
 
 
@@ -107,8 +107,8 @@ def trends(events: Events) -> Trends:
     squares = np.bincount(np.repeat(half, np.diff(starts)), weights=weight * weight, minlength=2 * len(T))
     of_means = np.asarray(sums.multiply(sums).sum(axis=1)).ravel() / np.maximum(count, 1)
     variation = (squares - of_means).reshape(-1, 2).sum(axis=1)
-    tells = (T >= ENOUGH_OBSERVATIONS) & (variation > ONE_HOT * T)
-    return Trends(np.where(tells, common, np.nan), np.where(tells, variation, np.nan))
+    enough = (T >= ENOUGH_OBSERVATIONS) & (variation > ONE_HOT * T)
+    return Trends(np.where(enough, common, np.nan), np.where(enough, variation, np.nan))
 
 
 def flips(events: Events) -> Flips:
@@ -131,7 +131,7 @@ def flips(events: Events) -> Flips:
 
 
 def lowest(numbers: UInt64, count: int) -> Int64:
-    """Return which of numbers (n,) are the lowest so many, ascending."""
+    """Return the rows of the lowest `count` of numbers (n,), ascending."""
     few = np.argpartition(numbers, count)[:count] if count < len(numbers) else np.arange(len(numbers))
     return few[np.argsort(numbers[few])]
 

@@ -1,6 +1,6 @@
-"""Geometry or semantics: what agreement would be left if the labels did not depend on the view at all.
+"""Geometry or semantics: the agreement that would be left if the labels did not depend on the view at all.
 
-View-independent labels are fused under the same poses, depth and noise. What is lost there is geometry's: pixels that
+View-independent labels are fused under the same poses, depth and noise. The loss there is geometry's: pixels that
 fall into the wrong voxel, voxels that hold more than one thing. The rest of the loss is the model's.
 """
 
@@ -34,7 +34,7 @@ def ceiling(
     world: VoxelTable | None = None,
     views: Iterable[Frame] | None = None,
 ) -> VoxelTable:
-    """Return the map of view-independent labels: what the fusion of `frames` would be with a model that never errs.
+    """Return the map of view-independent labels: the fusion of `frames` with a model that never errs.
 
     With `world` the map itself and no `views` nothing is lost, as each pixel sees the voxel that it falls into. Give
     ground truth, a map of finer voxels, or the frames before noise was added.
@@ -44,7 +44,7 @@ def ceiling(
         make_backend: Makes a new, empty map of the same voxels: `lambda: create("numba", voxel_size=0.2,
             num_classes=7)`.
         world: A map whose dominant labels are rendered into the frames; where there is none, the frames' own labels
-            count, which are to be the ground truth.
+            count, which must be the ground truth.
         views: The same frames free of the noise that was added to them: labels are seen from there.
 
     Raises:
@@ -61,8 +61,8 @@ def rendered(frames: Iterable[Frame], world: VoxelTable, views: Iterable[Frame] 
 
     Each pixel has the dominant label of the voxel it sees.
 
-    A pixel that sees no voxel of the map is ignored. `views` (the frames themselves where not given) say where a pixel
-    sees.
+    A pixel that sees no voxel of the map is ignored. `views` (the frames themselves where not given) show which
+    point a pixel sees.
 
     Raises:
         DataError: If a view is missing or differs in size from its frame.
@@ -127,6 +127,6 @@ def _paired(frames: Iterable[Frame], views: Iterable[Frame]) -> Iterator[tuple[F
     for frame in frames:
         view = next(views, None)
         if view is None or view.shape != frame.shape:
-            what = "there is none" if view is None else f"it is {view.shape[1]}x{view.shape[0]}"
-            raise DataError(f"frame {frame.index}: needs a view of its size to see labels from; {what}")
+            size = "there is none" if view is None else f"it is {view.shape[1]}x{view.shape[0]}"
+            raise DataError(f"frame {frame.index}: it needs a view of its size to see labels from; {size}")
         yield frame, view

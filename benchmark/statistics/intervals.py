@@ -38,19 +38,19 @@ from semstab.statistics.variance import (
 )
 
 LEVEL = 0.95
-"""Of intervals, where no other is asked for."""
+"""Default level of intervals."""
 
 LEAST_FRAMES = 8
-"""From fewer frames nothing is claimed about a flight."""
+"""With fewer frames nothing is claimed about a flight."""
 
 TOO_FEW = "too few frames to tell how frames differ: take {least} or more"
 
-NO_PLACES = "no two locations were seen twice: more overlap between frames is needed"
+NO_LOCATIONS = "no two locations were seen twice: more overlap between frames is needed"
 
 
 @dataclass(frozen=True, eq=False)
 class EstimateSpec:
-    """A number and the influences on it, None where it is undefined or all is in one cube; how its interval is made."""
+    """A number, the influences on it (None where it is undefined or all is in one cube), and its kind of interval."""
 
     value: float
     grid: Influences | None
@@ -61,7 +61,7 @@ class EstimateSpec:
 
     @property
     def answered(self) -> Scope:
-        """The scope of the interval: one group of frames does not tell how frames differ."""
+        """The scope of the interval: one group of frames does not show how frames differ."""
         notes = self.grid is not None and self.grid.per_group and len(self.grid.frames) > 1
         return self.scope if notes else THESE_FRAMES
 
@@ -70,7 +70,9 @@ def confidence_intervals(specs: Iterable[EstimateSpec]) -> list[Interval]:
     """Return the numbers with their confidence intervals."""
     with one_thread():
         return [
-            Interval(own.value, math.nan, math.nan, undecided=NO_PLACES) if own.grid is None else _answer(own, own.grid)
+            Interval(own.value, math.nan, math.nan, undecided=NO_LOCATIONS)
+            if own.grid is None
+            else _answer(own, own.grid)
             for own in specs
         ]
 
@@ -80,7 +82,7 @@ def estimate(
 ) -> Interval:
     """Return a number of a map with its interval; see `FUNCTIONALS` for its key, k is a class.
 
-    The scope is that of `Interval`; where frames are not known it is 'these frames'.
+    The scope is that of `Interval`; where frames are unknown it is 'these frames'.
     """
     return confidence_intervals([spec_of(sums, key, k, scope, level)])[0]
 
@@ -105,13 +107,13 @@ def difference(
     same_frames: bool | None = None,
     level: float = LEVEL,
 ) -> Interval:
-    """Return a number of map a less that of map b, paired on places, and on frames where both have the same ones.
+    """Return a number of map a less that of map b, paired on locations, and on frames where both have the same ones.
 
     - `same_frames`: False for another flight, whose frames have nothing to do with these; where it is not given, frames
       are paired if both maps have the same
 
-    Each map counts with all its voxels: those of the cubes that only one holds add to the variance. Of the very same
-    sums there is no difference anywhere: exactly 0, without a p-value.
+    Each map counts with all its voxels: those of the cubes that only one holds add to the variance. Identical sums
+    have no difference anywhere: exactly 0, without a p-value.
     """
     a, b = aligned(a, b)
     result = value(a, key, k) - value(b, key, k)
@@ -119,7 +121,7 @@ def difference(
         return no_difference(estimate(a, key, k, scope, level))
     one, other = grid_of(a, key, k), grid_of(b, key, k)
     if one is None or other is None:
-        return Interval(result, math.nan, math.nan, undecided=NO_PLACES)
+        return Interval(result, math.nan, math.nan, undecided=NO_LOCATIONS)
     own, theirs = (parts_of(sums, functional(key, k))[0][0] for sums in (a, b))
     scope = scope if own.step else THESE_FRAMES
     paired = (not own.step or same_flight(own, theirs)) if same_frames is None else same_frames
@@ -135,7 +137,7 @@ def difference(
 
 
 def identical(a: ClusterSums, b: ClusterSums, key: str, k: int | None = None) -> bool:
-    """Return whether a number is of the very same sums in two maps, so that it has no difference, anywhere."""
+    """Return whether a number has identical sums in two maps, so that it has no difference anywhere."""
     one, other = ([part for part, _ in parts_of(own, functional(key, k))] for own in aligned(a, b))
     if len(one) != len(other):
         return False
@@ -152,7 +154,7 @@ def identical(a: ClusterSums, b: ClusterSums, key: str, k: int | None = None) ->
 
 
 def no_difference(interval: Interval) -> Interval:
-    """Return a difference that there is nowhere, of places and frames as found."""
+    """Return a difference of exactly 0, with the locations and frames of an interval."""
     return dataclasses.replace(interval, value=0.0, low=0.0, high=0.0, degrees=math.inf, undecided="", p_value=math.nan)
 
 
@@ -167,7 +169,7 @@ def interval_of_cubes(
 ) -> Interval:
     """Return the statistic of sums (m, C) of cubes (m, 3) of an edge in metres, with its interval for these frames.
 
-    The second column counts what the first is a sum of.
+    The second column counts the terms of the first.
     """
     return confidence_intervals(
         [spec_of_cubes(ClusterIndex.of(cell, None, edge), columns, statistic, scale, bounds, level)]
@@ -199,7 +201,7 @@ def spec_of_observations(
 ) -> EstimateSpec:
     """Return the spec of an agreement of sums (m, C) of cubes and groups of frames, see `influences`.
 
-    Its interval is for this scene flown again where frames tell of it, else for these frames.
+    Its interval is for this scene flown again where there are enough frames for that, else for these frames.
     """
     result = float(statistic(columns.sum(axis=0)))
     grid = influences(ClusterIndex.of(cell, frame, edge, step), columns, statistic, halves)
@@ -208,7 +210,7 @@ def spec_of_observations(
 
 
 def scope_of(sums: ClusterSums, wanted: Scope = THIS_SCENE, key: str = "alpha", k: int | None = None) -> Scope:
-    """Return the scope of a number's interval: what is wanted if enough frames tell of it, else these frames."""
+    """Return the scope of a number's interval: the wanted one if there are enough frames for it, else these frames."""
     return wanted if frames_of(sums, key, k) >= LEAST_FRAMES else THESE_FRAMES
 
 
@@ -224,7 +226,7 @@ def _answer(spec: EstimateSpec, grid: Influences) -> Interval:
     if math.isnan(result):
         low, high = math.nan, math.nan
     elif spec.scale == "share":
-        low, high = _share_ends(result, spread, len(grid.places), level)
+        low, high = _share_ends(result, spread, len(grid.cubes), level)
     else:
         low, high = _ends(result, spread, grid.unseen(level), spec.scale, level)
     return _interval(result, max(low, spec.bounds[0]), min(high, spec.bounds[1]), grid, spread, scope)
@@ -298,17 +300,17 @@ def _interval(result: float, low: float, high: float, grid: Influences, spread: 
         high,
         scope=scope,
         frames=frames,
-        locations=len(grid.places),
+        locations=len(grid.cubes),
         degrees=spread.degrees if math.isfinite(spread.degrees) else math.nan,
         undecided=TOO_FEW.format(least=LEAST_FRAMES) if few else "",
     )
 
 
-# Intervals of differences and means of numbers that have nothing in common, from the intervals of these.
+# Intervals of differences and means of independent numbers, from their intervals.
 
 
 def unpaired(a: Interval, b: Interval, level: float = LEVEL) -> Interval:
-    """Return a number less another one of which nothing is shared, from their intervals (Zou and Donner 2008)."""
+    """Return a number less an independent one, from their intervals (Zou and Donner 2008)."""
     result = a.value - b.value
     low = result - math.hypot(a.value - a.low, b.high - b.value)
     high = result + math.hypot(a.high - a.value, b.value - b.low)
@@ -316,7 +318,7 @@ def unpaired(a: Interval, b: Interval, level: float = LEVEL) -> Interval:
 
 
 def mean_of(result: Sequence[Interval], level: float = LEVEL) -> Interval:
-    """Return the mean of numbers, of scenes for example, of which each errs by itself."""
+    """Return the mean of numbers with independent errors, as those of scenes."""
     n = len(result)
     value = sum(own.value for own in result) / n
     low = value - math.hypot(*(own.value - own.low for own in result)) / n
@@ -358,7 +360,7 @@ def standard_error(interval: Interval, level: float = LEVEL) -> float:
     return (interval.high - interval.low) / 2 / float(special.stdtrit(interval.degrees, (1 + level) / 2))
 
 
-# Intervals of what has no sums by frame and cube: a series over frames, and how much of a map another one covers.
+# Intervals without sums by frame and cube: of a series over frames, and of the coverage of one map by another.
 
 
 def mean_over_frames(frame: npt.NDArray[np.integer], values: Float64, level: float = LEVEL) -> Interval:
@@ -390,7 +392,7 @@ def difference_over_frames(a: Mapping[int, float], b: Mapping[int, float], level
 def coverage(new: ClusterSums, base: ClusterSums, level: float = LEVEL, *, same_frames: bool | None = None) -> Interval:
     """Return how many voxels with OP >= 2 a map has for each one of another, less 1, for these frames.
 
-    Of the same frames (where that is not given, the sums tell) it is a count, without an interval; else an estimate,
+    For the same frames (by default the sums show it) it is a count, without an interval; else it is an estimate,
     paired on cubes.
     """
     if same_flight(new, base) if same_frames is None else same_frames:
@@ -410,7 +412,7 @@ def coverage(new: ClusterSums, base: ClusterSums, level: float = LEVEL, *, same_
 def shares_of(new: ClusterSums, base: ClusterSums) -> dict[str, float]:
     """Return how many voxels with OP >= 2, and labelled observations in them, a map has for each one of another.
 
-    Else NaN.
+    The numbers are NaN where the other map has none.
     """
     totals = {name: [round(float(part[name].sum())) for part in (new, base)] for name in ("voxels", "observations")}
     return {name: after / before if before else math.nan for name, (after, before) in totals.items()}
@@ -421,7 +423,7 @@ def counted(value: float, sums: ClusterSums) -> Interval:
     of = sums if sums.step or sums.fine is None else sums.fine
     return Interval(
         value, value, value, frames=of.frame_count, locations=sums.cells, degrees=math.inf,
-        undecided=NO_PLACES if math.isnan(value) else "", p_value=0.0 if abs(value) > 0 else math.nan,
+        undecided=NO_LOCATIONS if math.isnan(value) else "", p_value=0.0 if abs(value) > 0 else math.nan,
     )  # fmt: skip
 
 
@@ -439,9 +441,9 @@ def within_a_flight(a: ClusterSums, b: ClusterSums) -> bool:
 
 
 def _groups_of(a: ClusterSums, b: ClusterSums) -> tuple[Int64, Int64]:
-    """Return the groups of frames of both, of the same number of frames each; none where they are not known.
+    """Return the groups of frames of both, of the same number of frames each; none where they are unknown.
 
-    Where there was no log these are the views of the cells.
+    Without a log these are the views of the cells.
     """
     a, b = (part if part.step or part.fine is None else part.fine for part in (a, b))
     step, known = max(a.step, b.step), bool(a.step and b.step)

@@ -1,4 +1,4 @@
-"""Several models' maps of one scene beside each other."""
+"""Comparison of several models' maps of one scene."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ from semstab.statistics.paired_differences import (
     voxelwise,
 )
 
-# Which model is more stable? Compared on the same places, at the same number of observations, with intervals.
+# Stability of models is compared at the same locations and number of observations, with intervals.
 
 
 def coverage(tables: Tables) -> tuple[MapCoverage, ...]:
@@ -80,16 +80,16 @@ def coverage_of(names: Sequence[str], parts: Sequence[Int64]) -> tuple[MapCovera
 
 
 def compared(*, truth: bool) -> tuple[Quantity, ...]:
-    """Return all that is compared, in the order of the tables; what needs ground truth only where there is some."""
+    """Return all compared measures, in the order of the tables, without `truth` only those that need none."""
     quantities = (ALPHA, PSA, *measures(), VOXEL_ALPHA, ACCURACY)
     return tuple(quantity for quantity in quantities if truth or quantity.needs != "truth")
 
 
-# --- On the same places -----------------------------------------------------------------------------------------------
+# --- At the same locations --------------------------------------------------------------------------------------------
 
 
 def repeated_rows(tables: Tables) -> list[Int64]:
-    """Return rows of the voxels that every map saw twice or more, one array a map, in the same order of voxels."""
+    """Return rows of the voxels that every map saw twice or more, one array per map, in the same order of voxels."""
     rows = shared_rows(*tables.values())
     again = np.all([table.op[r] >= 2 for table, r in zip(tables.values(), rows, strict=True)], axis=0)
     return [r[again] for r in rows]
@@ -113,7 +113,7 @@ def paired(
         truth: The map of the ground truth labels; without it there is no accuracy.
         logs: The logs of the tables: with them other numbers are for this scene flown again, else for these frames.
         cells: Sums of each model's common observations; without them there is no alpha.
-        seed: Of the resamples.
+        seed: Seed of the resamples.
     """
     rows = repeated_rows(tables)
     columns, statistics = _columns(tables, rows, truth)
@@ -197,11 +197,11 @@ def _ranking(measure: Quantity, statistic: Statistic, sums: Mapping[str, Float64
     ranks = ranks[:, ~np.isnan(resampled).any(axis=0)]
     order = sorted(values, key=lambda name: (math.isnan(values[name]), measure.sign * values[name]))
     rows = []
-    for place, name in enumerate(order, start=1):
+    for position, name in enumerate(order, start=1):
         own = ranks[list(sums).index(name)]
         low, high = np.quantile(own, [0.025, 0.975], method="inverted_cdf") if own.size else (1, len(sums))
         best = float(np.mean(own == 1)) if own.size else math.nan
-        rows.append(Rank(name, values[name], place, int(low), int(high), best))
+        rows.append(Rank(name, values[name], position, int(low), int(high), best))
     return Ranking(measure.key, tuple(rows))
 
 
@@ -222,7 +222,7 @@ class Region:
 
 
 Regions = Callable[[], Iterable[Region]]
-"""Those that make up a scene, as often as they are asked for: none is kept."""
+"""A function that yields the regions of a scene at each call: none stays in memory."""
 
 
 def compare_models(
@@ -236,11 +236,12 @@ def compare_models(
 ) -> ModelComparison:
     """Compare several models' maps of one scene; at least two.
 
-    - `coverage`: what each map holds
-    - `standardised`: means at a common distribution of OP, each map with all its voxels; none of labels beside scores
+    - `coverage`: the content of each map
+    - `standardised`: means at a common distribution of OP, each map with all its voxels; none if only
+      some maps are of labels
     - `paired`: values, differences and rankings: alpha of the observations that all made, with the same weights, where
       there are samples of them (`Sampler`); other measures on the voxels that all saw twice or more
-    - `observations`: what these are, and what the order owes to what was left out; None without samples
+    - `observations`: these observations, and how the order depends on those left out; None without samples
 
     Raises:
         ConfigError: For fewer than two maps.
@@ -274,7 +275,7 @@ def compare_regions(
     observed = np.sum(counts, axis=0)
     weights = common_weights(observed)
     means = {name: standardised_of(CubeSums.merged(parts), weights) for name, parts in strata.items()}
-    keys = () if mixed else voxelwise()  # means of labels beside means of scores would say nothing
+    keys = () if mixed else voxelwise()  # means of labels and means of scores are not comparable
     everywhere = {quantity.key: {name: own[quantity.key] for name, own in means.items()} for quantity in keys}
     return ModelComparison(
         scene=scene,
@@ -296,7 +297,7 @@ def _paired(regions: Regions, shared: SharedObservations | None, seed: int) -> P
 
 
 MOST = 1 << 22
-"""Voxels that are in memory at a time: of more common ones a sample is compared."""
+"""Most voxels in memory at a time: of more common voxels a sample is compared."""
 
 
 def share_of(voxels: int) -> float:
@@ -305,7 +306,7 @@ def share_of(voxels: int) -> float:
 
 
 def in_share(table: VoxelTable, share: float) -> Mask:
-    """Return (n,) which voxels are in the sample that is so large a part of all, by a hash of their index."""
+    """Return the mask (n,) of voxels in the sample that is this share of all, by a hash of their index."""
     if share >= 1:
         return np.ones(len(table), np.bool_)
     drawn: Mask = streams(table, slice(None), 0) >> np.uint64(11) < np.uint64(share * 2**53)
@@ -313,7 +314,7 @@ def in_share(table: VoxelTable, share: float) -> Mask:
 
 
 def common_voxels(regions: Regions) -> Region:
-    """Return the voxels that every map saw twice or more, with logs and ground truth; of very many a sample."""
+    """Return the voxels that every map saw twice or more, with logs and ground truth, or a sample of very many."""
     count = sum(len(repeated_rows(region.tables)[0]) for region in regions())
     share, parts = share_of(count), list[Region]()
     for region in regions():

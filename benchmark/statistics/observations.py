@@ -1,4 +1,4 @@
-"""Labels of sampled cells, frame by frame: what alpha, its intervals and comparisons follow from."""
+"""Labels of sampled cells, frame by frame: alpha, its intervals and comparisons follow from them."""
 
 from __future__ import annotations
 
@@ -72,7 +72,7 @@ def _near(voxel: Int64) -> Int64:
     return voxel
 
 
-# Where the frames of a sample of observations were taken.
+# The views from which the frames of a sample were taken.
 
 VIEW = 6
 """Numbers of a view: frame, centre, time stamp, footprint."""
@@ -80,7 +80,7 @@ VIEW = 6
 
 @dataclass(frozen=True, eq=False)
 class Views:
-    """Distinct views: frames that a camera took from one place count as one, the first of them.
+    """Distinct views: frames that a camera took from one position count as one, the first of them.
 
     Attributes:
         frame: (V,) indices of frames.
@@ -140,9 +140,8 @@ Entries = tuple[Int64, Int32, UInt16, Float64]
 class CellObservations:
     """Labels of the pixels of sampled cells, view by view: an entry (m,) for each cell, view and class.
 
-    Cells are cubes about as wide as a pixel's footprint, so that what two views say of one cell is what they say of the
-    same spot; they do not depend on the voxels of a map. A block of CELLS cells
-    along each edge is the unit of sampling.
+    Cells are cubes about as wide as a pixel's footprint, so that two views of one cell see the same spot; they do not
+    depend on the voxels of a map. A block of CELLS cells along each edge is the unit of sampling.
 
     Attributes:
         key: (m,) int64 of the cell, see `keys_of`.
@@ -220,16 +219,16 @@ class CellObservations:
         if not len(classes) or not len(self):
             return self
         log = self.observations(self.coarsening * 2)
-        kept = np.stack([log.ix, log.iy, log.iz], axis=1)[~np.isin(dominant(log.table()), classes)]
-        _, of = np.unique(np.concatenate([kept, self.cell // (2 * self.coarsening)]), axis=0, return_inverse=True)
-        return self.only(np.isin(of.ravel()[len(kept) :], of.ravel()[: len(kept)]))
+        retained = np.stack([log.ix, log.iy, log.iz], axis=1)[~np.isin(dominant(log.table()), classes)]
+        _, of = np.unique(np.concatenate([retained, self.cell // (2 * self.coarsening)]), axis=0, return_inverse=True)
+        return self.only(np.isin(of.ravel()[len(retained) :], of.ravel()[: len(retained)]))
 
     def only(self, rows: Any) -> CellObservations:
         """Return some of the entries."""
         return self._each(lambda column: column[rows])
 
     def copied(self) -> CellObservations:
-        """Return a copy in memory of its own."""
+        """Return a copy with its own memory."""
         return self._each(np.copy)
 
     def _each(self, change: Callable[[Any], Any]) -> CellObservations:
@@ -277,7 +276,7 @@ class CellObservations:
 
     @staticmethod
     def _number(cell: Int64) -> Int64:
-        """Return number cells (n, 3) in lexical order: (n,), equal for equal cells."""
+        """Return the numbers (n,) of cells (n, 3) in lexical order, equal for equal cells."""
         low = cell.min(axis=0, initial=np.iinfo(np.int64).max)
         size = cell.max(axis=0, initial=np.iinfo(np.int64).min) - low + 1
         x, y, z = (cell - low).T
@@ -295,11 +294,13 @@ class CellObservations:
         text = json.dumps({"schema": SCHEMA, "kind": "CellObservations", **about, "views": self.views.rows().tolist()})
         with atomic_path(path) as temporary, pq.ParquetWriter(temporary, content.schema, compression="zstd") as file:
             file.write_table(content)
-            file.add_key_value_metadata({"semstab": text})  # a schema's own is written twice, and copied more often
+            file.add_key_value_metadata(
+                {"semstab": text}
+            )  # metadata of a schema is written twice, and copied more often
 
     @classmethod
     def load(cls, path: str | Path) -> CellObservations:
-        """Read what `save` wrote.
+        """Read a file that `save` wrote.
 
         Raises:
             DataError: If the file is missing, damaged or of another kind.
@@ -312,7 +313,7 @@ class CellObservations:
                 content = file.read()
             about = parse_json((content.schema.metadata or {})[b"semstab"])
             if (about.pop("kind"), about.pop("schema")) != ("CellObservations", SCHEMA):
-                raise DataError("of another kind, or of another version, which sampled other cells: run it again")
+                raise DataError("it is of another kind, or of another version that sampled other cells; run it again")
             views = Views.of(about.pop("views"))
             about["classes"] = tuple(about["classes"])
             x, y, z, view, label, weight, drawn = map(arrays.values_of, content.columns)

@@ -1,6 +1,6 @@
-"""Values of models on the places that all saw twice, and their differences, with intervals and what these answer.
+"""Values of models at the locations that all saw twice, and their differences, with intervals and their scope.
 
-What the sums by frame and cube of space know is said for this scene flown again; the rest, as SBD, for these frames.
+Numbers of the sums by frame and cube of space are for this scene flown again; others, as SBD, are for these frames.
 """
 
 from __future__ import annotations
@@ -33,15 +33,15 @@ from semstab.statistics.observations import CellObservations, Views
 Rows = Int64
 
 SUMMED = (VOXEL_ALPHA, PSA, ENTROPY, ACCURACY)
-"""What the sums tell; of VSS they have that of places seen three times, of SBD nothing."""
+"""Measures that follow from the sums; their VSS is of locations seen three times, and they have no SBD."""
 
 
 @dataclass(frozen=True, eq=False)
 class OnCommonLocations:
-    """Models on the same places (n, 3): the sums of each map there, and the cubes of space that hold them.
+    """Models at the same locations (n, 3): the sums of each map there, and the cubes of space that hold them.
 
     Attributes:
-        known: What the sums of these maps tell.
+        known: Measures that follow from the sums of these maps.
     """
 
     sums: Mapping[str, ClusterSums]
@@ -68,7 +68,7 @@ class OnCommonLocations:
         return cls(sums, cubes, frozenset(SUMMED) - ({ACCURACY} if truth is None else set()))
 
     def value(self, measure: Quantity, name: str, columns: Float64, statistic: Statistic) -> Estimate:
-        """Return the value of one model; columns (n, C) are those that the statistic is of."""
+        """Return the value of one model; the statistic is of the sums of columns (n, C)."""
         if measure in self.known:
             sums = self.sums[name]
             return estimate(sums, measure.key, scope=scope_of(sums, key=measure.key)).ends
@@ -107,11 +107,11 @@ def _row(measure: Quantity, a: str, b: str, interval: Interval, *, tested: bool)
     return PairedDifference(measure.key, a, b, interval.ends, p, float("nan"), interval.scope, interval.undecided)
 
 
-# --- What is claimed --------------------------------------------------------------------------------------------------
+# --- Claims -----------------------------------------------------------------------------------------------------------
 
 
 def claimed_together(comparisons: Sequence[ModelComparison]) -> tuple[ModelComparison, ...]:
-    """Return scenes of one study: p-values of all that may be claimed in any of them, corrected together."""
+    """Return scenes of one study with the p-values of all differences that may be claimed, corrected together."""
     rows = _claimed([row for result in comparisons for row in result.paired.differences])
     ends = np.cumsum([0, *(len(result.paired.differences) for result in comparisons)])
     return tuple(
@@ -129,7 +129,7 @@ def _claimed(rows: Sequence[PairedDifference]) -> tuple[PairedDifference, ...]:
 def holm(p: Sequence[float]) -> list[float]:
     """Return p-values corrected for their number.
 
-    Rejecting those <= q keeps the chance of any false one at q (Holm 1979).
+    Rejecting those <= q limits the chance of any false rejection to q (Holm 1979).
 
     >>> [round(value, 2) for value in holm([0.01, 0.04, 0.03])]
     [0.03, 0.06, 0.06]
@@ -151,11 +151,11 @@ EDGES = (2, 3, 4, 5, 7, 10, 15, 20, 30, 50)
 """Upper edges of the strata of OP that comparisons are standardised by; OP = 1 is left out."""
 
 LEAST_VOXELS, LEAST_OVERLAP = 50, 0.1
-"""A stratum overlaps hardly where some map has fewer voxels in it, or a smaller part of what another map has."""
+"""A stratum hardly overlaps where some map has fewer voxels in it, or a smaller share of another map's voxels."""
 
 
 def voxelwise() -> dict[Quantity, Callable[[VoxelTable], Float64]]:
-    """Return what is compared and has one value a voxel (n,), NaN where undefined."""
+    """Return the compared measures that have one value per voxel (n,), NaN where undefined."""
     return {PSA: psa, **{measure: measure.of for measure in measures()}}
 
 
@@ -165,9 +165,7 @@ def stratum_counts(tables: Tables, edges: Sequence[int] = EDGES) -> Int64:
 
 
 def common_weights(counts: Int64) -> Float64:
-    """Return the common distribution of OP.
-
-    Shares (S,) of the strata among the voxels with OP >= 2 of all maps together.
+    """Return the common distribution of OP: shares (S,) of the strata among the voxels with OP >= 2 of all maps.
 
     A stratum that is empty in some map has weight 0: there is nothing to compare it with.
     """
@@ -177,7 +175,7 @@ def common_weights(counts: Int64) -> Float64:
 
 
 def thin_share(counts: Int64, weights: Float64) -> float:
-    """Return the weight of strata of which some map has few voxels, or a small part of what another has."""
+    """Return the weight of strata in which some map has few voxels, or a small share of another map's voxels."""
     few = (counts < LEAST_VOXELS).any(axis=0)
     few |= counts.min(axis=0) < LEAST_OVERLAP * counts.max(axis=0)
     return float(weights[few].sum())
@@ -236,18 +234,18 @@ def _stratum(table: VoxelTable, edges: Sequence[int]) -> Int64:
     return np.where(table.op >= 2, np.searchsorted(edges, table.op) + 1, 0)
 
 
-# Several models on the very observations that all of them made, and what their order owes to those that some left out.
+# Models on the observations that all of them made, and how their order depends on those that some left out.
 
 
 @dataclass(frozen=True, eq=False)
 class CommonObservations:
-    """Models of one scene, observed alike.
+    """Models of one scene with their common observations.
 
     Attributes:
-        shared: Of each: the observations of cells of which all models labelled every pixel.
-        ignoring: Of each: the observations that any made, with one class more, the last, for what the model did not
-            label.
-        missing: Share of the pixels of these that the model did not label.
+        shared: For each model the observations of cells of which all models labelled every pixel.
+        ignoring: For each model the observations that any model made, with one more class, the last, for the pixels
+            that the model did not label.
+        missing: Share of the pixels of these observations that the model did not label.
     """
 
     shared: tuple[CellObservations, ...]
@@ -256,13 +254,13 @@ class CommonObservations:
 
 
 def common_observations(models: Sequence[CellObservations]) -> CommonObservations:
-    """Return what samples of the same frames have in common.
+    """Return the common observations of samples of the same frames.
 
     Raises:
         DataError: If they differ in K.
     """
     if len({sample.K for sample in models}) > 1:
-        raise DataError("samples of other classes cannot be compared; fuse both alike")
+        raise DataError("samples with different classes cannot be compared; fuse both alike")
     size = max(sample.cell_size for sample in models)
     models = _of_the_same_blocks([sample.coarsened(size) for sample in models])
     of, first = _numbered(models)
@@ -313,7 +311,7 @@ def _filled(sample: CellObservations, locations: CellObservations, ignored: Floa
 
 
 def psa_bounds(log: Events) -> tuple[float, float]:
-    """Return the least and the largest mean PSA, whatever observations of the last class would have said.
+    """Return the least and the largest mean PSA, whatever the observations of the last class would have been.
 
     Manski (1990, American Economic Review 80): pairs of observations of which one is missing agree never, or always.
     """
@@ -344,7 +342,7 @@ def _pairs(log: Events, shares: Float64) -> Float64:
 
 @dataclass(frozen=True, eq=False)
 class SharedObservations:
-    """Sums of each model's common observations, their logs by fine cells, and what was compared."""
+    """Sums of each model's common observations, their logs by fine cells, and the comparison itself."""
 
     sums: Mapping[str, ClusterSums]
     logs: Mapping[str, Events]
@@ -352,7 +350,7 @@ class SharedObservations:
 
 
 def compared_observations(samples: Mapping[str, CellObservations]) -> SharedObservations:
-    """Return the observations that all models made, and what their order owes to those that some left out."""
+    """Return the observations that all models made, and how their order depends on those that some left out."""
     names = list(samples)
     both = common_observations([samples[name] for name in names])
     shared, ignoring = (dict(zip(names, each, strict=True)) for each in (both.shared, both.ignoring))

@@ -30,8 +30,8 @@ class MapSample:
 
     Attributes:
         table: Rows of the drawn voxels, sorted as a VoxelTable is.
-        events: Their observations, where a log was kept.
-        truth: The rows of the true labels' map at those voxels, where ground truth is known.
+        events: Their observations, where there is a log.
+        truth: The rows of the true labels' map at those voxels, where there is ground truth.
         summary: Additive sums over ALL voxels of the map.
     """
 
@@ -82,14 +82,11 @@ class MapSample:
         return cls(table, events, truth, functools.reduce(operator.add, (part.summary for part in parts)))
 
     def bound(self, *, most: int = MOST_VOXELS) -> int | None:
-        """Return the highest hash of a voxel, where there are as many as a sample has.
-
-        None where there is room for others.
-        """
+        """Return the highest hash of a voxel in a full sample; None where there is room for others."""
         return int(streams(self.table, slice(None), 0).max()) if len(self.table) >= most else None
 
     def below(self, bound: int | None) -> MapSample:
-        """Return the part of it that a sample with that highest hash can take in."""
+        """Return the part that a sample with that highest hash can take in."""
         rows = slice(None) if bound is None else np.flatnonzero(streams(self.table, slice(None), 0) <= bound)
         if isinstance(rows, slice) or len(rows) == len(self.table):
             return self
@@ -103,14 +100,14 @@ class MapSample:
 
     @classmethod
     def load(cls, path: Path) -> MapSample:
-        """Read what `save` wrote.
+        """Read a file that `save` wrote.
 
         Raises:
             DataError: If the file is missing or damaged.
         """
         arrays = read_arrays(path)
         if arrays is None:
-            raise DataError(f"{path}: not a sample of a map; it is missing or damaged, start the run again")
+            raise DataError(f"{path}: it is missing, damaged or not a sample of a map; start the run again")
         return from_arrays(cls, arrays)
 
 

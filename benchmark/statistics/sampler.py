@@ -1,7 +1,7 @@
 """A sample of cells, as wide as a pixel's footprint, with the labels that each view gives them.
 
 A cell is in the sample by a hash of the block that holds it, so that all models of a flight sample the same cells.
-Memory is bounded: whenever there are too many entries, every second block is let go.
+Memory is bounded: whenever there are too many entries, every second block is dropped.
 """
 
 from __future__ import annotations
@@ -25,10 +25,10 @@ BUDGET = 1 << 19
 """Most entries (cell, view, class)."""
 
 SIDE = 640
-"""Of frames with more pixels on a side every n-th pixel of each axis is taken."""
+"""Most pixels on a side: every n-th pixel of each axis of a larger frame is taken."""
 
 FEW = 4
-"""Of every FEW-th pixel of each axis the median depth is taken."""
+"""The median depth is that of every FEW-th pixel of each axis."""
 
 REACH = SPAN // 2
 """Blocks from the first camera within which there is a sample."""
@@ -61,14 +61,14 @@ class Anchor:
 
 
 class Sampler:
-    """Takes frames one by one, as they are fused; `sample` returns what is there.
+    """Takes frames one by one, as they are fused; `sample` returns the entries so far.
 
     The first frame sets the size of the cells: the power of 2 next above the median footprint of its pixels. Frames
     that a standing camera takes are one view, and so are frames with the same pose and the same labels.
 
     Args:
-        num_classes: K.
-        budget: Most entries to keep.
+        num_classes: K, the number of classes.
+        budget: Most entries of a sample.
     """
 
     def __init__(self, num_classes: int, budget: int = BUDGET) -> None:
@@ -134,7 +134,7 @@ class Sampler:
         return cell[:m], label[:m], pixels[:m], drawn[:m]
 
     def _take(self, view: int, cell: Int64, label: UInt16, weight: Float64, drawn: UInt32) -> None:
-        """Take entries of a view in; where they would be too many, let every second block go until they are not."""
+        """Add entries of a view; drop every second block while they are too many."""
         while self._entries + np.count_nonzero(drawn < self._share) > self.budget:
             self._share //= 2
             rows = np.flatnonzero(self._columns[-1][: self._entries] < self._share)

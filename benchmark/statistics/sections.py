@@ -49,23 +49,23 @@ MEANS: Mapping[str, Mean] = {
     "kappa": Mean("kappa", kappa_of, SIGNED, "agreement"),
     "voxel_alpha": Mean("voxel_alpha", alpha_of, SIGNED, "agreement"),
 }
-"""Over the voxels with OP >= 2, of values where they are defined, and agreement beyond chance."""
+"""Means over the voxels with OP >= 2 where values are defined, and agreement beyond chance."""
 
 OF_FLIPS: Mapping[str, Mean] = {
     **{name: Mean(name) for name in ("flip_rate", "flip_null")},
     "flip_excess": Mean("flip_excess", bounds=SIGNED),
 }
-"""Over the same voxels as the first of `MEANS`, so that those are the same to the last bit without a log."""
+"""Means over the same voxels as the first of `MEANS`, so that those are identical without a log."""
 
 OF_CHANGES: Mapping[str, Mean] = {
     "frames_since": Mean("frames_since", bounds=(0.0, math.inf)),
     "trend": Mean("trend", bounds=SIGNED),
 }
-"""Over fewer voxels."""
+"""Means over fewer voxels."""
 
 
-def place_sums(table: VoxelTable, columns: Columns, cubes: Cubes) -> CubeSums:
-    """Return the sums over cubes of the voxels with OP >= 2 of which `MEANS` are functions."""
+def location_sums(table: VoxelTable, columns: Columns, cubes: Cubes) -> CubeSums:
+    """Return the sums over cubes of the voxels with OP >= 2 that give `MEANS`."""
     T, agreement = table.op.astype(np.float64), columns["psa"]
     sums = cubes.means(
         {
@@ -98,10 +98,10 @@ def place_sums(table: VoxelTable, columns: Columns, cubes: Cubes) -> CubeSums:
 # --- Locations that flip
 
 ENOUGH = 4
-"""Observations from which on places that flip can be told from places that err now and then."""
+"""Observations that separate locations that flip from locations that err now and then."""
 
 UNIT = 2.0**-32
-"""Of probabilities: sums of multiples of it are exact, in whatever order a map's tiles are added."""
+"""Unit of probabilities: sums of its multiples are exact, in whatever order a map's tiles are added."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,8 +109,8 @@ class FlippingSums:
     """Locations of a map that flip, as sums over its locations with OP >= 2.
 
     Attributes:
-        share: Over the cubes: how likely places are not consistent, and how many there are.
-        often: How many were seen ENOUGH times.
+        share: Sums over cubes of the probability that a location is not consistent, and of their number.
+        often: Number of locations seen ENOUGH times.
         together: (K, K), above the diagonal: how often two observations of one location are of two classes, where
             it is not consistent.
     """
@@ -131,7 +131,7 @@ class FlippingSums:
         return self.share.specs({"": Mean("")})
 
     def flipping(self, share: Interval, classes: Sequence[str] = ()) -> Flipping:
-        """Return that share with its interval, and the two classes that stand together most often there."""
+        """Return that share with its interval, and the two classes that most often occur together there."""
         locations = self.share[""][1]
         seen = float(self.often / locations) if locations else float("nan")
         total = float(self.together.sum())
@@ -143,7 +143,7 @@ class FlippingSums:
 
 
 def _together(table: VoxelTable, inconsistent: Float64) -> Float64:
-    """Return (K, K) of voxels that are inconsistent with that probability (n,), NaN for those that do not count."""
+    """Return (K, K) for voxels that are inconsistent with a probability (n,), NaN for those that do not count."""
     starts, label, weight = table.evidence.entries
     of = np.repeat(np.arange(len(table)), np.diff(starts))
     share, counts, pairs = weight / table.op[of], np.nan_to_num(inconsistent)[of], np.zeros((table.K, table.K))
@@ -153,14 +153,14 @@ def _together(table: VoxelTable, inconsistent: Float64) -> Float64:
     return pairs
 
 
-# --- What needs a log
+# --- Sums that need a log
 
 
 @dataclass(frozen=True, eq=False)
 class LogSums:
-    """The sums over cubes that need a log, and how many voxels tell of a trend."""
+    """The sums over cubes that need a log, and how many voxels can show a trend."""
 
-    places: CubeSums
+    sums: CubeSums
     telling: int
 
 

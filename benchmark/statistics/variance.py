@@ -1,12 +1,12 @@
 """The variance of a number over new frames and new locations, by a model of random effects.
 
-The influences x_gf of what frame f observed at location g on a number are a sum over n_gf observations of a location's
+The influences x_gf on a number, from frame f at location g, are a sum over n_gf observations of a location's
 effect, a frame's effect and noise:
 
     x_gf = n_gf (l_g + q_f) + e_gf,    var e_gf = s^2 n_gf
 
 Effects of frames are alike by rho^d, d frames apart; those of locations by exp(-d / reach). The same scene flown again
-has the same l and new q and e; other scenes have all three anew. How large effects are and how far they reach is not
+has the same l and new q and e; other scenes have all three anew. The size and reach of effects are not
 decided: the variance is a mean over a grid of both, weighted by the restricted likelihood (Harville 1977, Journal of
 the American Statistical Association 72).
 """
@@ -31,7 +31,7 @@ LASTING = {0.0: 4.0, 0.8: 1.0}
 
 REACHES = {0.0: 4.0, 0.08: 1.0}
 """Correlation lengths of the effects of locations, as a share of the scene's extent, and their weights before the data:
-an effect that reaches as far as the scene cannot be told from none."""
+an effect that reaches as far as the scene cannot be separated from none."""
 
 SIZES = 7
 """Variances of an effect that are tried, evenly spaced in their logarithm: more of them, or more correlations, cover no
@@ -42,13 +42,13 @@ SMALLEST, UNLIKELY = 1e-4, 0.01
 probability."""
 
 MOST_LOCATIONS = 64
-"""Locations of a model at most: neighbouring cubes are taken together."""
+"""Most locations of a model: neighbouring cubes are taken together."""
 
 TINY = 1e-12
-"""A variance below is none."""
+"""A smaller variance counts as 0."""
 
 ROUNDING = 1e-13
-"""Influences below are rounding's."""
+"""Smaller influences come from rounding."""
 
 
 @dataclass(frozen=True)
@@ -59,7 +59,7 @@ class Spread:
     degrees: float
 
     def half(self, level: float) -> float:
-        """Return half the width of the confidence interval; NaN where nothing is known."""
+        """Return half the width of the confidence interval; NaN where it is unknown."""
         from scipy import special
 
         if not self.degrees > 0:
@@ -80,13 +80,13 @@ EXACT = Spread(0.0, math.inf)
 
 @dataclass(frozen=True, eq=False)
 class Variances:
-    """Variances (m,) that are possible, and how likely each is (m,)."""
+    """Possible variances (m,), and the probability of each (m,)."""
 
     weight: Float64
     variance: Float64
 
     def plus(self, other: Variances) -> Variances:
-        """Return those of a sum of independent errors."""
+        """Return the variances of a sum of independent errors."""
         weight = np.outer(self.weight, other.weight).ravel()
         return Variances(weight, np.add.outer(self.variance, other.variance).ravel())
 
@@ -112,7 +112,7 @@ NOTHING = Variances(np.ones(1), np.zeros(1))
 def variances(
     effect: Float64, weight: Float64, noise: Float64, distance: Float64, ranges: Mapping[float, float]
 ) -> Variances:
-    """Return what the variance of sum(weight * effect) may be if the effects (n,) are drawn anew.
+    """Return the possible variances of sum(weight * effect) if the effects (n,) are drawn anew.
 
     Args:
         effect: (n,) estimated effects.
@@ -151,14 +151,14 @@ class Influences:
     """Influences of locations and frames on a number.
 
     Attributes:
-        places: (G, 3) cubes in which something counts, frames (F,) groups.
+        cubes: (G, 3) cubes in which something counts, frames (F,) groups.
         block: (G,) influence of each cube; they sum to 0.
-        cell: (G, F) of each group of frames in each cube.
-        size: (G, F) how much is in it, all (G,) in each cube.
-        one_off: What the number falls by where all that counts was not as the first sum has it, but the opposite.
+        cell: (G, F) influence of each group of frames in each cube.
+        size: (G, F) amount that counts there, all (G,) the amount in each cube.
+        one_off: Amount by which the number falls if everything that counts were the opposite of the first sum.
     """
 
-    places: Int64
+    cubes: Int64
     frames: Int64
     block: Float64
     cell: Float64
@@ -169,8 +169,8 @@ class Influences:
     one_off: float
 
     def unseen(self, level: float) -> float:
-        """Return what so many locations without a single error may have missed."""
-        return self.one_off * float(1 - ((1 - level) / 2) ** (1 / len(self.places)))
+        """Return the part of the number that locations without a single error may have missed."""
+        return self.one_off * float(1 - ((1 - level) / 2) ** (1 / len(self.cubes)))
 
     def times(self, factor: float) -> Influences:
         """Return the influences on a multiple of the number."""
@@ -183,11 +183,11 @@ class Influences:
 
     def plus(self, other: Influences) -> Influences:
         """Return the influences on the sum of two numbers."""
-        locations, rows = np.unique(np.concatenate([self.places, other.places]), axis=0, return_inverse=True)
+        locations, rows = np.unique(np.concatenate([self.cubes, other.cubes]), axis=0, return_inverse=True)
         frames, columns = np.unique(np.concatenate([self.frames, other.frames]), return_inverse=True)
         block, everything = np.zeros(len(locations)), np.zeros(len(locations))
         cell, size = np.zeros((len(locations), len(frames))), np.zeros((len(locations), len(frames)))
-        row, column = np.split(rows.ravel(), [len(self.places)]), np.split(columns, [len(self.frames)])
+        row, column = np.split(rows.ravel(), [len(self.cubes)]), np.split(columns, [len(self.frames)])
         for grid, at, to in zip((self, other), row, column, strict=True):
             block[at] += grid.block
             everything[at] += grid.all
@@ -202,15 +202,15 @@ def influences(
 ) -> Influences | None:
     """Return the influences of sums (m, C) by cube and group of frames; None where all is in one cube.
 
-    halves (m, 2): at locations that two frames saw, how much of the first two sums both are held for, instead of half
-    each.
+    halves (m, 2) are the parts of the first two sums, at locations that two frames saw, that count for both frames
+    instead of half for each.
     """
     total = columns.sum(axis=0)
     gradient = gradient_of(of, total)
     everything = np.abs(index.by_cube(columns[:, 1]))
     some = everything > TINY * everything.sum()
     if some.sum() < 2 or everything.sum() < TINY or not np.isfinite(gradient).all():
-        return None  # of 150 classes hardly any voxel may count as consistent: 1e-112 of all of them
+        return None  # with 150 classes hardly any voxel may count as consistent: 1e-112 of all of them
     own: Float64 = columns @ gradient
     shared = own if halves is None else own + gradient[0] * (halves[:, 0] - total[0] / total[1] * halves[:, 1])
     by_frame, size = index.by_both(shared), index.by_both(np.abs(columns[:, 1]))
@@ -236,8 +236,8 @@ class Effects:
     """The model of a number's influences.
 
     Attributes:
-        noise: The variance that comes from it, unit: of a single observation.
-        frame: (F,) effects of the frames, error (F, F) the covariance of their errors; None where frames are not known.
+        noise: The variance from noise; unit is that of a single observation.
+        frame: (F,) effects of the frames, error (F, F) the covariance of their errors; None where frames are unknown.
     """
 
     grid: Influences
@@ -265,7 +265,7 @@ class Effects:
         mean = by_location @ location / total
         scatter = float(by_location @ (location - mean) ** 2) / total - unit * len(by_location) / total
         shrink = unit / max(scatter, 1e-3 * unit / float(np.median(by_location)), TINY * TINY)
-        ridge = size / (by_location + shrink)[:, None]  # locations as random effects: what frames differ in stays
+        ridge = size / (by_location + shrink)[:, None]  # locations as random effects: differences of frames stay
         normal = np.diag(by_frame * (1 + 1e-9)) - size.T @ ridge
         frame = np.linalg.solve(normal, cell.sum(axis=0) - ridge.T @ cell.sum(axis=1))
         error: Float64 = unit * np.linalg.inv(normal).astype(np.float64)
@@ -283,10 +283,10 @@ class Effects:
     def locations(self) -> Variances:
         """The variances over new locations."""
         grid = self.grid
-        of = _neighbours(grid.places.astype(np.float64), MOST_LOCATIONS)
+        of = _neighbours(grid.cubes.astype(np.float64), MOST_LOCATIONS)
         weight: Float64 = np.bincount(of, weights=grid.all).astype(np.float64)
         effect = np.bincount(of, weights=grid.block)
-        at = np.stack([np.bincount(of, weights=grid.all * axis) / weight for axis in grid.places.T], axis=1)
+        at = np.stack([np.bincount(of, weights=grid.all * axis) / weight for axis in grid.cubes.T], axis=1)
         apart = np.linalg.norm(at[:, None] - at[None], axis=2)
         centre = weight @ at / weight.sum()
         extent = 2 * math.sqrt(float(weight @ ((at - centre) ** 2).sum(axis=1)) / float(weight.sum()))
@@ -307,7 +307,7 @@ def _of_frames(effect: Float64, weight: Float64, noise: Float64, at: Float64) ->
 
 
 def _neighbours(points: Float64, most: int) -> Int64:
-    """Return (G,) to which of at most so many groups of neighbours points (G, 3) belong: halves of halves."""
+    """Return the group (G,) of points (G, 3), in at most `most` groups of neighbours: halves of halves."""
     groups = [np.arange(len(points))]
     while 2 * len(groups) <= most and len(groups) < len(points):
         halves = []
@@ -370,10 +370,10 @@ def spread_of_frames(effect: Float64, weight: Float64, at: Float64) -> Spread:
 # --- Gradients --------------------------------------------------------------------------------------------------------
 
 STEP = 1e-20
-"""Of a sum, into the complex plane: its square is nothing beside 1."""
+"""Step of a sum into the complex plane: its square is negligible against 1."""
 
 AT_ONCE = 2**20
-"""Numbers in the sums of which a statistic is taken together: all of 20,000 classes would take 3 GB."""
+"""Most numbers in the sums of one evaluation: all sums of 20,000 classes would take 3 GB."""
 
 
 def slope(statistic: Statistic, totals: Float64, direction: Float64) -> Float64:
@@ -381,7 +381,7 @@ def slope(statistic: Statistic, totals: Float64, direction: Float64) -> Float64:
 
     NaN where it is undefined.
 
-    By a step into the complex plane, which takes no difference and so loses no digit (Squire and Trapp 1998, SIAM
+    It is a step into the complex plane, which takes no difference and so loses no digit (Squire and Trapp 1998, SIAM
     Review 40).
     """
     with np.errstate(all="ignore"):  # complex numbers warn of NaN where real ones do not

@@ -1,4 +1,4 @@
-"""Is a model stable on a scene? A level with its probability; docs/metrics.md explains the thresholds."""
+"""The verdict on a model: a level of stability with its probability; docs/metrics.md explains the thresholds."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ class Limits:
     Attributes:
         stable: Alpha from which data may be relied on (Krippendorff 2018, Content Analysis, ch. 12).
         usable: Alpha from which tentative conclusions are allowed.
-        labelled: Share of the locations that a stable model labels at least.
-        class_locations: Voxels that a class dominates from which on it counts, where no critical classes are named.
+        labelled: Least share of the locations that a stable model labels.
+        class_locations: Least number of voxels that a class dominates to count, where no critical classes are named.
     """
 
     stable: float = 0.8
@@ -37,8 +37,8 @@ PROBABLE = 0.9
 """A class is named as unstable from this probability on."""
 
 MOST_CHANCE = 0.9
-"""Probability that two observations from anywhere agree from which on a map says almost nothing: where 95 % of a map
-are one class, any two agree at 90 % of the spots, whatever the labels are worth."""
+"""A map shows almost nothing if two observations from anywhere agree with at least this probability: where 95 % of a
+map are one class, any two agree at 90 % of the spots, however good the labels are."""
 
 DANGEROUS = 0.05
 """Largest share of the consistent locations that may be wrong."""
@@ -55,10 +55,10 @@ ADVICE: dict[Level, str] = {
     "misleading": "do not take agreement for truth",
     "no verdict": "too few locations were seen twice; more overlap between frames is needed",
 }
-"""What to do at each level."""
+"""Advice at each level."""
 
 ACTED_ON, LEAST_FLIPS = ("stable", "usable"), 0.001
-"""Levels at which labels are acted on, and the share of locations that flip from which on it is named."""
+"""Levels at which labels are acted on, and the least share of locations that flip that is reported."""
 
 NO_CELLS = "no cells were sampled; give the observations of a `Sampler`"
 STILL = "the camera stood still: all frames show one view"
@@ -89,7 +89,7 @@ def verdict(
         model: Its name.
         headline: Numbers of the map.
         cells: The observations that alpha rests on; without them there is no verdict.
-        flips: Locations about which frames do not agree: few of them hide in any mean.
+        flips: Locations about which frames do not agree: a few of them do not show in a mean.
         voxels: Voxels with OP >= 2.
         share: Their share of all voxels.
         blocks: Cubes of space in which they lie.
@@ -143,10 +143,10 @@ def _level(
 
 
 def _for(basis: Interval) -> str:
-    """Return what the interval is about."""
+    """Return the scope of the interval."""
     if basis.scope == THIS_SCENE:
         return f"for this scene flown again, from {basis.frames} frames"
-    reason = f"{basis.frames} frames; {LEAST_FRAMES} or more tell of another flight" if basis.frames else "no log"
+    reason = f"{basis.frames} frames; another flight needs {LEAST_FRAMES} or more" if basis.frames else "no log"
     return f"for these frames alone ({reason})"
 
 
@@ -164,6 +164,8 @@ def _flips(flips: Flipping) -> list[str]:
         return ["most locations were seen too seldom to tell which of them flip"]
     if not flips.share.value >= LEAST_FLIPS:
         return []
-    share, part = flips.share, f", {flips.part:.0%} of that between {flips.a} and {flips.b}" if flips.a else ""
-    far = f"{share.value:.1%} of the locations of this map flip ({share.low:.1%} to {share.high:.1%})"
-    return [f"not to act on: {far}{part}"]
+    share, part = flips.share, f", {flips.part:.0%} of them between {flips.a} and {flips.b}" if flips.a else ""
+    return [
+        f"{share.value:.1%} of the locations of this map flip ({share.low:.1%} to {share.high:.1%}{part}): do not act"
+        " on them"
+    ]

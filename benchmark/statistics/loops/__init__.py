@@ -1,10 +1,10 @@
-"""Compiled loops, and how they key cells of voxels: three voxel indices of BITS each, then three digits of 2 bits."""
+"""Compiled loops, and their keys of cells of voxels: three voxel indices of BITS each, then three digits of 2 bits."""
 
 CELLS = 4
 """Cells along a voxel's edge."""
 
 DIGITS = 6
-"""Bits of a key that say which cell of its voxel it is."""
+"""Bits of a key that number the cell in its voxel."""
 
 BITS = 19
 """Bits of a voxel's index along an axis, from the voxel on at which keys begin."""
@@ -12,4 +12,4 @@ BITS = 19
 SPAN = 1 << BITS
 SHIFTS = DIGITS + 2 * BITS, DIGITS + BITS, DIGITS
 WITHIN = 4, 2, 0
-"""Where in a key the three voxel indices begin, and the three digits."""
+"""Bits of a key at which the three voxel indices begin, and the three digits."""

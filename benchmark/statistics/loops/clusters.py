@@ -1,4 +1,4 @@
-"""The compiled pass over the log that adds up what each frame contributed to each cube of space."""
+"""The compiled pass over the log that adds up the contributions of each frame to each cube of space."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from semstab.core.compiled import CHUNKS, serial
 """The columns that every map has, before those by class."""
 
 DRIFT = 2
-"""How many columns of drift follow those."""
+"""Number of columns of drift that follow those."""
 
 (KNOWN, RIGHT, OBSERVED, OBSERVED_RIGHT, CONSISTENT, CONSISTENT_WRONG) = range(6)
 """The columns with ground truth, counted from the first of them."""
@@ -21,7 +21,7 @@ TIE = 1e-12
 
 @serial
 def _observations(log, first, T, number, active, x, total, squares, own):
-    """Return a voxel's observations by the classes that it ever saw, which are returned as how many they are.
+    """Write a voxel's observations by the classes that it ever saw, and return the number of these classes.
 
     log is (starts, label, weight) of all observations. x (T * A,) takes the evidence by observation and class, active
     (A,) the classes, ascending, total and squares (A,) the sums of evidence and of its squares, own (T,) those of each
@@ -56,9 +56,9 @@ def _observations(log, first, T, number, active, x, total, squares, own):
 
 @serial
 def _label(total, active, A, fused):
-    """Return which class is the dominant one.
+    """Return the dominant class.
 
-    That of the map, whose sums are rounded otherwise, or the lowest of equals.
+    It is that of the map, whose sums are rounded otherwise, or the lowest of equals.
     """
     best, top = 0, total[0]
     for j in range(A):
@@ -72,7 +72,7 @@ def _label(total, active, A, fused):
 
 @serial
 def _label_without(total, x, observation, A):
-    """Return which is the dominant class of the other observations."""
+    """Return the dominant class of the other observations."""
     best, top = 0, total[0] - x[observation]
     for j in range(1, A):
         rest = total[j] - x[observation + j]
@@ -83,9 +83,9 @@ def _label_without(total, x, observation, A):
 
 @serial
 def _add_truth(sums, base, x, first, T, group, truth, likely, total, active, A, label, without, mean, column, K):
-    """Add what is right of a voxel: the fused label by leaving a frame out, each observation by itself.
+    """Add the sums of right labels of a voxel: the fused label without one frame, and each observation by itself.
 
-    mean (A,) is room.
+    mean (A,) is work space.
     """
     true, lead, most = -1, total[label], 0.0
     for j in range(A):
@@ -126,9 +126,9 @@ def _add_truth(sums, base, x, first, T, group, truth, likely, total, active, A, 
 
 @serial
 def _agreement(total, squares, T, A, certain, surprise, apart):
-    """Return the agreement of two observations; of each class how surprising it is, and how far apart two of them are.
+    """Return the agreement of two observations; write the surprise of each class and the distance of two observations.
 
-    certain is what a class is to be sure of, log K.
+    certain is the unit of surprise, log K.
     """
     agreed = 0.0
     for j in range(A):
@@ -147,10 +147,10 @@ def add_influences(
 
     order (r,) has the voxels by cell, bounds (cells + 1,) where each cell's begin; rows (starts (n,) and ends) bound a
     voxel's rows of the log, `longest` at most; group (m,) is that of each row's frame. fused (n,) is its dominant class
-    in the map, (0,) where that is not known; truth (n,) is its true class or -1, likely (n,) that it is
-    consistent.
+    in the map, (0,) where that is not known; truth (n,) is its true class or -1, likely (n,) the
+    probability that it is consistent.
     The pairwise agreement P of a location is shared out as P + 2 (T - 1) / (T - 2) (a_t - P), a_t being frame t's mean
-    agreement with the others: what is left of a frame is then its own quality, free of that of the frames it was
+    agreement with the others: the part of a frame is then its own quality, free of that of the frames it was
     compared with, and the shares add up to T P.
     """
     starts, ends = rows

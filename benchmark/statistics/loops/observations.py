@@ -1,4 +1,4 @@
-"""Compiled passes over a frame's pixels: which show a sampled voxel, and which of those are of one cell and class."""
+"""Compiled passes over a frame's pixels: they select those of a sampled voxel, and group them by cell and class."""
 
 from __future__ import annotations
 
@@ -38,20 +38,20 @@ def hash_row(at_x, at_y, at_z, hashed):
 
 @serial
 def draw(depth, valid, labels, ray_x, ray_y, T, size, share, origin, reach, cell, drawn, label):
-    """Return the pixels that show a sampled block: key of the cell, hash and label; returns how many they are."""
+    """Write key of the cell, hash and label of the pixels that show a sampled block; return the number of pixels."""
     n = held = 0
     H, W = depth.shape
     at, hashed, last = np.empty((3, W), np.int32), np.empty(W, np.uint32), np.uint32(share - 1)
-    found = np.empty(W, np.int32)
+    selected = np.empty(W, np.int32)
     x, y, z = np.empty(HELD + W), np.empty(HELD + W), np.empty(HELD + W)
     for v in range(H):
-        place_row(depth[v], ray_x, ray_y[v], T, size, at[0], at[1], at[2])
+        locate_row(depth[v], ray_x, ray_y[v], T, size, at[0], at[1], at[2])
         hash_row(at[0], at[1], at[2], hashed)
         end = 0
-        for u in range(W):  # without a branch: where depth is noisy, none can be foretold
-            found[end] = u
+        for u in range(W):  # without a branch: it could not be predicted where depth is noisy
+            selected[end] = u
             end += hashed[u] <= last
-        for u in found[:end]:
+        for u in selected[:end]:
             d = np.float64(depth[v, u])
             x[held], y[held], z[held] = ray_x[u] * d, ray_y[v] * d, d
             drawn[n], label[n] = hashed[u], labels[v, u]
@@ -64,7 +64,7 @@ def draw(depth, valid, labels, ray_x, ray_y, T, size, share, origin, reach, cell
 
 
 @serial
-def place_row(depth, ray_x, ray_y, T, size, at_x, at_y, at_z):
+def locate_row(depth, ray_x, ray_y, T, size, at_x, at_y, at_z):
     """Find the block of each pixel of a row, any of invalid ones; without a branch, for vectors."""
     x0, x1, x2, x3 = T[0, 0], T[0, 1], T[0, 2], T[0, 3]
     y0, y1, y2, y3 = T[1, 0], T[1, 1], T[1, 2], T[1, 3]
@@ -100,7 +100,7 @@ def cells_of(at_x, at_y, at_z, T, size, origin, reach, key):
 
 @serial
 def digit(part):
-    """Return which of the cells along a voxel's edge a part of it, from 0 to 1, falls in."""
+    """Return the cell along a voxel's edge that a part of it, from 0 to 1, falls in."""
     cell = part * CELLS
     return np.int64(np.int32(cell if cell < CELLS else CELLS - 1.0))
 
@@ -109,8 +109,8 @@ def digit(part):
 def grouped(cell, label, drawn, pixels):
     """Move each pair of a cell and a label to the front, once, in order of appearance, and count its pixels (n,).
 
-    Return how many pairs there are. Those of one block lie side by side in the table, as they do in the image. Nobody
-    can foretell whether a pixel's cell is a new one, so that there is no branch for it.
+    Return the number of pairs. Those of one block lie side by side in the table, as they do in the image. A branch on
+    whether a pixel's cell is new could not be predicted, so there is none.
     """
     bits = 7
     while len(cell) > 1 << bits:
@@ -125,7 +125,7 @@ def grouped(cell, label, drawn, pixels):
         while (cell[there] != own) | (label[there] != its_label):
             slot = (slot + 1) & mask
             there = table[slot] if table[slot] >= 0 else i
-        cell[n], label[n], drawn[n], pixels[n] = own, its_label, drawn[i], 0.0  # of the next one, should it be new
+        cell[n], label[n], drawn[n], pixels[n] = own, its_label, drawn[i], 0.0  # the next pair, if it is new
         new = table[slot] < 0
         number = n if new else there
         table[slot] = number
@@ -142,7 +142,7 @@ def observe(number, view, label, weight, K, first, of, pixels, starts, classes, 
     """Write each observation: its cell, its pixels, and the share of each class among them, classes ascending.
 
     number, view (m,) are the cell and the view of each entry, in order. `first` is an entry of each observation, `of`
-    counts cells; returns how many observations there are, and how many classes of them together. All arrays are as long
+    counts cells; returns the number of observations, and the number of their classes together. All arrays are as long
     as the entries, `starts` is longer by one.
     """
     sums, met = np.zeros(K), np.empty(K, np.int64)

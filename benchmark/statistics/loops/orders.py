@@ -17,17 +17,17 @@ from semstab.backends.shared.score_loops import DOUBLES
 from semstab.core.compiled import CHUNKS, serial
 
 GOLDEN = np.uint64(0x9E3779B97F4A7C15)
-"""What the states of splitmix64 are apart."""
+"""The distance between successive states of splitmix64."""
 
 TURNS = 8
-"""A random order begins at so many observations, as far apart as can be, and goes round: what comes first differs."""
+"""A random order begins at so many observations, as far apart as possible, and goes round."""
 
 
 @intrinsic
 def _plogp_of_eight(_typing: Any, values: Any, _at: Any) -> Any:
-    """Return values[at .
+    """Replace values[at : at + 8] by p log2 p of each, by vector instructions.
 
-    At + 8] = p log2 p of each, by vector instructions, which the compiler has for no library's log.
+    The compiler has no such instructions for the logarithm of any library.
     """
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
@@ -65,7 +65,7 @@ def _drifts(x, A, T, drift):
 
 @serial
 def _dense(log, first, T, number, at, x):
-    """Return a voxel's T observations as columns `at` (T,) of x (A, T); returns A, how many classes it ever saw.
+    """Write a voxel's T observations as columns `at` (T,) of x (A, T); return A, the number of classes it ever saw.
 
     log is (starts, label, weight) of all observations; number is work space (K,), all -1.
     """
@@ -106,7 +106,7 @@ def _shuffle(order, T, state):
 
 @serial
 def mean_drifts(chunk, voxels, first, T, log, K, entries, seeds, null):
-    """Write the mean drift a step in TURNS orders, turns of one random order, of these voxels (r,) to null (n,).
+    """Write the mean drift per step in TURNS orders, turns of one random order, of these voxels (r,) to null (n,).
 
     first, T (n,) are the voxels' rows of the log, seeds (n,) their random streams; `entries` is the most that one has.
     """
@@ -127,7 +127,7 @@ def mean_drifts(chunk, voxels, first, T, log, K, entries, seeds, null):
 # Compiled loops over one-hot observations, whose drift depends on counts only.
 
 LONGEST_TABLE = 256
-"""Up to this OP the drift of one-hot observations is looked up."""
+"""Largest OP at which the drift of one-hot observations is looked up."""
 
 
 @serial
