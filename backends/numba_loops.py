@@ -1,8 +1,8 @@
 """Compiled loops over the partitions of the numba backend's map; each is updated by one thread at a time.
 
-The `next` of a voxel's record tells the position of its evidence: `ALONE`, of one class, in the record itself; from 0 on, more of
-it hangs on the record as a chain of nodes that begins there; below `ALONE`, in the dense row `DENSE - next`. Then the
-record holds the dominant class as its label, and the sum of p log2 p as its value.
+The `next` of a voxel's record tells the position of its evidence: `ALONE`, of one class, in the record itself; from 0
+on, more of it hangs on the record as a chain of nodes that begins there; below `ALONE`, in the dense row
+`DENSE - next`. Then the record holds the dominant class as its label, and the sum of p log2 p as its value.
 """
 
 from __future__ import annotations

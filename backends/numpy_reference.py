@@ -1,4 +1,4 @@
-"""Backend `numpy`: the reference. It stores the history H(q) of every voxel and leaves each metric to its definition."""
+"""Backend `numpy`: the reference. It stores the history H(q) of every voxel; each metric follows its definition."""
 
 from __future__ import annotations
 

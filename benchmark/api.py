@@ -26,8 +26,8 @@ def run(
 ) -> Result:
     """Fuse, measure and compare what the configuration selects, without printing; it may be a dict or a YAML file.
 
-    A folder `out`, whose finished units of an earlier start are reused, gets the summary, voxels, time series and, unless
-    `report` is False, tables, figures and report.html.
+    A folder `out`, whose finished units of an earlier start are reused, gets the summary, voxels, time series and,
+    unless `report` is False, tables, figures and report.html.
 
     Args:
         config: Settings, or a YAML file with them.

@@ -114,8 +114,8 @@ class _Candidate:
 def placement_of(folder: Path, opensfm: Path, shots: Mapping[str, Poses], find: Positions) -> Placement | None:
     """Return the georeference of a project whose cameras have these poses (4, 4) world to camera; None if it has none.
 
-    The frame of the files is compared with known positions of the cameras. If another frame fits clearly better, that is
-    taken, with a warning; another warning says that the cameras lie further off than GPS explains.
+    The frame of the files is compared with known positions of the cameras. If another frame fits clearly better, that
+    is taken, with a warning; another warning says that the cameras lie further off than GPS explains.
 
     Raises:
         DataError: For damaged files.
@@ -147,7 +147,7 @@ def placement_of(folder: Path, opensfm: Path, shots: Mapping[str, Poses], find: 
         explained = "of the same cameras" if known.exact else f"more than the {GPS_LIMIT:g} m that GPS explains"
         logger.warning(
             "%s: the cameras lie %.3g m (median, horizontal) from %s, %s: the poses are not in the assumed frame"
-            " (%s), and the map is displaced as far; put opensfm/%s and %s of this run back, or give crs, offset, linear",
+            " (%s), and the map is as far off; restore opensfm/%s and %s of this run, or give crs, offset, linear",
             folder, off, known.source, explained, taken.words, MATRIX, REFERENCE,
         )  # fmt: skip
     words = f"{taken.words}; cameras {off:.2f} m (median, horizontal) from {known.source}"
@@ -190,7 +190,7 @@ def _candidates(folder: Path, opensfm: Path) -> tuple[list[_Candidate], bool]:
 
 
 def _turned(georeference: Georeference, source: str) -> _Candidate:
-    """Return the georeference of topocentric poses; ODM's meshes have the height of the projection, but not east and north."""
+    """Return the georeference of topocentric poses; ODM's meshes have the projection's height, not east and north."""
     east, north, _ = georeference.offset
     return _Candidate(georeference, f"poses topocentric, brought into the projection by {source}", (east, north, 0.0))
 

@@ -71,8 +71,8 @@ class Prediction:
     """The prediction of a model for one image.
 
     Attributes:
-        labels: (H, W) uint8 or uint16: ids of its label space, 255 (65535) where it has no prediction; of a model without
-            classes, region ids from 1, `UNASSIGNED` where there is no region.
+        labels: (H, W) uint8 or uint16: ids of its label space, 255 (65535) where it has no prediction; of a model
+            without classes, region ids from 1, `UNASSIGNED` where there is no region.
         scores: (H, W, K) float32 that sum to 1 over the classes, or None where only labels are wanted.
     """
 
@@ -100,8 +100,8 @@ class Model(Protocol):
         label_space: The classes of its labels and scores, or None where it predicts regions without classes.
         gives_scores: Whether `predict` can give scores.
         fit_frames: Number of images that `fit` wants, 0 for most.
-        sequential: Whether its prediction on an image depends on the images before: it then gets the selected frames of a
-            sequence in order, all of them, from the first one after `reset`.
+        sequential: Whether its prediction on an image depends on the images before: it then gets the selected frames of
+            a sequence in order, all of them, from the first one after `reset`.
         wants_geometry: Whether `predict` is also given `geometry=`, one `Frame` an image: its depth, intrinsics and
             pose at the image's own pixels, depth 0 where it is not known; labels are all 0, there is no colour.
         streams: Whether `stream` needs less memory than `predict`: it is called where scores are many.
@@ -138,7 +138,7 @@ class Model(Protocol):
         return streamed(prediction)
 
     def identity(self) -> dict[str, Any]:
-        """Return what the output depends on in addition to the image, for JSON: settings, and the content of named files.
+        """Return what the output depends on apart from the image, for JSON: settings, and the content of named files.
 
         Predictions are stored and reused under it.
         """

@@ -176,7 +176,7 @@ class Checked(Wrapped):
 
 
 def _add_up(scores: npt.NDArray[np.floating[Any]]) -> bool:
-    """Return whether each pixel's scores (H, W, K) are not negative and sum to 1, or to 0 where there is no prediction."""
+    """Return whether each pixel's scores (H, W, K) are not negative and sum to 1, or to 0 without a prediction."""
     total = scores.sum(axis=2, dtype=np.float32)
     return bool((scores >= 0).all() and ((np.abs(total - 1) <= SUM_TOLERANCE) | (total == 0)).all())
 

@@ -291,7 +291,7 @@ class SegmenterOptions(ImageModelOptions):
 
     image_size: PositiveInt | tuple[PositiveInt, PositiveInt] | None = Field(
         None,
-        description="the shorter side in pixels, at the shape of the image; or [height, width]; where not given, the one that"
+        description="the shorter side in pixels, at the shape of the image; or [height, width]; by default the one that"
         " the checkpoint was trained with",
     )
     engine: Literal["torch", "onnx"] = Field("torch", description="torch, or ONNX Runtime on the CPU")

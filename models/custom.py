@@ -133,7 +133,7 @@ def _of_file(path: Path) -> ModuleType:
     if not path.is_file():
         raise ConfigError(f"{path}: there is no such file")
     content = hashlib.blake2b(str(path.resolve()).encode() + path.read_bytes(), digest_size=6).hexdigest()
-    name = f"{path.stem}_{content}"  # a module of its own, whatever other module has the file's name, and of this version
+    name = f"{path.stem}_{content}"  # a module of its own and of this version, whatever other files are called
     if name in sys.modules:
         return sys.modules[name]
     spec = importlib.util.spec_from_file_location(name, path.resolve())
@@ -203,8 +203,9 @@ class OwnModel(Model):
     """A function of an image (H, W, 3) uint8 RGB, or an object with such a method `predict`, or that is called so.
 
     It gives labels (H, W), whole numbers in the order of its classes, 255 (of more than 255 classes 65535) or less than
-    0 where it has no prediction; or scores (H, W, K) that sum to 1. A tensor is as good as an array. It may say `classes`,
-    `gives_scores`, `sequential` (then it has `reset`) and `wants_geometry` (then it is called with image and frame).
+    0 where it has no prediction; or scores (H, W, K) that sum to 1. A tensor is as good as an array. It may say
+    `classes`, `gives_scores`, `sequential` (then it has `reset`) and `wants_geometry` (then it is called with image and
+    frame).
     """
 
     def __init__(self, code: Code, options: Mapping[str, Any], classes: Sequence[str] | str | None) -> None:
@@ -307,5 +308,6 @@ def _label_space(code: Code, made: Any, classes: Sequence[str] | str | None) -> 
     if isinstance(names, Mapping):  # from ids, as Ultralytics has it
         names = [names[k] for k in sorted(names)]
     if names is None or isinstance(names, str) or not all(isinstance(name, str) for name in names):
-        raise ConfigError(f"{code.text}: its classes are not known; give it classes = [...], or name them with --classes a,b,c")
+        hint = "give it classes = [...], or name them with --classes a,b,c"
+        raise ConfigError(f"{code.text}: its classes are not known; {hint}")
     return LabelSpace(code.name, tuple(names))

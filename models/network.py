@@ -188,7 +188,7 @@ class NetworkFile(Model):
         self._path, self._options = path, options
         self._network = load_network(path, options.device, options.threads)
         if options.classes is None:
-            raise ConfigError(f"{path}: its classes are not known; name them with --classes a,b,c or a file with a name a line")
+            raise ConfigError(f"{path}: its classes are not known; name them with --classes a,b,c or a file of names")
         names = class_names(options.classes)
         self.label_space = names if isinstance(names, LabelSpace) else LabelSpace(path.stem, tuple(names))
         self.gives_scores = options.gives != "labels"
@@ -288,7 +288,9 @@ class NetworkFile(Model):
             values = values.transpose(2, 0, 1)
         if values.ndim != 2 + len(classes) or values.shape[: len(classes)] != classes:
             what = f"{classes[0]} classes" if classes else "labels"
-            raise DataError(f"{self._path}: its output of shape {output.shape} holds no {what}; correct classes or output")
+            raise DataError(
+                f"{self._path}: its output of shape {output.shape} holds no {what}; correct classes or output"
+            )
         return values
 
 

@@ -97,7 +97,7 @@ class SamOptions(ImageModelOptions):
     points_per_batch: int = Field(64, ge=1, description="points at a time; it changes speed and memory, not the masks")
     pred_iou: float = Field(0.88, ge=0, le=1, description="masks that the model itself rates lower are dropped")
     stability: float = Field(0.95, ge=0, le=1, description="masks that change more with the threshold are dropped")
-    stability_offset: float = Field(1.0, ge=0, description="distance by which the threshold is moved up and down, logits")
+    stability_offset: float = Field(1.0, ge=0, description="shift of the threshold up and down, logits")
     nms_iou: float = Field(0.7, ge=0, le=1, description="of masks whose boxes overlap more the better rated one stays")
     min_area: int = Field(100, ge=0, description="masks of fewer pixels are dropped")
     cache: Path | None = Field(None, description="folder that caches proposals, for other uses of the same ones")

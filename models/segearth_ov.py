@@ -274,7 +274,7 @@ def slide(
 
 
 def padded(pixels: torch.Tensor, multiple: int) -> tuple[torch.Tensor, tuple[slice, ...]]:
-    """Return the image (..., H, W) between zeros so that both sides are multiples, and the slices of the image in the result."""
+    """Return the image (..., H, W) between zeros so that both sides are multiples, and its slices in the result."""
     H, W = pixels.shape[-2:]
     top, left = -H % multiple // 2, -W % multiple // 2
     bottom, right = -H % multiple - top, -W % multiple - left

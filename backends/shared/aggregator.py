@@ -244,7 +244,7 @@ def _rays(frame: Frame) -> tuple[Float64, Float64]:
 
 
 def _offsets(spread: Int64) -> tuple[Int64, Int64]:
-    """Return the position of each band's entries in each partition (PARTITIONS, bands), and the first of each partition."""
+    """Return the start of each band's entries in each partition (PARTITIONS, bands), and of each partition."""
     ends = np.cumsum(spread.T.reshape(-1))
     offset = np.concatenate([[0], ends[:-1]]).reshape(PARTITIONS, -1)
     return offset, np.append(offset[:, 0], ends[-1])

@@ -92,7 +92,7 @@ def _update_rows(
 
 
 def blocks_of(index: Int64, resolution: int) -> tuple[Int32, Int64, Int32]:
-    """Return the distinct blocks (m, 3) of voxels (n, 3), each voxel's block as a row, and its offset in it (x fastest)."""
+    """Return the distinct blocks (m, 3) of voxels (n, 3), each voxel's block as a row, and its offset (x fastest)."""
     size = 1 << max(4, (2 * len(index)).bit_length())
     blocks, block = np.empty((len(index), 3), dtype=np.int32), np.empty(len(index), dtype=np.int64)
     offset, slots = np.empty(len(index), dtype=np.int32), np.full(size, -1, dtype=np.int32)

@@ -20,8 +20,8 @@ from semstab.core.compiled import parallel, serial
 #
 # Scores are flat arrays of float32 or float64, or of half-precision numbers by their bits (uint16), since compiled code
 # knows no such type. They are added up in float64, in an order that depends on the number of classes only. A pixel's
-# last classes are read together with the numbers that follow them: behind the last pixel there must be `LANES` numbers of whatever
-# value.
+# last classes are read together with the numbers that follow them: behind the last pixel there must be `LANES` numbers
+# of whatever value.
 
 LANES = 8
 
@@ -195,7 +195,7 @@ def sum_scores(
 ):  # fmt: skip
     """Sum the scores of each voxel's pixels, each scaled to sum 1, band by band; some voxels come twice.
 
-If a band has more than `room` of them, its number in `entries` is -1, and its rest is left undone.
+    If a band has more than `room` of them, its number in `entries` is -1, and its rest is left undone.
 
     - `labels`: (W,) 0 wherever there is depth: scores have no ignore id
     - `scores`: (H * W * K,), see `vectors`

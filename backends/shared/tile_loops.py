@@ -180,7 +180,7 @@ def _key_of(a, b, c, corner):
 
 @serial
 def _enter_runs(word, run_word, run_end, table, table_count, entry, count, n):
-    """Return the runs of a stretch of words into the table; runs that give way are entries. Returns how many there are."""
+    """Put runs of a stretch of words into the table; those that give way become entries, whose number is returned."""
     runs = 0
     for u in range(0, word.shape[0] - LANES, LANES):
         runs = runs_of_eight(word, u, run_word, run_end, runs)

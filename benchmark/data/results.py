@@ -17,8 +17,8 @@ SCHEMA = 4
 """Version of summary.json."""
 
 STAGES = ("decode", "wait", "flicker", "association", "update", "logging")
-"""The stages of a frame's time: decoding in a worker thread, parallel to the rest; waiting for it; flicker; the two parts
-of fusion, where the backend measures them separately; notifying the observers."""
+"""The stages of a frame's time: decoding in a worker thread, parallel to the rest; waiting for it; flicker; the two
+parts of fusion, where the backend measures them separately; notifying the observers."""
 
 LONGEST_NAME = 60
 """Bytes of a name in a file's name: with three of them, and what surrounds them, it has fewer than 255."""
@@ -160,8 +160,8 @@ class UnitSummary:
     fusion because what they show moves, frames_left_out the selected frames without a file or a pose, frames_empty
     the fused ones of which no pixel was valid; scores_left_out is there with `top_k`; statistics is what
     `semstab.statistics.describe` reports of the map, None where it was not asked for; sizes tells whether half or twice
-    the voxel size would give another result; worst_frames are those that moved the map most, the worst first; reduced is
-    there for soft scores.
+    the voxel size would give another result; worst_frames are those that moved the map most, the worst first; reduced
+    is there for soft scores.
     """
 
     unit: Unit = field(metadata=INLINE)

@@ -25,7 +25,7 @@ CONFUSION: dict[str, dict[str, float]] = {
     "human": {"clutter": 0.5, "road": 0.3, "low vegetation": 0.2},
     "moving car": {"static car": 0.7, "road": 0.2, "clutter": 0.1},
 }
-"""The classes that each true class is mistaken for, by weight, as segmentation networks confuse them in UAVid images."""
+"""The classes that each true class is mistaken for, by weight, as networks confuse them in UAVid images."""
 
 Share = Annotated[float, Field(ge=0, le=1)]
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9.-]*(_[A-Za-z0-9.-]+)*")
@@ -130,7 +130,7 @@ class CityOptions(Settings):
     )
     altitude: float = Field(45.0, ge=30, le=120, description="of the camera above the mean ground, metres")
     field_of_view: float = Field(60.0, ge=20, le=100, description="horizontal, degrees")
-    cache_megabytes: int = Field(256, ge=0, description="rendered frames that an open scene holds in memory for its models")
+    cache_megabytes: int = Field(256, ge=0, description="rendered frames that an open scene caches for its models")
     models: dict[str, SimulatedModel] = Field(
         default_factory=lambda: dict(MODELS),
         description="the simulated models by name, instead of the built-in ones",

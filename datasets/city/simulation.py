@@ -315,7 +315,7 @@ class Simulation:
         return scores
 
     def _cells(self, view: View, rows: slice) -> tuple[Int64, Int64, Int64]:
-        """Return the cell of each pixel, counted from the cell of the town's origin, so that errors move with the town."""
+        """Return the cell of each pixel, counted from that of the town's origin, so that errors move with the town."""
         size = self.model.cell
         first = np.rint(view.origin / size)
         x, y, z = ((np.floor(x / size) - first[k]).astype(np.int64) for k, x in enumerate(view.positions(rows)))

@@ -301,7 +301,7 @@ class FileScene(Scene):
         if mask is not None:  # outside of the mask's view nothing is masked
             values = read_mask(mask, self._reader(index, MASK)).astype(np.uint8)
             masked = self._stored(index, values, depth.shape, mask, "the mask is") == 1
-        shown = image if source.color_lens is None else None  # a distorted one does not show the view of the depth's camera
+        shown = image if source.color_lens is None else None  # a distorted one shows another view than the depth
         known = {"depth": self.surface or source.depth, "pose": source.pose_file, "color": shown, "mask": mask}
         known |= dict(files or {})
         return Frame(

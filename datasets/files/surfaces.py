@@ -115,7 +115,7 @@ def require_same_projection(path: Path, crs: str, georeference: Georeference) ->
 
 @dataclass(frozen=True, eq=False)
 class Triangles:
-    """vertices (n, 3) float64 in the scene's coordinates, metres; faces (m, 3) int32; `what` describes them in words."""
+    """vertices (n, 3) float64 in the scene's coordinates, metres; faces (m, 3) int32; `what` describes them."""
 
     vertices: Float64
     faces: Int32

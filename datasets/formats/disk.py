@@ -135,7 +135,7 @@ def decode_array(path: Path, data: bytes, key: str) -> npt.NDArray[Any]:
 
 
 def _decode_npy(where: str, data: bytes) -> npt.NDArray[Any]:
-    """Return the array; numpy itself evaluates the header as Python, with its warnings, and allocates the claimed size."""
+    """Return the array; numpy itself would evaluate the header as Python, and allocate the claimed size."""
     if not data.startswith(b"\x93NUMPY") or len(data) < 12:
         raise DataError(f"{where}: not an .npy array; {AGAIN}")
     width = 2 if data[6] == 1 else 4

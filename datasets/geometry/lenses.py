@@ -36,8 +36,8 @@ def fit(values: Pixels, K: Intrinsics, K_fit: Intrinsics, shape: tuple[int, int]
     """Return a label map (H', W') or scores (H', W', K) as a camera with K_fit and an image (H, W) sees them.
 
     K belongs to `values`. Both images share centre and axes. Each pixel gets the nearest label; scores are linear
-    between pixel centres, and beyond the outer centres the outer pixels hold. Pixels that K does not see are ignored: labels
-    of 255 (65535), scores of 0.
+    between pixel centres, and beyond the outer centres the outer pixels hold. Pixels that K does not see are ignored:
+    labels of 255 (65535), scores of 0.
     """
     if values.ndim == 2:
         return _nearest(values, K, K_fit, shape, int(ignore_id(values)))
@@ -155,7 +155,8 @@ def undistorted(
 ) -> Pixels:
     """Return an image of the lens, ids (H', W') or channels (H', W', C), as a pinhole with K and (H, W) sees it.
 
-    Ids are the nearest ones, channels are linear between pixel centres; pixels that the lens does not see are ignored, or 0.
+    Ids are the nearest ones, channels are linear between pixel centres; pixels that the lens does not see are ignored,
+    or 0.
 
     Raises:
         DataError: If the image is not of the lens's shape, with `where`, its file.
