@@ -30,7 +30,7 @@ REGISTRY = Registry(
     {
         "numpy": Entry(
             "semstab.backends.numpy_reference:NumpyReference",
-            "the reference: keeps every observation and computes each metric from its definition",
+            "the reference: it stores every observation and computes each metric from its definition",
         ),
         "numba": Entry(
             "semstab.backends.numba_hash:NumbaHash",
@@ -82,7 +82,7 @@ class FusionBackend(Protocol):
         """Return the map so far."""
 
     def events(self) -> Events | None:
-        """Return the log of observations, or None where the backend keeps none."""
+        """Return the log of observations, or None where the backend has none."""
         return None
 
 

@@ -34,7 +34,7 @@ from semstab.backends.shared.association import check_depth, check_frame, check_
 from semstab.backends.shared.keys import PARTITIONS, columns_of_keys, index_of_keys
 from semstab.backends.shared.observations import Change, MapTotal, Observed, ObservedScores
 from semstab.backends.shared.score_loops import LANES
-from semstab.core.compiled import is_kept, settings
+from semstab.core.compiled import is_cached, settings
 from semstab.core.types import Float64, Int32, Int64, UInt16
 from semstab.data.events import Events
 from semstab.data.evidence import Evidence
@@ -43,7 +43,7 @@ from semstab.data.results import FrameReport
 from semstab.data.voxels import Extent, VoxelTable
 from semstab.errors import ConfigError
 
-# The log of observations that the numba backend keeps on request.
+# The log of observations that the numba backend stores on request.
 
 
 class History:
@@ -56,7 +56,7 @@ class History:
         """The index, rows of the map, pixels, and entries as in `Observed`, without empty ones, of each frame."""
 
     def append(self, seen: Observed, row: Int64, frame: int) -> None:
-        """Keep a copy of the observations of the map's rows that outlives the next frame."""
+        """Store a copy of the observations of the map's rows that outlives the next frame."""
         some, n = seen.weight > 0, len(seen.key)
         entries = np.add.reduceat(some, seen.start[:-1], dtype=np.uint16) if n else np.zeros(0, np.uint16)
         rows, pixels = row.astype(np.int32), seen.pixels.astype(np.int32)
@@ -71,14 +71,14 @@ class History:
             voxel = rank[row] + 1  # a voxel is in a frame once
             observations[voxel] += 1
             entries[voxel] += number
-        place, entry = np.cumsum(observations), np.cumsum(entries)  # where each voxel's next observation goes
+        slot, entry = np.cumsum(observations), np.cumsum(entries)  # where each voxel's next observation goes
         voxels = np.repeat(np.arange(len(order), dtype=np.int32), observations[1:])
         frame, pixels = (np.empty(len(voxels), np.int32) for _ in range(2))
         starts = np.empty(len(voxels) + 1, np.int64)
         starts[-1] = entry[-1]
         label, weight = np.empty(entry[-1], np.uint16), np.empty(entry[-1])
         for seen in self._seen:
-            place_observations(rank, *seen, place, entry, frame, pixels, starts, label, weight)
+            place_observations(rank, *seen, slot, entry, frame, pixels, starts, label, weight)
         evidence = Evidence(starts, label, weight, self.num_classes)
         return Events(**index, voxel=voxels, frame=frame, evidence=evidence, pixels=pixels, voxel_size=self.voxel_size)
 
@@ -95,7 +95,7 @@ class NumbaHash:
     Attributes:
         evidence: 'float64', or 'float32' for half the memory of the evidence.
         threads: Number of threads; all of numba's where not given.
-        history: Keep every observation, for `events`; memory then grows with each.
+        history: Store every observation, for `events`; memory then grows with each.
         within: The voxels that the map is restricted to.
     """
 
@@ -115,7 +115,7 @@ class NumbaHash:
             raise ConfigError(f"evidence = '{evidence}': use float64 or float32")
         if threads is not None and not 1 <= threads <= settings.NUMBA_NUM_THREADS:
             raise ConfigError(f"threads = {threads}: use 1 to {settings.NUMBA_NUM_THREADS}, the threads that numba has")
-        if not (NumbaHash._loaded or is_kept(update)):
+        if not (NumbaHash._loaded or is_cached(update)):
             then = "the result is cached" if update.stats.cache_path else "no folder can be written to cache the result"
             logging.getLogger("semstab").warning("backend numba: compiling, once (half a minute); %s", then)
         self.voxel_size = voxel_size
@@ -263,7 +263,7 @@ class NumbaHash:
         return base
 
     def _make_nodes(self, entries: Int64) -> None:
-        """Give each partition room for a node an entry; what is left of its last stretch is used first."""
+        """Give each partition room for a node an entry; the rest of its last stretch is used first."""
         ranges = self._ranges
         spent = ranges[:, 0] == ranges[:, 1]
         ranges[spent, :2] = ranges[spent, 2:]
@@ -283,7 +283,7 @@ def _grow(rows: npt.NDArray[Any], needed: int) -> None:
 
 
 def _load_compiled() -> None:
-    """Load what fusing labels needs from numba's cache, or compile it, once a process: no frame waits for it then."""
+    """Load the code that fuses labels from numba's cache, or compile it, once a process: no frame waits for it then."""
     if NumbaHash._loaded:
         return
     NumbaHash._loaded = True

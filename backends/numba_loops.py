@@ -1,8 +1,8 @@
 """Compiled loops over the partitions of the numba backend's map; each is updated by one thread at a time.
 
-Where a voxel's evidence is says `next` of its record: `ALONE`, of one class, in the record itself; from 0 on, more of
-it hangs on the record as a chain of nodes that begins there; below `ALONE`, in the dense row `DENSE - next`. Then the
-record holds the dominant class as its label, and the sum of p log2 p as its value.
+The `next` of a voxel's record tells the position of its evidence: `ALONE`, of one class, in the record itself; from 0
+on, more of it hangs on the record as a chain of nodes that begins there; below `ALONE`, in the dense row
+`DENSE - next`. Then the record holds the dominant class as its label, and the sum of p log2 p as its value.
 """
 
 from __future__ import annotations
@@ -170,7 +170,7 @@ def _observe_voxel(record, nodes, ranges, s, label, weight, first, last, pixels,
 
 @compiled(forceinline=True)
 def _touch_ahead(v, last, row, records, nodes, dense):
-    """Ask for the records of later voxels, which lie across two lines of the cache, and for where they go on."""
+    """Ask for the records of later voxels, which lie across two lines of the cache, and for the nodes that follow."""
     soon = max(row[min(v + 2 * AHEAD, last)], 0)
     touch(records, soon)
     touch(records, soon + 1)
@@ -280,14 +280,14 @@ def read_chain(records, nodes, dense, order, starts, label, weight):
 
 @serial
 def place_observations(
-    rank, index, row, seen_pixels, entries, seen_label, seen_weight, place, entry, frame, pixels, starts, label, weight
+    rank, index, row, seen_pixels, entries, seen_label, seen_weight, slot, entry, frame, pixels, starts, label, weight
 ):  # fmt: skip
     """Write a frame's observations where each voxel's next one goes."""
     e = 0
     for i in range(row.shape[0]):
         voxel = rank[row[i]]
-        at, to = place[voxel], entry[voxel]
-        place[voxel] += 1
+        at, to = slot[voxel], entry[voxel]
+        slot[voxel] += 1
         entry[voxel] += entries[i]
         frame[at], pixels[at], starts[at] = index, seen_pixels[i], to
         for k in range(entries[i]):
@@ -352,10 +352,10 @@ def _touch_ahead_dense(v, last, row, records, flat, stride, seen, seen_sums):
     touch(records, later)
     touch(records, later + 1)
     soon = min(v + AHEAD // 2, last)
-    place = max(DENSE - np.int64(records[max(row[soon], 0)].next), 0) * stride
+    start = max(DENSE - np.int64(records[max(row[soon], 0)].next), 0) * stride
     for k in range(0, stride, 8):
         touch(seen_sums, seen[soon] + k)
-        touch(flat, place + k)
+        touch(flat, start + k)
 
 
 @serial

@@ -1,4 +1,4 @@
-"""Backend `numpy`: the reference. Keeps the history H(q) of every voxel and leaves each metric to its definition."""
+"""Backend `numpy`: the reference. It stores the history H(q) of every voxel; each metric follows its definition."""
 
 from __future__ import annotations
 
@@ -118,7 +118,7 @@ class NumpyReference:
         rows = np.fromiter(map(self._row.__getitem__, voxels), dtype=np.int64, count=len(voxels))
         if len(self._row) > len(self._op):
             room = len(self._row) + len(self._row) // 4
-            self._evidence.resize((room, self.num_classes), refcheck=False)  # in place: nothing is there twice
+            self._evidence.resize((room, self.num_classes), refcheck=False)  # in place: no copy is made
             self._op.resize(room, refcheck=False)
         return rows
 

@@ -150,13 +150,13 @@ class Open3DBlocks(FusionBackend):
     def _activate(self, index: Int64) -> Int64:
         """Return rows of voxels (n, 3), at least one, in the attributes, their blocks activated.
 
-        New ones start at 0.
+        New ones are 0.
         """
-        blocks, block, place = blocks_of(index, self.block_resolution)
+        blocks, block, offset = blocks_of(index, self.block_resolution)
         self._add_blocks(blocks)
         buffer, _ = self.grid.hashmap().find(self._tensor(blocks))
         buffers: Int64 = buffer.cpu().numpy().astype(np.int64)
-        return buffers[block] * self.block_resolution**3 + place
+        return buffers[block] * self.block_resolution**3 + offset
 
     def _index_of(self, rows: Int64) -> Int64:
         """Return voxel indices (n, 3) of rows: the inverse of `_activate`."""
@@ -181,7 +181,7 @@ class Open3DBlocks(FusionBackend):
     def _attribute(self, name: str) -> Any:
         """Return the attribute, flattened to (voxels, channels).
 
-        Taken anew each time, because a rehash moves the buffers.
+        It is taken anew each time, because a rehash moves the buffers.
         """
         values = self.grid.attribute(name)
         return values.reshape((-1, values.shape[-1]))

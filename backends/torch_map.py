@@ -104,7 +104,7 @@ class TorchMaps:
         self.device = device_of(device)
         self._dtype = torch.float64 if precision == "float64" else torch.float32
         self._grid: MapGrid | None = None
-        with torch.inference_mode(False):  # what is made in inference mode could not be updated outside of it
+        with torch.inference_mode(False):  # tensors made in inference mode could not be updated outside of it
             self.storage = Storage(num_classes, self._dtype, self.device, memory_gb)
             first = min(FIRST_ROWS, FIRST_BYTES // sum(c.row_bytes for c in self.storage.columns.values()))
             self.storage.make_room(max(reserve, 1), f"reserve = {reserve}", reserve or first)
@@ -124,7 +124,7 @@ class TorchMaps:
         *,
         index: int,
     ) -> dict[str, FrameReport]:
-        """Fuse what some of the models say of one view; a report for each.
+        """Fuse the predictions of some of the models on one view; return a report for each.
 
         Raises:
             DataError: If one of them cannot be fused, with all maps unchanged.

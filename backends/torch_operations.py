@@ -33,9 +33,9 @@ SUMS = len(fields(Change))
 
 @dataclass(frozen=True, eq=False)
 class Association:
-    """The voxels of a view: keys (n,) int64, distinct; and for each pixel its voxel's place there, (H, W) int32.
+    """The voxels of a view: keys (n,) int64, distinct; and for each pixel its voxel's index there, (H, W) int32.
 
-    In place of the voxel stands NONE, or LOST.
+    NONE or LOST stands instead of a voxel.
     """
 
     keys: torch.Tensor
@@ -49,7 +49,7 @@ class ViewEvidence:
     Attributes:
         sums: (K, n) integer.
         pixels: (n,) int64 pixels that count; 0 in voxels that the model does not see.
-        flags: (3,) int64 what is wrong: the highest label id that a pixel which counts has, where that is no class,
+        flags: (3,) int64 faults: the highest label id that a pixel which counts has, where that is no class,
             else -1 or a class; whether such a pixel is out of reach; whether a score is below 0.
     """
 
@@ -85,9 +85,9 @@ def associate(view: DepthView, grid: MapGrid) -> Association:
     rows = parts(H, chunk_of(view.depth.device) // W)
     runs = [torch.unique_consecutive(_keys(view, grid, terms, part), return_counts=True) for part in rows]
     key, length = (torch.cat(part) for part in zip(*runs, strict=True))
-    keys, place = torch.unique(key, return_inverse=True)
+    keys, inverse = torch.unique(key, return_inverse=True)
     nowhere = int((keys < 0).sum())
-    voxel = torch.where(key < 0, key, place - nowhere).to(torch.int32)
+    voxel = torch.where(key < 0, key, inverse - nowhere).to(torch.int32)
     pixels = torch.repeat_interleave(voxel, length, output_size=H * W)
     return Association(keys[nowhere:], pixels.reshape(H, W))
 
@@ -121,7 +121,7 @@ def camera_terms(view: DepthView, grid: MapGrid) -> list[torch.Tensor]:
 def camera_terms_single(view: DepthView, grid: MapGrid) -> list[torch.Tensor]:
     """Return a (3, 1, W), b (3, H, 1), start and offset (3, 1, 1), float32: x_w / r = d (a + b) + start.
 
-    In units of voxels, with the whole voxels of the camera's position left to the integers: so float32 holds no more
+    Units are voxels, with the whole voxels of the camera's position left to the integers: so float32 holds no more
     than the distance from the camera, and decides alike in UTM-sized coordinates.
     """
     ray_x, ray_y = view.rays

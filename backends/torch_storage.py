@@ -86,9 +86,9 @@ class VoxelHash:
         while len(keys):
             free = self.keys[at] == EMPTY
             self.keys[at[free]] = keys[free]  # several keys may want a slot: one of them gets it
-            placed = free & (self.keys[at] == keys)
-            self.rows[at[placed]] = rows[placed]
-            at, keys, rows = (at[~placed] + 1) & mask, keys[~placed], rows[~placed]
+            written = free & (self.keys[at] == keys)
+            self.rows[at[written]] = rows[written]
+            at, keys, rows = (at[~written] + 1) & mask, keys[~written], rows[~written]
 
 
 def mix(key: torch.Tensor) -> torch.Tensor:
@@ -195,7 +195,7 @@ class Storage:
             ) from error
 
     def _bytes_to_grow(self, voxels: int) -> int:
-        """Return the most memory taken while it grows: what it is then, and the column or hash that is copied."""
+        """Return the most memory taken while it grows: its memory then, and the column or hash that is copied."""
         columns = self.columns.values()
         then = SLOT_BYTES * slots_for(voxels) + voxels * sum(c.row_bytes for c in columns)
         copied = max(self.hash.bytes, *(c.values["evidence"].nbytes for c in columns))

@@ -26,14 +26,14 @@ def run(
 ) -> Result:
     """Fuse, measure and compare what the configuration selects, without printing; it may be a dict or a YAML file.
 
-    A folder `out`, in which the finished units of an earlier start are kept, gets the summary, voxels, time series and,
+    A folder `out`, whose finished units of an earlier start are reused, gets the summary, voxels, time series and,
     unless `report` is False, tables, figures and report.html.
 
     Args:
         config: Settings, or a YAML file with them.
         out: Folder of the results; without it they are in memory alone.
-        executor: Does the work; where not given, this process does it.
-        observers: Objects that are told what happens.
+        executor: Executor of the work; this process by default.
+        observers: Objects that are notified of each step.
         command: The command line, for the manifest.
         report: Whether tables, figures and report.html are written.
 

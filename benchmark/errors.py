@@ -1,4 +1,4 @@
-"""The one exception root: what the command line reports in one line, with its exit code."""
+"""The root of all exceptions, which the command line reports in one line, with its exit code."""
 
 import re
 from collections.abc import Sequence
@@ -16,7 +16,7 @@ OUT_OF_MEMORY = (
 
 
 class SemstabError(Exception):
-    """An error that the caller can mend. The message, a line, says what is wrong, where, and what to do."""
+    """An error that the caller can mend. The message, a line, names the fault, its source and the remedy."""
 
     exit_code = 2
 
@@ -41,7 +41,7 @@ class MissingDependencyError(SemstabError, ImportError):
 
 
 def nearest(name: str, known: Sequence[str]) -> str:
-    """Return a hint at what may be meant by a name that is not known."""
+    """Return a hint at the name that may be meant by one that is not known."""
     import difflib
 
     near = difflib.get_close_matches(name, known, n=1)

@@ -23,7 +23,7 @@ def filter_study_config(
     sources: Sequence[str],
     filters: Sequence[str],
     content: Mapping[str, Any],
-    kept: Path | None = None,
+    cache: Path | None = None,
 ) -> tuple[Config, list[str]]:
     """Return the study `filters` with these models, and filters over the scenes' label sources, as dataset settings.
 
@@ -46,7 +46,7 @@ def filter_study_config(
     able, left_out = _able(grid, predictors, scene)
     settings = {**content, "voxel_size": config.voxel_size, "frame_quality": True, "check": None, "name": STUDY}
     study = predicted_config(predictors, None, {**settings, "models": None})
-    more = {"try_filters": able, "kept": None if kept is None else str(kept)}
+    more = {"try_filters": able, "cache": None if cache is None else str(cache)}
     dataset_config = study.dataset.model_copy(update={"options": {**study.dataset.options, **more}})
     return study.model_copy(update={"dataset": dataset_config}), left_out
 

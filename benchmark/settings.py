@@ -21,7 +21,7 @@ def load_config(
 ) -> Config:
     """Return the configuration of a file, or of settings by name, over the defaults in configs/datasets/.
 
-    Overrides go on top.
+    Overrides come last.
 
     Raises:
         ConfigError: If a setting cannot be used.
@@ -33,7 +33,7 @@ def load_config(
 
 
 def as_config(settings: Config | Mapping[str, Any] | str | Path) -> Config:
-    """Return a configuration, or what `load_config` makes of a file or a dict."""
+    """Return a configuration, as it is or made by `load_config` from a file or a dict."""
     return settings if isinstance(settings, Config) else load_config(settings)
 
 

@@ -1,4 +1,4 @@
-"""A model on a scene: its frames, how its labels become rows of evidence, and a frame of it, ready to fuse."""
+"""A model on a scene: its frames, the mapping of its labels to rows of evidence, and a frame of it, ready to fuse."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ from semstab.pixels.preparation import keep_largest, leave_out, perturb
 
 @dataclass(frozen=True, eq=False)
 class Task:
-    """A model on a scene: which frames, and how its labels become rows of evidence.
+    """A model on a scene: its frames, and the mapping of its labels to rows of evidence.
 
     Attributes:
         indices: Indices of the frames, ascending; a range where they are evenly spaced.
         top_k: Number of the largest scores of a pixel that are fused; all where not given.
-        left_out: Number of selected frames that lack a file or a pose.
+        left_out: Number of selected frames without a file or a pose.
     """
 
     scene: Scene
@@ -51,17 +51,17 @@ class Task:
         return self.scene.digest([*self.indices], self.model)
 
 
-def tasks_of(scene: Scene, config: Config, beside: Sequence[str] = ()) -> Iterator[Task]:
+def tasks_of(scene: Scene, config: Config, others: Sequence[str] = ()) -> Iterator[Task]:
     """Yield the configuration's models on an open scene, checked; no image is read.
 
-    Frames are those that have labels of all of them, and of the label sources `beside` them: what is compared is fused
-    from the same frames.
+    Frames are those that have labels of all of them, and of the label sources `others`: models that are compared are
+    fused from the same frames.
     """
     names = selected(config.models, scene.models, scene.by_name, "model", scene.name)
     if not names:
         searched = f"searched {', '.join(scene.label_paths)}; " if scene.label_paths else ""
         raise DataError(f"{scene.name}: there are no label maps; {searched}add them, or choose with --scene")
-    frames = _chosen_frames(scene, config, [*dict.fromkeys((*names, *beside))])
+    frames = _chosen_frames(scene, config, [*dict.fromkeys((*names, *others))])
     indices = as_range(frames.indices)
     for model in names:
         source = scene.label_space(model)
@@ -87,7 +87,7 @@ def applies(part: Part, scene: str, model: str) -> bool:
 def _chosen_frames(scene: Scene, config: Config, sources: Sequence[str]) -> Selected:
     chosen = select_frames(scene, config.frames, sources)
     if not chosen.indices:
-        raise ConfigError(f"{scene.name}: the selection of frames leaves none of its {len(scene)}; mend 'frames'")
+        raise ConfigError(f"{scene.name}: the selection of frames leaves none of its {len(scene)}; change 'frames'")
     return chosen
 
 
@@ -132,7 +132,7 @@ def prepare(task: Task, frame: Frame, pixel_stride: int = 1) -> Frame:
 def _unlabelled(frame: Frame) -> Mask | None:
     """Return (H, W) the pixels with depth to which the model gave no label; None where there are none.
 
-    Classes that the run's taxonomy leaves out are labels, and so is what was left out because it moves.
+    Classes that the run's taxonomy leaves out count as labels, and so do pixels that were left out because they move.
     """
     none: Mask = frame.predicted == frame.ignore_id
     if not none.any():

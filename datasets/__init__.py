@@ -98,11 +98,11 @@ RECOGNISED = (
 
 
 def recognise(root: Path) -> tuple[str, str]:
-    """Return the dataset that a folder of scenes is of, and what tells so.
+    """Return the dataset that a folder of scenes belongs to, and the reason in words.
 
     Raises:
         DataError: If it is none; of an empty folder it is a `posed_folder`, whose reader says what is missing, with the
-            nearest formats, and what they lack.
+            nearest formats, and the files that these miss.
     """
     near, fits = list[tuple[float, str]](), list[tuple[int, int, str, str]]()
     for rank, name in enumerate(RECOGNISED):
@@ -113,7 +113,7 @@ def recognise(root: Path) -> tuple[str, str]:
             marks = re.findall(r"[\w.]+/(?:[\w./]+)?|\w+\.(?:txt|json)", cls.contents)
             lacks = [mark for mark in marks if not (root / mark).exists()]
             if len(lacks) < len(marks):
-                near.append((len(lacks) / len(marks), f"{name} (lacks {', '.join(lacks)})"))
+                near.append((len(lacks) / len(marks), f"{name} (without {', '.join(lacks)})"))
         else:
             deep = min(len(folder.relative_to(root).parts) for folder in folders)
             count = f"{len(folders)} scene{'s' if len(folders) > 1 else ''}"
@@ -123,4 +123,4 @@ def recognise(root: Path) -> tuple[str, str]:
     if not near:
         return RECOGNISED[-1], ""
     listed = " or ".join(text for _, text in sorted(near)[:3])
-    raise DataError(f"{root}: no format is recognised; nearly {listed}; or name it: --dataset NAME")
+    raise DataError(f"{root}: no format is recognised; the nearest are {listed}; name it with --dataset NAME")

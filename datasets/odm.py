@@ -24,7 +24,7 @@ from semstab.datasets.formats.disk import natural, subfolders
 from semstab.datasets.formats.images import COLOR_SUFFIXES, DEPTH_SUFFIXES
 from semstab.datasets.geometry.lenses import Lens
 from semstab.datasets.opensfm import Shot, read_reconstruction
-from semstab.datasets.placing import Place, Positions, place_of
+from semstab.datasets.placing import Placement, Positions, placement_of
 from semstab.errors import DataError
 
 # The files of a project of OpenDroneMap or OpenSfM: its poses, images, surfaces and depth maps, and their names.
@@ -59,7 +59,7 @@ class Project:
 
 
 def find_project(folder: Path) -> Project | None:
-    """Return the project in a folder, of OpenDroneMap or of OpenSfM; None where nothing is reconstructed."""
+    """Return the project in a folder, of OpenDroneMap or of OpenSfM; None where there is no reconstruction."""
     for opensfm in (folder / "opensfm", folder):
         for poses in (opensfm / UNDISTORTED, opensfm / DISTORTED):
             if poses.is_file():
@@ -116,11 +116,11 @@ LOCATIONS: dict[Kind, str] = {
     "openmvs": "opensfm/undistorted/openmvs/depthmaps/*.dmap",
     "files": "depth/NAME.png",
 }
-"""Sources of depth and where they are; the first of them that a project has is taken."""
+"""Sources of depth and their paths; the first of them that a project has is taken."""
 
 
 def find_depth(project: Project, kind: Kind, template: str) -> Path | None:
-    """Return the file or folder of a source of depth, None where the project lacks it; `template` names depth files."""
+    """Return the file or folder of a source of depth, None where the project has none; `template` names depth files."""
     if kind == "mesh":
         return next((path for pattern in MESHES for path in sorted(project.folder.glob(pattern))), None)
     if kind == "mve":
@@ -138,7 +138,7 @@ def depth_files(project: Project, kind: Kind | None, names: Mapping[str, str], t
         return {shot: project.folder / MVE.format(k) for k, shot in enumerate(names)}
     if kind == "openmvs":
         maps, folder = {}, project.opensfm / DMAPS
-        for path in sorted(folder.glob("*.dmap")):  # each says which image it is of
+        for path in sorted(folder.glob("*.dmap")):  # each names the image that it belongs to
             with open_file(path) as file:
                 image = dmap_header(path, file.read(HEADER_BYTES)).image
             maps[bare_name(Path(image.replace("\\", "/")).name)] = path
@@ -176,7 +176,7 @@ class Odm(FileDataset[OdmOptions]):
     def __init__(self, options: OdmOptions) -> None:
         self._depth = Template("depth", options.depth, ("name",), ("name",))
         self._read: dict[Path, list[Shot]] = {}
-        self._places: dict[Path, Place | None] = {}
+        self._placements: dict[Path, Placement | None] = {}
         super().__init__(options)
 
     def find_scenes(self, root: Path) -> Iterator[SceneEntry]:
@@ -215,29 +215,29 @@ class Odm(FileDataset[OdmOptions]):
         )
 
     def scene(self, name: str) -> FileScene:
-        """Open one; it says where its depth comes from."""
+        """Open one; it names the source of its depth."""
         scene = super().scene(name)
         kind = self.settled(scene.folder).depth_from
         scene.depth_from = f"{kind}, {scene.depth_from or LOCATIONS[kind]}" if kind is not None else scene.depth_from
-        place = None if self.options.crs is not None else self._place(scene.folder)
-        scene.placed = None if place is None else place.words
+        placement = None if self.options.crs is not None else self._placement(scene.folder)
+        scene.placed = None if placement is None else placement.words
         return scene
 
     def georeference(self, folder: Path, options: FileOptions) -> Georeference | None:
-        """Return the reference of the options, else what `place_of` finds in the project's files."""
+        """Return the reference of the options, else that of `placement_of` from the project's files."""
         if options.crs is not None:
             return super().georeference(folder, options)
-        place = self._place(folder)
-        return None if place is None else place.georeference
+        placement = self._placement(folder)
+        return None if placement is None else placement.georeference
 
     def mesh_origin(self, folder: Path, surface: Path) -> tuple[float, float, float] | None:
-        """Return where ODM's georeferenced meshes count from in a project whose poses are not in the projection."""
-        place = None if self.options.crs is not None else self._place(folder)
+        """Return the origin of ODM's georeferenced meshes in a project whose poses are not in the projection."""
+        placement = None if self.options.crs is not None else self._placement(folder)
         georeferenced = any(surface == path for path in folder.glob(GEOREFERENCED))
-        return place.mesh_origin if place is not None and georeferenced else None
+        return placement.mesh_origin if placement is not None and georeferenced else None
 
-    def _place(self, folder: Path) -> Place | None:
-        if folder not in self._places:
+    def _placement(self, folder: Path) -> Placement | None:
+        if folder not in self._placements:
             project = self._project(folder)
             shots = {bare_name(shot.name): shot.T_cw for shot in self._shots(project.poses)}
             names = {bare_name(shot.name): shot.name for shot in self._shots(project.poses)}
@@ -248,8 +248,8 @@ class Odm(FileDataset[OdmOptions]):
             def photograph(name: str) -> Path | None:
                 return find_image(photographs, names[name], contents, str(project.poses))
 
-            self._places[folder] = place_of(folder, project.opensfm, shots, Positions(bare_name, photograph))
-        return self._places[folder]
+            self._placements[folder] = placement_of(folder, project.opensfm, shots, Positions(bare_name, photograph))
+        return self._placements[folder]
 
     def frames(self, folder: Path) -> list[FrameSource]:
         """Return a frame for each shot, in natural order of names. Raises what `read_reconstruction` raises."""
@@ -285,7 +285,7 @@ class Odm(FileDataset[OdmOptions]):
             there = dict(zip(frame_names(shot.name for shot in originals), originals, strict=True))
             if lost := next((name for name in shots if name not in there), None):
                 raise DataError(
-                    f"{path}: does not say how the photograph {lost} is distorted, which labels_on: original needs"
+                    f"{path}: does not give the distortion of the photograph {lost}, which labels_on: original needs"
                 )
             shots = there
         return {name: shot.lens for name, shot in shots.items()}

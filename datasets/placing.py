@@ -1,4 +1,4 @@
-"""Places of projects of OpenDroneMap or OpenSfM on Earth, and by how many metres their cameras say so.
+"""Georeferences of projects of OpenDroneMap or OpenSfM, and the metres by which their cameras miss known positions.
 
 Sources: OpenDroneMap's stages run_opensfm, odm_georeferencing and odm_report, and OpenSfM's export_geocoords, in their
 versions from 2018 to 2026; docs/drones.md has the table of which version writes which frame.
@@ -25,7 +25,7 @@ logger = logging.getLogger("semstab")
 COORDS, PROJ = "odm_georeferencing/coords.txt", "odm_georeferencing/proj.txt"
 ALIGNMENT = "odm_georeferencing/alignment_matrix.json"
 SHOTS = "odm_report/shots.geojson"
-MATRIX, REFERENCE, KEPT = "geocoords_transformation.txt", "reference_lla.json", "reconstruction.topocentric.json"
+MATRIX, REFERENCE, TOPOCENTRIC = "geocoords_transformation.txt", "reference_lla.json", "reconstruction.topocentric.json"
 
 MAX_TEXT_BYTES = 2**26
 MAX_SHOTS_BYTES = 2**30
@@ -37,7 +37,7 @@ EXACT_LIMIT = 1.0
 """The same for positions that ODM itself computed of these cameras."""
 
 SLACK = 1.0
-"""Metres, and half of what fits best: so much worse than another frame may that of the files fit GPS."""
+"""Metres, and half of the best fit: the frame of the files may fit GPS worse than another one by so much."""
 
 EXACT_SLACK = 0.1
 MOST_PHOTOGRAPHS = 100
@@ -52,11 +52,11 @@ STEP = 1.0
 
 
 @dataclass(frozen=True)
-class Place:
-    """The place of a project on Earth.
+class Placement:
+    """The georeference of a project, and its source.
 
     Attributes:
-        words: How that was found and how well the cameras fit, in words.
+        words: The source of the georeference and the fit of the cameras, in words.
         mesh_origin: Origin of ODM's *_geo.obj in the projection; None: they are the scene's.
     """
 
@@ -111,11 +111,11 @@ class _Candidate:
     mesh_origin: tuple[float, float, float] | None = None
 
 
-def place_of(folder: Path, opensfm: Path, shots: Mapping[str, Poses], find: Positions) -> Place | None:
-    """Return the place of a project whose cameras have these poses (4, 4) world to camera; None where it has none.
+def placement_of(folder: Path, opensfm: Path, shots: Mapping[str, Poses], find: Positions) -> Placement | None:
+    """Return the georeference of a project whose cameras have these poses (4, 4) world to camera; None if it has none.
 
-    What the files say is compared with known positions of the cameras; where another frame fits clearly better, that
-    is taken, with a warning, and where the cameras lie further off than GPS explains it is warned of.
+    The frame of the files is compared with known positions of the cameras. If another frame fits clearly better, that
+    is taken, with a warning; another warning says that the cameras lie further off than GPS explains.
 
     Raises:
         DataError: For damaged files.
@@ -126,18 +126,18 @@ def place_of(folder: Path, opensfm: Path, shots: Mapping[str, Poses], find: Posi
         return None
     centres = np.array([-T[:3, :3].T @ T[:3, 3] for T in shots.values()])
     known = _known(folder, opensfm, list(shots), find, candidates[0].georeference.crs)
-    first, placed = candidates[0], [each.georeference.projected(centres)[:, :2] for each in candidates]
-    apart = [None if known is None else known.apart(dict(zip(shots, at, strict=True))) for at in placed]
+    first, projected = candidates[0], [each.georeference.projected(centres)[:, :2] for each in candidates]
+    apart = [None if known is None else known.apart(dict(zip(shots, at, strict=True))) for at in projected]
     if known is None or apart[0] is None:
         words = f"{first.words}; no known position to compare the cameras with"
-        return Place(first.georeference, words, first.mesh_origin)
+        return Placement(first.georeference, words, first.mesh_origin)
     distances = [np.inf if each is None else each for each in apart]
     best = int(np.argmin(distances))
     slack = 0.0 if not sure else EXACT_SLACK if known.exact else SLACK + distances[best] / 2
     chosen = best if distances[0] > distances[best] + slack else 0
     if chosen and sure:
         logger.warning(
-            "%s: the cameras lie %.3g m (median) from %s as its files say (%s), and %.3g m with %s, which is taken; is"
+            "%s: the cameras lie %.3g m (median) from %s by its files (%s), but %.3g m by %s, which is used; is"
             " a file left from another version of ODM?",
             folder, distances[0], known.source, first.words, distances[chosen], candidates[chosen].words,
         )  # fmt: skip
@@ -146,12 +146,12 @@ def place_of(folder: Path, opensfm: Path, shots: Mapping[str, Poses], find: Posi
     if off > limit:
         explained = "of the same cameras" if known.exact else f"more than the {GPS_LIMIT:g} m that GPS explains"
         logger.warning(
-            "%s: the cameras lie %.3g m (median, horizontal) from %s, %s: the poses are in another frame than supposed"
-            " (%s), and the map is as far off; put opensfm/%s and %s of this run back, or give crs, offset, linear",
+            "%s: the cameras lie %.3g m (median, horizontal) from %s, %s: the poses are not in the assumed frame"
+            " (%s), and the map is as far off; restore opensfm/%s and %s of this run, or give crs, offset, linear",
             folder, off, known.source, explained, taken.words, MATRIX, REFERENCE,
         )  # fmt: skip
     words = f"{taken.words}; cameras {off:.2f} m (median, horizontal) from {known.source}"
-    return Place(taken.georeference, words, taken.mesh_origin)
+    return Placement(taken.georeference, words, taken.mesh_origin)
 
 
 # --- frames -----------------------------------------------------------------------------------------------------------
@@ -168,11 +168,11 @@ def _candidates(folder: Path, opensfm: Path) -> tuple[list[_Candidate], bool]:
     offset = Georeference(crs, (east, north, 0.0))
     projected = [_Candidate(offset, f"poses in the projection, less the offset of {COORDS}")]
     if (alignment := folder / ALIGNMENT).is_file():
-        found = _affine(
+        aligned = _affine(
             crs, _matrix_of(read_content(alignment, MAX_TEXT_BYTES), alignment) @ _as_matrix(offset), alignment
         )
         words = f"poses in the projection, moved by {ALIGNMENT}"
-        projected = [_Candidate(found, words, (east, north, 0.0))]  # further from GPS for a reason
+        projected = [_Candidate(aligned, words, (east, north, 0.0))]  # further from GPS for a reason
     topocentric = []
     matrix, reference = opensfm / MATRIX, opensfm / REFERENCE
     if matrix.is_file():
@@ -184,13 +184,13 @@ def _candidates(folder: Path, opensfm: Path) -> tuple[list[_Candidate], bool]:
         topocentric.append(_turned(_affine(crs, T, matrix), f"opensfm/{MATRIX}"))
     if reference.is_file():
         topocentric.append(_turned(_linearised(crs, reference), f"opensfm/{REFERENCE}"))
-    if (opensfm / KEPT).is_file() or not topocentric:
+    if (opensfm / TOPOCENTRIC).is_file() or not topocentric:
         return projected + topocentric, True
     return (topocentric + projected, True) if matrix.is_file() else (projected + topocentric, False)
 
 
 def _turned(georeference: Georeference, source: str) -> _Candidate:
-    """Return the place of topocentric poses; of its meshes ODM took the projection's height, but not east and north."""
+    """Return the georeference of topocentric poses; ODM's meshes have the projection's height, not east and north."""
     east, north, _ = georeference.offset
     return _Candidate(georeference, f"poses topocentric, brought into the projection by {source}", (east, north, 0.0))
 
@@ -228,9 +228,9 @@ def _linearised(crs: str, path: Path) -> Georeference:
     from pyproj import CRS, Proj, Transformer
 
     latitude, longitude, altitude = _reference(path)
-    place = f"+lat_0={latitude!r} +lon_0={longitude!r} +h_0={altitude!r}"
+    origin = f"+lat_0={latitude!r} +lon_0={longitude!r} +h_0={altitude!r}"
     geographic = Transformer.from_pipeline(
-        f"+proj=pipeline +step +inv +proj=topocentric +ellps=WGS84 {place} +step +inv +proj=cart +ellps=WGS84"
+        f"+proj=pipeline +step +inv +proj=topocentric +ellps=WGS84 {origin} +step +inv +proj=cart +ellps=WGS84"
     )
     lon, lat, up = np.array(geographic.transform(*np.vstack([np.zeros(3), STEP * np.eye(3)]).T))
     east, north = Proj(CRS.from_wkt(crs))(lon, lat)
@@ -254,8 +254,10 @@ def _mercator(opensfm: Path) -> _Candidate | None:
         return None
     latitude, longitude, altitude = _reference(path)
     crs = f"+proj=tmerc +lat_0={latitude!r} +lon_0={longitude!r} +k=1 +datum=WGS84 +units=m +no_defs +type=crs"
-    found = Georeference.of(crs, (0.0, 0.0, altitude), str(path))
-    return _Candidate(found, f"poses topocentric about {REFERENCE}, in a transverse Mercator projection about it")
+    georeference = Georeference.of(crs, (0.0, 0.0, altitude), str(path))
+    return _Candidate(
+        georeference, f"poses topocentric about {REFERENCE}, in a transverse Mercator projection about it"
+    )
 
 
 def _reference(path: Path) -> tuple[float, float, float]:
@@ -306,9 +308,9 @@ def _known(folder: Path, opensfm: Path, names: list[str], find: Positions, crs: 
 
     projection = Proj(CRS.from_wkt(crs))
 
-    def projected(places: Mapping[str, tuple[float, float]]) -> dict[str, Float64]:
-        found = {name: np.array(projection(lon, lat)) for name, (lon, lat) in places.items()}
-        return {name: at for name, at in found.items() if np.isfinite(at).all()}
+    def projected(positions: Mapping[str, tuple[float, float]]) -> dict[str, Float64]:
+        points = {name: np.array(projection(lon, lat)) for name, (lon, lat) in positions.items()}
+        return {name: at for name, at in points.items() if np.isfinite(at).all()}
 
     wanted, coords, none = set(names), folder / COORDS, np.zeros((0, 2))
     sources: tuple[tuple[str, Callable[[], Iterator[tuple[str, float, float]]], bool], ...] = (
@@ -316,8 +318,8 @@ def _known(folder: Path, opensfm: Path, names: list[str], find: Positions, crs: 
         ("the GPS of the images (opensfm/exif)", lambda: _of_opensfm(opensfm / "exif", find.bare), False),
         ("the GPS of the images", lambda: _of_photographs(names, find.photograph), False),
     )
-    for source, places, exact in sources:
-        if named := projected({name: (lon, lat) for name, lon, lat in places() if name in wanted}):
+    for source, positions_of, exact in sources:
+        if named := projected({name: (lon, lat) for name, lon, lat in positions_of() if name in wanted}):
             return _Known(source, named, none, exact)
     if coords.is_file():
         east, north, positions = _read_coords(coords)
@@ -341,7 +343,7 @@ def _of_shots(path: Path | None, bare: Callable[[str], str]) -> Iterator[tuple[s
 
 
 def _of_opensfm(folder: Path, bare: Callable[[str], str]) -> Iterator[tuple[str, float, float]]:
-    """Yield the same of the images' GPS as OpenSfM keeps it, a file an image; what has none is passed over."""
+    """Yield the same of the images' GPS as OpenSfM keeps it, a file an image; images without it are passed over."""
     for path in _spread(sorted(folder.glob("*.exif"))):
         gps = read_object(path).get("gps")
         if isinstance(gps, dict) and {"latitude", "longitude"} <= gps.keys():
@@ -350,7 +352,7 @@ def _of_opensfm(folder: Path, bare: Callable[[str], str]) -> Iterator[tuple[str,
 
 
 def _of_photographs(names: list[str], photograph: Callable[[str], Path | None]) -> Iterator[tuple[str, float, float]]:
-    """Yield the same of the photographs' EXIF data; what has none, or cannot be read, is passed over."""
+    """Yield the same of the photographs' EXIF data; those without it, and unreadable ones, are passed over."""
     for name in _spread(names):
         path = photograph(name)
         if path is not None and (at := _exif_position(path)) is not None:
@@ -358,7 +360,7 @@ def _of_photographs(names: list[str], photograph: Callable[[str], Path | None]) 
 
 
 def _spread(items: list[Any]) -> list[Any]:
-    """Return evenly spaced ones of many."""
+    """Return some of many items, evenly spaced."""
     return items[:: -(-len(items) // MOST_PHOTOGRAPHS) or 1]
 
 

@@ -1,4 +1,4 @@
-"""Scenes and datasets: a scene names what it has, and by default lacks the rest."""
+"""Scenes and datasets: a scene names the parts that it has; by default it has no others."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ GROUND_TRUTH = "gt"
 
 @dataclasses.dataclass(frozen=True)
 class Filtering:
-    """Filters between a model and what is read as a label source.
+    """Filters between a model and a label source.
 
     Attributes:
         model: The label source without them; the source itself where that is not there.
@@ -44,8 +44,8 @@ class Filtering:
 class Scene(ABC):
     """One sequence. Opening it reads no image; what reads one may be called from several threads at once.
 
-    A dataset has to give `name`, `models`, and the four methods that are abstract; the rest are defaults for what a
-    scene may lack, or slower ways to get what `frame` holds too.
+    A dataset has to give `name`, `models`, and the four methods that are abstract; the rest are defaults for
+    missing parts, or slower ways to get the content of `frame`.
 
     Attributes:
         name: The scene's name, usable in a file name.
@@ -54,16 +54,16 @@ class Scene(ABC):
         further: Label sources that are read by name only, none of 'all'.
         regions: Maps of regions without classes, which `frame` reads by name and nothing fuses.
         up: (3,) unit vector of the world's up axis, or None where it is not known.
-        georeference: Place on Earth, or None where that is not known.
-        placed: How that was found and how well it fits, in words, or None.
+        georeference: Georeference, or None where that is not known.
+        placed: The source of the georeference and its fit, in words, or None.
         folder: Folder of its files, where label maps are looked for, or None where it has none.
         label_paths: Paths where the first frame's label maps are looked for, with MODEL for any name.
-        settings_file: The file that says what no option says, or None where there is no such file.
+        settings_file: The file with further settings, or None where there is no such file.
         labels_like_depth: Whether its label maps have the pixels of the depth, not those of the colour images.
         surface: The file of the surface that depth is cast at, or None where it is not cast.
         depth_from: Source of depth, in words, where that is not a file a frame.
         on_photographs: Whether `image` is a distorted photograph, which `color` shows undistorted.
-        skips_incomplete: Whether selected frames that lack a file are left out; else they are an error.
+        skips_incomplete: Whether selected frames without a file are left out; else they are an error.
     """
 
     name: str
@@ -85,7 +85,7 @@ class Scene(ABC):
 
     @abstractmethod
     def __len__(self) -> int:
-        """Return the number of frames of the sequence, those that lack a file or a pose among them."""
+        """Return the number of frames of the sequence, those without a file or a pose among them."""
 
     @abstractmethod
     def label_space(self, model: str) -> LabelSpace:
@@ -120,12 +120,12 @@ class Scene(ABC):
         return True
 
     def missing(self, index: int, sources: Sequence[str] = (), *, color: bool = False) -> list[str]:
-        """Return files that the frame lacks, among labels of these sources, and its colour. Reads no image."""
+        """Return the missing files of the frame, among labels of these sources, and its colour. Reads no image."""
         return []
 
     @property
     def settings(self) -> Mapping[str, Any]:
-        """The conventions by which its files are read, by name of option: what a check may advise to change."""
+        """The conventions by which its files are read, by name of option; a check may advise to change them."""
         return {}
 
     @property
@@ -134,7 +134,7 @@ class Scene(ABC):
         return None
 
     def frame_name(self, index: int) -> str:
-        """Return what people know a frame by: its files' name, else its index."""
+        """Return the name of a frame for people: its files' name, else its index."""
         return str(index)
 
     def filtering(self, model: str) -> Filtering:
@@ -243,7 +243,7 @@ def listed(missing: Sequence[str], folder: str = "") -> str:
     return f"{len(missing)} missing: {', '.join(missing[:MAX_LISTED])}{more}"
 
 
-# The frames of a scene that a selection picks, without those that lack a file or whose pose was lost.
+# The frames of a scene that a selection picks, without those that have no file or whose pose was lost.
 
 logger = logging.getLogger("semstab")
 
@@ -254,7 +254,7 @@ class Selected:
 
     Attributes:
         indices: Indices of the frames to read.
-        incomplete: Selected ones that were left out because they lack a file.
+        incomplete: Selected ones that were left out because a file is missing.
         lost: Selected ones that were left out because tracking was lost.
     """
 
@@ -277,7 +277,7 @@ def select_frames(
 
     Raises:
         ConfigError: For a frame or a time that the scene does not have.
-        DataError: If selected frames lack files and the scene does not leave such frames out.
+        DataError: If files of selected frames are missing and the scene does not leave such frames out.
     """
     times = scene.timestamps
     chosen = selection.indices(len(scene), None if times is None else times.tolist())

@@ -24,7 +24,7 @@ from semstab.errors import DataError
 
 DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")
 PINHOLES = (None, "PINHOLE", "SIMPLE_PINHOLE", "OPENCV", "perspective")
-"""Camera models that do not distort where the coefficients are zero."""
+"""Camera models that do not distort if the coefficients are zero."""
 
 
 class TransformsOptions(FileOptions):
@@ -61,7 +61,7 @@ class TransformsJson(FileDataset[TransformsOptions]):
 def read_transforms(path: Path, root: Path, folder: Path, depth: Template | None = None) -> list[FrameSource]:
     """Return the frames of a transforms.json, whose paths are relative to it and stay in root.
 
-    `depth` says, relative to `folder`, where depth maps are that the file does not name.
+    `depth` is a template, relative to `folder`, of depth maps that the file does not name.
 
     Raises:
         DataError: For missing or damaged values, distortion, or no depth; the message names the file and the frame.

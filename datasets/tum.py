@@ -29,7 +29,7 @@ CAMERAS = {
     "freiburg2": (520.908620, 521.007327, 325.141442, 249.701764),
     "freiburg3": (535.4, 539.2, 320.1, 247.6),
 }
-"""Calibrated intrinsics of the colour camera, to which depth is registered, by what the sequence's name holds."""
+"""Calibrated intrinsics of the colour camera, to which depth is registered, by a part of the sequence's name."""
 USUAL = (525.0, 525.0, 319.5, 239.5)
 
 
@@ -39,7 +39,7 @@ class TumOptions(FileOptions):
     depth_scale: opt.DepthScale = 5000
     up_axis: opt.UpAxis = "z"
     intrinsics: opt.FourIntrinsics = None
-    max_difference: opt.Positive = Field(0.02, description="seconds by which things of one frame may differ")
+    max_difference: opt.Positive = Field(0.02, description="seconds by which the time stamps of a frame may differ")
     poses: Literal["interpolate", "nearest"] = Field("interpolate", description="the pose at a depth image's time")
     trajectory: str = Field("groundtruth.txt", description="file of the poses: t tx ty tz qx qy qz qw")
 
@@ -61,7 +61,7 @@ class Tum(FileDataset[TumOptions]):
     def frames(self, folder: Path) -> list[FrameSource]:
         """Return a frame for each depth image that has a colour image; where no pose is near, its pose is NaN.
 
-        Where a surface gives the depth and no depth.txt is there, one a colour image.
+        If a surface gives the depth and no depth.txt is there, there is one frame for each colour image.
 
         Raises:
             DataError: For time stamps that do not ascend, or where nothing fits together in time.

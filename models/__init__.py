@@ -71,8 +71,8 @@ class Prediction:
     """The prediction of a model for one image.
 
     Attributes:
-        labels: (H, W) uint8 or uint16: ids of its label space, 255 (65535) where it says nothing; of a model without
-            classes, region ids from 1, `UNASSIGNED` where there is no region.
+        labels: (H, W) uint8 or uint16: ids of its label space, 255 (65535) where it has no prediction; of a model
+            without classes, region ids from 1, `UNASSIGNED` where there is no region.
         scores: (H, W, K) float32 that sum to 1 over the classes, or None where only labels are wanted.
     """
 
@@ -100,11 +100,11 @@ class Model(Protocol):
         label_space: The classes of its labels and scores, or None where it predicts regions without classes.
         gives_scores: Whether `predict` can give scores.
         fit_frames: Number of images that `fit` wants, 0 for most.
-        sequential: Whether what it says of an image depends on the images before: it then gets the selected frames of a
-            sequence in order, all of them, from the first one after `reset`.
+        sequential: Whether its prediction on an image depends on the images before: it then gets the selected frames of
+            a sequence in order, all of them, from the first one after `reset`.
         wants_geometry: Whether `predict` is also given `geometry=`, one `Frame` an image: its depth, intrinsics and
             pose at the image's own pixels, depth 0 where it is not known; labels are all 0, there is no colour.
-        streams: Whether `stream` keeps less in memory than `predict`: it is called where scores are many.
+        streams: Whether `stream` needs less memory than `predict`: it is called where scores are many.
     """
 
     label_space: LabelSpace | None = None
@@ -115,7 +115,7 @@ class Model(Protocol):
     streams: bool = False
 
     def fit(self, images: Sequence[Image]) -> Model:
-        """Return the model adapted to a sequence by its first `fit_frames` images; itself where that is nothing.
+        """Return the model adapted to a sequence by its first `fit_frames` images; itself if there is nothing to adapt.
 
         Called once a sequence, before the first `predict`, whatever frames are predicted later.
         """
@@ -133,14 +133,14 @@ class Model(Protocol):
         ...
 
     def stream(self, image: Image) -> Streamed:
-        """Return what `predict` says with scores, these class by class."""
+        """Return the predictions of `predict` with scores, these class by class."""
         (prediction,) = self.predict([image], scores=True)
         return streamed(prediction)
 
     def identity(self) -> dict[str, Any]:
-        """Return what the output depends on beside the image, for JSON: settings, and the content of what they name.
+        """Return what the output depends on apart from the image, for JSON: settings, and the content of named files.
 
-        Predictions are kept and reused under it.
+        Predictions are stored and reused under it.
         """
         ...
 

@@ -16,14 +16,14 @@ from semstab.data.labels import LabelSpace, ignore_id
 from semstab.errors import ConfigError, DataError
 from semstab.models import Image, Model, Prediction, Streamed, ask
 
-# A model around another one: what filters, taxonomies and votes are made of.
+# A model around another one, the base of filters, taxonomies and votes.
 
 
 class Wrapped(Model):
-    """Another model, with something done to what it says; all that is not overridden is the inner one's.
+    """A model that changes the predictions of another one; all that is not overridden is the inner one's.
 
-    Where it leaves scores as they are, it may set `streams` to the inner one's. What a sequence leaves behind belongs
-    into attributes that `reset` makes anew: copies for other sequences (`fit`) share them until then.
+    If it leaves scores as they are, it may set `streams` to the inner one's. The memory of a sequence belongs into
+    attributes that `reset` makes anew: copies for other sequences (`fit`) share them until then.
     """
 
     def __init__(self, inner: Model) -> None:
@@ -71,11 +71,11 @@ SUM_TOLERANCE = 0.01
 
 
 class Checked(Wrapped):
-    """A model whose predictions are checked: one line says what is wrong with them.
+    """A model whose predictions are checked: one line names their fault.
 
     Raises:
         ConfigError: For a class that is no model.
-        DataError: For predictions that are none of these images.
+        DataError: For predictions that do not belong to these images.
     """
 
     def __init__(self, model: Any, name: str) -> None:
@@ -176,7 +176,7 @@ class Checked(Wrapped):
 
 
 def _add_up(scores: npt.NDArray[np.floating[Any]]) -> bool:
-    """Return whether each pixel's scores (H, W, K) are not negative and sum to 1, or to 0 where nothing is said."""
+    """Return whether each pixel's scores (H, W, K) are not negative and sum to 1, or to 0 without a prediction."""
     total = scores.sum(axis=2, dtype=np.float32)
     return bool((scores >= 0).all() and ((np.abs(total - 1) <= SUM_TOLERANCE) | (total == 0)).all())
 

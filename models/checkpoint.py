@@ -1,4 +1,4 @@
-"""Pretrained models from a folder or from the hub: located, loaded whole, or one error that says what to do."""
+"""Pretrained models from a folder or from the hub: located, loaded whole, or one error with the remedy."""
 
 from __future__ import annotations
 
@@ -204,11 +204,11 @@ def _download(options: ModelOptions) -> Path:
         ) from error
     except (RepositoryNotFoundError, HFValidationError) as error:
         raise DataError(
-            f"model '{name}': there is no such folder, and no such model on the hub; mend the name"
+            f"model '{name}': there is no such folder, and no such model on the hub; correct the name"
         ) from error
     except RevisionNotFoundError as error:
         raise DataError(
-            f"model '{name}': the hub has no revision '{revision}' of it; mend it, or leave it out"
+            f"model '{name}': the hub has no revision '{revision}' of it; correct it, or leave it out"
         ) from error
     except Exception as error:  # no network has many faces
         raise DataError(
@@ -240,7 +240,7 @@ def _quiet() -> Iterator[None]:
             notes.enable_progress_bar()
 
 
-# A checkpoint's own preprocessing: how images become what the model was made for.
+# A checkpoint's own preprocessing, which makes the images that the model was trained on.
 
 Processing = Literal["pil", "torchvision"]
 
@@ -291,13 +291,13 @@ class SegmenterOptions(ImageModelOptions):
 
     image_size: PositiveInt | tuple[PositiveInt, PositiveInt] | None = Field(
         None,
-        description="the shorter side in pixels, the shape of the image kept; or [height, width]; where not given, what"
-        " the checkpoint was made for",
+        description="the shorter side in pixels, at the shape of the image; or [height, width]; by default the one that"
+        " the checkpoint was trained with",
     )
     engine: Literal["torch", "onnx"] = Field("torch", description="torch, or ONNX Runtime on the CPU")
-    prompts: tuple[str, ...] | None = Field(None, description="of a CLIPSeg model: what it is asked for, its classes")
+    prompts: tuple[str, ...] | None = Field(None, description="of a CLIPSeg model: its prompts, which are its classes")
     threshold: float | None = Field(
-        None, gt=0, lt=1, description="of a CLIPSeg model: where no prompt is as likely, nothing is said"
+        None, gt=0, lt=1, description="of a CLIPSeg model: pixels where no prompt is as likely are ignored"
     )
 
     @field_validator("prompts", mode="before")

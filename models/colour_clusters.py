@@ -21,7 +21,7 @@ Features = Float32
 
 
 class ColourClusterOptions(Settings):
-    """Number of clusters, and what they are found from."""
+    """Number of clusters, and the pixels that they are computed from."""
 
     clusters: int = Field(8, ge=2, lt=IGNORE_8BIT, description="number of clusters, the classes")
     fit_frames: int = Field(5, ge=1, description="the codebook comes from that many first frames of the sequence")
@@ -52,7 +52,7 @@ class ColourClusters(Model):
     """Each pixel is the nearest cluster centre of its smoothed colour and local texture.
 
     Features are the CIE Lab colour smoothed by a Gaussian window, and the standard deviation of lightness in it. The
-    centres are found once a sequence, in its first frames, and stay: an id means the same in every frame. Scores are
+    centres are computed once a sequence, in its first frames, and stay: an id means the same in every frame. Scores are
     the clusters' posteriors under equal, spherical Gaussians.
     """
 

@@ -42,7 +42,7 @@ class Code:
     Attributes:
         text: The name as it was given.
         name: Name of the class or the function.
-        target: Itself.
+        target: The class or the function itself.
         module: The module that holds it.
     """
 
@@ -59,26 +59,26 @@ class Code:
             ConfigError: If it is not there.
             MissingDependencyError, DataError: If it fails.
         """
-        place, _, name = text.rpartition(":")
-        in_file = place.endswith(".py")
-        if not name.isidentifier() or not (in_file or MODULE.fullmatch(place)):
+        source, _, name = text.rpartition(":")
+        in_file = source.endswith(".py")
+        if not name.isidentifier() or not (in_file or MODULE.fullmatch(source)):
             raise ConfigError(f"model '{text}': write FILE.py:NAME or package.module:NAME, NAME a class or a function")
         if not in_file:
             _may_import_from(Path.cwd())
-        module = guarded(text, lambda: _of_file(Path(place)) if in_file else importlib.import_module(place))
+        module = guarded(text, lambda: _of_file(Path(source)) if in_file else importlib.import_module(source))
         target = getattr(module, name, None)
         if target is None:
             own = [key for key, value in vars(module).items() if callable(value) and not key.startswith("_")]
             near = difflib.get_close_matches(name, own, n=1)
             hint = f"did you mean '{near[0]}'?" if near else f"it has {', '.join(own) or 'nothing to call'}"
-            raise ConfigError(f"{place}: has no '{name}'; {hint}")
+            raise ConfigError(f"{source}: has no '{name}'; {hint}")
         if not callable(target):
             raise ConfigError(f"{text}: is a {type(target).__name__}; name a class, or a function of an image")
         return cls(text, name, target, module)
 
     @property
     def digest(self) -> str:
-        """The hash of the file that it stands in."""
+        """The hash of the file that holds it."""
         file = self.module.__file__
         return "" if file is None else content_digest(Path(file))
 
@@ -90,7 +90,7 @@ class Code:
         """
         try:
             inspect.signature(self.target).bind(*more, **options)
-        except ValueError:  # compiled code does not say
+        except ValueError:  # compiled code has no signature
             return
         except TypeError as error:
             raise ConfigError(
@@ -99,18 +99,18 @@ class Code:
 
 
 def is_code(name: str) -> bool:
-    """Return whether a model's name says where code is, and is none of a registry."""
+    """Return whether a model's name is the path of code, and not one of a registry."""
     return ":" in name or name.endswith(".py")
 
 
 def absolute(name: str) -> str:
     """Return the name of code, its file's from the root of the file system."""
-    place, _, what = name.rpartition(":")
-    return f"{Path(place).expanduser().absolute()}:{what}" if place.endswith(".py") else name
+    source, _, what = name.rpartition(":")
+    return f"{Path(source).expanduser().absolute()}:{what}" if source.endswith(".py") else name
 
 
 def guarded(text: str, do: Callable[[], T]) -> T:
-    """Run a user's code, and turn an error in it into one line that says where it was raised."""
+    """Run a user's code, and turn an error in it into one line with the position where it was raised."""
     try:
         return do()
     except (ConfigError, DataError, MissingDependencyError):
@@ -118,7 +118,7 @@ def guarded(text: str, do: Callable[[], T]) -> T:
     except ImportError as error:
         package = f"; install {error.name.partition('.')[0]}" if error.name else ""
         raise MissingDependencyError(
-            f"{text}: it imports what is not there ({summarize_error(error)}){package}"
+            f"{text}: it imports a missing module ({summarize_error(error)}){package}"
         ) from error
     except (Exception, SystemExit) as error:
         last = traceback.extract_tb(error.__traceback__)[-1]
@@ -133,7 +133,7 @@ def _of_file(path: Path) -> ModuleType:
     if not path.is_file():
         raise ConfigError(f"{path}: there is no such file")
     content = hashlib.blake2b(str(path.resolve()).encode() + path.read_bytes(), digest_size=6).hexdigest()
-    name = f"{path.stem}_{content}"  # of its own, whatever else is called like the file, and of this version
+    name = f"{path.stem}_{content}"  # a module of its own and of this version, whatever other files are called
     if name in sys.modules:
         return sys.modules[name]
     spec = importlib.util.spec_from_file_location(name, path.resolve())
@@ -151,7 +151,7 @@ def _of_file(path: Path) -> ModuleType:
 
 
 def _may_import_from(folder: Path) -> None:
-    """Append the folder to the search path, where nothing in it takes the place of an installed package."""
+    """Append the folder to the search path, where nothing in it replaces an installed package."""
     if str(folder) not in sys.path:
         sys.path.append(str(folder))
 
@@ -167,7 +167,7 @@ class OwnOptions(BaseModel):
 
 
 def own_maker(text: str) -> tuple[type[BaseModel], Callable[[Any], Model]]:
-    """Return the options of a user's class or function, and what makes a model of it with them.
+    """Return the options of a user's class or function, and a function that makes a model of it with them.
 
     Both raise ConfigError, DataError, MissingDependencyError, each in one line.
     """
@@ -188,7 +188,7 @@ def own_maker(text: str) -> tuple[type[BaseModel], Callable[[Any], Model]]:
 
 
 class OfCode(Wrapped):
-    """A model of a user's own class: its file is part of what its predictions are kept under."""
+    """A model of a user's own class: its file is part of the key under which its predictions are stored."""
 
     def __init__(self, inner: Model, code: Code, options: Mapping[str, Any]) -> None:
         super().__init__(inner)
@@ -203,8 +203,9 @@ class OwnModel(Model):
     """A function of an image (H, W, 3) uint8 RGB, or an object with such a method `predict`, or that is called so.
 
     It gives labels (H, W), whole numbers in the order of its classes, 255 (of more than 255 classes 65535) or less than
-    0 where it says nothing; or scores (H, W, K) that sum to 1. A tensor is as good as an array. It may say `classes`,
-    `gives_scores`, `sequential` (then it has `reset`) and `wants_geometry` (then it is called with image and frame).
+    0 where it has no prediction; or scores (H, W, K) that sum to 1. A tensor is as good as an array. It may say
+    `classes`, `gives_scores`, `sequential` (then it has `reset`) and `wants_geometry` (then it is called with image and
+    frame).
     """
 
     def __init__(self, code: Code, options: Mapping[str, Any], classes: Sequence[str] | str | None) -> None:
@@ -268,7 +269,7 @@ class OwnModel(Model):
 
 
 def contents(options: Mapping[str, Any]) -> dict[str, Any]:
-    """Return options by what they say; a file or a folder by what is in it."""
+    """Return options by their value; a file or a folder by its content."""
     return {
         key: content_digest(Path(value).expanduser()) if is_path(value) else value for key, value in options.items()
     }
@@ -280,7 +281,7 @@ def is_path(value: Any) -> bool:
 
 
 def _array(output: Any) -> npt.NDArray[Any]:
-    """Return an array of what a model gives; tensors come from where they are."""
+    """Return the output of a model as an array; tensors are copied from their device."""
     return np.asarray(output.detach().cpu().numpy() if hasattr(output, "detach") else output)
 
 
@@ -307,5 +308,6 @@ def _label_space(code: Code, made: Any, classes: Sequence[str] | str | None) -> 
     if isinstance(names, Mapping):  # from ids, as Ultralytics has it
         names = [names[k] for k in sorted(names)]
     if names is None or isinstance(names, str) or not all(isinstance(name, str) for name in names):
-        raise ConfigError(f"{code.text}: its classes are not known; give it classes = [...], or say --classes a,b,c")
+        hint = "give it classes = [...], or name them with --classes a,b,c"
+        raise ConfigError(f"{code.text}: its classes are not known; {hint}")
     return LabelSpace(code.name, tuple(names))

@@ -76,7 +76,7 @@ class SemanticHead:
 
 
 class UniversalHead:
-    """Masks with classes: of each class the sum over all masks of class probability times mask probability.
+    """Masks with classes: each class has the sum over all masks of class probability times mask probability.
 
     Mask2Former, MaskFormer, OneFormer (asked for semantic segmentation), EoMT (whose windows are averaged).
     """
@@ -148,7 +148,7 @@ class PromptedHead:
         from transformers import CLIPSegForImageSegmentation
 
         if not options.prompts:
-            raise ConfigError("a 'clipseg' model finds what it is asked for; say prompts: [road, building, ...]")
+            raise ConfigError("a 'clipseg' model needs prompts; set prompts: [road, building, ...]")
         if options.image_size is not None and not isinstance(options.image_size, int):
             raise ConfigError("image_size: a 'clipseg' model sees squares; give one number")
         self.names: Mapping[int, str] = dict(enumerate(options.prompts))
@@ -216,7 +216,7 @@ def working_size(image: tuple[int, ...], shorter: int) -> tuple[int, int]:
 
 
 def _square(kind: str, config: Any, processor: Any, options: SegmenterOptions) -> tuple[int, int]:
-    """Return the side of the square that the model sees; an image is squeezed into it, which is said."""
+    """Return the side of the square that the model sees; an image is squeezed into it, which is reported."""
     wanted, made_for = options.image_size, getattr(config, "image_size", None) or _shorter_side(processor)
     side = made_for if wanted is None else wanted if isinstance(wanted, int) else wanted[0]
     if isinstance(wanted, tuple) and wanted[0] != wanted[1]:
@@ -245,14 +245,14 @@ def _merged(sums: Sequence[torch.Tensor], inputs: Any, images: Sequence[Image]) 
         total = torch.zeros(K, *((length, w) if tall else (h, length)))
         count = torch.zeros(total.shape[1:])
         for start, end, window in own:
-            place = (slice(start, end), slice(None)) if tall else (slice(None), slice(start, end))
-            total[:, *place] += window.cpu()
-            count[place] += 1
+            area = (slice(start, end), slice(None)) if tall else (slice(None), slice(start, end))
+            total[:, *area] += window.cpu()
+            count[area] += 1
         merged.append(total / count)
     return merged
 
 
-# ONNX Runtime in the place of torch: the same model, exported once for each image size and kept.
+# ONNX Runtime instead of torch: the same model, exported once for each image size and stored.
 
 INSTALL = "pip install 'semstab[onnx]'"
 
@@ -260,7 +260,7 @@ INSTALL = "pip install 'semstab[onnx]'"
 class OnnxEngine:
     """Pixels (N, 3, h, w) to logits (N, K, h', w') on the CPU in float32, an image at a time.
 
-    What was exported of that version of a model is kept in the cache folder, where it can be written.
+    The export of that version of a model is stored in the cache folder, where it can be written.
 
     Raises:
         ConfigError: For another device or dtype.
@@ -338,7 +338,7 @@ def _export(model: torch.nn.Module, example: torch.Tensor) -> bytes:
             )
         assert program is not None
         content: bytes = program.model_proto.SerializeToString()
-    except Exception as error:  # the exporter's own; and what protobuf says of more than 2 GB
+    except Exception as error:  # the exporter's own; and those of protobuf about more than 2 GB
         raise DataError(f"the model cannot be exported to ONNX ({summarize_error(error)}); use engine torch") from error
     finally:
         notes.setLevel(level)

@@ -1,4 +1,4 @@
-"""A mapping from a model's own classes to a taxonomy's by name: what Cityscapes and ADE20K call UAVid's classes."""
+"""A mapping from a model's own classes to a taxonomy's by name, from those of Cityscapes and ADE20K to UAVid's."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ class Vocabulary:
 
     Attributes:
         recognised_by: Names that only this vocabulary has, and always has.
-        rest: The class of what no class takes.
+        rest: The class of names that no class takes.
         strict: Class to the names that certainly are it; `lenient` to the names that are it on a generous view.
     """
 
@@ -65,8 +65,8 @@ def vocabularies() -> Mapping[str, Vocabulary]:
 def class_mapping(source: LabelSpace, target: LabelSpace, leniency: Leniency = "strict") -> LabelMapping:
     """Map a model's classes to a taxonomy by name.
 
-    A class goes where its vocabulary says, or to the class of `target` with its name or among whose members it is; one
-    of which the vocabulary says nothing else goes to its rest. Where `target` knows none of these, strict raises
+    A class goes to that of its vocabulary, or to the class of `target` with its name or among whose members it is; one
+    of which the vocabulary says nothing else goes to its rest. If `target` knows none of these, strict raises
     ConfigError and names the class, lenient leaves the class out, and warns where these are most.
     """
     vocabulary = next((entry for entry in vocabularies().values() if entry.matches(source)), None)
@@ -136,7 +136,7 @@ class InTaxonomy(Wrapped):
         return Streamed(labels, lambda: self._maps(streamed, labels != ignore_id(labels)))
 
     def identity(self) -> dict[str, Any]:
-        """Return the identity of the inner model, and where each class goes."""
+        """Return the identity of the inner model, and the mapping of its classes."""
         rows = list(self._mapping.rows)
         return {**self.inner.identity(), "taxonomy": self._mapping.target.to_dict(), "rows": rows}
 

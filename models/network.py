@@ -22,7 +22,7 @@ from semstab.errors import ConfigError, DataError, MissingDependencyError, summa
 from semstab.models import Image, Model, Prediction, content_digest, narrowed
 from semstab.models.names import class_names
 
-# What runs a network that lies in a file: ONNX Runtime, or torch for TorchScript and exported programs.
+# Engines for a network in a file: ONNX Runtime, or torch for TorchScript and exported programs.
 
 Array = npt.NDArray[Any]
 
@@ -145,7 +145,7 @@ def _only(path: Path, inputs: Sequence[str]) -> Sequence[str]:
 
 @contextlib.contextmanager
 def _quiet() -> Iterator[None]:
-    """Silence the notes of torch: that TorchScript is old, and its own log of what cannot be loaded."""
+    """Silence the notes of torch: that TorchScript is old, and its own log of parts that cannot be loaded."""
     notes = logging.getLogger("torch.export")
     level = notes.level
     notes.setLevel(logging.CRITICAL)
@@ -158,7 +158,7 @@ def _quiet() -> Iterator[None]:
 
 
 class NetworkOptions(Settings):
-    """The settings that say how an image is given to the network, and what it gives back."""
+    """The settings of the network's input and output."""
 
     classes: list[str] | str | None = Field(
         None, description="names in the order of its output; or a file: a name a line, or a taxonomy's YAML"
@@ -173,7 +173,7 @@ class NetworkOptions(Settings):
     layout: Literal["nchw", "nhwc"] = Field("nchw", description="of its input and of its output")
     output: int = Field(0, ge=0, description="which of its outputs, counted from 0")
     gives: Literal["logits", "probabilities", "labels"] | None = Field(
-        None, description="what its output is; where not given labels of whole numbers, else logits"
+        None, description="kind of its output; where not given labels if whole numbers, else logits"
     )
     device: str = Field("cpu", description="cpu, cuda, ...; ONNX files run on the cpu")
     threads: int | None = Field(None, ge=1, description="threads on a CPU")
@@ -188,7 +188,7 @@ class NetworkFile(Model):
         self._path, self._options = path, options
         self._network = load_network(path, options.device, options.threads)
         if options.classes is None:
-            raise ConfigError(f"{path}: its classes are not known; say --classes a,b,c or a file with a name a line")
+            raise ConfigError(f"{path}: its classes are not known; name them with --classes a,b,c or a file of names")
         names = class_names(options.classes)
         self.label_space = names if isinstance(names, LabelSpace) else LabelSpace(path.stem, tuple(names))
         self.gives_scores = options.gives != "labels"
@@ -240,7 +240,7 @@ class NetworkFile(Model):
             return Prediction(narrowed(np.asarray(full), K))
         maps = np.asarray(self._map(output, (K,)), dtype=np.float32)
         if np.isnan(maps).any():
-            raise DataError(f"{self._path}: gave {gives} that are NaN; mend scale, mean, std or precision")
+            raise DataError(f"{self._path}: gave {gives} that are NaN; correct scale, mean, std or precision")
         labels = largest(maps, shape)
         if not scores:
             return Prediction(narrowed(labels, K))
@@ -269,7 +269,7 @@ class NetworkFile(Model):
         except Exception as error:  # whatever the runtime has
             raise DataError(
                 f"{self._path}: cannot see an image of shape {pixels.shape} ({summarize_error(error)});"
-                " mend size, layout"
+                " correct size, layout"
             ) from error
         if self._options.output >= len(outputs):
             raise ConfigError(f"{self._path}: output: has {len(outputs)} outputs, counted from 0")
@@ -288,7 +288,9 @@ class NetworkFile(Model):
             values = values.transpose(2, 0, 1)
         if values.ndim != 2 + len(classes) or values.shape[: len(classes)] != classes:
             what = f"{classes[0]} classes" if classes else "labels"
-            raise DataError(f"{self._path}: its output of shape {output.shape} holds no {what}; mend classes or output")
+            raise DataError(
+                f"{self._path}: its output of shape {output.shape} holds no {what}; correct classes or output"
+            )
         return values
 
 
@@ -303,7 +305,7 @@ def upsampled(values: Float32, shape: tuple[int, int]) -> Float32:
 
 
 def largest(maps: Float32, shape: tuple[int, int]) -> Int64:
-    """Return (H, W) which of the maps (K, h, w), upsampled, is the largest, the lowest on ties; one at a time."""
+    """Return (H, W) the index of the largest of the maps (K, h, w), upsampled, the lowest on ties; one at a time."""
     best, label = upsampled(maps[0], shape), np.zeros(shape, dtype=np.int64)
     for k in range(1, len(maps)):
         value = upsampled(maps[k], shape)

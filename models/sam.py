@@ -93,11 +93,11 @@ CACHE_VERSION = 2
 class SamOptions(ImageModelOptions):
     """The settings that name a checkpoint, and say which of its masks are taken."""
 
-    points_per_side: int = Field(32, ge=1, le=256, description="the image is asked at a grid of so many points a side")
-    points_per_batch: int = Field(64, ge=1, description="points at a time; changes speed and memory, not the masks")
+    points_per_side: int = Field(32, ge=1, le=256, description="masks are proposed at a grid of so many points a side")
+    points_per_batch: int = Field(64, ge=1, description="points at a time; it changes speed and memory, not the masks")
     pred_iou: float = Field(0.88, ge=0, le=1, description="masks that the model itself rates lower are dropped")
     stability: float = Field(0.95, ge=0, le=1, description="masks that change more with the threshold are dropped")
-    stability_offset: float = Field(1.0, ge=0, description="by how much the threshold is moved up and down, logits")
+    stability_offset: float = Field(1.0, ge=0, description="shift of the threshold up and down, logits")
     nms_iou: float = Field(0.7, ge=0, le=1, description="of masks whose boxes overlap more the better rated one stays")
     min_area: int = Field(100, ge=0, description="masks of fewer pixels are dropped")
     cache: Path | None = Field(None, description="folder that caches proposals, for other uses of the same ones")
@@ -180,7 +180,7 @@ class SamProposer:
 
     @torch.inference_mode()
     def _propose(self, image: Image) -> Proposals:
-        """Ask the model at all points; of masks that it rates well and that are stable, drop duplicates."""
+        """Run the model at all points; of masks that it rates well and that are stable, drop duplicates."""
         encoded, options, (H, W) = self._encode(image), self.options, image.shape[:2]
         points = point_grid(options.points_per_side) * np.array(encoded.extent[::-1])
         grid = torch.as_tensor(points, dtype=self.model.dtype, device=self.model.device)
@@ -382,7 +382,7 @@ def read_rules(path: Path | None) -> Rules:
 
 
 class SamVoteOptions(SamOptions):
-    """The proposals, and who votes."""
+    """The proposals, and the model that votes."""
 
     voter: str = Field(description="the model whose labels vote, e.g. segformer")
     voter_options: dict[str, Any] = Field(default_factory=dict, description="its options, e.g. {model: FOLDER}")

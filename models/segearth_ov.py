@@ -54,7 +54,7 @@ def self_self_attention(attention: Any, tokens: torch.Tensor) -> torch.Tensor:
 
     Args:
         attention: A transformers CLIPAttention.
-        tokens: (N, T, D), what its block's first layer norm puts out.
+        tokens: (N, T, D), the output of its block's first layer norm.
     """
     q, k, v = (
         project(tokens).view(*tokens.shape[:2], attention.num_heads, attention.head_dim).transpose(1, 2)
@@ -65,7 +65,7 @@ def self_self_attention(attention: Any, tokens: torch.Tensor) -> torch.Tensor:
     return torch.as_tensor(attention.out_proj(mixed.transpose(1, 2).flatten(2)))
 
 
-# What an open-vocabulary model is asked: classes, their other names, and sentences around them.
+# The prompts of an open-vocabulary model: classes, their other names, and sentences around them.
 
 SHIPPED = importlib.resources.files("semstab.configs") / "models" / "segearth_uavid.yaml"
 
@@ -75,7 +75,7 @@ class Prompts(Settings):
 
     name: str = Field("prompts", description="of the taxonomy that the classes make")
     classes: list[str] = Field(min_length=2, description="a class an entry; after commas its other names")
-    background: str | None = Field(None, description="the class of a pixel of which nothing is likely")
+    background: str | None = Field(None, description="the class of a pixel where no class is likely")
     prob_threshold: float = Field(0.0, ge=0, le=1, description="likelihood below which a pixel is background")
     templates: list[str] = Field(["a photo of a {}."], min_length=1, description="sentences; {} stands for the name")
 
@@ -88,7 +88,7 @@ class Prompts(Settings):
 
     @field_validator("templates")
     @classmethod
-    def _templates_have_a_place(cls, value: list[str]) -> list[str]:
+    def _templates_hold_a_name(cls, value: list[str]) -> list[str]:
         if wrong := [template for template in value if template.count("{}") != 1]:
             raise ValueError(f"'{wrong[0]}' must hold {{}} once")
         return value
@@ -265,21 +265,21 @@ def slide(
     total, count = pixels.new_zeros(()), pixels.new_zeros(H, W)
     for top in starts(H, window, stride):
         for left in starts(W, window, stride):
-            place = (..., slice(top, top + window), slice(left, left + window))
-            logits = logits_of(pixels[place])
+            area = (..., slice(top, top + window), slice(left, left + window))
+            logits = logits_of(pixels[area])
             total = total if total.ndim else logits.new_zeros(len(logits), H, W)
-            total[place] += logits
-            count[place] += 1
+            total[area] += logits
+            count[area] += 1
     return total / count
 
 
 def padded(pixels: torch.Tensor, multiple: int) -> tuple[torch.Tensor, tuple[slice, ...]]:
-    """Return the image (..., H, W) between zeros so that both sides are multiples, and where it lies in it."""
+    """Return the image (..., H, W) between zeros so that both sides are multiples, and its slices in the result."""
     H, W = pixels.shape[-2:]
     top, left = -H % multiple // 2, -W % multiple // 2
     bottom, right = -H % multiple - top, -W % multiple - left
-    place = (slice(top, top + H), slice(left, left + W))
-    return nn.functional.pad(pixels, (left, right, top, bottom)), place
+    area = (slice(top, top + H), slice(left, left + W))
+    return nn.functional.pad(pixels, (left, right, top, bottom)), area
 
 
 CLIP_MEAN = (0.48145466, 0.4578275, 0.40821073)
@@ -295,7 +295,7 @@ class SegEarthOptions(ModelOptions):
         None, description="a SimFeatUp checkpoint (jbu_one); where not given, features are upsampled bilinearly"
     )
     resize: int = Field(448, ge=1, description="the longer side at which the image is shown, pixels")
-    window: int | None = Field(None, ge=1, description="side of a window, pixels; what CLIP was made for by default")
+    window: int | None = Field(None, ge=1, description="side of a window, pixels; that of CLIP's training by default")
     stride: int | None = Field(None, ge=1, description="from window to window, pixels; half a window by default")
     bias: float = Field(-0.3, description="weight of the whole image's likeness to a class: global bias alleviation")
     sharpness: float = Field(50.0, gt=0, description="factor of the likeness before the softmax")
@@ -363,13 +363,13 @@ class SegEarthOV(Model):
 
     def window_logits(self, window: torch.Tensor) -> torch.Tensor:
         """Return (queries, h, w) cosines of a window (3, h, w)."""
-        pixels, place = padded(window[None], int(self._model.vision_model.config.patch_size))
+        pixels, area = padded(window[None], int(self._model.vision_model.config.patch_size))
         whole, patches = dense_features(self._model, pixels)
         if self._upsampler is not None:
             patches = self._upsampler(patches, pixels)
         cosine = torch.einsum("qd,dhw->qhw", self.queries, nn.functional.normalize(patches[0], dim=0))
         cosine = cosine + self.options.bias * (self.queries @ nn.functional.normalize(whole[0], dim=0))[:, None, None]
-        return bilinear(cosine, pixels.shape[-2:])[:, *place]
+        return bilinear(cosine, pixels.shape[-2:])[:, *area]
 
     @torch.inference_mode()
     def _text_features(self, tokenizer: Any, prompts: Prompts) -> torch.Tensor:

@@ -24,7 +24,7 @@ CHUNK_BYTES = 1 << 26
 class Segmenter(Model):
     """The class of the largest value that the checkpoint gives a pixel, its maps upsampled bilinearly to the image.
 
-    Its classes are those of the checkpoint's id2label, or the prompts. What the values are: see `heads`.
+    Its classes are those of the checkpoint's id2label, or the prompts. See `heads` for these values.
     """
 
     Options: type[BaseModel] = SegmenterOptions
@@ -79,7 +79,7 @@ def _shares(
 ) -> Iterator[Float32]:
     """Yield the share (H, W) of each class's upsampled map in all: the softmax where the largest is given.
 
-    0 where no class has any, or where the label is not sure. Each map is upsampled twice, and none is kept.
+    It is 0 where no class has any, or where the label is not sure. Each map is upsampled twice, and none is stored.
     """
 
     def weight(k: int) -> torch.Tensor:
@@ -103,7 +103,7 @@ def label_space(id2label: Mapping[int, str], name: str) -> LabelSpace:
 
 
 def largest_upsampled(maps: torch.Tensor, size: tuple[int, ...]) -> tuple[torch.Tensor, torch.Tensor]:
-    """Return (H, W) the largest of maps (K, h, w), upsampled bilinearly to `size`, and whose it is (ties: the lowest).
+    """Return (H, W) the largest of maps (K, h, w), upsampled bilinearly to `size`, and its index (ties: the lowest).
 
     Class by class in chunks: 150 classes at 3840x2160 would take 5 GB at once.
     """

@@ -375,7 +375,7 @@ def test_a_large_image_is_thinned_with_its_camera():
     assert len(view.u) == 100
     whole = View.of(Frame(0, depth, CAMERA, np.eye(4), labels=labels), 100)
     np.testing.assert_array_equal(view.u, whole.u)
-    camera = view.kept_camera(Convention())
+    camera = view.sampled_camera(Convention())
     assert (camera.fx, camera.cx) == (CAMERA.fx / 2, CAMERA.cx / 2)
 
 

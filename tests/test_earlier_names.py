@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from importlib.metadata import EntryPoint
+from pathlib import Path
 
 import pytest
 from typer.testing import CliRunner
@@ -41,6 +42,9 @@ def test_settings(warned):
     options = PredictedOptions(dataset={"name": "city"}, models=[{"backbone": "colour-clusters"}], remedies=["vote:3"])
     assert options.try_filters == ["vote:3"]
     warned("'remedies'", "'try_filters'")
+    options = PredictedOptions(dataset={"name": "city"}, models=[{"model": "colour-clusters"}], kept="predictions")
+    assert options.cache == Path("predictions")
+    warned("'kept'", "'cache'")
 
 
 def test_a_setting_that_is_given_under_both_names_is_refused():

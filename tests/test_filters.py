@@ -269,10 +269,10 @@ def test_a_sequence_begins_without_memory(text):
     ("text", "said"),
     [
         ("emma:0.6", r"filter 'emma' is not known; did you mean 'ema'\?"),
-        ("ema:1.5", r"filter 'ema:1.5': the share that is kept of the belief before is a number from 0 to 0.999; got"),
+        ("ema:1.5", r"filter 'ema:1.5': the share of the previous belief is a number from 0 to 0.999; got"),
         ("ema:x", r"got 'x'"),
         ("ema:nan", r"got 'nan'"),
-        ("vote:2.5", r"filter 'vote:2.5': how many labels vote is a whole number from 2 to 1000; got '2.5'"),
+        ("vote:2.5", r"filter 'vote:2.5': the number of labels that vote is a whole number from 2 to 1000; got '2.5'"),
         ("vote-warped:1", r"from 2 to 1000"),
         ("guided:0", r"the radius of the windows in pixels is a whole number from 1 to 500"),
         ("map-prior:-1", r"the edge of a voxel in metres"),

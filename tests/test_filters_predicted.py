@@ -17,7 +17,7 @@ from semstab.datasets.formats.images import read_labels
 from semstab.errors import ConfigError, DataError
 from semstab.models import Model, Prediction
 from semstab.predict.filters import REGISTRY, parse
-from semstab.predict.predictor import Kept, PredictorConfig, load_predictor, parse_predictor, stored_labels
+from semstab.predict.predictor import Cached, PredictorConfig, load_predictor, parse_predictor, stored_labels
 from semstab.predict.sequence import SequenceOptions, predict_sequence
 from semstab.settings import filtered_config, predicted_config, resolve
 
@@ -154,19 +154,19 @@ def test_what_is_kept_on_disk_is_asked_once(tmp_path):
             return {"counted": 1}
 
     model, images = Counted(), [predicted_scene.image(k) for k in range(3)]
-    first = Kept(model, tmp_path).predict(images)
-    again = Kept(model, tmp_path).fit([]).predict(images, scores=True)
+    first = Cached(model, tmp_path).predict(images)
+    again = Cached(model, tmp_path).fit([]).predict(images, scores=True)
     assert model.asked == 3
     for a, b, image in zip(first, again, images, strict=True):
         np.testing.assert_array_equal(a.labels, image[..., 0] % 2)
         np.testing.assert_array_equal(a.labels, b.labels)
         assert a.scores is None
         assert (b.scores == 0.5).all()
-    Kept(model, tmp_path).fit(images[:1]).predict(images[:1])  # fitted to something else it is another model
+    Cached(model, tmp_path).fit(images[:1]).predict(images[:1])  # fitted to something else it is another model
     assert model.asked == 4
     for file in tmp_path.iterdir():
         file.write_bytes(file.read_bytes()[:500])
-    Kept(model, tmp_path).predict(images)  # what is damaged is asked for again
+    Cached(model, tmp_path).predict(images)  # what is damaged is asked for again
     assert model.asked == 7
 
 

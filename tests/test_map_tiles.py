@@ -392,7 +392,8 @@ def test_a_map_that_will_not_fit_is_fused_in_tiles_and_a_line_says_so(wall, both
         semstab.engine.run(config, out=tmp_path / "tiles", observers=[progress], executor=executor)
     assert len(executor.done) > 2
     assert re.search(
-        r"wall, a: about .* million voxels of 0.25 m would take .* GB, 3e-05 GB are there: fused in tiles", caplog.text
+        r"wall, a: about .* million voxels of 0.25 m would take .* GB, 3e-05 GB are free: it is fused in tiles",
+        caplog.text,
     )
     assert progress.frames == 30
     assert_same_bits(semstab.load(tmp_path / "tiles").table(), semstab.load(both[0]).table())

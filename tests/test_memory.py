@@ -59,7 +59,7 @@ def test_a_unit_that_will_not_fit_is_fused_in_tiles(root, monkeypatch) -> None:
     monkeypatch.setattr(memory, "available_bytes", lambda: 1000)
     sizing = memory.planned_sizes(config, plan.units, 1)
     assert sizing.tile_sizes.keys() == {each.identity for each in plan.units}
-    assert "2.5e-07 GB are there: fused in tiles of" in sizing.lines[0]
+    assert "2.5e-07 GB are free: it is fused in tiles of" in sizing.lines[0]
 
 
 def test_tiles_are_as_large_as_the_memory_allows_and_as_many_as_processes_need(root) -> None:

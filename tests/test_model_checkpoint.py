@@ -138,7 +138,7 @@ def answer(status, kind):
     ("error", "message"),
     [
         (ConnectionError("[Errno -2] Name or service not known"), r"the hub cannot be reached .*hf download a/model"),
-        (answer(404, RepositoryNotFoundError), "no such model on the hub; mend the name"),
+        (answer(404, RepositoryNotFoundError), "no such model on the hub; correct the name"),
         (answer(404, RevisionNotFoundError), "the hub has no revision 'v2' of it"),
         (answer(403, GatedRepoError), "its owner asks for consent"),
     ],

@@ -94,7 +94,7 @@ class Shifting(Model):
 
 def test_labels_lie_where_a_run_reads_them(scene):
     report = predict(scene)
-    assert (report.predicted, report.kept, report.sequence) == (6, 0, "flight")
+    assert (report.predicted, report.reused, report.sequence) == (6, 0, "flight")
     assert report.folders == (scene / "labels" / "clusters",)
     opened = open_dataset("posed_folder", {"root": scene}).scene("flight")
     assert opened.models == ("clusters",)
@@ -240,7 +240,7 @@ def test_finished_frames_are_kept(scene):
     predict(scene, Shifting(), indices=range(4))
     model = Shifting()
     report = predict(scene, model)
-    assert (report.predicted, report.kept, model.seen) == (2, 4, [1, 1])
+    assert (report.predicted, report.reused, model.seen) == (2, 4, [1, 1])
 
 
 def test_what_was_finished_before_an_error_is_kept(scene):
@@ -289,7 +289,7 @@ def test_a_map_that_was_deleted_is_predicted_again(scene):
 def test_scores_that_are_wanted_later_are_predicted(scene):
     predict(scene, Shifting())
     report = predict(scene, Shifting(), scores=True)
-    assert (report.predicted, report.kept) == (6, 0)
+    assert (report.predicted, report.reused) == (6, 0)
 
 
 def test_other_settings_do_not_mix(scene):
@@ -322,7 +322,7 @@ def test_maps_of_others_are_not_touched(scene):
 def test_a_damaged_manifest_is_said(scene):
     predict(scene)
     (scene / "labels/clusters/predictions.json").write_text("[]")
-    with pytest.raises(DataError, match="no manifest of predictions; delete the folder"):
+    with pytest.raises(DataError, match="is no manifest of predictions; delete the folder"):
         predict(scene)
 
 
@@ -334,8 +334,8 @@ def test_observers_see_every_frame(scene):
         def sequence_started(self, name, frames):
             self.said.append((name, frames))
 
-        def frame_done(self, kept):
-            self.said.append(kept)
+        def frame_done(self, reused):
+            self.said.append(reused)
 
     predict(scene, Shifting(), indices=[0, 2])
     counter = Counter()
@@ -485,7 +485,7 @@ def test_regions_are_not_labels_and_come_with_their_changes(scene):
 def test_region_changes_with_camera_motion_taken_out(scene):
     predict(scene, Tiles(), indices=[0, 3])
     report = predict(scene, Tiles(), indices=[0, 3])
-    assert report.kept == 2
+    assert report.reused == 2
     images = images_of(scene)
     a, b = (images.predicted(k, labels=read_labels(scene / f"regions/clusters/{k:03d}.png")) for k in (0, 3))
     brought, visible = warp(a.labels, a, b)
@@ -663,7 +663,7 @@ def test_a_frame_that_is_asked_for_again_is_predicted_once(scene, monkeypatch):
     for index in (0, 1, 0, 1):
         opened.frame(index, "colour-clusters")
     assert len(model.seen) == 2
-    monkeypatch.setattr("semstab.predict.live.KEPT_BYTES", 48 * 80)
+    monkeypatch.setattr("semstab.predict.live.CACHE_BYTES", 48 * 80)
     opened = dataset.scene("flight")
     for index in (0, 1, 0, 1):
         opened.frame(index, "colour-clusters")
@@ -774,10 +774,10 @@ def test_a_report_is_said_in_numbers():
     from semstab.predict.command import print_report
     from semstab.predict.sequence import SequenceReport
 
-    report = SequenceReport("flight", (Path("labels/x"),), predicted=10, kept=2, model_seconds=2.0, seconds=4.0)
+    report = SequenceReport("flight", (Path("labels/x"),), predicted=10, reused=2, model_seconds=2.0, seconds=4.0)
     console = Console(record=True, width=100, file=io.StringIO())
     print_report(report, console)
     print_report(dataclasses.replace(report, predicted=0), console)
     text = console.export_text()
-    assert "flight: 10 frames predicted, 2 kept from before, 2.50 frames/s (model 200 ms a frame)" in text
-    assert "flight: 0 frames predicted, 2 kept from before\n" in text
+    assert "flight: 10 frames predicted, 2 from an earlier start, 2.50 frames/s (model 200 ms a frame)" in text
+    assert "flight: 0 frames predicted, 2 from an earlier start\n" in text

@@ -87,10 +87,10 @@ def test_what_was_stopped_goes_on_as_if_it_had_not_been(scene):
         predict(scene, Average(fails_at=4))
     model = Average()
     report = predict(scene, model)
-    assert (report.predicted, report.kept, model.seen) == (6, 0, 6)
+    assert (report.predicted, report.reused, model.seen) == (6, 0, 6)
     assert_stored(scene, expected(range(6)))
     model = Average()
-    assert (predict(scene, model).kept, model.seen) == (6, 0)
+    assert (predict(scene, model).reused, model.seen) == (6, 0)
 
 
 def test_an_image_that_changed_changes_what_follows_even_where_that_was_stopped(scene):
@@ -154,7 +154,7 @@ def test_a_pose_that_changed_is_predicted_again(scene):
 
 def test_single_images_have_no_depth(scene, tmp_path):
     files = ImageFiles(str(scene / "color/*.png"))
-    with pytest.raises(ConfigError, match="looks at depth and pose, which single images have not; use --data"):
+    with pytest.raises(ConfigError, match="looks at depth and pose, which single images do not have; use --data"):
         predict_sequence(files, Looking(), range(6), tmp_path / "out", SequenceOptions("x"))
 
 
@@ -198,7 +198,7 @@ def test_whichever_frame_is_asked_for(scene, live):
 
 
 def test_frames_that_are_long_past_are_reached_again(scene, live, monkeypatch):
-    monkeypatch.setattr("semstab.predict.predictor.KEPT_BYTES", 0)
+    monkeypatch.setattr("semstab.predict.predictor.CACHE_BYTES", 0)
     opened, wanted = live(scene), expected(range(6))
     for k in (5, 0, 3):
         np.testing.assert_array_equal(opened.frame(k, "average").labels, wanted[k])

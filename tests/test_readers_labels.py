@@ -134,7 +134,7 @@ def test_a_folder_without_labels_of_the_scene_is_left_out_and_said(scene, caplog
 def test_a_labels_root_that_is_wrong_is_said(scene, tmp_path, caplog):
     root, _, _ = scene
     fails(
-        ConfigError, "nowhere: there is no such folder; mend labels_root", ds.opened, FORM, root,
+        ConfigError, "nowhere: there is no such folder; correct labels_root", ds.opened, FORM, root,
         labels_root=tmp_path / "nowhere",
     )  # fmt: skip
     assert ds.opened(FORM, root, labels_root=tmp_path).models == ()

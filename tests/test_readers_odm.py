@@ -352,9 +352,7 @@ def test_cameras_24_m_from_where_they_were_are_warned_of(tmp_path, source, caplo
     scene = opened(folder)
     assert scene.georeference.offset == down.OFFSET
     assert re.search(r"the cameras lie 24(\.\d)? m \(median, horizontal\) from ", caplog.text)
-    assert (
-        "put opensfm/geocoords_transformation.txt and reference_lla.json of this run back, or give crs" in caplog.text
-    )
+    assert "restore opensfm/geocoords_transformation.txt and reference_lla.json of this run, or give crs" in caplog.text
     assert f"from {KNOWN[source]}" in scene.placed
 
 

@@ -388,7 +388,7 @@ def summary_of(table: VoxelTable) -> UnitSummary:
 
 def planned(indices: Sequence[int] = (0,)) -> PlannedUnit:
     task = Task(Scene(), "net/x", indices, CLASSES.mapping_to(CLASSES), ("numpy",))
-    return PlannedUnit(Variation(), Config(voxel_size=0.25), task, "key", image_space=True, kept=True)
+    return PlannedUnit(Variation(), Config(voxel_size=0.25), task, "key", image_space=True, stored=True)
 
 
 def record(path: Path | Target, frames: list[Frame], *, finish: bool = True) -> tuple[Recording, VoxelTable]:

@@ -194,7 +194,7 @@ def test_voxels_that_were_lost_or_damaged_are_computed_again_and_told(root, tmp_
     (out / "voxels/wall__a__numpy.parquet").unlink()
     (out / "voxels/wall__b__numpy.parquet").write_bytes(b"x")
     assert len(count(config, out).computed) == 2
-    assert "wall__b__numpy.parquet: not as it was written; what it belongs to is computed again" in caplog.text
+    assert "wall__b__numpy.parquet: has changed since it was written; its unit is computed again" in caplog.text
     assert count(config, out).computed == []
 
 
@@ -233,10 +233,10 @@ def test_the_result_is_read_back_from_its_folder(finished, out, tmp_path) -> Non
         load_result(tmp_path)
     content = json.loads((out / "summary.json").read_text())
     (out / "summary.json").write_text(json.dumps({**content, "schema": 1}))
-    with pytest.raises(DataError, match=r"summary\.json: not a summary of this version of semstab; run it again"):
+    with pytest.raises(DataError, match=r"summary\.json: is not a summary of this version of semstab; run it again"):
         load_result(out)
     (out / "summary.json").write_text('{"name": "x"}')
-    with pytest.raises(DataError, match=r"summary\.json: not a summary of this version"):
+    with pytest.raises(DataError, match=r"summary\.json: is not a summary of this version"):
         load_result(out)
 
 
@@ -396,7 +396,7 @@ def test_a_worker_that_does_not_see_the_folder_sends_the_voxels_back_and_a_job_f
 
 def works(model: str, identities: str, kept: str = "") -> list[Work]:
     start = Start("", Path())
-    return [Work(start, "s", model, name, Config(), kept=name in kept) for name in identities]
+    return [Work(start, "s", model, name, Config(), stored=name in kept) for name in identities]
 
 
 def names(job: tuple[Work, ...]) -> str:

@@ -105,7 +105,7 @@ def test_a_job_that_kills_its_process_fails_and_the_others_finish(root, tmp_path
     jobs = iter([(fine[0],), (Deadly(start, "wall", "x", "deadly", config),), *((work,) for work in fine[1:])])
     outcomes = {each.identity: each for each in LocalProcesses(1).run(lambda: next(jobs, None), Observers([]))}
     assert len(outcomes) == 3
-    assert outcomes["deadly"].error.startswith("its process was killed, perhaps for want of memory")
+    assert outcomes["deadly"].error.startswith("its process was killed, perhaps because memory ran out")
     assert [outcomes[work.identity].error for work in fine] == [None] * 2
 
 
@@ -201,6 +201,6 @@ def test_a_dask_cluster_gives_the_same_numbers_though_a_worker_is_killed(
     finished = executor.run(lambda: next(jobs, None), Observers([]))
     next(finished)
     scheduler.kill()
-    with pytest.raises(ConfigError, match="the scheduler went away; start it again"):
+    with pytest.raises(ConfigError, match="the scheduler does not answer any more; start it again"):
         list(finished)
     executor.close()

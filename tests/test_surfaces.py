@@ -308,7 +308,7 @@ def test_a_raster_of_another_projection_or_turned_is_told_what_to_do(tmp_path) -
 def test_heights_need_z_to_be_up(flight, tmp_path) -> None:
     path = down.write_raster(tmp_path / "dsm.tif")
     dataset = open_dataset("posed_folder", {"root": flight, "surface": path, "up_axis": "-y"})
-    fails(ConfigError, "dsm.tif: is a surface over x and y, but up_axis is -y; turn it", dataset.scene, "field")
+    fails(ConfigError, "dsm.tif: holds heights over x and y, but up_axis is -y; turn it", dataset.scene, "field")
 
 
 def test_a_grid_that_is_too_fine_is_refused(tmp_path) -> None:
@@ -330,6 +330,6 @@ def test_without_a_size_it_is_said_what_to_set(flight, mesh, tmp_path) -> None:
         shutil.rmtree(bare / folder)
     options = {"root": bare, "surface": mesh, "casts": False}
     scene = open_dataset("posed_folder", options).scene("field")
-    fails(DataError, "no colour image says the size of depth; set intrinsics_size", scene.depth, 0)
+    fails(DataError, "no colour image gives the size of depth; set intrinsics_size", scene.depth, 0)
     told = open_dataset("posed_folder", options | {"intrinsics_size": (down.W, down.H)}).scene("field")
     np.testing.assert_allclose(told.depth(0), down.plane_depth(down.pose(0)), atol=2e-5)

@@ -90,7 +90,7 @@ LINE = np.arange(50.0)[:, None] * (1, 0, 0)
 
 @pytest.mark.parametrize("points", [np.zeros((0, 3)), np.zeros((2, 3)), np.ones((50, 3)), LINE])
 def test_too_few_points_are_refused(points):
-    with pytest.raises(DataError, match=f"no ground plane found under the cameras in {len(points)} points; say which"):
+    with pytest.raises(DataError, match=f"there is no ground plane under the cameras in {len(points)} points; set the"):
         estimate_up(points, looking((0, 1, 0)))
 
 

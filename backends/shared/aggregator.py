@@ -161,9 +161,9 @@ class Aggregator:
         keys, voxel, pixels = np.unique(key, return_inverse=True, return_counts=True)
         partition = partitions_of(keys)
         order = np.argsort(partition, kind="stable")
-        place = np.empty_like(order)
-        place[order] = np.arange(len(order))
-        entries, weight = np.unique(place[voxel] * self.num_classes + label, return_counts=True)
+        rank = np.empty_like(order)
+        rank[order] = np.arange(len(order))
+        entries, weight = np.unique(rank[voxel] * self.num_classes + label, return_counts=True)
         return Observed(
             key=keys[order],
             pixels=pixels[order],
@@ -178,7 +178,7 @@ class Aggregator:
     def _scores(self, frame: Frame, origin: Int64) -> Observed | ObservedScores | None:
         """Return the observations of scores, or None where a pixel with depth is out of reach.
 
-        As dense rows where the voxels have evidence for most of the classes, else by its entries.
+        They are dense rows where the voxels have evidence for most of the classes, else entries.
 
         Voxels outside the extent are left out at the end: all voxels of the frame decide how sums are rounded.
         """
@@ -244,7 +244,7 @@ def _rays(frame: Frame) -> tuple[Float64, Float64]:
 
 
 def _offsets(spread: Int64) -> tuple[Int64, Int64]:
-    """Return where each band's entries go in each partition (PARTITIONS, bands), and the first of each partition."""
+    """Return the start of each band's entries in each partition (PARTITIONS, bands), and of each partition."""
     ends = np.cumsum(spread.T.reshape(-1))
     offset = np.concatenate([[0], ends[:-1]]).reshape(PARTITIONS, -1)
     return offset, np.append(offset[:, 0], ends[-1])
@@ -253,7 +253,7 @@ def _offsets(spread: Int64) -> tuple[Int64, Int64]:
 def _flat(scores: Any) -> Any:
     """Return scores one after the other, half-precision ones as their bits.
 
-    What compiled code does not know, in float64.
+    Types that compiled code does not know become float64.
     """
     kind = scores.dtype if scores.dtype in (np.float16, np.float32) else np.float64
     values = fixed(scores.astype(kind, copy=False)).reshape(-1)

@@ -100,7 +100,7 @@ def _whole_millimetres(depth: Float32) -> bool:
 def observe(frame: Frame, voxel_size: float, num_classes: int, pixels: Mask | None = None) -> Observations:
     """Return the frame's observations: s_bar(q) = 1/|A_t(q)| sum of s_i over the pixels A_t(q) that fall into voxel q.
 
-    Only of some of its valid `pixels` (H, W), where these are given.
+    They are of some of its valid `pixels` (H, W) only, where these are given.
     """
     chosen = frame.valid if pixels is None else pixels
     points = back_project(frame, chosen)
@@ -114,7 +114,7 @@ def observe(frame: Frame, voxel_size: float, num_classes: int, pixels: Mask | No
 
 
 def back_project(frame: Frame, pixels: Mask | None = None) -> Float64:
-    """Return World coordinates (3, n), metres, of the frame's valid pixels, or of some of them (H, W), in row order.
+    """Return world coordinates (3, n), metres, of the frame's valid pixels, or of some of them (H, W), in row order.
 
     x_w = T_wc d ((u - cx) / fx, (v - cy) / fy, 1).
 
@@ -124,7 +124,7 @@ def back_project(frame: Frame, pixels: Mask | None = None) -> Float64:
 
 
 def pixels_held(frame: Frame, pixels: Mask, voxel_size: float, holds: Callable[[Int64], Mask]) -> Mask:
-    """Return which of the pixels (H, W) fall into voxels that are held, by their index (3, n)."""
+    """Return the pixels (H, W) that fall into voxels of a set, by their index (3, n)."""
     held = [holds(voxel_index(points, voxel_size, frame)) for points in _points(frame, pixels)]
     chosen = np.zeros_like(pixels)
     chosen[pixels] = np.concatenate(held)
@@ -132,7 +132,7 @@ def pixels_held(frame: Frame, pixels: Mask, voxel_size: float, holds: Callable[[
 
 
 def _points(frame: Frame, pixels: Mask) -> Iterator[Float64]:
-    """Yield World coordinates (3, n) of some pixels, of a few rows at a time: a large frame would take much memory."""
+    """Yield world coordinates (3, n) of some pixels, of a few rows at a time: a large frame would take much memory."""
     H, W = frame.shape
     K, R, t = frame.intrinsics, frame.T_wc[:3, :3], frame.T_wc[:3, 3]
     across, down = (np.arange(W) - K.cx) / K.fx, (np.arange(H) - K.cy) / K.fy
@@ -193,7 +193,7 @@ def _sums_of_evidence(frame: Frame, num_classes: int, chosen: Mask, voxel: Int64
     return s_sum
 
 
-# Any backend restricted to columns of voxels: of each frame it is shown the pixels that fall into them.
+# Any backend restricted to columns of voxels: it gets the pixels of each frame that fall into them.
 
 
 class Restricted:
@@ -205,7 +205,7 @@ class Restricted:
         self._within = within
 
     def integrate(self, frame: Frame) -> FrameReport:
-        """Fuse what the frame shows of the columns."""
+        """Fuse the pixels of the frame in the columns."""
         depth = np.where(falling_into(self._within, frame, self._voxel_size), frame.depth, np.float32(0))
         return self._backend.integrate(dataclasses.replace(frame, depth=depth))
 
@@ -216,7 +216,7 @@ class Restricted:
         return table if inside.all() else table.rows(inside)
 
     def events(self) -> Events | None:
-        """Return the log, where the backend keeps one."""
+        """Return the log, where the backend has one."""
         return self._backend.events()
 
 

@@ -20,7 +20,7 @@ STEP_BITS = 4
 STEPS = 1 << STEP_BITS
 
 LOWEST = 0x3FE5_8000_0000_0000
-"""The bits of the least m: a step has 1 in its middle, so that the logarithm of what is near 1 is exact to its bits."""
+"""The bits of the least m: a step has 1 in its middle, so that the logarithm of numbers near 1 is exact to its bits."""
 
 TERMS = 8
 """The terms of the series, which is off by 2^-50 of itself at most where |r| is at most 1/32."""
@@ -34,7 +34,7 @@ def _series() -> list[float]:
 
 
 def _table() -> tuple[list[float], list[float]]:
-    """Return the factor of m in each step, about 1 over its middle, and what that takes from the logarithm."""
+    """Return the factor of m in each step, about 1 over its middle, and the logarithm of that factor."""
     edges = np.array([LOWEST + (i << (MANTISSA_BITS - STEP_BITS)) for i in range(STEPS + 1)]).view(np.float64)
     inverse = np.where((edges[:-1] < 1) & (edges[1:] > 1), 1.0, 2.0 / (edges[:-1] + edges[1:]))
     return inverse.tolist(), (-np.log2(inverse.astype(np.longdouble))).astype(np.float64).tolist()
@@ -46,7 +46,7 @@ INVERSE, LOGARITHM = _table()
 def plogp_of(context: Any, builder: Any, p: Any) -> Any:
     """Return the vector of p log2 p of 0 <= p <= 2, 0 for 0.
 
-    It is right to a few units in the last place of the logarithm (with fused multiply-add, as machines have; else to
+    It is right to a few units in the last digit of the logarithm (with fused multiply-add, as machines have; else to
     2^-52).
 
     p = 2^e m, m from `LOWEST` to twice that; m c = 1 + r with c by m's step, and log p = e - log c + log(1 + r).
@@ -97,7 +97,7 @@ RESULT = types.Tuple([types.float64] * 5 + [types.intp])
 
 @intrinsic
 def observe_eights(_typing: Any, evidence: Any, _sums: Any, _share: Any, _before: Any, _after: Any) -> Any:
-    """Add s = share * sums to evidence, and return what comes of it.
+    """Add s = share * sums to evidence, and return sums over the result.
 
     Arguments: evidence, sums, share, before, after.
     Both arrays hold as many numbers, a multiple of `LANES`; those beyond the classes are 0. With p = before * evidence
@@ -122,14 +122,14 @@ def observe_eights(_typing: Any, evidence: Any, _sums: Any, _share: Any, _before
             return builder.fmul(a, b, flags=["contract"])
 
         with cgutils.for_range_slice(builder, INT(0), length, INT(LANES), intp=INT) as (k, _):
-            place = builder.bitcast(builder.gep(seen.data, [k]), DOUBLES.as_pointer())
-            s = times(builder.load(place, align=8), share)
-            place = builder.bitcast(builder.gep(own.data, [k]), ir.VectorType(number, LANES).as_pointer())
-            was = builder.load(place, align=size)
+            pointer = builder.bitcast(builder.gep(seen.data, [k]), DOUBLES.as_pointer())
+            s = times(builder.load(pointer, align=8), share)
+            pointer = builder.bitcast(builder.gep(own.data, [k]), ir.VectorType(number, LANES).as_pointer())
+            was = builder.load(pointer, align=size)
             was = was if number == DOUBLE else builder.fpext(was, DOUBLES)
             p, value = times(was, before), plus(was, s)
             stored = value if number == DOUBLE else builder.fptrunc(value, ir.VectorType(number, LANES))
-            builder.store(stored, place, align=size)
+            builder.store(stored, pointer, align=size)
             value = value if number == DOUBLE else builder.fpext(stored, DOUBLES)
             q = times(value, after)
             terms = (
@@ -187,9 +187,9 @@ def observe_row(evidence, sums, pixels, op, dominant, plogp_before, out):
 
     - `evidence`, `sums`: as `observe_eights` takes them; sums are those of the normalised scores of its pixels
 
-    `dominant` and `plogp_before` are what the observation before left in out[4] and out[7], which spares looking for
-    them. Leaves in `out` the change of VSS, that of the entropy in bits, the drift in bits, the dominant class before
-    and after, the squared length of s_bar, its entropy in bits, and the sum of p log2 p over the classes.
+    `dominant` and `plogp_before` are out[4] and out[7] of the observation before, which spares the search for them.
+    Leaves in `out` the change of VSS, that of the entropy in bits, the drift in bits, the dominant class before and
+    after, the squared length of s_bar, its entropy in bits, and the sum of p log2 p over the classes.
     """
     before, after = 1.0 / max(op, 1), 1.0 / (op + 1)
     top_before = evidence[dominant] * before

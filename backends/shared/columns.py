@@ -88,27 +88,27 @@ def _update_rows(
         sums[chunk, 3], sums[chunk, 4] = new, recurrent
 
 
-# Which blocks of voxels the voxels of a frame lie in.
+# The blocks of voxels that the voxels of a frame lie in.
 
 
 def blocks_of(index: Int64, resolution: int) -> tuple[Int32, Int64, Int32]:
-    """Return the distinct blocks (m, 3) of voxels (n, 3), each voxel's block as a row, and its place (x fastest)."""
+    """Return the distinct blocks (m, 3) of voxels (n, 3), each voxel's block as a row, and its offset (x fastest)."""
     size = 1 << max(4, (2 * len(index)).bit_length())
     blocks, block = np.empty((len(index), 3), dtype=np.int32), np.empty(len(index), dtype=np.int64)
-    place, slots = np.empty(len(index), dtype=np.int32), np.full(size, -1, dtype=np.int32)
-    n = _number(index, resolution, blocks, block, place, slots)
-    return blocks[:n], block, place
+    offset, slots = np.empty(len(index), dtype=np.int32), np.full(size, -1, dtype=np.int32)
+    n = _number(index, resolution, blocks, block, offset, slots)
+    return blocks[:n], block, offset
 
 
 @serial
-def _number(index, r, blocks, block, place, slots):
+def _number(index, r, blocks, block, offset, slots):
     """Number the blocks in order of appearance, and return how many there are."""
     mask = slots.shape[0] - 1
     n = 0
     for v in range(index.shape[0]):
         x, y, z = index[v, 0], index[v, 1], index[v, 2]
         a, b, c = x // r, y // r, z // r
-        place[v] = ((z - c * r) * r + (y - b * r)) * r + (x - a * r)
+        offset[v] = ((z - c * r) * r + (y - b * r)) * r + (x - a * r)
         at = np.int64(mix((a * 73856093) ^ (b * 19349663) ^ (c * 83492791)) & np.uint64(mask))
         while slots[at] >= 0:
             e = slots[at]

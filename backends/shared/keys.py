@@ -44,7 +44,7 @@ def out_of_reach(frame: Frame, origin: npt.ArrayLike, voxel_size: float) -> Data
     )
 
 
-# The hash of packed voxel keys, and how it cuts observations and maps into partitions.
+# The hash of packed voxel keys, which cuts observations and maps into partitions.
 
 PARTITIONS = 64
 

@@ -1,4 +1,4 @@
-"""The observations of a frame as compiled backends take them, and what they change in a map."""
+"""The observations of a frame as compiled backends take them, and the change that they make to a map."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ class ObservedScores:
     Attributes:
         key: (n,) int64 packed voxel index, relative to the origin.
         pixels: (n,) int64 pixels in the voxel.
-        row: (n,) int64 place of each voxel's first sum in `sums`.
+        row: (n,) int64 index of each voxel's first sum in `sums`.
         sums: float64, the sums of the voxels' normalised scores, K in a row; s_bar = sums / pixels.
         bounds: (PARTITIONS + 1,) int64 first voxel of each partition.
         K: Number of classes.
@@ -170,7 +170,7 @@ class MapTotal:
             frame: Its index.
             change: Its effect on the map.
             started: `time.perf_counter()` when its fusion began.
-            associated: The same when its pixels had become observations; NaN where that is not told apart.
+            associated: The same when its pixels had become observations; NaN where that is not measured separately.
         """
         finished = time.perf_counter()
         self.voxels += change.new

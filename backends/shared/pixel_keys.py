@@ -85,7 +85,7 @@ def drawn_pixels(depth, wanted, camera, T, size, odd, one_in):
 def columns_of(within, origin):
     """Return the lowest and highest but one of the first two coordinates, as packed keys count, (4,).
 
-    Or (0,) for all voxels.
+    The result is (0,) for all voxels.
     """
     if within is None:
         return np.zeros(0, dtype=np.int64)
@@ -97,7 +97,7 @@ def columns_of(within, origin):
 def frame_terms(ray_x: Floats, T: Float64, size: float, reach: int) -> tuple[Float64, float]:
     """Return the columns' rays (3, W) along the world's axes, voxels a metre of depth, and the margin of a face.
 
-    The margin bounds what rounding can move a point by, voxels. Of a point within reach no term is above
+    The margin bounds the voxels by which rounding can move a point. Of a point within reach no term is above
     8 reach + |t| / r voxels, and each of a dozen operations rounds its result by 2^-53 of that at most.
     """
     rays = T[:3, :1] * ray_x / size

@@ -20,8 +20,8 @@ from semstab.core.compiled import parallel, serial
 #
 # Scores are flat arrays of float32 or float64, or of half-precision numbers by their bits (uint16), since compiled code
 # knows no such type. They are added up in float64, in an order that depends on the number of classes only. A pixel's
-# last classes are read together with what follows them: behind the last pixel there must be `LANES` numbers of whatever
-# value.
+# last classes are read together with the numbers that follow them: behind the last pixel there must be `LANES` numbers
+# of whatever value.
 
 LANES = 8
 
@@ -77,7 +77,7 @@ def add_two(
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         array, at, K, _, u, end, _, to, fresh = arguments
         pixels = [u, builder.add(u, INT(1))]
-        places = [builder.add(at, builder.mul(K, pixel)) for pixel in pixels]
+        offsets = [builder.add(at, builder.mul(K, pixel)) for pixel in pixels]
         counted = [builder.icmp_signed("<", pixel, end) for pixel in pixels]
         scales = _data(context, builder, signature, arguments, 3)
         factors = [
@@ -87,14 +87,14 @@ def add_two(
         row = builder.gep(_data(context, builder, signature, arguments, 6), [to])
 
         def add(values: list[Any], k: Any) -> None:
-            place = builder.bitcast(builder.gep(row, [k]), DOUBLES.as_pointer())
-            total = builder.select(fresh, ZEROS, builder.load(place, align=8))
+            pointer = builder.bitcast(builder.gep(row, [k]), DOUBLES.as_pointer())
+            total = builder.select(fresh, ZEROS, builder.load(pointer, align=8))
             for value, factor, counts in zip(values, factors, counted, strict=True):
                 scaled = builder.fmul(builder.select(counts, value, ZEROS), factor, flags=["contract"])
                 total = builder.fadd(total, scaled, flags=["contract"])
-            builder.store(total, place, align=8)
+            builder.store(total, pointer, align=8)
 
-        _by_eights(context, builder, signature.args[0], array, places, K, add)
+        _by_eights(context, builder, signature.args[0], array, offsets, K, add)
         return context.get_dummy_value()
 
     number = types.intp
@@ -105,9 +105,9 @@ def _data(context: Any, builder: Any, signature: Any, arguments: Any, i: int) ->
     return context.make_array(signature.args[i])(context, builder, arguments[i]).data
 
 
-def _sums(context: Any, builder: Any, kind: Any, array: Any, places: list[Any], K: Any) -> list[Any]:
-    """Return for each place the vector of sums of every eighth of the K numbers from there on."""
-    totals = [cgutils.alloca_once_value(builder, ZEROS) for _ in places]
+def _sums(context: Any, builder: Any, kind: Any, array: Any, offsets: list[Any], K: Any) -> list[Any]:
+    """Return for each offset the vector of sums of every eighth of the K numbers from there on."""
+    totals = [cgutils.alloca_once_value(builder, ZEROS) for _ in offsets]
     for total in totals:
         builder.store(ZEROS, total)
 
@@ -115,7 +115,7 @@ def _sums(context: Any, builder: Any, kind: Any, array: Any, places: list[Any], 
         for total, value in zip(totals, values, strict=True):
             builder.store(builder.fadd(builder.load(total), value), total)
 
-    _by_eights(context, builder, kind, array, places, K, add)
+    _by_eights(context, builder, kind, array, offsets, K, add)
     return [builder.load(total) for total in totals]
 
 
@@ -138,16 +138,16 @@ def _folded(builder: Any, vectors: list[Any]) -> Any:
 
 
 def _by_eights(
-    context: Any, builder: Any, kind: Any, array: Any, places: list[Any], K: Any,
+    context: Any, builder: Any, kind: Any, array: Any, offsets: list[Any], K: Any,
     do: Callable[[list[Any], Any], None],
 ) -> None:  # fmt: skip
-    """Write code that does something with each eight of the K numbers from each place, the rest filled up by 0.
+    """Write code that does something with each eight of the K numbers from each offset, the rest filled up by 0.
 
-    - `do`: is given a vector of doubles for each place, and the place of its first one among the K
+    - `do`: is given a vector of doubles for each offset, and the index of its first one among the K
     """
     number, vector = NUMBERS[kind.dtype], ir.VectorType(NUMBERS[kind.dtype], LANES)
     data = builder.bitcast(context.make_array(kind)(context, builder, array).data, number.as_pointer())
-    starts = [builder.gep(data, [place]) for place in places]
+    starts = [builder.gep(data, [offset]) for offset in offsets]
     size = context.get_abi_sizeof(context.get_data_type(kind.dtype))
     whole = builder.and_(K, INT(-LANES))
     rest = builder.sub(K, whole)
@@ -195,7 +195,7 @@ def sum_scores(
 ):  # fmt: skip
     """Sum the scores of each voxel's pixels, each scaled to sum 1, band by band; some voxels come twice.
 
-    Where a band has more than `room` of them, its number in `entries` is -1, and its rest is left undone.
+    If a band has more than `room` of them, its number in `entries` is -1, and its rest is left undone.
 
     - `labels`: (W,) 0 wherever there is depth: scores have no ignore id
     - `scores`: (H * W * K,), see `vectors`
@@ -277,7 +277,7 @@ def _add_stretch(scores, at, K, stride, words, scale, run_word, run_end, table, 
 
 @parallel
 def scatter_rows(key, count, room, stride, entries, offset, out_key, out_pixels, out_row):
-    """Order entries by partition, within one by band and appearance; `out_row` is the place of their sums."""
+    """Order entries by partition, within one by band and appearance; `out_row` is the index of their sums."""
     for band in nb.prange(entries.shape[0]):
         cursor = offset[:, band].copy()
         for e in range(band * room, band * room + entries[band]):

@@ -106,7 +106,7 @@ def _words_fused(depth, labels, ignore, ray_a, ray_b, ray_c, a0, b0, c0, ta, tb,
     """Return the words of pixels; and any doubt, see `keys_fused`.
 
     Coordinates are counted from -2^16, half the width of a face included (`face_terms`): the bits of such a number are
-    those of 2^16, with the coordinate and a binary fraction in their places, where it is within reach.
+    those of 2^16, with the coordinate and a binary fraction in their positions, where it is within reach.
     """
     doubt = outside = 0
     for u in range(depth.shape[0]):
@@ -180,7 +180,7 @@ def _key_of(a, b, c, corner):
 
 @serial
 def _enter_runs(word, run_word, run_end, table, table_count, entry, count, n):
-    """Return the runs of a stretch of words into the table; what gives way is an entry. Returns how many there are."""
+    """Put runs of a stretch of words into the table; those that give way become entries, whose number is returned."""
     runs = 0
     for u in range(0, word.shape[0] - LANES, LANES):
         runs = runs_of_eight(word, u, run_word, run_end, runs)
@@ -251,7 +251,7 @@ def find_words(
 
 @serial
 def _describe(word, count, n, corner, partition, spread, low, high):
-    """Leave out what does not count; partitions, spread and extent of what is left, whose number is returned."""
+    """Leave out entries that do not count; partitions, spread and extent of what is left, whose number is returned."""
     low[:], high[:] = 1 << 20, -1
     m = 0
     for e in range(n):

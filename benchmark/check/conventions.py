@@ -23,7 +23,7 @@ KNOWN_SCALES = (256.0, 1000.0, 4000.0, 5000.0, 6553.5, *(10.0**k for k in range(
 """Units of depth in a metre that datasets use."""
 
 SNAP = 0.1
-"""A depth scale that was found from the data may be a known one that is this close to it."""
+"""A depth scale that was measured may be a known one that is this close to it."""
 
 OPTION = "dataset.options."
 """The beginning of the path of a dataset's option."""
@@ -85,7 +85,7 @@ class Reading:
         options: Names and values of the dataset's options.
         size: (width, height) of the depth images.
         ratios: Sizes that the intrinsics may be for, relative to what is said.
-        file: The scene.yaml that says what no option does, where the dataset has one.
+        file: The scene.yaml with further settings, where the dataset has one.
     """
 
     said: Mapping[str, Any]
@@ -104,7 +104,7 @@ class Reading:
     def usual_factor(self, factor: float) -> float:
         """Return the factor that leads to a depth scale which datasets use, if one is near.
 
-        Else to one of three digits.
+        Otherwise the depth scale has three digits.
         """
         now = 1.0 if self.depth_scale is None else self.depth_scale
         near = min(KNOWN_SCALES, key=lambda known: abs(known * factor / now - 1))
@@ -116,7 +116,7 @@ class Reading:
         return [round(side * share) for side, share in zip(said, ratio, strict=True)]
 
     def lines(self, convention: Convention) -> tuple[str, ...]:
-        """Return the lines of configuration that make the files be read that way: of scene.yaml, or of the options."""
+        """Return the lines of scene.yaml, or the options, with which the files are read by that convention."""
         said = {
             "pose": ("pose_convention", convention.pose),
             "axes": ("camera_axes", convention.axes),
@@ -132,7 +132,7 @@ class Reading:
         return f"{self.depth_scale / factor:.5g}"
 
     def advice(self, convention: Convention) -> str:
-        """Return where the lines are to be written, and what else may be wrong."""
+        """Return the file in which the lines belong, and the fault that they would mend."""
         where, factor = self._where(self.lines(convention)), convention.factor
         if factor == 1:
             return where
@@ -142,7 +142,7 @@ class Reading:
         return f"{where}; depth is {times}, or {unit}"
 
     def _where(self, lines: tuple[str, ...]) -> str:
-        """Return where such lines are to be written."""
+        """Return the file in which such lines belong."""
         them = "it" if len(lines) == 1 else "them"
         names = {line.removeprefix(OPTION).partition(":")[0] for line in lines}
         if any(not line.startswith(OPTION) for line in lines):
@@ -152,7 +152,7 @@ class Reading:
         return "the dataset has no such option: convert it, then write it into the scene.yaml"
 
     def change(self, name: str, value: str) -> str:
-        """Return a setting with its value, and where it is written."""
+        """Return a setting with its value, and the file in which it belongs."""
         line = self._line(name, value)
         return f"{line} ({self._where((line,))})"
 
@@ -188,11 +188,11 @@ def _ratios(frame: Frame, color_shape: tuple[int, ...] | None) -> Iterator[Ratio
     if color_shape is not None:
         possible.insert(0, (color_shape[1] / width, color_shape[0] / height))
     possible.append(((2 * camera.cx + 1) / width, (2 * camera.cy + 1) / height))
-    kept: list[Ratio] = [(1.0, 1.0)]
+    distinct: list[Ratio] = [(1.0, 1.0)]
     for ratio in possible:
-        if min(ratio) > 0 and all(_apart(ratio, other) for other in kept):
-            kept.append(ratio)
-    yield from kept[1:]
+        if min(ratio) > 0 and all(_apart(ratio, other) for other in distinct):
+            distinct.append(ratio)
+    yield from distinct[1:]
 
 
 def _apart(ratio: Ratio, other: Ratio) -> bool:

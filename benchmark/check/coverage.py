@@ -39,7 +39,7 @@ SHARED = 0.6
 """The suggested frame stride leaves this share of a frame's points in view of the next one."""
 
 BINS = ((1, 1), (2, 2), (3, 8), (9, 27))
-"""Distances between frames that are told together."""
+"""Distances between frames that are reported together."""
 
 
 @dataclass(frozen=True)
@@ -92,7 +92,7 @@ class Noise:
 
 @dataclass(frozen=True)
 class Suggestion:
-    """Settings that suit the data, each with the reason; None where nothing can be said."""
+    """Settings that suit the data, each with the reason; None where the data do not tell."""
 
     voxel_size: float | None
     voxel_size_reason: str
@@ -190,7 +190,7 @@ class Coverage:
 
 
 def world_points(view: View, u: Int64, v: Int64) -> Float64:
-    """Return (N, 3) world coordinates of kept pixels, metres."""
+    """Return (N, 3) world coordinates of sampled pixels, metres."""
     K = view.camera.every(view.stride)
     depth = view.depth[v, u].astype(np.float64)
     points = np.stack([(u - K.cx) / K.fx * depth, (v - K.cy) / K.fy * depth, depth], axis=1)
@@ -208,8 +208,8 @@ def plane_residuals(view: View) -> Float64:
     with np.errstate(all="ignore"):
         before, here, after = (1 / view.depth[v, u + step].astype(np.float64) for step in (-1, 0, 1))
         residuals = np.abs((before + after) / 2 - here) / here**2
-    found: Float64 = residuals[np.isfinite(residuals)]
-    return found
+    finite: Float64 = residuals[np.isfinite(residuals)]
+    return finite
 
 
 def persistence(views: Sequence[View], coverage: Coverage, voxel_size: float, pixel_stride: int) -> Persistence:
@@ -255,7 +255,7 @@ def suggest(coverage: Coverage, overlaps: Sequence[Overlap], stride: int) -> Sug
     shared = {row.apart[0]: row.in_view for row in overlaps}.get(frames, near)
     return Suggestion(
         voxel_size=voxel_size,
-        voxel_size_reason=f"the smallest in which {STAYS:.0%} of the points fall again when another frame sees them",
+        voxel_size_reason=f"{STAYS:.0%} of the points stay in such a voxel when another frame sees them",
         pixel_stride=pixels,
         pixel_stride_reason=f"{PIXELS_ACROSS} pixels or more along a voxel's edge at {far:.3g} m",
         frame_stride=stride * frames,

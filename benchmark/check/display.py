@@ -64,7 +64,7 @@ def _tables(checked: SceneCheck) -> dict[str, tuple[str, Table]]:
     """Return titles and tables by name."""
     verdict, tables = checked.verdict, dict[str, tuple[str, Table]]()
     if checked.overlaps:
-        tables["overlap"] = "what frames share, by how far apart they are", _overlap_table(checked)
+        tables["overlap"] = "overlap of frames, by their distance in the sequence", _overlap_table(checked)
     if verdict.fits:
         title = f"depth of {verdict.frames} frames reprojected into each other, {verdict.pairs} pairs"
         tables["conventions"] = title, _convention_table(checked)
@@ -139,7 +139,7 @@ def _advice(checked: SceneCheck, *, verbose: bool) -> Iterator[str]:
         )
     if checked.noise is not None:
         yield (
-            f"depth    off by {_metres(checked.noise.between)} between frames, {_metres(checked.noise.within)}"
+            f"depth    errs by {_metres(checked.noise.between)} between frames, by {_metres(checked.noise.within)}"
             f" within one; a pixel covers {_metres(checked.noise.footprint)}"
         )
     suggestion = checked.suggestion
@@ -159,7 +159,7 @@ def _conclusion(checked: SceneCheck) -> str:
     if not verdict.undetermined:
         return verdict.text
     because = f" ({verdict.reason})" if verdict.reason else ""
-    return f"{verdict.text}. What these frames cannot rule out{because}: {'; '.join(verdict.undetermined)}"
+    return f"{verdict.text}. These frames cannot rule out{because}: {'; '.join(verdict.undetermined)}"
 
 
 def _table(names: Sequence[str], numbers: Sequence[str]) -> Table:

@@ -1,6 +1,6 @@
-"""Do depth, poses and intrinsics agree, and if not, under which other convention would they?
+"""A check that depth, poses and intrinsics agree, and of the other conventions under which they would.
 
-Every convention is judged by the median relative depth error of points that one frame sees again in another, and by
+Every convention is assessed by the median relative depth error of points that one frame sees again in another, and by
 the share of points that it sees again at all: an alternative with little overlap is no evidence.
 """
 
@@ -21,7 +21,7 @@ from semstab.core.types import Float64
 
 DECADES: Float64 = np.power(10.0, np.arange(-5, 6))
 FINE: Float64 = np.power(10.0, np.arange(-30, 31) / 6)
-"""Factors on depth that are tried; the outermost decades only to see whether the ones inside are told apart."""
+"""Factors on depth that are tried; the outermost decades only to see whether the ones inside can be distinguished."""
 
 LARGEST_FACTOR = 1e4
 """Factors from 1 / this to this are reported."""
@@ -65,7 +65,7 @@ LEAST_SCALE_ERROR = 1.1
 """Depth that is too long or too short by less is measurement, not a wrong unit."""
 
 MOST_CANDIDATES = 3
-"""Alternatives that are named beside the best one, where they fit as well."""
+"""Alternatives that are named in addition to the best one, where they fit as well."""
 
 SIMPLER = 1.1
 """The factor within which errors of conventions count as equal: the one with the fewest changes is taken."""
@@ -96,7 +96,7 @@ class Fit:
 
     @property
     def has_evidence(self) -> bool:
-        """Return whether enough is seen again to judge by the error."""
+        """Return whether enough points are seen again for the error to count."""
         return self.points >= MIN_POINTS and self.share >= MIN_SHARE
 
     def clearly_beats(self, other: Fit) -> bool:
@@ -112,7 +112,7 @@ class Verdict:
 
     Attributes:
         state: Sound; unsound; or unclear, where the frames do not tell.
-        text: Why, in one line.
+        text: The reason, in one line.
         mend: Lines of configuration that would mend it, where they are known.
         error, share: Those of the configured convention, see `Fit`.
         frames, pairs: Numbers of those that were looked at.
@@ -133,7 +133,7 @@ class Verdict:
     fits: tuple[tuple[str, Fit], ...] = ()
 
     def summary(self) -> dict[str, Any]:
-        """Return what a run's manifest keeps."""
+        """Return the part that a run's manifest holds."""
         return {name: getattr(self, name) for name in ("state", "text", "error", "share", "frames", "pairs")}
 
     def to_dict(self) -> dict[str, Any]:
@@ -142,13 +142,13 @@ class Verdict:
         return {field.name: getattr(self, field.name) for field in dataclasses.fields(self)} | {"fits": rows}
 
 
-def judge(sample: Sample, reading: Reading, *, thorough: bool) -> Verdict:
+def assess(sample: Sample, reading: Reading, *, thorough: bool) -> Verdict:
     """Compare the configured convention with the alternatives; thorough: each with every factor on depth."""
-    return Judgement(sample, reading, thorough).verdict()
+    return Assessment(sample, reading, thorough).verdict()
 
 
-class Judgement:
-    """The fits of every convention that was tried, and what they say together."""
+class Assessment:
+    """The fits of every convention that was tried, and the verdict that follows from them."""
 
     def __init__(self, sample: Sample, reading: Reading, thorough: bool) -> None:
         self.sample, self.reading = sample, reading
@@ -191,7 +191,7 @@ class Judgement:
         mine = self.configured
         text = f"depth reprojects with {mine.error:.2%} median error, {mine.share:.0%} co-visible"
         if all(self._is_undetermined(fit) for fit in self._single_changes() if _is_of_poses(fit, mine)):
-            return "unclear", f"{text}, but so it does under every other convention of the poses"
+            return "unclear", f"{text}, but it does so under every other convention of the poses as well"
         return "sound", text
 
     def _as(self, state: State, text: str, mend: tuple[str, ...] = (), best: Fit | None = None) -> Verdict:
@@ -223,15 +223,15 @@ class Judgement:
         """The alternatives that show that the configured convention is wrong: the best one, then those as good."""
         possible = sorted((fit for fit in self.fits if self._may_refute(fit)), key=lambda fit: fit.error)
         best: Fit | None = None
-        found: list[Fit] = []
+        refuting: list[Fit] = []
         for fit in possible:
             if best is not None and best.clearly_beats(fit):
                 break
-            if not any(_one_hypothesis(fit, other) for other in found) and self._is_confirmed(fit):
-                found.append(fit)
+            if not any(_one_hypothesis(fit, other) for other in refuting) and self._is_confirmed(fit):
+                refuting.append(fit)
                 best = best or fit
         return sorted(
-            map(self._rounded, found), key=lambda fit: (fit.error > SIMPLER * found[0].error, *self._changes(fit))
+            map(self._rounded, refuting), key=lambda fit: (fit.error > SIMPLER * refuting[0].error, *self._changes(fit))
         )
 
     def _changes(self, fit: Fit) -> tuple[int, float]:
@@ -247,7 +247,7 @@ class Judgement:
         return measured if measured.clearly_beats(known) else known
 
     def _may_refute(self, fit: Fit) -> bool:
-        """Return whether a fit has what it takes to refute the configured one, as far as that costs nothing to see."""
+        """Return whether a fit meets those conditions for refuting the configured one that are cheap to check."""
         mine, factor = self.configured, fit.convention.factor
         size = max(factor, 1 / factor)
         if fit is mine or not fit.has_evidence or fit.share < LEAST_OF_OTHER * mine.share:
@@ -301,7 +301,7 @@ class Judgement:
     def _measured_scale(self, near: Fit) -> list[Fit]:
         """Return fits of the same convention with factors around a given one.
 
-        Between those of the search, then nearer.
+        The first ones lie between those of the search, the others nearer.
         """
         coarse = _fits(self.sample, near.convention, near.convention.factor * np.power(10.0, np.arange(-12, 13) / 72))
         best = min(coarse, key=lambda fit: (math.isnan(fit.error), fit.error)).convention
@@ -311,10 +311,10 @@ class Judgement:
     def _refuted(self, best: Fit) -> Verdict:
         mine, lines = self.configured, self.reading.lines(best.convention)
         if mine.has_evidence:
-            found = f"depth reprojects with {mine.error:.1%} error as configured, with"
+            evidence = f"depth reprojects with {mine.error:.1%} error as configured, but with"
         else:
-            found = f"as configured {mine.share:.1%} of the points are seen again; depth reprojects with"
-        text = f"{found} {best.error:.2%} error under {', '.join(lines)} ({self.reading.advice(best.convention)})"
+            evidence = f"{mine.share:.1%} of the points are seen again as configured; depth reprojects with"
+        text = f"{evidence} {best.error:.2%} error under {', '.join(lines)} ({self.reading.advice(best.convention)})"
         if candidates := [self._name(fit) for fit in self._refuting[1:]][:MOST_CANDIDATES]:
             text += f"; these frames cannot tell it from {' or '.join(candidates)}"
         return self._as("unsound", text, lines, best)

@@ -1,4 +1,4 @@
-"""Do label maps and depth show the same thing at the same pixel: the edges of one on the edges of the other."""
+"""A check that label maps and depth show the same thing at the same pixel: their edges lie on each other."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ LEAST_FIT = 0.1
 """Correlation of edges from which a fit is one."""
 
 LEAST_OFFSET = 0.03
-"""Share of the image's width: what is off by less in the middle of its sides is no matter of registration."""
+"""Share of the image's width: a smaller offset in the middle of its sides is no fault of the registration."""
 
 MOST = 0.75
 """Share of the frames that another registration has to fit better."""
@@ -59,8 +59,8 @@ class Offset:
     def __str__(self) -> str:
         x, y = self.shift
         return (
-            f"their edges lie on those of depth best when they are enlarged {self.scale:.2f} times and moved by"
-            f" ({x:.0f}, {y:.0f}) pixels (correlation {self.fit:.2f}, as they are {self.present:.2f})"
+            f"their edges fit those of depth best when they are enlarged {self.scale:.2f} times and moved by"
+            f" ({x:.0f}, {y:.0f}) pixels (correlation {self.fit:.2f}, now {self.present:.2f})"
         )
 
 
@@ -69,7 +69,7 @@ def find_offset(pairs: Sequence[Edges]) -> Offset | None:
 
     None where they fit.
 
-    Both halves of the frames have to say the same, so that edges that have nothing to do with each other do not count.
+    Both halves of the frames have to agree, so that edges that have nothing to do with each other do not count.
     """
     maps = [(_thinned(depth_edges(depth)), _thinned(edges)) for depth, edges in pairs]
     maps = [(a, b) for a, b in maps if a.any() and b.any() and a.shape == b.shape == maps[0][0].shape]
@@ -90,22 +90,22 @@ def find_offset(pairs: Sequence[Edges]) -> Offset | None:
 
 
 def depth_edges(depth: Float32) -> Mask:
-    """Return (H, W) where neighbouring pixels lie on different surfaces.
+    """Return a mask (H, W) of the pixels whose neighbours lie on other surfaces.
 
-    Small gaps are closed with the farthest depth around them: beside an edge sensors miss what lies behind it.
+    Small gaps are closed with the farthest depth around them: next to an edge sensors miss the surface behind it.
     """
     import cv2
 
-    found = np.where((depth > 0) & (depth < np.inf), depth, np.float32(0)).astype(np.float32)
+    known = np.where((depth > 0) & (depth < np.inf), depth, np.float32(0)).astype(np.float32)
     size = 2 * max(3, depth.shape[1] // 100) + 1
-    closed = np.where(found > 0, found, cv2.dilate(found, np.ones((size, size))))
+    closed = np.where(known > 0, known, cv2.dilate(known, np.ones((size, size))))
     with np.errstate(all="ignore"):
         log = np.where(closed > 0, np.log(closed), np.nan)
         return _changes(log, lambda a, b: np.abs(a - b) > JUMP)
 
 
 def label_edges(labels: npt.NDArray[Any], ignore: int) -> Mask:
-    """Return (H, W) where neighbouring pixels have different labels."""
+    """Return a mask (H, W) of the pixels whose neighbours have other labels."""
     return _changes(labels, lambda a, b: (a != b) & (a != ignore) & (b != ignore))
 
 
@@ -116,7 +116,7 @@ def grey_levels(color: UInt8) -> UInt8:
 
 
 def image_edges(grey: npt.NDArray[Any]) -> Mask:
-    """Return (H, W) where a grey image changes most: a tenth of its pixels."""
+    """Return a mask (H, W) of the tenth of its pixels where a grey image changes most."""
     dy, dx = np.gradient(grey.astype(np.float32))
     strength = np.hypot(dx, dy)
     edges: Mask = strength > max(float(np.quantile(strength, 0.9)), 1.0)
@@ -178,7 +178,7 @@ def _distance(one: tuple[int, ...], other: tuple[int, ...], shape: tuple[int, ..
     return float(max(x + scale / 2, y + scale / 2 * H / W))
 
 
-# Do a surface and the poses fit the images? Neighbouring photographs, compared where depth and pose carry them.
+# A check that a surface and the poses fit the images compares neighbouring photographs by depth and pose.
 #
 # Depth that is cast at a surface agrees between frames wherever the surface lies; the photographs do not.
 
@@ -235,8 +235,8 @@ def match_images(scene: Scene, views: Mapping[int, View], pairs: Sequence[Pair])
     return ImageMatch(now, float(mean[at]), change, change * float(np.median(np.concatenate(depths))), len(together))
 
 
-def judge_surface(match: ImageMatch | None, frames: int) -> Verdict:
-    """Return what the images say of a surface and the poses."""
+def assess_surface(match: ImageMatch | None, frames: int) -> Verdict:
+    """Return the verdict of the images on a surface and the poses."""
     if match is None:
         return Verdict(
             "unclear",
@@ -248,8 +248,8 @@ def judge_surface(match: ImageMatch | None, frames: int) -> Verdict:
         side = "further from the cameras" if match.change > 0 else "nearer to the cameras"
         return Verdict(
             "unsound",
-            f"neighbouring images match where the surface lies {abs(match.metres):.3g} m {side} (correlation"
-            f" {match.best:.2f}, as it is {match.now:.2f}): surface and poses lie in other heights or scales; bring"
+            f"neighbouring images match best if the surface lies {abs(match.metres):.3g} m {side} (correlation"
+            f" {match.best:.2f}, now {match.now:.2f}): surface and poses differ in height or scale; bring"
             " them to the same coordinates",
             frames=frames,
             pairs=match.pairs,
@@ -263,8 +263,8 @@ def judge_surface(match: ImageMatch | None, frames: int) -> Verdict:
         )
     return Verdict(
         "sound",
-        f"neighbouring images match where surface and poses carry them (correlation {match.now:.2f}; best"
-        f" {match.best:.2f}, with the surface {abs(match.metres):.2g} m away)",
+        f"neighbouring images match by surface and poses (correlation {match.now:.2f}; the best is"
+        f" {match.best:.2f}, with the surface moved by {abs(match.metres):.2g} m)",
         frames=frames,
         pairs=match.pairs,
     )
@@ -376,7 +376,7 @@ def find_sentinel(depths: Iterable[Float32], scale: float) -> Sentinel | None:
     return Sentinel(value, float(largest), share, float(below))
 
 
-# What looks wrong in a scene, but may be right: values that mean 'no depth', labels off the edges of depth.
+# Properties of a scene that look wrong, but may be right: values that mean 'no depth', labels off the edges of depth.
 
 REGISTERED_FRAMES = 16
 """Frames in which the edges of labels are compared with those of depth."""
@@ -385,10 +385,11 @@ REGISTERED_FRAMES = 16
 def notes(scene: Scene, views: Sequence[View], how: Reading, model: str) -> Iterator[str]:
     """Yield one line each; the views have the labels of `model`, or none."""
     if how.convention.depth == "planar" and (
-        found := find_sentinel((view.depth for view in views), how.depth_scale or 1)
+        sentinel := find_sentinel((view.depth for view in views), how.depth_scale or 1)
     ):
-        values = [*how.said.get("invalid_depth", ()), found.value]
-        yield f"{found}; set {how.change('invalid_depth', '[' + ', '.join(f'{value:.15g}' for value in values) + ']')}"
+        values = [*how.said.get("invalid_depth", ()), sentinel.value]
+        listed = "[" + ", ".join(f"{value:.15g}" for value in values) + "]"
+        yield f"{sentinel}; set {how.change('invalid_depth', listed)}"
     some = [views[k] for k in evenly(len(views), REGISTERED_FRAMES)]
     if (offset := find_offset(list(_edges(scene, some)))) is not None:
         what = "the images" if some[0].labels is None else f"labels of {model}"
@@ -406,7 +407,7 @@ def _edges(scene: Scene, views: Sequence[View]) -> Iterator[Edges]:
             continue
         try:
             grey = scene.predicted(view.index, labels=grey_levels(scene.image(view.index))).labels
-        except DataError:  # no image of the depth's view: whoever needs it says so
+        except DataError:  # no image of the depth's view: the error is raised where one is needed
             continue
         if grey is not None:
             yield view.depth, image_edges(grey[:: view.stride, :: view.stride])

@@ -16,10 +16,10 @@ from semstab.data.frames import Frame, Intrinsics
 from semstab.datasets import GROUND_TRUTH, Scene
 from semstab.datasets.geometry.cameras import CAMERA_AXES, ray_lengths
 
-# Which frames and pixels a check looks at, and what it keeps of them: bounded at any length and image size.
+# The frames and pixels that a check holds in memory: their number is bounded at any length and image size.
 
 MAX_PIXELS = 2**20
-"""The most pixels of an image: of a larger one only every n-th pixel of each axis is kept."""
+"""The most pixels of an image: of a larger one only every n-th pixel of each axis is used."""
 
 STEPS = (0, 1, 2, 8, 27)
 """Frames of a cluster, counted from its first one: their pairs lie 1 to 27 selected frames apart."""
@@ -29,14 +29,14 @@ Pair = tuple[int, int]
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """The part of a frame that is kept: every stride-th pixel, and of those a sample.
+    """The part of a frame that is held in memory: every stride-th pixel, and a sample of these.
 
     Attributes:
         depth: (H, W) planar, metres, as configured.
         camera: Intrinsics of the whole image, whose (width, height) is `size`.
         T_wc: (4, 4) camera-to-world, OpenCV axes, as configured.
         labels: (H, W) class ids, or None where the scene has no labels.
-        u, v: (N,) the sample: kept pixels with valid depth.
+        u, v: (N,) the sample: pixels with valid depth.
     """
 
     index: int
@@ -65,7 +65,7 @@ class View:
         return cls(frame.index, depth, frame.intrinsics, (W, H), stride, frame.T_wc, labels, frame.ignore_id, u, v)
 
     def pose(self, convention: Convention, configured: Convention) -> Float64:
-        """Return (4, 4) camera-to-world, OpenCV axes, were the file read by that convention."""
+        """Return (4, 4) camera-to-world, OpenCV axes, of the file as that convention reads it."""
         pose = self.T_wc.copy()
         pose[:3, :3] = pose[:3, :3] @ CAMERA_AXES[configured.axes].T
         if convention.pose != configured.pose:
@@ -73,20 +73,20 @@ class View:
         pose[:3, :3] = pose[:3, :3] @ CAMERA_AXES[convention.axes]
         return pose
 
-    def kept_camera(self, convention: Convention) -> Intrinsics:
-        """Return the intrinsics of the kept pixels."""
+    def sampled_camera(self, convention: Convention) -> Intrinsics:
+        """Return the intrinsics of every stride-th pixel."""
         width, height = self.size
         made_for = (width * convention.ratio[0], height * convention.ratio[1])
         return self.camera.resized(cast(Any, made_for), self.size).every(self.stride)
 
     def planar(self, u: Int64, v: Int64, convention: Convention, configured: Convention) -> Float64:
-        """Return planar depth at kept pixels, were the file read by that convention, but for its factor."""
+        """Return planar depth at pixels of the file as that convention reads it, without its factor."""
         depth: Float64 = self.depth[v, u].astype(np.float64)
         if convention.depth == configured.depth:
             return depth
         if configured.depth == "ray":
-            return depth * ray_lengths(self.kept_camera(configured), u, v)
-        return depth / ray_lengths(self.kept_camera(convention), u, v)
+            return depth * ray_lengths(self.sampled_camera(configured), u, v)
+        return depth / ray_lengths(self.sampled_camera(convention), u, v)
 
 
 def clusters(length: int, count: int) -> list[list[int]]:
@@ -135,7 +135,7 @@ class Sample:
         """Look the sample of the pair's first view up in the second one, for each factor on depth."""
         a, b = self.views[pair[0]], self.views[pair[1]]
         R, t = motion(a.pose(convention, self.configured), b.pose(convention, self.configured))
-        K_a, K_b = a.kept_camera(convention), b.kept_camera(convention)
+        K_a, K_b = a.sampled_camera(convention), b.sampled_camera(convention)
         depth = a.planar(a.u, a.v, convention, self.configured)
         points = np.stack([(a.u - K_a.cx) / K_a.fx * depth, (a.v - K_a.cy) / K_a.fy * depth, depth])
         # depth times f and t as it is, or depth as it is and t over f: the same but for the unit
@@ -157,10 +157,10 @@ class Sample:
 
 @dataclass(frozen=True, eq=False)
 class Matches:
-    """The places of a sample of N points in another view, for F factors on depth; all (F, N).
+    """The positions of a sample of N points in another view, for F factors on depth; all (F, N).
 
     Attributes:
-        u, v: The nearest kept pixel there.
+        u, v: The nearest pixel there.
         z: Distance from there along the optical axis, over the factor.
         depth: Planar depth of that pixel, over the factor.
         inside: Whether the point lies in that image, before the camera.

@@ -25,8 +25,8 @@ from semstab.check.coverage import (
     suggest,
     suggested_size,
 )
-from semstab.check.geometry import Verdict, judge, shifts_and_turns
-from semstab.check.registration import judge_surface, match_images, notes
+from semstab.check.geometry import Verdict, assess, shifts_and_turns
+from semstab.check.registration import assess_surface, match_images, notes
 from semstab.check.reprojection import Sample, View, clusters, evenly, label_source, pairs_within, reader
 from semstab.config import Config
 from semstab.core.json_form import to_json
@@ -38,7 +38,7 @@ from semstab.datasets import Scene, open_dataset
 from semstab.errors import DataError
 from semstab.task import frame_indices, selected
 
-# Which classes a label source predicts, how often, and which ids no class has.
+# The classes that a label source predicts, their frequencies, and the ids that no class has.
 
 MOST_IDS = 5
 
@@ -49,7 +49,7 @@ class Histogram:
 
     Attributes:
         space: Its taxonomy's name, or None where none is known.
-        pixels: Looked at.
+        pixels: Number of pixels that were counted.
         classes: Share of them by class, in the taxonomy's order; by id where no taxonomy is known.
         ignored: Share with the ignore id, or without usable scores.
         unknown: Share by id that no class has.
@@ -77,14 +77,14 @@ class Tally:
     def add(self, frame: Frame) -> None:
         """Count a frame's labels, or the classes of its largest scores."""
         counts = np.bincount(frame.predicted.ravel())
-        found = {int(i): int(counts[i]) for i in np.flatnonzero(counts)}
-        self._ignored += found.pop(frame.ignore_id, 0)
-        self._ids.update(found)
+        by_class = {int(i): int(counts[i]) for i in np.flatnonzero(counts)}
+        self._ignored += by_class.pop(frame.ignore_id, 0)
+        self._ids.update(by_class)
         if frame.scores is not None:
             self._widths.add(frame.scores.shape[2])
 
     def histogram(self, space: LabelSpace | None, missing: str | None = None) -> Histogram:
-        """Return the shares, with what is wrong about them; `missing` says why there is no taxonomy."""
+        """Return the shares, with their fault if there is one; `missing` says why there is no taxonomy."""
         ids = self._named(space)
         total = max(1, self._ignored + ids.total())
         if space is None:
@@ -116,7 +116,7 @@ class Tally:
     def _problem(self, space: LabelSpace | None, unknown: Mapping[int, float], labelled: int) -> str | None:
         if space is not None and self._widths - {len(space)}:
             widths = ", ".join(map(str, sorted(self._widths)))
-            return f"scores of {self.model} hold {widths} classes, {space.name} has {len(space)}"
+            return f"scores of {self.model} hold {widths} classes, but {space.name} has {len(space)}"
         if space is not None and unknown:
             listed = ", ".join(map(str, list(unknown)[:MOST_IDS])) + (", ..." if len(unknown) > MOST_IDS else "")
             return (
@@ -132,17 +132,17 @@ SCHEMA = 2
 CLUSTERS = 4
 POINTS = 8000
 LEAST_POINTS_A_VIEW, MOST_POINTS_A_VIEW = 50, 500
-"""The number of points that are reprojected, from neighbouring frames at so many places of the sequence."""
+"""The number of points that are reprojected, from neighbouring frames at so many positions of the sequence."""
 
 QUICK_POINTS = 2400
 CONFIRMING_CLUSTERS = 3
-"""The quick check looks at one place with so many points, and before it refuses data at so many places."""
+"""The quick check takes so many points from one position, and from so many positions before it refuses data."""
 
 LABELLED_FRAMES = 8
 """Frames in which the labels of every model but the first are counted."""
 
 VOXEL_FACTORS = (0.5, 1.0, 2.0)
-"""Voxel sizes for which the distribution of OP is told, relative to the configured or the suggested one."""
+"""Voxel sizes for which the distribution of OP is reported, relative to the configured or the suggested one."""
 
 
 @dataclass(frozen=True)
@@ -167,10 +167,10 @@ class Motion:
 class SceneCheck:
     """All that is known about a scene from its sample; `verdict` alone is about geometry.
 
-    `notes` are what looks wrong, but may be right: values that mean 'no depth', labels that are not registered.
-    `depth_from` says where depth comes from, where that is not a file a frame;
-    `placed` how its georeference was found and how well it fits.
-    Where the geometry is unsound nothing is said about overlap, noise and voxels.
+    `notes` name what looks wrong, but may be right: values that mean 'no depth', labels that are not registered.
+    `depth_from` names the source of depth, where no file holds it;
+    `placed` says where its georeference comes from and how well it fits.
+    If the geometry is unsound, overlap, noise and voxels are not measured.
     """
 
     scene: str
@@ -246,9 +246,9 @@ def check_scene(scene: Scene, config: Config) -> SceneCheck:
 
 
 def quick_check(scene: Scene, indices: Sequence[int], options: Mapping[str, Any] | None = None) -> Verdict:
-    """Do depth and poses of a scene agree? Reads a few frames, and only before it calls them unsound some more.
+    """Check that depth and poses of a scene agree, by a few frames, and by more before they are called unsound.
 
-    `options` are the dataset's, for the advice. A frame that cannot be read is passed over: whoever needs it says so.
+    `options` are the dataset's, for the advice. A frame that cannot be read is passed over.
     """
     return quick_sample(scene, indices, options)[0]
 
@@ -286,7 +286,7 @@ def refuse_unsound(scene: str, verdict: Verdict) -> None:
     """Raise DataError where the verdict on that scene is that depth and poses contradict each other."""
     if verdict.state == "unsound":
         raise DataError(
-            f"{scene}: {verdict.text}; `semstab-bench check` tells more, --no-geometry-check fuses it as it is"
+            f"{scene}: {verdict.text}; `semstab-bench check` reports more, --no-geometry-check fuses the scene as it is"
         )
 
 
@@ -297,7 +297,7 @@ class Inspection:
         source: Label source to read frames with; None needs no labels.
         groups: Positions in `indices` of frames that are compared with each other.
         points: About how many points are reprojected in all.
-        fused: Number of frames, evenly spaced, that are kept for fusing, too.
+        fused: Number of frames, evenly spaced, that are also held in memory for fusion.
         passing_over: Leave out frames that cannot be read, instead of raising what reading them raises.
         with_color: Whether to read also the size of a colour image: intrinsics may be for that.
     """
@@ -356,11 +356,11 @@ class Inspection:
         return Sample(views, pairs, self.reading(options).convention)
 
     def verdict(self, options: Mapping[str, Any], *, thorough: bool) -> Verdict:
-        """Judge depth reprojected from frame to frame; depth that is cast at a surface, by what the images say."""
+        """Assess depth by reprojection from frame to frame, and depth that is cast at a surface by the images."""
         sample = self.sample(options)
         if self.scene.surface is not None:
-            return judge_surface(match_images(self.scene, sample.views, sample.pairs), len(sample.views))
-        return judge(sample, self.reading(options), thorough=thorough)
+            return assess_surface(match_images(self.scene, sample.views, sample.pairs), len(sample.views))
+        return assess(sample, self.reading(options), thorough=thorough)
 
     def depth(self) -> Depth:
         """Return the depth of all frames that were read."""
@@ -371,7 +371,7 @@ class Inspection:
 
 
 def _with_coverage(checked: SceneCheck, inspection: Inspection, sample: Sample, config: Config) -> SceneCheck:
-    """Return what can be said about overlap, noise and voxels, where depth and poses may agree."""
+    """Return overlap, noise and voxels, where depth and poses may agree."""
     coverage = Coverage(sample)
     overlaps = coverage.overlaps()
     noise = coverage.noise() if overlaps and any(row.covisible > 0 for row in overlaps) else None
@@ -404,7 +404,7 @@ def _persistence(views: Sequence[View], coverage: Coverage, voxel_size: float, s
 def _motion(sample: Sample) -> Motion | None:
     """Return how far the camera moves and turns from one compared frame to another.
 
-    None where no depth compares with it.
+    The result is None where there is no depth to compare it with.
     """
     if not sample.pairs:
         return None
@@ -431,19 +431,19 @@ def _labels(scene: Scene, model: str, indices: Sequence[int], config: Config, in
     return tally.histogram(space)
 
 
-# Which voxel size suits the data, and where a given one lies.
+# The voxel size that suits the data, and how a given one compares with it.
 
 SCENES = 3
 """The most scenes that are looked at; the largest size suits all of them."""
 
 MADE = "city"
-"""The dataset that is made, not measured: nothing is to be told of its voxels."""
+"""The simulated dataset, for which no voxel size is suggested."""
 
 
 def with_voxel_size(config: Config) -> tuple[Config, dict[str, VoxelAdvice]]:
-    """Return the configuration, with the voxel size that `check` suggests for data of files where it says none.
+    """Return the configuration, with the voxel size that `check` suggests for files if none is set, and the advice.
 
-    And why, scene by scene.
+    The advice says scene by scene why that size was suggested.
 
     Raises:
         ConfigError, DataError: If there is no such scene.
@@ -453,17 +453,17 @@ def with_voxel_size(config: Config) -> tuple[Config, dict[str, VoxelAdvice]]:
     dataset = open_dataset(config.dataset.name, config.dataset.options)
     names = selected(config.scenes, dataset.scenes, (), "scene", config.dataset.name)
     some = [names[k] for k in evenly(len(names), SCENES)]
-    seen = {name: found for name in some if (found := _coverage(config, dataset.scene(name))) is not None}
-    sizes = [size for found in seen.values() if (size := suggested_size(found)) is not None]
+    coverages = {name: coverage for name in some if (coverage := _coverage(config, dataset.scene(name))) is not None}
+    sizes = [size for coverage in coverages.values() if (size := suggested_size(coverage)) is not None]
     if not sizes:
         return config, {}
     size = max(sizes)
-    advice = {name: VoxelAdvice(size, found.stays(size), size, chosen=True) for name, found in seen.items()}
+    advice = {name: VoxelAdvice(size, coverage.stays(size), size, chosen=True) for name, coverage in coverages.items()}
     return config.model_copy(update={"voxel_size": size}), advice
 
 
 def advise(sample: Sample | None, config: Config) -> VoxelAdvice | None:
-    """Return where the configured voxel size lies; None where nothing can be told of it."""
+    """Return how the configured voxel size compares with the suggested one; None where the data do not tell."""
     if sample is None or not sample.pairs or config.dataset.name == MADE:
         return None
     coverage = Coverage(sample)
@@ -472,7 +472,7 @@ def advise(sample: Sample | None, config: Config) -> VoxelAdvice | None:
 
 
 def _coverage(config: Config, scene: Scene) -> Coverage | None:
-    """Return what a scene's frames share; None where they cannot be read: whoever needs them says so."""
+    """Return what a scene's frames share; None where they cannot be read."""
     models = selected(config.models, scene.models, scene.by_name, "model", scene.name)
     with contextlib.suppress(DataError):
         indices = frame_indices(scene, config, models)

@@ -29,6 +29,7 @@ EARLIER: Mapping[str, str] = {
     "backbone": "model",
     "model": "checkpoint",
     "remedies": "try_filters",
+    "kept": "cache",
 }
 """Settings of version 0.3, and what they are called now: the old names work for one version."""
 

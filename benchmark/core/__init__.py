@@ -1,1 +1,1 @@
-"""Files, JSON, processes, compiled code and threads: what all else rests on."""
+"""Files, JSON, processes, compiled code and threads: the basis of all other modules."""

@@ -36,7 +36,7 @@ def compiled(**options: Any) -> Callable[[Any], Any]:
         dispatcher = nb.njit(error_model="numpy", nogil=True, **options)(function)
         try:
             dispatcher._cache = _Cache(function)
-        except RuntimeError:  # there is no place for its cache
+        except RuntimeError:  # there is no folder for its cache
             if folder := _own_temporary_folder():
                 settings.CACHE_DIR = folder
                 with contextlib.suppress(RuntimeError):
@@ -47,7 +47,7 @@ def compiled(**options: Any) -> Callable[[Any], Any]:
 
 
 class _Cache(FunctionCache):
-    """Compiled code of a function, taken only where all that it was compiled from is as it was.
+    """Compiled code of a function, taken only if all that it was compiled from is unchanged.
 
     numba alone checks the function's own file, not those of the functions and constants that it takes in.
     """
@@ -65,7 +65,7 @@ class _Cache(FunctionCache):
             return None
 
     def save_overload(self, signature: Any, data: Any) -> None:
-        """Keep compiled code; where the index is damaged, anew; where the disk is full, not at all."""
+        """Store compiled code; anew if the index is damaged, not at all if the disk is full."""
         try:
             super().save_overload(signature, data)  # type: ignore[no-untyped-call]
         except Exception:  # noqa: BLE001
@@ -113,7 +113,7 @@ def in_chunks(loop: Any, *arguments: Any) -> None:
             done.result()
 
 
-def is_kept(function: Any) -> bool:
+def is_cached(function: Any) -> bool:
     """Return whether an earlier process left the code of a compiled function."""
     source = f"{function.__module__.rpartition('.')[2]}.{function.__qualname__}-*.nbi"
     folder = function.stats.cache_path

@@ -1,4 +1,4 @@
-"""Files that are either there and whole, or not there: written beside, then renamed."""
+"""Files that are either there and whole, or not there: they are written under another name, then renamed."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ MAX_YAML_BYTES = 2**24
 
 @contextmanager
 def atomic_path(path: str | Path) -> Iterator[Path]:
-    """Yield a temporary path beside `path`; rename it to `path` if the block succeeds, else remove it."""
+    """Yield a temporary path next to `path`; rename it to `path` if the block succeeds, else remove it."""
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     handle, name = tempfile.mkstemp(dir=path.parent, prefix=TEMPORARY, suffix=path.suffix)
@@ -133,7 +133,7 @@ def content_key(settings: Mapping[str, Any]) -> str:
 
 
 def keep_only(written: Collection[Path], folder: Path) -> None:
-    """Remove other files of the same kinds from a folder of results: an earlier start's, which hold no longer."""
+    """Remove other files of the same kinds from a folder of results: outdated ones of an earlier start."""
     kinds = {path.suffix for path in written}
     for path in folder.iterdir() if folder.is_dir() else ():
         if path.suffix in kinds and path not in written:
@@ -164,7 +164,7 @@ def read_json(path: str | Path) -> Any:
 
 
 def read_limited(path: str | Path, limit: int) -> bytes:
-    """Return the content of a file. Raises OSError, too, for a pipe, a device, and what is larger than the limit."""
+    """Return the content of a file. Raises OSError also for a pipe, a device, and a file larger than the limit."""
     with open_file(path) as file:
         if (size := os.fstat(file.fileno()).st_size) > limit:
             raise OSError(errno.EFBIG, f"{size} bytes are too many for such a file, at most {limit}")
@@ -172,9 +172,9 @@ def read_limited(path: str | Path, limit: int) -> bytes:
 
 
 def open_file(path: str | Path) -> BufferedReader:
-    """Return a file, to read bytes from. Raises OSError, too, for what is no regular file: a pipe, a device."""
+    """Return a file, to read bytes from. Raises OSError also for a pipe, a device, and all but regular files."""
     if "\0" in str(path):
-        raise OSError(errno.EINVAL, "no file can be called so")
+        raise OSError(errno.EINVAL, "no file can have such a name")
     # a pipe to which nobody writes opens at once
     file = open(path, "rb", opener=lambda name, flags: os.open(name, flags | os.O_NONBLOCK))  # noqa: SIM115
     if not stat.S_ISREG(os.fstat(file.fileno()).st_mode):
@@ -195,7 +195,7 @@ def parse_yaml(text: str, where: str) -> Any:
         raise ConfigError(f"{where}: not valid YAML ({summarize_error(error)})") from error
 
 
-# Arrays for a later start: read as they were written, or not at all.
+# Arrays for a later start, which are read as they were written, or not at all.
 
 Arrays = Mapping[str, npt.NDArray[Any]]
 
@@ -211,7 +211,7 @@ def write_arrays(path: Path, arrays: Mapping[str, Any], *, packed: bool = True) 
 
 
 def read_arrays(path: Path) -> Arrays | None:
-    """Return what `write_arrays` wrote; None where it is missing, or not as it was."""
+    """Return the arrays that `write_arrays` wrote; None if the file is missing or has changed."""
     try:
         with path.open("rb") as file, np.load(file) as content:
             arrays = {name: content[name] for name in content.files}

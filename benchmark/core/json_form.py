@@ -1,4 +1,4 @@
-"""Frozen dataclasses as JSON content, and back: the one place where results become text, and text becomes results.
+"""Frozen dataclasses as JSON content, and back: the only module where results become text, and text becomes results.
 
 An undefined number (NaN, infinity) is null in JSON; a float field reads null as NaN.
 """
@@ -34,7 +34,7 @@ EXACT = ("int", "str", "bool")
 def to_json(value: Any) -> Any:
     """Return content that `json.dumps` takes, of dataclasses, mappings, sequences, numbers, numpy's scalars and arrays.
 
-    A class with a method `json_content` is written as what that returns; its `of_json_content` reads it.
+    A class with a method `json_content` is written as the result of that method; its `of_json_content` reads it.
 
     >>> to_json({"a": (1.5, float("nan")), "path": Path("x/y")})
     {'a': [1.5, None], 'path': 'x/y'}
@@ -94,7 +94,7 @@ def from_json(cls: type[T], content: Any, where: str | Path) -> T:
         line = _line(error.errors(include_url=False)[0])
     except RecursionError:
         line = "content: is nested too deeply"
-    raise DataError(f"{where}: {line}; it is damaged, or another version's; delete it and compute it again")
+    raise DataError(f"{where}: {line}; it is damaged, or of another version; delete it and compute it again")
 
 
 def number(content: Any) -> float:

@@ -1,4 +1,4 @@
-"""Reading ahead in worker threads while the caller works on an item, and keeping what was loaded last."""
+"""Reading ahead in worker threads while the caller works on an item, and a cache of what was loaded last."""
 
 from __future__ import annotations
 
@@ -43,8 +43,8 @@ def prefetch(
 ) -> Generator[Fetched[T], None, None]:
     """Yield read(index) for each index in order; `threads` workers are at most `threads` + 1 items ahead, 0 none.
 
-    Where that many items, each of `size` bytes, exceed `limit` bytes, fewer are read ahead, but always one.
-    What read raises for an index is raised in its place, after the items before it. Closing the iterator drops what
+    If that many items, each of `size` bytes, exceed `limit` bytes, fewer are read ahead, but always one.
+    An error that `read` raises for an index is raised after the items before it. Closing the iterator drops what
     was not begun and waits for what was: no thread outlives it.
     """
     if threads == 0:
@@ -80,7 +80,7 @@ def _timed(read: Callable[[K], T], index: K) -> tuple[T, float]:
 
 
 class SizedCache(Generic[K, T]):
-    """A cache that loads by key and keeps what was used last, at least one item, while sizes sum to at most `most`."""
+    """A cache that loads by key and retains the items used last, at least one, while sizes sum to at most `most`."""
 
     def __init__(self, load: Callable[[K], T], size: Callable[[T], int], most: int) -> None:
         self._load, self._size, self._most = load, size, most

@@ -49,7 +49,7 @@ def resident_bytes() -> int:
 
 
 def group_bytes(proc: Path, cgroups: Path) -> int | None:
-    """Return what the control groups of a process leave to it, page cache included; None where none has a limit.
+    """Return the memory that the control groups of a process leave to it, page cache included; None without a limit.
 
     Args:
         proc: A folder like /proc/self; lines of its file `cgroup` are such as '4:memory:/user' or, of version 2,

@@ -16,12 +16,12 @@ from typing import Any
 from semstab.errors import ConfigError, MissingDependencyError, nearest, summarize_error
 
 EARLIER: Mapping[str, str] = {"model": "backbone"}
-"""Kinds, and what they were called in version 0.3: entry points of the old group work for one version."""
+"""Kinds, and their names in version 0.3: entry points of the old group work for one version."""
 
 
 @dataclass(frozen=True)
 class Entry:
-    """One name: where its class is ('module:Class'), what it is, and how to install what it needs."""
+    """One name: its class ('module:Class'), a description, and how to install what it needs."""
 
     target: str
     summary: str
@@ -73,7 +73,7 @@ class Registry:
         try:
             return getattr(importlib.import_module(module), attribute)
         except Exception as error:  # RuntimeError: torchvision of another torch; OSError: a shared library is missing
-            hint = entry.install or "install what it needs"
+            hint = entry.install or "install the packages that it needs"
             raise MissingDependencyError(
                 f"{self.kind} '{name}' cannot be used ({summarize_error(error)}); {hint}"
             ) from error

@@ -1,4 +1,4 @@
-"""The comparison that `semstab.statistics` makes of several models' maps of one scene; in JSON as the fields say."""
+"""The comparison of several models' maps of one scene by `semstab.statistics`; JSON has the names of the fields."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ class Standardised:
     values: Mapping[str, ByModel]
 
     def of(self, quantity: Quantity, model: str) -> Estimate:
-        """Return a model's mean; undefined for what is no mean over voxels."""
+        """Return a model's mean; undefined for a measure that is no mean over voxels."""
         return self.values.get(quantity.key, {}).get(model, UNDEFINED)
 
 
@@ -56,7 +56,7 @@ class PairedDifference:
             study, of which something may be claimed (Holm 1979). The other measures describe: they have intervals and
             no test.
         scope: Question that interval and p-value answer, see `Interval`.
-        undecided: Why nothing may be claimed; empty where something may.
+        undecided: The reason why nothing may be claimed; empty where something may.
     """
 
     measure: str
@@ -121,12 +121,12 @@ class Paired:
 
 @dataclass(frozen=True)
 class Ignored:
-    """The observations that a model left out of those that any model labelled, and what that may be worth.
+    """The observations that a model left out of those that any model labelled, and bounds of their effect.
 
     Attributes:
         missing: Share of their pixels.
         psa_low, psa_high: Bounds of the agreement of two views in a cell, whatever the missing observations would have
-            said (Manski 1990): the worst case, and the best.
+            been (Manski 1990): the worst case, and the best.
         alpha: By the convention that what is left out agrees as by chance: alpha of what it labelled, times the share
             of pairs of views of which it labelled both.
     """
@@ -164,7 +164,7 @@ class ComparedObservations:
 
 @dataclass(frozen=True)
 class ModelComparison:
-    """Several models' maps of one scene beside each other."""
+    """Several models' maps of one scene side by side."""
 
     scene: str
     schema: int
@@ -176,7 +176,7 @@ class ModelComparison:
     observations: ComparedObservations | None
 
 
-# What differs between runs; in JSON as the fields say. Undefined numbers are NaN.
+# The differences between runs; JSON has the names of the fields. Undefined numbers are NaN.
 
 Basis = Literal["observations", "voxels", "cubes", "flights"]
 """The unit of pairing: observations (a cell in a view) that all made; voxels that all saw twice or more; cubes,
@@ -185,11 +185,11 @@ each map with all its voxels; nothing, each flight by itself."""
 
 @dataclass(frozen=True)
 class Contrast:
-    """A measure in a run, beside that in the base.
+    """A measure in a run, compared with that in the base.
 
     Attributes:
         measure: Its key.
-        of: The class whose locations it is of; empty: all.
+        of: The class whose locations it concerns; empty: all.
         difference: The run's less the base's, with its interval, the scope that this answers, and the p-value that
             there is none.
         p_holm: The p-value corrected for all that stand in one list with it (Holm 1979).
@@ -207,7 +207,7 @@ class Contrast:
 
 @dataclass(frozen=True)
 class FrameShare:
-    """A frame, its share of what was lost, and what people know it by."""
+    """A frame, its share of the loss, and its name."""
 
     frame: int
     share: float
@@ -227,8 +227,8 @@ class Area:
         loss: Mean over them: of agreement between frames, or 1.
         centre: Metres, as the run has coordinates.
         size: Metres from end to end.
-        improved_alike: Areas that improved by as much or more, in all: what chance gives where nothing got worse.
-        frames: The top contributing ones, the worst first; empty where the observations were not kept.
+        improved_alike: Areas that improved by as much or more, in all: what chance gives if nothing got worse.
+        frames: The top contributing ones, the worst first; empty where the observations were not stored.
     """
 
     number: int
@@ -270,7 +270,7 @@ class SceneComparison:
     """The runs on one scene.
 
     Attributes:
-        notes: Notes on what cannot be compared here, and why.
+        notes: Notes on the parts that cannot be compared here, with the reason.
         voxels: Number of voxels that all saw twice or more; 0 where they are not known.
         frames: Number of frames that they come from, about.
     """
@@ -296,7 +296,7 @@ class Compared:
 
 @dataclass(frozen=True)
 class RunComparison:
-    """Runs beside the first one, the base.
+    """Runs compared with the first one, the base.
 
     Attributes:
         overall: Macro means over the scenes, each counting once.

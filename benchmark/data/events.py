@@ -30,7 +30,7 @@ class Events:
         ix, iy, iz: (n,) int32 the voxels, sorted.
         voxel: (m,) int32 row into them, ascending.
         frame: (m,) int32 frame index.
-        evidence: (m, K) s_bar, the mean of the frame's evidence in the voxel; kept sparse.
+        evidence: (m, K) s_bar, the mean of the frame's evidence in the voxel; stored sparse.
         pixels: (m,) int32 pixels behind it.
         voxel_size: r, metres.
         classes: The K class names, where they are known.
@@ -114,7 +114,7 @@ class Events:
     def beliefs(self) -> Float64:
         """Return (m, K) the belief p^(t) after each observation.
 
-        The normalised sum of the voxel's evidence up to it.
+        It is the normalised sum of the voxel's evidence up to it.
         """
         accumulated = self.evidence[:]
         age = np.arange(len(self)) - self.starts[self.voxel]
@@ -127,7 +127,7 @@ class Events:
     def drift(self) -> Float64:
         """Return (m,) D_JS(p^(t), p^(t-1)) in bits, that each observation caused at its voxel.
 
-        0 for a voxel's first.
+        It is 0 for a voxel's first.
         """
         belief = self.beliefs()
         drift = np.zeros(len(self))

@@ -1,4 +1,4 @@
-"""Evidence of voxels or observations: rows of class weights, of which only what is not 0 is kept."""
+"""Evidence of voxels or observations: rows of class weights, of which only the entries that are not 0 are stored."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from semstab.core.types import Float64, Int64, UInt16
 from semstab.data.information import Concentration
 
 CHUNK_VALUES = 1 << 18
-"""Rows are made dense so many values at a time: what fits into a core's cache costs no new memory."""
+"""Rows are made dense so many values at a time: an array that fits into a core's cache costs no new memory."""
 
 PAIRWISE = 8
 """The number of classes from which on NumPy's sum depends on their layout; below, class by class is the faster one."""
@@ -26,14 +26,14 @@ STRETCH = 1 << 17
 def row_chunks(rows: int, K: int) -> Iterator[slice]:
     """Return slices of consecutive rows whose dense evidence has at most `CHUNK_VALUES` values.
 
-    One at least, if empty.
+    There is one at least, empty if there are no rows.
     """
     step = max(1, CHUNK_VALUES // max(K, 1))
     return (slice(first, min(first + step, rows)) for first in range(0, max(rows, 1), step))
 
 
 def stretches(rows: int, most: int = STRETCH) -> Iterator[slice]:
-    """Return consecutive rows, few enough that what is computed of them takes little memory; one stretch at least."""
+    """Return consecutive rows, few enough that computations on them take little memory; one stretch at least."""
     return (slice(first, min(first + most, rows)) for first in range(0, max(rows, 1), most))
 
 
@@ -46,7 +46,7 @@ class Evidence(NDArrayOperatorsMixin):
         label: (m,) uint16 the entry's class, ascending within a row.
         weight: (m,) float64.
         K: Number of classes.
-        known: The spread of rows over the classes, where that was found already: see `measured`.
+        known: The spread of rows over the classes, where that is known already: see `measured`.
     """
 
     starts: Int64
@@ -65,7 +65,7 @@ class Evidence(NDArrayOperatorsMixin):
 
     @classmethod
     def read(cls, rows: int, K: int, dense: Callable[[slice], Float64]) -> Evidence:
-        """Read so many rows of what gives a slice of them, dense (r, K)."""
+        """Read so many rows of an array or `Evidence`, dense (r, K)."""
         counts, labels, weights = [np.zeros(1, np.int64)], [], []
         for some in row_chunks(rows, K):
             part = dense(some)

@@ -56,7 +56,7 @@ class Intrinsics:
         return np.array([[self.fx, 0, self.cx], [0, self.fy, self.cy], [0, 0, 1]], dtype=np.float64)
 
     def every(self, stride: int) -> Intrinsics:
-        """Return the intrinsics of the image that keeps pixels 0, stride, 2 stride, ... of each axis."""
+        """Return the intrinsics of the image with pixels 0, stride, 2 stride, ... of each axis."""
         return Intrinsics(self.fx / stride, self.fy / stride, self.cx / stride, self.cy / stride)
 
     def resized(self, size: tuple[int, int], to: tuple[int, int]) -> Intrinsics:
@@ -89,12 +89,12 @@ class Frame:
         intrinsics: Intrinsics of the depth image; or its 3x3 camera matrix.
         T_wc: (4, 4) or (3, 4) float64 camera-to-world, metres; camera axes x right, y down, z forward (OpenCV).
         labels: (H, W) uint8 or uint16 class ids, ignore id 255 or 65535; other integers become the smaller one.
-        scores: (H, W, K) float, in place of labels, non-negative; normalised per pixel where they are used.
+        scores: (H, W, K) float, instead of labels, non-negative; normalised per pixel where they are used.
         color: (H, W, 3) uint8 RGB, optional.
         mask: (H, W) bool, True where a thing moves that is not to be fused, optional; `semstab.pixels.preparation`.
-        left_out: (H, W) bool, the pixels that were left out of fusion for what they show, optional.
+        left_out: (H, W) bool, the pixels that were left out of fusion because of their class or a mask, optional.
         unlabelled: (H, W) bool, the pixels with depth to which a model gave no label, optional.
-        scores_left_out: Part of the scores that was left out, where only the largest are kept.
+        scores_left_out: Part of the scores that was left out, where only the largest are used.
         timestamp: Seconds, optional.
         files: File that each field came from ('depth', 'pose', 'labels', ...); error messages name it.
 
@@ -172,7 +172,7 @@ class Frame:
 
     @property
     def left_out_pixels(self) -> int:
-        """Return how many pixels were left out of fusion for what they show."""
+        """Return how many pixels were left out of fusion because of their class or a mask."""
         return 0 if self.left_out is None else int(np.count_nonzero(self.left_out))
 
     @property
@@ -187,15 +187,15 @@ class Frame:
         return {name: image for name, image in images.items() if image is not None}
 
     def every(self, stride: int) -> Frame:
-        """Return the frame that keeps every stride-th pixel of each axis, from pixel (0, 0), with its intrinsics."""
+        """Return the frame with every stride-th pixel of each axis, from pixel (0, 0), with its intrinsics."""
         if stride == 1:
             return self
         pick = (slice(None, None, stride), slice(None, None, stride))
-        kept: dict[str, Any] = {name: image[pick] for name, image in self._images.items()}
-        return dataclasses.replace(self, intrinsics=self.intrinsics.every(stride), **kept)
+        images: dict[str, Any] = {name: image[pick] for name, image in self._images.items()}
+        return dataclasses.replace(self, intrinsics=self.intrinsics.every(stride), **images)
 
     def where(self, what: str) -> str:
-        """Return what an error message calls a field: its file where it has one, else the frame and the field."""
+        """Return the name of a field in an error message: its file where it has one, else the frame and the field."""
         return self.files.get(what, f"frame {self.index}, {what}")
 
     def _set(self, name: str, value: npt.NDArray[Any]) -> None:

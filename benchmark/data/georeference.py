@@ -1,4 +1,4 @@
-"""The place of a scene on Earth: a projection, and the affine map that brings the scene's coordinates into it."""
+"""The georeference of a scene: a projection, and the affine map that brings the scene's coordinates into it."""
 
 from __future__ import annotations
 

@@ -58,7 +58,7 @@ def _relative_entropy(p: Array, m: Array) -> Array:
     return divergence
 
 
-# How evidence is spread over the classes, row by row: what the measures of a belief are functions of.
+# The spread of evidence over the classes, row by row: the measures of a belief are functions of it.
 
 BLOCK = 1 << 13
 """Rows that are added one after the other."""
@@ -100,7 +100,7 @@ class Concentration:
         return cls(largest, lead, bits, dominant, squares)
 
     def take(self, rows: Any) -> Concentration:
-        """Return that of some rows: a slice, their numbers, or a mask (n,)."""
+        """Return the concentration of some rows: a slice, their numbers, or a mask (n,)."""
         return Concentration(*(values[rows] for values in vars(self).values()))
 
 
@@ -119,4 +119,4 @@ def by_group(
         own = [np.ascontiguousarray(column, dtype=np.float64) for column in values[first : first + TOGETHER]]
         some = slice(first, first + TOGETHER)
         add_by_group(of, *own, *(TOGETHER - len(own)) * own[:1], max(BLOCK, groups), sums[some], defined[some])
-    return tuple(np.ascontiguousarray(found[: len(values)].T) for found in (sums, defined))  # type: ignore[return-value]
+    return tuple(np.ascontiguousarray(part[: len(values)].T) for part in (sums, defined))  # type: ignore[return-value]

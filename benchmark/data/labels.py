@@ -64,17 +64,17 @@ def palette(K: int) -> tuple[Color, ...]:
     """
     chosen = [*PALETTE[:K]]
     grid = np.stack(np.meshgrid(LEVELS, LEVELS, LEVELS, indexing="ij"), axis=-1).reshape(-1, 3)
-    candidates, places = grid, _places(grid)
-    fit = (places[:, 0] >= LIGHTNESS[0]) & (places[:, 0] <= LIGHTNESS[1])
+    candidates, looks = grid, _looks_of(grid)
+    fit = (looks[:, 0] >= LIGHTNESS[0]) & (looks[:, 0] <= LIGHTNESS[1])
     fit &= np.linalg.norm(grid[:, None] - between(GLOW, 4 * len(GLOW)), axis=2).min(axis=1) >= CLEAR
-    candidates, places = candidates[fit], places[fit]
+    candidates, looks = candidates[fit], looks[fit]
     if len(chosen) < K:
-        own = _places(np.array(chosen))
-        nearest = np.min([_distance(places, one) for one in own], axis=0)
+        own = _looks_of(np.array(chosen))
+        nearest = np.min([_distance(looks, one) for one in own], axis=0)
     while len(chosen) < K:
         best = int(nearest.argmax())
         chosen.append((int(candidates[best, 0]), int(candidates[best, 1]), int(candidates[best, 2])))
-        nearest = np.minimum(nearest, _distance(places, places[best]))
+        nearest = np.minimum(nearest, _distance(looks, looks[best]))
     return tuple(chosen)
 
 
@@ -84,7 +84,7 @@ def between(colors: Sequence[Color], n: int) -> Float64:
     return np.stack([np.interp(at, np.arange(len(colors)), channel) for channel in np.transpose(colors)], axis=1)
 
 
-def _places(colors: npt.NDArray[np.integer]) -> Float64:
+def _looks_of(colors: npt.NDArray[np.integer]) -> Float64:
     """Return (n, 6) OKLab of colours (n, 3), as they are and without green cones."""
     share = colors / 255
     linear = np.where(share <= 0.04045, share / 12.92, ((share + 0.055) / 1.055) ** 2.4)
@@ -92,16 +92,16 @@ def _places(colors: npt.NDArray[np.integer]) -> Float64:
 
 
 def _oklab(linear: Float64) -> Float64:
-    found: Float64 = np.cbrt(linear @ TO_LMS.T) @ TO_LAB.T
-    return found
+    lab: Float64 = np.cbrt(linear @ TO_LMS.T) @ TO_LAB.T
+    return lab
 
 
-def _distance(places: Float64, one: Float64) -> Float64:
+def _distance(looks: Float64, one: Float64) -> Float64:
     """Return (n,) how far colours look from one: to all eyes, and half as much to those without green cones."""
-    difference = places - one
+    difference = looks - one
     seen = np.linalg.norm(difference[:, :3], axis=1) + 0.5 * np.linalg.norm(difference[:, 3:], axis=1)
-    found: Float64 = seen
-    return found
+    distance: Float64 = seen
+    return distance
 
 
 IGNORE_8BIT = 255
@@ -278,7 +278,7 @@ class LabelMapping:
     def scores(self, scores: npt.NDArray[np.floating[Any]], where: str) -> npt.NDArray[np.floating[Any]]:
         """Map soft scores (H, W, K of the source): classes that fall together are summed, ignored ones dropped.
 
-        Where an ignored class has the largest score, as where a label map has its id, all scores are 0: ignored.
+        If an ignored class has the largest score, all scores are 0, as a label map has the ignore id there.
 
         Raises:
             DataError: If the number of classes differs from the source space's.

@@ -1,6 +1,6 @@
-"""Measures of a voxel: each declared once, its formula with its name, its digits, which way is good.
+"""Measures of a voxel: each is declared once, with its formula, its name, its digits and the direction that is good.
 
-Summaries, comparisons, tables, figures, Parquet, the terminal and the recording take all of it from here.
+Summaries, comparisons, tables, figures, Parquet, the terminal and the recording take them from here.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ class Beliefs(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class Rows:
-    """Voxels whose evidence is dense: what formulas are computed on."""
+    """Voxels whose evidence is dense, on which formulas are computed."""
 
     op: Int32
     evidence: Float64
@@ -51,7 +51,7 @@ class Rows:
 
 @dataclass(frozen=True, eq=False)
 class Voxels:
-    """Voxels whose evidence is kept by its entries."""
+    """Voxels whose evidence is stored by its entries."""
 
     op: Int32
     evidence: Evidence
@@ -82,9 +82,9 @@ def whole(formula: Callable[[Beliefs], Values]) -> Callable[[Beliefs], Values]:
 
 
 def by_row(
-    found: Callable[[Concentration], Values],
+    of_concentration: Callable[[Concentration], Values],
 ) -> Callable[[Callable[[Rows], Values]], Callable[[Beliefs], Values]]:
-    """Return a formula of voxels that, where their evidence is kept by its entries, the one pass over these finds."""
+    """Return a formula of voxels that reads the concentration where evidence is stored by its entries."""
 
     def decorate(formula: Callable[[Rows], Values]) -> Callable[[Beliefs], Values]:
         @whole
@@ -92,7 +92,7 @@ def by_row(
         def of(table: Beliefs) -> Values:
             evidence = table.evidence
             if isinstance(evidence, Evidence):
-                return found(evidence.concentration)
+                return of_concentration(evidence.concentration)
             return formula(Rows(table.op, evidence, table.drift_sum))
 
         return of
@@ -146,7 +146,7 @@ class Measure(Quantity):
         of: Computes it: (n,), NaN where undefined; from dense evidence, some voxels at a time.
         lowest_op: Lowest OP at which it is defined.
         range: Range of its colours, in which maps differ; values beyond look like the ends.
-        panel: Whether it has a panel in the figure of a map: not where another one shows the same places.
+        panel: Whether it has a panel in the figure of a map: not where another one shows the same areas.
     """
 
     of: Callable[[Beliefs], Float64]
@@ -163,7 +163,7 @@ class Measure(Quantity):
 # --- Formulas ---------------------------------------------------------------------------------------------------------
 
 
-@by_row(lambda found: found.largest)
+@by_row(lambda concentration: concentration.largest)
 def vss(table: Rows) -> Float64:
     """Return the Voxel Semantic Stability (n,): max_k e_k / sum_k e_k, in [1/K, 1]; read it with OP."""
     concentration: Float64 = table.evidence.max(axis=1) / table.evidence.sum(axis=1)
@@ -197,13 +197,13 @@ def entropy(table: Beliefs) -> Float64:
     return bits(table) / math.log2(table.evidence.shape[1])
 
 
-@by_row(lambda found: found.bits)
+@by_row(lambda concentration: concentration.bits)
 def bits(table: Rows) -> Float64:
     """Return the entropy (n,): -sum_k p_k log2 p_k, bits."""
     return entropy_bits(normalise(table.evidence))
 
 
-@by_row(lambda found: found.lead)
+@by_row(lambda concentration: concentration.lead)
 def margin(table: Rows) -> Float64:
     """Return how far the dominant class is ahead (n,): the largest belief less the second largest, in [0, 1]."""
     belief = normalise(table.evidence)
@@ -214,7 +214,7 @@ def margin(table: Rows) -> Float64:
     return lead
 
 
-@by_row(lambda found: found.label.astype(np.int64))
+@by_row(lambda concentration: concentration.label.astype(np.int64))
 def dominant(table: Rows) -> Int64:
     """Return the dominant class (n,): argmax_k e_k, the lowest on ties."""
     label: Int64 = table.evidence.argmax(axis=1)

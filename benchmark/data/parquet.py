@@ -1,4 +1,4 @@
-"""Voxel tables and logs of observations as Parquet: columns, and in the metadata what they belong to."""
+"""Voxel tables and logs of observations as Parquet: columns, and in the metadata the map that they belong to."""
 
 from __future__ import annotations
 
@@ -81,12 +81,12 @@ def files_of(path: str | Path) -> list[Path]:
     path = Path(path)
     if not path.is_dir():
         return [path]
-    found = sorted((int(x), int(y), file) for file in path.iterdir() for x, y in TILE.findall(file.name))
-    files = [file for _, _, file in found]
+    tiles = sorted((int(x), int(y), file) for file in path.iterdir() for x, y in TILE.findall(file.name))
+    files = [file for _, _, file in tiles]
     if not files:
         raise DataError(f"{path}: a folder without tiles (tile=X_Y.parquet); run it again")
     marks = [(file, _about(file)) for file in files]
-    for (file, about), (x, y, _) in zip(marks, found, strict=True):
+    for (file, about), (x, y, _) in zip(marks, tiles, strict=True):
         if (about.get("map"), about.get("tile_size")) != (marks[0][1].get("map"), marks[0][1].get("tile_size")):
             raise DataError(f"{file}: is a tile of another map than {files[0].name}; remove it, or run it again")
         if about.get("tile") != [x, y]:
@@ -163,7 +163,7 @@ def columns(path: Path, names: Sequence[str]) -> dict[str, npt.NDArray[Any]]:
 
 @contextmanager
 def reading(path: str | Path) -> Iterator[None]:
-    """Turn whatever is wrong with a file's content into a DataError of one line that names the file."""
+    """Turn any error in a file's content into a DataError of one line that names the file."""
     import pyarrow as pa
 
     try:

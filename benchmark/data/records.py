@@ -26,10 +26,10 @@ if TYPE_CHECKING:
 
 UNITS, VOXELS, TRUTH, EVENTS, FRAMES, OVERVIEW = "units", "voxels", "truth", "events", "frames", "overview"
 OBSERVATIONS, SUMS = "observations", "sums"
-"""Folders of what is kept of units: what their numbers are; the voxel tables SCENE__MODEL__BACKEND.parquet; those of
+"""Folders of the files of units: their numbers; the voxel tables SCENE__MODEL__BACKEND.parquet; those of
 the ground truth of the same frames; logs of observations; time series; and the frames that figures show,
 SCENE__MODEL.npz with the arrays frame (its index), labels (H, W) rows 0..K-1 or the ignore id, palette (K, 3) and,
-where the dataset has it, color (H, W, 3). Beside them sums by frame and cube of space, `ClusterSums`."""
+where the dataset has it, color (H, W, 3). In addition sums by frame and cube of space, `ClusterSums`."""
 
 SUMS_BEFORE = "influence"
 """Folder of the sums in runs before 0.4."""
@@ -43,10 +43,10 @@ MAPS = 6
 
 @dataclass(frozen=True, order=True)
 class Variation:
-    """One point of one sweep, in one repeat: what differs from the base settings.
+    """One point of one sweep, in one repeat: the difference from the base settings.
 
     Attributes:
-        sweep: 'base', 'shared_taxonomy', 'backends', or what is swept: 'voxel_size' (metres), 'pixel_stride',
+        sweep: 'base', 'shared_taxonomy', 'backends', or the swept setting: 'voxel_size' (metres), 'pixel_stride',
             'frame_count', 'depth_noise' (relative standard deviation), 'translation_noise' (metres), 'rotation_noise'
             (degrees), 'translation_drift' (metres a square root of frame), 'rotation_drift' (degrees likewise).
         value: Value of the swept setting; None for 'base', 'shared_taxonomy' and 'backends'.
@@ -90,10 +90,10 @@ class FrameQuality:
     """The worth of single frames' labels, as filters left them; shares are 0 to 1, NaN where undefined.
 
     Attributes:
-        model, filters: Whose labels they are, and what was done to them ('ema:0.6+threshold:0.5'; '' for nothing).
+        model, filters: The source of the labels, and the filters over it ('ema:0.6+threshold:0.5'; '' for nothing).
         coverage: Labelled pixels for one that the model labels.
-        next_frame: Share of the pixels seen again by the next frame whose label the model gives that place then. No
-            filter saw that frame: what it only repeats does not count for it.
+        next_frame: Share of the pixels seen again by the next frame whose label the model then gives that surface
+            point. No filter saw that frame: what it only repeats does not count for it.
         accuracy: Share of the labelled pixels that are right; miou the mean over classes of intersection over union.
         consistent_wrong: Share of the pixels seen again that keep a label that is wrong.
         lag: Frames by which labels follow a true change later than the model, see `semstab.metrics.frame_quality`;
@@ -121,9 +121,9 @@ class Record:
     """One finished unit.
 
     Attributes:
-        key: Hash of its inputs and settings, under which it is kept.
+        key: Hash of its inputs and settings, under which it is stored.
         summary: Its report: unit (scene, model, backend), means, strata, classes, times, and what
-            `semstab.statistics` says of the map.
+            `semstab.statistics` reports of the map.
         image_space: Image-space measures of the 'base' units; all NaN elsewhere.
         quality: Quality of the labels of single frames, where `frame_quality` asked for it.
         voxels_file: File of its voxel table, or the folder of its tiles, for the 'base' and 'backends' units; None
@@ -141,7 +141,7 @@ class Record:
 
     @property
     def statistics(self) -> MapStatistics | None:
-        """Return what `semstab.statistics` says of the map."""
+        """Return the statistics of the map."""
         return self.summary.statistics
 
     @property
@@ -152,7 +152,7 @@ class Record:
     def table(self) -> VoxelTable:
         """Return its voxels, read from their file."""
         if self.voxels_file is None:
-            raise ValueError(f"{self.unit.slug}: the voxels of {self.variation} were not kept")
+            raise ValueError(f"{self.unit.slug}: the voxels of {self.variation} were not saved")
         return VoxelTable.load(self.voxels_file)
 
     @property
@@ -163,36 +163,36 @@ class Record:
     def tiles(self) -> Iterator[VoxelTable]:
         """Return its voxels, tile by tile; of a map in one file all of them."""
         if self.voxels_file is None:
-            raise ValueError(f"{self.unit.slug}: the voxels of {self.variation} were not kept")
+            raise ValueError(f"{self.unit.slug}: the voxels of {self.variation} were not saved")
         return VoxelTable.iter_tiles(self.voxels_file)
 
     @property
     def series(self) -> Path | None:
-        """File of its time series, beside that of its voxels."""
-        return self._beside(FRAMES, ".csv")
+        """File of its time series, in the folder of the run."""
+        return self._companion(FRAMES, ".csv")
 
     @property
     def observations_file(self) -> Path | None:
         """File of its sampled observations, which is there where its map has statistics."""
-        return self._beside(OBSERVATIONS)
+        return self._companion(OBSERVATIONS)
 
     @property
     def events_file(self) -> Path | None:
         """File, or folder of tiles, of its log, which is there where it was asked for and its backend keeps one."""
-        return self._beside(EVENTS, "" if self.in_tiles else ".parquet")
+        return self._companion(EVENTS, "" if self.in_tiles else ".parquet")
 
     @property
     def sums_file(self) -> Path | None:
-        """File of its sums by frame and cube of space, which is there where its map was judged."""
-        new = self._beside(SUMS)
-        return new if new is None or new.exists() else self._beside(SUMS_BEFORE)
+        """File of its sums by frame and cube of space, which is there where its map was assessed."""
+        new = self._companion(SUMS)
+        return new if new is None or new.exists() else self._companion(SUMS_BEFORE)
 
-    def _beside(self, folder: str, suffix: str = ".parquet") -> Path | None:
+    def _companion(self, folder: str, suffix: str = ".parquet") -> Path | None:
         return None if self.voxels_file is None else self.voxels_file.parents[1] / folder / f"{self.unit.slug}{suffix}"
 
 
 class Tables:
-    """Voxel tables of records, the last few of them at hand: those that belong together are asked for together."""
+    """Voxel tables of records, the last few of them in memory: those that belong together are asked for together."""
 
     def __init__(self, most: int = 1) -> None:
         self._most = most
@@ -232,7 +232,7 @@ class UnitContent:
         up: The scene's up axis, where it is known or could be estimated.
         files: Digests of the unit's other files, by their path in the folder.
         regions: Series of a source of regions, instead of a summary.
-        advice: Advice on its voxel size, where that was looked at.
+        advice: Advice on its voxel size, where that was assessed.
         checked: Agreement with the reference on a sample of its voxels, where it was checked so.
     """
 
@@ -258,18 +258,18 @@ class Failure:
 
 @dataclass(frozen=True, repr=False)
 class Result:
-    """All that a run or a study found; tables, figures, report and terminal are made from it.
+    """The result of a run or a study; tables, figures, report and terminal are made from it.
 
     Attributes:
         backend: The base backend: that of every unit but those of the 'backends' variation.
         records: Records in the order of the plan.
         agreement: Agreement of each pair of backends that must agree, on each scene and model that both fused.
         up: (x, y, z) unit vector of the world's up axis by scene, where it is known or could be estimated.
-        georeference: Place on Earth by scene, where that is known.
+        georeference: Georeference by scene, where that is known.
         regions: Flicker of the label sources that are regions without classes.
         compared: The same of each other backend and the base one, which need not agree.
         advice: Advice on the voxel size, scene by scene, for data of files.
-        comparisons: The models, with `statistics`, of each scene beside each other, as `compare_models` says it.
+        comparisons: The comparison of the models of each scene by `compare_models`, with `statistics`.
     """
 
     name: str
@@ -308,20 +308,22 @@ class Result:
         Raises:
             ConfigError: If there is none, or several, with what there is.
         """
-        kept = (*self.select(), *self.select(BACKENDS))
+        records = (*self.select(), *self.select(BACKENDS))
         asked = {"scene": scene, "model": model, "backend": backend or self.backend}
         for what, name in asked.items():
-            there = list(dict.fromkeys(getattr(record.unit, what) for record in kept))
+            there = list(dict.fromkeys(getattr(record.unit, what) for record in records))
             if name is not None and name not in there:
                 raise ConfigError(f"{self.name}: no {what} '{name}'; {nearest(name, there)}")
-        found = [
-            record for record in kept if all(name in (None, getattr(record.unit, what)) for what, name in asked.items())
+        fitting = [
+            record
+            for record in records
+            if all(name in (None, getattr(record.unit, what)) for what, name in asked.items())
         ]
-        if len(found) == 1:
-            return found[0]
-        units = ", ".join(f"{record.unit.scene} of {record.unit.model}" for record in found[:4])
+        if len(fitting) == 1:
+            return fitting[0]
+        units = ", ".join(f"{record.unit.scene} of {record.unit.model}" for record in fitting[:4])
         raise ConfigError(
-            f"{self.name}: {len(found)} units fit" + (f" ({units}); choose with scene and model" if found else "")
+            f"{self.name}: {len(fitting)} units fit" + (f" ({units}); choose with scene and model" if fitting else "")
         )
 
     @property
@@ -336,11 +338,11 @@ class Result:
 
     def sweeps(self) -> dict[str, tuple[float, ...]]:
         """Return the swept values, ascending, of each sweep that has values."""
-        found: dict[str, set[float]] = {}
+        values: dict[str, set[float]] = {}
         for record in self.records:
             if record.variation.value is not None:
-                found.setdefault(record.variation.sweep, set()).add(record.variation.value)
-        return {sweep: tuple(sorted(values)) for sweep, values in found.items()}
+                values.setdefault(record.variation.sweep, set()).add(record.variation.value)
+        return {sweep: tuple(sorted(values)) for sweep, values in values.items()}
 
     @property
     def runs(self) -> tuple[UnitSummary, ...]:
@@ -350,7 +352,7 @@ class Result:
         return tuple(r.summary for group in groups for r in units if (r.unit.scene, r.unit.model) == group)
 
     def to_arrow(self) -> pa.Table:
-        """Return one row a unit: what it is, how much there is, the mean of every measure, of recurrent voxels too."""
+        """Return one row a unit: its names, the size of its map, the mean of every measure, of recurrent voxels too."""
         return voxels.to_arrow(self._columns())
 
     def to_pandas(self) -> pd.DataFrame:

@@ -17,11 +17,11 @@ SCHEMA = 4
 """Version of summary.json."""
 
 STAGES = ("decode", "wait", "flicker", "association", "update", "logging")
-"""The stages of a frame's time: decoding in a worker thread, beside the rest; waiting for it; flicker; the two parts of
-fusion, where the backend tells them apart; telling the observers."""
+"""The stages of a frame's time: decoding in a worker thread, parallel to the rest; waiting for it; flicker; the two
+parts of fusion, where the backend measures them separately; notifying the observers."""
 
 LONGEST_NAME = 60
-"""Bytes of a name in a file's name: with three of them, and what is put around them, it has fewer than 255."""
+"""Bytes of a name in a file's name: with three of them, and what surrounds them, it has fewer than 255."""
 
 RECURRENT = 3
 """A voxel is recurrent where OP >= 3 (paper, Sensitivity to World-Space Association)."""
@@ -45,8 +45,8 @@ def slug(*names: str) -> str:
     """Join names to a file name: other names give another one.
 
     A name stays as it is where it consists of letters, digits, '.', '_' and '-', begins with none of '.', '_', does not
-    end with '_', holds no '__' and is at most LONGEST_NAME bytes long. Else what does not fit becomes '-', what is too
-    long is cut, and a digest of the name follows.
+    end with '_', holds no '__' and is at most LONGEST_NAME bytes long. Else other characters become '-', a name
+    that is too long is cut, and a digest of the name follows.
 
     >>> slug("scene-1", "a b"), slug("scene-1", "a-b")
     ('scene-1__a-b~2847e54c57', 'scene-1__a-b')
@@ -67,7 +67,7 @@ def _slug(name: str) -> str:
 class FrameReport:
     """The effect of fusing one frame.
 
-    The map's means are those after the frame; NaN where a backend does not keep them.
+    The map's means are those after the frame; NaN where a backend does not compute them.
 
     Of `seconds`, where a backend tells them apart, association_seconds go from pixels to voxels with their evidence,
     update_seconds into the map.
@@ -157,11 +157,11 @@ class UnitSummary:
     """One entry of 'runs' in summary.json.
 
     stages_ms has mean milliseconds a frame by stage, see `STAGES`; left_out counts the pixels that were left out of
-    fusion because what they show moves, frames_left_out the selected frames that lack a file or a pose, frames_empty
+    fusion because what they show moves, frames_left_out the selected frames without a file or a pose, frames_empty
     the fused ones of which no pixel was valid; scores_left_out is there with `top_k`; statistics is what
-    `semstab.statistics.describe` says of the map, None where nothing was asked for; sizes tells whether half or twice
-    the voxel size would say something else; worst_frames are those that moved the map most, the worst first; reduced is
-    there for soft scores.
+    `semstab.statistics.describe` reports of the map, None where it was not asked for; sizes tells whether half or twice
+    the voxel size would give another result; worst_frames are those that moved the map most, the worst first; reduced
+    is there for soft scores.
     """
 
     unit: Unit = field(metadata=INLINE)
@@ -181,7 +181,7 @@ class UnitSummary:
     reduced: ReducedScores | None = None
 
     def row(self) -> dict[str, str | int | float]:
-        """Return a row: what it is, how much there is, the mean of every measure, also of recurrent voxels alone."""
+        """Return a row: its names, the size of its map, the mean of every measure, also of recurrent voxels alone."""
         table, unit = self.table, self.unit
         return {
             "scene": unit.scene, "model": unit.model, "backend": unit.backend, "taxonomy": self.taxonomy,
@@ -195,7 +195,7 @@ class UnitSummary:
 
 @dataclass(frozen=True)
 class ReducedScores:
-    """The result of soft scores where each pixel is reduced to its likeliest class: what hard labels compare with.
+    """The result of soft scores with each pixel reduced to its likeliest class, to be compared with hard labels.
 
     Attributes:
         vss, recurrent_vss: Over all voxels, and over those with OP >= 3.
@@ -219,13 +219,13 @@ class FrameDrift:
 
 @dataclass(frozen=True)
 class VoxelAdvice:
-    """The place of a voxel size, by the depth of a few frames reprojected into each other.
+    """The assessment of a voxel size, by the depth of a few frames reprojected into each other.
 
     Attributes:
         voxel_size: Metres.
         stays: Share of the points that fall into the same voxel when another frame sees them.
-        suggested: The smallest size in which half of them do, metres; None where nothing can be told.
-        chosen: Whether it was chosen for that, and not given.
+        suggested: The smallest size in which half of them do, metres; None where the data do not tell.
+        chosen: Whether it was chosen for that reason, and not given.
     """
 
     voxel_size: float

@@ -1,4 +1,4 @@
-"""What `semstab.statistics` says of a map; in JSON as the fields say.
+"""The statistics of a map; JSON has the names of the fields.
 
 Undefined numbers are NaN; a section that could not be computed is None.
 """
@@ -43,13 +43,13 @@ class Interval(Estimate):
     """A value with its confidence interval.
 
     Attributes:
-        scope: What varies. 'this scene': the frames, when the same scene is flown again; 'other scenes': frames and
-            locations; 'these frames': locations like these in these very frames.
-        frames: That were fused, about; 0 where they are not known.
-        locations: Cubes of space that hold something that counts.
-        degrees: Of freedom of the standard error.
-        undecided: Why nothing may be claimed, and what to do; empty where something may.
-        p_value: Of a difference: that there is none.
+        scope: The source of variation. 'this scene': the frames, when the same scene is flown again; 'other scenes':
+            frames and locations; 'these frames': locations like these in these very frames.
+        frames: Number of frames that were fused, about; 0 where they are not known.
+        locations: Number of cubes of space that hold something that counts.
+        degrees: Degrees of freedom of the standard error.
+        undecided: The reason why nothing may be claimed, and the remedy; empty where something may.
+        p_value: P-value that a difference is 0.
     """
 
     scope: Scope = THESE_FRAMES
@@ -78,7 +78,8 @@ class StabilityVerdict:
 
     Attributes:
         level: See ADVICE.
-        probability: That the level is right, for the same scene flown again; NaN where it follows from no threshold.
+        probability: Probability that the level is right, for the same scene flown again; NaN where no threshold
+            decides.
         line: The reasons.
     """
 
@@ -204,7 +205,7 @@ class Correlogram:
     Attributes:
         time: Frames.
         angle: Degrees between the directions of view.
-        range: Ratio of the distances to the place, the larger one above.
+        range: Ratio of the distances to the location, the larger one above.
         baseline: Metres between the cameras.
         standard: The pairs with 5 to 15 degrees between them, for models and flights to be compared at.
     """
@@ -220,7 +221,7 @@ class Correlogram:
 class HeadlineStatistics:
     """The numbers that a verdict rests on, with intervals for the same scene flown again.
 
-    Where frames are not known, or too few to tell, the intervals are for these frames, as their `scope` says. alpha is
+    If frames are not known, or too few to tell, the intervals are for these frames, as their `scope` says. alpha is
     of sampled cells, NaN without them; psa and vss are of voxels, at OP >= 2 and OP >= 3; the last two are undefined
     without ground truth.
     """
@@ -234,12 +235,12 @@ class HeadlineStatistics:
 
 @dataclass(frozen=True)
 class Flipping:
-    """Places about which frames do not agree: with OP >= 2, and two frames agree with a probability below 0.8.
+    """Locations about which frames do not agree: with OP >= 2, and two frames agree with a probability below 0.8.
 
     Attributes:
-        share: Of these places, each counting by how likely it is one, for these frames.
+        share: Share of these locations, each counting by how likely it is one, for these frames.
         seen: The part of them that four frames or more saw: of fewer observations it cannot be told whether errors
-            come again at the same places.
+            recur at the same locations.
         a, b: The two classes between which most of them flip, with the part of all flips that is between these.
     """
 
@@ -252,10 +253,11 @@ class Flipping:
 
 @dataclass(frozen=True)
 class Trend:
-    """How far the belief moves one way in time: the share of the disagreement that odd and even observations both show.
+    """The movement of the belief in time: the share of the disagreement that odd and even observations both show.
 
-    0 in the mean where frames err independently. Drift of the model is not told from errors that depend on the view,
-    or that last over frames. `voxels` tell: they have OP >= 6, and their observations differ.
+    It is 0 in the mean if frames err independently. Drift of the model cannot be distinguished from errors that depend
+    on the view, or that last over frames. `voxels` is the number of voxels behind it: those with OP >= 6 whose
+    observations differ.
     """
 
     share: Interval
@@ -274,7 +276,7 @@ class FlipRates:
 
 @dataclass(frozen=True)
 class DriftStatistics:
-    """SBD in bits beside that of the same observations in random order, over the `voxels` where that is known."""
+    """SBD in bits, and that of the same observations in random order, over the `voxels` where that is known."""
 
     voxels: int
     sbd: Interval
@@ -286,7 +288,7 @@ class DriftStatistics:
 
 @dataclass(frozen=True)
 class EntropyParts:
-    """Mean entropy of the belief, and of that what is there within each frame and between them."""
+    """Mean entropy of the belief, and its parts within each frame and between them."""
 
     entropy: Interval
     within: Interval
@@ -295,7 +297,7 @@ class EntropyParts:
 
 @dataclass(frozen=True)
 class Losses:
-    """The pairwise disagreement 1 - PSA over voxels with OP >= 2 in both maps, and whose it is.
+    """The pairwise disagreement 1 - PSA over voxels with OP >= 2 in both maps, and its sources.
 
     share is geometry's part of the total. Negative parts of the model mean that its labels agree better than the
     view-independent ones: it errs alike in all views.
@@ -321,7 +323,7 @@ class Reliability:
 
 @dataclass(frozen=True)
 class Correctness:
-    """How right the fused labels of a group of voxels are; NaN where no voxel has a true class.
+    """Accuracy of the fused labels of a group of voxels; NaN where no voxel has a true class.
 
     Attributes:
         miou: Mean over the classes that are true or predicted somewhere, of intersection over union.
@@ -341,7 +343,7 @@ class Correctness:
 class Quadrants:
     """Shares of the voxels with OP >= 3 and a true class that are consistent or not, right or wrong.
 
-    wrong_of_consistent is the share of the consistent voxels that are wrong: what to expect where the map looks safe.
+    wrong_of_consistent is the share of the consistent voxels that are wrong: the error where the map looks safe.
     """
 
     voxels: int
@@ -406,9 +408,9 @@ class MapStatistics:
 
     @property
     def order_known(self) -> bool:
-        """Return whether a quarter of the places seen twice say what a random order of their observations gives.
+        """Return whether a random order of the observations was drawn for a quarter of the locations.
 
-        Of soft scores without a log only a few do, and not just any.
+        For soft scores without a log that is so for a few of them only, which are no random sample.
         """
         return 4 * self.drift.voxels >= self.repeated.voxels
 

@@ -1,4 +1,4 @@
-"""A map by its tiles: which of them hold some voxels, and the voxels of a region, a few tiles in memory at a time."""
+"""A map by its tiles: the tiles that hold some voxels, and the voxels of a region, a few tiles in memory at a time."""
 
 from __future__ import annotations
 
@@ -18,24 +18,24 @@ from semstab.data.voxels import VoxelTable
 AT_HAND = 1 << 22
 """Voxels of tiles that stay in memory."""
 
-Place = tuple[int, int]
+TileIndex = tuple[int, int]
 
 
 T = TypeVar("T", VoxelTable, Events)
 
 
 class Tiles(Generic[T]):
-    """The tiles of a map, or of its log, by place; one in a single file has one, which holds all.
+    """The tiles of a map, or of its log, by index; a map in a single file has one, which holds all.
 
     Attributes:
         size: Edge of a tile in voxels, None for that one.
         voxel_size: Metres.
     """
 
-    def __init__(self, load: Mapping[Place, Callable[[], T]], size: int | None, voxel_size: float) -> None:
+    def __init__(self, load: Mapping[TileIndex, Callable[[], T]], size: int | None, voxel_size: float) -> None:
         self.size, self.voxel_size = size, voxel_size
-        self._load: Mapping[Place, Callable[[], T]] = load
-        self._tables: SizedCache[Place, T] = SizedCache(lambda place: self._load[place](), len, AT_HAND)
+        self._load: Mapping[TileIndex, Callable[[], T]] = load
+        self._tables: SizedCache[TileIndex, T] = SizedCache(lambda tile: self._load[tile](), len, AT_HAND)
 
     @classmethod
     def open(cls, path: str | Path, kind: type[T]) -> Tiles[T]:
@@ -57,35 +57,35 @@ class Tiles(Generic[T]):
         """Return a table as the one tile of its map."""
         return cls({(0, 0): lambda: table}, None, table.voxel_size)
 
-    def __iter__(self) -> Iterator[Place]:
+    def __iter__(self) -> Iterator[TileIndex]:
         return iter(self._load)
 
-    def __getitem__(self, place: Place) -> T:
-        return self._tables[place]
+    def __getitem__(self, tile: TileIndex) -> T:
+        return self._tables[tile]
 
-    def holding(self, points: Float64) -> Iterator[tuple[Place, Int64]]:
+    def holding(self, points: Float64) -> Iterator[tuple[TileIndex, Int64]]:
         """Yield the tiles in which some of these points (n, 3) lie, metres, with the rows (m,) of these."""
         if self.size is None:
             yield (0, 0), np.arange(len(points))
             return
         index = np.floor(points[:, :2] / self.voxel_size).astype(np.int64)
-        places, of = np.unique(index // self.size, axis=0, return_inverse=True)
+        tiles, of = np.unique(index // self.size, axis=0, return_inverse=True)
         order = np.argsort(of.ravel(), kind="stable")
-        rows = np.split(order, np.cumsum(np.bincount(of.ravel(), minlength=len(places)))[:-1])
-        for (x, y), own in zip(places.tolist(), rows, strict=True):
+        rows = np.split(order, np.cumsum(np.bincount(of.ravel(), minlength=len(tiles)))[:-1])
+        for (x, y), own in zip(tiles.tolist(), rows, strict=True):
             if (x, y) in self._load:
                 yield (x, y), own
 
-    def region(self, place: Place, size: int) -> T:
+    def region(self, tile: TileIndex, size: int) -> T:
         """Return the voxels of a wider tile of that size, a multiple of the own one."""
         if self.size is None:
             table = self[0, 0]
-            return table.rows(np.flatnonzero((table.ix // size == place[0]) & (table.iy // size == place[1])))
-        inside = [own for own in self if self._in_wider(own, size) == place]
+            return table.rows(np.flatnonzero((table.ix // size == tile[0]) & (table.iy // size == tile[1])))
+        inside = [own for own in self if self._in_wider(own, size) == tile]
         first = self[next(iter(self))] if not inside else self[inside[0]]
         return type(first).joined([self[own] for own in inside]) if inside else first.rows(np.zeros(0, np.int64))
 
-    def wider(self, size: int) -> set[Place]:
+    def wider(self, size: int) -> set[TileIndex]:
         """Return the wider tiles of that size that hold a voxel."""
         if self.size is not None:
             return {self._in_wider(own, size) for own in self}
@@ -93,20 +93,20 @@ class Tiles(Generic[T]):
         pairs = np.unique(np.stack([table.ix // size, table.iy // size], axis=1), axis=0)
         return {(x, y) for x, y in pairs.tolist()}
 
-    def _in_wider(self, place: Place, size: int) -> Place:
+    def _in_wider(self, tile: TileIndex, size: int) -> TileIndex:
         assert self.size is not None
-        return place[0] * self.size // size, place[1] * self.size // size
+        return tile[0] * self.size // size, tile[1] * self.size // size
 
 
 def side_by_side(maps: Sequence[Tiles[Any]]) -> Iterator[tuple[Any, ...]]:
     """Yield the voxels of several maps region by region, by the widest of their tiles.
 
-    Of maps in single files at once.
+    Maps in single files are yielded at once.
     """
     sizes = [own.size for own in maps if own.size is not None]
     if not sizes:
         yield tuple(own[0, 0] for own in maps)
         return
     size = max(sizes)
-    for place in sorted({place for own in maps for place in own.wider(size)}):
-        yield tuple(own.region(place, size) for own in maps)
+    for tile in sorted({tile for own in maps for tile in own.wider(size)}):
+        yield tuple(own.region(tile, size) for own in maps)

@@ -33,7 +33,7 @@ CAPTION = "VSS from above, dark 0 to yellow 1; grey: seen once"
 
 
 def to_arrow(columns: Mapping[str, Any]) -> pa.Table:
-    """Return the columns; what is undefined is null."""
+    """Return the columns; undefined numbers are null."""
     import pyarrow as pa
 
     return pa.table({name: pa.array(values, from_pandas=True) for name, values in columns.items()})
@@ -61,7 +61,7 @@ def named(rows: npt.NDArray[np.integer[Any]], names: Sequence[str]) -> pa.Dictio
 
 
 def as_html(title: str, headers: Sequence[str], rows: Sequence[Sequence[Cell]]) -> str:
-    """Return a table with a caption; whatever names hold is shown as it is."""
+    """Return a table with a caption; names are shown as they are."""
     head = "".join(f"<th>{html.escape(header)}</th>" for header in headers)
     body = "".join("<tr>" + "".join(f"<td>{html.escape(_text(cell))}</td>" for cell in row) + "</tr>" for row in rows)
     caption = f'<caption style="text-align: left; white-space: nowrap">{html.escape(title)}</caption>'
@@ -77,7 +77,7 @@ def _text(cell: Cell) -> str:
     return f"{cell:,}" if isinstance(cell, int) else str(cell)
 
 
-# The columns of voxels and of observations, and what both tables do with them.
+# The columns of voxels and of observations, and the methods that both tables share.
 
 Types = dict[str, type[np.generic]]
 
@@ -90,7 +90,7 @@ OF_VOXELS: Types = INDEX | {
     "last_frame": np.int32, "self_sum": np.float64, "frame_entropy_sum": np.float64,
 }  # fmt: skip
 OF_EVENTS: Types = {"voxel": np.int32, "frame": np.int32, "evidence": np.float64, "pixels": np.int32}
-"""The columns of both by name: where a voxel is, and what its row and that of an observation have."""
+"""The columns of both by name: the index of a voxel, then those of its row and of an observation."""
 
 
 def index_columns(index: npt.NDArray[np.integer[Any]]) -> dict[str, Any]:
@@ -147,7 +147,7 @@ class VoxelTable:
     Attributes:
         ix, iy, iz: (n,) int32 voxel index, floor(x_w / r).
         op: (n,) int32 observation persistence: the number of frames that saw the voxel.
-        evidence: (n, K) accumulated evidence e(q), the sum over frames of s_bar; kept sparse.
+        evidence: (n, K) accumulated evidence e(q), the sum over frames of s_bar; stored sparse.
         drift_sum: (n,) float64 sum over t >= 2 of the JS divergence of successive beliefs, bits.
         pixels: (n,) int64 pixels that fell into the voxel, all frames.
         first_frame: (n,) int32 lowest frame index that saw it.
@@ -209,7 +209,7 @@ class VoxelTable:
         return replace(self, **columns, evidence=self.evidence.take(rows))
 
     def measured(self) -> VoxelTable:
-        """Return the same with what measures are functions of, which is then computed once: see `Evidence.measured`."""
+        """Return the same with its concentration, which is then computed once: see `Evidence.measured`."""
         return self if self.evidence.known is not None else replace(self, evidence=self.evidence.measured())
 
     def to_arrow(self) -> pa.Table:
@@ -261,7 +261,7 @@ class VoxelTable:
     ) -> None:
         """Write Parquet, atomically, some rows after the others; as a tile of a larger map, where one is named.
 
-        `extra` columns (n,), and what is `computed` from the rows that are written, go along for other programs and are
+        `extra` columns (n,), and those `computed` from the rows that are written, go along for other programs and are
         not read back.
         """
 
@@ -293,7 +293,7 @@ class VoxelTable:
 
     @classmethod
     def columns(cls, path: str | Path, names: Sequence[str]) -> dict[str, npt.NDArray[Any]]:
-        """Return single columns (n,) by name, also measures and what else the file has, in the order of `load`.
+        """Return single columns (n,) by name, also measures and further columns of the file, in the order of `load`.
 
         Raises:
             DataError: If one is not there.
@@ -301,9 +301,9 @@ class VoxelTable:
         files, sorting = parquet.files_of(path), tuple(INDEX)
         wanted = [*dict.fromkeys((*names, *(sorting if len(files) > 1 else ())))]
         parts = [parquet.columns(file, wanted) for file in files]
-        found = {name: np.concatenate([part[name] for part in parts]) for name in wanted}
-        order = in_order(found) if len(files) > 1 else slice(None)
-        return {name: found[name][order] for name in names}
+        columns = {name: np.concatenate([part[name] for part in parts]) for name in wanted}
+        order = in_order(columns) if len(files) > 1 else slice(None)
+        return {name: columns[name][order] for name in names}
 
     @classmethod
     def joined(cls, parts: Sequence[VoxelTable]) -> VoxelTable:

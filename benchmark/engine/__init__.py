@@ -1,4 +1,4 @@
-"""The engine of runs and studies: scenes x models x backends x variations, each unit kept when it is finished."""
+"""The engine of runs and studies: scenes x models x backends x variations, each unit is stored when it is finished."""
 
 from __future__ import annotations
 

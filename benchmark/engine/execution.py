@@ -68,7 +68,7 @@ def run_study(
 ) -> Result:
     """Compute the units that the folder `out` does not hold yet, and return the result of all.
 
-    Each unit is kept when it is finished, under a key of its settings and its input: a killed study is resumed by the
+    Each unit is stored when it is finished, under a key of its settings and its input: a killed study is resumed by the
     same command, and a changed setting computes again only the units that it touches. `command` goes into the manifest.
 
     A unit that fails later is among the result's failures, and the others finish.
@@ -109,7 +109,7 @@ def _execute(
 
 
 class _Execution:
-    """The units that an earlier start finished, and all others, kept as they finish."""
+    """The units that an earlier start finished, and all others, stored as they finish."""
 
     def __init__(self, plan: Plan, folder: Folder, executor: Executor, observers: Observers) -> None:
         self._plan, self._folder, self._executor, self._observers = plan, folder, executor, observers
@@ -125,7 +125,7 @@ class _Execution:
                 self._check_geometry(plan.config, self._missing)
 
     def compute(self, start: Start) -> None:
-        """Compute the units that are missing, each kept as it finishes."""
+        """Compute the units that are missing, each stored as it finishes."""
         planned = {each.identity: each for each in self._missing}
         whole, tiled = self._begin(start)
         queue = deque(jobs_of(whole, self._executor.width))

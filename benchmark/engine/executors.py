@@ -25,7 +25,7 @@ CONNECT_SECONDS = 10
 AWAY = OSError, RuntimeError, AttributeError
 """The errors of a client of Dask whose scheduler does not answer, while it gives it up, and once it has none."""
 
-LOST = "the scheduler went away; start it again, and the same command goes on from what is kept"
+LOST = "the scheduler does not answer any more; start it again, and the same command continues from the finished units"
 
 Future = cf.Future[tuple[Outcome, ...]]
 NextJob = Callable[[], Job | None]
@@ -75,7 +75,7 @@ class LocalProcesses(Executor):
     def run(self, next_job: NextJob, observers: Observers) -> Generator[Outcome, None, None]:
         """Yield outcomes as jobs finish.
 
-        Where a process dies, nobody knows of which job: those that were at work are run again, one by one. The job
+        If a process dies, its job is not known: those that were running are run again, one by one. The job
         whose process dies then fails, and the others finish.
         """
         begun = list[Job]()
@@ -87,7 +87,7 @@ class LocalProcesses(Executor):
                 try:
                     yield from self._run(begun, lambda: None, 1)
                 except BrokenProcessPool:
-                    text = "its process was killed, perhaps for want of memory; try fewer jobs, or larger voxels"
+                    text = "its process was killed, perhaps because memory ran out; try fewer jobs, or larger voxels"
                     yield from failed(begun.pop(0), text)
 
     def _run(self, begun: list[Job], next_job: NextJob, width: int) -> Generator[Outcome, None, None]:
@@ -257,13 +257,15 @@ class DaskCluster(Executor):
             raise ConfigError("the scheduler has no worker; start some with 'dask worker'")
         for worker, version in there.items():
             if version != own:
-                raise ConfigError(f"worker {worker} has semstab {version}, here is {own}; install the same on both")
+                raise ConfigError(
+                    f"worker {worker} has semstab {version}, this process has {own}; install the same version on both"
+                )
 
 
 def _run_settled(job: Job) -> tuple[Outcome, ...]:
     """Run a job in a worker of the cluster, with as many threads as are its own.
 
-    It runs a job in each of its threads at once: frames are decoded in turn where nothing else is said.
+    A worker runs a job in each of its threads at once: frames are decoded in turn unless `threads` is set.
     """
     configure_process()
     with contextlib.suppress(ValueError):  # called outside of a worker
@@ -279,5 +281,5 @@ def _distributed() -> Any:
 
 
 def cores() -> int:
-    """Return cores that this process may use."""
+    """Return the number of cores that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

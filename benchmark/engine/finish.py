@@ -1,4 +1,4 @@
-"""The end of a work: its map is measured, judged by the statistics, and written."""
+"""The end of a work: its map is measured, assessed by the statistics, and written."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ def finish(live: LiveMap, stream: Stream, watch: Stopwatch) -> Outcome:
         sizes = () if live.sizes is None else live.sizes.alphas()
     observations, sums, sample, analysis = live.sampled_observations(), dict[str, Float64](), None, None
     with watch("statistics"):
-        if fused is not None and work.judged:
+        if fused is not None and work.assessed:
             log = fused.events if config.statistics else None
             sample = MapSample.draw(fused.table, log, fused.truth, edges=config.strata)
         if fused is not None:
@@ -251,15 +251,15 @@ def _savers(
         savers[f"{OVERVIEW}/{slug(unit.scene, unit.model)}.npz"] = partial(_save_overview, stream)
     if tile is not None and observations is not None:
         savers[f"{tile.folder}/{tile.size}_{TILE_OBSERVATIONS}"] = observations.save
-    if tile is None and work.kept:
+    if tile is None and work.stored:
         savers |= unit_savers(live.task, live.rows, observations, analysis)
     if fused is None or not len(fused.table):
         return savers
     if tile is not None and sample is not None:
         savers[f"{tile.folder}/{tile.name}.sample"] = sample.below(tile.bound).save
-    if not work.kept:
+    if not work.stored:
         return savers
-    own = None if tile is None or tile.place is None else Tile(*tile.place, tile.size, tile.key)
+    own = None if tile is None or tile.index is None else Tile(*tile.index, tile.size, tile.key)
 
     def path(folder: str, *, waits: bool) -> str:
         if tile is None or own is None:
@@ -267,7 +267,7 @@ def _savers(
         return f"{tile.folder}/{folder}/{own.name}" if waits else f"{folder}/{unit.slug}/{own.name}"
 
     columns = analysis.columns(fused.table, fused.truth) if config.statistics and analysis is not None else {}
-    voxels = path(VOXELS, waits=config.statistics and work.judged)
+    voxels = path(VOXELS, waits=config.statistics and work.assessed)
     savers[voxels] = partial(save_voxels, fused.table, columns=columns, tile=own)
     if fused.events is not None and config.events:
         savers[path(EVENTS, waits=False)] = partial(fused.events.save, tile=own)
@@ -357,7 +357,9 @@ def estimate_up(points: VoxelTable | npt.ArrayLike, poses: Sequence[npt.ArrayLik
     planes = list(_planes(at, centre)) if len(at) >= 3 else []
     scores = [share * float(normal @ prior) for normal, share in planes]
     if max(scores, default=0.0) <= 0:
-        raise DataError(f"no ground plane found under the cameras in {len(at)} points; say which axis is up (up_axis)")
+        raise DataError(
+            f"there is no ground plane under the cameras in {len(at)} points; set the axis that points up (up_axis)"
+        )
     return planes[int(np.argmax(scores))][0]
 
 
@@ -387,7 +389,7 @@ def _planes(points: Float64, cameras: Float64) -> Iterator[tuple[Float64, float]
 def _largest_plane(points: Float64, distance: float, rng: np.random.Generator) -> Mask:
     """Return which points (n,) lie within a distance of that plane through three of them which has most (RANSAC).
 
-    Here and not by Open3D, as a run that fuses without it takes a second to load it.
+    Open3D can do the same, but takes a second to load.
     """
     a, b, c = points[rng.integers(len(points), size=(3, ITERATIONS))]
     normal = np.cross(b - a, c - a)

@@ -66,7 +66,7 @@ def require_file_names(out: Path, units: Iterable[Unit]) -> None:
         if other != unit:
             raise ConfigError(f"{other} and {unit} would be written to one file, {unit.slug}; rename a scene or model")
         if len(os.fsencode(unit.slug)) > longest:
-            raise ConfigError(f"{there}: its file system takes no name as long as {unit.slug}; choose another --out")
+            raise ConfigError(f"{there}: its file system allows no name as long as {unit.slug}; choose another --out")
 
 
 class Folder:
@@ -91,7 +91,7 @@ class Folder:
         self._lock.release()
 
     def finished(self, planned: PlannedUnit) -> UnitContent | None:
-        """Return what an earlier start left of a unit, if its input is the same and nothing wanted is missing."""
+        """Return a unit that an earlier start finished, if its input is the same and all that is wanted is there."""
         if not any(name.startswith(planned.identity) for name in self._files):
             return None
         try:
@@ -106,7 +106,7 @@ class Folder:
         return content if content is not None and self._is_whole(planned, content) else None
 
     def save(self, outcome: Outcome) -> None:
-        """Keep a finished unit."""
+        """Store a finished unit."""
         assert outcome.content is not None
         self.save_files(outcome)
         key = unit_key(outcome.identity, outcome.content.input)
@@ -124,7 +124,7 @@ class Folder:
     def clear(self, planned: PlannedUnit, keep: Collection[str]) -> None:
         """Remove what was left of a unit's voxels, truth and log, a file or tiles, but for these files."""
         slug = planned.unit.slug
-        for name in (VOXELS, TRUTH, EVENTS) if planned.kept else ():
+        for name in (VOXELS, TRUTH, EVENTS) if planned.stored else ():
             tiles = self.path.glob(f"{name}/{glob.escape(slug)}/*.parquet")
             for file in (self.path / f"{name}/{slug}.parquet", *tiles):
                 if file.relative_to(self.path).as_posix() not in keep:
@@ -150,7 +150,7 @@ class Folder:
             summary=content.summary,
             image_space=(content.image_space or ImageSpace()) if planned.image_space else ImageSpace(),
             quality=content.quality if planned.image_space else None,
-            voxels_file=self.path / voxels if planned.kept else None,
+            voxels_file=self.path / voxels if planned.stored else None,
             truth_file=self.path / truth if planned.image_space and has_truth else None,
         )
 
@@ -178,36 +178,36 @@ class Folder:
             start.marker.unlink(missing_ok=True)
 
     def _is_whole(self, planned: PlannedUnit, content: UnitContent) -> bool:
-        """Return whether the unit's file has what is wanted of it, and its other files are there as they were."""
+        """Return whether the unit's file has all that is wanted of it, and its other files are unchanged."""
         if planned.regions:
             return content.regions is not None
         summary = content.summary
         return (
             summary is not None
             and (content.image_space is not None or not planned.image_space)
-            and (summary.statistics is not None or not planned.judged)
+            and (summary.statistics is not None or not planned.assessed)
             and (content.checked is not None or not planned.sampled)
             and self.are_whole({name: content.files.get(name) for name in self._wanted(planned, content)})
         )
 
     def are_whole(self, files: Mapping[str, str | None]) -> bool:
-        """Return whether files are there, with these digests; the first that is not as it was is told."""
+        """Return whether files are there, with these digests; the first one that differs is reported."""
         for name, digest in files.items():
             path = self.path / name
             if digest is None or not path.exists():
                 return False
             if file_digest(path).hex() != digest:
-                logger.warning("%s: not as it was written; what it belongs to is computed again", path)
+                logger.warning("%s: has changed since it was written; its unit is computed again", path)
                 return False
         return True
 
     def _wanted(self, planned: PlannedUnit, content: UnitContent) -> list[str]:
         unit: Unit = planned.unit
         voxels = _in_tiles(unit, content) or [f"{VOXELS}/{unit.slug}.parquet"]
-        wanted = [*voxels, f"{FRAMES}/{unit.slug}.csv"] if planned.kept else []
-        if planned.kept and planned.judged:
+        wanted = [*voxels, f"{FRAMES}/{unit.slug}.csv"] if planned.stored else []
+        if planned.stored and planned.assessed:
             wanted.append(f"{SUMS}/{unit.slug}.parquet")
-        if planned.kept and planned.config.events and keeps_log(planned.unit.backend):
+        if planned.stored and planned.config.events and keeps_log(planned.unit.backend):
             wanted += _in_tiles(unit, content, EVENTS) or [f"{EVENTS}/{unit.slug}.parquet"]
         return wanted + ([f"{OVERVIEW}/{slug(unit.scene, unit.model)}.npz"] if planned.image_space else [])
 
@@ -222,7 +222,7 @@ def unit_key(identity: str, digest: str) -> str:
 
 
 def load_result(folder: str | Path) -> Result:
-    """Return what a finished run or study found, from its folder.
+    """Return the result of a finished run or study from its folder.
 
     Raises:
         DataError: If it is not there or damaged.
@@ -235,17 +235,17 @@ def load_result(folder: str | Path) -> Result:
     if isinstance(content, dict) and content.get("schema") == earlier.SCHEMA:
         content = earlier.translated(content, path) | {"schema": SCHEMA}
     if not isinstance(content, dict) or content.get("schema") != SCHEMA:
-        raise DataError(f"{path}: not a summary of this version of semstab; run it again, into another folder")
+        raise DataError(f"{path}: is not a summary of this version of semstab; run it again, into another folder")
     result = from_json(Result, {**content, "records": content.get("runs")}, path)
     if problem := _contradiction(result):
-        raise DataError(f"{path}: {problem}; it is damaged, or another version's; run it again")
+        raise DataError(f"{path}: {problem}; it is damaged, or of another version; run it again")
     records = _with_files(result.records, lambda file: folder / file)
     manifest = from_json(dict[str, Any], read_json(folder / "manifest.json"), folder / "manifest.json")
     return dataclasses.replace(result, records=records, manifest=manifest)
 
 
 def _contradiction(result: Result) -> str | None:
-    """Return what in a result refers to something that is not in it; None where nothing does."""
+    """Return the first part of a result that refers to something that is not in it; None where there is none."""
     if other := [record.unit.backend for record in result.select() if record.unit.backend != result.backend]:
         return f"a run at the base settings is fused by '{other[0]}', not by '{result.backend}'"
     for record in result.records:
@@ -255,7 +255,7 @@ def _contradiction(result: Result) -> str | None:
     quantities = {"op", "evidence", *(measure.key for measure in measures())}
     for row in result.agreement:
         if lost := quantities - row.differences.keys():
-            return f"the agreement on {row.scene} lacks {min(lost)}"
+            return f"the agreement on {row.scene} has no {min(lost)}"
     files = (file for record in result.records for file in (record.voxels_file, record.truth_file) if file is not None)
     outside = (file for file in files if file.is_absolute() or ".." in file.parts)
     return next((f"{file} is not in the folder" for file in outside), None)

@@ -57,7 +57,7 @@ def map_bytes(
 
 
 def log_bytes(observations: int, num_classes: int, *, soft: bool) -> int:
-    """Return the bytes of a log, kept frame by frame and sorted by voxel."""
+    """Return the bytes of a log, held frame by frame and sorted by voxel."""
     return observations * (100 + (20 * num_classes if soft else 0))
 
 
@@ -100,7 +100,7 @@ SMALLEST, LARGEST = 8, 1 << 16
 
 @dataclass
 class Sizing:
-    """Units that would not fit, by identity: the edge of their tiles, or why they cannot be fused; lines tell it."""
+    """Units that would not fit, by identity: the edge of their tiles, or why they cannot be fused; `lines` say so."""
 
     tile_sizes: dict[str, int] = field(default_factory=dict)
     refused: dict[str, str] = field(default_factory=dict)
@@ -108,11 +108,11 @@ class Sizing:
 
 
 def planned_sizes(config: Config, missing: Iterable[PlannedUnit], width: int) -> Sizing:
-    """Estimate the units that are to be fused; where one cannot be read, computing it will say so."""
+    """Estimate the units that are to be fused; where one cannot be read, its computation reports the error."""
     sizing, together = Sizing(), dict[object, list[PlannedUnit]]()
     for each in missing:
         if not each.regions:  # watched units of a sequence are in memory together; others can be put off
-            key = (each.unit.scene, each.unit.model) if each.kept else each.identity
+            key = (each.unit.scene, each.unit.model) if each.stored else each.identity
             together.setdefault(key, []).append(each)
     for group in together.values():
         try:
@@ -154,14 +154,14 @@ def _plan_sizes(config: Config, group: Sequence[PlannedUnit], width: int, sizing
         there = f"{free / GB:.2g} GB " + ("are free for it" if config.memory_gb is None else "is memory_gb")
         line = (
             f"{takes}, and {there}; use larger voxels (voxel_size), fewer frames (frames), a larger pixel_stride"
-            f"{_without(group, settings)}; or set memory_gb to try all the same ({why})"
+            f"{_without(group, settings)}; or set memory_gb to try anyway ({why})"
         )
         sizing.refused |= {each.identity: line for each in group}
         return
     edges = {each.identity: _tile_edge(each, size, SHARE * free, width, soft=soft) for each in group}
     sizing.tile_sizes |= edges
     sizing.lines.append(
-        f"{takes}, {free / GB:.2g} GB are there{' for each process' if width > 1 else ''}: fused in tiles of"
+        f"{takes}, {free / GB:.2g} GB are free{' for each process' if width > 1 else ''}: it is fused in tiles of"
         f" {edges[group[0].identity] * settings.voxel_size:g} m"
     )
 
@@ -169,7 +169,7 @@ def _plan_sizes(config: Config, group: Sequence[PlannedUnit], width: int, sizing
 def available_for_maps(config: Config, width: int, taken: float) -> float:
     """Return the bytes for the maps of a process: its share of `memory_gb`, else of what is free beyond `taken`.
 
-    Where hardly anything is free, a quarter of it is for maps all the same.
+    If hardly anything is free, maps still get a quarter of it.
     """
     free = available_bytes() / width
     return max(free - taken, free / 4) if config.memory_gb is None else config.memory_gb * GB / width
@@ -199,7 +199,7 @@ class MapSize(NamedTuple):
 def _tile_edge(planned: PlannedUnit, size: MapSize, budget: float, width: int, *, soft: bool) -> int:
     """Return the largest edge of a tile, a power of 2, within the budget.
 
-    Smaller where several processes share the tiles.
+    It is smaller where several processes share the tiles.
     """
     edge = LARGEST
     while edge > SMALLEST:
@@ -216,7 +216,7 @@ def map_size(task: Task, settings: Config) -> MapSize:
     """Estimate the size of a map from a few pairs of successive frames, evenly spaced.
 
     If no location is seen again later, each frame adds as many voxels as the second one of a pair adds to the first.
-    Where frames far apart see the same voxels, there are fewer: capture and recapture by every other one of the sampled
+    If frames far apart see the same voxels, there are fewer: capture and recapture by every other one of the sampled
     frames (Lincoln and Petersen).
     """
 
@@ -255,7 +255,7 @@ STEP = 32e6
 """Bytes by which the process may grow before its maps are measured again."""
 
 AMPLE = 4
-"""The free memory, in bytes of the maps, from which on freed memory is kept: the next images need not clear it."""
+"""The free memory, in bytes of the maps, from which on freed memory is retained: the next images need not clear it."""
 
 
 class MemoryBudget:
@@ -298,7 +298,7 @@ class MemoryBudget:
         size = f"a smaller --tile-size than {tile.size}" if tile is not None else "tiles (--tile-size 256)"
         return OutgrownError(
             f"{unit.scene}, {unit.model}, {unit.backend}: after {len(live.rows)} of {len(live.frames)} frames"
-            f" the map has {voxels / 1e6:.2g} million voxels of {config.voxel_size:g} m, of which its table"
+            f" the map has {voxels / 1e6:.2g} million voxels of {config.voxel_size:g} m; its table"
             f" {'and statistics' if config.statistics else 'alone'} would take {end_bytes(live) / GB:.2g} GB, and"
             f" {max(0, self._left) / GB:.2g} GB {which}; use {size}, larger voxels (voxel_size), fewer frames (frames),"
             " or a larger pixel_stride"

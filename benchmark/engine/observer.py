@@ -46,7 +46,7 @@ class Observer:
     def unit_finished(
         self, planned: PlannedUnit, content: UnitContent | None, table: VoxelTable | None, error: str | None
     ) -> None:
-        """Take note that a unit is computed and kept, or failed for the reason in `error`.
+        """Take note that a unit is computed and stored, or failed for the reason in `error`.
 
         The table holds its voxels where it is watched and was fused whole in this process.
         """

@@ -139,7 +139,7 @@ def _compared_maps(
 ) -> ModelComparison | None:
     """Return the comparison of a scene's maps; None where there are not two or more of them in one label space.
 
-    With the samples of all, on matched observations.
+    The samples of all of them give matched observations.
     """
     first = next(iter(regions()))
     classes = {table.classes for table in first.tables.values()}
@@ -173,7 +173,7 @@ def _regions_of(there: Sequence[Record], config: Config, tables: Tables) -> Regi
     return regions
 
 
-# manifest.json: where a run's numbers come from.
+# The content of manifest.json: the origin of a run's numbers.
 
 SCHEMA = 1
 """Version of manifest.json."""

@@ -52,7 +52,7 @@ POSE = 9
 """Numbers of a row of poses: down, forward and centre of a camera."""
 
 OVERVIEW_WIDTH = 1280
-"""Pixels of the frame that is kept for figures."""
+"""Pixels of the frame that is saved for figures."""
 
 
 @dataclass(eq=False)
@@ -91,7 +91,7 @@ class LiveMap:
                 live.truth = new_map(config, K, work.within, log=False)
             if work.sampled:
                 live.reference = NumpySample(config.voxel_size, K, work.within)
-        if work.judged and work.measures_images:
+        if work.assessed and work.measures_images:
             live.sampler = Sampler(K)
             if work.image_space and not config.frame_quality:
                 live.sizes = SizeSample(task, config)  # filters share the sizes of what they are put over
@@ -149,7 +149,7 @@ class LiveMap:
         return [self.task.mapping.target.classes.index(name) for name in self.work.config.exclude.classes]
 
     def sampled_observations(self) -> CellObservations | None:
-        """Return what was sampled, without the locations that are left out."""
+        """Return the sampled observations, without the locations that are left out."""
         if self.sampler is None:
             return None
         return self.sampler.sample(self.task.mapping.target.classes).without(self.left_out)
@@ -235,7 +235,7 @@ class Stream:
         return Prepared(fetched, frame, truth)
 
     def measure(self, now: Prepared, reports: Mapping[LiveMap, FrameReport]) -> dict[LiveMap, FrameRow]:
-        """Return flicker and stability in image coordinates, beside the reports of the maps: a row of each series."""
+        """Return flicker and stability in image coordinates with the reports of the maps: a row of each series."""
         frame, decoded, flicker, compensated = now.frame, now.fetched.item, math.nan, math.nan
         with self._watch("flicker") as lap:
             if self._sequential and self._previous is not None and self._previous.shape == frame.shape:
@@ -308,7 +308,7 @@ COLUMNS = ("compensated_flicker_percent", "compensated_share", "vc8", "vc16", "s
 """Numbers of a frame and those before it, by the name of their mean over all frames."""
 
 EDGES_EVERY = 8
-"""The number of frames of which one is searched for edges."""
+"""One frame out of so many is searched for edges."""
 
 SIDE = 640
 """Pixels of the longer side from which on every n-th pixel of each axis is measured, so that fusion does not wait."""
@@ -337,7 +337,7 @@ class ImageSpaceMeter:
         self._worst: list[tuple[float, int, npt.NDArray[Any], Mask]] = []
 
     def add(self, frame: Frame, truth: Frame | None) -> float:
-        """Add the next frame, with its truth in the same label space where there is any; its compensated flicker."""
+        """Add the next frame, and its truth in the same label space if there is any; return compensated flicker."""
         step = -(-max(frame.shape) // SIDE)
         sample, true = frame.every(step), None if truth is None else truth.every(step)
         flicker, share = math.nan, math.nan
@@ -372,7 +372,7 @@ class ImageSpaceMeter:
         return arrays | ({"worst_color": np.stack(known)} if known and len(known) == len(frames) else {})
 
     def result(self, flicker_percent: float) -> ImageSpace:
-        """Return means over the frames so far, beside the flicker of the unit's summary."""
+        """Return means over the frames so far, in addition to the flicker of the unit's summary."""
         return ImageSpace(flicker_percent, **{name: mean(self.rows.column(k)) for k, name in enumerate(COLUMNS)})
 
 

@@ -70,7 +70,7 @@ class TiledUnit:
         return f"{unit.scene} · {unit.model} · {unit.backend}"
 
     def next_job(self) -> Job | None:
-        """Return the next tile; None where there is none, until the pass over the frames tells them."""
+        """Return the next tile; None where there is none, or before the pass over the frames has ended."""
         if self._failed or not self._waiting:
             return None
         task, frames = self._waiting.pop(0)
@@ -115,8 +115,8 @@ class TiledUnit:
         """Return the tiles that are still to be computed; files of the unit that belong to none of them are removed."""
         frames = self._results[self._frames.name]
         self._tiles = {}
-        for place, own in frames.tiles().items():
-            task = dataclasses.replace(self._frames, place=place, origin=frames.origin)
+        for index, own in frames.tiles().items():
+            task = dataclasses.replace(self._frames, index=index, origin=frames.origin)
             self._tiles[task.name] = task, own
         waiting = [own for own in self._tiles.values() if not self._take_over(own[0])]
         self._folder.clear(self.planned, {name for result in self._results.values() for name in result.files})
@@ -162,7 +162,7 @@ def assembled(
         analysis = analyse_sample(task, config, sample, observations)
     files = {name: digest for each in (frames, *tiles) for name, digest in each.files.items()}
     files = {name: digest for name, digest in files.items() if not name.startswith(tasks[0].folder)}
-    if planned.kept:
+    if planned.stored:
         savers = unit_savers(task, rows, observations, analysis)
         if config.statistics and analysis is not None:
             for each in tasks:
@@ -187,8 +187,8 @@ def assembled(
 
 def _with_columns(task: TileTask, slug: str, analysis: Analysis, folder: Path) -> Savers:
     """Return the file of a tile's voxels, once more with the columns of the statistics."""
-    assert task.place is not None
-    waiting = folder / task.folder / VOXELS / f"tile={task.place[0]}_{task.place[1]}.parquet"
+    assert task.index is not None
+    waiting = folder / task.folder / VOXELS / f"tile={task.index[0]}_{task.index[1]}.parquet"
 
     def save(path: Path) -> None:
         truths = (folder / TRUTH / slug / waiting.name, folder / task.folder / TRUTH / waiting.name)

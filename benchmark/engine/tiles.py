@@ -124,7 +124,7 @@ class TileResult(TileMeta):
         return cls(**vars(meta), **own, sums=sums)
 
     def tiles(self) -> dict[tuple[int, int], list[int]]:
-        """Return the frames that meet each tile, in order, by its place."""
+        """Return the frames that meet each tile, in order, by its index."""
         frames: dict[tuple[int, int], list[int]] = {}
         for index, x, y in self.seen.tolist():
             frames.setdefault((x, y), []).append(index)

@@ -57,8 +57,8 @@ class PlannedUnit:
         task: The unit, opened and checked.
         identity: Hash of the settings that its numbers depend on; what shares it is computed once.
         image_space: Whether its stability in image coordinates is wanted.
-        kept: Whether its voxels and its time series are kept.
-        judged: Whether the statistics say something of its map: not of the one that others are only checked against.
+        stored: Whether its voxels and its time series are stored.
+        assessed: Whether its map gets statistics: one that others are only checked against gets none.
         sampled: Whether its map is checked against the reference on a sample of its voxels.
     """
 
@@ -67,8 +67,8 @@ class PlannedUnit:
     task: Task
     identity: str
     image_space: bool
-    kept: bool
-    judged: bool = True
+    stored: bool
+    assessed: bool = True
     sampled: bool = False
 
     @property
@@ -88,7 +88,7 @@ class PlannedUnit:
 
     def merged_with(self, other: PlannedUnit) -> PlannedUnit:
         """Return the same unit as the other one, with what is wanted of either."""
-        wanted = ("image_space", "kept", "judged", "sampled")
+        wanted = ("image_space", "stored", "assessed", "sampled")
         return dataclasses.replace(other, **{name: getattr(self, name) or getattr(other, name) for name in wanted})
 
 
@@ -133,7 +133,7 @@ def make_plan(config: Config) -> Plan:
     Raises:
         ConfigError, DataError, MissingDependencyError: If something does not.
     """
-    for backend in config.fused_by():  # an engine that is missing is said before all else
+    for backend in config.fused_by():  # a missing engine is reported before all else
         create(backend.name, voxel_size=config.voxel_size, num_classes=2, **backend.options)
     dataset = open_dataset(config.dataset.name, config.dataset.options)
     names = selected(config.scenes, dataset.scenes, (), "scene", config.dataset.name)
@@ -143,7 +143,7 @@ def make_plan(config: Config) -> Plan:
     units = (*base, *_varied_units(config, base, scenes))
     if config.exclude.predicted_classes:
         logger.warning(
-            "exclude.predicted_classes: pixels predicted so by mistake are left out too, and are then no error;"
+            "exclude.predicted_classes also leaves out pixels predicted so by mistake, which then are no error;"
             " exclude.classes leaves out locations by their fused class"
         )
     return Plan(config, scenes, units, tuple(_planned_regions(config, scenes)))
@@ -176,7 +176,7 @@ def _base_units(config: Config, scenes: Mapping[str, Scene]) -> Iterator[Planned
             one = settings.model_copy(update={"models": [task.model]})
             sampled = _is_sampled(config, config.backends[0])
             yield PlannedUnit(
-                Variation(BASE), one, task, identity(one, task), image_space=True, kept=True, sampled=sampled
+                Variation(BASE), one, task, identity(one, task), image_space=True, stored=True, sampled=sampled
             )
 
 
@@ -207,7 +207,7 @@ def _planned_regions(config: Config, scenes: Mapping[str, Scene]) -> Iterator[Pl
             task = Task(scene, model, frames, space.mapping_to(space), ("none",))
             fused_only = {"voxel_size", "strata", "statistics", "critical_classes", "scope", "verdict"}
             key = _hash(settings, {"regions": [name, model], "frames": frames}, fused_only)
-            yield PlannedUnit(Variation(REGIONS), settings, task, key, image_space=False, kept=False)
+            yield PlannedUnit(Variation(REGIONS), settings, task, key, image_space=False, stored=False)
 
 
 def _varied_units(config: Config, base: Sequence[PlannedUnit], scenes: Mapping[str, Scene]) -> Iterator[PlannedUnit]:
@@ -221,15 +221,15 @@ def _varied_units(config: Config, base: Sequence[PlannedUnit], scenes: Mapping[s
             _check_count(variation, task)
             left, (backend, *_) = variation.sweep == BACKENDS, varied.backends
             reference = left and backend.name not in [named.name for named in config.backends]
-            judged = varied.statistics or not reference
+            assessed = varied.statistics or not reference
             sampled = left and _is_sampled(config, backend)
-            yield PlannedUnit(variation, varied, task, identity(varied, task), False, left, judged, sampled)
+            yield PlannedUnit(variation, varied, task, identity(varied, task), False, left, assessed, sampled)
 
 
 def _variations(config: Config) -> Iterator[tuple[Variation, Part, Any]]:
     """Yield each point of each sweep, where it applies, and its value.
 
-    Then the taxonomy or the backend that is changed.
+    The taxonomy or the backend that is changed comes last.
     """
     if config.shared_taxonomy is not None:
         yield Variation(SHARED), Part(), config.shared_taxonomy
@@ -259,7 +259,7 @@ def _changed_settings(config: Config, variation: Variation, value: Any, base: Co
 def _evenly_sampled(count: int, base: Config) -> FrameSelection:
     """Return `count` frames, evenly spaced over the extent of the base's.
 
-    From its start to its stop, or over its list.
+    The extent is that from its start to its stop, or that of its list.
     """
     extent = base.frames.model_dump(include={"start", "stop", "from_time", "to_time"})
     even, listed = FrameSelection(**extent, spacing="even", count=count), base.frames.list
@@ -268,7 +268,7 @@ def _evenly_sampled(count: int, base: Config) -> FrameSelection:
 
 def _check_count(variation: Variation, task: Task) -> None:
     """Check that a sweep got all frames that it asks for: fewer would pass for another sampling density."""
-    chosen = len(task.indices) + task.left_out  # what lacks a pose or a file is left out, and said so
+    chosen = len(task.indices) + task.left_out  # frames without a pose or a file are left out, which is reported
     if variation.sweep == "frame_count" and chosen != variation.value:
         raise ConfigError(
             f"sweeps.frame_count: {task.scene.name} has {len(task.indices)} frames over the extent of the base ones,"
@@ -277,7 +277,7 @@ def _check_count(variation: Variation, task: Task) -> None:
 
 
 def identity(config: Config, task: Task) -> str:
-    """Hash of the settings that a unit's numbers depend on, beside its input."""
+    """Return the hash of the settings that a unit's numbers depend on in addition to its input."""
     mapping, filtering = task.mapping, task.scene.filtering(task.model)
     content = {
         "unit": dataclasses.asdict(task.units[0]),

@@ -42,12 +42,12 @@ class Start:
 
 @dataclass(frozen=True)
 class TileTask:
-    """One tile of the map of a unit; without a place, the pass over all frames that fuses nothing.
+    """One tile of the map of a unit; without an index, the pass over all frames that fuses nothing.
 
     Attributes:
-        key: Key of the unit, under which results are kept.
+        key: Key of the unit, under which results are stored.
         size: Voxels along the edge of a tile.
-        place: (x, y) of the tile: ix // size, iy // size.
+        index: (x, y) of the tile: ix // size, iy // size.
         origin: Voxel of the first camera, where it is known.
         bound: Highest hash in the sample of the tiles before, where that is full: no voxel above it will be in the
             map's.
@@ -55,14 +55,14 @@ class TileTask:
 
     key: str
     size: int
-    place: tuple[int, int] | None = None
+    index: tuple[int, int] | None = None
     origin: tuple[int, int, int] | None = None
     bound: int | None = field(default=None, compare=False)
 
     @property
     def name(self) -> str:
         """The name of its result."""
-        return f"{self.size}_{FRAMES}" if self.place is None else f"{self.size}_{self.place[0]}_{self.place[1]}"
+        return f"{self.size}_{FRAMES}" if self.index is None else f"{self.size}_{self.index[0]}_{self.index[1]}"
 
     @property
     def folder(self) -> str:
@@ -72,9 +72,9 @@ class TileTask:
     @property
     def extent(self) -> Extent | None:
         """The voxels of the tile."""
-        if self.place is None:
+        if self.index is None:
             return None
-        x, y = (corner * self.size for corner in self.place)
+        x, y = (corner * self.size for corner in self.index)
         return Extent((x, y), (x + self.size, y + self.size), self.origin)
 
 
@@ -84,7 +84,7 @@ class Work:
 
     Attributes:
         config: Settings with the frames one by one: those of its sequence that all label sources of the plan have.
-        left_out: Number of selected frames that lack a file or a pose.
+        left_out: Number of selected frames without a file or a pose.
         regions: Whether it is the flicker of regions without classes, and nothing is fused.
         tile: The tile of a unit in tiles; None for all of a unit.
     """
@@ -95,8 +95,8 @@ class Work:
     identity: str
     config: Config
     image_space: bool = False
-    kept: bool = False
-    judged: bool = True
+    stored: bool = False
+    assessed: bool = True
     sampled: bool = False
     left_out: int = 0
     regions: bool = False
@@ -105,7 +105,7 @@ class Work:
     @classmethod
     def of(cls, planned: PlannedUnit, start: Start) -> Work:
         """Return the whole of a planned unit."""
-        unit, wanted = planned.unit, (planned.image_space, planned.kept, planned.judged, planned.sampled)
+        unit, wanted = planned.unit, (planned.image_space, planned.stored, planned.assessed, planned.sampled)
         config = planned.config.model_copy(update={"frames": FrameSelection.of(planned.task.indices)})
         own = (unit.scene, unit.model, planned.identity, config)
         return cls(start, *own, *wanted, planned.task.left_out, planned.regions)
@@ -118,17 +118,17 @@ class Work:
     @property
     def fuses(self) -> bool:
         """Return whether there is a map."""
-        return self.tile is None or self.tile.place is not None
+        return self.tile is None or self.tile.index is not None
 
     @property
     def watched(self) -> bool:
-        """Return whether observers see its frames and its map: it is kept, and fused whole."""
-        return self.kept and self.tile is None
+        """Return whether observers see its frames and its map: it is stored, and fused whole."""
+        return self.stored and self.tile is None
 
     @property
     def measures_images(self) -> bool:
         """Return whether it takes the frames in sequence, to measure them in image coordinates."""
-        return self.tile is None or self.tile.place is None
+        return self.tile is None or self.tile.index is None
 
     @property
     def within(self) -> Extent | None:

@@ -16,7 +16,7 @@ import numpy.typing as npt
 from semstab.core.files import atomic_path
 from semstab.core.prefetch import SizedCache
 from semstab.core.types import Float64, Int64
-from semstab.data.tiles import AT_HAND, Place
+from semstab.data.tiles import AT_HAND, TileIndex
 from semstab.data.voxels import VoxelTable
 from semstab.datasets.files.surfaces import open_las, points_at_once
 from semstab.errors import ConfigError, DataError
@@ -162,7 +162,7 @@ class _Finder:
         self.chosen, self.tally, self._radius = chosen, Tally(), radius
         self._lookups = SizedCache(self.lookup, lambda lookup: len(lookup.table), AT_HAND)
 
-    def lookup(self, place: Place) -> VoxelLookup:
+    def lookup(self, place: TileIndex) -> VoxelLookup:
         """Return the lookup of a tile with voxels."""
         return VoxelLookup(self.chosen[place].table, self._radius)
 
@@ -200,7 +200,7 @@ class _Finder:
         self.tally.add(points, int(np.isfinite(apart).sum()), int(over.sum()))
         return Taken(label, columns)
 
-    def _near(self, points: Float64) -> Iterator[tuple[Place, Int64]]:
+    def _near(self, points: Float64) -> Iterator[tuple[TileIndex, Int64]]:
         """Yield the tiles that may hold the nearest voxels of points (n, 3), with the points' rows (m,)."""
         size, r = self.chosen.size, self.chosen.first.table.voxel_size
         if size is None:

@@ -15,7 +15,7 @@ from semstab.core.files import atomic_path
 from semstab.core.types import Float64, Int64
 from semstab.data.georeference import INSTALL
 from semstab.data.information import normalise
-from semstab.data.tiles import Place
+from semstab.data.tiles import TileIndex
 from semstab.errors import ConfigError, MissingDependencyError
 from semstab.exports.voxels import Chosen, Column, Voxels, crs_name, together
 from semstab.metrics import CATEGORIES, categories
@@ -313,7 +313,7 @@ def write_mesh(chosen: Chosen, path: Path) -> int:
     return voxels
 
 
-def _adjacent(chosen: Chosen, place: Place) -> Int64:
+def _adjacent(chosen: Chosen, place: TileIndex) -> Int64:
     """Return the voxels (n, 3) of the tiles around one that may touch it."""
     found, size = [np.zeros((0, 3), np.int64)], chosen.size
     for (dx, dy), axis, at in (((1, 0), 0, 0), ((-1, 0), 0, -1), ((0, 1), 1, 0), ((0, -1), 1, -1)):

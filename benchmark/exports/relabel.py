@@ -21,7 +21,7 @@ from semstab.data.frames import Frame
 from semstab.data.labels import IGNORE_8BIT, IGNORE_16BIT
 from semstab.data.measures import dominant
 from semstab.data.records import Record
-from semstab.data.tiles import AT_HAND, Place, Tiles
+from semstab.data.tiles import AT_HAND, TileIndex, Tiles
 from semstab.data.voxels import VoxelTable
 from semstab.engine.folder import SETTINGS, load_result
 from semstab.engine.units import make_plan
@@ -96,7 +96,7 @@ class FusedLabels:
 
     def __init__(self, tiles: Tiles[VoxelTable], belief: Belief, num_classes: int) -> None:
         self._tiles, self._belief, self._K = tiles, belief, num_classes
-        self._lookups: SizedCache[Place, VoxelLookup] = SizedCache(
+        self._lookups: SizedCache[TileIndex, VoxelLookup] = SizedCache(
             lambda place: VoxelLookup(self._tiles[place]), lambda lookup: len(lookup.table), AT_HAND
         )
 

@@ -26,7 +26,7 @@ from semstab.data.measures import dominant, measures
 from semstab.data.parquet import files_of
 from semstab.data.records import OVERVIEW, Record, Result
 from semstab.data.results import slug
-from semstab.data.tiles import AT_HAND, Place
+from semstab.data.tiles import AT_HAND, TileIndex
 from semstab.data.voxels import VoxelTable
 from semstab.errors import ConfigError, DataError
 from semstab.metrics import CATEGORIES, categories
@@ -148,10 +148,10 @@ class Chosen:
         """Return whether no voxel is left out."""
         return self._min_op <= 1 and not self._classes and self._thresholds is None
 
-    def __contains__(self, place: Place) -> bool:
+    def __contains__(self, place: TileIndex) -> bool:
         return place in self._files
 
-    def __getitem__(self, place: Place) -> Voxels:
+    def __getitem__(self, place: TileIndex) -> Voxels:
         """Return the voxels of a tile, which may be none."""
         return self._at_hand[place]
 
@@ -159,7 +159,7 @@ class Chosen:
         """Yield the voxels tile by tile, without empty tiles."""
         return (self[place] for place in self.places())
 
-    def places(self) -> Iterator[Place]:
+    def places(self) -> Iterator[TileIndex]:
         """Yield the tiles that have voxels.
 
         Raises:
@@ -180,7 +180,7 @@ class Chosen:
         """The voxels of one tile, for the properties that all share."""
         return next(iter(self))
 
-    def _read(self, place: Place) -> Voxels:
+    def _read(self, place: TileIndex) -> Voxels:
         """Read a tile and choose its voxels."""
         file, record = self._files[place], self._record
         assert record.voxels_file is not None

@@ -1,4 +1,4 @@
-"""The compiled loop behind `semstab.pixels.warp`: where each pixel of one view lies in another."""
+"""The compiled loop behind `semstab.pixels.warp`: the position of each pixel of one view in another."""
 
 from __future__ import annotations
 
@@ -114,51 +114,51 @@ def _total(scores, at, K, shift, unit):
 
 
 @parallel
-def cut(scores, k, kept, shift, unit, infinite, shares):
-    """Copy the k largest scores of each pixel into `kept` (n, K), which is 0; scores (n * K,) by their bits.
+def cut(scores, k, retained, shift, unit, infinite, shares):
+    """Copy the k largest scores of each pixel into `retained` (n, K), which is 0; scores (n * K,) by their bits.
 
-    Bits of numbers from 0 on sort like the numbers, and NaN is above all: it is kept, and the pixel stays unusable.
+    Bits of numbers from 0 on sort like the numbers, and NaN is above all: it is retained, and the pixel stays unusable.
 
     - `shift`, `unit`: see `_total`; infinite: the bits of infinity
     - `shares`: (CHUNKS, 3), 0: pixels with a prediction, the sum of the shares of their scores that are left out, and
       the largest one
     """
-    n, K = kept.shape
+    n, K = retained.shape
     for chunk in nb.prange(CHUNKS):
-        place = np.empty(k, dtype=np.int64)  # of the largest so far, in descending order
+        largest = np.empty(k, dtype=np.int64)  # of the largest so far, in descending order
         for i in range(n * chunk // CHUNKS, n * (chunk + 1) // CHUNKS):
-            found = 0
+            count = 0
             for c in range(K):
                 value = scores[i * K + c]
-                if found == k and value <= scores[i * K + place[k - 1]]:
+                if count == k and value <= scores[i * K + largest[k - 1]]:
                     continue
-                at = min(found, k - 1)
-                while at > 0 and scores[i * K + place[at - 1]] < value:
-                    place[at] = place[at - 1]
+                at = min(count, k - 1)
+                while at > 0 and scores[i * K + largest[at - 1]] < value:
+                    largest[at] = largest[at - 1]
                     at -= 1
-                place[at] = c
-                found = min(found + 1, k)
-            for j in range(found):
-                kept[i, place[j]] = scores[i * K + place[j]]
-            if 0 < scores[i * K + place[0]] < infinite:
+                largest[at] = c
+                count = min(count + 1, k)
+            for j in range(count):
+                retained[i, largest[j]] = scores[i * K + largest[j]]
+            if 0 < scores[i * K + largest[0]] < infinite:
                 left = 0.0
-                for j in range(found):
-                    left += _total(scores, i * K + place[j], 1, shift, unit)
+                for j in range(count):
+                    left += _total(scores, i * K + largest[j], 1, shift, unit)
                 share = max(0.0, 1.0 - left / _total(scores, i * K, K, shift, unit))
                 shares[chunk, 0] += 1.0
                 shares[chunk, 1] += share
                 shares[chunk, 2] = max(shares[chunk, 2], share)
 
 
-# Compiled loops behind video consistency: for how long each pixel has had its label.
+# Compiled loops behind video consistency: the time for which each pixel has had its label.
 
 
 @serial
 def lengthen(labels: Any, before: Any, valid: Any, most: int, length: Any) -> None:
     """Count the frames, `most` at most, for which each pixel has counted and had its label; all arrays are (n,)."""
     for i in range(len(length)):
-        kept = np.int32(length[i]) if labels[i] == before[i] else np.int32(0)
-        length[i] = min(kept + np.int32(1), np.int32(most)) if valid[i] else np.int32(0)
+        unchanged = np.int32(length[i]) if labels[i] == before[i] else np.int32(0)
+        length[i] = min(unchanged + np.int32(1), np.int32(most)) if valid[i] else np.int32(0)
 
 
 @serial

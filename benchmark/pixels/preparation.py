@@ -1,4 +1,4 @@
-"""Moving things are no evidence about a place: pixels of some classes, or under a mask, are left out of fusion."""
+"""Moving things are no evidence about a location: pixels of some classes, or under a mask, are left out of fusion."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from semstab.pixels.kernels import CHUNKS, cut
 def leave_out(frame: Frame, classes: Sequence[int] = (), *, masks: bool = True) -> Frame:
     """Return the frame without the pixels of these classes, and without masked ones.
 
-    The frame itself where that is none.
+    It is the frame itself if there are none.
 
     classes are ids in label maps, and positions in soft scores, where a pixel's class is that of its largest score.
     The pixels lose their label; `left_out` marks those of them that had a valid depth and label.
@@ -40,7 +40,7 @@ def _unlabelled(frame: Frame, where: Mask) -> dict[str, Any]:
     return {"scores": np.where(where[..., None], frame.scores.dtype.type(0), frame.scores)}
 
 
-# Noise on depth and poses, to see what geometry alone does to the numbers (paper, Sensitivity to Association).
+# Noise on depth and poses, to see the effect of geometry alone on the numbers (paper, Sensitivity to Association).
 
 DEPTH, POSE, WALK = range(3)
 """Each has random numbers of its own: the strength of one kind of noise changes no other."""
@@ -107,7 +107,7 @@ def keep_largest(frame: Frame, k: int) -> Frame:
 
     The rest are 0.
 
-    A pixel without a prediction stays without. `scores_left_out` of the frame says what share of them was left out.
+    A pixel without a prediction stays without. `scores_left_out` of the frame is the share of them that was left out.
     """
     assert frame.scores is not None
     scores = frame.scores
@@ -116,10 +116,10 @@ def keep_largest(frame: Frame, k: int) -> Frame:
     known = scores.dtype in (np.float16, np.float32)
     scores = np.abs(scores if known else scores.astype(np.float64))  # no -0, whose bits are large
     bits = BITS[scores.dtype.itemsize]
-    kept, shares = np.zeros(scores.shape, dtype=bits), np.zeros((CHUNKS, 3))
+    retained, shares = np.zeros(scores.shape, dtype=bits), np.zeros((CHUNKS, 3))
     infinite = int(np.array(np.inf, dtype=scores.dtype).view(bits))
     shift, unit = AS_DOUBLE[scores.dtype.itemsize]
-    cut(flat(scores).view(bits), k, kept.reshape(-1, scores.shape[2]), shift, unit, infinite, shares)
+    cut(flat(scores).view(bits), k, retained.reshape(-1, scores.shape[2]), shift, unit, infinite, shares)
     pixels, total = shares[:, :2].sum(axis=0)
     left_out = LeftOut(float(total / max(pixels, 1)), float(shares[:, 2].max()))
-    return dataclasses.replace(frame, scores=kept.view(scores.dtype), scores_left_out=left_out)
+    return dataclasses.replace(frame, scores=retained.view(scores.dtype), scores_left_out=left_out)

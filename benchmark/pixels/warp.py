@@ -89,7 +89,7 @@ def motion(frame: Frame, other: Frame) -> Float64:
 
 
 def by_rows(matrix: Float64) -> tuple[tuple[float, ...], ...]:
-    """Return a matrix as tuples, which compiled loops keep in registers."""
+    """Return a matrix as tuples, which compiled loops hold in registers."""
     return tuple(tuple(row) for row in matrix.tolist())
 
 
@@ -100,7 +100,7 @@ def carry(belief: Float32, source: Frame, target: Frame, *, depth_tolerance: flo
     """Return beliefs (H', W', K) of the source's pixels as the target's pixels see them (H, W, K), 0 where none is.
 
     Backward warping, linear between those of the four nearest pixels that see the same surface: their depth differs
-    from the point's distance z by at most depth_tolerance * z, and they say something. Nearest pixels, carried on from
+    from the point's distance z by at most depth_tolerance * z, and they have a belief. Nearest pixels, carried on from
     frame to frame, would stay behind a camera that moves by less than half a pixel.
     """
     from semstab.pixels.kernels import blend

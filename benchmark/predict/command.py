@@ -1,4 +1,4 @@
-"""The command `semstab-bench predict`: everything is checked before the model is loaded, and said at the end."""
+"""The command `semstab-bench predict`: everything is checked before the model is loaded, and a report follows."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ from semstab.predict.predictor import NAME as STORED
 from semstab.predict.predictor import PredictorConfig, load_predictor, stored_labels
 from semstab.predict.sequence import PredictionObserver, SequenceOptions, SequenceReport, predict_sequence
 
-# Image files to predict on, and which scenes of a dataset.
+# Image files to predict on, and scenes of a dataset.
 
 
 class ImageFiles:
@@ -43,13 +43,13 @@ class ImageFiles:
     labels_like_depth = False
 
     def __init__(self, pattern: str) -> None:
-        found = [Path(path) for path in glob.glob(str(Path(pattern).expanduser()), recursive=True)]  # noqa: PTH207
-        files = sorted((path for path in found if path.suffix.lower() in COLOR_SUFFIXES), key=lambda p: natural(str(p)))
+        paths = [Path(path) for path in glob.glob(str(Path(pattern).expanduser()), recursive=True)]  # noqa: PTH207
+        files = sorted((path for path in paths if path.suffix.lower() in COLOR_SUFFIXES), key=lambda p: natural(str(p)))
         if not files:
             raise DataError(f"{pattern}: no image of {', '.join(COLOR_SUFFIXES)} fits; quote the pattern in the shell")
         stems = [path.stem for path in files]
         if repeated := [path for path in files if stems.count(path.stem) > 1]:
-            raise DataError(f"{repeated[0]}: {repeated[1]} has the same name; predict them one folder after the other")
+            raise DataError(f"{repeated[0]}: {repeated[1]} has the same name; predict on one folder after the other")
         self.name = files[0].parent.resolve().name
         self._files = files
 
@@ -70,7 +70,7 @@ class ImageFiles:
         return self._files[index].stem
 
     def missing(self, index: int, sources: Sequence[str] = (), *, color: bool = False) -> list[str]:
-        """Return nothing: what is missing was not found."""
+        """Return nothing: all images of the pattern are there."""
         return []
 
     def predicted(self, index: int, *, labels: Labels | None = None, scores: Scores | None = None) -> Frame | None:
@@ -93,7 +93,7 @@ def chosen(names: Sequence[str] | None, known: Sequence[str], where: str) -> Seq
     return list(dict.fromkeys(names)) if names is not None else known
 
 
-# What a prediction command does: which images of which sequence, and where their predictions go.
+# The jobs of a prediction command: images of sequences, and the folders of their predictions.
 
 IMAGES: Mapping[str, Any] = {"color": True}
 """The parts of a frame that must be there where a model looks at images."""
@@ -101,7 +101,7 @@ IMAGES: Mapping[str, Any] = {"color": True}
 
 @dataclass(frozen=True, eq=False)
 class Job:
-    """One sequence: which of its images, and the folder above labels/, scores/ and regions/."""
+    """A sequence, the indices of its images, and the folder above labels/, scores/ and regions/."""
 
     sequence: ImageSequence
     indices: list[int]
@@ -115,7 +115,7 @@ def file_job(pattern: str, frames: FrameSelection, out: Path | None) -> Job:
         ConfigError: Without `out`, or where no image is selected.
     """
     if out is None:
-        raise ConfigError("--images: predictions of single images need a place; name it with --out")
+        raise ConfigError("--images: predictions of single images need a folder; name it with --out")
     files = ImageFiles(pattern)
     return Job(files, _some(frames.indices(len(files)), files), out)
 
@@ -131,7 +131,7 @@ def scene_jobs(
 
     Predictions go into the scene's own folder, into `out`, or of several into out/SCENE.
 
-    `looks_at` says what of a frame must be there, as for `select_frames`.
+    `looks_at` names the parts of a frame that must be there, as for `select_frames`.
 
     Raises:
         ConfigError: For a dataset without folders of its own where there is no `out`, and for a scene or frames that
@@ -143,28 +143,30 @@ def scene_jobs(
     for name in names:
         scene = opened.scene(name)
         indices = _some(select_frames(scene, frames, **looks_at).indices, scene)
-        jobs.append(Job(scene, indices, _place(scene, out if out is None or len(names) == 1 else out / name)))
+        jobs.append(Job(scene, indices, _folder_for(scene, out if out is None or len(names) == 1 else out / name)))
     return jobs
 
 
-def _place(scene: Scene, out: Path | None) -> Path:
-    place = out or scene.folder
-    if place is None:
-        raise ConfigError(f"{scene.name}: has no folder of its own; say with --out where its predictions go")
-    return place
+def _folder_for(scene: Scene, out: Path | None) -> Path:
+    folder = out or scene.folder
+    if folder is None:
+        raise ConfigError(f"{scene.name}: has no folder of its own; name one for its predictions with --out")
+    return folder
 
 
 def _some(indices: list[int], sequence: ImageSequence) -> list[int]:
     if not indices:
-        raise ConfigError(f"{sequence.name}: the selection of frames leaves none of its {len(sequence)}; mend --frames")
+        raise ConfigError(
+            f"{sequence.name}: the selection of frames leaves none of its {len(sequence)}; change --frames"
+        )
     return indices
 
 
-# A prediction in the terminal: progress with frames a second and time left, and at the end what lies where.
+# A prediction in the terminal: progress with frames a second and time left, and a report at the end.
 
 
 class PredictionBar(PredictionObserver):
-    """One bar a sequence. Speed and time left count frames that the model saw, not those kept from before."""
+    """One bar a sequence. Speed and time left count frames that the model saw, not those of an earlier start."""
 
     def __init__(self, console: Console) -> None:
         columns = (
@@ -184,12 +186,12 @@ class PredictionBar(PredictionObserver):
         self._bar.reset(self._work, total=frames, description=name, speed="")
         self._bar.start()
 
-    def frame_done(self, kept: bool) -> None:
+    def frame_done(self, reused: bool) -> None:
         """Advance by one frame."""
         self._left -= 1
-        if kept and not self._predicted:
+        if reused and not self._predicted:
             self._started = time.monotonic()
-        self._predicted += not kept
+        self._predicted += not reused
         speed = speed_text(self._predicted, time.monotonic() - self._started, self._left)
         self._bar.update(self._work, advance=1, speed=speed)
 
@@ -212,19 +214,19 @@ def speed_text(frames: int, seconds: float, left: int) -> str:
 
 
 def print_report(report: SequenceReport, console: Console) -> None:
-    """Print how many frames of a sequence, how fast, where; of regions, how much they change."""
-    kept = f", {report.kept} kept from before" if report.kept else ""
+    """Print the frames of a sequence, the speed and the folders, and how much regions change."""
+    reused = f", {report.reused} from an earlier start" if report.reused else ""
     speed = ""
     if report.predicted:
         model = 1e3 * report.model_seconds / report.predicted
         speed = f", {report.frames_per_second:.2f} frames/s (model {model:.0f} ms a frame)"
-    console.print(f"{report.sequence}: {report.predicted} frames predicted{kept}{speed}", soft_wrap=True)
+    console.print(f"{report.sequence}: {report.predicted} frames predicted{reused}{speed}", soft_wrap=True)
     for folder in report.folders:
         console.print(f"  {folder}", soft_wrap=True)
     if report.regions is not None:
         line = f"  flicker of matched regions {report.regions.flicker_percent:.2f} %"
         if report.regions.compensated:
-            line += f", camera motion taken out {report.regions.compensated_flicker_percent:.2f} %"
+            line += f", without camera motion {report.regions.compensated_flicker_percent:.2f} %"
         console.print(line, soft_wrap=True)
 
 
@@ -261,12 +263,12 @@ def run(
         ConfigError, DataError, MissingDependencyError: If something cannot be predicted; what was finished stays.
     """
     if top_k is not None and not predictor.get("scores"):
-        raise ConfigError("--top-k says how many scores a pixel keeps; add --scores, or leave it out")
+        raise ConfigError("--top-k sets how many scores a pixel keeps; add --scores, or leave it out")
     config = validated(PredictorConfig, {**predictor, "options": options}).resolved()
     selection = validated(FrameSelection, frames)
     jobs = _jobs(images, dataset, scenes, selection, out, config.looks_at)
     load = _loader(config)
-    load(jobs[0])  # what is wrong with it is said before the first image is read
+    load(jobs[0])  # its faults are reported before the first image is read
     sequence_options = SequenceOptions(
         config.label_name, config.scores, top_k=top_k, batch=batch, overwrite=overwrite, command=sys.argv
     )
@@ -287,7 +289,7 @@ def run(
 
 
 def _loader(config: PredictorConfig) -> Callable[[Job], tuple[ImageSequence, Model]]:
-    """Return what gives the images of a job and who predicts on them: one model for all, or each scene's own labels."""
+    """Return the images of a job and the model that predicts on them: one for all, or each scene's own labels."""
     if config.model != STORED:
         model = load_predictor(config)
         return lambda job: (job.sequence, model)
@@ -313,7 +315,7 @@ def _next_command(
     *,
     several: bool,
 ) -> str:
-    """Return what fuses the predictions: of the same scenes and frames, read the same way, as the others have none."""
+    """Return the command that fuses the predictions of the same scenes and frames."""
     words = ["semstab-bench", *([] if dataset.name == "posed_folder" else ["--dataset", dataset.name])]
     words += ["--data", str(dataset.options["root"])] if "root" in dataset.options else []
     for key, value in _said(dataset).items():
@@ -330,7 +332,7 @@ def _next_command(
 
 
 def _said(dataset: DatasetConfig) -> dict[str, Any]:
-    """Return the dataset's options that are not as they are by themselves, but for its root."""
+    """Return the dataset's options that differ from their defaults, without its root."""
     usual = {
         name: field.get_default(call_default_factory=True)
         for name, field in options_model(dataset.name).model_fields.items()
@@ -350,5 +352,5 @@ def _jobs(
     if images is None and dataset is not None:
         return scene_jobs(dataset, scenes, frames, out, looks_at)
     if images is None or dataset is not None:
-        raise ConfigError("say what to predict on: --images GLOB, or --data FOLDER, or --dataset NAME")
+        raise ConfigError("name the images to predict on: --images GLOB, or --data FOLDER, or --dataset NAME")
     return [file_job(images, frames, out)]

@@ -23,26 +23,35 @@ from semstab.models.border import Wrapped
 from semstab.pixels.warp import carry, warp
 
 Belief = Float32
-"""(H, W, K) float32: what is believed of each pixel, sums to 1 over the classes; to 0 where nothing is said."""
+"""(H, W, K) float32: the belief of each pixel, which sums to 1 over the classes, or to 0 where there is none."""
 
 REGISTRY = Registry(
     "filter",
     {
-        "ema": Entry("semstab.predict.filters:Ema", "KEEP: average at the pixel; KEEP is the share of before"),
-        "ema-warped": Entry("semstab.predict.filters:EmaWarped", "KEEP: the same of the place, by depth and pose"),
+        "ema": Entry(
+            "semstab.predict.filters:Ema",
+            "KEEP: average at the pixel; KEEP is the share of the previous belief",
+        ),
+        "ema-warped": Entry(
+            "semstab.predict.filters:EmaWarped",
+            "KEEP: average at the surface point, by depth and pose",
+        ),
         "vote": Entry("semstab.predict.filters:Vote", "N: majority of the pixel's last N labels"),
-        "vote-warped": Entry("semstab.predict.filters:VoteWarped", "N: the same of the place, by depth and pose"),
+        "vote-warped": Entry(
+            "semstab.predict.filters:VoteWarped",
+            "N: majority at the surface point, by depth and pose",
+        ),
         "guided": Entry(
             "semstab.predict.filters:Guided",
             "PIXELS: guided filter: borders follow those of the image",
         ),
         "threshold": Entry(
             "semstab.predict.filters:Threshold",
-            "SCORE: ignore where no class has it; needs scores",
+            "SCORE: ignore pixels where no class reaches it; needs scores",
         ),
         "map-prior": Entry(
             "semstab.predict.map_prior:MapPrior",
-            "METRES: times the belief of the map so far, in such voxels",
+            "METRES: multiply by the belief of the map so far, in such voxels",
         ),
     },
 )
@@ -50,7 +59,7 @@ REGISTRY = Registry(
 
 @dataclass(frozen=True)
 class Parameter:
-    """The number behind a filter's name: what it is, its usual value, from and up to what; whether it is whole."""
+    """The number behind a filter's name: its meaning, its default, its limits, and whether it is whole."""
 
     what: str
     usual: float
@@ -114,7 +123,7 @@ class Filter(ABC):
 
     @abstractmethod
     def __call__(self, belief: Belief, shown: Shown) -> Belief:
-        """Return the belief after what it does; the array that it is given stays as it is."""
+        """Return the belief after the filter; the given array is not changed."""
 
 
 @dataclass(frozen=True)
@@ -146,7 +155,7 @@ def parse(text: str) -> FilterSpec:
 
 
 def one_hot(rows: npt.NDArray[Any], K: int) -> Belief:
-    """Return beliefs that are certain: (H, W) rows 0..K-1, K where nothing is said."""
+    """Return beliefs that are certain: (H, W) rows 0..K-1, K where there is no prediction."""
     belief = np.zeros((rows.size, K + 1), dtype=np.float32)
     belief[np.arange(rows.size), rows.reshape(-1)] = 1
     return belief[:, :K].reshape(*rows.shape, K)
@@ -163,7 +172,7 @@ def normalised(belief: Belief) -> Belief:
 
 
 class Filtered(Wrapped):
-    """A model behind filters in their order. Where it says nothing, nothing is said.
+    """A model behind filters in their order. Pixels without a prediction stay without.
 
     Filters see its scores where it has any; else its labels count as certain.
 
@@ -198,9 +207,9 @@ class Filtered(Wrapped):
         self, images: Sequence[Image], *, scores: bool = False, geometry: Sequence[Frame] = ()
     ) -> list[Prediction]:
         """See `Model`; an image of another size begins anew."""
-        found = self.ask(images, self.inner.gives_scores, geometry)
+        predictions = self.ask(images, self.inner.gives_scores, geometry)
         frames: Sequence[Frame | None] = geometry or [None] * len(images)
-        return [self._filtered(*each, scores) for each in zip(found, images, frames, strict=True)]
+        return [self._filtered(*each, scores) for each in zip(predictions, images, frames, strict=True)]
 
     def identity(self) -> dict[str, Any]:
         """Return the identity of the inner model, and the filters."""
@@ -237,7 +246,7 @@ def belief_of(prediction: Prediction, space: LabelSpace) -> Belief:
 def labels_of(belief: Belief, space: LabelSpace, like: npt.NDArray[Any]) -> Labels:
     """Return the likeliest class of each pixel, by its id in maps such as `like`.
 
-    The ignore id where nothing is said.
+    It is the ignore id where there is no prediction.
     """
     ids = np.array([*space.ids], dtype=like.dtype)[belief.argmax(axis=2)]
     ids[~belief.any(axis=2)] = ignore_id(like)
@@ -248,7 +257,7 @@ def labels_of(belief: Belief, space: LabelSpace, like: npt.NDArray[Any]) -> Labe
 
 
 class Threshold(Filter):
-    """Nothing is said where the largest score is below the threshold."""
+    """Pixels whose largest score is below the threshold are ignored."""
 
     parameter = Parameter("the score from which a pixel counts", 0.6, 0, 1)
     needs_scores = True
@@ -259,13 +268,13 @@ class Threshold(Filter):
         return np.where(sure, belief, np.float32(0))
 
 
-# Exponential averages of beliefs: at the pixel, or at the place.
+# Exponential averages of beliefs: at the pixel, or at the surface point.
 
 
 class Ema(Filter):
     """b_t = keep b_{t-1} + (1 - keep) p_t at each pixel, whatever it shows; it begins with p_t."""
 
-    parameter = Parameter("the share that is kept of the belief before", 0.6, 0, 0.999)
+    parameter = Parameter("the share of the previous belief", 0.6, 0, 0.999)
     sequential = True
 
     def __init__(self, value: float) -> None:
@@ -279,7 +288,7 @@ class Ema(Filter):
 
 
 class EmaWarped(Filter):
-    """The same of each place: b_{t-1} is looked up where the pixel's surface point was, by depth and pose.
+    """The same at each surface point: b_{t-1} is looked up where the pixel's surface point was, by depth and pose.
 
     A pixel begins anew where that point was hidden or out of view, or where there is no depth.
     """
@@ -310,7 +319,7 @@ def mixed(before: Belief, now: Belief, keep: float) -> Belief:
 # Borders of classes that follow those of the image: the guided filter (He, Sun and Tang 2013, TPAMI).
 
 EPSILON = 0.05**2
-"""Variance of grey values, black 0 and white 1, from which an edge is kept rather than smoothed over."""
+"""Variance of grey values, black 0 and white 1, from which an edge is preserved rather than smoothed."""
 
 Grey = npt.NDArray[Any]
 """(H, W) float32."""
@@ -352,7 +361,7 @@ class Guided(Filter):
         return np.asarray(cv2.boxFilter(values, -1, (side, side), normalize=False, borderType=cv2.BORDER_CONSTANT))
 
 
-# Majorities of the last labels: at the pixel, or at the place.
+# Majorities of the last labels: at the pixel, or at the surface point.
 
 Rows = UInt16
 
@@ -360,10 +369,10 @@ Rows = UInt16
 class Vote(Filter):
     """Each class's share of the last N labels at the pixel, this one included: no later frame is looked at.
 
-    Where classes tie, the newer labels win.
+    If classes tie, the newer labels win.
     """
 
-    parameter = Parameter("how many labels vote", 5, 2, 1000, whole=True)
+    parameter = Parameter("the number of labels that vote", 5, 2, 1000, whole=True)
     sequential = True
 
     def __init__(self, value: float) -> None:
@@ -387,7 +396,7 @@ class Vote(Filter):
 
 
 class VoteWarped(Vote):
-    """The same of each place: the last N - 1 frames are asked for the pixel's surface point, by depth and pose.
+    """The same at each surface point: the last N - 1 frames are asked for the pixel's surface point, by depth and pose.
 
     A frame that did not see the point has no vote.
     """

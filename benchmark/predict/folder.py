@@ -52,12 +52,12 @@ class _Manifest:
 
 
 class PredictionFolder:
-    """labels/NAME, scores/NAME or regions/NAME of a scene; what an earlier start of the same finished is kept.
+    """labels/NAME, scores/NAME or regions/NAME of a scene; maps that an earlier start finished are reused.
 
     Attributes:
         path: The folder.
         kind: Kind of maps: PNG ids, .npz scores (K, H, W), PNG region ids.
-        settings: All that the maps depend on beside the image, for JSON.
+        settings: All that the maps depend on in addition to the image, for JSON.
         about: The rest of the manifest.
         space: The classes; None for regions.
         top_k: Number of scores that a pixel keeps; None for all.
@@ -103,7 +103,7 @@ class PredictionFolder:
         return name in self._frames and self._frames[name].image == image and self.file(name).is_file()
 
     def file(self, name: str) -> Path:
-        """Return where a frame's map is.
+        """Return the path of a frame's map.
 
         Raises:
             DataError: For a name that leads out of the folder.
@@ -111,13 +111,13 @@ class PredictionFolder:
         return inside(self.path, self.path, f"{name}{self._suffix}", f"image {name[:80]!r}")
 
     def write(self, name: str, image: str, values: npt.NDArray[Any], seconds: float) -> None:
-        """Keep a frame's map of ids (H, W)."""
+        """Store a frame's map of ids (H, W)."""
         self._claimed()
         write_png(self.file(name), values)
         self._done(name, image, seconds)
 
     def write_scores(self, name: str, image: str, maps: Iterable[npt.NDArray[Any]], seconds: float) -> None:
-        """Keep a frame's scores, which come class by class (H, W); one of them is in memory at a time."""
+        """Store a frame's scores, which come class by class (H, W); one of them is in memory at a time."""
         self._claimed()
         with atomic_path(self.file(name)) as temporary:
             write_stack(temporary, "scores", maps, len(self._space or ()), self._score_type, self._compressed)
@@ -162,7 +162,7 @@ class PredictionFolder:
             there = from_json(_Manifest, read_json(manifest), manifest)
         except DataError as error:
             raise DataError(
-                f"{manifest}: no manifest of predictions; delete the folder, or choose another --name"
+                f"{manifest}: is no manifest of predictions; delete the folder, or choose another --name"
             ) from error
         if there.key == self._content["key"]:
             return dict(there.frames)
@@ -194,7 +194,7 @@ def _short(value: Any) -> str:
     return text if len(text) <= 60 else f"{text[:57]}..."
 
 
-# Soft scores class by class, as they go to disk: one map in memory at a time, or few where the largest are kept.
+# Soft scores class by class, as they go to disk: one map in memory at a time, or few where only the largest are stored.
 
 Maps = Callable[[], Iterator[Float32]]
 """A function that gives the scores (H, W) of each class in order, anew at each call."""
@@ -212,7 +212,7 @@ def resized(maps: Maps, shape: tuple[int, ...], where: str) -> Maps:
 def largest_only(maps: Maps, count: int) -> Maps:
     """Yield the maps with 0 for all but each pixel's largest scores; more than `count` where some are equal."""
 
-    def kept() -> Iterator[Float32]:
+    def thinned() -> Iterator[Float32]:
         largest: list[Float32] = []  # in falling order, (H, W) each
         for each in maps():
             rest = each
@@ -223,4 +223,4 @@ def largest_only(maps: Maps, count: int) -> Maps:
         for each in maps():
             yield np.where(each >= largest[-1], each, np.float32(0))
 
-    return kept
+    return thinned

@@ -35,11 +35,11 @@ class ImageSequence(Protocol):
         ...
 
     def image_name(self, index: int) -> str:
-        """Return what the files of its prediction are called, without suffix."""
+        """Return the name of the files of its prediction, without suffix."""
         ...
 
     def missing(self, index: int, sources: Sequence[str] = (), *, color: bool = False) -> list[str]:
-        """Return files that the frame lacks, its image among them where colour is asked for."""
+        """Return the missing files of the frame, its image among them where colour is asked for."""
         ...
 
     def predicted(self, index: int, *, labels: Labels | None = None, scores: Scores | None = None) -> Frame | None:
@@ -79,7 +79,7 @@ class Picture:
 
 
 def picture(sequence: ImageSequence, index: int, model: Model) -> Picture:
-    """Return what the model is shown of an index.
+    """Return the image of an index as the model is shown it.
 
     Raises:
         DataError: If that fails; the message names the file, and as `geometry_of`.
@@ -90,7 +90,7 @@ def picture(sequence: ImageSequence, index: int, model: Model) -> Picture:
 
 
 def shown_digest(pixels: Image, geometry: Sequence[Frame]) -> str:
-    """Return a hash of an image, and of what else is shown of it."""
+    """Return a hash of an image and of the geometry that is shown with it."""
     digest = image_digest(pixels)
     for frame in geometry:
         seen = hashlib.blake2b(repr((digest, frame.intrinsics)).encode(), digest_size=16)
@@ -112,7 +112,7 @@ def geometry_of(sequence: ImageSequence, index: int, pixels: Image, model: Model
     frame = sequence.view(index, (pixels.shape[0], pixels.shape[1]))
     if frame is None:
         raise ConfigError(
-            f"{sequence.name}: the model looks at depth and pose, which single images have not; use --data"
+            f"{sequence.name}: the model looks at depth and pose, which single images do not have; use --data"
         )
     return (frame,)
 

@@ -30,8 +30,8 @@ from semstab.predict.predictor import InOrder, PredictorConfig, StoredSequence, 
 
 NAME = "predicted"
 
-KEPT_BYTES = 1 << 28
-"""Memory for predictions that are kept in case a frame is asked for again; what does not fit is predicted again."""
+CACHE_BYTES = 1 << 28
+"""Memory for predictions that are cached in case a frame is asked for again; what does not fit is predicted again."""
 
 
 class PredictedOptions(Settings):
@@ -40,16 +40,16 @@ class PredictedOptions(Settings):
     dataset: DatasetConfig = Field(description="a dataset with its options")
     models: list[PredictorConfig] = Field(min_length=1, description="each predicts every frame")
     frames: FrameSelection = Field(
-        FrameSelection(), description="what sequential models are shown, in order; those of the run by default"
+        FrameSelection(), description="frames that sequential models are shown, in order; those of the run by default"
     )
     scene_frames: dict[str, FrameSelection] = Field(
         default_factory=dict, description="frames of single scenes, instead of `frames`"
     )
 
     try_filters: list[str] = Field(
-        default_factory=list, description="filters, each put over each of the models and named beside it"
+        default_factory=list, description="filters, each is put over each of the models, which also predict without"
     )
-    kept: Path | None = Field(None, description="folder in which predictions of models are kept; in memory by default")
+    cache: Path | None = Field(None, description="folder in which predictions are cached; in memory by default")
 
     @field_validator("dataset")
     @classmethod
@@ -113,7 +113,7 @@ class PredictedDataset(Dataset):
         with self.lock:
             if source not in self._loaded:
                 config = self._configs[source]
-                self._loaded[source] = completed(config, self._shared(config), self._options.kept)
+                self._loaded[source] = completed(config, self._shared(config), self._options.cache)
             return self._loaded[source]
 
     def _shared(self, config: PredictorConfig) -> Model:
@@ -125,7 +125,7 @@ class PredictedDataset(Dataset):
         return model
 
     def frames_of(self, scene: Scene, source: str) -> list[int]:
-        """Return what a sequential model is shown of a scene: the selected frames that have what it looks at."""
+        """Return the frames that a sequential model is shown of a scene: selected ones that have what it looks at."""
         selection = self._options.scene_frames.get(scene.name, self._options.frames)
         return select_frames(scene, selection, **self._configs[source].looks_at).indices
 
@@ -157,8 +157,8 @@ class PredictedScene(Scene):
         self._dataset = dataset
         self._fitted: dict[str, Model] = {}
         self._digests: dict[int, bytes] = {}
-        self._kept: dict[tuple[str, int], Prediction] = {}
-        self._room = KEPT_BYTES
+        self._cache: dict[tuple[str, int], Prediction] = {}
+        self._room = CACHE_BYTES
         self._lock = dataset.lock
         self._in_order: dict[str, InOrder] = {}
         self._of_labels: dict[str, tuple[StoredSequence, Model]] = {}
@@ -181,7 +181,7 @@ class PredictedScene(Scene):
         return self._inner.tracked(index)
 
     def missing(self, index: int, sources: Sequence[str] = (), *, color: bool = False) -> list[str]:
-        """Return files that the frame lacks; it needs its colour where a model is among the sources."""
+        """Return the missing files of the frame; it needs its colour where a model is among the sources."""
         wanted = [self._dataset.predictors[source].looks_at for source in sources if source in self.models]
         stored = [*{source: None for each in wanted for source in each["sources"]}]
         truth = [source for source in sources if source == GROUND_TRUTH]
@@ -224,7 +224,7 @@ class PredictedScene(Scene):
         return self._inner.color(index)
 
     def image_name(self, index: int) -> str:
-        """Return what the frame's files are called."""
+        """Return the name of the frame's files."""
         return self._inner.image_name(index)
 
     def label_space(self, model: str) -> LabelSpace:
@@ -242,7 +242,7 @@ class PredictedScene(Scene):
         return space
 
     def frame(self, index: int, model: str, *, color: bool = True) -> Frame:
-        """Return the frame with what the model says about its image.
+        """Return the frame with the model's prediction on its image.
 
         Raises what the inner scene and the model raise.
         """
@@ -290,24 +290,24 @@ class PredictedScene(Scene):
         return digest.hexdigest()
 
     def _predict(self, index: int, model: str, image: Image) -> Prediction:
-        """Return what the model says about a frame; scores where they are wanted."""
+        """Return the model's prediction on a frame, with scores where they are wanted."""
         with self._lock:
             predictor = self._predictor(model)
             if predictor.sequential:
                 return self._ordered(model, predictor).at(index)
-            if (model, index) in self._kept:
-                return self._kept[model, index]
+            if (model, index) in self._cache:
+                return self._cache[model, index]
             geometry = geometry_of(self._sequence(model), index, image, predictor)
             scores = self._dataset.predictors[model].scores
             (prediction,) = ask(predictor, [image], scores=scores, geometry=geometry)
             if (size := size_of(prediction)) <= self._room:
-                self._kept[model, index] = prediction
+                self._cache[model, index] = prediction
                 self._room -= size
             return prediction
 
     def _ordered(self, model: str, predictor: Model) -> InOrder:
         if model not in self._in_order:
-            while len(self._in_order) > 1:  # what the others remember takes memory, and their turn is over
+            while len(self._in_order) > 1:  # the memory of the others takes space, and their turn is over
                 over = next(iter(self._in_order))
                 del self._in_order[over], self._fitted[over]
             scores = self._dataset.predictors[model].scores
@@ -329,7 +329,7 @@ class PredictedScene(Scene):
         return self._stored(model)[1] if self._takes_stored(model) else self._dataset.model(model)
 
     def _sequence(self, model: str) -> ImageSequence:
-        """Return what the model is shown."""
+        """Return the images that the model is shown."""
         return self._stored(model)[0] if self._takes_stored(model) else self._inner
 
     def _takes_stored(self, model: str) -> bool:

@@ -28,10 +28,10 @@ from semstab.models.network import is_network
 from semstab.predict.filters import Filtered, parse
 from semstab.predict.images import ImageSequence, geometry_of, shown_digest
 
-# What a model said, kept on disk: several filters over one model let it look at each image once.
+# Predictions of a model, cached on disk: it looks at each image once, whatever filters are put over it.
 
 
-class Kept(Wrapped):
+class Cached(Wrapped):
     """A model that looks its predictions up in a folder, by its identity and the image, and leaves new ones there.
 
     It has no memory of images before (`sequential`). Files of one folder may be read and written by several processes.
@@ -56,7 +56,7 @@ class Kept(Wrapped):
         return [self._one(image, scores, frame) for image, frame in zip(images, frames, strict=True)]
 
     def _one(self, image: Image, scores: bool, frame: Sequence[Frame]) -> Prediction:
-        """Predict an image; scores are kept wherever there are some: whoever asks later may want them."""
+        """Predict an image; scores are stored where there are any: a later caller may want them."""
         file = self._folder / f"{self._key(image, frame)}.npz"
         there = read_arrays(file)
         if there is None:
@@ -77,7 +77,7 @@ class Kept(Wrapped):
 NAME = "stored"
 
 NEAR = 4
-"""Frames that are at hand: each is asked for its image, its geometry and its labels."""
+"""Frames that are in memory: each is asked for its image, its geometry and its labels."""
 
 
 class StoredOptions(Settings):
@@ -123,7 +123,7 @@ class Stored(Model):
         return labels
 
     def identity(self) -> dict[str, Any]:
-        """Return where the labels are from; what they are is in the digest of each frame."""
+        """Return the source of the labels; their content is in the digest of each frame."""
         assert self.label_space is not None
         return {NAME: self._source, "classes": self.label_space.to_dict()}
 
@@ -166,11 +166,11 @@ class StoredSequence:
         return np.asarray(cv2.resize(image, shape[::-1], interpolation=cv2.INTER_AREA), dtype=np.uint8)
 
     def image_name(self, index: int) -> str:
-        """Return what the frame's files are called."""
+        """Return the name of the frame's files."""
         return self.scene.image_name(index)
 
     def missing(self, index: int, sources: Sequence[str] = (), *, color: bool = False) -> list[str]:
-        """Return files that the frame lacks, its labels among them."""
+        """Return the missing files of the frame, its labels among them."""
         return self.scene.missing(index, [*sources, self.source], color=self._color)
 
     def predicted(self, index: int, *, labels: Labels | None = None, scores: Scores | None = None) -> Frame:
@@ -195,7 +195,7 @@ class PredictorConfig(Settings):
     """The settings that name a model, and say how its predictions are called and given."""
 
     model: str = Field(description="a name from `semstab-bench list`; or FILE.py:NAME, net.onnx")
-    name: str | None = Field(None, description="what its predictions are called; the model's name by default")
+    name: str | None = Field(None, description="the name of its predictions; the model's by default")
     options: dict[str, Any] = Field(default_factory=dict, description="options of that model")
     scores: bool = Field(False, description="soft scores, not labels alone")
     taxonomy: str | None = Field(None, description="give labels in this taxonomy; the model's own classes by default")
@@ -204,7 +204,7 @@ class PredictorConfig(Settings):
         description="which of the model's classes count as a class of the taxonomy: certain ones, or near ones",
     )
     filters: list[str] = Field(
-        default_factory=list, description="what steadies its labels, in this order: ema:0.6, vote:5, ... (`list`)"
+        default_factory=list, description="filters that steady its labels, in this order: ema:0.6, vote:5, ... (`list`)"
     )
 
     @field_validator("name")
@@ -227,7 +227,7 @@ class PredictorConfig(Settings):
 
     @property
     def label_name(self) -> str:
-        """Return what its label maps are called."""
+        """Return the name of its label maps."""
         if self.name is not None:
             return self.name
         stem = Path(self.model).stem if is_network(self.model) else self.model.rpartition(":")[2]
@@ -253,7 +253,7 @@ class PredictorConfig(Settings):
 
     @property
     def looks_at(self) -> dict[str, Any]:
-        """Return what of a scene's frames must be there, as `select_frames` takes it."""
+        """Return the parts of a scene's frames that must be there, as `select_frames` takes them."""
         stored = self.model == NAME
         return {"sources": [self.options["source"]] if stored else [], "color": not stored or self.wants_color}
 
@@ -289,14 +289,14 @@ def stored_labels(config: PredictorConfig, scene: Scene) -> tuple[StoredSequence
     return sequence, completed(config, Stored(options, sequence))
 
 
-def completed(config: PredictorConfig, inner: Model, kept: Path | None = None) -> Model:
+def completed(config: PredictorConfig, inner: Model, cache: Path | None = None) -> Model:
     """Return a model with all that is asked for around it.
 
-    What it said of an image is looked up in the folder `kept`.
+    Its predictions are looked up in the folder `cache`, where one is given.
     """
     model: Model = Checked(inner, config.label_name)
-    if kept is not None and not model.sequential:
-        model = Kept(model, kept)
+    if cache is not None and not model.sequential:
+        model = Cached(model, cache)
     if config.taxonomy is not None:
         model = InTaxonomy(model, LabelSpace.load(config.taxonomy), config.mapping)
     if config.filters:
@@ -313,7 +313,7 @@ OWN = ("name", "scores", "taxonomy", "mapping", "filters")
 def parse_predictor(text: str, more: Mapping[str, Any] | None = None, filters: Sequence[str] = ()) -> PredictorConfig:
     """Parse 'segformer,checkpoint=FOLDER,taxonomy=uavid3': the model, then settings of the predictor or the model.
 
-    `more` are options, and `filters` come after its own, that are said elsewhere.
+    `more` are options, and `filters` follow its own; both are set elsewhere.
 
     Raises:
         ConfigError: For anything else.
@@ -343,16 +343,16 @@ def _absolute(options: BaseModel) -> BaseModel:
 
 # A sequential model inside a run: whichever frame is asked for, it has seen the sequence up to it.
 
-KEPT_BYTES = 1 << 28
+CACHE_BYTES = 1 << 28
 """Memory for the latest predictions: frames are asked for nearly, not quite in order."""
 
-LEAST_KEPT = 4
+LEAST_CACHED = 4
 
 
 class InOrder:
     """The predictions of a sequential model, shown a sequence in order, whatever is asked for when.
 
-    Where a prediction is no longer at hand, the model is shown the sequence from its first frame again.
+    If a prediction is no longer in memory, the model is shown the sequence from its first frame again.
 
     Attributes:
         indices: The frames that it is shown.
@@ -370,9 +370,9 @@ class InOrder:
     ) -> None:
         self.indices = indices
         self._model, self._sequence, self._scores, self._claim = model, sequence, scores, claim
-        self._place = {index: place for place, index in enumerate(indices)}
+        self._position = {index: position for position, index in enumerate(indices)}
         self._next = 0
-        self._kept: dict[int, Prediction] = {}
+        self._cache: dict[int, Prediction] = {}
 
     def at(self, index: int) -> Prediction:
         """Return the prediction of a frame.
@@ -380,14 +380,14 @@ class InOrder:
         Raises:
             ConfigError: For a frame that the model is not shown.
         """
-        place = self._placed(index)
-        if index not in self._kept:
-            if self._claim(self) or place < self._next:
+        position = self._position_of(index)
+        if index not in self._cache:
+            if self._claim(self) or position < self._next:
                 self._model.reset()
                 self._next = 0
-            for shown in self.indices[self._next : place + 1]:
+            for shown in self.indices[self._next : position + 1]:
                 self._show(shown)
-        return self._kept[index]
+        return self._cache[index]
 
     def shown_for(self, indices: Sequence[int]) -> list[int]:
         """Return the frames that the model is shown for the sake of these: its labels depend on all of them.
@@ -395,24 +395,24 @@ class InOrder:
         Raises:
             ConfigError: For a frame that is not among them.
         """
-        return list(self.indices[: max(map(self._placed, indices), default=-1) + 1])
+        return list(self.indices[: max(map(self._position_of, indices), default=-1) + 1])
 
-    def _placed(self, index: int) -> int:
-        if index not in self._place:
+    def _position_of(self, index: int) -> int:
+        if index not in self._position:
             raise ConfigError(
                 f"{self._sequence.name}: frame {index} is not among the {len(self.indices)} frames that a sequential"
                 " model is shown; its labels depend on these, so a sweep can only leave some of them out"
             )
-        return self._place[index]
+        return self._position[index]
 
     def _show(self, index: int) -> None:
         image = self._sequence.image(index)
         geometry = geometry_of(self._sequence, index, image, self._model)
         (prediction,) = ask(self._model, [image], scores=self._scores, geometry=geometry)
-        self._kept[index] = prediction
+        self._cache[index] = prediction
         self._next += 1
-        while len(self._kept) > LEAST_KEPT and sum(map(size_of, self._kept.values())) > KEPT_BYTES:
-            del self._kept[next(iter(self._kept))]
+        while len(self._cache) > LEAST_CACHED and sum(map(size_of, self._cache.values())) > CACHE_BYTES:
+            del self._cache[next(iter(self._cache))]
 
 
 def size_of(prediction: Prediction) -> int:

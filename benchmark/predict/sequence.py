@@ -1,4 +1,4 @@
-"""A model over a sequence: label maps, scores or regions on disk, resumable, with what they depend on beside them."""
+"""A model over a sequence: label maps, scores or regions on disk, resumable, with a manifest of what they depend on."""
 
 from __future__ import annotations
 
@@ -24,14 +24,14 @@ from semstab.pixels.warp import warp
 from semstab.predict.folder import Kind, PredictionFolder, ScoreType, largest_only, resized
 from semstab.predict.images import ImageSequence, Picture, first_images, picture
 
-# How much regions without classes change from frame to frame: the series of a sequence.
+# The series of a sequence: how much regions without classes change from frame to frame.
 
 COLUMNS = ("previous", "frame", *(field.name for field in fields(RegionChange)))
 
 
 @dataclass(frozen=True)
 class RegionSeries:
-    """One change a pair of successive frames: at the same pixel coordinates, and with camera motion taken out.
+    """One change a pair of successive frames: at the same pixel coordinates, and without camera motion.
 
     Attributes:
         frames: Names, one more than there are changes.
@@ -50,7 +50,7 @@ class RegionSeries:
 
     @property
     def compensated_flicker_percent(self) -> float:
-        """The same with camera motion taken out; NaN where it is not known."""
+        """The same without camera motion; NaN where it is not known."""
         return macro_mean([change.flicker_percent for change in self.compensated])
 
     def write(self, path: Path) -> None:
@@ -114,11 +114,11 @@ class SequenceOptions:
 
 @dataclass(frozen=True)
 class SequenceReport:
-    """The outcome of a prediction: where it is, how many frames, how fast.
+    """The outcome of a prediction: its folders, frames and speed.
 
     Attributes:
         folders: Folders that were written.
-        predicted: Frames that the model saw; `kept` ones were there from before.
+        predicted: Frames that the model saw; `reused` ones are those of an earlier start.
         model_seconds: Seconds in the model; `seconds` are those in all, decoding and writing included.
         regions: For a model without classes, the change from frame to frame.
     """
@@ -126,7 +126,7 @@ class SequenceReport:
     sequence: str
     folders: tuple[Path, ...]
     predicted: int
-    kept: int
+    reused: int
     model_seconds: float
     seconds: float
     regions: RegionSeries | None = None
@@ -143,8 +143,8 @@ class PredictionObserver:
     def sequence_started(self, name: str, frames: int) -> None:
         """Take note that a sequence of so many selected frames is begun."""
 
-    def frame_done(self, kept: bool) -> None:
-        """Take note of one more frame: predicted, or kept from before."""
+    def frame_done(self, reused: bool) -> None:
+        """Take note of one more frame: predicted, or reused from an earlier start."""
 
 
 def predict_sequence(
@@ -158,8 +158,8 @@ def predict_sequence(
     """Predict the images of these indices into out/labels/NAME, and out/scores/NAME; regions into out/regions/NAME.
 
     A model that adapts to a sequence is fitted to the sequence's first images. Frames that an earlier start of the
-    same finished are kept; an image whose content changed is predicted again. A sequential model that lacks a frame
-    is shown all of them again from the first one.
+    same finished are reused; an image whose content changed is predicted again. If a frame is missing, a sequential
+    model is shown all of them again from the first one.
 
     Raises:
         ConfigError: If the folder holds other predictions.
@@ -171,7 +171,7 @@ def predict_sequence(
     model = model.fit(first_images(sequence, model.fit_frames))
     work = _Work(sequence, model, indices, out, options, observers)
     with contextlib.closing(work):
-        anew = model.sequential and not all(work.kept(picture) for picture in work.pictures())
+        anew = model.sequential and not all(work.is_stored(picture) for picture in work.pictures())
         for picture in work.pictures():
             work.take(picture, anew)
         work.flush()
@@ -199,13 +199,13 @@ class _Work:
         self.indices = indices
         self.folders = _folders(sequence, model, indices, out, options)
         self._waiting: list[Picture] = []
-        self._predicted = self._kept = 0
+        self._predicted = self._reused = 0
         self._model_seconds = 0.0
 
     def pictures(self) -> Iterator[Picture]:
-        """Yield what the model is shown, in order.
+        """Yield the pictures that the model is shown, in order.
 
-        What a sequential one says depends on all that it was shown before.
+        The prediction of a sequential model depends on all images that it was shown before.
         """
         if self.model.sequential:
             self.model.reset()
@@ -221,15 +221,15 @@ class _Work:
                     item = dataclasses.replace(item, digest=so_far)
                 yield item
 
-    def kept(self, picture: Picture) -> bool:
+    def is_stored(self, picture: Picture) -> bool:
         """Return whether an earlier start finished it."""
         return all(folder.has(picture.name, picture.digest) for folder in self.folders)
 
     def take(self, picture: Picture, anew: bool) -> None:
-        """Keep what is finished, unless everything is made anew; predict the rest in batches of one size."""
-        if not anew and self.kept(picture):
-            self._kept += 1
-            self._tell(kept=True)
+        """Leave what is finished, unless everything is made anew; predict the rest in batches of one size."""
+        if not anew and self.is_stored(picture):
+            self._reused += 1
+            self._tell(reused=True)
             return
         if self._waiting and self._waiting[0].pixels.shape != picture.pixels.shape:
             self.flush()
@@ -238,7 +238,7 @@ class _Work:
             self.flush()
 
     def flush(self) -> None:
-        """Predict what waits."""
+        """Predict on the pictures that wait."""
         pictures, self._waiting = self._waiting, []
         if not pictures:
             return
@@ -246,29 +246,29 @@ class _Work:
         geometry = [frame for picture in pictures for frame in picture.geometry]
         images = [picture.pixels for picture in pictures]
         if self._too_large(pictures[0]):
-            found = [self.model.stream(image) for image in images]
+            predictions = [self.model.stream(image) for image in images]
         else:
-            found = [
+            predictions = [
                 streamed(prediction)
                 for prediction in ask(self.model, images, scores=self.options.scores, geometry=geometry)
             ]
         seconds = time.perf_counter() - started
         self._model_seconds += seconds
-        for shown, prediction in zip(pictures, found, strict=True):
+        for shown, prediction in zip(pictures, predictions, strict=True):
             self._write(shown, prediction, seconds / len(pictures))
             self._predicted += 1
-            self._tell(kept=False)
+            self._tell(reused=False)
 
     def close(self) -> None:
-        """Say in the manifests what is finished, also after an error or an interruption."""
+        """Write the manifests of what is finished, also after an error or an interruption."""
         for folder in self.folders:
             folder.close()
 
     def report(self, seconds: float, series: RegionSeries | None) -> SequenceReport:
-        """Return what was done."""
+        """Return the report."""
         paths = tuple(folder.path for folder in self.folders)
         return SequenceReport(
-            self.sequence.name, paths, self._predicted, self._kept, self._model_seconds, seconds, series
+            self.sequence.name, paths, self._predicted, self._reused, self._model_seconds, seconds, series
         )
 
     def _too_large(self, picture: Picture) -> bool:
@@ -276,22 +276,22 @@ class _Work:
         size = 4 * picture.pixels.shape[0] * picture.pixels.shape[1] * len(self.model.label_space or ())
         return self.options.scores and self.model.streams and size > SCORE_BYTES
 
-    def _write(self, picture: Picture, found: Streamed, seconds: float) -> None:
+    def _write(self, picture: Picture, prediction: Streamed, seconds: float) -> None:
         """Write a prediction at the pixels that the scene's label files have."""
         alike = self.sequence.labels_like_depth
-        frame = self.sequence.predicted(picture.index, labels=found.labels) if alike else None
+        frame = self.sequence.predicted(picture.index, labels=prediction.labels) if alike else None
         for folder in self.folders:
             if folder.kind != "scores":
-                labels = found.labels if frame is None else frame.predicted
+                labels = prediction.labels if frame is None else frame.predicted
                 folder.write(picture.name, picture.digest, labels, seconds)
                 continue
-            maps = found.maps if frame is None else resized(found.maps, frame.shape, picture.name)
+            maps = prediction.maps if frame is None else resized(prediction.maps, frame.shape, picture.name)
             maps = maps if self.options.top_k is None else largest_only(maps, self.options.top_k)
             folder.write_scores(picture.name, picture.digest, maps(), seconds)
 
-    def _tell(self, kept: bool) -> None:
+    def _tell(self, reused: bool) -> None:
         for observer in self.observers:
-            observer.frame_done(kept)
+            observer.frame_done(reused)
 
 
 def _folders(

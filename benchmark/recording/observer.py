@@ -397,5 +397,5 @@ def _plan_of(run: Path, config: Config, result: Result) -> Plan:
         assert record.series is not None
         frames = [frame for frame, *_ in timeline.read_rows(record.series)]
         task = Task(cast(Scene, scene), unit.model, frames, space.mapping_to(space), (unit.backend,))
-        units.append(PlannedUnit(record.variation, config, task, record.key, image_space=False, kept=True))
+        units.append(PlannedUnit(record.variation, config, task, record.key, image_space=False, stored=True))
     return Plan(config, {}, tuple(units), ())

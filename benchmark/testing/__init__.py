@@ -1,4 +1,4 @@
-"""The conformance suite for fusion backends: subclass it, say how to make one, and pytest does the rest.
+"""The conformance suite for fusion backends: subclass it, define how a backend is made, and pytest does the rest.
 
     from semstab.testing import BackendConformance
 
@@ -62,6 +62,6 @@ class BackendConformance(EvidenceTests, GeometryTests, ContractTests, PropertyTe
         tolerance: Largest difference of a sum (evidence, drift, ...) from its exact value; 1e-9 for float64.
         voxel_share: Part of the voxels that may differ from the reference on random frames, because other arithmetic
             puts a point on the other side of a voxel's face; 0 for float64.
-        reach: Voxels that a map holds to either side of its first camera, 2^31 unless the backend says that it reaches
-            less far; what lies beyond is refused.
+        reach: Voxels that a map holds to either side of its first camera, 2^31 unless the backend reaches less far;
+            points beyond are refused.
     """

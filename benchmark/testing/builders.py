@@ -1,4 +1,4 @@
-"""Building blocks of the tests: frames whose map is known by hand, random ones, and how two maps are compared."""
+"""Building blocks of the tests: frames whose map is known by hand, random ones, and a comparison of two maps."""
 
 from __future__ import annotations
 
@@ -159,11 +159,11 @@ def _rows(table: VoxelTable) -> dict[Voxel, Float64]:
     return dict(zip(voxels(table), np.concatenate(columns, axis=1), strict=True))
 
 
-# Common to all groups of tests: a backend to test, and how to fuse with it.
+# Common to all groups of tests: a backend to test, and the fusion with it.
 
 
 class BackendTests:
-    """Tests of the backend that `create` makes; BackendConformance says what the attributes mean."""
+    """Tests of the backend that `create` makes; BackendConformance explains the attributes."""
 
     tolerance: float = 1e-9
     voxel_share: float = 0.0

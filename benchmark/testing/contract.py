@@ -50,7 +50,7 @@ class ContractTests(BackendTests):
         assert table.drift_sum == self.near(ordered.drift_sum)
 
     def test_rows_are_sorted(self) -> None:
-        """By ix, then iy, then iz, whatever order the voxels came in."""
+        """Rows are sorted by ix, then iy, then iz, whatever order the voxels came in."""
         starts = [(2.5, 0.5), (-0.5, 1.5), (2.5, -7.5), (-0.5, 0.5)]
         table = self.fuse(*(sight_line(t, [(9.5, 0), (0.5, 0)], start=(*xy, -5)) for t, xy in enumerate(starts)))
         corners = [(-1, 0), (-1, 1), (2, -8), (2, 0)]
@@ -92,7 +92,7 @@ class ContractTests(BackendTests):
         assert_same_map(b.table(), self.fuse(sight_line(3, [(0.5, 1), (1.5, 1)])), self.tolerance)
 
     def test_events_hold_what_the_table_sums(self) -> None:
-        """A backend that keeps the log of observations keeps the whole of it."""
+        """A backend that stores the log of observations stores the whole of it."""
         backend = self.create(1.0, 3)
         for frame in as_frames([[(0.2, 0), (0.4, 1), (1.5, 2)], [(0.5, 1)], [(1.5, 0), (2.5, 2)]]):
             backend.integrate(frame)
@@ -202,7 +202,7 @@ class ContractTests(BackendTests):
             before = after
 
     def assert_report(self, report: FrameReport, before: VoxelTable, after: VoxelTable) -> None:
-        """Assert that counts and drift are differences; the means may be NaN, where a backend keeps none."""
+        """Assert that counts and drift are differences; the means may be NaN, where a backend has none."""
         assert report.points == after.pixels.sum() - before.pixels.sum()
         assert report.voxels == after.op.sum() - before.op.sum()
         assert report.new_voxels == len(after) - len(before)

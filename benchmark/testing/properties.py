@@ -130,7 +130,7 @@ class EvidenceTests(BackendTests):
             assert table.evidence[0] == self.near([0, 0, 1])
 
     def test_many_classes(self) -> None:
-        """In a 16-bit map 255 is a class like any other."""
+        """255 is a class like any other in a 16-bit map."""
         table = self.fuse(sight_line(0, [(0.5, 255), (1.5, 299), (2.5, 65535)], dtype=np.uint16), K=300)
         assert table.evidence.shape == (2, 300)
         assert dominant(table).tolist() == [255, 299]
@@ -155,7 +155,7 @@ class EvidenceTests(BackendTests):
         assert table.evidence[only(table)] == self.near([1 / 2, 1 / 2, 0])
 
 
-# Where a pixel falls: cameras, the faces of voxels, coordinates far from the origin, and maps that grow.
+# The voxel of a pixel: cameras, the faces of voxels, coordinates far from the origin, and maps that grow.
 
 
 class GeometryTests(BackendTests):
@@ -214,7 +214,7 @@ class GeometryTests(BackendTests):
         assert there.evidence == self.near(here.evidence)
 
     def test_the_outermost_voxels(self) -> None:
-        """As far as the backend reaches, -2^31 and 2^31 - 1 if nothing else is said, voxels are as good as any.
+        """Voxels are as good as any as far as the backend reaches, by default to -2^31 and 2^31 - 1.
 
         The next one is refused, and the map stays as it is.
         """

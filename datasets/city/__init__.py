@@ -34,7 +34,7 @@ GENERATOR_VERSION = 1
 
 
 class City(Dataset):
-    """The dataset. It keeps the scene that was opened last, so that its models share what is rendered."""
+    """The dataset. The scene that was opened last stays in memory, so that its models share rendered frames."""
 
     Options: type[BaseModel] = CityOptions
 
@@ -154,11 +154,11 @@ class CityScene(Scene):
 
     @cached_property
     def still(self) -> Caster:
-        """Return what rays hit of the town, whatever the time."""
+        """Return the still part of the town, at which rays are cast."""
         return Caster(self.world.still)
 
     def _share(self, index: int) -> float:
-        """Return how much of the flight lies behind at a frame."""
+        """Return the share of the flight that is over at a frame."""
         return index / max(1, len(self) - 1)
 
     def _pose(self, index: int) -> Float64:

@@ -1,4 +1,4 @@
-"""Labellers that agree with themselves for the wrong reasons, as simulated models: no verdict may be bought so."""
+"""Labellers that agree with themselves for the wrong reasons, as simulated models: no verdict may be gained so."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def _without_borders(predicted: UInt8, _view: View, _model: Simulation) -> UInt8
 
 
 def _without_doubt(predicted: UInt8, view: View, model: Simulation) -> UInt8:
-    """Return labels without the pixels that the model would label otherwise in another frame from the same place."""
+    """Return labels without the pixels that the model would label otherwise in another frame from the same position."""
     again = [model.labels(dataclasses.replace(view, frame=view.frame + 10**6 * k)) for k in range(1, DRAWS)]
     sure = np.all([other == predicted for other in again], axis=0) & (view.rendered.incidence > 0.5)
     return np.where(sure, predicted, np.uint8(IGNORE_8BIT))
@@ -74,11 +74,11 @@ LABELLERS: Mapping[str, Labeller] = {
     "world-locked": _locked_to_the_world,
     "by-row": _by_row,
 }
-"""The labellers by name: what each makes of a model's labels."""
+"""The labellers by name; each changes a model's labels."""
 
 
 def relabelled(model: Simulation, view: View) -> UInt8:
-    """Return the labels of a model, or what its labeller makes of them; 255 where there is nothing."""
+    """Return the labels of a model, changed by its labeller if it has one; 255 where there is nothing."""
     predicted = model.labels(view)
     if not model.model.labeller:
         return predicted

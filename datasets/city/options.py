@@ -25,7 +25,7 @@ CONFUSION: dict[str, dict[str, float]] = {
     "human": {"clutter": 0.5, "road": 0.3, "low vegetation": 0.2},
     "moving car": {"static car": 0.7, "road": 0.2, "clutter": 0.1},
 }
-"""The classes that each true class is mistaken for, by weight: what segmentation networks confuse in UAVid images."""
+"""The classes that each true class is mistaken for, by weight, as networks confuse them in UAVid images."""
 
 Share = Annotated[float, Field(ge=0, le=1)]
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9.-]*(_[A-Za-z0-9.-]+)*")
@@ -47,7 +47,7 @@ Labeller = Literal[
 
 
 class SimulatedModel(Settings):
-    """The errors of one simulated model, by what each is drawn for.
+    """The errors of one simulated model, each with the unit that it is drawn for.
 
     Each draw is a function of the seed, the model's and the scene's name, and of that.
 
@@ -81,7 +81,7 @@ class SimulatedModel(Settings):
         60.0, gt=0, le=1000, description="distance from which view errors grow no further, metres"
     )
     softness: float = Field(0.0, ge=0, le=0.49, description="largest score that goes to other classes; 0: class ids")
-    labeller: Labeller = Field("", description="what makes the labels over, so that they agree for a wrong reason")
+    labeller: Labeller = Field("", description="labeller that changes the labels so that they agree for a wrong reason")
     difficulty: dict[ClassName, Annotated[float, Field(ge=0, le=100)]] = Field(
         default_factory=dict, description="factors on place, view and flicker by true class; 1 where not given"
     )
@@ -130,7 +130,7 @@ class CityOptions(Settings):
     )
     altitude: float = Field(45.0, ge=30, le=120, description="of the camera above the mean ground, metres")
     field_of_view: float = Field(60.0, ge=20, le=100, description="horizontal, degrees")
-    cache_megabytes: int = Field(256, ge=0, description="rendered frames that an open scene keeps for its models")
+    cache_megabytes: int = Field(256, ge=0, description="rendered frames that an open scene caches for its models")
     models: dict[str, SimulatedModel] = Field(
         default_factory=lambda: dict(MODELS),
         description="the simulated models by name, instead of the built-in ones",

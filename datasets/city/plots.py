@@ -1,4 +1,4 @@
-"""Plots of land and what stands on them: houses with gardens, apartment blocks, a market hall, a park or fields."""
+"""Plots of land and the things on them: houses with gardens, apartment blocks, a market hall, a park or fields."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ class Building(NamedTuple):
 
 
 class Spot(NamedTuple):
-    """A small thing that stands at a place: a tree, a bush, a car, a person."""
+    """A small thing that stands at a point: a tree, a bush, a car, a person."""
 
     s: float
     t: float
@@ -93,7 +93,7 @@ def furnish(plot: Plot, town: Inventory, rng: np.random.Generator) -> None:
 
 
 class _Row(NamedTuple):
-    """A row of parcels along one long side of a plot: where it starts, which way its houses face, how deep it is."""
+    """A row of parcels along one long side of a plot: its start, the direction that its houses face, its depth."""
 
     land: Rectangle
     along_s: bool
@@ -107,7 +107,7 @@ class _Row(NamedTuple):
         return (self.land.s0, self.land.s1) if self.along_s else (self.land.t0, self.land.t1)
 
     def point(self, along: float, into: float) -> tuple[float, float]:
-        """Plan point at a place along the row and a distance behind its front."""
+        """Plan point at a position along the row and a distance behind its front."""
         across = self.front + self.inwards * into
         return (along, across) if self.along_s else (across, along)
 

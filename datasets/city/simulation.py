@@ -15,7 +15,7 @@ from semstab.data.labels import IGNORE_8BIT
 from semstab.datasets.city.mesh import BUILDING, CLUTTER, LOW_VEGETATION, ROAD, TREE, Surface, uavid8
 from semstab.datasets.city.options import CONFUSION, SimulatedModel
 
-# Random numbers that are a function of integers: the same place, view or frame always draws the same number.
+# Random numbers that are a function of integers: the same cell, view or frame always draws the same number.
 
 _GOLDEN = np.uint64(0x9E3779B97F4A7C15)
 _MIX1 = np.uint64(0xBF58476D1CE4E5B9)
@@ -48,7 +48,7 @@ def hash_integers(seed: int, *coordinates: Int64) -> UInt64:
 
 
 def rehash(state: UInt64, seed: int) -> UInt64:
-    """Return a second, independent hash of what `state` is a hash of."""
+    """Return a second, independent hash of the numbers behind the hash `state`."""
     return splitmix64(state ^ np.uint64(seed))
 
 
@@ -59,7 +59,7 @@ def uniform(state: UInt64) -> Float64:
 
 
 CHUNK = 1 << 18
-"""Rays cast at a time: what bounds the memory of a large image."""
+"""Rays cast at a time, which bounds the memory of a large image."""
 
 SUN = np.array([0.42, -0.38, 0.82]) / np.linalg.norm([0.42, -0.38, 0.82])
 AMBIENT, SUNLIGHT = 0.52, 0.60
@@ -97,7 +97,7 @@ class Rendered:
 
 
 class Caster:
-    """Triangles to cast rays at: embree finds the triangle in float32, its plane gives the place in float64."""
+    """Triangles to cast rays at: embree finds the triangle in float32, its plane gives the position in float64."""
 
     def __init__(self, surface: Surface) -> None:
         import trimesh
@@ -163,7 +163,7 @@ def pixel_rays(intrinsics: Intrinsics, T: Float64, rows: slice, width: int) -> F
 
 @dataclass(frozen=True)
 class _Hit:
-    """Per ray: planar depth (inf for none), place, normal towards the camera, incidence, class, material colour."""
+    """Per ray: planar depth (inf for none), position, normal towards the camera, incidence, class, material colour."""
 
     depth: Float64
     points: Float64
@@ -191,7 +191,7 @@ def _nearest(casters: tuple[Caster, Caster], origin: Float64, directions: Float6
 
 
 def _shade(hit: _Hit, casters: tuple[Caster, Caster]) -> UInt8:
-    """Return Lambert's law under one sun with cast shadows, with grain that is tied to the place."""
+    """Return Lambert's law under one sun with cast shadows, with grain that is tied to the position."""
     light = np.maximum(hit.normals @ SUN, 0.0)
     lit = np.flatnonzero(light > 0)
     start = hit.points[lit] + SHADOW_OFFSET * (hit.normals[lit] + SUN)
@@ -211,7 +211,7 @@ def _noise(points: Float64, cell: float) -> Float64:
     return 2 * uniform(hash_integers(17, x, y, z)) - 1
 
 
-# Simulated models: the true label map with errors tied to places, views, frames and class borders.
+# Simulated models: the true label map with errors tied to cells, views, frames and class borders.
 
 Labels = UInt8
 Scores = Float32
@@ -222,7 +222,7 @@ class View:
     """One frame as a model is given it.
 
     Attributes:
-        frame: Index, what flicker and border errors are drawn for.
+        frame: Index, for which flicker and border errors are drawn.
         T_wc: (4, 4) camera-to-world; origin (3,), from where cells are counted.
     """
 
@@ -233,7 +233,7 @@ class View:
     origin: Float64
 
     def positions(self, rows: slice) -> Float64:
-        """Return World coordinates (3, h, W) of rows of pixels, in the order of operations of the fusion backends."""
+        """Return world coordinates (3, h, W) of rows of pixels, in the order of operations of the fusion backends."""
         d = self.rendered.depth[rows].astype(np.float64)
         k, T = self.intrinsics, self.T_wc
         v = np.arange(rows.start, rows.start + len(d))[:, None]
@@ -265,7 +265,7 @@ class Simulation:
     def scores(self, view: View) -> Scores:
         """Return soft scores (H, W, 8) float32 that sum to 1, the predicted class the largest.
 
-        0 where there is nothing.
+        Scores are 0 where there is nothing.
         """
         predicted = self.labels(view)
         scores = np.zeros((*predicted.shape, len(self._weights)), dtype=np.float32)
@@ -278,18 +278,18 @@ class Simulation:
         if not (model.place or model.view or model.flicker):
             return predicted
         cells = self._cells(view, rows)
-        place = hash_integers(0, *cells)
+        spot = hash_integers(0, *cells)
         factor = self._factors[np.minimum(true, len(self._weights))]
-        wrong = self._strike(predicted, true, rehash(place, self._salts["place"]), model.place * factor)
+        wrong = self._strike(predicted, true, rehash(spot, self._salts["place"]), model.place * factor)
         if model.view:
             seen_from, distance = self._seen_from(view, cells)
             # grows with the angle to the normal, 1 from 60 degrees, and with the distance
             slant = np.minimum(1.0, 2 * (1 - view.rendered.incidence[rows].astype(np.float64)))
             chance = model.view * slant * np.minimum(1.0, distance / model.view_distance) * factor
-            drawn = hash_integers(self._salts["view"], place.view(np.int64), *seen_from)
+            drawn = hash_integers(self._salts["view"], spot.view(np.int64), *seen_from)
             wrong = self._strike(wrong, true, drawn, chance)
         if model.flicker:
-            wrong = self._strike(wrong, true, self._of_frame(place, view.frame, "flicker"), model.flicker * factor)
+            wrong = self._strike(wrong, true, self._of_frame(spot, view.frame, "flicker"), model.flicker * factor)
         return wrong
 
     def _strike(self, predicted: Labels, true: Labels, drawn: UInt64, chance: Float64) -> Labels:
@@ -304,8 +304,8 @@ class Simulation:
     def _softened(self, view: View, rows: slice, predicted: Labels) -> Scores:
         true = view.rendered.classes[rows]
         seen = true != IGNORE_8BIT
-        place = hash_integers(0, *self._cells(view, rows))
-        rest = self.model.softness * uniform(self._of_frame(place, view.frame, "soft"))[seen]
+        spot = hash_integers(0, *self._cells(view, rows))
+        rest = self.model.softness * uniform(self._of_frame(spot, view.frame, "soft"))[seen]
         best, other = predicted[seen], true[seen]
         spread = np.where((best == other)[:, None], self._weights[best], np.eye(len(self._weights))[other])
         spread *= rest[:, None]
@@ -315,16 +315,16 @@ class Simulation:
         return scores
 
     def _cells(self, view: View, rows: slice) -> tuple[Int64, Int64, Int64]:
-        """Return cell of each pixel, counted from the cell of the town's origin, so that errors move with the town."""
+        """Return the cell of each pixel, counted from that of the town's origin, so that errors move with the town."""
         size = self.model.cell
         first = np.rint(view.origin / size)
         x, y, z = ((np.floor(x / size) - first[k]).astype(np.int64) for k, x in enumerate(view.positions(rows)))
         return x, y, z
 
     def _seen_from(self, view: View, cells: tuple[Int64, Int64, Int64]) -> tuple[tuple[Int64, Int64, Int64], Float64]:
-        """Return quantised azimuth, elevation and distance of the camera as seen from the cell's centre.
+        """Return the camera's azimuth, elevation and distance from the cell's centre, quantised.
 
-        And that distance.
+        The distance itself follows.
         """
         model = self.model
         first = np.rint(view.origin / model.cell)
@@ -339,8 +339,8 @@ class Simulation:
         azimuth, elevation, far = (np.floor(step).astype(np.int64) for step in steps)
         return (azimuth, elevation, far), distance
 
-    def _of_frame(self, place: UInt64, frame: int, kind: str) -> UInt64:
-        return rehash(rehash(place, self._salts[kind]), frame)
+    def _of_frame(self, spot: UInt64, frame: int, kind: str) -> UInt64:
+        return rehash(rehash(spot, self._salts[kind]), frame)
 
     def _displaced_borders(self, view: View) -> Labels:
         """Return the true label map, read at pixels displaced by a smooth field of at most `border` pixels an axis."""
@@ -367,6 +367,6 @@ class Simulation:
 
 
 def _row_chunks(shape: tuple[int, ...]) -> list[slice]:
-    """Return slices of rows of at most CHUNK pixels: what bounds the memory of a large image."""
+    """Return slices of rows of at most CHUNK pixels, which bounds the memory of a large image."""
     step = max(1, CHUNK // shape[1])
     return [slice(top, min(top + step, shape[0])) for top in range(0, shape[0], step)]

@@ -42,7 +42,7 @@ class Layout:
         return c * a - d * b, d * a + c * b
 
     def heading(self, s: Float64, t: Float64, angle: Float64) -> Float64:
-        """Return the heading in the world of what points along `angle` (radians from the s axis) at plan points."""
+        """Return the heading in the world of a direction `angle` (radians from the s axis) at plan points."""
         a = self.bend[0] * self.wavenumber[0] * np.cos(self.wavenumber[0] * t + self.phase[0])
         b = self.bend[1] * self.wavenumber[1] * np.cos(self.wavenumber[1] * s + self.phase[1])
         along_s, along_t = np.cos(angle), np.sin(angle)
@@ -220,7 +220,7 @@ class Terrain:
 
 @dataclass(frozen=True)
 class Site:
-    """The place of a town: its street plan, and the ground under it."""
+    """The site of a town: its street plan, and the ground under it."""
 
     layout: Layout
     terrain: Terrain

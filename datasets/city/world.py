@@ -140,7 +140,7 @@ class Traffic:
         return cls(site, replace(cars, size=sizes, tint=paint), replace(walkers, size=heights, tint=clothes))
 
     def at(self, seconds: float, camera: Float64) -> Surface:
-        """Return what moves as it stands at a time, as far as it is within SIGHT of the camera at (x, y, z)."""
+        """Return the moving things at their positions at a time, those within SIGHT of the camera at (x, y, z)."""
         kinds = ((self.cars, car(), MOVING_CAR, ROAD_ABOVE), (self.walkers, person(), HUMAN, SIDEWALK_ABOVE))
         surfaces = []
         for movers, template, class_id, above in kinds:
@@ -159,7 +159,7 @@ def _movers(
     speeds: tuple[float, float],
     rng: np.random.Generator,
 ) -> Movers:
-    """Return movers on both sides of each street, keeping right; what shares a lane shares a speed."""
+    """Return movers on both sides of each street, keeping right; those that share a lane share a speed."""
     rows = []
     for street in streets:
         for side in (-1.0, 1.0):

@@ -31,7 +31,7 @@ MVEI_FLOAT = 9
 """Type of a sample: 32-bit float."""
 
 DMAP_HEADER = struct.Struct("<2sBb4I2f")
-"""Magic, what it holds, exponent; width and height of the image, then of the depth; least and largest depth."""
+"""Magic, the kind of content, exponent; width and height of the image, then of the depth; least and largest depth."""
 DMAP_CAMERA = 21 * 8
 """Bytes of K, R and C."""
 HEADER_BYTES = 2**18
@@ -143,7 +143,7 @@ def _metres(path: Path, data: bytes, start: int, shape: tuple[int, int], dtype: 
 
 
 FORMATS = {".bin": read_depth_map, ".mvei": read_mvei, ".dmap": read_dmap}
-"""Functions that read depth, by the suffix of the file; `read_depth` reads the rest."""
+"""Functions that read depth, by the suffix of the file; `read_depth` reads the others."""
 
 
 def stored_scale(frame: FrameSource, options: FileOptions) -> float:
@@ -188,6 +188,6 @@ def shape_of(frame: FrameSource, options: FileOptions) -> tuple[int, int]:
         H, W = read_depth(frame.depth, 1.0).shape
         return H, W
     if frame.label_camera is not None or frame.color is None or not frame.color.is_file():
-        raise DataError(f"{frame.color or frame.name}: no colour image says the size of depth; set intrinsics_size")
+        raise DataError(f"{frame.color or frame.name}: no colour image gives the size of depth; set intrinsics_size")
     width, height = color_size(frame.color)
     return height, width

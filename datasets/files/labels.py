@@ -1,4 +1,4 @@
-"""Label maps and scores of a scene wherever they stand: which sources there are, and the file of each frame."""
+"""Label maps and scores of a scene: the label sources that there are, and the file of each frame."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ class SceneEntry:
 
 @dataclass(frozen=True)
 class LabelSource:
-    """One label source of a scene: where a frame's file would be.
+    """One label source of a scene, with the path of each frame's file.
 
     Attributes:
         folders: The listed content of folders.
@@ -90,8 +90,8 @@ def find_sources(
 ) -> dict[str, LabelSource]:
     """Return the label sources of a scene with these frames; `gt` is the ground truth.
 
-    labels of X are the model X, scores of X found by a template are X-scores, so that neither name depends on what
-    else is there. A folder without a file of any frame is left out with a warning.
+    labels of X are the model X, scores of X found by a template are X-scores, so that neither name depends on
+    other folders. A folder without a file of any frame is left out with a warning.
 
     Raises:
         ConfigError: For a template that cannot be used, or a labels_root that is not there.
@@ -100,7 +100,7 @@ def find_sources(
     sources: dict[str, LabelSource] = {}
     base = options.labels_root or entry.folder
     if not os.path.isdir(base):  # noqa: PTH112  Path.is_dir raises where the name is too long
-        raise ConfigError(f"{base}: there is no such folder; mend labels_root")
+        raise ConfigError(f"{base}: there is no such folder; correct labels_root")
     for kind in KINDS:
         templates: dict[str, str] = {}
         for model, template in _stated(kind, options).items():
@@ -230,7 +230,7 @@ class LabelMaps:
         return file
 
     def space(self, model: str) -> LabelSpace | None:
-        """Return the classes of a label source, read once; None for regions, and where nothing says them.
+        """Return the classes of a label source, read once; None for regions, and where no file or option has them.
 
         They are those of option taxonomies, else of a label_space.yaml next to its maps, else of the scene.
 
@@ -259,7 +259,7 @@ class LabelMaps:
             raise ConfigError(f"{self._folder}: {error}") from error
 
     def label_space(self, model: str, where: Path) -> LabelSpace:
-        """Return the same; raises DataError with `where` where nothing says them, ConfigError where it has none."""
+        """Return the same; raises DataError with `where` where they are not known, ConfigError where it has none."""
         source = self.source(model)
         if model in self.regions:
             raise ConfigError(f"{self._folder}: '{model}' holds regions without classes, which cannot be fused")

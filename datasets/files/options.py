@@ -1,4 +1,4 @@
-"""Options that every dataset of files has, path templates, and where the files of a frame are."""
+"""Options that every dataset of files has, path templates, and the files of a frame."""
 
 from __future__ import annotations
 
@@ -109,7 +109,7 @@ class FileSettings(Settings):
 
 
 class FileOptions(FileSettings):
-    """Options of any dataset of files: where they are, and how they are read."""
+    """Options of any dataset of files: their paths, and the conventions by which they are read."""
 
     root: Path = Field(description="a scene's folder, or the folder above scenes")
     incomplete: Literal["error", "skip"] = Field("error", description="a selected frame without depth, pose or labels")
@@ -119,7 +119,7 @@ class FileOptions(FileSettings):
     )
     surface_cell: Positive | None = Field(None, description="metres of a cell of the grid of a cloud or raster")
     casts: Path | Literal[False] | None = Field(
-        None, description="folder where cast depth is kept, or false; semstab/casts in the user's cache by default"
+        None, description="folder where cast depth is stored, or false; semstab/casts in the user's cache by default"
     )
 
 
@@ -159,7 +159,7 @@ class Template:
         if path.is_absolute() or ".." in path.parts or UNSAFE.search(self.text) or not path.parts:
             raise ConfigError(
                 f"{where}: leaves its folder; write a path inside it, and set root, or labels_root for labels that"
-                " stand elsewhere"
+                " are elsewhere"
             )
 
     def filled(self, **values: str) -> str:
@@ -227,7 +227,7 @@ class Folders:
         return next((candidate for candidate in candidates if self.has(candidate)), None)
 
 
-# Where the files of a frame are.
+# The files of a frame.
 
 
 @dataclass(frozen=True, eq=False, slots=True)

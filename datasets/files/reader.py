@@ -28,12 +28,12 @@ Options = TypeVar("Options", bound=FileOptions)
 
 
 class FileDataset(Dataset, Generic[Options]):
-    """Scenes of files below a root. A reader says what a scene's folder looks like, and lists its frames.
+    """Scenes of files below a root. A reader recognises a scene's folder, and lists its frames.
 
     Attributes:
         contents: The files of a scene's folder, for error messages.
         labels_like_depth: Whether label maps that are made for it have the depth's pixels, not those of the images.
-        settings_file: Name of a file in a scene's folder that says what no option says, which `settled` reads.
+        settings_file: Name of a file in a scene's folder with further settings, which `settled` reads.
 
     Raises:
         DataError: If there is no scene.
@@ -72,7 +72,7 @@ class FileDataset(Dataset, Generic[Options]):
         if options.surface is not None:
             if options.surface.suffix.lower() in SEEN_FROM_ABOVE and options.up_axis not in (None, "z"):
                 raise ConfigError(
-                    f"{options.surface}: is a surface over x and y, but up_axis is {options.up_axis}; turn it, or take"
+                    f"{options.surface}: holds heights over x and y, but up_axis is {options.up_axis}; turn it, or take"
                     " a mesh"
                 )
             cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
@@ -99,13 +99,13 @@ class FileDataset(Dataset, Generic[Options]):
         return self.options
 
     def georeference(self, folder: Path, options: FileOptions) -> Georeference | None:
-        """Return where a scene lies on Earth: what the options say, else None. Raises what `Georeference.of` raises."""
+        """Return the georeference of a scene that the options give, else None. Raises what `Georeference.of` raises."""
         if options.crs is None:
             return None
         return Georeference.of(options.crs, options.offset or (0.0, 0.0, 0.0), f"{folder}: crs", options.linear)
 
     def mesh_origin(self, folder: Path, surface: Path) -> tuple[float, float, float] | None:
-        """Return where in the projection the coordinates of a mesh count from, None where they are the scene's."""
+        """Return the origin of a mesh's coordinates in the projection, None where they are the scene's."""
         return None
 
     def depth_files(self, folder: Path, before: str, after: str, *, instead: Iterable[str]) -> dict[str, Path]:
@@ -124,7 +124,7 @@ class FileDataset(Dataset, Generic[Options]):
         return {name: folder / f"{before}{name}{after}" for name in sorted({*there, *instead}, key=natural)}
 
     def has_depth(self, folder: Path) -> bool:
-        """Return whether a folder of depth images is there, or needs not be, as a surface gives the depth."""
+        """Return whether a folder of depth images is there, or is not needed, as a surface gives the depth."""
         return self.options.surface is not None or folder.is_dir()
 
     def class_ids(self) -> Mapping[str, UInt16]:
@@ -202,7 +202,7 @@ def frames_of(
         what: Name of the depth images in messages.
 
     Raises:
-        DataError: If that file has another number of poses than there are depth images, or what goes with each.
+        DataError: If that file has another number of poses than there are depth images, or of files that go with each.
     """
     if poses is not None and len(poses) != len(depth):
         raise DataError(

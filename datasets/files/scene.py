@@ -1,4 +1,4 @@
-"""A scene whose frames lie in files, of whatever layout: what readers of file formats share."""
+"""A scene whose frames lie in files, of whatever layout; readers of file formats share it."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ PLACES = {
     "root", "labels_root", "incomplete", "taxonomy", "taxonomies", "classes", "class_table", "crs", "offset", "surface",
     "casts", "images",
 }  # fmt: skip
-"""Options that say where things are, not what the numbers mean; label spaces and tables count by their content."""
+"""Options that are paths and do not change the numbers; label spaces and tables count by their content."""
 
 DEPTH, LABELS, MASK = "depth", "labels of ", "mask"
 """Kinds of a frame's files."""
@@ -78,7 +78,7 @@ class FileScene(Scene):
         self.on_photographs = any(frame.label_lens is not None for frame in frames)
 
     def __len__(self) -> int:
-        """Return the number of frames of the sequence, those that lack a file or a pose among them."""
+        """Return the number of frames of the sequence, those without a file or a pose among them."""
         return len(self._frames)
 
     @cached_property
@@ -101,7 +101,7 @@ class FileScene(Scene):
         return self._frame(index).name
 
     def missing(self, index: int, sources: Sequence[str] = (), *, color: bool = False) -> list[str]:
-        """Return paths of the files that the frame lacks: depth, pose, the labels of these sources, colour."""
+        """Return the paths of the missing files of the frame: depth, pose, the labels of these sources, colour."""
         frame = self._frame(index)
         files = [self.surface or frame.depth, *([frame.pose_file] if frame.pose is None else [])]
         lost = [str(path) for path in files if not self._folders.has(path)]
@@ -126,7 +126,7 @@ class FileScene(Scene):
         """Return the classes of that label source.
 
         Raises:
-            DataError: If nothing says them.
+            DataError: If they are not known.
             ConfigError: If there is no such source, or it has none.
         """
         return self._maps.label_space(model, self.settings_file or self.folder)
@@ -237,7 +237,7 @@ class FileScene(Scene):
     def T_wc(self, index: int) -> Poses:
         """Return pose (4, 4) camera-to-world in metres, OpenCV camera axes; needs no labels.
 
-        That the pose is rigid is checked by `Frame`.
+        `Frame` checks that the pose is rigid.
 
         Raises:
             DataError: If that fails; the message names the file.
@@ -252,7 +252,7 @@ class FileScene(Scene):
     def digest(self, indices: Sequence[int], model: str) -> str:
         """Return a hash of the settings, the classes, and the depth, poses and labels of those frames.
 
-        Of the images it is the content that `frame` read, where it did; others are read for it.
+        Images that `frame` has read count by that content; others are read for the hash.
         """
         space = self._maps.space(model)
         settings = self.options.model_dump(mode="json", exclude=PLACES)
@@ -301,7 +301,7 @@ class FileScene(Scene):
         if mask is not None:  # outside of the mask's view nothing is masked
             values = read_mask(mask, self._reader(index, MASK)).astype(np.uint8)
             masked = self._stored(index, values, depth.shape, mask, "the mask is") == 1
-        shown = image if source.color_lens is None else None  # a distorted one is not what the depth's camera sees
+        shown = image if source.color_lens is None else None  # a distorted one shows another view than the depth
         known = {"depth": self.surface or source.depth, "pose": source.pose_file, "color": shown, "mask": mask}
         known |= dict(files or {})
         return Frame(

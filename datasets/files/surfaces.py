@@ -115,7 +115,7 @@ def require_same_projection(path: Path, crs: str, georeference: Georeference) ->
 
 @dataclass(frozen=True, eq=False)
 class Triangles:
-    """vertices (n, 3) float64 in the scene's coordinates, metres; faces (m, 3) int32; `what` they are, in words."""
+    """vertices (n, 3) float64 in the scene's coordinates, metres; faces (m, 3) int32; `what` describes them."""
 
     vertices: Float64
     faces: Int32
@@ -152,8 +152,8 @@ def read_triangles(path: Path, cell: float | None, georeference: Georeference | 
 
 def _raster(path: Path, cell: float | None, georeference: Georeference | None) -> Triangles:
     heights = read_heights(path, cell, georeference)
-    found = _of_heights(heights, f"height raster, cells of {abs(heights.dx):.3g} m")
-    return _in_scene(found, georeference)
+    triangles = _of_heights(heights, f"height raster, cells of {abs(heights.dx):.3g} m")
+    return _in_scene(triangles, georeference)
 
 
 def _las(path: Path, cell: float | None, georeference: Georeference | None) -> Triangles:
@@ -223,7 +223,7 @@ READERS: Mapping[str, Callable[[Path, float | None, Georeference | None], Triang
 }  # fmt: skip
 
 SEEN_FROM_ABOVE = tuple(READERS)
-"""Suffixes of files that hold heights over x and y, whatever is in them."""
+"""Suffixes of files that hold heights over x and y, whatever their content."""
 
 
 # LAS and LAZ clouds: laspy and lazrs take the memory that a header asks for, so sizes are checked first.
@@ -240,7 +240,7 @@ POINT_BYTES_AT_ONCE = 2**26
 
 @contextmanager
 def open_las(path: Path) -> Iterator[Any]:
-    """Yield a laspy.LasReader. Whatever is wrong with the file is a DataError of one line, also while it is read."""
+    """Yield a laspy.LasReader. Any error in the file is a DataError of one line, also while it is read."""
     import laspy
 
     try:
@@ -485,10 +485,12 @@ class Surface:
     @cached_property
     def triangles(self) -> Triangles:
         """Return the surface in the scene's coordinates. Raises what `read_triangles` raises."""
-        found = read_triangles(self.path, self._cell, self._georeference)
+        triangles = read_triangles(self.path, self._cell, self._georeference)
         if self._mesh_origin is None or self._georeference is None:
-            return found
-        return replace(found, vertices=self._georeference.in_scene(found.vertices + np.array(self._mesh_origin)))
+            return triangles
+        return replace(
+            triangles, vertices=self._georeference.in_scene(triangles.vertices + np.array(self._mesh_origin))
+        )
 
     def depth(self, view: View) -> Float32:
         """Return depth (H, W) of a view along the optical axis in metres, 0 where it sees no surface."""
@@ -517,7 +519,7 @@ class Surface:
 
 
 def _apart(triangles: Triangles, centres: Float64) -> str:
-    """Return where the cameras are relative to a surface that they do not see, and what to do."""
+    """Return the position of the cameras relative to a surface that they do not see, and the remedy."""
     low, high = triangles.bounds
     nearest = np.clip(centres, low, high)
     closest = np.linalg.norm(centres - nearest, axis=1).argmin()
@@ -528,5 +530,5 @@ def _apart(triangles: Triangles, centres: Float64) -> str:
         )
     return (
         f"the nearest camera is {np.linalg.norm((x, y, z)):,.0f} m away (east {x:,.0f}, north {y:,.0f}, up {z:,.0f}"
-        " m); surface and poses lie in other coordinates, bring them to the same (an offset?)"
+        " m); surface and poses have different coordinates; bring them to the same (an offset?)"
     )

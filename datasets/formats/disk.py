@@ -95,7 +95,7 @@ def files_by_stem(folder: Path, suffixes: Container[str]) -> dict[str, str]:
         stem, suffix = os.path.splitext(entry.name)  # noqa: PTH122  of a hundred thousand names
         if suffix.lower() in suffixes and entry.is_file():
             if stem in files:
-                raise DataError(f"{folder / entry.name}: {files[stem]} is the same frame; keep one of the two")
+                raise DataError(f"{folder / entry.name}: {files[stem]} is the same frame; delete one of the two")
             files[stem] = entry.name
     return files
 
@@ -122,7 +122,7 @@ def _entries(folder: Path) -> Iterator[os.DirEntry[str]]:
         raise DataError(f"{folder}: the folder cannot be listed ({error.strerror})") from error
 
 
-# npy and npz bytes to an array of plain numbers: the whole one, or one DataError with the file; nothing is run.
+# npy and npz bytes to an array of plain numbers: the whole one, or one DataError with the file; no code is run.
 
 NPY_DTYPE = re.compile(rb"""['"]descr['"]\s*:\s*['"]([<>|=]?(?:b1|[iu][1248]|f[248]))['"]""")
 NPY_ORDER = re.compile(rb"""['"]fortran_order['"]\s*:\s*(True|False)""")
@@ -135,7 +135,7 @@ def decode_array(path: Path, data: bytes, key: str) -> npt.NDArray[Any]:
 
 
 def _decode_npy(where: str, data: bytes) -> npt.NDArray[Any]:
-    """Return parsed by hand: numpy evaluates the header as Python, with its warnings, and allocates what it claims."""
+    """Return the array; numpy itself would evaluate the header as Python, and allocate the claimed size."""
     if not data.startswith(b"\x93NUMPY") or len(data) < 12:
         raise DataError(f"{where}: not an .npy array; {AGAIN}")
     width = 2 if data[6] == 1 else 4
@@ -310,7 +310,7 @@ def records(path: Path) -> Iterator[tuple[int, str]]:
 
 
 def read_table(path: Path, columns: int, what: str) -> Float64:
-    """Return (n, columns) numbers, apart by whitespace or commas; `what` says in errors what a line is.
+    """Return (n, columns) numbers, apart by whitespace or commas; `what` describes a line in errors.
 
     Raises:
         DataError: For another number of words, or one that is no number; and for no line; the message names the line.

@@ -47,7 +47,7 @@ Read = Callable[[Path], bytes]
 
 
 def read_depth(path: Path, scale: float | None = None, read: Read = read_bytes) -> Float32:
-    """Return depth (H, W) in metres, float32, as stored: what marks a pixel invalid stays.
+    """Return depth (H, W) in metres, float32, as stored: values that mark a pixel invalid stay.
 
     `scale` is units per metre; not given, a 16-bit PNG holds millimetres and float files hold metres.
 
@@ -279,7 +279,7 @@ def _whole_png(path: Path, data: bytes) -> Iterator[Png]:
 
 @contextmanager
 def _one_line(path: Path, what: str) -> Iterator[None]:
-    """Turn what Pillow raises for damaged files into DataError."""
+    """Turn the exceptions of Pillow for damaged files into DataError."""
     try:
         yield
     except DataError:
@@ -385,7 +385,7 @@ def _imdecode(path: Path, data: bytes, mode: str) -> npt.NDArray[Any]:
 
 
 def _check_pixels(path: Path, width: int, height: int, pixel_bytes: int = 1) -> None:
-    """Check an image's size before memory is allocated for what a header claims."""
+    """Check an image's size before memory is allocated for the size that a header claims."""
     most = min(MAX_PIXELS, MAX_IMAGE_BYTES // pixel_bytes)
     if not (width > 0 and height > 0 and width * height <= most):
         raise DataError(f"{path}: claims {width}x{height} pixels (at most {most} are read); is it damaged?")

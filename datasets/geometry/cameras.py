@@ -177,7 +177,7 @@ def ray_lengths(camera: Intrinsics, u: npt.ArrayLike, v: npt.ArrayLike) -> Float
 
 
 def planar(depth: Float32, camera: Intrinsics) -> Float32:
-    """Return planar depth (H, W), metres, from distances along the rays; what marks a pixel invalid stays invalid."""
+    """Return planar depth (H, W), metres, from distances along the rays; invalid values stay invalid."""
     H, W = depth.shape
     along_axis: Float32 = (depth / ray_lengths(camera, np.arange(W), np.arange(H)[:, None])).astype(np.float32)
     return along_axis

@@ -1,4 +1,4 @@
-"""Cameras that distort, and their images as a pinhole at the same place sees them.
+"""Cameras that distort, and their images as a pinhole at the same position sees them.
 
 Models: OpenCV's, which are those of OpenSfM and ODM too (opencv.org, calib3d; opensfm.org, Geometric Models).
 """
@@ -35,9 +35,9 @@ FAR = 2.0**40
 def fit(values: Pixels, K: Intrinsics, K_fit: Intrinsics, shape: tuple[int, int]) -> Pixels:
     """Return a label map (H', W') or scores (H', W', K) as a camera with K_fit and an image (H, W) sees them.
 
-    K belongs to `values`. Both images share centre and axes. Of labels each pixel gets the nearest; scores are linear
-    between pixel centres, and beyond the outer centres the outer pixels hold. What K does not see is ignored: labels
-    of 255 (65535), scores of 0.
+    K belongs to `values`. Both images share centre and axes. Each pixel gets the nearest label; scores are linear
+    between pixel centres, and beyond the outer centres the outer pixels hold. Pixels that K does not see are ignored:
+    labels of 255 (65535), scores of 0.
     """
     if values.ndim == 2:
         return _nearest(values, K, K_fit, shape, int(ignore_id(values)))
@@ -89,7 +89,7 @@ SHAPE_TOLERANCE = 0.02
 def fitted(values: Pixels, shape: tuple[int, ...], where: str, what: str = "the image is") -> Pixels:
     """Return labels (H', W') or scores (H', W', K) at the pixels of an image (H, W) of the same view.
 
-    Nearest for ids, linear for scores.
+    Ids are the nearest ones, scores are linear.
 
     Raises:
         DataError: For another shape of image, with `where`, its file.
@@ -120,7 +120,7 @@ def at_image(frame: Frame, shape: tuple[int, int], where: str, K: Intrinsics | N
 
 
 def require_same_view(shape: tuple[int, ...], other: tuple[int, ...], where: str, what: str) -> None:
-    """Raise DataError with `where` and `what`, which has two places for sizes, unless the shapes are of one view."""
+    """Raise DataError with `where` and `what`, which has two holes for sizes, unless the shapes are of one view."""
     (H, W), (h, w) = shape[:2], other[:2]
     if abs(W * h / (H * w) - 1) > SHAPE_TOLERANCE:
         raise DataError(f"{where}: {what.format(f'{W}x{H}', f'{w}x{h}')}, another view; register one to the other")
@@ -138,7 +138,7 @@ SAMPLES = 2000
 
 @dataclass(frozen=True)
 class Lens:
-    """A camera that distorts: `camera` with its size, and what happens before its intrinsics.
+    """A camera that distorts: `camera` with its size, and the distortion before its intrinsics.
 
     Attributes:
         brown: k1 k2 p1 p2 k3: radial and tangential.
@@ -155,7 +155,8 @@ def undistorted(
 ) -> Pixels:
     """Return an image of the lens, ids (H', W') or channels (H', W', C), as a pinhole with K and (H, W) sees it.
 
-    Of ids the nearest, of channels linear between pixel centres; what the lens does not see is ignored, or 0.
+    Ids are the nearest ones, channels are linear between pixel centres; pixels that the lens does not see are ignored,
+    or 0.
 
     Raises:
         DataError: If the image is not of the lens's shape, with `where`, its file.
@@ -196,7 +197,7 @@ def _source_pixels(
 
 
 def _reach(lens: Lens, farthest: float) -> float:
-    """Return the distance from the axis, a metre ahead, up to which the lens maps further out what lies further out."""
+    """Return the distance from the axis, a metre ahead, up to which the lens preserves the order of distances."""
     radius = np.linspace(0, farthest, SAMPLES)
     if lens.model == "brown":
         k1, k2, _, _, k3 = lens.coefficients

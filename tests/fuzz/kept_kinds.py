@@ -28,7 +28,7 @@ from semstab.errors import DataError
 from semstab.models import Model, Prediction
 from semstab.models.names import class_names
 from semstab.predict.filters import parse
-from semstab.predict.predictor import Kept
+from semstab.predict.predictor import Cached
 from semstab.recording import Recording
 from semstab.recording.target import is_whole
 from semstab.recording.timeline import Clock, log_file
@@ -53,7 +53,7 @@ def of_kept(folder: Path) -> Iterator[Kind]:
     casts.put(view, np.ones((12, 16), np.float32))
     yield Kind("cast depth", (next((folder / "casts").rglob("*.cast")),), lambda _: casts.get(view))
     images = [predicted_scene.image(0)]
-    model = Kept(Halves(), folder / "predictions")
+    model = Cached(Halves(), folder / "predictions")
     model.predict(images)
     yield Kind("kept prediction", (next((folder / "predictions").glob("*.npz")),), lambda _: model.predict(images))
     compare([f"{tiled}:a", f"{tiled}:b"], folder / "compared")
