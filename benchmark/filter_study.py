@@ -23,7 +23,7 @@ def filter_study_config(
     sources: Sequence[str],
     filters: Sequence[str],
     content: Mapping[str, Any],
-    kept: Path | None = None,
+    cache: Path | None = None,
 ) -> tuple[Config, list[str]]:
     """Return the study `filters` with these models, and filters over the scenes' label sources, as dataset settings.
 
@@ -46,7 +46,7 @@ def filter_study_config(
     able, left_out = _able(grid, predictors, scene)
     settings = {**content, "voxel_size": config.voxel_size, "frame_quality": True, "check": None, "name": STUDY}
     study = predicted_config(predictors, None, {**settings, "models": None})
-    more = {"try_filters": able, "kept": None if kept is None else str(kept)}
+    more = {"try_filters": able, "kept": None if cache is None else str(cache)}
     dataset_config = study.dataset.model_copy(update={"options": {**study.dataset.options, **more}})
     return study.model_copy(update={"dataset": dataset_config}), left_out
 
@@ -63,8 +63,8 @@ def _able(grid: Sequence[str], predictors: Sequence[PredictorConfig], scene: Sce
     without = [each.label_name for each in predictors if needing and not _gives_scores(each, scene)]
     if not without:
         return list(grid), []
-    said = f"{', '.join(needing)}: left out, for {', '.join(without)} gives labels without scores"
-    return [text for text in grid if text not in needing], [said]
+    note = f"{', '.join(needing)}: left out, for {', '.join(without)} gives labels without scores"
+    return [text for text in grid if text not in needing], [note]
 
 
 def _gives_scores(predictor: PredictorConfig, scene: Scene) -> bool:

@@ -189,13 +189,13 @@ class _Once(logging.Filter):
 
     def __init__(self) -> None:
         super().__init__()
-        self._said: set[str] = set()
+        self._printed: set[str] = set()
 
     def filter(self, record: logging.LogRecord) -> bool:
         """Return whether it was not said before."""
         message = record.getMessage()
-        new = message not in self._said
-        self._said.add(message)
+        new = message not in self._printed
+        self._printed.add(message)
         return new
 
 

@@ -75,13 +75,13 @@ def gate(
     from rich.console import Console
 
     from semstab.comparison import gate_report
-    from semstab.comparison.gate import gate as judge
+    from semstab.comparison.gate import gate as assess
     from semstab.comparison.gate import gate_config
     from semstab.comparison.runs import open_run, save_summary
 
     gate_report.require_formats(out or ())
     if save_baseline is None or rule or config:
-        result = judge(new, against, gate_config(config, rule or (), level, undecided, scope))
+        result = assess(new, against, gate_config(config, rule or (), level, undecided, scope))
         for file in out or ():
             gate_report.write(result, file)
         print_lines(gate_report.plan(result) if plan else gate_report.lines(result, Console().width), quiet=quiet)

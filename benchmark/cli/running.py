@@ -161,7 +161,7 @@ def filters(
     models = [parse_predictor(text, {} if classes is None else {"classes": classes}) for text in predict or []]
     content = chosen(named, settings, options, dataset, data, frames)
     config, left_out = filter_study_config(
-        models, model or [], filter_ or [], content, kept=out.absolute() / "predictions"
+        models, model or [], filter_ or [], content, cache=out.absolute() / "predictions"
     )
     for line in left_out if not quiet else ():
         say(line)

@@ -171,13 +171,13 @@ def _classified(chosen: Chosen, cloud: Path, file: Path, radius: float | None, s
 
 def _few_met(tally: joining.Tally, some: Voxels) -> str:
     """Return why few points of a cloud may have a voxel."""
-    said = f"only {tally.classified / tally.points:.1%} of its points lie in or beside a voxel"
+    text = f"only {tally.classified / tally.points:.1%} of its points lie in or beside a voxel"
     within = tally.classified / max(1, tally.over)
     if within >= FEW_MET:
-        return f"{said}: the cloud is larger than the map; of the points over the map {within:.1%} do"
+        return f"{text}: the cloud is larger than the map; of the points over the map {within:.1%} do"
     where = "has no georeference" if some.georeference is None else "may be shifted or turned"
     return (
-        f"{said} ({within:.1%} of those over the map): the map {where}, or the cloud is of another"
+        f"{text} ({within:.1%} of those over the map): the map {where}, or the cloud is of another"
         " place or height; look at what check says of the project's place, or set a larger --radius"
     )
 

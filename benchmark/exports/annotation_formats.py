@@ -47,12 +47,12 @@ class TaskFile:
 
     def by_image(self) -> dict[str, list[tuple[int, AnnotationTask]]]:
         """Return the tasks, numbered from 1, by the file of their image."""
-        found: dict[str, list[tuple[int, AnnotationTask]]] = {}
+        tasks: dict[str, list[tuple[int, AnnotationTask]]] = {}
         for rank, task in enumerate(self.tasks, start=1):
-            found.setdefault(self.image(task), []).append((rank, task))
-        return found
+            tasks.setdefault(self.image(task), []).append((rank, task))
+        return tasks
 
-    def beside(self, ending: str) -> Path:
+    def companion(self, ending: str) -> Path:
         """Return a further file: tasks_ENDING beside tasks.json."""
         return self.path.with_name(f"{self.path.stem}_{ending}")
 
@@ -119,7 +119,7 @@ def label_studio(file: TaskFile) -> Iterator[str]:
     view = _node(
         "View", _node("Header", value="$title"), image, _node("PolygonLabels", *labels, name="label", toName="image")
     )
-    setup = file.beside("config.xml")
+    setup = file.companion("config.xml")
     write_text(setup, _xml(view, declaration=False))
     yield f"set-up of the project: {setup}; serve {file.folder} as local files"
 
@@ -151,7 +151,7 @@ def cvat(file: TaskFile) -> Iterator[str]:
         drawn.append(_node("image", *polygons, id=str(k), name=Path(name).name, width=str(W), height=str(H)))
     meta = _node("meta", _node("task", *scene, _node("labels", *labels)))
     write_text(file.path, _xml(_node("annotations", _node("version", "1.1"), meta, *drawn)))
-    constructor = file.beside("labels.json")
+    constructor = file.companion("labels.json")
     declared = [{"name": what, "mutable": False, "input_type": "text", "values": [""]} for what in own]
     write_json(constructor, [{"name": name, "color": color, "attributes": declared} for name, color in colors])
     yield f"labels of the task: {constructor} (Raw); images: {file.folder}; then upload as 'CVAT 1.1'"

@@ -248,15 +248,15 @@ def codes(voxels: Voxels, table: Path | None = None) -> UInt8:
         content = read_yaml(str(importlib.resources.files("semstab.configs") / "asprs.yaml"))
         shipped = content.get(voxels.taxonomy, {})
         given = {name: code for name, code in shipped.items() if name_key(name) in row}
-    found = np.full(1 + len(row), UNCLASSIFIED, np.uint8)
-    found[0] = NEVER_CLASSIFIED
+    codes_by_row = np.full(1 + len(row), UNCLASSIFIED, np.uint8)
+    codes_by_row[0] = NEVER_CLASSIFIED
     for name, code in given.items():
         if name_key(str(name)) not in row:
             raise ConfigError(f"{table}: no class '{name}' in the run; {nearest(str(name), voxels.classes)}")
         if isinstance(code, bool) or not isinstance(code, int) or not 0 <= code < 2**8:
             raise ConfigError(f"{table}: {name}: {code!r} is no ASPRS code; write a whole number from 0 to 255")
-        found[row[name_key(str(name))]] = code
-    return found
+        codes_by_row[row[name_key(str(name))]] = code
+    return codes_by_row
 
 
 def without_code(voxels: Voxels, table: Path | None) -> list[str]:

@@ -49,9 +49,9 @@ def write_raster(chosen: Chosen, path: Path, cell: int = 1) -> int:
     except ImportError as error:
         raise MissingDependencyError(f"{path}: .tif needs rasterio; {INSTALL}") from error
     some, seen, voxels = chosen.first, {}, 0
-    for place in chosen.places():
-        seen[place] = _window(chosen[place], cell)
-        voxels += len(chosen[place].table)
+    for tile in chosen.tiles():
+        seen[tile] = _window(chosen[tile], cell)
+        voxels += len(chosen[tile].table)
     whole = _fitting(functools.reduce(Window.around, seen.values()))
     edge, (west, north) = cell * some.table.voxel_size, _corner(some, whole, cell)
     height, width = whole.shape
@@ -73,7 +73,7 @@ def write_raster(chosen: Chosen, path: Path, cell: int = 1) -> int:
         rasterio.open(temporary_classes, "w", **one, **shape) as classes,
     ):
         for window in whole.parts():
-            there = [chosen[place] for place, own in seen.items() if own.meets(window)]
+            there = [chosen[tile] for tile, own in seen.items() if own.meets(window)]
             bands = _bands(together(there), cell, window) if there else {}
             at = Pixels(window.low[1] - whole.low[1], whole.high[0] - window.high[0], *reversed(window.shape))
             nothing = np.full(window.shape, np.nan, np.float32)
@@ -279,7 +279,7 @@ def write_mesh(chosen: Chosen, path: Path) -> int:
     """
     import trimesh
 
-    corners = {place: chosen[place].table.index.min(axis=0).astype(np.int64) for place in chosen.places()}
+    corners = {tile: chosen[tile].table.index.min(axis=0).astype(np.int64) for tile in chosen.tiles()}
     some, low = chosen.first, np.min([*corners.values()], axis=0)
     extras = {
         "origin": (some.linear @ (low * some.table.voxel_size) + some.offset).tolist(),
@@ -289,11 +289,11 @@ def write_mesh(chosen: Chosen, path: Path) -> int:
     }
     scene: Any = trimesh.Scene(metadata=extras)
     voxels, size, to_gltf = 0, 0, some.table.voxel_size * (_to_gltf(some.up) @ some.linear).T
-    for place in corners:
-        part = chosen[place]
+    for tile in corners:
+        part = chosen[tile]
         voxels += len(part.table)
         corner, label, quads = _sides(
-            part.table.index - low, part.classified.astype(np.int64) - 1, _adjacent(chosen, place) - low
+            part.table.index - low, part.classified.astype(np.int64) - 1, _adjacent(chosen, tile) - low
         )
         if not len(quads):
             continue
@@ -313,15 +313,15 @@ def write_mesh(chosen: Chosen, path: Path) -> int:
     return voxels
 
 
-def _adjacent(chosen: Chosen, place: Place) -> Int64:
+def _adjacent(chosen: Chosen, tile: Place) -> Int64:
     """Return the voxels (n, 3) of the tiles around one that may touch it."""
-    found, size = [np.zeros((0, 3), np.int64)], chosen.size
+    adjacent, size = [np.zeros((0, 3), np.int64)], chosen.size
     for (dx, dy), axis, at in (((1, 0), 0, 0), ((-1, 0), 0, -1), ((0, 1), 1, 0), ((0, -1), 1, -1)):
-        other = place[0] + dx, place[1] + dy
+        other = tile[0] + dx, tile[1] + dy
         if size is not None and other in chosen:
             index = chosen[other].table.index.astype(np.int64)
-            found.append(index[index[:, axis] % size == at % size])
-    return np.concatenate(found)
+            adjacent.append(index[index[:, axis] % size == at % size])
+    return np.concatenate(adjacent)
 
 
 def _sides(index: Int64, label: Int64, adjacent: Int64) -> tuple[Int64, Int64, Int64]:
@@ -346,8 +346,8 @@ def _sides(index: Int64, label: Int64, adjacent: Int64) -> tuple[Int64, Int64, I
         open_ = ~np.isin(keys + neighbour @ step, hiding)
         corner = (index[open_][:, None] - low + side) @ step
         parts.append(corner * K + label[open_][:, None])
-    found, quads = np.unique(np.concatenate(parts), return_inverse=True)
-    return np.stack(np.unravel_index(found // K, tuple(size)), axis=1) + low, found % K, quads.reshape(-1, 4)
+    packed, quads = np.unique(np.concatenate(parts), return_inverse=True)
+    return np.stack(np.unravel_index(packed // K, tuple(size)), axis=1) + low, packed % K, quads.reshape(-1, 4)
 
 
 def _to_gltf(up: tuple[float, float, float] | None) -> Float64:

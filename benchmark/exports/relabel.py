@@ -97,7 +97,7 @@ class FusedLabels:
     def __init__(self, tiles: Tiles[VoxelTable], belief: Belief, num_classes: int) -> None:
         self._tiles, self._belief, self._K = tiles, belief, num_classes
         self._lookups: SizedCache[Place, VoxelLookup] = SizedCache(
-            lambda place: VoxelLookup(self._tiles[place]), lambda lookup: len(lookup.table), AT_HAND
+            lambda tile: VoxelLookup(self._tiles[tile]), lambda lookup: len(lookup.table), AT_HAND
         )
 
     def of(self, frame: Frame, pixel_stride: int = 1) -> Int64:
@@ -107,34 +107,35 @@ class FusedLabels:
         """
         everywhere = dataclasses.replace(frame, labels=np.zeros(frame.shape, np.uint8), scores=None)
         points = back_project(everywhere).T
-        found, fused = np.full(len(points), UNSEEN), np.full(frame.shape, UNSEEN)
+        labels, fused = np.full(len(points), UNSEEN), np.full(frame.shape, UNSEEN)
         own = (
             observe(frame.every(pixel_stride), self._tiles.voxel_size, self._K) if self._belief.leave_one_out else None
         )
-        for place, pixels in self._tiles.holding(points):
-            found[pixels] = self._labels(self._lookups[place], points[pixels], own)
-        fused[everywhere.valid] = found
+        for tile, pixels in self._tiles.holding(points):
+            labels[pixels] = self._labels(self._lookups[tile], points[pixels], own)
+        fused[everywhere.valid] = labels
         return fused
 
     def _labels(self, lookup: VoxelLookup, points: Float64, own: Observations | None) -> Int64:
         """Return the classes (n,) of points in a tile."""
-        found = lookup.rows(points)
-        met = found != NONE
-        rows, inverse = np.unique(found[met], return_inverse=True)
+        voxel = lookup.rows(points)
+        met = voxel != NONE
+        rows, inverse = np.unique(voxel[met], return_inverse=True)
         seen = rows_of(lookup.table, rows)
         if own is not None:
             seen = _without(own, lookup, seen, rows)
         label = np.where(self._belief.of(seen), dominant(seen), UNSTABLE)
-        found[met], found[~met] = label[inverse], UNSEEN
-        return found
+        labels = np.full(len(points), UNSEEN)
+        labels[met] = label[inverse]
+        return labels
 
 
 def _without(own: Observations, lookup: VoxelLookup, seen: VoxelTable, rows: Int64) -> VoxelTable:
     """Return the voxels of a tile that a frame sees, `rows` of it, without the frame's own vote."""
     centers = np.add(own.index, 0.5, dtype=np.float64) * seen.voxel_size
-    found = lookup.rows(centers)
-    here = found != NONE
-    at = np.searchsorted(rows, found[here])
+    seen_rows = lookup.rows(centers)
+    here = seen_rows != NONE
+    at = np.searchsorted(rows, seen_rows[here])
     evidence, op, self_sum = seen.evidence[:], seen.op.copy(), seen.self_sum.copy()
     evidence[at] = np.abs(np.round(evidence[at] - own.s_bar[here], DECIMALS))
     op[at] -= 1

@@ -141,35 +141,35 @@ class Chosen:
         self._files = {(0, 0) if tile is None else (tile.x, tile.y): file for file, tile in tiles.items()}
         self.size = next(None if tile is None else tile.size for tile in tiles.values())
         self._highest = 0
-        self._at_hand = SizedCache(self._read, lambda voxels: len(voxels.table), AT_HAND)
+        self._cache = SizedCache(self._read, lambda voxels: len(voxels.table), AT_HAND)
 
     @property
     def whole(self) -> bool:
         """Return whether no voxel is left out."""
         return self._min_op <= 1 and not self._classes and self._thresholds is None
 
-    def __contains__(self, place: Place) -> bool:
-        return place in self._files
+    def __contains__(self, tile: Place) -> bool:
+        return tile in self._files
 
-    def __getitem__(self, place: Place) -> Voxels:
+    def __getitem__(self, tile: Place) -> Voxels:
         """Return the voxels of a tile, which may be none."""
-        return self._at_hand[place]
+        return self._cache[tile]
 
     def __iter__(self) -> Iterator[Voxels]:
         """Yield the voxels tile by tile, without empty tiles."""
-        return (self[place] for place in self.places())
+        return (self[tile] for tile in self.tiles())
 
-    def places(self) -> Iterator[Place]:
+    def tiles(self) -> Iterator[Place]:
         """Yield the tiles that have voxels.
 
         Raises:
             ConfigError: If none has.
         """
         left = False
-        for place in self._files:
-            if len(self[place].table):
+        for tile in self._files:
+            if len(self[tile].table):
                 left = True
-                yield place
+                yield tile
         if not left:
             limits = f"OP >= {self._min_op}" + (f" and class {' or '.join(self._classes)}" if self._classes else "")
             limits += " and the evidence that --thresholds asks for" if self._thresholds is not None else ""
@@ -180,9 +180,9 @@ class Chosen:
         """The voxels of one tile, for the properties that all share."""
         return next(iter(self))
 
-    def _read(self, place: Place) -> Voxels:
+    def _read(self, tile: Place) -> Voxels:
         """Read a tile and choose its voxels."""
-        file, record = self._files[place], self._record
+        file, record = self._files[tile], self._record
         assert record.voxels_file is not None
         table = VoxelTable.load(file)
         self._highest = max(self._highest, int(table.op.max(initial=0)))
@@ -237,13 +237,13 @@ def joined_columns(table: VoxelTable, file: Path) -> dict[str, Column]:
         raise DataError(f"{file}: has voxels of {content['voxel_size']:g} m, the map of {table.voxel_size:g} m")
     at = np.minimum(np.searchsorted(own, theirs), len(own) - 1)
     there = own[at] == theirs
-    found = {}
+    columns = {}
     for name in names:
         empty = np.nan if content[name].dtype.kind == "f" else 0
         values = np.full(len(table), empty, dtype=content[name].dtype)
         values[at[there]] = content[name][there]
-        found[name] = Column(values)
-    return found
+        columns[name] = Column(values)
+    return columns
 
 
 def crs_name(georeference: Georeference) -> str:

@@ -88,32 +88,32 @@ def pooled(records: Sequence[Record]) -> Pooled:
         classes=tuple(pool(rows, voxels) for rows in of_class),
         well_seen=tuple(split_last(tables)),
         fuse_ms_per_frame=macro_mean([record.summary.fuse_ms_per_frame for record in records]),
-        psa=_estimate(records, lambda found: found.agreement.psa),
-        alpha=_estimate(records, lambda found: found.headline.alpha),
-        drift=_estimate(records, lambda found: found.drift.sbd if found.order_known else UNDEFINED),
-        drift_null=_macro(records, lambda found: found.drift.null if found.order_known else UNDEFINED),
+        psa=_estimate(records, lambda stats: stats.agreement.psa),
+        alpha=_estimate(records, lambda stats: stats.headline.alpha),
+        drift=_estimate(records, lambda stats: stats.drift.sbd if stats.order_known else UNDEFINED),
+        drift_null=_macro(records, lambda stats: stats.drift.null if stats.order_known else UNDEFINED),
     )
 
 
 def _together(records: Sequence[Record], take: Callable[[MapStatistics], Estimate]) -> Estimate:
     """Return the macro mean of an estimate with its interval, the units being independent."""
-    found = [take(record.statistics) for record in records if record.statistics is not None]
-    found = [estimate for estimate in found if not math.isnan(estimate.low)]
-    if not found:
+    estimates = [take(record.statistics) for record in records if record.statistics is not None]
+    estimates = [estimate for estimate in estimates if not math.isnan(estimate.low)]
+    if not estimates:
         return UNDEFINED
-    value = macro_mean([estimate.value for estimate in found])
+    value = macro_mean([estimate.value for estimate in estimates])
     below, above = (
-        math.hypot(*(end - estimate.value for end, estimate in zip(ends, found, strict=True))) / len(found)
-        for ends in ([e.low for e in found], [e.high for e in found])
+        math.hypot(*(end - estimate.value for end, estimate in zip(ends, estimates, strict=True))) / len(estimates)
+        for ends in ([e.low for e in estimates], [e.high for e in estimates])
     )
     return Estimate(value, value - below, value + above)
 
 
 def _estimate(records: Sequence[Record], take: Callable[[MapStatistics], Estimate]) -> Estimate:
     """Return the mean over every unit that has a value; without an interval where one of them has none."""
-    found = [take(record.statistics) for record in records if record.statistics is not None]
-    if any(math.isnan(estimate.low) for estimate in found if not math.isnan(estimate.value)):
-        return Estimate(macro_mean([estimate.value for estimate in found]), math.nan, math.nan)
+    estimates = [take(record.statistics) for record in records if record.statistics is not None]
+    if any(math.isnan(estimate.low) for estimate in estimates if not math.isnan(estimate.value)):
+        return Estimate(macro_mean([estimate.value for estimate in estimates]), math.nan, math.nan)
     return _together(records, take)
 
 
@@ -165,12 +165,14 @@ class Level:
 
     def interval(self, estimate: Callable[[Pooled], Estimate]) -> Estimate:
         """Return an estimate's mean over the repeats, and the mean of their intervals: they err alike."""
-        found = [estimate(repeat) for repeat in self.repeats]
-        value, low, high = (macro_mean(ends) for ends in zip(*((e.value, e.low, e.high) for e in found), strict=True))
+        estimates = [estimate(repeat) for repeat in self.repeats]
+        value, low, high = (
+            macro_mean(ends) for ends in zip(*((e.value, e.low, e.high) for e in estimates), strict=True)
+        )
         return Estimate(value, low, high)
 
     @property
-    def judged(self) -> bool:
+    def assessed(self) -> bool:
         """Return whether it has statistics that are defined."""
         return not math.isnan(self.mean(lambda pooled: pooled.psa.value))
 
@@ -227,14 +229,14 @@ def swept(result: Result) -> list[Sweep]:
 def levels(result: Result, sweep: str, model: str, scene: str | None = None) -> tuple[Level, ...]:
     """Return the values of a sweep, ascending, over the scenes that have all of them."""
     scenes = complete_scenes(result, sweep, model)
-    found: dict[float, dict[int, list[Record]]] = {}
+    by_value: dict[float, dict[int, list[Record]]] = {}
     for record in result.select(sweep, model=model):
         value, repeat = record.variation.value, record.variation.repeat
         if value is not None and record.unit.scene in scenes and scene in (None, record.unit.scene):
-            found.setdefault(value, {}).setdefault(repeat, []).append(record)
+            by_value.setdefault(value, {}).setdefault(repeat, []).append(record)
     return tuple(
         Level(value, tuple(pooled(rows) for _, rows in sorted(repeats.items())))
-        for value, repeats in sorted(found.items())
+        for value, repeats in sorted(by_value.items())
     )
 
 

@@ -129,17 +129,17 @@ def _line(line: Line, x: Scale, y: Scale) -> Iterator[str]:
             ends = line.ends[k] if line.ends else (math.nan, math.nan)
             if all(map(math.isfinite, ends)):
                 yield f'<path class="line {color}" d="M{x(px):.1f} {y(ends[0]):.1f}V{y(ends[1]):.1f}"/>'
-            yield _circle(x(px), y(py), color, f"{line.name}: {_said(Estimate(py, *ends))}")
+            yield _circle(x(px), y(py), color, f"{line.name}: {_with_ends(Estimate(py, *ends))}")
 
 
 def _dot(x: Scale, at: float, estimate: Estimate, color: int, name: str) -> Iterator[str]:
     shade = f"c{color % SERIES}"
     if math.isfinite(estimate.low) and math.isfinite(estimate.high):
         yield f'<path class="line {shade}" d="M{x(estimate.low):.1f} {at:.1f}H{x(estimate.high):.1f}"/>'
-    yield _circle(x(estimate.value), at, shade, f"{name}: {_said(estimate)}")
+    yield _circle(x(estimate.value), at, shade, f"{name}: {_with_ends(estimate)}")
 
 
-def _said(estimate: Estimate) -> str:
+def _with_ends(estimate: Estimate) -> str:
     ends = f" ({estimate.low:.3g} to {estimate.high:.3g})" if math.isfinite(estimate.low) else ""
     return f"{estimate.value:.3g}{ends}"
 

@@ -108,11 +108,11 @@ class FilterStudy:
     @property
     def front(self) -> list[FilterResult]:
         """The rows that no other one beats in both flicker and worth, from the steadiest on."""
-        found: list[FilterResult] = []
+        front: list[FilterResult] = []
         for row in sorted([self.unfiltered, *self.filtered], key=lambda row: (row.flicker, -self.worth(row))):
-            if not found or self.worth(row) > self.worth(found[-1]):
-                found.append(row)
-        return found
+            if not front or self.worth(row) > self.worth(front[-1]):
+                front.append(row)
+        return front
 
 
 def filter_studies(result: Result) -> list[FilterStudy]:
@@ -123,7 +123,9 @@ def filter_studies(result: Result) -> list[FilterStudy]:
             groups.setdefault(record.quality.model, {}).setdefault(record.quality.filters, []).append(record)
     return [
         FilterStudy(
-            model, _row(rows[""], rows[""]), tuple(_row(found, rows[""]) for filters, found in rows.items() if filters)
+            model,
+            _row(rows[""], rows[""]),
+            tuple(_row(records, rows[""]) for filters, records in rows.items() if filters),
         )
         for model, rows in groups.items()
         if "" in rows and len(rows) > 1
@@ -132,38 +134,38 @@ def filter_studies(result: Result) -> list[FilterStudy]:
 
 def of_interest(result: Result) -> Result:
     """Return the result for tables and figures of maps: of a filter study the models, and the filters to use, alone."""
-    found = {each.model: {"", each.best.filters if each.best else ""} for each in filter_studies(result)}
-    if not found:
+    wanted = {each.model: {"", each.best.filters if each.best else ""} for each in filter_studies(result)}
+    if not wanted:
         return result
 
     def shown(record: Record) -> bool:
         quality = record.quality
-        return quality is None or quality.filters in found.get(quality.model, {quality.filters})
+        return quality is None or quality.filters in wanted.get(quality.model, {quality.filters})
 
     names = {record.unit.model for record in result.select() if shown(record)}
     records = tuple(record for record in result.records if record.unit.model in names)
     return dataclasses.replace(result, records=records)
 
 
-def advice(found: FilterStudy) -> Iterator[str]:
+def advice(study: FilterStudy) -> Iterator[str]:
     """Yield what to use and why; what only seems to help; what cannot be known."""
-    best, base = found.best, found.unfiltered
+    best, base = study.best, study.unfiltered
     if best is None:
-        least = "accuracy, IoU, coverage or time to follow" if found.has_truth else "next-frame consistency or coverage"
-        yield f"Use none of these filters over {found.model}: none steadies it without a loss of {least}."
+        least = "accuracy, IoU, coverage or time to follow" if study.has_truth else "next-frame consistency or coverage"
+        yield f"Use none of these filters over {study.model}: none steadies it without a loss of {least}."
     else:
-        yield f"Use --filter {typed(best)} over {found.model}: {_why(found, best)}."
-        if (whole := found.best_whole) is not None and whole != best:
-            yield f"Of those that leave every label, --filter {typed(whole)}: {_why(found, whole)}."
-    if found.misleading:
-        worst = found.misleading[0]
-        names = ", ".join(row.filters for row in found.misleading[:4])
-        more = f" and {len(found.misleading) - 4} more" if len(found.misleading) > 4 else ""
-        yield f"Steadier and worse: {names}{more}. {worst.filters} {_harm(found, worst)}."
-    if not found.has_truth:
+        yield f"Use --filter {typed(best)} over {study.model}: {_why(study, best)}."
+        if (whole := study.best_whole) is not None and whole != best:
+            yield f"Of those that leave every label, --filter {typed(whole)}: {_why(study, whole)}."
+    if study.misleading:
+        worst = study.misleading[0]
+        names = ", ".join(row.filters for row in study.misleading[:4])
+        more = f" and {len(study.misleading) - 4} more" if len(study.misleading) > 4 else ""
+        yield f"Steadier and worse: {names}{more}. {worst.filters} {_harm(study, worst)}."
+    if not study.has_truth:
         yield (
             "There is no ground truth: whether labels are right, and how late they follow a true change, is not known."
-            f" The choice rests on next-frame consistency, how often a label is what {found.model} says of the place in"
+            f" The choice rests on next-frame consistency, how often a label is what {study.model} says of the place in"
             " the next frame, which no filter has seen. What the model gets wrong in every frame stays wrong."
         )
     elif not math.isfinite(base.lag):
@@ -175,10 +177,10 @@ def typed(result: FilterResult) -> str:
     return result.filters.replace("+", " --filter ")
 
 
-def _why(found: FilterStudy, best: FilterResult) -> str:
-    base, (better, frames) = found.unfiltered, best.better
+def _why(study: FilterStudy, best: FilterResult) -> str:
+    base, (better, frames) = study.unfiltered, best.better
     parts = [f"flicker falls from {100 * base.flicker:.1f} to {100 * best.flicker:.1f} %"]
-    if found.has_truth:
+    if study.has_truth:
         parts.append(
             f"accuracy goes from {100 * base.accuracy:.1f} to {100 * best.accuracy:.1f} % (better in {better} of"
             f" {frames} frames), mean IoU from {100 * base.miou:.1f} to {100 * best.miou:.1f} %"
@@ -188,19 +190,19 @@ def _why(found: FilterStudy, best: FilterResult) -> str:
             f"next-frame consistency goes from {100 * base.next_frame:.1f} to {100 * best.next_frame:.1f} % (better in"
             f" {better} of {frames} frames)"
         )
-    if found.has_truth and math.isfinite(best.lag):
+    if study.has_truth and math.isfinite(best.lag):
         parts.append(f"labels follow a change {best.lag:.1f} frames late")
     if best.coverage < 1 - ALIKE:
         parts.append(f"{100 * best.coverage:.0f} % of the labels are left")
     return f"{', '.join(parts)}, for {best.milliseconds:.0f} ms a frame"
 
 
-def _harm(found: FilterStudy, row: FilterResult) -> str:
-    base = found.unfiltered
+def _harm(study: FilterStudy, row: FilterResult) -> str:
+    base = study.unfiltered
     steady = f"has {100 * row.flicker:.1f} % flicker ({100 * base.flicker:.1f} % without)"
     if row.flicker >= base.flicker:
         steady = f"has {100 * row.plain:.1f} % flicker at the same pixel ({100 * base.plain:.1f} % without)"
-    if not found.has_truth:
+    if not study.has_truth:
         return f"{steady}, but foresees {100 * row.next_frame:.1f} % of the next labels ({100 * base.next_frame:.1f} %)"
     late = f", and it follows changes {row.lag:.1f} frames late" if math.isfinite(row.lag) else ""
     return (
@@ -211,7 +213,7 @@ def _harm(found: FilterStudy, row: FilterResult) -> str:
 
 def _row(records: Sequence[Record], unfiltered: Sequence[Record]) -> FilterResult:
     qualities = [record.quality for record in records if record.quality is not None]
-    judged = [record.statistics.headline for record in records if record.statistics is not None]
+    headlines = [record.statistics.headline for record in records if record.statistics is not None]
 
     def mean(name: str) -> float:
         return macro_mean([getattr(quality, name) for quality in qualities])
@@ -220,7 +222,7 @@ def _row(records: Sequence[Record], unfiltered: Sequence[Record]) -> FilterResul
         filters=qualities[0].filters,
         flicker=macro_mean([record.image_space.compensated_flicker_percent for record in records]) / 100,
         plain=macro_mean([record.image_space.flicker_percent for record in records]) / 100,
-        alpha=macro_mean([row.alpha.value for row in judged]),
+        alpha=macro_mean([row.alpha.value for row in headlines]),
         **{
             name: mean(name)
             for name in ("next_frame", "accuracy", "miou", "consistent_wrong", "lag", "coverage", "milliseconds")

@@ -60,7 +60,7 @@ def warnings(result: Result) -> Iterator[str]:
             f"{once:.0%} of the voxels were seen once and look stable for that reason; larger voxels or more overlap"
             " help: --voxel-size"
         )
-    yield from dict.fromkeys(text for scene, found in result.advice.items() if (text := _size(scene, found, result)))
+    yield from dict.fromkeys(text for scene, advice in result.advice.items() if (text := _size(scene, advice, result)))
     stable = [record for record in result.select() if _is_untested(record)]
     if stable:
         names = ", ".join(dict.fromkeys(record.unit.model for record in stable))
@@ -80,19 +80,22 @@ def warnings(result: Result) -> Iterator[str]:
 
 def _is_untested(record: Record) -> bool:
     """Return whether a verdict is stable, of a map that was not compared with the ground truth."""
-    found = record.statistics
+    statistics = record.statistics
     return bool(
-        found and found.verdict.level == "stable" and found.correctness is None and record.unit.model != GROUND_TRUTH
+        statistics
+        and statistics.verdict.level == "stable"
+        and statistics.correctness is None
+        and record.unit.model != GROUND_TRUTH
     )
 
 
 def _suspicions(record: Record) -> Iterator[str]:
     """Yield reasons for which frames may agree though the labels are worth little."""
-    found, recall = record.statistics, record.image_space.edge_recall
-    if found is None or found.verdict.level not in ("stable", "usable"):
+    statistics, recall = record.statistics, record.image_space.edge_recall
+    if statistics is None or statistics.verdict.level not in ("stable", "usable"):
         return
-    if found.cells is not None and found.cells.labelled < LIMITS.labelled:
-        missing = f"{1 - found.cells.labelled:.0%} of the locations have no label in most frames"
+    if statistics.cells is not None and statistics.cells.labelled < LIMITS.labelled:
+        missing = f"{1 - statistics.cells.labelled:.0%} of the locations have no label in most frames"
         yield f"{missing}; what is left out cannot flicker"
     if recall < LEAST_RECALL and record.unit.model != GROUND_TRUTH:
         yield (
@@ -109,18 +112,18 @@ def _name(run: UnitSummary, result: Result) -> str:
     return f"{run.unit.scene}, {run.unit.model}" if len(result.scenes) > 1 else run.unit.model
 
 
-def _size(scene: str, found: VoxelAdvice, result: Result) -> str:
+def _size(scene: str, advice: VoxelAdvice, result: Result) -> str:
     """Return where the voxel size does not suit the data; empty where it does."""
     where = f"{scene}: " if len(result.scenes) > 1 else ""
-    if found.suggested is None:
+    if advice.suggested is None:
         return (
             f"{where}fewer than half of the points fall into the same voxel again when another frame sees them, at any"
             " voxel size: semstab-bench check examines depth and poses"
         )
-    if found.chosen or found.suggested <= found.voxel_size:
+    if advice.chosen or advice.suggested <= advice.voxel_size:
         return ""
-    size = f"voxels of {found.voxel_size:g} m"
-    return f"{where}{size} are so small that noise tears locations apart: --voxel-size {found.suggested:g}"
+    size = f"voxels of {advice.voxel_size:g} m"
+    return f"{where}{size} are so small that noise tears locations apart: --voxel-size {advice.suggested:g}"
 
 
 def _one_class(run: UnitSummary) -> bool:
@@ -150,12 +153,12 @@ def differences(result: Result) -> Iterator[str]:
         each = [difference(own[name], own[first], ALPHA.key) for own in sums if {name, first} <= own.keys()]
         if known := [one for one in each if not math.isnan(one.low)]:
             change = mean_of(known)
-            told = "does not differ significantly from"
+            relation = "does not differ significantly from"
             if change.decided and not change.low <= 0 <= change.high:
-                told = "is more stable than" if change.low > 0 else "is less stable than"
+                relation = "is more stable than" if change.low > 0 else "is less stable than"
             ends = f"{change.low:+.2f} to {change.high:+.2f}".replace("0.", ".")
             scenes = f", {len(known)} scenes" if len(known) > 1 else ""
-            yield f"{name} {told} {first}: alpha {change.value:+.2f} ({ends}){scenes}"
+            yield f"{name} {relation} {first}: alpha {change.value:+.2f} ({ends}){scenes}"
 
 
 def _common_sums(records: Sequence[Record]) -> Mapping[str, ClusterSums]:

@@ -96,28 +96,28 @@ def _legend(names: Sequence[str]) -> list[tuple[str, str]]:
 
 def _card(model: str, records: Sequence[Record]) -> dict[str, Any]:
     """Return a model: the verdict on it in each scene, and the numbers that it rests on."""
-    judged = [record.statistics for record in records if record.statistics is not None]
-    one = judged[0] if len(judged) == 1 else None
+    assessed = [record.statistics for record in records if record.statistics is not None]
+    one = assessed[0] if len(assessed) == 1 else None
     return {
         "model": model,
         "scenes": [_scene_verdict(record) for record in records[:12]],
         "more": max(0, len(records) - 12),
         "reasons": relations(one.verdict.line.partition(": ")[2]) if one is not None else "",
-        "numbers": [(name, value, note) for name, value, note in _numbers(records, judged, one) if value],
+        "numbers": [(name, value, note) for name, value, note in _numbers(records, assessed, one) if value],
     }
 
 
 def _scene_verdict(record: Record) -> dict[str, str]:
-    found = record.statistics
-    if found is None:
-        return {"scene": record.unit.scene, "level": "not judged", "kind": "open", "probability": ""}
-    level, probability = found.verdict.level, found.verdict.probability
-    said = "" if math.isnan(probability) else f"{100 * probability:.0f} %"
-    return {"scene": record.unit.scene, "level": level, "kind": KINDS.get(level, "bad"), "probability": said}
+    statistics = record.statistics
+    if statistics is None:
+        return {"scene": record.unit.scene, "level": "not assessed", "kind": "open", "probability": ""}
+    level, probability = statistics.verdict.level, statistics.verdict.probability
+    text = "" if math.isnan(probability) else f"{100 * probability:.0f} %"
+    return {"scene": record.unit.scene, "level": level, "kind": KINDS.get(level, "bad"), "probability": text}
 
 
 def _numbers(
-    records: Sequence[Record], judged: Sequence[MapStatistics], one: MapStatistics | None
+    records: Sequence[Record], assessed: Sequence[MapStatistics], one: MapStatistics | None
 ) -> Iterator[tuple[str, str, str]]:
     """Yield rows of a card: name, value, and its interval or unit; macro means over several scenes."""
 
@@ -132,9 +132,9 @@ def _numbers(
         return f"95 % CI {scale * estimate.low:.{digits}f} to {scale * estimate.high:.{digits}f}"
 
     head = None if one is None else one.headline
-    alphas = [found.headline.alpha.value for found in judged]
+    alphas = [stats.headline.alpha.value for stats in assessed]
     yield "alpha", mean(alphas, "{:.2f}"), interval(None if head is None else head.alpha)
-    psa = [found.headline.psa.value for found in judged]
+    psa = [stats.headline.psa.value for stats in assessed]
     yield "two frames agree", mean(psa, "{:.0f} %", 100), "of the locations"
     flicker = [record.image_space.compensated_flicker_percent for record in records]
     yield "flicker", mean(flicker, "{:.1f} %"), "of the pixels a frame, camera motion removed"
@@ -143,7 +143,7 @@ def _numbers(
     yield "VSS", mean([together.recurrent[VSS]], "{:.3f}"), "OP ≥ 3"
     yield "SBD", mean([together.recurrent[SBD]], "{:.4f}"), "bits, OP ≥ 3"
     yield "mIoU", mean([miou(record) for record in records], "{:.1f} %", 100), "of the fused labels"
-    wrong = [found.headline.wrong_of_consistent.value for found in judged]
+    wrong = [stats.headline.wrong_of_consistent.value for stats in assessed]
     yield "consistent but wrong", mean(wrong, "{:.1f} %", 100), "of the consistent locations"
 
 
@@ -273,8 +273,8 @@ def _classes(records: Sequence[Record], colors: Mapping[str, int]) -> str:
     """Return each class that counts for the verdict, with its alpha."""
     rows: dict[str, list[tuple[int, str, Estimate]]] = {}
     for record in records:
-        found, name = record.statistics, record.unit.model
-        for own in () if found is None or found.cells is None else found.cells.classes:
+        statistics, name = record.statistics, record.unit.model
+        for own in () if statistics is None or statistics.cells is None else statistics.cells.classes:
             if own.counts_for_verdict and not math.isnan(own.alpha.value):
                 rows.setdefault(own.name, []).append((colors[name], name, own.alpha))
     if not rows:
@@ -293,8 +293,8 @@ def _distance(records: Sequence[Record], colors: Mapping[str, int]) -> Iterator[
     ):
         lines = []
         for record in records:
-            found = record.statistics and record.statistics.correlogram
-            bins = getattr(found, axis) if found else ()
+            correlogram = record.statistics and record.statistics.correlogram
+            bins = getattr(correlogram, axis) if correlogram else ()
             if bins:
                 name, alphas = record.unit.model, [own.alpha for own in bins]
                 ends = [(alpha.low, alpha.high) for alpha in alphas]

@@ -71,10 +71,10 @@ def screen(result: Result, *, out: Path | None = None, seconds: float | None = N
 
 
 def _one(result: Result, record: Record) -> Iterator[str]:
-    run, found = record.summary, record.summary.statistics
+    run, statistics = record.summary, record.summary.statistics
     yield _head(f"{run.unit.scene} / {run.unit.model}", result, [run])
     yield ""
-    if found is not None:
+    if statistics is not None:
         yield from _verdict(run)
     recurrent, shares = run.table.recurrent, run.table.categories
     if shares:
@@ -115,21 +115,21 @@ def _geometry(result: Result) -> str:
 
 def _verdict(run: UnitSummary) -> Iterator[str]:
     """Yield the level, the number that it rests on, and what that number means."""
-    found = run.statistics
-    assert found is not None
-    level, alpha = found.verdict.level.upper(), found.headline.alpha
-    if found.verdict.level == "no verdict":
-        yield from textwrap.wrap(found.verdict.line, WIDTH, initial_indent="  ", subsequent_indent="    ")
+    statistics = run.statistics
+    assert statistics is not None
+    level, alpha = statistics.verdict.level.upper(), statistics.headline.alpha
+    if statistics.verdict.level == "no verdict":
+        yield from textwrap.wrap(statistics.verdict.line, WIDTH, initial_indent="  ", subsequent_indent="    ")
         return
-    yield f"  {level}{_probability(found.verdict)}    alpha {alpha.value:.2f}{_interval(alpha)}"
-    if found.verdict.level == "uninformative" and found.cells is not None:
-        share, name = _percent(found.cells.largest_share), found.cells.largest_class
+    yield f"  {level}{_probability(statistics.verdict)}    alpha {alpha.value:.2f}{_interval(alpha)}"
+    if statistics.verdict.level == "uninformative" and statistics.cells is not None:
+        share, name = _percent(statistics.cells.largest_share), statistics.cells.largest_class
         yield f"  {share} of the observations are {name}: agreement says nothing about such a map"
     else:
         yield f"  act on labels from alpha {_short(LIMITS.stable)} on, with care from {_short(LIMITS.usable)}"
-    psa = found.headline.psa.value
+    psa = statistics.headline.psa.value
     yield f"  two frames see the same class at {_percent(psa)} of the locations"
-    wrong = found.headline.wrong_of_consistent
+    wrong = statistics.headline.wrong_of_consistent
     if not math.isnan(wrong.value):
         yield f"  {_percent(wrong.value)}{_interval(wrong, 100)} of the consistent locations are wrong"
     yield ""
@@ -145,12 +145,12 @@ def _flicker(record: Record) -> Iterator[str]:
         yield f"  flicker  {compensated:.1f} % of the pixels change class per frame (camera motion removed)"
 
 
-def _interval(found: Estimate, scale: float = 1.0) -> str:
-    if math.isnan(found.low) or math.isnan(found.high):
+def _interval(estimate: Estimate, scale: float = 1.0) -> str:
+    if math.isnan(estimate.low) or math.isnan(estimate.high):
         return ""
     if scale == 1.0:
-        return f" (95 % CI {_short(found.low)} to {_short(found.high)})"
-    return f" ({scale * found.low:.0f} to {scale * found.high:.0f} %)"
+        return f" (95 % CI {_short(estimate.low)} to {_short(estimate.high)})"
+    return f" ({scale * estimate.low:.0f} to {scale * estimate.high:.0f} %)"
 
 
 def _short(value: float) -> str:
@@ -203,11 +203,11 @@ def _laid_out(cells: Sequence[str]) -> str:
 
 
 def _cells(record: Record) -> list[str]:
-    run, found = record.summary, record.summary.statistics
+    run, statistics = record.summary, record.summary.statistics
     level, alpha, agree = "-", "", math.nan
-    if found is not None:
-        level = f"{found.verdict.level}{_probability(found.verdict)}"
-        agree, own = 100 * found.headline.psa.value, found.headline.alpha
+    if statistics is not None:
+        level = f"{statistics.verdict.level}{_probability(statistics.verdict)}"
+        agree, own = 100 * statistics.headline.psa.value, statistics.headline.alpha
         ends = "" if math.isnan(own.low) else f" ({_short(own.low)} to {_short(own.high)})"
         alpha = f"{_number(own.value, 2)}{ends}"
     vss, sbd = (run.table.recurrent[m] for m in measures()[:2])
@@ -218,8 +218,8 @@ def _cells(record: Record) -> list[str]:
 
 def miou(record: Record) -> float:
     """Return the mIoU of the fused labels seen twice or more; NaN without ground truth."""
-    found = record.summary.statistics
-    rows = [] if found is None or found.correctness is None else found.correctness.strata
+    statistics = record.summary.statistics
+    rows = [] if statistics is None or statistics.correctness is None else statistics.correctness.strata
     return rows[0].miou if rows else math.nan
 
 
@@ -251,11 +251,11 @@ def _classes(records: Sequence[Record]) -> Iterator[str]:
 
 def class_alphas(records: Sequence[Record]) -> dict[str, float]:
     """Return alpha of each class, the macro mean over scenes, where it is known."""
-    found: dict[str, list[float]] = {}
+    alphas: dict[str, list[float]] = {}
     for statistics in (record.statistics for record in records if record.statistics is not None):
         for row in () if statistics.cells is None else statistics.cells.classes:
-            found.setdefault(row.name, []).append(row.alpha.value)
-    means = {name: macro_mean(values) for name, values in found.items()}
+            alphas.setdefault(row.name, []).append(row.alpha.value)
+    means = {name: macro_mean(values) for name, values in alphas.items()}
     return {name: alpha for name, alpha in means.items() if not math.isnan(alpha)}
 
 
@@ -330,7 +330,7 @@ class ProgressBar(Observer):
         self.bar = Progress(*columns, TimeElapsedColumn(), TimeRemainingColumn(), console=console, transient=True)
         self.work = self.bar.add_task("starting", total=None)
         self.notes: list[str] = []
-        self._said = time.monotonic()
+        self._printed = time.monotonic()
 
     def run_started(self, plan: Plan, finished: Mapping[str, UnitContent]) -> None:
         """Show the bar: the frames of every unit that is to be computed are its total."""
@@ -355,8 +355,8 @@ class ProgressBar(Observer):
     def advanced(self, frames: int, what: str) -> None:
         """Advance by so many frames."""
         self.bar.update(self.work, advance=frames, description=what[:40])
-        if not self.bar.console.is_interactive and time.monotonic() - self._said > SECONDS_A_LINE:
-            self._said = time.monotonic()
+        if not self.bar.console.is_interactive and time.monotonic() - self._printed > SECONDS_A_LINE:
+            self._printed = time.monotonic()
             (work,) = self.bar.tasks
             self.bar.console.print(
                 f"{what}: {work.completed:.0f} of {work.total:.0f} frames", markup=False, soft_wrap=True
@@ -380,9 +380,9 @@ def failure_lines(result: Result) -> Iterator[str]:
     for failure in result.failures:
         reasons.setdefault(failure.message, []).append(failure)
     for message, failures in reasons.items():
-        places = list(dict.fromkeys(f"{failure.unit.scene}, {failure.unit.model}" for failure in failures))
+        units = list(dict.fromkeys(f"{failure.unit.scene}, {failure.unit.model}" for failure in failures))
         varied = [name for failure in failures if (name := _named_task(failure))]
-        where = "" if message.startswith(places[0]) else f"{_first_of(places)}: "
+        where = "" if message.startswith(units[0]) else f"{_first_of(units)}: "
         what = f"{_first_of(varied)}: " if varied else ""
         yield f"{where}{what}{message}"
 
@@ -401,8 +401,8 @@ def _named_task(failure: Failure) -> str:
 
 def print_filter_study(result: Result, console: Console) -> None:
     """Print the filter to use for each model, then the table of all; '*' marks it, '!' makes labels worse."""
-    for found in filter_studies(result):
-        for sentence in advice(found):
+    for study in filter_studies(result):
+        for sentence in advice(study):
             console.print(sentence, highlight=False, markup=False)
     for table in tables(result):
         if table.name.startswith("filters"):

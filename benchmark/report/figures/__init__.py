@@ -50,18 +50,18 @@ def figures(result: Result, folder: str | Path) -> list[Figure]:
     Saved frames are taken from the study folder.
     """
     views, result = Views(), of_interest(result)
-    kept = [record for record in result.select() if record.voxels_file is not None]
+    with_voxels = [record for record in result.select() if record.voxels_file is not None]
     return [
-        *_overviews(result, kept, views, Path(folder) / OVERVIEW),
-        *_distributions(kept, views),
-        *_maps(result, kept, views),
+        *_overviews(result, with_voxels, views, Path(folder) / OVERVIEW),
+        *_distributions(with_voxels, views),
+        *_maps(result, with_voxels, views),
         *_sweeps(result),
     ]
 
 
-def _overviews(result: Result, kept: list[Record], views: Views, folder: Path) -> Iterator[Figure]:
+def _overviews(result: Result, with_voxels: list[Record], views: Views, folder: Path) -> Iterator[Figure]:
     """Yield one a model, of the first scene that has a saved frame."""
-    for model, records in by_model(kept).items():
+    for model, records in by_model(with_voxels).items():
         for record in records:
             path = folder / f"{slug(record.unit.scene, model)}.npz"
             if record.unit.scene in result.up and path.exists():
@@ -84,8 +84,8 @@ def _overview(record: Record, up: tuple[float, float, float], views: Views, path
     )
 
 
-def _distributions(kept: list[Record], views: Views) -> Iterator[Figure]:
-    if not kept:
+def _distributions(with_voxels: list[Record], views: Views) -> Iterator[Figure]:
+    if not with_voxels:
         return
 
     @functools.cache
@@ -93,14 +93,14 @@ def _distributions(kept: list[Record], views: Views) -> Iterator[Figure]:
         """Draw the figure of each model and scene."""
         return {
             model: {record.unit.scene: views.sums(record) for record in records}
-            for model, records in by_model(kept).items()
+            for model, records in by_model(with_voxels).items()
         }
 
     def ecdf(model: str) -> Canvas:
-        ends = informative(found for scenes in of_all().values() for found in scenes.values())
+        ends = informative(histograms for scenes in of_all().values() for histograms in scenes.values())
         return draw_ecdf(of_all()[model], ends)
 
-    for model in by_model(kept):
+    for model in by_model(with_voxels):
         yield Figure(
             slug("ecdf", model),
             f"The measures by scene: {model}",
@@ -121,9 +121,9 @@ def _distributions(kept: list[Record], views: Views) -> Iterator[Figure]:
     )
 
 
-def _maps(result: Result, kept: list[Record], views: Views) -> Iterator[Figure]:
+def _maps(result: Result, with_voxels: list[Record], views: Views) -> Iterator[Figure]:
     panels = " and ".join(measure.title for measure in measures() if measure.panel)
-    for record in kept:
+    for record in with_voxels:
         scene, model = record.unit.scene, record.unit.model
         if scene in result.up:
             yield Figure(

@@ -134,7 +134,9 @@ def draw_ecdf(scenes: Mapping[str, Histograms], ends: Mapping[str, float]) -> Fi
     panels = figure.subplots(math.ceil(len(shown) / 2), 2, squeeze=False).ravel()
     everything = together(scenes.values())
     for axes, letter, measure in zip(panels, LETTERS, shown, strict=False):
-        _draw_curves(axes, {name: found[measure.key] for name, found in scenes.items()}, everything[measure.key])
+        _draw_curves(
+            axes, {name: histograms[measure.key] for name, histograms in scenes.items()}, everything[measure.key]
+        )
         label = measure.title if measure.better == "lower" else f"{measure.largest:g} - {measure.title}"
         unit = f" ({measure.unit})" if measure.unit else ""
         axes.set(xlabel=label + unit, ylabel="share of voxels", xlim=(0, 1.03 * ends[measure.key]), ylim=(0.0, 1.02))
@@ -148,8 +150,8 @@ def draw_ecdf(scenes: Mapping[str, Histograms], ends: Mapping[str, float]) -> Fi
 
 def _draw_curves(axes: Axes, scenes: Mapping[str, MeasureByOP], everything: MeasureByOP) -> None:
     """Draw one curve a scene, and a dashed one of all recurrent voxels, where there are any."""
-    for k, (name, found) in enumerate(scenes.items()):
-        axes.step(found.values, found.ecdf(), where="post", color=color(k), label=f"{name}, all voxels")
+    for k, (name, histogram) in enumerate(scenes.items()):
+        axes.step(histogram.values, histogram.ecdf(), where="post", color=color(k), label=f"{name}, all voxels")
     recurrent = everything.ecdf(RECURRENT)
     if recurrent[-1]:
         axes.step(
@@ -165,14 +167,14 @@ def _draw_curves(axes: Axes, scenes: Mapping[str, MeasureByOP], everything: Meas
 def informative(units: Iterable[Histograms]) -> dict[str, float]:
     """Return where the x axis of each measure ends, so that every scene's curve is seen up to its last percent."""
 
-    def end(found: MeasureByOP) -> float:
-        reached = found.ecdf() >= INFORMATIVE
-        return float(found.values[reached.argmax()]) if reached.any() else found.largest
+    def end(histogram: MeasureByOP) -> float:
+        reached = histogram.ecdf() >= INFORMATIVE
+        return float(histogram.values[reached.argmax()]) if reached.any() else histogram.largest
 
     ends: dict[str, float] = {}
     for scene in units:
-        for key, found in scene.items():
-            ends[key] = max(ends.get(key, 0.06 * found.largest), end(found))
+        for key, histogram in scene.items():
+            ends[key] = max(ends.get(key, 0.06 * histogram.largest), end(histogram))
     return ends
 
 
@@ -201,12 +203,12 @@ def draw_persistence(models: Mapping[str, Histograms]) -> Figure:
     return figure
 
 
-def _draw_column(rows: Panels, found: Histograms, shade: str) -> None:
-    voxels = next(iter(found.values())).voxels
+def _draw_column(rows: Panels, histograms: Histograms, shade: str) -> None:
+    voxels = next(iter(histograms.values())).voxels
     present = voxels > 0
     x, few = op_position()[present], voxels[present] < ENOUGH
     for axes, measure in zip(rows[:-1], measures(), strict=True):
-        own = found[measure.key]
+        own = histograms[measure.key]
         curves = (own.mean(), own.quantile(0.25), own.quantile(0.75))
         mean, *ends = (lacking(measure, curve[present]) for curve in curves)
         axes.fill_between(x, *ends, color=shade, alpha=0.2, linewidth=0.8)
@@ -327,10 +329,10 @@ def _error(
     if interval is None:
         sd = level.spread(measure).sd
         return (0.0, 0.0) if math.isnan(sd) else (sd, sd)
-    found = level.interval(interval)
-    if math.isnan(found.low):
+    estimate = level.interval(interval)
+    if math.isnan(estimate.low):
         return 0.0, 0.0
-    return max(found.value - found.low, 0.0), max(found.high - found.value, 0.0)
+    return max(estimate.value - estimate.low, 0.0), max(estimate.high - estimate.value, 0.0)
 
 
 def _legend(models: list[str]) -> list[object]:

@@ -109,8 +109,8 @@ class Overview:
         try:
             data = read_bytes(path)
             with zipfile.ZipFile(io.BytesIO(data)) as archive:
-                found = {name: decode_array(path, data, name[:-4]) for name in archive.namelist()}
-            own = {name.removesuffix(".npy"): value for name, value in found.items()}
+                arrays = {name: decode_array(path, data, name[:-4]) for name in archive.namelist()}
+            own = {name.removesuffix(".npy"): value for name, value in arrays.items()}
             worst: list[Any] = [
                 own.get(f"worst_{name}") for name in ("frames", "flicker", "labels", "changed", "color")
             ]

@@ -165,9 +165,9 @@ class FromAbove:
     @classmethod
     def of(cls, table: VoxelTable, up: npt.ArrayLike) -> FromAbove:
         """See `best_view` and `top_down`."""
-        kept, axis, view = best_view(table, up)
-        rows, cell = top_down(rows_of(table, kept), axis)
-        rows = np.where(rows == EMPTY, EMPTY, np.flatnonzero(kept)[rows])
+        selected, axis, view = best_view(table, up)
+        rows, cell = top_down(rows_of(table, selected), axis)
+        rows = np.where(rows == EMPTY, EMPTY, np.flatnonzero(selected)[rows])
         shown = np.zeros(len(table), dtype=np.bool_)
         shown[rows[rows != EMPTY]] = True
         renumbered: npt.NDArray[Any] = np.where(rows == EMPTY, EMPTY, (np.cumsum(shown) - 1)[rows])

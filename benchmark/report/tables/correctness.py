@@ -10,7 +10,7 @@ from semstab.data.records import Result
 from semstab.data.statistics import Correctness, Correlogram, Estimate, LagBin, Losses, MapStatistics, Quadrants
 from semstab.metrics import macro_mean
 from semstab.report.tables.stability import settings
-from semstab.report.tables.statistics import INTERVALS, Number, by_scene, grouped, judged_records
+from semstab.report.tables.statistics import INTERVALS, Number, by_scene, grouped, assessed_records
 from semstab.report.tables.table import Column, Group, Row, Table
 from semstab.statistics.correctness import ACCURACY, BRIER, ECE, MIOU
 from semstab.statistics.correlogram import STANDARD
@@ -49,18 +49,18 @@ def correctness(result: Result) -> list[Table]:
 
 
 def _correct_by_stratum(result: Result) -> list[Table]:
-    judged = {
-        name: [found.correctness.strata for _, found in rows if found.correctness is not None]
-        for name, rows in judged_records(result).items()
+    by_model = {
+        name: [stats.correctness.strata for _, stats in rows if stats.correctness is not None]
+        for name, rows in assessed_records(result).items()
     }
-    if not any(judged.values()):
+    if not any(by_model.values()):
         return []
     columns = (
         Column("persistence", "Persistence"),
         Column("voxels", "Voxels", 0),
         *map(Column.of, RIGHT),
     )
-    groups = tuple(Group(name, _stratum_rows(strata)) for name, strata in judged.items() if strata)
+    groups = tuple(Group(name, _stratum_rows(strata)) for name, strata in by_model.items() if strata)
     caption = (
         f"{settings(result.select())} Voxels with a true class: more than half of the ground truth's evidence is for"
         " it. ECE: expected calibration error of the largest belief; Brier: 0 to 2. Macro means: each scene counts"
@@ -79,12 +79,12 @@ def _quadrants(result: Result) -> list[Table]:
         Column("wrong_of_consistent_percent", "Wrong of consistent (%)", 1, "lower"),
     )
     numbers = (
-        _quadrant(lambda found: found.voxels),
-        _quadrant(lambda found: found.consistent_right.percent),
-        _quadrant(lambda found: found.consistent_wrong.percent),
-        _quadrant(lambda found: found.inconsistent_right.percent),
-        _quadrant(lambda found: found.inconsistent_wrong.percent),
-        _quadrant(lambda found: found.wrong_of_consistent.percent),
+        _quadrant(lambda quadrants: quadrants.voxels),
+        _quadrant(lambda quadrants: quadrants.consistent_right.percent),
+        _quadrant(lambda quadrants: quadrants.consistent_wrong.percent),
+        _quadrant(lambda quadrants: quadrants.inconsistent_right.percent),
+        _quadrant(lambda quadrants: quadrants.inconsistent_wrong.percent),
+        _quadrant(lambda quadrants: quadrants.wrong_of_consistent.percent),
     )
     caption = (
         "Over the voxels with OP>=3 and a true class. Stable: PSA >= 0.8, of ten frames one may disagree; right: the"
@@ -99,12 +99,12 @@ def _quadrants(result: Result) -> list[Table]:
 
 def _lost(take: Callable[[Losses], float | Estimate]) -> Number:
     """Return a number of geometry's part; NaN where that is not known."""
-    return lambda found: math.nan if found.geometry is None else take(found.geometry)
+    return lambda stats: math.nan if stats.geometry is None else take(stats.geometry)
 
 
 def _quadrant(take: Callable[[Quadrants], float | Estimate]) -> Number:
     """Return a number of the quadrants; NaN without ground truth."""
-    return lambda found: math.nan if found.correctness is None else take(found.correctness.quadrants)
+    return lambda stats: math.nan if stats.correctness is None else take(stats.correctness.quadrants)
 
 
 def _stratum_rows(strata: Sequence[Sequence[Correctness]]) -> tuple[Row, ...]:
@@ -134,8 +134,12 @@ def comparison(result: Result) -> list[Table]:
     """Return paired differences, ranking, and what each map covers; one group a scene."""
     if not result.comparisons:
         return []
-    covered = coverage_table({found.scene: found.coverage for found in result.comparisons})
-    shared = {found.scene: found.observations for found in result.comparisons if found.observations is not None}
+    covered = coverage_table({comparison.scene: comparison.coverage for comparison in result.comparisons})
+    shared = {
+        comparison.scene: comparison.observations
+        for comparison in result.comparisons
+        if comparison.observations is not None
+    }
     return [_differences(result), _ranking(result), covered, *([ignored_table(shared)] if shared else [])]
 
 
@@ -152,13 +156,13 @@ def _differences(result: Result) -> Table:
         f"{_COMMON} Only the first measure is tested, its p corrected by Holm's method for all pairs of all scenes of"
         f" which something may be claimed; the others describe. {INTERVALS}"
     )
-    groups = tuple(Group(found.scene, _difference_rows(found)) for found in result.comparisons)
+    groups = tuple(Group(comparison.scene, _difference_rows(comparison)) for comparison in result.comparisons)
     return Table("comparison", "Differences on the same places", caption, columns, groups, "scene")
 
 
-def _difference_rows(found: ModelComparison) -> tuple[Row, ...]:
+def _difference_rows(comparison: ModelComparison) -> tuple[Row, ...]:
     words = {quantity.key: quantity.word for quantity in compared(truth=True)}
-    rows = sorted(found.paired.differences, key=lambda row: row.measure != found.paired.primary)
+    rows = sorted(comparison.paired.differences, key=lambda row: row.measure != comparison.paired.primary)
     return tuple(
         (row.a, row.b, words[row.measure], row.difference, row.p_holm, row.undecided or row.scope) for row in rows
     )
@@ -178,14 +182,14 @@ def _ranking(result: Result) -> Table:
         f"In common: {_COMMON[0].lower()}{_COMMON[1:]} Same OP: each map with all its voxels seen twice or more, its"
         f" strata of OP weighted by those of all maps together. {INTERVALS}"
     )
-    thin = max(found.standardised.thin for found in result.comparisons)
+    thin = max(comparison.standardised.thin for comparison in result.comparisons)
     if thin > THIN:
         caption += f" {thin:.0%} of the weight is in strata of OP that hardly overlap."
-    groups = tuple(Group(found.scene, _ranking_rows(found)) for found in result.comparisons)
+    groups = tuple(Group(comparison.scene, _ranking_rows(comparison)) for comparison in result.comparisons)
     return Table("comparison_ranking", "Order of the models", caption, columns, groups, "scene")
 
 
-def _ranking_rows(found: ModelComparison) -> tuple[Row, ...]:
+def _ranking_rows(comparison: ModelComparison) -> tuple[Row, ...]:
     quantities = {quantity.key: quantity for quantity in compared(truth=True)}
     return tuple(
         (
@@ -194,10 +198,10 @@ def _ranking_rows(found: ModelComparison) -> tuple[Row, ...]:
             rank.model,
             f"{rank.low} to {rank.high}",
             100 * rank.best,
-            found.paired.of(quantities[ranking.measure])[rank.model],
-            found.standardised.of(quantities[ranking.measure], rank.model),
+            comparison.paired.of(quantities[ranking.measure])[rank.model],
+            comparison.standardised.of(quantities[ranking.measure], rank.model),
         )
-        for ranking in found.paired.rankings
+        for ranking in comparison.paired.rankings
         for rank in ranking.ranks
     )
 
@@ -218,13 +222,15 @@ def ignored_table(observations: Mapping[str, ComparedObservations]) -> Table:
         " out agrees as by chance. The order depends on it where that alpha, or the agreement within its bounds, would"
         " order the models otherwise."
     )
-    groups = tuple(Group(scene, _ignored_rows(found)) for scene, found in observations.items())
+    groups = tuple(Group(scene, _ignored_rows(comparison)) for scene, comparison in observations.items())
     return Table("comparison_ignored", "What was left out", caption, columns, groups, "scene")
 
 
-def _ignored_rows(found: ComparedObservations) -> tuple[Row, ...]:
-    depends = "yes" if found.depends else "no"
-    return tuple((row.model, 100 * row.missing, row.psa_low, row.psa_high, row.alpha, depends) for row in found.ignored)
+def _ignored_rows(observations: ComparedObservations) -> tuple[Row, ...]:
+    depends = "yes" if observations.depends else "no"
+    return tuple(
+        (row.model, 100 * row.missing, row.psa_low, row.psa_high, row.alpha, depends) for row in observations.ignored
+    )
 
 
 def coverage_table(covered: Mapping[str, Sequence[MapCoverage]]) -> Table:
@@ -239,7 +245,7 @@ def coverage_table(covered: Mapping[str, Sequence[MapCoverage]]) -> Table:
         Column("alone", "in no other", 0),
     )
     caption = "A model that ignores hard pixels covers less, and is compared on easier places."
-    groups = tuple(Group(scene, tuple(map(_coverage_row, found))) for scene, found in covered.items())
+    groups = tuple(Group(scene, tuple(map(_coverage_row, maps))) for scene, maps in covered.items())
     return Table("comparison_coverage", "What each map covers", caption, columns, groups, "scene")
 
 
@@ -268,8 +274,8 @@ def correlogram(result: Result) -> list[Table]:
         *(Column(f"{axis}_{end}", f"{end}", 3, over=f"By {axis}") for axis in _AXES for end in ("nearest", "farthest")),
     )
     numbers = (
-        _of(lambda found: found.standard.alpha),
-        _of(lambda found: found.standard.pairs or math.nan),
+        _of(lambda correlogram: correlogram.standard.alpha),
+        _of(lambda correlogram: correlogram.standard.pairs or math.nan),
         *(_of(_end(axis, last)) for axis in _AXES for last in (0, -1)),
     )
     caption = (
@@ -286,12 +292,12 @@ _AXES = ("time", "angle", "range", "baseline")
 
 
 def _of(take: Callable[[Correlogram], float | Estimate]) -> Callable[[MapStatistics], float | Estimate]:
-    return lambda found: math.nan if found.correlogram is None else take(found.correlogram)
+    return lambda stats: math.nan if stats.correlogram is None else take(stats.correlogram)
 
 
 def _end(axis: str, last: int) -> Callable[[Correlogram], float]:
-    def value(found: Correlogram) -> float:
-        bins: Sequence[LagBin] = getattr(found, axis)
+    def value(correlogram: Correlogram) -> float:
+        bins: Sequence[LagBin] = getattr(correlogram, axis)
         return bins[last].alpha.value if len(bins) > 1 else math.nan
 
     return value

@@ -32,11 +32,11 @@ CAPTION = (
 
 def filter_tables(result: Result) -> list[Table]:
     """Return one table of all models, where filters were judged."""
-    found = filter_studies(result)
-    if not found:
+    studies = filter_studies(result)
+    if not studies:
         return []
-    groups = tuple(Group(each.model, tuple(map(row, [each.unfiltered, *each.filtered]))) for each in found)
-    best = [f"{each.best.filters} over {each.model}" if each.best else f"none over {each.model}" for each in found]
+    groups = tuple(Group(each.model, tuple(map(row, [each.unfiltered, *each.filtered]))) for each in studies)
+    best = [f"{each.best.filters} over {each.model}" if each.best else f"none over {each.model}" for each in studies]
     return [
         Table(
             "filters",
@@ -65,6 +65,6 @@ def row(result: FilterResult) -> Row:
     )
 
 
-def marked(found: FilterStudy, result: FilterResult) -> str:
+def marked(study: FilterStudy, result: FilterResult) -> str:
     """Return '*' for the one to use, '!' for one that is steadier and worse."""
-    return "*" if result == found.best else "!" if result in found.misleading else ""
+    return "*" if result == study.best else "!" if result in study.misleading else ""

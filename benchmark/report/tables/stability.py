@@ -193,7 +193,7 @@ def overview(result: Result) -> list[Table]:
     records = result.select()
     if not records:
         return []
-    rows = tuple(_row(name, found) for name, found in by_model(records).items())
+    rows = tuple(_row(name, own) for name, own in by_model(records).items())
     caption = (
         f"{settings(records)} Pooled over the voxels of all scenes; alpha and flicker are macro means of the scenes;"
         f" pixel flicker has the camera's motion in it. {SBD_OVER}"
@@ -220,8 +220,8 @@ def _row(model: str, records: Sequence[Record]) -> Row:
 
 def sensitivity(result: Result) -> list[Table]:
     """Return one table a sweep (paper, Sensitivity to World-Space Association), and one with agreement."""
-    found = [(_table(result, sweep), _agreement_table(result, sweep)) for sweep in swept(result)]
-    return [table for pair in found for table in pair if table is not None]
+    pairs = [(_table(result, sweep), _agreement_table(result, sweep)) for sweep in swept(result)]
+    return [table for pair in pairs for table in pair if table is not None]
 
 
 def _table(result: Result, sweep: Sweep) -> Table:
@@ -258,10 +258,10 @@ def _agreement_table(result: Result, sweep: Sweep) -> Table | None:
         Column("sbd_excess", "SBD excess", 4, signed=True),
     )
     by_model = {name: levels(result, sweep.name, name) for name in result.models}
-    found = {name: rows for name, rows in by_model.items() if any(level.judged for level in rows)}
-    if not found:
+    known = {name: rows for name, rows in by_model.items() if any(level.assessed for level in rows)}
+    if not known:
         return None
-    groups = tuple(Group(name, tuple(_agreement_row(sweep, level) for level in rows)) for name, rows in found.items())
+    groups = tuple(Group(name, tuple(_agreement_row(sweep, level) for level in rows)) for name, rows in known.items())
     caption = (
         "VSS is pooled over the voxels of all scenes; the rest is of those seen twice or more, macro means of the"
         " scenes. PSA: share of pairs of frames that agree about a voxel; alpha: of two views at the same spot, beyond"
@@ -335,7 +335,7 @@ def flicker(result: Result) -> list[Table]:
     tables = [Table("flicker", "Flicker in image space", caption, columns, (Group("", macro),), by="")]
     if any(len(scenes) > 1 for scenes in methods.values()):
         groups = tuple(
-            Group(name, tuple((scene, *_numbers([found])) for scene, found in scenes.items()))
+            Group(name, tuple((scene, *_numbers([numbers])) for scene, numbers in scenes.items()))
             for name, scenes in methods.items()
         )
         columns = (Column("scene", "Scene"), *_NUMBERS)
@@ -349,8 +349,8 @@ def _by_method(result: Result) -> dict[str, dict[str, ImageSpace]]:
     for record in result.select():
         methods.setdefault(record.unit.model, {})[record.unit.scene] = record.image_space
     for row in result.regions:
-        found = ImageSpace(row.flicker_percent, row.compensated_flicker_percent, row.compensated_share)
-        methods.setdefault(row.model, {})[row.scene] = found
+        numbers = ImageSpace(row.flicker_percent, row.compensated_flicker_percent, row.compensated_share)
+        methods.setdefault(row.model, {})[row.scene] = numbers
     return methods
 
 
@@ -461,9 +461,9 @@ def _group(result: Result, model: str) -> Group | None:
     scenes = set.intersection(*(set(rows) for rows in by_backend.values()))
     if not others or not scenes:
         return None
-    found = {name: pooled([row for scene, row in rows.items() if scene in scenes]) for name, rows in by_backend.items()}
-    base = found[result.backend]
-    return Group(model, tuple(_backend_row(name, mean, base) for name, mean in found.items()))
+    means = {name: pooled([row for scene, row in rows.items() if scene in scenes]) for name, rows in by_backend.items()}
+    base = means[result.backend]
+    return Group(model, tuple(_backend_row(name, mean, base) for name, mean in means.items()))
 
 
 def _backend_row(backend: str, mean: Pooled, base: Pooled) -> Row:
@@ -506,9 +506,9 @@ def reduced(result: Result) -> list[Table]:
 
 
 def _reduced_row(record: Record) -> Row:
-    found, table, statistics = record.summary.reduced, record.summary.table, record.summary.statistics
-    if found is not None:
-        return record.unit.scene, found.vss, found.recurrent_vss, found.voxel_alpha
+    reduced, table, statistics = record.summary.reduced, record.summary.table, record.summary.statistics
+    if reduced is not None:
+        return record.unit.scene, reduced.vss, reduced.recurrent_vss, reduced.voxel_alpha
     alpha = math.nan if statistics is None else statistics.agreement.voxel_alpha.value
     return record.unit.scene, table[VSS], table.recurrent[VSS], alpha
 

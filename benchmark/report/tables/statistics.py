@@ -43,18 +43,18 @@ def temporal_agreement(result: Result) -> list[Table]:
         Column.of(FLIP_RATE),
     )
     numbers: tuple[Number, ...] = (
-        lambda found: found.headline.alpha.ends,
+        lambda stats: stats.headline.alpha.ends,
         of_cells(lambda cells: cells.cells),
         of_cells(lambda cells: cells.views),
         of_cells(lambda cells: 100 * cells.labelled),
-        lambda found: found.repeated.voxels,
-        lambda found: found.agreement.vss.value,
-        lambda found: found.agreement.psa,
-        lambda found: found.agreement.kappa.value,
-        lambda found: found.agreement.voxel_alpha,
-        lambda found: found.agreement.within.value,
-        lambda found: found.agreement.between.value,
-        lambda found: math.nan if found.drift.flips is None else found.drift.flips.rate.value,
+        lambda stats: stats.repeated.voxels,
+        lambda stats: stats.agreement.vss.value,
+        lambda stats: stats.agreement.psa,
+        lambda stats: stats.agreement.kappa.value,
+        lambda stats: stats.agreement.voxel_alpha,
+        lambda stats: stats.agreement.within.value,
+        lambda stats: stats.agreement.between.value,
+        lambda stats: math.nan if stats.drift.flips is None else stats.drift.flips.rate.value,
     )
     caption = (
         "Alpha: agreement of two views at the same spot beyond chance, 1 perfect, 0 chance, of sampled cells that two"
@@ -68,8 +68,8 @@ def temporal_agreement(result: Result) -> list[Table]:
 
 def class_agreement(result: Result) -> list[Table]:
     """Return alpha of each class against all others; macro means over scenes."""
-    judged = judged_records(result)
-    groups = tuple(Group(name, _class_rows([found for _, found in rows])) for name, rows in judged.items())
+    assessed = assessed_records(result)
+    groups = tuple(Group(name, _class_rows([stats for _, stats in rows])) for name, rows in assessed.items())
     if not any(group.rows for group in groups):
         return []
     columns = (
@@ -81,7 +81,7 @@ def class_agreement(result: Result) -> list[Table]:
     )
     cells = [row[1:] for group in groups for row in group.rows]
     known = [k for k in range(len(columns)) if any(_says(row[k]) for row in cells)]
-    kept = tuple(
+    retained = tuple(
         Group(group.name, tuple((row[0], *(row[1 + k] for k in known)) for row in group.rows)) for group in groups
     )
     caption = (
@@ -91,7 +91,9 @@ def class_agreement(result: Result) -> list[Table]:
         f" counts once. {INTERVALS}"
     )
     title = "Agreement of the frames, by class"
-    return [Table("class_agreement", title, caption, (Column("class", "Class"), *(columns[k] for k in known)), kept)]
+    return [
+        Table("class_agreement", title, caption, (Column("class", "Class"), *(columns[k] for k in known)), retained)
+    ]
 
 
 def drift(result: Result) -> list[Table]:
@@ -109,8 +111,8 @@ def drift(result: Result) -> list[Table]:
         ordered(lambda drift: drift.sbd.value),
         ordered(lambda drift: drift.null.value),
         ordered(lambda drift: drift.excess),
-        lambda found: UNDEFINED if found.drift.trend is None else found.drift.trend.share.percent,
-        lambda found: math.nan if found.drift.trend is None else found.drift.trend.voxels,
+        lambda stats: UNDEFINED if stats.drift.trend is None else stats.drift.trend.share.percent,
+        lambda stats: math.nan if stats.drift.trend is None else stats.drift.trend.voxels,
     )
     logged = any(r.statistics is not None and r.statistics.drift.trend is not None for r in result.select())
     one_class = f"{SEEN_TWICE[:-1]}, where each frame says one class; --statistics adds the others, and the trend."
@@ -136,14 +138,14 @@ def uncertainty(result: Result) -> list[Table]:
         Column("within_percent", "within (%)", 0),
     )
 
-    def share(found: MapStatistics) -> float:
-        entropy = found.uncertainty.entropy.value
-        return 100 * found.uncertainty.within.value / entropy if entropy else math.nan
+    def share(stats: MapStatistics) -> float:
+        entropy = stats.uncertainty.entropy.value
+        return 100 * stats.uncertainty.within.value / entropy if entropy else math.nan
 
     numbers: tuple[Number, ...] = (
-        lambda found: found.uncertainty.entropy,
-        lambda found: found.uncertainty.within,
-        lambda found: found.uncertainty.between,
+        lambda stats: stats.uncertainty.entropy,
+        lambda stats: stats.uncertainty.within,
+        lambda stats: stats.uncertainty.between,
         share,
     )
     caption = (
@@ -155,8 +157,8 @@ def uncertainty(result: Result) -> list[Table]:
 
 def verdicts(result: Result) -> list[Table]:
     """Return what the evidence says of each model on each scene, and what to do."""
-    judged = judged_records(result)
-    if not judged:
+    assessed = assessed_records(result)
+    if not assessed:
         return []
     columns = (
         SCENE,
@@ -169,7 +171,7 @@ def verdicts(result: Result) -> list[Table]:
         Column("repeated_percent", "of the map (%)", 0),
         Column("advice", "Recommendation"),
     )
-    groups = tuple(Group(name, tuple(_verdict_row(*row) for row in rows)) for name, rows in judged.items())
+    groups = tuple(Group(name, tuple(_verdict_row(*row) for row in rows)) for name, rows in assessed.items())
     caption = (
         "The verdict is the most probable level of alpha for the same scene flown again: stable from"
         f" {LIMITS.stable:g} on, usable from {LIMITS.usable:.3g}, unstable below; undecided where no level has"
@@ -189,8 +191,8 @@ def by_scene(
 ) -> list[Table]:
     """Return one row a scene, and the macro mean of several; columns and units that have no number are left out."""
     cells = {
-        model: {record.unit.scene: [take(found) for take in numbers] for record, found in rows}
-        for model, rows in judged_records(result).items()
+        model: {record.unit.scene: [take(stats) for take in numbers] for record, stats in rows}
+        for model, rows in assessed_records(result).items()
     }
     cells = {model: {scene: row for scene, row in rows.items() if _known(row)} for model, rows in cells.items()}
     known = sorted({k for rows in cells.values() for row in rows.values() for k in _known(row)})
@@ -212,27 +214,27 @@ def by_scene(
     return [Table(name, title, caption, (SCENE, *(columns[k] for k in known)), groups)]
 
 
-def judged_records(result: Result) -> dict[str, list[tuple[Record, MapStatistics]]]:
+def assessed_records(result: Result) -> dict[str, list[tuple[Record, MapStatistics]]]:
     """Return the base units that have statistics, with these, by model."""
-    judged = {
+    assessed = {
         model: [(record, record.statistics) for record in records if record.statistics is not None]
         for model, records in by_model(result.select()).items()
     }
-    return {model: rows for model, rows in judged.items() if rows}
+    return {model: rows for model, rows in assessed.items() if rows}
 
 
 def ordered(take: Callable[[DriftStatistics], float | Estimate]) -> Number:
     """Return a number of drift beside random order; NaN where too few places tell what that gives."""
-    return lambda found: take(found.drift) if found.order_known else math.nan
+    return lambda stats: take(stats.drift) if stats.order_known else math.nan
 
 
 def of_cells(take: Callable[[CellAgreement], float]) -> Number:
     """Return a number of the sampled cells; NaN where there are none."""
-    return lambda found: math.nan if found.cells is None else take(found.cells)
+    return lambda stats: math.nan if stats.cells is None else take(stats.cells)
 
 
-def _value(found: float | Estimate) -> float:
-    return found.value if isinstance(found, Estimate) else found
+def _value(number: float | Estimate) -> float:
+    return number.value if isinstance(number, Estimate) else number
 
 
 def _says(cell: Cell) -> bool:
@@ -252,15 +254,15 @@ def _means(rows: Sequence[Sequence[float | Estimate]]) -> list[float]:
 
 def grouped(rows: Iterable[T], name: Callable[[T], str]) -> dict[str, list[T]]:
     """Return the rows of several units by their name, in order of appearance."""
-    found: dict[str, list[T]] = {}
+    groups: dict[str, list[T]] = {}
     for row in rows:
-        found.setdefault(name(row), []).append(row)
-    return found
+        groups.setdefault(name(row), []).append(row)
+    return groups
 
 
-def _class_rows(judged: Sequence[MapStatistics]) -> tuple[Row, ...]:
-    by_name = grouped((row for found in judged for row in found.agreement.classes), lambda row: row.name)
-    cells = (found.cells for found in judged if found.cells is not None)
+def _class_rows(assessed: Sequence[MapStatistics]) -> tuple[Row, ...]:
+    by_name = grouped((row for stats in assessed for row in stats.agreement.classes), lambda row: row.name)
+    cells = (stats.cells for stats in assessed if stats.cells is not None)
     alphas: dict[str, list[ClassAlpha]] = grouped((row for own in cells for row in own.classes), lambda row: row.name)
     return tuple(
         (
@@ -279,19 +281,19 @@ def _class_rows(judged: Sequence[MapStatistics]) -> tuple[Row, ...]:
 
 def _one_or_mean(values: Sequence[Estimate]) -> float | Estimate:
     """Return the one, with its interval; of several scenes the macro mean, which has none."""
-    return values[0] if len(values) == 1 else macro_mean([found.value for found in values])
+    return values[0] if len(values) == 1 else macro_mean([estimate.value for estimate in values])
 
 
-def _verdict_row(record: Record, found: MapStatistics) -> Row:
-    right = found.correctness
+def _verdict_row(record: Record, stats: MapStatistics) -> Row:
+    right = stats.correctness
     return (
         record.unit.scene,
-        found.verdict.level,
-        100 * found.verdict.probability,
-        found.headline.alpha.ends,
-        math.nan if found.cells is None else 100 * found.cells.labelled,
+        stats.verdict.level,
+        100 * stats.verdict.probability,
+        stats.headline.alpha.ends,
+        math.nan if stats.cells is None else 100 * stats.cells.labelled,
         UNDEFINED if right is None else right.quadrants.wrong_of_consistent.percent,
-        found.repeated.voxels,
-        100 * found.repeated.share,
-        ADVICE[found.verdict.level],
+        stats.repeated.voxels,
+        100 * stats.repeated.share,
+        ADVICE[stats.verdict.level],
     )
