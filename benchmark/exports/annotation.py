@@ -1,4 +1,4 @@
-"""Annotation tasks: the locations of a map on which frames disagree, each with the view that shows it best."""
+"""Find annotation tasks: the locations of a map on which frames disagree, each with the view that shows it best."""
 
 from __future__ import annotations
 
@@ -28,19 +28,20 @@ from semstab.statistics import psa
 from semstab.task import Task
 
 MIN_PSA = 0.8
-"""The share of pairs of frames that must agree: below, a location is annotated, as where belief drifts or is uncertain."""
+"""The share of pairs of frames that must agree. A location with a smaller share is annotated, as is one that drifts or
+is uncertain."""
 
 BLOCK = 16
-"""Largest edge of a location, voxels: what a person can judge at once."""
+"""The largest edge of a location, voxels, that a person can assess at once."""
 
 NEIGHBOURS = 1.8
-"""Largest distance of neighbours' centres, voxels: those across an edge or a corner are neighbours, too."""
+"""The largest distance of neighbours' centres, voxels: voxels across an edge or a corner are neighbours, too."""
 
 SMALLEST = 1 / 5000
-"""Part of an image, 8 x 8 pixels of 640 x 480, that an outline encloses; what is smaller cannot be judged."""
+"""The least share of an image that an outline encloses, 8 x 8 pixels of 640 x 480; a person cannot assess less."""
 
 MORE = 8
-"""The factor on the tasks wanted by which more are looked for in the frames: no frame may show a location well."""
+"""The number of locations that are searched in the frames for each task: perhaps no frame shows a location well."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,7 +76,7 @@ def annotation_tasks(chosen: Chosen, task: Task, most: int) -> list[AnnotationTa
 
     A location is a connected set of voxels that at least two frames saw, with the same two likeliest classes, on which
     frames disagree. Its best view has the largest product of size in the image, how frontal and how sharp it is. A
-    location where all frames are wrong alike is not found.
+    location where all frames make the same error is not found.
 
     Args:
         chosen: The voxels that may be annotated.
@@ -93,7 +94,7 @@ def annotation_tasks(chosen: Chosen, task: Task, most: int) -> list[AnnotationTa
         by_location.setdefault(view.location, []).append(view)
     if not by_location:
         raise ConfigError(
-            "no image shows a location where frames disagree as large as a person needs it; use larger voxels"
+            "no image shows a location where frames disagree large enough for a person; use larger voxels"
         )
     best = [_ranked(own) for own in by_location.values()]
     best.sort(key=lambda own: -own[0].bits)
@@ -102,10 +103,10 @@ def annotation_tasks(chosen: Chosen, task: Task, most: int) -> list[AnnotationTa
 
 @dataclass(frozen=True, eq=False)
 class _Locations:
-    """The voxels that are annotated; (n,) the location of each, 0, 1, ..., its two classes, and its entropy in bits.
+    """The voxels that are annotated: (n,) the location of each, 0, 1, ..., its two classes, and its entropy in bits.
 
     Attributes:
-        projected: Brings points (n, 3) of the scene into its projection, where it has one.
+        projected: The function that projects points (n, 3) of the scene, where the scene has a projection.
     """
 
     table: VoxelTable
@@ -186,7 +187,7 @@ class _View:
     """A location in a frame.
 
     Attributes:
-        bits: Bits of the voxels that it shows.
+        bits: Entropy of the voxels that it shows, bits.
         pixels: Pixels of the outline.
         area: Area of the surface across the line of sight, square metres: the more frontal, the larger.
         sharp: Mean square of the image's second derivative in the outline.

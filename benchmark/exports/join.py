@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from scipy.spatial import cKDTree
 
 
-# Which voxel a point belongs to: the one that it lies in, else the nearest within a radius.
+# A point belongs to the voxel that it lies in, else to the nearest voxel within a radius.
 
 NONE = -1
 """The row of a point that belongs to no voxel."""
@@ -46,7 +46,7 @@ class VoxelLookup:
 
     @property
     def bounds(self) -> tuple[Float64, Float64]:
-        """(3,) the lowest and the highest coordinates that may belong to a voxel, metres."""
+        """Return the lowest and the highest coordinates (3,) that may belong to a voxel, metres."""
         r = self.table.voxel_size
         return self._low * r - self._radius, (self._high + 1) * r + self._radius
 
@@ -85,10 +85,10 @@ class VoxelLookup:
 
 
 CHUNK = 1_000_000
-"""Points at a time."""
+"""The number of points that are read at a time."""
 
 MEASURES = ("vss", "op", "category")
-"""Columns of a point where none is chosen."""
+"""The columns of a point by default."""
 
 BEFORE = "classification_before"
 """The extra dimension with the classification that a LAS cloud had."""
@@ -144,9 +144,9 @@ def classify(chosen: Chosen, cloud: Path, out: Path, radius: float, asprs: Path 
     if write is None:
         raise ConfigError(f"{cloud}: a cloud is a .las, .laz or .ply file")
     if kinds.get(out.suffix.lower()) is not write:
-        raise ConfigError(f"{out}: {cloud.name} stays what it is; write {out.with_suffix(cloud.suffix)}")
+        raise ConfigError(f"{out}: the output has the format of {cloud.name}; write {out.with_suffix(cloud.suffix)}")
     if out.exists() and out.samefile(cloud):
-        raise ConfigError(f"{out}: is the cloud itself; choose another file")
+        raise ConfigError(f"{out}: this is the cloud itself; choose another file")
     finder = _Finder(chosen, radius)
     with atomic_path(out) as temporary:
         write(chosen.first, cloud, temporary, finder)
@@ -168,7 +168,7 @@ class _Finder:
 
     @cached_property
     def bounds(self) -> tuple[Float64, Float64]:
-        """(3,) the lowest and the highest coordinates of the file that may belong to a voxel, metres."""
+        """Return the lowest and the highest coordinates (3,) of the file that may belong to a voxel, metres."""
         low, high = np.full(3, np.inf), np.full(3, -np.inf)
         for tile in self.chosen.tiles():
             voxels, r = self.chosen[tile], self.chosen.first.table.voxel_size
@@ -226,8 +226,8 @@ def _outside(cloud: Path, finder: _Finder) -> DataError:
         for box in ((finder.tally.low, finder.tally.high), map_box)
     )
     georeferenced = finder.chosen.first.georeference is not None
-    mend = "mend the cloud's coordinates" if georeferenced else "give the run's dataset a georeference (crs, offset)"
-    return DataError(f"{cloud}: no point lies in the map: it spans {there} m, the map {here}; {mend}")
+    mend = "correct the cloud's coordinates" if georeferenced else "give the run's dataset a georeference (crs, offset)"
+    return DataError(f"{cloud}: no point lies in the map: the cloud spans {there} m, the map {here}; {mend}")
 
 
 # --- LAS --------------------------------------------------------------------------------------------------------------
@@ -279,7 +279,7 @@ def _classified_points(
 
 
 def _require_same_crs(voxels: Voxels, header: laspy.LasHeader, cloud: Path) -> None:
-    """Raise DataError where cloud and run say different projections."""
+    """Raise DataError where cloud and run have different projections."""
     stated = header.parse_crs()
     if stated is None or voxels.georeference is None:
         return
@@ -288,7 +288,7 @@ def _require_same_crs(voxels: Voxels, header: laspy.LasHeader, cloud: Path) -> N
     flat = stated.sub_crs_list[0] if stated.is_compound else stated
     there, here = (crs.to_epsg() for crs in (flat, CRS.from_wkt(voxels.georeference.crs)))
     if there is not None and here is not None and there != here:
-        raise DataError(f"{cloud}: is in EPSG:{there}, the run in EPSG:{here}; reproject the cloud")
+        raise DataError(f"{cloud}: the cloud is in EPSG:{there}, the run in EPSG:{here}; reproject the cloud")
 
 
 # --- PLY --------------------------------------------------------------------------------------------------------------
@@ -321,5 +321,7 @@ def _ply_chunks(source: Any, header: clouds.Header, cloud: Path) -> Iterator[npt
         wanted = min(CHUNK, header.count - first)
         points = np.fromfile(source, header.dtype, wanted)
         if len(points) < wanted:
-            raise DataError(f"{cloud}: ends after {first + len(points):,} of {header.count:,} points; it is cut short")
+            raise DataError(
+                f"{cloud}: the file ends after {first + len(points):,} of {header.count:,} points; it is cut short"
+            )
         yield points
