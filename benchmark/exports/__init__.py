@@ -185,4 +185,4 @@ def _few_met(tally: joining.Tally, some: Voxels) -> str:
 def _notes(voxels: Voxels, kind: str, settings: Settings) -> Iterator[str]:
     if kind in (".las", ".laz") and (names := clouds.without_code(voxels, settings.asprs)):
         listed = ", ".join(names[:3]) + (", ..." if len(names) > 3 else "")
-        yield f"without ASPRS code (--asprs): {listed}; their classification is 1; the dimension 'class' has their number"
+        yield f"without ASPRS code (--asprs): {listed}; their classification is 1, their number is in dimension 'class'"

@@ -164,7 +164,7 @@ class Accuracy:
 
     @classmethod
     def of(cls, confusion: Int64) -> Accuracy:
-        """Return the accuracy of pixels (K, K) by true and given class; a class counts for the mean where either has it."""
+        """Return the accuracy of pixels (K, K) by true and given class; a class without pixels does not count."""
         right, n = confusion.diagonal(), int(confusion.sum())
         union = confusion.sum(axis=0) + confusion.sum(axis=1) - right
         there = union > 0

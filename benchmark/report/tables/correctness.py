@@ -283,8 +283,8 @@ def correlogram(result: Result) -> list[Table]:
         "The table shows alpha of pairs of observations of a cell, by their distance. Models and flights are compared"
         " at a stated angle between the directions of view, not over all pairs that a flight has. Nearest and farthest"
         " are the first and the last bin with enough pairs in time (frames), angle, ratio of the ranges, and distance"
-        " of the cameras. Alpha is not extrapolated to cells without a size. Intervals are at 95%, for this scene flown again"
-        f" if a bin has {LEAST_FRAMES} frames, else for these frames."
+        " of the cameras. Alpha is not extrapolated to cells without a size. Intervals are at 95%, for this scene flown"
+        f" again if a bin has {LEAST_FRAMES} frames, else for these frames."
     )
     return by_scene(result, "correlogram", "Agreement by distance of the observations", caption, columns, numbers)
 

@@ -22,11 +22,11 @@ CAPTION = (
     "Flicker is the share of pixels seen in two frames in a row whose label changes, camera motion removed. Alpha is"
     " the agreement of two views at the same spot. It rises with any memory of earlier frames, because frames that"
     " share a memory are not independent: a high alpha of a filter with memory is no evidence. Next frame is the share"
-    " of pixels seen in the next frame that have the label that the unfiltered model gives them there; no filter has seen"
-    " that frame, so a repeated label does not count. Accuracy and mean IoU are of the labelled pixels of single"
-    " frames. Consistent, wrong is the share of pixels seen again that keep a wrong label. Lag is the number of frames by which"
-    " labels follow a true change later than the model (at most 8). Coverage is the number of labelled pixels for each"
-    " labelled pixel of the model. ms is the CPU time per frame. All numbers are means over scenes."
+    " of pixels seen in the next frame that have the label that the unfiltered model gives them there; no filter has"
+    " seen that frame, so a repeated label does not count. Accuracy and mean IoU are of the labelled pixels of single"
+    " frames. Consistent, wrong is the share of pixels seen again that keep a wrong label. Lag is the number of frames"
+    " by which labels follow a true change later than the model (at most 8). Coverage is the number of labelled pixels"
+    " for each labelled pixel of the model. ms is the CPU time per frame. All numbers are means over scenes."
 )
 
 

@@ -58,10 +58,10 @@ def temporal_agreement(result: Result) -> list[Table]:
     )
     caption = (
         "Alpha is the agreement of two views at the same spot beyond chance: 1 is perfect, 0 is chance. It is measured"
-        " on sampled cells that two views saw, and does not depend on the voxel size. The other numbers are of the voxels"
-        " seen twice or more. PSA is the share of pairs of frames that agree about a voxel; kappa (Fleiss) and voxel"
-        " alpha (Krippendorff) are the same agreement beyond chance. Disagreement has the parts of 1 - PSA within a"
-        " frame and between frames. Flip rate is the share of the steps from one observation to the next at which the"
+        " on sampled cells that two views saw, and does not depend on the voxel size. The other numbers are of the"
+        " voxels seen twice or more. PSA is the share of pairs of frames that agree about a voxel; kappa (Fleiss) and"
+        " voxel alpha (Krippendorff) are the same agreement beyond chance. Disagreement has the parts of 1 - PSA within"
+        " a frame and between frames. Flip rate is the share of the steps from one observation to the next at which the"
         f" predicted class changes. {INTERVALS}"
     )
     return by_scene(result, "temporal_agreement", "Agreement of the frames", caption, columns, numbers)
