@@ -126,7 +126,7 @@ class FramesOptions(BaseModel):
 
 
 class Frames(Dataset):
-    """A dataset of one scene: the frames that `semstab.fuse` was given. Only the process that has them can read them."""
+    """A dataset of one scene: the frames that `semstab.fuse` was given. Only the process that has them reads it."""
 
     Options: type[BaseModel] = FramesOptions
     sequences: ClassVar[weakref.WeakValueDictionary[str, Sequence]] = weakref.WeakValueDictionary()

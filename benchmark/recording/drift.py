@@ -132,7 +132,7 @@ class View(NamedTuple):
     file: str = ""
 
     def project(self, points: Float64) -> tuple[Float64, Mask]:
-        """Return the pixels (n, 2) of points (n, 3) in the viewer's image, and a mask of those whose number is inside."""
+        """Return the pixels (n, 2) of points (n, 3) in the viewer's image, and a mask of those with a number inside."""
         x, y, z = self.intrinsics.matrix @ ((points - self.T_wc[:3, 3]) @ self.T_wc[:3, :3]).T
         pixels = np.stack([x, y], axis=1) / np.where(z > 0, z, 1.0)[:, None] + 0.5  # its pixel centres are at halves
         size = np.array(self.shape[::-1], dtype=np.float64)

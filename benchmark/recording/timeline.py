@@ -98,8 +98,8 @@ SERIES = {
     "decode_ms": "Decoding, in a worker (ms)",
     "wait_ms": "Waiting for a frame (ms)",
 }
-"""The time series by name, and the titles of their plots. All but updated_voxels (voxels - new_voxels) are columns of the
-CSV."""
+"""The time series by name, and the titles of their plots. All but updated_voxels (voxels - new_voxels) are columns of
+the CSV."""
 
 OF_THE_MODEL = ("flicker_percent", "compensated_flicker_percent", "decode_ms", "wait_ms")
 """The series that are the same for all backends; they are logged with the first one."""
