@@ -1,4 +1,4 @@
-"""Any dataset as posed folders: plain files of depth, poses and labels, from which the same voxels come."""
+"""Write any dataset as posed folders: plain files of depth, poses and labels that give the same voxels."""
 
 from __future__ import annotations
 
@@ -44,10 +44,10 @@ from semstab.task import frame_indices, selected
 
 __all__ = ["Converted", "convert", "convert_scene"]
 
-# A posed folder that is being written: each file is whole or missing, and existing files stay.
+# In a posed folder that is being written each file is whole or missing, and existing files stay.
 
 SCHEMA = 1
-"""Version of conversion.json."""
+"""The version of conversion.json."""
 
 CONVERSION_FILE = "conversion.json"
 SCORES_SUFFIX = "-scores"
@@ -55,25 +55,25 @@ SCORES_SUFFIX = "-scores"
 
 MAX_UINT16 = 65535
 LONGEST_NAME = 200
-"""Bytes of a folder's name."""
+"""The most bytes of a folder's name."""
 
 
 @dataclass(frozen=True)
 class DepthFormat:
-    """16-bit PNG, `scale` units in a metre; or where scale is None .npy files of float32 metres."""
+    """A format of depth: 16-bit PNG with `scale` units per metre; .npy files of float32 metres where scale is None."""
 
     scale: float | None
 
     @property
     def suffix(self) -> str:
-        """Suffix of its files."""
+        """Return the suffix of its files."""
         return ".npy" if self.scale is None else ".png"
 
     def __str__(self) -> str:
-        return "float32 .npy" if self.scale is None else f"16-bit PNG, {self.scale:g} units a metre"
+        return "float32 .npy" if self.scale is None else f"16-bit PNG, {self.scale:g} units per metre"
 
     def stored(self, depth: Float32, tolerance: float) -> npt.NDArray[Any] | None:
-        """Return the depth as a file holds it; None where a pixel would be off by more than `tolerance` metres."""
+        """Return the depth as a file stores it; None if a pixel would be off by more than `tolerance` metres."""
         if self.scale is None:
             return depth
         units, error = quantised(depth, self.scale)
@@ -81,7 +81,7 @@ class DepthFormat:
 
 
 def quantised(depth: Float32, scale: float) -> tuple[UInt16, float]:
-    """Return depth in whole units of 1 / scale metres, invalid pixels 0, and by how many metres the worst pixel is off.
+    """Return depth in whole units of 1 / scale metres, with 0 for invalid pixels, and the largest error in metres.
 
     The error is infinite where depth does not fit into 16 bits, or a valid pixel would become invalid.
     """
@@ -91,7 +91,7 @@ def quantised(depth: Float32, scale: float) -> tuple[UInt16, float]:
         return units.astype(np.uint16), 0.0
     if units[valid].min() < 1 or units.max() > MAX_UINT16:
         return np.zeros(depth.shape, dtype=np.uint16), np.inf
-    back = np.divide(units.astype(np.uint16), scale, dtype=np.float32, casting="same_kind")  # as it is read
+    back = np.divide(units.astype(np.uint16), scale, dtype=np.float32, casting="same_kind")  # as a reader computes it
     return units.astype(np.uint16), float(np.abs(back.astype(np.float64) - depth)[valid].max())
 
 
@@ -154,20 +154,20 @@ class SceneFolder:
 
     @property
     def frames(self) -> set[str]:
-        """Names of the frames that are there."""
+        """Return the names of the existing frames."""
         return {file.stem for file in (self.path / "depth").glob("[!.]*")}
 
     def has_geometry(self, name: str) -> bool:
-        """Return whether depth, pose, colour and mask of a frame are there: depth is written last."""
+        """Return whether depth, pose, colour and mask of a frame exist: depth is written last."""
         assert self.form is not None
         return (self.path / "depth" / f"{name}{self.form.suffix}").exists()
 
     def has_labels(self, name: str, model: str) -> bool:
-        """Return whether a frame's labels or scores are there."""
+        """Return whether a frame's labels or scores exist."""
         return any(self._label_path(name, model, soft).exists() for soft in (False, True))
 
     def is_soft(self, model: str) -> bool:
-        """Return whether the model's scores were written, not labels."""
+        """Return whether the scores of the model were written instead of labels."""
         labels, scores = (self._label_path("", model, soft).parent for soft in (False, True))
         return scores.is_dir() and not labels.is_dir()
 
@@ -209,7 +209,7 @@ class SceneFolder:
         space.save(self._label_path("", model, self.is_soft(model)).parent / LABEL_SPACE_FILE)
 
     def read_as(self, model: str) -> str:
-        """Return the name of the model as posed_folder reads it."""
+        """Return the name of the model in posed_folder."""
         return f"{_bare(model)}{SCORES_SUFFIX}" if self.is_soft(model) else folder_name(model)
 
     def _label_path(self, name: str, model: str, soft: bool) -> Path:
@@ -218,7 +218,7 @@ class SceneFolder:
         return self.path / "labels" / folder_name(model) / f"{name}.png"
 
     def _require_same_camera(self, frame: Frame) -> None:
-        """Check that one intrinsics.txt serves all frames."""
+        """Raise DataError if a frame has other intrinsics than the frames before."""
         path = self.path / "intrinsics.txt"
         if self._intrinsics is None and not path.exists():
             write_text(path, matrix_text(frame.intrinsics.matrix))
@@ -226,15 +226,15 @@ class SceneFolder:
         if frame.intrinsics != self._intrinsics:
             raise DataError(
                 f"{frame.where('depth')}: intrinsics {frame.intrinsics} differ from those of the frames before"
-                f" ({self._intrinsics}), and a posed folder has one camera; convert the frames of each by themselves"
+                f" ({self._intrinsics}), and a posed folder has one camera; convert the frames of each separately"
             )
 
     def _claim(self) -> DepthFormat | None:
-        """Return how an earlier start stored depth; None where there was none."""
+        """Return the format of depth of an earlier start; None without one."""
         manifest = self.path / CONVERSION_FILE
         if not manifest.is_file():
             if self.path.exists() and (not self.path.is_dir() or any(self.path.glob("[!.]*"))):
-                raise ConfigError(f"{self.path}: is there already and holds no conversion; choose another --out")
+                raise ConfigError(f"{self.path}: the folder exists and holds no conversion; choose another --out")
             return None
         try:
             there = read_json(manifest)
@@ -246,19 +246,19 @@ class SceneFolder:
             raise DataError(f"{manifest}: damaged; delete {self.path}, and the scene is converted again") from error
         if key != self._key:
             raise ConfigError(
-                f"{self.path}: was converted from other data or with other settings; choose another --out"
+                f"{self.path}: it was converted from other data or with other settings; choose another --out"
             )
         return form
 
 
 def folder_name(name: str) -> str:
-    """Return the name itself where a folder can be called so, or else its `slug`."""
+    """Return the name itself if it can be the name of a folder, or else its `slug`."""
     fits = name.isprintable() and len(name.encode()) <= LONGEST_NAME and not set(name) & set("/\\")
     return name if fits and name[:1] not in ("", ".", "-") else slug(name)
 
 
 def matrix_text(matrix: Float64) -> str:
-    """Return a matrix as text, one row a line, that reads back to the same numbers."""
+    """Return a matrix as text, one row per line, that reads back to the same numbers."""
     return "".join(" ".join(f"{value:.17g}" for value in row) + "\n" for row in matrix)
 
 
@@ -268,7 +268,7 @@ def _bare(model: str) -> str:
 
 
 PROBED_FRAMES = 3
-"""Frames whose depth is tried in 16 bits; where a later frame does not fit, all become floats."""
+"""The number of frames whose depth is tried in 16 bits; if a later frame does not fit, all become floats."""
 
 Reporter = Callable[[str, int, int], None]
 
@@ -280,9 +280,9 @@ class Converted:
     Attributes:
         folder: Folder of the converted scene.
         frames: Number of selected frames, of which `written` were new or not complete.
-        depth: How its depth is stored, in words.
+        depth: The format of its depth, in words.
         renamed: Label sources that have another name in the folder.
-        lost: Things of the scene that a posed folder does not hold.
+        lost: Parts of the scene that a posed folder does not hold.
     """
 
     scene: str
@@ -304,7 +304,7 @@ def convert(
     the folder gives the voxels of the source. `progress` is called after each frame: task, frames done, all frames.
 
     Raises:
-        ConfigError: For a folder that holds something else.
+        ConfigError: For a folder with other content.
         DataError: For frames that a posed folder cannot hold.
     """
     dataset = open_dataset(config.dataset.name, config.dataset.options)
@@ -320,10 +320,12 @@ def convert_scene(scene: Scene, config: Config, path: Path, depth_error: float, 
     dataset = config.dataset.model_dump(mode="json")
     folder = SceneFolder(path, {"dataset": dataset, "scene": scene.name, "depth_error": depth_error}, depth_error)
     if others := folder.frames - set(map(_name, indices)):
-        raise ConfigError(f"{path}: holds frame {min(others)}, which is not selected now; choose another --out")
+        raise ConfigError(
+            f"{path}: the folder holds frame {min(others)}, which is not selected now; choose another --out"
+        )
     folders = [folder_name(name) for name in models]
     if repeated := [name for name in models if folders.count(folder_name(name)) > 1]:
-        raise ConfigError(f"{scene.name}: {' and '.join(repeated)} would get one folder; choose with --model")
+        raise ConfigError(f"{scene.name}: {' and '.join(repeated)} would get the same folder; choose with --model")
     work = _Work(scene, indices, models, folder, progress)
     settings: dict[str, Any] = {"pose_convention": "camera_to_world", "camera_axes": "opencv"}
     if up := _up_axis(scene):
@@ -384,7 +386,7 @@ class _Work:
         return len(written)
 
     def lost(self) -> Iterator[str]:
-        """Name everything of the scene that a posed folder does not hold."""
+        """Yield the names of the parts of the scene that a posed folder does not hold."""
         if self.timed:
             yield "time stamps"
         if self.scene.up is not None and _up_axis(self.scene) is None:
@@ -408,21 +410,23 @@ class _Work:
             self.folder.write_geometry(name, frame)
         if source is not None and not self.folder.has_labels(name, source):
             if frame.scores is not None and f"{source}{SCORES_SUFFIX}" in self.models:
-                raise ConfigError(f"{source} and {source}{SCORES_SUFFIX} would get one folder; choose with --model")
+                raise ConfigError(
+                    f"{source} and {source}{SCORES_SUFFIX} would get the same folder; choose with --model"
+                )
             self.folder.write_labels(name, frame, source)
 
 
 def _name(index: int) -> str:
-    """Return the name of a frame's files: frames keep their order, and their number where all are converted."""
+    """Return the name of a frame's files, which is its number."""
     return f"{index:06d}"
 
 
 def _up_axis(scene: Scene) -> str | None:
-    """Return the name of the world's up axis, where it is one."""
+    """Return the name of the world's up axis; None if up is no axis."""
     return next((name for name, axis in UP_AXES.items() if scene.up is not None and (scene.up == axis).all()), None)
 
 
-# A conversion in the terminal: a bar while it works, and a line a scene.
+# The terminal shows a bar during a conversion, and a line for each scene.
 
 
 @contextmanager
@@ -437,7 +441,7 @@ def frame_bar(console: Console) -> Iterator[Callable[[str, int, int], None]]:
 def print_converted(converted: Converted, console: Console) -> None:
     """Print the scene, its frames and folder, renamed label sources, and things that were not converted."""
     before = converted.frames - converted.written
-    there = f", {before} of them from before" if before else ""
+    there = f", {before} of them finished earlier" if before else ""
     console.print(
         f"{converted.scene}: {converted.frames} frames{there}, depth as {converted.depth}: {converted.folder}",
         soft_wrap=True,

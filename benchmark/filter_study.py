@@ -1,4 +1,4 @@
-"""The study of filters that make a model more stable: the shipped grid of filters over any model and scene."""
+"""Build the study of filters that make a model more stable: the shipped grid of filters over any model and scene."""
 
 from __future__ import annotations
 
@@ -27,11 +27,12 @@ def filter_study_config(
 ) -> tuple[Config, list[str]]:
     """Return the study `filters` with these models, and filters over the scenes' label sources, as dataset settings.
 
-    Without models or sources all sources are taken; without filters those of the shipped study, its map prior in voxels
-    of the run. What a model says is kept in a folder. Also says which filters are left out, as no scores are there.
+    Without models or sources all sources are taken; without filters those of the shipped study, with its map prior in
+    voxels of the run. The folder `cache` stores the predictions of models. Also returns a note on the filters that are
+    left out because a model gives no scores.
 
     Raises:
-        ConfigError: For what is not known.
+        ConfigError: For an unknown name.
         DataError: For a scene that cannot be read.
     """
     content = merge(dataset_defaults(content), content)
@@ -52,19 +53,19 @@ def filter_study_config(
 
 
 def _in_voxels(chain: str, size: float) -> str:
-    """Return a chain with the numbers of its filters; the map prior has the run's voxels where none is said."""
+    """Return a chain with the numbers of its filters; the map prior has the run's voxel size by default."""
     texts = (f"map-prior:{size:g}" if text == "map-prior" else text for text in chain.split("+"))
     return "+".join(str(parse(text)) for text in texts)
 
 
 def _able(grid: Sequence[str], predictors: Sequence[PredictorConfig], scene: Scene) -> tuple[list[str], list[str]]:
-    """Return the filters that all models can take, and what to say of the others."""
+    """Return the filters that all models can use, and a note on the others."""
     needing = [text for text in grid if parse(text.partition("+")[0]).kind.needs_scores]
     without = [each.label_name for each in predictors if needing and not _gives_scores(each, scene)]
     if not without:
         return list(grid), []
-    said = f"{', '.join(needing)}: left out, for {', '.join(without)} gives labels without scores"
-    return [text for text in grid if text not in needing], [said]
+    note = f"{', '.join(needing)}: left out, because {', '.join(without)} gives labels without scores"
+    return [text for text in grid if text not in needing], [note]
 
 
 def _gives_scores(predictor: PredictorConfig, scene: Scene) -> bool:

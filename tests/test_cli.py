@@ -102,7 +102,7 @@ def test_a_lost_pose_is_left_out_and_said_and_the_default_folder_is_new(wall, tm
     ("--data wall --report maybe", "--report maybe: write on or off"),
     ("--data wall --jobs 2 --rerun spawn", "a viewer follows a run in one process; leave out --jobs and"),
     ("--data wall --jobs 2 --scheduler tcp://x:1", "--jobs and --scheduler: the scheduler's workers do the work"),
-    ("view wall", "holds no finished run"),
+    ("view wall", "there is no finished run here"),
     ("study citi", "study 'citi' is not known; did you mean 'city'?, or name a .yaml file"),
     ("study nowhere.yaml", "nowhere.yaml: cannot be read"),
     ("study tiny.yaml --only voxelsize", "study tiny: no part 'voxelsize'; did you mean 'voxel_size'?"),
@@ -185,4 +185,4 @@ def test_ctrl_c_is_exit_130_and_the_same_command_goes_on(tmp_path) -> None:
     assert "interrupted" in stderr
     assert "Traceback" not in stderr
     again = bench(*arguments, cwd=tmp_path)
-    assert "from an earlier start: 1 of 2 units" in again.stderr
+    assert "finished earlier: 1 of 2 units" in again.stderr

@@ -94,7 +94,7 @@ def test_a_folder_of_millimetres_stays_one(tmp_path):
     with (root / "scene.yaml").open("a") as file:
         file.write("depth_scale: 10000\npose_convention: world_to_camera\ncamera_axes: opengl\n")
     (converted,) = convert(configure(root), tmp_path / "out")
-    assert converted.depth == "16-bit PNG, 1000 units a metre"
+    assert converted.depth == "16-bit PNG, 1000 units per metre"
     source, scene = opened(root), opened(tmp_path / "out/wall")
     assert (scene.options.pose_convention, scene.options.camera_axes) == ("camera_to_world", "opencv")
     for model in ("a", "b", "gt"):
@@ -170,7 +170,7 @@ def test_a_folder_of_something_else_is_not_touched(tmp_path):
     (tmp_path / "scene0").mkdir()
     (tmp_path / "scene0/mine.txt").write_text("mine")
     config = of_city(scenes=["scene0"])
-    with pytest.raises(ConfigError, match="is there already and holds no conversion"):
+    with pytest.raises(ConfigError, match="the folder exists and holds no conversion"):
         list(convert(config, tmp_path))
     list(convert(config, tmp_path / "out"))
     changed = of_city(options=CITY | {"seed": 1}, scenes=["scene0"])
@@ -180,14 +180,14 @@ def test_a_folder_of_something_else_is_not_touched(tmp_path):
     with pytest.raises(DataError, match=r"conversion\.json: damaged; delete"):
         list(convert(config, tmp_path / "out"))
     (tmp_path / "file").write_text("")
-    with pytest.raises(ConfigError, match="is there already"):
+    with pytest.raises(ConfigError, match="the folder exists"):
         convert_scene(Room(walk(2)), of_city(), tmp_path / "file", 0.0, lambda *_: None)
 
 
 def test_a_scene_is_not_converted_onto_itself(tmp_path):
     root = write(tmp_path / "room", Room(walk(2)))
     before = snapshot(root)
-    with pytest.raises(ConfigError, match="is there already"):
+    with pytest.raises(ConfigError, match="the folder exists"):
         list(convert(configure(root), tmp_path))
     assert snapshot(root) == before
 
@@ -222,7 +222,7 @@ def test_the_scale_of_a_dataset_is_found_again(tmp_path, scale):
         return np.divide(np.round(z * scale), scale, dtype=np.float32, casting="same_kind")
 
     room = Room(walk(2), told_depth=as_read)
-    assert of_memory(room, tmp_path).depth == f"16-bit PNG, {scale:g} units a metre"
+    assert of_memory(room, tmp_path).depth == f"16-bit PNG, {scale:g} units per metre"
     np.testing.assert_array_equal(opened(tmp_path / "out").depth(1), room.frame(1, "net").depth)
 
 
@@ -241,7 +241,7 @@ def test_invalid_depth_stays_invalid(tmp_path):
         return z
 
     room = Room(walk(2), told_depth=with_gaps)
-    assert of_memory(room, tmp_path).depth == "16-bit PNG, 1000 units a metre"
+    assert of_memory(room, tmp_path).depth == "16-bit PNG, 1000 units per metre"
     scene = opened(tmp_path / "out")
     for index in range(2):
         np.testing.assert_array_equal(scene.frame(index, "net").valid, room.frame(index, "net").valid)
@@ -302,7 +302,7 @@ def test_two_cameras_are_refused(tmp_path):
 def test_two_sources_of_one_folder_are_refused(tmp_path):
     room = Room(walk(2), soft=True)
     room.models = ("net", "net-scores")
-    with pytest.raises(ConfigError, match="net and net-scores would get one folder; choose with --model"):
+    with pytest.raises(ConfigError, match="net and net-scores would get the same folder; choose with --model"):
         of_memory(room, tmp_path)
 
 
@@ -361,9 +361,9 @@ def test_the_command_converts_and_says_what_it_did(tmp_path):
     arguments = ("convert", "--data", root, "--out", tmp_path / "out")
     result = bench(*arguments)
     assert result.exit_code == 0, result.output
-    assert f"wall: 3 frames, depth as 16-bit PNG, 1000 units a metre: {tmp_path}/out/wall" in result.stdout
+    assert f"wall: 3 frames, depth as 16-bit PNG, 1000 units per metre: {tmp_path}/out/wall" in result.stdout
     again = bench(*arguments)
-    assert "3 frames, 3 of them from before" in again.stdout
+    assert "3 frames, 3 of them finished earlier" in again.stdout
     manifest = json.loads((tmp_path / "out/wall/conversion.json").read_text())
     assert (manifest["schema"], manifest["depth_scale"]) == (1, 1000)
 
@@ -409,4 +409,4 @@ def test_every_format_gives_the_same_voxels(tmp_path, name):
     assert len(table) > 500
     assert_same_map(table, fused(reader, "net", 0.1), 0.0)
     if form.scale is not None:
-        assert converted.depth == f"16-bit PNG, {form.scale:g} units a metre"
+        assert converted.depth == f"16-bit PNG, {form.scale:g} units per metre"

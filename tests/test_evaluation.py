@@ -76,7 +76,7 @@ def test_a_runs_statistics_are_those_of_its_saved_maps_and_events(ran) -> None:
 def test_all_that_was_found_is_printed_where_it_was_asked_for(ran) -> None:
     _, printed, summary = ran
     assert len(summary["runs"]) == 3
-    for words in ("Agreement of the frames", "Order of the models", "Stable and right"):
+    for words in ("Agreement of the frames", "Order of the models", "Consistent and right"):
         assert words in printed
     (found,) = summary["comparisons"]
     assert found["paired"]["values"]["accuracy"].keys() == {"a", "b"}

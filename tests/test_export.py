@@ -308,13 +308,19 @@ def test_clouds_that_cannot_be_classified(fused, points):
         export(fused / "run", fused / to, model="a", classify=cloud)
 
     there = las_cloud(fused / "there.laz", points[-1:] + 1000)
-    fails(DataError, "no point lies in the map: it spans .* m, the map .*; mend the cloud", classify, there)
+    fails(DataError, "no point lies in the map: the cloud spans .* m, the map .*; correct the cloud", classify, there)
     beside = fused / "nowhere", fused / "never.laz"
     fails(DataError, "give the run's dataset a georeference", export, *beside, model="a", classify=there)
     elsewhere = las_cloud(fused / "elsewhere.laz", points, crs="EPSG:32616")
     fails(DataError, "is in EPSG:32616, the run in EPSG:32615; reproject", classify, elsewhere)
-    fails(ConfigError, "stays what it is; write .*never.las", classify, las_cloud(fused / "c.las", points), "never.ply")
-    fails(ConfigError, "is the cloud itself", classify, fused / "c.las", "c.las")
+    fails(
+        ConfigError,
+        "the output has the format of .*; write .*never.las",
+        classify,
+        las_cloud(fused / "c.las", points),
+        "never.ply",
+    )
+    fails(ConfigError, "this is the cloud itself", classify, fused / "c.las", "c.las")
     fails(ConfigError, "a cloud is a .las", classify, fused / "cloud.e57")
     damaged = fused / "damaged.laz"
     for size in (100, 300, -200):

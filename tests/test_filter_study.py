@@ -48,19 +48,21 @@ def test_the_steadiest_is_not_the_best(truth):
     assert found.best.filters == "ema-warped:0.6"
     assert [row.filters for row in found.misleading] == ["ema:0.98"]
     assert "Use --filter ema-warped:0.6 over net: flicker falls from 20.0 to 8.0 %" in said(found)
-    assert "Steadier and worse: ema:0.98." in said(found)
-    assert ("There is no ground truth: whether labels are right" in said(found)) is not truth
+    assert "These filters lower flicker and make labels worse: ema:0.98." in said(found)
+    assert ("There is no ground truth: the accuracy of labels" in said(found)) is not truth
 
 
 def test_the_best_is_the_steadier_one_of_those_alike_and_alpha_alone_chooses_nothing():
     found = study(result_of("ema:0.9", worth=0.79, alpha=0.99, flicker=0.01))
     assert found.best is None
-    assert said(found).startswith("Use none of these filters over net: none steadies it without a loss of accuracy")
+    assert said(found).startswith(
+        "Use none of these filters over net: none lowers its flicker without a loss of accuracy"
+    )
     found = study(result_of("ema:0.98", flicker=0.3, worth=0.4, plain=0.001, consistent_wrong=0.4, lag=4.5))
     assert found.best is None
     assert (
-        "Steadier and worse: ema:0.98. ema:0.98 has 0.1 % flicker at the same pixel (20.0 % without), but 40 %"
-        in said(found)
+        "These filters lower flicker and make labels worse: ema:0.98. ema:0.98 has 0.1 % flicker at the same pixel"
+        " (20.0 % without), but 40 %" in said(found)
     )
     assert "it follows changes 4.5 frames late" in said(found)
     rows = result_of("vote:3", 0.1, 0.9), result_of("vote:5", 0.05, 0.899), result_of("vote:9", 0.01, 0.88)

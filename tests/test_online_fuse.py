@@ -140,5 +140,5 @@ def test_a_saved_run_says_that_its_frames_are_gone(steady, tmp_path):
     folder = steady.save(Path(tmp_path) / "run")
     config = semstab.load_config(folder / "config.yaml")
     config.dataset.options["token"] = "of another process"
-    with pytest.raises(DataError, match=r"gave these frames to semstab\.fuse, and they are gone"):
+    with pytest.raises(DataError, match=r"gave these frames to semstab\.fuse, and they no longer exist"):
         semstab.run(config)

@@ -68,7 +68,7 @@ def test_a_listener_that_says_nothing_is_no_viewer(tmp_path, monkeypatch) -> Non
 
         other = threading.Thread(target=answer)
         other.start()
-        with pytest.raises(ConfigError, match="something else does"):
+        with pytest.raises(ConfigError, match="another program does"):
             Target(tmp_path / "x.rrd", url).open()
         other.join()
 

@@ -140,7 +140,7 @@ def test_a_run_reads_what_was_relabelled(fused, tmp_path):
     done = bench("relabel", fused / "run", "--out", tmp_path, "--category", "stable", cwd=tmp_path)
     assert "a-fused: 4 frames" in done.stdout
     assert "accuracy 0." in done.stdout
-    assert "a verdict on these maps means nothing" in done.stdout
+    assert "do not assess the stability of these maps" in done.stdout
     assert LabelSpace.load(tmp_path / "labels/a-fused/label_space.yaml").classes == ("wall", "door", "window")
     found = dataset_of(fused / "scene", labels_root=tmp_path, labels="labels/{model}/{name}")
     again = semstab.run(configure(fused / "scene", dataset=found, check=None))
@@ -160,7 +160,7 @@ def test_what_cannot_be_relabelled_is_refused(fused, tmp_path):
     shutil.copytree(fused / "run", tmp_path / "run")
     manifest = tmp_path / "run/manifest.json"
     manifest.write_text(manifest.read_text().replace('"scene/a": "', '"scene/a": "other'))
-    fails(DataError, "is not what was fused; run it again", relabel, tmp_path / "run", tmp_path / "out")
+    fails(DataError, "has changed since it was fused; run it again", relabel, tmp_path / "run", tmp_path / "out")
     # ScanNet's colour camera sees more than its depth camera, and label maps are the colour image's
     labels, color = np.arange(48, dtype=np.uint8).reshape(6, 8) % 3, np.zeros((6, 8, 3), np.uint8)
     frames = [dataclasses.replace(tiny_scene.frame(i, labels), color=color) for i in range(2)]

@@ -1,4 +1,4 @@
-"""The command line `semstab-bench`. Heavy imports stand inside the commands: --help answers at once."""
+"""The command line `semstab-bench`. Heavy imports are inside the commands, so that --help answers at once."""
 
 from __future__ import annotations
 
@@ -23,15 +23,15 @@ from semstab.cli.running import check, convert, filters, predict, run, show, stu
 from semstab.core.process import configure_process
 from semstab.errors import OUT_OF_MEMORY, SemstabError, summarize_error
 
-# Ctrl-C, which may come in the midst of anything: an import, a callback from compiled code.
+# Ctrl-C may interrupt any code: an import, a callback from compiled code.
 
 
 @contextlib.contextmanager
 def interruptible() -> Iterator[None]:
-    """Let Ctrl-C raise KeyboardInterrupt, whatever it is taken for on its way out of the block.
+    """Let Ctrl-C raise KeyboardInterrupt, even if code inside the block turns it into another error.
 
-    An import that it hits may fail in another way, and what a callback raises is printed and forgotten: the first
-    becomes the interruption that it was, of the second nothing is printed.
+    An interrupted import may fail with another error, which becomes KeyboardInterrupt again. An error in a callback is
+    normally printed and dropped; here it is not printed.
     """
     if threading.current_thread() is not threading.main_thread() or signal.getsignal(signal.SIGINT) == signal.SIG_IGN:
         yield
@@ -59,7 +59,7 @@ INTERRUPTED = 130
 
 
 def _without_kind(options: list[Any]) -> list[Any]:
-    """Show flags without a kind of value, which they do not take."""
+    """Return options whose flags show no kind of value, as they take none."""
     for option in options:
         if getattr(option, "is_flag", False):
             option.metavar = ""
@@ -67,7 +67,7 @@ def _without_kind(options: list[Any]) -> list[Any]:
 
 
 class Command(TyperCommand):
-    """A command whose flags are shown as such."""
+    """A command whose flags show no kind of value."""
 
     def get_params(self, ctx: Any) -> list[Any]:
         """Return its parameters, and --help."""
@@ -75,18 +75,18 @@ class Command(TyperCommand):
 
 
 OF_PATHS = ("run", "check", "predict")
-"""Commands whose first word may be a folder: --data."""
+"""The commands whose first word may be a folder, as with --data."""
 
 EARLIER = {
     "commit": "calibrate", "remedies": "filters", "--commit": "--thresholds", "--onto": "--classify",
     "--beside": "--join", "--leave-own-out": "--leave-one-out", "--trust-geometry": "--no-geometry-check",
     "--backbone": "--model",
 }  # fmt: skip
-"""Names of version 0.3, which work for one version."""
+"""The names of version 0.3, which work for one version."""
 
 
 def _of_today(args: list[str]) -> list[str]:
-    """Return a command line under the names of today, and warn; a command is the first word."""
+    """Return a command line with current names, and warn of earlier ones; a command is the first word."""
     known = dict(EARLIER)
     if args[:1] == ["predict"] and any(word.startswith(("-m", "--backbone")) for word in args):
         known["--model"] = "--checkpoint"
@@ -108,7 +108,7 @@ class Group(TyperGroup):
         return _without_kind(super().get_params(ctx))
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        """Put `run` in front of bare options, and today's names in place of earlier ones."""
+        """Put `run` in front of bare options, and replace earlier names."""
         own = {"--help", "-h", "--version", "--install-completion", "--show-completion"}
         if not args or (args[0].startswith("-") and args[0] not in own):
             args = ["run", *args]
@@ -128,7 +128,7 @@ class Group(TyperGroup):
             self.params = own
 
     def invoke(self, ctx: Any) -> Any:
-        """Catch every error, here alone: bad input is one line and exit code 2."""
+        """Report every error in one line; bad input gives exit code 2."""
         try:
             with interruptible():
                 return super().invoke(ctx)
@@ -136,7 +136,7 @@ class Group(TyperGroup):
             say(f"error: {error}")
             raise typer.Exit(error.exit_code) from error
         except KeyboardInterrupt as error:
-            say("interrupted; what was finished is kept, and the same command with the same --out resumes there")
+            say("interrupted; finished work is stored, and the same command with the same --out resumes there")
             raise typer.Exit(INTERRUPTED) from error
         except OSError as error:
             say(f"error: {error.filename or 'input or output'}: {error.strerror or error}")
@@ -156,8 +156,8 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},
     help="How stable are a segmentation model's predictions at the same physical place?\n\n"
-    "Fuses label maps by depth and pose into metric voxels and measures VSS, SBD, OP and entropy. Without a command it "
-    "runs; with no option either, on the built-in city.",
+    "Fuses label maps by depth and pose into metric voxels and measures VSS, SBD, OP and entropy. Without a command "
+    "`run` is the command; without options it runs on the built-in city.",
 )
 
 
@@ -170,7 +170,7 @@ def _version(value: bool) -> None:
 @app.callback()
 def root(
     version: Annotated[
-        bool, typer.Option("--version", callback=_version, is_eager=True, help="Say the version.")
+        bool, typer.Option("--version", callback=_version, is_eager=True, help="Print the version.")
     ] = False,
 ) -> None:
     """Take the options that stand before the command."""
@@ -185,17 +185,17 @@ for command, name in (
 
 
 class _Once(logging.Filter):
-    """A filter that says once what the check and the run would both warn of."""
+    """A filter that passes each warning of the check and the run once."""
 
     def __init__(self) -> None:
         super().__init__()
-        self._said: set[str] = set()
+        self._printed: set[str] = set()
 
     def filter(self, record: logging.LogRecord) -> bool:
-        """Return whether it was not said before."""
+        """Return whether the message is new."""
         message = record.getMessage()
-        new = message not in self._said
-        self._said.add(message)
+        new = message not in self._printed
+        self._printed.add(message)
         return new
 
 
@@ -205,5 +205,5 @@ def main() -> None:
     logging.getLogger("semstab").addFilter(_Once())
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
-            stream.reconfigure(errors="backslashreplace")  # names may hold what the terminal's encoding does not
+            stream.reconfigure(errors="backslashreplace")  # names may hold characters that the terminal cannot show
     app()

@@ -1,4 +1,4 @@
-"""Commands over finished runs: compare, gate, calibrate, export, relabel; conform and list."""
+"""Define the commands over finished runs: compare, gate, calibrate, export, relabel; conform and list."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def compare(
     verbose: Verbose = False,
     quiet: Quiet = False,
 ) -> None:  # fmt: skip
-    """Compare runs: by how much they differ, how surely, in which classes and places, and which frames did it."""
+    """Compare runs: report their differences with intervals, by class, location and frame."""
     from rich.console import Console
 
     from semstab.comparison.tables import print_comparison
@@ -42,13 +42,13 @@ def compare(
         print_lines([f"folder: {out}; report: {out / 'report.html'}"], quiet=quiet)
 
 
-# The commands gate and calibrate: quality gates, and thresholds from which labels may be acted on.
+# The commands gate and calibrate: quality gates, and thresholds above which labels may be acted on.
 
 NEXT_STEP = {
     "undecided": "take more frames (--plan says how many), or accept undecided rules with --undecided pass",
-    "fails": "mend the model, or keep it regardless with --save-baseline alone, without rules",
+    "fails": "improve the model, or save it regardless with --save-baseline alone, without rules",
 }
-"""What to do, by the outcome, so that a baseline is saved."""
+"""The next step by the outcome, so that a baseline is saved."""
 
 
 def gate(
@@ -60,28 +60,28 @@ def gate(
     config: Annotated[Path | None, typer.Option(
         "--config", "-c", help="YAML file: rules, level, undecided, scope.")] = None,
     level: Annotated[float | None, typer.Option(
-        help="How often a rule may err on each side.", show_default="0.05")] = None,
+        help="Probability that a rule errs, on each side.", show_default="0.05")] = None,
     undecided: Annotated[str | None, typer.Option(
         metavar="report|pass|fail", help="Undecided rules: exit code 5, or 0, or 4.", show_default="report")] = None,
     scope: ScopeOption = None,
     out: Annotated[list[Path] | None, typer.Option(
         "--out", "-o", metavar="FILE", help=".xml (JUnit), .md (pull request), .json; repeatable.")] = None,
     save_baseline: Annotated[Path | None, typer.Option(
-        metavar="FILE", help="Keep NEW as a small summary, where the gate passes.")] = None,
-    plan: Annotated[bool, typer.Option("--plan", metavar="", help="Say how many frames each rule needs.")] = False,
+        metavar="FILE", help="Save NEW as a small summary if the gate passes.")] = None,
+    plan: Annotated[bool, typer.Option("--plan", metavar="", help="Print how many frames each rule needs.")] = False,
     quiet: Quiet = False,
 ) -> None:  # fmt: skip
-    """Fail where a new model is shown to be worse: exit code 4 where a rule fails, 5 where one is undecided."""
+    """Fail if a new model is significantly worse: exit code 4 if a rule fails, 5 if one is undecided."""
     from rich.console import Console
 
     from semstab.comparison import gate_report
-    from semstab.comparison.gate import gate as judge
+    from semstab.comparison.gate import gate as assess
     from semstab.comparison.gate import gate_config
     from semstab.comparison.runs import open_run, save_summary
 
     gate_report.require_formats(out or ())
     if save_baseline is None or rule or config:
-        result = judge(new, against, gate_config(config, rule or (), level, undecided, scope))
+        result = assess(new, against, gate_config(config, rule or (), level, undecided, scope))
         for file in out or ():
             gate_report.write(result, file)
         print_lines(gate_report.plan(result) if plan else gate_report.lines(result, Console().width), quiet=quiet)
@@ -102,8 +102,8 @@ def gate(
 def calibrate(
     run: Annotated[str, typer.Argument(metavar="RUN", help="Folder of a run with ground truth, or FOLDER:MODEL.")],
     out: Annotated[Path, typer.Option("--out", "-o", metavar="FILE", help="YAML file to write.")],
-    precision: Annotated[float, typer.Option(help="How often a label that is acted on shall be right.")] = 0.95,
-    confidence: Annotated[float, typer.Option(help="With which this is to hold, class by class.")] = 0.95,
+    precision: Annotated[float, typer.Option(help="Least share of right labels among those that are acted on.")] = 0.95,
+    confidence: Annotated[float, typer.Option(help="Confidence that this holds, class by class.")] = 0.95,
     quiet: Quiet = False,
 ) -> None:
     """Find for each class the least evidence at which its labels are right often enough to be acted on."""
@@ -127,7 +127,7 @@ def conform(
     tolerance: Annotated[float, typer.Option(min=0, help="Largest difference of a sum or a measure.")] = 1e-9,
     quiet: Quiet = False,
 ) -> None:
-    """Hold an outside fusion program against the conformance data. Exit code 3 where its tables differ."""
+    """Test an external fusion program with the conformance data. Exit code 3 if its tables differ."""
     from semstab.conformance import conform
 
     wrong = 0
@@ -141,14 +141,16 @@ def conform(
         raise typer.Exit(DIFFERS)
 
 
-# The commands export and relabel: what a finished run gives to others.
+# The commands export and relabel: files for other programs.
 
 Run = Annotated[Path, typer.Argument(metavar="RUN", help="Folder of a finished run.")]
 Scene = Annotated[str | None, typer.Option("--scene", "-s", help="Scene; needed where the run has several.")]
 Model = Annotated[str | None, typer.Option("--model", "-m", help="Label source; needed where there are several.")]
 Thresholds = Annotated[Path | None, typer.Option(
     "--thresholds", metavar="FILE", help="Only labels above the thresholds of `semstab-bench calibrate`.")]  # fmt: skip
-Backend = Annotated[str | None, typer.Option("--backend", "-b", help="Whose map; the run's first backend by default.")]
+Backend = Annotated[
+    str | None, typer.Option("--backend", "-b", help="Backend of the map; by default the first of the run.")
+]
 
 
 def export(
@@ -159,8 +161,8 @@ def export(
     model: Model = None,
     backend: Backend = None,
     measure: Annotated[list[str] | None, typer.Option(
-        help="Column that goes along: vss, sbd, entropy, margin, op, ...; repeatable.")] = None,
-    min_op: Annotated[int, typer.Option(min=1, help="Only voxels that so many frames saw.")] = 1,
+        help="Column to write: vss, sbd, entropy, margin, op, ...; repeatable.")] = None,
+    min_op: Annotated[int, typer.Option(min=1, help="Only voxels that at least so many frames saw.")] = 1,
     classes: Annotated[list[str] | None, typer.Option("--class", help="Only voxels of this class; repeatable.")] = None,
     thresholds: Thresholds = None,
     cell: Annotated[int, typer.Option(min=1, help="Edge of a cell of .tif, in voxels.")] = 1,
@@ -173,11 +175,11 @@ def export(
         metavar="FILE", help="Parquet with more columns of the voxels: OUT/columns of compare.")] = None,
     task_format: Annotated[str | None, typer.Option(
         "--format", metavar="coco|labelstudio|cvat|fiftyone",
-        help="Annotation tasks instead: places where frames disagree.")] = None,
-    most: Annotated[int, typer.Option("--most", "-n", min=1, help="Annotation tasks at most.")] = 50,
+        help="Annotation tasks instead of the map: locations where frames disagree.")] = None,
+    most: Annotated[int, typer.Option("--most", "-n", min=1, help="Largest number of annotation tasks.")] = 50,
     quiet: Quiet = False,
 ) -> None:  # fmt: skip
-    """Write the fused map as a point cloud, raster, mesh or table, with how far to trust each location."""
+    """Write the fused map as a point cloud, raster, mesh or table, with the stability of each voxel."""
     from semstab.exports import export as write
 
     for file in write(
@@ -198,14 +200,14 @@ def relabel(
     min_op: Annotated[int, typer.Option(min=1, help="Ignore pixels of voxels that fewer frames saw.")] = 1,
     min_psa: Annotated[float, typer.Option(help="Ignore pixels of voxels on which fewer pairs of frames agree.")] = 0.0,
     category: Annotated[list[str] | None, typer.Option(
-        help="Keep pixels of voxels of this category alone; repeatable.")] = None,
+        help="Label only pixels of voxels of this category; repeatable.")] = None,
     thresholds: Thresholds = None,
     leave_one_out: Annotated[bool, typer.Option(
         "--leave-one-out", help="Label each frame by the other frames, without its own vote.")] = False,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace maps of other settings.")] = False,
     quiet: Quiet = False,
 ) -> None:  # fmt: skip
-    """Write the fused classes back into every frame: label maps of a new source, unstable voxels ignored."""
+    """Write the fused classes back into every frame, as label maps of a new source."""
     from rich.console import Console
 
     from semstab.convert import frame_bar
@@ -227,7 +229,7 @@ def relabel(
 
 
 def list_() -> None:
-    """List backends, datasets, models, filters, taxonomies and studies, each with 'ready' or what to install."""
+    """List backends, datasets, models, filters, taxonomies and studies, each with 'ready' or the missing package."""
     from rich.console import Console
     from rich.markup import escape
     from rich.table import Table
@@ -239,12 +241,12 @@ def list_() -> None:
     from semstab.settings import load_study, shipped_studies
 
     table = Table(show_edge=False)
-    for name in ("kind", "name", "", "what it is"):
+    for name in ("kind", "name", "", "description"):
         table.add_column(name)
     for registry in (backends.REGISTRY, datasets.REGISTRY, models.REGISTRY, filters.REGISTRY):
         for name, entry in sorted(registry.entries().items()):
             try:
-                registry.load(name)  # an entry is ready where all that is behind its name imports
+                registry.load(name)  # an entry is ready if all its imports succeed
                 ready = "[green]ready"
             except MissingDependencyError as error:
                 ready = f"[yellow]{escape(str(error))}"

@@ -1,4 +1,4 @@
-"""Options that commands share, and the settings that they give."""
+"""Define the options that commands share, and build settings from them."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import typer
 
 from semstab.errors import ConfigError, SemstabError, sanitize
 
-# Names that the shell completes: of backends, datasets, models, taxonomies, studies, scenes and label sources.
+# The shell completes names of backends, datasets, models, taxonomies, studies, scenes and label sources.
 
 Complete = Callable[[Any, str], list[str]]
 
@@ -22,18 +22,18 @@ def _beginning(names: Callable[[Any], Iterable[str]]) -> Complete:
         try:
             return sorted(name for name in names(ctx) if name.startswith(incomplete))
         except (SemstabError, OSError):
-            return []  # the command says it when it runs
+            return []  # the command reports the error when it runs
 
     return complete
 
 
 def _listed(module: str, function: str = "REGISTRY.entries") -> Complete:
-    """Complete the names that a function returns; its module is imported when the shell wants them."""
+    """Complete the names that a function returns; its module is imported when the shell asks for them."""
     return _beginning(lambda _: operator.attrgetter(function)(importlib.import_module(f"semstab.{module}"))())
 
 
 def _opened(ctx: Any) -> Any:
-    """Open the dataset that the options before select."""
+    """Open the dataset that the options so far select."""
     from semstab.datasets import open_dataset
     from semstab.settings import load_config, resolve
 
@@ -55,7 +55,7 @@ scenes, label_sources = _beginning(lambda ctx: [*_opened(ctx).scenes, "all"]), _
 
 
 SETTINGS, LABELS, CHECKS, MACHINE = "Settings", "Labels", "Checks", "Machine"
-"""Panels of the help beneath that of the options which most people need."""
+"""The panels of the help below that of the options which most people need."""
 
 # fmt: off
 ConfigFile = Annotated[Path | None, typer.Option("--config", "-c", help="YAML file with settings.",
@@ -67,7 +67,7 @@ DatasetOptions = Annotated[list[str] | None, typer.Option(
 DatasetSettings = Annotated[list[str] | None, typer.Option(
     "--set", metavar="KEY=VALUE", help="Any setting, e.g. dataset.options.depth_scale=5000.", rich_help_panel=SETTINGS)]
 DatasetName = Annotated[str | None, typer.Option(
-    help="Dataset, as named by `semstab-bench list`.", show_default="what --data is, else city",
+    help="Dataset, as named by `semstab-bench list`.", show_default="format of --data, else city",
     autocompletion=datasets)]
 Scenes = Annotated[list[str] | None, typer.Option(
     "--scene", "-s", help="Scene; repeatable; or 'all'.", show_default="all", autocompletion=scenes)]
@@ -76,19 +76,19 @@ Models = Annotated[list[str] | None, typer.Option(
     autocompletion=label_sources)]
 Predicted = Annotated[list[str] | None, typer.Option(
     "--predict", metavar="NAME[,KEY=VALUE...]",
-    help="Model that makes the labels, nothing on disk: a name of `list`, FILE.py:NAME; repeatable.")]
+    help="Model that makes the labels in memory: a name of `list`, FILE.py:NAME; repeatable.")]
 Classes = Annotated[str | None, typer.Option(
-    metavar="A,B,C|FILE", help="Names of the model's classes by id, where it does not say them.",
+    metavar="A,B,C|FILE", help="Names of the model's classes by id, if it does not contain them.",
     rich_help_panel=LABELS)]
 Filters = Annotated[list[str] | None, typer.Option(
     "--filter", metavar="NAME:NUMBER", autocompletion=filters,
     help="Filter over the labels: ema:0.6, vote:5, ... (`list`); repeatable, in this order.", rich_help_panel=LABELS)]
 VoxelSize = Annotated[float | None, typer.Option(
-    help="Edge of a voxel, metres.", show_default="what `check` suggests; city: 0.2")]
+    help="Edge of a voxel, metres.", show_default="as `check` suggests; city: 0.2")]
 Frames = Annotated[str | None, typer.Option(
     metavar="START:STOP:STRIDE", help="Frames, as a Python slice.", show_default="all")]
 TrustGeometry = Annotated[bool, typer.Option(
-    "--no-geometry-check", help="Fuse also where depth and poses contradict each other.", rich_help_panel=CHECKS)]
+    "--no-geometry-check", help="Fuse even if depth and poses contradict each other.", rich_help_panel=CHECKS)]
 Rerun = Annotated[str | None, typer.Option(
     metavar="FILE|spawn|connect|URL|serve|off", show_default="OUT/recording.rrd; of a study off",
     help="Recording: a file, and a viewer to start, to connect to, or to serve.")]
@@ -99,8 +99,8 @@ Scheduler = Annotated[str | None, typer.Option(
     metavar="URL", help="Dask scheduler to run on, e.g. tcp://HOST:PORT.", show_default="none",
     rich_help_panel=MACHINE)]
 TileSize = Annotated[str | None, typer.Option(
-    metavar="N|off", show_default="where a map would not fit",
-    help="Fuse maps tile by tile, N voxels wide (a power of 2); off: refuse what does not fit in memory.",
+    metavar="N|off", show_default="if a map would not fit",
+    help="Fuse maps tile by tile, N voxels wide (a power of 2); off: refuse maps that do not fit in memory.",
     rich_help_panel=MACHINE)]
 Verbose = Annotated[bool, typer.Option("--verbose", "-v", help="Also print every table.", rich_help_panel=SETTINGS)]
 ScopeOption = Annotated[str | None, typer.Option(
@@ -161,7 +161,7 @@ def select_dataset(content: dict[str, Any], name: str | None, data: Path | None,
         return
     group = content.setdefault("dataset", {})
     if not isinstance(group, dict) or not isinstance(group.get("options", {}), dict):
-        raise ConfigError("--set dataset: is given by other options too; write dataset.options.KEY=VALUE")
+        raise ConfigError("--set dataset: other options also set the dataset; write dataset.options.KEY=VALUE")
     if name is not None:
         group["name"] = name
     group["options"] = group.get("options", {}) | options
@@ -177,7 +177,7 @@ def _recognised(data: Path) -> str:
 
 
 def say(text: str) -> None:
-    """Print a line beside the results: on standard error."""
+    """Print a line on standard error, apart from the results."""
     typer.echo(sanitize(text), err=True)
 
 

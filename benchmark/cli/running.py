@@ -1,4 +1,4 @@
-"""The commands that compute: run, study, filters, check, predict, convert; and show and view of what they left."""
+"""Define the commands that compute: run, study, filters, check, predict, convert; and show and view of results."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ def run(
     events: Annotated[bool | None, typer.Option("--events", help="Also write the log of observations.",
     rich_help_panel=opt.SETTINGS)] = None,
     statistics: Annotated[bool | None, typer.Option(
-        "--statistics", help="Also measure drift, judge by ground truth, compare models; takes longer.")] = None,
+        "--statistics", help="Also measure drift and accuracy, and compare models; takes longer.")] = None,
     scope: opt.ScopeOption = None,
     out: Annotated[Path | None, typer.Option("--out", "-o", help="Run folder.", show_default="runs/TIME")] = None,
     rerun: opt.Rerun = None,
@@ -75,7 +75,7 @@ def run(
     quiet: opt.Quiet = False,
     verbose: opt.Verbose = False,
 ) -> None:  # fmt: skip
-    """Fuse every selected model with every selected backend, measure, compare. This is the default command."""
+    """Fuse every selected model with every selected backend, measure and compare. This is the default command."""
     from datetime import datetime
 
     from semstab.predict.predictor import parse_predictor
@@ -91,7 +91,7 @@ def run(
     if check in ("none", "off"):
         content["check"] = None
     if classes is not None and not predict:
-        raise ConfigError("--classes names what a model predicts; say which one with --predict")
+        raise ConfigError("--classes names the classes of a model; choose the model with --predict")
     if predict:
         given = {} if classes is None else {"classes": classes}
         loaded = predicted_config([parse_predictor(text, given, filters or []) for text in predict], config, content)
@@ -120,7 +120,7 @@ def study(
     quiet: opt.Quiet = False,
     verbose: opt.Verbose = False,
 ) -> None:  # fmt: skip
-    """Run everything that the paper reports: scenes x models x backends x variations. Resumes where it was."""
+    """Run everything that the paper reports: scenes x models x backends x variations. A second start resumes."""
     from semstab.data.results import slug
     from semstab.settings import load_study
 
@@ -140,7 +140,7 @@ def filters(
     filter_: opt.Filters = None,
     frames: opt.Frames = None,
     voxel_size: opt.VoxelSize = None,
-    taxonomy: Annotated[str | None, typer.Option(help="Taxonomy to fuse and judge in: a name or a file.")] = None,
+    taxonomy: Annotated[str | None, typer.Option(help="Taxonomy to fuse and assess in: a name or a file.")] = None,
     settings: opt.DatasetSettings = None,
     options: opt.DatasetOptions = None,
     trust_geometry: opt.TrustGeometry = False,
@@ -149,9 +149,9 @@ def filters(
     jobs: opt.Jobs = 1,
     quiet: opt.Quiet = False,
 ) -> None:
-    """Find which filter makes this model more stable: how right, how late, at what price. Resumes where it was.
+    """Find a filter that makes a model more stable, with its accuracy, delay and cost. A second start resumes.
 
-    --filter tries others than the usual ones; chains are written with a plus sign, ema-warped:0.6+threshold:0.5.
+    --filter replaces the shipped filters; chains are written with a plus sign, ema-warped:0.6+threshold:0.5.
     """
     from semstab.filter_study import filter_study_config
     from semstab.predict.predictor import parse_predictor
@@ -171,7 +171,7 @@ def filters(
 def execute(
     config: Config, out: Path, executor: Executor, rerun: str | None, report: str, *, quiet: bool, verbose: bool = False
 ) -> None:
-    """Run it, print the answer, and end with the exit code that it calls for."""
+    """Run a configuration, print the answer, and end with the exit code of its outcome."""
     began = time.monotonic()
     from rich.console import Console
 
@@ -189,7 +189,7 @@ def execute(
         if executor.elsewhere and recording[0].target.live:
             raise ConfigError("--rerun: a viewer follows a run in one process; leave out --jobs and --scheduler")
     observers: list[Observer] = [ProgressBar(Console(stderr=True, quiet=quiet)), *recording]
-    gc.freeze()  # modules stay: looking for garbage among them takes half a second of a short run
+    gc.freeze()  # the garbage collector skips modules, which takes half a second of a short run otherwise
     try:
         result = run_study(config, out, executor=executor, observers=observers, command=sys.argv, report=report == "on")
         for line in failure_lines(result):
@@ -208,12 +208,12 @@ def execute(
     if result.failures:
         raise typer.Exit(2)
     if not result.agrees:
-        say(f"error: the backends disagree; the agreement in {out / 'summary.json'} says where")
+        say(f"error: the backends disagree; the agreement in {out / 'summary.json'} shows where")
         raise typer.Exit(DISAGREE)
 
 
 def executor_of(jobs: int, scheduler: str | None) -> Executor:
-    """Return where the work is done: here, in processes of this machine, on a cluster."""
+    """Return the executor of the work: this process, processes of this machine, or a cluster."""
     import logging
 
     from semstab.engine import DaskCluster, InProcess, LocalProcesses
@@ -223,7 +223,7 @@ def executor_of(jobs: int, scheduler: str | None) -> Executor:
     if jobs > 1:
         raise ConfigError("--jobs and --scheduler: the scheduler's workers do the work; leave --jobs out")
     cluster = DaskCluster(scheduler)
-    for name in ("distributed", "distributed.client"):  # a unit that fails is one line of the run's own
+    for name in ("distributed", "distributed.client"):  # the run itself prints one line for a unit that fails
         logging.getLogger(name).setLevel(logging.CRITICAL)
     return cluster
 
@@ -257,7 +257,7 @@ def check(
     verbose: opt.Verbose = False,
     quiet: opt.Quiet = False,
 ) -> None:
-    """Check that a dataset makes sense: poses, depth, units, labels. Exit code 0 where it does, 2 where not."""
+    """Check poses, depth, units and labels of a dataset. Exit code 0 if they are sound, 2 if not."""
     from rich.console import Console
 
     from semstab.check import SCHEMA
@@ -297,7 +297,7 @@ def predict(
     device: Annotated[str | None, typer.Option(help="cpu, cuda, cuda:1, mps.", show_default="cpu")] = None,
     dtype: Annotated[str | None, typer.Option(help="float32, bfloat16 or float16.", show_default="float32")] = None,
     image_size: Annotated[str | None, typer.Option(
-        metavar="N|HxW", help="Shorter side, or height and width, that the model sees.")] = None,
+        metavar="N|HxW", help="Shorter side, or height and width, of the model's input.")] = None,
     classes: opt.Classes = None,
     batch: Annotated[int, typer.Option(min=1, help="Images at a time.")] = 1,
     threads: Annotated[int | None, typer.Option(min=1, help="Threads of the model on a CPU.")] = None,
@@ -307,14 +307,14 @@ def predict(
     filters: opt.Filters = None,
     scores: Annotated[bool, typer.Option("--scores", help="Also keep soft scores.")] = False,
     top_k: Annotated[int | None, typer.Option(
-        min=1, metavar="N", help="Of these only each pixel's N largest; 0 for the rest.")] = None,
+        min=1, metavar="N", help="Of these only the N largest of each pixel; 0 for the rest.")] = None,
     settings: Annotated[list[str] | None, typer.Option(
         "--set", metavar="KEY=VALUE", help="Any option of the model, or dataset.options.KEY=VALUE.")] = None,
     options: opt.DatasetOptions = None,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace predictions of other settings.")] = False,
     quiet: opt.Quiet = False,
 ) -> None:  # fmt: skip
-    """Run a segmentation model over images; label maps go where `run` and `study` read them. Resumes where it was."""
+    """Run a segmentation model over images; `run` and `study` read the label maps. A second start resumes."""
     from semstab.predict import command
     from semstab.settings import load_config, resolve
 
@@ -331,7 +331,7 @@ def predict(
     content = chosen(named, settings, options, dataset, data, frames)
     indices, group = content.pop("frames", {}), content.pop("dataset", None)
     if group is not None and data is None and dataset is None:
-        raise ConfigError("--option says how a dataset is read; choose one with --data or --dataset")
+        raise ConfigError("--option sets how a dataset is read; choose one with --data or --dataset")
     given = {"name": name, "taxonomy": taxonomy, "mapping": mapping, "scores": scores, "filters": filters}
     command.run(
         predictor={"model": model, **{key: value for key, value in given.items() if value is not None}},
@@ -362,7 +362,7 @@ def convert(
         min=0, metavar="METRES", help="Store depth in 16 bits where no pixel is off by more.")] = 0.0,
     quiet: opt.Quiet = False,
 ) -> None:  # fmt: skip
-    """Write any dataset as posed folders. Resumes where it was."""
+    """Write any dataset as posed folders. A second start resumes."""
     from rich.console import Console
 
     from semstab.convert import convert, frame_bar, print_converted
@@ -383,7 +383,7 @@ class FigureFormat(StrEnum):
 
 
 FORMER_TABLES = {"glance": "overview", "remedies": "filters"}
-"""Names of tables in 0.3, and now: the old ones work for one version."""
+"""The names of tables in 0.3, with the current names; the old ones work for one version."""
 
 
 def show(
@@ -392,7 +392,7 @@ def show(
         metavar="[TABLE]...", help="Tables to print, by the beginning of their names.")] = None,
     figures: Annotated[FigureFormat | None, typer.Option(help="Draw the figures for a paper into RUN/figures.")] = None,
 ) -> None:  # fmt: skip
-    """Print the answer of a finished run again, or its tables, without computing."""
+    """Print the answer of a finished run, or its tables, without computing."""
     from rich.console import Console
 
     from semstab.engine.folder import load_result
@@ -413,21 +413,21 @@ def show(
     for name in what or ():
         matching = [table for key, table in there.items() if key.startswith(FORMER_TABLES.get(name, name))]
         if not matching:
-            raise ConfigError(f"{run}: no table '{name}'; there are {', '.join(there)}")
+            raise ConfigError(f"{run}: no table '{name}'; the tables are {', '.join(there)}")
         print_lines(f"{to_terminal(table)}\n" for table in matching)
 
 
 def view(run: Annotated[Path, typer.Argument(metavar="RUN", help="Run folder, or an .rrd file.")]) -> None:
-    """Open a run's recording in the rerun viewer; where units lack pictures, it is made again from the run folder."""
+    """Open a run's recording in the rerun viewer; it is made again if units have no pictures in it."""
     import subprocess
 
     from semstab.recording import lacks_pictures, record_finished, viewer_command
 
     if not run.exists():
-        raise ConfigError(f"{run}: there is no such run or file; name the folder that --out gave, or one of runs/")
+        raise ConfigError(f"{run}: there is no such run or file; give the folder of --out, or one of runs/")
     recording, finished = run / "recording.rrd" if run.is_dir() else run, (run / "summary.json").is_file()
     if not finished and not recording.is_file():
-        raise ConfigError(f"{run}: holds no finished run; name the folder that --out gave, or one of runs/")
+        raise ConfigError(f"{run}: there is no finished run here; give the folder of --out, or one of runs/")
     if finished and lacks_pictures(run, recording):
         say(f"making {recording}")
         record_finished(run, recording)

@@ -1,4 +1,4 @@
-"""A finished run for other programs: point clouds, rasters, meshes and tables, in global coordinates."""
+"""Export a finished run for other programs: point clouds, rasters, meshes and tables, in global coordinates."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ __all__ = ["SUFFIXES", "Exported", "export"]
 logger = logging.getLogger("semstab")
 
 FEW_MET = 0.5
-"""Share of a cloud's points with a voxel, below which cloud and map may not lie in one place."""
+"""The share of a cloud's points with a voxel below which cloud and map may lie in different areas."""
 
 
 @dataclass(frozen=True)
@@ -41,7 +41,7 @@ class Exported:
 
 @dataclass(frozen=True)
 class Settings:
-    """Settings of some formats: a raster's cell in voxels, a table of ASPRS codes."""
+    """The settings of some formats: the cell of a raster in voxels, a table of ASPRS codes."""
 
     cell: int = 1
     asprs: Path | None = None
@@ -93,10 +93,10 @@ def export(
         scene: Scene of the unit; may be left out where there is one.
         model: Model of the unit; may be left out where there is one.
         backend: Backend of the unit, the base backend where not given.
-        measures: Columns that go along: measures, op, category, psa, or what the run's Parquet file has.
+        measures: Columns to write: measures, op, category, psa, or columns of the run's Parquet file.
         min_op: Only voxels seen that often are written.
         classes: Only voxels of these dominant classes are written; all where empty.
-        thresholds: A file of them: only voxels whose label has the evidence that they ask for (`AcceptanceThresholds`).
+        thresholds: A file of `AcceptanceThresholds`: only voxels whose label has the required evidence are written.
         cell: Edge of a raster's cell, in voxels.
         asprs: YAML file CLASS: CODE for LAS; else the table that ships for the taxonomy.
         classify: A cloud: write this cloud, classified; a point outside of all voxels takes the nearest one within
@@ -106,12 +106,12 @@ def export(
         commit: Name of `thresholds` in the version before.
         onto: Name of `classify` in the version before.
         beside: Name of `join` in the version before.
-        task_format: 'coco', 'labelstudio', 'cvat' or 'fiftyone': write annotation tasks for it, the places where frames
-            disagree, instead of the map.
+        task_format: 'coco', 'labelstudio', 'cvat' or 'fiftyone': write annotation tasks for it, the locations
+            where frames disagree, instead of the map.
         most: The largest number of annotation tasks.
 
     Returns:
-        Each file that was written, with what it holds.
+        Each file that was written, with its content.
 
     Raises:
         ConfigError, DataError, MissingDependencyError: If a file cannot be written; the message names it.
@@ -170,19 +170,19 @@ def _classified(chosen: Chosen, cloud: Path, file: Path, radius: float | None, s
 
 
 def _few_met(tally: joining.Tally, some: Voxels) -> str:
-    """Return why few points of a cloud may have a voxel."""
-    said = f"only {tally.classified / tally.points:.1%} of its points lie in or beside a voxel"
+    """Return the possible reasons why few points of a cloud have a voxel."""
+    text = f"only {tally.classified / tally.points:.1%} of its points lie in or next to a voxel"
     within = tally.classified / max(1, tally.over)
     if within >= FEW_MET:
-        return f"{said}: the cloud is larger than the map; of the points over the map {within:.1%} do"
+        return f"{text}: the cloud is larger than the map; of the points over the map {within:.1%} do"
     where = "has no georeference" if some.georeference is None else "may be shifted or turned"
     return (
-        f"{said} ({within:.1%} of those over the map): the map {where}, or the cloud is of another"
-        " place or height; look at what check says of the project's place, or set a larger --radius"
+        f"{text} ({within:.1%} of those over the map): the map {where}, or the cloud is of another"
+        " area or height; run semstab-bench check to see the position of the project, or set a larger --radius"
     )
 
 
 def _notes(voxels: Voxels, kind: str, settings: Settings) -> Iterator[str]:
     if kind in (".las", ".laz") and (names := clouds.without_code(voxels, settings.asprs)):
         listed = ", ".join(names[:3]) + (", ..." if len(names) > 3 else "")
-        yield f"without ASPRS code (--asprs): {listed}; their classification is 1, dimension 'class' tells them apart"
+        yield f"without ASPRS code (--asprs): {listed}; their classification is 1, their number is in dimension 'class'"

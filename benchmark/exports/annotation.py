@@ -1,4 +1,4 @@
-"""Annotation tasks: the places of a map on which frames disagree, each with the view that shows it best."""
+"""Find annotation tasks: the locations of a map on which frames disagree, each with the view that shows it best."""
 
 from __future__ import annotations
 
@@ -28,30 +28,31 @@ from semstab.statistics import psa
 from semstab.task import Task
 
 MIN_PSA = 0.8
-"""The share of pairs of frames that must agree: below, a place is annotated, as where belief drifts or is uncertain."""
+"""The share of pairs of frames that must agree. A location with a smaller share is annotated, as is one that drifts or
+is uncertain."""
 
 BLOCK = 16
-"""Largest edge of a place, voxels: what a person can judge at once."""
+"""The largest edge of a location, voxels, that a person can assess at once."""
 
 NEIGHBOURS = 1.8
-"""Largest distance of neighbours' centres, voxels: those across an edge or a corner are neighbours, too."""
+"""The largest distance of neighbours' centres, voxels: voxels across an edge or a corner are neighbours, too."""
 
 SMALLEST = 1 / 5000
-"""Part of an image, 8 x 8 pixels of 640 x 480, that an outline encloses; what is smaller cannot be judged."""
+"""The least share of an image that an outline encloses, 8 x 8 pixels of 640 x 480; a person cannot assess less."""
 
 MORE = 8
-"""The factor on the tasks wanted by which more are looked for in the frames: no frame may show a place well."""
+"""The number of locations that are searched in the frames for each task: perhaps no frame shows a location well."""
 
 
 @dataclass(frozen=True, eq=False)
 class AnnotationTask:
-    """A place to annotate, in the image that shows it best.
+    """A location to annotate, in the image that shows it best.
 
     Attributes:
         score: Bits of entropy that its label removes from the map: the sum over the voxels that the outline shows.
         label: The fused class, and `other` the next one; names.
-        voxels: Number of voxels of the place; `op` is the median of the frames that saw them.
-        center: (3,) of the place, metres: global coordinates where the scene has a georeference.
+        voxels: Number of voxels of the location; `op` is the median of the frames that saw them.
+        center: (3,) of the location, metres: global coordinates where the scene has a georeference.
         frame: Number of the best view, `image` the name of its files.
         outline: Polygons (n, 2) in pixels x, y of the image of `size` (width, height).
         views: Names of the other images that show it, the best first.
@@ -73,9 +74,9 @@ class AnnotationTask:
 def annotation_tasks(chosen: Chosen, task: Task, most: int) -> list[AnnotationTask]:
     """Return at most so many tasks, the highest score first.
 
-    A place is a connected set of voxels that at least two frames saw, with the same two likeliest classes, on which
+    A location is a connected set of voxels that at least two frames saw, with the same two likeliest classes, on which
     frames disagree. Its best view has the largest product of size in the image, how frontal and how sharp it is. A
-    place where all frames are wrong alike is not found.
+    location where all frames make the same error is not found.
 
     Args:
         chosen: The voxels that may be annotated.
@@ -86,30 +87,30 @@ def annotation_tasks(chosen: Chosen, task: Task, most: int) -> list[AnnotationTa
         ConfigError: If frames disagree nowhere, or no frame shows it large enough.
         DataError: If the frames have no colour image.
     """
-    places = _Places.of(chosen, MORE * most)
-    views = [view for fetched in prefetch(lambda i: _views(task, i, places), task.indices) for view in fetched.item]
-    by_place: dict[int, list[_View]] = {}
+    locations = _Locations.of(chosen, MORE * most)
+    views = [view for fetched in prefetch(lambda i: _views(task, i, locations), task.indices) for view in fetched.item]
+    by_location: dict[int, list[_View]] = {}
     for view in views:
-        by_place.setdefault(view.place, []).append(view)
-    if not by_place:
+        by_location.setdefault(view.location, []).append(view)
+    if not by_location:
         raise ConfigError(
-            "no image shows a place where frames disagree as large as a person needs it; use larger voxels"
+            "no image shows a location where frames disagree large enough for a person; use larger voxels"
         )
-    best = [_ranked(own) for own in by_place.values()]
+    best = [_ranked(own) for own in by_location.values()]
     best.sort(key=lambda own: -own[0].bits)
-    return [places.task(own, task) for own in best[:most]]
+    return [locations.task(own, task) for own in best[:most]]
 
 
 @dataclass(frozen=True, eq=False)
-class _Places:
-    """The voxels that are annotated; (n,) the place of each, 0, 1, ..., its two classes, and its entropy in bits.
+class _Locations:
+    """The voxels that are annotated: (n,) the location of each, 0, 1, ..., its two classes, and its entropy in bits.
 
     Attributes:
-        projected: Brings points (n, 3) of the scene into its projection, where it has one.
+        projected: The function that projects points (n, 3) of the scene, where the scene has a projection.
     """
 
     table: VoxelTable
-    place: Int64
+    location: Int64
     label: Int64
     other: Int64
     bits: Float64
@@ -117,8 +118,8 @@ class _Places:
     projected: Callable[[Float64], Float64]
 
     @classmethod
-    def of(cls, chosen: Chosen, most: int) -> _Places:
-        """Return the places with the most entropy, at most so many."""
+    def of(cls, chosen: Chosen, most: int) -> _Locations:
+        """Return the locations with the most entropy, at most so many."""
         parts = list(chosen)
         first = parts[0]
         table = VoxelTable.joined([part.table.rows(_disagreed(part.table)) for part in parts])
@@ -128,14 +129,14 @@ class _Places:
         rest = table.evidence[:]
         rest[np.arange(len(table)), label] = -1
         other = rest.argmax(axis=1)
-        place = _connected(table.index, np.stack([label, other], axis=1))
-        total = np.bincount(place, entropy)
+        location = _connected(table.index, np.stack([label, other], axis=1))
+        total = np.bincount(location, entropy)
         rank = np.empty(len(total), np.int64)
         rank[np.argsort(-total, kind="stable")] = np.arange(len(total))
-        rows = np.flatnonzero(rank[place] < most)
+        rows = np.flatnonzero(rank[location] < most)
         return cls(
             table.rows(rows),
-            rank[place[rows]],
+            rank[location[rows]],
             label[rows],
             other[rows],
             entropy[rows],
@@ -144,9 +145,9 @@ class _Places:
         )
 
     def task(self, views: list[_View], task: Task) -> AnnotationTask:
-        """Return the task of a place from its views, the best first."""
+        """Return the task of a location from its views, the best first."""
         best, names = views[0], task.scene.image_name
-        own = self.place == best.place
+        own = self.location == best.location
         k = int(np.flatnonzero(own)[0])
         center = self.projected(self.table.centers[own].mean(axis=0, keepdims=True))[0]
         return AnnotationTask(
@@ -178,21 +179,21 @@ def _connected(index: npt.NDArray[np.integer[Any]], classes: Int64) -> Int64:
     return sets(np.column_stack([whole, (index - corner[whole]) // BLOCK]))
 
 
-# Places in the images.
+# Locations in the images.
 
 
 @dataclass(frozen=True, eq=False)
 class _View:
-    """A place in a frame.
+    """A location in a frame.
 
     Attributes:
-        bits: Bits of the voxels that it shows.
+        bits: Entropy of the voxels that it shows, bits.
         pixels: Pixels of the outline.
         area: Area of the surface across the line of sight, square metres: the more frontal, the larger.
         sharp: Mean square of the image's second derivative in the outline.
     """
 
-    place: int
+    location: int
     frame: int
     size: tuple[int, int]
     outline: tuple[Float64, ...]
@@ -203,39 +204,45 @@ class _View:
 
 
 def _ranked(views: list[_View]) -> list[_View]:
-    """Return the views of a place, the best first."""
+    """Return the views of a location, the best first."""
     area, sharp = (max(getattr(view, name) for view in views) for name in ("area", "sharp"))
     return sorted(views, key=lambda view: -view.bits * view.pixels * (view.area / area) * (view.sharp / sharp))
 
 
-def _views(task: Task, index: int, places: _Places) -> list[_View]:
-    """Return the places that a frame shows."""
+def _views(task: Task, index: int, locations: _Locations) -> list[_View]:
+    """Return the locations that a frame shows."""
     image = task.scene.color(index)
     if image is None:
         raise DataError(f"{task.scene.name}, {task.scene.image_name(index)}: the frame has no colour image to annotate")
     frame = task.scene.view(index, image.shape[:2])
     rows = np.full(frame.shape, NONE)
-    rows[frame.valid] = VoxelLookup(places.table).rows(back_project(frame).T)
-    place = np.where(rows == NONE, NONE, places.place[rows])
+    rows[frame.valid] = VoxelLookup(locations.table).rows(back_project(frame).T)
+    location = np.where(rows == NONE, NONE, locations.location[rows])
     sharpness: Float64 = cv2.Laplacian(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), cv2.CV_64F).astype(np.float64) ** 2
-    boxes = enumerate(find_objects(place + 1))
-    found = [_view(frame, rows, place, k, box, places, sharpness) for k, box in boxes if box is not None]
-    return [view for view in found if view is not None]
+    boxes = enumerate(find_objects(location + 1))
+    seen = [_view(frame, rows, location, k, box, locations, sharpness) for k, box in boxes if box is not None]
+    return [view for view in seen if view is not None]
 
 
 def _view(
-    frame: Frame, rows: Int64, place: Int64, k: int, box: tuple[slice, slice], places: _Places, sharpness: Float64
+    frame: Frame,
+    rows: Int64,
+    location: Int64,
+    k: int,
+    box: tuple[slice, slice],
+    locations: _Locations,
+    sharpness: Float64,
 ) -> _View | None:
-    """Place k within a box of the image; None where the image shows too little of it."""
-    seen = place[box] == k
+    """Return location k within a box of the image; None where the image shows too little of it."""
+    seen = location[box] == k
     K, z = frame.intrinsics, frame.depth[box][seen].astype(np.float64)
-    outline, mask = outlined(seen, places.table.voxel_size * K.fx / float(np.median(z)), SMALLEST * rows.size)
+    outline, mask = outlined(seen, locations.table.voxel_size * K.fx / float(np.median(z)), SMALLEST * rows.size)
     if not mask.any():
         return None
     corner, (H, W) = np.array([box[1].start, box[0].start], np.float64), frame.shape
     return _View(
         k, frame.index, (W, H), tuple(polygon + corner for polygon in outline),
-        float(places.bits[np.unique(rows[box][seen])].sum()), float(mask.sum()), float((z**2).sum() / (K.fx * K.fy)),
+        float(locations.bits[np.unique(rows[box][seen])].sum()), float(mask.sum()), float((z**2).sum() / (K.fx * K.fy)),
         float(sharpness[box][mask].mean()) + 1e-9,
     )  # fmt: skip
 
@@ -255,9 +262,9 @@ def outlined(seen: Mask, voxel: float, smallest: float) -> tuple[tuple[Float64, 
     square = np.ones((2, 2), np.uint8)  # OpenCV's contours run through the centres of pixels: here, along their edges
     edged = cv2.dilate(closed, square, anchor=(1, 1))
     contours, _ = cv2.findContours(edged, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_SIMPLE)
-    kept = [cv2.approxPolyDP(c, 1.0, True) for c in contours if cv2.contourArea(c) >= max(4, smallest)]
-    kept = [c for c in kept if len(c) >= 3]
+    selected = [cv2.approxPolyDP(c, 1.0, True) for c in contours if cv2.contourArea(c) >= max(4, smallest)]
+    selected = [c for c in selected if len(c) >= 3]
     mask = np.zeros(closed.shape, np.uint8)
-    cv2.drawContours(mask, kept, -1, 1, cv2.FILLED)
+    cv2.drawContours(mask, selected, -1, 1, cv2.FILLED)
     inside = cv2.erode(mask, square, anchor=(0, 0))[:-1, :-1].astype(np.bool_)
-    return tuple(c[:, 0].astype(np.float64) for c in kept), inside
+    return tuple(c[:, 0].astype(np.float64) for c in selected), inside

@@ -1,4 +1,4 @@
-"""Annotation tasks as files of COCO, Label Studio, CVAT and FiftyOne, with the images that they name beside them."""
+"""Write annotation tasks as files of COCO, Label Studio, CVAT and FiftyOne, with the images that they name."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ from semstab.exports.annotation import AnnotationTask
 from semstab.task import Task
 
 MOST = 50
-"""Tasks where no number is given."""
+"""The number of tasks by default."""
 
 
 @dataclass(frozen=True, eq=False)
 class TaskFile:
-    """Tasks of a scene, the most urgent first, and the file that they go to.
+    """The tasks of a scene, the most urgent first, and the file in which they are stored.
 
     Attributes:
         space: The classes that are annotated.
@@ -38,7 +38,7 @@ class TaskFile:
 
     @property
     def folder(self) -> Path:
-        """The folder of the images: tasks_images beside tasks.json."""
+        """Return the folder of the images: tasks_images next to tasks.json."""
         return self.path.with_name(f"{self.path.stem}_images")
 
     def image(self, task: AnnotationTask) -> str:
@@ -47,18 +47,18 @@ class TaskFile:
 
     def by_image(self) -> dict[str, list[tuple[int, AnnotationTask]]]:
         """Return the tasks, numbered from 1, by the file of their image."""
-        found: dict[str, list[tuple[int, AnnotationTask]]] = {}
+        tasks: dict[str, list[tuple[int, AnnotationTask]]] = {}
         for rank, task in enumerate(self.tasks, start=1):
-            found.setdefault(self.image(task), []).append((rank, task))
-        return found
+            tasks.setdefault(self.image(task), []).append((rank, task))
+        return tasks
 
-    def beside(self, ending: str) -> Path:
-        """Return a further file: tasks_ENDING beside tasks.json."""
+    def companion(self, ending: str) -> Path:
+        """Return a further file: tasks_ENDING next to tasks.json."""
         return self.path.with_name(f"{self.path.stem}_{ending}")
 
 
 def about(task: AnnotationTask) -> dict[str, Any]:
-    """Return what is known of a task's place."""
+    """Return the properties of a task's location."""
     return {
         "score": round(task.score, 3), "fused": task.label, "second": task.other, "voxels": task.voxels, "op": task.op,
         "center": [round(x, 3) for x in task.center], "views": list(task.views),
@@ -66,7 +66,7 @@ def about(task: AnnotationTask) -> dict[str, Any]:
 
 
 def coco(file: TaskFile) -> Iterator[str]:
-    """Yield COCO's instances: polygons with a score; the order is that of the scores."""
+    """Write COCO's instances, polygons in the order of their scores; yield notes on their use."""
     numbers = {name: k for k, name in enumerate(file.by_image(), start=1)}
     sizes = {file.image(task): task.size for task in file.tasks}
     ids = {name: k for k, name in enumerate(file.space.classes, start=1)}
@@ -82,7 +82,7 @@ def coco(file: TaskFile) -> Iterator[str]:
         }  # fmt: skip
         annotations.append(own | about(task))
     write_json(file.path, {
-        "info": {"description": f"{file.scene}, {file.source}: places where frames disagree, by semstab"},
+        "info": {"description": f"{file.scene}, {file.source}: locations where frames disagree, by semstab"},
         "licenses": [],
         "images": [
             {"id": k, "file_name": name, "width": sizes[name][0], "height": sizes[name][1]}
@@ -95,7 +95,7 @@ def coco(file: TaskFile) -> Iterator[str]:
 
 
 def label_studio(file: TaskFile) -> Iterator[str]:
-    """Yield Label Studio's tasks with a predicted polygon, and the labelling set-up."""
+    """Write Label Studio's tasks with a predicted polygon, and the labelling set-up; yield notes on their use."""
     rows = []
     for rank, task in enumerate(file.tasks, start=1):
         W, H = task.size
@@ -119,13 +119,13 @@ def label_studio(file: TaskFile) -> Iterator[str]:
     view = _node(
         "View", _node("Header", value="$title"), image, _node("PolygonLabels", *labels, name="label", toName="image")
     )
-    setup = file.beside("config.xml")
+    setup = file.companion("config.xml")
     write_text(setup, _xml(view, declaration=False))
     yield f"set-up of the project: {setup}; serve {file.folder} as local files"
 
 
 def cvat(file: TaskFile) -> Iterator[str]:
-    """Yield CVAT for images 1.1, and the labels for the task's raw constructor."""
+    """Write CVAT for images 1.1, and the labels for the task's raw constructor; yield notes on their use."""
     images, colors, own = file.by_image(), list(_colors(file.space)), ("task", "score", "second")
     text = ("mutable", "False"), ("input_type", "text"), ("default_value", ""), ("values", "")
     attributes = [_node("attribute", _node("name", what), *(_node(*pair) for pair in text)) for what in own]
@@ -151,14 +151,14 @@ def cvat(file: TaskFile) -> Iterator[str]:
         drawn.append(_node("image", *polygons, id=str(k), name=Path(name).name, width=str(W), height=str(H)))
     meta = _node("meta", _node("task", *scene, _node("labels", *labels)))
     write_text(file.path, _xml(_node("annotations", _node("version", "1.1"), meta, *drawn)))
-    constructor = file.beside("labels.json")
+    constructor = file.companion("labels.json")
     declared = [{"name": what, "mutable": False, "input_type": "text", "values": [""]} for what in own]
     write_json(constructor, [{"name": name, "color": color, "attributes": declared} for name, color in colors])
     yield f"labels of the task: {constructor} (Raw); images: {file.folder}; then upload as 'CVAT 1.1'"
 
 
 def fiftyone(file: TaskFile) -> Iterator[str]:
-    """Yield FiftyOne's dataset as JSON: a sample an image, with polylines."""
+    """Write FiftyOne's dataset as JSON, a sample with polylines for each image; yield notes on its use."""
     fields, labels = "fiftyone.core.fields", "fiftyone.core.labels.Polylines"
     samples = []
     for name, tasks in file.by_image().items():
@@ -189,11 +189,11 @@ FORMATS: Mapping[str, tuple[str, Callable[[TaskFile], Iterator[str]]]] = {
     "coco": (".json", coco), "labelstudio": (".json", label_studio), "cvat": (".xml", cvat),
     "fiftyone": (".json", fiftyone),
 }  # fmt: skip
-"""The formats by name: the suffix of the file, and what writes it and yields how it is opened."""
+"""The formats by name: the suffix of the file, and the function that writes it and yields notes on its use."""
 
 
 def check(kind: str, path: Path) -> None:
-    """Raise ConfigError where a format is not known, or the file's suffix is not its own."""
+    """Raise ConfigError where a format is not known, or the file has the suffix of another format."""
     if kind not in FORMATS:
         raise ConfigError(f"no format '{kind}'; {nearest(kind, [*FORMATS])}")
     if path.suffix.lower() != FORMATS[kind][0]:
@@ -201,7 +201,7 @@ def check(kind: str, path: Path) -> None:
 
 
 def write_tasks(file: TaskFile, kind: str, task: Task) -> tuple[str, ...]:
-    """Write tasks of frames, and their images; return how they are opened."""
+    """Write tasks of frames, and their images; return notes on their use."""
     for one in {own.image: own for own in file.tasks}.values():
         color = task.scene.color(one.frame)
         assert color is not None

@@ -1,4 +1,4 @@
-"""PLY: how its rows are laid out, and the voxels as points with a class, a colour and measures, for CloudCompare."""
+"""Write point clouds: PLY for CloudCompare, and LAS; each point has the class, colour and measures of a voxel."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ TYPES = {
     "double": "f8", "int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2", "int32": "i4", "uint32": "u4",
     "float32": "f4", "float64": "f8",
 }  # fmt: skip
-"""NumPy's types by the names that PLY gives them."""
+"""The types of NumPy by their names in PLY."""
 
 ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">"}
 LONGEST_HEADER = 2**20
@@ -57,14 +57,14 @@ class Header:
         """Read the header of a cloud.
 
         Raises:
-            DataError: For another file than a binary PLY of points alone.
+            DataError: If the file is no binary PLY of points alone.
         """
         lines = list(_header_lines(file, path))
         try:
             return cls._parsed(lines, file.tell(), path)
         except DataError:
             raise
-        except (LookupError, ValueError) as error:  # a word that is missing, no number, a name that is there twice
+        except (LookupError, ValueError) as error:  # a missing word, no number, a repeated name
             raise DataError(
                 f"{path}: its header cannot be read ({summarize_error(error)}); save the cloud anew"
             ) from error
@@ -127,7 +127,7 @@ def write_ply(parts: Iterable[Voxels], path: Path, count: int) -> int:
 
 
 def legend(voxels: Voxels) -> Iterable[str]:
-    """Yield the lines that explain a file: the voxels' size, the coordinates, the classes, the columns."""
+    """Yield the lines that explain a file: the voxel size, the coordinates, the classes, the columns."""
     where = "coordinates of the scene" if voxels.georeference is None else crs_name(voxels.georeference)
     yield f"semstab: voxels of {voxels.table.voxel_size:g} m, {where}"
     yield from (f"class {k} {name}" for k, name in enumerate(("unclassified", *voxels.classes)))
@@ -157,11 +157,11 @@ def _header_lines(file: BinaryIO, path: Path) -> Iterable[str]:
     raise DataError(f"{path}: the header of a PLY file does not end; the file is damaged")
 
 
-# LAS and LAZ: the voxels as classified points, the class's number and measures in extra dimensions.
+# LAS and LAZ store the voxels as classified points, with the number of the class and measures in extra dimensions.
 
 MILLIMETRE = 0.001
 NEVER_CLASSIFIED, UNCLASSIFIED = 0, 1
-"""ASPRS codes of a point without a class, and of a class without a code."""
+"""The ASPRS codes of a point without a class, and of a class without a code."""
 
 FORMAT = 7
 """The point format of LAS 1.4 that has colour."""
@@ -210,7 +210,7 @@ def with_lazrs(path: Path) -> Any:
 def declare(header: laspy.LasHeader, voxels: Voxels, **more: tuple[npt.DTypeLike, str]) -> None:
     """Declare the class, the voxels' columns and `more` as extra dimensions where the header has none of that name.
 
-    Also write which class is which and, where the cloud has none, the reference system.
+    Also write the names of the classes and, where the cloud has none, the reference system.
     """
     import laspy
 
@@ -239,7 +239,7 @@ def codes(voxels: Voxels, table: Path | None = None) -> UInt8:
     Without a file the codes are those that ship for the taxonomy.
 
     Raises:
-        ConfigError: For a class that is not there or a code out of range.
+        ConfigError: For an unknown class or a code out of range.
     """
     row = {name_key(name): k for k, name in enumerate(voxels.classes, start=1)}
     if table is not None:
@@ -248,15 +248,15 @@ def codes(voxels: Voxels, table: Path | None = None) -> UInt8:
         content = read_yaml(str(importlib.resources.files("semstab.configs") / "asprs.yaml"))
         shipped = content.get(voxels.taxonomy, {})
         given = {name: code for name, code in shipped.items() if name_key(name) in row}
-    found = np.full(1 + len(row), UNCLASSIFIED, np.uint8)
-    found[0] = NEVER_CLASSIFIED
+    codes_by_row = np.full(1 + len(row), UNCLASSIFIED, np.uint8)
+    codes_by_row[0] = NEVER_CLASSIFIED
     for name, code in given.items():
         if name_key(str(name)) not in row:
             raise ConfigError(f"{table}: no class '{name}' in the run; {nearest(str(name), voxels.classes)}")
         if isinstance(code, bool) or not isinstance(code, int) or not 0 <= code < 2**8:
             raise ConfigError(f"{table}: {name}: {code!r} is no ASPRS code; write a whole number from 0 to 255")
-        found[row[name_key(str(name))]] = code
-    return found
+        codes_by_row[row[name_key(str(name))]] = code
+    return codes_by_row
 
 
 def without_code(voxels: Voxels, table: Path | None) -> list[str]:

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from scipy.spatial import cKDTree
 
 
-# Which voxel a point belongs to: the one that it lies in, else the nearest within a radius.
+# A point belongs to the voxel that it lies in, else to the nearest voxel within a radius.
 
 NONE = -1
 """The row of a point that belongs to no voxel."""
@@ -46,7 +46,7 @@ class VoxelLookup:
 
     @property
     def bounds(self) -> tuple[Float64, Float64]:
-        """(3,) the lowest and the highest coordinates that may belong to a voxel, metres."""
+        """Return the lowest and the highest coordinates (3,) that may belong to a voxel, metres."""
         r = self.table.voxel_size
         return self._low * r - self._radius, (self._high + 1) * r + self._radius
 
@@ -85,10 +85,10 @@ class VoxelLookup:
 
 
 CHUNK = 1_000_000
-"""Points at a time."""
+"""The number of points that are read at a time."""
 
 MEASURES = ("vss", "op", "category")
-"""Columns of a point where none is chosen."""
+"""The columns of a point by default."""
 
 BEFORE = "classification_before"
 """The extra dimension with the classification that a LAS cloud had."""
@@ -144,9 +144,9 @@ def classify(chosen: Chosen, cloud: Path, out: Path, radius: float, asprs: Path 
     if write is None:
         raise ConfigError(f"{cloud}: a cloud is a .las, .laz or .ply file")
     if kinds.get(out.suffix.lower()) is not write:
-        raise ConfigError(f"{out}: {cloud.name} stays what it is; write {out.with_suffix(cloud.suffix)}")
+        raise ConfigError(f"{out}: the output has the format of {cloud.name}; write {out.with_suffix(cloud.suffix)}")
     if out.exists() and out.samefile(cloud):
-        raise ConfigError(f"{out}: is the cloud itself; choose another file")
+        raise ConfigError(f"{out}: this is the cloud itself; choose another file")
     finder = _Finder(chosen, radius)
     with atomic_path(out) as temporary:
         write(chosen.first, cloud, temporary, finder)
@@ -162,16 +162,16 @@ class _Finder:
         self.chosen, self.tally, self._radius = chosen, Tally(), radius
         self._lookups = SizedCache(self.lookup, lambda lookup: len(lookup.table), AT_HAND)
 
-    def lookup(self, place: TileIndex) -> VoxelLookup:
+    def lookup(self, tile: TileIndex) -> VoxelLookup:
         """Return the lookup of a tile with voxels."""
-        return VoxelLookup(self.chosen[place].table, self._radius)
+        return VoxelLookup(self.chosen[tile].table, self._radius)
 
     @cached_property
     def bounds(self) -> tuple[Float64, Float64]:
-        """(3,) the lowest and the highest coordinates of the file that may belong to a voxel, metres."""
+        """Return the lowest and the highest coordinates (3,) of the file that may belong to a voxel, metres."""
         low, high = np.full(3, np.inf), np.full(3, -np.inf)
-        for place in self.chosen.places():
-            voxels, r = self.chosen[place], self.chosen.first.table.voxel_size
+        for tile in self.chosen.tiles():
+            voxels, r = self.chosen[tile], self.chosen.first.table.voxel_size
             index = voxels.table.index
             box = np.stack([index.min(axis=0) * r - self._radius, (index.max(axis=0) + 1) * r + self._radius])
             corners = voxels.in_file(np.array([*itertools.product(*box.T)]))
@@ -185,11 +185,11 @@ class _Finder:
             name: np.zeros(len(points), clouds.as_stored(own.values).dtype) for name, own in some.columns.items()
         }
         placed = some.in_scene(points)
-        for place, rows in self._near(placed):
-            voxels = self.chosen[place]
+        for tile, rows in self._near(placed):
+            voxels = self.chosen[tile]
             if not len(voxels.table):
                 continue
-            nearest, distance = self._lookups[place].nearest(placed[rows])
+            nearest, distance = self._lookups[tile].nearest(placed[rows])
             nearer = distance < apart[rows]
             to, of = rows[nearer], nearest[nearer]
             apart[to], label[to] = distance[nearer], voxels.classified[of]
@@ -212,8 +212,8 @@ class _Finder:
             for shift in itertools.product(steps, steps)
         ]
         tiles = np.unique(np.concatenate(pairs), axis=0)
-        places, first = np.unique(tiles[:, :2], axis=0, return_index=True)
-        for (x, y), rows in zip(places.tolist(), np.split(tiles[:, 2], first[1:]), strict=True):
+        keys, first = np.unique(tiles[:, :2], axis=0, return_index=True)
+        for (x, y), rows in zip(keys.tolist(), np.split(tiles[:, 2], first[1:]), strict=True):
             if (x, y) in self.chosen:
                 yield (x, y), rows
 
@@ -226,8 +226,8 @@ def _outside(cloud: Path, finder: _Finder) -> DataError:
         for box in ((finder.tally.low, finder.tally.high), map_box)
     )
     georeferenced = finder.chosen.first.georeference is not None
-    mend = "mend the cloud's coordinates" if georeferenced else "give the run's dataset a georeference (crs, offset)"
-    return DataError(f"{cloud}: no point lies in the map: it spans {there} m, the map {here}; {mend}")
+    mend = "correct the cloud's coordinates" if georeferenced else "give the run's dataset a georeference (crs, offset)"
+    return DataError(f"{cloud}: no point lies in the map: the cloud spans {there} m, the map {here}; {mend}")
 
 
 # --- LAS --------------------------------------------------------------------------------------------------------------
@@ -263,7 +263,7 @@ def _classified_points(
     points: laspy.ScaleAwarePointRecord, header: laspy.LasHeader, voxels: Voxels, find: Finder, asprs: Path | None
 ) -> laspy.ScaleAwarePointRecord:
     """Return a chunk with the classes and columns of its points."""
-    found = find(np.stack([points.x, points.y, points.z], axis=1))
+    assigned = find(np.stack([points.x, points.y, points.z], axis=1))
     taken = type(points).zeros(len(points), header=header)
     taken.copy_fields_from(points)
     if BEFORE not in points.point_format.dimension_names:
@@ -271,24 +271,24 @@ def _classified_points(
     codes = clouds.codes(voxels, asprs)
     if header.point_format.id < clouds.FIRST_OF_1_4:
         codes[codes > OLD_CODES] = clouds.UNCLASSIFIED
-    taken.classification = codes[found.label]
-    taken["class"] = found.label
-    for name, values in found.columns.items():
+    taken.classification = codes[assigned.label]
+    taken["class"] = assigned.label
+    for name, values in assigned.columns.items():
         taken[name] = values
     return taken
 
 
 def _require_same_crs(voxels: Voxels, header: laspy.LasHeader, cloud: Path) -> None:
-    """Raise DataError where cloud and run say different projections."""
-    said = header.parse_crs()
-    if said is None or voxels.georeference is None:
+    """Raise DataError where cloud and run have different projections."""
+    stated = header.parse_crs()
+    if stated is None or voxels.georeference is None:
         return
     from pyproj import CRS
 
-    flat = said.sub_crs_list[0] if said.is_compound else said
+    flat = stated.sub_crs_list[0] if stated.is_compound else stated
     there, here = (crs.to_epsg() for crs in (flat, CRS.from_wkt(voxels.georeference.crs)))
     if there is not None and here is not None and there != here:
-        raise DataError(f"{cloud}: is in EPSG:{there}, the run in EPSG:{here}; reproject the cloud")
+        raise DataError(f"{cloud}: the cloud is in EPSG:{there}, the run in EPSG:{here}; reproject the cloud")
 
 
 # --- PLY --------------------------------------------------------------------------------------------------------------
@@ -306,12 +306,12 @@ def _classify_ply(voxels: Voxels, cloud: Path, out: Path, find: Finder) -> None:
         comments = dict.fromkeys((*header.comments, *clouds.legend(voxels)))
         target.write(clouds.Header(dtype, header.count, 0, tuple(comments)).text())
         for points in _ply_chunks(source, header, cloud):
-            found = find(np.stack([points[axis].astype(np.float64) for axis in "xyz"], axis=1))
+            assigned = find(np.stack([points[axis].astype(np.float64) for axis in "xyz"], axis=1))
             chunk = np.empty(len(points), dtype)
             for name in own:
                 chunk[name] = points[name]
-            chunk["class"] = found.label
-            for name, values in found.columns.items():
+            chunk["class"] = assigned.label
+            for name, values in assigned.columns.items():
                 chunk[name] = values
             target.write(chunk.tobytes())
 
@@ -321,5 +321,7 @@ def _ply_chunks(source: Any, header: clouds.Header, cloud: Path) -> Iterator[npt
         wanted = min(CHUNK, header.count - first)
         points = np.fromfile(source, header.dtype, wanted)
         if len(points) < wanted:
-            raise DataError(f"{cloud}: ends after {first + len(points):,} of {header.count:,} points; it is cut short")
+            raise DataError(
+                f"{cloud}: the file ends after {first + len(points):,} of {header.count:,} points; it is cut short"
+            )
         yield points

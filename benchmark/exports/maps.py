@@ -1,4 +1,4 @@
-"""GeoTIFF: the map from above, with a band of classes and one of each measure; and the classes in their colours."""
+"""Write the map from above as GeoTIFF, with bands of classes and measures, and the voxels as a mesh (GLB)."""
 
 from __future__ import annotations
 
@@ -22,13 +22,13 @@ from semstab.metrics import CATEGORIES, categories
 from semstab.report.figures.topdown import covered, level_axes
 
 RASTER_MEASURES = ("vss", "entropy", "op")
-"""The bands of measures where none is chosen."""
+"""The bands of measures by default."""
 
 MOST_CELLS = 10**10
-"""Cells of a raster."""
+"""The most cells of a raster."""
 
 WINDOW = 1024
-"""Cells along a side of what is written at a time: whole blocks of the file."""
+"""The cells along a side of a window that is written at a time: whole blocks of the file."""
 
 STABLE = len(CATEGORIES) - 1
 
@@ -38,9 +38,11 @@ def write_raster(chosen: Chosen, path: Path, cell: int = 1) -> int:
 
     A cell is `cell` voxels wide. Its class is that of the summed belief of the topmost voxels of its columns, each
     measure their mean, height the highest one's centre; the share of stable voxels is that of all voxels below as well.
-    It is written window by window, of which only the tiles that are seen there are in memory; how many voxels there
-    are.
-    Raises ConfigError where the up axis is not known or the raster would be too large, MissingDependencyError.
+    It is written window by window; only the tiles that a window shows are in memory. Returns the number of voxels.
+
+    Raises:
+        ConfigError: If the up axis is not known or the raster would be too large.
+        MissingDependencyError: If rasterio is not installed.
     """
     try:
         import rasterio
@@ -49,9 +51,9 @@ def write_raster(chosen: Chosen, path: Path, cell: int = 1) -> int:
     except ImportError as error:
         raise MissingDependencyError(f"{path}: .tif needs rasterio; {INSTALL}") from error
     some, seen, voxels = chosen.first, {}, 0
-    for place in chosen.places():
-        seen[place] = _window(chosen[place], cell)
-        voxels += len(chosen[place].table)
+    for tile in chosen.tiles():
+        seen[tile] = _window(chosen[tile], cell)
+        voxels += len(chosen[tile].table)
     whole = _fitting(functools.reduce(Window.around, seen.values()))
     edge, (west, north) = cell * some.table.voxel_size, _corner(some, whole, cell)
     height, width = whole.shape
@@ -73,7 +75,7 @@ def write_raster(chosen: Chosen, path: Path, cell: int = 1) -> int:
         rasterio.open(temporary_classes, "w", **one, **shape) as classes,
     ):
         for window in whole.parts():
-            there = [chosen[place] for place, own in seen.items() if own.meets(window)]
+            there = [chosen[tile] for tile, own in seen.items() if own.meets(window)]
             bands = _bands(together(there), cell, window) if there else {}
             at = Pixels(window.low[1] - whole.low[1], whole.high[0] - window.high[0], *reversed(window.shape))
             nothing = np.full(window.shape, np.nan, np.float32)
@@ -94,14 +96,14 @@ def write_raster(chosen: Chosen, path: Path, cell: int = 1) -> int:
 
 @dataclass(frozen=True)
 class Window:
-    """Cells of the plane, low <= (ahead, right) <= high."""
+    """The cells of the plane with low <= (ahead, right) <= high."""
 
     low: tuple[int, int]
     high: tuple[int, int]
 
     @property
     def shape(self) -> tuple[int, int]:
-        """Rows and columns."""
+        """Return the numbers of rows and columns."""
         return self.high[0] - self.low[0] + 1, self.high[1] - self.low[1] + 1
 
     def around(self, other: Window) -> Window:
@@ -131,7 +133,7 @@ def seen_from_above(voxels: Voxels, cell: int = 1) -> tuple[Mapping[str, Column]
 
 def _axes(voxels: Voxels) -> tuple[Float64, Float64, Float64]:
     if voxels.up is None:
-        raise ConfigError("which way is up is not known; set up_axis of the dataset, and run again")
+        raise ConfigError("the up direction is not known; set up_axis of the dataset, and run again")
     return level_axes(voxels.up)
 
 
@@ -221,7 +223,7 @@ def _bands(voxels: Voxels, cell: int, window: Window) -> Mapping[str, Column]:
 
 
 class _Cells:
-    """Voxels (m,) in the cells (m,) of a raster, counted row by row."""
+    """The voxels (m,) in the cells (m,) of a raster, counted row by row."""
 
     def __init__(self, at: Int64, rows: Int64, shape: tuple[int, int]) -> None:
         self._at, self._rows, self._shape = at, rows, shape
@@ -244,25 +246,25 @@ class _Cells:
 
 
 def _topmost(cells: Int64, height: Float64) -> Int64:
-    """Return which entry (m,) is the highest of each cell (m, 2)."""
+    """Return the positions of the highest entry of each cell (m, 2)."""
     order = np.lexsort((height, cells[:, 1], cells[:, 0]))
     last = np.append((np.diff(cells[order], axis=0) != 0).any(axis=1), True)
     topmost: Int64 = order[last]
     return topmost
 
 
-# GLB: the voxels as cubes in the colours of their classes, for a browser.
+# GLB shows the voxels as cubes in the colours of their classes, in a browser.
 
 SIDES = np.array([
     [[1, 0, 0], [1, 1, 0], [1, 1, 1], [1, 0, 1]], [[0, 0, 0], [0, 0, 1], [0, 1, 1], [0, 1, 0]],
     [[0, 1, 0], [0, 1, 1], [1, 1, 1], [1, 1, 0]], [[0, 0, 0], [1, 0, 0], [1, 0, 1], [0, 0, 1]],
     [[0, 0, 1], [1, 0, 1], [1, 1, 1], [0, 1, 1]], [[0, 0, 0], [0, 1, 0], [1, 1, 0], [1, 0, 0]],
 ])  # fmt: skip
-"""(6, 4, 3) corners of a cube's sides, seen from outside against the clock: +x, -x, +y, -y, +z, -z."""
+"""The corners (6, 4, 3) of a cube's sides, anticlockwise from outside: +x, -x, +y, -y, +z, -z."""
 
 NEIGHBOURS = np.array([[1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, 1], [0, 0, -1]])
 MOST_SPANNED = 2**40
-"""Cells that the voxels of a tile may span: corners are packed into one number."""
+"""The most cells that the voxels of a tile may span: corners are packed into one number."""
 
 MOST_BYTES = 2**31
 """The most bytes of the meshes of a file: glTF counts in 32 bits, and trimesh makes a file in memory."""
@@ -279,7 +281,7 @@ def write_mesh(chosen: Chosen, path: Path) -> int:
     """
     import trimesh
 
-    corners = {place: chosen[place].table.index.min(axis=0).astype(np.int64) for place in chosen.places()}
+    corners = {tile: chosen[tile].table.index.min(axis=0).astype(np.int64) for tile in chosen.tiles()}
     some, low = chosen.first, np.min([*corners.values()], axis=0)
     extras = {
         "origin": (some.linear @ (low * some.table.voxel_size) + some.offset).tolist(),
@@ -289,17 +291,17 @@ def write_mesh(chosen: Chosen, path: Path) -> int:
     }
     scene: Any = trimesh.Scene(metadata=extras)
     voxels, size, to_gltf = 0, 0, some.table.voxel_size * (_to_gltf(some.up) @ some.linear).T
-    for place in corners:
-        part = chosen[place]
+    for tile in corners:
+        part = chosen[tile]
         voxels += len(part.table)
         corner, label, quads = _sides(
-            part.table.index - low, part.classified.astype(np.int64) - 1, _adjacent(chosen, place) - low
+            part.table.index - low, part.classified.astype(np.int64) - 1, _adjacent(chosen, tile) - low
         )
         if not len(quads):
             continue
         size += 16 * len(corner) + 24 * len(quads)
         if size > MOST_BYTES:
-            raise ConfigError("the mesh would be larger than 2 GB; choose with --class, --min-op")
+            raise ConfigError("the mesh would be larger than 2 GB; select fewer voxels with --class, --min-op")
         scene.add_geometry(
             trimesh.Trimesh(
                 (corner @ to_gltf).astype(np.float32),
@@ -313,15 +315,15 @@ def write_mesh(chosen: Chosen, path: Path) -> int:
     return voxels
 
 
-def _adjacent(chosen: Chosen, place: TileIndex) -> Int64:
+def _adjacent(chosen: Chosen, tile: TileIndex) -> Int64:
     """Return the voxels (n, 3) of the tiles around one that may touch it."""
-    found, size = [np.zeros((0, 3), np.int64)], chosen.size
+    adjacent, size = [np.zeros((0, 3), np.int64)], chosen.size
     for (dx, dy), axis, at in (((1, 0), 0, 0), ((-1, 0), 0, -1), ((0, 1), 1, 0), ((0, -1), 1, -1)):
-        other = place[0] + dx, place[1] + dy
+        other = tile[0] + dx, tile[1] + dy
         if size is not None and other in chosen:
             index = chosen[other].table.index.astype(np.int64)
-            found.append(index[index[:, axis] % size == at % size])
-    return np.concatenate(found)
+            adjacent.append(index[index[:, axis] % size == at % size])
+    return np.concatenate(adjacent)
 
 
 def _sides(index: Int64, label: Int64, adjacent: Int64) -> tuple[Int64, Int64, Int64]:
@@ -333,10 +335,10 @@ def _sides(index: Int64, label: Int64, adjacent: Int64) -> tuple[Int64, Int64, I
         adjacent: (b, 3) voxels that hide sides, and have none here.
     """
     low = index.min(axis=0) - 1
-    size = index.max(axis=0) - low + 3  # a cell more on each side: every neighbour has a key
+    size = index.max(axis=0) - low + 3  # a margin of one cell gives every neighbour a key
     if int(np.prod(size.astype(object))) >= MOST_SPANNED:
         raise ConfigError(
-            f"the voxels span {' x '.join(map(str, size))}: too much for a mesh; choose with --class, --min-op"
+            f"the voxels span {' x '.join(map(str, size))}: too much for a mesh; select fewer with --class, --min-op"
         )
     step = np.array([size[1] * size[2], size[2], 1])
     near = adjacent[((adjacent >= low) & (adjacent < low + size)).all(axis=1)]
@@ -346,8 +348,8 @@ def _sides(index: Int64, label: Int64, adjacent: Int64) -> tuple[Int64, Int64, I
         open_ = ~np.isin(keys + neighbour @ step, hiding)
         corner = (index[open_][:, None] - low + side) @ step
         parts.append(corner * K + label[open_][:, None])
-    found, quads = np.unique(np.concatenate(parts), return_inverse=True)
-    return np.stack(np.unravel_index(found // K, tuple(size)), axis=1) + low, found % K, quads.reshape(-1, 4)
+    packed, quads = np.unique(np.concatenate(parts), return_inverse=True)
+    return np.stack(np.unravel_index(packed // K, tuple(size)), axis=1) + low, packed % K, quads.reshape(-1, 4)
 
 
 def _to_gltf(up: tuple[float, float, float] | None) -> Float64:

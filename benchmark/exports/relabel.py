@@ -35,13 +35,13 @@ from semstab.statistics import psa
 from semstab.statistics.acceptance import AcceptanceThresholds
 from semstab.task import Task, read, truth_task
 
-# The class of the map at each pixel of a frame, where its voxel meets the criteria.
+# A pixel of a frame gets the class of the map where its voxel meets the criteria.
 
 UNSEEN, UNSTABLE = -1, -2
-"""Marks instead of a class: no depth or no voxel there; a voxel that fails the criteria."""
+"""The marks of a pixel without a class: no depth or no voxel there; a voxel that fails the criteria."""
 
 DECIMALS = 9
-"""Decimals of evidence without a frame's own vote: a rounding error decides no tie."""
+"""The decimals of evidence without a frame's own vote, so that no rounding error decides a tie."""
 
 
 @dataclass(frozen=True)
@@ -52,12 +52,12 @@ class Belief:
         min_op: Number of frames that must see a voxel.
         min_psa: Share of its pairs of frames that must agree; a voxel seen once has no pair.
         categories: Categories that a voxel may be in, any where none is named.
-        leave_one_out: Whether the frame's own vote is left out, and another frame must see it. Drift stays that of all
-            votes: it depends on their order.
+        leave_one_out: True to leave the frame's own vote out; another frame must then see the voxel. Drift stays that
+            of all votes: it depends on their order.
         thresholds: Thresholds whose evidence the label must have.
 
     Raises:
-        ConfigError: For a category that there is not, and values out of range.
+        ConfigError: For an unknown category, and values out of range.
     """
 
     min_op: int = 1
@@ -74,7 +74,7 @@ class Belief:
                 raise ConfigError(f"no category '{name}'; {nearest(name, CATEGORIES)}")
 
     def of(self, table: VoxelTable) -> Mask:
-        """Return (n,) whether each voxel meets them."""
+        """Return a mask (n,) of the voxels that meet the criteria."""
         believed = table.op >= max(self.min_op, 1)
         if self.min_psa > 0:
             believed &= np.nan_to_num(psa(table), nan=-1.0) >= self.min_psa
@@ -92,12 +92,12 @@ class Belief:
 
 
 class FusedLabels:
-    """The classes of a map that a frame sees, looked up; the latest tiles stay in memory."""
+    """A lookup of the classes of a map that a frame sees; the latest tiles stay in memory."""
 
     def __init__(self, tiles: Tiles[VoxelTable], belief: Belief, num_classes: int) -> None:
         self._tiles, self._belief, self._K = tiles, belief, num_classes
         self._lookups: SizedCache[TileIndex, VoxelLookup] = SizedCache(
-            lambda place: VoxelLookup(self._tiles[place]), lambda lookup: len(lookup.table), AT_HAND
+            lambda tile: VoxelLookup(self._tiles[tile]), lambda lookup: len(lookup.table), AT_HAND
         )
 
     def of(self, frame: Frame, pixel_stride: int = 1) -> Int64:
@@ -107,34 +107,35 @@ class FusedLabels:
         """
         everywhere = dataclasses.replace(frame, labels=np.zeros(frame.shape, np.uint8), scores=None)
         points = back_project(everywhere).T
-        found, fused = np.full(len(points), UNSEEN), np.full(frame.shape, UNSEEN)
+        labels, fused = np.full(len(points), UNSEEN), np.full(frame.shape, UNSEEN)
         own = (
             observe(frame.every(pixel_stride), self._tiles.voxel_size, self._K) if self._belief.leave_one_out else None
         )
-        for place, pixels in self._tiles.holding(points):
-            found[pixels] = self._labels(self._lookups[place], points[pixels], own)
-        fused[everywhere.valid] = found
+        for tile, pixels in self._tiles.holding(points):
+            labels[pixels] = self._labels(self._lookups[tile], points[pixels], own)
+        fused[everywhere.valid] = labels
         return fused
 
     def _labels(self, lookup: VoxelLookup, points: Float64, own: Observations | None) -> Int64:
         """Return the classes (n,) of points in a tile."""
-        found = lookup.rows(points)
-        met = found != NONE
-        rows, inverse = np.unique(found[met], return_inverse=True)
+        voxel = lookup.rows(points)
+        met = voxel != NONE
+        rows, inverse = np.unique(voxel[met], return_inverse=True)
         seen = rows_of(lookup.table, rows)
         if own is not None:
             seen = _without(own, lookup, seen, rows)
         label = np.where(self._belief.of(seen), dominant(seen), UNSTABLE)
-        found[met], found[~met] = label[inverse], UNSEEN
-        return found
+        labels = np.full(len(points), UNSEEN)
+        labels[met] = label[inverse]
+        return labels
 
 
 def _without(own: Observations, lookup: VoxelLookup, seen: VoxelTable, rows: Int64) -> VoxelTable:
     """Return the voxels of a tile that a frame sees, `rows` of it, without the frame's own vote."""
     centers = np.add(own.index, 0.5, dtype=np.float64) * seen.voxel_size
-    found = lookup.rows(centers)
-    here = found != NONE
-    at = np.searchsorted(rows, found[here])
+    seen_rows = lookup.rows(centers)
+    here = seen_rows != NONE
+    at = np.searchsorted(rows, seen_rows[here])
     evidence, op, self_sum = seen.evidence[:], seen.op.copy(), seen.self_sum.copy()
     evidence[at] = np.abs(np.round(evidence[at] - own.s_bar[here], DECIMALS))
     op[at] -= 1
@@ -163,7 +164,7 @@ class Accuracy:
 
     @classmethod
     def of(cls, confusion: Int64) -> Accuracy:
-        """Make it from pixels (K, K) by true and given class; a class counts for the mean where either has it."""
+        """Return the accuracy of pixels (K, K) by true and given class; a class without pixels does not count."""
         right, n = confusion.diagonal(), int(confusion.sum())
         union = confusion.sum(axis=0) + confusion.sum(axis=1) - right
         there = union > 0
@@ -173,11 +174,11 @@ class Accuracy:
 
 @dataclass(frozen=True)
 class Correctness:
-    """Labels against ground truth: before; of the pixels that have a label before and after, both; all after.
+    """The accuracy of labels by ground truth, before and after: on all pixels, and on those with a label in both.
 
     Attributes:
         all_before, all_after: Accuracy on all pixels with such a label.
-        before, after: Accuracy on the same pixels, those that kept a label or took another.
+        before, after: Accuracy on the same pixels, those that have a label before and after.
     """
 
     all_before: Accuracy
@@ -188,14 +189,14 @@ class Correctness:
 
 @dataclass(frozen=True)
 class Relabelled:
-    """Numbers of pixels of a relabelled source, whose maps are in `folder`.
+    """The numbers of pixels of a relabelled source, whose maps are in `folder`.
 
     Attributes:
-        confirmed: Pixels that have the class that they had.
-        changed: Pixels that have another class.
-        filled: Pixels that had none.
-        unseen: Pixels that had one, and have no depth or no voxel.
-        unstable: Pixels that had one, and whose voxel fails the criteria.
+        confirmed: Pixels with the same class as before.
+        changed: Pixels with another class than before.
+        filled: Pixels that had no class.
+        unseen: Pixels that had a class, and have no depth or no voxel.
+        unstable: Pixels that had a class, and whose voxel fails the criteria.
     """
 
     scene: str
@@ -217,7 +218,7 @@ class Relabelled:
         yield f"{self.scene}, {self.name}: {self.frames} frames in {self.folder}"
         counts = {
             "confirmed": self.confirmed, "changed": self.changed, "filled in": self.filled,
-            "dropped for want of depth or a voxel": self.unseen, "dropped as unstable": self.unstable,
+            "dropped without depth or voxel": self.unseen, "dropped by the criteria": self.unstable,
         }  # fmt: skip
         yield f"  of {self.pixels:,} pixels"
         yield from (f"    {n / self.pixels:6.1%} {what}" for what, n in counts.items())
@@ -227,11 +228,11 @@ class Relabelled:
             yield f"    accuracy {c.before.accuracy:.3f} before, {c.after.accuracy:.3f} after"
             yield f"    mean IoU {c.before.miou:.3f} before, {c.after.miou:.3f} after"
         if not self.leave_one_out:
-            yield "  a verdict on these maps means nothing: a voxel has one class in all of them"
+            yield "  do not assess the stability of these maps: a voxel has one class in all of them"
 
 
 class Tally:
-    """Counts of pixels, frame by frame."""
+    """A count of pixels, frame by frame."""
 
     def __init__(self, K: int) -> None:
         self._K = K
@@ -239,7 +240,7 @@ class Tally:
         self._confusion = {name: np.zeros((K, K), np.int64) for name in ("all_before", "before", "after", "all_after")}
 
     def add(self, own: Frame, fused: Int64, truth: Frame | None) -> None:
-        """Count a frame as it was, its fused rows (H, W), and its ground truth in the same classes."""
+        """Count the pixels of a frame, its fused rows (H, W), and its ground truth in the same classes."""
         before = np.where(own.predicted == own.ignore_id, UNSEEN, own.predicted.astype(np.int64))
         had, has = before >= 0, fused >= 0
         masks = {
@@ -266,7 +267,7 @@ class Tally:
             self._confusion[name] += np.bincount(pairs, minlength=self._K**2).reshape(self._K, self._K)
 
     def correctness(self) -> Correctness | None:
-        """Return the accuracies, None where no pixel had ground truth."""
+        """Return the accuracies; None where no pixel has ground truth."""
         if not self._confusion["all_before"].any():
             return None
         return Correctness(**{name: Accuracy.of(confusion) for name, confusion in self._confusion.items()})
@@ -301,13 +302,13 @@ def relabel(
         backend: Backend of the unit, the base backend where not given.
         name: Name of the new source, MODEL-fused where not given; its classes are in its folder.
         overwrite: Whether other predictions in the folder are replaced.
-        progress: Called with what is done, how much of it is done, and how much there is.
+        progress: A function that is called with the task, the number of finished frames, and the number of all frames.
 
     Returns:
-        The folder that was written, and how many pixels were confirmed, changed and filled.
+        The folder that was written, and the numbers of pixels that were confirmed, changed and filled.
 
     Raises:
-        ConfigError, DataError: If the data is no longer what was fused, or its label maps cannot have the depth's
+        ConfigError, DataError: If the data has changed since it was fused, or its label maps cannot have the depth's
             pixels.
     """
     result = load_result(run)
@@ -320,7 +321,7 @@ def relabel(
         Path(out) / "labels" / name, "labels", settings, {"name": name}, space, overwrite=overwrite
     )
     if record.voxels_file is None:
-        raise DataError(f"{run}: kept no voxels of {record.unit.slug}; run it again")
+        raise DataError(f"{run}: the run stored no voxels of {record.unit.slug}; run it again")
     tally, truth = Tally(len(space)), truth_task(task)
     fused = FusedLabels(Tiles.open(record.voxels_file, VoxelTable), chosen, len(space))
 
@@ -362,5 +363,5 @@ def task_of(run: Path, record: Record, fused: Mapping[str, str]) -> tuple[Task, 
     scene, model = record.unit.scene, record.unit.model
     task = next((task for task in plan.tasks if (task.scene.name, task.model) == (scene, model)), None)
     if task is None or task.digest != fused.get(f"{scene}/{model}"):
-        raise DataError(f"{run}: the data of {scene}, {model} is not what was fused; run it again")
+        raise DataError(f"{run}: the data of {scene}, {model} has changed since it was fused; run it again")
     return task, plan.config.pixel_stride

@@ -1,4 +1,4 @@
-"""The voxels of a finished unit for export: their selection, columns and coordinates; Parquet and CSV."""
+"""Select the voxels of a finished unit for export, with columns and coordinates; write Parquet and CSV."""
 
 from __future__ import annotations
 
@@ -56,11 +56,11 @@ class Voxels:
     """The voxels of a map that are exported, in the order of its table.
 
     Attributes:
-        table: Their rows.
-        columns: Numbers of each, by name.
-        classes: K names.
+        table: The rows of the voxels.
+        columns: The numbers of each voxel, by name.
+        classes: The names of the K classes.
         colors: (K, 3) RGB.
-        taxonomy: Whose classes they are.
+        taxonomy: The taxonomy of the classes.
         up: (3,) the scene's up axis, None where it is not known.
         georeference: Georeference of the scene, None where it has none.
     """
@@ -75,50 +75,50 @@ class Voxels:
 
     @property
     def points(self) -> Float64:
-        """(n, 3) centres: global coordinates where there is a georeference, else the scene's; metres."""
+        """Return centres (n, 3): global coordinates where there is a georeference, else the scene's; metres."""
         return self.in_file(self.table.centers)
 
     @property
     def laid(self) -> Float64:
-        """(n, 3) centres along the axes of `points`, without the offset; metres."""
+        """Return centres (n, 3) along the axes of `points`, without the offset; metres."""
         return self.table.centers if self.georeference is None else self.georeference.along(self.table.centers)
 
     @property
     def linear(self) -> Float64:
-        """(3, 3) from the scene's axes to those of `points`."""
+        """Return the matrix (3, 3) from the scene's axes to those of `points`."""
         return np.array(IDENTITY if self.georeference is None else self.georeference.linear)
 
     def in_file(self, points: Float64) -> Float64:
-        """Return coordinates (n, 3) of the scene as `points` has them."""
+        """Return coordinates (n, 3) of the scene in the system of `points`."""
         return points if self.georeference is None else self.georeference.projected(points)
 
     def in_scene(self, points: Float64) -> Float64:
-        """Return coordinates (n, 3) as `points` has them in those of the scene."""
+        """Return coordinates (n, 3) of the system of `points` in that of the scene."""
         return points if self.georeference is None else self.georeference.in_scene(points)
 
     @property
     def offset(self) -> Float64:
-        """(3,) `points` less `laid`."""
+        """Return the difference (3,) of `points` and `laid`."""
         return np.zeros(3) if self.georeference is None else np.array(self.georeference.offset)
 
     @property
     def classified(self) -> npt.NDArray[np.unsignedinteger[Any]]:
-        """(n,) dominant class in 8 or 16 bits, counted from 1: 0 is 'unclassified' in what is exported."""
+        """Return the dominant class (n,) in 8 or 16 bits, counted from 1: 0 is 'unclassified' in exported files."""
         return (dominant(self.table) + 1).astype(np.min_scalar_type(self.table.K))
 
 
 class Chosen:
     """The voxels of a unit that are exported, tile by tile; the latest tiles stay in memory.
 
-    Those with OP >= min_op and one of these dominant classes, all where none is named; with thresholds, of
-    those the ones whose label has enough evidence. `columns` names measures, op, category, psa, columns of the unit's
-    Parquet file, or of a file to `join`, which has some of the same voxels; where not given, see `usual`.
+    A voxel is exported if its OP is at least min_op, its dominant class is one of `classes` (any where none is named)
+    and, with thresholds, its label has enough evidence. `columns` names measures, op, category, psa, columns of the
+    unit's Parquet file, or of a file to `join`, which has some of the same voxels; for the default see `usual`.
 
     Attributes:
         size: Edge of a tile in voxels, None for the one tile of a map in a single file.
 
     Raises:
-        ConfigError: For a name that is not there, and where no voxel is left.
+        ConfigError: For an unknown name, and where no voxel is left.
     """
 
     def __init__(
@@ -133,7 +133,7 @@ class Chosen:
         thresholds: AcceptanceThresholds | None = None,
     ) -> None:
         if record.voxels_file is None:
-            raise ConfigError(f"{record.unit.slug}: its voxels were not kept; run it with a folder")
+            raise ConfigError(f"{record.unit.slug}: its voxels were not stored; run it with a folder")
         self._result, self._record = result, record
         self._columns, self._join = columns, join
         self._min_op, self._classes, self._thresholds = min_op, classes, thresholds
@@ -141,38 +141,38 @@ class Chosen:
         self._files = {(0, 0) if tile is None else (tile.x, tile.y): file for file, tile in tiles.items()}
         self.size = next(None if tile is None else tile.size for tile in tiles.values())
         self._highest = 0
-        self._at_hand = SizedCache(self._read, lambda voxels: len(voxels.table), AT_HAND)
+        self._cache = SizedCache(self._read, lambda voxels: len(voxels.table), AT_HAND)
 
     @property
     def whole(self) -> bool:
         """Return whether no voxel is left out."""
         return self._min_op <= 1 and not self._classes and self._thresholds is None
 
-    def __contains__(self, place: TileIndex) -> bool:
-        return place in self._files
+    def __contains__(self, tile: TileIndex) -> bool:
+        return tile in self._files
 
-    def __getitem__(self, place: TileIndex) -> Voxels:
+    def __getitem__(self, tile: TileIndex) -> Voxels:
         """Return the voxels of a tile, which may be none."""
-        return self._at_hand[place]
+        return self._cache[tile]
 
     def __iter__(self) -> Iterator[Voxels]:
         """Yield the voxels tile by tile, without empty tiles."""
-        return (self[place] for place in self.places())
+        return (self[tile] for tile in self.tiles())
 
-    def places(self) -> Iterator[TileIndex]:
+    def tiles(self) -> Iterator[TileIndex]:
         """Yield the tiles that have voxels.
 
         Raises:
             ConfigError: If none has.
         """
         left = False
-        for place in self._files:
-            if len(self[place].table):
+        for tile in self._files:
+            if len(self[tile].table):
                 left = True
-                yield place
+                yield tile
         if not left:
             limits = f"OP >= {self._min_op}" + (f" and class {' or '.join(self._classes)}" if self._classes else "")
-            limits += " and the evidence that --thresholds asks for" if self._thresholds is not None else ""
+            limits += " and the evidence that --thresholds requires" if self._thresholds is not None else ""
             raise ConfigError(f"{self._record.voxels_file}: no voxel with {limits}; OP goes up to {self._highest}")
 
     @cached_property
@@ -180,9 +180,9 @@ class Chosen:
         """The voxels of one tile, for the properties that all share."""
         return next(iter(self))
 
-    def _read(self, place: TileIndex) -> Voxels:
+    def _read(self, tile: TileIndex) -> Voxels:
         """Read a tile and choose its voxels."""
-        file, record = self._files[place], self._record
+        file, record = self._files[tile], self._record
         assert record.voxels_file is not None
         table = VoxelTable.load(file)
         self._highest = max(self._highest, int(table.op.max(initial=0)))
@@ -225,7 +225,7 @@ def joined_columns(table: VoxelTable, file: Path) -> dict[str, Column]:
     """Return the columns of a file with rows of these voxels, as `compare` writes it; 0, or NaN, without a row.
 
     Raises:
-        DataError: If it is no such file, or has voxels of another size.
+        DataError: If it is another file, or has voxels of another size.
     """
     import pyarrow.parquet as pq
 
@@ -234,16 +234,18 @@ def joined_columns(table: VoxelTable, file: Path) -> dict[str, Column]:
         content = parquet.read(file, (*INDEX, *names))
         own, theirs = voxel_keys(table.index, np.stack([content[name] for name in INDEX], axis=1))
     if content["voxel_size"] != table.voxel_size:
-        raise DataError(f"{file}: has voxels of {content['voxel_size']:g} m, the map of {table.voxel_size:g} m")
+        raise DataError(
+            f"{file}: the file has voxels of {content['voxel_size']:g} m, the map of {table.voxel_size:g} m"
+        )
     at = np.minimum(np.searchsorted(own, theirs), len(own) - 1)
     there = own[at] == theirs
-    found = {}
+    columns = {}
     for name in names:
         empty = np.nan if content[name].dtype.kind == "f" else 0
         values = np.full(len(table), empty, dtype=content[name].dtype)
         values[at[there]] = content[name][there]
-        found[name] = Column(values)
-    return found
+        columns[name] = Column(values)
+    return columns
 
 
 def crs_name(georeference: Georeference) -> str:
@@ -254,7 +256,7 @@ def crs_name(georeference: Georeference) -> str:
 
 
 def usual() -> tuple[str, ...]:
-    """Return the columns where none is chosen: the measures, OP, category."""
+    """Return the columns by default: the measures, OP, category."""
     return (*(measure.key for measure in measures()), "op", "category")
 
 
@@ -262,7 +264,7 @@ def rows_named(wanted: Sequence[str], names: Sequence[str], where: str) -> list[
     """Return the rows of classes by name.
 
     Raises:
-        ConfigError: If that fails, with the nearest known one.
+        ConfigError: For an unknown name, with the nearest known one.
     """
     known = {name_key(name): row for row, name in enumerate(names)}
     for name in wanted:
@@ -298,13 +300,13 @@ def _colors(overview: Path, K: int) -> UInt8:
     return palette
 
 
-# Parquet and CSV: a row a voxel, with its coordinates, the name of its class, and measures.
+# Parquet and CSV have a row for each voxel, with its coordinates, the name of its class, and measures.
 
 
 def write_parquet(parts: Iterable[Voxels], path: Path) -> int:
-    """Return columns, part after part, and in the metadata entry 'semstab' what they mean.
+    """Write columns, part after part, and a metadata entry 'semstab' that describes them; return the number of voxels.
 
-    What is undefined is null.
+    An undefined value is null.
     """
     import pyarrow.parquet as pq
 
@@ -312,7 +314,7 @@ def write_parquet(parts: Iterable[Voxels], path: Path) -> int:
 
 
 def write_csv(parts: Iterable[Voxels], path: Path) -> int:
-    """Return columns, part after part; what is undefined is an empty field."""
+    """Write columns, part after part; an undefined value is an empty field. Return the number of voxels."""
     from pyarrow import csv
 
     return _written(parts, path, csv.CSVWriter)

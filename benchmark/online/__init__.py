@@ -1,4 +1,4 @@
-"""Frames that a program has in memory: fused into a `Result`, or measured frame by frame in a training loop."""
+"""Fuse frames that a program has in memory into a `Result`, or measure them frame by frame in a training loop."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ __all__ = ["FusedResult", "TemporalStability", "fuse"]
 
 
 def __getattr__(name: str) -> Any:
-    """Return the metric: a `torchmetrics.Metric` where that is installed."""
+    """Return the metric: a `torchmetrics.Metric` if torchmetrics is installed."""
     if name != "TemporalStability":
         raise AttributeError(f"module 'semstab.online' has no attribute '{name}'")
     if find_spec("torchmetrics") is not None:

@@ -1,4 +1,4 @@
-"""Posed label maps of a program, as frames, and as the dataset `frames` that a run reads."""
+"""Read posed label maps of a program as frames, and as the dataset `frames` of a run."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from semstab.datasets.scene import GROUND_TRUTH, Dataset, Scene
 from semstab.errors import DataError
 
 FIELDS = "labels", "scores", "depth", "intrinsics", "T_wc", "color", "mask", "timestamp", "truth"
-"""Of a posed label map that is given as a mapping; see `Frame`. truth (H, W) has the true labels."""
+"""The fields of a posed label map that is given as a mapping; see `Frame`. truth (H, W) has the true labels."""
 
 
 def as_array(value: Any) -> npt.NDArray[Any]:
@@ -37,14 +37,14 @@ def as_frame(given: Frame | Mapping[str, Any], index: int) -> tuple[Frame, Frame
     """Return frame `index` of a sequence, and the same with its true labels where they are given.
 
     Raises:
-        DataError: If a field is missing, unknown, or not what `Frame` takes.
+        DataError: If a field is missing, unknown, or not valid for `Frame`.
     """
     if isinstance(given, Frame):
         return dataclasses.replace(given, index=index), None
     fields = dict(given)
     for name in fields:
         if name not in FIELDS:
-            raise DataError(f"frame {index}: no field '{name}'; there are {', '.join(FIELDS)}")
+            raise DataError(f"frame {index}: no field '{name}'; the fields are {', '.join(FIELDS)}")
     for name in ("depth", "intrinsics", "T_wc"):
         if name not in fields:
             raise DataError(
@@ -62,7 +62,7 @@ def as_frame(given: Frame | Mapping[str, Any], index: int) -> tuple[Frame, Frame
 
 
 class OwnFolder:
-    """A temporary folder that goes with the last reference to it, or with the process."""
+    """A temporary folder that is removed with the last reference to it, or with the process."""
 
     def __init__(self) -> None:
         self.path = Path(tempfile.mkdtemp(prefix="semstab-"))
@@ -70,10 +70,11 @@ class OwnFolder:
 
 
 class Sequence:
-    """Frames of a program on disk, in a temporary folder that goes with the last reference to them.
+    """The frames of a program on disk, in a temporary folder that is removed with the last reference to them.
 
     Attributes:
-        classes: How many the largest label, or the scores, ask for; timestamps (n,) seconds, where all frames have one.
+        classes: The number of classes by the largest label, or by the scores.
+        timestamps: (n,) seconds, where all frames have one and they ascend.
     """
 
     def __init__(self, frames: Iterable[Frame | Mapping[str, Any]]) -> None:
@@ -116,7 +117,7 @@ def _classes(frame: Frame) -> int:
 
 
 class FramesOptions(BaseModel):
-    """Which frames of this process: the token of a sequence, and how scene, model and classes are called."""
+    """The options of frames of this process: the token of their sequence, and the names of scene, model and classes."""
 
     token: str
     scene: str = "frames"
@@ -125,7 +126,7 @@ class FramesOptions(BaseModel):
 
 
 class Frames(Dataset):
-    """One scene of the frames that `semstab.fuse` was given; only the process that has them can read them."""
+    """A dataset of one scene: the frames that `semstab.fuse` was given. Only the process that has them reads it."""
 
     Options: type[BaseModel] = FramesOptions
     sequences: ClassVar[weakref.WeakValueDictionary[str, Sequence]] = weakref.WeakValueDictionary()
@@ -135,37 +136,39 @@ class Frames(Dataset):
 
     @property
     def scenes(self) -> tuple[str, ...]:
-        """The one scene."""
+        """Return the name of the one scene."""
         return (self._options.scene,)
 
     def scene(self, name: str) -> Scene:
-        """Open it.
+        """Return the scene of the frames.
 
         Raises:
-            DataError: If the frames are gone.
+            DataError: If the frames no longer exist.
         """
         sequence = self.sequences.get(self._options.token)
         if sequence is None:
-            raise DataError(f"{name}: a program gave these frames to semstab.fuse, and they are gone; fuse them again")
+            raise DataError(
+                f"{name}: a program gave these frames to semstab.fuse, and they no longer exist; fuse them again"
+            )
         return FramesScene(sequence, self._options)
 
 
 class FramesScene(Scene):
-    """Frames of a program, with the labels of one model, and the truth where every frame has it."""
+    """The frames of a program, with the labels of one model, and the truth where every frame has it."""
 
     def __init__(self, sequence: Sequence, options: FramesOptions) -> None:
         self._sequence = sequence
         self.name, self.models, self.ground_truth = options.scene, (options.model,), sequence.has_truth
         classes = options.classes or tuple(f"class {k}" for k in range(max(2, sequence.classes)))
         if len(classes) < sequence.classes:
-            raise DataError(f"{self.name}: there are labels up to {sequence.classes - 1}, and {len(classes)} classes")
+            raise DataError(f"{self.name}: there are labels up to {sequence.classes - 1}, but {len(classes)} classes")
         self._space = LabelSpace(options.scene, classes)
 
     def __len__(self) -> int:
         return self._sequence.count
 
     def label_space(self, model: str) -> LabelSpace:
-        """Return the same of the model and of the truth."""
+        """Return the label space, which model and truth share."""
         return self._space
 
     def frame(self, index: int, model: str, *, color: bool = True) -> Frame:
@@ -174,10 +177,10 @@ class FramesScene(Scene):
         return frame if model != GROUND_TRUTH or truth is None else truth
 
     def digest(self, indices: list[int], model: str) -> str:
-        """Return a hash of all frames and of which of them are meant."""
+        """Return a hash of all frames and of the selection."""
         return f"{self._sequence.digest}-{model}-{hashlib.blake2b(repr(indices).encode(), digest_size=8).hexdigest()}"
 
     @property
     def timestamps(self) -> Float64 | None:
-        """Seconds of each frame, where all have one and they ascend."""
+        """Return the seconds of each frame, where all have one and they ascend."""
         return self._sequence.timestamps

@@ -1,4 +1,4 @@
-"""Fuse the frames that a program has: a `Result` with all that a run says, and nothing written unless asked."""
+"""Fuse the frames of a program into a `Result` with all numbers of a run; no file stays unless it is saved."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ class FusedResult(Result):
 
     @property
     def summary(self) -> Summary:
-        """The numbers of the map in a row."""
+        """Return the numbers of the map in a row."""
         record = self.record()
         assert record.statistics is not None
         flicker = record.image_space.compensated_flicker_percent
@@ -44,15 +44,15 @@ class FusedResult(Result):
         """Write the run's folder: summary, voxels, series, tables and report.
 
         Raises:
-            ConfigError: If one is.
+            ConfigError: If the folder is not empty.
         """
         if Path(folder).exists() and (not Path(folder).is_dir() or any(Path(folder).iterdir())):
-            raise ConfigError(f"{folder}: is not empty; choose another folder")
+            raise ConfigError(f"{folder}: the folder is not empty; choose another folder")
         Reporting(self.__fspath__()).run_finished(self)
         return Path(shutil.copytree(self.__fspath__(), folder, dirs_exist_ok=True))
 
     def __fspath__(self) -> str:
-        """Return the folder of its files, which goes with the result."""
+        """Return the folder of its files, which is removed with the result."""
         return str(self._folder.path)
 
 
@@ -68,19 +68,19 @@ def fuse(
     observers: Iterable[Observer] = (),
     **settings: Any,
 ) -> FusedResult:
-    """Fuse posed label maps, and return all that a run says of them: measures, strata, alpha, verdict, intervals.
+    """Fuse posed label maps, and return all numbers of a run: measures, strata, alpha, verdict, intervals.
 
     - `frames`: `Frame`s, or mappings with labels (H, W) or scores (H, W, K), depth (H, W) in metres, intrinsics (3, 3),
-      T_wc (4, 4) or (3, 4) camera to world; color, mask, timestamp and truth (H, W) where there are such. NumPy or
+      T_wc (4, 4) or (3, 4) camera to world; color, mask, timestamp and truth (H, W) are optional. NumPy or
       torch. A generator is read once; its frames wait on disk, in a temporary folder
-    - `voxel_size`: metres; where not given, what `check` suggests for the data
+    - `voxel_size`: metres; by default the size that `check` suggests for the data
     - `classes`: names, in the order of the labels
     - `recording`: a file for the rerun viewer
     - `settings`: further settings of `Config`: statistics=True, scope='these frames', events=True, ...
 
     Raises:
         DataError: For a frame that cannot be fused, with its number.
-        ConfigError: For a setting.
+        ConfigError: For a setting that is not valid.
     """
     sequence, token = Sequence(frames), uuid.uuid4().hex
     Frames.sequences[token] = sequence

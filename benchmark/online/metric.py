@@ -1,4 +1,4 @@
-"""Temporal stability as a metric of a training loop: `update` with every batch, `compute` at the end of an epoch."""
+"""Measure temporal stability in a training loop: `update` with every batch, `compute` at the end of an epoch."""
 
 from __future__ import annotations
 
@@ -30,19 +30,19 @@ from semstab.statistics.cluster_sums import value
 from semstab.statistics.sampler import BUDGET
 
 SIDE = 640
-"""Flicker is measured on every n-th pixel of frames with more pixels on a side, as in a run."""
+"""The most pixels a side for flicker: it is measured on every n-th pixel of larger frames, as in a run."""
 
 MOST_VOXELS = 2_000_000
 
 
 @dataclass(frozen=True)
 class State:
-    """State of one process for one sequence; states of several processes are added.
+    """The state of one process for one sequence; states of several processes are added.
 
     Attributes:
-        updates: (n,) how often the belief of each voxel was moved by a further frame.
-        cells: The sampled observations from which alpha follows; None where it is not wanted.
-        one_in: Of so many voxels the table holds one.
+        updates: (n,) how often a further frame moved the belief of each voxel.
+        cells: The sampled observations from which alpha is computed; None without alpha.
+        one_in: The table holds one in so many voxels.
     """
 
     frames: int
@@ -53,10 +53,10 @@ class State:
     one_in: int
 
     def __add__(self, other: State) -> State:
-        """Add what another process saw of the same sequence.
+        """Return the sum of this state and that of another process for the same sequence.
 
-        All is as if one process had seen all frames, but for SBD and flicker: they are means over the steps from frame
-        to frame that each process saw.
+        All numbers are as if one process had seen all frames, except SBD and flicker: they are means over the steps
+        from frame to frame that each process saw.
         """
         one_in = max(self.one_in, other.one_in)
         a, b = (state._thinned(one_in) for state in (self, other))
@@ -72,7 +72,7 @@ class State:
         return dataclasses.replace(self, table=self.table.rows(rows), updates=self.updates[rows], one_in=one_in)
 
     def scalars(self) -> dict[str, float]:
-        """Return the numbers of `Summary.NAMES`: what `summary` has too, without intervals."""
+        """Return the numbers of `Summary.NAMES`, which `summary` has too, without intervals."""
         table = self._table()
         whole, sample = summarise(table), MapSample.draw(table).table.measured()
         alpha = math.nan
@@ -82,7 +82,7 @@ class State:
         return dict(zip(Summary.NAMES, map(float, numbers), strict=True))
 
     def summary(self) -> Summary:
-        """Return what a run says of these frames."""
+        """Return the numbers of a run of these frames."""
         analysis = analyse(MapSample.draw(self._table()), self.cells)
         return Summary.of(self.frames, analysis.table, analysis.summary, self._flicker)
 
@@ -102,7 +102,7 @@ class State:
 
 
 class _Map:
-    """A sequence while its frames come in; with more than `most` voxels it keeps a random half of them, and so on."""
+    """A sequence whose frames are being fused; beyond `most` voxels only a random half of them is fused, and so on."""
 
     def __init__(self, backend: FusionBackend, voxel_size: float, sampler: Sampler | None, most: int) -> None:
         self._backend, self._voxel_size, self._sampler, self._most = backend, voxel_size, sampler, most
@@ -138,7 +138,7 @@ class _Map:
         return dataclasses.replace(frame, depth=np.where(near, frame.depth, np.float32(0)))
 
     def state(self) -> State:
-        """Return all that is there so far."""
+        """Return the state so far."""
         table = self._backend.table()
         if self._one_in > 1:
             table = table.rows(in_sample(table.index.T, self._one_in))
@@ -148,9 +148,9 @@ class _Map:
 
 
 class TemporalStability:
-    """How stable predictions are at the same physical place, over the frames of one or more sequences.
+    """A metric of how stable predictions are at the same physical place, over the frames of one or more sequences.
 
-    Has the interface of torchmetrics, and is a `torchmetrics.Metric` where that is installed.
+    It has the interface of torchmetrics, and is a `torchmetrics.Metric` if torchmetrics is installed.
 
     >>> import numpy as np
     >>> metric = TemporalStability(num_classes=3, voxel_size=0.1)
@@ -165,17 +165,17 @@ class TemporalStability:
     {'vss@3': 0.93, 'op3_share': 1.0}
 
     Attributes:
-        num_classes: K.
-        voxel_size: Metres.
-        ignore_index: The label of pixels without one.
-        soft: Fuse scores as they are; else the likeliest class of each pixel, as of label maps on disk.
-        alpha: Also sample the cells from which alpha, and a verdict, follow: half of the time of an update.
-        max_voxels: Of a sequence; a larger map is sampled at random, and its memory stays bounded.
-        backend: That fuses.
+        num_classes: The number of classes, K.
+        voxel_size: The edge of a voxel, metres.
+        ignore_index: The label of pixels without a class.
+        soft: True to fuse scores; else the likeliest class of each pixel is fused, as from label maps on disk.
+        alpha: True to sample the cells that give alpha and a verdict: half of the time of an update.
+        max_voxels: The most voxels of a sequence; a larger map is sampled at random, so that its memory is bounded.
+        backend: The backend that fuses.
     """
 
     higher_is_better = True
-    """Of alpha, VSS and PSA; SBD and flicker are better where they are low."""
+    """True for alpha, VSS and PSA; SBD and flicker are better when low."""
 
     def __init__(
         self,
@@ -226,7 +226,7 @@ class TemporalStability:
     def compute(self) -> dict[str, float]:
         """Return alpha, vss@3, sbd (bits), psa, flicker (percent) and op3_share, means over sequences.
 
-        The same as a run says of these frames; NaN where undefined, as before the first update.
+        A run of these frames gives the same numbers; a number is NaN where undefined, as before the first update.
         """
         rows = [state.scalars() for state in self.states().values()]
         return {name: mean(np.array([row[name] for row in rows], np.float64)) for name in Summary.NAMES}
@@ -240,11 +240,11 @@ class TemporalStability:
         self._maps, self._merged = {}, {}
 
     def states(self) -> dict[str, State]:
-        """Return what was seen of each sequence, to be sent to another process and merged there."""
+        """Return the state of each sequence, to be sent to another process and merged there."""
         return _sum(self._merged, {name: own.state() for name, own in self._maps.items()})
 
     def merge_state(self, incoming_state: TemporalStability | Mapping[str, State]) -> None:
-        """Add what another metric, or its `states`, saw; a sequence may have been split between them."""
+        """Add the states of another metric, or its `states`; a sequence may have been split between them."""
         other = incoming_state.states() if isinstance(incoming_state, TemporalStability) else incoming_state
         self._merged = _sum(self._merged, other)
 
@@ -261,7 +261,7 @@ class TemporalStability:
             predicted, depth, T_wc = predicted[None], depth[None], T_wc[None]
         B = len(depth)
         if depth.ndim != 3 or len(predicted) != B:
-            raise DataError(f"predicted {predicted.shape} and depth {depth.shape}: they are no batch of one size")
+            raise DataError(f"predicted {predicted.shape} and depth {depth.shape} are not a batch of one size")
         if not isinstance(intrinsics, Intrinsics | list | tuple):
             intrinsics = as_array(intrinsics)
         own = [*intrinsics] if np.ndim(intrinsics) == 3 or _are_cameras(intrinsics) else [intrinsics] * B
@@ -291,7 +291,7 @@ class TemporalStability:
         return dataclasses.replace(frame, unlabelled=none) if none.any() else frame
 
     def _checked(self, k: int, labels: npt.NDArray[Any]) -> npt.NDArray[Any]:
-        """Return labels as uint8, or uint16 where there are more classes, with what is ignored under the highest id."""
+        """Return labels as uint8, or uint16 where there are more classes; ignored pixels get the highest id."""
         dtype, none = (np.uint8, IGNORE_8BIT) if self.num_classes < IGNORE_8BIT else (np.uint16, IGNORE_16BIT)
         known = (labels >= 0) & (labels < self.num_classes)
         if not known.all():
@@ -309,7 +309,7 @@ def _are_cameras(intrinsics: Any) -> bool:
 
 
 def _probabilities(logits: npt.NDArray[Any]) -> npt.NDArray[Any]:
-    """Return (H, W, K) scores that sum to 1: as given, or by a softmax where some are no probabilities."""
+    """Return (H, W, K) scores that sum to 1: as given, or by a softmax where they are not probabilities."""
     values = np.moveaxis(logits, 0, -1).astype(np.float32, copy=False)
     if values.min(initial=0) >= 0 and values.max(initial=1) <= 1:
         return values
@@ -319,7 +319,7 @@ def _probabilities(logits: npt.NDArray[Any]) -> npt.NDArray[Any]:
 
 
 def _sum(one: Mapping[str, State], other: Mapping[str, State]) -> dict[str, State]:
-    """Return the states of the sequences of both, those of one sequence added."""
+    """Return the states of the sequences of both; states of the same sequence are added."""
     both = dict(one)
     for name, state in other.items():
         both[name] = both[name] + state if name in both else state
@@ -354,7 +354,7 @@ def _added(a: VoxelTable, b: VoxelTable, updates_a: Int64, updates_b: Int64) -> 
 
 
 def _joined(a: CellObservations, b: CellObservations) -> CellObservations:
-    """Return what both sampled, of the blocks that are in both samples; frames are numbered anew."""
+    """Return the observations of both, in the blocks that are in both samples; frames are numbered anew."""
     size, share = max(a.cell_size, b.cell_size), min(a.share, b.share)
     later = dataclasses.replace(b, view=b.view + np.int32(len(a.views)))
     views = Views.joined([a.views, b.views])

@@ -1,4 +1,4 @@
-"""The numbers of one map that people track."""
+"""Define the numbers of a map that people track."""
 
 from __future__ import annotations
 

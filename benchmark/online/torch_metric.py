@@ -1,4 +1,4 @@
-"""`TemporalStability` as a `torchmetrics.Metric`: for MetricCollection, Lightning and several processes."""
+"""Make `TemporalStability` a `torchmetrics.Metric`, for MetricCollection, Lightning and several processes."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from semstab.online.summary import Summary
 
 
 class TemporalStability(Metric):
-    """`semstab.online.metric.TemporalStability`, whose arguments it takes, beside those of `torchmetrics.Metric`."""
+    """A `torchmetrics.Metric` that takes the arguments of `semstab.online.metric.TemporalStability` and its own."""
 
     higher_is_better = True
     is_differentiable = False
@@ -59,11 +59,11 @@ class TemporalStability(Metric):
         return (self._all or self._own).by_sequence()
 
     def states(self) -> dict[str, State]:
-        """Return what was seen of each sequence."""
+        """Return the state of each sequence."""
         return self._own.states()
 
     def merge_state(self, incoming_state: Any) -> None:
-        """Add what another metric, or its `states`, saw."""
+        """Add the states of another metric, or its `states`."""
         states: Mapping[str, State] = incoming_state if isinstance(incoming_state, Mapping) else incoming_state.states()
         self._own.merge_state(states)
         self._update_count += 1
@@ -82,7 +82,7 @@ class TemporalStability(Metric):
             self._all = None
 
     def _sync_dist(self, dist_sync_fn: Callable[..., Any] | None = None, process_group: Any | None = None) -> None:
-        """Gather what every process saw, and add it in the order of their ranks."""
+        """Gather the states of every process, and add them in the order of their ranks."""
         group = process_group or self.process_group
         gathered: list[Any] = [None] * dist.get_world_size(group)
         dist.all_gather_object(gathered, self._own.states(), group=group)

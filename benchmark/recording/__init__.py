@@ -1,27 +1,27 @@
-"""The rerun recording of a run, written while it is fused. Only this package imports rerun.
+"""Write the rerun recording of a run while it is fused. Only this package imports rerun.
 
 Entities, all below the scene's name:
 
 - `camera`, `camera/color`: Transform3D and Pinhole; EncodedImage (JPEG)
 - `camera/MODEL/labels`: SegmentationImage: classes
-- `camera/MODEL/contradictions`: the same: where labels are not the dominant class of the map before the frame
-- `camera/MODEL/drift`: the same: drift that the frame caused at each pixel's voxel. A Transform3D spreads each
+- `camera/MODEL/contradictions`: SegmentationImage: labels that are not the dominant class of the map before the frame
+- `camera/MODEL/drift`: SegmentationImage: drift that the frame caused at each pixel's voxel. A Transform3D spreads each
   picture over the camera's image
 - `depth`, `trajectory`: DepthImage; LineStrips3D
 - `map/MODEL/BACKEND/CHUNK`: VoxelGridMap, coloured by class; components category:colors, op:values and KEY:values of
   each measure, which the views map to its own
 - `series/NAME/MODEL/BACKEND`: Scalars: a series of `SERIES`
 - `flips/MODEL/voxel_N`: StateChange: the dominant class of the voxels that drifted most
-- `flips_report/MODEL`, `flips_at/...`: TextDocument: the top contributing frames; Points3D: where those voxels are
+- `flips_report/MODEL`, `flips_at/...`: TextDocument: the top contributing frames; Points3D: positions of those voxels
 - `camera/MODEL/flips`: Points2D: those voxels in the frame, where their numbers lie inside its image
 - `difference/MODEL/A and B/PART`: VoxelGridMap: voxels where two backends differ
-- `difference_report/MODEL/A and B`: TextDocument: how many they are
+- `difference_report/MODEL/A and B`: TextDocument: the number of these voxels
 - `legend`, `all_classes`: Points2D: the classes and their colours, those with the most voxels first
 - `log`: TextLog: each unit's final numbers
 
 and in the recording of a comparison
 
-- `change/RUN/agreement`, `.../truth`: VoxelGridMap: what each voxel that changed lost or gained
+- `change/RUN/agreement`, `.../truth`: VoxelGridMap: the loss or gain of each voxel that changed
 - `change/RUN/.../same`, `.../locations`: Points3D: the other voxels; the locations that got worse, with their numbers
 """
 

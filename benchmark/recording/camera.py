@@ -1,4 +1,4 @@
-"""The parts that are recorded once a scene: axes, legend, and the camera with pose, colour and depth.
+"""Record the parts that all models of a scene share: axes, legend, and the camera with pose, colour and depth.
 
 The camera has the frame's size. Pictures are smaller where that saves much; transforms lay them over each other.
 """
@@ -25,34 +25,34 @@ from semstab.recording.timeline import Background, path
 from semstab.task import Task
 
 IMAGE_SIDE, COARSE_SIDE = 640, 320
-"""Pixels a side at most, of colour and labels; of depth and of what is looked up for each pixel."""
+"""The most pixels a side: of colour and labels; of depth and of pictures that need a lookup for each pixel."""
 
 JPEG_QUALITY = 80
 
 
 def stride_of(shape: tuple[int, int], side: int = IMAGE_SIDE) -> int:
-    """Return every how many pixels a frame (H, W) is sampled for a picture: a power of 2, as JPEG decodes to."""
+    """Return the stride at which a frame (H, W) is sampled for a picture: a power of 2, as JPEG decoders support."""
     return int(2 ** max(0, math.ceil(math.log2(max(shape) / side))))
 
 
 def over_camera(stride: int) -> rr.Transform3D:
-    """Lay a picture of every stride-th pixel over the camera's image: each pixel in the middle of its square."""
+    """Return the transform that lays a picture of every stride-th pixel over the camera's image."""
     shift = (1 - stride) / 2
     return rr.Transform3D(translation=[shift, shift, 0], scale=[stride, stride, 1])
 
 
 def label_context(classes: LabelSpace) -> rr.AnnotationContext:
-    """Return names and colours of the classes by their row; what is ignored stays clear."""
+    """Return names and colours of the classes by their row; ignored pixels are transparent."""
     infos = [rr.AnnotationInfo(k, name, classes.colors[k]) for k, name in enumerate(classes.classes)]
     ignored = [rr.AnnotationInfo(ignore, "ignored", (0, 0, 0, 0)) for ignore in (IGNORE_8BIT, IGNORE_16BIT)]
     return rr.AnnotationContext(infos + [info for info in ignored if info.id >= len(classes)])
 
 
 SAMPLE = 20_000
-"""Voxels of a scene from which its camera pose follows."""
+"""The most voxels of a scene from which the camera pose of its views is computed."""
 
 ORIGIN_STEP = 1000.0
-"""Metres; map origins are multiples of it: a scene near its world's origin keeps its coordinates."""
+"""The step of map origins, metres: a scene near its world's origin keeps its coordinates."""
 
 
 class SceneLog:
@@ -76,8 +76,8 @@ class SceneLog:
         self._unread = False
 
     def log_static(self, stream: rr.RecordingStream) -> None:
-        """Log what holds in all frames: axes, legends, names and colours."""
-        if (up := self._tasks[0].scene.up) is not None:  # the axis of the world that is nearest to it
+        """Log the parts that hold in all frames: axes, legends, names and colours."""
+        if (up := self._tasks[0].scene.up) is not None:  # the nearest axis of the world
             axis = int(np.abs(up).argmax())
             axes = f"RIGHT_HAND_{'XYZ'[axis]}_{'UP' if up[axis] > 0 else 'DOWN'}"
             stream.log(path(self.name), getattr(rr.ViewCoordinates, axes), static=True)
@@ -99,7 +99,7 @@ class SceneLog:
         return self.origin
 
     def see(self, stream: rr.RecordingStream, task: Task, table: VoxelTable) -> None:
-        """Take from a finished map the order of the legend and, of the first one, the bounds of its views."""
+        """Update the order of the legend by a finished map; the first map also sets the bounds of the views."""
         self.legend.see(task.mapping.target, dominant(table))
         self.legend.log(stream, self.name)
         if self.bounds is None and len(table):
@@ -108,7 +108,7 @@ class SceneLog:
             self.bounds = SceneBounds(points, np.array([*self._poses.values()]).reshape(-1, 4, 4), task.scene.up)
 
     def log(self, stream: rr.RecordingStream, frame: Frame, background: Background) -> None:
-        """Log the frame's pose, camera, colour and depth, where that has not happened yet, and the track up to it."""
+        """Log the frame's pose, camera, colour and depth once, and the track up to it."""
         if frame.index in self._poses:
             return
         pose = self._poses[frame.index] = frame.T_wc.copy()
@@ -118,7 +118,9 @@ class SceneLog:
             stream.log(path(self.name, "camera"), _pinhole(frame))
         stream.log(path(self.name, "camera"), rr.Transform3D(translation=pose[:3, 3], mat3x3=pose[:3, :3]))
         n = len(self._poses)
-        if n % (n // 100 + 1) == 0:  # long ones not with every frame: their size would grow with its square
+        if (
+            n % (n // 100 + 1) == 0
+        ):  # a long track is not logged with every frame: the size would grow with the square of the length
             track = rr.LineStrips3D([[each[:3, 3] for each in self._poses.values()]], colors=(255, 255, 255))
             stream.log(path(self.name, "trajectory"), track)
         background.submit(frame.index, frame.timestamp, functools.partial(self._log_images, stream, frame))

@@ -1,4 +1,4 @@
-"""Pictures of what each frame did to the map, and the top contributing frames of the voxels that drifted most."""
+"""Record the changes that each frame made to the map, and the frames that moved the voxels with the largest drift."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ from semstab.data.labels import GLOW, LabelSpace, between
 from semstab.data.measures import SBD_MAX, mean_drift
 from semstab.recording.timeline import LINE_COLORS, Clock, path
 
-# The pictures: levels of drift, in colours that no class is given, and labels that contradict the map.
+# The pictures show levels of drift, in colours that no class has, and labels that contradict the map.
 
 NO_VOXEL, FIRST_SEEN, NO_DRIFT = 0, 1, 2
 LEVELS = 24
 LEVEL_EDGES = SBD_MAX * (np.arange(LEVELS + 1) / LEVELS) ** 2
-"""Bits at which one level of drift ends and the next begins: finer where drift is small; the last one is open."""
+"""The edges of the levels of drift, bits: finer where drift is small; the last level is open."""
 
 AGREES, CONTRADICTS = 1, 2
 
@@ -34,8 +34,8 @@ PICTURES = {
     "contradictions": "contradictions (orange)",
     "drift": f"drift (red to white, {SBD_MAX:.2f} bits; blue: new)",
 }
-"""The pictures of a frame by entity, and the titles of their views; the first one is seen first: where labels are not
-the dominant class that their voxel had before the frame."""
+"""The pictures of a frame by entity, and the titles of their views. The first one is shown first: it marks labels that
+are not the dominant class that their voxel had before the frame."""
 
 
 def levels_of(drift: Float32) -> UInt8:
@@ -47,7 +47,7 @@ def levels_of(drift: Float32) -> UInt8:
 
 
 def contexts() -> dict[str, rr.AnnotationContext]:
-    """Return names and colours in each picture; over the colour image what is as expected is dark."""
+    """Return names and colours of each picture; pixels without a finding are dark over the colour image."""
     names = [f"{low:.4f} to {high:.4f} bits" for low, high in itertools.pairwise(LEVEL_EDGES)]
     names[-1] = f"{LEVEL_EDGES[-2]:.4f} bits and more"
     none, glow = (NO_VOXEL, "no voxel", (0, 0, 0, 200)), between(GLOW, LEVELS).astype(int).tolist()
@@ -69,7 +69,7 @@ def contexts() -> dict[str, rr.AnnotationContext]:
 
 @dataclass(frozen=True, eq=False)
 class FrameChanges:
-    """The changes that a frame made to the n voxels that it saw, whatever becomes of the map.
+    """The changes that a frame made to the n voxels that it saw; later frames do not alter them.
 
     Attributes:
         key: (n,) int64 packed voxel index, relative to the origin.
@@ -101,21 +101,21 @@ class FrameChanges:
         return pictures
 
 
-# The voxels that drifted most, and the frames that contributed most to that.
+# The voxels that drifted most, and the frames that contributed most to their drift.
 
 SHOWN = 10
-"""Voxels that are shown of a model on a scene, at least APART voxels apart: one of each location that drifts."""
+"""The most voxels that are shown of a model on a scene, at least APART voxels apart: one of each location."""
 
 APART, CANDIDATES = 5, 20_000
 
 MAX_MOVES = 2_000_000
-"""Moves that are remembered of a model on a scene; past them, those of the voxels that drifted least are dropped."""
+"""The most moves that are stored of a model on a scene; beyond, those of the voxels that drifted least are dropped."""
 
 MOVED_BITS = 0.05
-"""Drift from which on a frame is listed, also where the dominant class stays: that of a drifting voxel."""
+"""The drift from which on a frame is listed although the dominant class stays: that of a drifting voxel, bits."""
 
 NUMBER = np.array([[0.04, 0.04], [0.04, 0.1]])
-"""Share of an image's longer side that a number takes up left of its point and above, and right of it and below."""
+"""The margins of a number, as shares of an image's longer side: left of its point and above, right of it and below."""
 
 MOVE = np.dtype([("row", np.int32), ("frame", np.int32), ("before", np.uint16), ("after", np.uint16), ("bits", "f4")])
 
@@ -132,7 +132,7 @@ class View(NamedTuple):
     file: str = ""
 
     def project(self, points: Float64) -> tuple[Float64, Mask]:
-        """Return where points (n, 3) are in the viewer's image (n, 2), and which have their number inside it."""
+        """Return the pixels (n, 2) of points (n, 3) in the viewer's image, and a mask of those with a number inside."""
         x, y, z = self.intrinsics.matrix @ ((points - self.T_wc[:3, 3]) @ self.T_wc[:3, :3]).T
         pixels = np.stack([x, y], axis=1) / np.where(z > 0, z, 1.0)[:, None] + 0.5  # its pixel centres are at halves
         size = np.array(self.shape[::-1], dtype=np.float64)
@@ -141,7 +141,7 @@ class View(NamedTuple):
 
 
 class DriftLog:
-    """A log of a map's drift, of a live one or else one of its own, that remembers which frames moved a belief."""
+    """A log of the drift of a map, a live one or its own, that stores which frames moved a belief."""
 
     def __init__(self, voxel_size: float, num_classes: int, live: GrowingMap | None = None) -> None:
         self.map: GrowingMap = NumbaHash(voxel_size, num_classes) if live is None else live
@@ -150,7 +150,7 @@ class DriftLog:
         self._views: dict[int, View] = {}
 
     def follow(self, frame: Frame) -> FrameChanges:
-        """Return what a frame did to the map; live maps have fused it by now."""
+        """Return the changes of the map by a frame; a live map has fused it already."""
         if self._is_own:
             self.map.integrate(frame)
         changes = self.map.changes
@@ -162,7 +162,7 @@ class DriftLog:
         file = PurePath(frame.files.get("labels") or frame.files.get("scores") or "")
         name = file.name if file.suffix else ""
         self._views[frame.index] = View(frame.timestamp, frame.intrinsics, np.array(frame.T_wc), frame.shape, name)
-        if sum(map(len, self._moves)) > MAX_MOVES:  # half as many stay: those of the voxels that drifted most
+        if sum(map(len, self._moves)) > MAX_MOVES:  # half of them stay: those of the voxels that drifted most
             every = np.concatenate(self._moves)
             order = np.argsort(-self.map.column("drift_sum")[every["row"]], kind="stable")[: MAX_MOVES // 2]
             self._moves = [every[np.sort(order)]]
@@ -170,7 +170,7 @@ class DriftLog:
         return FrameChanges(frame, *own, self.map.voxel_size, self.map.origin)
 
     def top_voxels(self) -> Int64:
-        """Return the rows of the voxels that drifted most, one of each location, the one that drifted most first."""
+        """Return the rows of the voxels that drifted most, one of each location, in the order of their drift."""
         total = self.map.column("drift_sum")
         least = np.partition(total, -CANDIDATES)[-CANDIDATES] if len(total) > CANDIDATES else 0.0
         rows = np.flatnonzero((total >= least) & (total > 0))
@@ -192,7 +192,7 @@ class DriftLog:
         translation: npt.NDArray[np.floating[Any]],
         clock: Clock,
     ) -> None:
-        """Log of each of the top voxels a lane with its dominant class, its moves in words, and where it is."""
+        """Log a lane with the dominant class of each top voxel, its moves in words, and its position."""
         if not self._views:
             return
         rows, names = self.top_voxels(), classes.classes
@@ -231,7 +231,7 @@ class DriftLog:
             centers - translation, labels=labels, colors=colors, radii=rr.Radius.ui_points(5.0), show_labels=True
         )
         stream.log(path(scene, "flips_at", model), points, static=True)
-        for index, view in self._views.items():  # in the view of an image 3D points would stand beside it as well
+        for index, view in self._views.items():  # the view of an image would also draw 3D points outside of it
             pixels, inside = view.project(centers)
             clock.set(stream, index, view.timestamp)
             numbers = rr.Points2D(

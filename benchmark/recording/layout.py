@@ -1,4 +1,4 @@
-"""The viewer's layout of a recording: maps left, camera right, series below, a tab for each scene."""
+"""Build the viewer's layout of a recording: maps left, camera right, series below, a tab for each scene."""
 
 from __future__ import annotations
 
@@ -26,19 +26,19 @@ from semstab.recording.timeline import SERIES, entity, path
 from semstab.recording.voxel_maps import CHUNKS, DIFFERENCE, chunk, color_modes, defaults, packed, thinned, visualizer
 from semstab.task import Task
 
-# The camera pose from which a map fills its view.
+# A view shows a map from the camera pose from which the map fills it.
 
 FIELD_OF_VIEW = math.radians(55)
-"""The viewer's, from bottom to top."""
+"""The viewer's field of view, from bottom to top, radians."""
 
 MARGIN = 0.96
-"""Share of a view's half height and half width that the map fills."""
+"""The share of a view's half height and half width that the map fills."""
 
 OUTLIERS = 0.005
-"""Share of a map's voxels that may lie beyond each edge of its view."""
+"""The share of a map's voxels that may lie beyond each edge of its view."""
 
 BACKGROUND = (72, 72, 78)
-"""Behind the maps: neither end of the colour maps vanishes in it."""
+"""The colour behind the maps, in which both ends of the colour maps are visible."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,7 +57,7 @@ class SceneBounds:
 
 
 def camera_pose(bounds: SceneBounds | None, aspect: float) -> rrb.EyeControls3D | None:
-    """Return from where a view of that width by height shows a scene; None where the viewer chooses."""
+    """Return the pose of a view of a scene, of that width by height; None where the viewer chooses it."""
     if bounds is None:
         return None
     target, distance = fit(bounds, aspect)
@@ -68,7 +68,8 @@ def camera_pose(bounds: SceneBounds | None, aspect: float) -> rrb.EyeControls3D 
 def direction(bounds: SceneBounds) -> tuple[Float64, Float64]:
     """Return unit vectors from a scene to the eye, and up.
 
-    Where the world's up is known the eye is above the points, across their longest extent; else from the cameras' side.
+    Where the world's up is known, the eye is above the points, across their longest extent; else it is on the cameras'
+    side.
     """
     points, cameras, up = bounds.points, bounds.cameras, bounds.up
     middle = (points.min(axis=0) + points.max(axis=0)) / 2
@@ -84,7 +85,7 @@ def direction(bounds: SceneBounds) -> tuple[Float64, Float64]:
 
 
 def fit(bounds: SceneBounds, aspect: float) -> tuple[Float64, float]:
-    """Return where an eye looks, and from how far, so that points and cameras fill a view of that width by height.
+    """Return the target of an eye, and its distance, at which points and cameras fill a view of that width by height.
 
     With the depth z of a point towards the eye, and its position (x, y) across, the view holds it where
     |x - x0| <= aspect * h * (d - z) and |y - y0| <= h * (d - z), h the tangent of half the field of view: so the edges
@@ -109,23 +110,23 @@ def fit(bounds: SceneBounds, aspect: float) -> tuple[Float64, float]:
     return (low + high) / 2 @ across + middle * toward, distance - middle
 
 
-# The classes of a scene's maps and their colours, in a grid.
+# The legend shows the classes of a scene's maps and their colours, in a grid.
 
 WIDTH, LINE, LETTER = 780.0, 24.0, 7.0
-"""Width of the legend, height of a line and width of a letter, in points of a window of 1500."""
+"""The width of the legend, the height of a line and the width of a letter, in points of a window of 1500."""
 
 DOT, GAP = 20.0, 34.0
-"""Width of a dot, and of the space around a name."""
+"""The widths of a dot and of the space around a name."""
 
 LABEL = -13.5
-"""The viewer draws a label below its point: from the middle of the label to its point."""
+"""The offset from the middle of a label to its point: the viewer draws a label below its point."""
 
 LINES = 2
-"""Lines of the legend that is always seen; all classes are in a tab."""
+"""The lines of the legend that is always visible; all classes are in a tab."""
 
 
 class Legend:
-    """Names and colours of a scene's classes, those with the most voxels first."""
+    """The names and colours of a scene's classes, those with the most voxels first."""
 
     def __init__(self, spaces: Iterable[LabelSpace]) -> None:
         spaces = list(spaces)
@@ -141,12 +142,12 @@ class Legend:
 
     @property
     def entries(self) -> list[tuple[str, Color]]:
-        """All names and colours."""
+        """Return all names and colours."""
         return sorted(self._voxels, key=lambda entry: -self._voxels[entry])
 
     @property
     def room(self) -> int:
-        """Return how many classes the legend that is always seen has room for."""
+        """Return how many classes the legend that is always visible can hold."""
         return LINES * self._columns
 
     def height(self, lines: int | None = None) -> float:
@@ -170,17 +171,17 @@ class Legend:
 
 # The views.
 
-# In a window of 1500 x 850 points, as laptops have it; in others the proportions are alike.
+# The sizes are for a window of 1500 x 850 points, as on laptops; other windows have similar proportions.
 LEFT, TITLE = (808, 538), 27
-"""Width and height of the left part, and the height of a view's title or of a row of tabs."""
+"""The width and height of the left part, and the height of a view's title or of a row of tabs."""
 DIFFERENCE_ASPECT, COMPARED_ASPECT, CHANGE_ASPECT = 2.2, 1.6, 1.2
 
 SIDE_BY_SIDE = 4
-"""Maps and cameras that are seen at once; more have a tab each."""
+"""The most maps and cameras that are shown at once; more have a tab each."""
 
 OVERVIEW = ("drift", "compensated_flicker_percent", "map_vss", "map_recurrent")
 COMPARED = ("drift", "map_vss", "map_entropy", "map_recurrent", "new_voxels", "fuse_ms")
-"""Series of two backends that are seen in one plot."""
+"""The series of two backends that are shown in one plot."""
 
 
 def blueprint(plan: Plan, legends: Mapping[str, Legend], bounds: Mapping[str, SceneBounds | None]) -> rrb.Blueprint:
@@ -196,20 +197,20 @@ def blueprint(plan: Plan, legends: Mapping[str, Legend], bounds: Mapping[str, Sc
 
 
 def drawn(task: Task) -> str:
-    """Return the backend whose map is drawn while it grows: the first that fuses as the recorder's own map does."""
+    """Return the backend whose map is drawn while it grows: the first that fuses like the recorder's own map."""
     alike = [name for name in task.backends if is_pointwise(name)]
     return (alike or list(task.backends))[0]
 
 
 def is_pointwise(backend: str) -> bool:
-    """Return whether a backend fuses as the reference does."""
+    """Return whether a backend fuses like the reference."""
     return bool(getattr(REGISTRY.load(backend), "pointwise", True))
 
 
 def view_3d(
     scene: str, contents: list[str], name: str, bounds: SceneBounds | None, aspect: float, **coloring: Any
 ) -> rrb.Spatial3DView:
-    """Return a view of a scene, seen from where its bounds fill that width by height."""
+    """Return a view of a scene whose bounds fill that width by height."""
     return rrb.Spatial3DView(
         origin=path(scene), contents=contents, name=name, background=BACKGROUND, line_grid=False,
         eye_controls=camera_pose(bounds, aspect), **coloring,
@@ -261,7 +262,7 @@ def _maps(name: str, tasks: list[Task], bounds: SceneBounds | None, height: floa
 def _map(
     title: str, task: Task, backend: str, bounds: SceneBounds | None, aspect: float, name: str = "class"
 ) -> rrb.Spatial3DView:
-    """Return a backend's map; coloured other than by class, the views say so of each of its chunks."""
+    """Return a backend's map; a view that is not coloured by class overrides the colours of each chunk."""
     scene, model = task.scene.name, task.model
     entity = path(scene, "map", model, backend)
     around = [path(scene, "camera"), path(scene, "trajectory"), path(scene, "flips_at", model)]
@@ -303,7 +304,7 @@ def _below(scene: str, tasks: list[Task]) -> rrb.Container:
 
 
 def _plot(scene: str, name: str, tasks: list[Task]) -> rrb.TimeSeriesView:
-    """Return a series of all models; of backends that fuse alike one line is drawn, but for their times."""
+    """Return a series of all models; backends that fuse alike share one line, except for their times."""
     lines = [
         entity(name, Unit(scene, task.model, backend))
         for task in tasks
@@ -327,12 +328,12 @@ def _flips(scene: str, task: Task) -> rrb.Container:
 
 
 def _comparison(task: Task, first: str, second: str, bounds: SceneBounds | None) -> rrb.Container:
-    """Return two backends: their maps and where these differ, and their series in the same plots."""
+    """Return two backends: their maps, the difference of the maps, and their series in the same plots."""
     scene, model, pair = task.scene.name, task.model, f"{first} and {second}"
     difference = view_3d(
         scene,
         [path(scene, "difference", model, pair, part) for part in DIFFERENCE],
-        f"Where they differ: orange in {first} only, blue in {second} only, else |VSS difference| (0 to 0.5)",
+        f"Differences: orange in {first} only, blue in {second} only, else |VSS difference| (0 to 0.5)",
         bounds,
         DIFFERENCE_ASPECT,
     )
@@ -354,17 +355,17 @@ def _comparison(task: Task, first: str, second: str, bounds: SceneBounds | None)
     return rrb.Horizontal(left, right, column_shares=[5, 4], name=f"{model}: {pair}")
 
 
-# Changes between two maps: each voxel by how much, the locations that got worse by number.
+# Changes between two maps: the change of each voxel, and the numbers of the locations that became worse.
 
 WORSE, SAME, BETTER, WHITE = (213, 94, 0), (150, 150, 150), (86, 180, 233), (255, 255, 255)
 LEAST = 0.05
-"""A change from which on a voxel is drawn as one."""
+"""The least change of a voxel that is drawn as a change."""
 
 CHANGES = {"agreement": "Agreement between frames", "truth": "Right and wrong"}
 
 Change = tuple[str, VoxelTable, npt.NDArray[Any], npt.NDArray[Any] | None, Sequence[tuple[str, str, tuple[float, ...]]]]
-"""A title, the voxels, the gain of each (n,), -1 to 1, in agreement and where truth tells; and locations: in which of
-the two they lost, their names and centres."""
+"""A title, the voxels, their gains (n,), -1 to 1, in agreement and, with truth, in correctness; and locations: the one
+of the two in which they lost, their names and centres."""
 
 
 def record_changes(
@@ -404,7 +405,9 @@ def _log_change(
         cells = (index[rows][changed] // factor).astype(np.int32)
         colors = packed(_shades(values[rows][changed]))
         stream.log(entity, rr.VoxelGridMap(cells, [table.voxel_size * factor] * 3, colors=colors), static=True)
-        rest = rr.Points3D(points[~changed], colors=SAME, radii=rr.Radius.ui_points(1.0))  # they do not hide the others
+        rest = rr.Points3D(
+            points[~changed], colors=SAME, radii=rr.Radius.ui_points(1.0)
+        )  # small points do not hide the others
         stream.log(f"{entity}/same", rest, static=True)
         if own := [(label, centre) for where, label, centre in locations if where == name]:
             labels, centres = zip(*own, strict=True)

@@ -1,4 +1,4 @@
-"""The observer that records a run, and the recording that a finished run's folder gives."""
+"""Record a run by an observer, or a finished run from its folder."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ from semstab.task import Task, read
 logger = logging.getLogger("semstab")
 
 BYTES_A_VOXEL = 120
-"""Memory that the recording's own map takes for a voxel, besides 8 bytes for each class."""
+"""The memory of a voxel in the recording's own map, without 8 bytes for each class."""
 
 
 class GroupLog:
@@ -52,7 +52,7 @@ class GroupLog:
 
     Attributes:
         live: A map that is being fused and can be followed; without it the recording fuses one of its own.
-        followed: Whether a map is followed at all.
+        followed: True to follow a map.
     """
 
     def __init__(
@@ -65,10 +65,10 @@ class GroupLog:
         self._maps: dict[str, VoxelLogger] = {}
         self._tables: dict[str, VoxelTable] = {}  # by backend, as they are finished
         self.last: tuple[int, float | None] = (task.indices[-1], None)
-        """Number and timestamp of the last frame."""
+        """The number and timestamp of the last frame."""
 
     def log(self, stream: rr.RecordingStream, frame: Frame, background: Background) -> None:
-        """Log the labels of a frame that all units fused, what it did to the map, and the map that grows."""
+        """Log the labels of a frame that all units fused, the changes that it made to the map, and the growing map."""
         self.last = frame.index, frame.timestamp
         changes, jobs = None, list[Callable[[], None]]()
         if self.drift is not None:
@@ -96,7 +96,7 @@ class GroupLog:
     ) -> None:
         """Log a unit's final voxels, their differences from the drawn unit, its numbers, the agreement of its frames.
 
-        - `factor`: of a table that is thinned already: it is not compared
+        - `factor`: the factor of a table that is thinned already: it is not compared
         """
         unit, first = summary.unit, drawn(self.task)
         if factor == 1:
@@ -164,7 +164,7 @@ class Recording(Observer):
         self._sent = 0
 
     def run_started(self, plan: Plan, finished: Mapping[str, UnitContent]) -> None:
-        """Keep the plan: layout, names and colours follow from it."""
+        """Store the plan, which gives layout, names and colours."""
         self._plan = plan
         for name in dict.fromkeys(task.scene.name for task in plan.tasks):
             self._scenes[name] = SceneLog([task for task in plan.tasks if task.scene.name == name])
@@ -210,7 +210,7 @@ class Recording(Observer):
             self.close()
 
     def log_finished(self, result: Result, *, pictures: bool = False) -> None:
-        """Log what the run's folder has of the units that are not logged yet; with pictures read frames again."""
+        """Log the units in the run's folder that are not logged yet; with pictures read their frames again."""
         stream, background = self._opened()
         for task in self._plan.tasks:
             scene, model = task.scene.name, task.model
@@ -263,11 +263,10 @@ class Recording(Observer):
             try:
                 stream.flush()
             except RuntimeError as error:
-                reason = "did the viewer go away?" if self.target.live else "is the disk full?"
+                reason = "was the viewer closed?" if self.target.live else "is the disk full?"
                 raise ConfigError(
-                    f"{self.target.file}: the recording is not whole ({summarize_error(error)}; {reason}); all"
-                    f" else is kept,"
-                    " and the same command makes it again"
+                    f"{self.target.file}: the recording is not complete ({summarize_error(error)}; {reason}); all"
+                    " other files are complete, and the same command makes the recording again"
                 ) from error
             finally:
                 stream.disconnect()
@@ -308,7 +307,7 @@ class Recording(Observer):
                     self._begin(task, each.item.T_wc[:3, 3], followed=fits)
                 self.frame_fused(task, each.item, {})
         if not fits:
-            text = f"{task.model}: drift of frames is left out, the map would not fit into memory a second time"
+            text = f"{task.model}: drift of frames is left out, because a second map would not fit into memory"
             self._opened()[0].log(path(scene, "log"), rr.TextLog(text))
 
     def _log_unit(self, group: GroupLog, summary: UnitSummary, table: VoxelTable, factor: int = 1) -> None:
@@ -319,7 +318,7 @@ class Recording(Observer):
         def job() -> None:
             group.log_unit(stream, summary, table, tolerance, factor)
             self._scenes[summary.unit.scene].see(stream, group.task, table)
-            if self._sent == 1:  # later ones wait for the end: each has all scenes
+            if self._sent == 1:  # later layouts wait for the end: each has all scenes
                 self._send_layout(stream)
 
         background.submit(*group.last, job)
@@ -334,18 +333,18 @@ class Recording(Observer):
         background.drain()
 
     def _send_layout(self, stream: rr.RecordingStream) -> None:
-        """Send the layout; a viewer that follows the run stays at the one that it got first."""
+        """Send the layout; a viewer that follows the run keeps the first one."""
         legends = {name: scene.legend for name, scene in self._scenes.items()}
         layout = blueprint(self._plan, legends, {name: scene.bounds for name, scene in self._scenes.items()})
         stream.send_blueprint(layout, make_default=True, make_active=self._sent == 0 or not self.target.live)
         self._sent += 1
 
 
-# The recording of a finished run, from its folder.
+# A finished run is recorded from its folder.
 
 
 def lacks_pictures(run: Path, file: Path) -> bool:
-    """Return whether a finished run has units that its recording has no pictures of, or that no recording is there.
+    """Return whether a finished run has no recording, or units without pictures in it.
 
     Units that were fused in tiles, in other processes, or by an earlier start have none.
     """
@@ -358,7 +357,7 @@ def lacks_pictures(run: Path, file: Path) -> bool:
 
 
 def record_finished(run: Path, file: Path) -> None:
-    """Make the recording of a finished run from its folder; pictures need the dataset that config.yaml names."""
+    """Write the recording of a finished run from its folder; pictures need the dataset that config.yaml names."""
     result, config = load_result(run), load_config(run / "config.yaml")
     recording = Recording(file)
     recording.run_started(_plan_of(run, config, result), {})
@@ -368,7 +367,7 @@ def record_finished(run: Path, file: Path) -> None:
 
 @dataclass(frozen=True)
 class _ClosedScene:
-    """A scene of which only the run folder is there."""
+    """A scene of which only the run folder is available."""
 
     name: str
     models: tuple[str, ...]

@@ -1,4 +1,4 @@
-"""Targets of a recording: a file, and a viewer while the run goes on."""
+"""Open the targets of a recording: a file, and a viewer while the run goes on."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ FOOTER, FOOTER_BYTES = b"RRF2FOOT", 64
 """The mark that ends a recording, among its last bytes."""
 
 ANSWER_SECONDS, SPAWN_SECONDS = 5.0, 30.0
-"""Seconds that a viewer may take to answer, and one that is started to listen."""
+"""The most seconds that a viewer may take to answer, and that a started viewer may take to listen."""
 
 HTTP2_SETTINGS = b"\x04"
 HTTP2_PREFACE = b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n" + bytes(3) + HTTP2_SETTINGS + bytes(5)
@@ -46,7 +46,7 @@ class Target:
         """Read `--rerun`; `default` is the file where it names none.
 
         Raises:
-            ConfigError: For anything else.
+            ConfigError: For any other text.
         """
         if text is None:
             return cls(default)
@@ -64,7 +64,7 @@ class Target:
 
     @property
     def live(self) -> bool:
-        """Return whether somebody may watch while the run goes on."""
+        """Return whether a viewer can show the run while it goes on."""
         return self.viewer is not None
 
     def open(self) -> rr.RecordingStream:
@@ -76,7 +76,7 @@ class Target:
         stream = rr.RecordingStream(APPLICATION)
         try:
             self.file.parent.mkdir(parents=True, exist_ok=True)
-            # In place, not renamed when it is whole: a viewer can follow the run, and a killed run leaves a recording.
+            # The file is written in place, so that a viewer can follow the run, and a killed run leaves a recording.
             if self.viewer is None:
                 stream.save(self.file)
             else:
@@ -92,7 +92,9 @@ class Target:
         if self.viewer == "serve":
             address = _address(DEFAULT_URL)
             if not _is_free(address):
-                raise ConfigError(f"--rerun serve: port {address[1]} is taken; end what listens there, or use connect")
+                raise ConfigError(
+                    f"--rerun serve: port {address[1]} is in use; end the program that listens there, or use connect"
+                )
             return rr.GrpcServerSink(*address)
         url = DEFAULT_URL if self.viewer == "spawn" else str(self.viewer)
         if self.viewer == "spawn" and _is_free(_address(url)):
@@ -103,7 +105,7 @@ class Target:
 
 
 def is_whole(file: Path) -> bool:
-    """Return whether a recording was closed: one that was cut by a kill, or by a full disk, has no footer."""
+    """Return whether a recording was closed: after a kill, or on a full disk, it has no footer."""
     try:
         with open_file(file) as recording:
             recording.seek(-min(FOOTER_BYTES, recording.seek(0, os.SEEK_END)), os.SEEK_END)
@@ -129,7 +131,7 @@ def _spawn(url: str) -> None:
     """Start a viewer that outlives this process, and wait until it answers.
 
     Raises:
-        ConfigError: If it ends before.
+        ConfigError: If it ends before it answers.
     """
     command = [*viewer_command(), "--port", str(_address(url)[1])]
     environment = os.environ | {"RERUN_APP_ONLY": "true"}
@@ -144,7 +146,7 @@ def _spawn(url: str) -> None:
                 " or record into a file"
             )
         time.sleep(0.05)
-    viewer.returncode = 0  # it outlives this process: no warning that nobody waited for its end
+    viewer.returncode = 0  # it outlives this process, so that Python need not warn of it
 
 
 def _address(url: str) -> tuple[str, int]:
@@ -158,13 +160,13 @@ def _is_free(address: tuple[str, int]) -> bool:
 
 
 def _why_no_viewer(url: str) -> str | None:
-    """Return None where a gRPC server answers: with less the SDK would wait for one at the end of the run."""
+    """Return None where a gRPC server answers; without one the SDK would wait at the end of the run."""
     try:
         with socket.create_connection(_address(url), timeout=ANSWER_SECONDS) as connection:
             if not url.startswith("rerun+http:"):
-                return None  # it is encrypted
+                return None  # an encrypted connection is not tested
             connection.sendall(HTTP2_PREFACE)
             answer = connection.recv(9)
     except (OSError, ValueError) as error:
         return str(error)
-    return None if answer[3:4] == HTTP2_SETTINGS else "something else does"
+    return None if answer[3:4] == HTTP2_SETTINGS else "another program does"

@@ -1,4 +1,4 @@
-"""Entity paths, the clock of the timelines, the background thread, and the time series."""
+"""Record time series; with entity paths, the clock of the timelines, and the background thread."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ from semstab.errors import DataError, summarize_error
 from semstab.task import Task
 
 FIRST_DATE, LAST_DATE = 1e8, 9e9
-"""Seconds; timestamps from the first on count from 1970 and are shown as dates, smaller ones as durations. Beyond the
-last one they are no seconds, and more nanoseconds than 64 bits hold: frames are shown by their number alone."""
+"""Seconds: timestamps from the first on count from 1970 and are shown as dates, smaller ones as durations. Beyond the
+last one, 64 bits do not hold their nanoseconds: frames are then shown by their number alone."""
 
 
 def path(*parts: str) -> str:
-    """Return an entity's path, with what a part may not hold escaped."""
+    """Return the path of an entity, with its parts escaped."""
     return "/" + rr.new_entity_path(list(parts)).lstrip("/")
 
 
@@ -34,7 +34,7 @@ class Clock:
         self._dated: bool | None = None  # a timeline has one type: the first timestamp decides
 
     def set(self, stream: rr.RecordingStream, frame: int, timestamp: float | None = None) -> None:
-        """Log at that frame from now on."""
+        """Set the time of all later logs to that frame."""
         stream.reset_time()
         stream.set_time("frame", sequence=frame)
         if timestamp is None or not abs(timestamp) <= LAST_DATE:
@@ -48,11 +48,11 @@ class Clock:
 
 
 MOST_PENDING = 4
-"""Jobs that may be waiting; they hold their frames."""
+"""The most jobs that may wait; they hold their frames in memory."""
 
 
 class Background:
-    """A thread that does jobs one after the other, each at the time of its frame."""
+    """A thread that runs jobs one after the other, each at the time of its frame."""
 
     def __init__(self, stream: rr.RecordingStream, clock: Clock) -> None:
         self._stream = stream
@@ -61,7 +61,7 @@ class Background:
         self._pending: deque[Future[None]] = deque()
 
     def submit(self, frame: int, timestamp: float | None, job: Callable[[], None]) -> None:
-        """Leave a job to the thread, and wait while too many are pending; raises what an earlier job raised."""
+        """Submit a job, and wait while too many are pending; an error of an earlier job is raised here."""
 
         def at_its_time() -> None:
             self._clock.set(self._stream, frame, timestamp)  # a stream has a time for each thread
@@ -71,17 +71,17 @@ class Background:
         self._pending.append(self._thread.submit(at_its_time))
 
     def drain(self, pending: int = 0) -> None:
-        """Wait until no more than so many jobs are pending; raises what one of them raised."""
+        """Wait until at most `pending` jobs remain; an error of a job is raised here."""
         while len(self._pending) > pending:
             self._pending.popleft().result()
 
     def close(self) -> None:
-        """Do what is pending, and end the thread."""
+        """Finish the pending jobs, and end the thread."""
         self._thread.shutdown()
         self.drain()
 
 
-# Time series: columns of RUN/frames/*.csv, and one that follows from two of them.
+# Time series are columns of RUN/frames/*.csv, and one that follows from two of them.
 
 SERIES = {
     "drift": "Mean drift of updates (bits)",
@@ -98,13 +98,13 @@ SERIES = {
     "decode_ms": "Decoding, in a worker (ms)",
     "wait_ms": "Waiting for a frame (ms)",
 }
-"""Time series by name, and the titles of their plots. All but updated_voxels (voxels - new_voxels) are columns of the
-CSV."""
+"""The time series by name, and the titles of their plots. All but updated_voxels (voxels - new_voxels) are columns of
+the CSV."""
 
 OF_THE_MODEL = ("flicker_percent", "compensated_flicker_percent", "decode_ms", "wait_ms")
-"""Series that are the same for all backends; they are logged with the first one."""
+"""The series that are the same for all backends; they are logged with the first one."""
 
-# Okabe and Ito's colours without black: distinct with any colour vision, and on the viewer's dark ground.
+# The colours of Okabe and Ito without black are distinct for any colour vision, and on the viewer's dark background.
 LINE_COLORS = (
     (230, 159, 0), (86, 180, 233), (0, 158, 115), (240, 228, 66), (204, 121, 167), (213, 94, 0), (0, 114, 178),
 )  # fmt: skip
@@ -169,7 +169,7 @@ def log_styles(stream: rr.RecordingStream, plan: Plan) -> None:
     for task in plan.tasks:
         for unit in task.units:
             color = LINE_COLORS[units.index((unit.model, unit.backend)) % len(LINE_COLORS)]
-            # Where backends agree their lines coincide; the viewer draws them by name, so each one is thinner.
+            # The lines of backends that agree coincide; the viewer draws them by name, so each line is thinner.
             width = 2.0 + 2.5 * sum(backend > unit.backend for backend in task.backends)
             for name in columns(unit, task):
                 label = unit.model if name in OF_THE_MODEL else f"{unit.model}, {unit.backend}"

@@ -1,8 +1,8 @@
-"""Fused voxels in the viewer: VoxelGridMaps with all measures on the same voxels; a view picks the one that it shows.
+"""Record fused voxels: VoxelGridMaps with all measures on the same voxels; a view selects the measure that it shows.
 
-A map is logged in chunks. While it grows a chunk is a stretch of voxels in the order of their first observation, so its
-voxels were seen together, are seen again together, and rest together: only chunks that changed are logged again, and
-those that got no new voxels without their indices.
+A map is logged in chunks. While it grows, a chunk is a range of voxels in the order of their first observation, so its
+voxels are mostly seen, and seen again, together. Only chunks that changed are logged again, and without their indices
+if they have no new voxels.
 """
 
 from __future__ import annotations
@@ -36,8 +36,9 @@ class ColorMode:
     """A colouring of a map; ranges are fixed, so that a colour means the same in every recording.
 
     Attributes:
-        tab: Its name where there is little room; `title` is that of its views.
-        range: Range of values that the colour map spans; None where voxels have a colour of their own.
+        tab: Its short name.
+        title: The title of its views.
+        range: The range of values that the colour map spans; None where voxels have a colour of their own.
     """
 
     tab: str
@@ -62,19 +63,19 @@ def color_modes() -> dict[str, ColorMode]:
 
 
 MAX_VOXELS = 2_000_000
-"""Voxels of one map; a larger one is thinned at its end."""
+"""The most voxels of a map; a larger map is thinned at its end."""
 
 CHUNKS = 10
-"""Parts of a map; a layout has an entry for each of them in each view, which takes kilobytes."""
+"""The number of parts of a map; a layout has an entry of kilobytes for each part in each view."""
 
 BUDGET = 2_000_000
-"""Voxels that are logged of one map while it grows; those at its end come on top, at most MAX_VOXELS."""
+"""The most voxels that are logged of a map while it grows; its end adds at most MAX_VOXELS."""
 
 MOST_A_FRAME = 10_000
-"""Voxels, of the budget, for which a frame pays: short runs need not log everything anew with each frame."""
+"""The most voxels of the budget that a frame may use, so that short runs do not log every voxel with each frame."""
 
 NEW = 10
-"""The number of voxels seen again that wait for one that is not drawn yet."""
+"""The weight of a voxel that is not drawn yet, in voxels that are seen again."""
 
 
 def edges() -> Int64:
@@ -95,14 +96,14 @@ def packed(colors: npt.ArrayLike) -> UInt32:
 
 
 def components(index: Int64 | None, size: float, classes: LabelSpace, voxels: Voxels) -> list[Any]:
-    """Return a grid that shows the dominant class, with all else that it can show; see `visualizer`.
+    """Return a grid that shows the dominant class, with the measures that it can show instead; see `visualizer`.
 
     Args:
         index: (n, 3) relative to the map's origin: small, so that the viewer's float32 keeps it exact; None where only
             colours and values changed.
         size: Edge of a voxel, metres.
         classes: The label space, with its colours.
-        voxels: Measured, so that each is computed in one pass.
+        voxels: Evidence that is measured, so that each measure is computed in one pass.
     """
     where: dict[str, Any] = {}
     if index is not None:
@@ -120,9 +121,9 @@ def components(index: Int64 | None, size: float, classes: LabelSpace, voxels: Vo
 
 
 def visualizer(name: str) -> rr.blueprint.Visualizer:
-    """Make a view show a measure, or the category, of a grid that has them all; otherwise it shows the class.
+    """Return a visualizer that shows a measure, or the category, of a grid; without one a view shows the class.
 
-    The view's `defaults` say how values are coloured.
+    The view's `defaults` set the colours of values.
     """
     source = ComponentSourceKind.SourceComponent
     if name == "category":
@@ -136,7 +137,7 @@ def visualizer(name: str) -> rr.blueprint.Visualizer:
 
 
 def defaults(name: str) -> list[rr.VoxelGridMap]:
-    """Return how a view colours the values of a measure."""
+    """Return the defaults by which a view colours the values of a measure."""
     mode = color_modes()[name]
     return [] if mode.range is None else [rr.VoxelGridMap.from_fields(colormap=mode.colormap, value_range=mode.range)]
 
@@ -159,7 +160,7 @@ def thinned(index: Int64, factor: int = 1) -> tuple[int, Int64]:
 
 
 def load_map(record: Record, origin: Int64) -> tuple[int, VoxelTable]:
-    """Return a unit's map, or of one in tiles, read one by one, few enough voxels: the edge of blocks, as `thinned`."""
+    """Return the edge of blocks, as `thinned`, and a unit's map; a map in tiles is thinned while it is read."""
     if not record.in_tiles:
         return 1, record.table()
     factor, parts = 1, list[VoxelTable]()
@@ -171,10 +172,10 @@ def load_map(record: Record, origin: Int64) -> tuple[int, VoxelTable]:
 
 
 class VoxelLogger:
-    """Logs the changes of a map within the budget: each of `frames` frames may log its share, and what is saved.
+    """Logs the changes of a map within the budget: each of `frames` frames may log its share, and what others left.
 
-    Where there is more to log, chunks come first in which the most voxels are new or were observed again since they
-    were logged.
+    If a frame has more to log, the chunks with the most voxels that are new, or were observed again since they were
+    logged, come first.
     """
 
     def __init__(self, entity: str, classes: LabelSpace, origin: Int64, frames: int) -> None:
@@ -182,12 +183,12 @@ class VoxelLogger:
         self._edges = edges()
         self._chunk_of = np.repeat(np.arange(CHUNKS, dtype=np.uint8), np.diff(self._edges))
         self._share = min(BUDGET / frames, MOST_A_FRAME)
-        self._allowed = 0.0  # voxels that the frames so far pay for and that are not logged
+        self._allowed = 0.0  # voxels of the budget that the frames so far have not used
         self._changed = np.zeros(CHUNKS, dtype=np.int64)  # observations in each chunk since it was logged
         self._drawn = np.zeros(CHUNKS, dtype=np.int64)  # voxels that each chunk was logged with
 
     def update(self, stream: rr.RecordingStream, fused: GrowingMap) -> list[Callable[[], None]]:
-        """Return jobs that log the last frame's changes as far as the budget allows, whatever becomes of the map."""
+        """Return jobs that log the last frame's changes as far as the budget allows; later frames do not alter them."""
         rows = fused.changes.row
         self._changed += np.bincount(self._chunk_of[rows[rows < MAX_VOXELS]], minlength=CHUNKS)
         self._allowed += self._share
@@ -213,7 +214,7 @@ class VoxelLogger:
         stream.log(chunk(self._entity, c), *components(index, size, self._classes, voxels))
 
     def finish(self, stream: rr.RecordingStream, table: VoxelTable, factor: int = 1) -> str:
-        """Log the final map in place of the growing one; return how it was thinned, where it is too large.
+        """Log the final map instead of the growing one; return a note on thinning where it is too large.
 
         Args:
             stream: The recording.
@@ -224,7 +225,7 @@ class VoxelLogger:
         factor, rows = thinned(index) if factor == 1 else (factor, np.arange(len(index)))
         for c, part in enumerate(np.split(rows, self._edges[1:-1])):
             if len(part):
-                at = np.s_[part[0] : part[-1] + 1] if factor == 1 else part  # what is not thinned is not copied
+                at = np.s_[part[0] : part[-1] + 1] if factor == 1 else part  # a map that is not thinned is not copied
                 values = table.op[at], table.evidence.take(at), table.drift_sum[at]
                 self._log(stream, c, index[at] // factor, table.voxel_size * factor, *values)
             elif self._drawn[c]:
@@ -233,7 +234,7 @@ class VoxelLogger:
         return thin if factor > 1 else ""
 
 
-# Voxels where the maps of two backends differ.
+# The voxels in which the maps of two backends differ.
 
 DIFFERENCE: dict[str, dict[str, Any]] = {
     "only_first": {"colors": (230, 159, 0)},
@@ -250,11 +251,11 @@ def log_difference(
     origin: Int64,
     tolerance: float,
 ) -> str:
-    """Log the voxels that one of two maps has only, and those whose VSS differs by more than the tolerance.
+    """Log the voxels that only one of two maps has, and those whose VSS differs by more than the tolerance.
 
     - `tables`: the two maps by the names of their backends
 
-    Returns how many there are, in words. They are of the final maps, so they are logged for all times.
+    Returns their numbers, in words. They are of the final maps, so they are logged for all times.
     """
     first, second = tables.values()
     in_first, in_second = shared_rows(first, second)
@@ -293,7 +294,7 @@ def agreement_report(statistics: MapStatistics) -> str:
     """Return the verdict, and agreement by the distance between two observations of a location, in Markdown."""
     lines = [statistics.verdict.line, ""]
     if statistics.correlogram is not None:
-        lines.append("Alpha between frames, by how far apart two observations of a location are:")
+        lines.append("Alpha between frames, by the distance of two observations of a location:")
     for axis, unit in AXES.items() if statistics.correlogram is not None else ():
         bins: tuple[LagBin, ...] = getattr(statistics.correlogram, axis)
         if bins:

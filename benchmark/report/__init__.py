@@ -1,4 +1,4 @@
-"""report.html and the tables of a finished run."""
+"""Write report.html and the tables of a finished run."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ __all__ = ["Reporting", "write_report"]
 
 
 class Reporting(Observer):
-    """Writes tables and report.html into the folder when all has been computed, unless they tell of the same result."""
+    """Writes tables and report.html into the folder at the end of a run, unless they show the same result already."""
 
     def __init__(self, folder: str | Path) -> None:
         self._folder = Path(folder)
@@ -32,14 +32,14 @@ class Reporting(Observer):
     def unit_finished(
         self, planned: PlannedUnit, content: UnitContent | None, table: VoxelTable | None, error: str | None
     ) -> None:
-        """Take the voxels that are seen from above, while the table is in memory."""
+        """Store the voxels that are seen from above, while the table is in memory."""
         if table is not None and content is not None and content.up is not None and planned.image_space:
             from semstab.report.figures.topdown import FromAbove
 
             self._above[planned.unit.slug] = FromAbove.of(table, content.up)
 
     def run_finished(self, result: Result) -> None:
-        """Write them; nothing where every unit failed."""
+        """Write tables and report, or nothing where every unit failed."""
         report = self._folder / "report.html"
         if report.exists() and (self._folder / "tables").exists() and not result.manifest["units"]["computed"]:
             with report.open(encoding="utf-8", errors="replace") as page:
@@ -51,7 +51,7 @@ class Reporting(Observer):
 
 
 HEAD = 1000
-"""Letters of the page among which its digest stands."""
+"""The first characters of the page, which contain its digest."""
 
 
 def digest_of(folder: Path) -> str:

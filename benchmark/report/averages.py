@@ -1,4 +1,4 @@
-"""Means of a study's units over scenes and repeats: tables and figures all take them from here."""
+"""Compute means of a study's units over scenes and repeats; tables and figures all take them from here."""
 
 from __future__ import annotations
 
@@ -15,15 +15,15 @@ from semstab.data.statistics import UNDEFINED, Estimate, MapStatistics
 from semstab.metrics import macro_mean, pool, split_last
 
 ENOUGH = 1000
-"""Voxels from which on a mean is taken at its word. Below, chance alone moves a mean VSS in its second digit: its
+"""The least number of voxels for a mean. With fewer, chance alone changes the second digit of a mean VSS: its
 standard error is up to 0.5 / sqrt(1000) = 0.016, even if the voxels were independent."""
 
 
 @dataclass(frozen=True)
 class Pooled:
-    """Voxels of several units together: a mean runs over all of them, so that a scene counts by its voxels.
+    """The voxels of several units together: a mean runs over all of them, so that a scene counts by its voxels.
 
-    Of the voxels with OP >= 2, macro means over the units with 95 % intervals, NaN where none has statistics:
+    PSA, alpha and drift are macro means over the units, with 95 % intervals; NaN where no unit has statistics.
 
     Attributes:
         every: All voxels.
@@ -33,7 +33,8 @@ class Pooled:
         well_seen: The last stratum in parts, where most voxels are in it.
         psa: Pairwise semantic agreement.
         alpha: Krippendorff's alpha.
-        drift: SBD, bits, and drift_null, that of the same observations in random order, where it is known.
+        drift: SBD in bits.
+        drift_null: SBD of the same observations in random order, where it is known.
     """
 
     voxels: int
@@ -52,22 +53,22 @@ class Pooled:
 
     @property
     def excess_drift(self) -> float:
-        """SBD less that of the same observations in random order, bits."""
+        """Return SBD less that of the same observations in random order, bits."""
         return self.drift.value - self.drift_null
 
     @property
     def mean_op(self) -> float:
-        """Observations a voxel."""
+        """Return the mean number of observations of a voxel."""
         return self.observations / self.voxels if self.voxels else math.nan
 
     @property
     def pixels(self) -> float:
-        """Sampled points an observation: how many pixels of a frame fall into a voxel."""
+        """Return the sampled points per observation: how many pixels of a frame fall into a voxel."""
         return self.points / self.observations if self.observations else math.nan
 
     @property
     def once(self) -> float:
-        """Share of the voxels that were seen once; NaN where the strata do not tell."""
+        """Return the share of the voxels that were seen once; NaN where the strata do not contain it."""
         return next((row.share for row in self.strata if row.name == "OP=1"), math.nan)
 
 
@@ -88,32 +89,32 @@ def pooled(records: Sequence[Record]) -> Pooled:
         classes=tuple(pool(rows, voxels) for rows in of_class),
         well_seen=tuple(split_last(tables)),
         fuse_ms_per_frame=macro_mean([record.summary.fuse_ms_per_frame for record in records]),
-        psa=_estimate(records, lambda found: found.agreement.psa),
-        alpha=_estimate(records, lambda found: found.headline.alpha),
-        drift=_estimate(records, lambda found: found.drift.sbd if found.order_known else UNDEFINED),
-        drift_null=_macro(records, lambda found: found.drift.null if found.order_known else UNDEFINED),
+        psa=_estimate(records, lambda stats: stats.agreement.psa),
+        alpha=_estimate(records, lambda stats: stats.headline.alpha),
+        drift=_estimate(records, lambda stats: stats.drift.sbd if stats.order_known else UNDEFINED),
+        drift_null=_macro(records, lambda stats: stats.drift.null if stats.order_known else UNDEFINED),
     )
 
 
 def _together(records: Sequence[Record], take: Callable[[MapStatistics], Estimate]) -> Estimate:
     """Return the macro mean of an estimate with its interval, the units being independent."""
-    found = [take(record.statistics) for record in records if record.statistics is not None]
-    found = [estimate for estimate in found if not math.isnan(estimate.low)]
-    if not found:
+    estimates = [take(record.statistics) for record in records if record.statistics is not None]
+    estimates = [estimate for estimate in estimates if not math.isnan(estimate.low)]
+    if not estimates:
         return UNDEFINED
-    value = macro_mean([estimate.value for estimate in found])
+    value = macro_mean([estimate.value for estimate in estimates])
     below, above = (
-        math.hypot(*(end - estimate.value for end, estimate in zip(ends, found, strict=True))) / len(found)
-        for ends in ([e.low for e in found], [e.high for e in found])
+        math.hypot(*(end - estimate.value for end, estimate in zip(ends, estimates, strict=True))) / len(estimates)
+        for ends in ([e.low for e in estimates], [e.high for e in estimates])
     )
     return Estimate(value, value - below, value + above)
 
 
 def _estimate(records: Sequence[Record], take: Callable[[MapStatistics], Estimate]) -> Estimate:
     """Return the mean over every unit that has a value; without an interval where one of them has none."""
-    found = [take(record.statistics) for record in records if record.statistics is not None]
-    if any(math.isnan(estimate.low) for estimate in found if not math.isnan(estimate.value)):
-        return Estimate(macro_mean([estimate.value for estimate in found]), math.nan, math.nan)
+    estimates = [take(record.statistics) for record in records if record.statistics is not None]
+    if any(math.isnan(estimate.low) for estimate in estimates if not math.isnan(estimate.value)):
+        return Estimate(macro_mean([estimate.value for estimate in estimates]), math.nan, math.nan)
     return _together(records, take)
 
 
@@ -134,7 +135,7 @@ def over_recurrent(measure: Measure) -> Callable[[Pooled], float]:
 
 @dataclass(frozen=True)
 class Spread:
-    """Mean and standard deviation over the repeats of a random variation; sd is NaN of a single one."""
+    """The mean and standard deviation over the repeats of a random variation; sd is NaN for a single repeat."""
 
     mean: float
     sd: float
@@ -150,7 +151,7 @@ class Spread:
 
 @dataclass(frozen=True)
 class Level:
-    """One value of a sweep: the pooled voxels of each repeat."""
+    """A value of a sweep, with the pooled voxels of each repeat."""
 
     value: float
     repeats: tuple[Pooled, ...]
@@ -164,23 +165,25 @@ class Level:
         return self.spread(measure).mean
 
     def interval(self, estimate: Callable[[Pooled], Estimate]) -> Estimate:
-        """Return an estimate's mean over the repeats, and the mean of their intervals: they err alike."""
-        found = [estimate(repeat) for repeat in self.repeats]
-        value, low, high = (macro_mean(ends) for ends in zip(*((e.value, e.low, e.high) for e in found), strict=True))
+        """Return the means of an estimate and of its interval over the repeats, whose errors are not independent."""
+        estimates = [estimate(repeat) for repeat in self.repeats]
+        value, low, high = (
+            macro_mean(ends) for ends in zip(*((e.value, e.low, e.high) for e in estimates), strict=True)
+        )
         return Estimate(value, low, high)
 
     @property
-    def judged(self) -> bool:
+    def assessed(self) -> bool:
         """Return whether it has statistics that are defined."""
         return not math.isnan(self.mean(lambda pooled: pooled.psa.value))
 
 
 @dataclass(frozen=True)
 class Sweep:
-    """How a swept setting is named, in a sentence and above a column, and its values printed: `{value * scale:g} unit`.
+    """The name of a swept setting, in a sentence and above a column; a value is printed as `{value * scale:g} unit`.
 
     Attributes:
-        noise: Whether it disturbs the geometry: then 0 leaves it as it is.
+        noise: True if it disturbs the geometry; 0 then leaves the geometry unchanged.
     """
 
     name: str
@@ -227,14 +230,14 @@ def swept(result: Result) -> list[Sweep]:
 def levels(result: Result, sweep: str, model: str, scene: str | None = None) -> tuple[Level, ...]:
     """Return the values of a sweep, ascending, over the scenes that have all of them."""
     scenes = complete_scenes(result, sweep, model)
-    found: dict[float, dict[int, list[Record]]] = {}
+    by_value: dict[float, dict[int, list[Record]]] = {}
     for record in result.select(sweep, model=model):
         value, repeat = record.variation.value, record.variation.repeat
         if value is not None and record.unit.scene in scenes and scene in (None, record.unit.scene):
-            found.setdefault(value, {}).setdefault(repeat, []).append(record)
+            by_value.setdefault(value, {}).setdefault(repeat, []).append(record)
     return tuple(
         Level(value, tuple(pooled(rows) for _, rows in sorted(repeats.items())))
-        for value, repeats in sorted(found.items())
+        for value, repeats in sorted(by_value.items())
     )
 
 

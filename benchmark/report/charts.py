@@ -1,4 +1,4 @@
-"""Charts of the page as inline SVG: lines with intervals, and dots with intervals; drawn in a millisecond each."""
+"""Draw the charts of the page as inline SVG: lines with intervals, and dots with intervals."""
 
 from __future__ import annotations
 
@@ -14,18 +14,18 @@ from semstab.data.statistics import Estimate
 WIDTH, HEIGHT = 520, 230
 LEFT, RIGHT, TOP, BOTTOM = 68, 12, 12, 42
 ROW = 24
-"""Units of the drawing, as many as pixels at its own size: of a chart, of its margins, of a row of dots."""
+"""Sizes of a chart, of its margins and of a row of dots, in units of the drawing: pixels at its own size."""
 
 POINTS = 400
-"""A longer line is drawn by the means of so many equal parts."""
+"""The most points of a line; a longer line is drawn by the means of so many equal parts."""
 
 SERIES = 8
-"""Colours of the style sheet, c0 to c7."""
+"""The number of colours of the style sheet, c0 to c7."""
 
 
 @dataclass(frozen=True)
 class Line:
-    """A line of a chart by its name; NaN breaks it. `ends` has an interval (low, high) a point."""
+    """A line of a chart, with its name; NaN breaks it. `ends` has an interval (low, high) for each point."""
 
     name: str
     x: Sequence[float]
@@ -37,7 +37,7 @@ class Line:
 
 @dataclass(frozen=True)
 class Scale:
-    """From values between two ends to units of the drawing."""
+    """A map from values between two ends to units of the drawing."""
 
     low: float
     high: float
@@ -53,11 +53,11 @@ class Scale:
         return cls(low, high if apart else low + max(abs(low), 1e-3), first, last)
 
     def __call__(self, value: float) -> float:
-        """Return where the value lies."""
+        """Return the position of a value."""
         return self.first + (value - self.low) / (self.high - self.low) * (self.last - self.first)
 
     def ticks(self, most: int = 5) -> list[float]:
-        """Round values between the ends: 1, 2 or 5 times a power of ten apart."""
+        """Return round values between the ends: 1, 2 or 5 times a power of ten apart."""
         rough = (self.high - self.low) / most
         power = 10.0 ** math.floor(math.log10(rough))
         step = next(factor * power for factor in (1, 2, 5, 10) if factor * power >= 0.999 * rough)
@@ -101,7 +101,7 @@ def dot_chart(rows: Mapping[str, Sequence[tuple[int, str, Estimate]]], x_label: 
 
 
 def thinned(line: Line) -> Line:
-    """Return the line, of more than POINTS points the means of parts of it."""
+    """Return the line; a line of more than POINTS points is reduced to the means of its parts."""
     if len(line.x) <= POINTS:
         return line
     with np.errstate(invalid="ignore"):
@@ -111,7 +111,7 @@ def thinned(line: Line) -> Line:
 
 
 def number(value: float) -> str:
-    """Return a value as a tick has it: '0.05', '1,200'."""
+    """Return a value as the text of a tick: '0.05', '1,200'."""
     return f"{value + 0.0:,.6g}".replace("-", "\N{MINUS SIGN}")
 
 
@@ -129,17 +129,17 @@ def _line(line: Line, x: Scale, y: Scale) -> Iterator[str]:
             ends = line.ends[k] if line.ends else (math.nan, math.nan)
             if all(map(math.isfinite, ends)):
                 yield f'<path class="line {color}" d="M{x(px):.1f} {y(ends[0]):.1f}V{y(ends[1]):.1f}"/>'
-            yield _circle(x(px), y(py), color, f"{line.name}: {_said(Estimate(py, *ends))}")
+            yield _circle(x(px), y(py), color, f"{line.name}: {_with_ends(Estimate(py, *ends))}")
 
 
 def _dot(x: Scale, at: float, estimate: Estimate, color: int, name: str) -> Iterator[str]:
     shade = f"c{color % SERIES}"
     if math.isfinite(estimate.low) and math.isfinite(estimate.high):
         yield f'<path class="line {shade}" d="M{x(estimate.low):.1f} {at:.1f}H{x(estimate.high):.1f}"/>'
-    yield _circle(x(estimate.value), at, shade, f"{name}: {_said(estimate)}")
+    yield _circle(x(estimate.value), at, shade, f"{name}: {_with_ends(estimate)}")
 
 
-def _said(estimate: Estimate) -> str:
+def _with_ends(estimate: Estimate) -> str:
     ends = f" ({estimate.low:.3g} to {estimate.high:.3g})" if math.isfinite(estimate.low) else ""
     return f"{estimate.value:.3g}{ends}"
 

@@ -1,4 +1,4 @@
-"""Which filter made a model more stable, at what price, and which one to use."""
+"""Find the filter that makes a model more stable at an acceptable price."""
 
 from __future__ import annotations
 
@@ -11,16 +11,16 @@ from semstab.data.records import Record, Result
 from semstab.metrics import macro_mean
 
 MOST_LAG = 1.0
-"""Frames by which a recommended filter may follow a change late, in the mean."""
+"""The most frames by which a recommended filter may follow a change late, in the mean."""
 
 LEAST_COVERAGE = 0.95
-"""Share of the model's labels that a recommended filter must leave."""
+"""The least share of the model's labels that a recommended filter must leave."""
 
 ALIKE = 0.005
-"""Shares that differ by no more are not said to be worse."""
+"""Shares that differ by no more count as equal."""
 
 LEVEL = 0.002
-"""Filters whose worth differs by no more are level: then the steadier one is better."""
+"""Filters whose quality differs by no more count as equal: then the one with less flicker is better."""
 
 
 @dataclass(frozen=True)
@@ -28,11 +28,12 @@ class FilterResult:
     """A filter over a model: macro means over the scenes, shares 0 to 1, NaN where undefined; see `FrameQuality`.
 
     Attributes:
-        filters: '' for the model itself.
-        flicker: Of places seen in two frames in a row, those whose label changes: motion-compensated.
-        plain: The same at the same pixel, whatever it shows.
-        alpha: As verdicts have it.
-        better: In how many frames, of how many, the accuracy is above the model's; without truth the next frame's.
+        filters: The names of the filters; '' for the model itself.
+        flicker: The share of points seen in two frames in a row whose label changes: motion-compensated.
+        plain: The same share at the same pixel, whatever it shows.
+        alpha: The alpha on which verdicts rest.
+        better: The number of frames whose accuracy, or next-frame consistency without truth, is above the model's, and
+            the number of all frames.
     """
 
     filters: str
@@ -50,7 +51,7 @@ class FilterResult:
 
     @property
     def family(self) -> str:
-        """The filter's name without its number; of a chain all of it."""
+        """Return the filter's name without its number; of a chain the whole name."""
         return self.filters if "+" in self.filters else self.filters.partition(":")[0]
 
 
@@ -64,15 +65,15 @@ class FilterStudy:
 
     @property
     def has_truth(self) -> bool:
-        """Return whether right and wrong are known."""
+        """Return whether there is ground truth."""
         return not math.isnan(self.unfiltered.accuracy)
 
     def worth(self, row: FilterResult) -> float:
-        """Return what a filter must not lower: accuracy; without ground truth next-frame consistency."""
+        """Return the quality that a filter must not lower: accuracy, or next-frame consistency without ground truth."""
         return row.accuracy if self.has_truth else row.next_frame
 
     def harmless(self, row: FilterResult) -> bool:
-        """Return whether it costs nothing that must not be lost, whatever it does for stability."""
+        """Return whether a filter lowers neither quality nor coverage too far, whatever it does for stability."""
         base = self.unfiltered
         if row.coverage < LEAST_COVERAGE:
             return False
@@ -82,15 +83,16 @@ class FilterStudy:
 
     @property
     def best(self) -> FilterResult | None:
-        """The filter to use: harmless, steadier than the model, and worth most; of those alike the steadiest.
+        """Return the filter to use: harmless, with less flicker than the model, and the highest quality.
 
-        Stability alone chooses nothing: a label that never changes is as steady as can be.
+        Of filters with equal quality the one with the least flicker is returned. Stability alone is no reason: a label
+        that never changes has no flicker.
         """
         return self._best_of(self.filtered)
 
     @property
     def best_whole(self) -> FilterResult | None:
-        """The same of the filters that leave every label."""
+        """Return the best of the filters that leave every label."""
         return self._best_of([row for row in self.filtered if row.coverage >= 1 - ALIKE])
 
     def _best_of(self, rows: Sequence[FilterResult]) -> FilterResult | None:
@@ -100,30 +102,32 @@ class FilterStudy:
 
     @property
     def misleading(self) -> list[FilterResult]:
-        """Filters that steady the labels, of places or of pixels, and make them worse; the worst first."""
+        """Return the filters that lower flicker, plain or compensated, and make labels worse; the worst first."""
         base = self.unfiltered
         worse = [row for row in self.filtered if self.worth(row) < self.worth(base) - ALIKE]
         return sorted((r for r in worse if r.flicker < base.flicker or r.plain < base.plain), key=self.worth)
 
     @property
     def front(self) -> list[FilterResult]:
-        """The rows that no other one beats in both flicker and worth, from the steadiest on."""
-        found: list[FilterResult] = []
+        """Return the rows that no other row beats in both flicker and quality, the least flicker first."""
+        front: list[FilterResult] = []
         for row in sorted([self.unfiltered, *self.filtered], key=lambda row: (row.flicker, -self.worth(row))):
-            if not found or self.worth(row) > self.worth(found[-1]):
-                found.append(row)
-        return found
+            if not front or self.worth(row) > self.worth(front[-1]):
+                front.append(row)
+        return front
 
 
 def filter_studies(result: Result) -> list[FilterStudy]:
-    """Return each model of which filtered labels were judged beside its own; none in other results."""
+    """Return a study of each model whose filtered labels were assessed together with its own; none in other results."""
     groups: dict[str, dict[str, list[Record]]] = {}
     for record in result.select():
         if record.quality is not None:
             groups.setdefault(record.quality.model, {}).setdefault(record.quality.filters, []).append(record)
     return [
         FilterStudy(
-            model, _row(rows[""], rows[""]), tuple(_row(found, rows[""]) for filters, found in rows.items() if filters)
+            model,
+            _row(rows[""], rows[""]),
+            tuple(_row(records, rows[""]) for filters, records in rows.items() if filters),
         )
         for model, rows in groups.items()
         if "" in rows and len(rows) > 1
@@ -131,43 +135,45 @@ def filter_studies(result: Result) -> list[FilterStudy]:
 
 
 def of_interest(result: Result) -> Result:
-    """Return the result for tables and figures of maps: of a filter study the models, and the filters to use, alone."""
-    found = {each.model: {"", each.best.filters if each.best else ""} for each in filter_studies(result)}
-    if not found:
+    """Return the result for tables and figures of maps: a filter study is reduced to models and the filters to use."""
+    wanted = {each.model: {"", each.best.filters if each.best else ""} for each in filter_studies(result)}
+    if not wanted:
         return result
 
     def shown(record: Record) -> bool:
         quality = record.quality
-        return quality is None or quality.filters in found.get(quality.model, {quality.filters})
+        return quality is None or quality.filters in wanted.get(quality.model, {quality.filters})
 
     names = {record.unit.model for record in result.select() if shown(record)}
     records = tuple(record for record in result.records if record.unit.model in names)
     return dataclasses.replace(result, records=records)
 
 
-def advice(found: FilterStudy) -> Iterator[str]:
-    """Yield what to use and why; what only seems to help; what cannot be known."""
-    best, base = found.best, found.unfiltered
+def advice(study: FilterStudy) -> Iterator[str]:
+    """Yield sentences: the filter to use and why, filters that only seem to help, and what is not known."""
+    best, base = study.best, study.unfiltered
     if best is None:
-        least = "accuracy, IoU, coverage or time to follow" if found.has_truth else "next-frame consistency or coverage"
-        yield f"Use none of these filters over {found.model}: none steadies it without a loss of {least}."
+        least = "accuracy, IoU, coverage or time to follow" if study.has_truth else "next-frame consistency or coverage"
+        yield f"Use none of these filters over {study.model}: none lowers its flicker without a loss of {least}."
     else:
-        yield f"Use --filter {typed(best)} over {found.model}: {_why(found, best)}."
-        if (whole := found.best_whole) is not None and whole != best:
-            yield f"Of those that leave every label, --filter {typed(whole)}: {_why(found, whole)}."
-    if found.misleading:
-        worst = found.misleading[0]
-        names = ", ".join(row.filters for row in found.misleading[:4])
-        more = f" and {len(found.misleading) - 4} more" if len(found.misleading) > 4 else ""
-        yield f"Steadier and worse: {names}{more}. {worst.filters} {_harm(found, worst)}."
-    if not found.has_truth:
+        yield f"Use --filter {typed(best)} over {study.model}: {_why(study, best)}."
+        if (whole := study.best_whole) is not None and whole != best:
+            yield f"Use --filter {typed(whole)} to leave every label: {_why(study, whole)}."
+    if study.misleading:
+        worst = study.misleading[0]
+        names = ", ".join(row.filters for row in study.misleading[:4])
+        more = f" and {len(study.misleading) - 4} more" if len(study.misleading) > 4 else ""
+        harm = _harm(study, worst)
+        yield f"These filters lower flicker and make labels worse: {names}{more}. {worst.filters} {harm}."
+    if not study.has_truth:
         yield (
-            "There is no ground truth: whether labels are right, and how late they follow a true change, is not known."
-            f" The choice rests on next-frame consistency, how often a label is what {found.model} says of the place in"
-            " the next frame, which no filter has seen. What the model gets wrong in every frame stays wrong."
+            "There is no ground truth: the accuracy of labels and their delay after a true change are not known. The"
+            " choice rests on next-frame consistency: how often a label is the one that"
+            f" {study.model} predicts there in the next frame, which no filter has seen. A label that is wrong in every"
+            " frame stays wrong."
         )
     elif not math.isfinite(base.lag):
-        yield "Nothing changes in what is seen here: how late labels follow is not known."
+        yield "No true label changes in these frames: the delay of labels after a change is not known."
 
 
 def typed(result: FilterResult) -> str:
@@ -175,10 +181,10 @@ def typed(result: FilterResult) -> str:
     return result.filters.replace("+", " --filter ")
 
 
-def _why(found: FilterStudy, best: FilterResult) -> str:
-    base, (better, frames) = found.unfiltered, best.better
+def _why(study: FilterStudy, best: FilterResult) -> str:
+    base, (better, frames) = study.unfiltered, best.better
     parts = [f"flicker falls from {100 * base.flicker:.1f} to {100 * best.flicker:.1f} %"]
-    if found.has_truth:
+    if study.has_truth:
         parts.append(
             f"accuracy goes from {100 * base.accuracy:.1f} to {100 * best.accuracy:.1f} % (better in {better} of"
             f" {frames} frames), mean IoU from {100 * base.miou:.1f} to {100 * best.miou:.1f} %"
@@ -188,30 +194,30 @@ def _why(found: FilterStudy, best: FilterResult) -> str:
             f"next-frame consistency goes from {100 * base.next_frame:.1f} to {100 * best.next_frame:.1f} % (better in"
             f" {better} of {frames} frames)"
         )
-    if found.has_truth and math.isfinite(best.lag):
+    if study.has_truth and math.isfinite(best.lag):
         parts.append(f"labels follow a change {best.lag:.1f} frames late")
     if best.coverage < 1 - ALIKE:
         parts.append(f"{100 * best.coverage:.0f} % of the labels are left")
-    return f"{', '.join(parts)}, for {best.milliseconds:.0f} ms a frame"
+    return f"{', '.join(parts)}, for {best.milliseconds:.0f} ms per frame"
 
 
-def _harm(found: FilterStudy, row: FilterResult) -> str:
-    base = found.unfiltered
+def _harm(study: FilterStudy, row: FilterResult) -> str:
+    base = study.unfiltered
     steady = f"has {100 * row.flicker:.1f} % flicker ({100 * base.flicker:.1f} % without)"
     if row.flicker >= base.flicker:
         steady = f"has {100 * row.plain:.1f} % flicker at the same pixel ({100 * base.plain:.1f} % without)"
-    if not found.has_truth:
-        return f"{steady}, but foresees {100 * row.next_frame:.1f} % of the next labels ({100 * base.next_frame:.1f} %)"
+    if not study.has_truth:
+        return f"{steady}, but predicts {100 * row.next_frame:.1f} % of the next labels ({100 * base.next_frame:.1f} %)"
     late = f", and it follows changes {row.lag:.1f} frames late" if math.isfinite(row.lag) else ""
     return (
-        f"{steady}, but {100 * row.consistent_wrong:.0f} % of what it shows is consistent but wrong"
+        f"{steady}, but {100 * row.consistent_wrong:.0f} % of its labels are consistent but wrong"
         f" ({100 * base.consistent_wrong:.0f} %){late}"
     )
 
 
 def _row(records: Sequence[Record], unfiltered: Sequence[Record]) -> FilterResult:
     qualities = [record.quality for record in records if record.quality is not None]
-    judged = [record.statistics.headline for record in records if record.statistics is not None]
+    headlines = [record.statistics.headline for record in records if record.statistics is not None]
 
     def mean(name: str) -> float:
         return macro_mean([getattr(quality, name) for quality in qualities])
@@ -220,7 +226,7 @@ def _row(records: Sequence[Record], unfiltered: Sequence[Record]) -> FilterResul
         filters=qualities[0].filters,
         flicker=macro_mean([record.image_space.compensated_flicker_percent for record in records]) / 100,
         plain=macro_mean([record.image_space.flicker_percent for record in records]) / 100,
-        alpha=macro_mean([row.alpha.value for row in judged]),
+        alpha=macro_mean([row.alpha.value for row in headlines]),
         **{
             name: mean(name)
             for name in ("next_frame", "accuracy", "miou", "consistent_wrong", "lag", "coverage", "milliseconds")
@@ -230,7 +236,7 @@ def _row(records: Sequence[Record], unfiltered: Sequence[Record]) -> FilterResul
 
 
 def _better(records: Sequence[Record], unfiltered: Sequence[Record]) -> tuple[int, int]:
-    """Return in how many frames, of how many, the filtered labels are worth more."""
+    """Return the number of frames whose filtered labels have a higher quality, and the number of all frames."""
     before = {record.unit.scene: record.quality for record in unfiltered}
     pairs: list[tuple[float, float]] = []
     for record in records:

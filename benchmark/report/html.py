@@ -1,4 +1,4 @@
-"""Parts of a page that needs no other file: its style, its tables, its images."""
+"""Make the parts of a page that needs no other file: its style, its tables, its images."""
 
 from __future__ import annotations
 
@@ -17,17 +17,17 @@ from semstab.report.figures.style import COLUMN, DPI, Figure
 from semstab.report.tables.table import ARROWS, Table, relations, sections
 
 SCREEN_DPI = 200
-"""Figures are embedded with that many pixels an inch and in 256 colours: a quarter of the file's size."""
+"""The pixels per inch of embedded figures, which have 256 colours: a quarter of the file's size."""
 
 CSS_INCH = 122
-"""Pixels of the page an inch of a figure: its smallest type then is as large as the text of the tables."""
+"""The pixels of the page per inch of a figure, so that its smallest type is as large as the text of the tables."""
 
 ABSENT = "absent"
 """A table's note of a class that covers no voxel: the page names such classes in a line."""
 
 
 def filled(template: str, **content: Any) -> str:
-    """Return a page, from its template; `style` and `script` are there already."""
+    """Return a page from its template; `style` and `script` are added."""
     from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
     here = Path(__file__).parent
@@ -73,7 +73,7 @@ def table_block(table: Table) -> dict[str, Any]:
 
 
 def _cell(text: str) -> str:
-    """Return a cell as typography has it: minus signs, a dash for what is undefined."""
+    """Return a cell in typographic form: with minus signs, and a dash where it is undefined."""
     if text == "--":
         return "\N{EN DASH}"
     is_number = text[-1:].isdigit() or re.fullmatch(r"[-+]?[\d.,]+ \([-+\d., ]+\)", text)
@@ -81,7 +81,7 @@ def _cell(text: str) -> str:
 
 
 def figure_block(figure: Figure, folder: Path) -> dict[str, Any]:
-    """Return a figure as the page holds it; it is drawn where FOLDER/figures lacks it."""
+    """Return a figure as the page holds it; it is drawn where FOLDER/figures does not contain it."""
     from PIL import Image
 
     png = folder / "figures" / f"{figure.name}.png"

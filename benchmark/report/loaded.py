@@ -1,4 +1,4 @@
-"""A finished run as a notebook wants it: its summaries, tables and series by name."""
+"""Give a notebook the summaries, tables and series of a finished run by name."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ class Run:
     """A finished run or study; a unit is named by scene, model and backend as far as that is needed.
 
     Attributes:
-        result: All that it found, typed.
+        result: Its results, typed.
     """
 
     folder: Path
@@ -34,7 +34,7 @@ class Run:
 
     @property
     def summary(self) -> pd.DataFrame:
-        """One row a unit: what it is, and the mean of every measure."""
+        """Return one row per unit: its names and the mean of every measure."""
         return self.result.to_pandas()
 
     def table(self, *, scene: str | None = None, model: str | None = None, backend: str | None = None) -> VoxelTable:
@@ -42,25 +42,25 @@ class Run:
         return self.result.record(scene=scene, model=model, backend=backend).table()
 
     def series(self, *, scene: str | None = None, model: str | None = None, backend: str | None = None) -> pd.DataFrame:
-        """Return the time series of a unit: one row a frame.
+        """Return the time series of a unit: one row per frame.
 
         Raises:
             DataError: If its file cannot be read.
         """
         file = self.result.record(scene=scene, model=model, backend=backend).series
         if file is None:
-            raise DataError(f"{self.folder}: the run kept no series of this unit; run it again")
+            raise DataError(f"{self.folder}: the run stored no series of this unit; run it again")
         return voxels.to_pandas(_columns(file))
 
     def events(self, *, scene: str | None = None, model: str | None = None, backend: str | None = None) -> Events:
         """Return the log of a unit's observations.
 
         Raises:
-            ConfigError: If the run kept none.
+            ConfigError: If the run stored none.
         """
         file = self.result.record(scene=scene, model=model, backend=backend).events_file
         if file is None or not file.exists():
-            raise ConfigError(f"{self.folder}: the run kept no log of observations; run it with --events")
+            raise ConfigError(f"{self.folder}: the run stored no log of observations; run it with --events")
         return Events.load(file)
 
     def _repr_html_(self) -> str:
@@ -71,13 +71,13 @@ def load(folder: str | Path) -> Run:
     """Return a finished run from its folder.
 
     Raises:
-        DataError: If it is not there or damaged.
+        DataError: If the run does not exist or is damaged.
     """
     return Run(Path(folder), load_result(folder))
 
 
 def read_series(file: Path) -> dict[str, npt.NDArray[Any]]:
-    """Read the time series in a file: by column (n,) values, one a frame, NaN or None where a value is missing.
+    """Read the time series in a file: (n,) values by column, one per frame, NaN or None where a value is missing.
 
     Raises:
         DataError: If it cannot be read.
@@ -92,5 +92,5 @@ def _columns(file: Path) -> dict[str, pa.ChunkedArray]:
     try:
         read = csv.read_csv(str(file))
         return {name: read.column(name) for name in read.column_names}
-    except (OSError, ValueError, LookupError, pa.ArrowException) as error:  # LookupError: a name that is there twice
+    except (OSError, ValueError, LookupError, pa.ArrowException) as error:  # LookupError: a repeated name
         raise DataError(f"{file}: cannot be read ({summarize_error(error)})") from error

@@ -1,4 +1,4 @@
-"""Warnings and notes on a result, in sentences; one that has no numbers to stand on is left out."""
+"""Write warnings and notes on a result, in sentences; a sentence without numbers to support it is left out."""
 
 from __future__ import annotations
 
@@ -20,34 +20,34 @@ from semstab.statistics.paired_differences import compared_observations
 from semstab.statistics.verdict import LIMITS
 
 MOSTLY_ONCE = 0.5
-"""The share of voxels seen once from which on a warning says so."""
+"""The share of voxels seen once from which on there is a warning."""
 
 LEAST_RECALL = 0.25
-"""Share of the edges of depth with a border of labels below which labels that agree are said to be coarse."""
+"""The share of the edges of depth with a border of labels below which there is a warning of coarse labels."""
 
 ONE_CLASS = 0.9
-"""Share of one class from which on it makes most of the numbers."""
+"""The share of a class from which on it determines most of the numbers."""
 
 
 def warnings(result: Result) -> Iterator[str]:
-    """Yield the facts without which a run would be misread, the weightiest first, with the command that mends each."""
+    """Yield the facts without which a run would be misread, the most important first, each with a remedy."""
     runs = [record.summary for record in result.select()]
     for run in runs:
         if run.frames_left_out:
             yield (
                 f"{_name(run, result)}: {run.frames_left_out} of {run.frames + run.frames_left_out} selected frames"
-                " lack a file or a pose and are left out: semstab-bench check"
+                " have no file or no pose and are left out: semstab-bench check"
             )
         if run.frames_empty:
             yield (
-                f"{_name(run, result)}: {run.frames_empty} of {run.frames} frames hold no pixel with both depth and a"
-                " label: semstab-bench check"
+                f"{_name(run, result)}: {run.frames_empty} of {run.frames} frames have no pixel with both depth and"
+                " a label: semstab-bench check"
             )
         cells = None if run.statistics is None else run.statistics.cells
         if cells is not None and 2 * cells.views <= cells.frames:
             yield (
-                f"{_name(run, result)}: {cells.frames} frames show {cells.views} distinct views, as the camera stands"
-                " still or frames repeat; views count, not frames"
+                f"{_name(run, result)}: {cells.frames} frames show {cells.views} distinct views: the camera stands"
+                " still, or frames repeat; the statistics count views, not frames"
             )
         if (cut := run.scores_left_out) is not None:
             yield (
@@ -57,47 +57,50 @@ def warnings(result: Result) -> Iterator[str]:
     once = sum(_seen_once(run) for run in runs) / max(1, sum(run.table.voxels for run in runs))
     if once >= MOSTLY_ONCE:
         yield (
-            f"{once:.0%} of the voxels were seen once and look stable for that reason; larger voxels or more overlap"
-            " help: --voxel-size"
+            f"{once:.0%} of the voxels were seen once and look consistent for that reason; larger voxels or more"
+            " overlap help: --voxel-size"
         )
-    yield from dict.fromkeys(text for scene, found in result.advice.items() if (text := _size(scene, found, result)))
+    yield from dict.fromkeys(text for scene, advice in result.advice.items() if (text := _size(scene, advice, result)))
     stable = [record for record in result.select() if _is_untested(record)]
     if stable:
         names = ", ".join(dict.fromkeys(record.unit.model for record in stable))
-        yield f"stable says that frames of {names} agree, not that they are right: no ground truth was compared"
+        yield f"stable means that frames of {names} agree, not that they are right: no ground truth was compared"
     if mixed(runs):
-        yield "labels and soft scores do not compare by VSS, entropy or voxel alpha: semstab-bench show RUN reduced"
+        yield "VSS, entropy and voxel alpha do not compare labels with soft scores: semstab-bench show RUN reduced"
     for record in result.select():
         yield from (f"{_name(record.summary, result)}: {text}" for text in _suspicions(record))
     largest = {max(run.table.classes, key=lambda row: row.voxels).name for run in runs if _one_class(run)}
     for name in largest:
         shares = [row.share for run in runs for row in run.table.classes if row.name == name]
         yield (
-            f"'{name}' covers {min(shares):.0%} of the map or more and makes most of its numbers; read them by class,"
-            f" or leave it out: --set exclude.classes=[{name}]"
+            f"'{name}' covers {min(shares):.0%} of the map or more and determines most of its numbers; read them by"
+            f" class, or leave it out: --set exclude.classes=[{name}]"
         )
 
 
 def _is_untested(record: Record) -> bool:
-    """Return whether a verdict is stable, of a map that was not compared with the ground truth."""
-    found = record.statistics
+    """Return whether a map has the verdict stable, but was not compared with the ground truth."""
+    statistics = record.statistics
     return bool(
-        found and found.verdict.level == "stable" and found.correctness is None and record.unit.model != GROUND_TRUTH
+        statistics
+        and statistics.verdict.level == "stable"
+        and statistics.correctness is None
+        and record.unit.model != GROUND_TRUTH
     )
 
 
 def _suspicions(record: Record) -> Iterator[str]:
-    """Yield reasons for which frames may agree though the labels are worth little."""
-    found, recall = record.statistics, record.image_space.edge_recall
-    if found is None or found.verdict.level not in ("stable", "usable"):
+    """Yield reasons why frames may agree although the labels are poor."""
+    statistics, recall = record.statistics, record.image_space.edge_recall
+    if statistics is None or statistics.verdict.level not in ("stable", "usable"):
         return
-    if found.cells is not None and found.cells.labelled < LIMITS.labelled:
-        missing = f"{1 - found.cells.labelled:.0%} of the locations have no label in most frames"
-        yield f"{missing}; what is left out cannot flicker"
+    if statistics.cells is not None and statistics.cells.labelled < LIMITS.labelled:
+        missing = f"{1 - statistics.cells.labelled:.0%} of the locations have no label in most frames"
+        yield f"{missing}; a pixel without a label cannot flicker"
     if recall < LEAST_RECALL and record.unit.model != GROUND_TRUTH:
         yield (
-            f"only {recall:.0%} of the edges of depth have a border of labels near them: are labels coarse, blurred, or"
-            " of few things?"
+            f"only {recall:.0%} of the edges of depth have a border of labels near them: the labels may be coarse,"
+            " blurred, or of few objects"
         )
 
 
@@ -109,32 +112,32 @@ def _name(run: UnitSummary, result: Result) -> str:
     return f"{run.unit.scene}, {run.unit.model}" if len(result.scenes) > 1 else run.unit.model
 
 
-def _size(scene: str, found: VoxelAdvice, result: Result) -> str:
-    """Return where the voxel size does not suit the data; empty where it does."""
+def _size(scene: str, advice: VoxelAdvice, result: Result) -> str:
+    """Return a warning if the voxel size does not suit the data, else an empty text."""
     where = f"{scene}: " if len(result.scenes) > 1 else ""
-    if found.suggested is None:
+    if advice.suggested is None:
         return (
-            f"{where}fewer than half of the points fall into the same voxel again when another frame sees them, at any"
-            " voxel size: semstab-bench check examines depth and poses"
+            f"{where}at any voxel size, fewer than half of the points fall into the same voxel again when another frame"
+            " sees them: semstab-bench check examines depth and poses"
         )
-    if found.chosen or found.suggested <= found.voxel_size:
+    if advice.chosen or advice.suggested <= advice.voxel_size:
         return ""
-    size = f"voxels of {found.voxel_size:g} m"
-    return f"{where}{size} are so small that noise tears locations apart: --voxel-size {found.suggested:g}"
+    size = f"voxels of {advice.voxel_size:g} m"
+    return f"{where}{size} are so small that noise splits locations: --voxel-size {advice.suggested:g}"
 
 
 def _one_class(run: UnitSummary) -> bool:
-    """Return whether one class covers most of the map, so that it makes most of the numbers."""
+    """Return whether one class covers most of the map, so that it determines most of the numbers."""
     return max(row.share for row in run.table.classes) >= ONE_CLASS
 
 
 def mixed(runs: Sequence[UnitSummary]) -> bool:
-    """Return whether some are of hard labels, others of soft scores."""
+    """Return whether some runs are of hard labels and others of soft scores."""
     return len({run.reduced is None for run in runs}) > 1
 
 
 def notes(result: Result) -> Iterator[str]:
-    """Yield the facts about several models, scenes or backends that no table says."""
+    """Yield the facts about several models, scenes or backends that no table shows."""
     records = result.select()
     yield from _ranking(result)
     yield from _least_seen(records)
@@ -142,7 +145,7 @@ def notes(result: Result) -> Iterator[str]:
 
 
 def differences(result: Result) -> Iterator[str]:
-    """Say which models are more or less stable than the first, by alpha of the observations that all of them made."""
+    """Yield which models are more or less stable than the first, by alpha of the observations that all of them made."""
     records = [record for record in result.select() if record.unit.model != GROUND_TRUTH]
     first, *others = by_model(records) or [""]
     sums = [_common_sums([r for r in records if r.unit.scene == scene]) for scene in result.scenes] if others else []
@@ -150,16 +153,16 @@ def differences(result: Result) -> Iterator[str]:
         each = [difference(own[name], own[first], ALPHA.key) for own in sums if {name, first} <= own.keys()]
         if known := [one for one in each if not math.isnan(one.low)]:
             change = mean_of(known)
-            told = "does not differ significantly from"
+            relation = "does not differ significantly from"
             if change.decided and not change.low <= 0 <= change.high:
-                told = "is more stable than" if change.low > 0 else "is less stable than"
+                relation = "is more stable than" if change.low > 0 else "is less stable than"
             ends = f"{change.low:+.2f} to {change.high:+.2f}".replace("0.", ".")
             scenes = f", {len(known)} scenes" if len(known) > 1 else ""
-            yield f"{name} {told} {first}: alpha {change.value:+.2f} ({ends}){scenes}"
+            yield f"{name} {relation} {first}: alpha {change.value:+.2f} ({ends}){scenes}"
 
 
 def _common_sums(records: Sequence[Record]) -> Mapping[str, ClusterSums]:
-    """Return the sums of the observations that all models of a scene made; none where they were not kept."""
+    """Return the sums of the observations that all models of a scene made; none where they were not stored."""
     files = {record.unit.model: record.observations_file for record in records}
     there = {name: CellObservations.load(file) for name, file in files.items() if file is not None and file.is_file()}
     same = len({own.classes for own in there.values()}) == 1
@@ -167,7 +170,7 @@ def _common_sums(records: Sequence[Record]) -> Mapping[str, ClusterSums]:
 
 
 def _ranking(result: Result) -> Iterator[str]:
-    """Say whether the order of the models changes where only recurrent voxels count."""
+    """Yield whether the order of the models changes if only recurrent voxels count."""
     records = comparable(result)
     means = {name: pooled(rows) for name, rows in by_model(records).items()}
     if mixed([record.summary for record in result.select()]):
@@ -178,7 +181,7 @@ def _ranking(result: Result) -> Iterator[str]:
     recurrent = _order({name: voxels.recurrent[VSS] for name, voxels in means.items()})
     taxonomy = records[0].summary.taxonomy
     if every == recurrent:
-        yield f"In one taxonomy ({taxonomy}) the order by VSS is {every}, over all voxels and for OP>=3 alike."
+        yield f"In one taxonomy ({taxonomy}) the order by VSS is {every}, both over all voxels and for OP>=3."
     else:
         yield f"In one taxonomy ({taxonomy}) the order by VSS is {every} over all voxels, but {recurrent} for OP>=3."
 
@@ -188,7 +191,7 @@ def _order(values: Mapping[str, float]) -> str:
 
 
 def _least_seen(records: Sequence[Record]) -> Iterator[str]:
-    """Yield the paradox between scenes: the one that seems most stable may be the one seen least."""
+    """Yield the paradox between scenes: the scene that seems most stable may be the one seen least."""
     for model, rows in by_model(records).items():
         tables = {row.unit.scene: row.summary.table for row in rows if row.summary.table.voxels}
         if len(tables) < 2:
@@ -197,19 +200,19 @@ def _least_seen(records: Sequence[Record]) -> Iterator[str]:
         if steadiest == min(tables, key=lambda name: tables[name].mean_op):
             yield (
                 f"{model} is most stable in {steadiest} (VSS {tables[steadiest][VSS]:.3f}), which is also the scene"
-                f" seen least often: {tables[steadiest].mean_op:.2f} frames a voxel."
+                f" seen least often: {tables[steadiest].mean_op:.2f} frames per voxel."
             )
 
 
 def _implementations(result: Result) -> Iterator[str]:
-    """Yield which fusion implementations leave the base one's maps."""
+    """Yield which fusion implementations differ from the base one."""
     rows = {
         name: [row.agrees for row in result.agreement if row.backends == (result.backend, name)]
         for name in dict.fromkeys(row.backends[1] for row in result.agreement)
     }
     if same := [name for name, agrees in rows.items() if all(agrees)]:
         drawn = max(row.one_in for row in result.agreement if row.backends[1] in same)
-        sample = f", as far as one voxel in {drawn} tells" if drawn > 1 else ""
+        sample = f" (one voxel in {drawn} was compared)" if drawn > 1 else ""
         make = "makes" if len(same) == 1 else "make"
         yield f"{' and '.join(same)} {make} the same maps as {result.backend}{sample}."
     for name, agrees in rows.items():
@@ -220,6 +223,6 @@ def _implementations(result: Result) -> Iterator[str]:
         missing = macro_mean([row.only_in[0] / max(1, row.voxels[0]) for row in pairs])
         other = macro_mean([row.differences["label"].mean for row in pairs])
         yield (
-            f"{name}, which associates otherwise than {pairs[0].backends[0]}, lacks {missing:.0%} of its voxels, and"
-            f" gives another label to {other:.1%} of those that both have."
+            f"{name} associates pixels and voxels in another way than {pairs[0].backends[0]}. It does not have"
+            f" {missing:.0%} of its voxels, and gives another label to {other:.1%} of those that both have."
         )

@@ -1,4 +1,4 @@
-"""report.html: the answer of a run or a study first, then where, when and in which classes; all else is folded."""
+"""Write report.html: first the answer of a run or a study, then maps, time lines and classes; the rest is folded."""
 
 from __future__ import annotations
 
@@ -31,19 +31,20 @@ from semstab.report.terminal import miou
 from semstab.statistics.verdict import LIMITS
 
 MOST_NAMED = 3
-"""Scenes that are named in the title."""
+"""The most scenes that are named in the title."""
 
 CELLS, BYTES, ALL_BYTES = 1_200_000, 1_000_000, 12_000_000
-"""Cells of a map in the page, and letters of its images: of one map, and of all; beyond, every n-th cell is left."""
+"""The most cells of a map in the page, and the most bytes of the images of one map and of all maps; a larger map is
+reduced to every n-th cell."""
 
 SBD_END = 0.25
-"""SBD, bits, that the largest code of a map's image stands for."""
+"""The SBD, bits, that the largest code of a map's image stands for."""
 
 UNKNOWN = 255
-"""Code of a value that is not defined; as a category, of a cell without a voxel."""
+"""The code of a value that is not defined; as a category, the code of a cell without a voxel."""
 
 KINDS = {"stable": "good", "usable": "part", "undecided": "open", "no verdict": "open"}
-"""Styles of verdicts; the others are bad news."""
+"""The styles of verdicts; all other verdicts have the style bad."""
 
 
 def render(
@@ -95,29 +96,29 @@ def _legend(names: Sequence[str]) -> list[tuple[str, str]]:
 
 
 def _card(model: str, records: Sequence[Record]) -> dict[str, Any]:
-    """Return a model: the verdict on it in each scene, and the numbers that it rests on."""
-    judged = [record.statistics for record in records if record.statistics is not None]
-    one = judged[0] if len(judged) == 1 else None
+    """Return the card of a model: the verdict on it in each scene, and the numbers that the verdict rests on."""
+    assessed = [record.statistics for record in records if record.statistics is not None]
+    one = assessed[0] if len(assessed) == 1 else None
     return {
         "model": model,
         "scenes": [_scene_verdict(record) for record in records[:12]],
         "more": max(0, len(records) - 12),
         "reasons": relations(one.verdict.line.partition(": ")[2]) if one is not None else "",
-        "numbers": [(name, value, note) for name, value, note in _numbers(records, judged, one) if value],
+        "numbers": [(name, value, note) for name, value, note in _numbers(records, assessed, one) if value],
     }
 
 
 def _scene_verdict(record: Record) -> dict[str, str]:
-    found = record.statistics
-    if found is None:
-        return {"scene": record.unit.scene, "level": "not judged", "kind": "open", "probability": ""}
-    level, probability = found.verdict.level, found.verdict.probability
-    said = "" if math.isnan(probability) else f"{100 * probability:.0f} %"
-    return {"scene": record.unit.scene, "level": level, "kind": KINDS.get(level, "bad"), "probability": said}
+    statistics = record.statistics
+    if statistics is None:
+        return {"scene": record.unit.scene, "level": "not assessed", "kind": "open", "probability": ""}
+    level, probability = statistics.verdict.level, statistics.verdict.probability
+    text = "" if math.isnan(probability) else f"{100 * probability:.0f} %"
+    return {"scene": record.unit.scene, "level": level, "kind": KINDS.get(level, "bad"), "probability": text}
 
 
 def _numbers(
-    records: Sequence[Record], judged: Sequence[MapStatistics], one: MapStatistics | None
+    records: Sequence[Record], assessed: Sequence[MapStatistics], one: MapStatistics | None
 ) -> Iterator[tuple[str, str, str]]:
     """Yield rows of a card: name, value, and its interval or unit; macro means over several scenes."""
 
@@ -132,18 +133,18 @@ def _numbers(
         return f"95 % CI {scale * estimate.low:.{digits}f} to {scale * estimate.high:.{digits}f}"
 
     head = None if one is None else one.headline
-    alphas = [found.headline.alpha.value for found in judged]
+    alphas = [stats.headline.alpha.value for stats in assessed]
     yield "alpha", mean(alphas, "{:.2f}"), interval(None if head is None else head.alpha)
-    psa = [found.headline.psa.value for found in judged]
+    psa = [stats.headline.psa.value for stats in assessed]
     yield "two frames agree", mean(psa, "{:.0f} %", 100), "of the locations"
     flicker = [record.image_space.compensated_flicker_percent for record in records]
-    yield "flicker", mean(flicker, "{:.1f} %"), "of the pixels a frame, camera motion removed"
+    yield "flicker", mean(flicker, "{:.1f} %"), "of the pixels per frame, camera motion removed"
     together = pooled(records)
     yield "seen 3 times or more", f"{100 * together.recurrent.share:.0f} %", f"of {together.voxels:,} voxels"
     yield "VSS", mean([together.recurrent[VSS]], "{:.3f}"), "OP ≥ 3"
     yield "SBD", mean([together.recurrent[SBD]], "{:.4f}"), "bits, OP ≥ 3"
     yield "mIoU", mean([miou(record) for record in records], "{:.1f} %", 100), "of the fused labels"
-    wrong = [found.headline.wrong_of_consistent.value for found in judged]
+    wrong = [stats.headline.wrong_of_consistent.value for stats in assessed]
     yield "consistent but wrong", mean(wrong, "{:.1f} %", 100), "of the consistent locations"
 
 
@@ -186,7 +187,7 @@ def _scenes(result: Result, folder: Path, above: Mapping[str, FromAbove]) -> Ite
 def _map(record: Record, above: FromAbove, overview: Overview | None, most: int) -> dict[str, Any]:
     """Return the map as the page's script paints it.
 
-    Images of numbers, and of the stability where there is no script.
+    It has images of numbers for the script, and an image of the stability for a page without script.
     """
     step = max(1, math.ceil(math.sqrt(above.rows.size / CELLS)))
     table, names = above.table, above.table.classes or tuple(map(str, range(above.table.K)))
@@ -238,7 +239,7 @@ def _timeline(records: Sequence[Record], colors: Mapping[str, int]) -> Iterator[
     series = {r.unit.model: read_series(r.series) for r in records if r.series is not None and r.series.exists()}
     for column, title, unit in (
         ("compensated_flicker_percent", "Flicker", "flicker, % of the pixels"),
-        ("drift", "Drift", "drift, bits a voxel"),
+        ("drift", "Drift", "drift, bits per voxel"),
     ):
         lines = [
             Line(name, own["frame"].tolist(), own[column].astype(float).tolist(), color=colors[name])
@@ -249,7 +250,7 @@ def _timeline(records: Sequence[Record], colors: Mapping[str, int]) -> Iterator[
 
 
 def _worst(record: Record, overview: Overview | None) -> Iterator[dict[str, Any]]:
-    """Yield the frames with the most flicker as small images: the picture, its labels, and which of them changed."""
+    """Yield the frames with the most flicker as small images: the image, its labels, and the labels that changed."""
     if overview is None or overview.worst is None:
         return
     worst, K = overview.worst, len(overview.palette)
@@ -270,11 +271,11 @@ def _indexed(index: Int64, palette: UInt8) -> str:
 
 
 def _classes(records: Sequence[Record], colors: Mapping[str, int]) -> str:
-    """Return each class that counts for the verdict, with its alpha."""
+    """Return a chart of the classes that count for the verdict, with their alphas."""
     rows: dict[str, list[tuple[int, str, Estimate]]] = {}
     for record in records:
-        found, name = record.statistics, record.unit.model
-        for own in () if found is None or found.cells is None else found.cells.classes:
+        statistics, name = record.statistics, record.unit.model
+        for own in () if statistics is None or statistics.cells is None else statistics.cells.classes:
             if own.counts_for_verdict and not math.isnan(own.alpha.value):
                 rows.setdefault(own.name, []).append((colors[name], name, own.alpha))
     if not rows:
@@ -285,7 +286,7 @@ def _classes(records: Sequence[Record], colors: Mapping[str, int]) -> str:
 
 
 def _distance(records: Sequence[Record], colors: Mapping[str, int]) -> Iterator[dict[str, str]]:
-    """Yield agreement by how far apart two observations are."""
+    """Yield charts of agreement by the distance of two observations."""
     for axis, title, unit in (
         ("time", "In time", "frames apart"),
         ("angle", "In angle", "degrees between the views"),
@@ -293,8 +294,8 @@ def _distance(records: Sequence[Record], colors: Mapping[str, int]) -> Iterator[
     ):
         lines = []
         for record in records:
-            found = record.statistics and record.statistics.correlogram
-            bins = getattr(found, axis) if found else ()
+            correlogram = record.statistics and record.statistics.correlogram
+            bins = getattr(correlogram, axis) if correlogram else ()
             if bins:
                 name, alphas = record.unit.model, [own.alpha for own in bins]
                 ends = [(alpha.low, alpha.high) for alpha in alphas]
@@ -349,7 +350,7 @@ def _title(result: Result) -> str:
 
 
 def _subtitle(result: Result) -> str:
-    units = {record.key for record in result.records}  # a sweep shares some with the base, as the manifest counts them
+    units = {record.key for record in result.records}  # a sweep and the base share units
     counts = [(len(result.scenes), "scene"), (len(result.models), "model"), (len(units), "unit")]
     parts = [f"{n:,} {name}{'' if n == 1 else 's'}" for n, name in counts]
     if records := result.select():

@@ -1,4 +1,4 @@
-"""The answer on one screen of 80 columns; progress while a run works; and what failed."""
+"""Print the answer on one screen of 80 columns, progress while a run works, and failures."""
 
 from __future__ import annotations
 
@@ -30,10 +30,10 @@ from semstab.task import Task
 
 WIDTH = 80
 RARE = 100
-"""Voxels below which a class is too rare to be called unstable."""
+"""The least number of voxels of a class that is listed; a rarer class is not called unstable."""
 
 MOST_CLASSES = {1: 5, 2: 3}
-"""How many of the least stable classes of a model are listed by the number of rows above; 1 beneath more rows."""
+"""The number of least stable classes that are listed for each model, by the number of rows above; else 1."""
 
 MOST_WARNINGS = 3
 STAGE_NAMES = {"read": "reading", "reference": "check", "voxel sizes": "other voxel sizes", "write": "writing"}
@@ -42,7 +42,7 @@ STAGE_NAMES = {"read": "reading", "reference": "check", "voxel sizes": "other vo
 def print_summary(
     result: Result, console: Console, *, out: Path | None = None, seconds: float | None = None, verbose: bool = False
 ) -> None:
-    """Print the answer first, then what to open; `verbose` adds every table of the run."""
+    """Print the answer, then the files to open; `verbose` adds every table of the run."""
     for line in screen(result, out=out, seconds=seconds):
         console.print(line, highlight=False, markup=False, soft_wrap=True)
     for table in tables(result) if verbose else ():
@@ -52,7 +52,7 @@ def print_summary(
 def screen(result: Result, *, out: Path | None = None, seconds: float | None = None) -> Iterator[str]:
     """Yield the lines of a run or a study.
 
-    Verdicts, least stable classes, warnings, the check, the time, where to look.
+    They are verdicts, least stable classes, warnings, the check, the time and the files to open.
     """
     records = result.select()
     if len(records) == 1:
@@ -71,10 +71,10 @@ def screen(result: Result, *, out: Path | None = None, seconds: float | None = N
 
 
 def _one(result: Result, record: Record) -> Iterator[str]:
-    run, found = record.summary, record.summary.statistics
+    run, statistics = record.summary, record.summary.statistics
     yield _head(f"{run.unit.scene} / {run.unit.model}", result, [run])
     yield ""
-    if found is not None:
+    if statistics is not None:
         yield from _verdict(run)
     recurrent, shares = run.table.recurrent, run.table.categories
     if shares:
@@ -90,7 +90,7 @@ def _one(result: Result, record: Record) -> Iterator[str]:
 
 
 def _head(name: str, result: Result, runs: Sequence[UnitSummary]) -> str:
-    """Return what was fused: '40 frames, 7 classes, 0.2 m voxels', and whether depth and poses agree."""
+    """Return the data that was fused: '40 frames, 7 classes, 0.2 m voxels', and whether depth and poses agree."""
     first = runs[0]
     frames = sorted({run.frames for run in runs})
     counts = f"{frames[0]} to {frames[-1]}" if len(frames) > 1 else f"{frames[0]}"
@@ -114,22 +114,22 @@ def _geometry(result: Result) -> str:
 
 
 def _verdict(run: UnitSummary) -> Iterator[str]:
-    """Yield the level, the number that it rests on, and what that number means."""
-    found = run.statistics
-    assert found is not None
-    level, alpha = found.verdict.level.upper(), found.headline.alpha
-    if found.verdict.level == "no verdict":
-        yield from textwrap.wrap(found.verdict.line, WIDTH, initial_indent="  ", subsequent_indent="    ")
+    """Yield the level, the number that it rests on, and the meaning of that number."""
+    statistics = run.statistics
+    assert statistics is not None
+    level, alpha = statistics.verdict.level.upper(), statistics.headline.alpha
+    if statistics.verdict.level == "no verdict":
+        yield from textwrap.wrap(statistics.verdict.line, WIDTH, initial_indent="  ", subsequent_indent="    ")
         return
-    yield f"  {level}{_probability(found.verdict)}    alpha {alpha.value:.2f}{_interval(alpha)}"
-    if found.verdict.level == "uninformative" and found.cells is not None:
-        share, name = _percent(found.cells.largest_share), found.cells.largest_class
-        yield f"  {share} of the observations are {name}: agreement says nothing about such a map"
+    yield f"  {level}{_probability(statistics.verdict)}    alpha {alpha.value:.2f}{_interval(alpha)}"
+    if statistics.verdict.level == "uninformative" and statistics.cells is not None:
+        share, name = _percent(statistics.cells.largest_share), statistics.cells.largest_class
+        yield f"  {share} of the observations are {name}: agreement does not assess such a map"
     else:
         yield f"  act on labels from alpha {_short(LIMITS.stable)} on, with care from {_short(LIMITS.usable)}"
-    psa = found.headline.psa.value
+    psa = statistics.headline.psa.value
     yield f"  two frames see the same class at {_percent(psa)} of the locations"
-    wrong = found.headline.wrong_of_consistent
+    wrong = statistics.headline.wrong_of_consistent
     if not math.isnan(wrong.value):
         yield f"  {_percent(wrong.value)}{_interval(wrong, 100)} of the consistent locations are wrong"
     yield ""
@@ -145,12 +145,12 @@ def _flicker(record: Record) -> Iterator[str]:
         yield f"  flicker  {compensated:.1f} % of the pixels change class per frame (camera motion removed)"
 
 
-def _interval(found: Estimate, scale: float = 1.0) -> str:
-    if math.isnan(found.low) or math.isnan(found.high):
+def _interval(estimate: Estimate, scale: float = 1.0) -> str:
+    if math.isnan(estimate.low) or math.isnan(estimate.high):
         return ""
     if scale == 1.0:
-        return f" (95 % CI {_short(found.low)} to {_short(found.high)})"
-    return f" ({scale * found.low:.0f} to {scale * found.high:.0f} %)"
+        return f" (95 % CI {_short(estimate.low)} to {_short(estimate.high)})"
+    return f" ({scale * estimate.low:.0f} to {scale * estimate.high:.0f} %)"
 
 
 def _short(value: float) -> str:
@@ -173,11 +173,11 @@ def _metres(size: float) -> str:
 COLUMNS = ("model", "verdict", "alpha (95 % CI)", "agree", "flicker", "VSS", "SBD", "mIoU")
 UNITS = ("", "", "", "%", "%", "OP>=3", "bits", "%")
 WIDTHS = (12, -15, -19, 6, 8, 6, 7, 5)
-"""Of the columns of several models; text stands left, below 0."""
+"""The widths of the columns of several models; a negative width marks text, which is aligned left."""
 
 
 def _several(result: Result, records: Sequence[Record]) -> Iterator[str]:
-    """Yield a row a scene and model; the differences to the first model where they are known."""
+    """Yield a row for each scene and model, and the differences to the first model where they are known."""
     listed = ", ".join(result.scenes[:3]) + (", ..." if len(result.scenes) > 3 else "")
     yield _head(listed, result, [record.summary for record in records])
     yield ""
@@ -203,11 +203,11 @@ def _laid_out(cells: Sequence[str]) -> str:
 
 
 def _cells(record: Record) -> list[str]:
-    run, found = record.summary, record.summary.statistics
+    run, statistics = record.summary, record.summary.statistics
     level, alpha, agree = "-", "", math.nan
-    if found is not None:
-        level = f"{found.verdict.level}{_probability(found.verdict)}"
-        agree, own = 100 * found.headline.psa.value, found.headline.alpha
+    if statistics is not None:
+        level = f"{statistics.verdict.level}{_probability(statistics.verdict)}"
+        agree, own = 100 * statistics.headline.psa.value, statistics.headline.alpha
         ends = "" if math.isnan(own.low) else f" ({_short(own.low)} to {_short(own.high)})"
         alpha = f"{_number(own.value, 2)}{ends}"
     vss, sbd = (run.table.recurrent[m] for m in measures()[:2])
@@ -218,8 +218,8 @@ def _cells(record: Record) -> list[str]:
 
 def miou(record: Record) -> float:
     """Return the mIoU of the fused labels seen twice or more; NaN without ground truth."""
-    found = record.summary.statistics
-    rows = [] if found is None or found.correctness is None else found.correctness.strata
+    statistics = record.summary.statistics
+    rows = [] if statistics is None or statistics.correctness is None else statistics.correctness.strata
     return rows[0].miou if rows else math.nan
 
 
@@ -231,7 +231,7 @@ def _number(value: float, digits: int) -> str:
 
 
 def _classes(records: Sequence[Record]) -> Iterator[str]:
-    """Yield the classes on which frames agree least, of those that cover enough of the map."""
+    """Yield the classes on which frames agree least, among those that cover enough of the map."""
     names = list(dict.fromkeys(record.unit.model for record in records))
     most, alone = MOST_CLASSES.get(len(records), 1), len(names) == 1
     lines = []
@@ -251,16 +251,16 @@ def _classes(records: Sequence[Record]) -> Iterator[str]:
 
 def class_alphas(records: Sequence[Record]) -> dict[str, float]:
     """Return alpha of each class, the macro mean over scenes, where it is known."""
-    found: dict[str, list[float]] = {}
+    alphas: dict[str, list[float]] = {}
     for statistics in (record.statistics for record in records if record.statistics is not None):
         for row in () if statistics.cells is None else statistics.cells.classes:
-            found.setdefault(row.name, []).append(row.alpha.value)
-    means = {name: macro_mean(values) for name, values in found.items()}
+            alphas.setdefault(row.name, []).append(row.alpha.value)
+    means = {name: macro_mean(values) for name, values in alphas.items()}
     return {name: alpha for name, alpha in means.items() if not math.isnan(alpha)}
 
 
 def _class_shares(records: Sequence[Record]) -> dict[str, tuple[int, float]]:
-    """Return voxels of each class, and their share of the map."""
+    """Return the number of voxels of each class, and their share of the map."""
     voxels: dict[str, int] = {}
     for row in (row for record in records for row in record.summary.table.classes):
         voxels[row.name] = voxels.get(row.name, 0) + row.voxels
@@ -269,7 +269,7 @@ def _class_shares(records: Sequence[Record]) -> dict[str, tuple[int, float]]:
 
 
 def _checks(result: Result) -> Iterator[str]:
-    """Yield how the backends agree with each other: one line a pair."""
+    """Yield the agreement of the backends: one line for each pair."""
     for pair in dict.fromkeys(row.backends for row in result.agreement):
         rows = [row for row in result.agreement if row.backends == pair]
         yield f"  {_check(pair, rows)}"
@@ -294,13 +294,13 @@ def _check(pair: tuple[str, str], rows: Sequence[Agreement]) -> str:
 
 
 def _where(result: Result, out: Path | None, seconds: float | None) -> Iterator[str]:
-    """Yield how long it took, and what to open or type next."""
+    """Yield the time that the run took, and the files and commands that come next."""
     if seconds is not None:
         stages = {STAGE_NAMES.get(k, k): v for k, v in result.manifest.get("seconds", {}).items() if k != "all"}
         longest = sorted(stages, key=lambda name: -stages[name])[:3]
         parts = ", ".join(f"{name} {stages[name]:.0f}" for name in longest if stages[name] >= 1)
         here = result.manifest.get("units", {}).get("executor") == InProcess.name
-        what = f"wall time by stage{'' if here else ', all workers'}"  # theirs is added up, and may exceed the run's
+        what = f"wall time by stage{'' if here else ', all workers'}"  # their sum may exceed the run's time
         yield f"  {seconds:.0f} s{f' ({what}: {parts})' if parts else ''}"
     if out is None:
         return
@@ -314,11 +314,11 @@ def _where(result: Result, out: Path | None, seconds: float | None) -> Iterator[
 # --- While it works, and what failed ---------------------------------------------------------------------------------
 
 SECONDS_A_LINE = 10.0
-"""Where there is no terminal for a bar, progress is a line that often."""
+"""The seconds between two lines of progress, where there is no terminal for a bar."""
 
 
 class ProgressBar(Observer):
-    """One bar for all of it, in frames that go into maps."""
+    """A progress bar for the whole run, in frames that are fused."""
 
     def __init__(self, console: Console) -> None:
         columns = (
@@ -330,13 +330,13 @@ class ProgressBar(Observer):
         self.bar = Progress(*columns, TimeElapsedColumn(), TimeRemainingColumn(), console=console, transient=True)
         self.work = self.bar.add_task("starting", total=None)
         self.notes: list[str] = []
-        self._said = time.monotonic()
+        self._printed = time.monotonic()
 
     def run_started(self, plan: Plan, finished: Mapping[str, UnitContent]) -> None:
         """Show the bar: the frames of every unit that is to be computed are its total."""
         units = plan.distinct()
         if finished:
-            self.bar.console.print(f"kept from before: {len(finished)} of {len(units)} units", style="dim")
+            self.bar.console.print(f"finished earlier: {len(finished)} of {len(units)} units", style="dim")
         for scene in plan.scenes.values():
             if scene.depth_from is not None:
                 self.notes.append(f"{scene.name}: depth from {scene.depth_from}")
@@ -348,41 +348,41 @@ class ProgressBar(Observer):
             self.bar.start()
 
     def geometry_checked(self, task: Task, verdict: Verdict) -> None:
-        """Remember, until the run is through, what could not be told."""
+        """Store an unclear result until the run is finished."""
         if verdict.state == "unclear":
             self.notes.append(f"{task.scene.name}: {verdict.text}")
 
     def advanced(self, frames: int, what: str) -> None:
-        """Advance by so many frames."""
+        """Advance the bar by a number of frames."""
         self.bar.update(self.work, advance=frames, description=what[:40])
-        if not self.bar.console.is_interactive and time.monotonic() - self._said > SECONDS_A_LINE:
-            self._said = time.monotonic()
+        if not self.bar.console.is_interactive and time.monotonic() - self._printed > SECONDS_A_LINE:
+            self._printed = time.monotonic()
             (work,) = self.bar.tasks
             self.bar.console.print(
                 f"{what}: {work.completed:.0f} of {work.total:.0f} frames", markup=False, soft_wrap=True
             )
 
     def run_finished(self, result: Result) -> None:
-        """Take the bar away, and say what is to be known of the scenes."""
+        """Remove the bar, and print the notes on the scenes."""
         self.close()
         for note in self.notes if not result.failures else ():
             self.bar.console.print(note, style="dim", soft_wrap=True, markup=False)
 
     def close(self) -> None:
-        """Take the bar away, also where the run was interrupted."""
+        """Remove the bar, also if the run was interrupted."""
         if self.bar.live.is_started:
             self.bar.stop()
 
 
 def failure_lines(result: Result) -> Iterator[str]:
-    """Yield one line for what failed for the same reason."""
+    """Yield one line for all failures with the same reason."""
     reasons: dict[str, list[Failure]] = {}
     for failure in result.failures:
         reasons.setdefault(failure.message, []).append(failure)
     for message, failures in reasons.items():
-        places = list(dict.fromkeys(f"{failure.unit.scene}, {failure.unit.model}" for failure in failures))
+        units = list(dict.fromkeys(f"{failure.unit.scene}, {failure.unit.model}" for failure in failures))
         varied = [name for failure in failures if (name := _named_task(failure))]
-        where = "" if message.startswith(places[0]) else f"{_first_of(places)}: "
+        where = "" if message.startswith(units[0]) else f"{_first_of(units)}: "
         what = f"{_first_of(varied)}: " if varied else ""
         yield f"{where}{what}{message}"
 
@@ -392,7 +392,7 @@ def _first_of(names: Sequence[str]) -> str:
 
 
 def _named_task(failure: Failure) -> str:
-    """Return what was varied; nothing of a unit at the base settings."""
+    """Return the setting that was varied; an empty text for a unit at the base settings."""
     if failure.variation.sweep == BASE:
         return ""
     value = failure.variation.value
@@ -400,9 +400,9 @@ def _named_task(failure: Failure) -> str:
 
 
 def print_filter_study(result: Result, console: Console) -> None:
-    """Print the filter to use for each model, then the table of all; '*' marks it, '!' makes labels worse."""
-    for found in filter_studies(result):
-        for sentence in advice(found):
+    """Print the recommended filter for each model, then the table of all filters."""
+    for study in filter_studies(result):
+        for sentence in advice(study):
             console.print(sentence, highlight=False, markup=False)
     for table in tables(result):
         if table.name.startswith("filters"):

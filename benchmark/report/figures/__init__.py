@@ -1,4 +1,4 @@
-"""Figures for a paper, PNG or SVG, at the widths of its column and page: `semstab-bench show RUN --figures png`."""
+"""Draw figures for a paper, PNG or SVG, as wide as its column or page: `semstab-bench show RUN --figures png`."""
 
 from __future__ import annotations
 
@@ -50,18 +50,18 @@ def figures(result: Result, folder: str | Path) -> list[Figure]:
     Saved frames are taken from the study folder.
     """
     views, result = Views(), of_interest(result)
-    kept = [record for record in result.select() if record.voxels_file is not None]
+    with_voxels = [record for record in result.select() if record.voxels_file is not None]
     return [
-        *_overviews(result, kept, views, Path(folder) / OVERVIEW),
-        *_distributions(kept, views),
-        *_maps(result, kept, views),
+        *_overviews(result, with_voxels, views, Path(folder) / OVERVIEW),
+        *_distributions(with_voxels, views),
+        *_maps(result, with_voxels, views),
         *_sweeps(result),
     ]
 
 
-def _overviews(result: Result, kept: list[Record], views: Views, folder: Path) -> Iterator[Figure]:
-    """Yield one a model, of the first scene that has a saved frame."""
-    for model, records in by_model(kept).items():
+def _overviews(result: Result, with_voxels: list[Record], views: Views, folder: Path) -> Iterator[Figure]:
+    """Yield one figure for each model, of the first scene that has a saved frame."""
+    for model, records in by_model(with_voxels).items():
         for record in records:
             path = folder / f"{slug(record.unit.scene, model)}.npz"
             if record.unit.scene in result.up and path.exists():
@@ -74,9 +74,9 @@ def _overview(record: Record, up: tuple[float, float, float], views: Views, path
     return Figure(
         slug("overview", scene, model),
         f"Overview: {scene}, {model}",
-        "A frame, its prediction, and the map that all sampled frames were fused into, seen from above, beneath a"
-        " ceiling where there is one, or from the side where more of it shows: the dominant"
-        " class of the topmost voxels, in the prediction's colours.",
+        "A frame, its prediction, and the map of all sampled frames. The map is seen from above, below a ceiling where"
+        " there is one, or from the side where that shows more. It shows the dominant class of the topmost voxels, in"
+        " the colours of the prediction.",
         f"A camera image of {scene}, the classes that {model} predicts for it, and the fused map from above in the"
         " same colours.",
         lambda: draw_overview(views.above(record, up), Overview.load(path)),
@@ -84,54 +84,55 @@ def _overview(record: Record, up: tuple[float, float, float], views: Views, path
     )
 
 
-def _distributions(kept: list[Record], views: Views) -> Iterator[Figure]:
-    if not kept:
+def _distributions(with_voxels: list[Record], views: Views) -> Iterator[Figure]:
+    if not with_voxels:
         return
 
     @functools.cache
     def of_all() -> dict[str, dict[str, Histograms]]:
-        """Draw the figure of each model and scene."""
+        """Return the histograms of each model and scene."""
         return {
             model: {record.unit.scene: views.sums(record) for record in records}
-            for model, records in by_model(kept).items()
+            for model, records in by_model(with_voxels).items()
         }
 
     def ecdf(model: str) -> Canvas:
-        ends = informative(found for scenes in of_all().values() for found in scenes.values())
+        ends = informative(histograms for scenes in of_all().values() for histograms in scenes.values())
         return draw_ecdf(of_all()[model], ends)
 
-    for model in by_model(kept):
+    for model in by_model(with_voxels):
         yield Figure(
             slug("ecdf", model),
             f"The measures by scene: {model}",
-            "Empirical distributions over the voxels of each scene, of measures of which more is better as what they"
-            " lack: 1 - VSS is disagreement. SBD is that of the voxels seen twice or more. Dashed: the recurrent voxels"
-            " of all scenes. The x axes are the same for each model and end where 99% of the voxels of every scene"
-            " are reached.",
-            f"A panel a measure of cumulative curves, one a scene, for {model}: how many voxels have how much.",
+            "Empirical distributions over the voxels of each scene. A measure that is better when high is shown by its"
+            " distance from the best value: 1 - VSS is disagreement. SBD is that of the voxels seen twice or more."
+            " Dashed: the recurrent voxels of all scenes. The x axes are the same for each model and end where every"
+            " curve has reached 99% of the voxels.",
+            f"A panel for each measure, with a cumulative curve for each scene, for {model}.",
             partial(ecdf, model),
         )
     yield Figure(
         "persistence",
         "The measures against observation persistence",
-        "Mean and interquartile range over the voxels of all scenes with that OP (above 8 in bins that widen by a"
-        " quarter), and their number. Where more than three quarters of the voxels agree fully, the range is a line.",
-        "For each model, every measure as a curve against OP on a logarithmic axis, and the number of voxels.",
+        "The mean and interquartile range over the voxels of all scenes with that OP (above 8 in bins that widen by a"
+        " quarter), and the number of these voxels. Where more than three quarters of the voxels agree fully, the range"
+        " is a line.",
+        "For each model, a curve of every measure against OP on a logarithmic axis, and the number of voxels.",
         lambda: draw_persistence({name: together(scenes.values()) for name, scenes in of_all().items()}),
     )
 
 
-def _maps(result: Result, kept: list[Record], views: Views) -> Iterator[Figure]:
+def _maps(result: Result, with_voxels: list[Record], views: Views) -> Iterator[Figure]:
     panels = " and ".join(measure.title for measure in measures() if measure.panel)
-    for record in kept:
+    for record in with_voxels:
         scene, model = record.unit.scene, record.unit.model
         if scene in result.up:
             yield Figure(
                 slug("stability_map", scene, model),
                 f"Stability from above: {scene}, {model}",
-                "The topmost voxel of each column along the up axis, beneath a ceiling where there is one, or of a wall"
-                f" the foremost: (a) its stability category, then {panels}; grey: seen once, which says nothing. Values"
-                " beyond a scale, which has an arrow there, look like its end.",
+                "The topmost voxel of each column along the up axis, below a ceiling where there is one; of a wall, the"
+                f" foremost voxel. (a) shows its stability category, the other panels show {panels}. A grey voxel was"
+                " seen once and has no category. An arrow on a scale marks values beyond its end.",
                 f"Maps of {scene} from above with the stability category, {panels} of {model}'s voxels.",
                 partial(_draw_map, record, result.up[scene], views),
                 unit=record.unit.slug,
@@ -150,9 +151,9 @@ def _sweeps(result: Result) -> Iterator[Figure]:
                 f"sensitivity_{sweep.name}",
                 f"Sensitivity to {sweep.title}",
                 "The share of recurrent voxels, and every measure over all voxels (solid) and over the recurrent ones"
-                f" (dashed; not drawn for fewer than {ENOUGH:,}), pooled over scenes; bars are the standard deviation"
-                " over repeats. The axes of VSS and margin span 0.1 or more, the others begin at 0. Read the others"
-                " with (a): which voxels there are to average changes along the sweep.",
+                f" (dashed; not drawn for fewer than {ENOUGH:,}), pooled over scenes. Bars are the standard deviation"
+                " over repeats. The axes of VSS and margin span 0.1 or more, the others begin at 0. Read every panel"
+                " together with (a): the set of averaged voxels changes along the sweep.",
                 f"Panels against {sweep.title}: the recurrent share and each measure, for all voxels and for the"
                 " recurrent ones.",
                 partial(draw_sweep, sweep, {name: levels(result, sweep.name, name) for name in models}),

@@ -1,4 +1,4 @@
-"""ECDFs of what each measure lacks, and each against OP (paper, Semantic Agreement and Belief Drift)."""
+"""Draw the ECDF of each measure, and each measure against OP (paper, Semantic Agreement and Belief Drift)."""
 
 from __future__ import annotations
 
@@ -23,10 +23,10 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
-# The voxels of units as histograms by OP, from which ECDFs and the curves against OP are read off; they add up.
+# Histograms of the voxels of units by OP give the ECDFs and the curves against OP; histograms can be added.
 
 BINS = 1000
-"""Bins of a measure between 0 and its largest value; a further one, the first, holds 0 alone."""
+"""The number of bins of a measure between 0 and its largest value; a further bin, the first, holds 0 alone."""
 
 
 def _op_bounds() -> Int64:
@@ -44,7 +44,7 @@ OP_BOUNDS = _op_bounds()
 class MeasureByOP:
     """A measure's voxels by OP and value: counts (OP bins, 1 + BINS), sums (OP bins,); `largest` ends the last bin.
 
-    The values count from the best one: of a measure of which more is better they are what it lacks, as in 1 - VSS.
+    The values are distances from the best value: 1 - VSS for a measure that is better when high.
     """
 
     counts: Int64
@@ -66,23 +66,23 @@ class MeasureByOP:
 
     @property
     def values(self) -> Float64:
-        """(1 + BINS,) the upper end of each bin."""
+        """Return (1 + BINS,) the upper end of each bin."""
         return np.arange(BINS + 1) / BINS * self.largest
 
     @property
     def voxels(self) -> Int64:
-        """(OP bins,) voxels where the measure is defined."""
+        """Return (OP bins,) the number of voxels where the measure is defined."""
         total: Int64 = self.counts.sum(axis=1)
         return total
 
     def ecdf(self, lowest_op: int = 1) -> Float64:
-        """Return (1 + BINS,) share of the voxels with at least that OP whose value is at most that of the bin."""
+        """Return (1 + BINS,) the share of the voxels with at least that OP whose value is at most that of the bin."""
         counts = self.counts[np.searchsorted(OP_BOUNDS, lowest_op) :].sum(axis=0)
         share: Float64 = counts.cumsum() / max(1, counts.sum())
         return share
 
     def mean(self) -> Float64:
-        """Return (OP bins,) mean by OP; NaN where there are no voxels."""
+        """Return (OP bins,) the mean by OP; NaN where there are no voxels."""
         mean: Float64 = np.where(self.voxels > 0, self.sums / np.maximum(1, self.voxels), np.nan)
         return mean
 
@@ -93,11 +93,11 @@ class MeasureByOP:
 
 
 Histograms = Mapping[str, MeasureByOP]
-"""Of a unit's voxels, or of several units' together: each measure by its key."""
+"""The histogram of each measure, by its key, of the voxels of a unit or of several units together."""
 
 
 def lacking(measure: Measure, value: Float64) -> Float64:
-    """Return how far values are from the best, and back."""
+    """Return the distance of values from the best value; applied twice it returns the values."""
     return value if measure.better == "lower" else measure.largest - value
 
 
@@ -113,7 +113,7 @@ def together(units: Iterable[Histograms]) -> Histograms:
 
 
 def op_position() -> Float64:
-    """Return (OP bins,) where a bin stands on a logarithmic axis: the geometric mean of its OP."""
+    """Return (OP bins,) the position of a bin on a logarithmic axis: the geometric mean of its OP."""
     last = np.append(OP_BOUNDS[1:] - 1, OP_BOUNDS[-1])
     return np.sqrt(OP_BOUNDS * last.astype(np.float64))
 
@@ -125,16 +125,18 @@ INFORMATIVE = 0.99
 
 
 def draw_ecdf(scenes: Mapping[str, Histograms], ends: Mapping[str, float]) -> Figure:
-    """Return the ECDF of how much each measure lacks in each scene, and in all recurrent voxels.
+    """Return the ECDF of each measure's distance from the best value, in each scene and in all recurrent voxels.
 
-    Ends are those of x axes.
+    `ends` are the ends of the x axes.
     """
     shown = measures()
     figure = canvas(PAGE, 2.4 * math.ceil(len(shown) / 2))
     panels = figure.subplots(math.ceil(len(shown) / 2), 2, squeeze=False).ravel()
     everything = together(scenes.values())
     for axes, letter, measure in zip(panels, LETTERS, shown, strict=False):
-        _draw_curves(axes, {name: found[measure.key] for name, found in scenes.items()}, everything[measure.key])
+        _draw_curves(
+            axes, {name: histograms[measure.key] for name, histograms in scenes.items()}, everything[measure.key]
+        )
         label = measure.title if measure.better == "lower" else f"{measure.largest:g} - {measure.title}"
         unit = f" ({measure.unit})" if measure.unit else ""
         axes.set(xlabel=label + unit, ylabel="share of voxels", xlim=(0, 1.03 * ends[measure.key]), ylim=(0.0, 1.02))
@@ -148,8 +150,8 @@ def draw_ecdf(scenes: Mapping[str, Histograms], ends: Mapping[str, float]) -> Fi
 
 def _draw_curves(axes: Axes, scenes: Mapping[str, MeasureByOP], everything: MeasureByOP) -> None:
     """Draw one curve a scene, and a dashed one of all recurrent voxels, where there are any."""
-    for k, (name, found) in enumerate(scenes.items()):
-        axes.step(found.values, found.ecdf(), where="post", color=color(k), label=f"{name}, all voxels")
+    for k, (name, histogram) in enumerate(scenes.items()):
+        axes.step(histogram.values, histogram.ecdf(), where="post", color=color(k), label=f"{name}, all voxels")
     recurrent = everything.ecdf(RECURRENT)
     if recurrent[-1]:
         axes.step(
@@ -163,16 +165,16 @@ def _draw_curves(axes: Axes, scenes: Mapping[str, MeasureByOP], everything: Meas
 
 
 def informative(units: Iterable[Histograms]) -> dict[str, float]:
-    """Return where the x axis of each measure ends, so that every scene's curve is seen up to its last percent."""
+    """Return the end of the x axis of each measure, so that every scene's curve is seen up to its last percent."""
 
-    def end(found: MeasureByOP) -> float:
-        reached = found.ecdf() >= INFORMATIVE
-        return float(found.values[reached.argmax()]) if reached.any() else found.largest
+    def end(histogram: MeasureByOP) -> float:
+        reached = histogram.ecdf() >= INFORMATIVE
+        return float(histogram.values[reached.argmax()]) if reached.any() else histogram.largest
 
     ends: dict[str, float] = {}
     for scene in units:
-        for key, found in scene.items():
-            ends[key] = max(ends.get(key, 0.06 * found.largest), end(found))
+        for key, histogram in scene.items():
+            ends[key] = max(ends.get(key, 0.06 * histogram.largest), end(histogram))
     return ends
 
 
@@ -201,12 +203,12 @@ def draw_persistence(models: Mapping[str, Histograms]) -> Figure:
     return figure
 
 
-def _draw_column(rows: Panels, found: Histograms, shade: str) -> None:
-    voxels = next(iter(found.values())).voxels
+def _draw_column(rows: Panels, histograms: Histograms, shade: str) -> None:
+    voxels = next(iter(histograms.values())).voxels
     present = voxels > 0
     x, few = op_position()[present], voxels[present] < ENOUGH
     for axes, measure in zip(rows[:-1], measures(), strict=True):
-        own = found[measure.key]
+        own = histograms[measure.key]
         curves = (own.mean(), own.quantile(0.25), own.quantile(0.75))
         mean, *ends = (lacking(measure, curve[present]) for curve in curves)
         axes.fill_between(x, *ends, color=shade, alpha=0.2, linewidth=0.8)
@@ -231,15 +233,15 @@ def mark_op(axes: Axes, largest: float) -> None:
 # The sensitivity sweeps: aggregate and recurrent values together with the recurrent share (paper, Sensitivity).
 
 APART = 0.06
-"""Of a step along the x axis: series that have the same values lie beside each other."""
+"""The distance between series along the x axis, as a share of a step: equal values are drawn side by side."""
 
 LEAST_SPAN = 0.1
-"""Of the axis of a share that is good when high (VSS, margin, PSA, alpha): a smaller difference looks small. What is
-good when low (SBD, entropy), and the recurrent share, stand on an axis from 0."""
+"""The least span of the axis of a share that is good when high (VSS, margin, PSA, alpha), so that a smaller difference
+looks small. The axes of measures that are good when low (SBD, entropy), and of the recurrent share, begin at 0."""
 
 
 def draw_sweep(sweep: Sweep, models: Mapping[str, tuple[Level, ...]]) -> Figure:
-    """Return the recurrent share and every measure along a sweep; the values stand at equal distances, in order."""
+    """Return the recurrent share and every measure along a sweep; the values are drawn in order, at equal distances."""
     shown = measures()
     rows = math.ceil((1 + len(shown)) / 3)
     figure = canvas(PAGE, 2.5 if rows == 1 else 2.1 * rows)
@@ -267,12 +269,12 @@ def draw_sweep(sweep: Sweep, models: Mapping[str, tuple[Level, ...]]) -> Figure:
 
 
 def positions(values: Sequence[float], levels: Sequence[Level], k: int, series: int) -> list[float]:
-    """Return where the k-th of so many series has its levels along the x axis."""
+    """Return the positions of the levels of the k-th series along the x axis."""
     return [values.index(level.value) + APART * (k - (series - 1) / 2) for level in levels]
 
 
 def settle_scale(axes: Axes, *, from_zero: bool) -> None:
-    """Widen the y axis to hold 0, or `LEAST_SPAN`; what is drawn, intervals too, stays inside with its markers."""
+    """Widen the y axis to hold 0, or `LEAST_SPAN`; curves, intervals and markers stay inside."""
     if not any(np.isfinite(np.asarray(line.get_ydata(), dtype=np.float64)).any() for line in axes.lines):
         axes.text(0.5, 0.5, "not known\nwithout --statistics", transform=axes.transAxes, ha="center", va="center")
         axes.set_yticks([])
@@ -281,7 +283,7 @@ def settle_scale(axes: Axes, *, from_zero: bool) -> None:
     if from_zero:
         axes.set_ylim(min(low, -0.04 * high), high)
     elif (missing := LEAST_SPAN - (high - low)) > 0:
-        top = max(high, min(high + missing / 2, 1.01))  # a share has no values above 1
+        top = max(high, min(high + missing / 2, 1.01))  # no share is above 1
         axes.set_ylim(top - LEAST_SPAN, top)
 
 
@@ -289,7 +291,7 @@ def mark_values(axes: Axes, sweep: Sweep, values: Sequence[float]) -> None:
     """Mark the swept values along the x axis, at equal distances."""
     axes.set_xticks(range(len(values)), [sweep.text(value) for value in values])
     axes.set_xlim(-0.35, len(values) - 0.65)
-    axes.margins(y=0.1)  # a point at an axis' end is seen whole
+    axes.margins(y=0.1)  # shows a point at the end of an axis whole
     axes.set_xlabel(f"{sweep.title.split(',')[0]} ({sweep.unit})" if sweep.unit else sweep.title)
 
 
@@ -323,14 +325,14 @@ def draw_line(
 def _error(
     level: Level, measure: Callable[[Pooled], float], interval: Callable[[Pooled], Estimate] | None
 ) -> tuple[float, float]:
-    """Return how far the bar reaches below and above the mean; 0 where that is not known."""
+    """Return the lengths of the bar below and above the mean; 0 where they are not known."""
     if interval is None:
         sd = level.spread(measure).sd
         return (0.0, 0.0) if math.isnan(sd) else (sd, sd)
-    found = level.interval(interval)
-    if math.isnan(found.low):
+    estimate = level.interval(interval)
+    if math.isnan(estimate.low):
         return 0.0, 0.0
-    return max(found.value - found.low, 0.0), max(found.high - found.value, 0.0)
+    return max(estimate.value - estimate.low, 0.0), max(estimate.high - estimate.value, 0.0)
 
 
 def _legend(models: list[str]) -> list[object]:

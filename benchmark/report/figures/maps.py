@@ -1,4 +1,4 @@
-"""Maps from above: stability, drift, entropy and where it comes from; and the overview from image to map."""
+"""Draw maps from above, of stability and of measures; and the overview from image to map."""
 
 from __future__ import annotations
 
@@ -38,14 +38,14 @@ BLANK = (255, 255, 255)
 UNDEFINED = "#cccccc"
 COLORMAP = "YlOrRd"
 LEGEND_LINE, LEGEND_KEY, LEGEND_LETTER = 0.15, 0.5, 0.066
-"""Inches of a legend: height of a line; width of a key with its margins, and of a letter."""
+"""The height of a line of a legend, and the widths of a key with its margins and of a letter, inches."""
 
 WIDE = 1.4
-"""A map this many times as wide as high or more has its panels beneath each other."""
+"""The panels of a map that is this many times as wide as high, or more, are drawn one below the other."""
 
 
 def draw_stability(above: FromAbove) -> Figure:
-    """Return stability category of the topmost voxels and the measures that have a panel, with a scale bar."""
+    """Return the stability category of the topmost voxels and the measures that have a panel, with a scale bar."""
     table, rows = above.table, above.rows
     shown = [measure for measure in measures() if measure.panel]
     figure, (kind, *panels) = map_panels(rows, 1 + len(shown))
@@ -83,7 +83,7 @@ class WorstFrames:
 
 @dataclass(frozen=True, eq=False)
 class Overview:
-    """What one frame showed to the camera and to the model.
+    """A frame as the camera and the model saw it.
 
     Attributes:
         frame: Its index.
@@ -109,8 +109,8 @@ class Overview:
         try:
             data = read_bytes(path)
             with zipfile.ZipFile(io.BytesIO(data)) as archive:
-                found = {name: decode_array(path, data, name[:-4]) for name in archive.namelist()}
-            own = {name.removesuffix(".npy"): value for name, value in found.items()}
+                arrays = {name: decode_array(path, data, name[:-4]) for name in archive.namelist()}
+            own = {name.removesuffix(".npy"): value for name, value in arrays.items()}
             worst: list[Any] = [
                 own.get(f"worst_{name}") for name in ("frames", "flicker", "labels", "changed", "color")
             ]
@@ -162,7 +162,7 @@ def legend_columns(names: Sequence[str]) -> int:
 def map_panels(rows: Int64, n: int) -> tuple[Figure, Sequence[Axes]]:
     """Return a figure for n maps.
 
-    Up to three side by side, or for wide maps beneath each other in one column of the page.
+    Up to three maps are side by side; wide maps are one below the other in one column of the page.
     """
     height, width = rows.shape
     if width >= WIDE * height:
@@ -218,21 +218,21 @@ def _draw_measure(
 
 
 def _beyond(values: Float64, ends: tuple[float, float]) -> str:
-    """Return at which ends of a scale there are values beyond it: a colour bar has an arrow there."""
+    """Return the ends of a scale beyond which there are values; a colour bar has an arrow there."""
     with np.errstate(invalid="ignore"):
         below, above = bool(np.any(values < ends[0] - 1e-9)), bool(np.any(values > ends[1] + 1e-9))
     return {(True, True): "both", (True, False): "min", (False, True): "max"}.get((below, above), "neither")
 
 
 def color_bar(figure: Figure, axes: Axes, colors: ScalarMappable, extend: str = "neither") -> Colorbar:
-    """Draw a colour bar beneath a panel."""
+    """Draw a colour bar below a panel."""
     bar = figure.colorbar(colors, ax=axes, location="bottom", aspect=40, pad=0.03, extend=extend)
     bar.outline.set_linewidth(0.4)
     return bar
 
 
 def framed(axes: Axes) -> None:
-    """Draw a thin frame and no ticks: the scale bar says the size."""
+    """Draw a thin frame and no ticks: the scale bar shows the size."""
     axes.set(xticks=[], yticks=[], anchor="N")
     axes.grid(visible=False)
     for spine in axes.spines.values():
@@ -263,7 +263,7 @@ def _handles(entries: Sequence[tuple[str, Any]]) -> list[Any]:
     return [Patch(facecolor=shade, edgecolor=FAINT, linewidth=0.4, label=name) for name, shade in entries]
 
 
-# What figures show of units' voxels, each table read once; the figures of a unit are drawn one after the other.
+# Figures show the voxels of units. Each table is read once: the figures of a unit are drawn one after the other.
 
 
 class Views:
@@ -292,15 +292,15 @@ class Views:
         return self._last[1]
 
 
-# Where two maps differ, seen from above or from the side.
+# The differences of two maps, seen from above or from the side.
 
 SAME = "#dedede"
-"""Of voxels that did not change; blank paper is where there are none."""
+"""The colour of voxels that did not change; the paper stays blank where there is no voxel."""
 
 
 @dataclass(frozen=True)
 class Panel:
-    """What is drawn of each voxel, from -1, worse, to 1, better; and the numbers of places (m,) at their centres."""
+    """A value of each voxel, from -1, worse, to 1, better; and the numbers of areas (m,), drawn at their centres."""
 
     title: str
     ends: tuple[str, str]
@@ -339,7 +339,7 @@ def _draw(figure: Figure, axes: Axes, panel: Panel, rows: Int64) -> None:
 
 
 def _number(axes: Axes, panel: Panel, table: VoxelTable, axis: Float64, height: int, cell: float) -> None:
-    """Draw the numbers of the areas, beside their centres."""
+    """Draw the numbers of the areas at their centres."""
     from matplotlib.patheffects import withStroke
 
     right, ahead, _ = level_axes(axis)

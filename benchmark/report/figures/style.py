@@ -1,4 +1,4 @@
-"""What all figures share: sizes, type, colours safe for any colour vision, files that come out the same each time."""
+"""Set the style of all figures: sizes, type, colours that suit any colour vision, and files without random bytes."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ if TYPE_CHECKING:
 
 
 COLUMN, PAGE = 3.4, 7.0
-"""Widths of one and of both columns of a page, inches."""
+"""The widths of one and of both columns of a page, inches."""
 
 DPI = 300
 
 COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000", "#F0E442")
-"""Okabe and Ito's palette, the darker colours first."""
+"""The palette of Okabe and Ito, the darker colours first."""
 
 INK, FAINT = "#222222", "#999999"
 
@@ -56,11 +56,11 @@ _STYLE: Any = {
 
 @dataclass(frozen=True)
 class Figure:
-    """A figure of the study: the name of its files, what to write beside it, and what draws it.
+    """A figure of the study: the name of its files, its title and caption, and the function that draws it.
 
     Attributes:
-        alt: For readers who do not see it.
-        unit: Whose voxels it shows as a map; empty: it shows none.
+        alt: A description for readers who do not see it.
+        unit: The unit whose voxels it shows as a map; empty for a figure without a map.
     """
 
     name: str
@@ -85,7 +85,7 @@ class Figure:
             for suffix, options in formats.items():
                 with atomic_path(folder / f"{self.name}.{suffix}") as temporary:
                     canvas.savefig(temporary, format=suffix, **options)
-                canvas.set_layout_engine("none")  # it is laid out by now; doing so again takes as long as drawing it
+                canvas.set_layout_engine("none")  # the layout is complete; repeating it takes as long as drawing
         return [folder / f"{self.name}.{suffix}" for suffix in formats]
 
 
@@ -124,7 +124,7 @@ def legend_columns(names: Sequence[str], width: float) -> int:
 
 
 LETTERS = "abcdefghijklmnop"
-"""Of panels, in order."""
+"""The letters of panels, in order."""
 
 
 def mark_panel(axes: Axes, letter: str, title: str) -> None:

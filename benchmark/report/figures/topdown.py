@@ -1,4 +1,4 @@
-"""The map seen from above: which voxel is the topmost one of each column along the up axis."""
+"""Find the topmost voxel of each column along the up axis: the map seen from above."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ from semstab.metrics.agreement import rows_of
 
 EMPTY = -1
 LARGEST = 2000
-"""Cells of a map's longer side; a larger map gets cells of several voxels."""
+"""The most cells along a map's longer side; the cells of a larger map are several voxels wide."""
 
 MOST = LARGEST**2
-"""Voxels that are kept of a map that is looked at tile by tile."""
+"""The most voxels that stay in memory of a map that is read tile by tile."""
 
 LID, LIDDED = 0.4, 0.2
 """A map is cut open where more than the second share of its columns are covered by voxels of the upper part, the first
@@ -28,10 +28,11 @@ SLENDER = 2.0
 """A map that is seen to be so many times as large from a side is shown from there: a wall, a facade."""
 
 SPARSE = 16
-"""Columns of cells a voxel from which on those that are there are found by sorting."""
+"""The number of columns per voxel from which on sorting finds the columns that have voxels."""
 
 OUTLIERS = 0.01
-"""Share of the voxels that may lie outside of the map at each of its four sides: lone ones far away would shrink it."""
+"""The share of the voxels that may lie outside of the map at each of its four sides, so that lone voxels far away do
+not shrink it."""
 
 
 def level_axes(up: npt.ArrayLike) -> tuple[Float64, Float64, Float64]:
@@ -49,7 +50,7 @@ def level_axes(up: npt.ArrayLike) -> tuple[Float64, Float64, Float64]:
 def top_down(table: VoxelTable, up: npt.ArrayLike, rank: Float64 | None = None) -> tuple[Int64, float]:
     """Return the row of the topmost voxel in each cell (H, W), or EMPTY, and the edge of a cell in metres.
 
-    rank (n,) says which voxel of a cell is shown instead of the topmost one: the highest.
+    The voxel of a cell that is shown has the highest rank (n,), instead of being the topmost one, where rank is given.
 
     The first row of cells is the farthest ahead. Where up is an axis of the world a cell is a column of voxels; else
     each voxel covers the cells that a level square of its size touches.
@@ -105,7 +106,7 @@ def _tops(table: VoxelTable, up: npt.ArrayLike, factor: int) -> VoxelTable:
 
 
 def best_view(table: VoxelTable, up: npt.ArrayLike) -> tuple[Mask, Float64, str]:
-    """Return which voxels (n,) to look at, against which axis (3,), and what that view is called."""
+    """Return a mask (n,) of the voxels to show, the axis (3,) towards the viewer, and the name of that view."""
     right, ahead, up_axis = level_axes(up)
     every = np.ones(len(table), dtype=np.bool_)
     centers = table.centers
@@ -134,7 +135,7 @@ def _columns(centers: Float64, axis: Float64, voxel_size: float) -> Int64:
 
 
 def _numbered(columns: Int64) -> tuple[Int64, int]:
-    """Return the same numbers without gaps (n,), and how many there are."""
+    """Return the numbers of columns (n,) without gaps, and how many columns there are."""
     if columns.max() > SPARSE * len(columns):
         numbers, own = np.unique(columns, return_inverse=True)
         return own, len(numbers)
@@ -146,14 +147,14 @@ def _numbered(columns: Int64) -> tuple[Int64, int]:
 
 @dataclass(frozen=True, eq=False)
 class FromAbove:
-    """The voxels that are seen from above, or from where more of them shows.
+    """The voxels that are seen from above, or from the side where that shows more of them.
 
     Attributes:
         table: These voxels alone.
-        shown: (n,) whether a voxel of the map is one of them.
+        shown: (n,) mask of these voxels in the map.
         rows: (H, W) the row of each cell's voxel in `table`, EMPTY where there is none.
         cell: The edge of a cell in metres.
-        view: What the view is called.
+        view: The name of the view.
     """
 
     table: VoxelTable
@@ -164,10 +165,10 @@ class FromAbove:
 
     @classmethod
     def of(cls, table: VoxelTable, up: npt.ArrayLike) -> FromAbove:
-        """See `best_view` and `top_down`."""
-        kept, axis, view = best_view(table, up)
-        rows, cell = top_down(rows_of(table, kept), axis)
-        rows = np.where(rows == EMPTY, EMPTY, np.flatnonzero(kept)[rows])
+        """Return the voxels of a map that are seen; see `best_view` and `top_down`."""
+        selected, axis, view = best_view(table, up)
+        rows, cell = top_down(rows_of(table, selected), axis)
+        rows = np.where(rows == EMPTY, EMPTY, np.flatnonzero(selected)[rows])
         shown = np.zeros(len(table), dtype=np.bool_)
         shown[rows[rows != EMPTY]] = True
         renumbered: npt.NDArray[Any] = np.where(rows == EMPTY, EMPTY, (np.cumsum(shown) - 1)[rows])

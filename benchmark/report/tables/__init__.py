@@ -1,4 +1,4 @@
-"""The study's tables: CSV, Markdown and LaTeX rounded as the paper's, JSON in full precision."""
+"""Make the study's tables: CSV, Markdown and LaTeX are rounded as in the paper, JSON has full precision."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ BUILDERS = (
     uncertainty, ceiling, correctness, cross_model, comparison, sensitivity, voxel_sizes, reduced, fusion,
     compared, agreement,
 )  # fmt: skip
-"""In the paper's order, the statistics with what they belong to; each makes none where the study has nothing for it."""
+"""The functions that make tables, in the paper's order; without numbers for its tables a function returns none."""
 
 
 def tables(result: Result) -> list[Table]:
@@ -56,12 +56,12 @@ def tables(result: Result) -> list[Table]:
 
 
 def write_tables(result: Result, folder: str | Path) -> list[Path]:
-    """Write FOLDER/tables/NAME.{csv,md,tex,json} for every table, in place of all others there; return the paths."""
+    """Write FOLDER/tables/NAME.{csv,md,tex,json} for every table, remove all other tables; return the paths."""
     return save_tables(tables(result), folder)
 
 
 def save_tables(made: Sequence[Table], folder: str | Path) -> list[Path]:
-    """Return the same of tables that are made already."""
+    """Write tables that are made already, as `write_tables` does; return the paths."""
     written = []
     for table in made:
         stem = Path(folder) / "tables" / table.name

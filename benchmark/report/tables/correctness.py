@@ -1,4 +1,4 @@
-"""Stability vs. accuracy where ground truth tells: geometry's part, correctness, quadrants."""
+"""Compare stability with accuracy by ground truth: geometry's part, correctness, quadrants."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from semstab.data.records import Result
 from semstab.data.statistics import Correctness, Correlogram, Estimate, LagBin, Losses, MapStatistics, Quadrants
 from semstab.metrics import macro_mean
 from semstab.report.tables.stability import settings
-from semstab.report.tables.statistics import INTERVALS, Number, by_scene, grouped, judged_records
+from semstab.report.tables.statistics import INTERVALS, Number, assessed_records, by_scene, grouped
 from semstab.report.tables.table import Column, Group, Row, Table
 from semstab.statistics.correctness import ACCURACY, BRIER, ECE, MIOU
 from semstab.statistics.correlogram import STANDARD
@@ -18,16 +18,16 @@ from semstab.statistics.intervals import LEAST_FRAMES
 from semstab.statistics.model_comparison import compared
 
 RIGHT = (ACCURACY, MIOU, ECE, BRIER)
-"""How right fused labels are, in the order of the columns."""
+"""The measures of the correctness of fused labels, in the order of the columns."""
 
 
 def ceiling(result: Result) -> list[Table]:
-    """Return disagreement that the ground truth's labels have too, and the rest."""
+    """Return the disagreement that the ground truth's labels also have, and the rest."""
     columns = (
         Column("disagreement", "1 - PSA", 4, "lower"),
-        Column("geometry", "geometry's", 4),
-        Column("model", "the model's", 4, "lower"),
-        Column("geometry_percent", "geometry's (%)", 0),
+        Column("geometry", "of geometry", 4),
+        Column("model", "of the model", 4, "lower"),
+        Column("geometry_percent", "of geometry (%)", 0),
     )
     numbers = (
         _lost(lambda losses: losses.total),
@@ -36,9 +36,9 @@ def ceiling(result: Result) -> list[Table]:
         _lost(lambda losses: 100 * losses.share.value),
     )
     caption = (
-        "Over the voxels that both the predictions and the ground truth saw twice or more. Geometry's: the disagreement"
-        " 1 - PSA that the ground truth's labels have under the same poses, depth and noise; the rest is the model's,"
-        f" negative where it errs alike in all views. {INTERVALS}"
+        "The table shows the voxels that both the predictions and the ground truth saw twice or more. The disagreement"
+        " of geometry is 1 - PSA of the ground truth's labels under the same poses, depth and noise. The rest is of the"
+        f" model; it is negative where the model makes the same error in all views. {INTERVALS}"
     )
     return by_scene(result, "ceiling", "Geometry or model", caption, columns, numbers)
 
@@ -49,22 +49,22 @@ def correctness(result: Result) -> list[Table]:
 
 
 def _correct_by_stratum(result: Result) -> list[Table]:
-    judged = {
-        name: [found.correctness.strata for _, found in rows if found.correctness is not None]
-        for name, rows in judged_records(result).items()
+    by_model = {
+        name: [stats.correctness.strata for _, stats in rows if stats.correctness is not None]
+        for name, rows in assessed_records(result).items()
     }
-    if not any(judged.values()):
+    if not any(by_model.values()):
         return []
     columns = (
         Column("persistence", "Persistence"),
         Column("voxels", "Voxels", 0),
         *map(Column.of, RIGHT),
     )
-    groups = tuple(Group(name, _stratum_rows(strata)) for name, strata in judged.items() if strata)
+    groups = tuple(Group(name, _stratum_rows(strata)) for name, strata in by_model.items() if strata)
     caption = (
-        f"{settings(result.select())} Voxels with a true class: more than half of the ground truth's evidence is for"
-        " it. ECE: expected calibration error of the largest belief; Brier: 0 to 2. Macro means: each scene counts"
-        " once; voxels are those of all scenes."
+        f"{settings(result.select())} The table shows the voxels with a true class, for which more than half of the"
+        " ground truth's evidence is. ECE is the expected calibration error of the largest belief; Brier is the Brier"
+        " score, 0 to 2. They are macro means: each scene counts once. The number of voxels is that of all scenes."
     )
     return [Table("correctness", "Stability vs. accuracy, by observation persistence", caption, columns, groups)]
 
@@ -79,32 +79,32 @@ def _quadrants(result: Result) -> list[Table]:
         Column("wrong_of_consistent_percent", "Wrong of consistent (%)", 1, "lower"),
     )
     numbers = (
-        _quadrant(lambda found: found.voxels),
-        _quadrant(lambda found: found.consistent_right.percent),
-        _quadrant(lambda found: found.consistent_wrong.percent),
-        _quadrant(lambda found: found.inconsistent_right.percent),
-        _quadrant(lambda found: found.inconsistent_wrong.percent),
-        _quadrant(lambda found: found.wrong_of_consistent.percent),
+        _quadrant(lambda quadrants: quadrants.voxels),
+        _quadrant(lambda quadrants: quadrants.consistent_right.percent),
+        _quadrant(lambda quadrants: quadrants.consistent_wrong.percent),
+        _quadrant(lambda quadrants: quadrants.inconsistent_right.percent),
+        _quadrant(lambda quadrants: quadrants.inconsistent_wrong.percent),
+        _quadrant(lambda quadrants: quadrants.wrong_of_consistent.percent),
     )
     caption = (
-        "Over the voxels with OP>=3 and a true class. Stable: PSA >= 0.8, of ten frames one may disagree; right: the"
-        " dominant class is the true one. Consistent but wrong is the dangerous one: no further observation reveals it."
-        f" {INTERVALS}"
+        "The table shows the voxels with OP>=3 and a true class. A voxel is consistent if PSA >= 0.8: one of ten frames"
+        " may disagree. It is right if its dominant class is the true one. A voxel that is consistent but wrong is"
+        f" dangerous: no further observation reveals the error. {INTERVALS}"
     )
-    return by_scene(result, "quadrants", "Stable and right", caption, columns, numbers)
+    return by_scene(result, "quadrants", "Consistent and right", caption, columns, numbers)
 
 
 # --- Parts ------------------------------------------------------------------------------------------------------------
 
 
 def _lost(take: Callable[[Losses], float | Estimate]) -> Number:
-    """Return a number of geometry's part; NaN where that is not known."""
-    return lambda found: math.nan if found.geometry is None else take(found.geometry)
+    """Return a function that takes a number of geometry's part; NaN where that is not known."""
+    return lambda stats: math.nan if stats.geometry is None else take(stats.geometry)
 
 
 def _quadrant(take: Callable[[Quadrants], float | Estimate]) -> Number:
-    """Return a number of the quadrants; NaN without ground truth."""
-    return lambda found: math.nan if found.correctness is None else take(found.correctness.quadrants)
+    """Return a function that takes a number of the quadrants; NaN without ground truth."""
+    return lambda stats: math.nan if stats.correctness is None else take(stats.correctness.quadrants)
 
 
 def _stratum_rows(strata: Sequence[Sequence[Correctness]]) -> tuple[Row, ...]:
@@ -120,13 +120,14 @@ def _right(rows: Sequence[Correctness]) -> list[float]:
     return [macro_mean(column) for column in zip(*values, strict=True)]
 
 
-# The models beside each other, on the same places and at the same number of observations.
+# The models side by side, on the same locations and at the same number of observations.
 
 THIN = 0.1
-"""Part of the weight in strata that hardly overlap, from which on the table says it."""
+"""The share of the weight in strata that hardly overlap from which on the table reports it."""
 
 _COMMON = (
-    "Alpha is of the observations (a cell in a view) that all labelled, the rest of voxels that all saw twice or more."
+    "Alpha is of the observations (a cell in a view) that all models labelled, the rest of the voxels that all saw"
+    " twice or more."
 )
 
 
@@ -134,8 +135,12 @@ def comparison(result: Result) -> list[Table]:
     """Return paired differences, ranking, and what each map covers; one group a scene."""
     if not result.comparisons:
         return []
-    covered = coverage_table({found.scene: found.coverage for found in result.comparisons})
-    shared = {found.scene: found.observations for found in result.comparisons if found.observations is not None}
+    covered = coverage_table({comparison.scene: comparison.coverage for comparison in result.comparisons})
+    shared = {
+        comparison.scene: comparison.observations
+        for comparison in result.comparisons
+        if comparison.observations is not None
+    }
     return [_differences(result), _ranking(result), covered, *([ignored_table(shared)] if shared else [])]
 
 
@@ -146,19 +151,19 @@ def _differences(result: Result) -> Table:
         Column("measure", "Measure"),
         Column("difference", "Difference", 4, signed=True),
         Column("p_holm", "p (Holm)", 4),
-        Column("answers", "interval answers"),
+        Column("answers", "interval is for"),
     )
     caption = (
-        f"{_COMMON} Only the first measure is tested, its p corrected by Holm's method for all pairs of all scenes of"
-        f" which something may be claimed; the others describe. {INTERVALS}"
+        f"{_COMMON} Only the first measure is tested. Its p is corrected by Holm's method for all pairs of all scenes"
+        f" that allow a claim; the other measures describe. {INTERVALS}"
     )
-    groups = tuple(Group(found.scene, _difference_rows(found)) for found in result.comparisons)
-    return Table("comparison", "Differences on the same places", caption, columns, groups, "scene")
+    groups = tuple(Group(comparison.scene, _difference_rows(comparison)) for comparison in result.comparisons)
+    return Table("comparison", "Differences on the same locations", caption, columns, groups, "scene")
 
 
-def _difference_rows(found: ModelComparison) -> tuple[Row, ...]:
+def _difference_rows(comparison: ModelComparison) -> tuple[Row, ...]:
     words = {quantity.key: quantity.word for quantity in compared(truth=True)}
-    rows = sorted(found.paired.differences, key=lambda row: row.measure != found.paired.primary)
+    rows = sorted(comparison.paired.differences, key=lambda row: row.measure != comparison.paired.primary)
     return tuple(
         (row.a, row.b, words[row.measure], row.difference, row.p_holm, row.undecided or row.scope) for row in rows
     )
@@ -175,17 +180,17 @@ def _ranking(result: Result) -> Table:
         Column("standardised", "Same OP", 4),
     )
     caption = (
-        f"In common: {_COMMON[0].lower()}{_COMMON[1:]} Same OP: each map with all its voxels seen twice or more, its"
-        f" strata of OP weighted by those of all maps together. {INTERVALS}"
+        f"The column 'In common' is of shared data. {_COMMON} The column 'Same OP' is of all voxels of each map that"
+        f" were seen twice or more, with its strata of OP weighted as in all maps together. {INTERVALS}"
     )
-    thin = max(found.standardised.thin for found in result.comparisons)
+    thin = max(comparison.standardised.thin for comparison in result.comparisons)
     if thin > THIN:
         caption += f" {thin:.0%} of the weight is in strata of OP that hardly overlap."
-    groups = tuple(Group(found.scene, _ranking_rows(found)) for found in result.comparisons)
+    groups = tuple(Group(comparison.scene, _ranking_rows(comparison)) for comparison in result.comparisons)
     return Table("comparison_ranking", "Order of the models", caption, columns, groups, "scene")
 
 
-def _ranking_rows(found: ModelComparison) -> tuple[Row, ...]:
+def _ranking_rows(comparison: ModelComparison) -> tuple[Row, ...]:
     quantities = {quantity.key: quantity for quantity in compared(truth=True)}
     return tuple(
         (
@@ -194,16 +199,16 @@ def _ranking_rows(found: ModelComparison) -> tuple[Row, ...]:
             rank.model,
             f"{rank.low} to {rank.high}",
             100 * rank.best,
-            found.paired.of(quantities[ranking.measure])[rank.model],
-            found.standardised.of(quantities[ranking.measure], rank.model),
+            comparison.paired.of(quantities[ranking.measure])[rank.model],
+            comparison.standardised.of(quantities[ranking.measure], rank.model),
         )
-        for ranking in found.paired.rankings
+        for ranking in comparison.paired.rankings
         for rank in ranking.ranks
     )
 
 
 def ignored_table(observations: Mapping[str, ComparedObservations]) -> Table:
-    """Return what each model left out, by scene."""
+    """Return the share of pixels that each model left out, by scene."""
     columns = (
         Column("model", "Model"),
         Column("missing_percent", "left out (%)", 1),
@@ -213,22 +218,24 @@ def ignored_table(observations: Mapping[str, ComparedObservations]) -> Table:
         Column("order", "Order depends on it"),
     )
     caption = (
-        "The share of pixels that a model left without a label where another one gives one; the agreement of two"
-        " views in a cell had these pixels agreed never, or always (Manski); alpha by the convention that what is left"
-        " out agrees as by chance. The order depends on it where that alpha, or the agreement within its bounds, would"
-        " order the models otherwise."
+        "A pixel is left out if a model gives it no label where another model gives one. The agreement of two views in"
+        " a cell has two bounds: these pixels agree never, or always (Manski). For alpha, pixels that are left out"
+        " agree as by chance. The order depends on them if that alpha, or the agreement within its bounds, would change"
+        " the order of the models."
     )
-    groups = tuple(Group(scene, _ignored_rows(found)) for scene, found in observations.items())
-    return Table("comparison_ignored", "What was left out", caption, columns, groups, "scene")
+    groups = tuple(Group(scene, _ignored_rows(comparison)) for scene, comparison in observations.items())
+    return Table("comparison_ignored", "Pixels that were left out", caption, columns, groups, "scene")
 
 
-def _ignored_rows(found: ComparedObservations) -> tuple[Row, ...]:
-    depends = "yes" if found.depends else "no"
-    return tuple((row.model, 100 * row.missing, row.psa_low, row.psa_high, row.alpha, depends) for row in found.ignored)
+def _ignored_rows(observations: ComparedObservations) -> tuple[Row, ...]:
+    depends = "yes" if observations.depends else "no"
+    return tuple(
+        (row.model, 100 * row.missing, row.psa_low, row.psa_high, row.alpha, depends) for row in observations.ignored
+    )
 
 
 def coverage_table(covered: Mapping[str, Sequence[MapCoverage]]) -> Table:
-    """Return what each map covers, by scene."""
+    """Return the coverage of each map, by scene."""
     columns = (
         Column("model", "Model"),
         Column("voxels", "Voxels", 0),
@@ -238,9 +245,9 @@ def coverage_table(covered: Mapping[str, Sequence[MapCoverage]]) -> Table:
         Column("common_percent", "in all maps (%)", 1),
         Column("alone", "in no other", 0),
     )
-    caption = "A model that ignores hard pixels covers less, and is compared on easier places."
-    groups = tuple(Group(scene, tuple(map(_coverage_row, found))) for scene, found in covered.items())
-    return Table("comparison_coverage", "What each map covers", caption, columns, groups, "scene")
+    caption = "A model that ignores hard pixels covers less, and is compared on easier locations."
+    groups = tuple(Group(scene, tuple(map(_coverage_row, maps))) for scene, maps in covered.items())
+    return Table("comparison_coverage", "Coverage of each map", caption, columns, groups, "scene")
 
 
 def _coverage_row(row: MapCoverage) -> Row:
@@ -255,7 +262,7 @@ def _coverage_row(row: MapCoverage) -> Row:
     )
 
 
-# Agreement at a stated distance of two observations, and from the nearest to the farthest.
+# Agreement at a stated distance of two observations, and of the nearest and the farthest observations.
 
 
 def correlogram(result: Result) -> list[Table]:
@@ -268,16 +275,16 @@ def correlogram(result: Result) -> list[Table]:
         *(Column(f"{axis}_{end}", f"{end}", 3, over=f"By {axis}") for axis in _AXES for end in ("nearest", "farthest")),
     )
     numbers = (
-        _of(lambda found: found.standard.alpha),
-        _of(lambda found: found.standard.pairs or math.nan),
+        _of(lambda correlogram: correlogram.standard.alpha),
+        _of(lambda correlogram: correlogram.standard.pairs or math.nan),
         *(_of(_end(axis, last)) for axis in _AXES for last in (0, -1)),
     )
     caption = (
-        "Alpha of pairs of observations of a cell, by how far apart they are: models and flights compare at a"
-        " stated angle between the directions of view, not over whatever pairs a flight has. Nearest, farthest: the"
-        " first and the last bin with enough pairs in time (frames), angle, ratio of the ranges, and distance of the"
-        " cameras. Not extrapolated to cells without a size; intervals at 95%, for this scene flown again"
-        f" if {LEAST_FRAMES} frames of a bin tell of it, else for these frames."
+        "The table shows alpha of pairs of observations of a cell, by their distance. Models and flights are compared"
+        " at a stated angle between the directions of view, not over all pairs that a flight has. Nearest and farthest"
+        " are the first and the last bin with enough pairs in time (frames), angle, ratio of the ranges, and distance"
+        " of the cameras. Alpha is not extrapolated to cells without a size. Intervals are at 95%, for this scene flown"
+        f" again if a bin has {LEAST_FRAMES} frames, else for these frames."
     )
     return by_scene(result, "correlogram", "Agreement by distance of the observations", caption, columns, numbers)
 
@@ -286,12 +293,12 @@ _AXES = ("time", "angle", "range", "baseline")
 
 
 def _of(take: Callable[[Correlogram], float | Estimate]) -> Callable[[MapStatistics], float | Estimate]:
-    return lambda found: math.nan if found.correlogram is None else take(found.correlogram)
+    return lambda stats: math.nan if stats.correlogram is None else take(stats.correlogram)
 
 
 def _end(axis: str, last: int) -> Callable[[Correlogram], float]:
-    def value(found: Correlogram) -> float:
-        bins: Sequence[LagBin] = getattr(found, axis)
+    def value(correlogram: Correlogram) -> float:
+        bins: Sequence[LagBin] = getattr(correlogram, axis)
         return bins[last].alpha.value if len(bins) > 1 else math.nan
 
     return value

@@ -1,4 +1,4 @@
-"""Filters over a model beside each other: how stable, how right, how late, what is left, what it costs."""
+"""Compare filters over a model: stability, correctness, delay, coverage and cost."""
 
 from __future__ import annotations
 
@@ -8,40 +8,40 @@ from semstab.report.tables.table import Column, Group, Row, Table
 
 COLUMNS = (
     Column("filter", "Filter"),
-    Column("flicker_percent", "Flicker (%)", 2, "lower", over="Steady?"),
-    Column("alpha", "alpha", 3, over="Steady?"),
-    Column("next_frame_percent", "Next frame (%)", 2, "higher", over="Right?"),
-    Column("accuracy_percent", "Accuracy (%)", 2, "higher", over="Right?"),
-    Column("miou_percent", "mIoU (%)", 2, "higher", over="Right?"),
-    Column("consistent_wrong_percent", "Consistent, wrong (%)", 2, "lower", over="Right?"),
+    Column("flicker_percent", "Flicker (%)", 2, "lower", over="Stability"),
+    Column("alpha", "alpha", 3, over="Stability"),
+    Column("next_frame_percent", "Next frame (%)", 2, "higher", over="Correctness"),
+    Column("accuracy_percent", "Accuracy (%)", 2, "higher", over="Correctness"),
+    Column("miou_percent", "mIoU (%)", 2, "higher", over="Correctness"),
+    Column("consistent_wrong_percent", "Consistent, wrong (%)", 2, "lower", over="Correctness"),
     Column("lag_frames", "Lag (frames)", 2, "lower", over="Price"),
     Column("coverage_percent", "Coverage (%)", 1, over="Price"),
     Column("milliseconds", "ms", 1, "lower", over="Price"),
 )
 CAPTION = (
-    "Flicker: of the places that two frames in a row see, those whose label changes (camera motion taken out). Alpha:"
-    " agreement of two views at the same spot; it rises with any memory of frames before, as frames that share one"
-    " are no longer independent: of a filter that remembers a high alpha says nothing. Next frame: of the places that"
-    " the next frame sees, those whose label the unfiltered model gives them there; no filter has seen that frame, so"
-    " what it merely repeats does not count. Accuracy and mean IoU: of the labelled pixels of single frames. Stable,"
-    " wrong: of the places seen again, those that keep a label that is wrong. Lag: frames by which labels follow a true"
-    " change of what is seen later than the model (at most 8). Coverage: labelled pixels for one of the model's. ms:"
-    " CPU time a frame. Means over scenes."
+    "Flicker is the share of pixels seen in two frames in a row whose label changes, camera motion removed. Alpha is"
+    " the agreement of two views at the same spot. It rises with any memory of earlier frames, because frames that"
+    " share a memory are not independent: a high alpha of a filter with memory is no evidence. Next frame is the share"
+    " of pixels seen in the next frame that have the label that the unfiltered model gives them there; no filter has"
+    " seen that frame, so a repeated label does not count. Accuracy and mean IoU are of the labelled pixels of single"
+    " frames. Consistent, wrong is the share of pixels seen again that keep a wrong label. Lag is the number of frames"
+    " by which labels follow a true change later than the model (at most 8). Coverage is the number of labelled pixels"
+    " for each labelled pixel of the model. ms is the CPU time per frame. All numbers are means over scenes."
 )
 
 
 def filter_tables(result: Result) -> list[Table]:
-    """Return one table of all models, where filters were judged."""
-    found = filter_studies(result)
-    if not found:
+    """Return one table of all models whose filters were assessed."""
+    studies = filter_studies(result)
+    if not studies:
         return []
-    groups = tuple(Group(each.model, tuple(map(row, [each.unfiltered, *each.filtered]))) for each in found)
-    best = [f"{each.best.filters} over {each.model}" if each.best else f"none over {each.model}" for each in found]
+    groups = tuple(Group(each.model, tuple(map(row, [each.unfiltered, *each.filtered]))) for each in studies)
+    best = [f"{each.best.filters} over {each.model}" if each.best else f"none over {each.model}" for each in studies]
     return [
         Table(
             "filters",
-            "Which filter makes the labels more stable",
-            f"{CAPTION} To use: {', '.join(best)}.",
+            "Filters that make labels more stable",
+            f"{CAPTION} Recommended: {', '.join(best)}.",
             COLUMNS,
             groups,
             "model",
@@ -50,7 +50,7 @@ def filter_tables(result: Result) -> list[Table]:
 
 
 def row(result: FilterResult) -> Row:
-    """Return its cells."""
+    """Return the cells of a filter."""
     return (
         result.filters or "none",
         100 * result.flicker,
@@ -65,6 +65,6 @@ def row(result: FilterResult) -> Row:
     )
 
 
-def marked(found: FilterStudy, result: FilterResult) -> str:
-    """Return '*' for the one to use, '!' for one that is steadier and worse."""
-    return "*" if result == found.best else "!" if result in found.misleading else ""
+def marked(study: FilterStudy, result: FilterResult) -> str:
+    """Return '*' for the recommended filter, '!' for one that lowers flicker and makes labels worse."""
+    return "*" if result == study.best else "!" if result in study.misleading else ""

@@ -1,4 +1,4 @@
-"""Stability in the world: by scene, by persistence, by class, and of the models in one taxonomy."""
+"""Make the tables of stability in the world: by scene, by persistence, by class, and of models in one taxonomy."""
 
 from __future__ import annotations
 
@@ -32,14 +32,14 @@ SBD_OVER = "Means of SBD (bits) run over the voxels seen twice or more."
 
 
 def of_measures(*, compared: bool = False, prefix: str = "", over: str = "") -> list[Column]:
-    """Return a column a measure: the paper prints more decimals where it compares."""
+    """Return a column for each measure: the paper prints more decimals where it compares."""
     return [Column.of(measure, compared=compared, prefix=prefix, over=over) for measure in measures()]
 
 
 def scenes(result: Result) -> list[Table]:
     """Return the multi-scene table.
 
-    Each scene, then totals and macro means (paper, Multi-Scene Voxel-Level Stability).
+    It has each scene, then totals and macro means (paper, Multi-Scene Voxel-Level Stability).
     """
     records = result.select()
     if not records:
@@ -56,8 +56,8 @@ def scenes(result: Result) -> list[Table]:
         for name, rows in by_model(records).items()
     )
     caption = (
-        f"{settings(records)} A scene's numbers are means over its voxels. Total / Mean: total voxels and points,"
-        f" macro means of the rest, in which each scene counts once. {SBD_OVER}"
+        f"{settings(records)} A scene's numbers are means over its voxels. Total / Mean has the total voxels and"
+        f" points, and macro means of the rest, in which each scene counts once. {SBD_OVER}"
     )
     return [Table("scenes", "Stability by scene", caption, columns, groups)]
 
@@ -74,11 +74,11 @@ def persistence(result: Result) -> list[Table]:
         rows = (*together.strata, *together.well_seen)
         groups.append(Group(name, tuple(_means_row(row) for row in rows), _means_row(together.recurrent)))
     caption = (
-        f"{settings(records)} Pooled: the means run over the voxels of all scenes together. The last row is the"
-        " recurrent voxels. A voxel seen once has no SBD, and where its pixels agree VSS = 1 and no entropy."
+        f"{settings(records)} The means are pooled: they run over the voxels of all scenes together. The last row is"
+        " the recurrent voxels. A voxel seen once has no SBD; if its pixels agree, its VSS is 1 and its entropy is 0."
     )
     if any(split_last([record.summary.table for record in own]) for own in by_model(records).values()):
-        caption += " Where most voxels are in the last stratum, it follows in parts."
+        caption += " If most voxels are in the last stratum, its parts follow."
     return [Table("persistence", "Stability by observation persistence", caption, columns, tuple(groups))]
 
 
@@ -92,8 +92,8 @@ def classes(result: Result) -> list[Table]:
         Group(name, tuple(_class_row(row) for row in pooled(rows).classes)) for name, rows in by_model(records).items()
     )
     caption = (
-        f"{settings(records)} Pooled: the means run over the voxels of all scenes that the class dominates."
-        f" {SBD_OVER} Rare: fewer than {ENOUGH:,} voxels, too few to compare."
+        f"{settings(records)} The means are pooled: they run over the voxels of all scenes that the class dominates."
+        f" {SBD_OVER} A rare class has fewer than {ENOUGH:,} voxels, too few to compare."
     )
     return [Table("classes", "Stability by dominant class", caption, columns, groups)]
 
@@ -101,7 +101,7 @@ def classes(result: Result) -> list[Table]:
 def cross_model(result: Result) -> list[Table]:
     """Return the models in one taxonomy.
 
-    All voxels and the recurrent ones (paper, Cross-Model Temporal Stability).
+    The means are over all voxels and over the recurrent ones (paper, Cross-Model Temporal Stability).
     """
     records = comparable(result)
     if not records:
@@ -109,8 +109,9 @@ def cross_model(result: Result) -> list[Table]:
     columns = (Column("over", "Means over"), VOXELS, SHARE, *of_measures(compared=True))
     groups = tuple(Group(name, _comparison_rows(rows)) for name, rows in by_model(records).items())
     caption = (
-        f"{settings(records)} Macro: each scene counts once. Pooled: the voxels of all scenes together; compare the"
-        f" recurrent voxels (OP>=3) with the pooled row, and their share between models. {SBD_OVER}"
+        f"{settings(records)} In a macro mean each scene counts once; a pooled mean runs over the voxels of all scenes"
+        " together. Compare the recurrent voxels (OP>=3) with the pooled row, and their share between models."
+        f" {SBD_OVER}"
     )
     return [Table("cross_model", "Models in one taxonomy", caption, columns, groups)]
 
@@ -118,7 +119,7 @@ def cross_model(result: Result) -> list[Table]:
 def comparable(result: Result) -> tuple[Record, ...]:
     """Return records of several models in one taxonomy.
 
-    Those fused for it, else the base ones where they share theirs.
+    They are the records fused for it, else the base records if these share a taxonomy.
     """
     records = result.select(SHARED) or result.select()
     several = len(by_model(records)) > 1
@@ -126,10 +127,10 @@ def comparable(result: Result) -> tuple[Record, ...]:
 
 
 def settings(records: Sequence[Record]) -> str:
-    """Return what the units have in common, as a sentence."""
+    """Return the voxel sizes and taxonomies of the units, as a sentence."""
     sizes = sorted({record.summary.table.voxel_size for record in records})
     spaces = dict.fromkeys(f"{record.summary.taxonomy} (K = {record.summary.table.K})" for record in records)
-    return f"Voxels of {', '.join(f'{size:g}' for size in sizes)} m, taxonomy {', '.join(spaces)}."
+    return f"Voxels measure {', '.join(f'{size:g}' for size in sizes)} m; the taxonomy is {', '.join(spaces)}."
 
 
 def _scene_row(record: Record) -> Row:
@@ -171,10 +172,10 @@ def _comparison_rows(records: Sequence[Record]) -> tuple[Row, ...]:
     )
 
 
-# Overview of the models: alpha, what all voxels say, what the recurrent ones say, and how many there are.
+# The overview of the models has alpha, the means of all voxels and of the recurrent ones, and their share.
 
 _HEADLINES = (VSS, SBD)
-"""The paper's two: an overview is no place for all."""
+"""The two measures of the paper: an overview has no room for all."""
 
 _COLUMNS = (
     Column("model", "Model"),
@@ -189,14 +190,14 @@ _COLUMNS = (
 
 
 def overview(result: Result) -> list[Table]:
-    """Return one row a model."""
+    """Return one row for each model."""
     records = result.select()
     if not records:
         return []
-    rows = tuple(_row(name, found) for name, found in by_model(records).items())
+    rows = tuple(_row(name, own) for name, own in by_model(records).items())
     caption = (
-        f"{settings(records)} Pooled over the voxels of all scenes; alpha and flicker are macro means of the scenes;"
-        f" pixel flicker has the camera's motion in it. {SBD_OVER}"
+        f"{settings(records)} The means are pooled over the voxels of all scenes; alpha and flicker are macro means of"
+        f" the scenes; pixel flicker includes the camera's motion. {SBD_OVER}"
     )
     return [Table("overview", "Overview", caption, _COLUMNS, (Group("", rows),), by="")]
 
@@ -215,13 +216,13 @@ def _row(model: str, records: Sequence[Record]) -> Row:
     )
 
 
-# The sensitivity sweeps: what all voxels say and what the recurrent ones say, side by side with their share.
+# The sensitivity sweeps: means of all voxels and of the recurrent ones side by side, with their share.
 
 
 def sensitivity(result: Result) -> list[Table]:
-    """Return one table a sweep (paper, Sensitivity to World-Space Association), and one with agreement."""
-    found = [(_table(result, sweep), _agreement_table(result, sweep)) for sweep in swept(result)]
-    return [table for pair in found for table in pair if table is not None]
+    """Return one table for each sweep (paper, Sensitivity to World-Space Association), and one with agreement."""
+    pairs = [(_table(result, sweep), _agreement_table(result, sweep)) for sweep in swept(result)]
+    return [table for pair in pairs for table in pair if table is not None]
 
 
 def _table(result: Result, sweep: Sweep) -> Table:
@@ -241,9 +242,9 @@ def _table(result: Result, sweep: Sweep) -> Table:
     )
     scenes = dict.fromkeys(scene for name in models for scene in complete_scenes(result, sweep.name, name))
     caption = (
-        f"Pooled: the means run over the voxels of all scenes together ({', '.join(scenes)}); ± is the standard"
-        f" deviation over the repeats, each with a seed of its own. {SBD_OVER} Few: fewer than {ENOUGH:,} recurrent"
-        " voxels."
+        f"The means are pooled: they run over the voxels of all scenes together ({', '.join(scenes)}); ± is the"
+        f" standard deviation over the repeats, each with a seed of its own. {SBD_OVER} The note 'few' marks fewer than"
+        f" {ENOUGH:,} recurrent voxels."
     )
     return Table(f"sensitivity_{sweep.name}", f"Sensitivity to {sweep.title}", caption, columns, groups)
 
@@ -258,16 +259,16 @@ def _agreement_table(result: Result, sweep: Sweep) -> Table | None:
         Column("sbd_excess", "SBD excess", 4, signed=True),
     )
     by_model = {name: levels(result, sweep.name, name) for name in result.models}
-    found = {name: rows for name, rows in by_model.items() if any(level.judged for level in rows)}
-    if not found:
+    known = {name: rows for name, rows in by_model.items() if any(level.assessed for level in rows)}
+    if not known:
         return None
-    groups = tuple(Group(name, tuple(_agreement_row(sweep, level) for level in rows)) for name, rows in found.items())
+    groups = tuple(Group(name, tuple(_agreement_row(sweep, level) for level in rows)) for name, rows in known.items())
     caption = (
-        "VSS is pooled over the voxels of all scenes; the rest is of those seen twice or more, macro means of the"
-        " scenes. PSA: share of pairs of frames that agree about a voxel; alpha: of two views at the same spot, beyond"
-        " chance; SBD excess: SBD less what the same observations give in random order (bits). These three do not"
-        " depend on how often a voxel was seen; which voxels were seen twice still changes along the sweep. ± is the"
-        " standard deviation over the repeats."
+        "VSS is pooled over the voxels of all scenes. The other numbers are of the voxels seen twice or more, and are"
+        " macro means of the scenes. PSA is the share of pairs of frames that agree about a voxel. Alpha is the"
+        " agreement of two views at the same spot beyond chance. SBD excess is SBD less that of the same observations"
+        " in random order (bits). These three do not depend on how often a voxel was seen, but the set of voxels seen"
+        " twice changes along the sweep. ± is the standard deviation over the repeats."
     )
     title = f"Agreement against {sweep.title}"
     return Table(f"sensitivity_agreement_{sweep.name}", title, caption, columns, groups)
@@ -312,14 +313,14 @@ _NUMBERS = (
     Column("self_vc16", "VC16", 4, "higher", over="Without truth"),
 )
 _WHAT = (
-    "Pixel flicker: share of the pixels valid in two consecutive sampled frames whose label changes. Flicker: the same"
-    " after the earlier map is warped by depth and pose, occluded pixels left out, so that camera motion does not"
-    " count; co-visible is the share of the valid pixels that the warped map reaches. VC8, VC16: video consistency, the"
-    " share of the pixels whose ground truth stays the same through a clip of 8 or 16 frames and whose prediction does"
-    " too; without truth, of all pixels valid throughout."
+    "Pixel flicker is the share of the pixels valid in two consecutive sampled frames whose label changes. Flicker is"
+    " the same share after the earlier map is warped by depth and pose, without occluded pixels, so that camera motion"
+    " does not count; co-visible is the share of the valid pixels that the warped map reaches. VC8 and VC16 are video"
+    " consistency: of the pixels whose ground truth stays the same through a clip of 8 or 16 frames, the share whose"
+    " prediction stays the same. Without truth they are of all pixels that are valid throughout the clip."
 )
 _REGIONS = (
-    " Regions without classes ({names}) are matched from frame to frame; a pixel stays where its regions are a match."
+    " Regions without classes ({names}) are matched from frame to frame; a pixel is unchanged if its regions match."
 )
 
 
@@ -331,11 +332,14 @@ def flicker(result: Result) -> list[Table]:
     regions = dict.fromkeys(row.model for row in result.regions)
     what = _WHAT + (_REGIONS.format(names=", ".join(regions)) if regions else "")
     macro = tuple((name, *_numbers(scenes.values())) for name, scenes in methods.items())
-    columns, caption = (Column("method", "Method"), *_NUMBERS), f"{what} Macro means: each scene counts once."
+    columns, caption = (
+        (Column("method", "Method"), *_NUMBERS),
+        f"{what} The numbers are macro means: each scene counts once.",
+    )
     tables = [Table("flicker", "Flicker in image space", caption, columns, (Group("", macro),), by="")]
     if any(len(scenes) > 1 for scenes in methods.values()):
         groups = tuple(
-            Group(name, tuple((scene, *_numbers([found])) for scene, found in scenes.items()))
+            Group(name, tuple((scene, *_numbers([numbers])) for scene, numbers in scenes.items()))
             for name, scenes in methods.items()
         )
         columns = (Column("scene", "Scene"), *_NUMBERS)
@@ -344,13 +348,13 @@ def flicker(result: Result) -> list[Table]:
 
 
 def _by_method(result: Result) -> dict[str, dict[str, ImageSpace]]:
-    """Group by model and scene; regions without classes have flicker only."""
+    """Return the numbers by model and scene; regions without classes have flicker only."""
     methods: dict[str, dict[str, ImageSpace]] = {}
     for record in result.select():
         methods.setdefault(record.unit.model, {})[record.unit.scene] = record.image_space
     for row in result.regions:
-        found = ImageSpace(row.flicker_percent, row.compensated_flicker_percent, row.compensated_share)
-        methods.setdefault(row.model, {})[row.scene] = found
+        numbers = ImageSpace(row.flicker_percent, row.compensated_flicker_percent, row.compensated_share)
+        methods.setdefault(row.model, {})[row.scene] = numbers
     return methods
 
 
@@ -367,14 +371,14 @@ def _numbers(scenes: Iterable[ImageSpace]) -> Row:
     )
 
 
-# The fusion implementations: the same frames through every backend, and how far each moves the measures.
+# The fusion implementations: the same frames through every backend, and the differences of the measures.
 
 DIFFERENCE = "Difference to the first"
 LARGEST = "Largest difference"
 
 
 def fusion(result: Result) -> list[Table]:
-    """Return each backend beside the base one, over the scenes that every backend fused."""
+    """Return each backend and the base one side by side, over the scenes that every backend fused."""
     groups = tuple(group for name in result.models if (group := _group(result, name)) is not None)
     if not groups:
         return []
@@ -384,20 +388,20 @@ def fusion(result: Result) -> list[Table]:
         Column("mean_op", "Mean OP", 2),
         *of_measures(compared=True),
         Column("recurrent_percent", "OP>=3 (%)", 2),
-        Column("fuse_ms_per_frame", "ms a frame", 1, "lower"),
+        Column("fuse_ms_per_frame", "ms per frame", 1, "lower"),
         Column("delta_voxels", "Voxels", 0, signed=True, over=DIFFERENCE),
         Column("delta_mean_op", "OP", 2, signed=True, over=DIFFERENCE),
         *(Column(f"delta_{m.key}", m.title, m.digits[1], signed=True, over=DIFFERENCE) for m in measures()),
     )
     caption = (
-        f"{settings(result.select())} Pooled: the means run over the voxels of all scenes together; ms a frame is the"
-        f" macro mean. The base backend stands first. {SBD_OVER}"
+        f"{settings(result.select())} The means are pooled: they run over the voxels of all scenes together; ms per"
+        f" frame is the macro mean. The base backend is first. {SBD_OVER}"
     )
     return [Table("fusion", "Fusion implementations", caption, columns, groups)]
 
 
 def compared(result: Result) -> list[Table]:
-    """Return where a backend that associates pixels and voxels in another way leaves the base one's map."""
+    """Return the differences of maps by backends that associate pixels and voxels in another way than the base one."""
     if not result.compared:
         return []
     titles = {"op": "OP", **{measure.key: measure.title for measure in measures() if not measure.lowest_op > 1}}
@@ -415,10 +419,10 @@ def compared(result: Result) -> list[Table]:
         for pair in pairs
     )
     caption = (
-        "The same frames through code that associates pixels and voxels in another way, and need not agree. Labels and"
-        " differences, which have no sign, are of the voxels that both maps have."
+        "The same frames were fused by backends that associate pixels and voxels in another way; their maps need not"
+        " agree. Labels and differences, which have no sign, are of the voxels that both maps have."
     )
-    return [Table("fusion_compared", "Where fusion implementations differ", caption, columns, groups, "backends")]
+    return [Table("fusion_compared", "Differences of fusion implementations", caption, columns, groups, "backends")]
 
 
 def _compared_row(row: Agreement, names: Iterable[str]) -> Row:
@@ -428,7 +432,7 @@ def _compared_row(row: Agreement, names: Iterable[str]) -> Row:
 
 
 def agreement(result: Result) -> list[Table]:
-    """Return how far each backend's map agrees with the base one's, voxel by voxel."""
+    """Return the agreement of each backend's map with the base one's, voxel by voxel."""
     if not result.agreement:
         return []
     titles = {"op": "OP", **{measure.key: measure.title for measure in measures()}, "evidence": "Evidence"}
@@ -442,9 +446,11 @@ def agreement(result: Result) -> list[Table]:
     pairs = dict.fromkeys(row.backends for row in result.agreement)
     rows = [(row.backends, _backend_agreement_row(row, titles)) for row in result.agreement]
     groups = tuple(Group(" and ".join(pair), tuple(row for of, row in rows if of == pair)) for pair in pairs)
-    caption = "The same frames through two backends: the largest difference of any voxel that both maps have."
+    caption = (
+        "Two backends fused the same frames. The table shows the largest difference of any voxel that both maps have."
+    )
     if one_in := {row.one_in for row in result.agreement} - {1}:
-        caption += f" Against the numpy reference one voxel in {max(one_in)} was compared, drawn at random."
+        caption += f" With the numpy reference, one voxel in {max(one_in)} was compared, drawn at random."
     return [Table("agreement", "Agreement of the fusion implementations", caption, columns, groups, "backends")]
 
 
@@ -461,9 +467,9 @@ def _group(result: Result, model: str) -> Group | None:
     scenes = set.intersection(*(set(rows) for rows in by_backend.values()))
     if not others or not scenes:
         return None
-    found = {name: pooled([row for scene, row in rows.items() if scene in scenes]) for name, rows in by_backend.items()}
-    base = found[result.backend]
-    return Group(model, tuple(_backend_row(name, mean, base) for name, mean in found.items()))
+    means = {name: pooled([row for scene, row in rows.items() if scene in scenes]) for name, rows in by_backend.items()}
+    base = means[result.backend]
+    return Group(model, tuple(_backend_row(name, mean, base) for name, mean in means.items()))
 
 
 def _backend_row(backend: str, mean: Pooled, base: Pooled) -> Row:
@@ -480,11 +486,11 @@ def _backend_row(backend: str, mean: Pooled, base: Pooled) -> Row:
     )
 
 
-# The same map by other means: soft scores reduced to labels, other voxel sizes.
+# The same map with other settings: soft scores reduced to labels, other voxel sizes.
 
 
 def reduced(result: Result) -> list[Table]:
-    """Return soft scores reduced to each pixel's likeliest class, beside hard labels: what the two compare by."""
+    """Return numbers that compare hard labels with soft scores, which are reduced to each pixel's likeliest class."""
     records = result.select()
     if len({record.summary.reduced is None for record in records}) < 2:
         return []
@@ -498,17 +504,17 @@ def reduced(result: Result) -> list[Table]:
         Group(name, tuple(_reduced_row(record) for record in rows)) for name, rows in by_model(records).items()
     )
     caption = (
-        "Hard labels and soft scores do not compare by VSS, entropy or voxel alpha, because scores spread their"
-        " evidence; alpha is of the likeliest classes. Here scores are reduced to each pixel's likeliest class, and"
-        " labels are as they are."
+        "VSS, entropy and voxel alpha do not compare hard labels with soft scores, because scores spread their"
+        " evidence; alpha is of the likeliest classes. Here scores are reduced to each pixel's likeliest class; labels"
+        " are unchanged."
     )
     return [Table("reduced", "Labels and reduced scores", caption, columns, groups)]
 
 
 def _reduced_row(record: Record) -> Row:
-    found, table, statistics = record.summary.reduced, record.summary.table, record.summary.statistics
-    if found is not None:
-        return record.unit.scene, found.vss, found.recurrent_vss, found.voxel_alpha
+    reduced, table, statistics = record.summary.reduced, record.summary.table, record.summary.statistics
+    if reduced is not None:
+        return record.unit.scene, reduced.vss, reduced.recurrent_vss, reduced.voxel_alpha
     alpha = math.nan if statistics is None else statistics.agreement.voxel_alpha.value
     return record.unit.scene, table[VSS], table.recurrent[VSS], alpha
 
@@ -525,7 +531,7 @@ def voxel_sizes(result: Result) -> list[Table]:
         )
     )
     columns = (Column("scene", "Scene"), Column("voxel_size", "Voxel (m)", 4), Column("frames", "Frames", 0))
-    caption = "Krippendorff's alpha of the same frames in voxels of other sizes: how far it depends on that choice."
+    caption = "The table shows Krippendorff's alpha of the same frames in voxels of other sizes."
     return (
         [Table("voxel_sizes", "Other voxel sizes", caption, (*columns, Column.of(VOXEL_ALPHA)), groups)]
         if groups

@@ -1,4 +1,4 @@
-"""What the statistics say of each map: agreement, drift, where uncertainty comes from, the verdict."""
+"""Make the tables of each map's statistics: agreement, drift, uncertainty and the verdict."""
 
 from __future__ import annotations
 
@@ -20,17 +20,17 @@ from semstab.statistics.verdict import ADVICE, DANGEROUS, DECIDED, LIMITS, MOST_
 SCENE = Column("scene", "Scene")
 REPEATED = Column("repeated_voxels", "Voxels", 0)
 INTERVALS = (
-    "In brackets: intervals at 95% for these frames; those of verdicts for this scene flown again"
-    f" if {LEAST_FRAMES} frames tell of it."
+    "Brackets hold intervals at 95% for these frames; those of verdicts are for this scene flown again"
+    f" if there are {LEAST_FRAMES} frames."
 )
-SEEN_TWICE = "Over the voxels seen twice or more."
+SEEN_TWICE = "The table shows the voxels seen twice or more."
 
 T = TypeVar("T")
 Number = Callable[[MapStatistics], float | Estimate]
 
 
 def temporal_agreement(result: Result) -> list[Table]:
-    """Return alpha and what it rests on, and agreement at the voxels, which depends on their size."""
+    """Return alpha with the data that it rests on, and the agreement at voxels, which depends on their size."""
     columns = (
         Column.of(ALPHA),
         Column("cells", "Cells", 0),
@@ -43,33 +43,34 @@ def temporal_agreement(result: Result) -> list[Table]:
         Column.of(FLIP_RATE),
     )
     numbers: tuple[Number, ...] = (
-        lambda found: found.headline.alpha.ends,
+        lambda stats: stats.headline.alpha.ends,
         of_cells(lambda cells: cells.cells),
         of_cells(lambda cells: cells.views),
         of_cells(lambda cells: 100 * cells.labelled),
-        lambda found: found.repeated.voxels,
-        lambda found: found.agreement.vss.value,
-        lambda found: found.agreement.psa,
-        lambda found: found.agreement.kappa.value,
-        lambda found: found.agreement.voxel_alpha,
-        lambda found: found.agreement.within.value,
-        lambda found: found.agreement.between.value,
-        lambda found: math.nan if found.drift.flips is None else found.drift.flips.rate.value,
+        lambda stats: stats.repeated.voxels,
+        lambda stats: stats.agreement.vss.value,
+        lambda stats: stats.agreement.psa,
+        lambda stats: stats.agreement.kappa.value,
+        lambda stats: stats.agreement.voxel_alpha,
+        lambda stats: stats.agreement.within.value,
+        lambda stats: stats.agreement.between.value,
+        lambda stats: math.nan if stats.drift.flips is None else stats.drift.flips.rate.value,
     )
     caption = (
-        "Alpha: agreement of two views at the same spot beyond chance, 1 perfect, 0 chance, of sampled cells that two"
-        " views saw, whatever the voxels are. The rest is of the voxels seen twice or more. PSA: share of pairs of"
-        " frames that agree about a voxel; kappa (Fleiss) and voxel alpha (Krippendorff): the same beyond chance;"
-        " disagreement: the parts of 1 - PSA within a frame and between frames; flip rate: share of the steps from one"
-        f" observation to the next at which the predicted class changes. {INTERVALS}"
+        "Alpha is the agreement of two views at the same spot beyond chance: 1 is perfect, 0 is chance. It is measured"
+        " on sampled cells that two views saw, and does not depend on the voxel size. The other numbers are of the"
+        " voxels seen twice or more. PSA is the share of pairs of frames that agree about a voxel; kappa (Fleiss) and"
+        " voxel alpha (Krippendorff) are the same agreement beyond chance. Disagreement has the parts of 1 - PSA within"
+        " a frame and between frames. Flip rate is the share of the steps from one observation to the next at which the"
+        f" predicted class changes. {INTERVALS}"
     )
     return by_scene(result, "temporal_agreement", "Agreement of the frames", caption, columns, numbers)
 
 
 def class_agreement(result: Result) -> list[Table]:
     """Return alpha of each class against all others; macro means over scenes."""
-    judged = judged_records(result)
-    groups = tuple(Group(name, _class_rows([found for _, found in rows])) for name, rows in judged.items())
+    assessed = assessed_records(result)
+    groups = tuple(Group(name, _class_rows([stats for _, stats in rows])) for name, rows in assessed.items())
     if not any(group.rows for group in groups):
         return []
     columns = (
@@ -80,22 +81,24 @@ def class_agreement(result: Result) -> list[Table]:
         *map(Column.of, (KAPPA, VOXEL_ALPHA)),
     )
     cells = [row[1:] for group in groups for row in group.rows]
-    known = [k for k in range(len(columns)) if any(_says(row[k]) for row in cells)]
-    kept = tuple(
+    known = [k for k in range(len(columns)) if any(_has_content(row[k]) for row in cells)]
+    retained = tuple(
         Group(group.name, tuple((row[0], *(row[1 + k] for k in known)) for row in group.rows)) for group in groups
     )
     caption = (
-        "Each class against all others; observations are the evidence for it in voxels seen twice or more, in frames,"
-        f" of all scenes. A class counts for the verdict where it has enough locations; unstable: the probability that"
-        f" its alpha is below {LIMITS.usable:.3f}. Classes that no frame saw are left out. Macro means: each scene"
-        f" counts once. {INTERVALS}"
+        "The table compares each class with all others. Observations are the evidence for a class in voxels seen twice"
+        " or more, in frames, of all scenes. A class counts for the verdict if it has enough locations. Unstable is the"
+        f" probability that its alpha is below {LIMITS.usable:.3f}. Classes that no frame saw are left out. The numbers"
+        f" are macro means: each scene counts once. {INTERVALS}"
     )
     title = "Agreement of the frames, by class"
-    return [Table("class_agreement", title, caption, (Column("class", "Class"), *(columns[k] for k in known)), kept)]
+    return [
+        Table("class_agreement", title, caption, (Column("class", "Class"), *(columns[k] for k in known)), retained)
+    ]
 
 
 def drift(result: Result) -> list[Table]:
-    """Return SBD beside what a random order of the same observations gives, and what goes one way in time."""
+    """Return SBD, the SBD of the same observations in random order, and the trend in time."""
     columns = (
         Column("voxels", "Voxels", 0),
         Column("sbd", "observed", 4, over="SBD (bits)"),
@@ -109,19 +112,19 @@ def drift(result: Result) -> list[Table]:
         ordered(lambda drift: drift.sbd.value),
         ordered(lambda drift: drift.null.value),
         ordered(lambda drift: drift.excess),
-        lambda found: UNDEFINED if found.drift.trend is None else found.drift.trend.share.percent,
-        lambda found: math.nan if found.drift.trend is None else found.drift.trend.voxels,
+        lambda stats: UNDEFINED if stats.drift.trend is None else stats.drift.trend.share.percent,
+        lambda stats: math.nan if stats.drift.trend is None else stats.drift.trend.voxels,
     )
     logged = any(r.statistics is not None and r.statistics.drift.trend is not None for r in result.select())
-    one_class = f"{SEEN_TWICE[:-1]}, where each frame says one class; --statistics adds the others, and the trend."
+    one_class = f"{SEEN_TWICE[:-1]} in which each frame has one class; --statistics adds the others, and the trend."
     seen = SEEN_TWICE if logged else one_class
     trend = (
-        " Trend in time: share of the disagreement that odd and even observations both show as a move in one direction,"
-        " in voxels seen six times or more that disagree; 0 in the mean where frames err independently. It cannot tell"
-        " drift of the model from errors that depend on the view or last over frames."
+        " Trend in time is the share of the disagreement that odd and even observations both show as a move in one"
+        " direction, in voxels seen six times or more that disagree. Its mean is 0 if the errors of frames are"
+        " independent. It does not separate drift of the model from errors that depend on the view or last over frames."
     )
     caption = (
-        f"{seen} Random order: what the same observations give in the mean of all orders; excess: SBD less that."
+        f"{seen} Random order is the mean SBD of the same observations over all orders; excess is SBD less that mean."
         f"{trend if logged else ''} {INTERVALS}"
     )
     return by_scene(result, "drift", "Belief drift against random order", caption, columns, numbers)
@@ -136,27 +139,28 @@ def uncertainty(result: Result) -> list[Table]:
         Column("within_percent", "within (%)", 0),
     )
 
-    def share(found: MapStatistics) -> float:
-        entropy = found.uncertainty.entropy.value
-        return 100 * found.uncertainty.within.value / entropy if entropy else math.nan
+    def share(stats: MapStatistics) -> float:
+        entropy = stats.uncertainty.entropy.value
+        return 100 * stats.uncertainty.within.value / entropy if entropy else math.nan
 
     numbers: tuple[Number, ...] = (
-        lambda found: found.uncertainty.entropy,
-        lambda found: found.uncertainty.within,
-        lambda found: found.uncertainty.between,
+        lambda stats: stats.uncertainty.entropy,
+        lambda stats: stats.uncertainty.within,
+        lambda stats: stats.uncertainty.between,
         share,
     )
     caption = (
-        f"{SEEN_TWICE} Entropy of the belief in units of log K, as the sum of what is there within each frame (borders,"
-        f" voxels larger than things, unsure scores) and of the frames' disagreement. {INTERVALS}"
+        f"{SEEN_TWICE} The entropy of the belief, in units of log K, is the sum of the entropy within each frame"
+        " (borders, voxels larger than objects, uncertain scores) and of the entropy by the frames' disagreement."
+        f" {INTERVALS}"
     )
-    return by_scene(result, "uncertainty", "Where the uncertainty comes from", caption, columns, numbers)
+    return by_scene(result, "uncertainty", "Sources of uncertainty", caption, columns, numbers)
 
 
 def verdicts(result: Result) -> list[Table]:
-    """Return what the evidence says of each model on each scene, and what to do."""
-    judged = judged_records(result)
-    if not judged:
+    """Return the verdict on each model on each scene, and a recommendation."""
+    assessed = assessed_records(result)
+    if not assessed:
         return []
     columns = (
         SCENE,
@@ -169,14 +173,14 @@ def verdicts(result: Result) -> list[Table]:
         Column("repeated_percent", "of the map (%)", 0),
         Column("advice", "Recommendation"),
     )
-    groups = tuple(Group(name, tuple(_verdict_row(*row) for row in rows)) for name, rows in judged.items())
+    groups = tuple(Group(name, tuple(_verdict_row(*row) for row in rows)) for name, rows in assessed.items())
     caption = (
         "The verdict is the most probable level of alpha for the same scene flown again: stable from"
-        f" {LIMITS.stable:g} on, usable from {LIMITS.usable:.3g}, unstable below; undecided where no level has"
-        f" {DECIDED:.0%}; misleading where more than {DANGEROUS:.0%} of the consistent locations are wrong, which only"
-        f" ground truth tells; uninformative where two observations from anywhere agree at {MOST_CHANCE:.0%}. Labelled:"
-        f" locations that have a label in half of their observations or more; below {LIMITS.labelled:.0%} a model is at"
-        f" most usable. Voxels: seen twice or more. {INTERVALS}"
+        f" {LIMITS.stable:g} on, usable from {LIMITS.usable:.3g}, unstable below. It is undecided if no level has"
+        f" {DECIDED:.0%}; misleading if more than {DANGEROUS:.0%} of the consistent locations are wrong, which only"
+        f" ground truth shows; uninformative if two observations from anywhere agree at {MOST_CHANCE:.0%}. Labelled is"
+        " the share of locations that have a label in half of their observations or more; below"
+        f" {LIMITS.labelled:.0%} a model is at most usable. Voxels are those seen twice or more. {INTERVALS}"
     )
     return [Table("verdicts", "Verdicts", caption, columns, groups)]
 
@@ -187,10 +191,10 @@ def verdicts(result: Result) -> list[Table]:
 def by_scene(
     result: Result, name: str, title: str, caption: str, columns: Sequence[Column], numbers: Sequence[Number]
 ) -> list[Table]:
-    """Return one row a scene, and the macro mean of several; columns and units that have no number are left out."""
+    """Return one row for each scene, and the macro mean of several; columns and units without numbers are left out."""
     cells = {
-        model: {record.unit.scene: [take(found) for take in numbers] for record, found in rows}
-        for model, rows in judged_records(result).items()
+        model: {record.unit.scene: [take(stats) for take in numbers] for record, stats in rows}
+        for model, rows in assessed_records(result).items()
     }
     cells = {model: {scene: row for scene, row in rows.items() if _known(row)} for model, rows in cells.items()}
     known = sorted({k for rows in cells.values() for row in rows.values() for k in _known(row)})
@@ -212,36 +216,36 @@ def by_scene(
     return [Table(name, title, caption, (SCENE, *(columns[k] for k in known)), groups)]
 
 
-def judged_records(result: Result) -> dict[str, list[tuple[Record, MapStatistics]]]:
+def assessed_records(result: Result) -> dict[str, list[tuple[Record, MapStatistics]]]:
     """Return the base units that have statistics, with these, by model."""
-    judged = {
+    assessed = {
         model: [(record, record.statistics) for record in records if record.statistics is not None]
         for model, records in by_model(result.select()).items()
     }
-    return {model: rows for model, rows in judged.items() if rows}
+    return {model: rows for model, rows in assessed.items() if rows}
 
 
 def ordered(take: Callable[[DriftStatistics], float | Estimate]) -> Number:
-    """Return a number of drift beside random order; NaN where too few places tell what that gives."""
-    return lambda found: take(found.drift) if found.order_known else math.nan
+    """Return a function that takes a number of drift; NaN where too few locations give the drift of a random order."""
+    return lambda stats: take(stats.drift) if stats.order_known else math.nan
 
 
 def of_cells(take: Callable[[CellAgreement], float]) -> Number:
-    """Return a number of the sampled cells; NaN where there are none."""
-    return lambda found: math.nan if found.cells is None else take(found.cells)
+    """Return a function that takes a number of the sampled cells; NaN where there are none."""
+    return lambda stats: math.nan if stats.cells is None else take(stats.cells)
 
 
-def _value(found: float | Estimate) -> float:
-    return found.value if isinstance(found, Estimate) else found
+def _value(number: float | Estimate) -> float:
+    return number.value if isinstance(number, Estimate) else number
 
 
-def _says(cell: Cell) -> bool:
+def _has_content(cell: Cell) -> bool:
     value = cell.value if isinstance(cell, Estimate) else cell
     return value != "" and not (isinstance(value, float) and math.isnan(value))
 
 
 def _known(row: Sequence[float | Estimate]) -> list[int]:
-    """Return which of the numbers are defined."""
+    """Return the positions of the numbers that are defined."""
     return [k for k, cell in enumerate(row) if not math.isnan(_value(cell))]
 
 
@@ -252,15 +256,15 @@ def _means(rows: Sequence[Sequence[float | Estimate]]) -> list[float]:
 
 def grouped(rows: Iterable[T], name: Callable[[T], str]) -> dict[str, list[T]]:
     """Return the rows of several units by their name, in order of appearance."""
-    found: dict[str, list[T]] = {}
+    groups: dict[str, list[T]] = {}
     for row in rows:
-        found.setdefault(name(row), []).append(row)
-    return found
+        groups.setdefault(name(row), []).append(row)
+    return groups
 
 
-def _class_rows(judged: Sequence[MapStatistics]) -> tuple[Row, ...]:
-    by_name = grouped((row for found in judged for row in found.agreement.classes), lambda row: row.name)
-    cells = (found.cells for found in judged if found.cells is not None)
+def _class_rows(assessed: Sequence[MapStatistics]) -> tuple[Row, ...]:
+    by_name = grouped((row for stats in assessed for row in stats.agreement.classes), lambda row: row.name)
+    cells = (stats.cells for stats in assessed if stats.cells is not None)
     alphas: dict[str, list[ClassAlpha]] = grouped((row for own in cells for row in own.classes), lambda row: row.name)
     return tuple(
         (
@@ -278,20 +282,20 @@ def _class_rows(judged: Sequence[MapStatistics]) -> tuple[Row, ...]:
 
 
 def _one_or_mean(values: Sequence[Estimate]) -> float | Estimate:
-    """Return the one, with its interval; of several scenes the macro mean, which has none."""
-    return values[0] if len(values) == 1 else macro_mean([found.value for found in values])
+    """Return a single value with its interval; of several scenes the macro mean, which has no interval."""
+    return values[0] if len(values) == 1 else macro_mean([estimate.value for estimate in values])
 
 
-def _verdict_row(record: Record, found: MapStatistics) -> Row:
-    right = found.correctness
+def _verdict_row(record: Record, stats: MapStatistics) -> Row:
+    right = stats.correctness
     return (
         record.unit.scene,
-        found.verdict.level,
-        100 * found.verdict.probability,
-        found.headline.alpha.ends,
-        math.nan if found.cells is None else 100 * found.cells.labelled,
+        stats.verdict.level,
+        100 * stats.verdict.probability,
+        stats.headline.alpha.ends,
+        math.nan if stats.cells is None else 100 * stats.cells.labelled,
         UNDEFINED if right is None else right.quadrants.wrong_of_consistent.percent,
-        found.repeated.voxels,
-        100 * found.repeated.share,
-        ADVICE[found.verdict.level],
+        stats.repeated.voxels,
+        100 * stats.repeated.share,
+        ADVICE[stats.verdict.level],
     )

@@ -1,4 +1,4 @@
-"""A table apart from its format: columns that know how their numbers are printed, and rows in groups."""
+"""Define a table apart from its format: columns that print their numbers, and rows in groups."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from semstab.report.averages import Spread
 from semstab.statistics import Estimate
 
 UNDEFINED = "--"
-"""What stands in print where a number is undefined; in JSON it is null, in CSV an empty field."""
+"""The text of an undefined number in print; in JSON it is null, in CSV an empty field."""
 
 Cell = str | int | float | Spread | Estimate
 Row = tuple[Cell, ...]
@@ -30,9 +30,9 @@ class Column:
     """A column: its key in CSV and JSON, its header in print, the decimals of its numbers (None: text).
 
     Attributes:
-        better: Which way is good.
-        signed: A positive number has its sign as well.
-        scientific: In powers of ten: '2e-16'.
+        better: The direction in which numbers are better.
+        signed: True to print the sign of positive numbers, too.
+        scientific: True to print powers of ten: '2e-16'.
         over: The heading that it shares with its neighbours.
     """
 
@@ -46,7 +46,7 @@ class Column:
 
     @classmethod
     def of(cls, quantity: Quantity, *, compared: bool = False, prefix: str = "", over: str = "") -> Column:
-        """Return the column of a measure: with the decimals of a summary, or of a comparison."""
+        """Return the column of a measure, with the decimals of a summary or of a comparison."""
         digits = quantity.digits[compared]
         return cls(prefix + quantity.key, quantity.title, digits, quantity.better, over=over)
 
@@ -77,7 +77,7 @@ class Column:
 
 @dataclass(frozen=True)
 class Group:
-    """Rows that belong together under a name, with a last row that sums them up, where there is one."""
+    """A group of rows under a name, with a last row that sums them up, where there is one."""
 
     name: str
     rows: tuple[Row, ...]
@@ -89,9 +89,9 @@ class Table:
     """A table of the study.
 
     Attributes:
-        name: Of its files.
-        caption: What the numbers are, and over what the means run.
-        by: What the groups are ('model'), the leading column of CSV and JSON; '' for one group without a name.
+        name: The name of its files.
+        caption: A description of the numbers, and of the data over which means run.
+        by: The kind of the groups ('model'), the leading column of CSV and JSON; '' for one group without a name.
     """
 
     name: str
@@ -102,7 +102,7 @@ class Table:
     by: str = "model"
 
     def only(self, *keys: str) -> Table:
-        """Return the same with these columns alone."""
+        """Return the table with these columns alone."""
         at = [k for k, column in enumerate(self.columns) if column.key in keys]
 
         def cut(row: Row) -> Row:
@@ -118,7 +118,7 @@ class Table:
                 yield group.name, row
 
 
-# One writer a format: a table as CSV, Markdown, LaTeX (booktabs) and JSON.
+# A writer for each format: CSV, Markdown, LaTeX (booktabs) and JSON.
 
 ARROWS = {"higher": "↑", "lower": "↓", "": ""}
 LATEX_WIDTHS = (
@@ -127,7 +127,7 @@ LATEX_WIDTHS = (
     (112, "table*", r"\small"),
     (122, "table*", r"\footnotesize"),
 )
-"""How many characters fit into one column of the page, or into both; a wider table is scaled to both (graphicx)."""
+"""The most characters in one column of the page, or in both; a wider table is scaled to both (graphicx)."""
 
 
 def to_csv(table: Table) -> str:
@@ -144,7 +144,7 @@ def to_csv(table: Table) -> str:
 
 
 def to_markdown(table: Table) -> str:
-    """Return a GitHub table under its title, the caption beneath."""
+    """Return a GitHub table under its title, with the caption below."""
     headers = [_markdown(" ".join(filter(None, (c.over, c.header, ARROWS[c.better])))) for c in table.columns]
     rule = ["---" if column.digits is None else "---:" for column in table.columns]
     lines = [f"### {_markdown(table.title)}", "", _pipes(headers), _pipes(rule)]
@@ -156,7 +156,7 @@ def to_markdown(table: Table) -> str:
 
 
 def to_latex(table: Table) -> str:
-    """Return a float with booktabs rules (needs the package booktabs), laid out as the paper's tables."""
+    """Return a float with booktabs rules (it needs the package booktabs), in the layout of the paper's tables."""
     width = _width(table)
     fitting = [kind[1:] for kind in LATEX_WIDTHS if width <= kind[0]]
     environment, size = fitting[0] if fitting else ("table*", r"\footnotesize")
@@ -188,7 +188,7 @@ def to_latex(table: Table) -> str:
 
 
 def to_terminal(table: Table, width: int = 0) -> str:
-    """Render for a terminal: title, rows, caption; as wide as the rows need, or folded to `width` columns."""
+    """Return title, rows and caption for a terminal, as wide as the rows need, or folded to `width` columns."""
     from rich.box import SIMPLE_HEAD
     from rich.console import Console
     from rich.markup import escape
@@ -216,7 +216,7 @@ def to_terminal(table: Table, width: int = 0) -> str:
 def to_json(table: Table) -> dict[str, Any]:
     """Return the JSON object, in full precision.
 
-    {mean, sd, repeats} over repeats, {value, low, high} with an interval.
+    A cell over repeats is {mean, sd, repeats}, a cell with an interval {value, low, high}.
     """
     return {
         "name": table.name,
@@ -231,9 +231,9 @@ def to_json(table: Table) -> dict[str, Any]:
 
 
 def sections(table: Table) -> Iterator[tuple[str, list[list[str]]]]:
-    """Yield what lies between two rules: the rows of a group under its name, then its total.
+    """Yield the rows between two rules: those of a group under its name, then its total.
 
-    One group needs no heading.
+    A single group has no heading.
     """
 
     def cells(row: tuple[Cell, ...]) -> list[str]:
@@ -255,9 +255,9 @@ def _leading(table: Table, cell: str) -> list[str]:
 
 
 def _csv_parts(cells: Sequence[Cell]) -> list[str]:
-    """Return the fields of a column.
+    """Return the suffixes of the fields of a column.
 
-    Beside its own that of the standard deviation over repeats, or those of the interval.
+    Its own field comes first, then that of the standard deviation over repeats, or those of the interval.
     """
     if any(isinstance(cell, Spread) for cell in cells):
         return ["", "_sd"]
@@ -283,7 +283,7 @@ def _pipes(cells: list[str]) -> str:
 
 
 def _markdown(text: str) -> str:
-    """Return text that Markdown shows as it is."""
+    """Return text that Markdown shows unchanged."""
     text = re.sub(r"([\\`*_\[\]|#~])", r"\\\1", relations(" ".join(text.split())))
     return text.replace("&", "&amp;").replace("<", "&lt;").replace(">", "&gt;")
 
@@ -294,7 +294,7 @@ def relations(text: str) -> str:
 
 
 def _width(table: Table) -> int:
-    """Return characters of the widest line, two for the space between columns."""
+    """Return the number of characters of the widest line, with two for the space between columns."""
     cells = [
         [column.header, *(column.text(row[k]) for _, row in table.rows())] for k, column in enumerate(table.columns)
     ]
@@ -324,7 +324,7 @@ _LATEX = {
 
 
 def _latex(text: str) -> str:
-    """Return text that LaTeX shows as it is; the hyphen that leads a number is a minus sign, and ± stands close."""
+    """Return text that LaTeX shows unchanged; a hyphen before a number becomes a minus sign, and ± has no spaces."""
     text = re.sub(r"(?<=\d) ± (?=\d)", "±", relations(" ".join(text.split())))
     text = re.sub(r"(^|(?<=\d )\(|, )-(?=\d)", "\\1\N{MINUS SIGN}", text)
     return "".join(_LATEX.get(character, character) for character in text)
