@@ -182,7 +182,7 @@ def test_only_voxels_that_all_saw_twice_are_compared():
     assert result.values["psa"]["b"].value == 0
     tables = {"a": table_of([(0, 0, 0)]), "b": table_of([(9, 9, 9)])}
     result = paired(tables)
-    assert result.voxels == result.blocks == 0
+    assert result.voxels == result.cubes == 0
     assert math.isnan(result.values["psa"]["a"].value)
     assert all(math.isnan(row.p_value) for row in result.differences)
     assert all(math.isnan(rank.best) for ranking in result.rankings for rank in ranking.ranks)

@@ -177,16 +177,16 @@ def between(low, high):
     return Interval((low + high) / 2, low, high, scope=THIS_SCENE, frames=60)
 
 
-def judged(low, high, wrong=UNKNOWN, voxels=5000, blocks=40, **cells):
+def judged(low, high, wrong=UNKNOWN, voxels=5000, **cells):
     """By alpha in that interval, of observations as these are unless said otherwise."""
     numbers = HeadlineStatistics(*[between(low, high)] * 5)
     own = {
-        "cell_size": 0.125, "cells": 800, "frames": 60, "views": 60, "chance": 0.4, "largest_class": "grass",
+        "cell_size": 0.125, "cells": 800, "cubes": 40, "frames": 60, "views": 60, "chance": 0.4, "largest_class": "grass",
         "largest_share": 0.5, "labelled": 1.0, "classes": (),
     } | cells  # fmt: skip
     return verdict(
         "net", headline=replace(numbers, wrong_of_consistent=wrong), cells=CellAgreement(**own), voxels=voxels,
-        share=0.5, blocks=blocks,
+        share=0.5,
     )  # fmt: skip
 
 
@@ -216,10 +216,10 @@ def test_stable_errors_are_misleading():
 
 
 def test_few_locations_have_no_verdict():
-    assert judged(0.9, 0.95, voxels=99).level == judged(0.9, 0.95, blocks=15).level == "no verdict"
+    assert judged(0.9, 0.95, cells=99).level == judged(0.9, 0.95, cubes=15).level == "no verdict"
     assert judged(0.9, 0.95, cells=0).level == "no verdict"
     assert "more overlap between frames" in judged(0.9, 0.95, voxels=99).line
-    assert judged(0.9, 0.95, voxels=100, blocks=16, cells=1).level == "stable"
+    assert judged(0.9, 0.95, voxels=1, cells=100, cubes=16).level == "stable"
 
 
 def test_a_camera_that_stood_still_has_no_verdict_and_a_single_frame_needs_more_overlap():

@@ -103,7 +103,7 @@ class Paired:
 
     primary: str
     voxels: int
-    blocks: int
+    cubes: int
     values: Mapping[str, ByModel]
     differences: tuple[PairedDifference, ...]
     rankings: tuple[Ranking, ...]

@@ -57,7 +57,7 @@ def _value(value: Any) -> Any:
     if "alpha" in named and any(beside <= named.keys() for beside in VOXEL_ALPHA):
         named["voxel_alpha"] = named.pop("alpha")
     if isinstance(named.get("blocks"), Mapping):  # statistics
-        named["blocks"] = named["blocks"].get("count", 0)
+        named["cubes"] = named.pop("blocks").get("count", 0)
         named |= {"cells": None, "correlogram": None}
         named["headline"] = {key: each for key, each in named["headline"].items() if key != "voxel_alpha"}
         named["headline"]["alpha"] = UNKNOWN

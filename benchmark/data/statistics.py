@@ -158,6 +158,7 @@ class CellAgreement:
     Attributes:
         cell_size: Edge of a fine cell in metres.
         cells: Fine cells that two views saw or more.
+        cubes: Cubes of space that hold them.
         frames: Frames that were fused.
         views: Distinct views among them: a camera that stands still has one.
         chance: Probability that two observations from anywhere on the map agree.
@@ -168,6 +169,7 @@ class CellAgreement:
 
     cell_size: float
     cells: int
+    cubes: int
     frames: int
     views: int
     chance: float
@@ -393,7 +395,7 @@ class MapStatistics:
     voxels: int
     observations: int
     repeated: Repeated
-    blocks: int
+    cubes: int
     verdict: StabilityVerdict
     agreement: FrameAgreement
     flipping: Flipping | None

@@ -64,7 +64,7 @@ class Cubes:
         return cls(*cubes_of((table.ix, table.iy, table.iz), table.voxel_size, edge, some))
 
     @classmethod
-    def of_log(cls, events: Events, edge: float) -> Cubes:
+    def of_log(cls, events: Events, edge: float | None = None) -> Cubes:
         """Return the same of the voxels of a log."""
         again = np.diff(events.bounds) >= 2
         return cls(*cubes_of((events.ix, events.iy, events.iz), events.voxel_size, edge, again))
@@ -217,12 +217,21 @@ def cluster_sums_of(
     return whole if cells is None else with_cells(whole, cells)
 
 
-def with_cells(whole: ClusterSums, cells: CellObservations) -> ClusterSums:
-    """Return the sums with those of sampled cells: fine cells, and coarse cells twice as wide."""
+def with_cells(whole: ClusterSums, cells: CellObservations, edge: float | None = None) -> ClusterSums:
+    """Return the sums with those of sampled cells: fine cells, and coarse cells twice as wide.
+
+    Args:
+        whole: Sums of the map.
+        cells: Labels of sampled cells.
+        edge: Edge of the cubes of the cells in metres, a power of 2; the smallest that leaves at most MOST_CELLS by
+            default, whatever the voxels of the map.
+    """
     parts = []
     for times in (1, 2):
         log = cells.observations(times * cells.coarsening)
-        own = _sums_of_log(log, Cubes.of_log(log, whole.edge))
+        cubes = Cubes.of_log(log, edge)
+        edge = cubes.edge
+        own = _sums_of_log(log, cubes)
         parts.append(replace(own, classes=whole.classes))
     step = max(part.step for part in parts)
     fine, coarse = (part.coarsened(part.edge, step) for part in parts)
@@ -236,12 +245,10 @@ def sums_of_cells(cells: CellObservations, edge: float | None = None) -> Cluster
         cells: Labels of sampled cells.
         edge: Edge of the cubes in metres, a power of 2; the smallest that leaves at most MOST_CELLS by default.
     """
-    if edge is None:
-        log = cells.observations()
-        edge = cubes_of((log.ix, log.iy, log.iz), log.voxel_size, some=np.diff(log.bounds) >= 2)[2]
     none, frame = np.zeros((0, 3), np.int32), np.zeros(0, np.int32)
     columns = np.zeros((0, width(cells.K, truth=False)))
-    return with_cells(ClusterSums(none, frame, columns, edge, 0, cells.cell_size, cells.K, cells.classes), cells)
+    empty = ClusterSums(none, frame, columns, cells.cell_size, 0, cells.cell_size, cells.K, cells.classes)
+    return with_cells(empty, cells, edge)
 
 
 def _sums_of_log(

@@ -159,7 +159,7 @@ def distinct_rows(rows: npt.NDArray[np.integer]) -> tuple[Int64, Int64]:
 Statistic = Callable[[Float64], Float64]
 Scale = Literal["share", "agreement", "plain"]
 
-SCHEMA = 4
+SCHEMA = 5
 WITHOUT_CELLS = 2, 3
 """Versions of files whose samples had no cells: only the sums of their maps are read."""
 MOST_CELLS, MOST_GROUPS = 256, 64
@@ -185,7 +185,8 @@ class ClusterSums:
             for sums that belong to none (`WITHOUT_FRAMES`).
         columns: (m, C) float64, see `layout`. A location counts 1 / T for each of its T frames in `voxels`, 1 in
             `observations`; its pairwise agreement is shared out among them in `psa` and `agreeing`.
-        edge: Metres, a power of 2.
+        edge: Metres, a power of 2; that of cells is their own, so that alpha and its interval are the same whatever the
+            voxels of the map.
         step: Frames of a group, a power of 2; 0 where they are unknown.
         fused: Number of frames that they come from.
         truth: True if sums of ground truth are included.
@@ -237,7 +238,16 @@ class ClusterSums:
         return len(self.index.cubes)
 
     def coarsened(self, edge: float, step: int) -> ClusterSums:
-        """Return the sums of larger cubes, or groups of frames; step 0 forgets those of the map, not of its cells."""
+        """Return the sums of larger cubes, or groups of frames; step 0 forgets those of the map, not of its cells.
+
+        Cubes of the cells are then at least as large as those of the map.
+        """
+        cells = (own and own.coarsened(max(edge, own.edge), own.step) for own in (self.fine, self.coarse))
+        fine, coarse = cells
+        return dataclasses.replace(self._map_coarsened(edge, step), fine=fine, coarse=coarse)
+
+    def _map_coarsened(self, edge: float, step: int) -> ClusterSums:
+        """Return the same, with the sums of cells as they are."""
         cell = _joined(self.cell, edge / self.edge)
         known = step and self.step
         frame = _joined(self.frame, step // self.step) if known else np.full(len(cell), -1)
@@ -252,8 +262,6 @@ class ClusterSums:
             columns=columns,
             edge=edge,
             step=step if known else 0,
-            fine=self.fine and self.fine.coarsened(edge, self.fine.step),
-            coarse=self.coarse and self.coarse.coarsened(edge, self.coarse.step),
         )
 
     def without_truth(self) -> ClusterSums:
@@ -267,8 +275,8 @@ class ClusterSums:
         import pyarrow.parquet as pq
 
         parts = [part for part in (self, self.fine, self.coarse) if part is not None]
-        about = {name: getattr(self, name) for name in ("edge", "K", "classes", "truth")}
-        about |= {name: [getattr(part, name) for part in parts] for name in ("step", "voxel_size", "fused")}
+        about = {name: getattr(self, name) for name in ("K", "classes", "truth")}
+        about |= {name: [getattr(part, name) for part in parts] for name in ("edge", "step", "voxel_size", "fused")}
         lengths = [len(part.frame) for part in parts]
         cell, frame = np.concatenate([part.cell for part in parts]), np.concatenate([part.frame for part in parts])
         columns = np.zeros((sum(lengths), self.columns.shape[1]))
@@ -304,7 +312,7 @@ class ClusterSums:
             if not old and (kind, version) != ("ClusterSums", SCHEMA):
                 raise DataError("it is of another kind or version")
             if old:
-                about |= {name: [about.get(name, 0)] for name in ("step", "voxel_size", "fused")}
+                about |= {name: [about.get(name, 0)] for name in ("edge", "step", "voxel_size", "fused")}
             meta = from_json(SumsMeta, about, path)
             part, *keys = (_key(arrow.values_of(content.column(name)), name) for name in KEYS)
             columns = np.stack([*map(arrow.values_of, content.columns[len(KEYS) :])], axis=1)
@@ -313,13 +321,13 @@ class ClusterSums:
             if np.any(np.abs(columns) > LARGEST**2):
                 raise DataError("a sum is larger than any map can have")
             parts: list[ClusterSums] = []
-            for number, (step, voxel_size, fused) in enumerate(
-                zip(meta.step, meta.voxel_size, meta.fused, strict=True)
+            for number, (edge, step, voxel_size, fused) in enumerate(
+                zip(meta.edge, meta.step, meta.voxel_size, meta.fused, strict=True)
             ):
                 own, truth = part == number, meta.truth and not number
                 sums = columns[own, : width(meta.K, truth=truth)].astype(np.float64)
                 cell, frame = np.stack([key[own] for key in keys[:3]], axis=1), keys[3][own]
-                where = cell.astype(np.int32), frame.astype(np.int32), sums, meta.edge, step
+                where = cell.astype(np.int32), frame.astype(np.int32), sums, edge, step
                 parts.append(cls(*where, voxel_size, meta.K, meta.classes, truth, fused))
         except (OSError, LookupError, TypeError, ValueError, OverflowError, pa.ArrowException) as error:
             raise DataError(f"{path}: not a file of cluster sums ({summarize_error(error)})") from error
@@ -337,25 +345,26 @@ LARGEST = 2.0**30
 
 @dataclass(frozen=True)
 class SumsMeta:
-    """Metadata of a file of sums: step, voxel_size and fused of each part; see `ClusterSums`."""
+    """Metadata of a file of sums: edge, step, voxel_size and fused of each part; see `ClusterSums`."""
 
-    edge: float
     K: int
     classes: tuple[str, ...]
     truth: bool
+    edge: tuple[float, ...]
     step: tuple[int, ...]
     voxel_size: tuple[float, ...]
     fused: tuple[int, ...]
 
     def __post_init__(self) -> None:
-        parts = {len(each) for each in (self.step, self.voxel_size, self.fused)}
+        parts = {len(each) for each in (self.edge, self.step, self.voxel_size, self.fused)}
         if not (parts <= {1} or parts <= {3}):
             raise DataError("sums of other parts than a map, fine and coarse cells")
         sizes = all(0 < size < math.inf for size in self.voxel_size)
         if not (sizes and self.K > 0 and len(self.classes) in (0, self.K)):
             raise DataError(f"{self.K} classes, {len(self.classes)} names, voxels of {self.voxel_size[0]:g} m")
-        if not (0 < self.edge <= LARGEST and math.frexp(self.edge)[0] == 0.5):
-            raise DataError(f"the edge of cubes is {self.edge:g} m, which is not a power of 2 in range")
+        for edge in self.edge:
+            if not (0 < edge <= LARGEST and math.frexp(edge)[0] == 0.5):
+                raise DataError(f"the edge of cubes is {edge:g} m, which is not a power of 2 in range")
         for step in self.step:
             if not 0 <= step <= LARGEST or step & (step - 1):
                 raise DataError(f"groups have {step} frames, which is not a power of 2 in range")
@@ -384,7 +393,7 @@ def aligned(*parts: ClusterSums) -> tuple[ClusterSums, ...]:
         raise DataError("the sums do not fit together: their maps differ in classes, or only some have ground truth")
     edge, steps = max(part.edge for part in parts), [part.step for part in parts]
     step = max(steps) if all(steps) else 0
-    same = [part if (part.edge, part.step) == (edge, step) else part.coarsened(edge, step) for part in parts]
+    same = [part if (part.edge, part.step) == (edge, step) else part._map_coarsened(edge, step) for part in parts]
     fine, coarse = [part.fine for part in same if part.fine], [part.coarse for part in same if part.coarse]
     if len(fine) < len(same) or len(coarse) < len(same):
         return tuple(same)

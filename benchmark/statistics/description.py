@@ -210,7 +210,7 @@ def analyse(
         voxels=whole.voxels,
         observations=whole.observations,
         repeated=repeated,
-        blocks=count,
+        cubes=count,
         verdict=verdict(
             name or "model",
             headline=headline,
@@ -218,7 +218,6 @@ def analyse(
             flips=flips_of_map,
             voxels=repeated.voxels,
             share=repeated.share,
-            blocks=count,
             limits=limits,
         ),
         agreement=_agreement(means, class_agreement_of(class_sums(table, events), table.classes)),
@@ -263,6 +262,7 @@ def cell_agreement(
     return CellAgreement(
         cell_size=cells.coarsening * cells.cell_size,
         cells=round(float(fine["voxels"].sum())),
+        cubes=fine.cells,
         frames=cells.frames,
         views=len(cells.views),
         chance=float((evidence**2).sum() - fine["own"].sum()) / (n * (n - 1)) if n > 1 else math.nan,

@@ -135,8 +135,8 @@ def paired(
                 for name, own in columns[measure].items()}  # fmt: skip
         rankings.append(_ranking(measure, statistic, sums, seed))
     paired_rows = differences(columns, statistics, common, of_cells)
-    blocks = 0 if common is None else common.cubes.count
-    return Paired(ALPHA.key, len(rows[0]), blocks, values, paired_rows, tuple(rankings))
+    cubes = 0 if common is None else common.cubes.count
+    return Paired(ALPHA.key, len(rows[0]), cubes, values, paired_rows, tuple(rankings))
 
 
 def _by_cube(cells: Mapping[str, ClusterSums]) -> dict[str, Float64]:

@@ -356,8 +356,11 @@ def compared_observations(samples: Mapping[str, CellObservations]) -> SharedObse
     shared, ignoring = (dict(zip(names, each, strict=True)) for each in (both.shared, both.ignoring))
     logs = {name: own.observations() for name, own in shared.items()}
     sums: dict[str, ClusterSums] = {}
+    edge: float | None = None
     for name, own in shared.items():
-        sums[name] = sums_of_cells(own, None if not sums else next(iter(sums.values())).edge)
+        sums[name] = sums_of_cells(own, edge)
+        fine = sums[name].fine
+        edge = None if fine is None else fine.edge
     ignored = []
     for name, missing in zip(names, both.missing, strict=True):
         log, alpha = ignoring[name].observations(), value_of(sums_of_cells(samples[name]), ALPHA.key)

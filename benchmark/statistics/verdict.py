@@ -43,8 +43,9 @@ map are one class, any two agree at 90 % of the spots, however good the labels a
 DANGEROUS = 0.05
 """Largest share of the consistent locations that may be wrong."""
 
-LEAST_VOXELS, LEAST_BLOCKS = 100, 16
-"""Voxels seen twice or more, and blocks of them, below which there is no verdict."""
+LEAST_CELLS, LEAST_CUBES = 100, 16
+"""Cells that two views saw or more, and cubes of space that hold them, below which there is no verdict. Both are the
+same whatever the voxels of the map."""
 
 ADVICE: dict[Level, str] = {
     "stable": "its labels agree from frame to frame; act on them",
@@ -80,7 +81,6 @@ def verdict(
     flips: Flipping | None = None,
     voxels: int,
     share: float,
-    blocks: int,
     limits: Limits = LIMITS,
 ) -> StabilityVerdict:
     """Return the most probable level of alpha.
@@ -92,11 +92,10 @@ def verdict(
         flips: Locations about which frames do not agree: a few of them do not show in a mean.
         voxels: Voxels with OP >= 2.
         share: Their share of all voxels.
-        blocks: Cubes of space in which they lie.
         limits: Limits of the levels.
     """
     support = f"{voxels} locations seen twice or more, {share:.0%} of the map"
-    if reason := _missing(cells, voxels, blocks):
+    if reason := _missing(cells):
         return StabilityVerdict("no verdict", math.nan, f"{model}: no verdict, {reason}; {support}")
     assert cells is not None
     probabilities = level_probabilities(headline.alpha, limits)
@@ -120,13 +119,13 @@ def verdict(
     return StabilityVerdict(level, probability, line)
 
 
-def _missing(cells: CellAgreement | None, voxels: int, blocks: int) -> str:
+def _missing(cells: CellAgreement | None) -> str:
     """Return why there is no verdict; empty where there is one."""
     if cells is None:
         return NO_CELLS
     if cells.views < 2 <= cells.frames:
         return STILL
-    return "" if voxels >= LEAST_VOXELS and blocks >= LEAST_BLOCKS and cells.cells else ADVICE["no verdict"]
+    return "" if cells.cells >= LEAST_CELLS and cells.cubes >= LEAST_CUBES else ADVICE["no verdict"]
 
 
 def _level(
