@@ -221,7 +221,7 @@ class Alone:
     def __init__(self, voxels):
         self.first = voxels
 
-    def places(self):
+    def tiles(self):
         return iter([(0, 0)])
 
     def __getitem__(self, place):
@@ -446,7 +446,7 @@ def test_few_points_that_are_met_are_warned_of(fused, table, caplog):
     assert classify(points) == ""
     high = np.concatenate([points[-3:], points[:3], points + np.array([0, 0, 50])])
     assert "f.ply: only " in classify(high)
-    assert "the map may be shifted or turned, or the cloud is of another place or height" in caplog.text
+    assert "the map may be shifted or turned, or the cloud is of another area or height" in caplog.text
     assert classify(high, classes=CLASSES) == ""
     large = np.concatenate([points, points + np.array([500, 0, 0]), points + np.array([0, 500, 0])])
     assert "the cloud is larger than the map; of the points over the map 100.0% do" in classify(large)

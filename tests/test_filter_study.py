@@ -108,7 +108,7 @@ def done(tmp_path_factory):
 
 def test_the_folder_and_the_terminal_hold_what_to_use(done):
     _, text = done
-    assert "threshold:0.6: left out, for net gives labels without scores" in text
+    assert "threshold:0.6: left out, because net gives labels without scores" in text
     assert "Use --filter vote-warped:5 over net: flicker falls from" in " ".join(text.split())
     table = text[text.index("Use --filter") :]
     assert "vote-warped:5" in table

@@ -130,7 +130,7 @@ def test_what_cannot_be_fused_is_one_line(city, classes):
             semstab.fuse([good, wrong], voxel_size=SIZE)
     with pytest.raises(DataError, match="there are no frames"):
         semstab.fuse([])
-    with pytest.raises(DataError, match="there are labels up to 7, and 3 classes"):
+    with pytest.raises(DataError, match="there are labels up to 7, but 3 classes"):
         semstab.fuse(frames_of(city, "sim-steady"), voxel_size=SIZE, classes=classes[:3])
     with pytest.raises(ConfigError, match="voxel_sizes"):
         semstab.fuse([good], voxel_sizes=SIZE)

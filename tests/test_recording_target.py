@@ -77,7 +77,7 @@ def test_serve_says_that_its_port_is_taken(tmp_path, monkeypatch) -> None:
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]
         monkeypatch.setattr(target, "DEFAULT_URL", f"rerun+http://127.0.0.1:{port}/proxy")
-        with pytest.raises(ConfigError, match=f"port {port} is taken"):
+        with pytest.raises(ConfigError, match=f"port {port} is in use"):
             Target(tmp_path / "x.rrd", "serve").open()
 
 

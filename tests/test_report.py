@@ -215,7 +215,7 @@ def test_a_study_of_sweeps_has_their_charts_and_one_in_which_everything_failed_h
     assert "VSS, OP ≥ 3 by temporal sampling, frames" in {attributes["aria-label"] for attributes in page.all("svg")}
     failure = Failure(Unit("s", "m", "numpy"), Variation(BASE), "no depth")
     page = page_of(study(failures=(failure,)), tmp_path)
-    assert "there is nothing to say yet" in page.text
+    assert "there are no results yet" in page.text
     assert "no depth" in page.text
 
 
@@ -240,7 +240,7 @@ def test_the_order_of_the_models_may_change_where_voxels_recur_and_the_shared_ta
     found = study(model("x", [1, 0, 0], [6, 4, 0]), model("y", [6, 4, 0], [8, 2, 0]))
     assert "In one taxonomy (abc) the order by VSS is x > y over all voxels, but y > x for OP>=3." in read(found)
     same = [model("x", SURE, SURE), model("y", SURE, SPLIT)]
-    line = "In one taxonomy (abc) the order by VSS is x > y, over all voxels and for OP>=3 alike."
+    line = "In one taxonomy (abc) the order by VSS is x > y, both over all voxels and for OP>=3."
     assert line in read(study(*same))
     shared = [model("x", SURE, SPLIT, SHARED), model("y", SURE, SURE, SHARED)]
     assert any("the order by VSS is y > x" in sentence for sentence in read(study(*same, *shared)))
@@ -249,7 +249,7 @@ def test_the_order_of_the_models_may_change_where_voxels_recur_and_the_shared_ta
 def test_the_scene_that_seems_most_stable_may_be_the_one_seen_least():
     scenes = [record(voxels((10, 4, SPLIT)), scene="looked at"), record(voxels((10, 1, SURE)), scene="passed by")]
     expected = (
-        "m is most stable in passed by (VSS 1.000), which is also the scene seen least often: 1.00 frames a voxel."
+        "m is most stable in passed by (VSS 1.000), which is also the scene seen least often: 1.00 frames per voxel."
     )
     assert expected in read(study(*scenes))
     assert expected not in read(study(record(voxels((10, 4, SURE)), scene="looked at"), scenes[1]))
@@ -268,4 +268,4 @@ def test_the_notes_say_which_implementations_agree():
     assert "numba and open3d make the same maps as numpy." in sentences
     assert "mine and numpy disagree in 1 of 2 comparisons." in sentences
     drawn = dataclasses.replace(found, agreement=tuple(dataclasses.replace(row, one_in=16) for row in rows[:1]))
-    assert "numba makes the same maps as numpy, as far as one voxel in 16 tells." in read(drawn)
+    assert "numba makes the same maps as numpy (one voxel in 16 was compared)." in read(drawn)

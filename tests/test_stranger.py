@@ -44,7 +44,7 @@ def test_frames_in_which_nothing_is_seen_are_counted(tmp_path) -> None:
     np.save(folder / "depth/0001.npy", np.full((tiny_scene.HEIGHT, tiny_scene.WIDTH), np.nan, np.float32))
     result = semstab.run(configure(folder))
     assert result.select()[0].summary.frames_empty == 1
-    assert "a: 1 of 3 frames hold no pixel with both depth and a label" in printed(result)
+    assert "a: 1 of 3 frames have no pixel with both depth and a label" in printed(result)
 
 
 def test_own_data_is_checked_on_a_sample_of_the_voxels(tmp_path) -> None:
@@ -93,7 +93,10 @@ def test_compared_backends_have_a_line(scene, tmp_path) -> None:
     assert "open3d-projective differs from numba by design" in told
     assert {table.name for table in tables(result)} >= {"fusion", "fusion_compared"}
     assert "agreement" not in {table.name for table in tables(result)}
-    assert any(sentence.startswith("open3d-projective, which") for sentence in notes(result))
+    assert any(
+        sentence.startswith("open3d-projective associates pixels and voxels in another way")
+        for sentence in notes(result)
+    )
 
 
 @pytest.fixture(scope="module")
@@ -126,9 +129,9 @@ def test_a_given_voxel_size_is_told_where_it_lies(wide) -> None:
     result = semstab.run(configure(wide, backends=["numba"], check=None, voxel_size=1.0))
     assert not result.advice["wide"].chosen
     assert [size.voxel_size for size in result.select()[0].summary.sizes] == [0.5, 1, 2]
-    assert "noise tears" not in printed(result)
+    assert "noise splits" not in printed(result)
     advice = dataclasses.replace(result.advice["wide"], voxel_size=0.5 * result.advice["wide"].suggested)
-    assert "noise tears locations apart: --voxel-size" in printed(dataclasses.replace(result, advice={"wide": advice}))
+    assert "noise splits locations" in printed(dataclasses.replace(result, advice={"wide": advice}))
     assert "'background' covers" in printed(result)
 
 

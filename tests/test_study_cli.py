@@ -52,7 +52,7 @@ def test_a_study_interrupted_and_killed_at_random_moments_ends_with_the_same_sum
         _, errors = process.communicate(timeout=30)
         if end == signal.SIGINT:
             assert process.returncode == 130
-            assert errors.startswith("interrupted; what was finished is kept")
+            assert errors.startswith("interrupted; finished work is stored")
             assert len(errors.splitlines()) == 1
     assert workers
     wait_until(lambda: all(map(gone, workers)))
