@@ -185,4 +185,4 @@ def test_ctrl_c_is_exit_130_and_the_same_command_goes_on(tmp_path) -> None:
     assert "interrupted" in stderr
     assert "Traceback" not in stderr
     again = bench(*arguments, cwd=tmp_path)
-    assert "from an earlier start: 1 of 2 units" in again.stderr
+    assert "kept from before: 1 of 2 units" in again.stderr
