@@ -178,7 +178,7 @@ def test_a_camera_that_only_turns_says_nothing_about_the_unit():
 def test_a_camera_that_does_not_move_at_all_is_unclear():
     verdict = checked(Room([walk(1)[0]] * 5))
     assert verdict.state == "unclear"
-    assert "so it does under every other convention of the poses" in verdict.text
+    assert "it does so under every other convention of the poses as well" in verdict.text
     assert verdict.reason == "the camera hardly moves and the camera hardly turns"
 
 
@@ -314,7 +314,7 @@ def test_frames_without_ground_truth_are_read_with_the_model():
 
 def test_unsound_data_are_refused_in_one_line():
     with pytest.raises(
-        DataError, match=r"^room: depth reprojects with .* --no-geometry-check fuses it as it is$"
+        DataError, match=r"^room: depth reprojects with .* --no-geometry-check fuses the scene as it is$"
     ) as caught:
         require_sound(Room(told_pose=np.linalg.inv), ALL)
     assert "\n" not in str(caught.value)

@@ -406,7 +406,7 @@ def test_label_maps_that_are_incomplete_do_not_matter(scene):
 
 def test_scenes_of_other_datasets(tmp_path):
     city = DatasetConfig(name="city", options={"width": 64, "height": 36, "frames": 2})
-    with pytest.raises(ConfigError, match="scene0: has no folder of its own; say with --out"):
+    with pytest.raises(ConfigError, match="scene0: has no folder of its own; name one for its predictions with --out"):
         scene_jobs(city, ["scene0"], FrameSelection(), None)
     jobs = scene_jobs(city, ["scene0", "scene1"], FrameSelection(), tmp_path)
     assert [job.out for job in jobs] == [tmp_path / "scene0", tmp_path / "scene1"]

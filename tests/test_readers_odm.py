@@ -669,7 +669,7 @@ def test_label_maps_of_another_view_are_named(tmp_path, lens) -> None:
 
 def test_original_labels_need_the_cameras_of_the_photographs(tmp_path) -> None:
     folder = write_project(tmp_path / "field")
-    match = "opensfm/reconstruction.json: does not say how the photograph DJI_0002 is distorted, which labels_on"
+    match = "opensfm/reconstruction.json: does not give the distortion of the photograph DJI_0002, which labels_on"
     fails(DataError, match, opened, folder, labels_on="original")
     write_distorted(folder, LENSES["brown"], undistorted=True)
     for path in (folder / "images").iterdir():

@@ -28,7 +28,7 @@ def test_what_is_nearly_a_format_says_what_it_lacks(tmp_path):
     FORMATS["hololens"].write(tmp_path, source(1000))
     (tmp_path / "K.txt").unlink()
     shutil.rmtree(tmp_path / "depth")
-    with pytest.raises(DataError, match=r"nearly hololens \(lacks depth/, K.txt\).*--dataset NAME"):
+    with pytest.raises(DataError, match=r"the nearest are hololens \(without depth/, K.txt\).*--dataset NAME"):
         recognise(tmp_path)
     (tmp_path / "empty").mkdir()
     assert recognise(tmp_path / "empty")[0] == "posed_folder"

@@ -38,7 +38,7 @@ def test_a_name_like_no_other_gets_them_all():
 def test_a_missing_package_says_how_to_install_it():
     with pytest.raises(MissingDependencyError, match=r"^shape 'engine' cannot be used \(.*\); pip install the-engine$"):
         SHAPES.load("engine")
-    with pytest.raises(MissingDependencyError, match=r"No module named .*; install what it needs$"):
+    with pytest.raises(MissingDependencyError, match=r"No module named .*; install the packages that it needs$"):
         SHAPES.load("bare")
 
 

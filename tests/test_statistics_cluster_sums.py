@@ -136,7 +136,7 @@ def test_an_older_file_is_read_without_its_cells(tmp_path, schema):
     whole.save(tmp_path / "sums.parquet")
     content = pq.read_table(tmp_path / "sums.parquet")
     about = json.loads(content.schema.metadata[b"semstab"])
-    about |= {name: about[name][0] for name in ("step", "voxel_size", "fused")}
+    about |= {name: about[name][0] for name in ("edge", "step", "voxel_size", "fused")}
     about |= {"schema": schema, "kind": "InfluenceSums"}
     if schema == 2:
         about.pop("fused")

@@ -218,7 +218,7 @@ def test_stable_errors_are_misleading():
 def test_few_locations_have_no_verdict():
     assert judged(0.9, 0.95, cells=99).level == judged(0.9, 0.95, cubes=15).level == "no verdict"
     assert judged(0.9, 0.95, cells=0).level == "no verdict"
-    assert "more overlap between frames" in judged(0.9, 0.95, voxels=99).line
+    assert "more overlap between frames" in judged(0.9, 0.95, cells=99).line
     assert judged(0.9, 0.95, voxels=1, cells=100, cubes=16).level == "stable"
 
 

@@ -211,14 +211,14 @@ def looked_at(photographs, surface):
 def test_images_confirm_a_surface_in_its_place(photographs, mesh) -> None:
     verdict = looked_at(photographs, mesh)
     assert verdict.state == "sound", verdict.text
-    assert "match where surface and poses carry them (correlation" in verdict.text
+    assert "match by surface and poses (correlation" in verdict.text
 
 
 @pytest.mark.parametrize(("up", "side"), [(1.5, "further from the cameras"), (-2.0, "nearer to the cameras")])
 def test_images_find_how_far_off_a_surface_lies(photographs, tmp_path, up, side) -> None:
     verdict = looked_at(photographs, down.write_mesh(tmp_path / "moved.ply", shift=(0, 0, up)))
     assert verdict.state == "unsound", verdict.text
-    found = re.search(rf"where the surface lies ([\d.]+) m {side} ", verdict.text)
+    found = re.search(rf"if the surface lies ([\d.]+) m {side} ", verdict.text)
     assert found, verdict.text
     assert float(found[1]) == pytest.approx(abs(up), rel=0.1)
 
@@ -250,7 +250,7 @@ def test_a_surface_in_other_coordinates_than_the_poses_says_how_far_off(flight, 
     path = down.write_mesh(tmp_path / "utm.obj", shift=down.OFFSET)
     match = (
         r"utm.obj: no frame sees it: the nearest camera is 5,220,1\d\d m away \(east -576,7\d\d, north -5,188,1\d\d,"
-        r" up \d+ m\); surface and poses lie in other coordinates"
+        r" up \d+ m\); surface and poses have different coordinates"
     )
     dataset = open_dataset("posed_folder", {"root": flight, "surface": path, "casts": False})
     fails(DataError, match, dataset.scene("field").geometry, 1)

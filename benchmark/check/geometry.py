@@ -214,7 +214,7 @@ class Assessment:
     def _best(self) -> Fit | None:
         """Return the alternative that clearly beats the configured convention.
 
-        Where there are several, see `_candidates`.
+        See `_candidates` for several ones.
         """
         return self._refuting[0] if self._refuting else None
 
@@ -319,7 +319,7 @@ class Assessment:
             text += f"; these frames cannot tell it from {' or '.join(candidates)}"
         return self._as("unsound", text, lines, best)
 
-    # --- what cannot be told -----------------------------------------------------------------------------------------
+    # --- undetermined settings ---------------------------------------------------------------------------------------
 
     def _single_changes(self) -> Iterator[Fit]:
         """Yield the fits that differ from the configured convention in one thing; of factors only ten and a tenth."""

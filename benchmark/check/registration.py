@@ -67,7 +67,7 @@ class Offset:
 def find_offset(pairs: Sequence[Edges]) -> Offset | None:
     """Return how far edges (H, W) of labels or images are off those of depth (H, W), frame by frame.
 
-    None where they fit.
+    The result is None where they fit.
 
     Both halves of the frames have to agree, so that edges that have nothing to do with each other do not count.
     """

@@ -1,4 +1,4 @@
-"""Compiled loops, and the folder of numba's cache: beside the code, or another that can be written."""
+"""Compiled loops, and the folder of numba's cache: next to the code, or another that can be written."""
 
 from __future__ import annotations
 
@@ -28,8 +28,8 @@ if sys.platform == "linux":  # the TBB that Open3D loads is too old for numba, w
 def compiled(**options: Any) -> Callable[[Any], Any]:
     """Return a decorator that compiles a function at its first call, and stores the code for later processes.
 
-    It is stored in __pycache__ beside the source, below HOME, or below the temporary folder; else each process compiles
-    anew.
+    It is stored in __pycache__ next to the source, below HOME, or below the temporary folder; else each process
+    compiles anew.
     """
 
     def decorate(function: Any) -> Any:

@@ -69,7 +69,7 @@ class FrameReport:
 
     The map's means are those after the frame; NaN where a backend does not compute them.
 
-    Of `seconds`, where a backend tells them apart, association_seconds go from pixels to voxels with their evidence,
+    Parts of `seconds`, where a backend measures them: association_seconds go from pixels to voxels with their evidence,
     update_seconds into the map.
 
     Attributes:

@@ -241,7 +241,7 @@ class Flipping:
 
     Attributes:
         share: Share of these locations, each counting by how likely it is one, for these frames.
-        seen: The part of them that four frames or more saw: of fewer observations it cannot be told whether errors
+        seen: The part of them that four frames or more saw: fewer observations do not show whether errors
             recur at the same locations.
         a, b: The two classes between which most of them flip, with the part of all flips that is between these.
     """

@@ -257,7 +257,7 @@ def run(
         batch: Images that the model is given together.
         overwrite: Whether other predictions in the folder are replaced.
         quiet: Whether nothing is printed.
-        top_k: Number of scores that a pixel keeps; None for all.
+        top_k: Number of scores that a pixel retains; None for all.
 
     Raises:
         ConfigError, DataError, MissingDependencyError: If something cannot be predicted; what was finished stays.

@@ -85,7 +85,7 @@ class Parameter:
 
 @dataclass(frozen=True, eq=False)
 class Shown:
-    """The data that a filter may look at beside the belief.
+    """The data that a filter may look at in addition to the belief.
 
     Attributes:
         frame: Depth and pose at the image's pixels, where the filter wants geometry.
@@ -311,7 +311,7 @@ class EmaWarped(Filter):
 
 
 def mixed(before: Belief, now: Belief, keep: float) -> Belief:
-    """Return keep * before + (1 - keep) * now; one of them alone where the other says nothing."""
+    """Return keep * before + (1 - keep) * now; one of them alone where the other has no belief."""
     weight = np.where(now.any(axis=2), np.where(before.any(axis=2), keep, 0.0), 1.0).astype(np.float32)[..., None]
     return weight * before + (1 - weight) * now
 

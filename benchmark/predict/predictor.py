@@ -356,7 +356,7 @@ class InOrder:
 
     Attributes:
         indices: The frames that it is shown.
-        claim: A function that is told whose the model is now, and says whether it was somebody else's: then it
+        claim: A function that hands the model to this object and returns whether another one had it: then it
             begins again.
     """
 

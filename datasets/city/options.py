@@ -231,4 +231,4 @@ FLIGHTS = {
          (490, 17, 22, 1.5, 9, 57)]
     )
 }  # fmt: skip
-"""Scene0 and scene1 see a place in about four of 20 frames, the others in fewer than two."""
+"""Scene0 and scene1 see a location in about four of 20 frames, the others in fewer than two."""
