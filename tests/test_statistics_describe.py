@@ -181,8 +181,8 @@ def judged(low, high, wrong=UNKNOWN, voxels=5000, **cells):
     """By alpha in that interval, of observations as these are unless said otherwise."""
     numbers = HeadlineStatistics(*[between(low, high)] * 5)
     own = {
-        "cell_size": 0.125, "cells": 800, "cubes": 40, "frames": 60, "views": 60, "chance": 0.4, "largest_class": "grass",
-        "largest_share": 0.5, "labelled": 1.0, "classes": (),
+        "cell_size": 0.125, "cells": 800, "cubes": 40, "frames": 60, "views": 60, "chance": 0.4,
+        "largest_class": "grass", "largest_share": 0.5, "labelled": 1.0, "classes": (),
     } | cells  # fmt: skip
     return verdict(
         "net", headline=replace(numbers, wrong_of_consistent=wrong), cells=CellAgreement(**own), voxels=voxels,
