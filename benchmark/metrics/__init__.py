@@ -25,6 +25,7 @@ from semstab.metrics.summary import (
     strata,
     summarise,
 )
+from semstab.metrics.temporal_consistency import TemporalConsistency, flow_by_depth, image_flow, occluded, warp_labels
 
 __all__ = [
     "CATEGORIES",
@@ -34,6 +35,7 @@ __all__ = [
     "FrameQualityMeter",
     "RegionChange",
     "SelfConsistency",
+    "TemporalConsistency",
     "VideoConsistency",
     "categories",
     "category_shares",
@@ -43,8 +45,11 @@ __all__ = [
     "dominant",
     "entropy",
     "flicker_percent",
+    "flow_by_depth",
+    "image_flow",
     "macro_mean",
     "matched_region_flicker",
+    "occluded",
     "op",
     "pool",
     "sbd",
@@ -52,4 +57,5 @@ __all__ = [
     "strata",
     "summarise",
     "vss",
+    "warp_labels",
 ]
