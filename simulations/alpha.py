@@ -2,10 +2,12 @@
 
     python simulations/alpha.py invariance [--scenes 3] [--seed 0]
     python simulations/alpha.py levels [--scenes 12] [--flights 16] [--seed 0]
+    python simulations/alpha.py shares [--scenes 12] [--flights 16] [--seed 0]
 
 Flights of `pictures.py`, with errors of eight kinds. `invariance` prints alpha and its level by voxel size and pixel
 stride. `levels` flies each scene again and again: alpha is right that all flights together give, an interval is right
 that holds it, and a verdict that names its level. It prints two tables in Markdown: by kind, and by stated probability.
+`shares` does the same where one class covers nearly the whole map: up to which share do the intervals hold?
 """
 
 from __future__ import annotations
@@ -13,9 +15,10 @@ from __future__ import annotations
 import argparse
 import math
 from collections import defaultdict
+from dataclasses import replace
 
 import numpy as np
-from pictures import KINDS, K, Views, frames, predicted, scene
+from pictures import KINDS, K, Views, field, frames, predicted, scene
 
 from semstab import backends
 from semstab.data.statistics import Level
@@ -109,16 +112,68 @@ def levels(scenes: int, flights: int, seed: int) -> None:
         print(f"| {' | '.join(line)} |")
 
 
+SHARES = (0.9, 0.95, 0.96, 0.97, 0.98, 0.99, 0.995, 0.999)
+"""Shares of the largest class."""
+
+
+def of_share(views: Views, share: float, rng: np.random.Generator) -> Views:
+    """Return the views with two classes: patches about 3 m wide, and all around them a class of that share."""
+    rough = field(views.points, rng, 3.0)
+    return replace(views, labels=(rough > np.quantile(rough[views.there], share)).astype(np.int64))
+
+
+def shares(scenes: int, flights: int, seed: int) -> None:
+    """Print how far intervals and verdicts hold by the share of the largest class.
+
+    Errors are as frequent at the patches as around them: of both classes as many labels are wrong, at every share.
+    """
+    print("| largest class | chance | interval holds alpha | wide, median | stated 90 % or more, right | undecided |")
+    print("|---:|---:|---:|---:|---:|---:|")
+    for share in SHARES:
+        rows, chance = [], []
+        for kind in ("pixel", "block", "burst", "lasting"):
+            for trial in range(scenes):
+                rng = np.random.default_rng([seed, trial])
+                views, (low, high) = of_share(scene(rng), share, rng), RATES[kind]
+                rate = low + (high - low) * (trial + rng.random()) / scenes
+                flown = []
+                for flight in range(flights):
+                    missed = predicted(views, kind, rate, trial, flight) != views.labels
+                    added = predicted(views, kind, rate * (1 - share) / share, trial, flights + flight) != views.labels
+                    labels = np.where(np.where(views.labels == 1, missed, added), 1 - views.labels, views.labels)
+                    flown.append(sums(views, labels))
+                truth = min(float(np.mean([value(own, "alpha") for own in flown])), 1.0)
+                for own in flown:
+                    alpha = estimate(own, "alpha")
+                    said = level_probabilities(alpha)
+                    level = max(said, key=lambda name: said[name])
+                    inside = alpha.low - 1e-9 <= truth <= alpha.high + 1e-9
+                    rows.append((inside, alpha.high - alpha.low, said[level], level == level_of(truth)))
+                    fine = own.fine
+                    assert fine is not None
+                    evidence = fine["evidence"].sum(axis=0)
+                    chance.append(((evidence / evidence.sum()) ** 2).sum())
+        inside, wide, stated, right = (np.array(column) for column in zip(*rows, strict=True))
+        sure = stated >= 0.9
+        print(
+            f"| {share:.1%} | {np.mean(chance):.3f} | {inside.mean():.3f} | {np.nanmedian(wide):.2f} |"
+            f" {right[sure].mean():.3f} ({sure.sum()}) | {np.mean(stated < DECIDED):.2f} |",
+            flush=True,
+        )
+
+
 def main() -> None:
     """Print the tables."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("table", choices=["invariance", "levels"])
+    parser.add_argument("table", choices=["invariance", "levels", "shares"])
     parser.add_argument("--scenes", type=int)
     parser.add_argument("--flights", type=int, default=16)
     parser.add_argument("--seed", type=int, default=0)
     arguments = parser.parse_args()
     if arguments.table == "invariance":
         invariance(arguments.scenes or 3, arguments.seed)
+    elif arguments.table == "shares":
+        shares(arguments.scenes or 12, arguments.flights, arguments.seed)
     else:
         levels(arguments.scenes or 12, arguments.flights, arguments.seed)
 

@@ -20,7 +20,7 @@ import semstab
 from semstab.comparison.differences import corrected, over_scenes
 from semstab.comparison.pairing import pair
 from semstab.comparison.runs import open_runs
-from semstab.comparison.tables import print_comparison
+from semstab.comparison.tables import print_comparison, sentences
 from semstab.comparison.writing import load_comparison, markdown
 from semstab.data.contrast import Against, Contrast, RunComparison
 from semstab.data.frames import Frame, Intrinsics
@@ -206,3 +206,26 @@ def test_bad_input_is_one_line_and_the_command_writes_markdown(runs, tmp_path):
         assert semstab.compare([runs / "old", runs / "old"]).scenes[0].basis == "cubes"
     finally:
         (runs / "old" / "gone").rename(runs / "old" / "voxels")
+
+
+@pytest.mark.parametrize(
+    ("change", "said"), [(-0.03, "new covers 3.0% fewer voxels than old."), (0.02, "2.0% more voxels"), (0.004, "")]
+)
+def test_coverage_is_a_count_and_neither_better_nor_worse(runs, change, said):
+    comparison = semstab.compare([runs / "old", f"{runs}/new:net"])
+    (against,) = comparison.overall
+
+    def covering(row: Contrast) -> Contrast:
+        if row.measure != "coverage":
+            return row
+        counted = Interval(change, change, change, p_value=0.0, degrees=math.inf)
+        return dataclasses.replace(
+            row, difference=counted, other=1 + change, change="worse" if change < 0 else "better"
+        )
+
+    rows = tuple(map(covering, against.contrasts))
+    other = dataclasses.replace(comparison, overall=(dataclasses.replace(against, contrasts=rows),))
+    text = " ".join(sentences(other))
+    assert said in text
+    assert "in coverage" not in text
+    assert bool(said) == ("covers" in text)

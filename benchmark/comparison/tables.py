@@ -283,8 +283,9 @@ LEAST_LEFT_OUT = 0.005
 
 def _of_run(comparison: RunComparison, own: Against) -> Iterator[str]:
     yield _stability(comparison, own)
-    if changes := _changes(own.contrasts, by_key(HEADLINES)):
+    if changes := _changes(own.contrasts, by_key([row for row in HEADLINES if row is not COVERAGE])):
         yield f"{own.other}: {changes}."
+    yield from _coverage(comparison, own)
     classes = {
         name: [row for row in own.by_class if row.of == name] for name in dict.fromkeys(r.of for r in own.by_class)
     }
@@ -320,6 +321,18 @@ def _stability(comparison: RunComparison, own: Against) -> str:
         f"Over all classes, no difference in stability between {own.other} and {comparison.base} is shown: {numbers},"
         f" {interval}{p}, for {row.difference.scope}{why}."
     )
+
+
+LEAST_COVERAGE = 0.005
+"""Least change of coverage that is reported: it is a count, so that any difference is a fact, however small."""
+
+
+def _coverage(comparison: RunComparison, own: Against) -> Iterator[str]:
+    for row in own.contrasts:
+        change = row.difference.value
+        if row.measure == COVERAGE.key and abs(change) >= LEAST_COVERAGE:
+            more = "more" if change > 0 else "fewer"
+            yield f"{own.other} covers {abs(change):.1%} {more} voxels than {comparison.base}."
 
 
 def _changes(rows: Sequence[Contrast], known: Mapping[str, Quantity]) -> str:
