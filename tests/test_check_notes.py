@@ -81,7 +81,9 @@ class Unregistered(Room):
 @pytest.mark.parametrize(("scale", "x"), [(525 / 585, 0), (585 / 525, 0), (1, 6), (1, -7)])
 def test_labels_that_are_not_registered_are_pointed_out(tmp_path, scale, x):
     (note,) = notes(write(tmp_path / "room", Unregistered(scale, x)))
-    assert note.startswith("labels of net look as if they were not registered to the depth: their edges lie on")
+    assert note.startswith(
+        "labels of net look as if they were not registered to the depth: their edges fit those of depth"
+    )
     enlarged = float(note.partition("enlarged ")[2].split()[0])
     assert enlarged == pytest.approx(1 / scale, abs=0.05)
 

@@ -181,7 +181,7 @@ def test_scores_count_by_their_largest_class():
     found = tallied(space, scores)
     assert (found.classes, found.ignored, found.problem) == ({"a": 0.25, "b": 0.25}, 0.5, None)
     wider = tallied(space, np.ones((1, 2, 3), np.float32))
-    assert wider.problem == "scores of net hold 3 classes, mine has 2"
+    assert wider.problem == "scores of net hold 3 classes, but mine has 2"
 
 
 def test_maps_without_a_label_are_a_problem():

@@ -125,7 +125,7 @@ def test_a_size_that_a_model_cannot_see_is_one_line():
 @pytest.mark.parametrize(
     ("kind", "options", "message"),
     [
-        ("clipseg", {}, "finds what it is asked for; say prompts"),
+        ("clipseg", {}, "model needs prompts; set prompts"),
         ("clipseg", {"prompts": ["a", "b"], "image_size": [32, 64]}, "sees squares; give one number"),
         ("eomt", {"image_size": 32}, "sees windows of the size that it was made for"),
         ("eomt", {"engine": "onnx"}, "engine onnx cannot run a 'eomt' model"),

@@ -228,12 +228,12 @@ def test_a_camera_that_stood_still_has_no_verdict_and_a_single_frame_needs_more_
 
 
 def test_a_map_of_nearly_one_class_is_uninformative_whatever_its_alpha_is():
-    found = judged(0.9, 0.95, chance=0.9, largest_share=0.95)
+    found = judged(0.9, 0.95, chance=0.94, largest_share=0.97)
     assert found.level == "uninformative"
     assert math.isnan(found.probability)
-    assert "95% of the observations are grass" in found.line
-    assert judged(0.1, 0.2, chance=0.9).level == "uninformative"
-    assert judged(0.9, 0.95, chance=0.89).level == "stable"
+    assert "97% of the observations are grass" in found.line
+    assert judged(0.1, 0.2, chance=0.94).level == "uninformative"
+    assert judged(0.9, 0.95, chance=0.93).level == "stable"
 
 
 def test_a_model_that_labels_little_is_at_most_usable():

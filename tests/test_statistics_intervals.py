@@ -71,6 +71,7 @@ def test_no_error_seen_is_not_no_error_and_next_to_nothing_is_nowhere():
     assert alpha.value == alpha.high == of_voxels.value == of_voxels.high == psa.high == 1
     assert psa.low == pytest.approx(0.025 ** (1 / 100))
     assert of_voxels.low == pytest.approx(1 - (1 - psa.low) / 0.5, abs=0.01)
+    assert sums.edge == sums.fine.edge == sums.coarse.edge
     assert alpha.low == pytest.approx(1 - 2 * (1 - of_voxels.low))  # that of fine cells counts twice
     # Of 150 classes so few voxels may be stable that the square of their number is none any more
     rng = np.random.default_rng(0)

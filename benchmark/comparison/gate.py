@@ -36,7 +36,15 @@ from semstab.data.measures import ENTROPY, Quantity
 from semstab.data.statistics import Interval
 from semstab.errors import ConfigError, DataError
 from semstab.statistics.agreement import ALPHA, PSA, VOXEL_ALPHA
-from semstab.statistics.cluster_sums import ClusterSums, columns_of, functional, of_space_alone, parts_of, value
+from semstab.statistics.cluster_sums import (
+    ClusterSums,
+    chance_of,
+    columns_of,
+    functional,
+    of_space_alone,
+    parts_of,
+    value,
+)
 from semstab.statistics.correctness import ACCURACY, ECE, MIOU
 from semstab.statistics.intervals import (
     LEAST_FRAMES,
@@ -48,6 +56,7 @@ from semstab.statistics.intervals import (
     standard_error,
     within_a_flight,
 )
+from semstab.statistics.verdict import LEAST_CLASSES
 
 # Rules are about the numbers that follow from the sums of a run; each has advice for runs that do not have it.
 
@@ -568,6 +577,8 @@ def _require_values(rule: Rule, pairs: Sequence[Pair]) -> None:
     """Raise ConfigError for a rule that cannot be evaluated, with advice."""
     for new, old in pairs:
         for entry in (new, old):
+            if entry is not None and _of_all_alpha(rule) and _is_nearly_one_class(entry.sums):
+                continue  # undecided, whatever alpha is
             if entry is not None and rule.measure.quantity is not COVERAGE and math.isnan(_value(rule, entry)):
                 named = f"{rule.measure.name} of {rule.class_name}" if rule.class_name else rule.measure.name
                 raise ConfigError(
@@ -598,13 +609,29 @@ def _interval_of(rule: Rule, new: Entry, base: Entry | None, level: float, scope
         change = counted(_covered(new.sums, base.sums), new.sums)
         return change if rule.change == "rise" else negative(change)
     if rule.measure.quantity is not FLICKER:
-        return bounded(rule, new.sums, None if base is None else base.sums, k=_k(rule, new), level=level, scope=scope)
+        k, before = _k(rule, new), None if base is None else base.sums
+        result = bounded(rule, new.sums, before, k=k, level=level, scope=scope)
+        if _of_all_alpha(rule) and any(map(_is_nearly_one_class, (new.sums, before))):
+            return dataclasses.replace(result, undecided=ONE_CLASS)
+        return result
     if scope == OTHER_SCENES:
         raise ConfigError(f"rule '{rule.text}': flicker is known only by frame; assess it with --scope this-scene")
     if base is None:
         return mean_over_frames(np.array([*new.flicker]), np.array([*new.flicker.values()]), 1 - 2 * level)
     result = flicker_difference(new.flicker, base.flicker, level=1 - 2 * level)
     return result if rule.change == "rise" else negative(result)
+
+
+ONE_CLASS = "nearly the whole map is one class, so that alpha tells nothing"
+
+
+def _of_all_alpha(rule: Rule) -> bool:
+    return rule.measure.quantity is ALPHA and rule.class_name is None
+
+
+def _is_nearly_one_class(sums: ClusterSums | None) -> bool:
+    """Return whether the verdict on the map is 'uninformative'."""
+    return sums is not None and sums.fine is not None and chance_of(sums.fine) * LEAST_CLASSES > 1
 
 
 # --- Coverage, which is counted ---------------------------------------------------------------------------------------

@@ -179,6 +179,11 @@ class CellAgreement:
     classes: tuple[ClassAlpha, ...]
 
     @property
+    def effective_classes(self) -> float:
+        """1 / chance: as many classes of equal size have this chance (Hill 1973, Ecology 54, of order 2)."""
+        return 1 / self.chance if self.chance > 0 else math.nan
+
+    @property
     def critical_classes(self) -> tuple[ClassAlpha, ...]:
         """The classes that count for the verdict, those most probably unstable first."""
         known = [row for row in self.classes if row.counts_for_verdict and not math.isnan(row.unstable)]

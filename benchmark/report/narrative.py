@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator, Mapping, Sequence
 
 from semstab.data.measures import VSS
@@ -12,11 +11,6 @@ from semstab.datasets import GROUND_TRUTH
 from semstab.metrics import macro_mean
 from semstab.report.averages import ENOUGH, by_model, pooled
 from semstab.report.tables.stability import comparable
-from semstab.statistics.agreement import ALPHA
-from semstab.statistics.cluster_sums import ClusterSums
-from semstab.statistics.intervals import difference, mean_of
-from semstab.statistics.observations import CellObservations
-from semstab.statistics.paired_differences import compared_observations
 from semstab.statistics.verdict import LIMITS
 
 MOSTLY_ONCE = 0.5
@@ -69,12 +63,18 @@ def warnings(result: Result) -> Iterator[str]:
         yield "VSS, entropy and voxel alpha do not compare labels with soft scores: semstab-bench show RUN reduced"
     for record in result.select():
         yield from (f"{_name(record.summary, result)}: {text}" for text in _suspicions(record))
-    largest = {max(run.table.classes, key=lambda row: row.voxels).name for run in runs if _one_class(run)}
-    for name in largest:
-        shares = [row.share for run in runs for row in run.table.classes if row.name == name]
+    covering: dict[str, list[tuple[str, float]]] = {}
+    for run in filter(_one_class, runs):
+        largest = max(run.table.classes, key=lambda row: row.voxels)
+        covering.setdefault(largest.name, []).append((run.unit.model, largest.share))
+    for name, own in covering.items():
+        all_of_them = len(own) == len(runs)
+        of = "" if all_of_them else f" of {', '.join(dict.fromkeys(model for model, _ in own))}"
+        least = min(share for _, share in own)
+        more = " or more" if len(own) > 1 and least < 0.995 else ""
         yield (
-            f"'{name}' covers {min(shares):.0%} of the map or more and determines most of its numbers; read them by"
-            f" class, or leave it out: --set exclude.classes=[{name}]"
+            f"'{name}' covers {least:.0%}{more} of the map{of}, and determines most of its numbers; read them by class,"
+            f" or leave it out: --set exclude.classes=[{name}]"
         )
 
 
@@ -142,31 +142,6 @@ def notes(result: Result) -> Iterator[str]:
     yield from _ranking(result)
     yield from _least_seen(records)
     yield from _implementations(result)
-
-
-def differences(result: Result) -> Iterator[str]:
-    """Yield which models are more or less stable than the first, by alpha of the observations that all of them made."""
-    records = [record for record in result.select() if record.unit.model != GROUND_TRUTH]
-    first, *others = by_model(records) or [""]
-    sums = [_common_sums([r for r in records if r.unit.scene == scene]) for scene in result.scenes] if others else []
-    for name in others:
-        each = [difference(own[name], own[first], ALPHA.key) for own in sums if {name, first} <= own.keys()]
-        if known := [one for one in each if not math.isnan(one.low)]:
-            change = mean_of(known)
-            relation = "does not differ significantly from"
-            if change.decided and not change.low <= 0 <= change.high:
-                relation = "is more stable than" if change.low > 0 else "is less stable than"
-            ends = f"{change.low:+.2f} to {change.high:+.2f}".replace("0.", ".")
-            scenes = f", {len(known)} scenes" if len(known) > 1 else ""
-            yield f"{name} {relation} {first}: alpha {change.value:+.2f} ({ends}){scenes}"
-
-
-def _common_sums(records: Sequence[Record]) -> Mapping[str, ClusterSums]:
-    """Return the sums of the observations that all models of a scene made; none where they were not stored."""
-    files = {record.unit.model: record.observations_file for record in records}
-    there = {name: CellObservations.load(file) for name, file in files.items() if file is not None and file.is_file()}
-    same = len({own.classes for own in there.values()}) == 1
-    return compared_observations(there).sums if 1 < len(there) == len(files) and same else {}
 
 
 def _ranking(result: Result) -> Iterator[str]:

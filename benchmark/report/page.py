@@ -24,7 +24,8 @@ from semstab.report.figures.topdown import EMPTY, FromAbove
 from semstab.report.filter_study import advice, filter_studies, of_interest
 from semstab.report.html import filled, jpeg, png, table_block
 from semstab.report.loaded import read_series
-from semstab.report.narrative import differences, notes, warnings
+from semstab.report.narrative import notes, warnings
+from semstab.report.ranking import answers
 from semstab.report.tables import tables
 from semstab.report.tables.table import relations
 from semstab.report.terminal import miou
@@ -70,7 +71,7 @@ def render(
         cards=[_card(name, records) for name, records in by_model(result.select()).items()],
         advice=[sentence for each in filter_studies(everything) for sentence in advice(each)],
         warnings=[relations(text) for text in warnings(result)],
-        notes=[relations(text) for text in (*differences(result), *notes(result))],
+        notes=[relations(text) for text in (*answers(result), *notes(result))],
         scenes=shown,
         maps=_script([unit for scene in shown for unit in scene["maps"]]),
         layers=_script({"categories": CATEGORIES, "colors": CATEGORY_COLORS, "sbd": SBD_END}),

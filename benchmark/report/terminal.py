@@ -22,7 +22,8 @@ from semstab.engine.observer import Observer
 from semstab.engine.units import Plan
 from semstab.metrics import CATEGORIES, macro_mean
 from semstab.report.filter_study import advice, filter_studies
-from semstab.report.narrative import differences, warnings
+from semstab.report.narrative import warnings
+from semstab.report.ranking import answers, short
 from semstab.report.tables import tables
 from semstab.report.tables.table import to_terminal
 from semstab.statistics.verdict import LIMITS
@@ -121,12 +122,12 @@ def _verdict(run: UnitSummary) -> Iterator[str]:
     if statistics.verdict.level == "no verdict":
         yield from textwrap.wrap(statistics.verdict.line, WIDTH, initial_indent="  ", subsequent_indent="    ")
         return
-    yield f"  {level}{_probability(statistics.verdict)}    alpha {alpha.value:.2f}{_interval(alpha)}"
+    yield f"  {level}{_probability(statistics.verdict)}    alpha {short(alpha.value)}{_interval(alpha)}"
     if statistics.verdict.level == "uninformative" and statistics.cells is not None:
         share, name = _percent(statistics.cells.largest_share), statistics.cells.largest_class
         yield f"  {share} of the observations are {name}: agreement does not assess such a map"
     else:
-        yield f"  act on labels from alpha {_short(LIMITS.stable)} on, with care from {_short(LIMITS.usable)}"
+        yield f"  act on labels from alpha {short(LIMITS.stable)} on, with care from {short(LIMITS.usable)}"
     psa = statistics.headline.psa.value
     yield f"  two frames see the same class at {_percent(psa)} of the locations"
     wrong = statistics.headline.wrong_of_consistent
@@ -149,14 +150,8 @@ def _interval(estimate: Estimate, scale: float = 1.0) -> str:
     if math.isnan(estimate.low) or math.isnan(estimate.high):
         return ""
     if scale == 1.0:
-        return f" (95 % CI {_short(estimate.low)} to {_short(estimate.high)})"
+        return f" (95 % CI {short(estimate.low)} to {short(estimate.high)})"
     return f" ({scale * estimate.low:.0f} to {scale * estimate.high:.0f} %)"
-
-
-def _short(value: float) -> str:
-    """Return '.55' for 0.55."""
-    text = f"{value:.2f}"
-    return text.replace("0.", ".", 1) if abs(value) < 1 else text
 
 
 def _percent(share: float) -> str:
@@ -177,10 +172,14 @@ WIDTHS = (12, -15, -19, 6, 8, 6, 7, 5)
 
 
 def _several(result: Result, records: Sequence[Record]) -> Iterator[str]:
-    """Yield a row for each scene and model, and the differences to the first model where they are known."""
+    """Yield which model is more stable where that is known, then a row for each scene and model."""
     listed = ", ".join(result.scenes[:3]) + (", ..." if len(result.scenes) > 3 else "")
     yield _head(listed, result, [record.summary for record in records])
     yield ""
+    for text in (told := list(answers(result))):
+        yield from textwrap.wrap(text, WIDTH, initial_indent="  ", subsequent_indent="    ")
+    if told:
+        yield ""
     known = any(not math.isnan(miou(record)) for record in records)
     columns = len(COLUMNS) if known else len(COLUMNS) - 1
     yield _laid_out(COLUMNS[:columns])
@@ -190,7 +189,6 @@ def _several(result: Result, records: Sequence[Record]) -> Iterator[str]:
         if len(result.scenes) > 1 and own:
             yield f"  {scene}"
         yield from (_laid_out(_cells(record)[:columns]) for record in own)
-    yield from (f"  {text}" for text in differences(result))
     yield from _classes(records)
     yield ""
 
@@ -208,8 +206,8 @@ def _cells(record: Record) -> list[str]:
     if statistics is not None:
         level = f"{statistics.verdict.level}{_probability(statistics.verdict)}"
         agree, own = 100 * statistics.headline.psa.value, statistics.headline.alpha
-        ends = "" if math.isnan(own.low) else f" ({_short(own.low)} to {_short(own.high)})"
-        alpha = f"{_number(own.value, 2)}{ends}"
+        ends = "" if math.isnan(own.low) else f" ({short(own.low)} to {short(own.high)})"
+        alpha = f"{short(own.value)}{ends}"
     vss, sbd = (run.table.recurrent[m] for m in measures()[:2])
     flicker = record.image_space.compensated_flicker_percent
     numbers = ((agree, 0), (flicker, 1), (vss, 3), (sbd, 4), (100 * miou(record), 1))
@@ -242,7 +240,9 @@ def _classes(records: Sequence[Record]) -> Iterator[str]:
         common = [key for key, (voxels, _) in shares.items() if voxels >= RARE and key in alphas]
         for key in sorted(common, key=alphas.__getitem__)[:most]:
             label, taken = key if alone else f"{name}: {key}", others.get(key, "")
-            lines.append(f"    {label[:26]:<26}{alphas[key]:>6.2f}   {taken[:24]:<24}{100 * shares[key][1]:>9.0f} %")
+            lines.append(
+                f"    {label[:26]:<26}{short(alphas[key]):>6}   {taken[:24]:<24}{100 * shares[key][1]:>9.0f} %"
+            )
     if lines:
         yield ""
         yield f"  {'least stable classes':<28}{'alpha':>6}   {'confused with':<24}{'of the map':>11}"

@@ -227,14 +227,14 @@ def with_cells(whole: ClusterSums, cells: CellObservations, edge: float | None =
             default, whatever the voxels of the map.
     """
     parts = []
-    for times in (1, 2):
+    for times in (2, 1):  # cubes that hold whole coarse cells hold whole fine ones
         log = cells.observations(times * cells.coarsening)
         cubes = Cubes.of_log(log, edge)
         edge = cubes.edge
         own = _sums_of_log(log, cubes)
         parts.append(replace(own, classes=whole.classes))
     step = max(part.step for part in parts)
-    fine, coarse = (part.coarsened(part.edge, step) for part in parts)
+    coarse, fine = (part.coarsened(part.edge, step) for part in parts)
     return replace(whole, fine=fine, coarse=coarse)
 
 

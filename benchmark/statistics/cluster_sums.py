@@ -477,6 +477,12 @@ BY_CLASS: Mapping[str, Functional] = {
 predicted (precision), and intersection over union."""
 
 
+def chance_of(cells: ClusterSums) -> float:
+    """Return the probability that two observations from anywhere, of different views, agree; NaN for fewer than two."""
+    evidence, n = cells["evidence"].sum(axis=0), float(cells["observations"].sum())
+    return float((evidence**2).sum() - cells["own"].sum()) / (n * (n - 1)) if n > 1 else math.nan
+
+
 def of_space_alone(key: str, k: int | None = None) -> bool:
     """Return whether a number does not depend on frames, so that its intervals are for these frames."""
     return set(functional(key, k).names) <= set(WITHOUT_FRAMES)

@@ -34,7 +34,7 @@ from semstab.metrics.agreement import shared_rows
 from semstab.metrics.summary import STRATA, groups_of
 from semstab.statistics.accumulate import Cubes, CubeSums, cluster_sums_of
 from semstab.statistics.agreement import class_agreement_of, class_sums, consistency_posterior, ratio_of, shares_of
-from semstab.statistics.cluster_sums import MOST_CLASSES, ClusterSums
+from semstab.statistics.cluster_sums import MOST_CLASSES, ClusterSums, chance_of
 from semstab.statistics.correctness import (
     Predictions,
     Truth,
@@ -265,7 +265,7 @@ def cell_agreement(
         cubes=fine.cells,
         frames=cells.frames,
         views=len(cells.views),
-        chance=float((evidence**2).sum() - fine["own"].sum()) / (n * (n - 1)) if n > 1 else math.nan,
+        chance=chance_of(fine),
         largest_class=names[largest],
         largest_share=float(evidence[largest]) / n if n else math.nan,
         labelled=cells.labelled_share(),

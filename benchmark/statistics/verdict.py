@@ -36,9 +36,9 @@ DECIDED = 0.6
 PROBABLE = 0.9
 """A class is named as unstable from this probability on."""
 
-MOST_CHANCE = 0.9
-"""A map shows almost nothing if two observations from anywhere agree with at least this probability: where 95 % of a
-map are one class, any two agree at 90 % of the spots, however good the labels are."""
+LEAST_CLASSES = 1.07
+"""Effective number of classes (`CellAgreement.effective_classes`) below which agreement tells almost nothing of a map:
+where 97 % of it are one class, any two observations agree with a probability of .94, however good the labels are."""
 
 DANGEROUS = 0.05
 """Largest share of the consistent locations that may be wrong."""
@@ -131,7 +131,7 @@ def _missing(cells: CellAgreement | None) -> str:
 def _level(
     headline: HeadlineStatistics, cells: CellAgreement, probabilities: Mapping[Level, float]
 ) -> tuple[Level, float]:
-    if cells.chance >= MOST_CHANCE:
+    if cells.effective_classes < LEAST_CLASSES:
         return "uninformative", math.nan
     level = max(probabilities, key=lambda name: probabilities[name])
     if math.isnan(probabilities[level]):

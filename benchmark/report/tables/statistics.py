@@ -15,7 +15,7 @@ from semstab.report.tables.table import Cell, Column, Group, Row, Table
 from semstab.statistics.agreement import ALPHA, KAPPA, PSA, VOXEL_ALPHA
 from semstab.statistics.drift import FLIP_RATE
 from semstab.statistics.intervals import LEAST_FRAMES
-from semstab.statistics.verdict import ADVICE, DANGEROUS, DECIDED, LIMITS, MOST_CHANCE
+from semstab.statistics.verdict import ADVICE, DANGEROUS, DECIDED, LEAST_CLASSES, LIMITS
 
 SCENE = Column("scene", "Scene")
 REPEATED = Column("repeated_voxels", "Voxels", 0)
@@ -178,7 +178,7 @@ def verdicts(result: Result) -> list[Table]:
         "The verdict is the most probable level of alpha for the same scene flown again: stable from"
         f" {LIMITS.stable:g} on, usable from {LIMITS.usable:.3g}, unstable below. It is undecided if no level has"
         f" {DECIDED:.0%}; misleading if more than {DANGEROUS:.0%} of the consistent locations are wrong, which only"
-        f" ground truth shows; uninformative if two observations from anywhere agree at {MOST_CHANCE:.0%}. Labelled is"
+        f" ground truth shows; uninformative if a map has fewer than {LEAST_CLASSES:g} effective classes. Labelled is"
         " the share of locations that have a label in half of their observations or more; below"
         f" {LIMITS.labelled:.0%} a model is at most usable. Voxels are those seen twice or more. {INTERVALS}"
     )

@@ -1,0 +1,136 @@
+"""Which model is more stable: a ranking by alpha of the observations that all models made, with ties."""
+
+from __future__ import annotations
+
+import functools
+import itertools
+import math
+import re
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+from semstab.data.records import Record, Result
+from semstab.datasets import GROUND_TRUTH
+from semstab.metrics import macro_mean
+from semstab.report.averages import by_model
+from semstab.statistics.agreement import ALPHA
+from semstab.statistics.cluster_sums import ClusterSums, value
+from semstab.statistics.intervals import LEVEL, difference, mean_of
+from semstab.statistics.observations import CellObservations
+from semstab.statistics.paired_differences import compared_observations, holm
+
+
+@dataclass(frozen=True)
+class Difference:
+    """Alpha of a model less that of another on common observations, the mean over scenes, with its 95 % interval.
+
+    Attributes:
+        p_holm: p-value, corrected for all pairs of models.
+        shown: Whether the difference is shown: Holm's p-value is below 0.05, and the interval excludes 0.
+    """
+
+    model: str
+    other: str
+    value: float
+    low: float
+    high: float
+    scenes: int
+    p_holm: float
+    shown: bool
+
+
+@dataclass(frozen=True)
+class Ranking:
+    """Models by alpha of their common observations.
+
+    Attributes:
+        ranks: Each rank and its models, the most stable first. A rank is 1 plus the number of models that are shown to
+            be more stable, so that models without a shown difference can share it.
+        differences: Of all pairs, each in the order of the models in the run.
+        unranked: Models whose map is nearly one class, about which alpha tells nothing.
+    """
+
+    ranks: tuple[tuple[int, tuple[str, ...]], ...]
+    differences: tuple[Difference, ...]
+    unranked: tuple[str, ...]
+
+
+def ranking(result: Result) -> Ranking:
+    """Return the ranking of a run's models by the observations that all of them made; empty for one model.
+
+    Scenes in which not all models have observations do not count.
+    """
+    records = [record for record in result.select() if record.unit.model != GROUND_TRUTH]
+    models = by_model(records)
+    unranked = tuple(name for name, own in models.items() if all(map(_is_uninformative, own)))
+    names = [name for name in models if name not in unranked]
+    sums = [_common_sums([r for r in records if r.unit.scene == scene]) for scene in result.scenes]
+    known = [own for own in sums if {*names} <= own.keys()] if len(names) > 1 else []
+    pairs = list(itertools.combinations(names, 2)) if known else []
+    changes = [mean_of([difference(own[b], own[a], ALPHA.key) for own in known]) for a, b in pairs]
+    p_values = holm([change.p_value for change in changes])
+    differences = tuple(
+        Difference(
+            b, a, change.value, change.low, change.high, len(known), p,
+            shown=change.decided and p < 1 - LEVEL and not change.low <= 0 <= change.high,
+        )
+        for (a, b), change, p in zip(pairs, changes, p_values, strict=True)
+    )  # fmt: skip
+    alpha = {name: macro_mean([value(own[name], ALPHA.key) for own in known]) for name in names} if known else {}
+    better = dict.fromkeys(alpha, 0)
+    for each in differences:
+        if each.shown:
+            better[each.other if each.value > 0 else each.model] += 1
+    order = sorted(alpha, key=lambda name: (better[name], -alpha[name]))
+    ranks = tuple((1 + n, tuple(own)) for n, own in itertools.groupby(order, key=better.__getitem__))
+    return Ranking(ranks, differences, unranked if len(models) > 1 else ())
+
+
+def answers(result: Result) -> Iterator[str]:
+    """Yield the answer: the difference of two models, or the ranks of more."""
+    ranked = ranking(result)
+    known = [each for each in ranked.differences if not math.isnan(each.low)]
+    if len(ranked.differences) == 1 and known:
+        (one,) = known
+        relation = "does not differ significantly from"
+        if one.shown:
+            relation = "is more stable than" if one.value > 0 else "is less stable than"
+        change, ends = short(one.value, "+"), f"{short(one.low, '+')} to {short(one.high, '+')}"
+        scenes = f", {one.scenes} of {len(result.scenes)} scenes" if one.scenes < len(result.scenes) else ""
+        yield f"{one.model} {relation} {one.other}: alpha {change} ({ends}){scenes}"
+    elif known:
+        ranks = "; ".join(f"{rank}. {', '.join(names)}" for rank, names in ranked.ranks)
+        yield f"most stable first: {ranks}"
+        yield (
+            "ranks are by alpha of the observations that all models made; a rank is 1 plus the number of models shown"
+            f" to be more stable (Holm over {len(ranked.differences)} pairs)"
+        )
+    if ranked.unranked:
+        yield f"not ranked, as nearly the whole map is one class: {', '.join(ranked.unranked)}"
+
+
+def short(value: float, sign: str = "") -> str:
+    """Return a number from -1 to 1 without the 0 before its point: '.55', '-.19', '1.00'; '-' where it is undefined."""
+    return "-" if math.isnan(value) else re.sub(r"^([+-]?)0\.", r"\1.", f"{value:{sign}.2f}")
+
+
+def _is_uninformative(record: Record) -> bool:
+    return record.statistics is not None and record.statistics.verdict.level == "uninformative"
+
+
+def _common_sums(records: list[Record]) -> Mapping[str, ClusterSums]:
+    """Return the sums of the observations that all models of a scene made; none where they were not stored."""
+    files = {record.unit.model: record.observations_file for record in records}
+    there = [(name, file) for name, file in files.items() if file is not None and file.is_file()]
+    if not 1 < len(there) == len(files):
+        return {}
+    return _sums_of_files(tuple((name, file, file.stat().st_mtime_ns) for name, file in there))
+
+
+@functools.lru_cache(maxsize=16)
+def _sums_of_files(files: tuple[tuple[str, Path, int], ...]) -> Mapping[str, ClusterSums]:
+    """Return the same of the files, which terminal and report need one after the other."""
+    observations = {name: CellObservations.load(file) for name, file, _ in files}
+    same = len({own.classes for own in observations.values()}) == 1
+    return compared_observations(observations).sums if same else {}

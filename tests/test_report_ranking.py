@@ -1,0 +1,105 @@
+"""Several models: which one is more stable, with ties, and which cannot be ranked."""
+
+from __future__ import annotations
+
+import io
+
+import pytest
+from rich.console import Console
+
+import semstab
+from semstab.comparison.gate import gate, gate_config
+from semstab.report.ranking import answers, ranking
+from semstab.report.terminal import print_summary
+
+ERRORS = {"place": 0.05, "view": 0.05, "cell": 2.0, "flicker": 0.03}
+
+
+@pytest.fixture(scope="module")
+def result(tmp_path_factory):
+    """Two models that err alike, one that flickers, and one that says one class everywhere."""
+    models = {
+        "twin": ERRORS, "nervous": ERRORS | {"flicker": 0.3}, "other-twin": ERRORS,
+        "constant": {"labeller": "constant"},
+    }  # fmt: skip
+    options = {"frames": 12, "width": 160, "height": 90, "models": models}
+    city = {"dataset": {"name": "city", "options": options}, "scenes": ["scene0"], "voxel_size": 0.4}
+    out = tmp_path_factory.mktemp("ranking") / "run"
+    config = semstab.load_config(overrides={**city, "models": list(models), "check": None})
+    return semstab.run(config, out=out, report=False), out
+
+
+def printed(result, out) -> str:
+    console = Console(file=io.StringIO(), width=100)
+    print_summary(result, console, out=out)
+    return console.file.getvalue()
+
+
+def test_models_without_a_shown_difference_share_a_rank(result):
+    ranks = dict(ranking(result[0]).ranks)
+    assert sorted(ranks[1]) == ["other-twin", "twin"]
+    assert ranks[3] == ("nervous",)
+
+
+def test_every_pair_is_compared_and_corrected(result):
+    found = ranking(result[0])
+    assert [(each.other, each.model) for each in found.differences] == [
+        ("twin", "nervous"), ("twin", "other-twin"), ("nervous", "other-twin"),
+    ]  # fmt: skip
+    assert [each.shown for each in found.differences] == [True, False, True]
+    assert all(each.low <= each.value <= each.high for each in found.differences)
+    assert found.differences[1].p_holm > 0.05
+
+
+def test_a_map_of_nearly_one_class_has_no_rank(result):
+    assert ranking(result[0]).unranked == ("constant",)
+    assert "not ranked, as nearly the whole map is one class: constant" in list(answers(result[0]))
+
+
+def test_the_answer_stands_above_the_table(result):
+    text = printed(*result)
+    assert text.index("most stable first: 1. ") < text.index("alpha (95 % CI)")
+    assert "; 3. nervous" in text
+    assert "Holm over 3 pairs" in text
+
+
+def test_the_report_has_the_same_answer(result):
+    semstab.run(semstab.load_config(result[1] / "config.yaml"), out=result[1])  # draws the report alone
+    assert "; 3. nervous" in (result[1] / "report.html").read_text()
+
+
+def test_two_models_are_one_sentence(tmp_path):
+    options = {"frames": 12, "width": 160, "height": 90}
+    city = {"dataset": {"name": "city", "options": options}, "scenes": ["scene0"], "voxel_size": 0.4}
+    models = ["sim-steady", "sim-flicker"]
+    config = semstab.load_config(overrides={**city, "models": models, "check": None})
+    found = semstab.run(config, out=tmp_path / "run", report=False)
+    (text,) = answers(found)
+    assert text.startswith("sim-flicker is less stable than sim-steady: alpha -")
+    assert printed(found, tmp_path / "run").index(text[:40]) < 300
+
+
+def test_one_model_has_no_ranking(result, tmp_path):
+    alone = semstab.run(
+        semstab.load_config(
+            overrides={
+                "dataset": {"name": "city", "options": {"frames": 6, "width": 96, "height": 54}},
+                "scenes": ["scene0"],
+                "models": ["sim-steady"],
+                "check": None,
+                "voxel_size": 0.8,
+            }
+        ),
+        out=tmp_path / "run",
+        report=False,
+    )
+    assert ranking(alone).ranks == ranking(alone).differences == ()
+    assert list(answers(alone)) == []
+
+
+def test_a_gate_on_alpha_of_nearly_one_class_is_undecided(result):
+    decided = gate(
+        f"{result[1]}:constant", f"{result[1]}:twin", gate_config(rules=["alpha drop < 0.02", "alpha > 0.5"])
+    )
+    assert [each.verdict for each in decided.judgements] == ["undecided", "undecided"]
+    assert "nearly the whole map is one class" in decided.judgements[0].reason
