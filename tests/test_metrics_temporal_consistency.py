@@ -17,7 +17,15 @@ from hypothesis import strategies as st
 
 from semstab import datasets
 from semstab.errors import ConfigError, DataError
-from semstab.metrics import TemporalConsistency, compensated_flicker, flow_by_depth, image_flow, occluded, warp_labels
+from semstab.metrics import (
+    TemporalConsistency,
+    VideoConsistency,
+    compensated_flicker,
+    flow_by_depth,
+    image_flow,
+    occluded,
+    warp_labels,
+)
 
 K, SHAPE = 7, (24, 37)
 OFFICIAL = {"vspw": 0.42644135146742373, "etc": 0.3116925927522956, "ssp": 0.42159191185519806}
@@ -46,6 +54,31 @@ def test_it_is_what_the_official_script_says(form):
             metric.add(labels, warp_labels(following, flow, "etc" if form == "etc" else "vspw"))
         metric.end_video()
     assert metric.value == pytest.approx(OFFICIAL[form], abs=1e-8)
+
+
+def test_vc_is_what_the_official_script_says():
+    """VC_perclip.py with clips of 3 frames, all clips but the last of each video."""
+    metric, clips = VideoConsistency(3), []
+    for seed in range(3):
+        maps, _ = video(seed)
+        for t, labels in enumerate(maps):
+            truth = maps[0].copy()
+            truth[:, :t] = t % K
+            clips.append(metric.add(labels, np.ones(SHAPE, bool), truth))
+        metric.end_video()
+    assert metric.published == pytest.approx(0.11825953602140238, abs=1e-12)
+    assert metric.value == pytest.approx(np.nanmean(clips))
+    assert metric.published != metric.value
+
+
+def test_a_video_of_one_clip_counts_in_no_published_mean():
+    metric, maps = VideoConsistency(3), video(0)[0]
+    for labels in maps[:3]:
+        metric.add(labels, np.ones(SHAPE, bool), maps[0])
+    assert math.isnan(metric.published)
+    metric.end_video()
+    assert math.isnan(metric.published)
+    assert not math.isnan(metric.value)
 
 
 @given(st.integers(0, 2**32 - 1))
@@ -100,7 +133,7 @@ def test_depth_and_pose_give_the_flow_that_flicker_rests_on():
     frame, following = scene.frame(1, "sim-flicker"), scene.frame(0, "sim-flicker")
     flow, visible = flow_by_depth(frame, following)
     assert np.isfinite(flow).all(axis=2).tolist() == visible.tolist()
-    warped = warp_labels(following.predicted, flow.astype(np.float32))
+    warped = warp_labels(following.predicted, flow)
     both = visible & frame.valid & (warped != 255)
     changed = 100 * np.mean(warped[both] != frame.predicted[both])
     assert changed == pytest.approx(compensated_flicker(following, frame).flicker_percent)

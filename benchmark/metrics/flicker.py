@@ -91,7 +91,9 @@ class VideoConsistency:
     """VC_n with ground truth, as in VSPW: 1 is a prediction that never changes where the truth does not.
 
     A clip has the share of the pixels with constant ground truth in its n frames whose prediction is constant too,
-    right or wrong; `value` is the mean over all clips of n consecutive frames, the last one included.
+    right or wrong; `value` is the mean over all clips of n consecutive frames, the last one included. `published` is
+    the mean that VSPW's VC_perclip.py computes: it leaves out the last clip of each video, and so videos of n frames;
+    the script counts every pixel, so give masks that are True everywhere for its number.
     Frames are added one by one, and none stays in memory. Clips do not reach across a change of the image size.
 
     Attributes:
@@ -126,10 +128,20 @@ class VideoConsistency:
         self._truth.end()
         return math.nan
 
+    def end_video(self) -> None:
+        """End a video: the next frame is of another one."""
+        self.skip()
+        self._clips.end()
+
     @property
     def value(self) -> float:
         """Mean over the clips in which a pixel counts, 0 to 1; NaN where there is none."""
         return self._clips.mean
+
+    @property
+    def published(self) -> float:
+        """The same without the last clip of each video, 0 to 1; NaN where there is none."""
+        return self._clips.published
 
 
 class SelfConsistency:
@@ -190,8 +202,9 @@ class _Clips:
 
     def __init__(self, n: int) -> None:
         self.n = n
-        self._sum = 0.0
-        self._count = 0
+        self._sum, self._count = 0.0, 0
+        self._last = math.nan  # of the video so far
+        self._lasts, self._videos = 0.0, 0  # of the videos before
 
     def add(self, constant: npt.NDArray[np.int16], counted: npt.NDArray[np.int16]) -> float:
         """Return the share of the pixels that have counted for n frames whose prediction has been constant as long."""
@@ -200,14 +213,27 @@ class _Clips:
         pixels, consistent = count_long(flat(counted), flat(constant), self.n)
         if not pixels:
             return math.nan
-        value: float = consistent / pixels
-        self._sum += value
+        self._last = consistent / pixels
+        self._sum += self._last
         self._count += 1
-        return value
+        return self._last
+
+    def end(self) -> None:
+        """End a video."""
+        if not math.isnan(self._last):
+            self._lasts += self._last
+            self._videos += 1
+        self._last = math.nan
 
     @property
     def mean(self) -> float:
         return self._sum / self._count if self._count else math.nan
+
+    @property
+    def published(self) -> float:
+        open_ = 0.0 if math.isnan(self._last) else self._last
+        count = self._count - self._videos - (not math.isnan(self._last))
+        return (self._sum - self._lasts - open_) / count if count else math.nan
 
 
 # Regions without classes: the change of a segmentation between two frames, whatever its ids are.

@@ -112,7 +112,7 @@ def _mean_iou(confusion: npt.NDArray[np.int64], *, own_alone: bool = False) -> f
     return float(np.mean(intersection[there] / union[there])) if there.any() else math.nan
 
 
-def warp_labels(labels: Labels, flow: Float32, sampling: Sampling = "nearest") -> Labels:
+def warp_labels(labels: Labels, flow: npt.NDArray[np.floating[Any]], sampling: Sampling = "nearest") -> Labels:
     """Return the next frame's labels at a frame's pixels: q(x, y) = labels(x + flow_x, y + flow_y).
 
     - 'nearest': the nearest pixel's label, NO_LABEL outside the image.
