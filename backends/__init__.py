@@ -41,16 +41,19 @@ REGISTRY = Registry(
             "semstab.backends.open3d_blocks:Open3DBlocks",
             "Open3D VoxelBlockGrid with semantic attributes on hashed voxel blocks; CPU or CUDA",
             install=WITH_OPEN3D,
+            needs=("open3d",),
         ),
         "torch": Entry(
             "semstab.backends.torch_map:TorchMap",
             "the fast one on an accelerator: a hash map on a CUDA device, fed from tensors; runs on a CPU too",
             install="pip install 'semstab[torch]'",
+            needs=("torch",),
         ),
         "open3d-projective": Entry(
             "semstab.backends.open3d_projective:Open3DProjective",
             "voxels look up their pixel, as Open3D's integration does; to compare: differs from the others by design",
             install=WITH_OPEN3D,
+            needs=("open3d",),
         ),
     },
 )

@@ -20,6 +20,7 @@ from semstab.data.frames import Frame
 from semstab.data.labels import IGNORE_8BIT, LabelSpace
 
 SEGMENTER, SAM = "semstab.models.segmenter:Segmenter", "semstab.models.sam:"
+NETWORKS = ("torch", "transformers")
 WITH_SEGFORMER, WITH_SAM = "pip install 'semstab[segformer]'", "pip install 'semstab[sam]'"
 
 REGISTRY = Registry(
@@ -33,23 +34,29 @@ REGISTRY = Registry(
             SEGMENTER,
             "any transformers checkpoint that segments: SegFormer, UPerNet, Mask2Former, OneFormer, EoMT, CLIPSeg, ...",
             install=WITH_SEGFORMER,
+            needs=NETWORKS,
         ),
-        "segformer": Entry(SEGMENTER, "the same by its first name", install=WITH_SEGFORMER),
-        "sam-raw": Entry(SAM + "SamRaw", "Segment Anything's proposals as regions without classes", install=WITH_SAM),
+        "segformer": Entry(SEGMENTER, "the same by its first name", install=WITH_SEGFORMER, needs=NETWORKS),
+        "sam-raw": Entry(
+            SAM + "SamRaw", "Segment Anything's proposals as regions without classes", install=WITH_SAM, needs=NETWORKS
+        ),
         "sam-heuristic": Entry(
             SAM + "SamHeuristic",
             "Segment Anything's proposals with classes from rules on colour, size and shape",
             install=WITH_SAM,
+            needs=NETWORKS,
         ),
         "sam-vote": Entry(
             SAM + "SamVote",
             "another model's labels, by majority inside Segment Anything's proposals",
             install=WITH_SAM,
+            needs=NETWORKS,
         ),
         "segearth-ov": Entry(
             "semstab.models.segearth_ov:SegEarthOV",
             "SegEarth-OV: CLIP as an open-vocabulary segmenter, for views from above, without training",
             install="pip install 'semstab[segearth]'",
+            needs=NETWORKS,
         ),
         "stored": Entry(
             "semstab.predict.predictor:Stored", "labels that a scene has already, for --filter: --set source=NAME"

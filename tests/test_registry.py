@@ -76,10 +76,32 @@ def test_the_list_says_what_is_not_ready(monkeypatch, capsys):
     monkeypatch.setattr(registry.importlib, "import_module", import_module)
     monkeypatch.setenv("COLUMNS", "300")
     assert "sam-raw" in models.REGISTRY.entries()
-    list_()
+    list_(check=True)
     (line,) = [line for line in capsys.readouterr().out.splitlines() if "sam-raw" in line]
     assert "torchvision::nms does not exist" in line
     assert "ready" not in line
+
+
+def test_the_list_names_packages_that_are_not_installed(monkeypatch, capsys):
+    from semstab.cli.finished import list_
+
+    found = registry.importlib.util.find_spec
+    monkeypatch.setattr(registry.importlib.util, "find_spec", lambda name: None if name == "torch" else found(name))
+    monkeypatch.setenv("COLUMNS", "300")
+    list_()
+    lines = capsys.readouterr().out.splitlines()
+    (line,) = [line for line in lines if "sam-raw" in line]
+    assert "torch: not installed; pip install 'semstab[sam]'" in line
+    assert all("ready" in line for line in lines if line.startswith((" dataset", " filter")))
+
+
+def test_the_list_imports_no_engine():
+    heavy = "open3d", "torch", "transformers", "rerun", "numba"
+    code = (
+        f"from semstab.cli.finished import list_; list_(); import sys; print([n for n in {heavy} if n in sys.modules])"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.splitlines()[-1] == "[]"
 
 
 @pytest.fixture

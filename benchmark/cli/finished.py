@@ -228,7 +228,9 @@ def relabel(
 # The command list.
 
 
-def list_() -> None:
+def list_(
+    check: Annotated[bool, typer.Option("--check", help="Also load each one, which takes seconds.")] = False,
+) -> None:
     """List backends, datasets, models, filters, taxonomies and studies, each with 'ready' or the missing package."""
     from rich.console import Console
     from rich.markup import escape
@@ -245,11 +247,13 @@ def list_() -> None:
         table.add_column(name)
     for registry in (backends.REGISTRY, datasets.REGISTRY, models.REGISTRY, filters.REGISTRY):
         for name, entry in sorted(registry.entries().items()):
-            try:
-                registry.load(name)  # an entry is ready if all its imports succeed
-                ready = "[green]ready"
-            except MissingDependencyError as error:
-                ready = f"[yellow]{escape(str(error))}"
+            missing = registry.missing(name)
+            if check and not missing:
+                try:
+                    registry.load(name)
+                except MissingDependencyError as error:
+                    missing = str(error)
+            ready = f"[yellow]{escape(missing)}" if missing else "[green]ready"
             table.add_row(registry.kind, name, ready, escape(entry.summary))
     for name in shipped_taxonomies():
         space = LabelSpace.load(name)

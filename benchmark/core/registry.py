@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import functools
 import importlib
+import importlib.util
 from collections.abc import Mapping
 from dataclasses import dataclass
 from importlib.metadata import entry_points
@@ -21,11 +22,16 @@ EARLIER: Mapping[str, str] = {"model": "backbone"}
 
 @dataclass(frozen=True)
 class Entry:
-    """One name: its class ('module:Class'), a description, and how to install what it needs."""
+    """One name: its class ('module:Class'), a description, and how to install what it needs.
+
+    Attributes:
+        needs: Packages that a bare installation may lack, under their names of import.
+    """
 
     target: str
     summary: str
     install: str = ""
+    needs: tuple[str, ...] = ()
 
 
 class Registry:
@@ -59,6 +65,17 @@ class Registry:
         if name not in entries:
             raise ConfigError(f"{self.kind} '{name}' is not known; {nearest(name, sorted(entries))}")
         return entries[name]
+
+    def missing(self, name: str) -> str:
+        """Return the advice for packages of an entry that are not installed; empty if all are. Imports nothing.
+
+        Raises:
+            ConfigError: If the name is not known.
+        """
+        entry = self.entry(name)
+        needs = entry.needs or (entry.target.partition(":")[0].partition(".")[0],)
+        absent = [package for package in needs if importlib.util.find_spec(package) is None]
+        return f"{', '.join(absent)}: not installed; {entry.install or 'install it'}" if absent else ""
 
     def load(self, name: str) -> Any:
         """Import the class behind a name.
