@@ -16,8 +16,9 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from semstab.check.conventions import KNOWN_SCALES
-from semstab.check.reprojection import evenly, reader
+from semstab.check.reprojection import reader
 from semstab.config import Config
+from semstab.core.arrays import evenly
 from semstab.core.files import (
     FolderLock,
     atomic_path,

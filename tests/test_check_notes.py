@@ -15,9 +15,10 @@ from room_scene import CLASSES, Room, walk, write
 from typer.testing import CliRunner
 
 from semstab.check import check
-from semstab.check.registration import depth_edges, find_offset, find_sentinel, grey_levels, image_edges
+from semstab.check.registration import find_offset, find_sentinel, grey_levels
 from semstab.cli import app
 from semstab.datasets import open_dataset
+from semstab.pixels.edges import depth_edges, image_edges
 
 DATA = Path(os.environ.get("SEMSTAB_DATA", Path(__file__).parents[1] / "../shared/data"))
 

@@ -17,9 +17,9 @@ from test_recording import read
 
 import semstab
 from semstab.config import BACKENDS
-from semstab.engine import load_result, streams
+from semstab.engine import load_result
 from semstab.engine.units import make_plan
-from semstab.metrics import compare, compensated_flicker
+from semstab.metrics import compare, compensated_flicker, image_space
 from semstab.recording import Recording, Target, lacks_pictures, record_finished
 from semstab.settings import load_config
 from semstab.task import read as read_frame
@@ -139,10 +139,10 @@ def test_a_backend_of_ones_own_that_breaks_leaves_its_trace(root, tmp_path, monk
 
 def test_large_frames_are_sampled_for_what_is_measured_in_the_image(root, monkeypatch) -> None:
     """Each pixel of the sample is looked up in the whole frame before: fusion need not wait for all of them."""
-    monkeypatch.setattr(streams, "SIDE", 4)  # of frames of 8x6: every second pixel
+    monkeypatch.setattr(image_space, "SIDE", 4)  # of frames of 8x6: every second pixel
     (task, *_) = make_plan(load_config(overrides=settings(root))).tasks
     frames = [read_frame(task, index) for index in task.indices]
-    meter = streams.ImageSpaceMeter()
+    meter = image_space.ImageSpaceMeter()
     for frame in frames:
         meter.add(frame, None)
     pairs = [compensated_flicker(a, b.every(2)).flicker_percent for a, b in itertools.pairwise(frames)]

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from semstab import backends, datasets
-from semstab.engine.finish import estimate_up
 from semstab.errors import DataError
+from semstab.metrics.up_axis import estimate_up
 
 DATA = Path(os.environ.get("SEMSTAB_DATA", Path(__file__).parents[2] / "shared" / "data"))
 

@@ -4,15 +4,14 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from striped_floor import K, flight
 
 from semstab import backends
-from semstab.engine.streams import SizeSample
 from semstab.statistics import krippendorff_alpha
+from semstab.statistics.voxel_sizes import SizeSample
 
 
 def soft(frame, kind, seed=0):
@@ -21,8 +20,7 @@ def soft(frame, kind, seed=0):
 
 
 def alphas(frames, voxel_size):
-    task = SimpleNamespace(indices=[frame.index for frame in frames], mapping=SimpleNamespace(target=range(K)))
-    maps = SizeSample(task, SimpleNamespace(voxel_size=voxel_size))
+    maps = SizeSample([frame.index for frame in frames], voxel_size, K)
     for frame in frames:
         maps.add(frame)
     return maps.alphas()

@@ -3,23 +3,20 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from semstab.check.conventions import OPTION, Reading
 from semstab.check.geometry import Verdict
-from semstab.check.reprojection import Pair, View, evenly
+from semstab.check.reprojection import Pair, View
+from semstab.core.arrays import evenly
 from semstab.core.types import Float32, Float64, Mask, UInt8
 from semstab.data.frames import Intrinsics
 from semstab.datasets import Scene
 from semstab.errors import DataError
-
-JUMP = 0.05
-"""An edge of depth is where it changes by this share from pixel to pixel."""
+from semstab.pixels.edges import depth_edges, image_edges, label_edges
 
 WIDTH = 192
 """Edges are compared on a grid of about so many columns."""
@@ -89,45 +86,10 @@ def find_offset(pairs: Sequence[Edges]) -> Offset | None:
     return Offset(float(SCALES[best[0]]), shift, float(whole[best]), float(whole[here]))
 
 
-def depth_edges(depth: Float32) -> Mask:
-    """Return a mask (H, W) of the pixels whose neighbours lie on other surfaces.
-
-    Small gaps are closed with the farthest depth around them: next to an edge sensors miss the surface behind it.
-    """
-    import cv2
-
-    known = np.where((depth > 0) & (depth < np.inf), depth, np.float32(0)).astype(np.float32)
-    size = 2 * max(3, depth.shape[1] // 100) + 1
-    closed = np.where(known > 0, known, cv2.dilate(known, np.ones((size, size))))
-    with np.errstate(all="ignore"):
-        log = np.where(closed > 0, np.log(closed), np.nan)
-        return _changes(log, lambda a, b: np.abs(a - b) > JUMP)
-
-
-def label_edges(labels: npt.NDArray[Any], ignore: int) -> Mask:
-    """Return a mask (H, W) of the pixels whose neighbours have other labels."""
-    return _changes(labels, lambda a, b: (a != b) & (a != ignore) & (b != ignore))
-
-
 def grey_levels(color: UInt8) -> UInt8:
     """Return the brightness (H, W) of colour (H, W, 3), 0 to 254, which can be brought to the depth like labels."""
     grey: UInt8 = (color.mean(axis=2) * (254 / 255)).astype(np.uint8)
     return grey
-
-
-def image_edges(grey: npt.NDArray[Any]) -> Mask:
-    """Return a mask (H, W) of the tenth of its pixels where a grey image changes most."""
-    dy, dx = np.gradient(grey.astype(np.float32))
-    strength = np.hypot(dx, dy)
-    edges: Mask = strength > max(float(np.quantile(strength, 0.9)), 1.0)
-    return edges
-
-
-def _changes(values: npt.NDArray[Any], changed: Callable[[Any, Any], Any]) -> Mask:
-    edges = np.zeros(values.shape, dtype=np.bool_)
-    edges[:, 1:] |= changed(values[:, 1:], values[:, :-1])
-    edges[1:] |= changed(values[1:], values[:-1])
-    return edges
 
 
 def _thinned(edges: Mask) -> Map:

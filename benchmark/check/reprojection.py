@@ -97,11 +97,6 @@ def clusters(length: int, count: int) -> list[list[int]]:
     return [[start + step for step in steps] for start in sorted(starts)]
 
 
-def evenly(length: int, count: int) -> list[int]:
-    """Return at most `count` positions of a sequence, evenly spaced, the first and the last among them."""
-    return sorted({round(position) for position in np.linspace(0, length - 1, min(length, count)).tolist()})
-
-
 def pairs_within(groups: Sequence[Sequence[int]]) -> list[Pair]:
     """Return every ordered pair of two positions of one cluster, each once."""
     return sorted({(a, b) for group in groups for a in group for b in group if a != b})

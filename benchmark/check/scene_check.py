@@ -27,8 +27,9 @@ from semstab.check.coverage import (
 )
 from semstab.check.geometry import Verdict, assess, shifts_and_turns
 from semstab.check.registration import assess_surface, match_images, notes
-from semstab.check.reprojection import Sample, View, clusters, evenly, label_source, pairs_within, reader
+from semstab.check.reprojection import Sample, View, clusters, label_source, pairs_within, reader
 from semstab.config import Config
+from semstab.core.arrays import evenly
 from semstab.core.json_form import to_json
 from semstab.core.prefetch import prefetch
 from semstab.data.frames import Frame

@@ -122,3 +122,8 @@ def values_of(column: pa.ChunkedArray) -> npt.NDArray[Any]:
         return cast(npt.NDArray[Any], column.to_numpy())
     parts = [np.from_dlpack(part) for part in column.chunks]
     return parts[0] if len(parts) == 1 else np.concatenate([np.zeros(0, column.type.to_pandas_dtype()), *parts])
+
+
+def evenly(length: int, count: int) -> list[int]:
+    """Return at most `count` positions of a sequence, evenly spaced, the first and the last among them."""
+    return sorted({round(position) for position in np.linspace(0, length - 1, min(length, count)).tolist()})

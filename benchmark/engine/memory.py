@@ -10,8 +10,8 @@ import numpy as np
 
 from semstab.backends import expected_bytes, restrictable
 from semstab.backends.numpy_reference import ONE_IN
-from semstab.check.reprojection import evenly
 from semstab.config import Config
+from semstab.core.arrays import evenly
 from semstab.core.prefetch import default_threads
 from semstab.core.process import available_bytes, resident_bytes, trim_malloc
 from semstab.core.types import Int64

@@ -1,4 +1,4 @@
-"""Live maps, and the frames that they share: preparation, flicker, ground truth and stability in image coordinates."""
+"""Live maps, and the frames that they share: preparation, ground truth, and meters of flicker and image space."""
 
 from __future__ import annotations
 
@@ -10,39 +10,27 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from semstab.backends import FusionBackend, create, takes_option
 from semstab.backends.numpy_reference import NumpySample
-from semstab.check.registration import depth_edges, label_edges
-from semstab.check.reprojection import evenly
 from semstab.config import Config
 from semstab.core.arrays import Rows
 from semstab.core.prefetch import Fetched
 from semstab.core.process import Stopwatch
-from semstab.core.types import Float64, Int32, Mask, UInt8, UInt16
+from semstab.core.types import Float64, Int32
 from semstab.data.frames import Frame
-from semstab.data.measures import mean
-from semstab.data.records import ImageSpace
-from semstab.data.results import FrameReport, SizeAlpha, Unit
+from semstab.data.results import FrameReport, Unit
 from semstab.data.voxels import Extent
 from semstab.datasets import Scene
 from semstab.engine.observer import Observers
 from semstab.engine.series import FrameRow, Series
 from semstab.engine.tiles import tiles_met
 from semstab.engine.work import Work
-from semstab.errors import DataError
-from semstab.metrics import (
-    FrameQualityMeter,
-    SelfConsistency,
-    VideoConsistency,
-    changed_pixels,
-    compensated_flicker,
-    flicker_percent,
-)
+from semstab.metrics import FrameQualityMeter, flicker_percent
+from semstab.metrics.image_space import ImageSpaceMeter
 from semstab.statistics import Sampler
-from semstab.statistics.agreement import krippendorff_alpha
 from semstab.statistics.observations import CellObservations
+from semstab.statistics.voxel_sizes import SizeSample
 from semstab.task import Task, prepare, tasks_of, truth_task
 
 WARM_UP_STRIDE = 8
@@ -94,7 +82,9 @@ class LiveMap:
         if work.assessed and work.measures_images:
             live.sampler = Sampler(K)
             if work.image_space and not config.frame_quality:
-                live.sizes = SizeSample(task, config)  # filters share the sizes of what they are put over
+                live.sizes = SizeSample(
+                    task.indices, config.voxel_size, K
+                )  # filters share the sizes of what they are put over
         return live
 
     @property
@@ -297,134 +287,3 @@ def _overview(task: Task, decoded: Frame) -> dict[str, Any]:
     palette = np.array(task.mapping.target.colors, dtype=np.uint8)
     arrays: dict[str, Any] = {"frame": frame.index, "labels": frame.predicted, "palette": palette}
     return arrays if frame.color is None else arrays | {"color": frame.color}
-
-
-# --- Stability in image coordinates -----------------------------------------------------------------------------------
-
-CLIPS = (8, 16)
-"""Frames a clip, as VSPW reports."""
-
-COLUMNS = ("compensated_flicker_percent", "compensated_share", "vc8", "vc16", "self_vc8", "self_vc16", "edge_recall")
-"""Numbers of a frame and those before it, by the name of their mean over all frames."""
-
-EDGES_EVERY = 8
-"""One frame out of so many is searched for edges."""
-
-SIDE = 640
-"""Pixels of the longer side from which on every n-th pixel of each axis is measured, so that fusion does not wait."""
-
-WORST, THUMBNAIL = 3, 320
-"""The number of frames with the most flicker that the report keeps, and the most pixels of their longer side."""
-
-
-def edge_recall(frame: Frame) -> float:
-    """Return which part of the edges of depth has a border of labels within two pixels; NaN without edges."""
-    import cv2
-
-    edges, borders = depth_edges(frame.depth) & frame.valid, label_edges(frame.predicted, frame.ignore_id)
-    near = cv2.dilate(borders.astype(np.uint8), np.ones((5, 5), np.uint8)) > 0
-    return mean(near[edges].astype(np.float64))
-
-
-class ImageSpaceMeter:
-    """The image-space measures of a unit's frames, taken in order; only the last one stays in memory."""
-
-    def __init__(self, rows: npt.ArrayLike = ()) -> None:
-        self.rows = Rows(len(COLUMNS), rows)
-        self._previous: Frame | None = None
-        self._by_truth = [VideoConsistency(n) for n in CLIPS]
-        self._by_itself = [SelfConsistency(n) for n in CLIPS]
-        self._worst: list[tuple[float, int, npt.NDArray[Any], Mask]] = []
-
-    def add(self, frame: Frame, truth: Frame | None) -> float:
-        """Add the next frame, and its truth in the same label space if there is any; return compensated flicker."""
-        step = -(-max(frame.shape) // SIDE)
-        sample, true = frame.every(step), None if truth is None else truth.every(step)
-        flicker, share = math.nan, math.nan
-        if self._previous is not None:  # each pixel of the sample is looked up in the whole frame before
-            pair = compensated_flicker(self._previous, sample)
-            flicker, share = pair.flicker_percent, pair.share
-        by_itself = [each.add(sample.predicted, sample.valid) for each in self._by_itself]
-        by_truth = [
-            each.skip() if true is None else each.add(sample.predicted, sample.valid & true.valid, true.predicted)
-            for each in self._by_truth
-        ]
-        recall = math.nan if len(self.rows) % EDGES_EVERY else edge_recall(sample)
-        self.rows.append((flicker, share, *by_truth, *by_itself, recall))
-        if self._previous is not None and flicker > (self._worst[-1][0] if len(self._worst) == WORST else 0.0):
-            some = _thumbnail(sample.shape)
-            labels, changed = sample.predicted[some].copy(), changed_pixels(self._previous, sample)[some].copy()
-            same = [one for one in self._worst if one[3].shape == changed.shape]
-            worst = sorted([*same, (flicker, sample.index, labels, changed)], key=lambda one: -one[0])
-            self._worst = worst[:WORST]
-        self._previous = frame
-        return flicker
-
-    def worst(self, task: Task, *, color: bool) -> dict[str, Any]:
-        """Return the frames with the most flicker as arrays (n, h, w): labels, changed pixels, colour on request."""
-        if not self._worst:
-            return {}
-        flicker, frames, labels, changed = zip(*self._worst, strict=True)
-        arrays = {"worst_frames": np.array(frames), "worst_flicker": np.array(flicker)}
-        arrays |= {"worst_labels": np.stack(labels), "worst_changed": np.stack(changed)}
-        images = [task.scene.frame(index, task.model, color=True).color for index in frames] if color else []
-        known = [image[_thumbnail(image.shape)] for image in images if image is not None]
-        return arrays | ({"worst_color": np.stack(known)} if known and len(known) == len(frames) else {})
-
-    def result(self, flicker_percent: float) -> ImageSpace:
-        """Return means over the frames so far, in addition to the flicker of the unit's summary."""
-        return ImageSpace(flicker_percent, **{name: mean(self.rows.column(k)) for k, name in enumerate(COLUMNS)})
-
-
-def _thumbnail(shape: tuple[int, ...]) -> tuple[slice, slice]:
-    """Return every n-th pixel of both axes, so that at most THUMBNAIL are left of the longer one."""
-    every = slice(None, None, -(-max(shape[:2]) // THUMBNAIL))
-    return every, every
-
-
-# --- A few frames at other voxel sizes --------------------------------------------------------------------------------
-
-FACTORS = (0.5, 1.0, 2.0)
-
-SIZE_FRAMES, SIZE_PIXELS = 12, 2**15
-"""The most frames, evenly spaced, that are fused once more at each voxel size, and the pixels of each, about."""
-
-
-class SizeSample:
-    """Pixels of some of a task's frames, from which alpha follows at half, once and twice the voxel size."""
-
-    def __init__(self, task: Task, config: Config) -> None:
-        self._indices = frozenset(task.indices[k] for k in evenly(len(task.indices), SIZE_FRAMES))
-        self._K, self._voxel_size = len(task.mapping.target), config.voxel_size
-        self._frames: list[Frame] = []
-
-    def add(self, frame: Frame) -> None:
-        """Keep some pixels of the frame, if it is one of them."""
-        if frame.index in self._indices:
-            some = frame.every(max(1, round(math.sqrt(math.prod(frame.shape) / SIZE_PIXELS))))
-            images = {
-                name: image.copy()
-                for name in ("depth", "labels", "scores")
-                if (image := getattr(some, name)) is not None
-            }
-            self._frames.append(dataclasses.replace(some, color=None, mask=None, left_out=None, **images))
-
-    def alphas(self) -> tuple[SizeAlpha, ...]:
-        """Return Krippendorff's alpha at each voxel size; none where the scene is larger than a map of the smallest."""
-        frames = self._frames
-        if any(frame.scores is not None for frame in frames):
-            frames = [frame if frame.labels is None else self._one_hot(frame, frame.labels) for frame in frames]
-        try:
-            return tuple(self._at(factor * self._voxel_size, frames) for factor in FACTORS) if frames else ()
-        except DataError:
-            return ()
-
-    def _one_hot(self, frame: Frame, labels: UInt8 | UInt16) -> Frame:
-        scores = np.eye(self._K, dtype=np.float32)[np.where(frame.valid, labels, 0)]
-        return dataclasses.replace(frame, labels=None, scores=scores, depth=np.where(frame.valid, frame.depth, 0))
-
-    def _at(self, voxel_size: float, frames: Sequence[Frame]) -> SizeAlpha:
-        backend = create("numba", voxel_size=voxel_size, num_classes=self._K)
-        for frame in frames:
-            backend.integrate(frame)
-        return SizeAlpha(voxel_size, len(self._indices), krippendorff_alpha(backend.table()))
