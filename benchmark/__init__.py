@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from semstab.exports import export
     from semstab.exports.relabel import Belief, relabel
     from semstab.online import FusedResult, TemporalStability, fuse
-    from semstab.report.loaded import load
+    from semstab.report.saved_run import load
     from semstab.settings import load_config, load_study
     from semstab.statistics.acceptance import AcceptanceThresholds
 

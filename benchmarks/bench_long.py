@@ -31,8 +31,8 @@ from semstab.config import Config  # noqa: E402
 from semstab.core.files import write_json  # noqa: E402
 from semstab.core.process import resident_bytes  # noqa: E402
 from semstab.datasets import open_dataset  # noqa: E402
+from semstab.engine.messages import Start, TileTask, Work  # noqa: E402
 from semstab.engine.units import make_plan  # noqa: E402
-from semstab.engine.work import Start, TileTask, Work  # noqa: E402
 
 WIDTH, HEIGHT, OWN, LEG = 16, 12, 50, 500
 

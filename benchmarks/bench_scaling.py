@@ -24,7 +24,7 @@ from bench_statistics import Watch, resident
 import semstab
 from semstab import backends
 from semstab.core.files import write_json
-from semstab.engine.finish import save_voxels
+from semstab.engine.measurement import save_voxels
 from semstab.metrics import summarise
 
 VOXEL_SIZE, APART, VISITS = 0.2, 200.0, 15

@@ -67,7 +67,7 @@ def start(module: str, *words: str, folder: Path) -> subprocess.Popen[bytes]:
 
 def _import() -> None:
     """What a worker loads for its first job, which is no part of what is measured."""
-    import semstab.engine.passes  # noqa: F401
+    import semstab.engine.frame_loop  # noqa: F401
 
 
 def cpu_seconds(pid: int) -> float:

@@ -25,8 +25,8 @@ from semstab.data.frames import Frame
 from semstab.data.labels import IGNORE_8BIT, IGNORE_16BIT, LabelSpace
 from semstab.errors import ConfigError, DataError, MissingDependencyError, summarize_error
 from semstab.models import Image, Labels, Model, Prediction, content_digest, narrowed
-from semstab.models.border import Wrapped
 from semstab.models.names import class_names
+from semstab.models.validation import Wrapped
 
 # Code that a user names: `FILE.py:NAME` or `package.module:NAME`, imported, and known by its content.
 

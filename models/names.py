@@ -20,7 +20,7 @@ from semstab.data.frames import Frame
 from semstab.data.labels import LEFT_OUT, LabelMapping, LabelSpace, ignore_id, name_key
 from semstab.errors import ConfigError, summarize_error
 from semstab.models import Image, Model, Prediction, Streamed
-from semstab.models.border import Wrapped
+from semstab.models.validation import Wrapped
 
 logger = logging.getLogger("semstab")
 

@@ -27,8 +27,8 @@ from semstab.data.frames import Frame
 from semstab.data.labels import LabelSpace, ignore_id
 from semstab.errors import ConfigError, DataError
 from semstab.models import UNASSIGNED, Image, Labels, Model, Prediction, create, image_digest
-from semstab.models.border import Checked, Wrapped
 from semstab.models.checkpoint import Checkpoint, ImageModelOptions, bilinear, load_processor
+from semstab.models.validation import Checked, Wrapped
 
 # The kinds of Segment Anything, which differ in their preprocessing.
 

@@ -10,7 +10,7 @@ from posed_config import configure
 
 import semstab
 from semstab.backends.numpy_reference import NumpyReference
-from semstab.engine import Observer, passes
+from semstab.engine import Observer, frame_loop
 
 
 def test_integrate_is_nine_calls_below_run_in_seven_files(tmp_path, monkeypatch) -> None:
@@ -37,7 +37,7 @@ def test_integrate_is_nine_calls_below_run_in_seven_files(tmp_path, monkeypatch)
 
 def test_the_pass_over_frames_is_one_short_function_with_eight_hooks() -> None:
     """Its verbs are those of the paper, in that order."""
-    source = inspect.getsource(passes.fuse_sequence)
+    source = inspect.getsource(frame_loop.fuse_sequence)
     assert len(source.splitlines()) <= 40
     verbs = ("prepare", "integrate", "sample", "measure", "notify")
     positions = [source.index(f".{verb}(") for verb in verbs]

@@ -21,10 +21,10 @@ from semstab.engine import load_result, run_study
 from semstab.errors import ConfigError
 from semstab.recording import Recording, color_modes
 from semstab.recording.voxel_maps import defaults
-from semstab.report.averages import describe, levels
 from semstab.report.figures.distributions import draw_ecdf, draw_persistence, draw_sweep, histograms, informative
 from semstab.report.figures.maps import draw_stability
 from semstab.report.figures.topdown import FromAbove
+from semstab.report.means import describe, levels
 from semstab.report.tables import tables
 from semstab.report.tables.table import to_csv
 from semstab.report.terminal import print_summary

@@ -18,7 +18,7 @@ from semstab.cli import app
 from semstab.data.labels import LabelSpace
 from semstab.errors import ConfigError, DataError, MissingDependencyError
 from semstab.models import Model, Prediction, create
-from semstab.models.border import Checked
+from semstab.models.validation import Checked
 from semstab.predict.predictor import PredictorConfig, load_predictor, parse_predictor
 
 IMAGE = blobs()

@@ -22,7 +22,6 @@ from semstab.data.measures import SBD_MAX, VSS, measures
 from semstab.data.voxels import VoxelTable
 from semstab.errors import DataError
 from semstab.metrics import CATEGORY_COLORS, categories, dominant, op, sbd, vss
-from semstab.report.averages import ENOUGH, describe, levels
 from semstab.report.figures import figures, topdown
 from semstab.report.figures.distributions import (
     BINS,
@@ -38,6 +37,7 @@ from semstab.report.figures.distributions import (
 from semstab.report.figures.maps import Overview, draw_overview, draw_stability, scale_length
 from semstab.report.figures.style import COLUMN, DPI, PAGE, legend_columns
 from semstab.report.figures.topdown import EMPTY, FromAbove, level_axes, top_down
+from semstab.report.means import ENOUGH, describe, levels
 from semstab.testing import SEQUENCES, as_frames, checks
 
 SURE, SPLIT = [1, 0, 0], [3, 1, 0]

@@ -28,8 +28,8 @@ from semstab.engine import run
 from semstab.errors import ConfigError, DataError
 from semstab.metrics import matched_region_flicker
 from semstab.models import Model, Prediction, Streamed, create
-from semstab.models.border import Checked
 from semstab.models.names import InTaxonomy
+from semstab.models.validation import Checked
 from semstab.pixels.warp import warp
 from semstab.predict.command import ImageFiles, file_job, scene_jobs
 from semstab.predict.predictor import PredictorConfig, load_predictor, parse_predictor

@@ -22,11 +22,11 @@ from semstab.data.records import Failure, Variation
 from semstab.data.results import Agreement, Unit
 from semstab.metrics import categories, vss
 from semstab.report import write_report
-from semstab.report.averages import ENOUGH
 from semstab.report.figures.topdown import EMPTY, FromAbove
-from semstab.report.loaded import read_series
+from semstab.report.means import ENOUGH
 from semstab.report.narrative import notes
 from semstab.report.page import UNKNOWN, render
+from semstab.report.saved_run import read_series
 from semstab.report.tables import tables
 
 SURE, SPLIT = [1, 0, 0], [3, 1, 0]

@@ -21,9 +21,9 @@ from semstab.data.records import Variation
 from semstab.datasets.files.scene import FileScene
 from semstab.engine import load_result, run_study
 from semstab.engine.folder import Folder
-from semstab.engine.passes import run_job
+from semstab.engine.frame_loop import run_job
+from semstab.engine.messages import Start, Work, jobs_of
 from semstab.engine.units import make_plan
-from semstab.engine.work import Start, Work, jobs_of
 from semstab.errors import ConfigError, DataError
 from semstab.metrics import SelfConsistency, VideoConsistency, compare, compensated_flicker, flicker_percent, summarise
 from semstab.settings import resolve

@@ -15,9 +15,9 @@ import tiny_study
 from tiny_study import Counting, summary
 
 from semstab.engine import DaskCluster, LocalProcesses, run_study
+from semstab.engine.messages import Start, Work
 from semstab.engine.observer import Observers
 from semstab.engine.units import make_plan
-from semstab.engine.work import Start, Work
 from semstab.errors import ConfigError, MissingDependencyError
 
 MODELS = ("a", "b", "c", "d")
@@ -115,7 +115,7 @@ def test_worker_processes_end_with_a_parent_that_was_killed(tmp_path) -> None:
         "from semstab.config import Config\n"
         "from semstab.engine import LocalProcesses\n"
         "from semstab.engine.observer import Observers\n"
-        "from semstab.engine.work import Start, Work\n"
+        "from semstab.engine.messages import Start, Work\n"
         "class Endless(Work):\n"
         "    def __reduce__(self):\n"
         "        return exec, ('import pathlib, time; pathlib.Path(\"at work\").touch(); time.sleep(600)',)\n"

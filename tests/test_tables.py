@@ -25,7 +25,7 @@ from semstab.core.files import write_text
 from semstab.data.measures import SBD, VSS
 from semstab.data.records import ImageSpace, RegionFlicker, Result
 from semstab.metrics import entropy, op, sbd, vss
-from semstab.report.averages import ENOUGH, Spread, complete_scenes, describe, levels, pooled, swept
+from semstab.report.means import ENOUGH, Spread, complete_scenes, describe, levels, pooled, swept
 from semstab.report.tables import tables, write_tables
 from semstab.report.tables.table import Column, Group, Table, to_csv, to_json, to_latex, to_markdown
 from semstab.statistics import Estimate

@@ -17,9 +17,9 @@ import typer
 from typer.core import TyperCommand, TyperGroup
 
 from semstab import __version__
-from semstab.cli.finished import calibrate, compare, conform, export, gate, list_, relabel
 from semstab.cli.options import say
-from semstab.cli.running import check, convert, filters, predict, run, show, study, view
+from semstab.cli.result_commands import calibrate, compare, conform, export, gate, list_, relabel
+from semstab.cli.run_commands import check, convert, filters, predict, run, show, study, view
 from semstab.core.process import configure_process
 from semstab.errors import OUT_OF_MEMORY, SemstabError, summarize_error
 

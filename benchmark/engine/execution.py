@@ -18,13 +18,13 @@ from semstab.core.process import trim_malloc
 from semstab.data.records import Result
 from semstab.engine.executors import Executor, InProcess
 from semstab.engine.folder import Folder, require_file_names
+from semstab.engine.frame_loop import share_open_scenes
 from semstab.engine.memory import planned_sizes
+from semstab.engine.messages import Job, Outcome, Start, Work, jobs_of
 from semstab.engine.observer import Observer, Observers
-from semstab.engine.passes import share_open_scenes
-from semstab.engine.results import UnitResults, advice_of, manifest, result_of
+from semstab.engine.run_result import UnitResults, advice_of, manifest, result_of
 from semstab.engine.tiled_units import TiledUnit
 from semstab.engine.units import Plan, PlannedUnit, make_plan
-from semstab.engine.work import Job, Outcome, Start, Work, jobs_of
 from semstab.errors import ConfigError, DataError
 from semstab.settings import resolve
 

@@ -16,9 +16,9 @@ from typing import Any
 
 from semstab.core.prefetch import default_threads
 from semstab.core.process import configure_process, follow_parent
+from semstab.engine.frame_loop import run_job
+from semstab.engine.messages import Job, Outcome, failed
 from semstab.engine.observer import Observers
-from semstab.engine.passes import run_job
-from semstab.engine.work import Job, Outcome, failed
 from semstab.errors import ConfigError, MissingDependencyError
 
 CONNECT_SECONDS = 10

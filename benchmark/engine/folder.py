@@ -38,8 +38,8 @@ from semstab.data.records import (
 )
 from semstab.data.results import SCHEMA, Unit, slug
 from semstab.datasets.formats.disk import file_digest
+from semstab.engine.messages import TILES, Outcome, Start
 from semstab.engine.units import PlannedUnit
-from semstab.engine.work import TILES, Outcome, Start
 from semstab.errors import ConfigError, DataError
 
 logger = logging.getLogger("semstab")

@@ -23,7 +23,7 @@ from semstab.statistics.cluster_sums import distinct_rows
 from semstab.task import Task, read
 
 if TYPE_CHECKING:
-    from semstab.engine.streams import LiveMap
+    from semstab.engine.live_maps import LiveMap
 
 GB = 1e9
 

@@ -14,7 +14,8 @@ from semstab.core.types import Float64
 from semstab.data.parquet import tile_of
 from semstab.data.records import TRUTH, VOXELS, UnitContent
 from semstab.data.voxels import VoxelTable
-from semstab.engine.finish import (
+from semstab.engine.folder import Folder, unit_key
+from semstab.engine.measurement import (
     Savers,
     analyse_sample,
     in_image_space,
@@ -24,10 +25,9 @@ from semstab.engine.finish import (
     unit_savers,
     written,
 )
-from semstab.engine.folder import Folder, unit_key
+from semstab.engine.messages import Job, Outcome, Start, TileTask, Work, failed
 from semstab.engine.tiles import TILE_OBSERVATIONS, TileResult, joined_series
 from semstab.engine.units import PlannedUnit
-from semstab.engine.work import Job, Outcome, Start, TileTask, Work, failed
 from semstab.errors import SemstabError
 from semstab.metrics.agreement import together
 from semstab.metrics.summary import TableSums

@@ -19,7 +19,7 @@ from semstab.data.frames import Frame
 from semstab.data.labels import LabelSpace, ignore_id
 from semstab.errors import ConfigError
 from semstab.models import Image, Labels, Model, Prediction, narrowed
-from semstab.models.border import Wrapped
+from semstab.models.validation import Wrapped
 from semstab.pixels.warp import carry, warp
 
 Belief = Float32

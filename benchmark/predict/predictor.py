@@ -21,10 +21,10 @@ from semstab.datasets import GROUND_TRUTH, Scene
 from semstab.datasets.geometry.lenses import Scores, require_same_view
 from semstab.errors import ConfigError
 from semstab.models import Image, Labels, Model, Prediction, ask, create, image_digest, narrowed, options_model
-from semstab.models.border import Checked, Wrapped
 from semstab.models.custom import absolute, is_path
 from semstab.models.names import InTaxonomy
 from semstab.models.network import is_network
+from semstab.models.validation import Checked, Wrapped
 from semstab.predict.filters import Filtered, parse
 from semstab.predict.images import ImageSequence, geometry_of, shown_digest
 

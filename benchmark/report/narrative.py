@@ -9,7 +9,7 @@ from semstab.data.records import Record, Result
 from semstab.data.results import UnitSummary, VoxelAdvice
 from semstab.datasets import GROUND_TRUTH
 from semstab.metrics import macro_mean
-from semstab.report.averages import ENOUGH, by_model, pooled
+from semstab.report.means import ENOUGH, by_model, pooled
 from semstab.report.tables.stability import comparable
 from semstab.statistics.verdict import LIMITS
 

@@ -17,15 +17,15 @@ from semstab.data.records import OVERVIEW, Failure, Record, Result
 from semstab.data.results import slug
 from semstab.data.statistics import Estimate, MapStatistics
 from semstab.metrics import CATEGORIES, CATEGORY_COLORS, categories, macro_mean
-from semstab.report.averages import by_model, describe, levels, over_recurrent, pooled, swept
 from semstab.report.charts import SERIES, Line, dot_chart, line_chart
 from semstab.report.figures.maps import Overview, Views
 from semstab.report.figures.topdown import EMPTY, FromAbove
 from semstab.report.filter_study import advice, filter_studies, of_interest
 from semstab.report.html import filled, jpeg, png, table_block
-from semstab.report.loaded import read_series
+from semstab.report.means import by_model, describe, levels, over_recurrent, pooled, swept
 from semstab.report.narrative import notes, warnings
 from semstab.report.ranking import answers
+from semstab.report.saved_run import read_series
 from semstab.report.tables import tables
 from semstab.report.tables.table import relations
 from semstab.report.terminal import miou

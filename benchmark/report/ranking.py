@@ -13,7 +13,7 @@ from pathlib import Path
 from semstab.data.records import Record, Result
 from semstab.datasets import GROUND_TRUTH
 from semstab.metrics import macro_mean
-from semstab.report.averages import by_model
+from semstab.report.means import by_model
 from semstab.statistics.agreement import ALPHA
 from semstab.statistics.cluster_sums import ClusterSums, value
 from semstab.statistics.intervals import LEVEL, difference, mean_of

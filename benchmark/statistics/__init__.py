@@ -9,9 +9,9 @@ from semstab.data.statistics import Estimate, Reliability
 from semstab.statistics.agreement import class_agreement, decompose, disagreement, fleiss_kappa, krippendorff_alpha, psa
 from semstab.statistics.correctness import consistent_wrong, correctness, join_truth, quadrants, reliability
 from semstab.statistics.correlogram import correlogram
-from semstab.statistics.description import Analysis, analyse, describe
 from semstab.statistics.drift import expected_sbd, flips, trends
 from semstab.statistics.geometry import ceiling, losses, rendered
+from semstab.statistics.map_statistics import Analysis, analyse, describe
 from semstab.statistics.model_comparison import compare_models, coverage, paired
 from semstab.statistics.observations import CellObservations, Views
 from semstab.statistics.paired_differences import claimed_together, standardised

@@ -27,7 +27,7 @@ from semstab.exports.clouds import Header
 from semstab.models.names import class_names
 from semstab.models.segearth_ov import read_prompts
 from semstab.report.figures.maps import Overview
-from semstab.report.loaded import read_series
+from semstab.report.saved_run import read_series
 from semstab.settings import load_config, resolve
 from semstab.statistics.cluster_sums import ClusterSums
 from semstab.statistics.observations import CellObservations

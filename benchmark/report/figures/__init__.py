@@ -12,7 +12,6 @@ from semstab.core.files import keep_only
 from semstab.data.measures import measures
 from semstab.data.records import OVERVIEW, Record, Result
 from semstab.data.results import slug
-from semstab.report.averages import ENOUGH, by_model, complete_scenes, levels, swept
 from semstab.report.figures.distributions import (
     Histograms,
     draw_ecdf,
@@ -24,6 +23,7 @@ from semstab.report.figures.distributions import (
 from semstab.report.figures.maps import Overview, Views, draw_overview, draw_stability
 from semstab.report.figures.style import Figure
 from semstab.report.filter_study import of_interest
+from semstab.report.means import ENOUGH, by_model, complete_scenes, levels, swept
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure as Canvas

@@ -15,8 +15,8 @@ from semstab.data.measures import Measure, measures, op
 from semstab.data.results import RECURRENT
 from semstab.data.statistics import Estimate
 from semstab.data.voxels import VoxelTable
-from semstab.report.averages import ENOUGH, Level, Pooled, Sweep, over_all, over_recurrent
 from semstab.report.figures.style import COLUMN, FAINT, INK, LETTERS, PAGE, canvas, color, legend_columns, mark_panel
+from semstab.report.means import ENOUGH, Level, Pooled, Sweep, over_all, over_recurrent
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

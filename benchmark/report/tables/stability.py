@@ -10,7 +10,7 @@ from semstab.data.measures import SBD, VSS, measures
 from semstab.data.records import ImageSpace, Record, Result
 from semstab.data.results import Agreement, Means, TableSummary
 from semstab.metrics import macro_mean, split_last
-from semstab.report.averages import (
+from semstab.report.means import (
     ENOUGH,
     Level,
     Pooled,

@@ -10,7 +10,7 @@ from semstab.data.measures import ENTROPY, VSS
 from semstab.data.records import Record, Result
 from semstab.data.statistics import UNDEFINED, CellAgreement, ClassAlpha, DriftStatistics, Estimate, MapStatistics
 from semstab.metrics import macro_mean
-from semstab.report.averages import by_model
+from semstab.report.means import by_model
 from semstab.report.tables.table import Cell, Column, Group, Row, Table
 from semstab.statistics.agreement import ALPHA, KAPPA, PSA, VOXEL_ALPHA
 from semstab.statistics.drift import FLIP_RATE

@@ -15,7 +15,7 @@ from typing import Any, Literal
 
 from semstab.core.files import csv_text
 from semstab.data.measures import Quantity
-from semstab.report.averages import Spread
+from semstab.report.means import Spread
 from semstab.statistics import Estimate
 
 UNDEFINED = "--"

@@ -22,10 +22,10 @@ from semstab.data.frames import Frame
 from semstab.data.results import FrameReport, Unit
 from semstab.data.voxels import Extent
 from semstab.datasets import Scene
+from semstab.engine.messages import Work
 from semstab.engine.observer import Observers
 from semstab.engine.series import FrameRow, Series
 from semstab.engine.tiles import tiles_met
-from semstab.engine.work import Work
 from semstab.metrics import FrameQualityMeter, flicker_percent
 from semstab.metrics.image_space import ImageSpaceMeter
 from semstab.statistics import Sampler

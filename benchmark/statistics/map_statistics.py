@@ -47,12 +47,7 @@ from semstab.statistics.correctness import (
     wrong_where_consistent,
 )
 from semstab.statistics.correlogram import correlogram
-from semstab.statistics.drift import expected_sbd
-from semstab.statistics.geometry import losses
-from semstab.statistics.intervals import confidence_intervals, headline_specs, probability_above, scope_of, spec_of
-from semstab.statistics.observations import CellObservations
-from semstab.statistics.sample import MapSample
-from semstab.statistics.sections import (
+from semstab.statistics.cube_sums import (
     MEANS,
     OF_CHANGES,
     OF_FLIPS,
@@ -63,6 +58,11 @@ from semstab.statistics.sections import (
     log_sums,
     row_columns,
 )
+from semstab.statistics.drift import expected_sbd
+from semstab.statistics.geometry import losses
+from semstab.statistics.intervals import confidence_intervals, headline_specs, probability_above, scope_of, spec_of
+from semstab.statistics.observations import CellObservations
+from semstab.statistics.sample import MapSample
 from semstab.statistics.verdict import LIMITS, Limits, verdict
 
 SCHEMA = 2

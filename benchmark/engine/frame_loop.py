@@ -18,11 +18,11 @@ from semstab.core.process import Stopwatch
 from semstab.data.frames import Frame
 from semstab.data.records import RegionFlicker, UnitContent
 from semstab.datasets import GROUND_TRUTH, Dataset, Scene, open_dataset
-from semstab.engine.finish import finish
+from semstab.engine.live_maps import Decoded, LiveMap, frame_order, streams_of
+from semstab.engine.measurement import finish
 from semstab.engine.memory import MemoryBudget
+from semstab.engine.messages import Job, Outcome, Work, failed
 from semstab.engine.observer import Observers
-from semstab.engine.streams import Decoded, LiveMap, frame_order, streams_of
-from semstab.engine.work import Job, Outcome, Work, failed
 from semstab.errors import DataError
 from semstab.metrics import macro_mean, matched_region_flicker
 from semstab.pixels.preparation import leave_out, perturb

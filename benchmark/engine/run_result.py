@@ -22,8 +22,8 @@ from semstab.data.tiles import Tiles, side_by_side
 from semstab.data.voxels import VoxelTable
 from semstab.datasets import GROUND_TRUTH
 from semstab.engine.folder import Folder
+from semstab.engine.messages import Outcome
 from semstab.engine.units import Plan, must_agree
-from semstab.engine.work import Outcome
 from semstab.metrics import compare
 from semstab.metrics.agreement import together
 from semstab.statistics import CellObservations, ModelComparison, claimed_together

@@ -27,10 +27,10 @@ from semstab.data.results import RECURRENT, STAGES, Agreement, FrameDrift, Reduc
 from semstab.data.voxels import VoxelTable
 from semstab.datasets import Scene
 from semstab.datasets.formats.disk import file_digest
+from semstab.engine.live_maps import LiveMap, Stream
+from semstab.engine.messages import Outcome, Start
 from semstab.engine.series import Series
-from semstab.engine.streams import LiveMap, Stream
 from semstab.engine.tiles import TILE_OBSERVATIONS, TileResult
-from semstab.engine.work import Outcome, Start
 from semstab.errors import DataError
 from semstab.metrics import compare
 from semstab.metrics.agreement import rows_of
