@@ -67,7 +67,7 @@ _HOMES = {
     "GateConfig": "comparison.gate", "Intrinsics": "data.frames", "LabelSpace": "data.labels",
     "MissingDependencyError": "errors", "SemstabError": "errors", "VoxelTable": "data.voxels",
     "FusedResult": "online", "TemporalStability": "online", "compare": "comparison.writing", "fuse": "online",
-    "export": "exports", "gate": "comparison.gate", "load": "report.loaded",
+    "export": "exports", "gate": "comparison.gate", "load": "report.saved_run",
     "load_config": "settings", "load_result": "engine.folder", "load_study": "settings", "relabel": "exports.relabel",
     "run": "api", "run_study": "api",
 }  # fmt: skip
