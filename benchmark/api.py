@@ -1,16 +1,18 @@
-"""The command line from Python: a run or a study, with its tables, figures and report."""
+"""A run or a study from Python, as the command line has it, with its tables, figures and report."""
 
 from __future__ import annotations
 
+import contextlib
+import dataclasses
+import tempfile
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from semstab.config import Config
 from semstab.data.records import Result
-from semstab.engine import Executor, Observer
-from semstab.engine.execution import run as execute
-from semstab.engine.execution import run_study as execute_study
+from semstab.engine import Executor, Observer, execute
+from semstab.errors import DataError
 from semstab.report import Reporting
 from semstab.settings import as_config
 
@@ -41,10 +43,19 @@ def run(
         The summaries of all units, with their voxels where `out` is given.
 
     Raises:
-        ConfigError, DataError: If something cannot be used or read; what was finished before stays in the folder.
+        ConfigError, DataError: If the plan cannot be made, or a unit failed, once everything else has been written.
     """
-    reporting = [Reporting(out)] if report and out is not None else []
-    return execute(as_config(config), out=out, executor=executor, observers=[*observers, *reporting], command=command)
+    with contextlib.ExitStack() as stack:
+        folder = Path(stack.enter_context(tempfile.TemporaryDirectory()) if out is None else out)
+        reporting = [Reporting(folder)] if report and out is not None else []
+        result, causes = execute(as_config(config), folder, executor, [*observers, *reporting], command)
+    if result.failures:
+        first = result.failures[0]
+        raise causes.get(first.message) or DataError(first.message)
+    if out is None:
+        records = tuple(dataclasses.replace(record, voxels_file=None, truth_file=None) for record in result.records)
+        return dataclasses.replace(result, records=records)
+    return result
 
 
 def run_study(
@@ -57,5 +68,5 @@ def run_study(
     report: bool = True,
 ) -> Result:
     """Run a study as `run` does: a unit that fails is among the result's failures, and the others finish."""
-    reporting = [Reporting(out)] if report else []
-    return execute_study(as_config(config), out, executor=executor, observers=[*observers, *reporting], command=command)
+    observing = [*observers, *([Reporting(out)] if report else [])]
+    return execute(as_config(config), Path(out), executor, observing, command)[0]

@@ -75,7 +75,7 @@ def test_motion_is_that_of_the_poses(sound):
 
 def test_persistence_is_that_of_the_run(folder, sound):
     """All 12 frames are fused, so that OP is the run's own."""
-    (run,) = semstab.engine.run(configure(folder, voxel_size=0.1, models=["gt"])).runs
+    (run,) = semstab.run(configure(folder, voxel_size=0.1, models=["gt"]), report=False).runs
     row = next(row for row in sound.persistence if row.voxel_size == 0.1)
     assert sound.fused_frames == 12
     assert (row.voxels, row.mean_op) == (run.table.voxels, pytest.approx(run.table.mean_op))
@@ -359,10 +359,12 @@ def test_a_run_refuses_unsound_data_unless_told_otherwise(tmp_path):
     folder = write(tmp_path / "room", Room(walk(5), told_pose=np.linalg.inv))
     config = configure(folder, models=["net"], check=None)
     with pytest.raises(DataError, match=r"room: depth reprojects .* pose_convention: world_to_camera"):
-        semstab.engine.run(config, out=tmp_path / "run")
+        semstab.run(config, out=tmp_path / "run", report=False)
     assert not list((tmp_path / "run").rglob("*.parquet"))
     trusting = config.model_copy(update={"check_geometry": False})
-    (run,) = semstab.engine.run(trusting, out=tmp_path / "run").runs  # the same folder: the numbers do not depend on it
+    (run,) = semstab.run(
+        trusting, out=tmp_path / "run", report=False
+    ).runs  # the same folder: the numbers do not depend on it
     assert run.table.voxels > 0
     assert "check" not in json.loads((tmp_path / "run/manifest.json").read_text())["seconds"]
     arguments = ("--data", folder, "-b", "numpy", "--rerun", "off", "-q", "--out")
@@ -394,13 +396,13 @@ def test_the_manifest_says_what_was_found_and_what_it_cost(folder, tmp_path):
             seen.append((task.scene.name, verdict.state))
 
     config = configure(folder, models=["net", "gt"])
-    semstab.engine.run(config, out=tmp_path / "run", observers=[Watching()])
+    semstab.run(config, out=tmp_path / "run", observers=[Watching()], report=False)
     manifest = json.loads((tmp_path / "run/manifest.json").read_text())
     assert manifest["geometry"]["room"]["state"] == "sound"
     assert manifest["geometry"]["room"]["frames"] == 4
     assert manifest["seconds"]["check"] > 0
     assert seen == [("room", "sound")]  # once a scene, not once a model
-    semstab.engine.run(config, out=tmp_path / "run", observers=[Watching()])
+    semstab.run(config, out=tmp_path / "run", observers=[Watching()], report=False)
     assert len(seen) == 1  # what is kept is not checked again
 
 

@@ -16,10 +16,11 @@ from posed_config import configure
 from records import record, study, voxels
 
 import semstab
+from semstab.api import run_study
 from semstab.core.json_form import to_json
 from semstab.data.events import Events
 from semstab.data.voxels import VoxelTable
-from semstab.engine import Observer, load_result, run_study
+from semstab.engine import Observer, load_result
 from semstab.engine.memory import map_bytes
 from semstab.errors import ConfigError, DataError
 from semstab.report.tables import tables
@@ -93,14 +94,14 @@ def test_the_verdict_on_each_model_is_printed(ran) -> None:
 
 def test_without_asking_there_is_what_the_map_alone_tells(tmp_path) -> None:
     root = tiny_scene.write(tmp_path / "wall", ("a",))
-    result = semstab.engine.run(configure(root, events=True), out=tmp_path / "run")
+    result = semstab.run(configure(root, events=True), out=tmp_path / "run", report=False)
     (entry,) = result.runs
     table = VoxelTable.load(tmp_path / "run" / "voxels" / f"{entry.unit.slug}.parquet")
     cells = CellObservations.load(tmp_path / "run" / "observations" / f"{entry.unit.slug}.parquet")
     assert to_json(entry.statistics) == to_json(describe(table, cells=cells, name="a"))
     assert entry.statistics.drift.trend is None
     assert result.comparisons == ()
-    again = semstab.engine.run(configure(root, events=True), out=tmp_path / "run")  # kept
+    again = semstab.run(configure(root, events=True), out=tmp_path / "run", report=False)  # kept
     assert to_json(again.runs[0].statistics) == to_json(entry.statistics)
 
 
@@ -124,10 +125,10 @@ class Interrupting(Observer):
 def test_a_run_that_was_interrupted_ends_with_the_same_statistics(tmp_path) -> None:
     root = tiny_scene.write(tmp_path / "wall")
     config = configure(root, statistics=True)
-    whole = semstab.engine.run(config)
+    whole = semstab.run(config, report=False)
     with pytest.raises(KeyboardInterrupt):
-        semstab.engine.run(config, out=tmp_path / "run", observers=[Interrupting()])
-    resumed = semstab.engine.run(config, out=tmp_path / "run")
+        semstab.run(config, out=tmp_path / "run", observers=[Interrupting()], report=False)
+    resumed = semstab.run(config, out=tmp_path / "run", report=False)
     assert [to_json(entry.statistics) for entry in resumed.runs] == [to_json(entry.statistics) for entry in whole.runs]
     assert to_json(resumed.comparisons) == to_json(whole.comparisons)
     assert whole.comparisons[0].paired.of(ACCURACY)["a"].value > 0.5  # the truth was fused again
@@ -135,21 +136,21 @@ def test_a_run_that_was_interrupted_ends_with_the_same_statistics(tmp_path) -> N
 
 def test_the_first_backend_that_keeps_a_log_has_all_statistics(tmp_path) -> None:
     root = tiny_scene.write(tmp_path / "wall", ("a",))
-    result = semstab.engine.run(configure(root, backends=["open3d"], check="numpy", statistics=True))
+    result = semstab.run(configure(root, backends=["open3d"], check="numpy", statistics=True), report=False)
     open3d, numpy = result.runs
     assert open3d.statistics.drift.trend is None
     assert open3d.statistics.correctness is not None
     assert numpy.statistics.drift.trend is not None
     assert numpy.statistics.agreement.voxel_alpha.value == pytest.approx(open3d.statistics.agreement.voxel_alpha.value)
     assert numpy.statistics.headline.alpha.value == open3d.statistics.headline.alpha.value
-    plain = semstab.engine.run(configure(root, backends=["open3d"], check="numpy"))
+    plain = semstab.run(configure(root, backends=["open3d"], check="numpy"), report=False)
     assert [entry.statistics is not None for entry in plain.runs] == [True, False]
 
 
 def test_frames_without_ground_truth_are_left_out_of_the_truth(tmp_path) -> None:
     root = tiny_scene.write(tmp_path / "wall", ("a",), frames=4)
     (root / "labels/gt/0002.png").unlink()
-    (entry,) = semstab.engine.run(configure(root, statistics=True)).runs
+    (entry,) = semstab.run(configure(root, statistics=True), report=False).runs
     assert entry.statistics.correctness.accuracy.value > 0.5
 
 
@@ -158,7 +159,7 @@ def test_no_ground_truth_no_judgement(tmp_path) -> None:
     for path in (root / "labels/gt").iterdir():
         path.unlink()
     (root / "labels/gt").rmdir()
-    (entry,) = semstab.engine.run(configure(root, statistics=True)).runs
+    (entry,) = semstab.run(configure(root, statistics=True), report=False).runs
     assert entry.statistics.correctness is entry.statistics.geometry is None
     assert entry.statistics.drift.trend is not None
 
@@ -166,7 +167,7 @@ def test_no_ground_truth_no_judgement(tmp_path) -> None:
 def test_models_of_different_classes_are_not_compared(tmp_path) -> None:
     root = tiny_scene.write(tmp_path / "wall")
     (root / "labels/b/label_space.yaml").write_text("name: other\nclasses: [wall, door, window, sky]\n")
-    assert semstab.engine.run(configure(root, statistics=True)).comparisons == ()
+    assert semstab.run(configure(root, statistics=True), report=False).comparisons == ()
 
 
 def test_the_log_counts_as_memory(tmp_path) -> None:
@@ -175,8 +176,9 @@ def test_the_log_counts_as_memory(tmp_path) -> None:
     held = 30 * 48 * (3 * 8 + 40)  # the log alone, as `Events` has it
     assert expected - without > held
     with pytest.raises(ConfigError, match="no statistics; or set memory_gb"):
-        semstab.engine.run(
-            configure(root, backends=["numba"], check=None, statistics=True, memory_gb=1e-6, tile_size="off")
+        semstab.run(
+            configure(root, backends=["numba"], check=None, statistics=True, memory_gb=1e-6, tile_size="off"),
+            report=False,
         )
 
 
@@ -185,7 +187,7 @@ def test_summaries_of_several_scenes_say_which_one_a_verdict_is_of(tmp_path, cap
 
     for scene in ("x", "y"):
         tiny_scene.write(tmp_path / "walls" / scene, ("a",))
-    print_summary(semstab.engine.run(configure(tmp_path / "walls")), Console(width=80))
+    print_summary(semstab.run(configure(tmp_path / "walls"), report=False), Console(width=80))
     printed = " ".join(capsys.readouterr().out.split())
     assert "x a no verdict" in printed
     assert "y a no verdict" in printed
@@ -206,7 +208,7 @@ def studied(tmp_path_factory):
     root = tiny_study.write(base / "wall", frames=8)
     noise = {"depth_noise": {"values": [0, 0.05], "repeats": 2}}
     settings = {"models": list(MODELS), "backends": ["numpy"], "statistics": True, "frames": {}, "sweeps": noise}
-    run_study(tiny_study.configure(root, **settings), base / "out")
+    run_study(tiny_study.configure(root, **settings), base / "out", report=False)
     return load_result(base / "out"), base / "out"
 
 

@@ -86,9 +86,9 @@ def test_a_mask_of_another_size_or_type_is_refused() -> None:
 
 
 def test_a_run_leaves_out_a_class_and_says_how_many_pixels(root, tmp_path) -> None:
-    everything = semstab.engine.run(configure(root)).runs[0]
+    everything = semstab.run(configure(root), report=False).runs[0]
     out = tmp_path / "run"
-    still = semstab.engine.run(configure(root, exclude={"predicted_classes": ["Door"]}), out=out).runs[0]
+    still = semstab.run(configure(root, exclude={"predicted_classes": ["Door"]}), out=out, report=False).runs[0]
     assert still.left_out > 0
     assert still.table.points + still.left_out == everything.table.points
     classes = {group.name: group.voxels for group in still.table.classes}
@@ -104,7 +104,7 @@ def test_locations_of_a_class_are_left_out_and_errors_elsewhere_stay(root, tmp_p
 
     def of(name, **settings):
         config = configure(root, statistics=True, tile_size=tile_size, **settings)
-        return semstab.engine.run(config, out=tmp_path / name).runs[0]
+        return semstab.run(config, out=tmp_path / name, report=False).runs[0]
 
     whole, some = of("whole"), of("some", exclude={"classes": ["door"]})
     tables = [semstab.load(tmp_path / name).table() for name in ("whole", "some")]

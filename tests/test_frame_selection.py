@@ -13,10 +13,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from posed_config import configure, dataset_of
 
+from semstab.api import run
 from semstab.config import Config, FrameSelection, as_range
 from semstab.datasets import open_dataset
 from semstab.datasets.scene import select_frames
-from semstab.engine import run
 from semstab.engine.units import make_plan
 from semstab.errors import ConfigError, DataError
 
@@ -196,7 +196,7 @@ def plan_of(root, settings, **options):
 
 
 def run_of(root, settings, **options):
-    return run(configure(root, dataset=dataset_of(root, **options), **settings)).runs
+    return run(configure(root, dataset=dataset_of(root, **options), **settings), report=False).runs
 
 
 @given(st.sets(st.integers(0, 40), min_size=1))

@@ -32,10 +32,10 @@ def test_words_for_one_reference_system_are_one_wkt_with_its_number() -> None:
 
 def test_a_finished_run_knows_where_its_scenes_lie(root, tmp_path) -> None:
     dataset = dataset_of(root, crs=UTM, offset=OFFSET)
-    semstab.engine.run(configure(root, dataset=dataset), out=tmp_path / "run")
+    semstab.run(configure(root, dataset=dataset), out=tmp_path / "run", report=False)
     found = semstab.load_result(tmp_path / "run").georeference
     assert found == {"wall": Georeference(wkt("EPSG:32615", "x"), OFFSET)}
-    semstab.engine.run(configure(root), out=tmp_path / "run")
+    semstab.run(configure(root), out=tmp_path / "run", report=False)
     assert semstab.load_result(tmp_path / "run").georeference == {}
 
 

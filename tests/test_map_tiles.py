@@ -161,8 +161,8 @@ def both(wall, tmp_path_factory):
 
 def run_both(root, folder, **options):
     executor = Counting()
-    semstab.engine.run(configure(root, **options), out=folder / "whole")
-    semstab.engine.run(configure(root, **options, tile_size=8), out=folder / "tiles", executor=executor)
+    semstab.run(configure(root, **options), out=folder / "whole", report=False)
+    semstab.run(configure(root, **options, tile_size=8), out=folder / "tiles", executor=executor, report=False)
     assert len(executor.done) > 4
     return folder / "whole", folder / "tiles"
 
@@ -325,7 +325,7 @@ def test_models_are_compared_tile_by_tile(tmp_path) -> None:
     root, found = tiny_scene.write(tmp_path / "wall", frames=8), []
     for size in (None, 8):
         settings = {"check": None, "backends": ["numba"], "statistics": True, "events": True, "tile_size": size}
-        semstab.engine.run(configure(root, **settings), out=tmp_path / str(size))
+        semstab.run(configure(root, **settings), out=tmp_path / str(size), report=False)
         found.append(summary_of(tmp_path / str(size))["comparisons"])
     assert differences(*found, tolerance=1e-12) == []
     assert_same_comparison(*(tmp_path / size for size in ("None", "8")))
@@ -360,18 +360,18 @@ def test_tiles_that_were_finished_before_an_interruption_are_taken_over(wall, bo
     config, out = configure(wall, **SETTINGS, tile_size=8), tmp_path / "run"
     first, second = Counting(stop_after=3), Counting()
     with pytest.raises(KeyboardInterrupt):
-        semstab.engine.run(config, out=out, executor=first)
+        semstab.run(config, out=out, executor=first, report=False)
     (damaged,) = out.glob(f"tiles/*/{first.done[1]}.npz")
     damaged.write_bytes(damaged.read_bytes()[:-20])
-    semstab.engine.run(config, out=out, executor=second)
+    semstab.run(config, out=out, executor=second, report=False)
     assert set(first.done) & set(second.done) == {first.done[1]}
     assert_same_run(both[0], out)
-    assert semstab.engine.run(config, out=out).manifest["units"]["kept"] == 1
+    assert semstab.run(config, out=out, report=False).manifest["units"]["kept"] == 1
 
 
 def test_a_run_in_tiles_by_several_processes_leaves_what_one_process_leaves(wall, both, tmp_path) -> None:
     config = configure(wall, **SETTINGS, tile_size=8)
-    semstab.engine.run(config, out=tmp_path / "tiles", executor=LocalProcesses(2))
+    semstab.run(config, out=tmp_path / "tiles", executor=LocalProcesses(2), report=False)
     assert differences(summary_of(both[1]), summary_of(tmp_path / "tiles"), tolerance=0) == []
     assert_same_run(both[0], tmp_path / "tiles")
 
@@ -389,7 +389,7 @@ def test_a_map_that_will_not_fit_is_fused_in_tiles_and_a_line_says_so(wall, both
     progress, executor = Progress(), Counting()
     config = configure(wall, **SETTINGS, memory_gb=30e-6)
     with mock.patch("semstab.engine.memory.resident_bytes", return_value=0):  # the estimates of maps count alone
-        semstab.engine.run(config, out=tmp_path / "tiles", observers=[progress], executor=executor)
+        semstab.run(config, out=tmp_path / "tiles", observers=[progress], executor=executor, report=False)
     assert len(executor.done) > 2
     assert re.search(
         r"wall, a: about .* million voxels of 0.25 m would take .* GB, 3e-05 GB are free: it is fused in tiles",
@@ -410,7 +410,7 @@ def test_a_map_that_outgrows_the_memory_is_given_up_in_one_line(settings, line, 
         mock.patch("semstab.engine.execution.planned_sizes", forced_sizes),
         pytest.raises(OutgrownError, match=rf"after \d+ of \d+ frames the map has .* is left of memory_gb; {line}"),
     ):
-        semstab.engine.run(config, out=tmp_path / "run")
+        semstab.run(config, out=tmp_path / "run", report=False)
 
 
 def forced_sizes(config, missing, width) -> Sizing:
@@ -424,7 +424,7 @@ def test_parts_of_other_tiles_are_not_taken_for_those_of_these(wall, both, tmp_p
     for size, executor in ((8, Counting(stop_after=4)), (16, Counting())):
         config = configure(wall, **SETTINGS, tile_size=size)
         with contextlib.suppress(KeyboardInterrupt):
-            semstab.engine.run(config, out=tmp_path / "tiles", executor=executor)
+            semstab.run(config, out=tmp_path / "tiles", executor=executor, report=False)
     assert_same_bits(semstab.load(tmp_path / "tiles").table(), semstab.load(both[0]).table())
 
 
@@ -435,7 +435,7 @@ def test_a_unit_in_tiles_takes_the_place_of_a_whole_one_and_back(wall, tmp_path)
         (tmp_path / "run" / "units").mkdir(parents=True, exist_ok=True)
         for unit in (tmp_path / "run" / "units").iterdir():
             unit.unlink()
-        semstab.engine.run(configure(wall, backends=["numba"], check=None, tile_size=size), out=tmp_path / "run")
+        semstab.run(configure(wall, backends=["numba"], check=None, tile_size=size), out=tmp_path / "run", report=False)
         assert [path.name for path in voxels.iterdir()] == [there]
 
 
@@ -464,7 +464,7 @@ def test_tiles_of_two_maps_are_no_table(both, tmp_path) -> None:
 ])  # fmt: skip
 def test_what_cannot_be_tiled_is_refused_in_one_line(settings, message, wall) -> None:
     with pytest.raises(ConfigError, match=message):
-        semstab.engine.run(configure(wall, **{"backends": ["numba"], "check": None, **settings}))
+        semstab.run(configure(wall, **{"backends": ["numba"], "check": None, **settings}), report=False)
 
 
 @hypothesis_settings(max_examples=20, deadline=None)

@@ -15,9 +15,10 @@ from posed_config import configure
 from rich.console import Console
 
 import semstab
+from semstab.api import run_study
 from semstab.data.measures import VSS, Measure, measures, register, registered
 from semstab.data.voxels import VoxelTable
-from semstab.engine import load_result, run_study
+from semstab.engine import load_result
 from semstab.errors import ConfigError
 from semstab.recording import Recording, color_modes
 from semstab.recording.voxel_maps import defaults
@@ -64,7 +65,7 @@ def study(tmp_path_factory, registered_rival):
     config = tiny_study.configure(
         tiny_study.write(base / "data" / "wall"), statistics=True, sweeps={"voxel_size": [0.25, 0.5]}
     )
-    return run_study(config, base / "study"), base / "study"
+    return run_study(config, base / "study", report=False), base / "study"
 
 
 def test_the_summary_has_its_means_and_reads_them_back(run, study) -> None:

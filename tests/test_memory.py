@@ -36,7 +36,7 @@ def test_the_estimate_holds_for_a_flight_and_saturates_over_one_place(tmp_path) 
     """From a few pairs of frames; frames that see nothing new add observations only."""
     root = tiny_scene.write(tmp_path / "wall", models=("a",), frames=60)
     plan, config = planned(root, voxel_size=0.05, pixel_stride=1)
-    table = semstab.engine.run(config).runs[0].table
+    table = semstab.run(config, report=False).runs[0].table
     size = memory.map_size(plan.tasks[0], plan.units[0].config)
     assert size.voxels == pytest.approx(table.voxels, rel=0.3)
     assert size.observations == pytest.approx(table.observations, rel=0.3)
@@ -48,7 +48,7 @@ def test_a_unit_that_will_not_fit_is_refused_before_a_frame_is_fused(root, tmp_p
     _, config = planned(root, memory_gb=1e-6, tile_size="off")
     said = r"wall, a: about .* million voxels of 0.25 m would take .* GB, and 1e-06 GB is memory_gb; use larger voxels"
     with pytest.raises(ConfigError, match=said + r".*pixel_stride.*\(numpy\).*off forbids to fuse it in tiles"):
-        semstab.engine.run(config, out=tmp_path / "run")
+        semstab.run(config, out=tmp_path / "run", report=False)
     assert not (tmp_path / "run" / "voxels").exists()
 
 

@@ -73,7 +73,7 @@ def test_a_run_in_several_processes_is_the_same_run(root, tmp_path) -> None:
     """Its recording has the same series and maps; the images are added from the finished folder."""
     one, two = tmp_path / "one", tmp_path / "two"
     recording = Recording(Target(one / "recording.rrd"))
-    semstab.engine.run(load_config(overrides=settings(root)), out=one, observers=[recording])
+    semstab.run(load_config(overrides=settings(root)), out=one, observers=[recording], report=False)
     file = tmp_path / "wall.yaml"
     file.write_text(yaml.safe_dump(settings(root)))
     bench("--config", file, "--jobs", "2", "--out", "two", "-q", cwd=tmp_path, recording=True)
@@ -87,7 +87,9 @@ def test_a_run_in_several_processes_is_the_same_run(root, tmp_path) -> None:
 def test_a_study_writes_frame_series_and_where_asked_a_recording_of_its_base_units(root, tmp_path) -> None:
     content = settings(root, sweeps={"voxel_size": [0.5]}, name="tiny")
     out = tmp_path / "study"
-    semstab.engine.run_study(load_config(overrides=content), out, observers=[Recording(Target(out / "recording.rrd"))])
+    semstab.run_study(
+        load_config(overrides=content), out, observers=[Recording(Target(out / "recording.rrd"))], report=False
+    )
     slugs = {f"wall__{model}__{backend}" for model in "ab" for backend in ("numba", "numpy")}
     assert {file.stem for file in (out / "frames").iterdir()} == slugs
     result = load_result(out)
@@ -108,10 +110,10 @@ def test_a_kept_unit_that_gained_a_measure_is_computed_again(root, tmp_path) -> 
     from semstab.data.measures import Measure, registered
 
     config, out = load_config(overrides=settings(root, backends=["numpy"])), tmp_path / "run"
-    semstab.engine.run(config, out=out)
+    semstab.run(config, out=out, report=False)
     ones = Measure(key="ones", title="Ones", better="higher", of=lambda table: np.ones(len(table.op)), range=(0, 1))
     with registered(ones):
-        result = semstab.engine.run(config, out=out)
+        result = semstab.run(config, out=out, report=False)
         assert result.manifest["units"] == {
             "units": 2, "kept": 0, "computed": 2, "failed": 0, "executor": "in this process"
         }  # fmt: skip
@@ -127,13 +129,13 @@ def test_a_backend_of_ones_own_that_breaks_leaves_its_trace(root, tmp_path, monk
     monkeypatch.setattr(NumpyReference, "integrate", broken)
     out = tmp_path / "run"
     with pytest.raises(ZeroDivisionError):
-        semstab.engine.run(load_config(overrides=settings(root, models=["a"])), out=out)
+        semstab.run(load_config(overrides=settings(root, models=["a"])), out=out, report=False)
     log = (out / "failures.log").read_text()
     assert log.startswith("ZeroDivisionError: by zero\nTraceback")
     assert load_result(out).failures[0].message == "ZeroDivisionError: by zero"
     assert [run.unit.backend for run in load_result(out).runs] == ["numba"]
     monkeypatch.undo()
-    semstab.engine.run(load_config(overrides=settings(root, models=["a"])), out=out)
+    semstab.run(load_config(overrides=settings(root, models=["a"])), out=out, report=False)
     assert not (out / "failures.log").exists()
 
 

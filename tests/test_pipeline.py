@@ -56,7 +56,7 @@ class Watching(Observer):
 
 def test_ground_truth_of_a_static_wall_is_perfectly_stable(root) -> None:
     """Pixels are as large as voxels here, and the truth is tied to the wall: every voxel keeps one label."""
-    (run,) = semstab.engine.run(configure(root, models=["gt"])).runs
+    (run,) = semstab.run(configure(root, models=["gt"]), report=False).runs
     # 8 columns, and one more a frame; 6 rows
     assert run.table.voxels == (8 + 2) * 6
     assert run.table.points == run.table.observations == 3 * 48
@@ -70,10 +70,10 @@ def test_ground_truth_of_a_static_wall_is_perfectly_stable(root) -> None:
 
 def test_observers_see_everything_and_every_model_goes_through_every_backend(root) -> None:
     watching = Watching()
-    semstab.engine.run(configure(root, models=["a"]), observers=[watching])
+    semstab.run(configure(root, models=["a"]), observers=[watching], report=False)
     unit = "wall__a__numpy"
     assert watching.seen == ["start 1", f"{unit} 0", f"{unit} 1", f"{unit} 2", f"{unit} done 60", "finished"]
-    result = semstab.engine.run(configure(root, backends=["open3d"]))
+    result = semstab.run(configure(root, backends=["open3d"]), report=False)
     assert [run.unit.slug for run in result.runs] == [
         "wall__a__open3d", "wall__a__numpy", "wall__b__open3d", "wall__b__numpy"
     ]  # fmt: skip
@@ -83,7 +83,7 @@ def test_observers_see_everything_and_every_model_goes_through_every_backend(roo
 
 def test_the_run_folder_holds_what_the_design_promises(root, tmp_path) -> None:
     out = tmp_path / "run"
-    result = semstab.engine.run(configure(root, events=True), out=out, command=["semstab-bench", "--x"])
+    result = semstab.run(configure(root, events=True), out=out, command=["semstab-bench", "--x"], report=False)
     summary = json.loads((out / "summary.json").read_text())
     assert summary == json.loads(json.dumps(summary))
     assert summary["schema"] == 4
@@ -121,7 +121,7 @@ def test_the_frame_series_ends_where_the_table_is(root, tmp_path) -> None:
     """The map's running means, kept frame by frame, equal those of the final table."""
     for backend in ("numpy", "open3d"):
         out = tmp_path / backend
-        (run,) = semstab.engine.run(configure(root, models=["b"], backends=[backend], check=None), out=out).runs
+        (run,) = semstab.run(configure(root, models=["b"], backends=[backend], check=None), out=out, report=False).runs
         text = (out / "frames" / f"{run.unit.slug}.csv").read_text().splitlines()
         last = dict(zip(text[0].split(","), text[-1].split(","), strict=True))
         assert int(last["map_voxels"]) == run.table.voxels
@@ -131,23 +131,23 @@ def test_the_frame_series_ends_where_the_table_is(root, tmp_path) -> None:
 
 
 def test_running_the_resolved_configuration_again_gives_the_same_numbers(root, tmp_path) -> None:
-    first = semstab.engine.run(configure(root), out=tmp_path / "one")
-    again = semstab.engine.run(load_config(tmp_path / "one" / "config.yaml"), out=tmp_path / "two")
+    first = semstab.run(configure(root), out=tmp_path / "one", report=False)
+    again = semstab.run(load_config(tmp_path / "one" / "config.yaml"), out=tmp_path / "two", report=False)
     assert without_times(again) == without_times(first)
     assert (tmp_path / "one" / "config.yaml").read_text() == (tmp_path / "two" / "config.yaml").read_text()
 
 
 def test_a_folder_of_another_run_is_told_and_of_something_else_refused(root, tmp_path, caplog) -> None:
     out = tmp_path / "run"
-    semstab.engine.run(configure(root), out=out)
-    changed = semstab.engine.run(configure(root, voxel_size=0.5), out=out)
+    semstab.run(configure(root), out=out, report=False)
+    changed = semstab.run(configure(root, voxel_size=0.5), out=out, report=False)
     assert "earlier results of other settings (voxel_size: 0.25 there, 0.5 here) are replaced" in caplog.text
     assert changed.manifest["units"]["kept"] == 0
     with pytest.raises(ConfigError, match="is not empty and holds no run"):
-        semstab.engine.run(configure(root), out=root)
+        semstab.run(configure(root), out=root, report=False)
     (tmp_path / "file").write_text("")
     with pytest.raises(ConfigError, match="is a file"):
-        semstab.engine.run(configure(root), out=tmp_path / "file")
+        semstab.run(configure(root), out=tmp_path / "file", report=False)
 
 
 @pytest.mark.parametrize(("name", "text"), [("config.yaml", "voxel_size: 0.2\n"), ("study.yaml", "name: x\n")])
@@ -156,7 +156,7 @@ def test_a_folder_of_an_earlier_version_is_refused_and_not_touched(root, tmp_pat
     (out / "units").mkdir(parents=True)
     (out / name).write_text(text)
     with pytest.raises(ConfigError, match=r"run: holds results of an earlier version .*; choose another folder"):
-        semstab.engine.run(configure(root), out=out)
+        semstab.run(configure(root), out=out, report=False)
     assert sorted(path.name for path in out.rglob("*")) == sorted(["units", name])
     assert (out / name).read_text() == text
 
@@ -165,13 +165,13 @@ def test_a_folder_that_a_killed_start_began_or_whose_unit_is_damaged_is_taken_ov
     out = tmp_path / "run"
     (out / "units").mkdir(parents=True)
     (out / ".semstab-ab12cd34.yaml").write_text("half")
-    semstab.engine.run(configure(root, models=["a"]), out=out)
+    semstab.run(configure(root, models=["a"]), out=out, report=False)
     assert not list(out.rglob(".*"))
     out, config = tmp_path / "run", configure(root)
-    whole = semstab.engine.run(config, out=out)
+    whole = semstab.run(config, out=out, report=False)
     unit, *_ = sorted((out / "units").iterdir())
     unit.write_text('{"key": ')
-    again = semstab.engine.run(config, out=out)
+    again = semstab.run(config, out=out, report=False)
     assert f"{unit.name}: damaged; the unit is computed again" in caplog.text
     assert again.manifest["units"]["computed"] == 1
     assert without_times(again) == without_times(whole)
@@ -184,7 +184,7 @@ def test_an_observer_that_fails_costs_nothing_else_and_is_told_at_the_end(root, 
 
     watching, out = Watching(), tmp_path / "run"
     with pytest.raises(OSError, match="No space left"):
-        semstab.engine.run(configure(root, models=["a"]), out=out, observers=[Failing(), watching])
+        semstab.run(configure(root, models=["a"]), out=out, observers=[Failing(), watching], report=False)
     assert watching.seen[-1] == "finished"
     assert load_result(out).runs[0].table.voxels == 60
 
@@ -195,7 +195,7 @@ def test_disagreement_is_reported_after_everything_is_written(root, tmp_path, mo
     table = NumpyReference.table
     late = {"first_frame": np.full(60, 7), "last_frame": np.full(60, 8)}
     monkeypatch.setattr(NumpyReference, "table", lambda self: dataclasses.replace(table(self), **late))
-    agreeing = semstab.engine.run(configure(root, models=["a"], backends=["open3d"]))
+    agreeing = semstab.run(configure(root, models=["a"], backends=["open3d"]), report=False)
     assert agreeing.agrees  # frame numbers are not compared, evidence is
 
     def half(self):
@@ -203,7 +203,7 @@ def test_disagreement_is_reported_after_everything_is_written(root, tmp_path, mo
         return dataclasses.replace(whole, evidence=whole.evidence / 2)
 
     monkeypatch.setattr(NumpyReference, "table", half)
-    result = semstab.engine.run(configure(root, models=["a"], backends=["open3d"]), out=tmp_path / "run")
+    result = semstab.run(configure(root, models=["a"], backends=["open3d"]), out=tmp_path / "run", report=False)
     assert not result.agrees
     assert result.agreement[0].differences["evidence"].max > 0.1
     assert json.loads((tmp_path / "run" / "summary.json").read_text())["agreement"][0]["agrees"] is False
@@ -224,16 +224,16 @@ def test_disagreement_is_reported_after_everything_is_written(root, tmp_path, mo
 ])  # fmt: skip
 def test_a_selection_that_does_not_fit_is_refused_before_anything_is_read(root, settings, message) -> None:
     with pytest.raises((ConfigError, DataError), match=message):
-        semstab.engine.run(configure(root, **settings))
+        semstab.run(configure(root, **settings), report=False)
 
 
 def test_pixel_stride_keeps_every_nth_pixel_and_a_taxonomy_file_merges_classes(root, tmp_path) -> None:
-    (run,) = semstab.engine.run(configure(root, models=["gt"], pixel_stride=2)).runs
+    (run,) = semstab.run(configure(root, models=["gt"], pixel_stride=2), report=False).runs
     assert run.table.points == 3 * 4 * 3
     assert run.table[VSS] == 1.0
     path = tmp_path / "two.yaml"
     path.write_text(yaml.safe_dump({"classes": ["wall", {"name": "opening", "members": ["door", "window"]}]}))
-    (run,) = semstab.engine.run(configure(root, models=["gt"], taxonomy=str(path))).runs
+    (run,) = semstab.run(configure(root, models=["gt"], taxonomy=str(path)), report=False).runs
     assert (run.taxonomy, run.table.K) == ("two", 2)
     assert [row.name for row in run.table.classes] == ["wall", "opening"]
 
@@ -241,21 +241,21 @@ def test_pixel_stride_keeps_every_nth_pixel_and_a_taxonomy_file_merges_classes(r
 def test_the_number_of_threads_changes_no_number(root, tmp_path) -> None:
     """And is no part of what a run folder is compared by: what one thread finished, four keep."""
     out = tmp_path / "run"
-    one = semstab.engine.run(configure(root, threads=1), out=out)
-    four = semstab.engine.run(configure(root, threads=4), out=tmp_path / "four")
+    one = semstab.run(configure(root, threads=1), out=out, report=False)
+    four = semstab.run(configure(root, threads=4), out=tmp_path / "four", report=False)
     assert without_times(one) == without_times(four)
     watching = Watching()
-    semstab.engine.run(configure(root, threads=4), out=out, observers=[watching])
+    semstab.run(configure(root, threads=4), out=out, observers=[watching], report=False)
     assert watching.seen == ["start 2", "kept a", "kept b", "finished"]
 
 
 def test_the_time_of_a_frame_is_told_by_stage(root, tmp_path) -> None:
-    (run,) = semstab.engine.run(configure(root, models=["a"]), out=tmp_path / "run").runs
+    (run,) = semstab.run(configure(root, models=["a"]), out=tmp_path / "run", report=False).runs
     assert tuple(run.stages_ms) == STAGES
     assert all(run.stages_ms[stage] >= 0 for stage in ("decode", "wait", "flicker", "logging"))
     summary = json.loads((tmp_path / "run" / "summary.json").read_text())
     assert summary["runs"][0]["stages_ms"]["association"] is None  # numpy does not tell its parts apart
-    (kept,) = semstab.engine.run(configure(root, models=["a"]), out=tmp_path / "run").runs
+    (kept,) = semstab.run(configure(root, models=["a"]), out=tmp_path / "run", report=False).runs
     assert kept.stages_ms["decode"] == run.stages_ms["decode"]
     header, first, *_ = (tmp_path / "run" / "frames" / "wall__a__numpy.csv").read_text().splitlines()
     row = dict(zip(header.split(","), first.split(","), strict=True))
@@ -273,9 +273,9 @@ def test_colour_is_decoded_only_for_observers_that_want_it(root) -> None:
         def frame_fused(self, task, frame, rows) -> None:
             seen.append(frame.color is not None)
 
-    semstab.engine.run(configure(root, models=["a"]), observers=[Painting()])
+    semstab.run(configure(root, models=["a"]), observers=[Painting()], report=False)
     Painting.wants_color = True
-    semstab.engine.run(configure(root, models=["a"]), observers=[Painting()])
+    semstab.run(configure(root, models=["a"]), observers=[Painting()], report=False)
     assert seen == [False] * 3 + [True] * 3
 
 
@@ -286,9 +286,9 @@ def test_each_image_is_read_once(root, tmp_path, monkeypatch) -> None:
         disk, "file_digest", lambda path, digest=disk.file_digest: (read.append(path.name), digest(path))[1]
     )
     config = configure(root, models=["a"])
-    semstab.engine.run(config, out=tmp_path / "run")
+    semstab.run(config, out=tmp_path / "run", report=False)
     assert not [name for name in read if name.endswith(".png")]
     watching = Watching()
-    semstab.engine.run(config, out=tmp_path / "run", observers=[watching])
+    semstab.run(config, out=tmp_path / "run", observers=[watching], report=False)
     assert "kept a" in watching.seen
     assert len([name for name in read if name.endswith(".png")]) == 2 * tiny_scene.FRAMES

@@ -17,6 +17,7 @@ from command_line import bench, error_of
 from PIL import Image
 from posed_config import configure, dataset_of
 
+from semstab.api import run
 from semstab.config import Config, DatasetConfig, FrameSelection
 from semstab.core.files import FolderLock
 from semstab.data.labels import LabelSpace
@@ -24,7 +25,6 @@ from semstab.data.measures import ENTROPY
 from semstab.datasets import open_dataset
 from semstab.datasets.formats.images import read_labels
 from semstab.datasets.scene import select_frames
-from semstab.engine import run
 from semstab.errors import ConfigError, DataError
 from semstab.metrics import matched_region_flicker
 from semstab.models import Model, Prediction, Streamed, create
@@ -502,7 +502,7 @@ def test_regions_are_read_by_name_and_never_fused(scene):
     with pytest.raises(ConfigError, match="'tiles' holds regions without classes, which cannot be fused"):
         opened.label_space("tiles")
     dataset = DatasetConfig(name="posed_folder", options={"root": str(scene)})
-    (found,) = run(Config(dataset=dataset, voxel_size=0.25, check=None)).runs
+    (found,) = run(Config(dataset=dataset, voxel_size=0.25, check=None), report=False).runs
     assert found.unit.model == "thirds"
     predict(scene, Shifting(), name="tiles")
     with pytest.raises(DataError, match=r"regions/tiles: .*labels/tiles is called 'tiles' too; rename one"):
@@ -589,11 +589,11 @@ PREDICTOR = "colour-clusters,clusters=4,samples=500,fit_frames=2"
 
 
 def test_model_to_voxels_is_the_same_as_by_way_of_the_disk(scene):
-    (live,) = run(live_config(scene, PREDICTOR)).runs
+    (live,) = run(live_config(scene, PREDICTOR), report=False).runs
     before = sorted(path for path in scene.rglob("*"))
     predict(scene, clusters())
     dataset = DatasetConfig(name="posed_folder", options={"root": str(scene)})
-    (stored,) = run(Config(dataset=dataset, voxel_size=0.25, check=None)).runs
+    (stored,) = run(Config(dataset=dataset, voxel_size=0.25, check=None), report=False).runs
     assert live.unit.model == "colour-clusters"
     assert live.table == stored.table
     assert live.flicker_percent == stored.flicker_percent
@@ -602,17 +602,19 @@ def test_model_to_voxels_is_the_same_as_by_way_of_the_disk(scene):
 
 def test_a_run_with_predictions_is_kept_and_reproduced(scene, tmp_path):
     config = live_config(scene, PREDICTOR)
-    first = run(config, out=tmp_path / "run")
+    first = run(config, out=tmp_path / "run", report=False)
     again = Config.build(yaml.safe_load((tmp_path / "run/config.yaml").read_text()))
-    assert run(again, out=tmp_path / "run").runs[0].table == first.runs[0].table
+    assert run(again, out=tmp_path / "run", report=False).runs[0].table == first.runs[0].table
     before = {path.name for path in (tmp_path / "run/units").iterdir()}
     Image.fromarray(predicted_scene.image(5, seed=9)).save(scene / "color/005.png")
-    run(config, out=tmp_path / "run")
+    run(config, out=tmp_path / "run", report=False)
     assert {path.name for path in (tmp_path / "run/units").iterdir()} > before
 
 
 def test_labels_and_scores_of_several_models(scene):
-    found = run(live_config(scene, PREDICTOR, f"{PREDICTOR},scores=true", f"{PREDICTOR},seed=3,name=other"))
+    found = run(
+        live_config(scene, PREDICTOR, f"{PREDICTOR},scores=true", f"{PREDICTOR},seed=3,name=other"), report=False
+    )
     assert [unit.unit.model for unit in found.runs] == ["colour-clusters", "colour-clusters-scores", "other"]
     hard, soft, _ = (unit.table for unit in found.runs)
     assert soft[ENTROPY] > hard[ENTROPY]
@@ -673,7 +675,7 @@ def test_a_frame_that_is_asked_for_again_is_predicted_once(scene, monkeypatch):
 def test_the_built_in_city_with_a_model():
     settings = {"dataset": {"name": "city", "options": {"width": 64, "height": 36, "frames": 2}}}
     config = predicted_config([parse_predictor(PREDICTOR)], None, {**settings, "scenes": ["scene0"], "check": None})
-    (found,) = run(config).runs
+    (found,) = run(config, report=False).runs
     assert (found.unit.scene, found.unit.model, found.taxonomy) == ("scene0", "colour-clusters", "colour clusters")
 
 
@@ -687,13 +689,13 @@ def test_the_built_in_city_with_a_model():
 )
 def test_runs_that_cannot_predict(scene, predictors, message):
     with pytest.raises(ConfigError, match=message):
-        run(live_config(scene, *predictors))
+        run(live_config(scene, *predictors), report=False)
 
 
 def test_regions_cannot_be_fused(scene, monkeypatch):
     monkeypatch.setattr("semstab.predict.live.create", lambda name, **options: Tiles())
     with pytest.raises(ConfigError, match="finds regions without classes, which cannot be fused"):
-        run(live_config(scene, PREDICTOR))
+        run(live_config(scene, PREDICTOR), report=False)
 
 
 # --- label_space.yaml -------------------------------------------------------------------------------------------------

@@ -11,11 +11,11 @@ import pytest
 from PIL import Image
 from posed_config import dataset_of
 
+from semstab.api import run
 from semstab.config import Config, FrameSelection
 from semstab.data.labels import LabelSpace
 from semstab.datasets import open_dataset
 from semstab.datasets.formats.images import read_labels
-from semstab.engine import run
 from semstab.errors import ConfigError, DataError
 from semstab.models import Model, Prediction
 from semstab.models.names import InTaxonomy
@@ -234,10 +234,10 @@ def test_what_a_unit_depends_on_are_all_frames_before(scene, live):
 
 def test_live_and_by_way_of_the_disk_are_the_same(scene, live):
     frames = {"stride": 2, "start": 1}
-    (found,) = run(live_config(scene, frames=frames)).runs
+    (found,) = run(live_config(scene, frames=frames), report=False).runs
     predict(scene, Average(), FrameSelection(**frames).indices(6))
     (stored,) = run(
-        Config(dataset=dataset_of(scene), frames=frames, voxel_size=0.25, backends=["numpy"], check=None)
+        Config(dataset=dataset_of(scene), frames=frames, voxel_size=0.25, backends=["numpy"], check=None), report=False
     ).runs
     assert found.table == stored.table
     assert found.flicker_percent == stored.flicker_percent
@@ -245,13 +245,13 @@ def test_live_and_by_way_of_the_disk_are_the_same(scene, live):
 
 def test_a_run_says_what_it_was_shown(scene, live, tmp_path):
     config = live_config(scene, frames={"stride": 2})
-    run(config, out=tmp_path / "run")
+    run(config, out=tmp_path / "run", report=False)
     import yaml
 
     said = yaml.safe_load((tmp_path / "run/config.yaml").read_text())
     assert said["dataset"]["options"]["frames"]["stride"] == 2
     said["frames"] = {**said["frames"], "stride": 3}
     again = Config.build({key: value for key, value in said.items() if key != "schema"})
-    (found,) = run(again, out=tmp_path / "run").runs
+    (found,) = run(again, out=tmp_path / "run", report=False).runs
     assert found.unit.model == "average"
     assert json.loads((tmp_path / "run/summary.json").read_text())["runs"][0]["frames"] == 2

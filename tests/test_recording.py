@@ -59,7 +59,7 @@ def run(tmp_path_factory):
     folder = tmp_path_factory.mktemp("recording")
     root = tiny_scene.write(folder / "data" / "wall")
     out = folder / "run"
-    semstab.engine.run(config_of(root), out=out, observers=[Recording(out / "recording.rrd")])
+    semstab.run(config_of(root), out=out, observers=[Recording(out / "recording.rrd")], report=False)
     return out
 
 
@@ -273,10 +273,10 @@ def test_the_file_is_whole_and_the_world_stands_upright(run) -> None:
 def test_a_start_that_finds_everything_kept_leaves_the_recording_alone(run) -> None:
     path = run / "recording.rrd"
     before = path.read_bytes()
-    semstab.engine.run(config_of(run.parent / "data" / "wall"), out=run, observers=[Recording(path)])
+    semstab.run(config_of(run.parent / "data" / "wall"), out=run, observers=[Recording(path)], report=False)
     assert path.read_bytes() == before
     whole = run.parent / "whole.rrd"  # from the run folder it is whole, but for what only the images show
-    semstab.engine.run(config_of(run.parent / "data" / "wall"), out=run, observers=[Recording(whole)])
+    semstab.run(config_of(run.parent / "data" / "wall"), out=run, observers=[Recording(whole)], report=False)
     verify(whole)
     first, again = read(path), read(whole)
     for column in SERIES:
@@ -298,7 +298,7 @@ def test_a_resumed_run_says_what_it_does_not_show(tmp_path) -> None:
     path = tmp_path / "run" / "recording.rrd"
     first = Recording(path)
     with pytest.raises(KeyboardInterrupt):
-        semstab.engine.run(config, out=path.parent, observers=[first, Interrupting()])
+        semstab.run(config, out=path.parent, observers=[first, Interrupting()], report=False)
     first.close()
     first.close()
     verify(path)
@@ -306,7 +306,7 @@ def test_a_resumed_run_says_what_it_does_not_show(tmp_path) -> None:
     assert len(series(rows, "/wall/series/updated_voxels/a/numpy")) == 3
     assert len(series(rows, "/wall/series/updated_voxels/b/numpy")) == 1
 
-    semstab.engine.run(config, out=path.parent, observers=[Recording(path)])
+    semstab.run(config, out=path.parent, observers=[Recording(path)], report=False)
     verify(path)
     rows = read(path)
     kept, fused_now = sorted(notes(rows))
@@ -343,16 +343,16 @@ def test_a_map_of_the_run_is_followed_where_that_is_possible(tmp_path, monkeypat
 def test_a_path_that_cannot_be_written_is_named(run, tmp_path) -> None:
     config = config_of(run.parent / "data" / "wall")
     with pytest.raises(ConfigError, match=r"recording cannot be written"):
-        semstab.engine.run(config, observers=[Recording(tmp_path)])
+        semstab.run(config, observers=[Recording(tmp_path)], report=False)
     (tmp_path / "file").write_text("")
     with pytest.raises(ConfigError, match=r"file/x\.rrd: the recording cannot be written"):
-        semstab.engine.run(config, observers=[Recording(tmp_path / "file" / "x.rrd")])
+        semstab.run(config, observers=[Recording(tmp_path / "file" / "x.rrd")], report=False)
 
 
 def test_without_a_recording_rerun_is_not_imported(run) -> None:
     program = (
         "import sys, semstab; from semstab.settings import load_config;"
-        f"semstab.engine.run(load_config({str(run / 'config.yaml')!r}));"
+        f"semstab.run(load_config({str(run / 'config.yaml')!r}));"
         "assert 'semstab.engine.execution' in sys.modules and 'rerun' not in sys.modules"
     )
     subprocess.run([sys.executable, "-c", program], check=True)

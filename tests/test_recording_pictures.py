@@ -54,7 +54,7 @@ def compared(tmp_path_factory):
         cv2.imwrite(str(root / "color" / f"{i:04d}.jpg"), picture)
     config = config_with(root, "numba", "open3d-projective")
     out = folder / "run"
-    semstab.engine.run(config, out=out, observers=[Recording(out / "recording.rrd")])
+    semstab.run(config, out=out, observers=[Recording(out / "recording.rrd")], report=False)
     return config, out
 
 
@@ -383,7 +383,7 @@ class Killing(Observer):
         os.kill(os.getpid(), signal.SIGKILL)
 config = load_config(overrides={{"dataset": {{"name": "posed_folder", "options": {{"root": {str(root)!r}}}}},
     "backends": ["numba"], "check": None, "voxel_size": 0.25}})
-semstab.engine.run(config, observers=[Recording({str(path)!r}), Killing()])
+semstab.run(config, observers=[Recording({str(path)!r}), Killing()])
 """
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, check=False)
     assert done.returncode == -signal.SIGKILL
@@ -404,7 +404,7 @@ def again(compared):
     tiled = out.parent / "tiled"
     options = {"backends": config.backends[:1], "tile_size": 8}
     recording = Recording(tiled / "recording.rrd")
-    semstab.engine.run(config.model_copy(update=options), out=tiled, observers=[recording])
+    semstab.run(config.model_copy(update=options), out=tiled, observers=[recording], report=False)
     assert len(list((tiled / "voxels").glob("*/*.parquet"))) > 1
     assert lacks_pictures(tiled, tiled / "recording.rrd")
     verify(tiled / "recording.rrd")

@@ -15,11 +15,12 @@ import tiny_study
 from tiny_study import Counting, Interrupting, configure, summary
 
 import semstab
+from semstab.api import run_study
 from semstab.config import BACKENDS, Config
 from semstab.core.json_form import to_json
 from semstab.data.records import Variation
 from semstab.datasets.files.scene import FileScene
-from semstab.engine import load_result, run_study
+from semstab.engine import load_result
 from semstab.engine.folder import Folder
 from semstab.engine.frame_loop import run_job
 from semstab.engine.messages import Start, Work, jobs_of
@@ -41,7 +42,7 @@ def finished(tmp_path_factory):
     """The folder of a finished study, its result, and what an observer counted."""
     folder, counting = tmp_path_factory.mktemp("finished"), Counting()
     config = configure(tiny_study.write(folder / "wall"))
-    result = run_study(config, folder / "out", observers=[counting], command=["semstab-bench", "study"])
+    result = run_study(config, folder / "out", observers=[counting], command=["semstab-bench", "study"], report=False)
     return folder / "out", result, counting
 
 
@@ -53,18 +54,18 @@ def out(finished, tmp_path):
 
 def count(config, out, **options) -> Counting:
     counting = Counting()
-    run_study(config, out, observers=[counting], **options)
+    run_study(config, out, observers=[counting], **options, report=False)
     return counting
 
 
 def test_every_unit_has_the_numbers_of_a_run_with_its_settings(root, tmp_path) -> None:
     """Though its frames were decoded once for all of them."""
     config = resolve(configure(root, shared_taxonomy=None, strata=[1, 3]))
-    result = run_study(config, tmp_path / "out")
+    result = run_study(config, tmp_path / "out", report=False)
     cells = make_plan(config).units
     assert [record.variation for record in result.records] == [cell.variation for cell in cells]
     for cell, record in zip(cells, result.records, strict=True):
-        (run,) = semstab.engine.run(cell.config, out=tmp_path / "run" / record.key).runs
+        (run,) = semstab.run(cell.config, out=tmp_path / "run" / record.key, report=False).runs
         expected, found = to_json(run), to_json(record.summary)
         for name in (*tiny_study.TIMES, "sizes"):  # only base units are fused at other voxel sizes, too
             expected.pop(name), found.pop(name)
@@ -120,7 +121,7 @@ def decoded(monkeypatch) -> list[tuple[int, str]]:
 
 
 def test_frames_are_decoded_once_for_all_units_of_a_model(root, tmp_path, decoded) -> None:
-    run_study(configure(root), tmp_path / "out")
+    run_study(configure(root), tmp_path / "out", report=False)
     predicted = [pair for pair in decoded if pair[1] != "gt"]
     # a's ten frames for the sweep of frame_count, b's five
     assert sorted(predicted) == sorted([(i, "a") for i in range(10)] + [(i, "b") for i in (0, 2, 4, 7, 9)])
@@ -131,7 +132,7 @@ def test_maps_that_exceed_the_memory_bound_are_put_off_and_the_numbers_are_the_s
     root, tmp_path, finished, decoded, monkeypatch
 ) -> None:
     monkeypatch.setattr("semstab.engine.memory.resident_bytes", lambda: 0)  # what is estimated counts alone
-    run_study(configure(root, memory_gb=0.0002), tmp_path / "tight")
+    run_study(configure(root, memory_gb=0.0002), tmp_path / "tight", report=False)
     assert len(decoded) > 25
     assert summary(tmp_path / "tight") == summary(finished[0])
 
@@ -140,7 +141,7 @@ def test_a_unit_that_would_not_fit_into_memory_fails_before_it_is_fused(root, tm
     monkeypatch.setattr("semstab.engine.memory.resident_bytes", lambda: 0)  # what is estimated counts alone
     small = {"memory_gb": 0.00003, "tile_size": "off"}
     config = configure(root, backends=["numpy"], sweeps={"pixel_stride": [8]}, **small)
-    result = run_study(config, tmp_path / "out")
+    result = run_study(config, tmp_path / "out", report=False)
     assert {failure.variation.sweep for failure in result.failures} == {"base"}
     assert "would take" in result.failures[0].message
     assert [record.variation.sweep for record in result.records] == ["pixel_stride"] * 2
@@ -149,7 +150,7 @@ def test_a_unit_that_would_not_fit_into_memory_fails_before_it_is_fused(root, tm
 def test_an_interrupted_study_goes_on_where_it_was(root, tmp_path, finished) -> None:
     config, out = configure(root), tmp_path / "out"
     with pytest.raises(KeyboardInterrupt):
-        run_study(config, out, observers=[Interrupting(4)])
+        run_study(config, out, observers=[Interrupting(4)], report=False)
     assert not (out / "summary.json").exists()
     resumed = count(config, out)
     assert (resumed.kept, len(resumed.computed)) == (4, 13 - 4)
@@ -174,7 +175,7 @@ def test_a_changed_setting_computes_only_what_it_touches(root, out) -> None:
 def test_what_was_a_sweep_becomes_the_base_with_all_that_a_base_has(root, out, tmp_path) -> None:
     coarse = configure(root, voxel_size=0.5, sweeps={}, backends=["numpy"])
     assert len(count(coarse, out).computed) == 2  # now with its voxels and in image space
-    run_study(coarse, tmp_path / "fresh")
+    run_study(coarse, tmp_path / "fresh", report=False)
     assert summary(out) == summary(tmp_path / "fresh")
     # the voxels of the first base were overwritten: it is computed again, its sweeps are not
     assert sorted(count(configure(root), out).computed) == ["wall__a__numpy base None", "wall__b__numpy base None"]
@@ -190,7 +191,7 @@ def test_a_changed_input_computes_what_reads_it(root, out) -> None:
 
 def test_voxels_that_were_lost_or_damaged_are_computed_again_and_told(root, tmp_path, caplog) -> None:
     out, config = tmp_path / "out", configure(root, sweeps={}, backends=["numpy"])
-    run_study(config, out)
+    run_study(config, out, report=False)
     (out / "voxels/wall__a__numpy.parquet").unlink()
     (out / "voxels/wall__b__numpy.parquet").write_bytes(b"x")
     assert len(count(config, out).computed) == 2
@@ -202,7 +203,7 @@ def test_a_failing_unit_is_reported_and_the_others_finish(root, tmp_path) -> Non
     (root / "depth/0003.png").write_bytes(b"no image")  # read by the sweep of frame_count alone
     (root / "labels/b/0002.png").write_bytes(b"no image")  # among the base frames of b
     counting, out = Counting(), tmp_path / "out"
-    result = run_study(configure(root), out, observers=[counting])
+    result = run_study(configure(root), out, observers=[counting], report=False)
     assert len(counting.failed) == 1 + 6
     assert len(counting.computed) == 6
     assert {failure.unit.model for failure in result.failures} == {"a", "b"}
@@ -242,7 +243,7 @@ def test_the_result_is_read_back_from_its_folder(finished, out, tmp_path) -> Non
 
 def test_stability_in_image_space_is_that_of_the_base_frames(root, tmp_path) -> None:
     config = resolve(configure(root, frames={}, sweeps={"pixel_stride": [2]}, backends=["numpy"]))
-    result = run_study(config, tmp_path / "out")
+    result = run_study(config, tmp_path / "out", report=False)
     (task, _) = [cell.task for cell in make_plan(config).units][:2]
     frames = [read(task, i) for i in range(10)]
     truth = [read(dataclasses.replace(task, model="gt"), i) for i in range(10)]
@@ -264,25 +265,25 @@ def test_stability_in_image_space_is_that_of_the_base_frames(root, tmp_path) -> 
 
 def test_ground_truth_is_consistent_and_frames_without_it_are_in_no_clip(root, tmp_path) -> None:
     config = configure(root, frames={}, models=["gt", "a"], sweeps={}, backends=["numpy"])
-    gt, a = run_study(config, tmp_path / "out").select()
+    gt, a = run_study(config, tmp_path / "out", report=False).select()
     assert np.isnan(gt.image_space.vc8)  # nothing to compare it with
     assert gt.image_space.compensated_flicker_percent == 0
     assert a.image_space.compensated_flicker_percent > 0
     (root / "labels/gt/0005.png").unlink()
     config = configure(root, frames={}, models=["a"], sweeps={}, backends=["numpy"])
-    (a,) = run_study(config, tmp_path / "out").select()
+    (a,) = run_study(config, tmp_path / "out", report=False).select()
     assert np.isnan(a.image_space.vc8)
     assert a.image_space.self_vc8 >= 0
 
 
 def test_statistics_come_with_every_unit_and_all_of_them_where_they_are_wanted(root, tmp_path) -> None:
     config = configure(root, sweeps={"voxel_size": [0.5]}, backends=["numpy"], models=["a", "gt"])
-    before = run_study(config, tmp_path / "out").records
+    before = run_study(config, tmp_path / "out", report=False).records
     wanted = configure(root, sweeps={"voxel_size": [0.5]}, backends=["numpy"], models=["a", "gt"], statistics=True)
     assert len(count(wanted, tmp_path / "out").computed) == 4
-    result = run_study(wanted, tmp_path / "out")
+    result = run_study(wanted, tmp_path / "out", report=False)
     settings = make_plan(resolve(wanted)).units[0].config.model_copy(update={"events": True})
-    run = semstab.engine.run(settings, out=tmp_path / "run").runs[0]
+    run = semstab.run(settings, out=tmp_path / "run", report=False).runs[0]
     events = semstab.Events.load(tmp_path / "run" / "events" / f"{run.unit.slug}.parquet")
     base, gt, *swept = result.records
     assert base.statistics.agreement.psa.value == pytest.approx(psa_by_definition(events))
@@ -292,15 +293,15 @@ def test_statistics_come_with_every_unit_and_all_of_them_where_they_are_wanted(r
     assert all(record.statistics.voxel_size == 0.5 for record in swept)
     assert to_json(before[0].statistics.agreement) == to_json(base.statistics.agreement)
     assert before[0].statistics.drift.trend is before[0].statistics.correctness is None
-    again = run_study(config, tmp_path / "out").records
+    again = run_study(config, tmp_path / "out", report=False).records
     assert to_json([record.statistics for record in again]) == to_json([record.statistics for record in before])
 
 
 def test_the_base_models_are_compared_where_statistics_are_wanted(root, tmp_path) -> None:
     settings = {"sweeps": {}, "backends": ["numpy"], "models": ["a", "b", "gt"]}
-    assert run_study(configure(root, **settings), tmp_path / "plain").comparisons == ()
+    assert run_study(configure(root, **settings), tmp_path / "plain", report=False).comparisons == ()
     config = configure(root, **settings, statistics=True)
-    result = run_study(config, tmp_path / "out")
+    result = run_study(config, tmp_path / "out", report=False)
     (found,) = result.comparisons
     maps = {record.unit.model: record.table() for record in result.select()}
     truth = maps.pop("gt")
@@ -309,7 +310,7 @@ def test_the_base_models_are_compared_where_statistics_are_wanted(root, tmp_path
     expected = compare_models(maps, truth=truth, observations=cells, scene="wall")
     assert to_json(found) == to_json(expected)
     assert {row.measure for row in found.paired.differences} >= {"psa", "alpha", "accuracy"}
-    for other in (load_result(tmp_path / "out"), run_study(config, tmp_path / "out")):  # read, kept
+    for other in (load_result(tmp_path / "out"), run_study(config, tmp_path / "out", report=False)):  # read, kept
         assert to_json(other.comparisons) == to_json(result.comparisons)
         assert to_json([r.statistics for r in other.records]) == to_json([r.statistics for r in result.records])
 
@@ -322,19 +323,23 @@ def psa_by_definition(events) -> float:
 
 
 def test_units_fused_by_another_backend_are_checked_unless_they_differ_by_design(root, tmp_path) -> None:
-    result = run_study(configure(root, sweeps={}, backends=["numpy", "numba", "open3d-projective"]), tmp_path / "out")
+    result = run_study(
+        configure(root, sweeps={}, backends=["numpy", "numba", "open3d-projective"]), tmp_path / "out", report=False
+    )
     assert [row.backends for row in result.agreement] == [("numpy", "numba")] * 2
     assert all(row.agrees for row in result.agreement)
     assert [record.unit.backend for record in result.select(BACKENDS)] == ["numba"] * 2 + ["open3d-projective"] * 2
     unchecked = configure(root, sweeps={}, backends=["numpy", {"name": "numba", "check": False}])
-    assert run_study(unchecked, tmp_path / "out").agreement == ()
+    assert run_study(unchecked, tmp_path / "out", report=False).agreement == ()
     assert [run.unit.backend for run in result.runs][:3] == ["numpy", "numba", "open3d-projective"]
 
 
 def test_models_are_compared_in_the_shared_taxonomy(root, tmp_path) -> None:
     path = tmp_path / "two.yaml"
     path.write_text("classes: [wall, {name: opening, members: [door, window]}]\n")
-    result = run_study(configure(root, sweeps={}, backends=["numpy"], shared_taxonomy=str(path)), tmp_path / "out")
+    result = run_study(
+        configure(root, sweeps={}, backends=["numpy"], shared_taxonomy=str(path)), tmp_path / "out", report=False
+    )
     assert [record.summary.table.K for record in result.select("shared_taxonomy")] == [2, 2]
     assert [record.summary.taxonomy for record in result.select("shared_taxonomy")] == ["two", "two"]
     # the file's content counts, not its name
@@ -369,7 +374,7 @@ def test_a_scene_can_have_frames_of_its_own(tmp_path) -> None:
 ])  # fmt: skip
 def test_what_does_not_fit_together_is_refused_before_anything_is_read(root, tmp_path, settings, message) -> None:
     with pytest.raises((ConfigError, DataError), match=message):
-        run_study(configure(root, **settings), tmp_path / "out")
+        run_study(configure(root, **settings), tmp_path / "out", report=False)
     assert not (tmp_path / "out").exists()
 
 
@@ -383,7 +388,7 @@ def test_a_worker_that_does_not_see_the_folder_sends_the_voxels_back_and_a_job_f
     folder.save(outcome)
     folder.close()
     counting = Counting()
-    result = run_study(config, tmp_path / "out", observers=[counting])
+    result = run_study(config, tmp_path / "out", observers=[counting], report=False)
     assert counting.kept == 1
     assert summarise(result.select()[0].table()) == result.select()[0].summary.table
     config = resolve(configure(root, sweeps={"voxel_size": [0.5]}, backends=["numpy"], models=["a"]))

@@ -15,7 +15,7 @@ import yaml
 from command_line import bench, started
 from test_study_executors import children, gone, wait_until
 
-from semstab.engine import run_study
+from semstab.api import run_study
 
 
 @pytest.fixture
@@ -57,9 +57,9 @@ def test_a_study_interrupted_and_killed_at_random_moments_ends_with_the_same_sum
     assert workers
     wait_until(lambda: all(map(gone, workers)))
     kept, counting = units(out), tiny_study.Counting()
-    run_study(tiny_study.configure(root, backends=["numpy"]), out, observers=[counting])
+    run_study(tiny_study.configure(root, backends=["numpy"]), out, observers=[counting], report=False)
     assert counting.kept == kept > 0
-    run_study(tiny_study.configure(root, backends=["numpy"]), tmp_path / "whole")
+    run_study(tiny_study.configure(root, backends=["numpy"]), tmp_path / "whole", report=False)
     assert tiny_study.summary(out) == tiny_study.summary(tmp_path / "whole")
     assert not list(out.rglob(".*"))  # not even what was half-written when it was killed
 

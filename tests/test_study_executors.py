@@ -14,7 +14,8 @@ import pytest
 import tiny_study
 from tiny_study import Counting, summary
 
-from semstab.engine import DaskCluster, LocalProcesses, run_study
+from semstab.api import run_study
+from semstab.engine import DaskCluster, LocalProcesses
 from semstab.engine.messages import Start, Work
 from semstab.engine.observer import Observers
 from semstab.engine.units import make_plan
@@ -38,7 +39,7 @@ def config(root):
 def expected(config, tmp_path_factory):
     """The numbers of the study in this process."""
     out = tmp_path_factory.mktemp("expected")
-    run_study(config, out)
+    run_study(config, out, report=False)
     return summary(out)
 
 
@@ -80,14 +81,14 @@ class Killing(Counting):
 
 def test_local_processes_give_the_same_numbers_though_one_is_killed(config, tmp_path, expected) -> None:
     killing = Killing(lambda: min(children()))
-    result = run_study(config, tmp_path / "out", executor=LocalProcesses(2), observers=[killing])
+    result = run_study(config, tmp_path / "out", executor=LocalProcesses(2), observers=[killing], report=False)
     assert result.failures == ()
     assert summary(tmp_path / "out") == expected
     assert result.manifest["units"]["executor"] == "2 local processes"
     assert len(killing.computed) == killing.units
     assert children() == set()
     again = Counting()
-    run_study(config, tmp_path / "out", executor=LocalProcesses(2), observers=[again])
+    run_study(config, tmp_path / "out", executor=LocalProcesses(2), observers=[again], report=False)
     assert again.computed == []
 
 
@@ -189,7 +190,7 @@ def test_a_dask_cluster_gives_the_same_numbers_though_a_worker_is_killed(
     """Without its scheduler, which is killed as well then, it says in one line that jobs are left."""
     address, scheduler, workers = cluster
     killing = Killing(lambda: workers[0].pid)
-    result = run_study(config, tmp_path / "out", executor=DaskCluster(address), observers=[killing])
+    result = run_study(config, tmp_path / "out", executor=DaskCluster(address), observers=[killing], report=False)
     assert workers[0].wait(10) == -signal.SIGKILL
     assert result.failures == ()
     assert summary(tmp_path / "out") == expected

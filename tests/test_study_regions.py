@@ -11,7 +11,8 @@ import pytest
 import tiny_study
 from tiny_study import Counting, configure, summary
 
-from semstab.engine import load_result, run_study
+from semstab.api import run_study
+from semstab.engine import load_result
 from semstab.errors import ConfigError
 from semstab.metrics import matched_region_flicker
 
@@ -35,7 +36,7 @@ def regions() -> list[np.ndarray]:
 
 def test_regions_are_matched_by_where_they_are(root, tmp_path) -> None:
     config = configure(root, frames={}, region_maps=["regions"], sweeps={}, backends=["numpy"])
-    result = run_study(config, tmp_path / "out")
+    result = run_study(config, tmp_path / "out", report=False)
     (found,) = result.regions
     pairs = [matched_region_flicker(*pair).flicker_percent for pair in itertools.pairwise(regions())]
     assert (found.scene, found.model) == ("wall", "regions")
@@ -49,33 +50,37 @@ def test_regions_are_matched_by_where_they_are(root, tmp_path) -> None:
 
 def test_they_are_kept_and_computed_again_like_units(root, tmp_path) -> None:
     config = configure(root, frames={}, region_maps=["regions"], sweeps={"voxel_size": [0.5]}, backends=["numpy"])
-    run_study(config, tmp_path / "out")
+    run_study(config, tmp_path / "out", report=False)
     again = Counting()
-    run_study(config, tmp_path / "out", observers=[again])
+    run_study(config, tmp_path / "out", observers=[again], report=False)
     assert (again.units, again.kept) == (3, 3)
     cv2.imwrite(str(root / "labels/regions/0001.png"), np.full((6, 8), 7, np.uint16))
     changed = Counting()
-    result = run_study(config, tmp_path / "out", observers=[changed])
+    result = run_study(config, tmp_path / "out", observers=[changed], report=False)
     assert changed.computed == ["wall__regions__none region_maps None"]
-    run_study(config, tmp_path / "fresh")
+    run_study(config, tmp_path / "fresh", report=False)
     assert summary(tmp_path / "out") == summary(tmp_path / "fresh")
     assert result.regions[0].compensated_flicker_percent > 0
 
 
 def test_settings_of_the_map_do_not_touch_them(root, tmp_path) -> None:
-    run_study(configure(root, frames={}, region_maps=["regions"], sweeps={}, backends=["numpy"]), tmp_path / "out")
+    run_study(
+        configure(root, frames={}, region_maps=["regions"], sweeps={}, backends=["numpy"]),
+        tmp_path / "out",
+        report=False,
+    )
     other = configure(
         root, frames={}, region_maps=["regions"], sweeps={}, backends=["numpy"], voxel_size=0.7, strata=[1]
     )
     counting = Counting()
-    run_study(other, tmp_path / "out", observers=[counting])
+    run_study(other, tmp_path / "out", observers=[counting], report=False)
     assert counting.computed == ["wall__a__numpy base None"]
 
 
 def test_a_source_of_regions_that_fails_is_a_failure(root, tmp_path) -> None:
     (root / "labels/regions/0002.png").write_bytes(b"no image")
     config = configure(root, frames={}, region_maps=["regions"], sweeps={}, backends=["numpy"])
-    result = run_study(config, tmp_path / "out")
+    result = run_study(config, tmp_path / "out", report=False)
     assert result.regions == ()
     assert [failure.unit.model for failure in result.failures] == ["regions"]
     assert len(result.records) == 1
@@ -83,7 +88,11 @@ def test_a_source_of_regions_that_fails_is_a_failure(root, tmp_path) -> None:
 
 def test_one_frame_has_no_flicker_and_a_source_that_is_not_there_is_refused(root, tmp_path) -> None:
     config = configure(root, frames={"count": 1}, region_maps=["regions"], sweeps={}, backends=["numpy"])
-    (found,) = run_study(config, tmp_path / "out").regions
+    (found,) = run_study(config, tmp_path / "out", report=False).regions
     assert math.isnan(found.flicker_percent)
     with pytest.raises(ConfigError, match="wall: no region map 'region'; did you mean 'regions'"):
-        run_study(configure(root, frames={}, region_maps=["region"], sweeps={}, backends=["numpy"]), tmp_path / "out")
+        run_study(
+            configure(root, frames={}, region_maps=["region"], sweeps={}, backends=["numpy"]),
+            tmp_path / "out",
+            report=False,
+        )

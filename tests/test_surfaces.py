@@ -132,8 +132,8 @@ def test_a_posed_folder_gives_the_voxels_of_its_depth_files(flight, mesh, tmp_pa
     bare = shutil.copytree(flight, tmp_path / "field")
     shutil.rmtree(bare / "depth")
     dataset = dataset_of(bare, surface=str(mesh), casts=str(tmp_path / "casts"))
-    result = semstab.engine.run(configure(bare, dataset=dataset), out=tmp_path / "run")
-    stored = semstab.engine.run(configure(flight), out=tmp_path / "stored")
+    result = semstab.run(configure(bare, dataset=dataset), out=tmp_path / "run", report=False)
+    stored = semstab.run(configure(flight), out=tmp_path / "stored", report=False)
     ours, theirs = (one.records[0].table() for one in (result, stored))
     assert (len(ours), ours.pixels.sum()) == (len(theirs), theirs.pixels.sum())
     assert result.manifest["depth_from"] == {"field": f"rays cast at {mesh}"}
@@ -151,7 +151,7 @@ def test_intrinsics_are_those_of_the_depth_files_that_a_surface_stands_for(fligh
 def test_a_run_is_kept_while_its_surface_is_the_same(flight, mesh, tmp_path) -> None:
     def units(surface):
         dataset = dataset_of(flight, surface=str(surface), casts=False)
-        return semstab.engine.run(configure(flight, dataset=dataset), out=tmp_path / "run").manifest["units"]
+        return semstab.run(configure(flight, dataset=dataset), out=tmp_path / "run", report=False).manifest["units"]
 
     assert units(mesh)["computed"] == 1
     assert units(shutil.copy(mesh, tmp_path / "same.ply"))["computed"] == 0
@@ -255,7 +255,7 @@ def test_a_surface_in_other_coordinates_than_the_poses_says_how_far_off(flight, 
     dataset = open_dataset("posed_folder", {"root": flight, "surface": path, "casts": False})
     fails(DataError, match, dataset.scene("field").geometry, 1)
     config = configure(flight, dataset=dataset_of(flight, surface=str(path), casts=False))
-    fails(DataError, match, semstab.engine.run, config)
+    fails(DataError, match, semstab.run, config)
     fails(DataError, match, list, check(config))
 
 

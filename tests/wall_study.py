@@ -10,9 +10,9 @@ import numpy as np
 from posed_config import configure
 from posed_writer import write_posed
 
+from semstab.api import run_study
 from semstab.data.frames import Frame, Intrinsics
 from semstab.data.records import Result
-from semstab.engine import run_study
 from semstab.report.figures import write_figures
 
 WIDTH, HEIGHT, FOCAL, FRAMES = 96, 64, 64.0, 9
@@ -60,7 +60,7 @@ def wall_study(base: Path) -> tuple[Result, Path]:
         check=None,
     )
     folder = base / "wall study"
-    result = run_study(config, folder)
+    result = run_study(config, folder, report=False)
     assert not result.failures
     records = tuple(
         dataclasses.replace(record, summary=dataclasses.replace(record.summary, fuse_ms_per_frame=12.5))

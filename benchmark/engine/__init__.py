@@ -6,16 +6,16 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from semstab.engine.execution import run, run_study
+    from semstab.engine.execution import execute
     from semstab.engine.executors import DaskCluster, Executor, InProcess, LocalProcesses
     from semstab.engine.folder import load_result
     from semstab.engine.observer import Observer
 
-__all__ = ["DaskCluster", "Executor", "InProcess", "LocalProcesses", "Observer", "load_result", "run", "run_study"]
+__all__ = ["DaskCluster", "Executor", "InProcess", "LocalProcesses", "Observer", "execute", "load_result"]
 
 _HOMES = {
     "DaskCluster": "executors", "Executor": "executors", "InProcess": "executors", "LocalProcesses": "executors",
-    "Observer": "observer", "load_result": "folder", "run": "execution", "run_study": "execution",
+    "Observer": "observer", "execute": "execution", "load_result": "folder",
 }  # fmt: skip
 
 

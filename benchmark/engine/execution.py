@@ -6,7 +6,6 @@ import contextlib
 import dataclasses
 import itertools
 import logging
-import tempfile
 import time
 from collections import deque
 from collections.abc import Mapping, Sequence
@@ -31,67 +30,34 @@ from semstab.settings import resolve
 logger = logging.getLogger("semstab")
 
 
-def run(
+def execute(
     config: Config,
-    *,
-    out: str | Path | None = None,
+    out: Path,
     executor: Executor | None = None,
     observers: Sequence[Observer] = (),
     command: Sequence[str] = (),
-) -> Result:
-    """Fuse, measure and compare what the configuration selects; as `run_study`, but a failing unit is an error.
-
-    Without a folder `out` the result has summaries, but no voxels.
-
-    Raises:
-        ConfigError, DataError: If the plan cannot be made, or a unit failed, once everything else has been written.
-    """
-    with contextlib.ExitStack() as stack:
-        folder = Path(stack.enter_context(tempfile.TemporaryDirectory()) if out is None else out)
-        result, causes = _execute(config, folder, executor or InProcess(), observers, command)
-    if result.failures:
-        first = result.failures[0]
-        raise causes.get(first.message) or DataError(first.message)
-    if out is None:
-        records = tuple(dataclasses.replace(record, voxels_file=None, truth_file=None) for record in result.records)
-        return dataclasses.replace(result, records=records)
-    return result
-
-
-def run_study(
-    config: Config,
-    out: str | Path,
-    *,
-    executor: Executor | None = None,
-    observers: Sequence[Observer] = (),
-    command: Sequence[str] = (),
-) -> Result:
+) -> tuple[Result, Mapping[str, BaseException]]:
     """Compute the units that the folder `out` does not hold yet, and return the result of all.
 
-    Each unit is stored when it is finished, under a key of its settings and its input: a killed study is resumed by the
+    Each unit is stored when it is finished, under a key of its settings and its input: a killed run is resumed by the
     same command, and a changed setting computes again only the units that it touches. `command` goes into the manifest.
+    A unit that fails is among the result's failures, and the others finish.
 
-    A unit that fails later is among the result's failures, and the others finish.
+    Returns:
+        The result, and the exceptions of failing units in this process, by message.
 
     Raises:
         ConfigError, DataError: If the plan does not fit together, or a scene's depth and poses contradict each other,
             before anything is computed.
     """
-    return _execute(config, Path(out), executor or InProcess(), observers, command)[0]
-
-
-def _execute(
-    config: Config, out: Path, executor: Executor, observing: Sequence[Observer], command: Sequence[str]
-) -> tuple[Result, Mapping[str, BaseException]]:
-    """Return the result, and the exceptions of failing units in this process, by message."""
-    started, observers = time.perf_counter(), Observers(observing)
+    started, telling, executor = time.perf_counter(), Observers(observers), executor or InProcess()
     config = resolve(config)
     config, advice = with_voxel_size(config)
     plan = make_plan(config)
     require_file_names(out, (each.unit for each in plan.units))
     folder = Folder(out, config)
     try:
-        execution = _Execution(plan, folder, executor, observers)
+        execution = _Execution(plan, folder, executor, telling)
         with folder.started(config) as start, share_open_scenes(start.name, plan.scenes):
             execution.compute(start)
         units = execution.units
@@ -100,11 +66,11 @@ def _execute(
         units.watch.seconds["all"] = time.perf_counter() - started
         result = dataclasses.replace(result, manifest=manifest(plan, units, executor.name, command))
         folder.save_result(result)
-        observers.tell(lambda observer: observer.run_finished(result))
+        telling.tell(lambda observer: observer.run_finished(result))
     finally:
         folder.close()
         executor.close()
-    observers.raise_first()
+    telling.raise_first()
     return result, units.causes
 
 

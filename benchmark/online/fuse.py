@@ -10,10 +10,10 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
+from semstab.api import run
 from semstab.data.frames import Frame
 from semstab.data.records import Result
 from semstab.engine import Observer
-from semstab.engine.execution import run
 from semstab.errors import ConfigError
 from semstab.online.frames import Frames, OwnFolder, Sequence
 from semstab.online.summary import Summary
@@ -94,5 +94,5 @@ def fuse(
             from semstab.recording import Recording, Target
 
             watching.append(stack.enter_context(contextlib.closing(Recording(Target.parse(str(recording), Path())))))
-        result = run(config, out=folder.path, observers=watching)
+        result = run(config, out=folder.path, observers=watching, report=False)
     return FusedResult(**{name: getattr(result, name) for name in vars(result)}, _folder=folder)

@@ -42,13 +42,13 @@ def test_a_map_that_outgrows_the_memory_is_given_up_in_one_line(growing, tmp_pat
     """Though its first frame promised little; what was finished before is kept."""
     settings = {"backends": ["numba"], "check": None, "voxel_size": 0.0125, "check_geometry": False}
     small = configure(growing, models=["a"], frames={"stop": 2}, **settings)
-    semstab.engine.run(small, out=tmp_path / "out")
+    semstab.run(small, out=tmp_path / "out", report=False)
     large = configure(growing, memory_gb=0.012, tile_size="off", **settings)
     with pytest.raises(ConfigError, match=r"wall, a, numba: after \d of 6 frames the map has .* million voxels"):
-        semstab.engine.run(large, out=tmp_path / "out")
-    again = semstab.engine.run(small, out=tmp_path / "out")
+        semstab.run(large, out=tmp_path / "out", report=False)
+    again = semstab.run(small, out=tmp_path / "out", report=False)
     assert again.manifest["units"]["kept"] == 1
-    assert len(semstab.engine.run(large.model_copy(update={"memory_gb": 2.0})).records) == 2
+    assert len(semstab.run(large.model_copy(update={"memory_gb": 2.0}), report=False).records) == 2
 
 
 def group(folder, limit: str, used: int, cache: int, version: int) -> None:

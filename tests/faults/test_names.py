@@ -56,11 +56,11 @@ def test_every_hostile_name_gets_results_of_its_own(tmp_path) -> None:
     for name in HORRORS:
         shutil.copytree(tmp_path / "scenes" / "plain", tmp_path / "scenes" / name)
     config = configure(tmp_path / "scenes", models=["z", "y__z"], check=None, voxel_size=1.0)
-    result = semstab.engine.run(config, out=tmp_path / "out")
+    result = semstab.run(config, out=tmp_path / "out", report=False)
     files = [record.voxels_file for record in result.records]
     assert len(set(files)) == len(files) == 2 * (len(HORRORS) + 1)
     assert all(file.parent == tmp_path / "out" / "voxels" and file.is_file() for file in files)
-    again = semstab.engine.run(config, out=tmp_path / "out")
+    again = semstab.run(config, out=tmp_path / "out", report=False)
     assert again.manifest["units"]["kept"] == len(files)
 
 

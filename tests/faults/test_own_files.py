@@ -37,7 +37,7 @@ def folder(tmp_path_factory) -> Path:
     """OUT/run, OUT/converted, OUT/labels/net: a run with two backends, a conversion, predictions."""
     out = tmp_path_factory.mktemp("own")
     config = configure(tiny_scene.write(out / "wall"), backends=["numpy", "numba"], check=None)
-    semstab.engine.run(config, out=out / "run")
+    semstab.run(config, out=out / "run", report=False)
     list(convert(config, out / "converted"))
     predicted(out).close()
     return out

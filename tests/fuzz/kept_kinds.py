@@ -41,7 +41,7 @@ def of_kept(folder: Path) -> Iterator[Kind]:
     wall = tiny_scene.write(folder / "wall")
     config = configure(wall, check=None, tile_size=8)
     tiled = folder / "tiled"
-    semstab.engine.run(config, out=tiled, observers=[Recording(tiled / "recording.rrd")])
+    semstab.run(config, out=tiled, observers=[Recording(tiled / "recording.rrd")], report=False)
     tile = min(tiled.glob("voxels/*/*.parquet"))
     yield Kind("tile of a map", (tile,), lambda file: VoxelTable.load(file.parent))
     task = make_plan(config).tasks[0]
