@@ -20,7 +20,7 @@ def test_the_topmost_voxel_of_a_column_is_seen_and_north_is_up():
     vss = np.array([0.0, 1.0, np.nan, 0.0])
     assert cells(from_above(index, vss, (0, 0, 1)), 2, 3) == [[NOWHERE, NOWHERE, DARK], [BRIGHT, ONCE, NOWHERE]]
     below = cells(from_above(index, vss, (0, 0, -1)), 2, 3)
-    assert below[1][0] == DARK
+    assert below[0][0] == DARK  # a map seen from below is mirrored
     assert cells(from_above(index, vss), 6, 3)[0] == [BRIGHT, NOWHERE, NOWHERE]  # along its shortest side, y
 
 

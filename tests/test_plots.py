@@ -19,10 +19,11 @@ from wall_study import MODELS, drawn_walls, wall_study
 from semstab import backends
 from semstab.data.labels import palette
 from semstab.data.measures import SBD_MAX, VSS, measures
+from semstab.data.topdown import EMPTY, level_axes, top_down
 from semstab.data.voxels import VoxelTable
 from semstab.errors import DataError
 from semstab.metrics import CATEGORY_COLORS, categories, dominant, op, sbd, vss
-from semstab.report.figures import figures, topdown
+from semstab.report.figures import figures
 from semstab.report.figures.distributions import (
     BINS,
     OP_BOUNDS,
@@ -36,7 +37,7 @@ from semstab.report.figures.distributions import (
 )
 from semstab.report.figures.maps import Overview, draw_overview, draw_stability, scale_length
 from semstab.report.figures.style import COLUMN, DPI, PAGE, legend_columns
-from semstab.report.figures.topdown import EMPTY, FromAbove, level_axes, top_down
+from semstab.report.figures.topdown import FromAbove
 from semstab.report.means import ENOUGH, describe, levels
 from semstab.testing import SEQUENCES, as_frames, checks
 
@@ -47,6 +48,10 @@ PALETTE = np.array([[200, 0, 0], [0, 200, 0], [0, 0, 200]], dtype=np.uint8)
 @pytest.fixture(scope="module")
 def walls(tmp_path_factory):
     return wall_study(tmp_path_factory.getbasetemp())[0]
+
+
+def of_table(table, up):
+    return top_down(table.centers, table.voxel_size, up)
 
 
 def at(index, r=1.0, **columns):
@@ -147,7 +152,7 @@ AXES = {
 @given(st.sets(st.tuples(*[st.integers(-3, 3)] * 3), min_size=1, max_size=40))
 def test_the_topmost_voxel_of_each_column(up, index):
     table = at(list(index))
-    image, cell = top_down(table, up)
+    image, cell = of_table(table, up)
     tops = {}
     for row, i in enumerate(table.index):
         ahead, right, height = (int(x) for x in AXES[up](i))
@@ -166,22 +171,20 @@ def test_a_tilted_floor_has_no_holes(up):
     right, ahead, above = level_axes(up)
     a, b = np.meshgrid(np.arange(-6, 6, 0.05), np.arange(-4, 4, 0.05))
     points = a[..., None] * right + b[..., None] * ahead + 0.5 * above
-    image, _ = top_down(at(np.unique(np.floor(points.reshape(-1, 3) / 0.2).astype(int), axis=0), r=0.2), up)
+    image, _ = of_table(at(np.unique(np.floor(points.reshape(-1, 3) / 0.2).astype(int), axis=0), r=0.2), up)
     inside = image[3:-3, 3:-3]
     assert inside.shape[0] > 30
     assert (inside != EMPTY).all()
 
 
-def test_large_maps_have_large_cells_and_lone_voxels_far_away_are_cut_off(monkeypatch):
-    monkeypatch.setattr(topdown, "LARGEST", 10)
+def test_large_maps_have_large_cells_and_lone_voxels_far_away_are_cut_off():
     table = at([(x, 0, x % 7) for x in range(40)])
-    image, cell = top_down(table, (0, 0, 1))
+    image, cell = top_down(table.centers, 1.0, (0, 0, 1), largest=10)
     assert cell == 4.0
     assert image.shape == (1, 10)
     assert [table.iz[row] for row in image[0][:3]] == [3, 6, 4]
-    monkeypatch.undo()
     plate = [(x, y, 0) for x in range(40) for y in range(40)]
-    image, _ = top_down(at([*plate, (10_000, 0, 0), (0, -10_000, 0)]), (0, 0, 1))
+    image, _ = of_table(at([*plate, (10_000, 0, 0), (0, -10_000, 0)]), (0, 0, 1))
     assert image.shape == (40, 40)
 
 

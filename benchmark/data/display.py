@@ -9,6 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from semstab.core.types import Float64, Int32, UInt8
+from semstab.data.topdown import EMPTY, top_down
 
 WIDTH = 360
 """Pixels of a picture's longer side, about."""
@@ -27,19 +28,14 @@ def from_above(index: Int32, vss: Float64, up: npt.ArrayLike | None = None) -> U
     """
     import cv2
 
-    height = int(np.argmin(np.ptp(index, axis=0))) if up is None else int(np.argmax(np.abs(np.asarray(up, float))))
-    right, ahead = (axis for axis in range(3) if axis != height)
-    rank = index[:, height] if up is None or np.asarray(up)[height] > 0 else -index[:, height]
-    low, high = index.min(axis=0), index.max(axis=0)
-    cell = max(1, -(-int((high - low)[[right, ahead]].max() + 1) // WIDTH))
-    column, row = ((index[:, axis] - low[axis]) // cell for axis in (right, ahead))
+    shortest = np.diag([1.0, -1.0, 1.0])[int(np.argmin(np.ptp(index, axis=0)))]  # so that z is up before a wall
+    away = shortest if up is None else np.asarray(up, dtype=np.float64)
+    rows, _ = top_down(index.astype(np.float64) + 0.5, 1.0, away, largest=WIDTH)
     colors = cv2.applyColorMap(np.nan_to_num(255 * vss).astype(np.uint8)[:, None], cv2.COLORMAP_VIRIDIS)[:, 0, ::-1]
     colors = np.where(np.isnan(vss)[:, None], np.array(ONCE, np.uint8), colors)
-    picture = np.full((int(row.max()) + 1, int(column.max()) + 1, 3), NOWHERE, np.uint8)
-    order = np.argsort(rank, kind="stable")  # the topmost is written last
-    picture[row[order], column[order]] = colors[order]
-    scale = max(1, WIDTH // max(picture.shape))
-    return np.ascontiguousarray(picture[::-1].repeat(scale, axis=0).repeat(scale, axis=1))
+    picture = np.where((rows == EMPTY)[..., None], np.array(NOWHERE, np.uint8), colors[rows])
+    scale = max(1, WIDTH // max(rows.shape))
+    return np.ascontiguousarray(picture.repeat(scale, axis=0).repeat(scale, axis=1))
 
 
 def as_figure(picture: UInt8, caption: str) -> str:

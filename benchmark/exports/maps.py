@@ -16,10 +16,10 @@ from semstab.core.types import Float64, Int64
 from semstab.data.georeference import INSTALL
 from semstab.data.information import normalise
 from semstab.data.tiles import TileIndex
+from semstab.data.topdown import covered, level_axes
 from semstab.errors import ConfigError, MissingDependencyError
 from semstab.exports.voxels import Chosen, Column, Voxels, crs_name, together
 from semstab.metrics import CATEGORIES, categories
-from semstab.report.figures.topdown import covered, level_axes
 
 RASTER_MEASURES = ("vss", "entropy", "op")
 """The bands of measures by default."""

@@ -16,10 +16,11 @@ from semstab.data.measures import SBD, VSS, dominant
 from semstab.data.records import OVERVIEW, Failure, Record, Result
 from semstab.data.results import slug
 from semstab.data.statistics import Estimate, MapStatistics
+from semstab.data.topdown import EMPTY
 from semstab.metrics import CATEGORIES, CATEGORY_COLORS, categories, macro_mean
 from semstab.report.charts import SERIES, Line, dot_chart, line_chart
 from semstab.report.figures.maps import Overview, Views
-from semstab.report.figures.topdown import EMPTY, FromAbove
+from semstab.report.figures.topdown import FromAbove
 from semstab.report.filter_study import advice, filter_studies, of_interest
 from semstab.report.html import filled, jpeg, png, table_block
 from semstab.report.means import by_model, describe, levels, over_recurrent, pooled, swept

@@ -16,13 +16,14 @@ import numpy.typing as npt
 from semstab.core.types import Float64, Int64, Mask, UInt8
 from semstab.data.measures import dominant, measures
 from semstab.data.records import Record, Tables
+from semstab.data.topdown import EMPTY, OUTLIERS, level_axes, top_down
 from semstab.data.voxels import VoxelTable
 from semstab.datasets.formats.disk import decode_array, read_bytes
 from semstab.errors import DataError, summarize_error
 from semstab.metrics import CATEGORIES, CATEGORY_COLORS, categories
 from semstab.report.figures.distributions import Histograms, histograms, together
 from semstab.report.figures.style import COLORS, COLUMN, FAINT, INK, LETTERS, PAGE, canvas, mark_panel
-from semstab.report.figures.topdown import EMPTY, MOST, OUTLIERS, FromAbove, best_view, level_axes, top_down, topmost
+from semstab.report.figures.topdown import MOST, FromAbove, best_view, topmost
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -312,7 +313,7 @@ class Panel:
 def draw_changes(table: VoxelTable, up: npt.ArrayLike, panels: Sequence[Panel]) -> Figure:
     """Return the largest change in each column of voxels, worse in orange, better in blue."""
     axis, view = best_view(table, up)[1:]
-    seen = [top_down(table, axis, np.abs(panel.values)) for panel in panels]
+    seen = [top_down(table.centers, table.voxel_size, axis, np.abs(panel.values)) for panel in panels]
     figure, axes = map_panels(seen[0][0], len(panels))
     for own, letter, panel, (rows, cell) in zip(axes, LETTERS, panels, seen, strict=False):
         _draw(figure, own, panel, rows)

@@ -10,12 +10,9 @@ import numpy as np
 import numpy.typing as npt
 
 from semstab.core.types import Float64, Int64, Mask
+from semstab.data.topdown import EMPTY, LARGEST, OUTLIERS, level_axes, top_down
 from semstab.data.voxels import VoxelTable
 from semstab.metrics.agreement import rows_of
-
-EMPTY = -1
-LARGEST = 2000
-"""The most cells along a map's longer side; the cells of a larger map are several voxels wide."""
 
 MOST = LARGEST**2
 """The most voxels that stay in memory of a map that is read tile by tile."""
@@ -29,60 +26,6 @@ SLENDER = 2.0
 
 SPARSE = 16
 """The number of columns per voxel from which on sorting finds the columns that have voxels."""
-
-OUTLIERS = 0.01
-"""The share of the voxels that may lie outside of the map at each of its four sides, so that lone voxels far away do
-not shrink it."""
-
-
-def level_axes(up: npt.ArrayLike) -> tuple[Float64, Float64, Float64]:
-    """Return right-handed unit vectors (right, ahead, up).
-
-    Right is the world's x axis, or y where up is x, laid level.
-    """
-    up_axis = np.asarray(up, dtype=np.float64) / np.linalg.norm(up)
-    along = np.eye(3)[0 if abs(up_axis[0]) < 0.9 else 1]
-    right = along - (along @ up_axis) * up_axis
-    right /= np.linalg.norm(right)
-    return right, np.cross(up_axis, right), up_axis
-
-
-def top_down(table: VoxelTable, up: npt.ArrayLike, rank: Float64 | None = None) -> tuple[Int64, float]:
-    """Return the row of the topmost voxel in each cell (H, W), or EMPTY, and the edge of a cell in metres.
-
-    The voxel of a cell that is shown has the highest rank (n,), instead of being the topmost one, where rank is given.
-
-    The first row of cells is the farthest ahead. Where up is an axis of the world a cell is a column of voxels; else
-    each voxel covers the cells that a level square of its size touches.
-    """
-    right, ahead, up_axis = level_axes(up)
-    centers = table.centers
-    plane = np.stack([centers @ ahead, centers @ right], axis=1)
-    low, high = np.quantile(plane, [OUTLIERS, 1 - OUTLIERS], axis=0)
-    factor = max(1, int(np.ceil((high - low).max() / table.voxel_size / LARGEST)))
-    cell = factor * table.voxel_size
-    cells, rows = covered(plane, up_axis, table.voxel_size, cell)
-    first, last = (np.floor(edge / cell).astype(np.int64) for edge in (low, high))
-    inside = ((cells >= first) & (cells <= last)).all(axis=1)
-    cells, rows = cells[inside] - first, rows[inside]
-    height = centers @ up_axis if rank is None else rank
-    order = np.argsort(height[rows], kind="stable")  # the topmost is written last
-    image = np.full(last - first + 1, EMPTY, dtype=np.int64)
-    image[tuple(cells[order].T)] = rows[order]
-    return image[::-1], cell
-
-
-def covered(plane: Float64, up: Float64, voxel_size: float, cell: float) -> tuple[Int64, Int64]:
-    """Return the cells (m, 2) of an edge, and the voxel (m,) that covers each, by centres (n, 2) in the plane.
-
-    Where up is an axis of the world a cell is a column of voxels; else each voxel covers the cells that a level square
-    of its size touches, where a cell is one voxel.
-    """
-    aligned = np.isclose(np.abs(up).max(), 1.0)
-    reach = 0.0 if aligned or cell > voxel_size else 0.499 * voxel_size
-    corners = [(0.0, 0.0)] if reach == 0.0 else [(a, b) for a in (-reach, reach) for b in (-reach, reach)]
-    cells = np.concatenate([np.floor((plane + corner) / cell).astype(np.int64) for corner in corners])
-    return cells, np.tile(np.arange(len(plane)), len(corners))
 
 
 def topmost(tiles: Iterable[VoxelTable], up: npt.ArrayLike) -> VoxelTable:
@@ -167,7 +110,7 @@ class FromAbove:
     def of(cls, table: VoxelTable, up: npt.ArrayLike) -> FromAbove:
         """Return the voxels of a map that are seen; see `best_view` and `top_down`."""
         selected, axis, view = best_view(table, up)
-        rows, cell = top_down(rows_of(table, selected), axis)
+        rows, cell = top_down(rows_of(table, selected).centers, table.voxel_size, axis)
         rows = np.where(rows == EMPTY, EMPTY, np.flatnonzero(selected)[rows])
         shown = np.zeros(len(table), dtype=np.bool_)
         shown[rows[rows != EMPTY]] = True
