@@ -45,7 +45,7 @@ SBD_END = 0.25
 UNKNOWN = 255
 """The code of a value that is not defined; as a category, the code of a cell without a voxel."""
 
-KINDS = {"stable": "good", "usable": "part", "undecided": "open", "no verdict": "open"}
+KINDS = {"stable": "good", "usable": "part", "undecided": "open", "uninformative": "open", "no verdict": "open"}
 """The styles of verdicts; all other verdicts have the style bad."""
 
 
@@ -70,9 +70,10 @@ def render(
         subtitle=_subtitle(result),
         models=_legend(result.models),
         cards=[_card(name, records) for name, records in by_model(result.select()).items()],
+        answers=[relations(text) for text in answers(result)],
         advice=[sentence for each in filter_studies(everything) for sentence in advice(each)],
         warnings=[relations(text) for text in warnings(result)],
-        notes=[relations(text) for text in (*answers(result), *notes(result))],
+        notes=[relations(text) for text in notes(result)],
         scenes=shown,
         maps=_script([unit for scene in shown for unit in scene["maps"]]),
         layers=_script({"categories": CATEGORIES, "colors": CATEGORY_COLORS, "sbd": SBD_END}),
