@@ -25,7 +25,7 @@ from semstab.report.filter_study import advice, filter_studies, of_interest
 from semstab.report.html import filled, jpeg, png, table_block
 from semstab.report.means import by_model, describe, levels, over_recurrent, pooled, swept
 from semstab.report.narrative import notes, warnings
-from semstab.report.ranking import answers
+from semstab.report.ranking import answers, stated
 from semstab.report.saved_run import read_series
 from semstab.report.tables import tables
 from semstab.report.tables.table import relations
@@ -115,9 +115,8 @@ def _scene_verdict(record: Record) -> dict[str, str]:
     statistics = record.statistics
     if statistics is None:
         return {"scene": record.unit.scene, "level": "not assessed", "kind": "open", "probability": ""}
-    level, probability = statistics.verdict.level, statistics.verdict.probability
-    text = "" if math.isnan(probability) else f"{100 * probability:.0f} %"
-    return {"scene": record.unit.scene, "level": level, "kind": KINDS.get(level, "bad"), "probability": text}
+    level, p = statistics.verdict.level, stated(statistics.verdict)
+    return {"scene": record.unit.scene, "level": level, "kind": KINDS.get(level, "bad"), "probability": p}
 
 
 def _numbers(

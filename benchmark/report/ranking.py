@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from semstab.data.records import Record, Result
+from semstab.data.statistics import StabilityVerdict
 from semstab.datasets import GROUND_TRUTH
 from semstab.metrics import macro_mean
 from semstab.report.means import by_model
@@ -113,6 +114,12 @@ def answers(result: Result) -> Iterator[str]:
 def short(value: float, sign: str = "") -> str:
     """Return a number from -1 to 1 without the 0 before its point: '.55', '-.19', '1.00'; '-' where it is undefined."""
     return "-" if math.isnan(value) else re.sub(r"^([+-]?)0\.", r"\1.", f"{value:{sign}.2f}")
+
+
+def stated(verdict: StabilityVerdict) -> str:
+    """Return the probability of a level: 'p .51', 'p>.99', which no share of a map can be taken for; '' without one."""
+    p = verdict.probability
+    return "" if math.isnan(p) else "p>.99" if p >= 0.995 else f"p {short(p)}"
 
 
 def _is_uninformative(record: Record) -> bool:

@@ -16,14 +16,14 @@ from semstab.config import BASE
 from semstab.data.measures import measures
 from semstab.data.records import Failure, Record, Result, UnitContent
 from semstab.data.results import Agreement, UnitSummary
-from semstab.data.statistics import Estimate, StabilityVerdict
+from semstab.data.statistics import Estimate
 from semstab.engine.executors import InProcess
 from semstab.engine.observer import Observer
 from semstab.engine.units import Plan
 from semstab.metrics import CATEGORIES, macro_mean
 from semstab.report.filter_study import advice, filter_studies
 from semstab.report.narrative import warnings
-from semstab.report.ranking import answers, short
+from semstab.report.ranking import answers, short, stated
 from semstab.report.tables import tables
 from semstab.report.tables.table import to_terminal
 from semstab.statistics.verdict import LIMITS
@@ -108,7 +108,8 @@ def _geometry(result: Result) -> str:
     states = [state for state in scenes.values() if isinstance(state, Mapping)] if isinstance(scenes, Mapping) else []
     if not states:
         return ""
-    errors = [float(error) for state in states if isinstance(error := state.get("error"), float)]
+    known = (state.get("error") for state in states)
+    errors = [error for error in known if isinstance(error, float) and math.isfinite(error)]
     if all(state.get("state") == "sound" for state in states):
         return f"geometry ok ({100 * max(errors):.2g} %)" if errors else "geometry ok"
     return "geometry unclear: semstab-bench check"
@@ -122,7 +123,7 @@ def _verdict(run: UnitSummary) -> Iterator[str]:
     if statistics.verdict.level == "no verdict":
         yield from textwrap.wrap(statistics.verdict.line, WIDTH, initial_indent="  ", subsequent_indent="    ")
         return
-    yield f"  {level}{_probability(statistics.verdict)}    alpha {short(alpha.value)}{_interval(alpha)}"
+    yield f"  {level} {stated(statistics.verdict)}".rstrip() + f"    alpha {short(alpha.value)}{_interval(alpha)}"
     if statistics.verdict.level == "uninformative" and statistics.cells is not None:
         share, name = _percent(statistics.cells.largest_share), statistics.cells.largest_class
         yield f"  {share} of the observations are {name}: agreement does not assess such a map"
@@ -134,10 +135,6 @@ def _verdict(run: UnitSummary) -> Iterator[str]:
     if not math.isnan(wrong.value):
         yield f"  {_percent(wrong.value)}{_interval(wrong, 100)} of the consistent locations are wrong"
     yield ""
-
-
-def _probability(verdict: StabilityVerdict) -> str:
-    return "" if math.isnan(verdict.probability) else f" {_percent(verdict.probability)}"
 
 
 def _flicker(record: Record) -> Iterator[str]:
@@ -204,7 +201,7 @@ def _cells(record: Record) -> list[str]:
     run, statistics = record.summary, record.summary.statistics
     level, alpha, agree = "-", "", math.nan
     if statistics is not None:
-        level = f"{statistics.verdict.level}{_probability(statistics.verdict)}"
+        level = f"{statistics.verdict.level} {stated(statistics.verdict)}".rstrip()
         agree, own = 100 * statistics.headline.psa.value, statistics.headline.alpha
         ends = "" if math.isnan(own.low) else f" ({short(own.low)} to {short(own.high)})"
         alpha = f"{short(own.value)}{ends}"

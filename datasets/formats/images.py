@@ -42,6 +42,9 @@ MAX_PIXELS = 2**28
 MAX_IMAGE_BYTES = 2**29
 """Largest decoded image: RGB of 178 megapixels."""
 
+MAX_SIDE = 2**16
+"""Most pixels of a side: a few bytes of a damaged header can claim 16 x 8,388,364, which takes seconds to unpack."""
+
 Size = tuple[int, int]
 Read = Callable[[Path], bytes]
 
@@ -387,5 +390,6 @@ def _imdecode(path: Path, data: bytes, mode: str) -> npt.NDArray[Any]:
 def _check_pixels(path: Path, width: int, height: int, pixel_bytes: int = 1) -> None:
     """Check an image's size before memory is allocated for the size that a header claims."""
     most = min(MAX_PIXELS, MAX_IMAGE_BYTES // pixel_bytes)
-    if not (width > 0 and height > 0 and width * height <= most):
-        raise DataError(f"{path}: claims {width}x{height} pixels (at most {most} are read); is it damaged?")
+    if not (0 < width <= MAX_SIDE and 0 < height <= MAX_SIDE and width * height <= most):
+        limits = f"at most {most} are read, {MAX_SIDE} on a side"
+        raise DataError(f"{path}: claims {width}x{height} pixels ({limits}); is it damaged?")
