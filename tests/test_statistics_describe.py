@@ -192,7 +192,7 @@ def judged(low, high, wrong=UNKNOWN, voxels=5000, **cells):
 
 def of_class(name, low, high, *, matters=True):
     alpha = between(low, high)
-    return ClassAlpha(name, 200.0, matters, alpha, 1 - probability_above(alpha, LIMITS.usable, "agreement"))
+    return ClassAlpha(name, 200.0, matters, alpha, 1 - probability_above(alpha, LIMITS.usable, "agreement"), 0.1)
 
 
 @pytest.mark.parametrize(("low", "high", "level"), [

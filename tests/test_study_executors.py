@@ -133,7 +133,7 @@ def test_worker_processes_end_with_a_parent_that_was_killed(tmp_path) -> None:
 
 def test_a_script_without_a_main_guard_is_told_so(root, tmp_path) -> None:
     (tmp_path / "script.py").write_text(
-        "from semstab.config import Config\nfrom semstab.engine import LocalProcesses, run_study\n"
+        "from semstab import run_study\nfrom semstab.config import Config\nfrom semstab.engine import LocalProcesses\n"
         f"config = Config.build({tiny_study.content(root)!r})\n"
         "run_study(config, 'out', executor=LocalProcesses(1))\n"
     )

@@ -142,6 +142,7 @@ class ClassAlpha:
         counts_for_verdict: Whether the verdict depends on it.
         alpha: Alpha with its interval.
         unstable: Probability that alpha is below the level 'usable'; NaN where that is not known.
+        disagreement: Its share of the disagreement between views: of two labels that differ, each class has one half.
     """
 
     name: str
@@ -149,6 +150,7 @@ class ClassAlpha:
     counts_for_verdict: bool
     alpha: Interval
     unstable: float
+    disagreement: float
 
 
 @dataclass(frozen=True)

@@ -34,7 +34,7 @@ RARE = 100
 """The least number of voxels of a class that is listed; a rarer class is not called unstable."""
 
 MOST_CLASSES = {1: 5, 2: 3}
-"""The number of least stable classes that are listed for each model, by the number of rows above; else 1."""
+"""The number of classes that are listed for each model, by the number of rows above; else 1."""
 
 MOST_WARNINGS = 3
 STAGE_NAMES = {"read": "reading", "reference": "check", "voxel sizes": "other voxel sizes", "write": "writing"}
@@ -53,7 +53,7 @@ def print_summary(
 def screen(result: Result, *, out: Path | None = None, seconds: float | None = None) -> Iterator[str]:
     """Yield the lines of a run or a study.
 
-    They are verdicts, least stable classes, warnings, the check, the time and the files to open.
+    They are verdicts, the classes that disagree most, warnings, the check, the time and the files to open.
     """
     records = result.select()
     if len(records) == 1:
@@ -226,34 +226,36 @@ def _number(value: float, digits: int) -> str:
 
 
 def _classes(records: Sequence[Record]) -> Iterator[str]:
-    """Yield the classes on which frames agree least, among those that cover enough of the map."""
+    """Yield the classes that disagree most, among those that cover enough of the map."""
     names = list(dict.fromkeys(record.unit.model for record in records))
     most, alone = MOST_CLASSES.get(len(records), 1), len(names) == 1
     lines = []
     for name in names:
-        alphas = class_alphas([record for record in records if record.unit.model == name])
-        shares = _class_shares([record for record in records if record.unit.model == name])
-        others = {k: v for r in records if r.unit.model == name for k, v in r.summary.table.confused_with.items()}
-        common = [key for key, (voxels, _) in shares.items() if voxels >= RARE and key in alphas]
-        for key in sorted(common, key=alphas.__getitem__)[:most]:
-            label, taken = key if alone else f"{name}: {key}", others.get(key, "")
+        own = [record for record in records if record.unit.model == name]
+        classes, shares = class_means(own), _class_shares(own)
+        others = {k: v for record in own for k, v in record.summary.table.confused_with.items()}
+        common = [key for key, (voxels, _) in shares.items() if voxels >= RARE and key in classes]
+        for key in sorted(common, key=lambda key: -classes[key][1])[:most]:
+            label, (alpha, disagreement) = key if alone else f"{name}: {key}", classes[key]
             lines.append(
-                f"    {label[:26]:<26}{short(alphas[key]):>6}   {taken[:24]:<24}{100 * shares[key][1]:>9.0f} %"
+                f"    {label[:28]:<28}{short(alpha):>5}   {others.get(key, '')[:16]:<16}"
+                f"{100 * shares[key][1]:>6.0f} %{100 * disagreement:>12.0f} %"
             )
     if lines:
         yield ""
-        yield f"  {'least stable classes':<28}{'alpha':>6}   {'confused with':<24}{'of the map':>11}"
+        head = f"{'classes that disagree most':<30}{'alpha':>5}   {'confused with':<16}{'of map':>8}{'disagreement':>14}"
+        yield f"  {head}"
         yield from lines
 
 
-def class_alphas(records: Sequence[Record]) -> dict[str, float]:
-    """Return alpha of each class, the macro mean over scenes, where it is known."""
-    alphas: dict[str, list[float]] = {}
+def class_means(records: Sequence[Record]) -> dict[str, tuple[float, float]]:
+    """Return alpha of each class and its share of the disagreement, macro means over scenes, where both are known."""
+    known: dict[str, list[tuple[float, float]]] = {}
     for statistics in (record.statistics for record in records if record.statistics is not None):
         for row in () if statistics.cells is None else statistics.cells.classes:
-            alphas.setdefault(row.name, []).append(row.alpha.value)
-    means = {name: macro_mean(values) for name, values in alphas.items()}
-    return {name: alpha for name, alpha in means.items() if not math.isnan(alpha)}
+            if not (math.isnan(row.alpha.value) or math.isnan(row.disagreement)):
+                known.setdefault(row.name, []).append((row.alpha.value, row.disagreement))
+    return {name: (macro_mean([a for a, _ in own]), macro_mean([d for _, d in own])) for name, own in known.items()}
 
 
 def _class_shares(records: Sequence[Record]) -> dict[str, tuple[int, float]]:

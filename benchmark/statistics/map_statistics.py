@@ -259,6 +259,7 @@ def cell_agreement(
     own, evidence = scope_of(sums, scope), fine["evidence"].sum(axis=0)
     alphas = confidence_intervals(spec_of(sums, "alpha", k, own) for k in range(table.K) if table.K <= MOST_CLASSES)
     n, largest = float(fine["observations"].sum()), int(evidence.argmax())
+    disagreement = _disagreement(evidence / n if n else evidence, np.array([alpha.value for alpha in alphas]))
     return CellAgreement(
         cell_size=cells.coarsening * cells.cell_size,
         cells=round(float(fine["voxels"].sum())),
@@ -276,10 +277,21 @@ def cell_agreement(
                 name in named if named else locations[k] >= limits.class_locations,
                 alpha,
                 1 - probability_above(alpha, limits.usable, "agreement"),
+                float(disagreement[k]),
             )
             for k, (name, alpha) in enumerate(zip(names, alphas, strict=False))
         ),
     )
+
+
+def _disagreement(shares: Float64, alpha: Float64) -> Float64:
+    """Return the share (K,) of each class in all disagreement, from shares of the observations and alpha of each class.
+
+    A class against all others disagrees with the probability (1 - alpha) 2 p (1 - p).
+    """
+    own = np.nan_to_num((1 - alpha) * shares[: len(alpha)] * (1 - shares[: len(alpha)])).clip(min=0)
+    total = own.sum()
+    return own / total if total > 0 else np.full(len(own), np.nan)
 
 
 # --- Sections ---------------------------------------------------------------------------------------------------------
