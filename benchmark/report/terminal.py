@@ -243,8 +243,8 @@ def _classes(records: Sequence[Record]) -> Iterator[str]:
             )
     if lines:
         yield ""
-        head = f"{'classes that disagree most':<30}{'alpha':>5}   {'confused with':<16}{'of map':>8}{'disagreement':>14}"
-        yield f"  {head}"
+        columns = f"{'alpha':>5}   {'confused with':<16}{'of map':>8}{'disagreement':>14}"
+        yield f"  {'classes that disagree most':<30}{columns}"
         yield from lines
 
 
