@@ -12,9 +12,9 @@ NAMES = {"Backbone": "Model"}
 
 def __getattr__(name: str) -> Any:
     """Return what `semstab.models` has under a name, with a warning."""
-    found = getattr(models, NAMES.get(name, name))
+    value = getattr(models, NAMES.get(name, name))
     warnings.warn(
         f"semstab.backbones is now called semstab.models; {name} is {NAMES.get(name, name)} there",
         DeprecationWarning, stacklevel=2,
     )  # fmt: skip
-    return found
+    return value

@@ -385,7 +385,7 @@ class SamVoteOptions(SamOptions):
     """The proposals, and the model that votes."""
 
     voter: str = Field(description="the model whose labels vote, e.g. segformer")
-    voter_options: dict[str, Any] = Field(default_factory=dict, description="its options, e.g. {model: FOLDER}")
+    voter_options: dict[str, Any] = Field(default_factory=dict, description="its options, e.g. {checkpoint: FOLDER}")
 
 
 class SamVote(Wrapped):

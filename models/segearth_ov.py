@@ -289,7 +289,9 @@ CLIP_STD = (0.26862954, 0.26130258, 0.27577711)
 class SegEarthOptions(ModelOptions):
     """The settings that name a CLIP and its prompts, and say how the image is shown to it."""
 
-    model: str = Field("openai/clip-vit-base-patch16", description="a CLIP folder, or an id on the Hugging Face hub")
+    checkpoint: str = Field(
+        "openai/clip-vit-base-patch16", description="a CLIP folder, or an id on the Hugging Face hub"
+    )
     prompts: Path | None = Field(None, description="YAML file like configs/models/segearth_uavid.yaml, the default")
     upsampler: Path | None = Field(
         None, description="a SimFeatUp checkpoint (jbu_one); where not given, features are upsampled bilinearly"

@@ -14,7 +14,7 @@ from semstab.core import registry
 from semstab.core.registry import Registry
 from semstab.datasets.files.options import Template
 from semstab.errors import ConfigError
-from semstab.models import Model, options_model
+from semstab.models import REGISTRY, Model, options_model
 from semstab.models.checkpoint import ModelOptions
 from semstab.predict.live import PredictedOptions
 from semstab.predict.predictor import PredictorConfig
@@ -50,6 +50,17 @@ def test_settings(warned):
 def test_a_setting_that_is_given_under_both_names_is_refused():
     with pytest.raises(ConfigError, match="unknown setting 'backbones'"):
         Config.build({"backbones": ["net"], "models": ["net"]}, "x")
+
+
+@pytest.mark.parametrize("name", [name for name in REGISTRY.entries() if name != "stored"])
+def test_no_model_has_its_weights_under_the_old_name(name):
+    assert "model" not in options_model(name).model_fields
+
+
+def test_the_checkpoint_of_segearth_has_a_default():
+    assert options_model("segearth-ov")().checkpoint == "openai/clip-vit-base-patch16"
+    assert options_model("segearth-ov")(model="clip").checkpoint == "clip"
+    assert "checkpoint" not in options_model("segearth-ov")().identity()
 
 
 def test_only_what_was_renamed_is_translated():

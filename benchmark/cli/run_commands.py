@@ -176,8 +176,7 @@ def execute(
     from rich.console import Console
 
     from semstab.api import run_study
-    from semstab.report.filter_study import filter_studies
-    from semstab.report.terminal import ProgressBar, failure_lines, print_filter_study, print_summary
+    from semstab.report.terminal import ProgressBar, failure_lines, print_answer
 
     if report not in ("on", "off"):
         raise ConfigError(f"--report {report}: write on or off")
@@ -194,10 +193,8 @@ def execute(
         result = run_study(config, out, executor=executor, observers=observers, command=sys.argv, report=report == "on")
         for line in failure_lines(result):
             say(f"error: {line}")
-        if filter_studies(result) and not quiet:
-            print_filter_study(result, Console())
-        elif result.select() and not quiet:
-            print_summary(result, Console(), out=out, seconds=time.monotonic() - began, verbose=verbose)
+        if result.select() and not quiet:
+            print_answer(result, Console(), out=out, seconds=time.monotonic() - began, verbose=verbose)
         else:
             print_lines([f"  folder  {out}"], quiet=quiet)
         for each in recording:
@@ -398,7 +395,7 @@ def show(
     from semstab.engine.folder import load_result
     from semstab.report.tables import tables
     from semstab.report.tables.table import to_terminal
-    from semstab.report.terminal import print_summary
+    from semstab.report.terminal import print_answer
 
     result = load_result(run)
     there = {table.name: table for table in tables(result)}
@@ -407,7 +404,7 @@ def show(
 
         print_lines(map(str, write_figures(result, run, svg=figures is FigureFormat.svg)))
     elif not what:
-        print_summary(result, Console(), out=run)
+        print_answer(result, Console(), out=run)
         listed = f"tables  {', '.join(there)}"
         print_lines(textwrap.wrap(listed, 80, initial_indent="  ", subsequent_indent=" " * 10))
     for name in what or ():

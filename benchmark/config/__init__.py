@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable, Mapping, Sequence
-from typing import TYPE_CHECKING, Any, Literal, Self
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self
 
 import yaml
 from pydantic import Field, ValidationError, ValidationInfo, field_validator
@@ -91,12 +91,13 @@ class VerdictSettings(Settings):
     stable: float = Field(0.8, gt=0, lt=1, description="alpha from which labels may be relied on")
     usable: float = Field(2 / 3, gt=0, lt=1, description="and from which on they may be acted on with care")
     labelled: float = Field(0.9, ge=0, le=1, description="part of the locations that a stable model labels at least")
-    class_locations: float = Field(100.0, ge=1, description="voxels that a class must dominate to be judged")
+    class_locations: float = Field(100.0, ge=1, description="voxels that a class must dominate to be assessed")
 
 
 class Config(Settings):
     """Settings that determine the numbers of a run or a study: scenes x models x backends x variations."""
 
+    earlier: ClassVar[Mapping[str, str]] = {"backbones": "models"}
     name: str = Field("run", min_length=1, description="the title of the report; a study's is its file's by default")
     description: str = Field("", description="one line")
     dataset: DatasetConfig = DatasetConfig()
@@ -128,7 +129,7 @@ class Config(Settings):
     statistics: bool = Field(
         False, description="also statistics of order, correctness and model comparison; fuses the ground truth too"
     )
-    frame_quality: bool = Field(False, description="also judge each frame's labels; the filters study does")
+    frame_quality: bool = Field(False, description="also assess each frame's labels; the filters study does")
     critical_classes: list[str] = Field([], description="classes of the verdict; all frequent ones if none is named")
     scope: ScopeSetting = Field(THIS_SCENE, description="of intervals: 'these frames', 'this scene', 'other scenes'")
     verdict: VerdictSettings = VerdictSettings()

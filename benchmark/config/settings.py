@@ -10,7 +10,7 @@ import re
 import reprlib
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, Any, Generic, Literal, Self, TypeVar
+from typing import Annotated, Any, ClassVar, Generic, Literal, Self, TypeVar
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, field_validator, model_validator
 
@@ -24,20 +24,15 @@ Model = TypeVar("Model", bound=BaseModel)
 V = TypeVar("V")
 
 
-EARLIER: Mapping[str, str] = {
-    "backbones": "models",
-    "backbone": "model",
-    "model": "checkpoint",
-    "remedies": "try_filters",
-    "kept": "cache",
-}
-"""Settings of version 0.3, and what they are called now: the old names work for one version."""
-
-
 class Settings(BaseModel):
-    """A group of settings: frozen, and closed to unknown keys."""
+    """A group of settings: frozen, and closed to unknown keys.
+
+    Attributes:
+        earlier: Names of version 0.3, and those of today: the old ones work for one version.
+    """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
+    earlier: ClassVar[Mapping[str, str]] = {}
 
     @model_validator(mode="before")
     @classmethod
@@ -45,8 +40,8 @@ class Settings(BaseModel):
         if not isinstance(content, dict):
             return content
         named = dict(content)
-        for earlier, today in EARLIER.items():
-            if earlier in named and earlier not in cls.model_fields and today in {*cls.model_fields} - {*named}:
+        for earlier, today in cls.earlier.items():
+            if earlier in named and today not in named:
                 logger.warning("setting '%s' is now called '%s'; the next version will not know it", earlier, today)
                 named[today] = named.pop(earlier)
         return named
@@ -132,6 +127,7 @@ Deviation = Annotated[float, Field(ge=0, le=1e9)]
 class Part(Settings):
     """One of the things that are varied, on all scenes and models of the configuration or on some."""
 
+    earlier: ClassVar[Mapping[str, str]] = {"backbones": "models"}
     scenes: list[str] | None = Field(None, min_length=1, description="some of the scenes; all where not given")
     models: list[str] | None = Field(None, min_length=1, description="some of the models; all where not given")
 

@@ -64,17 +64,17 @@ def palette(K: int) -> tuple[Color, ...]:
     """
     chosen = [*PALETTE[:K]]
     grid = np.stack(np.meshgrid(LEVELS, LEVELS, LEVELS, indexing="ij"), axis=-1).reshape(-1, 3)
-    candidates, looks = grid, _looks_of(grid)
-    fit = (looks[:, 0] >= LIGHTNESS[0]) & (looks[:, 0] <= LIGHTNESS[1])
+    candidates, appearance = grid, _appearance_of(grid)
+    fit = (appearance[:, 0] >= LIGHTNESS[0]) & (appearance[:, 0] <= LIGHTNESS[1])
     fit &= np.linalg.norm(grid[:, None] - between(GLOW, 4 * len(GLOW)), axis=2).min(axis=1) >= CLEAR
-    candidates, looks = candidates[fit], looks[fit]
+    candidates, appearance = candidates[fit], appearance[fit]
     if len(chosen) < K:
-        own = _looks_of(np.array(chosen))
-        nearest = np.min([_distance(looks, one) for one in own], axis=0)
+        own = _appearance_of(np.array(chosen))
+        nearest = np.min([_distance(appearance, one) for one in own], axis=0)
     while len(chosen) < K:
         best = int(nearest.argmax())
         chosen.append((int(candidates[best, 0]), int(candidates[best, 1]), int(candidates[best, 2])))
-        nearest = np.minimum(nearest, _distance(looks, looks[best]))
+        nearest = np.minimum(nearest, _distance(appearance, appearance[best]))
     return tuple(chosen)
 
 
@@ -84,7 +84,7 @@ def between(colors: Sequence[Color], n: int) -> Float64:
     return np.stack([np.interp(at, np.arange(len(colors)), channel) for channel in np.transpose(colors)], axis=1)
 
 
-def _looks_of(colors: npt.NDArray[np.integer]) -> Float64:
+def _appearance_of(colors: npt.NDArray[np.integer]) -> Float64:
     """Return (n, 6) OKLab of colours (n, 3), as they are and without green cones."""
     share = colors / 255
     linear = np.where(share <= 0.04045, share / 12.92, ((share + 0.055) / 1.055) ** 2.4)
@@ -96,9 +96,9 @@ def _oklab(linear: Float64) -> Float64:
     return lab
 
 
-def _distance(looks: Float64, one: Float64) -> Float64:
+def _distance(appearance: Float64, one: Float64) -> Float64:
     """Return (n,) how far colours look from one: to all eyes, and half as much to those without green cones."""
-    difference = looks - one
+    difference = appearance - one
     seen = np.linalg.norm(difference[:, :3], axis=1) + 0.5 * np.linalg.norm(difference[:, 3:], axis=1)
     distance: Float64 = seen
     return distance

@@ -9,7 +9,7 @@ import threading
 from collections.abc import Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from pydantic import BaseModel, Field, field_validator
@@ -35,8 +35,9 @@ CACHE_BYTES = 1 << 28
 
 
 class PredictedOptions(Settings):
-    """The dataset whose images are predicted on, and who predicts."""
+    """The dataset whose images are predicted on, and the models that predict."""
 
+    earlier: ClassVar[Mapping[str, str]] = {"backbones": "models", "remedies": "try_filters", "kept": "cache"}
     dataset: DatasetConfig = Field(description="a dataset with its options")
     models: list[PredictorConfig] = Field(min_length=1, description="each predicts every frame")
     frames: FrameSelection = Field(

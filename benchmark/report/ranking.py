@@ -1,4 +1,4 @@
-"""Which model is more stable: a ranking by alpha of the observations that all models made, with ties."""
+"""The answer about several models: a ranking by alpha of the observations that all of them made, with ties."""
 
 from __future__ import annotations
 
@@ -7,13 +7,14 @@ import itertools
 import math
 import re
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from semstab.data.records import Record, Result
 from semstab.data.statistics import StabilityVerdict
 from semstab.datasets import GROUND_TRUTH
 from semstab.metrics import macro_mean
+from semstab.report.filter_study import filter_studies
 from semstab.report.means import by_model
 from semstab.statistics.agreement import ALPHA
 from semstab.statistics.cluster_sums import ClusterSums, value
@@ -54,20 +55,41 @@ class Ranking:
 
     ranks: tuple[tuple[int, tuple[str, ...]], ...]
     differences: tuple[Difference, ...]
-    unranked: tuple[str, ...]
+    unranked: tuple[str, ...] = ()
 
 
 def ranking(result: Result) -> Ranking:
     """Return the ranking of a run's models by the observations that all of them made; empty for one model.
 
-    Scenes in which not all models have observations do not count.
+    Scenes in which not all models have observations do not count. Filters are not ranked: frames that share a memory
+    agree by it.
     """
+    if filter_studies(result):
+        return Ranking((), ())
     records = [record for record in result.select() if record.unit.model != GROUND_TRUTH]
     models = by_model(records)
     unranked = tuple(name for name, own in models.items() if all(map(_is_uninformative, own)))
-    names = [name for name in models if name not in unranked]
-    sums = [_common_sums([r for r in records if r.unit.scene == scene]) for scene in result.scenes]
-    known = [own for own in sums if {*names} <= own.keys()] if len(names) > 1 else []
+    names = tuple(name for name in models if name not in unranked)
+    scenes = (_files([record for record in records if record.unit.scene == scene]) for scene in result.scenes)
+    return replace(_ranking(tuple(filter(None, scenes)), names), unranked=unranked if len(models) > 1 else ())
+
+
+Files = tuple[tuple[str, Path, int], ...]
+"""The models of a scene, their files of observations, and when these were written."""
+
+
+def _files(records: list[Record]) -> Files:
+    """Return the files of a scene; none where a model has none."""
+    files = [(record.unit.model, record.observations_file) for record in records]
+    there = tuple((name, file, file.stat().st_mtime_ns) for name, file in files if file is not None and file.is_file())
+    return there if len(there) == len(files) > 1 else ()
+
+
+@functools.lru_cache(maxsize=8)
+def _ranking(scenes: tuple[Files, ...], names: tuple[str, ...]) -> Ranking:
+    """Return the ranking of some models, which terminal and report ask for one after the other."""
+    sums = [_common_sums(files) for files in scenes] if len(names) > 1 else []
+    known = [own for own in sums if {*names} <= own.keys()]
     pairs = list(itertools.combinations(names, 2)) if known else []
     changes = [mean_of([difference(own[b], own[a], ALPHA.key) for own in known]) for a, b in pairs]
     p_values = holm([change.p_value for change in changes])
@@ -85,7 +107,7 @@ def ranking(result: Result) -> Ranking:
             better[each.other if each.value > 0 else each.model] += 1
     order = sorted(alpha, key=lambda name: (better[name], -alpha[name]))
     ranks = tuple((1 + n, tuple(own)) for n, own in itertools.groupby(order, key=better.__getitem__))
-    return Ranking(ranks, differences, unranked if len(models) > 1 else ())
+    return Ranking(ranks, differences)
 
 
 def answers(result: Result) -> Iterator[str]:
@@ -113,7 +135,7 @@ def answers(result: Result) -> Iterator[str]:
 
 def short(value: float, sign: str = "") -> str:
     """Return a number from -1 to 1 without the 0 before its point: '.55', '-.19', '1.00'; '-' where it is undefined."""
-    return "-" if math.isnan(value) else re.sub(r"^([+-]?)0\.", r"\1.", f"{value:{sign}.2f}")
+    return "-" if math.isnan(value) else re.sub(r"^([+-]?)0\.", r"\1.", f"{round(value, 2) + 0.0:{sign}.2f}")
 
 
 def stated(verdict: StabilityVerdict) -> str:
@@ -126,18 +148,8 @@ def _is_uninformative(record: Record) -> bool:
     return record.statistics is not None and record.statistics.verdict.level == "uninformative"
 
 
-def _common_sums(records: list[Record]) -> Mapping[str, ClusterSums]:
-    """Return the sums of the observations that all models of a scene made; none where they were not stored."""
-    files = {record.unit.model: record.observations_file for record in records}
-    there = [(name, file) for name, file in files.items() if file is not None and file.is_file()]
-    if not 1 < len(there) == len(files):
-        return {}
-    return _sums_of_files(tuple((name, file, file.stat().st_mtime_ns) for name, file in there))
-
-
-@functools.lru_cache(maxsize=16)
-def _sums_of_files(files: tuple[tuple[str, Path, int], ...]) -> Mapping[str, ClusterSums]:
-    """Return the same of the files, which terminal and report need one after the other."""
+def _common_sums(files: Files) -> Mapping[str, ClusterSums]:
+    """Return the sums of the observations that all models of a scene made; none where their classes differ."""
     observations = {name: CellObservations.load(file) for name, file, _ in files}
     same = len({own.classes for own in observations.values()}) == 1
     return compared_observations(observations).sums if same else {}

@@ -25,11 +25,16 @@ from semstab.report.filter_study import advice, filter_studies
 from semstab.report.narrative import warnings
 from semstab.report.ranking import answers, short, stated
 from semstab.report.tables import tables
+from semstab.report.tables.filters import row as filter_row
 from semstab.report.tables.table import to_terminal
 from semstab.statistics.verdict import LIMITS
 from semstab.task import Task
 
 WIDTH = 80
+
+MAJORITY = 0.5
+"""A class with this share of the map or more is listed only if no other is: others disagree with it most."""
+
 RARE = 100
 """The least number of voxels of a class that is listed; a rarer class is not called unstable."""
 
@@ -235,7 +240,8 @@ def _classes(records: Sequence[Record]) -> Iterator[str]:
         classes, shares = class_means(own), _class_shares(own)
         others = {k: v for record in own for k, v in record.summary.table.confused_with.items()}
         common = [key for key, (voxels, _) in shares.items() if voxels >= RARE and key in classes]
-        for key in sorted(common, key=lambda key: -classes[key][1])[:most]:
+        named = [key for key in common if shares[key][1] < MAJORITY] or common
+        for key in sorted(named, key=lambda key: -classes[key][1])[:most]:
             label, (alpha, disagreement) = key if alone else f"{name}: {key}", classes[key]
             lines.append(
                 f"    {label[:28]:<28}{short(alpha):>5}   {others.get(key, '')[:16]:<16}"
@@ -398,11 +404,41 @@ def _named_task(failure: Failure) -> str:
     return f"{failure.variation.sweep} {failure.unit.backend if value is None else f'{value:g}'}"
 
 
+def print_answer(
+    result: Result, console: Console, *, out: Path | None = None, seconds: float | None = None, verbose: bool = False
+) -> None:
+    """Print the answer of a run or a study: of a filter study the recommended filters."""
+    if filter_studies(result):
+        print_filter_study(result, console)
+    else:
+        print_summary(result, console, out=out, seconds=seconds, verbose=verbose)
+
+
+FILTER_HEADS = (
+    ("", "flick", "", "next", "accu-", "", "same,", "", "", "", ""),
+    ("filter", "%", "alpha", "%", "racy", "mIoU", "wrong", "lag", "cov.", "ms", ""),
+)
+"""The two lines above the rows of filters: 'next' is the next frame, 'same, wrong' consistent but wrong labels."""
+
+
 def print_filter_study(result: Result, console: Console) -> None:
-    """Print the recommended filter for each model, then the table of all filters."""
+    """Print the recommended filter for each model, then a row for each filter."""
     for study in filter_studies(result):
         for sentence in advice(study):
             console.print(sentence, highlight=False, markup=False)
-    for table in tables(result):
-        if table.name.startswith("filters"):
-            console.print(f"\n{to_terminal(table)}", highlight=False, markup=False, soft_wrap=True)
+        console.print(f"\n  filters for {study.model}", highlight=False, markup=False)
+        rows = [filter_row(study, filtered) for filtered in (study.unfiltered, *study.filtered)]
+        for row in (*FILTER_HEADS, *rows):
+            *first, last = str(row[0]).split("+")
+            for part in first:
+                console.print(f"    {part}", highlight=False, markup=False)
+            name = f" +{last}" if first else last
+            digits = (1, 3, 1, 1, 1, 1, 1, 0, 0)
+            cells = [_number(c, d) if isinstance(c, float) else str(c) for c, d in zip(row[1:-1], digits, strict=True)]
+            line = f"    {name:<19}{''.join(f'{cell:>6}' for cell in cells)}  {row[-1]}"
+            console.print(line.rstrip(), highlight=False, markup=False, soft_wrap=True)
+    text = (
+        "Alpha rises with any memory: it recommends nothing here. 'worse': less flicker, at the pixel or"
+        " the location, and labels that are right less often."
+    )
+    console.print("\n".join(["", *textwrap.wrap(text, WIDTH)]), highlight=False, markup=False)

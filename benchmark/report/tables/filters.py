@@ -17,6 +17,7 @@ COLUMNS = (
     Column("lag_frames", "Lag (frames)", 2, "lower", over="Price"),
     Column("coverage_percent", "Coverage (%)", 1, over="Price"),
     Column("milliseconds", "ms", 1, "lower", over="Price"),
+    Column("advice", "Advice"),
 )
 CAPTION = (
     "Flicker is the share of pixels seen in two frames in a row whose label changes, camera motion removed. Alpha is"
@@ -26,7 +27,8 @@ CAPTION = (
     " seen that frame, so a repeated label does not count. Accuracy and mean IoU are of the labelled pixels of single"
     " frames. Consistent, wrong is the share of pixels seen again that keep a wrong label. Lag is the number of frames"
     " by which labels follow a true change later than the model (at most 8). Coverage is the number of labelled pixels"
-    " for each labelled pixel of the model. ms is the CPU time per frame. All numbers are means over scenes."
+    " for each labelled pixel of the model. ms is the CPU time per frame. Worse: less flicker, at the pixel or the"
+    " location, and labels that are right less often. All numbers are means over scenes."
 )
 
 
@@ -35,7 +37,10 @@ def filter_tables(result: Result) -> list[Table]:
     studies = filter_studies(result)
     if not studies:
         return []
-    groups = tuple(Group(each.model, tuple(map(row, [each.unfiltered, *each.filtered]))) for each in studies)
+    groups = tuple(
+        Group(each.model, tuple(row(each, filtered) for filtered in (each.unfiltered, *each.filtered)))
+        for each in studies
+    )
     best = [f"{each.best.filters} over {each.model}" if each.best else f"none over {each.model}" for each in studies]
     return [
         Table(
@@ -49,7 +54,7 @@ def filter_tables(result: Result) -> list[Table]:
     ]
 
 
-def row(result: FilterResult) -> Row:
+def row(study: FilterStudy, result: FilterResult) -> Row:
     """Return the cells of a filter."""
     return (
         result.filters or "none",
@@ -62,9 +67,5 @@ def row(result: FilterResult) -> Row:
         result.lag,
         100 * result.coverage,
         result.milliseconds,
+        "use" if result == study.best else "worse" if result in study.misleading else "",
     )
-
-
-def marked(study: FilterStudy, result: FilterResult) -> str:
-    """Return '*' for the recommended filter, '!' for one that lowers flicker and makes labels worse."""
-    return "*" if result == study.best else "!" if result in study.misleading else ""
