@@ -87,6 +87,7 @@ def main() -> None:
     parser.add_argument("shelf")
     parser.add_argument("--folder", type=Path, default=Path(__file__).parents[1] / "docs")
     arguments = parser.parse_args()
+    arguments.folder.mkdir(parents=True, exist_ok=True)
     pictures = {
         "viewer.png": (CITY, ""),
         "viewer-compare.png": (["--data", arguments.shelf, *SHELF], "fcn: numba and open3d-projective"),
