@@ -19,11 +19,14 @@ TRANSLATED = {
     ROOT / name
     for name in (
         "benchmark/backbones.py", "benchmark/cli/__init__.py", "benchmark/cli/run_commands.py",
-        "benchmark/config/settings.py", "benchmark/core/registry.py", "benchmark/data/earlier.py",
-        "benchmark/settings.py", "datasets/files/options.py",
+        "benchmark/core/registry.py", "benchmark/data/earlier.py", "benchmark/settings.py",
+        "datasets/files/options.py",
     )
 }  # fmt: skip
-"""What reads summaries, settings and command lines of earlier versions, and so knows their words."""
+"""Modules that read summaries and command lines of earlier versions, and so know their words."""
+
+DECLARED = re.compile(r"^    earlier: ClassVar.*$", re.MULTILINE)
+"""The line of a class of settings that names what its settings were called."""
 
 
 @pytest.mark.parametrize("word", GONE)
@@ -32,5 +35,6 @@ def test_a_word_that_is_gone_stays_gone(word):
     pages = (
         path for folder in FOLDERS for path in (ROOT / folder).rglob("*") if path.suffix in (".py", ".md", ".yaml")
     )
-    there = [path for path in pages if path not in TRANSLATED and pattern.search(path.read_text(encoding="utf-8"))]
+    texts = ((path, DECLARED.sub("", path.read_text(encoding="utf-8"))) for path in pages if path not in TRANSLATED)
+    there = [path for path, text in texts if pattern.search(text)]
     assert there == []
