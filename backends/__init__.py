@@ -3,18 +3,13 @@
 from __future__ import annotations
 
 import inspect
-from dataclasses import dataclass
 from functools import partial
-from typing import Any, Protocol, cast, runtime_checkable
-
-import numpy as np
-import numpy.typing as npt
+from typing import Any, Protocol, cast
 
 from semstab.core.registry import Entry, Registry
-from semstab.core.types import Float32, Float64, Int64, UInt16
 from semstab.data.events import Events
 from semstab.data.frames import Frame
-from semstab.data.results import FrameReport
+from semstab.data.results import Changes, FrameReport
 from semstab.data.voxels import Extent, VoxelTable
 from semstab.errors import ConfigError
 
@@ -88,61 +83,9 @@ class FusionBackend(Protocol):
         """Return the log of observations, or None where the backend has none."""
         return None
 
-
-@dataclass(frozen=True, eq=False)
-class Changes:
-    """The change that one frame made to each of the n voxels that it saw.
-
-    Attributes:
-        row: (n,) int64 the voxel's number: voxels are numbered from 0 in the order of their first observation.
-        key: (n,) int64 its index, packed, relative to the map's origin; overwritten by the next frame.
-        drift: (n,) float32 D_JS of its belief before and after the frame, bits; NaN where it was not seen before.
-        before, after: (n,) uint16 its dominant class; where it was not seen before, both are the one after.
-    """
-
-    row: Int64
-    key: Int64
-    drift: Float32
-    before: UInt16
-    after: UInt16
-
-    @classmethod
-    def room(cls, row: Int64, key: Int64) -> Changes:
-        """Return changes to be filled, for the voxels of these rows and keys."""
-        n = len(row)
-        return cls(row, key, np.empty(n, np.float32), np.empty(n, np.uint16), np.empty(n, np.uint16))
-
-
-@runtime_checkable
-class GrowingMap(FusionBackend, Protocol):
-    """A backend whose map can be followed voxel by voxel while it grows, as the recording needs it.
-
-    A voxel's number, its row, stays the same; keys are packed as in `semstab.backends.shared.keys`.
-    """
-
-    @property
-    def voxel_size(self) -> float:
-        """Edge of a voxel, metres."""
-
-    @property
-    def origin(self) -> Int64:
-        """(3,) voxel index that packed keys count from; of an empty map 0."""
-
-    @property
-    def changes(self) -> Changes:
-        """The change of each voxel by the last frame."""
-
-    def __len__(self) -> int:
-        """Return the number of voxels."""
-
-    def column(self, name: str, rows: Int64 | slice = ...) -> npt.NDArray[Any]:
-        """Return a table column (n,), such as op or drift_sum, for the voxels of those rows; for all if not given."""
-
-    def evidence_of(self, rows: Int64) -> Float64:
-        """Return the evidence (n, K) of the voxels of those rows."""
-
-    def index_of(self, rows: Int64) -> Int64:
-        """Return voxel indices (n, 3) of the voxels of those rows."""
+    def changes(self) -> Changes | None:
+        """Return the changes by the last frame, for the recording; None where the backend does not say them."""
+        return None
 
 
 def create(
@@ -174,6 +117,11 @@ def create(
     from semstab.backends.shared.association import Restricted
 
     return Restricted(make(), voxel_size, within)
+
+
+def changes_of(backend: FusionBackend) -> Changes | None:
+    """Return the changes of a backend's map by the last frame, or None: an outside backend need not say them."""
+    return backend.changes() if hasattr(backend, "changes") else None
 
 
 def restrictable(name: str) -> bool:

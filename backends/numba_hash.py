@@ -16,7 +16,6 @@ import numba as nb
 import numpy as np
 import numpy.typing as npt
 
-from semstab.backends import Changes
 from semstab.backends.numba_loops import (
     DENSE,
     SLOT,
@@ -32,14 +31,14 @@ from semstab.backends.numba_loops import (
 from semstab.backends.shared.aggregator import Aggregator
 from semstab.backends.shared.association import check_depth, check_frame, check_settings
 from semstab.backends.shared.keys import PARTITIONS, columns_of_keys, index_of_keys
-from semstab.backends.shared.observations import Change, MapTotal, Observed, ObservedScores
+from semstab.backends.shared.observations import BeliefChange, Change, MapTotal, Observed, ObservedScores
 from semstab.backends.shared.score_loops import LANES
 from semstab.core.compiled import is_cached, settings
 from semstab.core.types import Float64, Int32, Int64, UInt16
 from semstab.data.events import Events
 from semstab.data.evidence import Evidence
 from semstab.data.frames import Frame, Intrinsics
-from semstab.data.results import FrameReport
+from semstab.data.results import Changes, FrameReport
 from semstab.data.voxels import Extent, VoxelTable
 from semstab.errors import ConfigError
 
@@ -134,8 +133,8 @@ class NumbaHash:
         self._slots["row"] = -1
         self._used = np.zeros(PARTITIONS, dtype=np.int64)
         self._ranges = np.zeros((PARTITIONS, 4), dtype=np.int64)  # two free stretches of nodes: start, end, start, end
-        self.changes = Changes.room(*np.zeros((2, 0), dtype=np.int64))
-        """The change of each voxel by the last frame."""
+        self._last: tuple[Int64, BeliefChange] | None = None
+        """Packed keys of the last frame's voxels, which the next frame overwrites, and their changes."""
         _load_compiled()
 
     @staticmethod
@@ -154,16 +153,16 @@ class NumbaHash:
                 check_frame(frame, self.num_classes)
             seen = self._pixels.observe(frame)
             observed = time.perf_counter()
-            change = self._add(seen, frame.index)
+            change, row = self._add(seen, frame.index)
             if self._history is not None:
                 entries = seen.sparse() if isinstance(seen, ObservedScores) else seen
-                self._history.append(entries, self.changes.row, frame.index)
+                self._history.append(entries, row, frame.index)
             return self._total.add(frame.index, change, started, observed)
         finally:
             nb.set_num_threads(threads)
 
-    def _add(self, seen: Observed | ObservedScores, frame: int) -> Change:
-        """Add a frame's observations."""
+    def _add(self, seen: Observed | ObservedScores, frame: int) -> tuple[Change, Int64]:
+        """Add a frame's observations; return the change and the rows of its voxels."""
         self._make_slots(int((self._used + np.diff(seen.bounds)).max()))
         row, slot = np.empty_like(seen.key), np.empty_like(seen.key)
         new = np.zeros(PARTITIONS, dtype=np.int64)
@@ -171,8 +170,9 @@ class NumbaHash:
         base = len(self) + np.concatenate([[0], np.cumsum(new)])
         _grow(self._records, int(base[-1]))
         sums = np.zeros((PARTITIONS, 4))
-        self.changes = changes = Changes.room(row, seen.key)
-        report = sums, changes.drift, changes.before, changes.after
+        changed = BeliefChange.room(len(row))
+        self._last = seen.key, changed
+        report = sums, *changed
         if isinstance(seen, ObservedScores):
             dense_base = self._make_dense(seen, row, new)
             update_dense(
@@ -188,7 +188,14 @@ class NumbaHash:
         self._used += new
         vss, entropy, _, recurrent = sums.sum(axis=0)
         drift = sums[:, 2].sum()
-        return Change.of((seen.pixels.sum(), len(seen.key), new.sum(), drift, vss, entropy, recurrent))
+        return Change.of((seen.pixels.sum(), len(seen.key), new.sum(), drift, vss, entropy, recurrent)), row
+
+    def changes(self) -> Changes | None:
+        """Return the changes by the last frame."""
+        if self._last is None:
+            return None
+        key, changed = self._last
+        return Changes(index_of_keys(key, self.origin), *changed)
 
     def __len__(self) -> int:
         """Return the number of voxels."""
@@ -215,23 +222,10 @@ class NumbaHash:
         """Return the voxels' rows in the order of the table; packed keys sort like (ix, iy, iz)."""
         return np.argsort(self._records["key"][: len(self)], kind="stable").astype(np.int32)
 
-    def column(self, name: str, rows: Int64 | slice = np.s_[:]) -> npt.NDArray[Any]:
-        """Return a table column (n,), such as op or drift_sum, for the voxels of those rows; for all if not given."""
-        values: npt.NDArray[Any] = self._records[name][: len(self)][rows].copy()  # the array may move as it grows
-        return values
-
-    def evidence_of(self, rows: Int64) -> Float64:
-        """Return the evidence (n, K) of the voxels of those rows."""
-        return np.asarray(self._evidence_of(rows.astype(np.int32)))
-
     @property
     def origin(self) -> Int64:
         """(3,) voxel index that packed keys count from: that of the first camera; of an empty map 0."""
         return np.zeros(3, dtype=np.int64) if self._pixels.origin is None else self._pixels.origin
-
-    def index_of(self, rows: Int64) -> Int64:
-        """Return voxel indices (n, 3) of the voxels of those rows."""
-        return index_of_keys(self._records["key"][rows], self.origin)
 
     def events(self) -> Events | None:
         """Return every observation in order of integration within a voxel, where there is a `history`; else None."""

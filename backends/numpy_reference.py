@@ -23,7 +23,7 @@ from semstab.core.types import Int32, Int64, Mask
 from semstab.data.events import Events
 from semstab.data.evidence import Evidence
 from semstab.data.frames import Frame
-from semstab.data.results import FrameReport
+from semstab.data.results import Changes, FrameReport
 from semstab.data.voxels import Extent, VoxelTable, index_columns
 
 ONE_IN, MOST = 16, 10_000
@@ -57,6 +57,7 @@ class NumpyReference:
         self._evidence = np.zeros((0, num_classes))  # e(q), row by row, with room for more rows
         self._op = np.zeros(0, dtype=np.int64)
         self._total = MapTotal(num_classes)
+        self._changes: Changes | None = None
 
     @staticmethod
     def expected_bytes(voxels: int, observations: int, num_classes: int, soft: bool = False) -> int:
@@ -78,8 +79,13 @@ class NumpyReference:
         self._evidence[rows] = after
         self._op[rows] += 1
         self._history.append(_Seen(rows.astype(np.int32), frame.index, Evidence.of(seen.s_bar), seen.pixels))
-        change = Change.between(before, after, self._op[rows], seen.pixels)
+        change, changed = Change.between(before, after, self._op[rows], seen.pixels)
+        self._changes = Changes(seen.index, *changed)
         return self._total.add(frame.index, change, started)
+
+    def changes(self) -> Changes | None:
+        """Return the changes by the last frame."""
+        return self._changes
 
     def table(self) -> VoxelTable:
         """Return the map so far, from the history."""

@@ -19,11 +19,11 @@ from semstab.backends import FusionBackend
 from semstab.backends.shared.aggregator import Aggregator
 from semstab.backends.shared.association import check_depth, check_frame, check_settings
 from semstab.backends.shared.columns import blocks_of, update_rows
-from semstab.backends.shared.observations import Change, MapTotal, Observed, ObservedScores
+from semstab.backends.shared.observations import BeliefChange, Change, MapTotal, Observed, ObservedScores
 from semstab.core.types import Int64
 from semstab.data.evidence import Evidence
 from semstab.data.frames import Frame
-from semstab.data.results import FrameReport
+from semstab.data.results import Changes, FrameReport
 from semstab.data.voxels import Extent, VoxelTable, index_columns
 from semstab.errors import ConfigError
 
@@ -68,6 +68,7 @@ class Open3DBlocks(FusionBackend):
         self.in_place = self.device.get_type() == o3c.Device.DeviceType.CPU
         self._pixels = Aggregator(voxel_size, num_classes, within)
         self._total = MapTotal(num_classes)
+        self._changes: Changes | None = None
         self.attributes = {
             "op": (o3c.int32, 1),
             "evidence": (o3c.float64, num_classes),
@@ -101,9 +102,15 @@ class Open3DBlocks(FusionBackend):
         if isinstance(seen, ObservedScores):
             seen = seen.sparse()
         observed = time.perf_counter()
-        rows = self._activate(self._pixels.index_of(seen.key)) if len(seen.key) else seen.key
-        change = self._update(rows, seen, frame.index)
+        index = self._pixels.index_of(seen.key)
+        rows = self._activate(index) if len(index) else seen.key
+        change, changed = self._update(rows, seen, frame.index)
+        self._changes = Changes(index, *changed)
         return self._total.add(frame.index, change, started, observed)
+
+    def changes(self) -> Changes | None:
+        """Return the changes by the last frame."""
+        return self._changes
 
     def table(self) -> VoxelTable:
         """Return the map so far: the voxels of all active blocks that a frame has seen."""
@@ -167,8 +174,8 @@ class Open3DBlocks(FusionBackend):
         index: Int64 = keys[block] * r + local
         return index
 
-    def _update(self, rows: Int64, seen: Observed, frame: int) -> Change:
-        """Add one observation to each row."""
+    def _update(self, rows: Int64, seen: Observed, frame: int) -> tuple[Change, BeliefChange]:
+        """Add one observation to each row; return the change of the map, and of each voxel as `Changes` has it."""
         names = tuple(self.attributes)
         values = {name: self._attribute(name).numpy() if self.in_place else self._read(name, rows) for name in names}
         columns = {name: value if name == "evidence" else value.reshape(-1) for name, value in values.items()}

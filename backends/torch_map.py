@@ -15,11 +15,12 @@ import torch
 
 from semstab.backends import FusionBackend
 from semstab.backends.shared.association import INDEX_LIMIT, check_depth, check_settings
-from semstab.backends.shared.keys import HALF, columns_of_keys, out_of_reach
+from semstab.backends.shared.keys import HALF, columns_of_keys, index_of_keys, out_of_reach
 from semstab.backends.shared.observations import Change, MapTotal
 from semstab.backends.torch_operations import (
     LOST,
     Association,
+    Update,
     ViewEvidence,
     associate,
     count_labels,
@@ -43,7 +44,7 @@ from semstab.backends.torch_storage import (
 )
 from semstab.data.evidence import Evidence
 from semstab.data.frames import Frame, Intrinsics
-from semstab.data.results import FrameReport
+from semstab.data.results import Changes, FrameReport
 from semstab.data.voxels import VoxelTable
 from semstab.errors import ConfigError, DataError
 
@@ -104,6 +105,8 @@ class TorchMaps:
         self.device = device_of(device)
         self._dtype = torch.float64 if precision == "float64" else torch.float32
         self._grid: MapGrid | None = None
+        self._keys = torch.empty(0)
+        self._updates: dict[str, Update] = {}
         with torch.inference_mode(False):  # tensors made in inference mode could not be updated outside of it
             self.storage = Storage(num_classes, self._dtype, self.device, memory_gb)
             first = min(FIRST_ROWS, FIRST_BYTES // sum(c.row_bytes for c in self.storage.columns.values()))
@@ -150,10 +153,12 @@ class TorchMaps:
         self.storage.make_room(voxels, f"frame {view.camera.index}")
         self.storage.add(seen.keys, rows, voxels)
         self._grid = grid
-        changes = [
-            update(self.storage.columns[name], rows, of_name, view.camera.index) for name, of_name in evidence.items()
-        ]
-        sums = torch.stack(changes).tolist() if changes else []
+        self._updates = {
+            name: update(self.storage.columns[name], rows, of_name, view.camera.index)
+            for name, of_name in evidence.items()
+        }
+        self._keys = seen.keys
+        sums = torch.stack([of_name.sums for of_name in self._updates.values()]).tolist() if evidence else []
         return {
             name: self._totals[name].add(view.camera.index, Change.of(of_name), started, associated)
             for name, of_name in zip(predicted, sums, strict=True)
@@ -177,6 +182,16 @@ class TorchMaps:
         )
         index = columns_of_keys(keys.numpy(), self._grid.origin if self._grid else (0, 0, 0))
         return VoxelTable(**index, **values, voxel_size=self.voxel_size)
+
+    def changes(self, name: str) -> Changes | None:
+        """Return the changes of a model's map by the last view, brought to memory; None where it was not fused."""
+        last = self._updates.get(name)
+        if last is None:
+            return None
+        assert self._grid is not None
+        index = index_of_keys(self._keys[last.observed].cpu().numpy(), self._grid.origin)
+        drift, before, after = last.changed.cpu().numpy().T
+        return Changes(index, drift.astype(np.float32), before.astype(np.uint16), after.astype(np.uint16))
 
     def _columns_of(self, name: str) -> Columns:
         if name not in self.storage.columns:
@@ -336,3 +351,7 @@ class TorchMap(FusionBackend):
     def table(self) -> VoxelTable:
         """Return the map so far, brought to memory."""
         return self.maps.table("")
+
+    def changes(self) -> Changes | None:
+        """Return the changes by the last frame, brought to memory."""
+        return self.maps.changes("")

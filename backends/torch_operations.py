@@ -193,21 +193,37 @@ def shares(values: torch.Tensor, softmax: bool) -> tuple[torch.Tensor, torch.Ten
 # --- The map ----------------------------------------------------------------------------------------------------------
 
 
-def update(columns: Columns, rows: torch.Tensor, evidence: ViewEvidence, frame: int) -> torch.Tensor:
-    """Add one observation to the rows (n,) of the voxels that the evidence sees; returns a `Change` in float64."""
+@dataclass(frozen=True, eq=False)
+class Update:
+    """The change of a map by a frame, on the device.
+
+    Attributes:
+        sums: (SUMS,) float64 a `Change`.
+        observed: (n,) numbers of the frame's voxels that were updated.
+        changed: (n, 3) float64 of each: drift in bits, NaN where it is new; dominant class before and after.
+    """
+
+    sums: torch.Tensor
+    observed: torch.Tensor
+    changed: torch.Tensor
+
+
+def update(columns: Columns, rows: torch.Tensor, evidence: ViewEvidence, frame: int) -> Update:
+    """Add one observation to the rows (n,) of the voxels that the evidence sees."""
     observed = torch.nonzero(evidence.pixels)[:, 0]
     sums = torch.zeros(SUMS, dtype=torch.float64, device=observed.device)
+    changed = sums.new_empty((len(observed), 3))
     for part in parts(len(observed), 4 * chunk_of(observed.device) // columns.num_classes):
         voxels = observed[part]
         pixels = evidence.pixels[voxels]
         sums_of = evidence.sums[:, voxels].T.to(torch.float64).contiguous()
         s_bar = sums_of / (pixels.to(torch.float64) * evidence.scale)[:, None]
-        sums += _observe(columns, rows[voxels], s_bar, pixels, frame)
-    return sums
+        sums += _observe(columns, rows[voxels], s_bar, pixels, frame, changed[part])
+    return Update(sums, observed, changed)
 
 
 def _observe(
-    columns: Columns, rows: torch.Tensor, s_bar: torch.Tensor, pixels: torch.Tensor, frame: int
+    columns: Columns, rows: torch.Tensor, s_bar: torch.Tensor, pixels: torch.Tensor, frame: int, changed: torch.Tensor
 ) -> torch.Tensor:
     held = columns.values
     op = held["op"][rows]
@@ -227,7 +243,10 @@ def _observe(
     held["frame_entropy_sum"][rows] += _entropy_bits(s_bar)
     held["first_frame"][rows] = torch.where(new, frame, held["first_frame"][rows].clamp(max=frame))
     held["last_frame"][rows] = torch.where(new, frame, held["last_frame"][rows].clamp(min=frame))
-    vss, entropy = q.amax(dim=1) - p.amax(dim=1), entropy_q - entropy_p
+    (top_p, dominant_p), (top_q, dominant_q) = p.max(dim=1), q.max(dim=1)
+    changed[:, 0] = torch.where(new, math.nan, drift)
+    changed[:, 1], changed[:, 2] = torch.where(new, dominant_q, dominant_p), dominant_q
+    vss, entropy = top_q - top_p, entropy_q - entropy_p
     sums = (
         pixels.sum(), pixels.new_tensor(len(rows)), new.sum(), drift.sum(), vss.sum(), entropy.sum(),
         (op + 1 == RECURRENT).sum(),

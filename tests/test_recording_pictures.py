@@ -22,7 +22,6 @@ from test_recording import config_of, grid, notes, read, series, verify
 
 import semstab
 from semstab import backends, metrics
-from semstab.backends.numba_hash import NumbaHash
 from semstab.data.frames import Frame, Intrinsics
 from semstab.data.labels import LabelSpace
 from semstab.data.measures import SBD_MAX
@@ -196,21 +195,27 @@ def saved(path: Path) -> Iterator[rr.RecordingStream]:
     stream.disconnect()
 
 
-@pytest.mark.parametrize("evidence", ["float64", "float32"])
-def test_what_numba_says_of_a_frame_is_what_happened(evidence) -> None:
+@pytest.mark.parametrize(
+    ("name", "options"),
+    [("numpy", {}), ("numba", {}), ("numba", {"evidence": "float32"}), ("open3d", {}), ("torch", {})],
+)
+def test_a_backend_says_the_changes_that_a_frame_made(name, options) -> None:
+    if name == "torch":
+        pytest.importorskip("torch")
     rng = np.random.default_rng(5)
     reference = backends.create("numpy", voxel_size=0.5, num_classes=4)
-    fused = NumbaHash(voxel_size=0.5, num_classes=4, evidence=evidence)
+    fused = backends.create(name, voxel_size=0.5, num_classes=4, **options)
+    assert fused.changes() is None
     for index in range(5):
         view = frame(index, rng.integers(0, 4, (10, 14)))
         old = {tuple(i): (d, k) for i, d, k in described(reference.table())}
         reference.integrate(view)
         fused.integrate(view)
         new = {tuple(i): (d, k) for i, d, k in described(reference.table())}
-        changes = fused.changes
-        assert len(changes.row) == len(new)
+        changes = fused.changes()
+        assert len(changes.index) == len(new)
         for voxel, bits, before, after in zip(
-            fused.index_of(changes.row).tolist(), changes.drift, changes.before, changes.after, strict=True
+            changes.index.tolist(), changes.drift, changes.before, changes.after, strict=True
         ):
             assert after == new[tuple(voxel)][1]
             if tuple(voxel) in old:
@@ -227,16 +232,16 @@ def described(table: semstab.VoxelTable) -> list[tuple[list[int], float, int]]:
 
 @pytest.mark.parametrize("stride", [1, 2, 4])
 def test_every_pixel_shows_its_voxel_whatever_becomes_of_the_map(stride) -> None:
-    log = DriftLog(0.05, 4)
+    log, fused = DriftLog(0.05), backends.create("numba", voxel_size=0.05, num_classes=4)
     rng = np.random.default_rng(1)
     first, second = rng.integers(0, 4, (2, 90, 121))
     second[0, :3] = 255
-    log.follow(frame(0, first))
-    changes = log.follow(frame(1, second))
+    followed(log, fused, frame(0, first))
+    changes = followed(log, fused, frame(1, second))
     whole = changes.pictures(1)
     assert np.unique(whole["contradictions"]).tolist() == [drift.NO_VOXEL, drift.AGREES, drift.CONTRADICTS]
     np.testing.assert_array_equal(whole["drift"] == drift.NO_VOXEL, second == 255)
-    log.follow(frame(2, np.zeros((90, 121))))
+    followed(log, fused, frame(2, np.zeros((90, 121))))
     for name, picture in changes.pictures(stride).items():
         np.testing.assert_array_equal(picture, whole[name][::stride, ::stride])
 
@@ -251,21 +256,24 @@ def alternating(count: int) -> list[Frame]:
     return views
 
 
-def tracked(views: list[Frame]) -> DriftLog:
-    log = DriftLog(1.0, 3)
+def followed(log: DriftLog, fused: backends.FusionBackend, view: Frame) -> drift.FrameChanges:
+    fused.integrate(view)
+    return log.follow(view, fused.changes())
+
+
+def tracked(views: list[Frame]) -> tuple[DriftLog, semstab.VoxelTable]:
+    log, fused = DriftLog(1.0), backends.create("numba", voxel_size=1.0, num_classes=3)
     for view in views:
-        log.follow(view)
-    return log
+        followed(log, fused, view)
+    return log, fused.table()
 
 
 def test_the_voxel_that_flickers_comes_first_with_its_top_contributing_frames(tmp_path) -> None:
-    log = tracked(alternating(6))
-    table = log.map.table()
+    log, table = tracked(alternating(6))
     worst = table.centers[table.drift_sum.argmax()]
-    (row, *_) = log.top_voxels()
-    np.testing.assert_allclose((log.map.index_of([row])[0] + 0.5) * 1.0, worst)
+    np.testing.assert_allclose(table.centers[drift.top_voxels(table)[0]], worst)
     with saved(tmp_path / "flips.rrd") as stream:
-        log.log(stream, "s", "net", CLASSES, np.zeros(3), Clock())
+        log.log(stream, "s", "net", CLASSES, table, np.zeros(3), Clock())
     verify(tmp_path / "flips.rrd")
     rows = read(tmp_path / "flips.rrd")
     reference = backends.create("numpy", voxel_size=1.0, num_classes=3)
@@ -301,59 +309,97 @@ def test_a_number_is_drawn_where_it_lies_inside_the_image() -> None:
 
 
 def test_of_each_location_that_drifts_one_voxel_is_shown() -> None:
-    log = DriftLog(0.05, 3)
+    fused = backends.create("numba", voxel_size=0.05, num_classes=3)
     for index in range(4):
         labels = np.zeros((60, 80))
         labels[10:20, 10:20] = labels[40:50, 60:70] = index % 2 + 1
-        log.follow(frame(index, labels))
-    index = log.map.index_of(log.top_voxels())
+        fused.integrate(frame(index, labels))
+    table = fused.table()
+    index = table.index[drift.top_voxels(table)]
     assert len(index) > 2
     distance = np.abs(index[:, None] - index).max(axis=2)
     assert distance[~np.eye(len(index), dtype=bool)].min() >= drift.APART
 
 
+def test_the_numbered_voxels_are_listed_in_the_order_of_their_drift(tmp_path) -> None:
+    """Of two that change, the one that is later in the table changes more often."""
+    views = []
+    for index in range(6):
+        labels = np.zeros((6, 8))
+        labels[:1, :1] = 1 if index == 3 else 0
+        labels[5:, 7:] = 1 + index % 2
+        views.append(frame(index, labels))
+    log, fused = DriftLog(0.05), backends.create("numba", voxel_size=0.05, num_classes=3)
+    for view in views:
+        followed(log, fused, view)
+    table = fused.table()
+    rows = drift.top_voxels(table)
+    assert rows[0] > rows[1]
+    with saved(tmp_path / "flips.rrd") as stream:
+        log.log(stream, "s", "net", CLASSES, table, np.zeros(3), Clock())
+    (text,) = (row["TextDocument:text"][0] for row in read(tmp_path / "flips.rrd")["/s/flips_report/net"])
+    stated = [float(bits) for bits in re.findall(r"drift ([\d.]+) bits in all", text)]
+    np.testing.assert_allclose(stated, table.drift_sum[rows], atol=6e-4)
+
+
 def test_the_log_of_flips_is_bounded_and_keeps_those_of_the_worst(monkeypatch) -> None:
-    log = tracked(alternating(12))
+    log, table = tracked(alternating(12))
     monkeypatch.setattr(drift, "MAX_MOVES", 12)
-    bounded = tracked(alternating(12))
-    assert sum(len(part) for part in bounded._moves) <= 12
-    assert bounded.top_voxels()[0] == log.top_voxels()[0]
+    bounded, _ = tracked(alternating(12))
+    kept, every = (np.concatenate(each._moves) for each in (bounded, log))
+    worst = drift.packed(table.index[drift.top_voxels(table)[:1]])
+    assert len(kept) <= 12
+    assert set(every["frame"][every["voxel"] == worst]) >= set(kept["frame"][kept["voxel"] == worst]) != set()
 
 
-def grow(path: Path, labels: list[np.ndarray], *, finish: bool) -> tuple[dict[str, list[dict[str, Any]]], NumbaHash]:
-    """The rows of a map that grows by these frames, and the map."""
-    fused = NumbaHash(voxel_size=0.25, num_classes=3)
+def grow(path: Path, labels: list[np.ndarray], *, finish: bool) -> tuple[dict[str, list[dict[str, Any]]], Any]:
+    """The rows of a map that grows by these frames, and its table."""
+    fused = backends.create("numba", voxel_size=0.25, num_classes=3)
     growing = voxel_maps.VoxelLogger("/map", CLASSES, np.zeros(3, dtype=np.int64), frames=len(labels))
     with saved(path) as stream:
         for index, each in enumerate(labels):
             stream.set_time("frame", sequence=index)
-            fused.integrate(frame(index, each))
-            for job in growing.update(stream, fused):
+            report = fused.integrate(frame(index, each))
+            for job in growing.update(stream, report.map_voxels, fused.table):
                 job()
         if finish:
             growing.finish(stream, fused.table())
-    return read(path), fused
+    return read(path), fused.table()
 
 
 def test_what_a_growing_map_logs_is_bounded(monkeypatch, tmp_path) -> None:
     monkeypatch.setattr(voxel_maps, "BUDGET", 600)
     monkeypatch.setattr(voxel_maps, "MAX_VOXELS", 2000)
     rng = np.random.default_rng(0)  # every voxel changes with every frame
-    rows, fused = grow(tmp_path / "grown.rrd", [rng.integers(0, 3, (12, 16)) for _ in range(20)], finish=True)
+    rows, table = grow(tmp_path / "grown.rrd", [rng.integers(0, 3, (12, 16)) for _ in range(20)], finish=True)
     logged = sum(len(row["vss:values"]) for at in rows for row in rows[at] if at.startswith("/map/"))
-    assert 300 + len(fused) < logged <= 600 + len(fused)
+    assert 300 + len(table) < logged <= 600 + len(table)
     voxels = grid(rows, "/map")
-    np.testing.assert_allclose(voxels["vss"], metrics.vss(fused.table()), rtol=1e-6)
-    np.testing.assert_array_equal(voxels["voxel_indices"], fused.table().index)
+    np.testing.assert_allclose(voxels["vss"], metrics.vss(table), rtol=1e-6)
+    np.testing.assert_array_equal(voxels["voxel_indices"], table.index)
 
 
-def test_a_chunk_that_got_no_new_voxels_is_logged_without_its_indices(tmp_path) -> None:
-    rows, fused = grow(tmp_path / "grown.rrd", [np.full((12, 16), index % 3) for index in range(4)], finish=False)
-    located = {row["frame"]: row.get("VoxelGridMap:voxel_indices") is not None for row in rows["/map/00"]}
-    assert located == {0: True, 1: False, 2: False, 3: False}
-    voxels, table = grid(rows, "/map"), fused.table()
+def test_a_map_within_the_budget_is_logged_with_each_frame(tmp_path) -> None:
+    rows, table = grow(tmp_path / "grown.rrd", [np.full((12, 16), index % 3) for index in range(4)], finish=False)
+    assert {row["frame"] for row in rows["/map/00"]} == {0, 1, 2, 3}
+    voxels = grid(rows, "/map")
     np.testing.assert_array_equal(voxels["voxel_indices"], table.index)
     np.testing.assert_array_equal(voxels["op"], table.op)
+
+
+def test_chunks_that_a_thinned_map_lacks_are_cleared(monkeypatch, tmp_path) -> None:
+    monkeypatch.setattr(voxel_maps, "MAX_VOXELS", 60)
+    fused = backends.create("numba", voxel_size=0.25, num_classes=3)
+    growing = voxel_maps.VoxelLogger("/map", CLASSES, np.zeros(3, dtype=np.int64), frames=1)
+    with saved(tmp_path / "thin.rrd") as stream:
+        small = np.full((12, 16), 255)
+        small[:8, :4] = 1
+        for labels in (small, np.full((12, 16), 1)):
+            report = fused.integrate(frame(0, labels))
+            for job in growing.update(stream, report.map_voxels, fused.table):
+                job()
+        note = growing.finish(stream, fused.table())
+    assert "one voxel of each block" in note
 
 
 def test_500_frames_of_4k_stay_below_the_size_that_is_stated() -> None:

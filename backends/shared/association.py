@@ -16,7 +16,7 @@ import numpy as np
 from semstab.core.types import Float32, Float64, Int64, Mask
 from semstab.data.events import Events
 from semstab.data.frames import Frame
-from semstab.data.results import FrameReport
+from semstab.data.results import Changes, FrameReport
 from semstab.data.voxels import Extent, VoxelTable
 from semstab.errors import ConfigError, DataError
 
@@ -218,6 +218,10 @@ class Restricted:
     def events(self) -> Events | None:
         """Return the log, where the backend has one."""
         return self._backend.events()
+
+    def changes(self) -> Changes | None:
+        """Return the changes by the last frame, where the backend says them."""
+        return self._backend.changes() if hasattr(self._backend, "changes") else None
 
 
 def falling_into(within: Extent, frame: Frame, voxel_size: float) -> Mask:

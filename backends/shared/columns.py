@@ -9,33 +9,37 @@ import numpy as np
 
 from semstab.backends.shared.beliefs import js_term, plogp
 from semstab.backends.shared.keys import PARTITIONS, mix
-from semstab.backends.shared.observations import Change, Observed
+from semstab.backends.shared.observations import BeliefChange, Change, Observed
 from semstab.backends.shared.pixel_keys import AHEAD, touch
 from semstab.core.compiled import parallel, serial
 from semstab.core.types import Int32, Int64
 from semstab.data.results import RECURRENT
 
 
-def update_rows(rows: Int64, seen: Observed, frame: int, **columns: Any) -> Change:
+def update_rows(rows: Int64, seen: Observed, frame: int, **columns: Any) -> tuple[Change, BeliefChange]:
     """Add a frame's observations to rows of dense columns, in place.
 
     columns are evidence (N, K) and the others of VoxelTable (N,), all 0 in rows not seen before.
+
+    Returns:
+        The change of the map, and that of the belief of each row.
     """
     chunks = np.linspace(0, len(rows), PARTITIONS + 1).astype(np.int64)
     sums = np.zeros((PARTITIONS, 5))
+    changed = BeliefChange.room(len(rows))
     _update_rows(
         rows, chunks, seen.start, seen.label, seen.weight, seen.pixels, frame, sums, columns["evidence"], columns["op"],
         columns["drift_sum"], columns["pixels"], columns["first_frame"], columns["last_frame"], columns["self_sum"],
-        columns["frame_entropy_sum"],
+        columns["frame_entropy_sum"], *changed,
     )  # fmt: skip
     vss, entropy, drift, new, recurrent = sums.sum(axis=0)
-    return Change.of((seen.pixels.sum(), len(rows), new, drift, vss, entropy, recurrent))
+    return Change.of((seen.pixels.sum(), len(rows), new, drift, vss, entropy, recurrent)), changed
 
 
 @parallel
 def _update_rows(
     rows, chunks, start, label, weight, seen_pixels, frame, sums, evidence, op, drift_sum, pixels, first_frame,
-    last_frame, self_sum, frame_entropy_sum,
+    last_frame, self_sum, frame_entropy_sum, drift_of, class_before, class_after,
 ):  # fmt: skip
     K = evidence.shape[1]
     flat = evidence.reshape(-1)
@@ -61,6 +65,7 @@ def _update_rows(
                 self_sum[r] += share * share
                 frame_entropy_sum[r] -= plogp(share)
             top_before = top_after = drift = 0.0
+            before = after = 0
             for k in range(K):
                 if evidence[r, k] == 0.0 and s[k] == 0.0:
                     continue
@@ -68,7 +73,10 @@ def _update_rows(
                 evidence[r, k] += s[k]
                 q = evidence[r, k] / (T + 1)
                 s[k] = 0.0
-                top_before, top_after = max(top_before, p), max(top_after, q)
+                if p > top_before:
+                    top_before, before = p, k
+                if q > top_after:
+                    top_after, after = q, k
                 if p != 1.0 or q != 1.0:
                     entropy += plogp(p) - plogp(q)
                     drift += js_term(p, q)
@@ -81,6 +89,8 @@ def _update_rows(
                 drifted += drift
                 drift_sum[r] += drift
                 first_frame[r], last_frame[r] = min(first_frame[r], frame), max(last_frame[r], frame)
+            drift_of[i] = drift if T > 0 else np.nan
+            class_before[i], class_after[i] = before if T > 0 else after, after
             op[r] = T + 1
             pixels[r] += seen_pixels[i]
             recurrent += 1 if T + 1 == RECURRENT else 0

@@ -6,12 +6,12 @@ import math
 import time
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
-from semstab.core.types import Float64, Int64, Mask, UInt16
+from semstab.core.types import Float32, Float64, Int64, Mask, UInt16
 from semstab.data.information import entropy_bits, js_divergence, normalise
 from semstab.data.results import RECURRENT, FrameReport
 
@@ -99,6 +99,19 @@ class WorkSpace:
 # Totals of a map as it grows, whatever holds its voxels, and the report of each frame made of them.
 
 
+class BeliefChange(NamedTuple):
+    """Drift (n,) of the voxels that a frame saw, and their dominant class before and after, as `Changes` has them."""
+
+    drift: Float32
+    before: UInt16
+    after: UInt16
+
+    @classmethod
+    def room(cls, n: int) -> BeliefChange:
+        """Return changes of n voxels to be filled."""
+        return cls(np.empty(n, np.float32), np.empty(n, np.uint16), np.empty(n, np.uint16))
+
+
 @dataclass(frozen=True)
 class Change:
     """The change of a map by one frame, summed over the voxels that it touched.
@@ -128,8 +141,8 @@ class Change:
         return cls(int(points), int(voxels), int(new), float(drift), float(vss), float(entropy), int(recurrent))
 
     @classmethod
-    def between(cls, before: Float64, after: Float64, op: Int64, pixels: Int64) -> Change:
-        """Return the change of the n touched voxels, from their evidence.
+    def between(cls, before: Float64, after: Float64, op: Int64, pixels: Int64) -> tuple[Change, BeliefChange]:
+        """Return the change of the map, and that of the belief of each of the n touched voxels.
 
         Args:
             before: (n, K) evidence before the frame; all 0 before the first.
@@ -141,7 +154,9 @@ class Change:
         before, after = np.asfortranarray(before), np.asfortranarray(after)  # sums over few classes run along n
         p_after, p_before, drift = normalise(after), normalise(before.T[:, known].T), np.zeros(len(op))
         drift[known] = js_divergence(p_after.T[:, known].T, p_before)
-        return cls(
+        dominant_after = after.argmax(axis=1).astype(np.uint16)
+        dominant_before = np.where(known, before.argmax(axis=1).astype(np.uint16), dominant_after)
+        change = cls(
             points=int(pixels.sum()),
             voxels=len(op),
             new=int(np.count_nonzero(~known)),
@@ -150,6 +165,7 @@ class Change:
             entropy=float(entropy_bits(p_after).sum() - entropy_bits(p_before).sum()),
             recurrent=int(np.count_nonzero(op == RECURRENT)),
         )
+        return change, BeliefChange(np.where(known, drift, np.nan).astype(np.float32), dominant_before, dominant_after)
 
 
 class MapTotal:

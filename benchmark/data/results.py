@@ -9,6 +9,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 from semstab.core.json_form import INLINE
+from semstab.core.types import Float32, Int64, UInt16
 from semstab.data.frames import LeftOut
 from semstab.data.measures import Measure, MeasureMeans
 from semstab.data.statistics import MapStatistics
@@ -103,6 +104,22 @@ class FrameReport:
         """Mean drift of the frame's updates, bits a re-observed voxel; NaN where it met none."""
         updated = self.voxels - self.new_voxels
         return self.drift_sum / updated if updated else math.nan
+
+
+@dataclass(frozen=True, eq=False)
+class Changes:
+    """The change that one frame made to each of the n voxels that it saw.
+
+    Attributes:
+        index: (n, 3) int64 index of the voxel.
+        drift: (n,) float32 D_JS of its belief before and after the frame, bits; NaN where it was not seen before.
+        before, after: (n,) uint16 its dominant class; where it was not seen before, both are the one after.
+    """
+
+    index: Int64
+    drift: Float32
+    before: UInt16
+    after: UInt16
 
 
 @dataclass(frozen=True)

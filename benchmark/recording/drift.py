@@ -11,14 +11,13 @@ import numpy as np
 import numpy.typing as npt
 import rerun as rr
 
-from semstab.backends import GrowingMap
-from semstab.backends.numba_hash import NumbaHash
 from semstab.backends.shared.association import back_project, voxel_index
-from semstab.backends.shared.keys import HALF
-from semstab.core.types import Float32, Float64, Int64, Mask, UInt8, UInt16
+from semstab.core.types import Float32, Float64, Int64, Mask, UInt8
 from semstab.data.frames import Frame, Intrinsics
 from semstab.data.labels import GLOW, LabelSpace, between
 from semstab.data.measures import SBD_MAX, mean_drift
+from semstab.data.results import Changes
+from semstab.data.voxels import VoxelTable
 from semstab.recording.timeline import LINE_COLORS, Clock, path
 
 # The pictures show levels of drift, in colours that no class has, and labels that contradict the map.
@@ -69,36 +68,40 @@ def contexts() -> dict[str, rr.AnnotationContext]:
 
 @dataclass(frozen=True, eq=False)
 class FrameChanges:
-    """The changes that a frame made to the n voxels that it saw; later frames do not alter them.
+    """The changes that a frame made to the n voxels that it saw.
 
     Attributes:
-        key: (n,) int64 packed voxel index, relative to the origin.
-        drift: (n,) float32 bits, NaN where the voxel was not seen before.
-        before: (n,) uint16 dominant class before the frame; where the voxel was not seen, after it.
+        frame: Its labels and depth.
+        changes: Of its voxels.
+        voxel_size: Edge of a voxel, metres.
     """
 
     frame: Frame
-    key: Int64
-    drift: Float32
-    before: UInt16
+    changes: Changes
     voxel_size: float
-    origin: Int64
 
     def pictures(self, stride: int) -> dict[str, UInt8]:
         """Return each of PICTURES, of every stride-th pixel (H', W'); the stride is a power of 2."""
         frame = self.frame.every(stride)  # rays divided by a power of 2 stay exact: each pixel falls into its voxel
-        x, y, z = voxel_index(back_project(frame), self.voxel_size, frame) - self.origin[:, None] + HALF
-        order = np.argsort(self.key)
-        voxel = order[np.searchsorted(self.key, x << 42 | y << 21 | z, sorter=order)]
-        contradicts = frame.predicted[frame.valid] != self.before[voxel]
+        key = packed(self.changes.index)
+        order = np.argsort(key)
+        pixels = packed(voxel_index(back_project(frame), self.voxel_size, frame).T)
+        voxel = order[np.searchsorted(key, pixels, sorter=order)]
+        contradicts = frame.predicted[frame.valid] != self.changes.before[voxel]
         shown = {
             "contradictions": np.where(contradicts, CONTRADICTS, AGREES),
-            "drift": levels_of(self.drift)[voxel],
+            "drift": levels_of(self.changes.drift)[voxel],
         }
         pictures = {name: np.full(frame.shape, NO_VOXEL, np.uint8) for name in PICTURES}
         for name, picture in pictures.items():
             picture[frame.valid] = shown[name]
         return pictures
+
+
+def packed(index: npt.NDArray[np.integer[Any]]) -> Int64:
+    """Return one number (n,) for each voxel (n, 3), different for voxels within 2^20 of each other along each axis."""
+    x, y, z = index.T.astype(np.int64) & ((1 << 21) - 1)
+    return np.asarray(x << 42 | y << 21 | z)
 
 
 # The voxels that drifted most, and the frames that contributed most to their drift.
@@ -109,7 +112,7 @@ SHOWN = 10
 APART, CANDIDATES = 5, 20_000
 
 MAX_MOVES = 2_000_000
-"""The most moves that are stored of a model on a scene; beyond, those of the voxels that drifted least are dropped."""
+"""The most moves that are stored of a model on a scene; of more, those of the voxels that moved least are dropped."""
 
 MOVED_BITS = 0.05
 """The drift from which on a frame is listed although the dominant class stays: that of a drifting voxel, bits."""
@@ -117,7 +120,7 @@ MOVED_BITS = 0.05
 NUMBER = np.array([[0.04, 0.04], [0.04, 0.1]])
 """The margins of a number, as shares of an image's longer side: left of its point and above, right of it and below."""
 
-MOVE = np.dtype([("row", np.int32), ("frame", np.int32), ("before", np.uint16), ("after", np.uint16), ("bits", "f4")])
+MOVE = np.dtype([("voxel", np.int64), ("frame", np.int32), ("before", np.uint16), ("after", np.uint16), ("bits", "f4")])
 
 COLORS = (*LINE_COLORS, (255, 255, 255), (170, 255, 195), (220, 190, 255))
 
@@ -140,48 +143,45 @@ class View(NamedTuple):
         return pixels, (z > 0) & np.all((pixels >= first) & (pixels <= size - last), axis=1)
 
 
-class DriftLog:
-    """A log of the drift of a map, a live one or its own, that stores which frames moved a belief."""
+def top_voxels(table: VoxelTable) -> Int64:
+    """Return the rows of the voxels that drifted most, one of each location, in the order of their drift."""
+    total = table.drift_sum
+    least = np.partition(total, -CANDIDATES)[-CANDIDATES] if len(total) > CANDIDATES else 0.0
+    rows = np.flatnonzero((total >= least) & (total > 0))
+    index = table.index[rows]
+    chosen: list[int] = []
+    for k in np.lexsort([*index.T[::-1], -total[rows]]):
+        if np.all(np.abs(index[chosen] - index[k]).max(axis=1) >= APART):
+            chosen.append(int(k))
+        if len(chosen) == SHOWN:
+            break
+    return rows[chosen]
 
-    def __init__(self, voxel_size: float, num_classes: int, live: GrowingMap | None = None) -> None:
-        self.map: GrowingMap = NumbaHash(voxel_size, num_classes) if live is None else live
-        self._is_own = live is None
+
+class DriftLog:
+    """A log of the frames that moved the beliefs of a map, and of where they were taken."""
+
+    def __init__(self, voxel_size: float) -> None:
+        self._voxel_size = voxel_size
         self._moves: list[npt.NDArray[np.void]] = []  # records of MOVE, in the order of the frames
         self._views: dict[int, View] = {}
 
-    def follow(self, frame: Frame) -> FrameChanges:
-        """Return the changes of the map by a frame; a live map has fused it already."""
-        if self._is_own:
-            self.map.integrate(frame)
-        changes = self.map.changes
+    def follow(self, frame: Frame, changes: Changes) -> FrameChanges:
+        """Store the moves of a frame that the map has fused; return its changes, for pictures."""
         at = np.flatnonzero((changes.before != changes.after) | (changes.drift >= MOVED_BITS))
         moves = np.zeros(len(at), dtype=MOVE)
-        moves["row"], moves["frame"], moves["bits"] = changes.row[at], frame.index, changes.drift[at]
+        moves["voxel"], moves["frame"], moves["bits"] = packed(changes.index[at]), frame.index, changes.drift[at]
         moves["before"], moves["after"] = changes.before[at], changes.after[at]
         self._moves += [moves] if len(moves) else []
         file = PurePath(frame.files.get("labels") or frame.files.get("scores") or "")
         name = file.name if file.suffix else ""
         self._views[frame.index] = View(frame.timestamp, frame.intrinsics, np.array(frame.T_wc), frame.shape, name)
-        if sum(map(len, self._moves)) > MAX_MOVES:  # half of them stay: those of the voxels that drifted most
+        if sum(map(len, self._moves)) > MAX_MOVES:  # half of them stay: those of the voxels that were moved most
             every = np.concatenate(self._moves)
-            order = np.argsort(-self.map.column("drift_sum")[every["row"]], kind="stable")[: MAX_MOVES // 2]
+            _, voxel = np.unique(every["voxel"], return_inverse=True)
+            order = np.argsort(-np.bincount(voxel, every["bits"])[voxel], kind="stable")[: MAX_MOVES // 2]
             self._moves = [every[np.sort(order)]]
-        own = changes.key.copy(), changes.drift, changes.before
-        return FrameChanges(frame, *own, self.map.voxel_size, self.map.origin)
-
-    def top_voxels(self) -> Int64:
-        """Return the rows of the voxels that drifted most, one of each location, in the order of their drift."""
-        total = self.map.column("drift_sum")
-        least = np.partition(total, -CANDIDATES)[-CANDIDATES] if len(total) > CANDIDATES else 0.0
-        rows = np.flatnonzero((total >= least) & (total > 0))
-        index = self.map.index_of(rows)
-        chosen: list[int] = []
-        for k in np.lexsort([*index.T[::-1], -total[rows]]):
-            if np.all(np.abs(index[chosen] - index[k]).max(axis=1) >= APART):
-                chosen.append(int(k))
-            if len(chosen) == SHOWN:
-                break
-        return rows[chosen]
+        return FrameChanges(frame, changes, self._voxel_size)
 
     def log(
         self,
@@ -189,23 +189,24 @@ class DriftLog:
         scene: str,
         model: str,
         classes: LabelSpace,
+        table: VoxelTable,
         translation: npt.NDArray[np.floating[Any]],
         clock: Clock,
     ) -> None:
-        """Log a lane with the dominant class of each top voxel, its moves in words, and its position."""
+        """Log a lane with the dominant class of each top voxel of a map, its moves in words, and its position."""
         if not self._views:
             return
-        rows, names = self.top_voxels(), classes.classes
-        centers = ((self.map.index_of(rows) + 0.5) * self.map.voxel_size).astype(np.float64)
-        bits, first_frame, op = (self.map.column(name, rows) for name in ("drift_sum", "first_frame", "op"))
-        dominant, sbd = self.map.evidence_of(rows).argmax(axis=1), mean_drift(bits, op)
+        top, names = top_voxels(table), classes.classes
+        bits, first_frame, op = table.drift_sum[top], table.first_frame[top], table.op[top]
+        voxels, centers = packed(table.index[top]), table.centers[top]
+        class_now, sbd = np.asarray(table.evidence.take(top)).argmax(axis=1), mean_drift(bits, op)
         every = np.concatenate([np.zeros(0, dtype=MOVE), *self._moves])
         lines = [f"**{model}**: the voxels with the largest drift, and the frames that moved them", ""]
-        lines += [] if len(rows) else ["No voxel drifted."]
+        lines += [] if len(top) else ["No voxel drifted."]
         lanes = rr.StateConfiguration(values=names, labels=names, colors=[(*color, 255) for color in classes.colors])
-        for i, row in enumerate(rows):
-            moves = every[every["row"] == row]
-            first = int(moves["before"][0]) if len(moves) else int(dominant[i])
+        for i, voxel in enumerate(voxels):
+            moves = every[every["voxel"] == voxel]
+            first = int(moves["before"][0]) if len(moves) else int(class_now[i])
             x, y, z = centers[i]
             lines.append(
                 f"- **voxel {i + 1}** at ({x:.2f}, {y:.2f}, {z:.2f}) m: OP {op[i]}, drift {bits[i]:.3f} bits in all,"
@@ -224,9 +225,9 @@ class DriftLog:
                 lines.append(f"    - frame {frame}{f' ({view.file})' if view.file else ''}: {change}, {moved:.4f} bits")
         report = rr.TextDocument("\n".join(lines) + "\n", media_type=rr.MediaType.MARKDOWN)
         stream.log(path(scene, "flips_report", model), report, static=True)
-        if not len(rows):
+        if not len(top):
             return
-        labels, colors = [f"{i + 1}" for i in range(len(rows))], COLORS[: len(rows)]
+        labels, colors = [f"{i + 1}" for i in range(len(top))], COLORS[: len(top)]
         points = rr.Points3D(
             centers - translation, labels=labels, colors=colors, radii=rr.Radius.ui_points(5.0), show_labels=True
         )

@@ -197,7 +197,7 @@ def blueprint(plan: Plan, legends: Mapping[str, Legend], bounds: Mapping[str, Sc
 
 
 def drawn(task: Task) -> str:
-    """Return the backend whose map is drawn while it grows: the first that fuses like the recorder's own map."""
+    """Return the backend whose map is drawn while it grows: the first that fuses like the reference."""
     alike = [name for name in task.backends if is_pointwise(name)]
     return (alike or list(task.backends))[0]
 

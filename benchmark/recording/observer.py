@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 import rerun as rr
 
-from semstab.backends import FusionBackend, GrowingMap
+from semstab.backends import FusionBackend, changes_of, create, expected_bytes
 from semstab.config import BACKENDS, BASE, Config
 from semstab.core.prefetch import prefetch
 from semstab.core.process import available_bytes
@@ -34,7 +34,7 @@ from semstab.errors import ConfigError, SemstabError, summarize_error
 from semstab.recording import timeline
 from semstab.recording.camera import COARSE_SIDE, SceneLog, over_camera, stride_of
 from semstab.recording.drift import DriftLog
-from semstab.recording.layout import blueprint, drawn, is_pointwise
+from semstab.recording.layout import blueprint, drawn
 from semstab.recording.target import DEFAULT_URL, Target, is_whole
 from semstab.recording.timeline import Background, Clock, path
 from semstab.recording.voxel_maps import VoxelLogger, agreement_report, load_map, log_difference
@@ -43,46 +43,43 @@ from semstab.task import Task, read
 
 logger = logging.getLogger("semstab")
 
-BYTES_A_VOXEL = 120
-"""The memory of a voxel in the recording's own map, without 8 bytes for each class."""
+REPLAY = "numba"
+"""The backend by which a finished run is fused again, where its recording lacks pictures."""
 
 
 class GroupLog:
     """The recording of one model on a scene.
 
     Attributes:
-        live: A map that is being fused and can be followed; without it the recording fuses one of its own.
-        followed: True to follow a map.
+        fused: The map whose growth and drift are drawn; None where none is fused.
     """
 
-    def __init__(
-        self, task: Task, voxel_size: float, origin: Int64, live: GrowingMap | None = None, *, followed: bool = True
-    ) -> None:
+    def __init__(self, task: Task, voxel_size: float, origin: Int64, fused: FusionBackend | None) -> None:
         self.task, self.origin = task, origin
         self._scene, self._classes = task.scene.name, task.mapping.target
-        self._size = voxel_size
-        self.drift = DriftLog(voxel_size, len(self._classes), live) if followed else None
+        self._size, self._fused = voxel_size, fused
+        self._drift = DriftLog(voxel_size)
         self._maps: dict[str, VoxelLogger] = {}
         self._tables: dict[str, VoxelTable] = {}  # by backend, as they are finished
         self.last: tuple[int, float | None] = (task.indices[-1], None)
         """The number and timestamp of the last frame."""
 
-    def log(self, stream: rr.RecordingStream, frame: Frame, background: Background) -> None:
-        """Log the labels of a frame that all units fused, the changes that it made to the map, and the growing map."""
+    def log(self, stream: rr.RecordingStream, frame: Frame, voxels: int, background: Background) -> None:
+        """Log the labels of a fused frame, the changes that it made to the map, and the map of so many voxels."""
         self.last = frame.index, frame.timestamp
-        changes, jobs = None, list[Callable[[], None]]()
-        if self.drift is not None:
-            changes = self.drift.follow(frame)
-            if is_pointwise(drawn(self.task)):
-                jobs = self._map(drawn(self.task)).update(stream, self.drift.map)
+        drift, jobs = None, list[Callable[[], None]]()
+        if self._fused is not None:
+            jobs = self._map(drawn(self.task)).update(stream, voxels, self._fused.table)
+            if (changes := changes_of(self._fused)) is not None:
+                drift = self._drift.follow(frame, changes)
 
         def job() -> None:
             stride, coarse = stride_of(frame.shape), stride_of(frame.shape, COARSE_SIDE)
             pictures: dict[str, tuple[npt.NDArray[Any], int]] = {
                 "labels": (np.ascontiguousarray(frame.predicted[::stride, ::stride]), stride)
             }
-            if changes is not None:
-                pictures |= {name: (picture, coarse) for name, picture in changes.pictures(coarse).items()}
+            if drift is not None:
+                pictures |= {name: (picture, coarse) for name, picture in drift.pictures(coarse).items()}
             for name, (picture, every) in pictures.items():
                 image = rr.SegmentationImage(picture, draw_order=-10)
                 stream.log(path(self._scene, "camera", self.task.model, name), image, over_camera(every))
@@ -118,8 +115,12 @@ class GroupLog:
 
     def log_flips(self, stream: rr.RecordingStream, clock: Clock) -> None:
         """Log the voxels that drifted most, and the frames that contributed most."""
-        if self.drift is not None:
-            self.drift.log(stream, self._scene, self.task.model, self._classes, self.origin * self._size, clock)
+        table = self._tables.get(drawn(self.task))
+        if table is None and self._fused is not None:
+            table = self._fused.table()
+        if table is not None:
+            model, translation = self.task.model, self.origin * self._size
+            self._drift.log(stream, self._scene, model, self._classes, table, translation, clock)
 
     def _log_difference(self, stream: rr.RecordingStream, first: str, second: str, tolerance: float) -> None:
         model, pair = self.task.model, f"{first} and {second}"
@@ -157,7 +158,7 @@ class Recording(Observer):
         self._stream: rr.RecordingStream | None = None
         self._background: Background | None = None
         self._clock = Clock()
-        self._live: GrowingMap | None = None
+        self._fused: FusionBackend | None = None  # the map that is drawn
         self._group: GroupLog | None = None  # the model on a scene that is being fused
         self._unfinished: set[Unit] = set()  # of the group
         self._logged: set[Unit] = set()
@@ -170,20 +171,24 @@ class Recording(Observer):
             self._scenes[name] = SceneLog([task for task in plan.tasks if task.scene.name == name])
 
     def group_started(self, task: Task, config: Config, backends: Mapping[Unit, FusionBackend]) -> None:
-        """Follow the first map that can be followed."""
+        """Follow the map that is drawn."""
         self._end_group()
         self._unfinished = {*backends}
-        self._live = next((each for each in backends.values() if isinstance(each, GrowingMap)), None)
+        self._fused = next((each for unit, each in backends.items() if unit.backend == drawn(task)), None)
 
     def frame_fused(self, task: Task, frame: Frame, rows: Mapping[Unit, FrameRow]) -> None:
         """Log a row of each time series, the camera, and the map."""
+        voxels = next((row.report.map_voxels for unit, row in rows.items() if unit.backend == drawn(task)), 0)
+        self._log_frame(task, frame, rows, voxels)
+
+    def _log_frame(self, task: Task, frame: Frame, rows: Mapping[Unit, FrameRow], voxels: int) -> None:
         stream, background = self._opened()
         self._clock.set(stream, frame.index, frame.timestamp)
         group = self._group or self._begin(task, frame.T_wc[:3, 3])
         for unit, row in rows.items():
             timeline.log_row(stream, unit, group.task, row.cells())
         self._scenes[task.scene.name].log(stream, frame, background)
-        group.log(stream, frame, background)
+        group.log(stream, frame, voxels, background)
 
     def unit_finished(
         self, planned: PlannedUnit, content: UnitContent | None, table: VoxelTable | None, error: str | None
@@ -229,7 +234,7 @@ class Recording(Observer):
                 logger.warning("%s, %s: recorded without pictures (%s)", scene, model, error)
             background.drain()
             self._clock.set(stream, task.indices[-1])
-            group = self._group or self._begin(task, followed=False)
+            group = self._group or self._begin(task)
             for record in records:
                 if record.series is not None:
                     timeline.log_file(stream, record.unit, task, record.series, self._clock)
@@ -281,7 +286,7 @@ class Recording(Observer):
             self._send_layout(self._stream)
         return self._stream, self._background
 
-    def _begin(self, task: Task, position: Float64 | None = None, *, followed: bool = True) -> GroupLog:
+    def _begin(self, task: Task, position: Float64 | None = None) -> GroupLog:
         """Begin the log of a model on a scene, with all backends of the plan."""
         stream, _ = self._opened()
         scene, voxel_size = self._scenes[task.scene.name], self._plan.config.voxel_size
@@ -289,25 +294,24 @@ class Recording(Observer):
             position = task.scene.T_wc(task.indices[0])[:3, 3]
         origin = scene.begin(stream, position, voxel_size)
         own = next(each for each in self._plan.tasks if (each.scene.name, each.model) == (scene.name, task.model))
-        self._group = GroupLog(own, voxel_size, origin, self._live, followed=followed)
-        self._live = None
+        self._group = GroupLog(own, voxel_size, origin, self._fused)
         return self._group
 
     def _replay_frames(self, task: Task, summary: UnitSummary) -> None:
-        """Read the frames of a task again; where the map would not fit into memory, their drift is left out."""
-        config, scene = self._plan.config, task.scene.name
-        fits = summary.table.voxels * (BYTES_A_VOXEL + 8 * summary.table.K) < available_bytes() / 2
+        """Read and fuse the frames of a task again; where the map would not fit into memory, drift is left out."""
+        config, scene, K = self._plan.config, task.scene.name, summary.table.K
+        fits = expected_bytes(REPLAY, summary.table.voxels, 0, K, soft=True) < available_bytes() / 2
+        self._fused = create(REPLAY, voxel_size=config.voxel_size, num_classes=K) if fits else None
         frames = prefetch(
             lambda index: read(task, index, config.pixel_stride),
             task.indices, threads=config.threads, size=lambda frame: frame.nbytes,
         )  # fmt: skip
         with contextlib.closing(frames):
             for each in frames:
-                if self._group is None:
-                    self._begin(task, each.item.T_wc[:3, 3], followed=fits)
-                self.frame_fused(task, each.item, {})
+                voxels = 0 if self._fused is None else self._fused.integrate(each.item).map_voxels
+                self._log_frame(task, each.item, {}, voxels)
         if not fits:
-            text = f"{task.model}: drift of frames is left out, because a second map would not fit into memory"
+            text = f"{task.model}: drift of frames is left out, because its map would not fit into memory"
             self._opened()[0].log(path(scene, "log"), rr.TextLog(text))
 
     def _log_unit(self, group: GroupLog, summary: UnitSummary, table: VoxelTable, factor: int = 1) -> None:
@@ -325,7 +329,7 @@ class Recording(Observer):
 
     def _end_group(self) -> None:
         """Log the flips of the group that is fused."""
-        group, self._group, self._live, self._unfinished = self._group, None, None, set()
+        group, self._group, self._fused, self._unfinished = self._group, None, None, set()
         if group is None:
             return
         stream, background = self._opened()

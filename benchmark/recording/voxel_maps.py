@@ -1,8 +1,7 @@
 """Record fused voxels: VoxelGridMaps with all measures on the same voxels; a view selects the measure that it shows.
 
-A map is logged in chunks. While it grows, a chunk is a range of voxels in the order of their first observation, so its
-voxels are mostly seen, and seen again, together. Only chunks that changed are logged again, and without their indices
-if they have no new voxels.
+A map is logged in chunks, ranges of rows of its table, which the viewer can load one by one. While it grows it is
+logged now and then, as a budget of voxels allows.
 """
 
 from __future__ import annotations
@@ -17,9 +16,7 @@ import numpy.typing as npt
 import rerun as rr
 from rerun.blueprint.encodings import ComponentSourceKind, VisualizerComponentMapping
 
-from semstab.backends import GrowingMap
-from semstab.core.types import Float64, Int32, Int64, UInt32
-from semstab.data.evidence import Evidence
+from semstab.core.types import Int64, UInt32
 from semstab.data.labels import LabelSpace
 from semstab.data.measures import Voxels, bits, measures, sbd
 from semstab.data.records import Record
@@ -71,11 +68,8 @@ CHUNKS = 10
 BUDGET = 2_000_000
 """The most voxels that are logged of a map while it grows; its end adds at most MAX_VOXELS."""
 
-MOST_A_FRAME = 10_000
-"""The most voxels of the budget that a frame may use, so that short runs do not log every voxel with each frame."""
-
-NEW = 10
-"""The weight of a voxel that is not drawn yet, in voxels that are seen again."""
+MOST_A_FRAME = 25_000
+"""The most voxels that a frame adds to what may be logged, so that short runs do not log every voxel each frame."""
 
 
 def edges() -> Int64:
@@ -95,23 +89,21 @@ def packed(colors: npt.ArrayLike) -> UInt32:
     return rgba
 
 
-def components(index: Int64 | None, size: float, classes: LabelSpace, voxels: Voxels) -> list[Any]:
+def components(index: Int64, size: float, classes: LabelSpace, voxels: Voxels) -> list[Any]:
     """Return a grid that shows the dominant class, with the measures that it can show instead; see `visualizer`.
 
     Args:
-        index: (n, 3) relative to the map's origin: small, so that the viewer's float32 keeps it exact; None where only
-            colours and values changed.
+        index: (n, 3) relative to the map's origin: small, so that the viewer's float32 keeps it exact.
         size: Edge of a voxel, metres.
         classes: The label space, with its colours.
         voxels: Evidence that is measured, so that each measure is computed in one pass.
     """
-    where: dict[str, Any] = {}
-    if index is not None:
-        where = {"voxel_indices": index.astype(np.int32), "voxel_size": [size] * 3}
     category = packed(CATEGORY_COLORS)[categorise(voxels.op, sbd(voxels), bits(voxels))]
     values: dict[str, npt.NDArray[Any]] = {measure.key: measure.of(voxels) for measure in measures()}
     return [
-        rr.VoxelGridMap.from_fields(**where, colors=packed(classes.colors)[dominant(voxels)]),
+        rr.VoxelGridMap.from_fields(
+            voxel_indices=index.astype(np.int32), voxel_size=[size] * 3, colors=packed(classes.colors)[dominant(voxels)]
+        ),
         rr.DynamicArchetype("category", components={"colors": rr.components.ColorBatch(category)}),
         *(
             rr.DynamicArchetype(name, components={"values": rr.components.VoxelValueBatch(each.astype(np.float32))})
@@ -172,46 +164,34 @@ def load_map(record: Record, origin: Int64) -> tuple[int, VoxelTable]:
 
 
 class VoxelLogger:
-    """Logs the changes of a map within the budget: each of `frames` frames may log its share, and what others left.
-
-    If a frame has more to log, the chunks with the most voxels that are new, or were observed again since they were
-    logged, come first.
-    """
+    """Logs a map while it grows, as often as the budget allows: each of `frames` frames adds its share to it."""
 
     def __init__(self, entity: str, classes: LabelSpace, origin: Int64, frames: int) -> None:
         self._entity, self._classes, self._origin = entity, classes, origin
         self._edges = edges()
-        self._chunk_of = np.repeat(np.arange(CHUNKS, dtype=np.uint8), np.diff(self._edges))
         self._share = min(BUDGET / frames, MOST_A_FRAME)
         self._allowed = 0.0  # voxels of the budget that the frames so far have not used
-        self._changed = np.zeros(CHUNKS, dtype=np.int64)  # observations in each chunk since it was logged
-        self._drawn = np.zeros(CHUNKS, dtype=np.int64)  # voxels that each chunk was logged with
+        self._drawn = 0  # chunks of the growing map
 
-    def update(self, stream: rr.RecordingStream, fused: GrowingMap) -> list[Callable[[], None]]:
-        """Return jobs that log the last frame's changes as far as the budget allows; later frames do not alter them."""
-        rows = fused.changes.row
-        self._changed += np.bincount(self._chunk_of[rows[rows < MAX_VOXELS]], minlength=CHUNKS)
+    def update(
+        self, stream: rr.RecordingStream, voxels: int, table: Callable[[], VoxelTable]
+    ) -> list[Callable[[], None]]:
+        """Return jobs that log the map if the budget allows so many voxels; later frames do not alter them."""
         self._allowed += self._share
-        sizes = np.diff(np.minimum(self._edges, len(fused)))
-        urgency = (self._changed + NEW * (sizes - self._drawn)) / np.maximum(sizes, 1)
-        jobs: list[Callable[[], None]] = []
-        for c in np.argsort(-urgency, kind="stable"):
-            if self._changed[c] == 0 or sizes[c] > self._allowed:
-                break
-            self._allowed -= sizes[c]
-            at = np.arange(self._edges[c], self._edges[c] + sizes[c])
-            index = fused.index_of(at) - self._origin if self._drawn[c] != sizes[c] else None
-            values = fused.column("op", at), fused.evidence_of(at), fused.column("drift_sum", at)
-            jobs.append(functools.partial(self._log, stream, int(c), index, fused.voxel_size, *values))
-            self._changed[c], self._drawn[c] = 0, sizes[c]
-        return jobs
+        if not 0 < voxels <= min(self._allowed, MAX_VOXELS):
+            return []
+        self._allowed -= voxels
+        grown = table()
+        chunks = [part for part in np.split(np.arange(len(grown)), self._edges[1:-1]) if len(part)]
+        self._drawn = len(chunks)
+        return [functools.partial(self._log, stream, c, grown, part, 1) for c, part in enumerate(chunks)]
 
-    def _log(
-        self, stream: rr.RecordingStream, c: int, index: Int64 | None, size: float,
-        op: Int32, evidence: Float64 | Evidence, drift_sum: Float64,
-    ) -> None:  # fmt: skip
-        voxels = Voxels(op, Evidence.of(evidence).measured(), drift_sum)
-        stream.log(chunk(self._entity, c), *components(index, size, self._classes, voxels))
+    def _log(self, stream: rr.RecordingStream, c: int, table: VoxelTable, rows: Int64, factor: int) -> None:
+        """Log rows of a table as a chunk, whose voxels stand for blocks with an edge of `factor` voxels."""
+        at = np.s_[rows[0] : rows[-1] + 1] if factor == 1 else rows  # a map that is not thinned is not copied
+        voxels = Voxels(table.op[at], table.evidence.take(at).measured(), table.drift_sum[at])
+        index = (table.index[at] - self._origin) // factor
+        stream.log(chunk(self._entity, c), *components(index, table.voxel_size * factor, self._classes, voxels))
 
     def finish(self, stream: rr.RecordingStream, table: VoxelTable, factor: int = 1) -> str:
         """Log the final map instead of the growing one; return a note on thinning where it is too large.
@@ -225,10 +205,8 @@ class VoxelLogger:
         factor, rows = thinned(index) if factor == 1 else (factor, np.arange(len(index)))
         for c, part in enumerate(np.split(rows, self._edges[1:-1])):
             if len(part):
-                at = np.s_[part[0] : part[-1] + 1] if factor == 1 else part  # a map that is not thinned is not copied
-                values = table.op[at], table.evidence.take(at), table.drift_sum[at]
-                self._log(stream, c, index[at] // factor, table.voxel_size * factor, *values)
-            elif self._drawn[c]:
+                self._log(stream, c, table, part, factor)
+            elif c < self._drawn:
                 stream.log(chunk(self._entity, c), rr.Clear(recursive=False))
         thin = f"; drawn: one voxel of each block of {factor}x{factor}x{factor}, as large as the block"
         return thin if factor > 1 else ""
