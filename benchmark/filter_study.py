@@ -8,12 +8,13 @@ from typing import Any
 
 from semstab.check import with_voxel_size
 from semstab.config import Config, merge
-from semstab.datasets import Scene, open_dataset
+from semstab.datasets import Scene
 from semstab.models import create
 from semstab.predict.filters import parse
 from semstab.predict.predictor import NAME as STORED
 from semstab.predict.predictor import PredictorConfig, StoredSequence
 from semstab.settings import dataset_defaults, load_config, load_study, predicted_config, resolve
+from semstab.task import open_scenes
 
 STUDY = "filters"
 
@@ -37,11 +38,11 @@ def filter_study_config(
     """
     content = merge(dataset_defaults(content), content)
     config = resolve(load_config(None, {key: value for key, value in content.items() if key != "models"}))
-    dataset = open_dataset(config.dataset.name, config.dataset.options)
-    scene = dataset.scene((config.scenes or dataset.scenes)[0])
+    scenes = open_scenes(config)
+    scene = next(iter(scenes.values()))
     names = sources or ([] if models else config.models or scene.models)
     predictors = [*models, *(PredictorConfig(model=STORED, options={"source": name}) for name in names)]
-    config, _ = with_voxel_size(config)
+    config, _ = with_voxel_size(config, scenes)
     shipped = load_study(STUDY).dataset.options["try_filters"]
     grid = [_in_voxels(text, config.voxel_size) for text in filters or shipped]
     able, left_out = _able(grid, predictors, scene)

@@ -14,7 +14,7 @@ from semstab.core.types import Mask
 from semstab.data.frames import Frame
 from semstab.data.labels import LabelMapping, LabelSpace
 from semstab.data.results import Unit
-from semstab.datasets import GROUND_TRUTH, Scene
+from semstab.datasets import GROUND_TRUTH, Scene, open_dataset
 from semstab.datasets.scene import Selected, select_frames
 from semstab.errors import ConfigError, DataError
 from semstab.pixels.preparation import keep_largest, leave_out, perturb
@@ -49,6 +49,17 @@ class Task:
     def digest(self) -> str:
         """Return a hash of the input behind it."""
         return self.scene.digest([*self.indices], self.model)
+
+
+def open_scenes(config: Config) -> dict[str, Scene]:
+    """Open the scenes that a configuration selects, by name; no image is read.
+
+    Raises:
+        ConfigError, DataError: If there is no such scene, or its files contradict each other.
+    """
+    dataset = open_dataset(config.dataset.name, config.dataset.options)
+    names = selected(config.scenes, dataset.scenes, (), "scene", config.dataset.name)
+    return {name: dataset.scene(name) for name in names}
 
 
 def tasks_of(scene: Scene, config: Config, others: Sequence[str] = ()) -> Iterator[Task]:

@@ -441,20 +441,15 @@ MADE = "city"
 """The simulated dataset, for which no voxel size is suggested."""
 
 
-def with_voxel_size(config: Config) -> tuple[Config, dict[str, VoxelAdvice]]:
+def with_voxel_size(config: Config, scenes: Mapping[str, Scene]) -> tuple[Config, dict[str, VoxelAdvice]]:
     """Return the configuration, with the voxel size that `check` suggests for files if none is set, and the advice.
 
     The advice says scene by scene why that size was suggested.
-
-    Raises:
-        ConfigError, DataError: If there is no such scene.
     """
     if config.sets_voxel_size or config.dataset.name == MADE:
         return config, {}
-    dataset = open_dataset(config.dataset.name, config.dataset.options)
-    names = selected(config.scenes, dataset.scenes, (), "scene", config.dataset.name)
-    some = [names[k] for k in evenly(len(names), SCENES)]
-    coverages = {name: coverage for name in some if (coverage := _coverage(config, dataset.scene(name))) is not None}
+    some = [[*scenes.values()][k] for k in evenly(len(scenes), SCENES)]
+    coverages = {scene.name: coverage for scene in some if (coverage := _coverage(config, scene)) is not None}
     sizes = [size for coverage in coverages.values() if (size := suggested_size(coverage)) is not None]
     if not sizes:
         return config, {}

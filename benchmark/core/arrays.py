@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import dataclasses
+import threading
 import types
 from array import array
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from typing import TYPE_CHECKING, Any, TypeVar, Union, cast, get_args, get_origin, get_type_hints
 
 import numpy as np
@@ -18,6 +19,7 @@ if TYPE_CHECKING:
 
 
 T = TypeVar("T")
+A = TypeVar("A", bound="npt.NDArray[Any]")
 Arrays = dict[str, npt.NDArray[Any]]
 
 
@@ -99,6 +101,31 @@ class Rows:
 
 
 # Arrays of numpy as columns of Arrow, and back.
+
+
+class RecentArrays:
+    """The arrays that were made last, by number, of at most so many bytes; threads may share it."""
+
+    def __init__(self, most_bytes: int) -> None:
+        self._most, self._bytes = most_bytes, 0
+        self._arrays: dict[int, npt.NDArray[Any]] = {}  # the one that was asked for last comes last
+        self._lock = threading.Lock()
+
+    def get(self, number: int, make: Callable[[], A]) -> A:
+        """Return the array of that number, read-only; make it where it is not at hand."""
+        with self._lock:
+            known = self._arrays.pop(number, None)
+            if known is not None:
+                self._arrays[number] = known
+                return cast(A, known)
+        made = make()
+        made.flags.writeable = False
+        with self._lock:
+            self._bytes += made.nbytes - (self._arrays.pop(number).nbytes if number in self._arrays else 0)
+            self._arrays[number] = made
+            while self._bytes > self._most and self._arrays:
+                self._bytes -= self._arrays.pop(next(iter(self._arrays))).nbytes
+        return made
 
 
 def column(values: npt.NDArray[Any]) -> pa.Array:

@@ -26,6 +26,7 @@ from semstab.engine.tiled_units import TiledUnit
 from semstab.engine.units import Plan, PlannedUnit, make_plan
 from semstab.errors import ConfigError, DataError
 from semstab.settings import resolve
+from semstab.task import open_scenes
 
 logger = logging.getLogger("semstab")
 
@@ -52,8 +53,9 @@ def execute(
     """
     started, telling, executor = time.perf_counter(), Observers(observers), executor or InProcess()
     config = resolve(config)
-    config, advice = with_voxel_size(config)
-    plan = make_plan(config)
+    scenes = open_scenes(config)
+    config, advice = with_voxel_size(config, scenes)
+    plan = make_plan(config, scenes)
     require_file_names(out, (each.unit for each in plan.units))
     folder = Folder(out, config)
     try:

@@ -29,9 +29,9 @@ from semstab.data.labels import LabelSpace
 from semstab.data.measures import measures
 from semstab.data.records import REGIONS, Variation
 from semstab.data.results import Unit
-from semstab.datasets import Scene, open_dataset
+from semstab.datasets import Scene
 from semstab.errors import ConfigError
-from semstab.task import Task, applies, frame_indices, selected, tasks_of
+from semstab.task import Task, applies, frame_indices, open_scenes, selected, tasks_of
 
 logger = logging.getLogger("semstab")
 
@@ -127,18 +127,20 @@ class Plan:
         )
 
 
-def make_plan(config: Config) -> Plan:
+def make_plan(config: Config, scenes: Mapping[str, Scene] | None = None) -> Plan:
     """Open what the configuration selects and check that it fits together; no image is read.
+
+    Args:
+        config: Resolved settings.
+        scenes: Their scenes, where they are open already: what these have read is not read again.
 
     Raises:
         ConfigError, DataError, MissingDependencyError: If something does not.
     """
     for backend in config.fused_by():  # a missing engine is reported before all else
         create(backend.name, voxel_size=config.voxel_size, num_classes=2, **backend.options)
-    dataset = open_dataset(config.dataset.name, config.dataset.options)
-    names = selected(config.scenes, dataset.scenes, (), "scene", config.dataset.name)
-    _check_names(config.scene_frames, names, "scene_frames")
-    scenes = {name: dataset.scene(name) for name in names}
+    scenes = open_scenes(config) if scenes is None else scenes
+    _check_names(config.scene_frames, [*scenes], "scene_frames")
     base = tuple(_base_units(config, scenes))
     units = (*base, *_varied_units(config, base, scenes))
     if config.exclude.predicted_classes:

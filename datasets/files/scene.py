@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from semstab.core.arrays import RecentArrays
 from semstab.core.prefetch import prefetch
 from semstab.core.types import Float32, Float64, UInt8, UInt16
 from semstab.data.frames import Frame, Intrinsics
@@ -32,6 +33,9 @@ PLACES = {
     "casts", "images",
 }  # fmt: skip
 """Options that are paths and do not change the numbers; label spaces and tables count by their content."""
+
+DEPTH_BYTES = 1 << 27
+"""The most bytes of depth images that stay in memory."""
 
 DEPTH, LABELS, MASK = "depth", "labels of ", "mask"
 """Kinds of a frame's files."""
@@ -70,6 +74,7 @@ class FileScene(Scene):
         self.regions = self._maps.regions
         self.label_paths = tuple(label_paths(options, entry, frames))
         self._digests: dict[tuple[int, str], bytes] = {}
+        self._depths = RecentArrays(DEPTH_BYTES)
         self._tracked: dict[int, bool] = {}
         self._surface = surface
         self._surface_seen = False
@@ -186,11 +191,16 @@ class FileScene(Scene):
         return at_image(self.geometry(index), shape, str(source.color or source.name), K)
 
     def depth(self, index: int) -> Float32:
-        """Return depth (H, W) float32 in metres along the optical axis.
+        """Return depth (H, W) float32 in metres along the optical axis, read-only.
+
+        The last images stay in memory: check, fusion, ground truth and pictures want the same ones.
 
         Raises:
             DataError: If that fails, with the file.
         """
+        return self._depths.get(index, lambda: self._read_depth(index))
+
+    def _read_depth(self, index: int) -> Float32:
         if self._surface is None:
             read = self._reader(index, DEPTH)
             return stored_depth(self._frame(index), self.options, read, lambda shape: self.intrinsics(index, shape))
