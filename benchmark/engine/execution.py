@@ -61,7 +61,10 @@ def execute(
     try:
         execution = _Execution(plan, folder, executor, telling)
         with folder.started(config) as start, share_open_scenes(start.name, plan.scenes):
-            execution.compute(start)
+            execution.begin(start)
+            with contextlib.closing(executor.run(execution.next_job, telling)) as outcomes:
+                for outcome in itertools.chain(execution.ended, outcomes):
+                    execution.take(outcome)
         units = execution.units
         units.advice = advice or advice_of(plan, units.contents)
         result = result_of(plan, folder, units)
@@ -77,7 +80,12 @@ def execute(
 
 
 class _Execution:
-    """The units that an earlier start finished, and all others, stored as they finish."""
+    """The units that an earlier start finished, and all others, stored as they finish.
+
+    Attributes:
+        units: What is known of each unit so far.
+        ended: Outcomes of tiled units that an earlier start computed and did not store.
+    """
 
     def __init__(self, plan: Plan, folder: Folder, executor: Executor, observers: Observers) -> None:
         self._plan, self._folder, self._executor, self._observers = plan, folder, executor, observers
@@ -87,50 +95,48 @@ class _Execution:
             units.contents = {key: content for key, content in there if content is not None}
         units.finished_before, finished = len(units.contents), dict(units.contents)
         observers.tell(lambda observer: observer.run_started(plan, finished))
-        self._missing = [each for identity, each in plan.distinct().items() if identity not in finished]
+        self._missing = {each.identity: each for each in plan.distinct().values() if each.identity not in finished}
+        self._queue, self._tiled, self.ended = deque[Job](), dict[str, TiledUnit](), list[Outcome]()
         if plan.config.check_geometry:
             with units.watch("check"):
-                self._check_geometry(plan.config, self._missing)
+                self._check_geometry(plan.config, [*self._missing.values()])
 
-    def compute(self, start: Start) -> None:
-        """Compute the units that are missing, each stored as it finishes."""
-        planned = {each.identity: each for each in self._missing}
-        whole, tiled = self._begin(start)
-        queue = deque(jobs_of(whole, self._executor.width))
-        ended = [outcome for unit in tiled.values() if (outcome := unit.ended()) is not None]
-
-        def next_job() -> Job | None:
-            return queue.popleft() if queue else next(filter(None, (unit.next_job() for unit in tiled.values())), None)
-
-        with contextlib.closing(self._executor.run(next_job, self._observers)) as outcomes:
-            for outcome in itertools.chain(ended, outcomes):
-                own: Outcome | None = outcome
-                unit = tiled.get(outcome.identity)
-                if unit is not None and outcome.tile is not None:
-                    self.units.add_seconds(outcome)
-                    with self.units.watch("assemble"):
-                        own = unit.take(outcome)
-                    step, name = unit.step(), unit.name
-                    self._observers.tell(lambda observer: observer.advanced(step, name))  # noqa: B023
-                if own is not None:
-                    self._keep(planned[own.identity], own, in_tiles=unit is not None)
-
-    def _begin(self, start: Start) -> tuple[list[Work], dict[str, TiledUnit]]:
-        """Return the work of units that are fused whole, and the units in tiles; those that cannot be fused fail."""
+    def begin(self, start: Start) -> None:
+        """Queue the units that are fused whole, and the units in tiles; those that cannot be fused fail."""
         with self.units.watch("sizing"):
-            sizing = planned_sizes(self._plan.config, self._missing, self._executor.width)
+            sizing = planned_sizes(self._plan.config, self._missing.values(), self._executor.width)
             trim_malloc()
         for line in sizing.lines:
             logger.warning("%s", line)
-        whole, tiled = list[Work](), dict[str, TiledUnit]()
-        for each in self._missing:
+        whole = list[Work]()
+        for each in self._missing.values():
             if (error := sizing.refused.get(each.identity)) is not None:
                 self._keep(each, Outcome(each.identity, error=error, cause=ConfigError(error)))
             elif (size := sizing.tile_sizes.get(each.identity)) is not None:
-                tiled[each.identity] = TiledUnit(each, size, self._folder, start)
+                self._tiled[each.identity] = TiledUnit(each, size, self._folder, start)
             else:
                 whole.append(Work.of(each, start))
-        return whole, tiled
+        self._queue = deque(jobs_of(whole, self._executor.width))
+        self.ended = [outcome for unit in self._tiled.values() if (outcome := unit.ended()) is not None]
+
+    def next_job(self) -> Job | None:
+        """Return the next job; None where there is none until outcomes that are taken call for more."""
+        if self._queue:
+            return self._queue.popleft()
+        return next(filter(None, (unit.next_job() for unit in self._tiled.values())), None)
+
+    def take(self, outcome: Outcome) -> None:
+        """Store the outcome of a unit, or of a tile."""
+        own: Outcome | None = outcome
+        unit = self._tiled.get(outcome.identity)
+        if unit is not None and outcome.tile is not None:
+            self.units.add_seconds(outcome)
+            with self.units.watch("assemble"):
+                own = unit.take(outcome)
+            step, name = unit.step(), unit.name
+            self._observers.tell(lambda observer: observer.advanced(step, name))
+        if own is not None:
+            self._keep(self._missing[own.identity], own, in_tiles=unit is not None)
 
     def _keep(self, each: PlannedUnit, outcome: Outcome, *, in_tiles: bool = False) -> None:
         units, folder, content = self.units, self._folder, outcome.content
