@@ -183,6 +183,23 @@ def open_file(path: str | Path) -> BufferedReader:
     return file
 
 
+FILE_DIGEST = "sha256"
+"""Processors have instructions for it: there it takes half of blake2b's time."""
+
+
+def file_digest(path: Path) -> bytes:
+    """Return a hash of a file's content.
+
+    Raises:
+        DataError: If it cannot be read.
+    """
+    try:
+        with open_file(path) as file:
+            return hashlib.file_digest(file, FILE_DIGEST).digest()
+    except OSError as error:
+        raise DataError(f"{path}: cannot be read ({error.strerror})") from error
+
+
 def parse_yaml(text: str, where: str) -> Any:
     """Return the content of a YAML text, without tags that make objects.
 

@@ -18,9 +18,19 @@ import yaml
 
 from semstab.backends import keeps_log
 from semstab.config import Config, read_yaml
-from semstab.core.files import TEMPORARY, FolderLock, atomic_path, read_json, remove_leftovers, write_json, write_text
+from semstab.core.files import (
+    TEMPORARY,
+    FolderLock,
+    atomic_path,
+    file_digest,
+    read_json,
+    remove_leftovers,
+    write_json,
+    write_text,
+)
 from semstab.core.json_form import from_json, to_json
 from semstab.data import earlier
+from semstab.data.digests import DIGESTS, write_digests
 from semstab.data.measures import measures
 from semstab.data.records import (
     EVENTS,
@@ -37,7 +47,6 @@ from semstab.data.records import (
     UnitContent,
 )
 from semstab.data.results import SCHEMA, Unit, slug
-from semstab.datasets.formats.disk import file_digest
 from semstab.engine.messages import TILES, Outcome, Start
 from semstab.engine.units import PlannedUnit
 from semstab.errors import ConfigError, DataError
@@ -154,14 +163,15 @@ class Folder:
             truth_file=self.path / truth if planned.image_space and has_truth else None,
         )
 
-    def save_result(self, result: Result) -> None:
-        """Write summary.json and manifest.json."""
+    def save_result(self, result: Result, contents: Iterable[UnitContent]) -> None:
+        """Write summary.json, manifest.json, and the digests of the units' files."""
         records = _with_files(result.records, lambda file: file.relative_to(self.path))
         content = to_json(dataclasses.replace(result, records=records, manifest={}))
         runs = content.pop("records")
         del content["manifest"]
         write_json(self.path / "summary.json", {"schema": SCHEMA, "runs": runs, **content})
         write_json(self.path / "manifest.json", result.manifest)
+        write_digests(self.path, {name: digest for content in contents for name, digest in content.files.items()})
 
     @contextlib.contextmanager
     def started(self, config: Config) -> Iterator[Start]:
@@ -171,6 +181,7 @@ class Folder:
             for folder in (self.path / name, *self.path.glob(f"{name}/*/")):
                 remove_leftovers(folder)
         (self.path / FAILURES).unlink(missing_ok=True)
+        (self.path / DIGESTS).unlink(missing_ok=True)  # until this start has ended, files are of this one or the last
         start.marker.touch()
         try:
             yield start
@@ -188,13 +199,17 @@ class Folder:
             and (summary.statistics is not None or not planned.assessed)
             and (content.checked is not None or not planned.sampled)
             and self.are_whole({name: content.files.get(name) for name in self._wanted(planned, content)})
+            and (not planned.stored or self.are_whole(content.files))
         )
 
     def are_whole(self, files: Mapping[str, str | None]) -> bool:
         """Return whether files are there, with these digests; the first one that differs is reported."""
         for name, digest in files.items():
             path = self.path / name
-            if digest is None or not path.exists():
+            if digest is None:
+                return False
+            if not path.exists():
+                logger.warning("%s: is missing; its unit is computed again", path)
                 return False
             if file_digest(path).hex() != digest:
                 logger.warning("%s: has changed since it was written; its unit is computed again", path)

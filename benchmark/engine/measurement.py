@@ -14,7 +14,7 @@ import numpy.typing as npt
 
 from semstab.backends.numpy_reference import NumpySample, in_sample
 from semstab.config import Config
-from semstab.core.files import atomic_path
+from semstab.core.files import atomic_path, file_digest
 from semstab.core.process import Stopwatch, trim_malloc
 from semstab.core.types import Float64
 from semstab.data.events import Events
@@ -26,7 +26,6 @@ from semstab.data.records import EVENTS, FRAMES, OBSERVATIONS, OVERVIEW, SUMS, T
 from semstab.data.results import RECURRENT, STAGES, Agreement, FrameDrift, ReducedScores, UnitSummary, slug
 from semstab.data.voxels import VoxelTable
 from semstab.datasets import Scene
-from semstab.datasets.formats.disk import file_digest
 from semstab.engine.live_maps import LiveMap, Stream
 from semstab.engine.messages import Outcome, Start
 from semstab.engine.series import Series
