@@ -261,8 +261,11 @@ def check(
     from semstab.check import check as check_scenes
     from semstab.check.display import print_check
     from semstab.core.files import write_json
+    from semstab.engine.folder import require_output
     from semstab.settings import load_config, resolve
 
+    if json_file is not None:
+        require_output(json_file, [config])
     named = {"scenes": scene, "models": model, "voxel_size": voxel_size}
     selected = resolve(load_config(config, chosen(named, settings, options, dataset, data, frames)))
     console, results = Console(quiet=quiet), []

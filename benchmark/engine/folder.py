@@ -64,6 +64,32 @@ FAILURES = "failures.log"
 WRITTEN = (UNITS, VOXELS, TRUTH, EVENTS, OBSERVATIONS, FRAMES, SUMS, OVERVIEW, TILES, "tables", "figures")
 """Folders into which files are written."""
 
+OWN_FILES = (SETTINGS, FAILURES, DIGESTS, "summary.json", "manifest.json", "report.html", "recording.rrd")
+"""Files of a run beside these folders."""
+
+
+def require_output(path: str | Path, inputs: Iterable[str | Path | None] = ()) -> None:
+    """Require that a file to write is none of a run's own files, and none of the files that are read for it.
+
+    Raises:
+        ConfigError: If it is.
+    """
+    path = Path(path)
+    real = path.resolve()
+    for folder in real.parents:
+        parts = real.relative_to(folder).parts
+        own = (parts[0] in WRITTEN and len(parts) > 1) or (real.name in OWN_FILES and len(parts) == 1)
+        if own and (folder / SETTINGS).is_file() and _holds_run(folder):
+            raise ConfigError(f"{path}: is a file of the run in this folder; name another file")
+    if any(real == Path(given).resolve() for given in inputs if given is not None):
+        raise ConfigError(f"{path}: is also read; name another file")
+
+
+def _holds_run(folder: Path) -> bool:
+    """Return whether a folder holds a run or a study, of any version."""
+    with (folder / SETTINGS).open(encoding="utf-8", errors="replace") as lines:
+        return lines.readline(200).startswith(LAYOUT.rstrip("0123456789"))
+
 
 def require_file_names(out: Path, units: Iterable[Unit]) -> None:
     """Raise ConfigError where two units' files would share a name, or one is too long for the file system."""

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from semstab.config import nearest
-from semstab.engine.folder import load_result
+from semstab.engine.folder import load_result, require_output
 from semstab.errors import ConfigError
 from semstab.exports import annotation_formats, clouds, maps
 from semstab.exports import join as joining
@@ -118,6 +118,7 @@ def export(
     """
     files = [Path(file) for file in ([to] if isinstance(to, str | Path) else to)]
     for file in files:
+        require_output(file, (asprs, classify or onto, join or beside, thresholds or commit))
         if task_format is not None:
             annotation_formats.check(task_format, file)
         elif file.suffix.lower() not in SUFFIXES:

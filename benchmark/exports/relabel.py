@@ -29,7 +29,7 @@ from semstab.errors import ConfigError, DataError
 from semstab.exports.join import NONE, VoxelLookup
 from semstab.metrics import CATEGORIES, categories
 from semstab.metrics.agreement import rows_of
-from semstab.predict.folder import PredictionFolder
+from semstab.predict.folder import NO_FOLDER_NAME, PredictionFolder, names_a_folder
 from semstab.settings import load_config
 from semstab.statistics import psa
 from semstab.statistics.acceptance import AcceptanceThresholds
@@ -311,6 +311,8 @@ def relabel(
         ConfigError, DataError: If the data has changed since it was fused, or its label maps cannot have the depth's
             pixels.
     """
+    if name is not None and not names_a_folder(name):
+        raise ConfigError(f"name {name!r}: {NO_FOLDER_NAME}")
     result = load_result(run)
     record = result.record(scene=scene, model=model, backend=backend)
     task, pixel_stride = task_of(Path(run), record, result.manifest["inputs"])

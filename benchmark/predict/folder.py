@@ -21,6 +21,7 @@ from semstab.datasets.files.labels import LABEL_SPACE_FILE
 from semstab.datasets.files.options import inside
 from semstab.datasets.formats.images import LABEL_SUFFIXES, SCORE_SUFFIXES
 from semstab.datasets.geometry.lenses import fitted
+from semstab.datasets.scene import GROUND_TRUTH
 from semstab.errors import ConfigError, DataError
 
 SCHEMA = 1
@@ -32,6 +33,14 @@ SAVE_SECONDS = 5.0
 
 Kind = Literal["labels", "scores", "regions"]
 ScoreType = Literal["float16", "float32"]
+
+
+NO_FOLDER_NAME = "it names a folder; use letters, digits, '-' and '_'"
+
+
+def names_a_folder(name: str) -> bool:
+    """Return whether the maps of a label source can lie in a folder of its name, which is not the ground truth's."""
+    return name not in ("", ".", "..", GROUND_TRUTH) and not set(name) & set("/\\") and name.isprintable()
 
 
 @dataclass(frozen=True)
