@@ -51,6 +51,11 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
         temporary.unlink(missing_ok=True)
 
 
+def not_written() -> OSError:
+    """Return the error of a file that a library wrote without an error and not whole; `atomic_path` names it."""
+    return OSError(errno.ENOSPC, "could not be written whole; the disk may be full")
+
+
 class FolderLock:
     """A folder that one process owns until `release`, or until it dies.
 
@@ -97,12 +102,12 @@ def csv_text(text: str) -> str:
     return f"'{text}" if text.startswith(("=", "+", "-", "@", "\t", "\r")) else text
 
 
-def write_png(path: str | Path, image: npt.NDArray[Any]) -> None:
-    """Write a grey or BGR image atomically."""
+def write_image(path: str | Path, image: npt.NDArray[Any], *settings: int) -> None:
+    """Write a grey or BGR image atomically, in the format of the path's suffix, with settings of OpenCV."""
     import cv2
 
-    with atomic_path(path) as temporary:
-        temporary.write_bytes(cv2.imencode(".png", image)[1].tobytes())
+    with atomic_path(path) as temporary:  # imwrite does not say that the disk is full
+        temporary.write_bytes(cv2.imencode(Path(path).suffix, image, settings)[1].tobytes())
 
 
 def write_stack(

@@ -118,7 +118,7 @@ def export(
     """
     files = [Path(file) for file in ([to] if isinstance(to, str | Path) else to)]
     for file in files:
-        require_output(file, (asprs, classify or onto, join or beside, thresholds or commit))
+        require_output(file, (asprs, join or beside, thresholds or commit))
         if task_format is not None:
             annotation_formats.check(task_format, file)
         elif file.suffix.lower() not in SUFFIXES:

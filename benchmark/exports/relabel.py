@@ -346,12 +346,14 @@ def relabel(
         folder.write(task.scene.image_name(frame.index), record.key, maps, 0.0)
         tally.add(frame, rows, known)
         progress(f"{task.scene.name} · {name}", done, len(task.indices))
+    folder.require_whole()
     folder.save()
     report = Relabelled(
         task.scene.name, task.model, name, str(folder.path), len(task.indices), **tally.counts,
         leave_one_out=chosen.leave_one_out, correctness=tally.correctness(),
     )  # fmt: skip
     write_json(folder.path / REPORT, {**dataclasses.asdict(report), "belief": chosen.settings()})
+    folder.close()
     return report
 
 
