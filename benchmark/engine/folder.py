@@ -190,14 +190,21 @@ class Folder:
         )
 
     def save_result(self, result: Result, contents: Iterable[UnitContent]) -> None:
-        """Write summary.json, manifest.json, and the digests of the units' files."""
+        """Write summary.json, manifest.json, and the digests of the units' files.
+
+        Raises:
+            DataError: If one of these files is gone.
+        """
+        digests = {name: digest for content in contents for name, digest in content.files.items()}
+        if lost := next((name for name in digests if not (self.path / name).exists()), None):
+            raise DataError(f"{self.path / lost}: was written, and is gone; run the same command again")
         records = _with_files(result.records, lambda file: file.relative_to(self.path))
         content = to_json(dataclasses.replace(result, records=records, manifest={}))
         runs = content.pop("records")
         del content["manifest"]
         write_json(self.path / "summary.json", {"schema": SCHEMA, "runs": runs, **content})
         write_json(self.path / "manifest.json", result.manifest)
-        write_digests(self.path, {name: digest for content in contents for name, digest in content.files.items()})
+        write_digests(self.path, digests)
 
     @contextlib.contextmanager
     def started(self, config: Config) -> Iterator[Start]:
