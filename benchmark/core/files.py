@@ -11,7 +11,7 @@ import stat
 import tempfile
 import zipfile
 from collections.abc import Collection, Iterable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from io import BufferedReader
 from pathlib import Path
 from typing import Any
@@ -35,9 +35,7 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
     """Yield a temporary path next to `path`; rename it to `path` if the block succeeds, else remove it."""
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
-    handle, name = tempfile.mkstemp(dir=path.parent, prefix=TEMPORARY, suffix=path.suffix)
-    os.close(handle)
-    temporary = Path(name)
+    handle, temporary = _locked_temporary(path)
     try:
         yield temporary
         os.umask(mask := os.umask(0))
@@ -49,6 +47,18 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
         raise
     finally:
         temporary.unlink(missing_ok=True)
+        os.close(handle)
+
+
+def _locked_temporary(path: Path) -> tuple[int, Path]:
+    """Create a temporary file next to a path, locked so that `remove_abandoned` leaves it alone."""
+    while True:
+        handle, name = tempfile.mkstemp(dir=path.parent, prefix=TEMPORARY, suffix=path.suffix)
+        with suppress(OSError):  # a file system without locks
+            fcntl.flock(handle, fcntl.LOCK_SH)
+        if Path(name).exists():  # else it was removed before it was locked
+            return handle, Path(name)
+        os.close(handle)
 
 
 def not_written() -> OSError:
@@ -64,6 +74,7 @@ class FolderLock:
     """
 
     def __init__(self, path: Path) -> None:
+        self.path = path
         path.mkdir(parents=True, exist_ok=True)
         self._handle: int | None = os.open(path, os.O_RDONLY)
         try:
@@ -84,6 +95,14 @@ def remove_leftovers(folder: Path) -> None:
     """Remove what `atomic_path` left where its process was killed; nobody else may be writing there."""
     for path in folder.glob(f"{TEMPORARY}*"):
         path.unlink()
+
+
+def remove_abandoned(folder: Path) -> None:
+    """Remove what `atomic_path` left in a folder that others may be writing to: the files that no process holds."""
+    for path in folder.glob(f"{TEMPORARY}*"):
+        with suppress(OSError), path.open("rb") as file:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            path.unlink(missing_ok=True)
 
 
 def write_text(path: str | Path, text: str) -> None:

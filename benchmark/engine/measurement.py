@@ -301,15 +301,16 @@ def _save_overview(stream: Stream, path: Path) -> None:
 
 def written(start: Start, savers: Savers) -> tuple[dict[str, str], dict[str, bytes]]:
     """Write files into the folder where it is shared; their digests, and their bytes where it is not."""
+    if start.marker.exists():
+        for name, save in savers.items():
+            save(start.folder / name)
+        return {name: file_digest(start.folder / name).hex() for name in savers}, {}
     digests, returned = {}, {}
-    shared = start.marker.exists()
     with tempfile.TemporaryDirectory() as elsewhere:
         for name, save in savers.items():
-            path = (start.folder if shared else Path(elsewhere)) / name
+            path = Path(elsewhere) / name
             save(path)
-            digests[name] = file_digest(path).hex()
-            if not shared:
-                returned[name] = path.read_bytes()
+            digests[name], returned[name] = file_digest(path).hex(), path.read_bytes()
     return digests, returned
 
 

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from semstab.config import nearest
+from semstab.core.files import remove_abandoned
 from semstab.engine.folder import load_result, require_output
 from semstab.errors import ConfigError
 from semstab.exports import annotation_formats, clouds, maps
@@ -123,6 +124,8 @@ def export(
             annotation_formats.check(task_format, file)
         elif file.suffix.lower() not in SUFFIXES:
             raise ConfigError(f"{file}: format '{file.suffix}' is not known; {nearest(file.suffix, SUFFIXES)}")
+    for folder in {file.parent for file in files if file.parent.is_dir()}:
+        remove_abandoned(folder)  # of a killed export
     result = load_result(run)
     record = result.record(scene=scene, model=model, backend=backend)
     settings = Settings(cell, None if asprs is None else Path(asprs))

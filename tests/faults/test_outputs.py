@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import shutil
+import signal
+import time
 
 import pytest
 import tiny_scene
@@ -11,6 +13,7 @@ from posed_config import configure
 
 import semstab
 from semstab.comparison.runs import open_run, save_summary
+from semstab.core.files import FolderLock, atomic_path
 
 
 @pytest.fixture(scope="module")
@@ -76,3 +79,32 @@ def test_a_baseline_may_replace_the_one_that_it_was_held_against(run, tmp_path) 
 def test_a_relabelled_source_stays_in_its_folder(run, tmp_path, name) -> None:
     assert "it names a folder" in error_of("relabel", "run", "--out", "o", "--name", name, cwd=tmp_path)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["run"]
+
+
+def test_what_a_killed_export_left_is_removed_and_what_is_being_written_is_not(run, tmp_path) -> None:
+    (tmp_path / ".semstab-killed.ply").write_bytes(b"half")
+    with atomic_path(tmp_path / "other.csv") as written:
+        bench("export", "run", "--to", "m.csv", cwd=tmp_path)
+        assert [path.name for path in tmp_path.glob(".semstab-*")] == [written.name]
+        written.write_text("whole")
+    assert (tmp_path / "other.csv").read_text() == "whole"
+
+
+def test_two_comparisons_into_one_folder_are_refused(run, tmp_path) -> None:
+    shutil.copytree(run, tmp_path / "other")
+    held = FolderLock(tmp_path / "out")
+    said = error_of("compare", "run", "other", "--out", "out", cwd=tmp_path)
+    held.release()
+    assert "out: another process works on it; wait for it, or choose another folder" in said
+    (tmp_path / "out" / ".semstab-killed.json").write_text("half")
+    bench("compare", "run", "other", "--out", "out", cwd=tmp_path)
+    assert not list((tmp_path / "out").glob(".semstab-*"))
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+def test_a_signal_ends_an_export_in_one_line_that_promises_nothing(run, tmp_path, monkeypatch, number) -> None:
+    monkeypatch.setattr("semstab.exports.load_result", lambda folder: (signal.raise_signal(number), time.sleep(5)))
+    before = signal.getsignal(number)
+    done = bench("export", "run", "--to", "m.csv", cwd=tmp_path, code=128 + number)
+    assert done.stderr == "interrupted; no file is half-written; start the same command again\n"
+    assert signal.getsignal(number) == before
