@@ -55,8 +55,8 @@ def interruptible() -> Iterator[None]:
             raise KeyboardInterrupt(came[0]) from error
         raise
     finally:
-        for each, before in ended.items():
-            signal.signal(each, before)
+        for own, before in ended.items():
+            signal.signal(own, before)
         sys.unraisablehook = hook
 
 

@@ -1,6 +1,6 @@
 """Kill runs, studies, predictions, exports and conversions at random moments, half of them at their folder's birth.
 
-    python tests/faults/kills.py [COUNT [SEED]]         make faults: 280, 40 of each of 7 kinds
+    python tests/faults/kills.py [COUNT [SEED [KIND...]]]       make faults: 280, 40 of each of 7 kinds
 
 Each is then started again as it was, and has to leave what one without a kill leaves. Where several are at work on the
 machine, a kill may come after the end: those are counted apart. Beside these, a fifth as many are started twice at
@@ -146,12 +146,13 @@ def until_birth(out: Path, seconds: float) -> None:
     time.sleep(seconds)
 
 
-def main(count: int, seed: int) -> None:
+def main(count: int, seed: int, *only: str) -> None:
     """Kill so many, say how many ended as they should, and fail where one did not."""
     rng, told, wrong = random.Random(seed), collections.Counter[str](), []
     with tempfile.TemporaryDirectory() as temporary:
         base = Path(temporary)
         made, whole, seconds = kinds(base), {}, {}
+        made = {kind: own for kind, own in made.items() if kind in (only or made)}
         for kind, (words, left) in made.items():
             started = time.monotonic()
             finished(words(base / kind), base / "log")
@@ -185,4 +186,5 @@ def main(count: int, seed: int) -> None:
 
 
 if __name__ == "__main__":
-    main(*map(int, (*sys.argv[1:], *("280", "0")[len(sys.argv) - 1 :])))
+    count, seed, *only = (*sys.argv[1:], *("280", "0")[len(sys.argv) - 1 :])
+    main(int(count), int(seed), *only)
