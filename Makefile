@@ -8,7 +8,7 @@ help:
 	@echo 'make test    set up, then lint, types and import contract beside a minute of damaged files, and the whole test suite'
 	@echo 'make quick   between edits, a minute at most: ruff, and the tests of what changed since the last commit'
 	@echo 'make fuzz    damage files of every kind for an hour (FUZZ_SECONDS=3600 FUZZ_SEED=1); fuzz-short: the same 10,000 inputs everywhere'
-	@echo 'make faults  kill a hundred runs, studies, predictions and conversions, fill their disk, and see that nothing is lost'
+	@echo 'make faults  kill 280 runs, studies, predictions, exports and conversions (FAULTS=280), fill their disk, and see that nothing is lost'
 	@echo 'make docs    build the documentation into site/, warnings are errors'
 	@echo 'make setup   the set-up alone: system libraries, .venv, semstab; make setup-dev: and what the tests need'
 	@echo 'make format  let ruff format and mend the code'
@@ -44,7 +44,7 @@ fuzz-short: setup-dev
 	$(BIN)/python tests/fuzz/fuzz.py --inputs 10000 --seconds 300 --seed 1
 
 faults: setup-dev
-	$(BIN)/python tests/faults/kills.py 100
+	$(BIN)/python tests/faults/kills.py $(or $(FAULTS),280)
 	$(BIN)/python tests/faults/disk.py 12
 
 lint: setup-dev

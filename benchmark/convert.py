@@ -25,8 +25,8 @@ from semstab.core.files import (
     content_key,
     read_json,
     remove_leftovers,
+    write_image,
     write_json,
-    write_png,
     write_text,
 )
 from semstab.core.prefetch import prefetch
@@ -184,23 +184,23 @@ class SceneFolder:
             raise DepthFormatError
         self._require_same_camera(frame)
         if frame.color is not None:
-            write_png(self.path / "color" / f"{name}.png", np.ascontiguousarray(frame.color[..., ::-1]))
+            write_image(self.path / "color" / f"{name}.png", np.ascontiguousarray(frame.color[..., ::-1]))
         if frame.mask is not None:
-            write_png(self.path / "mask" / f"{name}.png", np.where(frame.mask, 0, 255).astype(np.uint8))
+            write_image(self.path / "mask" / f"{name}.png", np.where(frame.mask, 0, 255).astype(np.uint8))
         write_text(self.path / "pose" / f"{name}.txt", matrix_text(frame.T_wc))
         path = self.path / "depth" / f"{name}{self.form.suffix}"
         if self.form.scale is None:
             with atomic_path(path) as temporary:
                 np.save(temporary, stored)
         else:
-            write_png(path, stored)
+            write_image(path, stored)
 
     def write_labels(self, name: str, frame: Frame, model: str) -> None:
         """Write a frame's label ids, or its scores."""
         path = self._label_path(name, model, frame.scores is not None)
         if frame.scores is None:
             assert frame.labels is not None
-            write_png(path, frame.labels)
+            write_image(path, frame.labels)
         else:
             with atomic_path(path) as temporary:
                 np.savez_compressed(temporary, scores=frame.scores.transpose(2, 0, 1))

@@ -19,7 +19,7 @@ from semstab.core.json_form import to_json
 from semstab.data.measures import ENTROPY, SBD, VSS
 from semstab.data.records import Result
 from semstab.data.results import STAGES, Unit
-from semstab.datasets.formats import disk
+from semstab.datasets.files import scene
 from semstab.engine import Observer, load_result
 from semstab.errors import ConfigError, DataError
 from semstab.settings import load_config
@@ -283,7 +283,7 @@ def test_each_image_is_read_once(root, tmp_path, monkeypatch) -> None:
     """The key of a unit comes from the bytes that were decoded, and equals the one that a later start computes."""
     read = []
     monkeypatch.setattr(
-        disk, "file_digest", lambda path, digest=disk.file_digest: (read.append(path.name), digest(path))[1]
+        scene, "file_digest", lambda path, digest=scene.file_digest: (read.append(path.name), digest(path))[1]
     )
     config = configure(root, models=["a"])
     semstab.run(config, out=tmp_path / "run", report=False)

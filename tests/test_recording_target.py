@@ -120,10 +120,21 @@ def test_the_viewer_of_a_recording_listens_on_this_machine_only(tmp_path, monkey
     (tmp_path / "x.rrd").write_bytes(b"")
     started: list[list[str]] = []
     monkeypatch.setattr(
-        subprocess, "run", lambda command, check: started.append(command) or subprocess.CompletedProcess(command, 0)
+        subprocess, "run", lambda command, **_: started.append(command) or subprocess.CompletedProcess(command, 0)
     )
     CliRunner().invoke(cli.app, ["view", str(tmp_path / "x.rrd")])
     assert started[0][1:3] == ["--bind", "127.0.0.1"]
+
+
+def test_a_viewer_without_a_display_is_told_in_one_line(tmp_path, monkeypatch) -> None:
+    (tmp_path / "x.rrd").write_bytes(b"")
+    monkeypatch.delenv("DISPLAY", raising=False)
+    monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
+    monkeypatch.setattr(sys, "platform", "linux")
+    monkeypatch.setattr(subprocess, "run", lambda command, **_: subprocess.CompletedProcess(command, 101))
+    done = CliRunner().invoke(cli.app, ["view", str(tmp_path / "x.rrd")])
+    assert done.exit_code == 2
+    assert "x.rrd: there is no display for the viewer; copy the file to a machine with one" in done.stderr
 
 
 def listens(port: int) -> bool:

@@ -189,6 +189,31 @@ def test_a_changed_input_computes_what_reads_it(root, out) -> None:
     assert len(count(config, out).computed) == 6
 
 
+def test_every_file_that_was_lost_or_damaged_is_computed_again_and_told(root, tmp_path, caplog) -> None:
+    out = tmp_path / "out"
+    config = configure(root, models=["a"], sweeps={}, backends=["numpy"], events=True, statistics=True)
+    run_study(config, out, report=False)
+    folders = ("voxels", "truth", "events", "observations", "frames", "sums", "overview")
+    files = [next((out / name).glob("wall__*")) for name in folders]
+    before = {file: file.read_bytes() for file in files}
+    for file in files:
+        for damage, said in ((Path.unlink, "is missing"), (flip, "has changed since it was written")):
+            damage(file)
+            caplog.clear()
+            assert len(count(config, out).computed) == 1, file
+            assert f"{file}: {said}; its unit is computed again" in caplog.text
+            assert (
+                file.parent.name in ("frames", "overview") or file.read_bytes() == before[file]
+            )  # times; a ZIP's dates
+    assert count(config, out).computed == []
+
+
+def flip(file: Path) -> None:
+    content = bytearray(file.read_bytes())
+    content[len(content) // 2] ^= 1
+    file.write_bytes(content)
+
+
 def test_voxels_that_were_lost_or_damaged_are_computed_again_and_told(root, tmp_path, caplog) -> None:
     out, config = tmp_path / "out", configure(root, sweeps={}, backends=["numpy"])
     run_study(config, out, report=False)

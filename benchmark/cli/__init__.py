@@ -28,7 +28,7 @@ from semstab.errors import OUT_OF_MEMORY, SemstabError, summarize_error
 
 @contextlib.contextmanager
 def interruptible() -> Iterator[None]:
-    """Let Ctrl-C raise KeyboardInterrupt, even if code inside the block turns it into another error.
+    """Let Ctrl-C, TERM and HUP raise KeyboardInterrupt, even if code inside the block turns it into another error.
 
     An interrupted import may fail with another error, which becomes KeyboardInterrupt again. An error in a callback is
     normally printed and dropped; here it is not printed.
@@ -37,25 +37,41 @@ def interruptible() -> Iterator[None]:
         yield
         return
     came: list[int] = []
+    ended: dict[int, Any] = {}
 
     def interrupt(number: int, _frame: Any) -> None:
         came.append(number)
         sys.unraisablehook = lambda _: None
-        raise KeyboardInterrupt
+        raise KeyboardInterrupt(number)
 
-    before, hook = signal.signal(signal.SIGINT, interrupt), sys.unraisablehook
+    hook = sys.unraisablehook
+    for each in ENDINGS:
+        if signal.getsignal(each) != signal.SIG_IGN:  # nohup
+            ended[each] = signal.signal(each, interrupt)
     try:
         yield
     except Exception as error:
         if came:
-            raise KeyboardInterrupt from error
+            raise KeyboardInterrupt(came[0]) from error
         raise
     finally:
-        signal.signal(signal.SIGINT, before)
+        for own, before in ended.items():
+            signal.signal(own, before)
         sys.unraisablehook = hook
 
 
-INTERRUPTED = 130
+ENDINGS = signal.SIGINT, signal.SIGTERM, signal.SIGHUP
+"""Signals that end a command in one line."""
+
+RESUMED = ("run", "study", "filters", "predict", "convert")
+"""The commands that go on where they were."""
+
+
+def _interrupted(command: str | None) -> str:
+    """Return what is left of a command that a signal ended."""
+    if command in RESUMED:
+        return "interrupted; finished work is stored, and the same command with the same --out resumes there"
+    return "interrupted; no file is half-written; start the same command again"
 
 
 def _without_kind(options: list[Any]) -> list[Any]:
@@ -136,8 +152,9 @@ class Group(TyperGroup):
             say(f"error: {error}")
             raise typer.Exit(error.exit_code) from error
         except KeyboardInterrupt as error:
-            say("interrupted; finished work is stored, and the same command with the same --out resumes there")
-            raise typer.Exit(INTERRUPTED) from error
+            say(_interrupted(ctx.invoked_subcommand))
+            number = next((each for each in error.args if isinstance(each, int)), signal.SIGINT)
+            raise typer.Exit(128 + number) from error
         except OSError as error:
             say(f"error: {error.filename or 'input or output'}: {error.strerror or error}")
             raise typer.Exit(2) from error

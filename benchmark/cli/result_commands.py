@@ -78,8 +78,11 @@ def gate(
     from semstab.comparison.gate import gate as assess
     from semstab.comparison.gate import gate_config
     from semstab.comparison.runs import open_run, save_summary
+    from semstab.engine.folder import require_output
 
     gate_report.require_formats(out or ())
+    for file in (*(out or ()), *([] if save_baseline is None else [save_baseline])):
+        require_output(file, [config])
     if save_baseline is None or rule or config:
         result = assess(new, against, gate_config(config, rule or (), level, undecided, scope))
         for file in out or ():
@@ -108,7 +111,9 @@ def calibrate(
 ) -> None:
     """Find for each class the least evidence at which its labels are right often enough to be acted on."""
     from semstab.comparison.calibration import calibrate_run, lines
+    from semstab.engine.folder import require_output
 
+    require_output(out)
     thresholds = calibrate_run(run, precision=precision, confidence=confidence)
     thresholds.save(out)
     print_lines(lines(thresholds), quiet=quiet)

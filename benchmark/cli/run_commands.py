@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gc
+import os
 import re
 import sys
 import textwrap
@@ -261,8 +262,11 @@ def check(
     from semstab.check import check as check_scenes
     from semstab.check.display import print_check
     from semstab.core.files import write_json
+    from semstab.engine.folder import require_output
     from semstab.settings import load_config, resolve
 
+    if json_file is not None:
+        require_output(json_file, [config])
     named = {"scenes": scene, "models": model, "voxel_size": voxel_size}
     selected = resolve(load_config(config, chosen(named, settings, options, dataset, data, frames)))
     console, results = Console(quiet=quiet), []
@@ -428,4 +432,9 @@ def view(run: Annotated[Path, typer.Argument(metavar="RUN", help="Run folder, or
     if finished and lacks_pictures(run, recording):
         say(f"making {recording}")
         record_finished(run, recording)
-    raise typer.Exit(subprocess.run([*viewer_command(), str(recording)], check=False).returncode)
+    display = sys.platform != "linux" or bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
+    stderr = None if display else subprocess.DEVNULL  # where it says in several lines that there is none
+    code = subprocess.run([*viewer_command(), str(recording)], check=False, stderr=stderr).returncode
+    if code and not display:
+        raise ConfigError(f"{recording}: there is no display for the viewer; copy the file to a machine with one")
+    raise typer.Exit(code)

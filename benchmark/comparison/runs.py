@@ -27,6 +27,7 @@ from semstab.core.files import atomic_path, parse_json, read_limited
 from semstab.core.json_form import from_json, to_json
 from semstab.data import earlier
 from semstab.data.contrast import FrameShare
+from semstab.data.digests import require_unchanged
 from semstab.data.georeference import Georeference
 from semstab.data.records import ImageSpace, Record
 from semstab.data.results import UnitSummary
@@ -234,6 +235,7 @@ def _chosen(path: Path, there: Sequence[str], wanted: str) -> str:
 def _flicker(file: Path | None) -> Flicker:
     if file is None:
         return {}
+    require_unchanged(file)
     try:
         with file.open(encoding="utf-8", newline="") as lines:
             rows = [(row["frame"], row.get("compensated_flicker_percent")) for row in csv.DictReader(lines)]

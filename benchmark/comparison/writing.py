@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 from collections.abc import Iterator, Mapping, Sequence
 from functools import partial
@@ -12,7 +13,7 @@ from semstab.comparison.differences import ComparisonData, Progress, find
 from semstab.comparison.locations import Changes
 from semstab.comparison.tables import HEADLINES, IN_CLASSES, IOU, by_key, heading, scopes, sentences, tables
 from semstab.config.settings import ScopeOption, validated
-from semstab.core.files import keep_only, read_json, write_json, write_text
+from semstab.core.files import TEMPORARY, FolderLock, keep_only, read_json, write_json, write_text
 from semstab.core.json_form import from_json
 from semstab.core.types import THIS_SCENE
 from semstab.data import parquet
@@ -125,11 +126,19 @@ def compare(
     Raises:
         ConfigError, DataError: For runs that cannot be opened, or have no scene or no classes in common, in one line.
     """
+    lock = None
     if out is not None:
         _require_own(Path(out))
-    comparison = find(runs, progress, validated(ScopeOption, {"scope": scope}, "compare: ").scope)
-    if out is not None:
-        write(comparison, out)
+        lock = FolderLock(Path(out))
+    try:
+        comparison = find(runs, progress, validated(ScopeOption, {"scope": scope}, "compare: ").scope)
+        if out is not None:
+            write(comparison, out)
+    finally:
+        if lock is not None:
+            lock.release()
+            with contextlib.suppress(OSError):
+                lock.path.rmdir()  # where nothing was written
     return comparison.result
 
 
@@ -220,9 +229,13 @@ def _recorded(comparison: ComparisonData) -> Iterator[tuple[tuple[str, str], tup
         yield (scene.scene, own.other), (title, shown.table, shown.change, shown.right, areas)
 
 
+def _has_files(folder: Path) -> bool:
+    return any(not file.name.startswith(TEMPORARY) for file in folder.iterdir())  # a killed comparison leaves those
+
+
 def _require_own(folder: Path) -> None:
     """Raise ConfigError where the folder holds something else than a comparison, as a run."""
     if folder.is_file():
         raise ConfigError(f"{folder}: it is a file; name a folder")
-    if folder.is_dir() and any(folder.iterdir()) and not (folder / CONTENT).exists():
+    if folder.is_dir() and _has_files(folder) and not (folder / CONTENT).exists():
         raise ConfigError(f"{folder}: it is not empty and holds no comparison; choose another folder")

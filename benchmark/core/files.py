@@ -11,7 +11,7 @@ import stat
 import tempfile
 import zipfile
 from collections.abc import Collection, Iterable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from io import BufferedReader
 from pathlib import Path
 from typing import Any
@@ -35,9 +35,7 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
     """Yield a temporary path next to `path`; rename it to `path` if the block succeeds, else remove it."""
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
-    handle, name = tempfile.mkstemp(dir=path.parent, prefix=TEMPORARY, suffix=path.suffix)
-    os.close(handle)
-    temporary = Path(name)
+    handle, temporary = _locked_temporary(path)
     try:
         yield temporary
         os.umask(mask := os.umask(0))
@@ -49,6 +47,23 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
         raise
     finally:
         temporary.unlink(missing_ok=True)
+        os.close(handle)
+
+
+def _locked_temporary(path: Path) -> tuple[int, Path]:
+    """Create a temporary file next to a path, locked so that `remove_abandoned` leaves it alone."""
+    while True:
+        handle, name = tempfile.mkstemp(dir=path.parent, prefix=TEMPORARY, suffix=path.suffix)
+        with suppress(OSError):  # a file system without locks
+            fcntl.flock(handle, fcntl.LOCK_SH)
+        if Path(name).exists():  # else it was removed before it was locked
+            return handle, Path(name)
+        os.close(handle)
+
+
+def not_written() -> OSError:
+    """Return the error of a file that a library wrote without an error and not whole; `atomic_path` names it."""
+    return OSError(errno.ENOSPC, "could not be written whole; the disk may be full")
 
 
 class FolderLock:
@@ -59,6 +74,7 @@ class FolderLock:
     """
 
     def __init__(self, path: Path) -> None:
+        self.path = path
         path.mkdir(parents=True, exist_ok=True)
         self._handle: int | None = os.open(path, os.O_RDONLY)
         try:
@@ -81,6 +97,14 @@ def remove_leftovers(folder: Path) -> None:
         path.unlink()
 
 
+def remove_abandoned(folder: Path) -> None:
+    """Remove what `atomic_path` left in a folder that others may be writing to: the files that no process holds."""
+    for path in folder.glob(f"{TEMPORARY}*"):
+        with suppress(OSError), path.open("rb") as file:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            path.unlink(missing_ok=True)
+
+
 def write_text(path: str | Path, text: str) -> None:
     """Write `text` atomically, in UTF-8."""
     with atomic_path(path) as temporary:
@@ -97,12 +121,12 @@ def csv_text(text: str) -> str:
     return f"'{text}" if text.startswith(("=", "+", "-", "@", "\t", "\r")) else text
 
 
-def write_png(path: str | Path, image: npt.NDArray[Any]) -> None:
-    """Write a grey or BGR image atomically."""
+def write_image(path: str | Path, image: npt.NDArray[Any], *settings: int) -> None:
+    """Write a grey or BGR image atomically, in the format of the path's suffix, with settings of OpenCV."""
     import cv2
 
-    with atomic_path(path) as temporary:
-        temporary.write_bytes(cv2.imencode(".png", image)[1].tobytes())
+    with atomic_path(path) as temporary:  # imwrite does not say that the disk is full
+        temporary.write_bytes(cv2.imencode(Path(path).suffix, image, settings)[1].tobytes())
 
 
 def write_stack(
@@ -181,6 +205,23 @@ def open_file(path: str | Path) -> BufferedReader:
         file.close()
         raise OSError(errno.EINVAL, "it is no regular file")
     return file
+
+
+FILE_DIGEST = "sha256"
+"""Processors have instructions for it: there it takes half of blake2b's time."""
+
+
+def file_digest(path: Path) -> bytes:
+    """Return a hash of a file's content.
+
+    Raises:
+        DataError: If it cannot be read.
+    """
+    try:
+        with open_file(path) as file:
+            return hashlib.file_digest(file, FILE_DIGEST).digest()
+    except OSError as error:
+        raise DataError(f"{path}: cannot be read ({error.strerror})") from error
 
 
 def parse_yaml(text: str, where: str) -> Any:

@@ -6,6 +6,7 @@ import difflib
 import functools
 import importlib.resources
 import reprlib
+import unicodedata
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -112,6 +113,11 @@ UNKNOWN = -1
 """The mark in a mapping's table for an id that the source label space does not have."""
 
 
+def is_line(name: str) -> bool:
+    """Return whether a name is text of one line that every file format can hold: without control characters."""
+    return not any(unicodedata.category(c) in ("Cc", "Cs", "Zl", "Zp") or c in "\ufffe\uffff" for c in name)
+
+
 @dataclass(frozen=True)
 class LabelSpace:
     """The classes of a label map: ids, names and colours, without the ignore id.
@@ -137,6 +143,9 @@ class LabelSpace:
 
     def __post_init__(self) -> None:
         K = len(self.classes)
+        for name in (self.name, *self.classes, *(m for ms in self.members for m in ms), *self.ignored):
+            if not is_line(name):
+                raise ConfigError(f"taxonomy {self.name}: the name {name!r} holds a control character; rename it")
         if K < 2:
             raise ConfigError(f"taxonomy {self.name}: {K} class; stability needs at least 2 (entropy divides by log K)")
         object.__setattr__(self, "ids", self.ids or tuple(range(K)))

@@ -15,11 +15,13 @@ import numpy.typing as npt
 
 from semstab.core.arrays import column, values_of
 from semstab.core.files import atomic_path, parse_json
+from semstab.data.digests import require_unchanged
 from semstab.data.evidence import Evidence
 from semstab.errors import DataError, summarize_error
 
 if TYPE_CHECKING:
     import pyarrow as pa
+    import pyarrow.parquet as pq
 
 
 SCHEMA = 1
@@ -154,29 +156,41 @@ def columns(path: Path, names: Sequence[str]) -> dict[str, npt.NDArray[Any]]:
     Raises:
         DataError: If one is not there.
     """
-    import pyarrow.parquet as pq
-
-    with reading(path), pq.ParquetFile(path) as file:  # pq.read_table imports pandas
+    with reading(path), opened(path) as file:
         content = file.read(columns=list(names))
         return {name: values_of(content.column(name)) for name in names}
 
 
 @contextmanager
-def reading(path: str | Path) -> Iterator[None]:
-    """Turn any error in a file's content into a DataError of one line that names the file."""
+def opened(path: str | Path) -> Iterator[pq.ParquetFile]:
+    """Open a file to read its columns.
+
+    Raises:
+        DataError: If it is of a finished run, and not as the run wrote it.
+    """
+    import pyarrow.parquet as pq
+
+    require_unchanged(path)
+    with pq.ParquetFile(path) as file:  # pq.read_table imports pandas
+        yield file
+
+
+@contextmanager
+def reading(path: str | Path, kind: str = "a semstab table") -> Iterator[None]:
+    """Turn any error in a file's content into a DataError of one line that names the file and what it should be."""
     import pyarrow as pa
 
     try:
         yield
     except (OSError, LookupError, TypeError, ValueError, OverflowError, pa.ArrowException) as error:
-        raise DataError(f"{path}: not a semstab table ({summarize_error(error)})") from error
+        if isinstance(error, DataError) and str(error).startswith(f"{path}: "):
+            raise
+        raise DataError(f"{path}: not {kind} ({summarize_error(error)})") from error
 
 
 def read(path: str | Path, names: Iterable[str]) -> dict[str, Any]:
     """Return columns by name, voxel_size and classes; what it raises becomes a DataError in `reading`."""
-    import pyarrow.parquet as pq
-
-    with pq.ParquetFile(path) as content:
+    with opened(path) as content:
         about = parse_json((content.schema_arrow.metadata or {})[b"semstab"])
         if about["schema"] != SCHEMA:
             raise DataError(f"written with schema {about['schema']}, this version reads {SCHEMA}")

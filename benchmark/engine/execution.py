@@ -70,7 +70,7 @@ def execute(
         result = result_of(plan, folder, units)
         units.watch.seconds["all"] = time.perf_counter() - started
         result = dataclasses.replace(result, manifest=manifest(plan, units, executor.name, command))
-        folder.save_result(result)
+        folder.save_result(result, units.contents.values())
         telling.tell(lambda observer: observer.run_finished(result))
     finally:
         folder.close()

@@ -18,9 +18,19 @@ import yaml
 
 from semstab.backends import keeps_log
 from semstab.config import Config, read_yaml
-from semstab.core.files import TEMPORARY, FolderLock, atomic_path, read_json, remove_leftovers, write_json, write_text
+from semstab.core.files import (
+    TEMPORARY,
+    FolderLock,
+    atomic_path,
+    file_digest,
+    read_json,
+    remove_leftovers,
+    write_json,
+    write_text,
+)
 from semstab.core.json_form import from_json, to_json
 from semstab.data import earlier
+from semstab.data.digests import DIGESTS, write_digests
 from semstab.data.measures import measures
 from semstab.data.records import (
     EVENTS,
@@ -37,7 +47,6 @@ from semstab.data.records import (
     UnitContent,
 )
 from semstab.data.results import SCHEMA, Unit, slug
-from semstab.datasets.formats.disk import file_digest
 from semstab.engine.messages import TILES, Outcome, Start
 from semstab.engine.units import PlannedUnit
 from semstab.errors import ConfigError, DataError
@@ -54,6 +63,32 @@ SETTINGS = "config.yaml"
 FAILURES = "failures.log"
 WRITTEN = (UNITS, VOXELS, TRUTH, EVENTS, OBSERVATIONS, FRAMES, SUMS, OVERVIEW, TILES, "tables", "figures")
 """Folders into which files are written."""
+
+OWN_FILES = (SETTINGS, FAILURES, DIGESTS, "summary.json", "manifest.json", "report.html", "recording.rrd")
+"""Files of a run beside these folders."""
+
+
+def require_output(path: str | Path, inputs: Iterable[str | Path | None] = ()) -> None:
+    """Require that a file to write is none of a run's own files, and none of the files that are read for it.
+
+    Raises:
+        ConfigError: If it is.
+    """
+    path = Path(path)
+    real = path.resolve()
+    for folder in real.parents:
+        parts = real.relative_to(folder).parts
+        own = (parts[0] in WRITTEN and len(parts) > 1) or (real.name in OWN_FILES and len(parts) == 1)
+        if own and (folder / SETTINGS).is_file() and _holds_run(folder):
+            raise ConfigError(f"{path}: is a file of the run in this folder; name another file")
+    if any(real == Path(given).resolve() for given in inputs if given is not None):
+        raise ConfigError(f"{path}: is also read; name another file")
+
+
+def _holds_run(folder: Path) -> bool:
+    """Return whether a folder holds a run or a study, of any version."""
+    with (folder / SETTINGS).open(encoding="utf-8", errors="replace") as lines:
+        return lines.readline(200).startswith(LAYOUT.rstrip("0123456789"))
 
 
 def require_file_names(out: Path, units: Iterable[Unit]) -> None:
@@ -154,14 +189,22 @@ class Folder:
             truth_file=self.path / truth if planned.image_space and has_truth else None,
         )
 
-    def save_result(self, result: Result) -> None:
-        """Write summary.json and manifest.json."""
+    def save_result(self, result: Result, contents: Iterable[UnitContent]) -> None:
+        """Write summary.json, manifest.json, and the digests of the units' files.
+
+        Raises:
+            DataError: If one of these files is gone.
+        """
+        digests = {name: digest for content in contents for name, digest in content.files.items()}
+        if lost := next((name for name in digests if not (self.path / name).exists()), None):
+            raise DataError(f"{self.path / lost}: was written, and is gone; run the same command again")
         records = _with_files(result.records, lambda file: file.relative_to(self.path))
         content = to_json(dataclasses.replace(result, records=records, manifest={}))
         runs = content.pop("records")
         del content["manifest"]
         write_json(self.path / "summary.json", {"schema": SCHEMA, "runs": runs, **content})
         write_json(self.path / "manifest.json", result.manifest)
+        write_digests(self.path, digests)
 
     @contextlib.contextmanager
     def started(self, config: Config) -> Iterator[Start]:
@@ -171,6 +214,7 @@ class Folder:
             for folder in (self.path / name, *self.path.glob(f"{name}/*/")):
                 remove_leftovers(folder)
         (self.path / FAILURES).unlink(missing_ok=True)
+        (self.path / DIGESTS).unlink(missing_ok=True)  # until this start has ended, files are of this one or the last
         start.marker.touch()
         try:
             yield start
@@ -188,13 +232,17 @@ class Folder:
             and (summary.statistics is not None or not planned.assessed)
             and (content.checked is not None or not planned.sampled)
             and self.are_whole({name: content.files.get(name) for name in self._wanted(planned, content)})
+            and (not planned.stored or self.are_whole(content.files))
         )
 
     def are_whole(self, files: Mapping[str, str | None]) -> bool:
         """Return whether files are there, with these digests; the first one that differs is reported."""
         for name, digest in files.items():
             path = self.path / name
-            if digest is None or not path.exists():
+            if digest is None:
+                return False
+            if not path.exists():
+                logger.warning("%s: is missing; its unit is computed again", path)
                 return False
             if file_digest(path).hex() != digest:
                 logger.warning("%s: has changed since it was written; its unit is computed again", path)

@@ -196,7 +196,8 @@ class Stream:
         self._sequential = any(live.work.measures_images for live in maps)
         self._previous: Frame | None = None
         base = any(live.work.image_space and live.work.measures_images for live in maps)
-        self.image_space = ImageSpaceMeter() if base else None
+        series = any(live.work.stored and live.work.measures_images for live in maps)  # theirs hold flicker
+        self.image_space = ImageSpaceMeter() if base or series else None
         quality = base and maps[0].work.config.frame_quality
         self.quality = FrameQualityMeter(len(self.task.mapping.target)) if quality else None
         self.truth_task = truth_task(self.task) if base or maps[0].work.config.statistics else None

@@ -14,7 +14,7 @@ import numpy.typing as npt
 
 from semstab.backends.numpy_reference import NumpySample, in_sample
 from semstab.config import Config
-from semstab.core.files import atomic_path
+from semstab.core.files import atomic_path, file_digest
 from semstab.core.process import Stopwatch, trim_malloc
 from semstab.core.types import Float64
 from semstab.data.events import Events
@@ -26,7 +26,6 @@ from semstab.data.records import EVENTS, FRAMES, OBSERVATIONS, OVERVIEW, SUMS, T
 from semstab.data.results import RECURRENT, STAGES, Agreement, FrameDrift, ReducedScores, UnitSummary, slug
 from semstab.data.voxels import VoxelTable
 from semstab.datasets import Scene
-from semstab.datasets.formats.disk import file_digest
 from semstab.engine.live_maps import LiveMap, Stream
 from semstab.engine.messages import Outcome, Start
 from semstab.engine.series import Series
@@ -302,15 +301,16 @@ def _save_overview(stream: Stream, path: Path) -> None:
 
 def written(start: Start, savers: Savers) -> tuple[dict[str, str], dict[str, bytes]]:
     """Write files into the folder where it is shared; their digests, and their bytes where it is not."""
+    if start.marker.exists():
+        for name, save in savers.items():
+            save(start.folder / name)
+        return {name: file_digest(start.folder / name).hex() for name in savers}, {}
     digests, returned = {}, {}
-    shared = start.marker.exists()
     with tempfile.TemporaryDirectory() as elsewhere:
         for name, save in savers.items():
-            path = (start.folder if shared else Path(elsewhere)) / name
+            path = Path(elsewhere) / name
             save(path)
-            digests[name] = file_digest(path).hex()
-            if not shared:
-                returned[name] = path.read_bytes()
+            digests[name], returned[name] = file_digest(path).hex(), path.read_bytes()
     return digests, returned
 
 

@@ -201,6 +201,8 @@ def _with_columns(task: TileTask, slug: str, analysis: Analysis, folder: Path) -
 
 def _centers(files: Sequence[Path], voxel_size: float, step: int) -> Float64:
     """Return (n, 3) of every n-th voxel, metres, in the order of a whole table."""
+    if not files:
+        return np.zeros((0, 3))
     parts = [VoxelTable.columns(file, ("ix", "iy", "iz")) for file in files]
     index = np.concatenate([np.stack([*part.values()], axis=1)[::step] for part in parts])
     return (index[np.lexsort(index.T[::-1])] + 0.5) * voxel_size

@@ -9,7 +9,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from semstab.config import nearest
-from semstab.engine.folder import load_result
+from semstab.core.files import remove_abandoned
+from semstab.engine.folder import load_result, require_output
 from semstab.errors import ConfigError
 from semstab.exports import annotation_formats, clouds, maps
 from semstab.exports import join as joining
@@ -118,10 +119,13 @@ def export(
     """
     files = [Path(file) for file in ([to] if isinstance(to, str | Path) else to)]
     for file in files:
+        require_output(file, (asprs, join or beside, thresholds or commit))
         if task_format is not None:
             annotation_formats.check(task_format, file)
         elif file.suffix.lower() not in SUFFIXES:
             raise ConfigError(f"{file}: format '{file.suffix}' is not known; {nearest(file.suffix, SUFFIXES)}")
+    for folder in {file.parent for file in files if file.parent.is_dir()}:
+        remove_abandoned(folder)  # of a killed export
     result = load_result(run)
     record = result.record(scene=scene, model=model, backend=backend)
     settings = Settings(cell, None if asprs is None else Path(asprs))

@@ -11,8 +11,8 @@ from xml.etree import ElementTree
 import cv2
 
 from semstab.config import nearest
-from semstab.core.files import atomic_path, write_json, write_text
-from semstab.data.labels import LabelSpace
+from semstab.core.files import write_image, write_json, write_text
+from semstab.data.labels import LabelSpace, is_line
 from semstab.errors import ConfigError
 from semstab.exports.annotation import AnnotationTask
 from semstab.task import Task
@@ -205,8 +205,8 @@ def write_tasks(file: TaskFile, kind: str, task: Task) -> tuple[str, ...]:
     for one in {own.image: own for own in file.tasks}.values():
         color = task.scene.color(one.frame)
         assert color is not None
-        with atomic_path(file.path.parent / file.image(one)) as path:
-            cv2.imwrite(str(path), cv2.cvtColor(color, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, 95])
+        image = file.path.parent / file.image(one)
+        write_image(image, cv2.cvtColor(color, cv2.COLOR_RGB2BGR), cv2.IMWRITE_JPEG_QUALITY, 95)
     return tuple(FORMATS[kind][1](file))
 
 
@@ -219,10 +219,15 @@ def _colors(space: LabelSpace) -> Iterator[tuple[str, str]]:
 
 def _node(tag: str, *content: ElementTree.Element | str, **attributes: str) -> ElementTree.Element:
     """Return an element with a text or others in it."""
-    node = ElementTree.Element(tag, attributes)
-    node.text = "".join(each for each in content if isinstance(each, str)) or None
+    node = ElementTree.Element(tag, {key: _in_xml(value) for key, value in attributes.items()})
+    node.text = _in_xml("".join(each for each in content if isinstance(each, str))) or None
     node.extend(each for each in content if not isinstance(each, str))
     return node
+
+
+def _in_xml(text: str) -> str:
+    """Return a text with U+FFFD for the characters that XML cannot hold, which a scene's or an image's name may."""
+    return "".join(c if is_line(c) else "\ufffd" for c in text)
 
 
 def _xml(root: ElementTree.Element, *, declaration: bool = True) -> str:

@@ -5,7 +5,8 @@ from __future__ import annotations
 import importlib.resources
 import itertools
 import json
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO
@@ -14,10 +15,11 @@ import numpy as np
 import numpy.typing as npt
 
 from semstab.config import nearest, read_yaml
-from semstab.core.files import atomic_path
+from semstab.core.files import atomic_path, not_written
 from semstab.core.types import UInt8
 from semstab.data.georeference import INSTALL
 from semstab.data.labels import name_key
+from semstab.datasets.files.surfaces import open_las
 from semstab.errors import ConfigError, DataError, MissingDependencyError, summarize_error
 from semstab.exports.voxels import Voxels, crs_name
 
@@ -180,10 +182,7 @@ def write_las(parts: Iterable[Voxels], path: Path, asprs: Path | None = None) ->
     header, written = las.LasHeader(point_format=FORMAT, version="1.4"), 0
     header.scales, header.offsets = np.full(3, MILLIMETRE), np.floor(first.points.min(axis=0))
     declare(header, first)
-    with (
-        atomic_path(path) as temporary,
-        las.open(str(temporary), mode="w", header=header, do_compress=path.suffix.lower() == ".laz") as cloud,
-    ):
+    with atomic_path(path) as temporary, las_writer(temporary, header) as cloud:
         for voxels in itertools.chain([first], left):
             points = las.ScaleAwarePointRecord.zeros(len(voxels.table), header=header)
             points.x, points.y, points.z = voxels.points.T
@@ -195,6 +194,31 @@ def write_las(parts: Iterable[Voxels], path: Path, asprs: Path | None = None) ->
             cloud.write_points(points)
             written += len(points)
     return written
+
+
+@contextmanager
+def las_writer(path: Path, header: laspy.LasHeader) -> Iterator[laspy.LasWriter]:
+    """Yield the writer of a LAS or LAZ file, which is then opened again: lazrs does not see each full disk.
+
+    Raises:
+        OSError: If it could not be written, or is not whole.
+    """
+    las = with_lazrs(path)
+    from lazrs import LazrsError
+
+    try:
+        compress = path.suffix.lower() == ".laz"
+        with path.open("w+b") as file, las.open(file, "w", False, header=header, do_compress=compress) as writer:
+            yield writer
+    except LazrsError as error:
+        raise not_written() from error
+    try:
+        with open_las(path) as reader:
+            whole = reader.header.point_count == writer.header.point_count
+    except DataError as error:
+        raise not_written() from error
+    if not whole:
+        raise not_written()
 
 
 def with_lazrs(path: Path) -> Any:

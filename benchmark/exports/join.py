@@ -234,16 +234,21 @@ def _outside(cloud: Path, finder: _Finder) -> DataError:
 
 
 def _classify_las(voxels: Voxels, cloud: Path, out: Path, find: Finder, asprs: Path | None) -> None:
-    module = clouds.with_lazrs(cloud)
+    clouds.with_lazrs(cloud)
     with open_las(cloud) as reader:
         _require_same_crs(voxels, reader.header, cloud)
-        header = _extended(reader.header, voxels)
-        compress = out.suffix.lower() == ".laz"
-        with module.open(out, mode="w", header=header, do_compress=compress) as writer:
-            for points in reader.chunk_iterator(min(CHUNK, points_at_once(reader.header))):
-                writer.write_points(_classified_points(points, writer.header, voxels, find, asprs))
-            if extended := _without_copc(reader.evlrs or ()):
-                writer.write_evlrs(type(reader.header.vlrs)(extended))
+        header, records = _extended(reader.header, voxels), type(reader.header.vlrs)(_without_copc(reader.evlrs or ()))
+    with clouds.las_writer(out, header) as writer:
+        for points in _las_chunks(cloud):
+            writer.write_points(_classified_points(points, writer.header, voxels, find, asprs))
+        if records:
+            writer.write_evlrs(records)
+
+
+def _las_chunks(cloud: Path) -> Iterator[laspy.ScaleAwarePointRecord]:
+    """Yield the points of a cloud; errors of what is written from them are none of the cloud's."""
+    with open_las(cloud) as reader:
+        yield from reader.chunk_iterator(min(CHUNK, points_at_once(reader.header)))
 
 
 def _extended(header: laspy.LasHeader, voxels: Voxels) -> laspy.LasHeader:

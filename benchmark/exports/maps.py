@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 import functools
+import logging
+import zlib
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from contextlib import contextmanager
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from semstab.core.files import atomic_path
+from semstab.core.files import atomic_path, not_written
 from semstab.core.types import Float64, Int64
 from semstab.data.georeference import INSTALL
 from semstab.data.information import normalise
@@ -71,8 +74,8 @@ def write_raster(chosen: Chosen, path: Path, cell: int = 1) -> int:
     with (
         atomic_path(path) as temporary,
         atomic_path(path.with_suffix(f".class{path.suffix}")) as temporary_classes,
-        rasterio.open(temporary, "w", **many, **shape) as file,
-        rasterio.open(temporary_classes, "w", **one, **shape) as classes,
+        _raster(temporary, **many, **shape) as file,
+        _raster(temporary_classes, **one, **shape) as classes,
     ):
         for window in whole.parts():
             there = [chosen[tile] for tile, own in seen.items() if own.meets(window)]
@@ -80,18 +83,57 @@ def write_raster(chosen: Chosen, path: Path, cell: int = 1) -> int:
             at = Pixels(window.low[1] - whole.low[1], whole.high[0] - window.high[0], *reversed(window.shape))
             nothing = np.full(window.shape, np.nan, np.float32)
             for number, name in enumerate(names, start=1):
-                file.write(bands[name].values if bands else nothing, number, window=at)
+                file.write(bands[name].values if bands else nothing, number, at)
             label = bands["class"].values if bands else nothing
-            classes.write(np.nan_to_num(label, nan=0).astype(kind), 1, window=at)
+            classes.write(np.nan_to_num(label, nan=0).astype(kind), 1, at)
         for number, (name, unit, about) in enumerate(_abouts(some), start=1):
-            file.set_band_description(number, name)
-            file.set_band_unit(number, unit)
-            file.update_tags(number, about=about)
-        file.update_tags(1, **legend)
-        classes.write_colormap(1, palette)
-        classes.set_band_description(1, "class")
-        classes.update_tags(1, **legend)
+            file.raster.set_band_description(number, name)
+            file.raster.set_band_unit(number, unit)
+            file.raster.update_tags(number, about=about)
+        file.raster.update_tags(1, **legend)
+        classes.raster.write_colormap(1, palette)
+        classes.raster.set_band_description(1, "class")
+        classes.raster.update_tags(1, **legend)
     return voxels
+
+
+@dataclass
+class _Raster:
+    """A raster that is written, and the checksum of each window of each band."""
+
+    raster: Any
+    sums: list[tuple[int, Any, int]] = field(default_factory=list)
+
+    def write(self, values: npt.NDArray[Any], band: int, window: Any) -> None:
+        """Write a window of a band."""
+        self.raster.write(values, band, window=window)
+        self.sums.append((band, window, zlib.crc32(np.ascontiguousarray(values).data)))
+
+
+@contextmanager
+def _raster(path: Path, **profile: Any) -> Iterator[_Raster]:
+    """Create a raster, which is read again at the end: GDAL reports no full disk.
+
+    Raises:
+        OSError: If it does not hold what was written.
+    """
+    import rasterio
+
+    logging.getLogger("rasterio").addHandler(logging.NullHandler())  # its lines about the disk; the error says it
+    try:
+        with rasterio.open(path, "w", **profile) as file:
+            written = _Raster(file)
+            yield written
+            names = file.descriptions
+        with rasterio.open(path) as file:
+            whole = file.descriptions == names and all(
+                zlib.crc32(np.ascontiguousarray(file.read(band, window=window)).data) == checksum
+                for band, window, checksum in written.sums
+            )
+    except rasterio.errors.RasterioError as error:
+        raise not_written() from error
+    if not whole:
+        raise not_written()
 
 
 @dataclass(frozen=True)

@@ -29,7 +29,7 @@ from semstab.errors import ConfigError, DataError
 from semstab.exports.join import NONE, VoxelLookup
 from semstab.metrics import CATEGORIES, categories
 from semstab.metrics.agreement import rows_of
-from semstab.predict.folder import PredictionFolder
+from semstab.predict.folder import NO_FOLDER_NAME, PredictionFolder, names_a_folder
 from semstab.settings import load_config
 from semstab.statistics import psa
 from semstab.statistics.acceptance import AcceptanceThresholds
@@ -311,6 +311,8 @@ def relabel(
         ConfigError, DataError: If the data has changed since it was fused, or its label maps cannot have the depth's
             pixels.
     """
+    if name is not None and not names_a_folder(name):
+        raise ConfigError(f"name {name!r}: {NO_FOLDER_NAME}")
     result = load_result(run)
     record = result.record(scene=scene, model=model, backend=backend)
     task, pixel_stride = task_of(Path(run), record, result.manifest["inputs"])
@@ -344,12 +346,14 @@ def relabel(
         folder.write(task.scene.image_name(frame.index), record.key, maps, 0.0)
         tally.add(frame, rows, known)
         progress(f"{task.scene.name} · {name}", done, len(task.indices))
+    folder.require_whole()
     folder.save()
     report = Relabelled(
         task.scene.name, task.model, name, str(folder.path), len(task.indices), **tally.counts,
         leave_one_out=chosen.leave_one_out, correctness=tally.correctness(),
     )  # fmt: skip
     write_json(folder.path / REPORT, {**dataclasses.asdict(report), "belief": chosen.settings()})
+    folder.close()
     return report
 
 

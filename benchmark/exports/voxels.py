@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from semstab.config import nearest
-from semstab.core.files import atomic_path
+from semstab.core.files import atomic_path, csv_text
 from semstab.core.prefetch import SizedCache
 from semstab.core.types import Float64, UInt8
 from semstab.data import labels as colors
@@ -317,7 +317,13 @@ def write_csv(parts: Iterable[Voxels], path: Path) -> int:
     """Write columns, part after part; an undefined value is an empty field. Return the number of voxels."""
     from pyarrow import csv
 
-    return _written(parts, path, csv.CSVWriter)
+    return _written(map(_in_csv, parts), path, csv.CSVWriter)
+
+
+def _in_csv(part: Voxels) -> Voxels:
+    """Return a part with names in which a spreadsheet sees no formula."""
+    columns = {csv_text(name): column for name, column in part.columns.items()}
+    return replace(part, columns=columns, classes=tuple(map(csv_text, part.classes)))
 
 
 def _written(parts: Iterable[Voxels], path: Path, opened: Callable[[Path, pa.Schema], Any]) -> int:

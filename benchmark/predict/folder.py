@@ -13,7 +13,7 @@ from typing import Any, Literal
 import numpy as np
 import numpy.typing as npt
 
-from semstab.core.files import FolderLock, atomic_path, content_key, read_json, write_json, write_png, write_stack
+from semstab.core.files import FolderLock, atomic_path, content_key, read_json, write_image, write_json, write_stack
 from semstab.core.json_form import from_json
 from semstab.core.types import Float32
 from semstab.data.labels import LabelSpace
@@ -21,6 +21,7 @@ from semstab.datasets.files.labels import LABEL_SPACE_FILE
 from semstab.datasets.files.options import inside
 from semstab.datasets.formats.images import LABEL_SUFFIXES, SCORE_SUFFIXES
 from semstab.datasets.geometry.lenses import fitted
+from semstab.datasets.scene import GROUND_TRUTH
 from semstab.errors import ConfigError, DataError
 
 SCHEMA = 1
@@ -32,6 +33,14 @@ SAVE_SECONDS = 5.0
 
 Kind = Literal["labels", "scores", "regions"]
 ScoreType = Literal["float16", "float32"]
+
+
+NO_FOLDER_NAME = "it names a folder; use letters, digits, '-' and '_'"
+
+
+def names_a_folder(name: str) -> bool:
+    """Return whether the maps of a label source can lie in a folder of its name, which is not the ground truth's."""
+    return name not in ("", ".", "..", GROUND_TRUTH) and not set(name) & set("/\\") and name.isprintable()
 
 
 @dataclass(frozen=True)
@@ -94,6 +103,7 @@ class PredictionFolder:
             **about,
         }
         self._frames: dict[str, _Predicted] = self._claim(overwrite)
+        self._written: set[str] = set()
         self._space = space
         self._saved = -math.inf
         self._lock: FolderLock | None = None
@@ -113,7 +123,7 @@ class PredictionFolder:
     def write(self, name: str, image: str, values: npt.NDArray[Any], seconds: float) -> None:
         """Store a frame's map of ids (H, W)."""
         self._claimed()
-        write_png(self.file(name), values)
+        write_image(self.file(name), values)
         self._done(name, image, seconds)
 
     def write_scores(self, name: str, image: str, maps: Iterable[npt.NDArray[Any]], seconds: float) -> None:
@@ -133,6 +143,17 @@ class PredictionFolder:
         self.save()
         if self._lock is not None:
             self._lock.release()
+            self._lock = None
+
+    def require_whole(self) -> None:
+        """Require the maps that were written.
+
+        Raises:
+            DataError: If one is gone; the next start predicts it again.
+        """
+        for name in sorted(self._written):
+            if not self.file(name).is_file():
+                raise DataError(f"{self.file(name)}: was written, and is gone; run the same command again")
 
     def _claimed(self) -> None:
         if self._lock is None:
@@ -140,6 +161,7 @@ class PredictionFolder:
             self._save()  # before the first map: without it, maps are taken for somebody else's
 
     def _done(self, name: str, image: str, seconds: float) -> None:
+        self._written.add(name)
         self._frames[name] = _Predicted(image, round(seconds, 4))
         if time.monotonic() - self._saved > SAVE_SECONDS:
             self.save()

@@ -17,7 +17,7 @@ from semstab.config import Settings, validated
 from semstab.core.files import content_key, parse_yaml, read_arrays, write_arrays
 from semstab.data.frames import Frame
 from semstab.data.labels import LabelSpace, ignore_id
-from semstab.datasets import GROUND_TRUTH, Scene
+from semstab.datasets import Scene
 from semstab.datasets.geometry.lenses import Scores, require_same_view
 from semstab.errors import ConfigError
 from semstab.models import Image, Labels, Model, Prediction, ask, create, image_digest, narrowed, options_model
@@ -26,6 +26,7 @@ from semstab.models.names import InTaxonomy
 from semstab.models.network import is_network
 from semstab.models.validation import Checked, Wrapped
 from semstab.predict.filters import Filtered, parse
+from semstab.predict.folder import NO_FOLDER_NAME, names_a_folder
 from semstab.predict.images import ImageSequence, geometry_of, shown_digest
 
 # Predictions of a model, cached on disk: it looks at each image once, whatever filters are put over it.
@@ -211,8 +212,8 @@ class PredictorConfig(Settings):
     @field_validator("name")
     @classmethod
     def _names_a_folder(cls, value: str | None) -> str | None:
-        if value is not None and (value in ("", ".", "..", GROUND_TRUTH) or set(value) & set("/\\\0")):
-            raise ValueError("it names a folder; use letters, digits, '-' and '_'")
+        if value is not None and not names_a_folder(value):
+            raise ValueError(NO_FOLDER_NAME)
         return value
 
     @field_validator("filters")

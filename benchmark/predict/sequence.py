@@ -265,7 +265,13 @@ class _Work:
             folder.close()
 
     def report(self, seconds: float, series: RegionSeries | None) -> SequenceReport:
-        """Return the report."""
+        """Return the report.
+
+        Raises:
+            DataError: If a map that was written is gone.
+        """
+        for folder in self.folders:
+            folder.require_whole()
         paths = tuple(folder.path for folder in self.folders)
         return SequenceReport(
             self.sequence.name, paths, self._predicted, self._reused, self._model_seconds, seconds, series

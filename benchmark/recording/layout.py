@@ -80,6 +80,8 @@ def direction(bounds: SceneBounds) -> tuple[Float64, Float64]:
     else:
         flat = (points - middle) - np.outer((points - middle) @ up, up)
         across = np.cross(np.linalg.eigh(flat.T @ flat)[1][:, 2], up)
+        if np.linalg.norm(across) < 1e-9:  # a single column of voxels extends along no side
+            across = np.linalg.svd(up[None])[2][1]
         toward = across * (1 if across @ side > 0 else -1) + up
     return toward / np.linalg.norm(toward), up / np.linalg.norm(up)
 

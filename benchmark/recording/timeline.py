@@ -11,6 +11,7 @@ from typing import Any
 
 import rerun as rr
 
+from semstab.data.digests import require_unchanged
 from semstab.data.measures import ENTROPY, VSS
 from semstab.data.results import RECURRENT, Unit
 from semstab.engine.units import Plan
@@ -135,6 +136,7 @@ def read_rows(file: Path) -> list[tuple[int, float | None, dict[str, str]]]:
     Raises:
         DataError: If it is damaged.
     """
+    require_unchanged(file)
     try:
         with file.open(encoding="utf-8", newline="") as lines:
             return [

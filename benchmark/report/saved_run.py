@@ -10,6 +10,7 @@ import numpy.typing as npt
 
 from semstab.core.arrays import values_of
 from semstab.data import voxels
+from semstab.data.digests import require_unchanged
 from semstab.data.events import Events
 from semstab.data.records import Result
 from semstab.data.voxels import VoxelTable
@@ -89,6 +90,7 @@ def _columns(file: Path) -> dict[str, pa.ChunkedArray]:
     import pyarrow as pa
     from pyarrow import csv
 
+    require_unchanged(file)
     try:
         read = csv.read_csv(str(file))
         return {name: read.column(name) for name in read.column_names}

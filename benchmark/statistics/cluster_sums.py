@@ -22,7 +22,8 @@ from semstab.core import arrays as arrow
 from semstab.core.files import atomic_path, parse_json
 from semstab.core.json_form import from_json
 from semstab.core.types import Float64, Int32, Int64, Mask
-from semstab.errors import DataError, summarize_error
+from semstab.data import parquet
+from semstab.errors import DataError
 from semstab.statistics.agreement import ONE_HOT, alpha_of, ratio_of
 
 # --- Columns ----------------------------------------------------------------------------------------------------------
@@ -300,11 +301,8 @@ class ClusterSums:
         Raises:
             DataError: If the file is missing, damaged or of another kind.
         """
-        import pyarrow as pa
-        import pyarrow.parquet as pq
-
-        try:
-            with pq.ParquetFile(path) as file:  # pq.read_table imports pandas
+        with parquet.reading(path, "a file of cluster sums"):
+            with parquet.opened(path) as file:
                 content = file.read()
             about = parse_json((content.schema.metadata or {})[b"semstab"])
             kind, version = about.pop("kind"), about.pop("schema")
@@ -329,8 +327,6 @@ class ClusterSums:
                 cell, frame = np.stack([key[own] for key in keys[:3]], axis=1), keys[3][own]
                 where = cell.astype(np.int32), frame.astype(np.int32), sums, edge, step
                 parts.append(cls(*where, voxel_size, meta.K, meta.classes, truth, fused))
-        except (OSError, LookupError, TypeError, ValueError, OverflowError, pa.ArrowException) as error:
-            raise DataError(f"{path}: not a file of cluster sums ({summarize_error(error)})") from error
         whole, *cells = parts
         return dataclasses.replace(whole, fine=cells[0], coarse=cells[1]) if cells else whole
 

@@ -16,11 +16,12 @@ import numpy.typing as npt
 from semstab.core import arrays
 from semstab.core.files import atomic_path, parse_json
 from semstab.core.types import Float64, Int32, Int64, UInt16, UInt32
+from semstab.data import parquet
 from semstab.data.events import Events
 from semstab.data.evidence import Evidence
 from semstab.data.measures import dominant, mean
 from semstab.data.voxels import index_columns
-from semstab.errors import DataError, summarize_error
+from semstab.errors import DataError
 from semstab.statistics.loops import CELLS, SHIFTS, SPAN, WITHIN
 
 Voxel = tuple[int, int, int]
@@ -305,11 +306,8 @@ class CellObservations:
         Raises:
             DataError: If the file is missing, damaged or of another kind.
         """
-        import pyarrow as pa
-        import pyarrow.parquet as pq
-
-        try:
-            with pq.ParquetFile(path) as file:  # pq.read_table imports pandas
+        with parquet.reading(path, "a file of sampled observations"):
+            with parquet.opened(path) as file:
                 content = file.read()
             about = parse_json((content.schema.metadata or {})[b"semstab"])
             if (about.pop("kind"), about.pop("schema")) != ("CellObservations", SCHEMA):
@@ -319,5 +317,3 @@ class CellObservations:
             x, y, z, view, label, weight, drawn = map(arrays.values_of, content.columns)
             key, low = keys_of(np.stack([x, y, z], axis=1).astype(np.int64))
             return cls(key, view, label, weight, drawn, low, views, **about)
-        except (OSError, LookupError, TypeError, ValueError, OverflowError, pa.ArrowException) as error:
-            raise DataError(f"{path}: not a file of sampled observations ({summarize_error(error)})") from error

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from semstab.core.arrays import RecentArrays
+from semstab.core.files import file_digest
 from semstab.core.prefetch import prefetch
 from semstab.core.types import Float32, Float64, UInt8, UInt16
 from semstab.data.frames import Frame, Intrinsics
@@ -272,7 +273,7 @@ class FileScene(Scene):
             digest.update(table.tobytes())
         files = [self._images(index, model) for index in indices]
         unread = [k for k, own in enumerate(files) if own.keys() - self._digests.keys()]
-        for fetched in prefetch(lambda k: {key: disk.file_digest(path) for key, path in files[k].items()}, unread):
+        for fetched in prefetch(lambda k: {key: file_digest(path) for key, path in files[k].items()}, unread):
             self._digests = fetched.item | self._digests
         for index, own in zip(indices, files, strict=True):
             source = self._frame(index)

@@ -17,11 +17,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from semstab.core.files import atomic_path
+from semstab.core.files import atomic_path, file_digest
 from semstab.core.types import Float32, Float64, Int32
 from semstab.data.frames import Intrinsics
 from semstab.data.georeference import INSTALL, Georeference
-from semstab.datasets.formats.disk import file_digest
 from semstab.errors import ConfigError, DataError, MissingDependencyError, SemstabError, summarize_error
 
 # Heights on a grid over x and y: of a raster file, and of the points of a cloud.

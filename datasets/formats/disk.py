@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from semstab.core.files import open_file, parse_json, read_limited
+from semstab.core.files import FILE_DIGEST, parse_json, read_limited
 from semstab.core.types import Float64
 from semstab.data.frames import Intrinsics
 from semstab.datasets.geometry.cameras import Poses
@@ -25,8 +25,6 @@ from semstab.errors import DataError, summarize_error
 
 AGAIN = "copy or export it again"
 MAX_BYTES = 2**32
-DIGEST = "sha256"
-"""Processors have instructions for it: there it takes half of blake2b's time."""
 
 
 def read_bytes(path: Path, limit: int = MAX_BYTES) -> bytes:
@@ -52,21 +50,8 @@ def read_text(path: Path, limit: int) -> str:
 
 
 def digest(data: bytes) -> bytes:
-    """Return a hash of a file's content."""
-    return hashlib.new(DIGEST, data).digest()
-
-
-def file_digest(path: Path) -> bytes:
-    """Return the same of a file that was not read.
-
-    Raises:
-        DataError: If it cannot be.
-    """
-    try:
-        with open_file(path) as file:
-            return hashlib.file_digest(file, DIGEST).digest()
-    except OSError as error:
-        raise DataError(f"{path}: cannot be read ({error.strerror})") from error
+    """Return a hash of a file's content, the one of `semstab.core.files.file_digest`."""
+    return hashlib.new(FILE_DIGEST, data).digest()
 
 
 def natural(name: str) -> tuple[list[str | int], str]:

@@ -1,6 +1,6 @@
-"""Kill runs, studies, predictions and conversions at random moments, half of them at their folder's birth.
+"""Kill runs, studies, predictions, exports and conversions at random moments, half of them at their folder's birth.
 
-    python tests/faults/kills.py [COUNT [SEED]]         make faults: 100
+    python tests/faults/kills.py [COUNT [SEED [KIND...]]]       make faults: 280, 40 of each of 7 kinds
 
 Each is then started again as it was, and has to leave what one without a kill leaves. Where several are at work on the
 machine, a kill may come after the end: those are counted apart. Beside these, a fifth as many are started twice at
@@ -16,6 +16,7 @@ import json
 import os
 import random
 import signal
+import subprocess
 import sys
 import tempfile
 import time
@@ -34,6 +35,9 @@ from semstab.cli import app
 from semstab.recording.target import is_whole
 
 Words = list[str]
+KINDS = ("csv", "parquet", "ply", "laz", "tif", "glb")
+"""The formats that are exported at once."""
+
 TIMES = ("fuse_ms_per_frame", "stages_ms")
 
 
@@ -95,11 +99,12 @@ def of_run(out: Path) -> Any:
 
 def of_files(out: Path) -> Any:
     """What a conversion or a prediction leaves, file by file; manifests without times and places."""
-    manifests = ("conversion.json", "predictions.json")
+    manifests = ("conversion.json", "predictions.json", "relabelled.json")
     files = sorted(path for path in out.rglob("*") if path.is_file())
     kept = {str(path.relative_to(out)): path.read_bytes() for path in files if path.name not in manifests}
-    frames = [list(json.loads(path.read_text()).get("frames", {})) for path in files if path.name in manifests]
-    return kept, frames
+    told = [json.loads(path.read_text()) for path in files if path.name in manifests]
+    frames = [list(each["frames"]) for each in told if isinstance(each.get("frames"), dict)]
+    return kept, frames, [{**each, "folder": None} for each in told if "confirmed" in each]
 
 
 def kinds(base: Path) -> dict[str, tuple[Callable[[Path], Words], Callable[[Path], Any]]]:
@@ -109,6 +114,10 @@ def kinds(base: Path) -> dict[str, tuple[Callable[[Path], Words], Callable[[Path
     study = base / "tiny.yaml"
     study.write_text(yaml.safe_dump(tiny_study.content(tiny_study.write(base / "walls"), backends=["numpy"])))
     common = ["--data", str(wall), "--backend", "numpy", "--quiet", "--report", "off", "--voxel-size", "0.1"]
+    one = ["--data", str(wall), "--model", "a", "--backend", "numpy", "--quiet", "--report", "off", "--rerun", "off"]
+    fused = base / "fused"
+    words = [sys.executable, "-m", "semstab", *one, "--voxel-size", "0.1", "--out", str(fused)]
+    subprocess.run(words, check=True)
     return {
         "run": (lambda out: [*common, "--out", str(out)], of_run),
         "tiles": (
@@ -120,6 +129,11 @@ def kinds(base: Path) -> dict[str, tuple[Callable[[Path], Words], Callable[[Path
             lambda out: ["predict", "-m", "colour-clusters", "--data", str(flight), "--out", str(out), "--quiet"],
             of_files,
         ),
+        "export": (
+            lambda out: ["export", str(fused), *(word for k in KINDS for word in ("--to", f"{out}/m.{k}")), "--quiet"],
+            of_files,
+        ),
+        "relabel": (lambda out: ["relabel", str(fused), "--out", str(out), "--quiet"], of_files),
         "convert": (lambda out: ["convert", "--data", str(wall), "--out", str(out), "--quiet"], of_files),
     }
 
@@ -132,12 +146,13 @@ def until_birth(out: Path, seconds: float) -> None:
     time.sleep(seconds)
 
 
-def main(count: int, seed: int) -> None:
+def main(count: int, seed: int, *only: str) -> None:
     """Kill so many, say how many ended as they should, and fail where one did not."""
     rng, told, wrong = random.Random(seed), collections.Counter[str](), []
     with tempfile.TemporaryDirectory() as temporary:
         base = Path(temporary)
         made, whole, seconds = kinds(base), {}, {}
+        made = {kind: own for kind, own in made.items() if kind in (only or made)}
         for kind, (words, left) in made.items():
             started = time.monotonic()
             finished(words(base / kind), base / "log")
@@ -171,4 +186,5 @@ def main(count: int, seed: int) -> None:
 
 
 if __name__ == "__main__":
-    main(*map(int, (*sys.argv[1:], *("100", "0")[len(sys.argv) - 1 :])))
+    count, seed, *only = (*sys.argv[1:], *("280", "0")[len(sys.argv) - 1 :])
+    main(int(count), int(seed), *only)

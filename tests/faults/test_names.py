@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import csv
 import shutil
+from xml.etree import ElementTree
 
+import pyarrow.parquet as pq
 import pytest
 import tiny_scene
 import yaml
@@ -14,9 +17,12 @@ from typer.testing import CliRunner
 
 import semstab
 from semstab.cli import app
+from semstab.data.labels import LabelSpace
 from semstab.data.results import Unit, slug
 from semstab.engine.folder import require_file_names
 from semstab.errors import ConfigError
+from semstab.exports import export
+from semstab.exports.annotation_formats import _node, _xml
 
 HORRORS = (
     "a b", "a-b", "x", "x__y", "-rf", "[/bold]", "$x^{", "<b>&amp;", "ä" * 100, "new\nline", "\u202e",
@@ -73,3 +79,27 @@ def test_a_study_is_kept_below_studies_whatever_its_name(tmp_path, monkeypatch) 
     assert done.exit_code == 0, done.stderr
     assert len(list((tmp_path / "studies").iterdir())) == 1
     assert not list(tmp_path.parent.parent.glob("escape"))
+
+
+@pytest.mark.parametrize("name", ["a\nelement face 9", "\x1b[31mred", "tab\t", "line\u2028", "\ufffe"])
+def test_a_class_name_with_a_control_character_is_refused_where_it_is_read(name) -> None:
+    with pytest.raises(ConfigError, match=r"holds a control character; rename it"):
+        LabelSpace("t", ("wall", name))
+    LabelSpace("t", ("Gebäude", "=cmd|' /C calc'!A0", "a b\u00a0c"))  # text, whatever it says
+
+
+def test_a_spreadsheet_sees_no_formula_in_an_exported_table(tmp_path) -> None:
+    root = tiny_scene.write(tmp_path / "wall", models=("a",))
+    scene = yaml.safe_load((root / "scene.yaml").read_text())
+    (root / "scene.yaml").write_text(yaml.safe_dump(scene | {"classes": ["=cmd|' /C calc'!A0", "+door", "@window"]}))
+    semstab.run(configure(root, models=["a"], check=None), out=tmp_path / "run", report=False)
+    export(tmp_path / "run", [tmp_path / "m.csv", tmp_path / "m.parquet"])
+    rows = list(csv.DictReader((tmp_path / "m.csv").read_text(encoding="utf-8").splitlines()))
+    assert {row["class"] for row in rows} <= {"'=cmd|' /C calc'!A0", "'+door", "'@window"}
+    assert set(pq.read_table(tmp_path / "m.parquet")["class"].to_pylist()) <= {"=cmd|' /C calc'!A0", "+door", "@window"}
+
+
+def test_xml_is_valid_whatever_a_scene_is_called() -> None:
+    text = _xml(_node("task", _node("name", "a\x1b[31m\x00b\nc"), source="\ufffe\x07"))
+    (name,) = ElementTree.fromstring(text)
+    assert name.text == "a\ufffd[31m\ufffdb\ufffdc"

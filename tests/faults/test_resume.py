@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import os
+import subprocess
+import sys
 
 import kills
 import pytest
@@ -105,3 +107,11 @@ def test_a_second_start_is_refused_in_one_line(started, tmp_path, kind, owned) -
 def started(tmp_path_factory):
     """The commands that `make faults` kills."""
     return kills.kinds(tmp_path_factory.mktemp("started"))
+
+
+def test_some_that_were_killed_and_started_again_leave_the_same_bits(tmp_path) -> None:
+    """Two kinds, as `make faults` does with all of them."""
+    words = [sys.executable, kills.__file__, "2", "0", "export", "relabel"]
+    done = subprocess.run(words, cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert "2 of 2 left what one without a kill leaves" in done.stdout

@@ -14,6 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from semstab.core.types import Float64, Int64, Mask, UInt8
+from semstab.data.digests import require_unchanged
 from semstab.data.measures import dominant, measures
 from semstab.data.records import Record, Tables
 from semstab.data.topdown import EMPTY, OUTLIERS, level_axes, top_down
@@ -107,6 +108,7 @@ class Overview:
         Raises:
             DataError: If the file is damaged or of another kind.
         """
+        require_unchanged(path)
         try:
             data = read_bytes(path)
             with zipfile.ZipFile(io.BytesIO(data)) as archive:
