@@ -6,7 +6,7 @@ import sys
 from pathlib import Path
 
 from semstab.backends import create
-from semstab.conformance import read_case, write_rows
+from semstab.conformance.files import read_case, write_rows
 
 
 def fuse(backend: str, case: Path, out: Path) -> None:

@@ -15,8 +15,8 @@ from semstab.core.files import write_text
 from semstab.core.types import Float64
 from semstab.data.frames import Frame, Intrinsics
 
-Case = tuple[float, int, list[Frame]]
-"""Voxel size in metres, number of classes, frames."""
+Case = tuple[float, int, list[Frame]] | tuple[float, int, list[Frame], int]
+"""Voxel size in metres, number of classes, frames; how often all of them are fused, one round after the other."""
 
 FAR = 2.0**60
 """So long a focal length, in pixels, that all pixels look along one line."""
@@ -30,6 +30,120 @@ def line(index: int, hits: Sequence[tuple[float, Any]], start: Sequence[float] =
     values = np.array([[value for _, value in hits]])
     given: dict[str, Any] = {"scores": values.astype(np.float32)} if values.ndim == 3 else {"labels": values}
     return Frame(index, depth, Intrinsics(FAR, FAR, 0, 0), T_wc, **given)
+
+
+def many_cases() -> Mapping[str, Case]:
+    """Return the cases of much: frames, pixels, classes, rows, range, digits."""
+    half = 0.5
+    return {
+        "alike": (1.0, 3, [line(t, [(half, int(t == 3)), (1.5, 2)]) for t in range(20)], 15),
+        "labels_then_scores": (1.0, 3, _mixed()),
+        "frame_numbers": (
+            1.0,
+            2,
+            [line(t, [(half, t % 2), (1.5, 0)][: 1 + n // 3]) for n, t in enumerate(FRAME_NUMBERS)],
+        ),
+        "small_scores": (1.0, 4, [line(t, hits) for t, hits in enumerate(_small_scores())]),
+        "classes_41": (1.0, 41, [_classes(t, 41, np.uint8) for t in range(3)]),
+        "classes_300": (1.0, 300, [_classes(t, 300, np.uint16) for t in range(3)]),
+        "pixels_1000": (1.0, 3, [line(t, [(half, (t + n) * n % 3) for n in range(1050 - t)]) for t in range(3)]),
+        "images_4096": (1.0, 3, _large_images()),
+        "ranges": (0.02, 3, [_ranges(t) for t in range(3)]),
+        "near": (0.0005, 3, [_rays(t, 0.001, 0.01) for t in range(3)]),
+        "rays": (0.05, 3, [_at_faces(t, 0.05) for t in range(4)]),
+        "utm_faces": (0.2, 3, [_utm_face(t) for t in range(len(OFF_A_FACE) * 3)]),
+        "frames_255": (1.0, 3, [line(0, [(0.2, 0), (0.4, 0), (0.6, 1)]), line(1, SEVEN)], 150),
+        "frames_65536": (1.0, 3, [line(0, [(half, 0)]), line(1, [(half, 1)])], 32769),
+    }
+
+
+SEVEN = [*((0.1 + n / 10, (2, 2, 2, 0, 1, 1, 1)[n]) for n in range(7)), (1.5, 1)]
+"""Seven pixels in one voxel, whose sevenths no binary number holds, and one in the next."""
+
+FRAME_NUMBERS = (16777216, 3, 2147483647, 16777217)
+"""Some that float32 cannot tell from another, and the largest; the last one sees a voxel alone."""
+
+OFF_A_FACE = (0.0, 1e-7, -1e-7, 3e-8, -3e-8, 5e-9, -5e-9, 2e-9, -2e-9)
+"""Metres between a face and a point; float64 numbers are 9.3e-10 m apart at 5.4e6 m, and 5.8e-11 m at 4.5e5 m."""
+
+
+def _numbered() -> list[Frame]:
+    return [line(t, [(0.5, t % 2), (1.5, 0)][: 1 + n // 3]) for n, t in enumerate(FRAME_NUMBERS)]
+
+
+def _mixed() -> list[Frame]:
+    """Labels, then scores, then labels, of 8 and of 16 bits, in two voxels."""
+    return [
+        line(0, [(0.5, 0), (1.5, 2)]),
+        line(1, [(0.5, (0.5, 0.375, 0.125)), (1.5, (0.25, 0.25, 0.5))]),
+        line(2, [(0.4, (0.125, 0.75, 0.125)), (0.6, (0.5, 0.5, 0.0))]),
+        line(3, [(0.5, np.uint16(1)), (1.5, np.uint16(2))]),
+    ]
+
+
+def _small_scores() -> list[list[tuple[float, tuple[float, ...]]]]:
+    """Scores below .001 beside large ones, down to 1e-7, and pixels whose scores are all small."""
+    return [
+        [(0.5, (0.9985, 0.0005, 0.0007, 0.0003)), (1.5, (1.0, 1e-5, 1e-6, 1e-7))],
+        [(0.5, (0.9, 0.0995, 0.0004, 0.0001)), (0.6, (1e-4, 2e-4, 3e-4, 4e-4)), (1.5, (1e-7, 1.0, 0.0, 1e-4))],
+        [(0.5, (0.0009, 0.9991, 0.0, 0.0)), (1.5, (2e-7, 1e-7, 1e-7, 4e-7))],
+    ]
+
+
+def _classes(t: int, K: int, kind: type[Any]) -> Frame:
+    """A pixel of each class but the last t, and a second one of class t, in one voxel; one pixel in the next."""
+    labels = [*range(K - t), t, (K // 2 + t) % K]
+    T_wc = np.eye(4)
+    T_wc[:3, 3] = 0.5, 0.5, 0.0
+    depth = np.full((1, len(labels)), 0.5, np.float32)
+    depth[0, -1] = 1.5
+    return Frame(t, depth, Intrinsics(FAR, FAR, 0, 0), T_wc, labels=np.array([labels], kind))
+
+
+def _large_images() -> list[Frame]:
+    """Images of 65, 257 and 4,100 rows, and of 4,100 columns; 64 pixels share a voxel."""
+    frames = []
+    for t, (W, H) in enumerate([(2, 65), (2, 257), (1, 4100), (4100, 1)]):
+        v, u = np.indices((H, W))
+        labels = ((u + v) % 7 % 3).astype(np.uint8)
+        depth = np.ones((H, W), np.float32)
+        frames.append(Frame(t, depth, Intrinsics(64.0, 64.0, -0.5, -0.5), np.eye(4), labels=labels))
+    return frames
+
+
+def _ranges(t: int) -> Frame:
+    """Depth from 1 mm to 10 km, in equal steps of its logarithm, in a narrow camera that looks past the origin."""
+    return _rays(t, 0.001, 10_000.0, focal=4000.0, turn=(0.001, 0.002, 0.3))
+
+
+def _rays(t: int, low: float, high: float, focal: float = 40.0, turn: Sequence[float] = (0.0, 0.0, 0.0)) -> Frame:
+    """Twelve by six pixels with depth from low to high, metres."""
+    depth = np.geomspace(low, high, 72).reshape(6, 12).astype(np.float32)
+    labels = ((np.arange(72) * (t + 1)) % 5 % 3).reshape(6, 12).astype(np.uint8)
+    T_wc = _pose(turn, (0.0001 * t, 0.0002, -0.0001))
+    return Frame(t, depth, Intrinsics(focal, focal + 0.7, 5.3, 2.9), T_wc, labels=labels)
+
+
+def _at_faces(t: int, voxel_size: float) -> Frame:
+    """Intrinsics that float32 cannot hold, and depth that puts x as close to a face as float32 depth can."""
+    camera = Intrinsics(fx=525.123456789012, fy=517.987654321098, cx=0.123456789012, cy=0.456789012345)
+    u = 1 + np.arange(48).reshape(4, 12) * 13 % 599
+    face = (1 + (u * 7 + t * 5) % 40) * voxel_size
+    ray = (np.arange(12) - camera.cx) / camera.fx
+    depth = np.full((4, 12), 0.0)
+    depth[:, 1:] = face[:, 1:] / ray[None, 1:]
+    labels = ((u + t) % 3).astype(np.uint8)
+    T_wc = np.eye(4)
+    T_wc[1, 3] = 0.013
+    return Frame(t, depth.astype(np.float32), camera, T_wc, labels=labels)
+
+
+def _utm_face(n: int) -> Frame:
+    """A point at UTM coordinates, on a face of a voxel or at most 1e-7 m off it, on each axis in turn."""
+    axis, off = n % 3, OFF_A_FACE[n // 3]
+    at = np.array([448262.3, 5411932.7, 301.1])
+    at[axis] = round(at[axis] / 0.2) * 0.2 + off
+    return line(n, [(0.5, n % 2), (0.5, 2 * (n % 2))], start=at - (0.0, 0.0, 0.5))
 
 
 def cases() -> Mapping[str, Case]:
@@ -52,6 +166,7 @@ def cases() -> Mapping[str, Case]:
         "half_scores": (0.5, 3, _walk(2, 3, np.zeros(3), soft=np.float16)),
         "random": (0.5, 4, _walk(6, 4, np.array([0.03, -0.04, 0.05]))),
         "random_scores": (0.5, 4, _walk(4, 4, np.array([0.03, -0.04, 0.05]), soft=np.float32)),
+        **many_cases(),
     }
 
 
@@ -109,11 +224,12 @@ def _pose(turn: Sequence[float] | Float64, at: Any) -> Float64:
     return T_wc
 
 
-def make(folder: Path) -> None:
-    """Write every case into a folder of its own."""
-    for name, (voxel_size, classes, frames) in cases().items():
-        write_case(folder / name, voxel_size, classes, frames)
-        fuse("numpy", folder / name, folder / name / EXPECTED)
+def make(folder: Path, *, leaving_out: Sequence[str] = ()) -> None:
+    """Write every case into a folder of its own, but for some tables that take long."""
+    for name, (voxel_size, classes, frames, *rounds) in cases().items():
+        write_case(folder / name, voxel_size, classes, frames, *rounds)
+        if name not in leaving_out:
+            fuse("numpy", folder / name, folder / name / EXPECTED)
     write_text(folder / "order.txt", "\n".join([*cases(), ""]))
 
 

@@ -43,7 +43,7 @@ class Oracle:
                 s = self.evidence(frame, u, v)
                 if self.has_depth(d) and s is not None:
                     seen.setdefault(self.voxel(frame, self.world_point(frame, u, v, d)), []).append(s)
-        new = [q for q in seen if q not in self.history]
+        new = {q for q in seen if q not in self.history}
         for q, vectors in seen.items():
             self.observe(q, frame, vectors)
         return FrameReport(

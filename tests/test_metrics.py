@@ -27,6 +27,7 @@ from semstab.metrics import (
     summarise,
     vss,
 )
+from semstab.metrics.agreement import COUNTS, SUMS
 from semstab.testing import JS_HALF, SEQUENCES, as_frames, checks, sight_line
 
 
@@ -278,7 +279,7 @@ def test_a_map_agrees_with_itself():
     assert (row.scene, row.model, row.backends) == ("s", "b", ("numpy", "open3d"))
     assert (row.voxels, row.only_in) == ((3, 3), (0, 0))
     assert {name: (d.max, d.mean) for name, d in row.differences.items()} == dict.fromkeys(
-        ["op", *(measure.key for measure in measures()), "evidence", "label"], (0, 0)
+        [*COUNTS, *SUMS, *(measure.key for measure in measures()), "label"], (0, 0)
     )
 
 
@@ -286,7 +287,12 @@ def test_a_map_agrees_with_itself():
     ("column", "row", "value", "quantities"),
     [
         ("op", 2, 5, {"op", "sbd"}),
-        ("drift_sum", 1, 0.4, {"sbd"}),
+        ("drift_sum", 1, 0.4, {"drift_sum", "sbd"}),
+        ("pixels", 1, 9, {"pixels"}),
+        ("first_frame", 1, 9, {"first_frame"}),
+        ("last_frame", 1, 9, {"last_frame"}),
+        ("self_sum", 1, 0.25, {"self_sum"}),
+        ("frame_entropy_sum", 1, 0.25, {"frame_entropy_sum"}),
         ("evidence", 1, [2, 2], {"evidence"}),
         ("evidence", 2, [1, 3], {"evidence", "label"}),
         ("evidence", 2, [2, 2], {"evidence", "vss", "entropy", "margin"}),
@@ -298,6 +304,8 @@ def test_a_difference_in_any_quantity_is_disagreement(column, row, value, quanti
     result = compare(TABLE, dataclasses.replace(TABLE, **{column: values}), UNITS)
     assert not result.agrees
     assert {name for name, difference in result.differences.items() if difference.max > 1e-9} == quantities
+    assert result.first.column == (f"evidence_{np.argmax(value != TABLE.evidence[row])}" if np.ndim(value) else column)
+    assert result.first.voxel == tuple(TABLE.index[row])
 
 
 def test_differences_are_largest_and_mean_over_shared_voxels():
@@ -311,6 +319,23 @@ def test_differences_within_the_tolerance_agree():
     other = dataclasses.replace(TABLE, drift_sum=TABLE.drift_sum + np.array([0, 1e-6, 0]))
     assert not compare(TABLE, other, UNITS).agrees
     assert compare(TABLE, other, UNITS, tolerance=1e-5).agrees
+
+
+def test_the_tolerance_of_a_sum_is_relative_to_it():
+    """65,536 observations of thirds: sums in another order differ by their rounding, and by no more."""
+    large = dataclasses.replace(TABLE, self_sum=np.array([1.0, 2.0, 65536 / 3]))
+    assert compare(large, dataclasses.replace(large, self_sum=np.add(large.self_sum, [0, 0, 1e-5])), UNITS).agrees
+    assert not compare(large, dataclasses.replace(large, self_sum=np.add(large.self_sum, [0, 0, 1e-4])), UNITS).agrees
+    assert not compare(large, dataclasses.replace(large, self_sum=np.add(large.self_sum, [1e-5, 0, 0])), UNITS).agrees
+
+
+def test_the_first_number_that_differs_is_a_sentence():
+    wrong = compare(dataclasses.replace(TABLE, op=np.array([1, 3, 5])), TABLE, UNITS).first
+    assert str(wrong) == f"op of the voxel {tuple(TABLE.index[1].tolist())} is 3, expected 2 (and 1 more)"
+    missing = compare(without(TABLE, 1), TABLE, UNITS).first
+    assert str(missing) == f"the voxel {tuple(TABLE.index[1].tolist())} is missing"
+    surplus = compare(TABLE, without(TABLE, 1), UNITS).first
+    assert str(surplus) == f"the voxel {tuple(TABLE.index[1].tolist())} should not be there"
 
 
 def test_an_sbd_that_one_map_lacks_is_a_difference_of_1():

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import io
 import json
 
 import cv2
@@ -12,6 +13,7 @@ import pytest
 import tiny_scene
 import yaml
 from posed_config import configure
+from rich.console import Console
 
 import semstab
 from semstab import metrics
@@ -22,6 +24,7 @@ from semstab.data.results import STAGES, Unit
 from semstab.datasets.files import scene
 from semstab.engine import Observer, load_result
 from semstab.errors import ConfigError, DataError
+from semstab.report.terminal import print_answer
 from semstab.settings import load_config
 
 
@@ -193,10 +196,6 @@ def test_disagreement_is_reported_after_everything_is_written(root, tmp_path, mo
     from semstab.backends.numpy_reference import NumpyReference
 
     table = NumpyReference.table
-    late = {"first_frame": np.full(60, 7), "last_frame": np.full(60, 8)}
-    monkeypatch.setattr(NumpyReference, "table", lambda self: dataclasses.replace(table(self), **late))
-    agreeing = semstab.run(configure(root, models=["a"], backends=["open3d"]), report=False)
-    assert agreeing.agrees  # frame numbers are not compared, evidence is
 
     def half(self):
         whole = table(self)
@@ -207,6 +206,47 @@ def test_disagreement_is_reported_after_everything_is_written(root, tmp_path, mo
     assert not result.agrees
     assert result.agreement[0].differences["evidence"].max > 0.1
     assert json.loads((tmp_path / "run" / "summary.json").read_text())["agreement"][0]["agrees"] is False
+
+
+PLANTED = {
+    "self_sum": lambda table: table.op,
+    "frame_entropy_sum": lambda table: table.frame_entropy_sum * np.log(2),
+    "first_frame": lambda table: table.first_frame + 1,
+    "last_frame": lambda table: table.first_frame,
+    "pixels": lambda table: np.minimum(table.pixels, 1),
+    "op": lambda table: np.minimum(table.op, 2),
+    "drift_sum": lambda table: np.where(table.drift_sum < 0.1, 0, table.drift_sum),
+}
+"""A wrong column, from a right table."""
+
+
+@pytest.mark.parametrize("column", PLANTED)
+def test_a_wrong_column_is_named_with_its_voxel(root, tmp_path, monkeypatch, column) -> None:
+    """The check of a run compares every column of the voxel table with the reference's."""
+    from semstab.backends.numba_hash import NumbaHash
+
+    table, tables = NumbaHash.table, []
+
+    def planted(self):
+        right = table(self)
+        tables.append((right, dataclasses.replace(right, **{column: PLANTED[column](right)})))
+        return tables[-1][1]
+
+    monkeypatch.setattr(NumbaHash, "table", planted)
+    monkeypatch.setattr("semstab.backends.numpy_reference.ONE_IN", 1)
+    settings = configure(root, models=["a"], backends=["numba"], voxel_size=0.5)
+    result = semstab.run(settings, out=tmp_path / "run", report=False)
+    (row,) = result.agreement
+    assert not result.agrees
+    assert row.first is not None
+    (right, wrong) = tables[0]
+    (q,) = np.flatnonzero((right.index == row.first.voxel).all(axis=1))
+    assert row.first.column == column
+    assert (row.first.got, row.first.expected) == pytest.approx((getattr(wrong, column)[q], getattr(right, column)[q]))
+    assert load_result(tmp_path / "run").agreement == result.agreement
+    printed = io.StringIO()
+    print_answer(result, Console(file=printed, width=400))
+    assert f"numba and numpy DISAGREE in 1 of 1 maps: wall, a: {row.first}" in printed.getvalue()
 
 
 @pytest.mark.parametrize(("settings", "message"), [

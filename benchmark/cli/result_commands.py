@@ -121,7 +121,7 @@ def calibrate(
 
 # The command conform.
 
-DIFFERS = 3
+DIFFERS, RANDOM_CASES = 3, 4
 
 
 def conform(
@@ -130,13 +130,20 @@ def conform(
     ],
     only: Annotated[list[str] | None, typer.Option(metavar="CASE", help="This case alone; repeatable.")] = None,
     tolerance: Annotated[float, typer.Option(min=0, help="Largest difference of a sum or a measure.")] = 1e-9,
+    random: Annotated[
+        int | None,
+        typer.Option(
+            min=0, metavar="N", help="Also N random cases, random:0 and so on; 4 by default, none with --only."
+        ),
+    ] = None,
     quiet: Quiet = False,
 ) -> None:
     """Test an external fusion program with the conformance data. Exit code 3 if its tables differ."""
     from semstab.conformance import conform
 
     wrong = 0
-    for verdict in conform(command, only or (), tolerance):
+    more = random if random is not None else 0 if only else RANDOM_CASES
+    for verdict in conform(command, only or (), tolerance, more):
         wrong += bool(verdict.problem)
         if verdict.problem:
             say(f"{verdict.case}: {verdict.problem}")

@@ -206,7 +206,9 @@ def execute(
     if result.failures:
         raise typer.Exit(2)
     if not result.agrees:
-        say(f"error: the backends disagree; the agreement in {out / 'summary.json'} shows where")
+        first = next(row for row in result.agreement if not row.agrees)
+        where = f" ({first.scene}, {first.model}: {first.first})" if first.first else ""
+        say(f"error: the backends disagree{where}; the agreement in {out / 'summary.json'} shows where")
         raise typer.Exit(DISAGREE)
 
 

@@ -269,13 +269,42 @@ class Deviation:
 
 
 @dataclass(frozen=True)
+class Mismatch:
+    """The first voxel of a map whose number in a column is another one than expected.
+
+    Attributes:
+        voxel: Its index ix, iy, iz.
+        column: A column of the voxel table, a class's evidence (`evidence_3`), or a measure.
+        got: Its value in the map; OP is 0 where the map lacks the voxel.
+        expected: Its value in the map that is right, or in the other one.
+        voxels: Number of voxels that differ in this column.
+    """
+
+    voxel: tuple[int, int, int]
+    column: str
+    got: float
+    expected: float
+    voxels: int = 1
+
+    def __str__(self) -> str:
+        if self.column == "op" and not self.got:
+            what = f"the voxel {self.voxel} is missing"
+        elif self.column == "op" and not self.expected:
+            what = f"the voxel {self.voxel} should not be there"
+        else:
+            what = f"{self.column} of the voxel {self.voxel} is {self.got!r}, expected {self.expected!r}"
+        return what + (f" (and {self.voxels - 1:,} more)" if self.voxels > 1 else "")
+
+
+@dataclass(frozen=True)
 class Agreement:
     """The agreement of two backends' maps of the same frames; one entry of 'agreement' in summary.json.
 
     Attributes:
-        differences: Differences of OP, of every measure, of the evidence and of the label (1 where it is another), by
-            their keys.
+        differences: Differences of every column of the voxel table, of every measure, and of the label (1 where it is
+            another), by their keys; evidence is one.
         one_in: Number of voxels of which one, drawn at random, was compared.
+        first: The first number that differs too much, where the maps do not agree.
     """
 
     scene: str
@@ -286,3 +315,4 @@ class Agreement:
     differences: Mapping[str, Deviation]
     agrees: bool
     one_in: int = 1
+    first: Mismatch | None = None

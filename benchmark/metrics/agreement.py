@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import reduce
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -15,7 +15,7 @@ import numpy.typing as npt
 from semstab.core.types import Float64, Int32, Int64, Mask
 from semstab.data.events import Events
 from semstab.data.measures import dominant, measures
-from semstab.data.results import Agreement, Deviation, Unit
+from semstab.data.results import Agreement, Deviation, Mismatch, Unit
 from semstab.data.voxels import VoxelTable
 from semstab.errors import DataError
 
@@ -104,29 +104,37 @@ LABEL = "label"
 """The share of voxels with another dominant class; it alone is no disagreement, as a tie depends on the last bit."""
 
 TOLERANCE = 1e-9
-"""Largest difference allowed between float64 backends in any quantity of any voxel."""
+"""Largest difference allowed between float64 backends in a measure, or in a sum; of a sum above 1, relative to it."""
+
+COUNTS = ("op", "pixels", "first_frame", "last_frame")
+SUMS = ("evidence", "drift_sum", "self_sum", "frame_entropy_sum")
+"""The columns of a voxel table besides the index: whole numbers, and sums over the frames."""
 
 
 def compare(
     a: VoxelTable, b: VoxelTable, units: tuple[Unit, Unit], *, tolerance: float = TOLERANCE, voxel_share: float = 0.0
 ) -> Agreement:
-    """Compare two maps of the same frames, voxel by voxel.
+    """Compare two maps of the same frames, voxel by voxel, in every column of the voxel table and every measure.
 
-    They agree where no quantity differs by more than `tolerance`, and where at most `voxel_share` of the voxels are in
-    only one map. An SBD that is undefined in one map only counts as a difference of 1, its range.
+    They agree where nothing differs by more than `tolerance` (sums above 1: relative to the sum), and where at most
+    `voxel_share` of the voxels are in only one map. An SBD that is undefined in one map only counts as a difference of
+    1, its range.
 
     Raises:
         DataError: If the maps differ in K or voxel size.
     """
     in_a, in_b = shared_rows(a, b)
     chunks = [
-        _differences(_Rows.of(a, in_a[start : start + CHUNK]), _Rows.of(b, in_b[start : start + CHUNK]))
+        _differences(a, b, in_a[start : start + CHUNK], in_b[start : start + CHUNK], tolerance)
         for start in range(0, max(1, len(in_a)), CHUNK)
     ]
-    differences = {name: _deviation([chunk[name] for chunk in chunks], len(in_a)) for name in chunks[0]}
+    differences = {name: _deviation([(c[name].max, c[name].sum) for c in chunks], len(in_a)) for name in chunks[0]}
     only_in = (len(a) - len(in_a), len(b) - len(in_b))
-    same_voxels = sum(only_in) <= voxel_share * max(len(a), len(b))
-    same_values = all(not d.max > tolerance for name, d in differences.items() if name != LABEL)
+    first = None
+    if sum(only_in) > voxel_share * max(len(a), len(b)):
+        first = next(_in_one_only(a, b, in_a, in_b))
+    for name in differences:
+        first = first or _joined([found for chunk in chunks if (found := chunk[name].first) is not None])
     return Agreement(
         scene=units[0].scene,
         model=units[0].model,
@@ -134,8 +142,22 @@ def compare(
         voxels=(len(a), len(b)),
         only_in=only_in,
         differences=differences,
-        agrees=same_voxels and same_values,
+        agrees=first is None,
+        first=first,
     )
+
+
+def mismatches(got: VoxelTable, expected: VoxelTable, tolerance: float = TOLERANCE) -> Iterator[Mismatch]:
+    """Yield where a map is not the expected one: voxels, then each column of the table, then each measure.
+
+    Raises:
+        DataError: If the maps differ in K or voxel size.
+    """
+    in_got, in_expected = shared_rows(got, expected)
+    yield from _in_one_only(got, expected, in_got, in_expected)
+    for column in _differences(got, expected, in_got, in_expected, tolerance).values():
+        if column.first is not None:
+            yield column.first
 
 
 def together(parts: Sequence[Agreement]) -> Agreement:
@@ -149,6 +171,7 @@ def together(parts: Sequence[Agreement]) -> Agreement:
             name: _together([part.differences[name] for part in parts], shared) for name in parts[0].differences
         },
         agrees=all(part.agrees for part in parts),
+        first=next((part.first for part in parts if part.first is not None), None),
     )
 
 
@@ -170,24 +193,65 @@ class _Rows:
         return cls(table.op[rows], table.evidence[rows], table.drift_sum[rows])
 
 
-def _differences(a: _Rows, b: _Rows) -> dict[str, tuple[float, float]]:
-    """Return the largest difference of each quantity and the mean over the classes summed over the voxels."""
-    of_measures = {measure.key: _difference(measure.of(a), measure.of(b)) for measure in measures()}
-    other = dominant(a) != dominant(b)
-    return {
-        "op": _difference(a.op, b.op),
-        **of_measures,
-        "evidence": _difference(a.evidence, b.evidence),
-        LABEL: (float(other.max(initial=False)), float(other.sum())),
-    }
+class _Difference(NamedTuple):
+    """Largest difference of a quantity, its sum over the voxels (mean over classes), and the first that is too much."""
+
+    max: float
+    sum: float
+    first: Mismatch | None
 
 
-def _difference(x: npt.NDArray[Any], y: npt.NDArray[Any]) -> tuple[float, float]:
-    difference = np.abs(x.astype(np.float64) - y)
-    undefined = np.isnan(difference)
-    if undefined.any():
-        difference[undefined] = np.isnan(x[undefined]) != np.isnan(y[undefined])
-    return float(difference.max(initial=0.0)), float(difference.sum()) * len(x) / max(1, difference.size)
+def _differences(a: VoxelTable, b: VoxelTable, in_a: Int64, in_b: Int64, tolerance: float) -> dict[str, _Difference]:
+    """Return the differences of each quantity: columns, then measures, then the label."""
+    rows_a, rows_b = _Rows.of(a, in_a), _Rows.of(b, in_b)
+
+    def values(name: str) -> tuple[npt.NDArray[Any], npt.NDArray[Any]]:
+        if name == "evidence":
+            return rows_a.evidence, rows_b.evidence
+        return getattr(a, name)[in_a], getattr(b, name)[in_b]
+
+    def difference(name: str, x: npt.NDArray[Any], y: npt.NDArray[Any], most: Any = tolerance) -> _Difference:
+        apart = np.abs(x.astype(np.float64) - y)
+        undefined = np.isnan(apart)
+        if undefined.any():
+            apart[undefined] = np.isnan(x[undefined]) != np.isnan(y[undefined])
+        largest, total = float(apart.max(initial=0.0)), float(apart.sum()) * len(x) / max(1, apart.size)
+        if largest <= tolerance:
+            return _Difference(largest, total, None)
+        wrong = apart > most
+        rows = np.flatnonzero(wrong if wrong.ndim == 1 else wrong.any(axis=1))
+        if not len(rows):
+            return _Difference(largest, total, None)
+        where = tuple(np.argwhere(wrong)[0])
+        column = name if len(where) == 1 else f"{name}_{where[1]}"
+        first = Mismatch(_voxel(a, in_a[rows[0]]), column, x[where].item(), y[where].item(), len(rows))
+        return _Difference(largest, total, first)
+
+    found = {name: difference(name, *values(name)) for name in COUNTS}
+    for name in SUMS:
+        x, y = values(name)
+        found[name] = difference(name, x, y, tolerance * np.maximum(1.0, np.abs(y)))
+    for measure in measures():
+        found[measure.key] = difference(measure.key, measure.of(rows_a), measure.of(rows_b))
+    other = dominant(rows_a) != dominant(rows_b)
+    return found | {LABEL: _Difference(float(other.max(initial=False)), float(other.sum()), None)}
+
+
+def _in_one_only(got: VoxelTable, expected: VoxelTable, in_got: Int64, in_expected: Int64) -> Iterator[Mismatch]:
+    """Yield the first voxel that is missing, and the first that should not be there."""
+    for table, shared, is_expected in ((expected, in_expected, True), (got, in_got, False)):
+        alone = np.setdiff1d(np.arange(len(table)), shared, assume_unique=True)
+        if len(alone):
+            op = (0, int(table.op[alone[0]]))
+            yield Mismatch(_voxel(table, alone[0]), "op", *(op if is_expected else op[::-1]), len(alone))
+
+
+def _voxel(table: VoxelTable, row: Any) -> tuple[int, int, int]:
+    return int(table.ix[row]), int(table.iy[row]), int(table.iz[row])
+
+
+def _joined(parts: Sequence[Mismatch]) -> Mismatch | None:
+    return replace(parts[0], voxels=sum(part.voxels for part in parts)) if parts else None
 
 
 def _deviation(chunks: Sequence[tuple[float, float]], voxels: int) -> Deviation:

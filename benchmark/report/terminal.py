@@ -290,11 +290,10 @@ def _check(pair: tuple[str, str], rows: Sequence[Agreement]) -> str:
     if not bad:
         return f"checked {checked} against {reference} on {voxels:,} voxels{drawn}: equal"
     row = bad[0]
-    measure = max(row.differences, key=lambda name: row.differences[name].max)
-    only = f", {sum(row.only_in):,} voxels in one only" if any(row.only_in) else ""
+    only = f"; {sum(row.only_in):,} voxels in one only" if any(row.only_in) else ""
     return (
-        f"{checked} and {reference} DISAGREE in {len(bad)} of {len(rows)} maps: {row.scene}, {row.model}: {measure}"
-        f" differs by {row.differences[measure].max:.1e}{only}"
+        f"{checked} and {reference} DISAGREE in {len(bad)} of {len(rows)} maps: {row.scene}, {row.model}:"
+        f" {row.first or 'the agreement in summary.json shows where'}{only}"
     )
 
 

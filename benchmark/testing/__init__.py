@@ -8,22 +8,24 @@
 
 `properties` and `contract` hold scenes so small that the answer is worked out by hand in their docstrings; they are
 also the shortest way to learn the definitions. Further tests check random sequences, and agreement with the reference.
-`builders` make the frames and compare the maps.
-
-Put `pytest.register_assert_rewrite("semstab.testing")` into conftest.py, and failures show the values.
+`cases` runs the data that `semstab-bench conform` gives to programs. `builders` make the frames and compare the maps: a
+failure names column, voxel, what it is and what was expected.
 """
 
 from semstab.errors import MissingDependencyError
 
 try:
     import hypothesis  # noqa: F401
-    import pytest  # noqa: F401
+    import pytest
 except ImportError as missing:
     raise MissingDependencyError(
         f"semstab.testing cannot be used ({missing}); pip install 'semstab[testing]'"
     ) from missing
 
-from semstab.testing.builders import (
+for _part in ("builders", "cases", "contract", "properties"):
+    pytest.register_assert_rewrite(f"semstab.testing.{_part}")  # a failure shows the values that were compared
+
+from semstab.testing.builders import (  # noqa: E402
     EXACT,
     HITS,
     JS_HALF,
@@ -36,8 +38,9 @@ from semstab.testing.builders import (
     sight_line,
     voxels,
 )
-from semstab.testing.contract import ContractTests
-from semstab.testing.properties import EvidenceTests, GeometryTests, PropertyTests
+from semstab.testing.cases import CaseTests  # noqa: E402
+from semstab.testing.contract import ContractTests  # noqa: E402
+from semstab.testing.properties import EvidenceTests, GeometryTests, PropertyTests  # noqa: E402
 
 __all__ = [
     "EXACT",
@@ -55,7 +58,7 @@ __all__ = [
 ]
 
 
-class BackendConformance(EvidenceTests, GeometryTests, ContractTests, PropertyTests):
+class BackendConformance(EvidenceTests, GeometryTests, ContractTests, PropertyTests, CaseTests):
     """The contract of every fusion backend. A subclass defines `create`; the rest is inherited.
 
     Attributes:
@@ -64,4 +67,5 @@ class BackendConformance(EvidenceTests, GeometryTests, ContractTests, PropertyTe
             puts a point on the other side of a voxel's face; 0 for float64.
         reach: Voxels that a map holds to either side of its first camera, 2^31 unless the backend reaches less far;
             points beyond are refused.
+        long_cases: Whether the cases of very many frames (65,538) are run too.
     """
