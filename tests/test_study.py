@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import dataclasses
 import itertools
 import json
@@ -222,6 +223,23 @@ def test_voxels_that_were_lost_or_damaged_are_computed_again_and_told(root, tmp_
     assert len(count(config, out).computed) == 2
     assert "wall__b__numpy.parquet: has changed since it was written; its unit is computed again" in caplog.text
     assert count(config, out).computed == []
+
+
+def test_a_second_backend_that_is_computed_again_keeps_its_series(root, tmp_path) -> None:
+    """Its flicker without camera motion is that of the first one, which is not computed again."""
+    out, config = tmp_path / "out", configure(root, models=["a"], sweeps={}, backends=["numpy", "numba"])
+    run_study(config, out, report=False)
+    file = out / "frames/wall__a__numba.csv"
+
+    def column() -> list[str]:
+        with file.open(newline="") as lines:
+            return [row["compensated_flicker_percent"] for row in csv.DictReader(lines)]
+
+    before = column()
+    assert any(before)
+    file.unlink()
+    assert len(count(config, out).computed) == 1
+    assert column() == before
 
 
 def test_a_failing_unit_is_reported_and_the_others_finish(root, tmp_path) -> None:

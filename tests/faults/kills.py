@@ -115,9 +115,13 @@ def kinds(base: Path) -> dict[str, tuple[Callable[[Path], Words], Callable[[Path
     study.write_text(yaml.safe_dump(tiny_study.content(tiny_study.write(base / "walls"), backends=["numpy"])))
     common = ["--data", str(wall), "--backend", "numpy", "--quiet", "--report", "off", "--voxel-size", "0.1"]
     one = ["--data", str(wall), "--model", "a", "--backend", "numpy", "--quiet", "--report", "off", "--rerun", "off"]
-    fused = base / "fused"
-    words = [sys.executable, "-m", "semstab", *one, "--voxel-size", "0.1", "--out", str(fused)]
-    subprocess.run(words, check=True)
+
+    @functools.cache
+    def fused() -> str:
+        words = [sys.executable, "-m", "semstab", *one, "--voxel-size", "0.1", "--out", str(base / "fused")]
+        subprocess.run(words, check=True)
+        return str(base / "fused")
+
     return {
         "run": (lambda out: [*common, "--out", str(out)], of_run),
         "tiles": (
@@ -130,10 +134,10 @@ def kinds(base: Path) -> dict[str, tuple[Callable[[Path], Words], Callable[[Path
             of_files,
         ),
         "export": (
-            lambda out: ["export", str(fused), *(word for k in KINDS for word in ("--to", f"{out}/m.{k}")), "--quiet"],
+            lambda out: ["export", fused(), *(word for k in KINDS for word in ("--to", f"{out}/m.{k}")), "--quiet"],
             of_files,
         ),
-        "relabel": (lambda out: ["relabel", str(fused), "--out", str(out), "--quiet"], of_files),
+        "relabel": (lambda out: ["relabel", fused(), "--out", str(out), "--quiet"], of_files),
         "convert": (lambda out: ["convert", "--data", str(wall), "--out", str(out), "--quiet"], of_files),
     }
 
