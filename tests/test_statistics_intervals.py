@@ -23,6 +23,7 @@ from semstab.statistics.intervals import (
     difference,
     estimate,
     mean_of,
+    probability_above,
     spec_of,
     standard_error,
     unpaired,
@@ -79,6 +80,19 @@ def test_no_error_seen_is_not_no_error_and_next_to_nothing_is_nowhere():
     columns = np.stack([rng.random(32 * 32) < 0.3, np.ones(32 * 32)], axis=1)
     assert places.estimate(columns, ratio_of).decided
     assert places.estimate(1e-112 * columns, ratio_of).undecided == NO_LOCATIONS
+
+
+def test_an_interval_says_its_level_and_what_follows_from_it_does_not_depend_on_that():
+    sums = simulated(frames=32, observations=8, side=24)
+    usual, narrow = estimate(sums, "alpha"), estimate(sums, "alpha", level=0.8)
+    assert (usual.level, narrow.level, narrow.of) == (0.95, 0.8, "80 % CI")
+    assert narrow.high - narrow.low < 0.8 * (usual.high - usual.low)
+    above = usual.value - (usual.value - usual.low) / 2
+    assert 0.6 < probability_above(usual, above, "agreement") < 0.99
+    assert probability_above(narrow, above, "agreement") == pytest.approx(probability_above(usual, above, "agreement"))
+    half = difference(sums, simulated(frames=32, observations=8, side=24, quality="bad"), "psa", level=0.8)
+    assert half.level == 0.8
+    assert mean_of([half, half]).level == 0.8
 
 
 def test_few_places_and_places_that_err_alike_leave_a_wide_interval_and_one_cube_none():

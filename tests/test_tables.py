@@ -283,7 +283,7 @@ def test_markdown_has_as_many_cells_in_every_row_and_an_interval_fields_of_its_o
     columns = (Column("x", "X", 2), Column("y", "Y", 1))
     table = Table("t", "t", "t", columns, (Group("", ((Estimate(-0.5, -0.75, 0.25), 1.0), (0.5, 2.0))),), by="")
     assert to_csv(table).splitlines() == ["x,x_low,x_high,y", "-0.50,-0.75,0.25,1.0", "0.50,,,2.0"]
-    assert to_json(table)["rows"][0]["x"] == {"value": -0.5, "low": -0.75, "high": 0.25}
+    assert to_json(table)["rows"][0]["x"] == {"value": -0.5, "low": -0.75, "high": 0.25, "level": 0.95}
     assert r"$-$0.50 ($-$0.75, 0.25)" in to_latex(table)
 
 

@@ -30,7 +30,7 @@ from semstab.core.types import THESE_FRAMES, THIS_SCENE, Int64, Scope
 from semstab.data.contrast import Against, Compared, Contrast, RunComparison, SceneComparison
 from semstab.data.measures import Measure, Quantity, mean
 from semstab.data.results import slug
-from semstab.data.statistics import UNKNOWN, Interval
+from semstab.data.statistics import CONFIDENCE, UNKNOWN, Interval
 from semstab.data.voxels import VoxelTable
 from semstab.errors import ConfigError
 from semstab.metrics import macro_mean
@@ -38,7 +38,6 @@ from semstab.statistics.accumulate import Cubes
 from semstab.statistics.agreement import ALPHA, ratio_of
 from semstab.statistics.cluster_sums import ClusterSums, functional, of_space_alone, value
 from semstab.statistics.correctness import ACCURACY, MIOU
-from semstab.statistics.intervals import LEVEL as INTERVAL_LEVEL
 from semstab.statistics.intervals import (
     coverage,
     difference,
@@ -56,7 +55,7 @@ from semstab.statistics.paired_differences import LEAST_VOXELS, holm
 OF_ANY_SIZE = OF_LIKELIEST = (ALPHA, ACCURACY, MIOU, RECALL, PRECISION, IOU)
 """Measures that hardly depend on the size of voxels, and need no more than the likeliest classes of scores."""
 
-LEVEL = 0.05
+SIGNIFICANCE = 0.05
 """Corrected p-value below which a difference is claimed."""
 
 
@@ -101,7 +100,7 @@ def corrected(lists: Sequence[Sequence[Contrast]]) -> list[tuple[Contrast, ...]]
 
 
 def _with_change(row: Contrast, p_holm: float, sign: float) -> Contrast:
-    shown = p_holm < LEVEL and row.difference.decided
+    shown = p_holm < SIGNIFICANCE and row.difference.decided
     gain = -sign * row.difference.value
     return dataclasses.replace(row, p_holm=p_holm, change=("better" if gain > 0 else "worse") if shown else "")
 
@@ -152,7 +151,7 @@ def sums_difference(
     scope: Scope = THIS_SCENE,
     same_frames: bool | None = None,
     apart: bool = False,
-    level: float = INTERVAL_LEVEL,
+    level: float = CONFIDENCE,
 ) -> Interval:
     """Return a number of one run's sums less another's, or its coverage of the other's voxels, with its interval.
 
@@ -163,20 +162,20 @@ def sums_difference(
     if new.truth != base.truth:
         new, base = new.without_truth(), base.without_truth()
     if key == COVERAGE.key:
-        return _with_p_value(coverage(new, base, level, same_frames=same_frames), level)
+        return _with_p_value(coverage(new, base, level, same_frames=same_frames))
     scope, number = THESE_FRAMES if of_space_alone(key, k) else scope, functional(key, k)
     if apart:
-        return unpaired(estimate(new, key, k, scope, level), estimate(base, key, k, scope, level), level)
+        return unpaired(estimate(new, key, k, scope, level), estimate(base, key, k, scope, level))
     result, most = difference(new, base, key, k, scope, same_frames=same_frames, level=level), number.high - number.low
     return dataclasses.replace(result, low=max(result.low, -most), high=min(result.high, most))
 
 
-def flicker_difference(new: Flicker, base: Flicker, *, paired: bool = True, level: float = INTERVAL_LEVEL) -> Interval:
+def flicker_difference(new: Flicker, base: Flicker, *, paired: bool = True, level: float = CONFIDENCE) -> Interval:
     """Return the mean flicker of one run less another's, by frame where both have the same ones."""
     if paired and len(new.keys() & base.keys()) > 1:
-        return _with_p_value(difference_over_frames(new, base, level), level)
+        return _with_p_value(difference_over_frames(new, base, level))
     each = [mean_over_frames(np.array([*own]), np.array([*own.values()]), level) for own in (new, base)]
-    return unpaired(each[0], each[1], level)
+    return unpaired(each[0], each[1])
 
 
 def _flicker(base: Flicker, other: Flicker, *, paired: bool) -> Contrast:
@@ -200,11 +199,11 @@ def _of_voxels(measure: Measure, base: VoxelTable, other: VoxelTable, edge: floa
     return Contrast(measure.key, "", mean(before), mean(after), result, math.nan, "")
 
 
-def _with_p_value(interval: Interval, level: float = INTERVAL_LEVEL) -> Interval:
+def _with_p_value(interval: Interval) -> Interval:
     """Return the interval with the p-value that the number is 0."""
     from scipy import special
 
-    error = standard_error(interval, level)
+    error = standard_error(interval)
     if not error > 0:
         return interval
     degrees = interval.degrees if interval.degrees > 0 else math.inf

@@ -348,7 +348,7 @@ class Judgement:
         """
         from scipy import special
 
-        error = standard_error(self.interval, 1 - 2 * level)
+        error = standard_error(self.interval)
         margin = abs(self.rule.limit - (0.0 if self.rule.change else self.interval.value))
         if self.interval.scope == THESE_FRAMES or not (error > 0 and margin > 0):
             return None
@@ -591,7 +591,7 @@ def _require_values(rule: Rule, pairs: Sequence[Pair]) -> None:
 
 def _assess(rule: Rule, pairs: Sequence[Pair], level: float, scope: Scope) -> Judgement:
     """Assess a rule by the mean of the scenes, whose errors are independent, or in the scene that it names."""
-    result = mean_of([_interval_of(rule, new, old, level, scope) for new, old in pairs], 1 - 2 * level)
+    result = mean_of([_interval_of(rule, new, old, level, scope) for new, old in pairs])
     values = [[math.nan if entry is None else _value(rule, entry) for entry in pair] for pair in pairs]
     return Judgement(rule, verdict(rule, result), result, *(float(mean) for mean in np.mean(values, axis=0)))
 

@@ -12,7 +12,7 @@ from rich.console import Console
 from semstab.comparison.locations import MOST
 from semstab.data.contrast import Against, Area, Basis, ComparedObservations, Contrast, FrameShare, RunComparison
 from semstab.data.measures import ENTROPY, VSS, Quantity, measures
-from semstab.data.statistics import Interval
+from semstab.data.statistics import CONFIDENCE, Interval
 from semstab.report.tables.correctness import coverage_table, ignored_table
 from semstab.report.tables.table import Column, Group, Row, Table, to_terminal
 from semstab.report.terminal import WIDTH
@@ -66,9 +66,9 @@ IN_CLASSES = (ALPHA, PSA, RECALL, IOU)
 """Measures that the table of classes shows side by side."""
 
 ANSWERS = (
-    f"Brackets hold intervals at 95%, for this scene flown again where there are {LEAST_FRAMES} frames or more, else"
-    " for these frames, that is, for other locations in the same frames. p (Holm) is the p-value of no difference,"
-    " corrected for all comparisons of the scene, or of all scenes together."
+    f"Brackets hold intervals at {CONFIDENCE:.0%}, for this scene flown again where there are {LEAST_FRAMES} frames or"
+    " more, else for these frames, that is, for other locations in the same frames. p (Holm) is the p-value of no"
+    " difference, corrected for all comparisons of the scene, or of all scenes together."
 )
 
 

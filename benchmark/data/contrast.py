@@ -71,7 +71,7 @@ class PairedDifference:
 
 @dataclass(frozen=True)
 class Rank:
-    """A model's rank, 1 being the best, with the range that holds 95 % of the resamples.
+    """A model's rank, 1 being the best, with the range that holds CONFIDENCE of the resamples.
 
     best is the share of the resamples in which it is first.
     """

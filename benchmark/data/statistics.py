@@ -16,23 +16,33 @@ from semstab.data.measures import MeasureMeans
 # --- Parts ------------------------------------------------------------------------------------------------------------
 
 
+CONFIDENCE = 0.95
+"""Level of confidence intervals, where no other is asked for."""
+
+
 @dataclass(frozen=True)
 class Estimate:
-    """A value with its 95 % confidence interval; NaN where undefined."""
+    """A value with its confidence interval, and the level of that; NaN where undefined."""
 
     value: float
     low: float
     high: float
+    level: float = field(default=CONFIDENCE, kw_only=True)
 
     @property
     def ends(self) -> Estimate:
         """The value with its interval alone."""
-        return Estimate(self.value, self.low, self.high)
+        return Estimate(self.value, self.low, self.high, level=self.level)
 
     @property
     def percent(self) -> Estimate:
         """The share in percent."""
-        return Estimate(100 * self.value, 100 * self.low, 100 * self.high)
+        return Estimate(100 * self.value, 100 * self.low, 100 * self.high, level=self.level)
+
+    @property
+    def of(self) -> str:
+        """The interval's name in print, '95 % CI'."""
+        return f"{100 * self.level:g} % CI"
 
 
 UNDEFINED = Estimate(math.nan, math.nan, math.nan)

@@ -21,7 +21,7 @@ from semstab.data.labels import LabelSpace
 from semstab.data.measures import Voxels, bits, measures, sbd
 from semstab.data.records import Record
 from semstab.data.results import RECURRENT
-from semstab.data.statistics import LagBin, MapStatistics
+from semstab.data.statistics import CONFIDENCE, LagBin, MapStatistics
 from semstab.data.voxels import VoxelTable
 from semstab.metrics import CATEGORY_COLORS, dominant, vss
 from semstab.metrics.agreement import shared_rows
@@ -276,7 +276,7 @@ def agreement_report(statistics: MapStatistics) -> str:
     for axis, unit in AXES.items() if statistics.correlogram is not None else ():
         bins: tuple[LagBin, ...] = getattr(statistics.correlogram, axis)
         if bins:
-            lines += ["", f"| {unit} | alpha | 95% | for |", "|---|---|---|---|"]
+            lines += ["", f"| {unit} | alpha | {CONFIDENCE:.0%} | for |", "|---|---|---|---|"]
         for row in bins:
             a = row.alpha
             band = f"{a.low:.2f} to {a.high:.2f} | {a.scope}{'' if a.decided else ', undecided'}"

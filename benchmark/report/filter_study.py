@@ -19,7 +19,7 @@ LEAST_COVERAGE = 0.95
 ALIKE = 0.005
 """Shares that differ by no more count as equal."""
 
-LEVEL = 0.002
+ALIKE_WORTH = 0.002
 """Filters whose quality differs by no more count as equal: then the one with less flicker is better."""
 
 
@@ -98,7 +98,9 @@ class FilterStudy:
     def _best_of(self, rows: Sequence[FilterResult]) -> FilterResult | None:
         able = [row for row in rows if row.flicker < self.unfiltered.flicker and self.harmless(row)]
         most = max(map(self.worth, able), default=math.nan)
-        return min((row for row in able if self.worth(row) >= most - LEVEL), key=lambda row: row.flicker, default=None)
+        return min(
+            (row for row in able if self.worth(row) >= most - ALIKE_WORTH), key=lambda row: row.flicker, default=None
+        )
 
     @property
     def misleading(self) -> list[FilterResult]:

@@ -23,7 +23,7 @@ standard error is up to 0.5 / sqrt(1000) = 0.016, even if the voxels were indepe
 class Pooled:
     """The voxels of several units together: a mean runs over all of them, so that a scene counts by its voxels.
 
-    PSA, alpha and drift are macro means over the units, with 95 % intervals; NaN where no unit has statistics.
+    PSA, alpha and drift are macro means over the units, with intervals at CONFIDENCE; NaN where no unit has statistics.
 
     Attributes:
         every: All voxels.

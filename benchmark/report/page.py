@@ -15,7 +15,7 @@ from semstab.core.types import Int64, UInt8
 from semstab.data.measures import SBD, VSS, dominant
 from semstab.data.records import OVERVIEW, Failure, Record, Result
 from semstab.data.results import slug
-from semstab.data.statistics import Estimate, MapStatistics
+from semstab.data.statistics import CONFIDENCE, Estimate, MapStatistics
 from semstab.data.topdown import EMPTY
 from semstab.metrics import CATEGORIES, CATEGORY_COLORS, categories, macro_mean
 from semstab.report.charts import SERIES, Line, dot_chart, line_chart
@@ -66,6 +66,7 @@ def render(
         "report.html.j2",
         kind="Study of temporal semantic stability" if result.sweeps() else "Temporal semantic stability",
         digest=digest,
+        confidence=CONFIDENCE,
         title=_title(result),
         subtitle=_subtitle(result),
         models=_legend(result.models),
@@ -132,7 +133,7 @@ def _numbers(
         if estimate is None or math.isnan(estimate.low):
             return ""
         digits = 2 if scale == 1.0 else 0
-        return f"95 % CI {scale * estimate.low:.{digits}f} to {scale * estimate.high:.{digits}f}"
+        return f"{estimate.of} {scale * estimate.low:.{digits}f} to {scale * estimate.high:.{digits}f}"
 
     head = None if one is None else one.headline
     alphas = [stats.headline.alpha.value for stats in assessed]

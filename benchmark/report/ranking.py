@@ -18,14 +18,14 @@ from semstab.report.filter_study import filter_studies
 from semstab.report.means import by_model
 from semstab.statistics.agreement import ALPHA
 from semstab.statistics.cluster_sums import ClusterSums, value
-from semstab.statistics.intervals import LEVEL, difference, mean_of
+from semstab.statistics.intervals import difference, mean_of
 from semstab.statistics.observations import CellObservations
 from semstab.statistics.paired_differences import compared_observations, holm
 
 
 @dataclass(frozen=True)
 class Difference:
-    """Alpha of a model less that of another on common observations, the mean over scenes, with its 95 % interval.
+    """Alpha of a model less that of another on common observations, the mean over scenes, with its interval.
 
     Attributes:
         p_holm: p-value, corrected for all pairs of models.
@@ -96,7 +96,7 @@ def _ranking(scenes: tuple[Files, ...], names: tuple[str, ...]) -> Ranking:
     differences = tuple(
         Difference(
             b, a, change.value, change.low, change.high, len(known), p,
-            shown=change.decided and p < 1 - LEVEL and not change.low <= 0 <= change.high,
+            shown=change.decided and p < 1 - change.level and not change.low <= 0 <= change.high,
         )
         for (a, b), change, p in zip(pairs, changes, p_values, strict=True)
     )  # fmt: skip

@@ -16,7 +16,7 @@ from semstab.config import BASE
 from semstab.data.measures import measures
 from semstab.data.records import Failure, Record, Result, UnitContent
 from semstab.data.results import Agreement, UnitSummary
-from semstab.data.statistics import Estimate
+from semstab.data.statistics import UNDEFINED, Estimate
 from semstab.engine.executors import InProcess
 from semstab.engine.observer import Observer
 from semstab.engine.units import Plan
@@ -152,7 +152,7 @@ def _interval(estimate: Estimate, scale: float = 1.0) -> str:
     if math.isnan(estimate.low) or math.isnan(estimate.high):
         return ""
     if scale == 1.0:
-        return f" (95 % CI {short(estimate.low)} to {short(estimate.high)})"
+        return f" ({estimate.of} {short(estimate.low)} to {short(estimate.high)})"
     return f" ({scale * estimate.low:.0f} to {scale * estimate.high:.0f} %)"
 
 
@@ -167,7 +167,7 @@ def _metres(size: float) -> str:
 # --- Several ----------------------------------------------------------------------------------------------------------
 
 
-COLUMNS = ("model", "verdict", "alpha (95 % CI)", "agree", "flicker", "VSS", "SBD", "mIoU")
+COLUMNS = ("model", "verdict", f"alpha ({UNDEFINED.of})", "agree", "flicker", "VSS", "SBD", "mIoU")
 UNITS = ("", "", "", "%", "%", "OP>=3", "bits", "%")
 WIDTHS = (12, -15, -19, 6, 8, 6, 7, 5)
 """The widths of the columns of several models; a negative width marks text, which is aligned left."""

@@ -48,8 +48,8 @@ def correlogram(cells: CellObservations) -> Correlogram:
     """Return alpha of fine cells in bins of the distance of two observations.
 
     Observations of a cell that are 1, 2, 4, 8, ... apart are paired, so that the cost is linear. Chance is that of
-    the pairs in the bin. Bands are at 95 %, for this scene flown again where the bin has enough frames for that, else
-    for these frames.
+    the pairs in the bin. Bands are at CONFIDENCE, for this scene flown again where the bin has enough frames for that,
+    else for these frames.
     """
     seen = cells.observations()
     labels = np.unique(seen.evidence.label)  # the other classes change nothing

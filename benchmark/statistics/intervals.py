@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from semstab.core.types import THESE_FRAMES, THIS_SCENE, Float64, Int64, Scope
-from semstab.data.statistics import UNKNOWN, HeadlineStatistics, Interval
+from semstab.data.statistics import CONFIDENCE, UNKNOWN, HeadlineStatistics, Interval
 from semstab.statistics.agreement import ratio_of
 from semstab.statistics.cluster_sums import (
     MOST_GROUPS,
@@ -37,9 +37,6 @@ from semstab.statistics.variance import (
     spread_of_frames,
 )
 
-LEVEL = 0.95
-"""Default level of intervals."""
-
 LEAST_FRAMES = 8
 """With fewer frames nothing is claimed about a flight."""
 
@@ -57,7 +54,7 @@ class EstimateSpec:
     scope: Scope
     scale: Scale
     bounds: tuple[float, float]
-    level: float = LEVEL
+    level: float = CONFIDENCE
 
     @property
     def answered(self) -> Scope:
@@ -70,7 +67,7 @@ def confidence_intervals(specs: Iterable[EstimateSpec]) -> list[Interval]:
     """Return the numbers with their confidence intervals."""
     with one_thread():
         return [
-            Interval(own.value, math.nan, math.nan, undecided=NO_LOCATIONS)
+            Interval(own.value, math.nan, math.nan, undecided=NO_LOCATIONS, level=own.level)
             if own.grid is None
             else _answer(own, own.grid)
             for own in specs
@@ -78,7 +75,7 @@ def confidence_intervals(specs: Iterable[EstimateSpec]) -> list[Interval]:
 
 
 def estimate(
-    sums: ClusterSums, key: str, k: int | None = None, scope: Scope = THIS_SCENE, level: float = LEVEL
+    sums: ClusterSums, key: str, k: int | None = None, scope: Scope = THIS_SCENE, level: float = CONFIDENCE
 ) -> Interval:
     """Return a number of a map with its interval; see `FUNCTIONALS` for its key, k is a class.
 
@@ -88,7 +85,7 @@ def estimate(
 
 
 def spec_of(
-    sums: ClusterSums, key: str, k: int | None = None, scope: Scope = THIS_SCENE, level: float = LEVEL
+    sums: ClusterSums, key: str, k: int | None = None, scope: Scope = THIS_SCENE, level: float = CONFIDENCE
 ) -> EstimateSpec:
     """Return the spec of a number of a map, see `estimate`."""
     number = functional(key, k)
@@ -105,7 +102,7 @@ def difference(
     scope: Scope = THIS_SCENE,
     *,
     same_frames: bool | None = None,
-    level: float = LEVEL,
+    level: float = CONFIDENCE,
 ) -> Interval:
     """Return a number of map a less that of map b, paired on locations, and on frames where both have the same ones.
 
@@ -133,7 +130,8 @@ def difference(
     if spread.variance <= TINY:
         ends = confidence_intervals(spec_of(sums, key, k, scope, level) for sums in (a, b))
         low, high = ends[0].low - ends[1].high, ends[0].high - ends[1].low
-    return dataclasses.replace(_interval(result, low, high, between, spread, scope), p_value=spread.p_value(result))
+    change = _interval(result, low, high, between, spread, scope, level)
+    return dataclasses.replace(change, p_value=spread.p_value(result))
 
 
 def identical(a: ClusterSums, b: ClusterSums, key: str, k: int | None = None) -> bool:
@@ -165,7 +163,7 @@ def interval_of_cubes(
     statistic: Statistic,
     scale: Scale,
     bounds: tuple[float, float] = (-math.inf, math.inf),
-    level: float = LEVEL,
+    level: float = CONFIDENCE,
 ) -> Interval:
     """Return the statistic of sums (m, C) of cubes (m, 3) of an edge in metres, with its interval for these frames.
 
@@ -182,7 +180,7 @@ def spec_of_cubes(
     statistic: Statistic,
     scale: Scale,
     bounds: tuple[float, float] = (-math.inf, math.inf),
-    level: float = LEVEL,
+    level: float = CONFIDENCE,
 ) -> EstimateSpec:
     """Return the spec of a statistic of cubes, see `interval_of_cubes`."""
     grid = influences(index, columns, statistic)
@@ -197,7 +195,7 @@ def spec_of_observations(
     columns: Float64,
     halves: Float64,
     statistic: Statistic,
-    level: float = LEVEL,
+    level: float = CONFIDENCE,
 ) -> EstimateSpec:
     """Return the spec of an agreement of sums (m, C) of cubes and groups of frames, see `influences`.
 
@@ -229,7 +227,7 @@ def _answer(spec: EstimateSpec, grid: Influences) -> Interval:
         low, high = _share_ends(result, spread, len(grid.cubes), level)
     else:
         low, high = _ends(result, spread, grid.unseen(level), spec.scale, level)
-    return _interval(result, max(low, spec.bounds[0]), min(high, spec.bounds[1]), grid, spread, scope)
+    return _interval(result, max(low, spec.bounds[0]), min(high, spec.bounds[1]), grid, spread, scope, level)
 
 
 def grid_of(sums: ClusterSums, key: str, k: int | None = None) -> Influences | None:
@@ -245,7 +243,7 @@ def grid_of(sums: ClusterSums, key: str, k: int | None = None) -> Influences | N
 
 
 def probability_above(interval: Interval, threshold: float, scale: Scale) -> float:
-    """Return how probable a number is above a threshold, from its interval at 95 %; NaN where nothing is claimed."""
+    """Return how probable a number is above a threshold, from its interval; NaN where nothing is claimed."""
     from scipy import special
 
     low, high = interval.low, interval.high
@@ -258,7 +256,7 @@ def probability_above(interval: Interval, threshold: float, scale: Scale) -> flo
     if math.isnan(value) or math.isnan(error):
         return math.nan
     degrees = interval.degrees if interval.degrees > 0 else math.inf
-    error /= float(special.stdtrit(degrees, (1 + LEVEL) / 2))
+    error /= float(special.stdtrit(degrees, (1 + interval.level) / 2))
     return float(special.stdtr(degrees, (value - above) / error)) if error > TINY else float(value >= above)
 
 
@@ -291,7 +289,9 @@ def _ends(result: float, spread: Spread, unseen: float, scale: Scale, level: flo
     return 1 - (1 - result) * math.exp(ratio), 1 - (1 - result) * math.exp(-ratio)
 
 
-def _interval(result: float, low: float, high: float, grid: Influences, spread: Spread, scope: Scope) -> Interval:
+def _interval(
+    result: float, low: float, high: float, grid: Influences, spread: Spread, scope: Scope, level: float
+) -> Interval:
     frames = round(len(grid.frames) * grid.per_group)
     few = scope != THESE_FRAMES and frames < LEAST_FRAMES
     return Interval(
@@ -303,36 +303,35 @@ def _interval(result: float, low: float, high: float, grid: Influences, spread: 
         locations=len(grid.cubes),
         degrees=spread.degrees if math.isfinite(spread.degrees) else math.nan,
         undecided=TOO_FEW.format(least=LEAST_FRAMES) if few else "",
+        level=level,
     )
 
 
 # Intervals of differences and means of independent numbers, from their intervals.
 
 
-def unpaired(a: Interval, b: Interval, level: float = LEVEL) -> Interval:
-    """Return a number less an independent one, from their intervals (Zou and Donner 2008)."""
+def unpaired(a: Interval, b: Interval) -> Interval:
+    """Return a number less an independent one, from their intervals of one level (Zou and Donner 2008)."""
     result = a.value - b.value
     low = result - math.hypot(a.value - a.low, b.high - b.value)
     high = result + math.hypot(a.high - a.value, b.value - b.low)
-    return _combined(result, low, high, (a, b), 1.0, level)
+    return _combined(result, low, high, (a, b), 1.0)
 
 
-def mean_of(result: Sequence[Interval], level: float = LEVEL) -> Interval:
-    """Return the mean of numbers with independent errors, as those of scenes."""
+def mean_of(result: Sequence[Interval]) -> Interval:
+    """Return the mean of numbers with independent errors, as those of scenes, whose intervals have one level."""
     n = len(result)
     value = sum(own.value for own in result) / n
     low = value - math.hypot(*(own.value - own.low for own in result)) / n
     high = value + math.hypot(*(own.high - own.value for own in result)) / n
-    return result[0] if n == 1 else _combined(value, low, high, result, 1 / n, level)
+    return result[0] if n == 1 else _combined(value, low, high, result, 1 / n)
 
 
-def _combined(
-    value: float, low: float, high: float, parts: Sequence[Interval], weight: float, level: float
-) -> Interval:
+def _combined(value: float, low: float, high: float, parts: Sequence[Interval], weight: float) -> Interval:
     """Return the p-value by the variances that the parts' intervals stand for, each with its degrees of freedom."""
     from scipy import special
 
-    variances = [(weight * standard_error(own, level)) ** 2 for own in parts]
+    variances = [(weight * standard_error(own)) ** 2 for own in parts]
     spread = sum(v**2 / own.degrees for v, own in zip(variances, parts, strict=True) if v > 0 and own.degrees > 0)
     total = sum(variances)
     degrees = max(total**2 / spread, 1.0) if spread > 0 else math.inf
@@ -348,22 +347,23 @@ def _combined(
         degrees=degrees,
         undecided="; ".join(dict.fromkeys(own.undecided for own in parts if own.undecided)),
         p_value=p,
+        level=parts[0].level,
     )
 
 
-def standard_error(interval: Interval, level: float = LEVEL) -> float:
+def standard_error(interval: Interval) -> float:
     """Return the standard error that an interval by Student's t stands for."""
     from scipy import special
 
     if not interval.degrees > 0:
-        return (interval.high - interval.low) / 2 / float(special.ndtri((1 + level) / 2))
-    return (interval.high - interval.low) / 2 / float(special.stdtrit(interval.degrees, (1 + level) / 2))
+        return (interval.high - interval.low) / 2 / float(special.ndtri((1 + interval.level) / 2))
+    return (interval.high - interval.low) / 2 / float(special.stdtrit(interval.degrees, (1 + interval.level) / 2))
 
 
 # Intervals without sums by frame and cube: of a series over frames, and of the coverage of one map by another.
 
 
-def mean_over_frames(frame: npt.NDArray[np.integer], values: Float64, level: float = LEVEL) -> Interval:
+def mean_over_frames(frame: npt.NDArray[np.integer], values: Float64, level: float = CONFIDENCE) -> Interval:
     """Return the mean of values (F,), NaN where undefined, of frames (F,) by their index, for another flight."""
     there = ~np.isnan(values)
     if there.sum() < 2:
@@ -376,11 +376,11 @@ def mean_over_frames(frame: npt.NDArray[np.integer], values: Float64, level: flo
     few = TOO_FEW.format(least=LEAST_FRAMES) if len(values) < LEAST_FRAMES else ""
     return Interval(
         result, result - half, result + half, THIS_SCENE, len(values), degrees=spread.degrees, undecided=few,
-        p_value=spread.p_value(result),
+        p_value=spread.p_value(result), level=level,
     )  # fmt: skip
 
 
-def difference_over_frames(a: Mapping[int, float], b: Mapping[int, float], level: float = LEVEL) -> Interval:
+def difference_over_frames(a: Mapping[int, float], b: Mapping[int, float], level: float = CONFIDENCE) -> Interval:
     """Return the mean difference of two series by frame, paired on the frames of both, for another flight."""
     frames = sorted(a.keys() & b.keys())
     differences = np.array([a[frame] - b[frame] for frame in frames])
@@ -389,7 +389,9 @@ def difference_over_frames(a: Mapping[int, float], b: Mapping[int, float], level
     return mean_over_frames(np.array(frames), differences, level)
 
 
-def coverage(new: ClusterSums, base: ClusterSums, level: float = LEVEL, *, same_frames: bool | None = None) -> Interval:
+def coverage(
+    new: ClusterSums, base: ClusterSums, level: float = CONFIDENCE, *, same_frames: bool | None = None
+) -> Interval:
     """Return how many voxels with OP >= 2 a map has for each one of another, less 1, for these frames.
 
     For the same frames (by default the sums show it) it is a count, without an interval; else it is an estimate,

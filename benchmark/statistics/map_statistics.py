@@ -153,7 +153,7 @@ def analyse(
 ) -> Analysis:
     """Return all statistics of one map; the same seed gives the same numbers.
 
-    Intervals are at 95 %, those of all other numbers for these frames; undefined numbers are NaN, and a section
+    Intervals are at CONFIDENCE, those of all other numbers for these frames; undefined numbers are NaN, and a section
     that cannot be computed is None.
 
     Args:

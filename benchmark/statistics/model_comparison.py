@@ -13,7 +13,7 @@ from semstab.data.contrast import MapCoverage, ModelComparison, Paired, Rank, Ra
 from semstab.data.events import Events
 from semstab.data.measures import Quantity, dominant, measures
 from semstab.data.results import RECURRENT
-from semstab.data.statistics import UNDEFINED, Estimate
+from semstab.data.statistics import CONFIDENCE, UNDEFINED, Estimate
 from semstab.data.voxels import VoxelTable
 from semstab.errors import ConfigError
 from semstab.metrics.agreement import require_same_grid, shared_rows
@@ -199,7 +199,8 @@ def _ranking(measure: Quantity, statistic: Statistic, sums: Mapping[str, Float64
     rows = []
     for position, name in enumerate(order, start=1):
         own = ranks[list(sums).index(name)]
-        low, high = np.quantile(own, [0.025, 0.975], method="inverted_cdf") if own.size else (1, len(sums))
+        tail = round((1 - CONFIDENCE) / 2, 9)
+        low, high = np.quantile(own, [tail, 1 - tail], method="inverted_cdf") if own.size else (1, len(sums))
         best = float(np.mean(own == 1)) if own.size else math.nan
         rows.append(Rank(name, values[name], position, int(low), int(high), best))
     return Ranking(measure.key, tuple(rows))

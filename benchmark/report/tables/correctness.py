@@ -7,7 +7,16 @@ from collections.abc import Callable, Mapping, Sequence
 
 from semstab.data.contrast import ComparedObservations, MapCoverage, ModelComparison
 from semstab.data.records import Result
-from semstab.data.statistics import Correctness, Correlogram, Estimate, LagBin, Losses, MapStatistics, Quadrants
+from semstab.data.statistics import (
+    CONFIDENCE,
+    Correctness,
+    Correlogram,
+    Estimate,
+    LagBin,
+    Losses,
+    MapStatistics,
+    Quadrants,
+)
 from semstab.metrics import macro_mean
 from semstab.report.tables.stability import settings
 from semstab.report.tables.statistics import INTERVALS, Number, assessed_records, by_scene, grouped
@@ -174,7 +183,7 @@ def _ranking(result: Result) -> Table:
         Column("measure", "Measure"),
         Column("rank", "Rank", 0),
         Column("model", "Model"),
-        Column("range", "95% of resamples"),
+        Column("range", f"{CONFIDENCE:.0%} of resamples"),
         Column("best_percent", "first in (%)", 0),
         Column("value", "In common", 4),
         Column("standardised", "Same OP", 4),
@@ -283,8 +292,8 @@ def correlogram(result: Result) -> list[Table]:
         "The table shows alpha of pairs of observations of a cell, by their distance. Models and flights are compared"
         " at a stated angle between the directions of view, not over all pairs that a flight has. Nearest and farthest"
         " are the first and the last bin with enough pairs in time (frames), angle, ratio of the ranges, and distance"
-        " of the cameras. Alpha is not extrapolated to cells without a size. Intervals are at 95%, for this scene flown"
-        f" again if a bin has {LEAST_FRAMES} frames, else for these frames."
+        " of the cameras. Alpha is not extrapolated to cells without a size. Intervals are at"
+        f" {CONFIDENCE:.0%}, for this scene flown again if a bin has {LEAST_FRAMES} frames, else for these frames."
     )
     return by_scene(result, "correlogram", "Agreement by distance of the observations", caption, columns, numbers)
 

@@ -8,7 +8,15 @@ from typing import TypeVar
 
 from semstab.data.measures import ENTROPY, VSS
 from semstab.data.records import Record, Result
-from semstab.data.statistics import UNDEFINED, CellAgreement, ClassAlpha, DriftStatistics, Estimate, MapStatistics
+from semstab.data.statistics import (
+    CONFIDENCE,
+    UNDEFINED,
+    CellAgreement,
+    ClassAlpha,
+    DriftStatistics,
+    Estimate,
+    MapStatistics,
+)
 from semstab.metrics import macro_mean
 from semstab.report.means import by_model
 from semstab.report.tables.table import Cell, Column, Group, Row, Table
@@ -20,7 +28,7 @@ from semstab.statistics.verdict import ADVICE, DANGEROUS, DECIDED, LEAST_CLASSES
 SCENE = Column("scene", "Scene")
 REPEATED = Column("repeated_voxels", "Voxels", 0)
 INTERVALS = (
-    "Brackets hold intervals at 95% for these frames; those of verdicts are for this scene flown again"
+    f"Brackets hold intervals at {CONFIDENCE:.0%} for these frames; those of verdicts are for this scene flown again"
     f" if there are {LEAST_FRAMES} frames."
 )
 SEEN_TWICE = "The table shows the voxels seen twice or more."
