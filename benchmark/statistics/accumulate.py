@@ -26,6 +26,7 @@ from semstab.statistics.cluster_sums import (
     MOST_CLASSES,
     ClusterIndex,
     ClusterSums,
+    FirstColumns,
     Scale,
     Statistic,
     cubes_of,
@@ -276,7 +277,7 @@ def _sums_of_log(
     consistent = np.zeros(0) if likely is None else likely
     in_chunks(
         add_influences, order, bounds, (events.starts, events.ends), longest, events.evidence.entries, K, group, own,
-        label, consistent, K <= MOST_CLASSES, truth, len(groups), sums,
+        label, consistent, FirstColumns.of(K, truth=truth), len(groups), sums,
     )  # fmt: skip
     rows = np.flatnonzero(sums[:, layout(K, truth=False)["observations"].start])
     cell, frame = np.divmod(rows, max(len(groups), 1))

@@ -13,7 +13,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -37,6 +37,7 @@ BINS = 15
 PLAIN = (
     "voxels", "psa", "observations", "agreeing", "own", "twice", "twice_agreeing", "recurrent", "vss", "entropy",
 )  # fmt: skip
+BY_CLASS_ALONE = ("class_apart", "class_own")
 DRIFT = ("sbd_excess", "sbd_known")
 WITH_TRUTH = ("known", "right", "observed", "observed_right", "consistent", "consistent_wrong")
 BY_TRUE_CLASS = ("class_known", "class_right", "class_predicted")
@@ -49,7 +50,7 @@ def layout(K: int, *, truth: bool) -> Mapping[str, slice]:
     """Return the columns of the sums for each name; those by class have K columns, `gap` one for each bin."""
     by_class = K <= MOST_CLASSES
     widths = [(name, 1) for name in PLAIN] + [("evidence", K)]
-    widths += [(name, K) for name in ("class_apart", "class_own")] if by_class else []
+    widths += [(name, K) for name in BY_CLASS_ALONE] if by_class else []
     widths += [(name, 1) for name in DRIFT]
     if truth:
         widths += [(name, 1) for name in WITH_TRUTH]
@@ -58,6 +59,39 @@ def layout(K: int, *, truth: bool) -> Mapping[str, slice]:
     ends = np.cumsum([width for _, width in widths])
     slices = {name: slice(int(end) - width, int(end)) for (name, width), end in zip(widths, ends, strict=True)}
     return MappingProxyType(slices)
+
+
+class FirstColumns(NamedTuple):
+    """The first column of each sum over observations, for compiled loops; -1 where the sums have none of that name."""
+
+    voxels: int
+    psa: int
+    observations: int
+    agreeing: int
+    own: int
+    twice: int
+    twice_agreeing: int
+    recurrent: int
+    vss: int
+    entropy: int
+    evidence: int
+    class_apart: int
+    class_own: int
+    known: int
+    right: int
+    observed: int
+    observed_right: int
+    consistent: int
+    consistent_wrong: int
+    class_known: int
+    class_right: int
+    class_predicted: int
+
+    @classmethod
+    def of(cls, K: int, *, truth: bool) -> FirstColumns:
+        """Return those of a layout."""
+        columns = layout(K, truth=truth)
+        return cls(*(columns[name].start if name in columns else -1 for name in cls._fields))
 
 
 def width(K: int, *, truth: bool) -> int:

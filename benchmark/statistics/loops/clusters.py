@@ -6,15 +6,6 @@ import numpy as np
 
 from semstab.core.compiled import CHUNKS, serial
 
-(VOXELS, PSA, OBSERVATIONS, AGREEING, OWN, TWICE, TWICE_AGREEING, RECURRENT, VSS, ENTROPY) = range(10)
-"""The columns that every map has, before those by class."""
-
-DRIFT = 2
-"""Number of columns of drift that follow those."""
-
-(KNOWN, RIGHT, OBSERVED, OBSERVED_RIGHT, CONSISTENT, CONSISTENT_WRONG) = range(6)
-"""The columns with ground truth, counted from the first of them."""
-
 TIE = 1e-12
 """Sums of evidence that differ by no more are equal."""
 
@@ -82,10 +73,10 @@ def _label_without(total, x, observation, A):
 
 
 @serial
-def _add_truth(sums, base, x, first, T, group, truth, likely, total, active, A, label, without, mean, column, K):
+def _add_truth(sums, base, x, first, T, group, truth, likely, total, active, A, label, without, mean, columns):
     """Add the sums of right labels of a voxel: the fused label without one frame, and each observation by itself.
 
-    mean (A,) is work space.
+    mean (A,) is work space, columns are `FirstColumns`.
     """
     true, lead, most = -1, total[label], 0.0
     for j in range(A):
@@ -105,23 +96,23 @@ def _add_truth(sums, base, x, first, T, group, truth, likely, total, active, A, 
         own = right * share
         if not alike and true >= 0:
             own = (right + (T - 1) * (mean[true] - (without[t] == true))) * share
-        sums[r, column + KNOWN] += share
-        sums[r, column + RIGHT] += own
-        sums[r, column + OBSERVED] += 1.0
+        sums[r, columns.known] += share
+        sums[r, columns.right] += own
+        sums[r, columns.observed] += 1.0
         if true >= 0:
-            sums[r, column + OBSERVED_RIGHT] += x[t * A + true]
+            sums[r, columns.observed_right] += x[t * A + true]
         if T > 2:
-            sums[r, column + CONSISTENT] += likely * share
-            sums[r, column + CONSISTENT_WRONG] += likely * (1.0 - right) * share
-        if K:
-            sums[r, column + 6 + truth] += share
-            sums[r, column + 6 + K + truth] += own
+            sums[r, columns.consistent] += likely * share
+            sums[r, columns.consistent_wrong] += likely * (1.0 - right) * share
+        if columns.class_known >= 0:
+            sums[r, columns.class_known + truth] += share
+            sums[r, columns.class_right + truth] += own
             if alike:
-                sums[r, column + 6 + 2 * K + active[label]] += share
+                sums[r, columns.class_predicted + active[label]] += share
                 continue
             for j in range(A):
                 predicted = (label == j) + (T - 1) * (mean[j] - (without[t] == j))
-                sums[r, column + 6 + 2 * K + active[j]] += predicted * share
+                sums[r, columns.class_predicted + active[j]] += predicted * share
 
 
 @serial
@@ -140,10 +131,8 @@ def _agreement(total, squares, T, A, certain, surprise, apart):
 
 
 @serial
-def add_influences(
-    chunk, order, bounds, rows, longest, log, K, group, fused, truth, likely, by_class, with_truth, groups, sums
-):
-    """Add the observations of voxels, of which each has two or more, to `sums` (cells * groups, C).
+def add_influences(chunk, order, bounds, rows, longest, log, K, group, fused, truth, likely, columns, groups, sums):
+    """Add the observations of voxels, of which each has two or more, to `sums` (cells * groups, C) at `FirstColumns`.
 
     order (r,) has the voxels by cell, bounds (cells + 1,) where each cell's begin; rows (starts (n,) and ends) bound a
     voxel's rows of the log, `longest` at most; group (m,) is that of each row's frame. fused (n,) is its dominant class
@@ -157,7 +146,6 @@ def add_influences(
     x, number, active = np.empty(longest * K), np.full(K, -1), np.empty(K, np.int64)
     total, squares, own, without = np.empty(K), np.empty(K), np.empty(longest), np.empty(longest, np.int64)
     mean, surprise, apart, certain = np.empty(K), np.empty(K), np.empty(K), np.log(K)
-    first_truth = ENTROPY + 1 + (3 * K if by_class else K) + DRIFT
     for cell in range(chunk, bounds.shape[0] - 1, CHUNKS):
         for at in range(bounds[cell], bounds[cell + 1]):
             i = order[at]
@@ -175,28 +163,28 @@ def add_influences(
                 for j in range(A):
                     k, s = active[j], x[t * A + j]
                     with_others += s * total[j]
-                    sums[r, ENTROPY + 1 + k] += s
+                    sums[r, columns.evidence + k] += s
                     surprised += s * surprise[j]
-                    if by_class:
+                    if columns.class_apart >= 0:
                         others = (total[j] - s) * of_others
                         differs = s + others - 2.0 * s * others
-                        sums[r, ENTROPY + 1 + K + k] += apart[j] + spread * (differs - apart[j])
-                        sums[r, ENTROPY + 1 + 2 * K + k] += s**2
+                        sums[r, columns.class_apart + k] += apart[j] + spread * (differs - apart[j])
+                        sums[r, columns.class_own + k] += s**2
                 share = agreed + spread * ((with_others - own[t]) * of_others - agreed)
-                sums[r, VOXELS] += part
-                sums[r, PSA] += share * part
-                sums[r, OBSERVATIONS] += 1.0
-                sums[r, AGREEING] += share
-                sums[r, OWN] += own[t]
-                sums[r, ENTROPY] += surprised
+                sums[r, columns.voxels] += part
+                sums[r, columns.psa] += share * part
+                sums[r, columns.observations] += 1.0
+                sums[r, columns.agreeing] += share
+                sums[r, columns.own] += own[t]
+                sums[r, columns.entropy] += surprised
                 if T == 2:
-                    sums[r, TWICE] += 1.0
-                    sums[r, TWICE_AGREEING] += agreed
+                    sums[r, columns.twice] += 1.0
+                    sums[r, columns.twice_agreeing] += agreed
                 else:
-                    sums[r, RECURRENT] += part
-                    sums[r, VSS] += x[t * A + label] * part
-            if with_truth and truth[i] >= 0:
+                    sums[r, columns.recurrent] += part
+                    sums[r, columns.vss] += x[t * A + label] * part
+            if columns.known >= 0 and truth[i] >= 0:
                 _add_truth(
                     sums, cell * groups, x, first, T, group, truth[i], consistent, total, active, A, label, without,
-                    mean, first_truth, K if by_class else 0,
+                    mean, columns,
                 )  # fmt: skip
