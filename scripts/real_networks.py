@@ -65,7 +65,7 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict, dataclass
 from importlib import metadata
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -73,6 +73,10 @@ import semstab
 from semstab.core.files import atomic_path
 from semstab.data.measures import VSS
 from semstab.data.records import Record
+from semstab.statistics.verdict import LIMITS
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 ROOT = Path(__file__).parents[1]
 CSV, JSON, FIGURE = "real-networks.csv", "real-networks.json", ROOT / "docs" / "real-networks.png"
@@ -81,6 +85,7 @@ WEIGHTS = {"voc": "pascal_384x384", "city": "city_512x256"}
 """Ending of the names of files of weights, by the training data's short name in nets.py."""
 PACKAGES = ("semstab", "numpy", "numba", "opencv-python-headless", "scipy", "torch")
 RESAMPLES = 9999
+USABLE = LIMITS.usable
 
 
 @dataclass(frozen=True)
@@ -419,6 +424,11 @@ def _pairs(rows: Sequence[Row], measure: str, against: str) -> tuple[list[float]
     return [x for x, _ in pairs], [y for _, y in pairs]
 
 
+def with_miou(rows: Sequence[Row]) -> dict[str, dict[str, Any]]:
+    """Return the correlation of each measure with published mIoU, over all networks of one condition."""
+    return {measure: spearman(*_pairs(rows, measure, "published_miou")) for measure in MEASURES}
+
+
 def spearman(x: Sequence[float], y: Sequence[float]) -> dict[str, Any]:
     """Return Spearman's rank correlation, its bootstrap interval over pairs, and the number of pairs.
 
@@ -460,24 +470,20 @@ def signed(number: float | None) -> str:
 
 def condition_table(rows: Sequence[Row]) -> list[str]:
     """Return the table of correlations, a Markdown row for each condition."""
-    found = {
-        (each["condition"], each["measure"]): each
-        for each in correlations(rows)
-        if (each["of"], each["against"]) == ("all", "published_miou")
-    }
     lines = [
         "| sequence | voxels, m | frames | networks | " + " | ".join(TITLES[measure] for measure in MEASURES) + " |",
         "|---|---|---|---|" + "---|" * len(MEASURES),
     ]
     for name in dict.fromkeys(row.condition for row in rows):
-        one = next(row for row in rows if row.condition == name)
+        of_condition = [row for row in rows if row.condition == name]
+        one, found = of_condition[0], with_miou(of_condition)
         title = one.scene + (", scores" if one.kind == "scores" else "")
         cells = []
         for measure in MEASURES:
-            each = found[name, measure]
+            each = found[measure]
             ends = "" if each["rho"] is None else f" ({signed(each['low'])} to {signed(each['high'])})"
             cells.append(signed(each["rho"]) + ends)
-        of = [found[name, measure]["networks"] for measure in MEASURES]
+        of = [found[measure]["networks"] for measure in MEASURES]
         count = f"{of[1]}" if of[0] == of[1] else f"{of[1]}, alpha {of[0]}"
         lines.append(f"| {title} | {one.voxel_size:g} | {one.frames} | {count} | " + " | ".join(cells) + " |")
     return lines
@@ -499,8 +505,8 @@ def network_table(rows: Sequence[Row], condition: str) -> list[str]:
     return lines
 
 
-FAMILIES = {"espnetv2": ("#0072B2", "o", "ESPNetv2"), "dicenet": ("#D55E00", "s", "DiCENet")}
-"""Colours of Okabe and Ito, told apart by any colour vision, and markers."""
+FAMILIES = {"espnetv2": ("#0072B2", "o", -0.3, "ESPNetv2"), "dicenet": ("#D55E00", "s", 0.3, "DiCENet")}
+"""Colours of Okabe and Ito, told apart by any colour vision, markers, and a shift so that equal mIoUs stay apart."""
 
 
 def draw(rows: Sequence[Row], file: Path, condition: str = MAIN) -> None:
@@ -510,51 +516,48 @@ def draw(rows: Sequence[Row], file: Path, condition: str = MAIN) -> None:
     from matplotlib.lines import Line2D
 
     shown = [row for row in rows if row.condition == condition]
-    found = {
-        each["measure"]: each
-        for each in correlations(shown)
-        if (each["of"], each["against"]) == ("all", "published_miou")
-    }
+    grey: dict[str, Any] = {"color": "#555555", "linestyle": "none"}
+    marks = [
+        Line2D([], [], color=color, marker=marker, linestyle="none", label=title)
+        for color, marker, _, title in FAMILIES.values()
+    ]
+    marks.append(Line2D([], [], marker="o", markerfacecolor="white", label="uninformative", **grey))
+    if any(math.isnan(row.alpha) for row in shown):
+        marks.append(Line2D([], [], marker="x", label="no alpha: one class", **grey))
     with mpl.rc_context({"font.size": 10, "axes.spines.top": False, "axes.spines.right": False}):
         figure = Figure(figsize=(7, 3.3), layout="constrained")
-        for axes, measure in zip(figure.subplots(1, 2), ("vss", "alpha"), strict=True):
-            bottom = 0.0
-            for row in shown:
-                color, marker, _ = FAMILIES.get(row.network.rpartition("-")[0], ("#000000", "^", ""))
-                value, low, high = (getattr(row, measure + end) for end in ("", "_low", "_high"))
-                hollow = row.verdict == "uninformative"
-                face = "white" if hollow else color
-                if math.isnan(value):
-                    axes.plot(row.published_miou, 0.015, marker="x", color=color, transform=axes.get_xaxis_transform(),
-                              clip_on=False)  # fmt: skip
-                    continue
-                bars = [[max(value - low, 0)], [max(high - value, 0)]] if not math.isnan(low) else None
-                axes.errorbar(row.published_miou, value, bars, fmt=marker, color=color, markerfacecolor=face,
-                              elinewidth=1, capsize=2, markersize=6)  # fmt: skip
-                bottom = min(bottom, low if not math.isnan(low) else value)
-            each = found[measure]
-            axes.set_title(
-                f"{TITLES[measure]}: rank correlation {signed(each['rho'])}\n"
-                f"(95 % {signed(each['low'])} to {signed(each['high'])}, {each['networks']} networks)", fontsize=10
-            )  # fmt: skip
-            axes.set_xlabel("published mIoU on PASCAL VOC, %")
-            axes.set_ylabel({"vss": "mean VSS, OP >= 3", "alpha": "alpha"}[measure])
-            axes.grid(color="#dddddd", linewidth=0.5)
-            axes.set_axisbelow(True)
-            if measure == "alpha":
-                axes.set_ylim(min(bottom - 0.02, 0), 1.02)
-        marks = [
-            Line2D([], [], color=color, marker=marker, linestyle="none", label=title)
-            for color, marker, title in FAMILIES.values()
-        ]
-        grey: dict[str, Any] = {"color": "#555555", "linestyle": "none"}
-        if any(row.verdict == "uninformative" for row in shown):
-            marks.append(Line2D([], [], marker="o", markerfacecolor="white", label="uninformative", **grey))
-        if any(math.isnan(row.alpha) for row in shown):
-            marks.append(Line2D([], [], marker="x", label="no alpha: one class", **grey))
+        left, right = figure.subplots(1, 2)
+        _panel(left, shown, "vss")
+        left.set_ylabel("mean VSS, OP >= 3")
+        _panel(right, shown, "alpha")
+        right.set_ylabel("alpha")
+        right.set_ylim(top=1.02)
+        right.axhline(USABLE, color="#555555", linewidth=0.8, linestyle="--")
+        right.annotate("usable", (0.4, USABLE), xycoords=("axes fraction", "data"), xytext=(0, 2),
+                       textcoords="offset points", fontsize=9)  # fmt: skip
         figure.legend(handles=marks, loc="outside lower center", ncols=len(marks), frameon=False)
         with atomic_path(file) as path:
             figure.savefig(path, format="png", dpi=150, metadata={"Software": None})
+
+
+def _panel(axes: Axes, rows: Sequence[Row], measure: str) -> None:
+    """Draw a measure with its intervals; a network without it is a cross on the axis."""
+    for row in rows:
+        color, marker, shift, _ = FAMILIES.get(row.network.rpartition("-")[0], ("#000000", "^", 0, ""))
+        x = row.published_miou + shift
+        value, low, high = (getattr(row, measure + end) for end in ("", "_low", "_high"))
+        if math.isnan(value):
+            axes.plot(x, 0.015, "x", color=color, transform=axes.get_xaxis_transform(), clip_on=False)
+            continue
+        face = "white" if row.verdict == "uninformative" else color
+        bars = None if math.isnan(low) else [[max(value - low, 0)], [max(high - value, 0)]]
+        axes.errorbar(x, value, bars, fmt=marker, color=color, markerfacecolor=face, elinewidth=1, capsize=2)
+    each = with_miou(rows)[measure]
+    ends = f"95 % {signed(each['low'])} to {signed(each['high'])}, {each['networks']} networks"
+    axes.set_title(f"{TITLES[measure]}: rank correlation {signed(each['rho'])}\n({ends})", fontsize=10)
+    axes.set_xlabel("published mIoU on PASCAL VOC, %")
+    axes.grid(color="#dddddd", linewidth=0.5)
+    axes.set_axisbelow(True)
 
 
 def show(results: Path, file: Path) -> None:
