@@ -20,7 +20,7 @@ Sequences, each a posed folder DATA/NAME (docs/formats.md):
     livingroom  211 RGB-D frames of a rendered living room, test data of Open3D (github.com/isl-org/open3d_downloads at
                 55705ea, MIT): tests/reconstruction_system/livingroom1_clean_micro. `sequence` writes the folder.
     hololens    sample-data/hololens-dataset/000 of github.com/ardaduz/deep-video-mvs (MIT), its frames 120 to 215, by
-                `semstab-bench convert`: a room of people and sofas, seen by a headset.
+                `semstab-bench convert`: an office with tables, sofas and a kitchen, seen by a headset.
     brighton    18 photographs of a drone (github.com/pierotofy/drone_dataset_brighton_beach, BSD-2-Clause) with poses
                 by COLMAP and depth from the dense cloud, `semstab-bench convert` of the project. The networks of
                 Cityscapes were trained on streets from a car: views from above are outside their domain.
@@ -533,7 +533,7 @@ def draw(rows: Sequence[Row], file: Path, condition: str = MAIN) -> None:
         right.set_ylabel("alpha")
         right.set_ylim(top=1.02)
         right.axhline(USABLE, color="#555555", linewidth=0.8, linestyle="--")
-        right.annotate("usable", (0.4, USABLE), xycoords=("axes fraction", "data"), xytext=(0, 2),
+        right.annotate("usable", (0.16, USABLE), xycoords=("axes fraction", "data"), xytext=(0, 2),
                        textcoords="offset points", fontsize=9)  # fmt: skip
         figure.legend(handles=marks, loc="outside lower center", ncols=len(marks), frameon=False)
         with atomic_path(file) as path:

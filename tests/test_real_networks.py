@@ -255,19 +255,82 @@ def test_the_page_has_the_table_of_the_results(rows) -> None:
 @pytest.mark.parametrize("document", [PAGE, README])
 def test_correlations_in_the_text_are_those_of_the_main_condition(document, rows, stated) -> None:
     text = re.sub(r"\s+", " ", document.read_text(encoding="utf-8"))
-    pattern = rf"(alpha|VSS|agreement of two frames|flicker) {SIGNED}(?: \({SIGNED} to {SIGNED}\))?"
-    keys = {"alpha": "alpha", "VSS": "vss", "agreement of two frames": "agree", "flicker": "flicker"}
+    text = re.split(r" ## (?!On)", text[text.index("## On real networks") :])[0] if document == README else text
+    pattern = rf"(?i)(alpha|VSS|agreement of two frames|flicker) {SIGNED}(?: \({SIGNED} to {SIGNED}\))?"
+    keys = {"alpha": "alpha", "vss": "vss", "agreement of two frames": "agree", "flicker": "flicker"}
     found = {
         each["measure"]: each
         for each in stated["correlations"]
         if (each["condition"], each["of"], each["against"]) == (real_networks.MAIN, "all", "published_miou")
     }
     said = re.findall(pattern, text)
-    assert {"alpha", "VSS"} <= {title for title, *_ in said}
+    assert {"alpha", "vss"} <= {title.lower() for title, *_ in said}
     for title, *numbers in said:
-        each = found[keys[title]]
+        each = found[keys[title.lower()]]
         expected = [real_networks.signed(each[key]) for key in ("rho", "low", "high")]
         assert numbers in (expected, [expected[0], "", ""])
+
+
+def correlation(stated, measure, against, of):
+    (each,) = [
+        each
+        for each in stated["correlations"]
+        if (each["condition"], each["measure"]) == (real_networks.MAIN, measure)
+        and (each["against"], each["of"]) == (against, of)
+    ]
+    rho, low, high = (real_networks.signed(each[key]) for key in ("rho", "low", "high"))
+    return each["networks"], rho, f"({low} to {high})"
+
+
+def test_correlations_without_the_uninformative_networks_are_those_of_the_results(stated) -> None:
+    count, *alpha = correlation(stated, "alpha", "published_miou", "informative")
+    _, *vss = correlation(stated, "vss", "published_miou", "informative")
+    text = re.sub(r"\s+", " ", PAGE.read_text(encoding="utf-8"))
+    assert f"Among the {count} others alpha has {' '.join(alpha)}, VSS has {' '.join(vss)}" in text
+
+
+def test_the_correlation_with_the_number_of_classes_is_that_of_the_results(stated) -> None:
+    _, rho, _ = correlation(stated, "vss", "effective_classes", "all")
+    assert f"With the effective number of classes, VSS has {rho}." in PAGE.read_text(encoding="utf-8")
+
+
+def test_levels_and_alphas_in_the_text_are_those_of_the_rows(rows) -> None:
+    row = {(row.condition, row.network): row for row in rows}
+    main = {network: each for (condition, network), each in row.items() if condition == real_networks.MAIN}
+    text = re.sub(r"\s+", " ", PAGE.read_text(encoding="utf-8"))
+    few, many = row["livingroom-labels-20-0.02", "espnetv2-2.0"], main["espnetv2-2.0"]
+    said = [f"{digits(each)} ({each.verdict}) in {each.frames}" for each in (few, many)]
+    assert f"espnetv2-2.0 has {said[0]} frames and {said[1]}," in text
+    assert f"dicenet-0.75, with {digits(main['dicenet-0.75'])}, calls" in text
+    assert f"dicenet-0.2: {main['dicenet-0.2'].verdict}." in text
+    for network in ("dicenet-1.0", "espnetv2-2.0"):
+        assert f"{network}: {main[network].verdict}, {digits(main[network])}." in text
+
+
+def digits(row):
+    return f"{row.alpha:.2f}".removeprefix("0")
+
+
+def test_both_voxel_sizes_rank_the_networks_alike(rows) -> None:
+    for stride in (20, 10, 5):
+        small, large = (
+            [row for row in rows if row.condition == f"livingroom-labels-{stride}-{v}"] for v in (0.02, 0.04)
+        )
+        for measure in real_networks.MEASURES:
+            of = [[getattr(row, measure) for row in each if not math.isnan(row.alpha)] for each in (small, large)]
+            assert real_networks.spearman(*of)["rho"] == 1
+
+
+def test_the_text_says_what_the_other_sequences_show(rows) -> None:
+    office = [row for row in rows if row.scene == "hololens"]
+    assert max(office, key=lambda row: row.alpha).network == "dicenet-0.2"
+    assert next(row.verdict for row in office if row.network == "dicenet-0.2") == "uninformative"
+    alpha = real_networks.with_miou(office)["alpha"]
+    assert alpha["low"] < 0 < alpha["high"]
+    flight = real_networks.with_miou([row for row in rows if row.scene == "brighton"])
+    assert min(flight[measure]["rho"] for measure in ("alpha", "vss", "agree")) > 0 > flight["flicker"]["rho"]
+    scores = real_networks.with_miou([row for row in rows if row.kind == "scores"])
+    assert scores["agree"]["low"] > 0
 
 
 def test_shares_of_background_in_the_text_are_those_of_the_main_condition(rows) -> None:
