@@ -36,6 +36,7 @@ Numbers. results/real-networks.csv has a row for each network in each condition:
     verdict, probability   the most probable level for the same scene flown again
     vss, _low, _high       mean VSS of the voxels with OP >= 3; vss_all of all voxels
     agree, _low, _high     probability that two frames agree on a voxel (PSA), OP >= 2
+    within, between        the parts of 1 - agree within a frame (unsure scores, mixed voxels) and between frames
     flicker, compensated   percent of the pixels whose label differs in consecutive frames; after warping by depth
     effective_classes      1 / probability that two observations from anywhere agree (Hill number of order 2)
     largest_class, _share  the class with most observations
@@ -161,6 +162,8 @@ class Row:
     agree: float
     agree_low: float
     agree_high: float
+    within: float
+    between: float
     flicker: float
     compensated: float
     effective_classes: float
@@ -174,6 +177,7 @@ class Row:
 
 
 MEASURES = ("alpha", "vss", "agree", "flicker")
+PARTS = ("within", "between")
 TITLES = {"alpha": "alpha", "vss": "VSS", "agree": "two frames agree", "flicker": "flicker"}
 
 
@@ -327,6 +331,7 @@ def _row(condition: Condition, network: Network, record: Record) -> Row:
         verdict=statistics.verdict.level, probability=statistics.verdict.probability,
         vss=headline.vss.value, vss_low=headline.vss.low, vss_high=headline.vss.high, vss_all=summary.table[VSS],
         agree=headline.psa.value, agree_low=headline.psa.low, agree_high=headline.psa.high,
+        within=statistics.agreement.within.value, between=statistics.agreement.between.value,
         flicker=summary.flicker_percent, compensated=record.image_space.compensated_flicker_percent,
         effective_classes=cells.effective_classes, largest_class=cells.largest_class,
         largest_share=cells.largest_share, voxels=summary.table.voxels, mean_op=summary.table.mean_op,
@@ -400,22 +405,17 @@ def correlations(rows: Sequence[Row]) -> list[dict[str, Any]]:
     `of` is 'all' networks for which both numbers are defined, or the 'informative' ones among them, whose verdict is
     another than 'uninformative'.
     """
-    return [
-        {
-            "condition": name,
-            "measure": measure,
-            "against": against,
-            "of": of,
-            **spearman(*_pairs(chosen, measure, against)),
-        }
-        for name in dict.fromkeys(row.condition for row in rows)
-        for of in ("all", "informative")
-        for chosen in [
-            [row for row in rows if row.condition == name and (of == "all" or row.verdict != "uninformative")]
-        ]
-        for against in ("published_miou", "effective_classes")
-        for measure in MEASURES
-    ]
+    found = []
+    for name in dict.fromkeys(row.condition for row in rows):
+        everything = [row for row in rows if row.condition == name]
+        informative = [row for row in everything if row.verdict != "uninformative"]
+        for of, chosen in (("all", everything), ("informative", informative)):
+            for against in ("published_miou", "effective_classes"):
+                measures = (*MEASURES, *PARTS) if (of, against) == ("all", "published_miou") else MEASURES
+                for measure in measures:
+                    key = {"condition": name, "measure": measure, "against": against, "of": of}
+                    found.append(key | spearman(*_pairs(chosen, measure, against)))
+    return found
 
 
 def _pairs(rows: Sequence[Row], measure: str, against: str) -> tuple[list[float], list[float]]:
@@ -573,7 +573,7 @@ def show(results: Path, file: Path) -> None:
         print(*network_table(rows, name), "", sep="\n")
     print(*condition_table(rows), "", sep="\n")
     for each in correlations(rows):
-        if (each["of"], each["against"]) != ("all", "published_miou"):
+        if each["measure"] in PARTS or (each["of"], each["against"]) != ("all", "published_miou"):
             ends = f"({signed(each['low'])} to {signed(each['high'])})"
             pair = f"{each['measure']} with {each['against']}"
             print(f"{each['condition']:27}{pair:34}{signed(each['rho']):6}{ends:18}{each['networks']} {each['of']}")

@@ -333,6 +333,16 @@ def test_the_text_says_what_the_other_sequences_show(rows) -> None:
     assert scores["agree"]["low"] > 0
 
 
+def test_the_parts_of_disagreement_of_scores_are_those_of_the_results(stated) -> None:
+    rho = {
+        each["measure"]: real_networks.signed(each["rho"])
+        for each in stated["correlations"]
+        if each["condition"].startswith("livingroom-scores") and each["measure"] in real_networks.PARTS
+    }
+    text = re.sub(r"\s+", " ", PAGE.read_text(encoding="utf-8"))
+    assert f"that part of disagreement has {rho['within']}; the part between frames has {rho['between']}" in text
+
+
 def test_shares_of_background_in_the_text_are_those_of_the_main_condition(rows) -> None:
     shares = {row.network: 100 * row.largest_share for row in rows if row.condition == real_networks.MAIN}
     said = re.findall(r"(\w+-[\d.]+) \(([\d.]+) % background\)", PAGE.read_text(encoding="utf-8"))
