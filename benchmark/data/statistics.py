@@ -375,12 +375,18 @@ class Quadrants:
 
 @dataclass(frozen=True)
 class CorrectnessStatistics:
-    """Stability vs. accuracy; strata has all voxels with a true class first, then each stratum of OP."""
+    """Stability vs. accuracy of the fused labels.
+
+    Attributes:
+        accuracy, miou: Of the voxels seen twice or more, as `compare` and gates have them.
+        strata: All voxels with a true class, then each stratum of OP.
+    """
 
     accuracy: Interval
     strata: tuple[Correctness, ...]
     reliability: tuple[Reliability, ...]
     quadrants: Quadrants
+    miou: Interval = UNKNOWN
 
 
 @dataclass(frozen=True)

@@ -146,7 +146,7 @@ def _numbers(
     yield "seen 3 times or more", f"{100 * together.recurrent.share:.0f} %", f"of {together.voxels:,} voxels"
     yield "VSS", mean([together.recurrent[VSS]], "{:.3f}"), "OP ≥ 3"
     yield "SBD", mean([together.recurrent[SBD]], "{:.4f}"), "bits, OP ≥ 3"
-    yield "mIoU", mean([miou(record) for record in records], "{:.1f} %", 100), "of the fused labels"
+    yield "mIoU", mean([miou(record) for record in records], "{:.1f} %", 100), "of voxels seen twice or more"
     wrong = [stats.headline.wrong_of_consistent.value for stats in assessed]
     yield "consistent but wrong", mean(wrong, "{:.1f} %", 100), "of the consistent locations"
 

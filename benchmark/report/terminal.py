@@ -219,8 +219,7 @@ def _cells(record: Record) -> list[str]:
 def miou(record: Record) -> float:
     """Return the mIoU of the fused labels seen twice or more; NaN without ground truth."""
     statistics = record.summary.statistics
-    rows = [] if statistics is None or statistics.correctness is None else statistics.correctness.strata
-    return rows[0].miou if rows else math.nan
+    return math.nan if statistics is None or statistics.correctness is None else statistics.correctness.miou.value
 
 
 def _number(value: float, digits: int) -> str:

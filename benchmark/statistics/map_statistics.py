@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -33,12 +34,15 @@ from semstab.data.voxels import VoxelTable
 from semstab.metrics.agreement import shared_rows
 from semstab.metrics.summary import STRATA, groups_of
 from semstab.statistics.accumulate import Cubes, CubeSums, cluster_sums_of
-from semstab.statistics.agreement import class_agreement_of, class_sums, consistency_posterior, ratio_of, shares_of
+from semstab.statistics.agreement import class_agreement_of, class_sums, consistency_posterior, shares_of
 from semstab.statistics.cluster_sums import MOST_CLASSES, ClusterSums, chance_of
 from semstab.statistics.correctness import (
+    ACCURACY,
+    MIOU,
     Predictions,
     Truth,
     by_stratum,
+    correctness_of,
     join_truth,
     prediction_sums,
     quadrant_sums,
@@ -228,7 +232,7 @@ def analyse(
         drift=_drift(repeats, means, of_locations, log, of_flips),
         uncertainty=EntropyParts(means["entropy"], means["entropy_within"], means["entropy_between"]),
         geometry=None if limit is None else losses(table, limit),
-        correctness=None if truth is None else _correctness(table, truth, consistent, cubes, edges),
+        correctness=None if truth is None else _correctness(table, truth, consistent, influence, edges, scope),
         strata=_strata(whole, table, columns, edges),
     )
     return Analysis(summary, whole, influence, sample, shares, drawn)
@@ -323,15 +327,21 @@ def _drift(
 
 
 def _correctness(
-    table: VoxelTable, truth: Truth, consistent: Float64, cubes: Cubes, edges: Sequence[int]
+    table: VoxelTable, truth: Truth, consistent: Float64, sums: ClusterSums, edges: Sequence[int], scope: Scope
 ) -> CorrectnessStatistics:
     predictions = Predictions.of(table.evidence, truth.label)
-    right = cubes.means({"right": np.where(truth.known, predictions.right, np.nan)})
+    repeated = prediction_sums(predictions, truth.known & (table.op >= 2))
+    accuracy, miou = confidence_intervals(
+        spec_of(sums, key, scope=scope_of(sums, scope, key)) for key in (ACCURACY.key, MIOU.key)
+    )
+    if math.isnan(miou.value):  # there are no sums of so many classes
+        miou = dataclasses.replace(miou, value=correctness_of(repeated).miou)
     return CorrectnessStatistics(
-        accuracy=CubeSums(cubes.cell, cubes.edge, right).estimate("right", ratio_of),
+        accuracy=accuracy,
+        miou=miou,
         strata=by_stratum(predictions, table.op, truth.known, edges),
-        reliability=reliability_of(prediction_sums(predictions, truth.known & (table.op >= 2))),
-        quadrants=quadrants_of(quadrant_sums(table, truth, consistent, cubes.edge)),
+        reliability=reliability_of(repeated),
+        quadrants=quadrants_of(quadrant_sums(table, truth, consistent, sums.edge)),
     )
 
 
