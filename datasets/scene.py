@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import logging
+import math
 import os
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
@@ -140,6 +141,10 @@ class Scene(ABC):
     def filtering(self, model: str) -> Filtering:
         """Return the filters of a label source."""
         return Filtering(model)
+
+    def prediction_seconds(self, index: int, model: str) -> float:
+        """Return the seconds that a model took to predict on a frame; NaN where it did not, as labels are read."""
+        return math.nan
 
     def geometry(self, index: int, *, color: bool = False) -> Frame:
         """Return the frame but for its labels: all pixels are of class 0.

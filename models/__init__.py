@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import hashlib
+import os
+import re
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -14,6 +16,7 @@ import numpy.typing as npt
 from pydantic import BaseModel
 
 from semstab.config import validated
+from semstab.core.process import printing_aside
 from semstab.core.registry import Entry, Registry
 from semstab.core.types import Float32, UInt8, UInt16
 from semstab.data.frames import Frame
@@ -57,6 +60,12 @@ REGISTRY = Registry(
             "SegEarth-OV: CLIP as an open-vocabulary segmenter, for views from above, without training",
             install="pip install 'semstab[segearth]'",
             needs=NETWORKS,
+        ),
+        "smp": Entry(
+            "semstab.models.smp:SmpNetwork",
+            "a network of segmentation_models_pytorch by the names of its architecture and encoder (timm's too)",
+            install="pip install 'semstab[smp]'",
+            needs=("torch", "segmentation_models_pytorch"),
         ),
         "stored": Entry(
             "semstab.predict.predictor:Stored", "labels that a scene has already, for --filter: --set source=NAME"
@@ -167,13 +176,51 @@ def ask(
 
 
 def content_digest(path: Path) -> str:
-    """Return a hash of a file, or of the names and contents of all files in a folder."""
+    """Return a hash of a file, or of the names and contents of all files in a folder.
+
+    That of an ONNX file is also of the files that it stores weights in.
+    """
     digest = hashlib.blake2b(digest_size=16)
-    for file in [path] if path.is_file() else sorted(each for each in path.rglob("*") if each.is_file()):
-        digest.update(b"" if file == path else str(file.relative_to(path)).encode() + b"\0")
+    if path.is_file():
+        files = [path, *(path.parent / name for name in external_data(path))]
+    else:
+        files = sorted(each for each in path.rglob("*") if each.is_file())
+    for file in files:
+        digest.update(b"" if file == path else os.path.relpath(file, path).encode() + b"\0")
         with file.open("rb") as opened:
             hashlib.file_digest(opened, lambda: digest)
     return digest.hexdigest()
+
+
+def external_data(path: Path) -> list[str]:
+    """Return the files, relative to its folder, in which an ONNX file stores weights; of other files none."""
+    if path.suffix != ".onnx":
+        return []
+    try:
+        import onnx
+    except ImportError:  # its usual name: without the package nothing tells others
+        return [name for name in [f"{path.name}.data"] if path.with_name(name).is_file()]
+    try:
+        model = onnx.load(path, load_external_data=False)
+    except Exception:  # noqa: BLE001 - what is no ONNX file has none; whoever loads it says so
+        return []
+    return sorted(
+        {
+            entry.value
+            for tensor in _tensors(model.graph)
+            for entry in tensor.external_data
+            if entry.key == "location" and (path.parent / entry.value).is_file()
+        }
+    )
+
+
+def _tensors(graph: Any) -> Iterator[Any]:
+    """Yield the stored tensors of an ONNX graph and of the graphs inside its nodes."""
+    yield from graph.initializer
+    for attribute in (each for node in graph.node for each in node.attribute):
+        yield from (attribute.t, *attribute.tensors)
+        for inner in (attribute.g, *attribute.graphs):
+            yield from _tensors(inner)
 
 
 def image_digest(image: Image) -> str:
@@ -186,6 +233,12 @@ def image_digest(image: Image) -> str:
 def narrowed(ids: npt.NDArray[Any], classes: int) -> Labels:
     """Return the class ids as the narrowest type that holds so many classes and the ignore id."""
     return ids.astype(np.uint8) if classes <= IGNORE_8BIT else ids.astype(np.uint16)
+
+
+def sides(value: Any) -> Any:
+    """Return the text HEIGHTxWIDTH as two numbers, and all else as it is; for options of sizes."""
+    found = re.fullmatch(r"\s*(\d{1,9})\s*x\s*(\d{1,9})\s*", value, re.IGNORECASE) if isinstance(value, str) else None
+    return value if found is None else [int(side) for side in found.groups()]
 
 
 def maker(name: str) -> tuple[type[BaseModel], Callable[[Any], Model]]:
@@ -222,4 +275,5 @@ def create(name: str, **options: Any) -> Model:
         MissingDependencyError: If its packages are not installed.
     """
     model, make = maker(name)
-    return make(validated(model, options, f"model '{name}': "))
+    with printing_aside():
+        return make(validated(model, options, f"model '{name}': "))

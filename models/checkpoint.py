@@ -20,7 +20,9 @@ from transformers import AutoImageProcessor, SegformerImageProcessorPil
 
 from semstab.config import Settings
 from semstab.core.files import read_json
-from semstab.errors import ConfigError, DataError, MissingDependencyError, summarize_error
+from semstab.errors import ConfigError, DataError, MissingDependencyError
+from semstab.models import sides
+from semstab.models.devices import checked_device, first_sentence
 
 if not transformers.is_torch_available():  # else its classes are stand-ins that fail when they are used
     raise ImportError(f"transformers {transformers.__version__} does not work with torch {torch.__version__}")
@@ -113,7 +115,7 @@ class Checkpoint:
                 return loader.from_pretrained(self.folder, local_files_only=True, **options)
             except Exception as error:  # the loaders raise whatever their parsers do
                 what = loader.__name__
-                raise DataError(f"{self.folder}: {what} cannot load it ({_first_sentence(error)}); {AGAIN}") from error
+                raise DataError(f"{self.folder}: {what} cannot load it ({first_sentence(error)}); {AGAIN}") from error
 
     def load_model(self, loader: Any, options: ModelOptions) -> Any:
         """Return a model on its device, ready to predict.
@@ -141,23 +143,6 @@ AGAIN = "name a folder that save_pretrained wrote, or a hub id, of such a model"
 def bilinear(images: torch.Tensor, size: Any) -> torch.Tensor:
     """Return images (K, h, w) brought to (K, H, W), pixel areas aligned."""
     return torch.nn.functional.interpolate(images[None], size=size, mode="bilinear", align_corners=False)[0]
-
-
-def checked_device(name: str) -> torch.device:
-    """Return the device of that name.
-
-    Raises:
-        ConfigError: If torch has none.
-    """
-    try:
-        device = torch.device(name)
-        torch.empty(0, device=device)
-    except (RuntimeError, AssertionError, NotImplementedError) as error:
-        raise ConfigError(f"device {name}: torch cannot use it ({_first_sentence(error)}); use cpu") from error
-    if device.type == "cuda":  # reduced precision flips labels
-        torch.backends.cudnn.allow_tf32 = False
-        torch.backends.cuda.matmul.allow_tf32 = False
-    return device
 
 
 def _require_model(folder: Path) -> None:
@@ -214,16 +199,11 @@ def _download(options: ModelOptions) -> Path:
     except Exception as error:  # no network has many faces
         raise DataError(
             f"model '{name}': there is no such folder, it is not in the hub's cache, and the hub cannot be reached"
-            f" ({_first_sentence(error)}); where there is a network 'hf download {name} --local-dir FOLDER', then name"
+            f" ({first_sentence(error)}); where there is a network 'hf download {name} --local-dir FOLDER', then name"
             " the folder"
         ) from error
     _require_model(folder)
     return folder
-
-
-def _first_sentence(error: Exception) -> str:
-    """Return the first sentence of an error, without the paragraphs of advice that libraries append."""
-    return re.split(r"(?<=[.:;]) |\n", summarize_error(error), maxsplit=1)[0].rstrip(".:;")
 
 
 @contextlib.contextmanager
@@ -300,6 +280,8 @@ class SegmenterOptions(ImageModelOptions):
     threshold: float | None = Field(
         None, gt=0, lt=1, description="of a CLIPSeg model: pixels where no prompt is as likely are ignored"
     )
+
+    _sides = field_validator("image_size", mode="before")(sides)
 
     @field_validator("prompts", mode="before")
     @classmethod

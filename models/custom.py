@@ -21,6 +21,7 @@ import numpy as np
 import numpy.typing as npt
 from pydantic import BaseModel, ConfigDict, Field
 
+from semstab.core.process import printing_aside
 from semstab.data.frames import Frame
 from semstab.data.labels import IGNORE_8BIT, IGNORE_16BIT, LabelSpace
 from semstab.errors import ConfigError, DataError, MissingDependencyError, summarize_error
@@ -112,7 +113,8 @@ def absolute(name: str) -> str:
 def guarded(text: str, do: Callable[[], T]) -> T:
     """Run a user's code, and turn an error in it into one line with the position where it was raised."""
     try:
-        return do()
+        with printing_aside():
+            return do()
     except (ConfigError, DataError, MissingDependencyError):
         raise
     except ImportError as error:
@@ -121,11 +123,23 @@ def guarded(text: str, do: Callable[[], T]) -> T:
             f"{text}: it imports a missing module ({summarize_error(error)}){package}"
         ) from error
     except (Exception, SystemExit) as error:
-        last = traceback.extract_tb(error.__traceback__)[-1]
+        last = _users_own(text, traceback.extract_tb(error.__traceback__))
         at = f"{Path(last.filename).name}:{last.lineno}"
         if isinstance(error, SyntaxError):
             at = f"{Path(error.filename or '').name}:{error.lineno}"
         raise DataError(f"{text}: {type(error).__name__} at {at}: {summarize_error(error)}") from error
+
+
+def _users_own(text: str, stack: Sequence[traceback.FrameSummary]) -> traceback.FrameSummary:
+    """Return the innermost line that lies in the folder of the user's code, where there is one: torch's are not his."""
+    source = text.rpartition(":")[0]
+    file = source if source.endswith(".py") else getattr(sys.modules.get(source), "__file__", None)
+    folder = None if file is None else Path(file).expanduser().resolve().parent
+    for frame in reversed(stack):
+        path = Path(frame.filename).resolve()
+        if folder is not None and folder in path.parents and "site-packages" not in path.relative_to(folder).parts:
+            return frame
+    return stack[-1]
 
 
 def _of_file(path: Path) -> ModuleType:
@@ -260,7 +274,7 @@ class OwnModel(Model):
                 )
             return Prediction(_ids(output, K, self._code.text))
         if output.shape == (*shape, K) and output.dtype.kind == "f":
-            soft = output.astype(np.float32, copy=False)
+            soft = output if output.dtype == np.float16 else output.astype(np.float32, copy=False)
             return Prediction(_ids(soft.argmax(axis=2), K, self._code.text), soft if scores else None)
         raise DataError(
             f"{self._code.text}: gave {output.dtype} of shape {output.shape} for an image of {shape}; give labels"

@@ -124,7 +124,9 @@ class InTaxonomy(Wrapped):
         for each in self.ask(images, scores, geometry):
             labels, mapped = self._mapping.labels(each.labels, "prediction"), None
             if each.scores is not None:
-                mapped = np.array(self._mapping.scores(each.scores, "prediction"), dtype=np.float32)
+                mapped = np.array(
+                    self._mapping.scores(each.scores.astype(np.float32, copy=False), "prediction"), dtype=np.float32
+                )
                 mapped[labels == ignore_id(labels)] = 0
             predictions.append(Prediction(labels, mapped))
         return predictions

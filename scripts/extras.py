@@ -31,6 +31,20 @@ import tiny_models
 tiny_models.{model}(Path({model!r}))
 """
 
+SMP = """
+import torch, segmentation_models_pytorch
+net = segmentation_models_pytorch.create_model("unet", encoder_name="resnet18", encoder_weights=None, classes=4)
+torch.save(net.state_dict(), "smp.pth")
+"""
+
+TFLITE = """
+import sys
+from pathlib import Path
+sys.path.insert(0, {tests!r})
+import tiny_tflite
+tiny_tflite.write(Path("net.tflite"))
+"""
+
 NETWORK = """
 import numpy as np, onnx
 from onnx import TensorProto, helper, numpy_helper
@@ -116,7 +130,8 @@ def predicting(model: str, predictor: str, *more: str, over: str = "") -> Use:
     """Return a run with labels of a tiny model."""
     command = ("-m", "semstab", *SCENE, "--predict", predictor, *more, "--out", "OUT")
     shown = f"`--predict {predictor.partition(',points')[0]}`, a tiny model"
-    prepare = NETWORK if model == "onnx" else TINY.format(tests=str(fresh.SOURCE / "tests"), model=model)
+    prepare = {"onnx": NETWORK, "smp": SMP, "tflite": TFLITE}.get(model, TINY)
+    prepare = prepare.format(tests=str(fresh.SOURCE / "tests"), model=model) if prepare in (TINY, TFLITE) else prepare
     return Use(shown, (command,), "verdict", prepare=prepare, over=over)
 
 
@@ -133,6 +148,8 @@ USES = {
     "segearth": predicting("clip", "segearth-ov,checkpoint=clip"),
     "torchvision": predicting("segformer", "segformer,checkpoint=segformer,processor=torchvision", over="segformer"),
     "onnx": predicting("onnx", "net.onnx", "--classes", "building,road,tree,car"),
+    "tflite": predicting("tflite", "net.tflite", "--classes", "building,road,tree,car"),
+    "smp": predicting("smp", "smp,encoder=resnet18,checkpoint=smp.pth", "--classes", "building,road,tree,car"),
     "geo": Use(
         "a run with `crs`, `export` to .laz and .tif",
         (

@@ -199,6 +199,22 @@ def test_every_model_is_counted(tmp_path):
     assert sum(checked.labels[0].classes.values()) == pytest.approx(1)
 
 
+def test_labels_that_were_begun_only_stop_nobody_else(tmp_path):
+    folder = tiny_scene.write(tmp_path / "wall")
+    first, *others = sorted((folder / "labels/b").glob("*.png"))
+    for file in others:
+        file.unlink()
+    (checked,) = check(configure(folder))
+    assert [labels.model for labels in checked.labels] == ["a"]
+    (note,) = [note for note in checked.notes if note.startswith("labels of b: ")]
+    assert note.startswith(f"labels of b: 1 of {1 + len(others)} selected frames have a map, so they were not checked")
+    with pytest.raises(DataError, match="labels/b"):
+        list(check(configure(folder, models=["b"])))
+    (folder / "labels/a" / first.name).unlink()
+    with pytest.raises(DataError, match="labels/"):
+        list(check(configure(folder)))
+
+
 def test_unknown_classes_are_a_problem_beside_the_geometry(tmp_path):
     folder = write(tmp_path / "room")
     (folder / "scene.yaml").write_text("")

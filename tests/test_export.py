@@ -450,3 +450,15 @@ def test_few_points_that_are_met_are_warned_of(fused, table, caplog):
     assert classify(high, classes=CLASSES) == ""
     large = np.concatenate([points, points + np.array([500, 0, 0]), points + np.array([0, 500, 0])])
     assert "the cloud is larger than the map; of the points over the map 100.0% do" in classify(large)
+
+
+def test_a_model_is_chosen_after_a_colon(fused):
+    export(f"{fused / 'run'}:b", fused / "colon.csv")
+    export(fused / "run", fused / "option.csv", model="b")
+    assert (fused / "colon.csv").read_text() == (fused / "option.csv").read_text()
+    done = bench("export", f"{fused / 'run'}:a", "--to", str(fused / "colon.ply"), cwd=fused)
+    assert done.returncode == 0, done.stderr
+    with pytest.raises(ConfigError, match=r"run:a: --model b names another model; use one of the two"):
+        export(f"{fused / 'run'}:a", fused / "colon.csv", model="b")
+    with pytest.raises(ConfigError, match=r"nothing"):
+        export(f"{fused / 'run'}:nothing", fused / "colon.csv")

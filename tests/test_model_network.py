@@ -14,6 +14,7 @@ from pictures import blobs
 
 from semstab.errors import ConfigError, DataError
 from semstab.models import create
+from semstab.models.network import resized
 from semstab.predict.predictor import parse_predictor
 
 IMAGE = blobs()
@@ -171,6 +172,7 @@ def test_a_predictor_is_called_as_its_file(folder, monkeypatch):
         ("words.onnx", {"classes": CLASSES}, r"its input is a tensor\(string\); a network of images takes"),
         ("text.onnx", {"classes": CLASSES}, "ONNX Runtime cannot load it .*; is it an ONNX file"),
         ("text.pt", {"classes": CLASSES}, "cannot load it as TorchScript .*; where it holds weights alone, name the"),
+        ("text.pth", {"classes": CLASSES}, "cannot load it as TorchScript .*; where it holds weights alone, name the"),
         ("text.pt2", {"classes": CLASSES}, "cannot load it as an exported program"),
     ],
 )
@@ -181,7 +183,7 @@ def test_files_and_options_that_cannot_be_used(folder, net, monkeypatch, name, o
     same = helper.make_node("Identity", ["words"], ["out"])
     graph = helper.make_graph([same], "net", [strings], [helper.make_tensor_value_info("out", TensorProto.STRING, [1])])
     onnx.save(helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=9), "words.onnx")
-    for text in ("text.onnx", "text.pt", "text.pt2"):
+    for text in ("text.onnx", "text.pt", "text.pth", "text.pt2"):
         (folder / text).write_text("no network")
     with pytest.raises((ConfigError, DataError), match=message) as caught:
         create(name, **options).predict([IMAGE])
@@ -194,3 +196,40 @@ def test_logits_that_are_no_numbers_are_named(tmp_path, net, scores):
     model = create(str(path), classes=CLASSES, mean=MEAN, std=STD)
     with pytest.raises(DataError, match=r"logs.onnx: gave logits that are NaN"):
         model.predict([IMAGE], scores=scores)
+
+
+def test_weights_that_an_onnx_file_stores_beside_it_are_part_of_its_digest(tmp_path, net):
+    whole = onnx.load(save_onnx(tmp_path / "whole.onnx", net))
+    usual = {"save_as_external_data": True, "all_tensors_to_one_file": True, "size_threshold": 0}
+    onnx.save_model(whole, tmp_path / "net.onnx", location="net.onnx.data", **usual)
+    before = create(str(tmp_path / "net.onnx"), classes=CLASSES).identity()
+    with torch.no_grad():
+        net.weight += 1
+    changed = onnx.load(save_onnx(tmp_path / "whole.onnx", net))
+    with torch.no_grad():
+        net.weight -= 1
+    graph = (tmp_path / "net.onnx").read_bytes()
+    (tmp_path / "net.onnx.data").unlink()  # else it is appended to
+    onnx.save_model(changed, tmp_path / "net.onnx", location="net.onnx.data", **usual)
+    assert (tmp_path / "net.onnx").read_bytes() == graph  # only the weights differ, and they lie in the other file
+    assert create(str(tmp_path / "net.onnx"), classes=CLASSES).identity() != before
+
+
+def test_how_an_image_is_resized_is_an_option(folder):
+    pixels = torch.from_numpy(IMAGE.copy()).permute(2, 0, 1)[None].float()
+    usual = {"classes": CLASSES, "size": "24x44", "mean": MEAN, "std": STD}
+    for how, antialias in (("antialias", True), ("bilinear", False)):
+        small = torch.nn.functional.interpolate(pixels, size=(24, 44), mode="bilinear", antialias=antialias)
+        np.testing.assert_allclose(resized(IMAGE, (24, 44), how).transpose(2, 0, 1), small[0], atol=1e-3, err_msg=how)
+    found = [create(str(folder / "net.onnx"), resize=how, **usual) for how in ("pillow", "bilinear")]
+    first, second = (model.predict([IMAGE], scores=True)[0].scores for model in found)
+    assert np.abs(first - second).max() > 1e-3
+    assert found[0].identity() != found[1].identity()
+
+
+def test_scores_come_class_by_class_too(folder):
+    model = create(str(folder / "net.onnx"), classes=CLASSES, mean=MEAN, std=STD)
+    (whole,) = model.predict([IMAGE], scores=True)
+    streamed = model.stream(IMAGE)
+    np.testing.assert_array_equal(np.dstack(list(streamed.maps())), whole.scores)
+    np.testing.assert_array_equal(streamed.labels, whole.labels)

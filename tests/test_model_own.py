@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 import sys
+import tracemalloc
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
 
@@ -208,6 +209,47 @@ def test_a_predictor_is_called_as_its_class_and_found_from_anywhere(file, monkey
     assert resolved.options == {"classes": None, "table": str(file.parent / "table.csv"), "above": 3}
 
 
+# --- What it prints, and scores in half precision ---------------------------------------------------------------------
+
+
+def test_what_it_prints_goes_to_standard_error(tmp_path, capsys):
+    text = """
+import sys
+classes = ["a", "b"]
+print("imported")
+class F:
+    def __init__(self):
+        print("loading")
+        self.once = sys.stdout
+    def predict(self, image):
+        print("predicting")
+        return image[..., 0] * 0
+"""
+    model = create(f"{written(tmp_path, text)}:F")
+    labels_of(model)
+    sys.stdout.write("an answer\n")
+    said = capsys.readouterr()
+    assert (said.out, said.err) == ("an answer\n", "imported\nloading\npredicting\n")
+
+
+def test_scores_in_half_precision_are_not_copied(tmp_path):
+    text = """
+import numpy as np
+classes = [f"c{k}" for k in range(50)]
+SCORES = np.full((48, 80, 50), 1 / 50, np.float16)
+def f(image):
+    return SCORES
+"""
+    model = Checked(create(f"{written(tmp_path, text)}:f"), "f")
+    (found,) = model.predict([IMAGE], scores=True)
+    assert found.scores.dtype == np.float16
+    tracemalloc.start()
+    model.predict([IMAGE], scores=True)
+    _, peak = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert peak < found.scores.nbytes  # a copy in float32 takes twice that, in float64 four times
+
+
 # --- What cannot be used ----------------------------------------------------------------------------------------------
 
 
@@ -242,6 +284,7 @@ def test_names_and_options_that_cannot_be_used(file, monkeypatch, name, options,
         ("def f(image:\n", DataError, r"SyntaxError at other.py:1: "),
         ("import sys\nsys.exit('usage: model FILE')", DataError, "SystemExit at other.py:2: usage: model FILE"),
         ("class F:\n  def __init__(self):\n    1 / 0\n", DataError, "ZeroDivisionError at other.py:3"),
+        ("import torch\ndef g():\n  return torch.load(__file__)\nF = g()", DataError, r"Error at other.py:3: "),
         ("class F:\n  classes = ['a', 'b']\n", ConfigError, "has no method predict"),
         ("class F:\n  def __init__(self, weights): pass\n", ConfigError, "missing a required argument: 'weights'"),
         ("class F:\n  sequential = True\n  classes = ['a', 'b']\n  def predict(self, i): pass\n", ConfigError, "reset"),

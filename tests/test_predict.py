@@ -7,6 +7,7 @@ import dataclasses
 import io
 import itertools
 import json
+import re
 from pathlib import Path
 
 import numpy as np
@@ -22,18 +23,21 @@ from semstab.config import Config, DatasetConfig, FrameSelection
 from semstab.core.files import FolderLock
 from semstab.data.labels import LabelSpace
 from semstab.data.measures import ENTROPY
+from semstab.data.results import slug
 from semstab.datasets import open_dataset
 from semstab.datasets.formats.images import read_labels
 from semstab.datasets.scene import select_frames
 from semstab.errors import ConfigError, DataError
 from semstab.metrics import matched_region_flicker
-from semstab.models import Model, Prediction, Streamed, create
+from semstab.models import Model, Prediction, Streamed, create, options_model
 from semstab.models.names import InTaxonomy
 from semstab.models.validation import Checked
 from semstab.pixels.warp import warp
 from semstab.predict.command import ImageFiles, file_job, scene_jobs
-from semstab.predict.predictor import PredictorConfig, load_predictor, parse_predictor
+from semstab.predict.folder import names_a_folder
+from semstab.predict.predictor import PredictorConfig, load_predictor, parse_predictor, parse_predictors
 from semstab.predict.sequence import PredictionObserver, SequenceOptions, predict_sequence
+from semstab.report.terminal import screen
 from semstab.settings import predicted_config
 
 CLUSTERS = {"clusters": 4, "samples": 500, "fit_frames": 2}
@@ -544,6 +548,69 @@ def test_a_predictor_in_one_word():
     assert (found.model, found.label_name, found.scores, found.taxonomy) == ("segformer", "b0", True, "uavid3")
     assert found.options == {"checkpoint": "models/b0", "image_size": [512, 896]}
     assert parse_predictor("colour-clusters").label_name == "colour-clusters"
+
+
+@pytest.mark.parametrize(
+    ("texts", "names"),
+    [
+        (["net.py:net,scale=2.0", "net.py:net,scale=0.5"], ["net scale=2.0", "net scale=0.5"]),
+        (["net.py:net", "net.py:net,scale=0.5", "own.py:other"], ["net", "net scale=0.5", "other"]),
+        (["a.py:net", "b.py:net"], ["net a", "net b"]),
+        (["n.py:net,weights=one/w.pt,s=1", "n.py:net,weights=two/w.pt,s=1"], ["net weights=one-w.pt", "net weights=two-w.pt"]),  # noqa: E501
+        (["n.py:net,weights=x/a.pt", "n.py:net,weights=x/b.pt"], ["net weights=a.pt", "net weights=b.pt"]),
+        (["net.onnx,size=[32, 64]", "net.onnx,size=[64, 96]"], ["net size=32x64", "net size=64x96"]),
+        (["n.py:net,s=1,scores=true", "n.py:net,s=1"], ["net-scores", "net"]),
+        (["n.py:net,s=1,name=mine", "n.py:net,s=2"], ["mine", "net"]),
+        (["n.py:net,s=1,filters=[ema:0.5]", "n.py:net,s=2,filters=[ema:0.5]"], ["net-ema-0.5 s=1", "net-ema-0.5 s=2"]),
+    ],
+)  # fmt: skip
+def test_predictors_of_one_name_are_named_after_their_difference(texts, names):
+    found = [one.source_name for one in parse_predictors(texts)]
+    assert found == names
+    assert all(names_a_folder(name) for name in found)
+    assert len({slug("scene", name) for name in found}) == len(found)
+
+
+@pytest.mark.parametrize("texts", [["n.py:net,s=1", "n.py:net,s=1"], ["n.py:net,name=a", "n.py:net,name=a"]])
+def test_the_same_predictor_twice_is_said(texts):
+    with pytest.raises(ConfigError, match=r"two models are called '(net|a)'; give one a name: name=NAME"):
+        parse_predictors(texts)
+
+
+@pytest.mark.parametrize(("text", "size"), [("256x832", (256, 832)), ("256", 256), ("[256, 832]", (256, 832))])
+def test_a_size_is_height_and_width(text, size):
+    options = parse_predictor(f"segformer,checkpoint=b0,image_size={text}").options
+    assert options_model("segformer")(**options).image_size == size
+    options = parse_predictor(f"net.onnx,size={text}").options
+    assert options_model("net.onnx")(**options).size == size
+
+
+def test_an_option_of_a_model_may_be_called_as_one_of_ours(scene, tmp_path):
+    (tmp_path / "own.py").write_text(
+        "class Net:\n    classes = ['a', 'b']\n    def __init__(self, dataset, frames=0):\n"
+        "        assert (dataset, frames) == ('pascal', 3)\n"
+        "    def predict(self, image):\n        return image[..., 0] * 0\n"
+    )
+    options = ("--set", "dataset=pascal", "--set", "frames=3", "--set", "dataset.options.incomplete=skip")
+    done = bench("predict", "-m", f"{tmp_path / 'own.py'}:Net", "--data", str(scene), *options, cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    said = json.loads((scene / "labels/Net/predictions.json").read_text())
+    assert said["settings"]["options"] == {"dataset": "pascal", "frames": 3}
+
+
+def test_time_in_the_network_stands_apart_from_reading(scene, tmp_path):
+    (tmp_path / "slow.py").write_text(
+        "import time\nclasses = ['a', 'b']\ndef slow(image):\n    time.sleep(.3)\n    return (image[..., 0] > 99) - 0\n"
+    )
+    config = live_config(scene, f"{tmp_path / 'slow.py'}:slow")
+    result = run(config, out=tmp_path / "run", report=False)
+    (summary,) = result.runs
+    seconds, frames = result.manifest["seconds"], summary.frames
+    assert 290 < summary.stages_ms["network"] < 1000
+    assert seconds["network"] > 0.1 * frames
+    assert seconds["network"] > 2 * seconds["read"]
+    (line,) = [line for line in screen(result, seconds=9.0) if line.startswith("  predicted: ")]
+    assert re.fullmatch(r"  predicted: slow [1-3](\.\d+)? frames/s", line), line
 
 
 @pytest.mark.parametrize(

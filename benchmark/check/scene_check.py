@@ -220,7 +220,7 @@ def check(config: Config) -> Iterator[SceneCheck]:
 
 def check_scene(scene: Scene, config: Config) -> SceneCheck:
     """Check one scene under the configuration's selection of frames, models, taxonomy, voxel size and stride."""
-    models = list(selected(config.models, scene.models, scene.by_name, "model", scene.name))
+    models, begun = _whole(scene, config)
     indices = frame_indices(scene, config, models)
     first = models[0] if models else label_source(scene)
     inspection = Inspection(
@@ -239,11 +239,34 @@ def check_scene(scene: Scene, config: Config) -> SceneCheck:
         depth_from=scene.depth_from,
         placed=scene.placed,
         labels=tuple(_labels(scene, name, indices, config, inspection) for name in models),
-        notes=tuple(
-            notes(scene, [inspection.views[at] for at in sorted(inspection.views)], how, inspection.tally.model)
+        notes=(
+            *notes(scene, [inspection.views[at] for at in sorted(inspection.views)], how, inspection.tally.model),
+            *begun,
         ),
     )
     return checked if verdict.state == "unsound" else _with_coverage(checked, inspection, sample, config)
+
+
+def _whole(scene: Scene, config: Config) -> tuple[list[str], list[str]]:
+    """Return the models to check, and a note on each whose maps lack frames while another one has them all.
+
+    Models that the configuration names are all checked.
+    """
+    models = list(selected(config.models, scene.models, scene.by_name, "model", scene.name))
+    if config.models is not None or scene.skips_incomplete or len(models) < 2:
+        return models, []
+    indices = frame_indices(scene, config)
+    there = {name: sum(not scene.missing(index, [name]) for index in indices) for name in models}
+    whole = [name for name in models if there[name] == len(indices)]
+    if not whole:
+        return models, []
+    begun = [
+        f"labels of {name}: {there[name]} of {len(indices)} selected frames have a map, so they were not checked;"
+        " predict the others, or delete the folder"
+        for name in models
+        if name not in whole
+    ]
+    return whole, begun
 
 
 def quick_check(scene: Scene, indices: Sequence[int], options: Mapping[str, Any] | None = None) -> Verdict:

@@ -155,7 +155,7 @@ def conform(
 
 # The commands export and relabel: files for other programs.
 
-Run = Annotated[Path, typer.Argument(metavar="RUN", help="Folder of a finished run.")]
+Run = Annotated[Path, typer.Argument(metavar="RUN", help="Folder of a finished run, or FOLDER:MODEL.")]
 Scene = Annotated[str | None, typer.Option("--scene", "-s", help="Scene; needed where the run has several.")]
 Model = Annotated[str | None, typer.Option("--model", "-m", help="Label source; needed where there are several.")]
 Thresholds = Annotated[Path | None, typer.Option(

@@ -79,7 +79,7 @@ def run(
     """Fuse every selected model with every selected backend, measure and compare. This is the default command."""
     from datetime import datetime
 
-    from semstab.predict.predictor import parse_predictor
+    from semstab.predict.predictor import parse_predictors
     from semstab.settings import filtered_config, load_config, predicted_config
 
     named = {
@@ -95,7 +95,7 @@ def run(
         raise ConfigError("--classes names the classes of a model; choose the model with --predict")
     if predict:
         given = {} if classes is None else {"classes": classes}
-        loaded = predicted_config([parse_predictor(text, given, filters or []) for text in predict], config, content)
+        loaded = predicted_config(parse_predictors(predict, given, filters or []), config, content)
     else:
         loaded = filtered_config(filters, config, content) if filters else load_config(config, content)
     if device is not None:
@@ -155,11 +155,11 @@ def filters(
     --filter replaces the shipped filters; chains are written with a plus sign, ema-warped:0.6+threshold:0.5.
     """
     from semstab.filter_study import filter_study_config
-    from semstab.predict.predictor import parse_predictor
+    from semstab.predict.predictor import parse_predictors
 
     named: dict[str, Any] = {"scenes": scene, "voxel_size": voxel_size, "taxonomy": taxonomy}
     named["check_geometry"] = False if trust_geometry else None
-    models = [parse_predictor(text, {} if classes is None else {"classes": classes}) for text in predict or []]
+    models = parse_predictors(predict or [], {} if classes is None else {"classes": classes})
     content = chosen(named, settings, options, dataset, data, frames)
     config, left_out = filter_study_config(
         models, model or [], filter_ or [], content, cache=out.absolute() / "predictions"
@@ -318,27 +318,29 @@ def predict(
     quiet: opt.Quiet = False,
 ) -> None:  # fmt: skip
     """Run a segmentation model over images; `run` and `study` read the label maps. A second start resumes."""
+    from semstab.models import sides
     from semstab.predict import command
     from semstab.settings import load_config, resolve
 
-    size: int | list[int] | None = None
+    size: Any = None
     if image_size is not None:
-        sides = image_size.lower().split("x")
-        if len(sides) > 2 or not all(re.fullmatch(r"[0-9]{1,9}", side) for side in sides):
+        size = int(image_size) if re.fullmatch(r"[0-9]{1,9}", image_size) else sides(image_size)
+        if size == image_size:
             raise ConfigError(f"--image-size {image_size}: write the shorter side, for example 512, or HEIGHTxWIDTH")
-        size = int(sides[0]) if len(sides) == 1 else [int(side) for side in sides]
     named = {
         "checkpoint": checkpoint, "revision": revision, "device": device, "dtype": dtype, "threads": threads,
         "classes": classes, "image_size": size,
     }  # fmt: skip
-    content = chosen(named, settings, options, dataset, data, frames)
-    indices, group = content.pop("frames", {}), content.pop("dataset", None)
+    of_data = [setting for setting in settings or () if setting.startswith(("dataset.", "frames."))]
+    content = chosen({}, of_data, options, dataset, data, frames)
+    indices, group = content.get("frames", {}), content.get("dataset")
+    own = chosen(named, [setting for setting in settings or () if setting not in of_data], None)
     if group is not None and data is None and dataset is None:
         raise ConfigError("--option sets how a dataset is read; choose one with --data or --dataset")
     given = {"name": name, "taxonomy": taxonomy, "mapping": mapping, "scores": scores, "filters": filters}
     command.run(
         predictor={"model": model, **{key: value for key, value in given.items() if value is not None}},
-        options=content,
+        options=own,
         images=images,
         dataset=None if group is None else resolve(load_config(None, {"dataset": group})).dataset,
         scenes=None if scene == ["all"] else scene,

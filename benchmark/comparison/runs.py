@@ -32,7 +32,7 @@ from semstab.data.georeference import Georeference
 from semstab.data.records import ImageSpace, Record
 from semstab.data.results import UnitSummary
 from semstab.datasets import GROUND_TRUTH
-from semstab.engine.folder import load_result
+from semstab.engine.folder import load_result, run_and_model
 from semstab.errors import ConfigError, DataError, summarize_error
 from semstab.statistics.cluster_sums import ClusterSums
 
@@ -156,11 +156,8 @@ def open_run(named: str | os.PathLike[str]) -> RunHandle:
         ConfigError: If there is no such folder or label source, or several.
         DataError: If it is damaged.
     """
-    text = os.fspath(named)
-    start, _, wanted = text.rpartition(":")
-    if Path(text).exists() or not start:
-        start, wanted = text, ""
-    path = Path(start)
+    path, model_named = run_and_model(named)
+    wanted = model_named or ""
     if not path.exists():
         raise ConfigError(f"{path}: there is no such folder; give the folder of a run, or FOLDER:MODEL")
     if path.is_file():

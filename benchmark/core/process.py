@@ -21,6 +21,28 @@ if TYPE_CHECKING:
     from multiprocessing.connection import Connection
 
 
+_aside, _depth = threading.RLock(), 0
+
+
+@contextlib.contextmanager
+def printing_aside() -> Iterator[None]:
+    """Send what other people's code prints in the block to standard error, apart from the results.
+
+    One thread at a time is in such a block; it may be nested.
+    """
+    global _depth  # noqa: PLW0603 - sys.stdout is global as well
+    with _aside:
+        _depth += 1
+        stdout = sys.stdout
+        if _depth == 1:
+            sys.stdout = sys.stderr
+        try:
+            yield
+        finally:
+            _depth -= 1
+            sys.stdout = stdout
+
+
 PROC, CGROUPS = Path("/proc/self"), Path("/sys/fs/cgroup")
 
 V1_FILES = ("memory.limit_in_bytes", "memory.usage_in_bytes", ("total_inactive_file", "total_active_file"))

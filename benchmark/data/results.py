@@ -17,8 +17,9 @@ from semstab.data.statistics import MapStatistics
 SCHEMA = 4
 """Version of summary.json."""
 
-STAGES = ("decode", "wait", "flicker", "association", "update", "logging")
-"""The stages of a frame's time: decoding in a worker thread, parallel to the rest; waiting for it; flicker; the two
+STAGES = ("decode", "network", "wait", "flicker", "association", "update", "logging")
+"""The stages of a frame's time: decoding in a worker thread, parallel to the rest, with the part of it that a model
+took to predict; waiting for it; flicker; the two
 parts of fusion, where the backend measures them separately; notifying the observers."""
 
 LONGEST_NAME = 60

@@ -269,6 +269,25 @@ def unit_key(identity: str, digest: str) -> str:
     return identity + hashlib.blake2b(digest.encode(), digest_size=8).hexdigest()
 
 
+def run_and_model(named: str | os.PathLike[str]) -> tuple[Path, str | None]:
+    """Return the folder of a run, and the model of 'FOLDER:MODEL' where the text names no folder or file itself."""
+    text = os.fspath(named)
+    folder, _, model = text.rpartition(":")
+    return (Path(text), None) if Path(text).exists() or not folder else (Path(folder), model)
+
+
+def model_of(named: str | os.PathLike[str], model: str | None) -> tuple[Path, str | None]:
+    """Return the folder of a run, and the model that 'FOLDER:MODEL' or else `model` names.
+
+    Raises:
+        ConfigError: If both name one, and not the same.
+    """
+    folder, own = run_and_model(named)
+    if own is not None and model not in (None, own):
+        raise ConfigError(f"{folder}:{own}: --model {model} names another model; use one of the two")
+    return folder, model if own is None else own
+
+
 def load_result(folder: str | Path) -> Result:
     """Return the result of a finished run or study from its folder.
 

@@ -104,7 +104,10 @@ class Fusion:
         fetched = prefetch(self._decode, self.order, threads=self._threads, size=lambda each: each.nbytes)
         with contextlib.closing(fetched):
             for each in fetched:
-                self.watch.seconds["read"] += each.waited
+                in_network = min(each.waited, each.item.network) if each.item.network > 0 else 0.0
+                self.watch.seconds["read"] += each.waited - in_network
+                if in_network:
+                    self.watch.seconds["network"] += in_network
                 yield each
 
     def _decode(self, index: int) -> Decoded:
@@ -118,7 +121,7 @@ class Fusion:
             measures_quality = any(stream.quality is not None for stream in wanting)
             name = scene.filtering(model).model if measures_quality else model  # without filters
             unfiltered = None if name == model else scene.frame(index, name, color=False)
-            return Decoded(index, frame, truth, unfiltered)
+            return Decoded(index, frame, truth, unfiltered, network=scene.prediction_seconds(index, model))
         except Exception as error:  # noqa: BLE001 - raised again by `Stream.prepare`
             return Decoded(index, error=error)
 

@@ -161,13 +161,18 @@ _warm: set[tuple[str, str, int, bool]] = set()
 
 @dataclass(frozen=True, eq=False)
 class Decoded:
-    """A frame as its scene has it, its ground truth, the model's frame before filters; or the error of decoding it."""
+    """A frame as its scene has it, its ground truth, the model's frame before filters; or the error of decoding it.
+
+    Attributes:
+        network: Seconds that the model took to predict on it; NaN where labels are read.
+    """
 
     index: int
     frame: Frame | None = None
     truth: Frame | None = None
     model: Frame | None = None
     error: Exception | None = None
+    network: float = math.nan
 
     @property
     def nbytes(self) -> int:
@@ -243,7 +248,7 @@ class Stream:
         self._previous = frame if self._sequential else None
         cut = frame.scores_left_out
         left_out = (frame.left_out_pixels, *((math.nan, math.nan) if cut is None else (cut.mean, cut.most)))
-        seconds = now.fetched.seconds, now.fetched.waited, lap.seconds, math.nan
+        seconds = now.fetched.seconds, decoded.network, now.fetched.waited, lap.seconds, math.nan
         numbers = frame.timestamp, flicker, compensated, *seconds, *left_out
         return {live: FrameRow(report, *numbers) for live, report in reports.items()}
 

@@ -40,6 +40,7 @@ class FrameRow:
     flicker_percent: float
     compensated_flicker_percent: float = math.nan
     decode_seconds: float = math.nan
+    network_seconds: float = math.nan
     wait_seconds: float = math.nan
     flicker_seconds: float = math.nan
     logging_seconds: float = math.nan

@@ -10,7 +10,7 @@ from pathlib import Path
 
 from semstab.config import nearest
 from semstab.core.files import remove_abandoned
-from semstab.engine.folder import load_result, require_output
+from semstab.engine.folder import load_result, model_of, require_output
 from semstab.errors import ConfigError
 from semstab.exports import annotation_formats, clouds, maps
 from semstab.exports import join as joining
@@ -89,7 +89,7 @@ def export(
     """Write a unit of the run in a folder to files, in the format that each one's suffix names (`SUFFIXES`).
 
     Args:
-        run: Folder of the run.
+        run: Folder of the run, or FOLDER:MODEL.
         to: Files to write, one or several.
         scene: Scene of the unit; may be left out where there is one.
         model: Model of the unit; may be left out where there is one.
@@ -117,6 +117,7 @@ def export(
     Raises:
         ConfigError, DataError, MissingDependencyError: If a file cannot be written; the message names it.
     """
+    run, model = model_of(run, model)
     files = [Path(file) for file in ([to] if isinstance(to, str | Path) else to)]
     for file in files:
         require_output(file, (asprs, join or beside, thresholds or commit))
@@ -140,7 +141,7 @@ def export(
         )  # fmt: skip
 
     if task_format is not None:
-        task, _ = task_of(Path(run), record, result.manifest["inputs"])
+        task, _ = task_of(run, record, result.manifest["inputs"])
         tasks = annotation_tasks(chosen(("op",)), task, most)
         named = task.mapping.target, task.scene.name, task.model
         return [_tasks_written(TaskFile(tasks, *named, file), task_format, task) for file in files]

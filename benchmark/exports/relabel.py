@@ -23,7 +23,7 @@ from semstab.data.measures import dominant
 from semstab.data.records import Record
 from semstab.data.tiles import AT_HAND, TileIndex, Tiles
 from semstab.data.voxels import VoxelTable
-from semstab.engine.folder import SETTINGS, load_result
+from semstab.engine.folder import SETTINGS, load_result, model_of
 from semstab.engine.units import make_plan
 from semstab.errors import ConfigError, DataError
 from semstab.exports.join import NONE, VoxelLookup
@@ -294,7 +294,7 @@ def relabel(
     """Write the fused class of every pixel of every frame of a unit to OUT/labels/NAME.
 
     Args:
-        run: Folder of the run.
+        run: Folder of the run, or FOLDER:MODEL.
         out: Folder that gets labels/NAME.
         belief: The criteria of a voxel; other pixels are ignored, as are those without depth.
         scene: Scene of the unit; may be left out where there is one.
@@ -313,9 +313,10 @@ def relabel(
     """
     if name is not None and not names_a_folder(name):
         raise ConfigError(f"name {name!r}: {NO_FOLDER_NAME}")
+    run, model = model_of(run, model)
     result = load_result(run)
     record = result.record(scene=scene, model=model, backend=backend)
-    task, pixel_stride = task_of(Path(run), record, result.manifest["inputs"])
+    task, pixel_stride = task_of(run, record, result.manifest["inputs"])
     chosen, name = belief or Belief(), name or f"{record.unit.model}-fused"
     settings = {"unit": record.key, "backend": record.unit.backend, **chosen.settings()}
     space = task.mapping.target

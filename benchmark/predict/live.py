@@ -5,7 +5,9 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import json
+import math
 import threading
+import time
 from collections.abc import Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
@@ -160,6 +162,7 @@ class PredictedScene(Scene):
         self._digests: dict[int, bytes] = {}
         self._cache: dict[tuple[str, int], Prediction] = {}
         self._room = CACHE_BYTES
+        self._seconds: dict[tuple[str, int], float] = {}
         self._lock = dataset.lock
         self._in_order: dict[str, InOrder] = {}
         self._of_labels: dict[str, tuple[StoredSequence, Model]] = {}
@@ -197,6 +200,10 @@ class PredictedScene(Scene):
         predictor = self._fitted.get(model)
         took = predictor.seconds if isinstance(predictor, Filtered) else []
         return Filtering(next(same, model), "+".join(one.filters), 1e3 * float(np.median(took)) if took else 0.0)
+
+    def prediction_seconds(self, index: int, model: str) -> float:
+        """Return the seconds that a model took to predict on a frame since they were last asked for; else NaN."""
+        return math.nan if self._takes_stored(model) else self._seconds.pop((model, index), math.nan)
 
     @property
     def settings(self) -> Mapping[str, Any]:
@@ -294,13 +301,17 @@ class PredictedScene(Scene):
         """Return the model's prediction on a frame, with scores where they are wanted."""
         with self._lock:
             predictor = self._predictor(model)
-            if predictor.sequential:
-                return self._ordered(model, predictor).at(index)
             if (model, index) in self._cache:
                 return self._cache[model, index]
+            started = time.perf_counter()
+            if predictor.sequential:
+                prediction = self._ordered(model, predictor).at(index)
+                self._seconds[model, index] = time.perf_counter() - started
+                return prediction
             geometry = geometry_of(self._sequence(model), index, image, predictor)
             scores = self._dataset.predictors[model].scores
             (prediction,) = ask(predictor, [image], scores=scores, geometry=geometry)
+            self._seconds[model, index] = time.perf_counter() - started
             if (size := size_of(prediction)) <= self._room:
                 self._cache[model, index] = prediction
                 self._room -= size

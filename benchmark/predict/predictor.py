@@ -320,7 +320,7 @@ def parse_predictor(text: str, more: Mapping[str, Any] | None = None, filters: S
     Raises:
         ConfigError: For anything else.
     """
-    model, *settings = re.split(r",(?![^\[{]*[\]}])", text)  # not at the commas of a list
+    model, *settings = _parts(text)
     own: dict[str, Any] = {}
     options: dict[str, Any] = {**(more or {})}
     for setting in settings:
@@ -331,6 +331,69 @@ def parse_predictor(text: str, more: Mapping[str, Any] | None = None, filters: S
         group[key] = parse_yaml(value, f"--predict {text}")
     own["filters"] = [*own.get("filters", ()), *filters]
     return validated(PredictorConfig, {"model": model, "options": options, **own}, f"--predict {text}: ")
+
+
+def parse_predictors(
+    texts: Sequence[str], more: Mapping[str, Any] | None = None, filters: Sequence[str] = ()
+) -> list[PredictorConfig]:
+    """Parse several of them; those that would have one name are named after the settings in which they differ.
+
+    net.py:net,scale=2.0 and net.py:net,scale=0.5 are 'net scale=2.0' and 'net scale=0.5'.
+
+    Raises:
+        ConfigError: As `parse_predictor`, and where two are the same.
+    """
+    parsed = [parse_predictor(text, more, filters) for text in texts]
+    called: dict[str, list[int]] = {}
+    for position, one in enumerate(parsed):
+        called.setdefault(one.source_name, []).append(position)
+    for alike in (group for group in called.values() if len(group) > 1):
+        by_themselves = [position for position in alike if parsed[position].name is None]
+        for position, more_name in zip(by_themselves, _differences([texts[p] for p in by_themselves]), strict=True):
+            one = parsed[position]
+            name = " ".join([one.label_name, *more_name])
+            if not names_a_folder(name):
+                raise ConfigError(f"--predict {texts[position]}: has the name of another one; give it one: name=NAME")
+            parsed[position] = one.model_copy(update={"name": name})
+    names = [one.source_name for one in parsed]
+    for name, text in zip(names, texts, strict=True):
+        if names.count(name) > 1:
+            raise ConfigError(f"--predict {text}: two models are called '{name}'; give one a name: name=NAME")
+    return parsed
+
+
+def _differences(texts: Sequence[str]) -> list[list[str]]:
+    """Return of each text the settings that not all of them have, as KEY=VALUE; of different files also the file.
+
+    A path is given by its last part where these differ, and characters that file systems do not take become '-'.
+    """
+    split = [_parts(text) for text in texts]
+    files = [_stem(model) for model, *_ in split]
+    settings = [dict(part.partition("=")[::2] for part in parts[1:]) for parts in split]
+    keys = dict.fromkeys(key for each in settings for key in each if key != "name")
+    varied = [key for key in keys if len({each.get(key) for each in settings}) > 1]
+    shown = {key: _last_parts([each.get(key) for each in settings]) for key in varied}
+    return [
+        [*([file] if len(set(files)) > 1 else []), *(f"{key}={shown[key][k]}" for key in varied if key in each)]
+        for k, (file, each) in enumerate(zip(files, settings, strict=True))
+    ]
+
+
+def _parts(text: str) -> list[str]:
+    """Return what stands between commas, but for those of a list."""
+    return re.split(r",(?![^\[{]*[\]}])", text)
+
+
+def _stem(model: str) -> str:
+    return Path(model.rpartition(":")[0] or model).stem
+
+
+def _last_parts(values: Sequence[str | None]) -> list[str]:
+    """Return values as a folder's name may hold them, paths by their last part where these tell them apart."""
+    given = ["" if value is None else value for value in values]
+    last = [value.rstrip("/").rpartition("/")[2] for value in given]
+    chosen = last if len(set(last)) == len(set(given)) else given
+    return [re.sub(r'[/\\:*?"<>|\x00-\x1f]+', "-", re.sub(r"\s*,\s*", "x", value.strip("[]{}"))) for value in chosen]
 
 
 def _absolute(options: BaseModel) -> BaseModel:

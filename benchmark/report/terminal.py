@@ -197,7 +197,7 @@ def _several(result: Result, records: Sequence[Record]) -> Iterator[str]:
 
 def _laid_out(cells: Sequence[str]) -> str:
     first, *rest = cells
-    name = first if len(first) <= WIDTHS[0] else f"{first[: WIDTHS[0] - 3]}..."
+    name = first if len(first) <= WIDTHS[0] else f"{first[:4]}...{first[7 - WIDTHS[0] :]}"  # names differ at the end
     pairs = zip(rest, WIDTHS[1:], strict=False)
     return f"  {name:<{WIDTHS[0]}}" + "".join(f" {c:<{-w - 1}}" if w < 0 else f"{c:>{w}}" for c, w in pairs)
 
@@ -305,6 +305,8 @@ def _where(result: Result, out: Path | None, seconds: float | None) -> Iterator[
         here = result.manifest.get("units", {}).get("executor") == InProcess.name
         what = f"wall time by stage{'' if here else ', all workers'}"  # their sum may exceed the run's time
         yield f"  {seconds:.0f} s{f' ({what}: {parts})' if parts else ''}"
+    if speeds := _speeds(result):
+        yield from textwrap.wrap(f"predicted: {speeds}", WIDTH, initial_indent="  ", subsequent_indent="    ")
     if out is None:
         return
     if (out / "report.html").exists():
@@ -312,6 +314,16 @@ def _where(result: Result, out: Path | None, seconds: float | None) -> Iterator[
     if (out / "recording.rrd").exists():
         yield f"  viewer  semstab-bench view {out}"
     yield f"  more    semstab-bench show {out}"
+
+
+def _speeds(result: Result) -> str:
+    """Return the frames a second that each network predicts; '' where labels were read."""
+    took: dict[str, list[float]] = {}
+    for record in result.select():
+        milliseconds = record.summary.stages_ms.get("network", math.nan)
+        if milliseconds > 0:
+            took.setdefault(record.unit.model, []).append(milliseconds)
+    return ", ".join(f"{model} {1e3 / macro_mean(each):.3g} frames/s" for model, each in took.items())
 
 
 # --- While it works, and what failed ---------------------------------------------------------------------------------
