@@ -250,7 +250,8 @@ def maker(name: str) -> tuple[type[BaseModel], Callable[[Any], Model]]:
     Raises:
         ConfigError, DataError, MissingDependencyError: If it cannot be loaded.
     """
-    from semstab.models.custom import is_code, own_maker
+    from semstab.core.code import is_code
+    from semstab.models.custom import own_maker
     from semstab.models.network import NetworkFile, NetworkOptions, is_network
 
     if is_network(name):

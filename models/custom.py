@@ -2,172 +2,22 @@
 
 from __future__ import annotations
 
-import difflib
-import hashlib
-import importlib
-import importlib.util
-import inspect
-import re
-import sys
-import traceback
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from types import ModuleType
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 from pydantic import BaseModel, ConfigDict, Field
 
-from semstab.core.process import printing_aside
+from semstab.core.code import Code, guarded
 from semstab.data.frames import Frame
 from semstab.data.labels import IGNORE_8BIT, IGNORE_16BIT, LabelSpace
-from semstab.errors import ConfigError, DataError, MissingDependencyError, summarize_error
+from semstab.errors import ConfigError, DataError
 from semstab.models import Image, Labels, Model, Prediction, content_digest, narrowed
 from semstab.models.names import class_names
 from semstab.models.validation import Wrapped
-
-# Code that a user names: `FILE.py:NAME` or `package.module:NAME`, imported, and known by its content.
-
-T = TypeVar("T")
-
-MODULE = re.compile(r"[A-Za-z_]\w*(\.[A-Za-z_]\w*)*")
-
-
-@dataclass(frozen=True)
-class Code:
-    """A class or a function in a user's file or package.
-
-    Attributes:
-        text: The name as it was given.
-        name: Name of the class or the function.
-        target: The class or the function itself.
-        module: The module that holds it.
-    """
-
-    text: str
-    name: str
-    target: Callable[..., Any]
-    module: ModuleType
-
-    @classmethod
-    def load(cls, text: str) -> Code:
-        """Import it.
-
-        Raises:
-            ConfigError: If it is not there.
-            MissingDependencyError, DataError: If it fails.
-        """
-        source, _, name = text.rpartition(":")
-        in_file = source.endswith(".py")
-        if not name.isidentifier() or not (in_file or MODULE.fullmatch(source)):
-            raise ConfigError(f"model '{text}': write FILE.py:NAME or package.module:NAME, NAME a class or a function")
-        if not in_file:
-            _may_import_from(Path.cwd())
-        module = guarded(text, lambda: _of_file(Path(source)) if in_file else importlib.import_module(source))
-        target = getattr(module, name, None)
-        if target is None:
-            own = [key for key, value in vars(module).items() if callable(value) and not key.startswith("_")]
-            near = difflib.get_close_matches(name, own, n=1)
-            hint = f"did you mean '{near[0]}'?" if near else f"it has {', '.join(own) or 'nothing to call'}"
-            raise ConfigError(f"{source}: has no '{name}'; {hint}")
-        if not callable(target):
-            raise ConfigError(f"{text}: is a {type(target).__name__}; name a class, or a function of an image")
-        return cls(text, name, target, module)
-
-    @property
-    def digest(self) -> str:
-        """The hash of the file that holds it."""
-        file = self.module.__file__
-        return "" if file is None else content_digest(Path(file))
-
-    def accepts(self, options: dict[str, Any], *more: Any) -> None:
-        """Check the call with `more` and these options.
-
-        Raises:
-            ConfigError: If it cannot be called so.
-        """
-        try:
-            inspect.signature(self.target).bind(*more, **options)
-        except ValueError:  # compiled code has no signature
-            return
-        except TypeError as error:
-            raise ConfigError(
-                f"{self.text}: {error}; options are KEY=VALUE after its name, or --set KEY=VALUE"
-            ) from error
-
-
-def is_code(name: str) -> bool:
-    """Return whether a model's name is the path of code, and not one of a registry."""
-    return ":" in name or name.endswith(".py")
-
-
-def absolute(name: str) -> str:
-    """Return the name of code, its file's from the root of the file system."""
-    source, _, what = name.rpartition(":")
-    return f"{Path(source).expanduser().absolute()}:{what}" if source.endswith(".py") else name
-
-
-def guarded(text: str, do: Callable[[], T]) -> T:
-    """Run a user's code, and turn an error in it into one line with the position where it was raised."""
-    try:
-        with printing_aside():
-            return do()
-    except (ConfigError, DataError, MissingDependencyError):
-        raise
-    except ImportError as error:
-        package = f"; install {error.name.partition('.')[0]}" if error.name else ""
-        raise MissingDependencyError(
-            f"{text}: it imports a missing module ({summarize_error(error)}){package}"
-        ) from error
-    except (Exception, SystemExit) as error:
-        last = _users_own(text, traceback.extract_tb(error.__traceback__))
-        at = f"{Path(last.filename).name}:{last.lineno}"
-        if isinstance(error, SyntaxError):
-            at = f"{Path(error.filename or '').name}:{error.lineno}"
-        raise DataError(f"{text}: {type(error).__name__} at {at}: {summarize_error(error)}") from error
-
-
-def _users_own(text: str, stack: Sequence[traceback.FrameSummary]) -> traceback.FrameSummary:
-    """Return the innermost line that lies in the folder of the user's code, where there is one: torch's are not his."""
-    source = text.rpartition(":")[0]
-    file = source if source.endswith(".py") else getattr(sys.modules.get(source), "__file__", None)
-    folder = None if file is None else Path(file).expanduser().resolve().parent
-    for frame in reversed(stack):
-        path = Path(frame.filename).resolve()
-        if folder is not None and folder in path.parents and "site-packages" not in path.relative_to(folder).parts:
-            return frame
-    return stack[-1]
-
-
-def _of_file(path: Path) -> ModuleType:
-    path = path.expanduser()
-    if not path.is_file():
-        raise ConfigError(f"{path}: there is no such file")
-    content = hashlib.blake2b(str(path.resolve()).encode() + path.read_bytes(), digest_size=6).hexdigest()
-    name = f"{path.stem}_{content}"  # a module of its own and of this version, whatever other files are called
-    if name in sys.modules:
-        return sys.modules[name]
-    spec = importlib.util.spec_from_file_location(name, path.resolve())
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    _may_import_from(path.resolve().parent)
-    sys.modules[name] = module
-    try:
-        spec.loader.exec_module(module)
-    except BaseException:
-        del sys.modules[name]
-        raise
-    return module
-
-
-def _may_import_from(folder: Path) -> None:
-    """Append the folder to the search path, where nothing in it replaces an installed package."""
-    if str(folder) not in sys.path:
-        sys.path.append(str(folder))
 
 
 class OwnOptions(BaseModel):
@@ -185,7 +35,7 @@ def own_maker(text: str) -> tuple[type[BaseModel], Callable[[Any], Model]]:
 
     Both raise ConfigError, DataError, MissingDependencyError, each in one line.
     """
-    code = Code.load(text)
+    code = Code.load(text, "model")
     cls: Any = code.target
     if not (isinstance(cls, type) and Model in cls.__mro__):
         return OwnOptions, lambda options: OwnModel(code, dict(options.model_extra or {}), options.classes)

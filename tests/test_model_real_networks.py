@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 import torch
 
+from semstab.core.code import Code
 from semstab.datasets import open_dataset
 from semstab.models import create
-from semstab.models.custom import Code
 
 DATA = Path(os.environ.get("SEMSTAB_DATA", Path(__file__).parents[1] / "../shared/data"))
 NETWORKS = Path(os.environ.get("SEMSTAB_NETWORKS", Path(__file__).parents[1] / "../shared/networks"))

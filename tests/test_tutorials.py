@@ -27,7 +27,15 @@ def make_project(folder: Path) -> None:
     shutil.rmtree(folder / "project/labels")
 
 
+def save_backend(folder: Path) -> None:
+    """The file that the reader saves."""
+    code = python_blocks("tutorials/own-backend.md")[0]
+    assert len(code.splitlines()) < 60
+    (folder / "fusion.py").write_text(code, encoding="utf-8")
+
+
 @pytest.mark.parametrize(("name", "prepare", "left"), [
+    ("own-backend", save_backend, ["mine/report.html", "both/report.html"]),
     ("own-sequence", make_nothing, ["runs/first/report.html", "runs/first/tables/classes.csv"]),
     ("two-models", make_nothing, ["both/report.html", "versus/report.html", "versus/comparison.json"]),
     ("drone-flight", make_project, ["map/report.html", "map.ply", "map.tif"]),

@@ -28,7 +28,8 @@ DISAGREE = 3
 
 def run(
     backend: Annotated[list[str] | None, typer.Option(
-        "--backend", "-b", help="Fusion backend; repeatable.", show_default="numba", autocompletion=opt.backends,
+        "--backend", "-b", help="Fusion backend: a name of `list`, FILE.py:NAME; repeatable.", show_default="numba",
+        autocompletion=opt.backends,
     )] = None,
     config: opt.ConfigFile = None,
     data: opt.DataFolder = None,

@@ -23,6 +23,8 @@ from semstab.config.settings import (
     read_yaml,
     validated,
 )
+from semstab.core.code import absolute, is_code
+from semstab.core.registry import name_code
 from semstab.core.types import THIS_SCENE
 from semstab.errors import ConfigError, nearest
 
@@ -51,9 +53,27 @@ class DatasetConfig(Settings):
 class BackendConfig(Part):
     """The settings that name a fusion backend: its options, where it fuses, whether it must agree with the others."""
 
-    name: str = Field(description="a name from `semstab-bench list`")
+    name: str = Field(description="a name from `semstab-bench list`, or that of a class of one's own")
+    code: str | None = Field(None, description="that class, as FILE.py:NAME or package.module:NAME")
     options: dict[str, Any] = Field(default_factory=dict, description="options of that backend")
     check: bool | None = Field(None, description="whether it must agree; by default where it associates by pixel")
+
+    @classmethod
+    def of(cls, text: str) -> Self:
+        """Return the backend of a name, or of FILE.py:NAME."""
+        if not is_code(text):
+            return cls(name=text)
+        return cls(name=text.rpartition(":")[2].removesuffix(".py"), code=absolute(text))
+
+    def model_post_init(self, _: Any) -> None:
+        """Let the registry know the class behind the name."""
+        if self.code is not None:
+            name_code("backend", self.name, self.code)
+
+    def __setstate__(self, state: dict[Any, Any]) -> None:
+        """Let the registry of another process know it, too."""
+        super().__setstate__(state)
+        self.model_post_init(None)
 
 
 class Perturbation(Settings):
@@ -166,9 +186,10 @@ class Config(Settings):
     @field_validator("backends", mode="before")
     @classmethod
     def _names_are_backends(cls, value: Any) -> Any:
-        if not isinstance(value, list | tuple):
-            return value if not isinstance(value, str) else [{"name": value}]
-        return [{"name": item} if isinstance(item, str) else item for item in value]
+        listed = [value] if isinstance(value, str) else value
+        if not isinstance(listed, list | tuple):
+            return value
+        return [BackendConfig.of(item) if isinstance(item, str) else item for item in listed]
 
     @field_validator("backends")
     @classmethod
@@ -225,9 +246,9 @@ class Config(Settings):
 
     def fused_by(self) -> list[BackendConfig]:
         """Return the backends that fuse the base units: those named, and the one they are checked against."""
-        if self.check in (None, SAMPLE, *(backend.name for backend in self.backends)):
+        if self.check is None or self.check in (SAMPLE, *(backend.name for backend in self.backends)):
             return [*self.backends]
-        return [*self.backends, BackendConfig(name=self.check)]
+        return [*self.backends, BackendConfig.of(self.check)]
 
     def only(self, parts: Sequence[str]) -> Config:
         """Return the base units and these parts alone: sweeps, 'shared_taxonomy', 'backends'.

@@ -14,10 +14,20 @@ from dataclasses import dataclass
 from importlib.metadata import entry_points
 from typing import Any
 
+from semstab.core.code import Code
 from semstab.errors import ConfigError, MissingDependencyError, nearest, summarize_error
 
 EARLIER: Mapping[str, str] = {"model": "backbone"}
 """Kinds, and their names in version 0.3: entry points of the old group work for one version."""
+
+
+_code: dict[tuple[str, str], str] = {}
+"""Code of users by kind and name; see `semstab.core.code`."""
+
+
+def name_code(kind: str, name: str, text: str) -> None:
+    """Give a class of a user's file or package a name that registries of that kind know in this process."""
+    _code[kind, name] = text
 
 
 @dataclass(frozen=True)
@@ -81,10 +91,14 @@ class Registry:
         """Import the class behind a name.
 
         Raises:
-            ConfigError: If the name is not known.
+            ConfigError: If the name is not known, or is that of a user's code and of a built-in class.
             MissingDependencyError: If its packages are not installed, or fail when they are imported, as those of
                 versions that do not fit each other do.
         """
+        if (text := _code.get((self.kind, name))) is not None:
+            if name in self.builtin:
+                raise ConfigError(f"{text}: a built-in {self.kind} is called '{name}'; give the class another name")
+            return Code.load(text, self.kind).target
         entry = self.entry(name)
         module, _, attribute = entry.target.partition(":")
         try:

@@ -25,6 +25,7 @@ from semstab.config import (
     Perturbation,
     Sweeps,
 )
+from semstab.core.code import Code
 from semstab.data.labels import LabelSpace
 from semstab.data.measures import measures
 from semstab.data.records import REGIONS, Variation
@@ -247,7 +248,7 @@ def _changed_settings(config: Config, variation: Variation, value: Any, base: Co
     sweep = variation.sweep
     if sweep == BACKENDS:  # its map is compared with the base one, whose statistics are enough where they are full
         logged = next((backend.name for backend in config.fused_by() if keeps_log(backend.name)), None)
-        backend = BackendConfig(name=value.name, options=value.options)
+        backend = BackendConfig(name=value.name, code=value.code, options=value.options)
         return {"backends": [backend], "statistics": config.statistics and value.name == logged}
     if sweep == "frame_count":
         return {"frames": _evenly_sampled(int(value), base)}
@@ -284,6 +285,7 @@ def identity(config: Config, task: Task) -> str:
     content = {
         "unit": dataclasses.asdict(task.units[0]),
         "options": config.backends[0].options,
+        **({} if config.backends[0].code is None else {"code": Code.load(config.backends[0].code, "backend").digest}),
         "frames": [*task.indices],
         "taxonomy": [mapping.target.name, mapping.target.classes, mapping.source.ids, mapping.rows],
     }

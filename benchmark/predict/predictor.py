@@ -14,6 +14,7 @@ import numpy as np
 from pydantic import BaseModel, Field, field_validator, model_validator
 
 from semstab.config import Settings, validated
+from semstab.core.code import absolute
 from semstab.core.files import content_key, parse_yaml, read_arrays, write_arrays
 from semstab.data.frames import Frame
 from semstab.data.labels import LabelSpace, ignore_id
@@ -21,7 +22,7 @@ from semstab.datasets import Scene
 from semstab.datasets.geometry.lenses import Scores, require_same_view
 from semstab.errors import ConfigError
 from semstab.models import Image, Labels, Model, Prediction, ask, create, image_digest, narrowed, options_model
-from semstab.models.custom import absolute, is_path
+from semstab.models.custom import is_path
 from semstab.models.names import InTaxonomy
 from semstab.models.network import is_network
 from semstab.models.validation import Checked, Wrapped

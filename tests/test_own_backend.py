@@ -1,0 +1,79 @@
+"""A backend that a user names by its file."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+import tiny_scene
+from command_line import bench
+
+from semstab import backends
+from semstab.engine import load_result
+from semstab.errors import ConfigError
+from semstab.settings import load_config
+
+ALIKE = """
+from semstab.backends.numpy_reference import NumpyReference
+
+class Mine(NumpyReference):
+    pass
+"""
+
+
+@pytest.fixture
+def folder(tmp_path) -> Path:
+    tiny_scene.write(tmp_path / "wall", models=("a",))
+    (tmp_path / "fusion.py").write_text(ALIKE, encoding="utf-8")
+    return tmp_path
+
+
+def run(folder: Path, *words: str, code: int = 0):
+    common = ["--data", "wall", "--voxel-size", "0.25", "--rerun", "off", "--report", "off", "--out", "out"]
+    return bench(*common, *words, cwd=folder, code=code)
+
+
+def test_it_is_called_by_the_name_of_its_class_and_checked(folder) -> None:
+    said = run(folder, "--backend", "fusion.py:Mine", "--check", "numpy").stdout
+    assert "checked Mine against numpy on 60 voxels: equal" in said
+    assert load_result(folder / "out").backend == "Mine"
+
+
+def test_other_processes_know_it(folder) -> None:
+    run(folder, "--backend", "fusion.py:Mine", "--jobs", "2")
+    assert load_result(folder / "out").backend == "Mine"
+
+
+def test_settings_of_a_run_name_its_file(folder) -> None:
+    run(folder, "--backend", "fusion.py:Mine")
+    (backend,) = load_config(folder / "out/config.yaml").backends
+    assert (backend.name, backend.code) == ("Mine", f"{folder / 'fusion.py'}:Mine")
+
+
+def test_a_changed_file_computes_its_units_again(folder) -> None:
+    run(folder, "--backend", "fusion.py:Mine", "--check", "numpy")
+    wrong = ALIKE.replace(
+        "pass", "keeps_log = True\n    def table(self):\n        return super().table().rows(slice(1, None))"
+    )
+    (folder / "fusion.py").write_text(wrong, encoding="utf-8")
+    said = run(folder, "--backend", "fusion.py:Mine", "--check", "numpy", code=3)
+    assert "the backends disagree" in said.stderr
+
+
+@pytest.mark.parametrize(("text", "line"), [
+    ("fusion.py:Others", "has no 'Others'"),
+    ("nowhere.py:Mine", "there is no such file"),
+    ("fusion.py:", "write FILE.py:NAME"),
+])  # fmt: skip
+def test_a_name_that_is_not_there_is_one_line(folder, text, line) -> None:
+    said = run(folder, "--backend", text, code=2).stderr
+    assert line in said
+    assert len(said.strip().splitlines()) == 1
+
+
+def test_a_name_of_a_built_in_backend_is_refused(tmp_path, monkeypatch) -> None:
+    (tmp_path / "fusion.py").write_text(ALIKE.replace("Mine", "numba"), encoding="utf-8")
+    monkeypatch.setattr("semstab.core.registry._code", {})
+    load_config(overrides={"backends": f"{tmp_path / 'fusion.py'}:numba"})
+    with pytest.raises(ConfigError, match="a built-in backend is called 'numba'"):
+        backends.create("numba", voxel_size=1.0, num_classes=2)
