@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from semstab.datasets.geometry.cameras import at_times, from_quaternions
-from semstab.datasets.tum import mutual_nearest
+from semstab.datasets.geometry.cameras import mutual_nearest
 from semstab.errors import DataError
 
 TUM = FORMATS["tum"]
