@@ -35,10 +35,13 @@ class Ros:
     """Messages of ROS 1 or ROS 2."""
 
     def __init__(self, container: str) -> None:
-        from rosbags.typesys import Stores, get_typestore
+        from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
         self.first = container == "ROS 1"
         self.store = get_typestore(Stores.ROS1_NOETIC if self.first else Stores.LATEST)
+        if self.first:
+            definition = "geometry_msgs/TransformStamped[] transforms"
+            self.store.register(get_types_from_msg(definition, "tf2_msgs/msg/TFMessage"))
         self.types = self.store.types
 
     def stamp(self, ns: int) -> Any:
@@ -62,7 +65,7 @@ class Ros:
             header=self.header(ns, frame), format=format_, data=np.frombuffer(data, np.uint8)
         )
 
-    def info(self, ns: int, frame: Frame, D=(0.0,) * 5, model="plumb_bob", size=None, P=None, roi=None) -> Any:  # noqa: N803
+    def info(self, ns: int, frame: Frame, D=(0.0,) * 5, model="plumb_bob", size=None, P=None, roi=None) -> Any:
         K = frame.intrinsics.matrix
         W, H = size or (frame.shape[1], frame.shape[0])
         named = {"D": np.array(D, float), "K": K.ravel(), "R": np.eye(3).ravel()}

@@ -60,7 +60,7 @@ SETTINGS, LABELS, CHECKS, MACHINE = "Settings", "Labels", "Checks", "Machine"
 # fmt: off
 ConfigFile = Annotated[Path | None, typer.Option("--config", "-c", help="YAML file with settings.",
     rich_help_panel=SETTINGS)]
-DataFolder = Annotated[Path | None, typer.Option(help="Folder of scenes, one scene, or a bag; its format is recognised.")]
+DataFolder = Annotated[Path | None, typer.Option(help="Folder of scenes, a scene, or a bag; its format is recognised.")]
 DatasetOptions = Annotated[list[str] | None, typer.Option(
     "--option", metavar="KEY=VALUE", help="Option of the dataset, short for --set dataset.options.KEY=VALUE.",
     rich_help_panel=SETTINGS)]

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import itertools
 import os
+import re
 import threading
 import weakref
 from collections.abc import Iterator, Mapping, Sequence
@@ -30,6 +31,12 @@ REPAIR = {
 }
 SAME_TYPE = {"tf/msg/tfMessage": "tf2_msgs/msg/TFMessage"}
 """Types of messages that have the bytes of another one."""
+
+QUOTED = re.compile(r"\w*(?:Error)?\(('[^']*'),?\)")
+"""An exception, or its arguments, in a message: KeyError('version')."""
+
+TF_MESSAGE = "geometry_msgs/TransformStamped[] transforms"
+"""The definition of tf2_msgs/TFMessage, which rosbags does not have for ROS 1."""
 
 NANOSECONDS = 10**9
 MOST_LISTED = 12
@@ -84,11 +91,13 @@ class OpenBag:
         try:
             from rosbags.rosbag1 import Reader as Reader1
             from rosbags.rosbag2 import Reader as Reader2
-            from rosbags.typesys import Stores, get_typestore
+            from rosbags.typesys import Stores, get_types_from_msg, get_typestore
         except ImportError as error:
             raise MissingDependencyError(f"{path}: bags need rosbags ({summarize_error(error)}); {INSTALL}") from error
         with self._one_line():
             store: Any = get_typestore(Stores.ROS1_NOETIC if first else Stores.LATEST)
+            if first:
+                store.register(get_types_from_msg(TF_MESSAGE, "tf2_msgs/msg/TFMessage"))
             self._reader: Any = Reader1(path) if first else Reader2(path)
             self._reader.open()
             weakref.finalize(self, self._reader.close)
@@ -96,10 +105,10 @@ class OpenBag:
             self._connections: dict[str, list[Any]] = {}
             for connection in self._reader.connections:
                 self._connections.setdefault(connection.topic, []).append(connection)
-        self.topics: Mapping[str, Topic] = {
-            name: Topic(name, same[0].msgtype.replace("/msg/", "/"), sum(each.msgcount for each in same))
-            for name, same in self._connections.items()
-        }
+            self.topics: Mapping[str, Topic] = {
+                name: Topic(name, same[0].msgtype.replace("/msg/", "/"), sum(int(each.msgcount) for each in same))
+                for name, same in self._connections.items()
+            }
 
     def of_types(self, *types: str) -> list[str]:
         """Return the topics of messages of these types that have any message, by name."""
@@ -164,12 +173,15 @@ class OpenBag:
         """Turn what rosbags raises for a damaged bag into DataError."""
         try:
             yield
-        except (DataError, MemoryError):
+        except DataError:
             raise
         except Exception as error:
             where = f"{self.path}{f', {what}' if what else ''}"
+            why = QUOTED.sub(r"\1", summarize_error(error)).rstrip(".")
+            if isinstance(error, MemoryError):
+                why = "a length in it is damaged, or the memory does not suffice for a chunk"
             suffix = next((end for end in SUFFIXES if end == self.path.suffix.lower()), ".db3")
-            raise DataError(f"{where}: not a whole bag ({summarize_error(error)}); {REPAIR[suffix]}") from error
+            raise DataError(f"{where}: not a whole bag ({why}); {REPAIR[suffix]}") from error
 
 
 def seconds(time: int) -> str:
