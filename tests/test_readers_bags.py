@@ -529,7 +529,7 @@ def test_a_bag_and_a_file_that_is_none_are_named_on_the_command_line(tmp_path, f
     assert f"depth    {DEPTH} (16UC1), camera {DEPTH_INFO}" in " ".join(out.stdout.split()).replace(
         "depth /", "depth    /"
     )
-    assert error_of("gone.bag", cwd=tmp_path).endswith("gone.bag: there is no such file or folder")
+    assert error_of("gone.bag", cwd=tmp_path).endswith("gone.bag: there is no such file")
     (tmp_path / "note.txt").write_text("no bag")
     assert "note.txt: a file, but no bag (.bag, .mcap, .db3)" in error_of("check", "note.txt", cwd=tmp_path)
 

@@ -39,6 +39,6 @@ def test_a_path_alone_is_checked_and_run(tmp_path):
     result = bench("check", tmp_path / "rgbd", *CAMERA, cwd=tmp_path)
     assert "read as tum (depth.txt, groundtruth.txt and rgb.txt; 1 scene)" in result.stderr
     assert "rgbd    " in result.stdout
-    assert error_of(tmp_path / "nothing", cwd=tmp_path).endswith("nothing: there is no such file or folder")
+    assert error_of(tmp_path / "nothing", cwd=tmp_path).endswith("nothing: there is no such folder")
     result = bench(tmp_path / "rgbd", *CAMERA, "--out", tmp_path / "run", cwd=tmp_path, code=2)
     assert "labels" in result.stderr  # there are none

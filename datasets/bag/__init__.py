@@ -130,8 +130,8 @@ class Recorded:
         self.sources: list[str] = []
         if chosen.color is not None and chosen.color.frame != seen.frame:
             logger.warning(
-                "%s: depth is of the frame '%s', colour of '%s': labels are looked up as if both saw from one point; set"
-                " depth to a topic that is registered to colour",
+                "%s: depth is of the frame '%s', colour of '%s': labels are looked up as if both saw from one point;"
+                " set depth to a topic that is registered to colour",
                 content.bag.path, seen.frame, chosen.color.frame,
             )  # fmt: skip
         at, to = self._pairs()
