@@ -55,6 +55,12 @@ REGISTRY = Registry(
         ),
         "colmap": Entry("semstab.datasets.colmap:Colmap", "COLMAP models, text or binary, with depth maps"),
         "odm": Entry("semstab.datasets.odm:Odm", "projects of OpenDroneMap and OpenSfM, depth from their mesh or DSM"),
+        "bag": Entry(
+            "semstab.datasets.bag:Bag",
+            "ROS 1 and ROS 2 bags with colour, depth, camera info and poses",
+            "pip install 'semstab[bags]'",
+            ("rosbags",),
+        ),
         "tartanair": Entry("semstab.datasets.tartanair:TartanAir", "TartanAir: simulated flights, NED poses"),
         "hololens": Entry("semstab.datasets.hololens:HoloLens", "DeepVideoMVS and HoloLens: poses.txt and K.txt"),
     },
@@ -92,18 +98,24 @@ def open_dataset(name: str, options: dict[str, Any] | BaseModel) -> Dataset:
 
 RECOGNISED = (
     "odm", "hololens", "tum", "seven_scenes", "replica", "scannet", "tartanair", "transforms_json", "colmap",
-    "posed_folder",
+    "bag", "posed_folder",
 )  # fmt: skip
 """Formats that a folder is recognised as: the one whose scenes lie highest, of these the first."""
 
 
+FILES = (".bag", ".mcap", ".db3")
+"""Suffixes of files that are a scene each."""
+
+
 def recognise(root: Path) -> tuple[str, str]:
-    """Return the dataset that a folder of scenes belongs to, and the reason in words.
+    """Return the dataset that a folder of scenes, or a file, belongs to, and the reason in words.
 
     Raises:
         DataError: If it is none; of an empty folder it is a `posed_folder`, whose reader says what is missing, with the
             nearest formats, and the files that these miss.
     """
+    if root.is_file() and root.suffix.lower() not in FILES:
+        raise DataError(f"{root}: a file, but no bag ({', '.join(FILES)}); give the folder of a scene, or above scenes")
     near, fits = list[tuple[float, str]](), list[tuple[int, int, str, str]]()
     for rank, name in enumerate(RECOGNISED):
         cls: Any = REGISTRY.load(name)

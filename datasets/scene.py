@@ -63,6 +63,7 @@ class Scene(ABC):
         labels_like_depth: Whether its label maps have the pixels of the depth, not those of the colour images.
         surface: The file of the surface that depth is cast at, or None where it is not cast.
         depth_from: Source of depth, in words, where that is not a file a frame.
+        sources: Where its parts come from, in words, a line each, where that was found and could be another.
         on_photographs: Whether `image` is a distorted photograph, which `color` shows undistorted.
         skips_incomplete: Whether selected frames without a file are left out; else they are an error.
     """
@@ -81,6 +82,7 @@ class Scene(ABC):
     labels_like_depth: bool = True
     surface: Path | None = None
     depth_from: str | None = None
+    sources: tuple[str, ...] = ()
     on_photographs: bool = False
     skips_incomplete: bool = False
 

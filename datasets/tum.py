@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
-import numpy.typing as npt
 from pydantic import BaseModel, Field
 
 from semstab.core.types import Float64
@@ -18,7 +17,7 @@ from semstab.datasets.files import options as opt
 from semstab.datasets.files.options import FileOptions, FrameSource, inside
 from semstab.datasets.files.reader import FileDataset
 from semstab.datasets.formats.disk import read_table, records, to_number
-from semstab.datasets.geometry.cameras import at_times, camera_of, from_quaternions, nearest
+from semstab.datasets.geometry.cameras import at_times, camera_of, from_quaternions, mutual_nearest
 from semstab.errors import DataError
 
 logger = logging.getLogger("semstab")
@@ -120,13 +119,6 @@ class Tum(FileDataset[TumOptions]):
         stamps = np.array(times, dtype=np.float64)
         _require_ascending(path, stamps)
         return stamps, paths
-
-
-def mutual_nearest(times: Float64, others: Float64, max_difference: float) -> npt.NDArray[np.intp]:
-    """Return for each ascending time the index of the other one where each is the other's nearest; -1 for none."""
-    to_other, back = nearest(times, others), nearest(others, times)
-    mutual = (back[to_other] == np.arange(len(times))) & (np.abs(others[to_other] - times) <= max_difference)
-    return np.where(mutual, to_other, -1)
 
 
 def _require_ascending(path: Path, times: Float64) -> None:

@@ -63,6 +63,14 @@ assert len(cloud.points) > 1000, len(cloud.points)
 assert cloud.header.parse_crs().to_epsg() == raster.crs.to_epsg() == 32615
 """
 
+FLIGHT = """
+import sys
+from pathlib import Path
+sys.path.insert(0, {tests!r})
+import bag_writer, dataset_writers
+bag_writer.write_bag(Path("flight"), "ROS 1", lambda ros: bag_writer.records(ros, dataset_writers.source(1000)))
+"""
+
 CLUSTER = """
 import subprocess, sys
 if __name__ == "__main__":
@@ -159,6 +167,12 @@ USES = {
         ),
         "map.tif",
         proof=GEO,
+    ),
+    "bags": Use(
+        "`check flight.bag`, four frames",
+        (("-m", "semstab", "check", "flight.bag"),),
+        "/camera/aligned_depth_to_color/image_raw",
+        prepare=FLIGHT.format(tests=str(fresh.SOURCE / "tests")),
     ),
     "pandas": Use(
         "`semstab.load(RUN).summary`",

@@ -9,6 +9,7 @@ import struct
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
+import bag_writer as bags
 import cv2
 import numpy as np
 from posed_writer import write_posed
@@ -314,6 +315,12 @@ def write_reconstruction(folder: Path, parts: Sequence[tuple[dict[str, dict], di
     return path
 
 
+def write_rosbag2(folder: Path, frames: Sequence[Frame], container: str = "sqlite3") -> list[str]:
+    """A rosbag2, depth and colour as raw images, poses on /tf; the folder may be there."""
+    bags.write_bag(folder, container, lambda ros: bags.records(ros, frames))
+    return bags.names_of(len(frames))
+
+
 Writer = Callable[[Path, Sequence[Frame]], list[str]]
 
 
@@ -346,6 +353,8 @@ FORMATS = {
     "colmap, text": Format("colmap", write_colmap, None),
     "colmap, binary": Format("colmap", functools.partial(write_colmap, binary=True, model="sparse/0"), None),
     "odm": Format("odm", write_odm, None),
+    "bag, sqlite3": Format("bag", write_rosbag2, 1000),
+    "bag, MCAP": Format("bag", functools.partial(write_rosbag2, container="MCAP"), 1000),
     "tartanair": Format("tartanair", write_tartanair, None, {"intrinsics": camera_option}),
 }
 

@@ -10,8 +10,7 @@ from dataset_writers import FORMATS, numbers, opened, source, write_labels, writ
 from hypothesis import given
 from hypothesis import strategies as st
 
-from semstab.datasets.geometry.cameras import at_times, from_quaternions
-from semstab.datasets.tum import mutual_nearest
+from semstab.datasets.geometry.cameras import at_times, from_quaternions, mutual_nearest
 from semstab.errors import DataError
 
 TUM = FORMATS["tum"]

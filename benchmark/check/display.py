@@ -34,6 +34,8 @@ def print_check(checked: SceneCheck, console: Console, *, verbose: bool = False)
     say(f"  {state.upper()}  {_conclusion(checked)}", 4, STATES[state])
     if checked.placed is not None:
         say(f"  place    {checked.placed}", 11)
+    for source in checked.sources:
+        say(f"  {source}", 11)
     for note in checked.notes:
         say(f"  note: {note}", 4, "yellow")
     tables = _tables(checked)

@@ -170,6 +170,7 @@ class SceneCheck:
 
     `notes` name what looks wrong, but may be right: values that mean 'no depth', labels that are not registered.
     `depth_from` names the source of depth, where no file holds it;
+    `sources` say where its parts come from, where that was found, a line each;
     `placed` says where its georeference comes from and how well it fits.
     If the geometry is unsound, overlap, noise and voxels are not measured.
     """
@@ -191,6 +192,7 @@ class SceneCheck:
     notes: tuple[str, ...] = ()
     depth_from: str | None = None
     placed: str | None = None
+    sources: tuple[str, ...] = ()
 
     @property
     def problems(self) -> tuple[str, ...]:
@@ -238,6 +240,7 @@ def check_scene(scene: Scene, config: Config) -> SceneCheck:
         verdict=verdict,
         depth_from=scene.depth_from,
         placed=scene.placed,
+        sources=scene.sources,
         labels=tuple(_labels(scene, name, indices, config, inspection) for name in models),
         notes=(
             *notes(scene, [inspection.views[at] for at in sorted(inspection.views)], how, inspection.tally.model),

@@ -91,7 +91,7 @@ class Command(TyperCommand):
 
 
 OF_PATHS = ("run", "check", "predict")
-"""The commands whose first word may be a folder, as with --data."""
+"""The commands whose first word may be a path, as with --data."""
 
 EARLIER = {
     "commit": "calibrate", "remedies": "filters", "--commit": "--thresholds", "--onto": "--classify",
@@ -116,6 +116,11 @@ def _of_today(args: list[str]) -> list[str]:
     return named
 
 
+def _is_path(word: str) -> bool:
+    """Return whether a word that is no command is meant as a path: of a file or folder, or with a suffix."""
+    return os.sep in word or bool(Path(word).suffix) or Path(word).exists()
+
+
 class Group(TyperGroup):
     """Runs `run` where no command is named, shows its options in the help, and reports every error in one line."""
 
@@ -128,7 +133,7 @@ class Group(TyperGroup):
         own = {"--help", "-h", "--version", "--install-completion", "--show-completion"}
         if not args or (args[0].startswith("-") and args[0] not in own):
             args = ["run", *args]
-        if args[0] not in self.commands and args[0] not in own and (os.sep in args[0] or Path(args[0]).is_dir()):
+        if args[0] not in self.commands and args[0] not in own and _is_path(args[0]):
             args = ["run", "--data", *args]
         if args[0] in OF_PATHS and len(args) > 1 and not args[1].startswith("-"):
             args = [args[0], "--data", *args[1:]]

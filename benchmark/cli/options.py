@@ -60,7 +60,7 @@ SETTINGS, LABELS, CHECKS, MACHINE = "Settings", "Labels", "Checks", "Machine"
 # fmt: off
 ConfigFile = Annotated[Path | None, typer.Option("--config", "-c", help="YAML file with settings.",
     rich_help_panel=SETTINGS)]
-DataFolder = Annotated[Path | None, typer.Option(help="Folder of scenes, or one scene; its format is recognised.")]
+DataFolder = Annotated[Path | None, typer.Option(help="Folder of scenes, or one scene, or a bag; the format is found.")]
 DatasetOptions = Annotated[list[str] | None, typer.Option(
     "--option", metavar="KEY=VALUE", help="Option of the dataset, short for --set dataset.options.KEY=VALUE.",
     rich_help_panel=SETTINGS)]
@@ -150,8 +150,8 @@ def chosen(
 
 def select_dataset(content: dict[str, Any], name: str | None, data: Path | None, seed: int | None) -> None:
     """Put the dataset that options select into the settings."""
-    if data is not None and not data.is_dir():
-        raise ConfigError(f"{data}: there is no such folder")
+    if data is not None and not data.exists():
+        raise ConfigError(f"{data}: there is no such {'file' if data.suffix else 'folder'}")
     options = {"root": None if data is None else str(data), "seed": seed}
     options = {key: value for key, value in options.items() if value is not None}
     given = content.get("dataset")

@@ -153,6 +153,7 @@ class PredictedScene(Scene):
         self.placed = inner.placed
         self.surface = inner.surface
         self.depth_from = inner.depth_from
+        self.sources = inner.sources
         self.folder = inner.folder
         self.settings_file = inner.settings_file
         self.skips_incomplete = inner.skips_incomplete

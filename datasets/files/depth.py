@@ -18,6 +18,7 @@ from semstab.datasets.files.options import FileOptions, FrameSource
 from semstab.datasets.formats.disk import AGAIN, read_bytes
 from semstab.datasets.formats.images import MAX_PIXELS, MILLIMETRES, Read, color_size, read_depth
 from semstab.datasets.geometry.cameras import planar
+from semstab.datasets.geometry.lenses import undistorted
 from semstab.errors import DataError
 
 # Depth maps of multi-view stereo programs: MVE's .mvei, OpenMVS's .dmap, COLMAP's .bin.
@@ -172,6 +173,9 @@ def stored_depth(
             depth[depth == np.float32(value) / np.float32(stored_scale(frame, options))] = 0
     if options.max_depth is not None:
         depth[depth >= options.max_depth] = 0
+    if frame.depth_lens is not None:
+        K = camera((depth.shape[0], depth.shape[1]))
+        depth = undistorted(depth, frame.depth_lens, K, (depth.shape[0], depth.shape[1]), str(frame.depth), "depth is")
     return planar(depth, camera((depth.shape[0], depth.shape[1]))) if options.depth_kind == "ray" else depth
 
 

@@ -86,9 +86,13 @@ class LabelSource:
 
 
 def find_sources(
-    options: FileOptions, entry: SceneEntry, frames: Sequence[FrameSource], folders: Folders
+    options: FileOptions,
+    entry: SceneEntry,
+    frames: Sequence[FrameSource],
+    folders: Folders,
+    own: Mapping[str, Path],
 ) -> dict[str, LabelSource]:
-    """Return the label sources of a scene with these frames; `gt` is the ground truth.
+    """Return the label sources of a scene with these frames, those in folders of their `own` first; `gt` is the truth.
 
     labels of X are the model X, scores of X found by a template are X-scores, so that neither name depends on
     other folders. A folder without a file of any frame is left out with a warning.
@@ -99,8 +103,10 @@ def find_sources(
     """
     sources: dict[str, LabelSource] = {}
     base = options.labels_root or entry.folder
-    if not os.path.isdir(base):  # noqa: PTH112  Path.is_dir raises where the name is too long
+    if options.labels_root is not None and not os.path.isdir(base):  # noqa: PTH112  Path.is_dir raises where the name is too long
         raise ConfigError(f"{base}: there is no such folder; correct labels_root")
+    for name, folder in own.items():
+        sources[name] = LabelSource.of("labels", folder, "{name}", frames, folders)
     for kind in KINDS:
         templates: dict[str, str] = {}
         for model, template in _stated(kind, options).items():
@@ -167,6 +173,7 @@ class LabelMaps:
     Attributes:
         class_ids: A table by label source, from the ids of its files to those of its taxonomy, where they differ.
         folders: The listed content of the folders where maps may be.
+        own: Folders of label maps by the label source that they are, besides those that templates find.
 
     Raises:
         ConfigError: For options that cannot be used.
@@ -179,8 +186,9 @@ class LabelMaps:
         frames: Sequence[FrameSource],
         class_ids: Mapping[str, UInt16],
         folders: Folders,
+        own: Mapping[str, Path],
     ) -> None:
-        labels, base = find_sources(options, entry, frames, folders), options.labels_root or entry.folder
+        labels, base = find_sources(options, entry, frames, folders, own), options.labels_root or entry.folder
         template = Template("regions", REGIONS, ("model", "name"), ("model", "name"))
         regions = {
             name: LabelSource.of("labels", base, filled, frames, folders)

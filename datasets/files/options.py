@@ -13,8 +13,9 @@ from typing import Annotated, Literal, Self
 from pydantic import Field, PositiveInt, model_validator
 
 from semstab.config import Settings
+from semstab.core.files import file_digest
 from semstab.datasets import GROUND_TRUTH
-from semstab.datasets.formats.disk import natural, subfolders
+from semstab.datasets.formats.disk import natural, read_bytes, subfolders
 from semstab.datasets.geometry.cameras import Camera, Poses
 from semstab.datasets.geometry.lenses import Lens
 from semstab.errors import ConfigError, DataError
@@ -204,7 +205,7 @@ def inside(root: Path, folder: Path, relative: str, where: str) -> Path:
 
 
 class Folders:
-    """The contents of folders, each listed once. Several threads may ask."""
+    """The contents of folders, each listed once, and of the files in them. Several threads may ask."""
 
     def __init__(self) -> None:
         self._names: dict[str, frozenset[str]] = {}
@@ -218,6 +219,14 @@ class Folders:
             except OSError:
                 self._names[folder] = frozenset()
         return name in self._names[folder]
+
+    def read(self, path: Path) -> bytes:
+        """Return the content of a file; raises what `read_bytes` raises."""
+        return read_bytes(path)
+
+    def digest(self, path: Path) -> bytes:
+        """Return a hash of a file's content; raises what `file_digest` raises."""
+        return file_digest(path)
 
     def one_of(self, path: Path, suffixes: Collection[str]) -> Path | None:
         """Return the path where it has one of the suffixes, else that with the first suffix there is a file of."""
@@ -242,6 +251,7 @@ class FrameSource:
         pose: (4, 4) in the dataset's convention, where it is not in a file of its own.
         label_camera: Intrinsics of the images of label maps, where that is another one.
         label_lens: The same where they are distorted photographs.
+        depth_lens: Lens of the depth image, where that is distorted.
         color_lens: Lens of the colour image, where that is distorted.
         photograph: The distorted photograph, where label maps belong to it.
         aliases: Other names that its label maps may have.
@@ -257,6 +267,7 @@ class FrameSource:
     pose: Poses | None = None
     label_camera: Camera | None = None
     label_lens: Lens | None = None
+    depth_lens: Lens | None = None
     color_lens: Lens | None = None
     photograph: Path | None = None
     aliases: tuple[str, ...] = ()

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from abc import abstractmethod
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Generic, TypeVar
 
@@ -79,11 +79,17 @@ class FileDataset(Dataset, Generic[Options]):
             casts = None if options.casts is False else options.casts or cache / "semstab" / "casts"
             origin = self.mesh_origin(entry.folder, options.surface)
             surface = Surface(options.surface, options.surface_cell, georeference, casts, origin)
-        scene = FileScene(entry, frames, options, self.class_ids(), surface)
+        scene = self.opened(entry, frames, options, surface)
         scene.georeference = georeference
         scene.labels_like_depth = self.labels_like_depth
         scene.settings_file = None if self.settings_file is None else entry.folder / self.settings_file
         return scene
+
+    def opened(
+        self, entry: SceneEntry, frames: Sequence[FrameSource], options: FileOptions, surface: Surface | None
+    ) -> FileScene:
+        """Return the scene of these frames."""
+        return FileScene(entry, frames, options, self.class_ids(), surface)
 
     def find_scenes(self, root: Path) -> Iterable[SceneEntry]:
         """Return the scenes below the root, in natural order; raises what `find_scenes` raises."""

@@ -12,7 +12,6 @@ from typing import Any
 import numpy as np
 
 from semstab.core.arrays import RecentArrays
-from semstab.core.files import file_digest
 from semstab.core.prefetch import prefetch
 from semstab.core.types import Float32, Float64, UInt8, UInt16
 from semstab.data.frames import Frame, Intrinsics
@@ -45,6 +44,15 @@ DEPTH, LABELS, MASK = "depth", "labels of ", "mask"
 class FileScene(Scene):
     """One sequence of files, each required when it is read; opening it reads no image.
 
+    Args:
+        entry: Its name and its folder.
+        frames: The files of its frames.
+        options: The settings by which they are read.
+        class_ids: Tables of class ids by label source, where they are not those of its taxonomy.
+        surface: What depth is cast at, if that is not stored.
+        folders: Where files are looked up and read.
+        label_folders: Folders of label maps, one file a frame, by the label source that they are.
+
     Raises:
         ConfigError: For options that cannot be used.
         DataError: For two frames of one name.
@@ -59,6 +67,8 @@ class FileScene(Scene):
         options: FileOptions,
         class_ids: Mapping[str, UInt16] | None = None,
         surface: Surface | None = None,
+        folders: Folders | None = None,
+        label_folders: Mapping[str, Path] | None = None,
     ) -> None:
         if len({frame.name for frame in frames}) < len(frames):
             raise DataError(f"{entry.folder}: two frames have one name; frames need names of their own")
@@ -68,8 +78,8 @@ class FileScene(Scene):
         self.skips_incomplete = options.incomplete == "skip"
         self.up = np.array(UP_AXES[options.up_axis], dtype=np.float64) if options.up_axis else None
         self._frames = frames
-        self._folders = Folders()
-        self._maps = LabelMaps(options, entry, frames, class_ids or {}, self._folders)
+        self._folders = folders or Folders()
+        self._maps = LabelMaps(options, entry, frames, class_ids or {}, self._folders, label_folders or {})
         self.models = self._maps.models
         self.ground_truth = self._maps.ground_truth
         self.regions = self._maps.regions
@@ -218,11 +228,12 @@ class FileScene(Scene):
         source = self._frame(index)
         path = self._color_file(source)
         if path is None or source.color_lens is None:
-            return None if path is None else read_color(path)
+            return None if path is None else read_color(path, self._folders.read)
         size = source.camera.size or source.color_lens.camera.size
         assert size is not None
         shape = (size[1], size[0])
-        return undistorted(read_color(path), source.color_lens, self.intrinsics(index, shape), shape, str(path))
+        image, K = read_color(path, self._folders.read), self.intrinsics(index, shape)
+        return undistorted(image, source.color_lens, K, shape, str(path))
 
     def image(self, index: int) -> UInt8:
         """Return the image that models predict on: in colour, or the distorted photograph of the label maps."""
@@ -234,7 +245,7 @@ class FileScene(Scene):
                 f"{self.folder}: the photograph of {source.name} is not there, on which labels are predicted; add it"
                 " to images/, or set labels_on: undistorted"
             )
-        return read_color(source.photograph)
+        return read_color(source.photograph, self._folders.read)
 
     def image_name(self, index: int) -> str:
         """Return the frame's name in path templates."""
@@ -273,11 +284,11 @@ class FileScene(Scene):
             digest.update(table.tobytes())
         files = [self._images(index, model) for index in indices]
         unread = [k for k, own in enumerate(files) if own.keys() - self._digests.keys()]
-        for fetched in prefetch(lambda k: {key: file_digest(path) for key, path in files[k].items()}, unread):
+        for fetched in prefetch(lambda k: {key: self._folders.digest(path) for key, path in files[k].items()}, unread):
             self._digests = fetched.item | self._digests
         for index, own in zip(indices, files, strict=True):
             source = self._frame(index)
-            cameras = (source.camera, source.label_camera, source.depth_scale, source.label_lens)
+            cameras = (source.camera, source.label_camera, source.depth_scale, source.label_lens, source.depth_lens)
             digest.update(source.name.encode() + b"\0" + self._stored_pose(source).tobytes() + repr(cameras).encode())
             digest.update(b"" if self._surface is None else self._surface.digest)
             for key in own:
@@ -346,7 +357,7 @@ class FileScene(Scene):
         """Give the content of a frame's file; its digest is remembered, so that `digest` need not read it again."""
 
         def read(path: Path) -> bytes:
-            data = disk.read_bytes(path)
+            data = self._folders.read(path)
             self._digests[index, what] = disk.digest(data)
             return data
 

@@ -142,14 +142,19 @@ def read_mask(path: Path, read: Read = read_bytes) -> Mask:
     return mask
 
 
-def read_color(path: Path) -> UInt8:
-    """Return the colour (H, W, 3) uint8 RGB of PNG, JPEG or TIFF, not rotated by EXIF.
+def read_color(path: Path, read: Read = read_bytes) -> UInt8:
+    """Return the colour (H, W, 3) uint8 RGB of PNG, JPEG, TIFF or .npy, not rotated by EXIF.
 
     Raises:
         DataError: If damaged.
     """
-    data = read_bytes(path)
+    data = read(path)
     suffix = path.suffix.lower()
+    if suffix == ".npy":
+        color = decode_array(path, data, "color")
+        if color.dtype != np.uint8 or color.shape[2:] != (3,):
+            raise DataError(f"{path}: colour is {color.dtype} of shape {color.shape}; store uint8 RGB (H, W, 3)")
+        return color
     if suffix == ".png":
         with _whole_png(path, data) as png:
             if png.kind == "grey" and png.bits == 16:

@@ -148,11 +148,39 @@ def at_times(
     return T
 
 
+def between_times(times: Float64, poses: Poses, wanted: Float64, max_gap: float) -> Poses:
+    """Return (m, 4, 4) at `wanted` seconds of a trajectory (n, 4, 4) at strictly ascending `times`, never extrapolated.
+
+    As `at_times` between two poses; NaN before the first, after the last one, and between two that are more than
+    `max_gap` seconds apart.
+    """
+    known = np.isfinite(poses).all(axis=(1, 2))
+    times, poses = times[known], poses[known]
+    T = np.full((len(wanted), 4, 4), np.nan)
+    if not len(times):
+        return T
+    after = np.searchsorted(times, wanted)
+    exact = times[after.clip(max=len(times) - 1)] == wanted
+    T[exact] = poses[after[exact]]
+    inner = (after > 0) & (after < len(times)) & ~exact
+    inner[inner] = (times[after[inner]] - times[after[inner] - 1]) <= max_gap
+    if inner.any():
+        T[inner] = _between(times, poses, wanted[inner])
+    return T
+
+
 def nearest(times: Float64, others: Float64) -> npt.NDArray[np.intp]:
     """Return for each time the index of the nearest of the ascending others; of two as near the earlier one."""
     after = np.searchsorted(others, times).clip(max=len(others) - 1)
     before = np.maximum(after - 1, 0)
     return np.where(np.abs(times - others[before]) <= np.abs(others[after] - times), before, after)
+
+
+def mutual_nearest(times: Float64, others: Float64, max_difference: float) -> npt.NDArray[np.intp]:
+    """Return for each ascending time the index of the other one where each is the other's nearest; -1 for none."""
+    to_other, back = nearest(times, others), nearest(others, times)
+    mutual = (back[to_other] == np.arange(len(times))) & (np.abs(others[to_other] - times) <= max_difference)
+    return np.where(mutual, to_other, -1)
 
 
 def _between(times: Float64, poses: Poses, wanted: Float64) -> Poses:

@@ -142,21 +142,22 @@ class Lens:
 
     Attributes:
         brown: k1 k2 p1 p2 k3: radial and tangential.
+        rational: k1 k2 p1 p2 k3 k4 k5 k6: the same with a radial denominator.
         fisheye: k1 k2 k3 k4: of the angle to the optical axis.
     """
 
     camera: Camera
-    model: Literal["brown", "fisheye"]
+    model: Literal["brown", "rational", "fisheye"]
     coefficients: tuple[float, ...]
 
 
 def undistorted(
     values: Pixels, lens: Lens, K: Intrinsics, shape: tuple[int, int], where: str, what: str = "the image is"
 ) -> Pixels:
-    """Return an image of the lens, ids (H', W') or channels (H', W', C), as a pinhole with K and (H, W) sees it.
+    """Return an image of the lens, of ids or depth (H', W') or channels (H', W', C), as a pinhole with K sees it.
 
-    Ids are the nearest ones, channels are linear between pixel centres; pixels that the lens does not see are ignored,
-    or 0.
+    The pinhole's image is (H, W). Ids and depth are the nearest ones, channels are linear between pixel centres; where
+    the lens does not see a pixel ids are ignored, all else is 0.
 
     Raises:
         DataError: If the image is not of the lens's shape, with `where`, its file.
@@ -169,7 +170,8 @@ def undistorted(
     x, y = _source_pixels(lens, (values.shape[0], values.shape[1]), K, shape)
     remap: Any = cv2.remap
     if values.ndim == 2:
-        image = remap(values, x, y, cv2.INTER_NEAREST, borderValue=int(ignore_id(values)))
+        nothing = 0 if values.dtype.kind == "f" else int(ignore_id(values))
+        image = remap(values, x, y, cv2.INTER_NEAREST, borderValue=nothing)
     else:
         wide = values if values.dtype == np.uint8 else values.astype(np.float32, copy=False)
         parts = [wide[..., k : k + CHANNELS] for k in range(0, values.shape[2], CHANNELS)]
@@ -187,7 +189,7 @@ def _source_pixels(
 
     inner = lens.camera.at(source)
     size = (shape[1], shape[0])
-    maps: Any = cv2.initUndistortRectifyMap if lens.model == "brown" else cv2.fisheye.initUndistortRectifyMap
+    maps: Any = cv2.fisheye.initUndistortRectifyMap if lens.model == "fisheye" else cv2.initUndistortRectifyMap
     x, y = maps(inner.matrix, np.array(lens.coefficients), np.eye(3), K.matrix, size, cv2.CV_32FC1)
     u = (np.arange(shape[1]) - K.cx) / K.fx
     v = (np.arange(shape[0])[:, None] - K.cy) / K.fy
@@ -199,9 +201,10 @@ def _source_pixels(
 def _reach(lens: Lens, farthest: float) -> float:
     """Return the distance from the axis, a metre ahead, up to which the lens preserves the order of distances."""
     radius = np.linspace(0, farthest, SAMPLES)
-    if lens.model == "brown":
-        k1, k2, _, _, k3 = lens.coefficients
-        distorted = radius * (1 + k1 * radius**2 + k2 * radius**4 + k3 * radius**6)
+    if lens.model != "fisheye":
+        k1, k2, _, _, k3, k4, k5, k6 = (*lens.coefficients, 0.0, 0.0, 0.0)[:8]
+        radial = 1 + k1 * radius**2 + k2 * radius**4 + k3 * radius**6
+        distorted = radius * radial / (1 + k4 * radius**2 + k5 * radius**4 + k6 * radius**6)
     else:
         angle = np.arctan(radius)
         distorted = angle * (1 + sum(k * angle ** (2 * n) for n, k in enumerate(lens.coefficients, start=1)))

@@ -1,0 +1,242 @@
+"""ROS bags: ROS 1 .bag, and rosbag2 of sqlite3 or MCAP, with depth, colour, camera info and poses on their topics.
+
+Sources: docs.ros.org (sensor_msgs, tf2_msgs, nav_msgs, geometry_msgs); REP 103, 104 and 105. Read by rosbags.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+import numpy as np
+from pydantic import BaseModel
+
+from semstab.core.types import Float64
+from semstab.data.frames import Intrinsics
+from semstab.datasets.bag.index import Content, Int64, Stream, read_once
+from semstab.datasets.bag.messages import Folder, Messages
+from semstab.datasets.bag.options import BagOptions
+from semstab.datasets.bag.reading import NANOSECONDS, SUFFIXES, OpenBag, is_bag, seconds
+from semstab.datasets.files.labels import SceneEntry
+from semstab.datasets.files.options import FileOptions, FrameSource
+from semstab.datasets.files.reader import DEEPEST, FileDataset
+from semstab.datasets.files.scene import FileScene
+from semstab.datasets.files.surfaces import Surface
+from semstab.datasets.formats.disk import files_named, natural, subfolders
+from semstab.datasets.formats.images import MILLIMETRES
+from semstab.datasets.geometry.cameras import Camera, mutual_nearest
+from semstab.datasets.geometry.lenses import Lens
+from semstab.errors import DataError
+
+logger = logging.getLogger("semstab")
+
+
+class Bag(FileDataset[BagOptions]):
+    """{name} is the stamp of the colour image, 1305031102.175304000; of the depth image where there is no colour.
+
+    Label maps may be named by it with six digits, too, or as whole nanoseconds. They are in the folder that is called
+    as the bag is without its suffix: run/labels/MODEL/ beside run.bag.
+    """
+
+    Options: type[BaseModel] = BagOptions
+    contents = f"a ROS bag ({', '.join(SUFFIXES)}, or a folder of a rosbag2)"
+
+    def __init__(self, options: BagOptions) -> None:
+        self._bags: dict[Path, Path] = {}
+        self._opened: dict[Path, Recorded] = {}
+        super().__init__(options)
+
+    def find_scenes(self, root: Path) -> list[SceneEntry]:
+        """Return the bag that the root is, else the bags below it in natural order.
+
+        Raises:
+            DataError: If there is none, or two would have one name.
+        """
+        if not root.exists():
+            raise DataError(f"{root}: there is no such bag or folder; set root to a bag, or to the folder above bags")
+        paths = [root] if is_bag(root) else sorted(_bags_below(root, DEEPEST), key=lambda path: natural(str(path)))
+        if not paths:
+            raise DataError(f"{root}: no bag here, nor {DEEPEST} folders deep; expected {self.contents}")
+        entries = []
+        for path in paths:
+            folder = path if path.is_dir() else path.with_suffix("")
+            if folder in self._bags:
+                raise DataError(f"{path}: {self._bags[folder].name} would be a scene of the same name; rename one")
+            self._bags[folder] = path
+            parts = (folder.resolve().name or "scene",) if path == root else folder.relative_to(root).parts
+            entries.append(SceneEntry("-".join(parts), folder, "/".join(parts)))
+        return entries
+
+    @property
+    def folders(self) -> list[Path]:
+        """The bags."""
+        return list(self._bags.values())
+
+    def is_scene(self, folder: Path) -> bool:
+        """Return whether a path is a bag."""
+        return is_bag(folder)
+
+    def frames(self, folder: Path) -> list[FrameSource]:
+        """Return a frame for each depth image with a colour image; NaN is its pose where no two poses are around it.
+
+        Raises:
+            DataError: If the bag lacks a part, is damaged, or nothing fits together in time.
+        """
+        bag = OpenBag(self._bags[folder])
+        self._opened[folder] = recorded = Recorded(read_once(bag, self.options), self.options)
+        return recorded.frames()
+
+    def opened(
+        self, entry: SceneEntry, frames: Sequence[FrameSource], options: FileOptions, surface: Surface | None
+    ) -> FileScene:
+        """Return the scene of a bag, which says on which topics its parts are."""
+        recorded = self._opened.pop(entry.folder)
+        labels = recorded.label_folders
+        scene = FileScene(entry, frames, options, self.class_ids(), surface, recorded.messages, labels)
+        scene.sources = tuple(recorded.sources)
+        return scene
+
+
+def _bags_below(folder: Path, levels: int) -> Iterator[Path]:
+    """Yield the bags in a folder and, up to so many levels, in the folders below it."""
+    if not folder.is_dir():
+        return
+    for suffix in SUFFIXES:
+        yield from (path for path in files_named(folder, "", suffix).values() if is_bag(path))
+    for name in subfolders(folder) if levels else ():
+        yield from [folder / name] if is_bag(folder / name) else _bags_below(folder / name, levels - 1)
+
+
+class Recorded:
+    """The frames of a bag whose content is known: which messages belong together, and what each frame is read with.
+
+    Attributes:
+        messages: Its image messages as files.
+        label_folders: The folders of these that are label maps, by label source.
+        sources: Where each part comes from, in words.
+
+    Raises:
+        DataError: If nothing fits together in time, or there is no pose.
+    """
+
+    def __init__(self, content: Content, options: BagOptions) -> None:
+        self._content = content
+        self._options = options
+        chosen, streams = content.chosen, content.streams
+        seen = chosen.depth or chosen.color
+        assert seen is not None
+        self._seen = seen
+        self.sources: list[str] = []
+        if chosen.color is not None and chosen.color.frame != seen.frame:
+            logger.warning(
+                "%s: depth is of the frame '%s', colour of '%s': labels are looked up as if both saw from one point;"
+                " set depth to a topic that is registered to colour",
+                content.bag.path, seen.frame, chosen.color.frame,
+            )  # fmt: skip
+        at, to = self._pairs()
+        named = streams[(chosen.color or seen).topic]
+        self._stamps = streams[seen.topic].stamps[at]
+        self._names = [seconds(int(stamp)) for stamp in named.stamps[to]]
+        self._poses = self._posed()
+        folders = []
+        if chosen.depth is not None:
+            folders.append(Folder(chosen.depth, False, [streams[chosen.depth.topic].place(k) for k in at]))
+        if chosen.color is not None:
+            folders.append(Folder(chosen.color, True, [named.place(k) for k in to]))
+        for source, images in chosen.labels.items():
+            stream = streams[images.topic]
+            near = stream.near(named.stamps[to], options.max_difference)
+            folders.append(Folder(images, False, [None if k is None else stream.place(k) for k in near]))
+            count = len(near) - near.count(None)
+            self.sources.append(f"labels   {source}: {images}, of {count} of {len(at)} frames")
+        self.messages = Messages(content.bag, folders, self._names)
+        self.label_folders = {source: self.messages.folder(images) for source, images in chosen.labels.items()}
+        self.sources += [text for topic, stream in streams.items() for text in _order(topic, stream)]
+        if chosen.others:
+            self.sources.append(f"others   {', '.join(chosen.others)} (set depth, color)")
+
+    def _pairs(self) -> tuple[Int64, Int64]:
+        """Return the frames, by the number of the depth image and of the colour image, or of the only one twice."""
+        bag, chosen, limit = self._content.bag, self._content.chosen, self._options.max_difference
+        depth, color = chosen.depth, chosen.color
+        base = self._content.streams[self._seen.topic]
+        self.sources.append(
+            f"depth    {depth or 'cast at the surface'}, camera {chosen.depth_info or 'of the options'}"
+        )
+        self.sources.append(f"colour   {color or 'none'}{f', camera {chosen.color_info}' if chosen.color_info else ''}")
+        if depth is None or color is None:
+            return np.arange(len(base)), np.arange(len(base))
+        other, start = self._content.streams[color.topic], int(base.stamps[0])
+        partners = mutual_nearest(base.since(start), other.since(start), limit).astype(np.int64)
+        at = np.flatnonzero(partners >= 0)
+        if not len(at):
+            raise DataError(
+                f"{bag.path}: no image of {depth.topic} is within {limit:g} s of one of {color.topic}; set"
+                " max_difference, or stamps: bag"
+            )
+        said = f"{len(at)} of {len(base)} depth and {len(other)} colour images are within {limit:g} s"
+        self.sources.append(f"frames   {said}")
+        if len(at) < len(base):
+            logger.warning(
+                "%s: %d depth images have no colour image within %g s (max_difference); left out",
+                bag.path, len(base) - len(at), limit,
+            )  # fmt: skip
+        return at, partners[at]
+
+    def _posed(self) -> Float64:
+        """Return (n, 4, 4) poses of the frames, NaN where there is none."""
+        bag, limit = self._content.bag, self._options.max_pose_gap
+        poses, where = self._content.poses.at(self._stamps.tolist(), self._seen.frame)
+        known = int(np.count_nonzero(np.isfinite(poses).all(axis=(1, 2))))
+        if not known:
+            raise DataError(
+                f"{bag.path}: no frame lies between two poses of {where} that are at most {limit:g} s apart; set"
+                " max_pose_gap, or stamps: bag"
+            )
+        self.sources.append(f"poses    {where}; around {known} of {len(poses)} frames, at most {limit:g} s apart")
+        return poses
+
+    def frames(self) -> list[FrameSource]:
+        """Return the frames, in the order of their stamps."""
+        return [self._frame(*each) for each in zip(self._names, self._stamps.tolist(), self._poses, strict=True)]
+
+    def _frame(self, name: str, stamp: int, pose: Float64) -> FrameSource:
+        chosen, options, messages = self._content.chosen, self._options, self.messages
+        camera, lens = self._camera(self._seen.topic, stamp)
+        color_camera, color_lens = self._camera(chosen.color.topic, stamp) if chosen.color else (camera, lens)
+        image = None if chosen.color is None else messages.file(chosen.color, name)
+        on_original = options.labels_on == "original"
+        depth = messages.folder(self._seen) / name if chosen.depth is None else messages.file(chosen.depth, name)
+        millimetres = chosen.depth is not None and chosen.depth.kind.encoding != "32FC1"
+        return FrameSource(
+            name=name,
+            depth=depth,
+            pose_file=self._content.bag.path,
+            camera=camera,
+            pose=pose,
+            label_camera=color_camera if color_camera != camera and color_lens is None else None,
+            label_lens=color_lens if on_original else None,
+            depth_lens=lens if chosen.depth is not None else None,
+            color_lens=color_lens,
+            photograph=image,
+            aliases=(name[:-3], name.replace(".", "")),
+            color=image,
+            depth_scale=MILLIMETRES if millimetres else 1.0,
+            timestamp=stamp / NANOSECONDS,
+        )
+
+    def _camera(self, topic: str, stamp: int) -> tuple[Camera, Lens | None]:
+        cameras = self._content.cameras.get(topic)
+        if cameras is not None and cameras.cameras and (self._options.intrinsics is None or topic != self._seen.topic):
+            return cameras.at(stamp)
+        if self._options.intrinsics is None:  # a colour image without CameraInfo is taken to be as depth sees it
+            return self._camera(self._seen.topic, stamp)
+        return Camera(Intrinsics(*self._options.intrinsics)), None
+
+
+def _order(topic: str, stream: Stream) -> Iterator[str]:
+    if stream.unsorted:
+        yield f"order    {topic}: {stream.unsorted} messages come after a later stamp; sorted"
+    if stream.repeated:
+        yield f"order    {topic}: {stream.repeated} messages have the stamp of another one; left out"

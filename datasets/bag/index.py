@@ -1,0 +1,129 @@
+"""What one pass over a bag finds: stamps and places of images, cameras over time, and poses. No pixel is kept."""
+
+from __future__ import annotations
+
+from array import array
+from dataclasses import dataclass, field
+
+import numpy as np
+import numpy.typing as npt
+
+from semstab.core.types import Float64
+from semstab.datasets.bag.cameras import camera_of, is_rectified
+from semstab.datasets.bag.options import BagOptions
+from semstab.datasets.bag.poses import CameraPoses
+from semstab.datasets.bag.reading import NANOSECONDS, OpenBag, Place, stamp_of
+from semstab.datasets.bag.topics import Chosen, Images, choose
+from semstab.datasets.geometry.cameras import Camera, nearest
+from semstab.datasets.geometry.lenses import Lens
+from semstab.errors import DataError
+
+Int64 = npt.NDArray[np.int64]
+
+
+class Stream:
+    """The messages of a topic in the order of their stamps; of equal stamps the first that was recorded.
+
+    Attributes:
+        stamps: (n,) nanoseconds, ascending.
+        unsorted: How many messages came after one with a later stamp.
+        repeated: How many have the stamp of another one, and are left out.
+    """
+
+    def __init__(self, stamps: array[int], times: array[int], ranks: array[int]) -> None:
+        own = np.frombuffer(stamps, dtype=np.int64)
+        order = np.argsort(own, kind="stable")
+        order = order[np.append(True, np.diff(own[order]) > 0)[: len(order)]]
+        self.stamps: Int64 = own[order]
+        self.unsorted = int(np.count_nonzero(np.diff(own) < 0))
+        self.repeated = len(own) - len(order)
+        self._times: Int64 = np.frombuffer(times, dtype=np.int64)[order]
+        self._ranks: Int64 = np.frombuffer(ranks, dtype=np.int64)[order]
+
+    def __len__(self) -> int:
+        """Return the number of messages."""
+        return len(self.stamps)
+
+    def place(self, k: int) -> Place:
+        """Return where in the bag a message is."""
+        return Place(int(self._times[k]), int(self._ranks[k]))
+
+    def since(self, start: int) -> Float64:
+        """Return (n,) seconds since a stamp."""
+        return (self.stamps - start) / NANOSECONDS
+
+    def near(self, stamps: Int64, max_difference: float) -> list[int | None]:
+        """Return for each stamp the message nearest to it, None where none is within `max_difference` seconds."""
+        if not len(self):
+            return [None] * len(stamps)
+        wanted = (stamps - self.stamps[0]) / NANOSECONDS
+        own = self.since(int(self.stamps[0]))
+        at = nearest(wanted, own)
+        close = np.abs(own[at] - wanted) <= max_difference
+        return [int(k) if there else None for k, there in zip(at, close, strict=True)]
+
+
+@dataclass
+class Cameras:
+    """The cameras of a topic of CameraInfo over time; one that does not change is there once."""
+
+    stamps: list[int] = field(default_factory=list)
+    cameras: list[tuple[Camera, Lens | None]] = field(default_factory=list)
+
+    def add(self, stamp: int, camera: tuple[Camera, Lens | None]) -> None:
+        """Add the camera from a stamp on."""
+        if not self.cameras or self.cameras[-1] != camera:
+            self.stamps.append(stamp)
+            self.cameras.append(camera)
+
+    def at(self, stamp: int) -> tuple[Camera, Lens | None]:
+        """Return the last camera that was said until a stamp, else the first one."""
+        return self.cameras[max(int(np.searchsorted(self.stamps, stamp, side="right")) - 1, 0)]
+
+
+@dataclass(frozen=True)
+class Content:
+    """A bag, the topics that are read, its image messages by topic, its poses, and its cameras by images."""
+
+    bag: OpenBag
+    chosen: Chosen
+    streams: dict[str, Stream]
+    poses: CameraPoses
+    cameras: dict[str, Cameras]
+
+
+def read_once(bag: OpenBag, options: BagOptions) -> Content:
+    """Read all that a scene needs but pixels, in one pass.
+
+    Raises:
+        DataError: If the bag lacks a part or is damaged.
+    """
+    chosen, poses = choose(bag, options), CameraPoses(bag, options)
+    pictures = {each.topic: each for each in (chosen.depth, chosen.color, *chosen.labels.values()) if each is not None}
+    stamps, times, ranks = ({topic: array("q") for topic in pictures} for _ in range(3))
+    infos = [(chosen.depth_info, chosen.depth or chosen.color), (chosen.color_info, chosen.color)]
+    cameras = {images.topic: Cameras() for _, images in infos if images is not None}
+    topics = {*pictures, *poses.topics, *(info for info, _ in infos if info is not None)}
+    for topic, place, message in bag.messages(sorted(topics)):
+        if topic in pictures:
+            stamps[topic].append(place.time if options.stamps == "bag" else stamp_of(message))
+            times[topic].append(place.time)
+            ranks[topic].append(place.rank)
+        elif topic in poses.topics:
+            poses.add(topic, place.time, message)
+        for info, images in infos:
+            if topic == info and images is not None:
+                stamp = place.time if options.stamps == "bag" else stamp_of(message)
+                cameras[images.topic].add(stamp, _camera(bag, options, topic, message, images))
+    for topic in pictures:
+        if options.stamps == "header" and len(stamps[topic]) > 1 and not any(stamps[topic]):
+            raise DataError(f"{bag.path}: all stamps in the headers of {topic} are 0; set stamps: bag")
+    streams = {topic: Stream(stamps[topic], times[topic], ranks[topic]) for topic in pictures}
+    return Content(bag, chosen, streams, poses, cameras)
+
+
+def _camera(
+    bag: OpenBag, options: BagOptions, topic: str, message: object, images: Images
+) -> tuple[Camera, Lens | None]:
+    rectified = is_rectified(images.base) if options.rectified is None else options.rectified
+    return camera_of(message, f"{bag.path}, {topic}", rectified=rectified)

@@ -1,0 +1,169 @@
+"""Poses of a bag's camera: from /tf and /tf_static, from a topic of poses, or from a file."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from semstab.datasets.bag.options import BagOptions
+from semstab.datasets.bag.reading import NANOSECONDS, OpenBag, stamp_of
+from semstab.datasets.formats.disk import read_table
+from semstab.datasets.geometry.cameras import Poses, from_quaternions
+from semstab.datasets.geometry.transforms import Trajectory, Transforms, bare
+from semstab.errors import DataError
+
+TF = "tf"
+TF_TYPE = ("tf2_msgs/TFMessage", "tf/tfMessage")
+
+POSES: Mapping[str, Callable[[Any], tuple[str, Any]]] = {
+    "nav_msgs/Odometry": lambda message: (message.child_frame_id, message.pose.pose),
+    "geometry_msgs/TransformStamped": lambda message: (message.child_frame_id, message.transform),
+    "geometry_msgs/PoseStamped": lambda message: ("", message.pose),
+    "geometry_msgs/PoseWithCovarianceStamped": lambda message: ("", message.pose.pose),
+}
+"""The frame that a message's pose is of ('': it does not say) and the pose, by type; the first ones are preferred."""
+
+WORLDS = ("map", "world", "odom")
+"""What the frames of a world have in their names; the first ones are preferred."""
+
+
+SAME = 1000
+"""Nanoseconds by which a stamp of a file of poses may differ from that of the image that it is of."""
+
+
+def numbers_of(pose: Any) -> tuple[float, ...]:
+    """Return x y z qx qy qz qw of a Pose or a Transform."""
+    at = pose.position if hasattr(pose, "position") else pose.translation
+    turn = pose.orientation if hasattr(pose, "orientation") else pose.rotation
+    return at.x, at.y, at.z, turn.x, turn.y, turn.z, turn.w
+
+
+class CameraPoses:
+    """What a bag says about where its camera is: add the messages of `topics`, then ask.
+
+    Attributes:
+        topics: The topics that are needed.
+
+    Raises:
+        DataError: If an option names what is not there.
+    """
+
+    def __init__(self, bag: OpenBag, options: BagOptions) -> None:
+        self._path = bag.path
+        self._options = options
+        self._transforms = Transforms()
+        self._tf = bag.of_types(*TF_TYPE)
+        named = None if options.pose == TF else options.pose
+        found = [name for kind in POSES for name in sorted(bag.of_types(kind), key=lambda k: -bag.topics[k].count)]
+        wanted = options.trajectory is None and options.pose != TF
+        self._topic = named or (found[0] if found and wanted else None)
+        self._read = None if self._topic is None else POSES[bag.topics[self._topic].type]
+        self._own, self._of = Trajectory(), ""
+        self._frame = ""
+        self.topics = [*self._tf, *([] if self._topic is None else [self._topic])]
+
+    def add(self, topic: str, time: int, message: Any) -> None:
+        """Add a message of one of the topics, with its bag time."""
+        if topic == self._topic and self._read is not None:
+            self._of, pose = self._read(message)
+            self._frame = message.header.frame_id
+            self._own.add(self._stamp(message, time), numbers_of(pose))
+            return
+        fixed = topic.rstrip("/").endswith("tf_static")
+        for each in message.transforms:
+            stamp = self._stamp(each, time)
+            self._transforms.add(
+                each.header.frame_id, each.child_frame_id, stamp, numbers_of(each.transform), fixed=fixed
+            )
+
+    def _stamp(self, message: Any, time: int) -> int:
+        return time if self._options.stamps == "bag" else stamp_of(message)
+
+    def at(self, stamps: Sequence[int], camera: str) -> tuple[Poses, str]:
+        """Return poses (n, 4, 4) of the camera at stamps, NaN where they are not known, and where they come from.
+
+        `camera` is the frame of the images.
+
+        Raises:
+            DataError: If nothing tells where the camera is.
+        """
+        options = self._options
+        camera = bare(options.camera_frame or camera)
+        if options.trajectory is not None:
+            numbers = read_table(options.trajectory, 8, "timestamp tx ty tz qx qy qz qw")
+            series = Trajectory()
+            for time, *pose in numbers.tolist():
+                series.add(round(time * NANOSECONDS), pose)
+            poses = series.at(_snapped(stamps, series.stamps), options.max_pose_gap, options.trajectory)
+            return self._from_body(poses, options.pose_frame or "", camera, stamps, str(options.trajectory))
+        chain, why = self._chain(camera)
+        if chain and (options.pose == TF or (options.pose is None)):
+            poses = self._transforms.at(chain, stamps, options.max_pose_gap, self._path)
+            poses = poses @ self._extrinsics()
+            by = f" by {', '.join(reversed(chain[1:-1]))}" if chain[1:-1] else ""
+            return poses, f"{' and '.join(self._tf)}: {chain[0]} in {chain[-1]}{by}"
+        if self._topic is None:
+            raise DataError(f"{self._path}: no pose of the camera: {why}")
+        poses = self._own.at(stamps, options.max_pose_gap, Path(f"{self._path}, {self._topic}"))
+        body = options.pose_frame or self._of
+        where = f"{self._topic}{f' in {self._frame}' if self._frame else ''}"
+        return self._from_body(poses, bare(body), camera, stamps, where)
+
+    def _from_body(self, poses: Poses, body: str, camera: str, stamps: Sequence[int], where: str) -> tuple[Poses, str]:
+        """Return poses of the camera from those of a body that it is mounted on; '' is the camera itself."""
+        options = self._options
+        if options.extrinsics is not None:
+            return poses @ self._extrinsics(), f"{where}, and extrinsics"
+        if body in ("", camera):
+            return poses, f"{where}, of the camera"
+        chain = self._transforms.upwards(camera)
+        if body not in chain:
+            raise DataError(
+                f"{self._path}: the poses of {where} are of the frame '{body}', from which no transform leads to the"
+                f" camera's frame '{camera}'; set extrinsics: [x, y, z, qx, qy, qz, qw], or pose_frame: {camera} if"
+                " they are the camera's"
+            )
+        chain = chain[: chain.index(body) + 1]
+        mounted = self._transforms.at(chain, stamps, options.max_pose_gap, self._path)
+        return poses @ mounted, f"{where}, of {body}; {camera} in it from {' and '.join(self._tf)}"
+
+    def _extrinsics(self) -> Poses:
+        if self._options.extrinsics is None:
+            return np.eye(4)
+        numbers = np.array([self._options.extrinsics], dtype=np.float64)
+        T: Poses = from_quaternions(numbers[:, :3], numbers[:, 3:], Path("option extrinsics"))[0]
+        return T
+
+    def _chain(self, camera: str) -> tuple[list[str], str]:
+        """Return the frames from the camera up to the world, or none and the reason."""
+        chain, world = self._transforms.upwards(camera), self._options.world_frame
+        if not self._tf:
+            return [], "there is no /tf; set trajectory: FILE, or pose: TOPIC"
+        if len(chain) == 1:
+            known = ", ".join(self._transforms.frames()[:8])
+            return [], f"'{camera}', the frame of its images, is not in /tf (camera_frame: one of {known})"
+        if world is not None:
+            if bare(world) not in chain:
+                raise DataError(
+                    f"{self._path}: option world_frame: '{world}' is not above '{camera}' in /tf, which hangs from"
+                    f" {', '.join(chain[1:])}"
+                )
+            return chain[: chain.index(bare(world)) + 1], ""
+        moving = [frame for k, frame in enumerate(chain) if self._transforms.moves(chain[: k + 1])]
+        if not moving:
+            return [], f"no transform moves between '{camera}' and '{chain[-1]}', from which it hangs"
+        named = (f for word in WORLDS for f in moving if word in f.rpartition("/")[2].lower())
+        found = next(named, moving[-1])
+        return chain[: chain.index(found) + 1], ""
+
+
+def _snapped(stamps: Sequence[int], others: Sequence[int]) -> list[int]:
+    """Return stamps, each as the nearest of the others where a file with six digits of a second cannot tell them."""
+    own, theirs = np.array(stamps, dtype=np.int64), np.sort(np.array(others, dtype=np.int64))
+    after = np.searchsorted(theirs, own).clip(max=len(theirs) - 1)
+    for near in (theirs[after], theirs[np.maximum(after - 1, 0)]):
+        own = np.where(np.abs(near - own) <= SAME, near, own)
+    return [int(stamp) for stamp in own]

@@ -1,0 +1,199 @@
+"""ROS bags: their topics, every message once in order, and single messages read when they are wanted.
+
+Formats: wiki.ros.org/Bags/Format/2.0; rosbag2 of sqlite3 and MCAP (mcap.dev/spec). All are read by the library rosbags.
+The messages are of ROS's own types, whose fields are those of each distribution; what else a bag holds is not parsed.
+"""
+
+from __future__ import annotations
+
+import itertools
+import os
+import re
+import threading
+import weakref
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from semstab.errors import DataError, MissingDependencyError, summarize_error
+
+INSTALL = "pip install 'semstab[bags]'"
+SUFFIXES = (".bag", ".mcap", ".db3")
+METADATA = "metadata.yaml"
+"""The file that makes a folder a rosbag2."""
+
+REPAIR = {
+    ".bag": "record it to its end, or 'rosbag reindex'",
+    ".mcap": "record it to its end, or 'mcap recover'",
+    ".db3": "record it to its end, or 'ros2 bag reindex'",
+}
+SAME_TYPE = {"tf/msg/tfMessage": "tf2_msgs/msg/TFMessage"}
+"""Types of messages that have the bytes of another one."""
+
+QUOTED = re.compile(r"\w*(?:Error)?\(('[^']*'),?\)")
+"""An exception, or its arguments, in a message: KeyError('version')."""
+
+TF_MESSAGE = "geometry_msgs/TransformStamped[] transforms"
+"""The definition of tf2_msgs/TFMessage, which rosbags does not have for ROS 1."""
+
+NANOSECONDS = 10**9
+MOST_LISTED = 12
+
+
+def is_bag(path: Path) -> bool:
+    """Return whether a path is a bag by its name, or a folder with a metadata.yaml and bags in it."""
+    if path.suffix.lower() in SUFFIXES and path.is_file():
+        return True
+    return path.is_dir() and (path / METADATA).is_file() and any(f"{suffix}" in _endings(path) for suffix in SUFFIXES)
+
+
+def _endings(folder: Path) -> set[str]:
+    """Return the suffixes of a folder's files; that of a compressed one is the one before."""
+    names = (name.lower().removesuffix(".zstd") for name in os.listdir(folder))  # noqa: PTH208  names, not paths
+    return {os.path.splitext(name)[1] for name in names}  # noqa: PTH122
+
+
+@dataclass(frozen=True)
+class Topic:
+    """A topic: its name, the type of its messages without '/msg/', sensor_msgs/Image, and how many there are."""
+
+    name: str
+    type: str
+    count: int
+
+
+@dataclass(frozen=True, slots=True)
+class Place:
+    """Where a message is: the nanoseconds of its bag time, and how many of its topic come before it at that time."""
+
+    time: int
+    rank: int = 0
+
+
+class OpenBag:
+    """One bag, which is opened once; several threads may read from it.
+
+    Attributes:
+        path: The file, or the folder of a rosbag2.
+        topics: Its topics by name, in their order.
+
+    Raises:
+        DataError: If it is no whole bag, in one line.
+        MissingDependencyError: If rosbags is not installed.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self._lock = threading.Lock()
+        first = path.suffix.lower() == ".bag" and path.is_file()
+        try:
+            from rosbags.rosbag1 import Reader as Reader1
+            from rosbags.rosbag2 import Reader as Reader2
+            from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+        except ImportError as error:
+            raise MissingDependencyError(f"{path}: bags need rosbags ({summarize_error(error)}); {INSTALL}") from error
+        with self._one_line():
+            store: Any = get_typestore(Stores.ROS1_NOETIC if first else Stores.LATEST)
+            if first:
+                store.register(get_types_from_msg(TF_MESSAGE, "tf2_msgs/msg/TFMessage"))
+            self._reader: Any = Reader1(path) if first else Reader2(path)
+            self._reader.open()
+            weakref.finalize(self, self._reader.close)
+            self._deserialize = store.deserialize_ros1 if first else store.deserialize_cdr
+            self._connections: dict[str, list[Any]] = {}
+            for connection in self._reader.connections:
+                self._connections.setdefault(connection.topic, []).append(connection)
+            self.topics: Mapping[str, Topic] = {
+                name: Topic(name, same[0].msgtype.replace("/msg/", "/"), sum(int(each.msgcount) for each in same))
+                for name, same in self._connections.items()
+            }
+
+    def of_types(self, *types: str) -> list[str]:
+        """Return the topics of messages of these types that have any message, by name."""
+        return sorted(topic.name for topic in self.topics.values() if topic.type in types and topic.count)
+
+    def listed(self) -> str:
+        """Return its topics, with their types, in one line."""
+        short = [f"{topic.name} {topic.type.rpartition('/')[2]} ({topic.count})" for topic in self.topics.values()]
+        more = f", {len(short) - MOST_LISTED} more" if len(short) > MOST_LISTED else ""
+        return ", ".join(short[:MOST_LISTED]) + more or "none"
+
+    def messages(self, topics: Sequence[str]) -> Iterator[tuple[str, Place, Any]]:
+        """Yield topic, place and message of all messages of the topics, in order of bag time, each read once.
+
+        Raises:
+            DataError: If the bag is damaged there.
+        """
+        ranks: dict[str, Place] = {}
+        for name, time, raw, kind in self._raw(topics):
+            before = ranks.get(name)
+            place = ranks[name] = Place(time, before.rank + 1 if before is not None and before.time == time else 0)
+            with self._one_line(f"{name} at {seconds(time)}"):
+                message = self._deserialize(raw, kind)
+            yield name, place, message
+
+    def first(self, topic: str) -> Any:
+        """Return the first message of a topic; None where there is none. Raises DataError."""
+        return next((message for _, _, message in self.messages([topic])), None)
+
+    def message(self, topic: str, place: Place) -> Any:
+        """Return one message of a topic.
+
+        Raises:
+            DataError: If it is damaged.
+        """
+        with self._lock, self._one_line(f"{topic} at {seconds(place.time)}"):
+            found = self._reader.messages(self._connections[topic], start=place.time, stop=place.time + 1)
+            connection, _, raw = next(itertools.islice(found, place.rank, None), (None, 0, b""))
+            if connection is None:
+                raise DataError(
+                    f"{self.path}: {topic} has no message at {seconds(place.time)} any more; it has changed"
+                )
+        with self._one_line(f"{topic} at {seconds(place.time)}"):
+            return self._deserialize(raw, SAME_TYPE.get(connection.msgtype, connection.msgtype))
+
+    def _raw(self, topics: Sequence[str]) -> Iterator[tuple[str, int, bytes, str]]:
+        wanted = [connection for name in topics for connection in self._connections.get(name, ())]
+        if not wanted:
+            return
+        with self._lock, self._one_line():
+            found = self._reader.messages(wanted)
+        while True:
+            with self._lock, self._one_line():
+                item = next(found, None)
+            if item is None:
+                return
+            connection, time, raw = item
+            yield connection.topic, time, raw, SAME_TYPE.get(connection.msgtype, connection.msgtype)
+
+    @contextmanager
+    def _one_line(self, what: str = "") -> Iterator[None]:
+        """Turn what rosbags raises for a damaged bag into DataError."""
+        try:
+            yield
+        except DataError:
+            raise
+        except Exception as error:
+            where = f"{self.path}{f', {what}' if what else ''}"
+            why = QUOTED.sub(r"\1", summarize_error(error)).rstrip(".")
+            if isinstance(error, MemoryError):
+                why = "a length in it is damaged, or the memory does not suffice for a chunk"
+            suffix = next((end for end in SUFFIXES if end == self.path.suffix.lower()), ".db3")
+            raise DataError(f"{where}: not a whole bag ({why}); {REPAIR[suffix]}") from error
+
+
+def seconds(time: int) -> str:
+    """Return nanoseconds as seconds with all nine digits.
+
+    >>> seconds(1305031102175304000)
+    '1305031102.175304000'
+    """
+    return f"{time // NANOSECONDS}.{time % NANOSECONDS:09d}"
+
+
+def stamp_of(message: Any) -> int:
+    """Return the nanoseconds of a message's header."""
+    stamp = message.header.stamp
+    return int(stamp.sec) * NANOSECONDS + int(stamp.nanosec)
