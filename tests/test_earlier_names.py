@@ -52,7 +52,9 @@ def test_a_setting_that_is_given_under_both_names_is_refused():
         Config.build({"backbones": ["net"], "models": ["net"]}, "x")
 
 
-@pytest.mark.parametrize("name", [name for name in REGISTRY.entries() if name != "stored"])
+@pytest.mark.parametrize(
+    "name", [name for name in REGISTRY.entries() if name != "stored" and not REGISTRY.missing(name)]
+)
 def test_no_model_has_its_weights_under_the_old_name(name):
     assert "model" not in options_model(name).model_fields
 
