@@ -64,8 +64,8 @@ def test_a_run_equals_the_study_without_sweeps_voxel_for_voxel(root, tmp_path) -
     bench("study", file, "--out", "study", "-q", cwd=tmp_path)
     same(tmp_path / "run", tmp_path / "study")
     assert {path.name for path in (tmp_path / "run").iterdir()} == {
-        "config.yaml", "manifest.json", "summary.json", "digests.json", "units", "voxels", "frames", "observations", "overview", "sums",
-        "truth",
+        "config.yaml", "manifest.json", "summary.json", "digests.json", "units", "voxels", "frames", "observations",
+        "overview", "sums", "truth",
     }  # fmt: skip
 
 
