@@ -111,8 +111,8 @@ def test_frames_that_see_too_little_are_counted_and_not_judged() -> None:
     assert (few.judged, few.unjudged) == (0, 5)
 
 
-def test_an_excess_below_two_in_a_hundred_places_is_not_named() -> None:
-    share = np.array([0.019, *[0.0] * 9])
+def test_an_excess_below_three_in_a_hundred_places_is_not_named() -> None:
+    share = np.array([0.029, *[0.0] * 9])
     outliers = [
         outlying_frames(LoneDisagreement(np.arange(10), np.full(10, 900), times * share, 0 * share), 10).frames
         for times in (1, 2)

@@ -31,11 +31,11 @@ LEAST_PLACES = 50
 LEAST_FRAMES = 6
 """Judged frames from which on one of them can stand out."""
 
-LEAST_EXCESS = 0.02
-"""Share of its places by which a frame stands out at least: 2 in 100."""
+LEAST_EXCESS = 0.03
+"""Share of its places by which a frame stands out at least: 3 in 100."""
 
 LEVEL = 0.025
-"""Nominal level at which any frame of equal ones is named; simulated, it is .01 to .05 (docs/validity.md)."""
+"""Nominal level at which any frame of equal ones is named; simulated, it is .05 at most (docs/validity.md)."""
 
 
 @dataclass(frozen=True, eq=False)
