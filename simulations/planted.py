@@ -3,8 +3,9 @@
     python simulations/planted.py SCENE OUT [--source fcn] [--class bunny_book] [--to kleenex]
 
 Writes OUT/third (the class is labelled as another one in every third frame), OUT/first (in the first third of the
-frames) and OUT/flip (2 % of the pixels, drawn at random, have a random class), each with the scene's own depth, poses
-and ground truth.
+frames), OUT/flip (2 % of the pixels, drawn at random, have a random class) and OUT/blocks (in every third frame, from
+the first on, 15 % of the blocks of 24 x 24 pixels have another class each), each with the scene's own depth, poses and
+ground truth.
 """
 
 from __future__ import annotations
@@ -20,6 +21,9 @@ import yaml
 from PIL import Image
 
 SHARE, SEED = 0.02, 0
+BLOCK, BLOCKS = 24, 0.15
+"""Pixels along the edge of a block of wrong labels, and the share of the blocks."""
+
 Fault = Callable[[int, int, np.ndarray], np.ndarray]
 
 
@@ -39,6 +43,16 @@ def plant(scene: Path, out: Path, source: str, fault: Fault) -> None:
         Image.fromarray(changed).save(labels / file.name)
 
 
+def in_blocks(labels: np.ndarray, classes: int, rng: np.random.Generator, share: float = BLOCKS) -> np.ndarray:
+    """The labels (H, W) with another class in each of a share of the blocks, where they have a class at all."""
+    H, W = labels.shape
+    grid = -(-H // BLOCK), -(-W // BLOCK)
+    drawn = rng.permutation(grid[0] * grid[1]).reshape(grid) < round(share * grid[0] * grid[1])
+    moved = np.where(drawn, rng.integers(1, classes, grid), 0)
+    moved = np.repeat(np.repeat(moved, BLOCK, axis=0), BLOCK, axis=1)[:H, :W]
+    return np.where(labels < classes, (labels + moved) % classes, labels).astype(labels.dtype)
+
+
 def faults(names: list[str], wrong: str, to: str) -> dict[str, Fault]:
     """By name."""
     k, other = names.index(wrong), names.index(to)
@@ -55,6 +69,7 @@ def faults(names: list[str], wrong: str, to: str) -> dict[str, Fault]:
         "third": lambda number, count, labels: labels if number % 3 else relabelled(labels),
         "first": lambda number, count, labels: relabelled(labels) if number < count // 3 else labels,
         "flip": lambda number, count, labels: flipped(labels),
+        "blocks": lambda number, count, labels: labels if number % 3 else in_blocks(labels, len(names), rng),
     }
 
 

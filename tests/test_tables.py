@@ -59,7 +59,7 @@ def test_the_walls_tables_are_as_in_the_golden_file(walls, suffix):
 def test_a_study_of_everything_has_every_table(walls):
     assert [table.name for table in tables(walls)] == [
         "overview", "verdicts", "flicker", "flicker_by_scene", "scenes", "persistence", "classes", "temporal_agreement",
-        "correlogram", "class_agreement", "drift", "uncertainty", "cross_model", "sensitivity_voxel_size",
+        "correlogram", "class_agreement", "drift", "frames", "uncertainty", "cross_model", "sensitivity_voxel_size",
         "sensitivity_agreement_voxel_size", "sensitivity_depth_noise", "sensitivity_agreement_depth_noise",
         "sensitivity_frame_count", "sensitivity_agreement_frame_count", "voxel_sizes", "fusion", "agreement",
     ]  # fmt: skip

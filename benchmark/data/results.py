@@ -178,8 +178,7 @@ class UnitSummary:
     fusion because what they show moves, frames_left_out the selected frames without a file or a pose, frames_empty
     the fused ones of which no pixel was valid; scores_left_out is there with `top_k`; statistics is what
     `semstab.statistics.describe` reports of the map, None where it was not asked for; sizes tells whether half or twice
-    the voxel size would give another result; worst_frames are those that moved the map most, the worst first; reduced
-    is there for soft scores.
+    the voxel size would give another result; reduced is there for soft scores.
     """
 
     unit: Unit = field(metadata=INLINE)
@@ -195,7 +194,6 @@ class UnitSummary:
     scores_left_out: LeftOut | None = None
     statistics: MapStatistics | None = None
     sizes: tuple[SizeAlpha, ...] = ()
-    worst_frames: tuple[FrameDrift, ...] = ()
     reduced: ReducedScores | None = None
 
     def row(self) -> dict[str, str | int | float]:
@@ -223,16 +221,6 @@ class ReducedScores:
     vss: float
     recurrent_vss: float
     voxel_alpha: float
-
-
-@dataclass(frozen=True)
-class FrameDrift:
-    """A frame that moved the beliefs which it met: mean drift in bits, and of how many voxels."""
-
-    frame: int
-    drift: float
-    voxels: int
-    name: str = ""
 
 
 @dataclass(frozen=True)

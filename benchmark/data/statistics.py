@@ -403,6 +403,47 @@ class StratumStatistics:
     entropy_between: float
 
 
+@dataclass(frozen=True)
+class FrameDisagreement:
+    """A frame that stands alone.
+
+    Attributes:
+        frame: Its index, of frames that share a view the first one's.
+        name: The name of its file.
+        places: The sampled places that it saw, as two other views did at least.
+        share: Share of these at which its neighbours, the views before and after it, agree on another class.
+        null: The mean of that over the other views of the same places.
+    """
+
+    frame: int
+    name: str
+    places: int
+    share: float
+    null: float
+
+    @property
+    def excess(self) -> float:
+        """Share less its null."""
+        return self.share - self.null
+
+
+@dataclass(frozen=True)
+class OutlyingFrames:
+    """The frames that stand alone more often than frames of the same quality do.
+
+    Attributes:
+        judged: Number of views that could be judged; 0 where they are too few for one to stand out.
+        unjudged: Number of views that see too few places which two other views saw.
+        usual: Mean excess of the frames that are not named.
+        frames: Those that are named, the largest excess first.
+    """
+
+    judged: int
+    unjudged: int
+    usual: float
+    frames: tuple[FrameDisagreement, ...] = ()
+
+
 # --- One map ----------------------------------------------------------------------------------------------------------
 
 
@@ -430,6 +471,7 @@ class MapStatistics:
     geometry: Losses | None
     correctness: CorrectnessStatistics | None
     strata: tuple[StratumStatistics, ...]
+    outlying_frames: OutlyingFrames | None = None
 
     @property
     def order_known(self) -> bool:

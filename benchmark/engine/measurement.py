@@ -23,7 +23,7 @@ from semstab.data.frames import LeftOut
 from semstab.data.measures import dominant, mean, measures, vss
 from semstab.data.parquet import Tile
 from semstab.data.records import EVENTS, FRAMES, OBSERVATIONS, OVERVIEW, SUMS, TRUTH, VOXELS, FrameQuality, UnitContent
-from semstab.data.results import RECURRENT, STAGES, Agreement, FrameDrift, ReducedScores, UnitSummary, slug
+from semstab.data.results import RECURRENT, STAGES, Agreement, ReducedScores, UnitSummary, slug
 from semstab.data.voxels import VoxelTable
 from semstab.datasets import Scene
 from semstab.engine.live_maps import LiveMap, Stream
@@ -33,16 +33,13 @@ from semstab.engine.tiles import TILE_OBSERVATIONS, TileResult
 from semstab.errors import DataError
 from semstab.metrics import compare
 from semstab.metrics.agreement import rows_of
-from semstab.metrics.image_space import ImageSpaceMeter
+from semstab.metrics.image_space import PICTURED, ImageSpaceMeter, LonePicture
 from semstab.metrics.summary import TableSums
 from semstab.metrics.up_axis import estimate_up
 from semstab.statistics import Analysis, CellObservations, MapSample, analyse
 from semstab.statistics.agreement import alpha_of, alpha_sums, ratio_of
 from semstab.statistics.verdict import Limits
 from semstab.task import Task, read
-
-WORST = 3
-"""The number of frames that are named because they moved the map most."""
 
 SMALL = 1 << 30
 """A process with fewer bytes keeps freed memory for the next table."""
@@ -139,7 +136,7 @@ def analyse_sample(task: Task, config: Config, sample: MapSample, observations: 
     """Return the statistics of a map; its true labels are right, and bound how far geometry lets labels agree."""
     return analyse(
         sample, observations, name=task.model, edges=config.strata, critical=config.critical_classes,
-        scope=config.scope, limits=Limits(**config.verdict.model_dump()),
+        scope=config.scope, limits=Limits(**config.verdict.model_dump()), frame_name=task.scene.frame_name,
     )  # fmt: skip
 
 
@@ -189,7 +186,6 @@ def unit_content(
         scores_left_out=None if np.isnan(cut).all() else LeftOut(mean(cut), float(np.nanmax(most))),
         statistics=None if analysis is None else analysis.summary,
         reduced=_reduced(result.reduced) if len(result.reduced) else None,
-        worst_frames=_worst(rows, task.scene),
         sizes=result.sizes,
     )
     return UnitContent(task.digest, summary, files=result.files, checked=result.checked)
@@ -212,15 +208,6 @@ def reduced_sums(table: VoxelTable) -> Float64:
 
 def _reduced(sums: Float64) -> ReducedScores:
     return ReducedScores(float(ratio_of(sums[:2])), float(ratio_of(sums[2:4])), float(alpha_of(sums[4:])))
-
-
-def _worst(rows: Series, scene: Scene) -> tuple[FrameDrift, ...]:
-    """Return the frames that moved the map most, of those that met as many known voxels as half of the frames do."""
-    known, drift = rows.column("voxels") - rows.column("new_voxels"), rows.drift
-    met = np.flatnonzero(known >= max(1, np.median(known) if len(known) else 0))
-    worst = met[np.argsort(-drift[met], kind="stable")][:WORST]
-    frames = rows.column("frame").astype(np.int64).tolist()
-    return tuple(FrameDrift(frames[k], float(drift[k]), int(known[k]), scene.frame_name(frames[k])) for k in worst)
 
 
 def up_axis(scene: Scene, points: VoxelTable | Float64, poses: Float64) -> tuple[float, float, float] | None:
@@ -249,7 +236,8 @@ def _savers(
     """
     work, config, unit, tile, savers = live.work, live.work.config, live.unit, live.work.tile, Savers()
     if work.image_space and stream.overview:
-        savers[f"{OVERVIEW}/{slug(unit.scene, unit.model)}.npz"] = partial(_save_overview, stream)
+        pictures = pictures_of_outlying(live.task, config, analysis)
+        savers[overview_file(live.task)] = partial(save_overview, stream.overview | pictures)
     if tile is not None and observations is not None:
         savers[f"{tile.folder}/{tile.size}_{TILE_OBSERVATIONS}"] = observations.save
     if tile is None and work.stored:
@@ -280,7 +268,9 @@ def _savers(
 def unit_savers(task: Task, rows: Series, observations: CellObservations | None, analysis: Analysis | None) -> Savers:
     """Return the files of a unit that do not depend on tiles: its time series, and what statistics rest on."""
     slug = task.units[0].slug
-    savers: Savers = {f"{FRAMES}/{slug}.csv": partial(rows.save_csv, names=task.scene.frame_name)}
+    of_frames = {} if analysis is None else analysis.of_frames()
+    series = partial(rows.save_csv, names=task.scene.frame_name, of_frames=of_frames)
+    savers: Savers = {f"{FRAMES}/{slug}.csv": series}
     if observations is not None:
         savers[f"{OBSERVATIONS}/{slug}.parquet"] = observations.save
     if analysis is not None:
@@ -288,15 +278,29 @@ def unit_savers(task: Task, rows: Series, observations: CellObservations | None,
     return savers
 
 
-def _save_overview(stream: Stream, path: Path) -> None:
-    """Save a frame of the sequence, and those with the most flicker."""
-    meter, task = stream.image_space, stream.task
-    color_of = (
-        (lambda index: task.scene.frame(index, task.model, color=True).color) if "color" in stream.overview else None
-    )
-    worst = {} if meter is None else meter.worst(color_of)
+def overview_file(task: Task) -> str:
+    """Return the path of the pictures of a model on a scene, in the folder of the run."""
+    return f"{OVERVIEW}/{slug(task.scene.name, task.model)}.npz"
+
+
+def save_overview(arrays: Mapping[str, Any], path: Path) -> None:
+    """Save a frame of the sequence, and pictures of those that stand out."""
     with atomic_path(path) as temporary:
-        np.savez_compressed(temporary, **stream.overview, **worst)
+        np.savez_compressed(temporary, **arrays)
+
+
+def pictures_of_outlying(task: Task, config: Config, analysis: Analysis | None) -> dict[str, npt.NDArray[Any]]:
+    """Return pictures of the first frames that stand out, which are read once more, as arrays by name.
+
+    A frame is held against those of the run before and after it, the first and the last one against the two nearest.
+    """
+    outlying, pictures = None if analysis is None else analysis.summary.outlying_frames, list[LonePicture]()
+    for each in () if outlying is None else outlying.frames[:PICTURED]:
+        at = task.indices.index(each.frame)
+        start = min(max(at - 1, 0), len(task.indices) - 3)
+        others = [read(task, task.indices[k], config.pixel_stride) for k in range(start, start + 3) if k != at]
+        pictures.append(LonePicture.of(read(task, each.frame, config.pixel_stride, color=True), others))
+    return LonePicture.arrays(pictures)
 
 
 def written(start: Start, savers: Savers) -> tuple[dict[str, str], dict[str, bytes]]:

@@ -5,8 +5,9 @@ from __future__ import annotations
 import csv
 import dataclasses
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -23,7 +24,10 @@ FRAME_COLUMNS = (
     "map_entropy", "map_recurrent", "fuse_ms",
     "decode_ms", "wait_ms", "association_ms", "update_ms", "left_out",
 )  # fmt: skip
-"""The columns of OUT/frames/*.csv; drift in bits; an undefined number is an empty field."""
+"""The first columns of OUT/frames/*.csv; drift in bits; an undefined number is an empty field."""
+
+OF_FRAMES = ("lone_percent", "lone_null_percent", "outlying")
+"""The next ones, which follow from all frames (`semstab.statistics.frame_disagreement`); the last one is the name."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -95,12 +99,19 @@ class Series:
         values = vars(row.report) | vars(row)
         self._rows.append(values[name] for name in NUMBERS)
 
-    def save_csv(self, path: Path, names: Callable[[int], str] = str) -> None:
-        """Write FRAME_COLUMNS as text and the frames' names, with a header, atomically."""
+    def save_csv(
+        self,
+        path: Path,
+        names: Callable[[int], str] = str,
+        of_frames: Mapping[int, Mapping[str, float]] = MappingProxyType({}),
+    ) -> None:
+        """Write FRAME_COLUMNS, OF_FRAMES by index and the frames' names as text, with a header, atomically."""
         with atomic_path(path) as temporary, temporary.open("w", encoding="utf-8", newline="") as file:
-            writer = csv.DictWriter(file, (*FRAME_COLUMNS, "name"), lineterminator="\n")
+            writer = csv.DictWriter(file, (*FRAME_COLUMNS, *OF_FRAMES, "name"), lineterminator="\n")
             writer.writeheader()
-            writer.writerows(row.cells() | {"name": names(row.report.frame)} for row in self)
+            for row in self:
+                index = row.report.frame
+                writer.writerow(row.cells() | dict(of_frames.get(index, {})) | {"name": names(index)})
 
     def __len__(self) -> int:
         """Return the number of frames."""

@@ -6,6 +6,7 @@ import dataclasses
 import functools
 import operator
 from collections.abc import Mapping, Sequence
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -20,6 +21,9 @@ from semstab.engine.measurement import (
     analyse_sample,
     in_image_space,
     no_voxels,
+    overview_file,
+    pictures_of_outlying,
+    save_overview,
     save_voxels,
     unit_content,
     unit_savers,
@@ -162,6 +166,10 @@ def assembled(
         analysis = analyse_sample(task, config, sample, observations)
     files = {name: digest for each in (frames, *tiles) for name, digest in each.files.items()}
     files = {name: digest for name, digest in files.items() if not name.startswith(tasks[0].folder)}
+    if (pictures := pictures_of_outlying(task, config, analysis)) and overview_file(task) in files:
+        with np.load(folder / overview_file(task)) as content:
+            arrays = {name: content[name] for name in content.files}
+        files |= written(start, {overview_file(task): partial(save_overview, arrays | pictures)})[0]
     if planned.stored:
         savers = unit_savers(task, rows, observations, analysis)
         if config.statistics and analysis is not None:

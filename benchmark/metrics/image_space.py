@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -29,8 +30,8 @@ EDGES_EVERY = 8
 SIDE = 640
 """Pixels of the longer side from which on every n-th pixel of each axis is measured, so that fusion does not wait."""
 
-WORST, THUMBNAIL = 3, 320
-"""The number of frames with the most flicker that the report keeps, and the most pixels of their longer side."""
+PICTURED, THUMBNAIL = 3, 320
+"""The most frames of a unit that stand out and are kept as pictures, and the most pixels of their longer side."""
 
 
 def edge_recall(frame: Frame) -> float:
@@ -50,7 +51,6 @@ class ImageSpaceMeter:
         self._previous: Frame | None = None
         self._by_truth = [VideoConsistency(n) for n in CLIPS]
         self._by_itself = [SelfConsistency(n) for n in CLIPS]
-        self._worst: list[tuple[float, int, npt.NDArray[Any], Mask]] = []
 
     def add(self, frame: Frame, truth: Frame | None) -> float:
         """Add the next frame, and its truth in the same label space if there is any; return compensated flicker."""
@@ -67,33 +67,51 @@ class ImageSpaceMeter:
         ]
         recall = math.nan if len(self.rows) % EDGES_EVERY else edge_recall(sample)
         self.rows.append((flicker, share, *by_truth, *by_itself, recall))
-        if self._previous is not None and flicker > (self._worst[-1][0] if len(self._worst) == WORST else 0.0):
-            some = _thumbnail(sample.shape)
-            labels, changed = sample.predicted[some].copy(), changed_pixels(self._previous, sample)[some].copy()
-            same = [one for one in self._worst if one[3].shape == changed.shape]
-            worst = sorted([*same, (flicker, sample.index, labels, changed)], key=lambda one: -one[0])
-            self._worst = worst[:WORST]
         self._previous = frame
         return flicker
-
-    def worst(self, color_of: Callable[[int], UInt8 | None] | None = None) -> dict[str, Any]:
-        """Return the frames with the most flicker as arrays (n, h, w): labels, changed pixels, and colour.
-
-        Args:
-            color_of: Reads the colour (H, W, 3) of a frame by its index; without it there is none.
-        """
-        if not self._worst:
-            return {}
-        flicker, frames, labels, changed = zip(*self._worst, strict=True)
-        arrays = {"worst_frames": np.array(frames), "worst_flicker": np.array(flicker)}
-        arrays |= {"worst_labels": np.stack(labels), "worst_changed": np.stack(changed)}
-        images = [color_of(index) for index in frames] if color_of else []
-        known = [image[_thumbnail(image.shape)] for image in images if image is not None]
-        return arrays | ({"worst_color": np.stack(known)} if known and len(known) == len(frames) else {})
 
     def result(self, flicker_percent: float) -> ImageSpace:
         """Return means over the frames so far, in addition to the flicker of the unit's summary."""
         return ImageSpace(flicker_percent, **{name: mean(self.rows.column(k)) for k, name in enumerate(COLUMNS)})
+
+
+@dataclass(frozen=True, eq=False)
+class LonePicture:
+    """A frame as a small picture, with the pixels at which it stands alone.
+
+    Attributes:
+        frame: Its index.
+        labels: (h, w) rows 0..K-1, and above where a pixel has none.
+        alone: (h, w) pixels whose label differs from that of each other frame, which all see the same surface point.
+        color: (h, w, 3) its image; None where there is none.
+    """
+
+    frame: int
+    labels: npt.NDArray[Any]
+    alone: Mask
+    color: UInt8 | None
+
+    @classmethod
+    def of(cls, frame: Frame, others: Sequence[Frame]) -> LonePicture:
+        """Hold a frame against others, with the camera's motion removed."""
+        sample = frame.every(-(-max(frame.shape) // SIDE))
+        some = _thumbnail(sample.shape)
+        alone = np.logical_and.reduce([changed_pixels(other, sample) for other in others])
+        color = None if frame.color is None else frame.color[_thumbnail(frame.color.shape)]
+        return cls(frame.index, sample.predicted[some], alone[some], color)
+
+    @staticmethod
+    def arrays(pictures: Sequence[LonePicture]) -> dict[str, npt.NDArray[Any]]:
+        """Return pictures as arrays (n, ...) by name, those with the size of the first; colour where all have it."""
+        same = [own for own in pictures if own.labels.shape == pictures[0].labels.shape]
+        if not same:
+            return {}
+        arrays = {"lone_frames": np.array([own.frame for own in same])}
+        arrays |= {"lone_labels": np.stack([own.labels for own in same])}
+        arrays |= {"lone_alone": np.stack([own.alone for own in same])}
+        images = [own.color for own in same if own.color is not None]
+        alike = len(images) == len(same) and len({image.shape for image in images}) == 1
+        return arrays | ({"lone_color": np.stack(images)} if alike else {})
 
 
 def _thumbnail(shape: tuple[int, ...]) -> tuple[slice, slice]:

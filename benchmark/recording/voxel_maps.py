@@ -26,6 +26,7 @@ from semstab.data.voxels import VoxelTable
 from semstab.metrics import CATEGORY_COLORS, dominant, vss
 from semstab.metrics.agreement import shared_rows
 from semstab.metrics.summary import categorise
+from semstab.report.narrative import outlying_line
 
 
 @dataclass(frozen=True)
@@ -269,8 +270,10 @@ AXES = {
 
 
 def agreement_report(statistics: MapStatistics) -> str:
-    """Return the verdict, and agreement by the distance between two observations of a location, in Markdown."""
+    """Return the verdict, the frames that stand out, and agreement by the distance of two observations, in Markdown."""
     lines = [statistics.verdict.line, ""]
+    if statistics.outlying_frames is not None:
+        lines += [outlying_line(statistics.outlying_frames), ""]
     if statistics.correlogram is not None:
         lines.append("Alpha between frames, by the distance of two observations of a location:")
     for axis, unit in AXES.items() if statistics.correlogram is not None else ():

@@ -7,10 +7,12 @@ from collections.abc import Iterator, Mapping, Sequence
 from semstab.data.measures import VSS
 from semstab.data.records import Record, Result
 from semstab.data.results import UnitSummary, VoxelAdvice
+from semstab.data.statistics import OutlyingFrames
 from semstab.datasets import GROUND_TRUTH
 from semstab.metrics import macro_mean
 from semstab.report.means import ENOUGH, by_model, pooled
 from semstab.report.tables.stability import comparable
+from semstab.statistics.frame_disagreement import LEAST_FRAMES, LEAST_PLACES
 from semstab.statistics.verdict import LIMITS
 
 MOSTLY_ONCE = 0.5
@@ -76,6 +78,26 @@ def warnings(result: Result) -> Iterator[str]:
             f"'{name}' covers {least:.0%}{more} of the map{of}, and determines most of its numbers; read them by class,"
             f" or leave it out: --set exclude.classes=[{name}]"
         )
+
+
+MOST_FRAMES = 12
+"""The most frames that are named in a sentence; the table `frames` has all."""
+
+
+def outlying_line(found: OutlyingFrames, of: str = "", *, most: int = MOST_FRAMES) -> str:
+    """Return which frames stand out, by the names of their files, in order of the sequence; `of` says of what.
+
+    'frames that stand out: 2 of 40, frame-07 frame-31'.
+    """
+    head = f"frames that stand out{f', {of}' if of else ''}"
+    if not found.judged:
+        return f"{head}: not known, fewer than {LEAST_FRAMES} views share {LEAST_PLACES} places with two others"
+    left = f" ({found.unjudged} not judged: they share too few places)" if found.unjudged else ""
+    if not found.frames:
+        return f"{head}: none of {found.judged}{left}"
+    names = [each.name for each in sorted(found.frames, key=lambda each: each.frame)]
+    more = f" and {len(names) - most} more" if len(names) > most else ""
+    return f"{head}: {len(names)} of {found.judged}{left}, {' '.join(names[:most])}{more}"
 
 
 def _is_untested(record: Record) -> bool:

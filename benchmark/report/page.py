@@ -24,7 +24,7 @@ from semstab.report.figures.topdown import FromAbove
 from semstab.report.filter_study import advice, filter_studies, of_interest
 from semstab.report.html import filled, jpeg, png, table_block
 from semstab.report.means import by_model, describe, levels, over_recurrent, pooled, swept
-from semstab.report.narrative import notes, warnings
+from semstab.report.narrative import notes, outlying_line, warnings
 from semstab.report.ranking import answers, stated
 from semstab.report.saved_run import read_series
 from semstab.report.tables import tables
@@ -181,7 +181,8 @@ def _scenes(result: Result, folder: Path, above: Mapping[str, FromAbove]) -> Ite
             "unknown_up": up is None,
             "models": _legend(result.models) if len(result.models) > 1 else [],
             "timeline": list(_timeline(records, colors)),
-            "worst": [row for record in records for row in _worst(record, overviews.get(record.unit.model))],
+            "outlying": [text for record in records for text in _outlying(record, alone=len(records) == 1)],
+            "lone": [row for record in records for row in _lone(record, overviews.get(record.unit.model))],
             "classes": _classes(records, colors),
             "distance": list(_distance(records, colors)),
         }
@@ -238,34 +239,45 @@ def _reduced(image: UInt8, most: int) -> UInt8:
 
 
 def _timeline(records: Sequence[Record], colors: Mapping[str, int]) -> Iterator[dict[str, str]]:
-    """Yield flicker and drift by frame."""
+    """Yield flicker, and how often a frame stands alone beyond its null, by frame."""
     series = {r.unit.model: read_series(r.series) for r in records if r.series is not None and r.series.exists()}
-    for column, title, unit in (
-        ("compensated_flicker_percent", "Flicker", "flicker, % of the pixels"),
-        ("drift", "Drift", "drift, bits per voxel"),
+    for columns, title, unit in (
+        (("compensated_flicker_percent",), "Flicker", "flicker, % of the pixels"),
+        (("lone_percent", "lone_null_percent"), "Frames that stand alone", "alone less its null, % of the places"),
     ):
-        lines = [
-            Line(name, own["frame"].tolist(), own[column].astype(float).tolist(), color=colors[name])
-            for name, own in series.items()
-        ]
+        lines = []
+        for name, own in series.items():
+            if all(column in own for column in columns):
+                first, *null = (own[column].astype(float) for column in columns)
+                values = first - null[0] if null else first
+                lines.append(Line(name, own["frame"].tolist(), values.tolist(), color=colors[name]))
         if any(np.isfinite(line.y).any() for line in lines):
             yield {"title": title, "chart": line_chart(lines, "frame", unit)}
 
 
-def _worst(record: Record, overview: Overview | None) -> Iterator[dict[str, Any]]:
-    """Yield the frames with the most flicker as small images: the image, its labels, and the labels that changed."""
-    if overview is None or overview.worst is None:
+def _outlying(record: Record, *, alone: bool) -> Iterator[str]:
+    """Yield a sentence on the frames that stand out."""
+    found = None if record.statistics is None else record.statistics.outlying_frames
+    if found is not None:
+        yield outlying_line(found, "" if alone else record.unit.model, most=len(found.frames))
+
+
+def _lone(record: Record, overview: Overview | None) -> Iterator[dict[str, Any]]:
+    """Yield frames that stand out as small images: the image, its labels, and the pixels where it stands alone."""
+    found = None if record.statistics is None else record.statistics.outlying_frames
+    if overview is None or overview.lone is None or found is None:
         return
-    worst, K = overview.worst, len(overview.palette)
+    lone, K, named = overview.lone, len(overview.palette), {each.frame: each for each in found.frames}
     palette = np.vstack([overview.palette, np.full((1, 3), 128, np.uint8)])
     faded = np.tile(160 + 0.35 * palette.mean(axis=1, keepdims=True), 3).astype(np.uint8)
-    changed = np.vstack([faded, np.array([[213, 94, 0]], np.uint8)])
-    for k, (frame, flicker) in enumerate(zip(worst.frames, worst.flicker, strict=True)):
-        labels = np.minimum(worst.labels[k].astype(np.int64), K)
-        pictures = [] if worst.color is None else [("image", jpeg(worst.color[k]))]
+    marked = np.vstack([faded, np.array([[213, 94, 0]], np.uint8)])
+    for k, frame in enumerate(lone.frames.tolist()):
+        own, labels = named[frame], np.minimum(lone.labels[k].astype(np.int64), K)
+        pictures = [] if lone.color is None else [("image", jpeg(lone.color[k]))]
         pictures.append(("labels", _indexed(labels, palette)))
-        pictures.append(("changed", _indexed(np.where(worst.changed[k], K + 1, labels), changed)))
-        yield {"title": f"{record.unit.model}, frame {frame}: {flicker:.1f} % flicker", "pictures": pictures}
+        pictures.append(("alone", _indexed(np.where(lone.alone[k], K + 1, labels), marked)))
+        shares = f"alone at {100 * own.share:.0f} % of its places, other frames there at {100 * own.null:.0f} %"
+        yield {"title": f"{record.unit.model}, {own.name}: {shares}", "pictures": pictures}
 
 
 def _indexed(index: Int64, palette: UInt8) -> str:

@@ -22,7 +22,7 @@ from semstab.engine.observer import Observer
 from semstab.engine.units import Plan
 from semstab.metrics import CATEGORIES, macro_mean
 from semstab.report.filter_study import advice, filter_studies
-from semstab.report.narrative import warnings
+from semstab.report.narrative import outlying_line, warnings
 from semstab.report.ranking import answers, short, stated
 from semstab.report.tables import tables
 from semstab.report.tables.filters import row as filter_row
@@ -88,8 +88,7 @@ def _one(result: Result, record: Record) -> Iterator[str]:
         yield f"  map  {stable} stable  {uncertain} uncertain  {drifting} drifting  {low} seen less than 3 times"
     yield from _flicker(record)
     yield from _classes([record])
-    if run.worst_frames:
-        yield f"  most drift in frames    {' '.join(frame.name or str(frame.frame) for frame in run.worst_frames)}"
+    yield from _outlying([record])
     means = "  ".join(f"{m.word} {recurrent[m]:.{m.digits[0]}f}{f' {m.unit}' if m.unit else ''}" for m in measures())
     yield f"  paper (OP>=3)  {means}"
     yield ""
@@ -192,6 +191,7 @@ def _several(result: Result, records: Sequence[Record]) -> Iterator[str]:
             yield f"  {scene}"
         yield from (_laid_out(_cells(record)[:columns]) for record in own)
     yield from _classes(records)
+    yield from _outlying(records)
     yield ""
 
 
@@ -261,6 +261,19 @@ def class_means(records: Sequence[Record]) -> dict[str, tuple[float, float]]:
             if not (math.isnan(row.alpha.value) or math.isnan(row.disagreement)):
                 known.setdefault(row.name, []).append((row.alpha.value, row.disagreement))
     return {name: (macro_mean([a for a, _ in own]), macro_mean([d for _, d in own])) for name, own in known.items()}
+
+
+def _outlying(records: Sequence[Record]) -> Iterator[str]:
+    """Yield the frames that stand out; of several maps only where there are some."""
+    for record in records:
+        found = None if record.statistics is None else record.statistics.outlying_frames
+        if found is None or (len(records) > 1 and not found.frames):
+            continue
+        scene = record.unit.scene if len({each.unit.scene for each in records}) > 1 else ""
+        of = ", ".join(name for name in (scene, record.unit.model) if name) if len(records) > 1 else ""
+        yield from textwrap.wrap(
+            outlying_line(found, of), WIDTH, initial_indent="  ", subsequent_indent="    ", break_on_hyphens=False
+        )
 
 
 def _class_shares(records: Sequence[Record]) -> dict[str, tuple[int, float]]:

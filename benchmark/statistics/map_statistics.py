@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -63,6 +63,7 @@ from semstab.statistics.cube_sums import (
     row_columns,
 )
 from semstab.statistics.drift import expected_sbd
+from semstab.statistics.frame_disagreement import LoneDisagreement, lone_disagreement, outlying_frames
 from semstab.statistics.geometry import losses
 from semstab.statistics.intervals import confidence_intervals, headline_specs, probability_above, scope_of, spec_of
 from semstab.statistics.observations import CellObservations
@@ -83,6 +84,7 @@ class Analysis:
         sample: The voxels that the statistics rest on.
         shares: Number of locations with each share of the dominant class: see `consistency_posterior`.
         drawn: Columns (n,) of the voxels of the sample that need its log or its true labels.
+        lone: How often each frame stands alone; None without sampled cells.
     """
 
     summary: MapStatistics
@@ -91,6 +93,19 @@ class Analysis:
     sample: MapSample
     shares: Float64
     drawn: Columns
+    lone: LoneDisagreement | None = None
+
+    def of_frames(self) -> dict[int, dict[str, float]]:
+        """Return the numbers of each frame by its index, as the time series names them; see `LoneDisagreement`."""
+        if self.lone is None:
+            return {}
+        found = self.summary.outlying_frames
+        named = {each.frame for each in found.frames} if found else set()
+        rows = zip(self.lone.frame.tolist(), self.lone.share.tolist(), self.lone.null.tolist(), strict=True)
+        return {
+            frame: {"lone_percent": 100 * share, "lone_null_percent": 100 * null, "outlying": int(frame in named)}
+            for frame, share, null in rows
+        }
 
     def columns(self, table: VoxelTable, truth: VoxelTable | None = None) -> Columns:
         """Return one value per voxel (n,) by name for the map or any part of it, NaN where undefined.
@@ -154,6 +169,7 @@ def analyse(
     critical: Sequence[str] = (),
     scope: Scope = THIS_SCENE,
     limits: Limits = LIMITS,
+    frame_name: Callable[[int], str] = str,
 ) -> Analysis:
     """Return all statistics of one map; the same seed gives the same numbers.
 
@@ -171,6 +187,7 @@ def analyse(
         critical: The classes that the verdict depends on; where none is named, all with enough locations.
         scope: Scope of the headline and of alpha by class, where there are enough views for it.
         limits: Limits of the verdict.
+        frame_name: Returns the name of a frame's file by its index.
     """
     table, events = sample.table.measured(), sample.events
     truth = None if sample.truth is None else join_truth(table, sample.truth)
@@ -204,6 +221,9 @@ def analyse(
     agreeing = None if cells is None else cell_agreement(cells, influence, table, scope, critical, limits)
     repeats = whole.means.voxels[SBD.key]
     repeated = Repeated(repeats, repeats / whole.voxels if whole.voxels else math.nan)
+    lone, outlying = None if cells is None else lone_disagreement(cells), None
+    if cells is not None and lone is not None:
+        outlying = outlying_frames(lone, len(cells.views), name=frame_name)
     flips_of_map = flipping.flipping(inconsistent, table.classes)
     summary = MapStatistics(
         schema=SCHEMA,
@@ -234,8 +254,9 @@ def analyse(
         geometry=None if limit is None else losses(table, limit),
         correctness=None if truth is None else _correctness(table, truth, consistent, influence, edges, scope),
         strata=_strata(whole, table, columns, edges),
+        outlying_frames=outlying,
     )
-    return Analysis(summary, whole, influence, sample, shares, drawn)
+    return Analysis(summary, whole, influence, sample, shares, drawn, lone)
 
 
 def cell_agreement(

@@ -65,21 +65,19 @@ def draw_stability(above: FromAbove) -> Figure:
 
 
 @dataclass(frozen=True, eq=False)
-class WorstFrames:
-    """The frames of a sequence with the most flicker, the worst first, as small images.
+class LoneFrames:
+    """Frames that stand out, the largest excess first, as small images.
 
     Attributes:
         frames: (n,) their indices.
-        flicker: (n,) percent, camera motion removed.
         labels: (n, h, w) rows 0..K-1, and above where a pixel has none.
-        changed: (n, h, w) pixels whose label differs from that of the frame before.
+        alone: (n, h, w) pixels whose label differs from those of the frames before and after.
         color: (n, h, w, 3); None where the dataset has no images.
     """
 
     frames: Int64
-    flicker: Float64
     labels: npt.NDArray[np.integer[Any]]
-    changed: Mask
+    alone: Mask
     color: Image | None
 
 
@@ -92,14 +90,14 @@ class Overview:
         labels: (H, W) predicted rows 0..K-1; K and above: ignored.
         color: (H, W, 3) the image; None where the dataset has none.
         palette: (K, 3) RGB of the classes.
-        worst: The frames with the most flicker; None where no pixel changed.
+        lone: Frames that stand out; None where none does.
     """
 
     frame: int
     labels: npt.NDArray[np.integer[Any]]
     color: Image | None
     palette: Image
-    worst: WorstFrames | None = None
+    lone: LoneFrames | None = None
 
     @classmethod
     def load(cls, path: Path) -> Overview:
@@ -114,12 +112,10 @@ class Overview:
             with zipfile.ZipFile(io.BytesIO(data)) as archive:
                 arrays = {name: decode_array(path, data, name[:-4]) for name in archive.namelist()}
             own = {name.removesuffix(".npy"): value for name, value in arrays.items()}
-            worst: list[Any] = [
-                own.get(f"worst_{name}") for name in ("frames", "flicker", "labels", "changed", "color")
-            ]
+            lone: list[Any] = [own.get(f"lone_{name}") for name in ("frames", "labels", "alone", "color")]
             return cls(
                 int(own["frame"]), own["labels"], own.get("color"), own["palette"],
-                None if worst[0] is None else WorstFrames(*worst),
+                None if lone[0] is None else LoneFrames(*lone),
             )  # fmt: skip
         except (ValueError, TypeError, KeyError, RuntimeError, zipfile.BadZipFile) as error:
             raise DataError(

@@ -24,7 +24,7 @@ from semstab.report.tables.stability import (
     sensitivity,
     voxel_sizes,
 )
-from semstab.report.tables.statistics import class_agreement, drift, temporal_agreement, uncertainty, verdicts
+from semstab.report.tables.statistics import class_agreement, drift, frames, temporal_agreement, uncertainty, verdicts
 from semstab.report.tables.table import TEXT_WRITERS, Cell, Column, Group, Table, to_csv, to_json, to_latex, to_markdown
 
 __all__ = [
@@ -43,7 +43,7 @@ __all__ = [
 
 BUILDERS = (
     overview, verdicts, flicker, scenes, persistence, classes, temporal_agreement, correlogram, class_agreement, drift,
-    uncertainty, ceiling, correctness, cross_model, comparison, sensitivity, voxel_sizes, reduced, fusion,
+    frames, uncertainty, ceiling, correctness, cross_model, comparison, sensitivity, voxel_sizes, reduced, fusion,
     compared, agreement,
 )  # fmt: skip
 """The functions that make tables, in the paper's order; without numbers for its tables a function returns none."""

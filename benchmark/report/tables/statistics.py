@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import TypeVar
 
 from semstab.data.measures import ENTROPY, VSS
@@ -16,12 +16,15 @@ from semstab.data.statistics import (
     DriftStatistics,
     Estimate,
     MapStatistics,
+    OutlyingFrames,
 )
 from semstab.metrics import macro_mean
 from semstab.report.means import by_model
 from semstab.report.tables.table import Cell, Column, Group, Row, Table
 from semstab.statistics.agreement import ALPHA, KAPPA, PSA, VOXEL_ALPHA
 from semstab.statistics.drift import FLIP_RATE
+from semstab.statistics.frame_disagreement import LEAST_EXCESS, LEAST_PLACES, LEVEL
+from semstab.statistics.frame_disagreement import LEAST_FRAMES as LEAST_JUDGED
 from semstab.statistics.intervals import LEAST_FRAMES
 from semstab.statistics.verdict import ADVICE, DANGEROUS, DECIDED, LEAST_CLASSES, LIMITS
 
@@ -136,6 +139,42 @@ def drift(result: Result) -> list[Table]:
         f"{trend if logged else ''} {INTERVALS}"
     )
     return by_scene(result, "drift", "Belief drift against random order", caption, columns, numbers)
+
+
+def frames(result: Result) -> list[Table]:
+    """Return the frames that stand out, by the names of their files; a map without any has one row that says so."""
+    groups = []
+    for model, rows in assessed_records(result).items():
+        known = [(record, stats.outlying_frames) for record, stats in rows]
+        lines = tuple(row for record, found in known if found is not None for row in _frame_rows(record, found))
+        groups += [Group(model, lines)] if lines else []
+    if not groups:
+        return []
+    columns = (
+        SCENE,
+        Column("frame", "Frame"),
+        Column("places", "Places", 0),
+        Column("alone_percent", "alone (%)", 1, "lower", over="Of its places"),
+        Column("null_percent", "other frames there (%)", 1, over="Of its places"),
+        Column("judged", "Judged", 0),
+        Column("unjudged", "Not judged", 0),
+    )
+    caption = (
+        "A frame stands alone at a place where the views that saw it next before and after agree on another class. It"
+        " is named where it does so more often than other frames do at the same places, beyond the spread of the frames"
+        f" (generalized extreme studentized deviate test, at {LEVEL:g}), and by {LEAST_EXCESS:.0%} of the places or"
+        " more. Places are the sampled ones that the frame saw, as two other views did at least. Frames with fewer than"
+        f" {LEAST_PLACES} places are not judged, and none is where fewer than {LEAST_JUDGED} frames can be."
+    )
+    return [Table("frames", "Frames that stand out", caption, columns, tuple(groups))]
+
+
+def _frame_rows(record: Record, found: OutlyingFrames) -> Iterator[Row]:
+    counts = found.judged, found.unjudged
+    for each in found.frames:
+        yield record.unit.scene, each.name, each.places, 100 * each.share, 100 * each.null, *counts
+    if not found.frames:
+        yield record.unit.scene, "none", math.nan, math.nan, math.nan, *counts
 
 
 def uncertainty(result: Result) -> list[Table]:

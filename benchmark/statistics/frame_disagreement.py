@@ -1,0 +1,159 @@
+"""Which frames stand alone: at places where the views before and after them agree, they give another class.
+
+A place is a block of the sample (`Sampler`), 4 x 4 x 4 cells; its class in a view is the one that most of the view's
+labelled pixels there have. The neighbours of a view at a place are the NEIGHBOURS other views that saw it next before
+and after. A frame next to a bad one is not blamed: its neighbours do not agree with each other where the bad one errs.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from semstab.core.types import Float64, Int64, Mask
+from semstab.data.events import Events
+from semstab.data.statistics import FrameDisagreement, OutlyingFrames
+from semstab.statistics.loops import CELLS
+from semstab.statistics.observations import CellObservations
+
+NEIGHBOURS = 4
+"""Most other views that a view is held against at a place: half of them before it, half after it, or the nearest."""
+
+LEAST_VIEWS = 3
+"""Views of a place from which on one of them can stand alone."""
+
+LEAST_PLACES = 50
+"""Places from which on a frame is judged."""
+
+LEAST_FRAMES = 6
+"""Judged frames from which on one of them can stand out."""
+
+LEAST_EXCESS = 0.03
+"""Share of its places by which a frame stands out at least: 3 in 100."""
+
+LEVEL = 0.025
+"""Nominal level at which any frame of equal ones is named; 4 to 5 of 100 simulated runs (docs/validity.md)."""
+
+
+@dataclass(frozen=True, eq=False)
+class LoneDisagreement:
+    """How often each judged frame stands alone.
+
+    Attributes:
+        frame: (F,) indices of frames, the first of their view, ascending.
+        places: (F,) places that the frame saw, as two other views did at least.
+        share: (F,) share of them at which all neighbours agree on another class than the frame's.
+        null: (F,) the mean of the same over the other views of these places: what the frame would have if it were one
+            of them.
+    """
+
+    frame: Int64
+    places: Int64
+    share: Float64
+    null: Float64
+
+    @property
+    def excess(self) -> Float64:
+        """(F,) share less its null; 0 in the mean where all views of a place err alike."""
+        return self.share - self.null
+
+
+def lone_disagreement(cells: CellObservations) -> LoneDisagreement:
+    """Return how often each frame disagrees with all of its neighbours at a place, while these agree.
+
+    x_vt = 1 where view t of place v stands alone, else 0. If the T_v views of a place are exchangeable, x_vt has the
+    same mean for all of them, so that
+
+        excess_t = mean over v of (x_vt - (sum_s x_vs - x_vt) / (T_v - 1))
+
+    is 0 in the mean, however hard the places are that frame t sees, and however often they were seen.
+    """
+    log = cells.observations(CELLS)
+    voxel, alone = log.voxel.astype(np.int64), stands_alone(log)
+    T, total = np.bincount(voxel)[voxel], np.bincount(voxel, alone)[voxel]
+    several = LEAST_VIEWS <= T
+    frame, of = np.unique(log.frame[several], return_inverse=True)
+    places = np.bincount(of, minlength=len(frame))
+    others = (total - alone)[several] / (T - 1)[several]
+    share, null = (np.bincount(of, x, len(frame)) / places for x in (alone[several], others))
+    return LoneDisagreement(frame.astype(np.int64), places, share, null)
+
+
+def stands_alone(log: Events) -> Mask:
+    """Return the observations (m,) whose neighbours at the place, two or more, all have one class that is another."""
+    label, rows = log.evidence.argmax(axis=1), np.arange(len(log))
+    first, last = log.starts[log.voxel], log.ends[log.voxel]
+    width = np.minimum(last - first, NEIGHBOURS + 1)
+    start = np.clip(rows - NEIGHBOURS // 2, first, last - width)
+    reference = label[np.where(start == rows, np.minimum(start + 1, len(log) - 1), start)]
+    alone: Mask = (width >= LEAST_VIEWS) & (label != reference)
+    for k in range(NEIGHBOURS + 1):
+        at = np.minimum(start + k, len(log) - 1)
+        alone &= (k >= width) | (at == rows) | (label[at] == reference)
+    return alone
+
+
+def outlying_rows(values: Float64, level: float = LEVEL) -> Int64:
+    """Return the rows of values (n,) that lie above the others, by the generalized extreme studentized deviate test.
+
+    The largest value is taken away again and again, up to half of all; R_i is the i-th one's distance from the mean of
+    those that are left with it, in their standard deviations. With the largest i for which R_i exceeds its limit, i
+    values lie above the others: so several outliers do not hide each other (Rosner 1983, Technometrics 25, one-sided).
+
+    Args:
+        values: (n,) finite numbers, about normal where nothing lies above the others.
+        level: The nominal probability that any of n values from one normal distribution is returned.
+    """
+    order, outlying = np.argsort(-values, kind="stable"), 0
+    for i in range((len(values) - 1) // 2):
+        left = values[order[i:]]
+        deviation = float(left.std(ddof=1))
+        if deviation > 0 and left[0] - left.mean() > largest_deviate(len(left), level) * deviation:
+            outlying = i + 1
+    return np.asarray(np.sort(order[:outlying]), np.int64)
+
+
+def largest_deviate(n: int, level: float) -> float:
+    """Return the studentized deviate that the largest of n normal values exceeds with this probability (Grubbs)."""
+    from scipy.special import stdtrit
+
+    t = float(stdtrit(n - 2, 1 - level / n))
+    return float((n - 1) * t / np.sqrt((n - 2 + t * t) * n))
+
+
+def outlying_frames(found: LoneDisagreement, views: int, *, name: Callable[[int], str] = str) -> OutlyingFrames:
+    """Return the frames that stand alone more often than those of the same quality do.
+
+    The null is the spread of the frames themselves, which has in it how places, labels and frames vary: a frame is
+    named where its excess is an outlier among the excesses, and at least LEAST_EXCESS above the mean of the frames
+    that are not named. The excess of a frame with fewer places than half of the frames have is more uncertain, and
+    counts as sqrt(places / median) of its own.
+
+    Args:
+        found: Of the frames of a map.
+        views: Distinct views of the map; those without enough places are counted, not judged.
+        name: Returns the name of a frame's file by its index.
+    """
+    judged = np.flatnonzero(found.places >= LEAST_PLACES)
+    if len(judged) < LEAST_FRAMES:
+        return OutlyingFrames(judged=0, unjudged=views, usual=math.nan)
+    places, excess = found.places[judged], found.excess[judged]
+    above = outlying_rows(excess * np.sqrt(np.minimum(places / np.median(places), 1.0)))
+    usual = float(np.delete(excess, above).mean())
+    named = above[excess[above] >= usual + LEAST_EXCESS]
+    rows = judged[named[np.argsort(-excess[named], kind="stable")]]
+    return OutlyingFrames(
+        judged=len(judged),
+        unjudged=views - len(judged),
+        usual=usual,
+        frames=tuple(
+            FrameDisagreement(
+                int(found.frame[k]), name(int(found.frame[k])), int(found.places[k]), float(found.share[k]),
+                float(found.null[k]),
+            )
+            for k in rows
+        ),
+    )  # fmt: skip
