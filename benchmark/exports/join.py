@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import io
 import itertools
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
@@ -234,10 +235,11 @@ def _outside(cloud: Path, finder: _Finder) -> DataError:
 
 
 def _classify_las(voxels: Voxels, cloud: Path, out: Path, find: Finder, asprs: Path | None) -> None:
-    clouds.with_lazrs(cloud)
+    las = clouds.with_lazrs(cloud)
     with open_las(cloud) as reader:
         _require_same_crs(voxels, reader.header, cloud)
         header, records = _extended(reader.header, voxels), type(reader.header.vlrs)(_without_copc(reader.evlrs or ()))
+        las.open(io.BytesIO(), "w", header=copy.deepcopy(header)).close()  # one that cannot be written is the cloud's
     with clouds.las_writer(out, header) as writer:
         for points in _las_chunks(cloud):
             writer.write_points(_classified_points(points, writer.header, voxels, find, asprs))

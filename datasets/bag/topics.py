@@ -146,8 +146,10 @@ def _images(bag: OpenBag, options: BagOptions) -> Iterable[tuple[str, Images]]:
     """Yield the topics of images that can be read; of a named one that cannot be an error is raised."""
     named = {topic for topic, _ in _named(options).values()}
     for name in bag.of_types(RAW, COMPRESSED):
-        message = bag.first(name)
         try:
+            message = bag.first(name)
+            if message is None:
+                raise DataError(f"{bag.path}, {name}: holds no message that can be read; record the bag again")
             kind = kind_of(message, bag.topics[name].type, f"{bag.path}, {name}")
         except DataError:
             if name in named:
@@ -213,5 +215,6 @@ def _info_of(bag: OpenBag, images: Images) -> str | None:
     own = f"{images.base.rpartition('/')[0]}/camera_info"
     if own in infos:
         return own
-    same = [name for name in infos if bare(bag.first(name).header.frame_id) == images.frame]
+    firsts = ((name, bag.first(name)) for name in infos)
+    same = [name for name, message in firsts if message is not None and bare(message.header.frame_id) == images.frame]
     return min(same, default=None)
