@@ -15,6 +15,8 @@ from semstab.errors import DataError
 from semstab.report.tables import tables
 
 NOW = {new: old for old, new in KEYS.items()}
+GONE = ("cells", "correlogram", "outlying_frames")
+"""What version 0.3 did not have."""
 
 
 def as_in_0_3(value):
@@ -24,7 +26,7 @@ def as_in_0_3(value):
     if not isinstance(value, dict):
         return value
     interval = "scope" in value and "low" in value
-    named = {NOW.get(key, key): as_in_0_3(item) for key, item in value.items() if key not in ("cells", "correlogram")}
+    named = {NOW.get(key, key): as_in_0_3(item) for key, item in value.items() if key not in GONE}
     if interval:
         named["places"] = named.pop("locations")
         named["question"] = {"these frames": "this map"}.get(named["question"], "the next flight")
@@ -32,7 +34,7 @@ def as_in_0_3(value):
         named["alpha"] = named.pop("voxel_alpha")
     if "kappa" in named and "psa" in named:
         named |= {"alpha_between": named["alpha"], "each_place": named["alpha"]}
-    if "judged" in named:
+    if isinstance(named.get("judged"), dict):
         named["judged"]["alpha_between"] = named["judged"]["alpha"]
         share = {
             "name": "road",

@@ -24,7 +24,7 @@ def test_a_torchscript_file_labels_as_the_networks_own_code(tmp_path):
     dataset = open_dataset("posed_folder", {"root": str(DATA / "livingroom")})
     image = dataset.scene(dataset.scenes[0]).image(60)
     own = create(f"{NETWORKS / 'nets.py'}:dicenet_voc", scale=0.5)
-    wrapper = Code.load(f"{NETWORKS / 'nets.py'}:dicenet_voc").target(scale=0.5)
+    wrapper = Code.load(f"{NETWORKS / 'nets.py'}:dicenet_voc", "model").target(scale=0.5)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         torch.jit.trace(wrapper.net, torch.rand(1, 3, 384, 384), check_trace=False).save(tmp_path / "net.pt")

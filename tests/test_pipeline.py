@@ -21,7 +21,7 @@ from semstab.core.json_form import to_json
 from semstab.data.measures import ENTROPY, SBD, VSS
 from semstab.data.records import Result
 from semstab.data.results import STAGES, Unit
-from semstab.datasets.files import scene
+from semstab.datasets.files import options
 from semstab.engine import Observer, load_result
 from semstab.errors import ConfigError, DataError
 from semstab.report.terminal import print_answer
@@ -323,7 +323,7 @@ def test_each_image_is_read_once(root, tmp_path, monkeypatch) -> None:
     """The key of a unit comes from the bytes that were decoded, and equals the one that a later start computes."""
     read = []
     monkeypatch.setattr(
-        scene, "file_digest", lambda path, digest=scene.file_digest: (read.append(path.name), digest(path))[1]
+        options, "file_digest", lambda path, digest=options.file_digest: (read.append(path.name), digest(path))[1]
     )
     config = configure(root, models=["a"])
     semstab.run(config, out=tmp_path / "run", report=False)

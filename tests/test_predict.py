@@ -586,13 +586,13 @@ def test_a_size_is_height_and_width(text, size):
 
 
 def test_an_option_of_a_model_may_be_called_as_one_of_ours(scene, tmp_path):
-    (tmp_path / "own.py").write_text(
+    (tmp_path / "asks.py").write_text(
         "class Net:\n    classes = ['a', 'b']\n    def __init__(self, dataset, frames=0):\n"
         "        assert (dataset, frames) == ('pascal', 3)\n"
         "    def predict(self, image):\n        return image[..., 0] * 0\n"
     )
     options = ("--set", "dataset=pascal", "--set", "frames=3", "--set", "dataset.options.incomplete=skip")
-    done = bench("predict", "-m", f"{tmp_path / 'own.py'}:Net", "--data", str(scene), *options, cwd=tmp_path)
+    done = bench("predict", "-m", f"{tmp_path / 'asks.py'}:Net", "--data", str(scene), *options, cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     said = json.loads((scene / "labels/Net/predictions.json").read_text())
     assert said["settings"]["options"] == {"dataset": "pascal", "frames": 3}

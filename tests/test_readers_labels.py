@@ -93,7 +93,7 @@ def test_a_name_from_a_file_cannot_lead_out_of_the_folder(tmp_path):
     for name in ("../../../etc/passwd", "a\nb", "a\0b", "x" * 2000, "\ud800"):
         frames = [FrameSource(name, tmp_path, tmp_path, camera)]
         options = FileOptions(root=tmp_path)
-        fails(DataError, "leaves|cannot be the path", find_sources, options, place, frames, Folders())
+        fails(DataError, "leaves|cannot be the path", find_sources, options, place, frames, Folders(), {})
 
 
 def test_labels_and_scores_side_by_side(scene):
