@@ -41,6 +41,11 @@ class Engine(Protocol):
 ONNX_TYPES = {"tensor(float)": np.float32, "tensor(float16)": np.float16, "tensor(uint8)": np.uint8}
 
 
+def _require_cpu(path: Path, device: str, kind: str) -> None:
+    if device != "cpu":
+        raise ConfigError(f"{path}: {kind} files run on the cpu, not on {device}; leave device out")
+
+
 class OnnxFile:
     """A network of one image, run by ONNX Runtime on the CPU."""
 
@@ -54,8 +59,7 @@ class OnnxFile:
             raise MissingDependencyError(
                 f"{path}: needs ONNX Runtime ({summarize_error(error)}); pip install 'semstab[onnx]'"
             ) from error
-        if device != "cpu":
-            raise ConfigError(f"{path}: ONNX files run on the cpu, not on {device}; leave device out")
+        _require_cpu(path, device, "ONNX")
         settings = onnxruntime.SessionOptions()
         settings.log_severity_level = 4
         if threads is not None:
@@ -145,8 +149,7 @@ class TfliteFile:
             raise MissingDependencyError(
                 f"{path}: needs LiteRT ({summarize_error(error)}); pip install 'semstab[tflite]'"
             ) from error
-        if device != "cpu":
-            raise ConfigError(f"{path}: TFLite files run on the cpu, not on {device}; leave device out")
+        _require_cpu(path, device, "TFLite")
         try:
             self._interpreter: Any = Interpreter(model_path=str(path), num_threads=threads)
             self._interpreter.allocate_tensors()

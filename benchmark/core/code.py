@@ -16,6 +16,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any, TypeVar
 
+from semstab.core.files import file_digest
 from semstab.core.process import printing_aside
 from semstab.errors import ConfigError, DataError, MissingDependencyError, summarize_error
 
@@ -69,7 +70,7 @@ class Code:
     def digest(self) -> str:
         """The hash of the file that holds it."""
         file = self.module.__file__
-        return "" if file is None else hashlib.blake2b(Path(file).read_bytes(), digest_size=16).hexdigest()
+        return "" if file is None else file_digest(Path(file)).hex()
 
     def accepts(self, options: dict[str, Any], *more: Any) -> None:
         """Check the call with `more` and these options.

@@ -42,8 +42,8 @@ def require_unchanged(path: str | Path) -> None:
 
 def _state(path: Path) -> tuple[int, int, int]:
     """Return what differs once a file was written again."""
-    found = path.stat()
-    return found.st_ino, found.st_size, found.st_mtime_ns
+    state = path.stat()
+    return state.st_ino, state.st_size, state.st_mtime_ns
 
 
 @lru_cache(maxsize=64)

@@ -227,14 +227,14 @@ def _differences(a: VoxelTable, b: VoxelTable, in_a: Int64, in_b: Int64, toleran
         first = Mismatch(_voxel(a, in_a[rows[0]]), column, x[where].item(), y[where].item(), len(rows))
         return _Difference(largest, total, first)
 
-    found = {name: difference(name, *values(name)) for name in COUNTS}
+    differences = {name: difference(name, *values(name)) for name in COUNTS}
     for name in SUMS:
         x, y = values(name)
-        found[name] = difference(name, x, y, tolerance * np.maximum(1.0, np.abs(y)))
+        differences[name] = difference(name, x, y, tolerance * np.maximum(1.0, np.abs(y)))
     for measure in measures():
-        found[measure.key] = difference(measure.key, measure.of(rows_a), measure.of(rows_b))
+        differences[measure.key] = difference(measure.key, measure.of(rows_a), measure.of(rows_b))
     other = dominant(rows_a) != dominant(rows_b)
-    return found | {LABEL: _Difference(float(other.max(initial=False)), float(other.sum()), None)}
+    return differences | {LABEL: _Difference(float(other.max(initial=False)), float(other.sum()), None)}
 
 
 def _in_one_only(got: VoxelTable, expected: VoxelTable, in_got: Int64, in_expected: Int64) -> Iterator[Mismatch]:

@@ -84,20 +84,20 @@ MOST_FRAMES = 12
 """The most frames that are named in a sentence; the table `frames` has all."""
 
 
-def outlying_line(found: OutlyingFrames, of: str = "", *, most: int = MOST_FRAMES) -> str:
+def outlying_line(outlying: OutlyingFrames, of: str = "", *, most: int = MOST_FRAMES) -> str:
     """Return which frames stand out, by the names of their files, in order of the sequence; `of` says of what.
 
     'frames that stand out: 2 of 40, frame-07 frame-31'.
     """
     head = f"frames that stand out{f', {of}' if of else ''}"
-    if not found.judged:
+    if not outlying.judged:
         return f"{head}: not known, fewer than {LEAST_FRAMES} views share {LEAST_PLACES} places with two others"
-    left = f" ({found.unjudged} not judged: they share too few places)" if found.unjudged else ""
-    if not found.frames:
-        return f"{head}: none of {found.judged}{left}"
-    names = [each.name for each in sorted(found.frames, key=lambda each: each.frame)]
+    left = f" ({outlying.unjudged} not judged: they share too few places)" if outlying.unjudged else ""
+    if not outlying.frames:
+        return f"{head}: none of {outlying.judged}{left}"
+    names = [each.name for each in sorted(outlying.frames, key=lambda each: each.frame)]
     more = f" and {len(names) - most} more" if len(names) > most else ""
-    return f"{head}: {len(names)} of {found.judged}{left}, {' '.join(names[:most])}{more}"
+    return f"{head}: {len(names)} of {outlying.judged}{left}, {' '.join(names[:most])}{more}"
 
 
 def _is_untested(record: Record) -> bool:
