@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 from typing import Any
 
 from semstab.check import with_voxel_size
@@ -24,12 +23,11 @@ def filter_study_config(
     sources: Sequence[str],
     filters: Sequence[str],
     content: Mapping[str, Any],
-    cache: Path | None = None,
 ) -> tuple[Config, list[str]]:
     """Return the study `filters` with these models, and filters over the scenes' label sources, as dataset settings.
 
     Without models or sources all sources are taken; without filters those of the shipped study, with its map prior in
-    voxels of the run. The folder `cache` stores the predictions of models. Also returns a note on the filters that are
+    voxels of the run. Also returns a note on the filters that are
     left out because a model gives no scores.
 
     Raises:
@@ -48,8 +46,7 @@ def filter_study_config(
     able, left_out = _able(grid, predictors, scene)
     settings = {**content, "voxel_size": config.voxel_size, "frame_quality": True, "check": None, "name": STUDY}
     study = predicted_config(predictors, None, {**settings, "models": None})
-    more = {"try_filters": able, "cache": None if cache is None else str(cache)}
-    dataset_config = study.dataset.model_copy(update={"options": {**study.dataset.options, **more}})
+    dataset_config = study.dataset.model_copy(update={"options": {**study.dataset.options, "try_filters": able}})
     return study.model_copy(update={"dataset": dataset_config}), left_out
 
 

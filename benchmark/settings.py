@@ -11,7 +11,7 @@ from semstab.config import Config, merge, nearest, read_yaml, validated
 from semstab.config.settings import in_full
 from semstab.datasets import GROUND_TRUTH, open_dataset, resolved
 from semstab.errors import ConfigError
-from semstab.predict.live import NAME as PREDICTED
+from semstab.predict.dataset import NAME as PREDICTED
 from semstab.predict.predictor import NAME as STORED
 from semstab.predict.predictor import PredictorConfig, StoredSequence
 

@@ -6,6 +6,7 @@ import dataclasses
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from pathlib import Path
 
 import numpy as np
 
@@ -51,13 +52,13 @@ class Task:
         return self.scene.digest([*self.indices], self.model)
 
 
-def open_scenes(config: Config) -> dict[str, Scene]:
-    """Open the scenes that a configuration selects, by name; no image is read.
+def open_scenes(config: Config, run_folder: Path | None = None) -> dict[str, Scene]:
+    """Open the scenes that a configuration selects, by name, for a run in that folder; no image is read.
 
     Raises:
         ConfigError, DataError: If there is no such scene, or its files contradict each other.
     """
-    dataset = open_dataset(config.dataset.name, config.dataset.options)
+    dataset = open_dataset(config.dataset.name, config.dataset.options, run_folder)
     names = selected(config.scenes, dataset.scenes, (), "scene", config.dataset.name)
     return {name: dataset.scene(name) for name in names}
 

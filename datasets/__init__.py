@@ -29,7 +29,7 @@ REGISTRY = Registry(
     "dataset",
     {
         "predicted": Entry(
-            "semstab.predict.live:PredictedDataset",
+            "semstab.predict.dataset:PredictedDataset",
             "another dataset with labels that models make while it is fused: `run --predict`",
         ),
         "frames": Entry("semstab.online.frames:Frames", "frames that a Python program gives to `semstab.fuse`"),
@@ -83,8 +83,8 @@ def resolved(config: DatasetConfig) -> DatasetConfig:
     return config.model_copy(update={"options": options.model_copy(update=paths).model_dump(mode="json")})
 
 
-def open_dataset(name: str, options: dict[str, Any] | BaseModel) -> Dataset:
-    """Open a dataset by name with its options.
+def open_dataset(name: str, options: dict[str, Any] | BaseModel, run_folder: Path | None = None) -> Dataset:
+    """Open a dataset by name with its options, for a run in that folder where there is one.
 
     Raises:
         ConfigError: If the name or an option cannot be used.
@@ -93,7 +93,9 @@ def open_dataset(name: str, options: dict[str, Any] | BaseModel) -> Dataset:
     """
     cls = REGISTRY.load(name)
     validated = options if isinstance(options, BaseModel) else cls.Options.model_validate(options)
-    return cast("Dataset", cls(validated))
+    dataset = cast("Dataset", cls(validated))
+    dataset.run_folder = run_folder
+    return dataset
 
 
 RECOGNISED = (

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import logging
 import math
@@ -148,6 +149,10 @@ class Scene(ABC):
         """Return the seconds that a model took to predict on a frame; NaN where it did not, as labels are read."""
         return math.nan
 
+    def reading(self, indices: Sequence[int], model: str) -> contextlib.AbstractContextManager[None]:
+        """Return a block in which these frames are going to be read, with that model's labels."""
+        return contextlib.nullcontext()
+
     def geometry(self, index: int, *, color: bool = False) -> Frame:
         """Return the frame but for its labels: all pixels are of class 0.
 
@@ -220,9 +225,14 @@ class Scene(ABC):
 
 
 class Dataset(ABC):
-    """A set of scenes. Its class has `Options`, a pydantic model, and is made with an instance of it."""
+    """A set of scenes. Its class has `Options`, a pydantic model, and is made with an instance of it.
+
+    Attributes:
+        run_folder: Folder of the run that reads it, for what it makes on the way; None where nobody runs.
+    """
 
     Options: type[BaseModel]
+    run_folder: Path | None = None
 
     @property
     @abstractmethod

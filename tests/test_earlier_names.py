@@ -16,7 +16,7 @@ from semstab.datasets.files.options import Template
 from semstab.errors import ConfigError
 from semstab.models import REGISTRY, Model, options_model
 from semstab.models.checkpoint import ModelOptions
-from semstab.predict.live import PredictedOptions
+from semstab.predict.dataset import PredictedOptions
 from semstab.predict.predictor import PredictorConfig
 from semstab.settings import load_study
 
@@ -43,8 +43,8 @@ def test_settings(warned):
     assert options.try_filters == ["vote:3"]
     warned("'remedies'", "'try_filters'")
     options = PredictedOptions(dataset={"name": "city"}, models=[{"model": "colour-clusters"}], kept="predictions")
-    assert options.cache == Path("predictions")
-    warned("'kept'", "'cache'")
+    assert options.folder == Path("predictions")
+    warned("'kept'", "'folder'")
 
 
 def test_a_setting_that_is_given_under_both_names_is_refused():

@@ -10,14 +10,13 @@ import pytest
 from posed_config import dataset_of
 from typer.testing import CliRunner
 
+from semstab.api import run
 from semstab.cli import app
-from semstab.data.labels import LabelSpace
 from semstab.datasets import open_dataset
 from semstab.datasets.formats.images import read_labels
 from semstab.errors import ConfigError, DataError
-from semstab.models import Model, Prediction
 from semstab.predict.filters import REGISTRY, parse
-from semstab.predict.predictor import Cached, PredictorConfig, load_predictor, parse_predictor, stored_labels
+from semstab.predict.predictor import PredictorConfig, load_predictor, parse_predictor, stored_labels
 from semstab.predict.sequence import SequenceOptions, predict_sequence
 from semstab.settings import filtered_config, predicted_config, resolve
 
@@ -139,35 +138,43 @@ def test_labels_that_change_on_disk_are_filtered_again(scene):
     assert live(filtered_config(["ema:0.6"], None, config))[1] != before
 
 
-def test_what_is_kept_on_disk_is_asked_once(tmp_path):
-    class Counted(Model):
-        label_space = LabelSpace("two", ("a", "b"))
-        gives_scores = True
-        asked = 0
+COUNTED = """
+import os
 
-        def predict(self, images, *, scores=False):
-            self.asked += len(images)
-            half = np.full((*images[0].shape[:2], 2), 0.5, np.float32)
-            return [Prediction(image[..., 0] % 2, half if scores else None) for image in images]
+import numpy as np
 
-        def identity(self):
-            return {"counted": 1}
+classes = ["dark", "bright"]
+gives_scores = True
 
-    model, images = Counted(), [predicted_scene.image(k) for k in range(3)]
-    first = Cached(model, tmp_path).predict(images)
-    again = Cached(model, tmp_path).fit([]).predict(images, scores=True)
-    assert model.asked == 3
-    for a, b, image in zip(first, again, images, strict=True):
-        np.testing.assert_array_equal(a.labels, image[..., 0] % 2)
-        np.testing.assert_array_equal(a.labels, b.labels)
-        assert a.scores is None
-        assert (b.scores == 0.5).all()
-    Cached(model, tmp_path).fit(images[:1]).predict(images[:1])  # fitted to something else it is another model
-    assert model.asked == 4
-    for file in tmp_path.iterdir():
-        file.write_bytes(file.read_bytes()[:500])
-    Cached(model, tmp_path).predict(images)  # what is damaged is asked for again
-    assert model.asked == 7
+def net(image):
+    with open(os.environ["COUNTS"], "a") as file:
+        file.write("x")
+    bright = image.mean(axis=2, dtype=np.float32)[..., None] / 255
+    return np.concatenate([1 - bright, bright], axis=2)
+"""
+
+
+@pytest.mark.parametrize("shown", [True, False])
+def test_filters_over_one_model_share_its_maps(scene, monkeypatch, shown):
+    (scene.parent / "counted.py").write_text(COUNTED)
+    monkeypatch.setenv("COUNTS", str(scene.parent / "count"))
+    file = f"{scene.parent / 'counted.py'}:net"
+    chains = [["ema:0.6"], ["vote:3"], ["guided:4", "threshold:0.6"]]
+    models = [parse_predictor(file)] * shown + [parse_predictor(file, filters=chain) for chain in chains]
+    out = scene.parent / "run"
+    found = run(predicted_config(models, None, {"dataset": dataset_of(scene), "voxel_size": 0.25}), out=out)
+    assert (scene.parent / "count").read_text() == "x" * 6
+    base = "net" if shown else "net-ema-0.6-unfiltered"
+    assert {path.name for path in (out / "predictions/flight/scores").iterdir()} == {base}
+    names = ["net-ema-0.6", "net-vote-3", "net-guided-4-threshold-0.6"]
+    assert [record.unit.model for record in found.runs] == ["net"] * shown + names
+    for name, chain in zip(names, chains, strict=True):
+        alone = load_predictor(parse_predictor(file, filters=chain))
+        frames = [predicted_scene.frame(k, 1) for k in range(6)]
+        wanted = alone.predict([predicted_scene.image(k) for k in range(6)], geometry=frames)
+        for k in range(6):
+            read = read_labels(out / f"predictions/flight/labels/{name}/{k:03d}.png")
+            np.testing.assert_array_equal(read, wanted[k].labels, err_msg=name)
 
 
 # --- The command line -------------------------------------------------------------------------------------------------

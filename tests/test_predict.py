@@ -7,6 +7,7 @@ import dataclasses
 import io
 import itertools
 import json
+import math
 import re
 from pathlib import Path
 
@@ -338,13 +339,13 @@ def test_observers_see_every_frame(scene):
         def sequence_started(self, name, frames):
             self.said.append((name, frames))
 
-        def frame_done(self, reused):
-            self.said.append(reused)
+        def frame_done(self, shown, seconds):
+            self.said.append((shown.name, math.isnan(seconds)))
 
     predict(scene, Shifting(), indices=[0, 2])
     counter = Counter()
     predict(scene, Shifting(), indices=range(3), observers=[counter])
-    assert counter.said == [("flight", 3), True, False, True]
+    assert counter.said == [("flight", 3), ("000", True), ("001", False), ("002", True)]
 
 
 # --- Images -----------------------------------------------------------------------------------------------------------
@@ -726,17 +727,70 @@ def test_frames_have_colour_where_it_is_wanted(scene):
 
 def test_a_frame_that_is_asked_for_again_is_predicted_once(scene, monkeypatch):
     model = Shifting()
-    monkeypatch.setattr("semstab.predict.live.create", lambda name, **options: model)
-    dataset = open_dataset("predicted", live_config(scene, PREDICTOR).dataset.options)
-    opened = dataset.scene("flight")
+    monkeypatch.setattr("semstab.predict.dataset.create", lambda name, **options: model)
+    opened = open_dataset("predicted", live_config(scene, PREDICTOR).dataset.options).scene("flight")
     for index in (0, 1, 0, 1):
         opened.frame(index, "colour-clusters")
     assert len(model.seen) == 2
-    monkeypatch.setattr("semstab.predict.live.CACHE_BYTES", 48 * 80)
-    opened = dataset.scene("flight")
-    for index in (0, 1, 0, 1):
-        opened.frame(index, "colour-clusters")
-    assert len(model.seen) == 2 + 3
+
+
+def test_a_run_leaves_the_maps_that_it_read(scene, tmp_path):
+    run(live_config(scene, PREDICTOR, f"{PREDICTOR},scores=true"), out=tmp_path / "run", report=False)
+    predict(scene, clusters(), name="colour-clusters", scores=True)
+    made = tmp_path / "run/predictions/flight"
+    for k in range(6):
+        labels, scores = f"labels/colour-clusters/{k:03d}.png", f"scores/colour-clusters/{k:03d}.npz"
+        assert (made / labels).read_bytes() == (scene / labels).read_bytes()
+        whole, half = (np.load(folder / scores)["scores"] for folder in (made, scene))
+        assert (whole.dtype, half.dtype) == (np.float32, np.float16)
+        np.testing.assert_array_equal(whole.astype(np.float16), half)
+    dataset = {"name": "posed_folder", "options": {"root": str(scene), "labels_root": str(made.parent),
+               "labels": "{scene}/labels/{model}/{name}", "scores": "{scene}/scores/{model}/{name}"}}  # fmt: skip
+    (again,) = run({"dataset": dataset, "voxel_size": 0.25, "check": None, "models": ["colour-clusters"]}).runs
+    first = run(live_config(scene, PREDICTOR), out=tmp_path / "run", report=False).runs[0]
+    assert again.table == first.table
+
+
+def test_maps_are_read_again_whatever_is_fused_from_them(scene, tmp_path, monkeypatch):
+    model = Shifting()
+    monkeypatch.setattr("semstab.predict.dataset.create", lambda name, **options: model)
+    run(live_config(scene, PREDICTOR, frames={"stride": 2}), out=tmp_path / "run", report=False)
+    assert len(model.seen) == 3
+    run(live_config(scene, PREDICTOR, voxel_size=0.5), out=tmp_path / "run", report=False)
+    assert len(model.seen) == 6
+    Image.fromarray(predicted_scene.image(5, seed=9)).save(scene / "color/005.png")
+    (tmp_path / "run/predictions/flight/labels/colour-clusters/000.png").unlink()
+    run(live_config(scene, PREDICTOR, voxel_size=0.2), out=tmp_path / "run", report=False)
+    assert len(model.seen) == 8
+
+
+def test_a_model_that_fails_leaves_what_is_finished(scene, tmp_path):
+    (tmp_path / "fails.py").write_text(
+        "classes = ['a', 'b']\ncalls = []\ndef net(image):\n    calls.append(0)\n"
+        "    if len(calls) == 4:\n        raise RuntimeError('out of luck')\n    return image[..., 0] // 128\n"
+    )
+    config = live_config(scene, f"{tmp_path / 'fails.py'}:net")
+    with pytest.raises(DataError, match="out of luck"):
+        run(config, out=tmp_path / "run", report=False)
+    done = sorted((tmp_path / "run/predictions/flight/labels/net").glob("*.png"))
+    assert [path.stem for path in done] == ["000", "001", "002"]
+    run(config, out=tmp_path / "run", report=False)  # the other three, and no fourth call
+
+
+@pytest.mark.parametrize("jobs", [1, 2])
+def test_processes_share_what_one_of_them_predicts(scene, tmp_path, jobs):
+    (tmp_path / "counts.py").write_text(
+        "import os\nclasses = ['a', 'b']\ndef net(image):\n    with open(os.environ['COUNTS'], 'a') as file:\n"
+        "        file.write('x')\n    return image[..., 0] // 128\n"
+    )
+    settings = ("--set", "sweeps.voxel_size=[0.2,0.25,0.5]", "--report", "off", "--rerun", "off")
+    (tmp_path / "counted").touch()
+    done = bench(
+        "run", "--data", scene, "--predict", f"{tmp_path / 'counts.py'}:net", "--voxel-size", "0.25", "--jobs", jobs,
+        *settings, "--out", tmp_path / "run", cwd=tmp_path, COUNTS=str(tmp_path / "counted"),
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    assert (tmp_path / "counted").read_text() == "x" * 6
 
 
 def test_the_built_in_city_with_a_model():
@@ -760,7 +814,7 @@ def test_runs_that_cannot_predict(scene, predictors, message):
 
 
 def test_regions_cannot_be_fused(scene, monkeypatch):
-    monkeypatch.setattr("semstab.predict.live.create", lambda name, **options: Tiles())
+    monkeypatch.setattr("semstab.predict.dataset.create", lambda name, **options: Tiles())
     with pytest.raises(ConfigError, match="finds regions without classes, which cannot be fused"):
         run(live_config(scene, PREDICTOR), report=False)
 

@@ -175,7 +175,7 @@ def test_a_taxonomy_leaves_a_model_sequential():
 @pytest.fixture
 def live(monkeypatch):
     """Opens a scene whose labels an average predicts; all scenes of one dataset share the model."""
-    monkeypatch.setattr("semstab.predict.live.create", lambda name, **options: Average())
+    monkeypatch.setattr("semstab.predict.dataset.create", lambda name, **options: Average())
 
     def open_it(root, name="flight", **settings):
         config = resolve(live_config(root, **settings))
@@ -197,8 +197,7 @@ def test_whichever_frame_is_asked_for(scene, live):
             np.testing.assert_array_equal(opened.frame(k, "average").labels, wanted[k])
 
 
-def test_frames_that_are_long_past_are_reached_again(scene, live, monkeypatch):
-    monkeypatch.setattr("semstab.predict.predictor.CACHE_BYTES", 0)
+def test_frames_that_are_long_past_are_reached_again(scene, live):
     opened, wanted = live(scene), expected(range(6))
     for k in (5, 0, 3):
         np.testing.assert_array_equal(opened.frame(k, "average").labels, wanted[k])

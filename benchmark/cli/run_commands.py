@@ -162,9 +162,7 @@ def filters(
     named["check_geometry"] = False if trust_geometry else None
     models = parse_predictors(predict or [], {} if classes is None else {"classes": classes})
     content = chosen(named, settings, options, dataset, data, frames)
-    config, left_out = filter_study_config(
-        models, model or [], filter_ or [], content, cache=out.absolute() / "predictions"
-    )
+    config, left_out = filter_study_config(models, model or [], filter_ or [], content)
     for line in left_out if not quiet else ():
         say(line)
     execute(config, out, executor_of(jobs, None), "off", report, quiet=quiet)

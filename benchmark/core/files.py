@@ -70,15 +70,15 @@ class FolderLock:
     """A folder that one process owns until `release`, or until it dies.
 
     Raises:
-        ConfigError: If another one has it.
+        ConfigError: If another one has it, unless `wait`: then it is waited for.
     """
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, *, wait: bool = False) -> None:
         self.path = path
         path.mkdir(parents=True, exist_ok=True)
         self._handle: int | None = os.open(path, os.O_RDONLY)
         try:
-            fcntl.flock(self._handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            fcntl.flock(self._handle, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
         except OSError as error:
             self.release()
             raise ConfigError(f"{path}: another process works on it; wait for it, or choose another folder") from error
@@ -130,14 +130,18 @@ def write_image(path: str | Path, image: npt.NDArray[Any], *settings: int) -> No
 
 
 def write_stack(
-    path: Path, key: str, layers: Iterable[npt.NDArray[Any]], count: int, dtype: np.dtype[Any], compressed: bool
+    path: Path, key: str, layers: Iterable[npt.NDArray[Any]], count: int, dtype: np.dtype[Any] | None, compressed: bool
 ) -> None:
-    """Write an .npz file of one array, of `count` layers of one shape that come one after the other."""
+    """Write an .npz file of one array, of `count` layers of one shape that come one after the other.
+
+    Numbers are stored as `dtype`; None: as those of the first layer.
+    """
     method = zipfile.ZIP_DEFLATED if compressed else zipfile.ZIP_STORED
     zipped = zipfile.ZipFile(path, "w", method, compresslevel=1)
     with zipped as archive, archive.open(f"{key}.npy", "w", force_zip64=True) as file:
         for number, layer in enumerate(layers):
             if number == 0:
+                dtype = dtype or layer.dtype
                 shape = (count, *layer.shape)
                 header = {"descr": np.lib.format.dtype_to_descr(dtype), "fortran_order": False, "shape": shape}
                 np.lib.format.write_array_header_1_0(file, header)

@@ -53,7 +53,7 @@ def execute(
     """
     started, telling, executor = time.perf_counter(), Observers(observers), executor or InProcess()
     config = resolve(config)
-    scenes = open_scenes(config)
+    scenes = open_scenes(config, out.absolute())
     config, advice = with_voxel_size(config, scenes)
     plan = make_plan(config, scenes)
     require_file_names(out, (each.unit for each in plan.units))

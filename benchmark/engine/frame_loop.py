@@ -10,6 +10,7 @@ import math
 from collections import defaultdict
 from collections.abc import Generator, Iterator, Mapping, Sequence
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 
@@ -102,7 +103,8 @@ class Fusion:
     def decoded_frames(self) -> Generator[Fetched[Decoded], None, None]:
         """Yield frames in order, decoded ahead by threads."""
         fetched = prefetch(self._decode, self.order, threads=self._threads, size=lambda each: each.nbytes)
-        with contextlib.closing(fetched):
+        model = self.streams[0].task.model if self.streams else GROUND_TRUTH
+        with self._scene.reading(self.order, model), contextlib.closing(fetched):
             for each in fetched:
                 in_network = min(each.waited, each.item.network) if each.item.network > 0 else 0.0
                 self.watch.seconds["read"] += each.waited - in_network
@@ -178,13 +180,13 @@ def _scene(work: Work) -> Scene:
     if work.start.name in _shared:
         return _shared[work.start.name][work.scene]
     dataset = work.config.dataset
-    return _dataset(work.start.name, dataset.name, json.dumps(dataset.options)).scene(work.scene)
+    return _dataset(work.start.name, work.start.folder, dataset.name, json.dumps(dataset.options)).scene(work.scene)
 
 
 @functools.lru_cache(maxsize=1)
-def _dataset(_start: str, name: str, options: str) -> Dataset:
+def _dataset(_start: str, folder: Path, name: str, options: str) -> Dataset:
     """Return the dataset, opened once for a start: its scenes share what they read or render."""
-    return open_dataset(name, json.loads(options))
+    return open_dataset(name, json.loads(options), folder)
 
 
 def _ground_truth(scene: Scene, index: int) -> Frame | None:

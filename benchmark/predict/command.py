@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 import glob
 import json
+import math
 import shlex
 import sys
 import time
@@ -25,7 +26,7 @@ from semstab.datasets.geometry.lenses import Labels, Scores
 from semstab.datasets.scene import select_frames
 from semstab.errors import ConfigError, DataError
 from semstab.models import Image, Model
-from semstab.predict.images import ImageSequence
+from semstab.predict.images import ImageSequence, Picture
 from semstab.predict.predictor import NAME as STORED
 from semstab.predict.predictor import PredictorConfig, load_predictor, stored_labels
 from semstab.predict.sequence import PredictionObserver, SequenceOptions, SequenceReport, predict_sequence
@@ -186,8 +187,9 @@ class PredictionBar(PredictionObserver):
         self._bar.reset(self._work, total=frames, description=name, speed="")
         self._bar.start()
 
-    def frame_done(self, reused: bool) -> None:
+    def frame_done(self, shown: Picture, seconds: float) -> None:
         """Advance by one frame."""
+        reused = math.isnan(seconds)
         self._left -= 1
         if reused and not self._predicted:
             self._started = time.monotonic()

@@ -69,7 +69,9 @@ class PredictionFolder:
         settings: All that the maps depend on in addition to the image, for JSON.
         about: The rest of the manifest.
         space: The classes; None for regions.
+        score_type: Type of stored scores; None for that of the model's.
         top_k: Number of scores that a pixel keeps; None for all.
+        wait: Wait until no other process writes into the folder; else that is an error once a map is written.
 
     Raises:
         ConfigError: If the folder holds maps of other settings or of other origin.
@@ -83,14 +85,15 @@ class PredictionFolder:
         about: Mapping[str, Any],
         space: LabelSpace | None,
         *,
-        score_type: ScoreType = "float16",
+        score_type: ScoreType | None = "float16",
         top_k: int | None = None,
         overwrite: bool = False,
+        wait: bool = False,
     ) -> None:
         self.path = path
         self.kind = kind
         self._suffix = ".npz" if kind == "scores" else ".png"
-        self._score_type = np.dtype(score_type)
+        self._score_type = None if score_type is None else np.dtype(score_type)
         self._compressed = top_k is not None  # most of it is 0
         said = dict(settings) | ({"score_type": score_type} if kind == "scores" else {})
         if top_k is not None and kind == "scores":
@@ -102,11 +105,15 @@ class PredictionFolder:
             "settings": said,
             **about,
         }
-        self._frames: dict[str, _Predicted] = self._claim(overwrite)
+        self._lock = FolderLock(path, wait=True) if wait else None
+        try:
+            self._frames: dict[str, _Predicted] = self._claim(overwrite)
+        except BaseException:
+            self._release()
+            raise
         self._written: set[str] = set()
         self._space = space
         self._saved = -math.inf
-        self._lock: FolderLock | None = None
 
     def has(self, name: str, image: str) -> bool:
         """Return whether the map of that frame is there, predicted from an image of that digest."""
@@ -141,9 +148,7 @@ class PredictionFolder:
     def close(self) -> None:
         """Save it, and let another process have it."""
         self.save()
-        if self._lock is not None:
-            self._lock.release()
-            self._lock = None
+        self._release()
 
     def require_whole(self) -> None:
         """Require the maps that were written.
@@ -155,9 +160,14 @@ class PredictionFolder:
             if not self.file(name).is_file():
                 raise DataError(f"{self.file(name)}: was written, and is gone; run the same command again")
 
+    def _release(self) -> None:
+        if self._lock is not None:
+            self._lock.release()
+            self._lock = None
+
     def _claimed(self) -> None:
-        if self._lock is None:
-            self._lock = FolderLock(self.path)
+        self._lock = self._lock or FolderLock(self.path)
+        if self._saved == -math.inf:
             self._save()  # before the first map: without it, maps are taken for somebody else's
 
     def _done(self, name: str, image: str, seconds: float) -> None:

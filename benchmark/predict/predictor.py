@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any, ClassVar, Literal, Self
@@ -15,64 +15,19 @@ from pydantic import BaseModel, Field, field_validator, model_validator
 
 from semstab.config import Settings, validated
 from semstab.core.code import absolute
-from semstab.core.files import content_key, parse_yaml, read_arrays, write_arrays
+from semstab.core.files import parse_yaml
 from semstab.data.frames import Frame
 from semstab.data.labels import LabelSpace, ignore_id
 from semstab.datasets import Scene
 from semstab.datasets.geometry.lenses import Scores, require_same_view
 from semstab.errors import ConfigError
-from semstab.models import Image, Labels, Model, Prediction, ask, create, image_digest, narrowed, options_model
+from semstab.models import Image, Labels, Model, Prediction, create, narrowed, options_model
 from semstab.models.custom import is_path
 from semstab.models.names import InTaxonomy
 from semstab.models.network import is_network
-from semstab.models.validation import Checked, Wrapped
+from semstab.models.validation import Checked
 from semstab.predict.filters import Filtered, parse
 from semstab.predict.folder import NO_FOLDER_NAME, names_a_folder
-from semstab.predict.images import ImageSequence, geometry_of, shown_digest
-
-# Predictions of a model, cached on disk: it looks at each image once, whatever filters are put over it.
-
-
-class Cached(Wrapped):
-    """A model that looks its predictions up in a folder, by its identity and the image, and leaves new ones there.
-
-    It has no memory of images before (`sequential`). Files of one folder may be read and written by several processes.
-    """
-
-    def __init__(self, inner: Model, folder: Path) -> None:
-        super().__init__(inner)
-        self._folder = folder
-        self._fitted_to: list[str] = []
-
-    def fit(self, images: Sequence[Image]) -> Self:
-        """See `Model`."""
-        fitted = super().fit(images)
-        fitted._fitted_to = [image_digest(image) for image in images]
-        return fitted
-
-    def predict(
-        self, images: Sequence[Image], *, scores: bool = False, geometry: Sequence[Frame] = ()
-    ) -> list[Prediction]:
-        """See `Model`."""
-        frames = [[frame] for frame in geometry] or [[]] * len(images)
-        return [self._one(image, scores, frame) for image, frame in zip(images, frames, strict=True)]
-
-    def _one(self, image: Image, scores: bool, frame: Sequence[Frame]) -> Prediction:
-        """Predict an image; scores are stored where there are any: a later caller may want them."""
-        file = self._folder / f"{self._key(image, frame)}.npz"
-        there = read_arrays(file)
-        if there is None:
-            (prediction,) = self.ask([image], self.gives_scores, frame)
-            held: dict[str, Any] = {"labels": prediction.labels}
-            held |= {"scores": prediction.scores} if self.gives_scores else {}
-            write_arrays(file, held, packed=False)
-            return prediction if scores else Prediction(prediction.labels)
-        return Prediction(there["labels"], there["scores"] if scores else None)
-
-    def _key(self, image: Image, frame: Sequence[Frame]) -> str:
-        seen = {"fitted": self._fitted_to, "shown": shown_digest(image, frame)}
-        return content_key({"model": self.identity(), **seen})
-
 
 # Labels that a scene has already, as a model: what filters take where nothing is to be predicted.
 
@@ -292,16 +247,24 @@ def stored_labels(config: PredictorConfig, scene: Scene) -> tuple[StoredSequence
     return sequence, completed(config, Stored(options, sequence))
 
 
-def completed(config: PredictorConfig, inner: Model, cache: Path | None = None) -> Model:
+def completed(config: PredictorConfig, inner: Model) -> Model:
     """Return a model with all that is asked for around it.
 
-    Its predictions are looked up in the folder `cache`, where one is given.
+    Raises:
+        ConfigError: If classes map nowhere, and what `filtered` raises.
     """
     model: Model = Checked(inner, config.label_name)
-    if cache is not None and not model.sequential:
-        model = Cached(model, cache)
     if config.taxonomy is not None:
         model = InTaxonomy(model, LabelSpace.load(config.taxonomy), config.mapping)
+    return filtered(config, model)
+
+
+def filtered(config: PredictorConfig, model: Model) -> Model:
+    """Return a model of its taxonomy behind the filters that are asked for.
+
+    Raises:
+        ConfigError: If scores are wanted of a model that has none.
+    """
     if config.filters:
         model = Filtered(model, [parse(text) for text in config.filters], config.unfiltered.label_name)
     if config.scores and not model.gives_scores:
@@ -405,82 +368,3 @@ def _absolute(options: BaseModel) -> BaseModel:
     if isinstance(checkpoint, str) and Path(checkpoint).expanduser().is_dir():
         paths["checkpoint"] = str(Path(checkpoint).expanduser().absolute())
     return options.model_copy(update=paths)
-
-
-# A sequential model inside a run: whichever frame is asked for, it has seen the sequence up to it.
-
-CACHE_BYTES = 1 << 28
-"""Memory for the latest predictions: frames are asked for nearly, not quite in order."""
-
-LEAST_CACHED = 4
-
-
-class InOrder:
-    """The predictions of a sequential model, shown a sequence in order, whatever is asked for when.
-
-    If a prediction is no longer in memory, the model is shown the sequence from its first frame again.
-
-    Attributes:
-        indices: The frames that it is shown.
-        claim: A function that hands the model to this object and returns whether another one had it: then it
-            begins again.
-    """
-
-    def __init__(
-        self,
-        model: Model,
-        sequence: ImageSequence,
-        indices: Sequence[int],
-        scores: bool,
-        claim: Callable[[InOrder], bool],
-    ) -> None:
-        self.indices = indices
-        self._model, self._sequence, self._scores, self._claim = model, sequence, scores, claim
-        self._position = {index: position for position, index in enumerate(indices)}
-        self._next = 0
-        self._cache: dict[int, Prediction] = {}
-
-    def at(self, index: int) -> Prediction:
-        """Return the prediction of a frame.
-
-        Raises:
-            ConfigError: For a frame that the model is not shown.
-        """
-        position = self._position_of(index)
-        if index not in self._cache:
-            if self._claim(self) or position < self._next:
-                self._model.reset()
-                self._next = 0
-            for shown in self.indices[self._next : position + 1]:
-                self._show(shown)
-        return self._cache[index]
-
-    def shown_for(self, indices: Sequence[int]) -> list[int]:
-        """Return the frames that the model is shown for the sake of these: its labels depend on all of them.
-
-        Raises:
-            ConfigError: For a frame that is not among them.
-        """
-        return list(self.indices[: max(map(self._position_of, indices), default=-1) + 1])
-
-    def _position_of(self, index: int) -> int:
-        if index not in self._position:
-            raise ConfigError(
-                f"{self._sequence.name}: frame {index} is not among the {len(self.indices)} frames that a sequential"
-                " model is shown; its labels depend on these, so a sweep can only leave some of them out"
-            )
-        return self._position[index]
-
-    def _show(self, index: int) -> None:
-        image = self._sequence.image(index)
-        geometry = geometry_of(self._sequence, index, image, self._model)
-        (prediction,) = ask(self._model, [image], scores=self._scores, geometry=geometry)
-        self._cache[index] = prediction
-        self._next += 1
-        while len(self._cache) > LEAST_CACHED and sum(map(size_of, self._cache.values())) > CACHE_BYTES:
-            del self._cache[next(iter(self._cache))]
-
-
-def size_of(prediction: Prediction) -> int:
-    """Return the bytes that a prediction keeps in memory."""
-    return prediction.labels.nbytes + (0 if prediction.scores is None else prediction.scores.nbytes)

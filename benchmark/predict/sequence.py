@@ -8,6 +8,7 @@ import dataclasses
 import importlib.metadata
 import io
 import itertools
+import math
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass, fields
@@ -94,22 +95,28 @@ class SequenceOptions:
 
     Attributes:
         name: Name of the predictions.
-        scores: Whether to keep soft scores, too, in `score_type`.
+        scores: Whether to keep soft scores, too, in `score_type`; None: as the model gives them.
         top_k: Number of the largest scores that a pixel keeps; None for all.
         batch: Images that the model sees at once.
         threads: Threads that decode images ahead.
         overwrite: Replace predictions of other settings.
         command: The command line, for the manifest.
+        at_image: Maps have the pixels of their images, also where label maps of the scene have those of the depth.
+        fit: Adapt the model to the sequence's first images; False where that is done.
+        wait: Wait for another process that writes into the same folders; False is an error then.
     """
 
     name: str
     scores: bool = False
-    score_type: ScoreType = "float16"
+    score_type: ScoreType | None = "float16"
     top_k: int | None = None
     batch: int = 1
     threads: int | None = None
     overwrite: bool = False
     command: Sequence[str] = ()
+    at_image: bool = False
+    fit: bool = True
+    wait: bool = False
 
 
 @dataclass(frozen=True)
@@ -143,8 +150,8 @@ class PredictionObserver:
     def sequence_started(self, name: str, frames: int) -> None:
         """Take note that a sequence of so many selected frames is begun."""
 
-    def frame_done(self, reused: bool) -> None:
-        """Take note of one more frame: predicted, or reused from an earlier start."""
+    def frame_done(self, shown: Picture, seconds: float) -> None:
+        """Take note of one more frame, and the model's seconds; NaN where it is reused from an earlier start."""
 
 
 def predict_sequence(
@@ -168,7 +175,8 @@ def predict_sequence(
     for observer in observers:
         observer.sequence_started(sequence.name, len(indices))
     started = time.perf_counter()
-    model = model.fit(first_images(sequence, model.fit_frames))
+    if options.fit:
+        model = model.fit(first_images(sequence, model.fit_frames))
     work = _Work(sequence, model, indices, out, options, observers)
     with contextlib.closing(work):
         anew = model.sequential and not all(work.is_stored(picture) for picture in work.pictures())
@@ -229,7 +237,7 @@ class _Work:
         """Leave what is finished, unless everything is made anew; predict the rest in batches of one size."""
         if not anew and self.is_stored(picture):
             self._reused += 1
-            self._tell(reused=True)
+            self._tell(picture, math.nan)
             return
         if self._waiting and self._waiting[0].pixels.shape != picture.pixels.shape:
             self.flush()
@@ -257,7 +265,7 @@ class _Work:
         for shown, prediction in zip(pictures, predictions, strict=True):
             self._write(shown, prediction, seconds / len(pictures))
             self._predicted += 1
-            self._tell(reused=False)
+            self._tell(shown, seconds / len(pictures))
 
     def close(self) -> None:
         """Write the manifests of what is finished, also after an error or an interruption."""
@@ -284,7 +292,7 @@ class _Work:
 
     def _write(self, picture: Picture, prediction: Streamed, seconds: float) -> None:
         """Write a prediction at the pixels that the scene's label files have."""
-        alike = self.sequence.labels_like_depth
+        alike = self.sequence.labels_like_depth and not self.options.at_image
         frame = self.sequence.predicted(picture.index, labels=prediction.labels) if alike else None
         for folder in self.folders:
             if folder.kind != "scores":
@@ -295,9 +303,9 @@ class _Work:
             maps = maps if self.options.top_k is None else largest_only(maps, self.options.top_k)
             folder.write_scores(picture.name, picture.digest, maps(), seconds)
 
-    def _tell(self, reused: bool) -> None:
+    def _tell(self, shown: Picture, seconds: float) -> None:
         for observer in self.observers:
-            observer.frame_done(reused)
+            observer.frame_done(shown, seconds)
 
 
 def _folders(
@@ -320,6 +328,7 @@ def _folders(
             score_type=options.score_type,
             top_k=options.top_k,
             overwrite=options.overwrite,
+            wait=options.wait,
         )
         for kind in kinds
     ]

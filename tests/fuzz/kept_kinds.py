@@ -28,7 +28,7 @@ from semstab.errors import DataError
 from semstab.models import Model, Prediction
 from semstab.models.names import class_names
 from semstab.predict.filters import parse
-from semstab.predict.predictor import Cached
+from semstab.predict.producer import Producer
 from semstab.recording import Recording
 from semstab.recording.target import is_whole
 from semstab.recording.timeline import Clock, log_file
@@ -52,10 +52,12 @@ def of_kept(folder: Path) -> Iterator[Kind]:
     casts = Casts(folder / "casts", b"surface")
     casts.put(view, np.ones((12, 16), np.float32))
     yield Kind("cast depth", (next((folder / "casts").rglob("*.cast")),), lambda _: casts.get(view))
-    images = [predicted_scene.image(0)]
-    model = Cached(Halves(), folder / "predictions")
-    model.predict(images)
-    yield Kind("kept prediction", (next((folder / "predictions").glob("*.npz")),), lambda _: model.predict(images))
+    flight = predicted_scene.write(folder / "flight", frames=1)
+    maps = folder / "predictions"
+    produced(flight, maps)
+    files = (maps / "labels/halves/000.png", maps / "scores/halves/000.npz", maps / "labels/halves/predictions.json")
+    for file in files:
+        yield Kind(f"predicted {file.name}", (file,), lambda _: produced(flight, maps))
     compare([f"{tiled}:a", f"{tiled}:b"], folder / "compared")
     yield Kind("comparison.json", (folder / "compared/comparison.json",), lambda file: load_comparison(file.parent))
     yield Kind("recording.rrd", (tiled / "recording.rrd",), is_whole)
@@ -63,6 +65,12 @@ def of_kept(folder: Path) -> Iterator[Kind]:
     stream = rr.RecordingStream("fuzz")
     yield Kind("series of a recording", (series,), lambda file: log_file(stream, task.units[0], task, file, Clock()))
     yield from of_text(folder)
+
+
+def produced(flight: Path, maps: Path) -> Prediction:
+    """The labels and scores of its first frame."""
+    scene = open_dataset("posed_folder", {"root": flight}).scene("flight")
+    return Producer(scene, Halves(), maps, "halves", scores=True).read(0, scores=True)
 
 
 class Halves(Model):

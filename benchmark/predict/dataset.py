@@ -1,15 +1,18 @@
-"""A dataset whose labels a model predicts when they are asked for: model to voxels with nothing on disk."""
+"""A dataset whose labels models predict while it is fused: their maps go to disk, and are read as others are."""
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
+import functools
 import hashlib
 import json
 import math
+import shutil
+import tempfile
 import threading
-import time
+import weakref
 from collections.abc import Iterator, Mapping, Sequence
-from functools import partial
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -24,22 +27,25 @@ from semstab.datasets import GROUND_TRUTH, Dataset, Filtering, Scene, open_datas
 from semstab.datasets.geometry.lenses import Labels, Scores
 from semstab.datasets.scene import select_frames
 from semstab.errors import ConfigError
-from semstab.models import Image, Model, Prediction, ask, create
+from semstab.models import Model, create
 from semstab.predict.filters import Filtered, parse
-from semstab.predict.images import ImageSequence, first_images, geometry_of
+from semstab.predict.images import ImageSequence, first_images
 from semstab.predict.predictor import NAME as STORED
-from semstab.predict.predictor import InOrder, PredictorConfig, StoredSequence, completed, size_of, stored_labels
+from semstab.predict.predictor import PredictorConfig, completed, filtered, stored_labels
+from semstab.predict.producer import Producer, Written
 
 NAME = "predicted"
 
-CACHE_BYTES = 1 << 28
-"""Memory for predictions that are cached in case a frame is asked for again; what does not fit is predicted again."""
+PREDICTIONS = "predictions"
+"""Folder of the predicted maps in a run's folder."""
 
 
 class PredictedOptions(Settings):
     """The dataset whose images are predicted on, and the models that predict."""
 
-    earlier: ClassVar[Mapping[str, str]] = {"backbones": "models", "remedies": "try_filters", "kept": "cache"}
+    earlier: ClassVar[Mapping[str, str]] = {
+        "backbones": "models", "remedies": "try_filters", "kept": "folder", "cache": "folder",
+    }  # fmt: skip
     dataset: DatasetConfig = Field(description="a dataset with its options")
     models: list[PredictorConfig] = Field(min_length=1, description="each predicts every frame")
     frames: FrameSelection = Field(
@@ -52,7 +58,7 @@ class PredictedOptions(Settings):
     try_filters: list[str] = Field(
         default_factory=list, description="filters, each is put over each of the models, which also predict without"
     )
-    cache: Path | None = Field(None, description="folder in which predictions are cached; in memory by default")
+    folder: Path | None = Field(None, description="folder of the predicted maps; OUT/predictions by default")
 
     @field_validator("dataset")
     @classmethod
@@ -70,25 +76,30 @@ class PredictedOptions(Settings):
         names = [predictor.source_name for predictor in value]
         if repeated := [name for name in names if names.count(name) > 1]:
             raise ValueError(f"two models are called '{repeated[0]}'; give one a name")
+        models = dict[str, PredictorConfig]()
+        for predictor in value:  # labels and scores of one name are of one model: they lie side by side
+            alike = predictor.model_copy(update={"scores": False})
+            if models.setdefault(predictor.label_name, alike) != alike:
+                raise ValueError(f"two models are called '{predictor.label_name}'; give one a name")
         return [predictor.resolved() for predictor in value]
 
 
 class PredictedDataset(Dataset):
     """The scenes of another dataset with predicted labels; the ground truth stays what it is there.
 
-    Models are loaded when their classes are first asked for, once for all scenes. One image is predicted at a time,
-    whoever asks: `lock`.
+    Models are loaded when their classes are first asked for, once for all scenes. Maps are written into the option
+    `folder`, else into the run's folder, else into a folder that goes with the dataset.
     """
 
     Options: type[BaseModel] = PredictedOptions
 
     def __init__(self, options: PredictedOptions) -> None:
         self._dataset = open_dataset(options.dataset.name, options.dataset.options)
-        self._configs = {predictor.source_name: predictor for predictor in _with_filters(options)}
+        self.predictors: Mapping[str, PredictorConfig] = {each.source_name: each for each in _with_filters(options)}
+        self._hidden: dict[str, PredictorConfig] = {}
         self._options = options
         self._loaded: dict[str, Model] = {}
         self._models: dict[str, Model] = {}
-        self._shown_by: dict[str, object] = {}
         self.lock = threading.RLock()
 
     @property
@@ -100,42 +111,76 @@ class PredictedDataset(Dataset):
         """Open a scene; raises what the inner dataset raises."""
         return PredictedScene(self._dataset.scene(name), self)
 
-    @property
-    def predictors(self) -> Mapping[str, PredictorConfig]:
-        """The predictors by label source."""
-        return self._configs
+    @functools.cached_property
+    def folder(self) -> Path:
+        """The folder of the predicted maps: SCENE/labels/NAME and SCENE/scores/NAME."""
+        if self._options.folder is not None:
+            return self._options.folder
+        if self.run_folder is not None:
+            return self.run_folder / PREDICTIONS
+        scratch = tempfile.mkdtemp(prefix="semstab-predictions-")
+        weakref.finalize(self, shutil.rmtree, scratch, ignore_errors=True)
+        return Path(scratch)
 
-    def model(self, source: str) -> Model:
-        """Return the model behind a label source.
+    def predictor(self, source: str) -> PredictorConfig:
+        """Return the settings of a label source.
 
         Raises:
             ConfigError: If there is none of that name.
         """
-        if source not in self._configs:
-            raise ConfigError(f"model '{source}' does not predict here; there is {', '.join(self._configs)}")
+        if source not in {**self.predictors, **self._hidden}:
+            raise ConfigError(f"model '{source}' does not predict here; there is {', '.join(self.predictors)}")
+        return self.predictors.get(source) or self._hidden[source]
+
+    def model(self, source: str) -> Model:
+        """Return the model behind a label source, its filters included.
+
+        Raises:
+            ConfigError: If there is none of that name.
+        """
+        config = self.predictor(source)
         with self.lock:
             if source not in self._loaded:
-                config = self._configs[source]
-                self._loaded[source] = completed(config, self._shared(config), self._options.cache)
+                self._loaded[source] = completed(config, self._shared(config))
             return self._loaded[source]
 
     def _shared(self, config: PredictorConfig) -> Model:
         """Return the model itself, loaded once for all that is put around it, unless it remembers what it was shown."""
-        what = json.dumps([config.model, config.options], sort_keys=True)
-        model = self._models.get(what) or create(config.model, **config.options)
+        settings = json.dumps([config.model, config.options], sort_keys=True)
+        model = self._models.get(settings) or create(config.model, **config.options)
         if not getattr(model, "sequential", False):
-            self._models[what] = model
+            self._models[settings] = model
         return model
+
+    def without_filters(self, source: str) -> str | None:
+        """Return the source whose maps the filters of this one take; None where it has none, or filters stored labels.
+
+        It is among the models where one of them is the same without filters. Else it has a name of its own.
+        """
+        config = self.predictor(source)
+        if not config.filters or config.model == STORED:
+            return None
+        alike = config.unfiltered.model_copy(update={"scores": False})
+        with self.lock:
+            for name, other in {**self.predictors, **self._hidden}.items():
+                if not other.filters and other.model_copy(update={"name": None, "scores": False}) == alike:
+                    return name
+            hidden = alike.model_copy(update={"name": f"{config.label_name}-unfiltered"})
+            self._hidden[hidden.source_name] = hidden
+        return hidden.source_name
+
+    def wants_scores(self, label_name: str) -> bool:
+        """Return whether the scores of that model are read, too: by the run, or by filters."""
+        named = [source for source, config in self.predictors.items() if config.label_name == label_name]
+        if any(self.predictors[source].scores for source in named):
+            return True
+        over = [base for source in self.predictors if (base := self.without_filters(source)) is not None]
+        return any(self.predictor(base).label_name == label_name and self.model(base).gives_scores for base in over)
 
     def frames_of(self, scene: Scene, source: str) -> list[int]:
         """Return the frames that a sequential model is shown of a scene: selected ones that have what it looks at."""
         selection = self._options.scene_frames.get(scene.name, self._options.frames)
-        return select_frames(scene, selection, **self._configs[source].looks_at).indices
-
-    def claim(self, source: str, who: object) -> bool:
-        """Return whether the model was last shown a sequence by somebody else; from now on it is `who` that shows."""
-        before, self._shown_by[source] = self._shown_by.get(source), who
-        return before is not who
+        return select_frames(scene, selection, **self.predictor(source).looks_at).indices
 
 
 class PredictedScene(Scene):
@@ -159,14 +204,8 @@ class PredictedScene(Scene):
         self.skips_incomplete = inner.skips_incomplete
         self._inner = inner
         self._dataset = dataset
-        self._fitted: dict[str, Model] = {}
+        self._producers: dict[str, Producer] = {}
         self._digests: dict[int, bytes] = {}
-        self._cache: dict[tuple[str, int], Prediction] = {}
-        self._room = CACHE_BYTES
-        self._seconds: dict[tuple[str, int], float] = {}
-        self._lock = dataset.lock
-        self._in_order: dict[str, InOrder] = {}
-        self._of_labels: dict[str, tuple[StoredSequence, Model]] = {}
 
     def __len__(self) -> int:
         """Return the number of frames."""
@@ -198,13 +237,14 @@ class PredictedScene(Scene):
             return Filtering(model)
         known, one = self._dataset.predictors, self._dataset.predictors[model]
         same = (name for name, other in known.items() if other.model_copy(update={"name": None}) == one.unfiltered)
-        predictor = self._fitted.get(model)
-        took = predictor.seconds if isinstance(predictor, Filtered) else []
+        producer = self._producers.get(one.label_name)
+        took = producer.model.seconds if producer is not None and isinstance(producer.model, Filtered) else []
         return Filtering(next(same, model), "+".join(one.filters), 1e3 * float(np.median(took)) if took else 0.0)
 
     def prediction_seconds(self, index: int, model: str) -> float:
         """Return the seconds that a model took to predict on a frame since they were last asked for; else NaN."""
-        return math.nan if self._takes_stored(model) else self._seconds.pop((model, index), math.nan)
+        stored = model == GROUND_TRUTH or self._dataset.predictors[model].model == STORED
+        return math.nan if stored else self._producer(model).seconds(index)
 
     @property
     def settings(self) -> Mapping[str, Any]:
@@ -243,12 +283,19 @@ class PredictedScene(Scene):
             ConfigError: For a model without classes.
         """
         if model == GROUND_TRUTH:
-            space: LabelSpace | None = self._inner.label_space(GROUND_TRUTH)
+            return self._inner.label_space(GROUND_TRUTH)
+        config = self._dataset.predictor(model)
+        if config.model == STORED:
+            space = self._producer(model).model.label_space
         else:
-            space = self._unfitted(model).label_space
+            space = self._dataset.model(model).label_space
         if space is None:
             raise ConfigError(f"model '{model}' finds regions without classes, which cannot be fused")
         return space
+
+    def reading(self, indices: Sequence[int], model: str) -> contextlib.AbstractContextManager[None]:
+        """Predict these frames ahead of the loop that reads them in the block."""
+        return contextlib.nullcontext() if model == GROUND_TRUTH else self._producer(model).ahead(indices)
 
     def frame(self, index: int, model: str, *, color: bool = True) -> Frame:
         """Return the frame with the model's prediction on its image.
@@ -257,18 +304,12 @@ class PredictedScene(Scene):
         """
         if model == GROUND_TRUTH:
             return self._inner.frame(index, model, color=color)
-        sequence = self._sequence(model)
-        image = sequence.image(index)
-        prediction = self._predict(index, model, image)
-        labels = prediction.labels if prediction.scores is None else None
-        frame = sequence.predicted(index, labels=labels, scores=prediction.scores)
+        producer, scores = self._producer(model), self._dataset.predictor(model).scores
+        prediction = producer.read(index, scores=scores)
+        labels = None if scores else prediction.labels
+        frame = producer.sequence.predicted(index, labels=labels, scores=prediction.scores)
         assert frame is not None
-        if sequence is self._inner:
-            self._digests[index] = _digest(image, frame)
-        else:
-            image = self._inner.color(index) if color else image  # type: ignore[assignment]
-        shown = self._inner.color(index) if color and self._inner.on_photographs else image
-        return dataclasses.replace(frame, color=shown if color else None)
+        return dataclasses.replace(frame, color=self._inner.color(index) if color else None)
 
     def digest(self, indices: list[int], model: str) -> str:
         """Return a hash of the model, its settings, and the image, depth and pose of those frames.
@@ -280,11 +321,9 @@ class PredictedScene(Scene):
         """
         if model == GROUND_TRUTH:
             return self._inner.digest(indices, model)
-        with self._lock:
-            predictor = self._predictor(model)
-            shown = self._ordered(model, predictor).shown_for(indices) if predictor.sequential else None
-        config = self._dataset.predictors[model]
-        about = [predictor.identity(), config.scores, *([] if shown is None else [shown])]
+        producer, config = self._producer(model), self._dataset.predictor(model)
+        shown = producer.shown_for(indices) if producer.model.sequential else None
+        about = [producer.model.identity(), config.scores, *([] if shown is None else [shown])]
         digest = hashlib.blake2b(json.dumps(about, sort_keys=True).encode(), digest_size=16)
         if config.model == STORED:
             digest.update(self._inner.digest(shown or indices, config.options["source"]).encode())
@@ -298,62 +337,30 @@ class PredictedScene(Scene):
             digest.update(self._digests[index])
         return digest.hexdigest()
 
-    def _predict(self, index: int, model: str, image: Image) -> Prediction:
-        """Return the model's prediction on a frame, with scores where they are wanted."""
-        with self._lock:
-            predictor = self._predictor(model)
-            if (model, index) in self._cache:
-                return self._cache[model, index]
-            started = time.perf_counter()
-            if predictor.sequential:
-                prediction = self._ordered(model, predictor).at(index)
-                self._seconds[model, index] = time.perf_counter() - started
-                return prediction
-            geometry = geometry_of(self._sequence(model), index, image, predictor)
-            scores = self._dataset.predictors[model].scores
-            (prediction,) = ask(predictor, [image], scores=scores, geometry=geometry)
-            self._seconds[model, index] = time.perf_counter() - started
-            if (size := size_of(prediction)) <= self._room:
-                self._cache[model, index] = prediction
-                self._room -= size
-            return prediction
+    def _producer(self, source: str) -> Producer:
+        """Return the producer of a source's maps; labels and scores of one model have one."""
+        config = self._dataset.predictor(source)
+        with self._dataset.lock:
+            if config.label_name not in self._producers:
+                self._producers[config.label_name] = self._new_producer(source, config)
+            return self._producers[config.label_name]
 
-    def _ordered(self, model: str, predictor: Model) -> InOrder:
-        if model not in self._in_order:
-            while len(self._in_order) > 1:  # the memory of the others takes space, and their turn is over
-                over = next(iter(self._in_order))
-                del self._in_order[over], self._fitted[over]
-            scores = self._dataset.predictors[model].scores
-            shown = self._dataset.frames_of(self._inner, model)
-            self._in_order[model] = InOrder(
-                predictor, self._sequence(model), shown, scores, partial(self._dataset.claim, model)
-            )
-        return self._in_order[model]
-
-    def _predictor(self, model: str) -> Model:
-        """Return the model, fitted to this sequence's first images."""
-        if model not in self._fitted:
-            predictor = self._unfitted(model)
-            self._fitted[model] = predictor.fit(first_images(self._inner, predictor.fit_frames))
-        return self._fitted[model]
-
-    def _unfitted(self, model: str) -> Model:
-        """Return the model as it is loaded; the scene's own labels are a model of this scene alone."""
-        return self._stored(model)[1] if self._takes_stored(model) else self._dataset.model(model)
-
-    def _sequence(self, model: str) -> ImageSequence:
-        """Return the images that the model is shown."""
-        return self._stored(model)[0] if self._takes_stored(model) else self._inner
-
-    def _takes_stored(self, model: str) -> bool:
-        config = self._dataset.predictors.get(model)
-        return config is not None and config.model == STORED
-
-    def _stored(self, model: str) -> tuple[StoredSequence, Model]:
-        with self._lock:
-            if model not in self._of_labels:
-                self._of_labels[model] = stored_labels(self._dataset.predictors[model], self._inner)
-            return self._of_labels[model]
+    def _new_producer(self, source: str, config: PredictorConfig) -> Producer:
+        sequence: ImageSequence = self._inner
+        model, before, unfiltered = None, None, self._dataset.without_filters(source)
+        if config.model == STORED:
+            sequence, model = stored_labels(config, self._inner)
+        elif unfiltered is not None and not self._dataset.model(unfiltered).sequential:
+            before = self._producer(unfiltered)
+            model = filtered(config, Written(before))
+        else:
+            model = self._dataset.model(source)
+            model = model.fit(first_images(self._inner, model.fit_frames))
+        return Producer(
+            sequence, model, self._dataset.folder / self.name, config.label_name,
+            scores=self._dataset.wants_scores(config.label_name),
+            frames=self._dataset.frames_of(self._inner, source) if model.sequential else None, before=before,
+        )  # fmt: skip
 
 
 def _with_filters(options: PredictedOptions) -> Iterator[PredictorConfig]:
