@@ -4,15 +4,17 @@
     python scripts/mutate.py --lines 30 --seed 1 benchmark/metrics backends
     python scripts/mutate.py --at benchmark/metrics/summary.py:143  # all mutants of a line
 
-A mutant lives in a copy of the repository. It meets the tests that `make quick` runs after a change of its file, the
-nearest first, until one fails; a test is said to have killed it only if it passes without it. Mutants that survive
-either do what the code did, or show that a test is missing: at most a quarter of those that change behaviour may.
+A mutant lives in a copy of the repository. It meets the tests that `make quick` runs after a change of its file, those
+that name its function or class first, until one fails; a test is said to have killed it only if it passes without it.
+Mutants that survive either do what the code did, or show that a test is missing: at most a quarter of those that change
+behaviour may. Where the time is over before all tests have started, a mutant stays open.
 """
 
 from __future__ import annotations
 
 import argparse
 import ast
+import collections
 import copy
 import itertools
 import os
@@ -49,9 +51,10 @@ NAMES = {"min": "max", "max": "min", "minimum": "maximum", "maximum": "minimum",
 
 @dataclass(frozen=True)
 class Mutant:
-    """A change of one expression or statement: bytes begin to end of a file, relative to the repository."""
+    """A change of one expression or statement: bytes begin to end of a file, in the function or class of a name."""
 
     file: Path
+    within: str
     line: int
     begin: int
     end: int
@@ -90,7 +93,7 @@ def changes(node: ast.AST) -> Iterator[str]:
             yield f"({ast.unparse(node.operand)})"
         case ast.Constant(value=bool()):
             yield str(not node.value)
-        case ast.Constant(value=int() | float()):
+        case ast.Constant(value=int() | float()) if node.value + 1 != node.value:
             yield from (repr(node.value + 1), f"({node.value - 1!r})")
         case ast.Call(func=ast.Name(id=name)) if name in NAMES:
             yield ast.unparse(ast.Call(ast.Name(NAMES[name]), node.args, node.keywords))
@@ -129,11 +132,12 @@ def mutants(file: Path) -> list[Mutant]:
     content = (ROOT / file).read_bytes()
     starts = [0, *itertools.accumulate(len(line) for line in content.splitlines(keepends=True))]
     found = []
-    for node in _nodes(ast.parse(content)):
-        for after in changes(node):
-            begin = starts[node.lineno - 1] + node.col_offset  # type: ignore[attr-defined]
-            end = starts[node.end_lineno - 1] + node.end_col_offset  # type: ignore[attr-defined]
-            found.append(Mutant(file, node.lineno, begin, end, content[begin:end].decode(), after))  # type: ignore[attr-defined]
+    for top in ast.parse(content).body:
+        for node in (node for node in _nodes(top) if isinstance(node, ast.expr | ast.stmt)):
+            begin = starts[node.lineno - 1] + node.col_offset
+            end = starts[(node.end_lineno or 0) - 1] + (node.end_col_offset or 0)
+            place = file, getattr(top, "name", ""), node.lineno, begin, end, content[begin:end].decode()
+            found += [Mutant(*place, after) for after in changes(node)]
     return found
 
 
@@ -166,15 +170,12 @@ class Copy:
         os.utime(self.folder / file, (stamp := next(self._stamps), stamp))
 
     def first_failure(self, tests: list[str], seconds: float) -> str | None:
-        """Return the first test that fails, of those that start within so many seconds; None where none does."""
+        """Return the first test that fails; None where none does, OPEN where some did not start in so many seconds."""
         command = [sys.executable, "-m", "pytest", "-x", "-q", "--tb=no", "-rfE", "-p", "no:cacheprovider", *tests]
-        known = os.environ | {
-            "PYTHONPATH": str(self.folder / "src"),
-            "SEMSTAB_TESTS_UNTIL": str(time.time() + seconds),
-            "COLUMNS": "300",
-        }
+        until = time.time() + seconds
+        own = {"PYTHONPATH": str(self.folder / "src"), "SEMSTAB_TESTS_UNTIL": str(until), "COLUMNS": "300"}
         with subprocess.Popen(
-            command, cwd=self.folder, env=known, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
+            command, cwd=self.folder, env=os.environ | own, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
             start_new_session=True,
         ) as process:  # fmt: skip
             try:
@@ -183,27 +184,29 @@ class Copy:
                 os.killpg(process.pid, 9)
                 return HANG
         if process.returncode in (0, 5):  # 5: no tests are left
-            return None
+            return OPEN if time.time() > until else None
         failed = re.search(r"^(?:FAILED|ERROR) (.*?)(?: - .*)?$", said, re.MULTILINE)
         return failed[1] if failed else f"pytest ended with code {process.returncode}: {said[-200:]}"
 
 
-HANG = "it hangs"
+HANG = "a test that hangs"
+OPEN = "open: the time was over before all tests had started"
 
 
 def met(mutant: Mutant, copies: queue.Queue[Copy], seconds: float) -> str | None:
-    """Return the test that finds a mutant; None where it survives."""
+    """Return the test that kills a mutant; None where it survives, OPEN where time was over."""
     module = module_of(mutant.file)
     assert module is not None
     own = f"src/{module.replace('.', '/')}"
-    tests = [*map(str, selected({mutant.file})), own + (".py" if (ROOT / f"{own}.py").exists() else "/__init__.py")]
+    tests = sorted(selected({mutant.file}), key=lambda test: mutant.within not in (ROOT / test).read_text("utf-8"))
+    words = [*map(str, tests), own + (".py" if (ROOT / f"{own}.py").exists() else "/__init__.py")]
     content, copied, passed = (ROOT / mutant.file).read_bytes(), copies.get(), list[str]()
     until = time.time() + seconds
     try:
         while True:
             copied.write(mutant.file, mutant.source(content))
             try:
-                found = copied.first_failure([*tests, *passed], max(until - time.time(), 1))
+                found = copied.first_failure([*words, *passed], max(until - time.time(), 1))
             finally:
                 copied.write(mutant.file, content)
             if found is None or "::" not in found:
@@ -223,13 +226,13 @@ def product(given: Iterable[Path]) -> list[Path]:
 
 
 def main() -> int:
-    """Draw mutants, let them meet the tests, print what became of each; return 1 where more than a share survived."""
+    """Draw mutants, let them meet the tests, print what became of each."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("paths", nargs="*", type=Path, help="files and folders of the product; all by default")
     parser.add_argument("--lines", type=int, default=100)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--jobs", type=int, default=2, help="mutants that are tested at once")
-    parser.add_argument("--seconds", type=float, default=120, help="no test of a mutant starts later")
+    parser.add_argument("--seconds", type=float, default=300, help="no test of a mutant starts later")
     parser.add_argument("--at", metavar="FILE:LINE", action="append", help="all mutants of this line, instead of drawn")
     own = parser.parse_args()
     if own.at:
@@ -239,17 +242,19 @@ def main() -> int:
         chosen = [each for file, line in places for each in mutants(file) if each.line == line]
     else:
         chosen = drawn(product(own.paths), own.lines, random.Random(own.seed))
-    survived, copies = 0, queue.Queue[Copy]()
+    told, copies = collections.Counter[str](), queue.Queue[Copy]()
     with tempfile.TemporaryDirectory(prefix="semstab-mutants-") as folder, ThreadPoolExecutor(own.jobs) as pool:
         for k in range(own.jobs):
             copies.put(Copy(Path(folder) / str(k)))
         fates = {pool.submit(met, mutant, copies, own.seconds): mutant for mutant in chosen}
         for fate in as_completed(fates):
             killer = fate.result()
-            survived += killer is None
-            print(f"{fates[fate]}\n    {'SURVIVED' if killer is None else f'killed by {killer}'}", flush=True)
-    share = f"{survived / max(len(chosen), 1):.0%}"
-    print(f"{len(chosen)} mutants: {len(chosen) - survived} killed, {survived} survived ({share})")
+            became = "survived" if killer is None else "open" if killer == OPEN else "killed"
+            told[became] += 1
+            said = killer if became == "open" else "SURVIVED" if killer is None else f"killed by {killer}"
+            print(f"{fates[fate]}\n    {said}", flush=True)
+    counts = ", ".join(f"{told[became]} {became}" for became in ("killed", "survived", "open"))
+    print(f"{len(chosen)} mutants: {counts}")
     return 0
 
 
