@@ -27,7 +27,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Iterable, Iterator
-from concurrent.futures import ThreadPoolExecutor, as_completed
+from concurrent.futures import Future, ThreadPoolExecutor, as_completed
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -176,12 +176,11 @@ class Copy:
         own = {"PYTHONPATH": str(self.folder / "src"), "SEMSTAB_TESTS_UNTIL": str(until), "COLUMNS": "300"}
         with subprocess.Popen(
             command, cwd=self.folder, env=os.environ | own, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
-            start_new_session=True,
         ) as process:  # fmt: skip
             try:
                 said, _ = process.communicate(timeout=seconds + HANGS)
             except subprocess.TimeoutExpired:
-                os.killpg(process.pid, 9)
+                process.kill()
                 return HANG
         if process.returncode in (0, 5):  # 5: no tests are left
             return OPEN if time.time() > until else None
@@ -225,6 +224,14 @@ def product(given: Iterable[Path]) -> list[Path]:
     return sorted(name for file in files if module_of(name := file.relative_to(ROOT)) is not None)
 
 
+def _each(pool: ThreadPoolExecutor, fates: Iterable[Future[str | None]]) -> Iterator[Future[str | None]]:
+    """Yield the fates as they are known; start no other mutant after Ctrl-C."""
+    try:
+        yield from as_completed(fates)
+    finally:
+        pool.shutdown(cancel_futures=True)
+
+
 def main() -> int:
     """Draw mutants, let them meet the tests, print what became of each."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -247,7 +254,7 @@ def main() -> int:
         for k in range(own.jobs):
             copies.put(Copy(Path(folder) / str(k)))
         fates = {pool.submit(met, mutant, copies, own.seconds): mutant for mutant in chosen}
-        for fate in as_completed(fates):
+        for fate in _each(pool, fates):
             killer = fate.result()
             became = "survived" if killer is None else "open" if killer == OPEN else "killed"
             told[became] += 1
