@@ -1,7 +1,7 @@
 # A fresh Debian or Ubuntu machine needs no more than `make bench` and `make test`.
 BIN := .venv/bin
 
-.PHONY: help setup setup-dev bench quick test docs fuzz fuzz-short faults lint format clean
+.PHONY: help setup setup-dev bench quick test docs fuzz fuzz-short faults mutants lint format clean
 
 help:
 	@echo 'make bench   set up, then fuse the built-in city with Open3D: semstab-bench --backend open3d'
@@ -9,6 +9,7 @@ help:
 	@echo 'make quick   between edits, a minute at most: ruff, and the tests of what changed since the last commit'
 	@echo 'make fuzz    damage files of every kind for an hour (FUZZ_SECONDS=3600 FUZZ_SEED=1); fuzz-short: the same 10,000 inputs everywhere'
 	@echo 'make faults  kill 280 runs, studies, predictions, exports and conversions (FAULTS=280), fill their disk, and see that nothing is lost'
+	@echo 'make mutants  change 100 lines of the product, one at a time (MUTANTS="--lines 100 --seed 0"), and say which the tests find'
 	@echo 'make docs    build the documentation into site/, warnings are errors'
 	@echo 'make setup   the set-up alone: system libraries, .venv, semstab; make setup-dev: and what the tests need'
 	@echo 'make format  let ruff format and mend the code'
@@ -46,6 +47,10 @@ fuzz-short: setup-dev
 faults: setup-dev
 	$(BIN)/python tests/faults/kills.py $(or $(FAULTS),280)
 	$(BIN)/python tests/faults/disk.py 12
+
+MUTANTS := --lines 100 --seed 0
+mutants: setup-dev
+	nice -n 5 $(BIN)/python scripts/mutate.py $(MUTANTS)
 
 lint: setup-dev
 	$(BIN)/ruff check .

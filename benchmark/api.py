@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-import tempfile
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from semstab.config import Config
+from semstab.core.files import ScratchFolder
 from semstab.data.records import Result
 from semstab.engine import Executor, Observer, execute
 from semstab.errors import DataError
@@ -46,7 +46,10 @@ def run(
         ConfigError, DataError: If the plan cannot be made, or a unit failed, once everything else has been written.
     """
     with contextlib.ExitStack() as stack:
-        folder = Path(stack.enter_context(tempfile.TemporaryDirectory()) if out is None else out)
+        if out is None:
+            scratch = ScratchFolder()
+            stack.callback(scratch.remove)
+        folder = scratch.path if out is None else Path(out)
         reporting = [Reporting(folder)] if report and out is not None else []
         result, causes = execute(as_config(config), folder, executor, [*observers, *reporting], command)
     if result.failures:

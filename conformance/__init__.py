@@ -39,7 +39,9 @@ SECONDS = 120.0
 LONG = ("frames_65536",)
 """Cases of so many frames that a backend that takes a millisecond a frame needs a minute."""
 
-AT_FACES = ("faces", "decimal_faces", "negative", "ranges", "near", "rays", "utm", "utm_faces")
+AT_FACES = (
+    "faces", "decimal_faces", "negative", "ranges", "near", "rays", "quotients", "utm", "utm_faces", "utm_origins",
+)  # fmt: skip
 """Cases whose points lie at faces or far away: arithmetic other than float64 may put them into other voxels."""
 
 

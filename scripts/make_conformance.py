@@ -51,6 +51,8 @@ def many_cases() -> Mapping[str, Case]:
         "ranges": (0.02, 3, [_ranges(t) for t in range(3)]),
         "near": (0.0005, 3, [_rays(t, 0.001, 0.01) for t in range(3)]),
         "rays": (0.05, 3, [_at_faces(t, 0.05) for t in range(4)]),
+        "quotients": (0.25, 3, [_quotients(t, f) for t, f in enumerate((49, 103, 107, 161, 187, 197))]),
+        "utm_origins": (0.02, 3, _on_faces(30, 0.02)),
         "utm_faces": (0.2, 3, [_utm_face(t) for t in range(len(OFF_A_FACE) * 3)]),
         "frames_255": (1.0, 3, [line(0, [(0.2, 0), (0.4, 0), (0.6, 1)]), line(1, SEVEN)], 150),
         "frames_65536": (1.0, 3, [line(0, [(half, 0)]), line(1, [(half, 1)])], 32769),
@@ -136,6 +138,25 @@ def _at_faces(t: int, voxel_size: float) -> Frame:
     T_wc = np.eye(4)
     T_wc[1, 3] = 0.013
     return Frame(t, depth.astype(np.float32), camera, T_wc, labels=labels)
+
+
+def _quotients(t: int, focal: int) -> Frame:
+    """A row of pixels, or a column, whose rays meet a plane in the faces: (u - c) / f times 0.25 f is (u - c) 0.25.
+
+    In float64 a third of these products are a last digit above or below, and those of (u - c) (1 / f) are others.
+    """
+    n, W, H = 240, *((240, 1) if t % 2 == 0 else (1, 240))
+    depth, labels = np.full((H, W), 0.25 * focal, np.float32), (np.arange(n) * (t + 1) % 7 % 3).astype(np.uint8)
+    camera = Intrinsics(float(focal), float(focal), *((n / 2, 0.0) if t % 2 == 0 else (0.0, n / 2)))
+    return Frame(t, depth, camera, np.eye(4), labels=labels.reshape(H, W))
+
+
+def _on_faces(count: int, voxel_size: float) -> list[Frame]:
+    """Points at UTM coordinates on faces of all three axes, as close as float64 knows them, in voxels apart."""
+    rng = np.random.default_rng(count)
+    near = np.round(np.array([448262.3, 5411932.7, 301.1]) / voxel_size)
+    corners = (near + rng.integers(-500, 500, (count, 3))) * voxel_size
+    return [line(t, [(0.5, t % 3)], start=at - (0.0, 0.0, 0.5)) for t, at in enumerate(corners)]
 
 
 def _utm_face(n: int) -> Frame:

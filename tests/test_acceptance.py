@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import re
 
 import numpy as np
@@ -17,8 +18,11 @@ from semstab.cli import app
 from semstab.data.measures import dominant, vss
 from semstab.data.voxels import VoxelTable
 from semstab.errors import ConfigError, DataError
+from semstab.statistics import acceptance
 from semstab.statistics.acceptance import AcceptanceThresholds, calibrate
 from semstab.statistics.correctness import Truth
+
+OF_FEW = acceptance._of_few
 
 CLASSES = ("road", "car", "tree")
 
@@ -68,6 +72,20 @@ def test_labels_that_err_together_count_as_few():
         calibrate([(table, Truth(true >= 0, true))], precision=0.5).classes["road"].low for true in (apart, together)
     ]
     assert low[0] > low[1]
+
+
+def test_labels_without_an_error_have_the_lower_end_of_clopper_and_pearson(monkeypatch):
+    """All cubes are right: the lower end is error^(1 / m), m the number of cubes of one size that tell as much."""
+    index = np.stack(np.meshgrid(*[np.arange(8)] * 3, indexing="ij"), axis=-1).reshape(-1, 3).astype(np.int32)
+    table = dataclasses.replace(log_of(np.zeros((len(index), 3), int), index=index).table(), classes=("a", "b", "c"))
+    label = dominant(table).astype(np.int64)
+    tried = []
+    monkeypatch.setattr(acceptance, "_of_few", lambda sums, error: tried.append((sums, error)) or OF_FEW(sums, error))
+    found = calibrate([(table, Truth(label >= 0, label))], precision=0.01).classes["a"]
+    sums, error = tried[0]
+    m = sums[:, 1].sum() ** 2 / (sums[:, 1] ** 2).sum()
+    assert 0.5 * len(sums) < m < len(sums)
+    assert found.low == pytest.approx(error ** (1 / m))
 
 
 def test_a_file_keeps_it_and_another_kind_of_map_is_refused(commit, tmp_path):

@@ -23,6 +23,7 @@ from semstab.data.voxels import VoxelTable
 from semstab.engine import Observer, load_result
 from semstab.engine.memory import map_bytes
 from semstab.errors import ConfigError, DataError
+from semstab.report import terminal
 from semstab.report.tables import tables
 from semstab.report.tables.table import to_json as table_content
 from semstab.report.terminal import print_summary
@@ -90,6 +91,20 @@ def test_the_verdict_on_each_model_is_printed(ran) -> None:
     screen = printed.partition("\n\nOverview")[0]
     assert max(len(line) for line in screen.splitlines()) <= 80
     assert len(screen.splitlines()) <= 24
+
+
+def test_classes_of_too_few_voxels_are_not_listed(tmp_path, monkeypatch) -> None:
+    root = tiny_scene.write(tmp_path / "wall", ("a",))
+    result = semstab.run(configure(root), out=tmp_path / "run", report=False)
+    voxels = {row.name: row.voxels for row in result.record().summary.table.classes}
+    least = min(voxels, key=voxels.__getitem__)
+    assert max(voxels.values()) < terminal.RARE
+    assert "classes that disagree most" not in "\n".join(terminal.screen(result))
+    for bound, listed in ((voxels[least], True), (voxels[least] + 1, False)):
+        monkeypatch.setattr(terminal, "RARE", bound)
+        shown = "\n".join(terminal.screen(result)).partition("classes that disagree most")[2]
+        assert (f"\n    {least} " in shown) == listed
+        assert len(shown.splitlines()) > 2
 
 
 def test_without_asking_there_is_what_the_map_alone_tells(tmp_path) -> None:

@@ -67,6 +67,8 @@ def test_las_has_the_voxels_to_the_millimetre_with_their_measures_and_projection
         assert cloud.header.parse_crs().to_epsg() == 32615
         assert (cloud["class"] == dominant(table) + 1).all()
         assert (cloud.classification == np.array([6, 64, 1])[dominant(table)]).all()
+        colors = trimesh.load(written(fused, "map.ply")).colors[:, :3].astype(int)
+        assert (np.stack([cloud.red, cloud.green, cloud.blue], axis=1) == colors * 257).all()  # 255 becomes 65535
         np.testing.assert_allclose(cloud.vss, vss(table), rtol=1e-6)
         assert (cloud.op == table.op).all()
         assert {d.name: d.description for d in cloud.point_format.extra_dimensions}["sbd"] == "SBD, bits"

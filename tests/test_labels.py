@@ -84,6 +84,13 @@ def test_many_classes_map_to_16_bits():
     assert (mapped.tolist(), mapped.dtype) == ([[0, 255, 299, 65535]], np.uint16)
 
 
+def test_255_classes_are_the_most_that_8_bits_hold():
+    space = LabelSpace("wide", tuple(f"class {k}" for k in range(255)))
+    turned = LabelSpace("turned", space.classes[::-1])
+    mapped = turned.mapping_to(space).labels(u16(0, 254, 65535), "")
+    assert (mapped.tolist(), mapped.dtype) == ([[254, 0, 255]], np.uint8)
+
+
 @pytest.mark.parametrize("labels", [u8(0, 9, 8, 9), u16(0, 9, 8, 9)])
 def test_an_id_outside_the_taxonomy_is_named_with_its_file(labels):
     expected = r"^labels/0012.png: label id 8, 9 \(3 pixels\) is outside the taxonomy uavid8 \(8 classes, ids 0 to 7\)$"

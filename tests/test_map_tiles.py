@@ -28,6 +28,7 @@ from semstab import backends
 from semstab.comparison.calibration import calibrate_run
 from semstab.comparison.differences import find
 from semstab.core.json_form import to_json
+from semstab.data import voxels
 from semstab.data.frames import Frame, Intrinsics
 from semstab.data.parquet import Tile
 from semstab.data.voxels import Extent, VoxelTable
@@ -439,12 +440,20 @@ def test_a_unit_in_tiles_takes_the_place_of_a_whole_one_and_back(wall, tmp_path)
         assert [path.name for path in voxels.iterdir()] == [there]
 
 
-def test_tiles_of_two_maps_are_no_table(both, tmp_path) -> None:
+def test_tiles_of_two_maps_are_no_table(both, tmp_path, monkeypatch) -> None:
     tiles = tmp_path / "tiles"
     shutil.copytree(both[1] / "voxels" / "wall__a__numba", tiles)
     table = VoxelTable.load(tiles)
     assert sum(map(len, VoxelTable.iter_tiles(tiles))) == len(table) == 222
     np.testing.assert_array_equal(VoxelTable.columns(tiles, ["vss", "ix"])["vss"], semstab.metrics.vss(table))
+    for free, fits in ((222 * voxels.BYTES_A_VOXEL, True), (222 * voxels.BYTES_A_VOXEL - 1, False)):
+        monkeypatch.setattr(voxels, "available_bytes", lambda free=free: free)
+        with (
+            contextlib.nullcontext()
+            if fits
+            else pytest.raises(DataError, match=r"0.000222 million voxels in \d+ tiles")
+        ):
+            VoxelTable.load(tiles)
     some = next(VoxelTable.iter_tiles(tiles))
     some.save(tiles / "tile=9_9.parquet", tile=Tile(9, 9, 8, "another"))
     with pytest.raises(DataError, match=r"tile=9_9.* is a tile of another map than .*; remove it"):

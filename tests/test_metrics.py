@@ -160,6 +160,13 @@ def test_classes_hold_the_voxels_that_they_dominate():
     assert [row.name for row in summarise(voxel_table([1], [[1, 0, 0]])).classes] == ["0", "1", "2"]
 
 
+def test_a_class_is_confused_with_the_one_that_has_most_evidence_where_it_dominates():
+    """Where road dominates, tree has 1 and car 2; where tree does, nobody else has evidence; car dominates nowhere."""
+    evidence = [[3, 1, 0], [2, 0, 1], [2, 0, 1], [0, 3, 0]]
+    table = voxel_table(op=[4, 3, 3, 3], evidence=evidence, classes=("road", "tree", "car"))
+    assert summarise(table).confused_with == {"road": "car"}
+
+
 def test_means_of_nothing_are_undefined():
     summary = summarise(voxel_table(op=[1], evidence=[[1, 0]]))
     for row in (summary.strata[1], summary.recurrent, summary.classes[1]):

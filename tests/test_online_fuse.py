@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import gc
+import os
+import subprocess
+import sys
 import tempfile
 from pathlib import Path
 
@@ -11,6 +14,7 @@ import pytest
 import torch
 
 import semstab
+from semstab.core.files import ScratchFolder
 from semstab.core.json_form import to_json
 from semstab.datasets import GROUND_TRUTH, open_dataset
 from semstab.errors import ConfigError, DataError
@@ -116,6 +120,48 @@ def test_nothing_is_written_unless_asked_and_then_all_of_it(city, classes, tmp_p
     del result
     gc.collect()
     assert not [*temporary.iterdir()]
+
+
+KILLED = """
+import os, sys
+import numpy as np
+import semstab
+
+def frames(last):
+    for i in range(4):
+        labels, depth = np.zeros((8, 8), np.uint8), np.ones((8, 8), np.float32)
+        K = np.array([[8, 0, 4], [0, 8, 4], [0, 0, 1]])
+        yield dict(labels=labels, depth=depth, intrinsics=K, T_wc=np.eye(4))
+    last()
+
+class Killed(semstab.engine.Observer):
+    def frame_fused(self, *given, **named):
+        os.kill(os.getpid(), 9)
+
+if sys.argv[1] == "frames":
+    semstab.fuse(frames(lambda: os.kill(os.getpid(), 9)), voxel_size=0.1, backend="numpy")
+semstab.fuse(frames(lambda: None), voxel_size=0.1, backend="numpy", observers=[Killed()])
+"""
+
+
+@pytest.mark.parametrize("when", ["frames", "fusion"])
+def test_what_a_killed_program_left_is_removed_by_the_next(when, tmp_path, monkeypatch):
+    done = subprocess.run([sys.executable, "-c", KILLED, when], env=os.environ | {"TMPDIR": str(tmp_path)}, check=False)
+    assert done.returncode == -9
+    left = set(tmp_path.glob("semstab-*"))
+    assert len(left) == (1 if when == "frames" else 2)
+    (tmp_path / "semstab-scratch-linked").symlink_to(tmp_path.parent)
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    first = ScratchFolder()
+    assert not any(path.exists() for path in left)
+    (first.path / "mine").touch()
+    second = ScratchFolder()
+    assert (first.path / "mine").exists()  # held by this process
+    assert any(tmp_path.parent.iterdir())
+    first.remove()
+    del second
+    gc.collect()
+    assert [path.name for path in tmp_path.iterdir()] == ["semstab-scratch-linked"]
 
 
 def test_what_cannot_be_fused_is_one_line(city, classes):

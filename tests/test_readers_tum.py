@@ -143,6 +143,15 @@ def test_stamps_out_of_order_are_named(folder, name):
     assert str(folder / name) in str(e.value)
 
 
+@pytest.mark.parametrize("name", ["rgb.txt", "depth.txt", "groundtruth.txt"])
+def test_two_records_of_one_stamp_are_out_of_order(folder, name):
+    lines = (folder / name).read_text().splitlines()
+    write_lines(folder / name, [*lines[:2], *lines[1:]])
+    stamp = lines[1].split()[0].replace(".", r"\.")
+    with pytest.raises(DataError, match=rf"record 2 \({stamp}\d*\) is not after record 1 \({stamp}"):
+        opened(TUM, folder)
+
+
 def test_calibrations_go_by_the_sequences_name(tmp_path):
     for name, fx in (("rgbd_dataset_freiburg2_desk", 520.908620), ("my_kinect", 525)):
         folder = tmp_path / name

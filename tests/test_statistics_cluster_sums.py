@@ -12,6 +12,7 @@ from simulated_events import grid, log_of, log_of_evidence, soft
 from striped_floor import K, fused, sampled
 from striped_floor import flight as over_stripes
 
+from semstab.core.json_form import to_json
 from semstab.data.measures import dominant, entropy, sbd, vss
 from semstab.errors import DataError
 from semstab.metrics.agreement import rows_of
@@ -201,6 +202,10 @@ def test_a_series_over_frames_and_how_much_of_a_map_is_covered():
     part = cluster_sums_of(rows_of(table, np.flatnonzero(kept)))
     assert coverage(part, whole).value == pytest.approx(kept[table.op >= 2].mean() - 1)
     assert (coverage(whole, whole).low, coverage(whole, whole).high) == (0.0, 0.0)
+    larger = whole.coarsened(2 * whole.edge, 0)
+    for ours, theirs in ((part, larger), (larger, part)):  # on the larger cubes of the two
+        alike = [sums.coarsened(larger.edge, 0) for sums in (ours, theirs)]
+        assert to_json(coverage(ours, theirs, same_frames=False)) == to_json(coverage(*alike, same_frames=False))
     assert same_flight(whole, whole)
     assert whole.frame_count == whole.coarsened(whole.edge, 2 * whole.step).frame_count
     assert not same_flight(whole, part)

@@ -102,6 +102,8 @@ def test_a_description_holds_what_the_functions_say(described):
     by_class = {row.name: row.voxel_alpha for row in summary.agreement.classes}
     assert {row.name: row.alpha.value for row in found.classes} == pytest.approx(by_class)
     assert summary.drift.excess.value == pytest.approx(np.nanmean(sbd(table) - expected_sbd(table)))
+    flipped = summary.drift.flips
+    assert flipped.excess.value == pytest.approx(flipped.rate.value - flipped.null.value)
     parts = summary.uncertainty
     assert parts.entropy.value == pytest.approx(parts.within.value + parts.between.value)
     geometry = summary.geometry

@@ -278,6 +278,39 @@ class RaysInFloat32(Mutant):
         yield np.stack([((R[i, 0] * x + R[i, 1] * y) + R[i, 2] * d) + t[i] for i in range(3)])
 
 
+class OtherRays(Mutant):
+    """Another product of a ray and depth, of which each is right but for its last digit."""
+
+    def product(self, pixels, f, d):
+        """Return x or y (n,) from pixels less the principal point, focal length and depth."""
+        raise NotImplementedError
+
+    def points(self, frame, pixels):
+        K, (v, u) = frame.intrinsics, np.nonzero(pixels)
+        d = frame.depth[v, u].astype(float)
+        x, y = self.product(u - K.cx, K.fx, d), self.product(v - K.cy, K.fy, d)
+        R, t = frame.T_wc[:3, :3], frame.T_wc[:3, 3]
+        yield np.stack([((R[i, 0] * x + R[i, 1] * y) + R[i, 2] * d) + t[i] for i in range(3)])
+
+
+@found_by("quotients")
+class TimesOneOverTheFocalLength(OtherRays):
+    def product(self, pixels, f, d):
+        return pixels * (1 / f) * d
+
+
+@found_by("quotients")
+class DepthBeforeTheFocalLength(OtherRays):
+    def product(self, pixels, f, d):
+        return pixels * d / f
+
+
+@found_by("quotients")
+class RaysInExtendedPrecision(OtherRays):
+    def product(self, pixels, f, d):
+        return (pixels.astype(np.longdouble) / f * d).astype(float)
+
+
 @found_by("rays")
 class IntrinsicsInFloat32(Mutant):
     def read(self, frame):
@@ -304,6 +337,46 @@ class AnEpsilonBeforeTheFloor(Mutant):
 class CoordinatesInMicrometres(Mutant):
     def index(self, points, voxel_size, frame):
         return super().index(np.round(points, 6), voxel_size, frame)
+
+
+@found_by("decimal_faces")
+class TimesOneOverTheVoxelSize(Mutant):
+    def index(self, points, voxel_size, frame):
+        return np.floor(points * (1 / voxel_size)).astype(np.int64)
+
+
+class OriginInMetres(Mutant):
+    """An origin is subtracted in metres, and added again as voxels."""
+
+    origin = None
+
+    def index(self, points, voxel_size, frame):
+        if self.origin is None:
+            self.origin = self.chosen(frame.T_wc[:3, 3:], voxel_size)
+        there = np.round(self.origin / voxel_size).astype(np.int64)
+        return super().index(points - self.origin, voxel_size, frame) + there
+
+    def chosen(self, position, voxel_size):
+        """Return the origin (3, 1), metres, from the position of the first camera."""
+        raise NotImplementedError
+
+
+@found_by("utm_origins")
+class OriginInTheVoxelOfTheFirstCamera(OriginInMetres):
+    def chosen(self, position, voxel_size):
+        return np.floor(position / voxel_size) * voxel_size
+
+
+@found_by("utm_origins")
+class OriginInWholeMetres(OriginInMetres):
+    def chosen(self, position, voxel_size):
+        return np.floor(position)
+
+
+@found_by("utm_origins")
+class OriginInWholeKilometres(OriginInMetres):
+    def chosen(self, position, voxel_size):
+        return np.floor(position / 1000) * 1000
 
 
 @found_by("frame_numbers")

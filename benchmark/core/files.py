@@ -7,8 +7,11 @@ import fcntl
 import hashlib
 import json
 import os
+import shutil
 import stat
 import tempfile
+import time
+import weakref
 import zipfile
 from collections.abc import Collection, Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
@@ -26,6 +29,12 @@ from semstab.errors import ConfigError, DataError, summarize_error
 
 TEMPORARY = ".semstab-"
 """The beginning of the names of files that are not whole yet."""
+
+SCRATCH = "semstab-scratch-"
+"""The beginning of the names of temporary folders that a process holds a lock on."""
+
+BRIEFLY = 0.2
+"""Seconds for which another process may hold a lock file to see that nobody needs it."""
 
 MAX_YAML_BYTES = 2**24
 
@@ -89,6 +98,80 @@ class FolderLock:
         if self._handle is not None:
             os.close(self._handle)
         self._handle = None
+
+
+@contextmanager
+def only_writer(path: str | Path) -> Iterator[None]:
+    """Let no other process write a file while the block lasts.
+
+    Raises:
+        ConfigError: If another one writes it.
+    """
+    real = Path(path).resolve()
+    real.parent.mkdir(parents=True, exist_ok=True)
+    lock = real.parent / f"{TEMPORARY}{hashlib.blake2b(os.fsencode(real.name), digest_size=8).hexdigest()}.lock"
+    handle, until = None, time.monotonic() + BRIEFLY
+    while handle is None:
+        handle = os.open(lock, os.O_RDONLY | os.O_CREAT, 0o666)
+        try:
+            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            removed = os.fstat(handle).st_nlink == 0
+        except BlockingIOError as error:
+            removed = True
+            if time.monotonic() > until:
+                os.close(handle)
+                raise ConfigError(f"{path}: another process writes it; wait for it, or name another file") from error
+        except OSError:  # a file system without locks
+            removed = False
+        if removed:
+            os.close(handle)
+            handle = None
+            time.sleep(0.01)
+    try:
+        yield
+    finally:
+        lock.unlink(missing_ok=True)
+        os.close(handle)
+
+
+class ScratchFolder:
+    """A temporary folder that is removed with the last reference to it, with its process, or after a kill by the next.
+
+    Attributes:
+        path: The folder, empty.
+    """
+
+    def __init__(self) -> None:
+        _remove_abandoned_scratch(Path(tempfile.gettempdir()))
+        while True:
+            own = Path(tempfile.mkdtemp(prefix=SCRATCH))
+            handle = os.open(own, os.O_RDONLY)
+            with suppress(OSError):  # a file system without locks
+                fcntl.flock(handle, fcntl.LOCK_SH)
+            if own.exists():  # else it was removed before it was locked
+                break
+            os.close(handle)
+        self.path = own / "files"  # a run locks it
+        self.path.mkdir()
+        self.remove = weakref.finalize(self, _remove_scratch, own, handle)
+
+
+def _remove_scratch(own: Path, handle: int) -> None:
+    shutil.rmtree(own, ignore_errors=True)
+    os.close(handle)
+
+
+def _remove_abandoned_scratch(folder: Path) -> None:
+    """Remove the scratch folders of this user that no process holds."""
+    for path in folder.glob(f"{SCRATCH}*"):
+        with suppress(OSError):
+            handle = os.open(path, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW)
+            try:
+                fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                if os.fstat(handle).st_uid == os.getuid():
+                    shutil.rmtree(path, ignore_errors=True)
+            finally:
+                os.close(handle)
 
 
 def remove_leftovers(folder: Path) -> None:

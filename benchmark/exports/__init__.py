@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import logging
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -9,7 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from semstab.config import nearest
-from semstab.core.files import remove_abandoned
+from semstab.core.files import only_writer, remove_abandoned
 from semstab.engine.folder import load_result, model_of, require_output
 from semstab.errors import ConfigError
 from semstab.exports import annotation_formats, clouds, maps
@@ -140,15 +141,18 @@ def export(
             join=None if join is None else Path(join),
         )  # fmt: skip
 
-    if task_format is not None:
-        task, _ = task_of(run, record, result.manifest["inputs"])
-        tasks = annotation_tasks(chosen(("op",)), task, most)
-        named = task.mapping.target, task.scene.name, task.model
-        return [_tasks_written(TaskFile(tasks, *named, file), task_format, task) for file in files]
-    if classify is not None:
-        return [_classified(chosen(joining.MEASURES), Path(classify), file, radius, settings) for file in files]
-    usual = {".tif": maps.RASTER_MEASURES}
-    return [_written(chosen(usual.get(file.suffix.lower())), file, settings) for file in files]
+    with contextlib.ExitStack() as held:
+        for file in dict(sorted((file.resolve(), file) for file in files)).values():
+            held.enter_context(only_writer(file))
+        if task_format is not None:
+            task, _ = task_of(run, record, result.manifest["inputs"])
+            tasks = annotation_tasks(chosen(("op",)), task, most)
+            named = task.mapping.target, task.scene.name, task.model
+            return [_tasks_written(TaskFile(tasks, *named, file), task_format, task) for file in files]
+        if classify is not None:
+            return [_classified(chosen(joining.MEASURES), Path(classify), file, radius, settings) for file in files]
+        usual = {".tif": maps.RASTER_MEASURES}
+        return [_written(chosen(usual.get(file.suffix.lower())), file, settings) for file in files]
 
 
 def _written(chosen: Chosen, file: Path, settings: Settings) -> Exported:

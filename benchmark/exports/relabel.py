@@ -336,25 +336,25 @@ def relabel(
                 known = read(truth, index)
         return frame, fused.of(frame, pixel_stride), known
 
-    for done, fetched in enumerate(prefetch(read_and_fuse, task.indices), start=1):
-        frame, rows, known = fetched.item
-        maps = labels_of(rows, space.ids)
-        if done == 1 and not np.array_equal(task.scene.predicted(frame.index, labels=maps).predicted, maps):
-            raise DataError(
-                f"{task.scene.name}: its label maps have the pixels of the image, not those of the depth; convert it"
-                " (semstab-bench convert), and run and relabel the posed folder"
-            )
-        folder.write(task.scene.image_name(frame.index), record.key, maps, 0.0)
-        tally.add(frame, rows, known)
-        progress(f"{task.scene.name} · {name}", done, len(task.indices))
-    folder.require_whole()
-    folder.save()
-    report = Relabelled(
-        task.scene.name, task.model, name, str(folder.path), len(task.indices), **tally.counts,
-        leave_one_out=chosen.leave_one_out, correctness=tally.correctness(),
-    )  # fmt: skip
-    write_json(folder.path / REPORT, {**dataclasses.asdict(report), "belief": chosen.settings()})
-    folder.close()
+    with contextlib.closing(folder):
+        for done, fetched in enumerate(prefetch(read_and_fuse, task.indices), start=1):
+            frame, rows, known = fetched.item
+            maps = labels_of(rows, space.ids)
+            if done == 1 and not np.array_equal(task.scene.predicted(frame.index, labels=maps).predicted, maps):
+                raise DataError(
+                    f"{task.scene.name}: its label maps have the pixels of the image, not those of the depth;"
+                    " convert it (semstab-bench convert), and run and relabel the posed folder"
+                )
+            folder.write(task.scene.image_name(frame.index), record.key, maps, 0.0)
+            tally.add(frame, rows, known)
+            progress(f"{task.scene.name} · {name}", done, len(task.indices))
+        folder.require_whole()
+        folder.save()
+        report = Relabelled(
+            task.scene.name, task.model, name, str(folder.path), len(task.indices), **tally.counts,
+            leave_one_out=chosen.leave_one_out, correctness=tally.correctness(),
+        )  # fmt: skip
+        write_json(folder.path / REPORT, {**dataclasses.asdict(report), "belief": chosen.settings()})
     return report
 
 

@@ -5,8 +5,6 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import pickle
-import shutil
-import tempfile
 import weakref
 from collections.abc import Iterable, Mapping
 from pathlib import Path
@@ -16,6 +14,7 @@ import numpy as np
 import numpy.typing as npt
 from pydantic import BaseModel
 
+from semstab.core.files import ScratchFolder
 from semstab.core.types import Float64
 from semstab.data.frames import Frame
 from semstab.data.labels import LabelSpace
@@ -61,14 +60,6 @@ def as_frame(given: Frame | Mapping[str, Any], index: int) -> tuple[Frame, Frame
     return frame, Frame(index, frame.depth, frame.intrinsics, frame.T_wc, labels=truth, timestamp=frame.timestamp)
 
 
-class OwnFolder:
-    """A temporary folder that is removed with the last reference to it, or with the process."""
-
-    def __init__(self) -> None:
-        self.path = Path(tempfile.mkdtemp(prefix="semstab-"))
-        weakref.finalize(self, shutil.rmtree, self.path, ignore_errors=True)
-
-
 class Sequence:
     """The frames of a program on disk, in a temporary folder that is removed with the last reference to them.
 
@@ -78,7 +69,7 @@ class Sequence:
     """
 
     def __init__(self, frames: Iterable[Frame | Mapping[str, Any]]) -> None:
-        self._folder = OwnFolder()
+        self._folder = ScratchFolder()
         self.count = self.classes = 0
         self.has_truth, times, digest = True, list[float | None](), hashlib.blake2b(digest_size=16)
         for given in frames:

@@ -11,11 +11,12 @@ from pathlib import Path
 from typing import Any
 
 from semstab.api import run
+from semstab.core.files import ScratchFolder
 from semstab.data.frames import Frame
 from semstab.data.records import Result
 from semstab.engine import Observer
 from semstab.errors import ConfigError
-from semstab.online.frames import Frames, OwnFolder, Sequence
+from semstab.online.frames import Frames, Sequence
 from semstab.online.summary import Summary
 from semstab.report import Reporting, write_report
 from semstab.settings import as_config
@@ -87,7 +88,7 @@ def fuse(
     options = {"token": token, "scene": scene, "model": model, "classes": tuple(classes)}
     content = {"name": scene, "dataset": {"name": "frames", "options": options}, "backends": [backend], **settings}
     config = as_config(content if voxel_size is None else {**content, "voxel_size": voxel_size})
-    folder = OwnFolder()
+    folder = ScratchFolder()
     with contextlib.ExitStack() as stack:
         watching = list(observers)
         if recording is not None:

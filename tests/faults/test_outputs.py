@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import json
 import shutil
 import signal
+import subprocess
+import sys
 import time
+from pathlib import Path
 
 import pytest
 import tiny_scene
@@ -13,7 +17,8 @@ from posed_config import configure
 
 import semstab
 from semstab.comparison.runs import open_run, save_summary
-from semstab.core.files import FolderLock, atomic_path
+from semstab.core.files import FolderLock, atomic_path, only_writer
+from semstab.exports.relabel import Belief, relabel
 
 
 @pytest.fixture(scope="module")
@@ -88,6 +93,48 @@ def test_what_a_killed_export_left_is_removed_and_what_is_being_written_is_not(r
         assert [path.name for path in tmp_path.glob(".semstab-*")] == [written.name]
         written.write_text("whole")
     assert (tmp_path / "other.csv").read_text() == "whole"
+
+
+def test_two_exports_to_one_file_are_refused(run, tmp_path) -> None:
+    (tmp_path / "linked").symlink_to(tmp_path)
+    with only_writer(tmp_path / "m.csv"):
+        said = error_of("export", "run", "--to", "a.ply", "--to", "linked/m.csv", cwd=tmp_path)
+        assert "m.csv: another process writes it; wait for it, or name another file" in said
+        bench("export", "run", "--to", "other.csv", cwd=tmp_path)
+    bench("export", "run", "--to", "m.csv", "--to", "linked/m.csv", cwd=tmp_path)
+    assert (tmp_path / "m.csv").read_bytes() == (tmp_path / "other.csv").read_bytes()
+    assert not list(tmp_path.glob(".semstab-*"))
+    assert not (tmp_path / "a.ply").exists()
+
+
+def test_the_lock_of_a_killed_export_holds_nobody_up(run, tmp_path) -> None:
+    killed = (
+        "import os; from semstab.core.files import only_writer\nwith only_writer('m.csv'):\n    os.kill(os.getpid(), 9)"
+    )
+    assert subprocess.run([sys.executable, "-c", killed], cwd=tmp_path, check=False).returncode == -9
+    assert len(list(tmp_path.glob(".semstab-*"))) == 1
+    bench("export", "run", "--to", "m.csv", cwd=tmp_path)
+    assert not list(tmp_path.glob(".semstab-*"))
+
+
+def test_labels_and_their_report_are_the_same_however_often_it_was_started(run, tmp_path) -> None:
+    words = ["relabel", "run", "--out", "twice", "--leave-one-out"]
+
+    def stop(what, done, total):
+        if done == 3:
+            raise KeyboardInterrupt
+
+    bench("relabel", "run", "--out", "once", "--leave-one-out", cwd=tmp_path)
+    with pytest.raises(KeyboardInterrupt):
+        relabel(run, tmp_path / "twice", belief=Belief(leave_one_out=True), progress=stop)
+    bench(*words, cwd=tmp_path)
+    first = content(tmp_path / "twice")
+    bench(*words, cwd=tmp_path)
+    assert content(tmp_path / "twice") == first
+    report = Path("labels/a-fused/relabelled.json")
+    once, twice = (json.loads((tmp_path / name / report).read_text()) for name in ("once", "twice"))
+    assert {**once, "folder": ""} == {**twice, "folder": ""}
+    assert once["pixels"] == 8 * tiny_scene.WIDTH * tiny_scene.HEIGHT
 
 
 def test_two_comparisons_into_one_folder_are_refused(run, tmp_path) -> None:
