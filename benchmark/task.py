@@ -134,8 +134,13 @@ def prepare(task: Task, frame: Frame, pixel_stride: int = 1) -> Frame:
         classes = tuple(task.mapping.source.ids[k] for k in classes)
     frame = leave_out(frame, classes, masks=task.exclude.masks)
     frame = _in_label_space(task.mapping, dataclasses.replace(frame, unlabelled=_unlabelled(frame)))
-    if task.top_k is not None and frame.scores is not None:
-        frame = keep_largest(frame, task.top_k)
+    if task.top_k is not None:
+        if frame.scores is None and task.model != GROUND_TRUTH:
+            raise ConfigError(
+                f"{task.scene.name}: top_k keeps the largest scores of a pixel, but {task.model} has label maps;"
+                " leave it out, or choose models with scores"
+            )
+        frame = frame if frame.scores is None else keep_largest(frame, task.top_k)
     if task.perturbation is not None:
         frame = perturb(frame, task.perturbation, task.scene.name)
     return frame.every(pixel_stride)

@@ -5,9 +5,10 @@ Sources: Schönberger and Frahm, Structure-from-Motion Revisited, CVPR 2016; col
 
 from __future__ import annotations
 
+import logging
 import os
 import struct
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -20,9 +21,11 @@ from semstab.datasets.files import options as opt
 from semstab.datasets.files.options import FileOptions, Folders, FrameSource, Template, inside
 from semstab.datasets.files.reader import FileDataset
 from semstab.datasets.formats.disk import AGAIN, natural, to_number
-from semstab.datasets.formats.images import DEPTH_SUFFIXES
+from semstab.datasets.formats.images import DEPTH_SUFFIXES, color_size
 from semstab.datasets.geometry.cameras import Camera, Poses, from_quaternions
 from semstab.errors import DataError
+
+logger = logging.getLogger("semstab")
 
 MODEL_FOLDERS = ("sparse", "sparse/0", ".")
 
@@ -61,7 +64,7 @@ class Colmap(FileDataset[ColmapOptions]):
         model = self._model(folder)
         assert model is not None
         path, images = read_model(model)
-        frames = []
+        frames: list[FrameSource] = []
         for image in images:
             depth_name = self._depth.filled(image=image.name, name=image.frame)
             wanted = inside(options.root, folder, depth_name, str(path))
@@ -74,6 +77,7 @@ class Colmap(FileDataset[ColmapOptions]):
                     depth_scale=1 / (options.metres_per_unit or 1.0) if depth.suffix == ".bin" else None,
                 )
             )  # fmt: skip
+        _tell_sizes(path, frames)
         return frames
 
     def _model(self, folder: Path) -> Path | None:
@@ -83,6 +87,24 @@ class Colmap(FileDataset[ColmapOptions]):
 
 
 # The sparse model, text and binary (colmap.github.io/format.html): the cameras and the images; points are skipped.
+
+
+def _tell_sizes(path: Path, frames: Sequence[FrameSource]) -> None:
+    """Warn of the first image of each camera whose file has another size than the model says."""
+    first = {frame.camera: frame.color for frame in reversed(frames) if frame.color is not None}
+    for camera, color in first.items():
+        try:
+            size = color_size(color)
+        except DataError:  # raised where the image is needed
+            continue
+        if camera.size is not None and camera.size != size:
+            (width, height), (w, h) = camera.size, size
+            logger.warning(
+                "%s: says that %s has %dx%d pixels, but the file has %dx%d; intrinsics are scaled to it, right only"
+                " where the image was resized after the reconstruction",
+                path.parent, color.name, width, height, w, h,
+            )  # fmt: skip
+
 
 MODELS: Mapping[str, tuple[int, int]] = {
     "SIMPLE_PINHOLE": (3, 1), "PINHOLE": (4, 2), "SIMPLE_RADIAL": (4, 1), "RADIAL": (5, 1), "OPENCV": (8, 2),

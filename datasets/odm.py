@@ -5,6 +5,7 @@ Sources: opendronemap.org (docs, Outputs); opensfm.org; the folders of real proj
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,7 +21,7 @@ from semstab.datasets.files.labels import SceneEntry
 from semstab.datasets.files.options import FileOptions, Folders, FrameSource, Template, inside
 from semstab.datasets.files.reader import FileDataset
 from semstab.datasets.files.scene import FileScene
-from semstab.datasets.formats.disk import natural, subfolders
+from semstab.datasets.formats.disk import natural, records, subfolders
 from semstab.datasets.formats.images import COLOR_SUFFIXES, DEPTH_SUFFIXES
 from semstab.datasets.geometry.lenses import Lens
 from semstab.datasets.opensfm import Shot, read_reconstruction
@@ -38,7 +39,7 @@ MESHES = (
 )  # fmt: skip
 GEOREFERENCED = "odm_texturing*/*_geo.obj"
 DSM = "odm_dem/dsm.tif"
-MVE = "mve/views/view_{:04d}.mve/depth-L0.mvei"
+VIEWS = "mve/views"
 DMAPS = "undistorted/openmvs/depthmaps"
 
 Kind = Literal["mesh", "dsm", "mve", "openmvs", "files"]
@@ -135,7 +136,7 @@ def find_depth(project: Project, kind: Kind, template: str) -> Path | None:
 def depth_files(project: Project, kind: Kind | None, names: Mapping[str, str], template: Template) -> dict[str, Path]:
     """Return the depth map of each shot, there or not, by its name; `names`: those of frames by those of shots."""
     if kind == "mve":
-        return {shot: project.folder / MVE.format(k) for k, shot in enumerate(names)}
+        return _mve_files(project.folder / VIEWS, names)
     if kind == "openmvs":
         maps, folder = {}, project.opensfm / DMAPS
         for path in sorted(folder.glob("*.dmap")):  # each names the image that it belongs to
@@ -146,6 +147,42 @@ def depth_files(project: Project, kind: Kind | None, names: Mapping[str, str], t
     folders = Folders()
     wanted = {shot: project.folder / template.filled(name=name) for shot, name in names.items()}
     return {shot: folders.one_of(path, DEPTH_SUFFIXES) or path for shot, path in wanted.items()}
+
+
+def _mve_files(views: Path, names: Mapping[str, str]) -> dict[str, Path]:
+    """Return the depth map of each shot by the image that its view names, or by the view's number where it names none.
+
+    MVE calls a view after its image, or '0007' after its own number, which then counts shots.
+
+    Raises:
+        DataError: If views name images, but none of a shot.
+    """
+    by_name: dict[str, Path] = {}
+    numbers: set[str] = set()
+    for view in sorted(views.glob("view_*.mve")):
+        number = view.stem.removeprefix("view_")
+        said = _view_name(view / "meta.ini") or number
+        by_name[bare_name(said)] = view / "depth-L0.mvei"
+        if said.isdigit() and int(said) == int(number or 0):
+            numbers.add(said)
+    wanted = {shot: bare_name(name) for shot, name in names.items()}
+    if not by_name.keys() & set(wanted.values()):
+        if by_name.keys() - numbers:
+            raise DataError(
+                f"{views}: the views are called {', '.join(sorted(by_name)[:3])} in their meta.ini, which no shot of"
+                f" the reconstruction is ({', '.join(sorted(wanted.values())[:3])}); take depth_from: mesh"
+            )
+        return {shot: views / f"view_{k:04d}.mve/depth-L0.mvei" for k, shot in enumerate(names)}
+    return {shot: by_name.get(name, views / f"{name}.mve/depth-L0.mvei") for shot, name in wanted.items()}
+
+
+def _view_name(path: Path) -> str | None:
+    """Return the name in the part [view] of a meta.ini; None where there is none."""
+    lines = [text for _, text in records(path)] if path.is_file() else []
+    start = lines.index("[view]") + 1 if "[view]" in lines else len(lines)
+    part = itertools.takewhile(lambda line: not line.startswith("["), lines[start:])
+    said = (line.partition("=") for line in part)
+    return next((value.strip() for key, _, value in said if key.strip() == "name" and value.strip()), None)
 
 
 class OdmOptions(FileOptions):
@@ -255,6 +292,11 @@ class Odm(FileDataset[OdmOptions]):
         """Return a frame for each shot, in natural order of names. Raises what `read_reconstruction` raises."""
         project = self._project(folder)
         shots, contents, where = self._shots(project.poses), Folders(), str(project.poses)
+        if project.undistorted and (shot := next((shot for shot in shots if shot.lens is not None), None)) is not None:
+            raise DataError(
+                f"{where}: the camera of {shot.name[:80]} distorts, but these should be undistorted images; run ODM"
+                " again from opensfm, or remove the file to take the photographs of reconstruction.json"
+            )
         names = frame_names(shot.name for shot in shots)
         by_shot = {shot.name: name for shot, name in zip(shots, names, strict=True)}
         depth = depth_files(project, self.settled(folder).depth_from, by_shot, self._depth)

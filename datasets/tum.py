@@ -17,7 +17,7 @@ from semstab.datasets.files import options as opt
 from semstab.datasets.files.options import FileOptions, FrameSource, inside
 from semstab.datasets.files.reader import FileDataset
 from semstab.datasets.formats.disk import read_table, records, to_number
-from semstab.datasets.geometry.cameras import at_times, camera_of, from_quaternions, mutual_nearest
+from semstab.datasets.geometry.cameras import Camera, at_times, camera_of, from_quaternions, mutual_nearest
 from semstab.errors import DataError
 
 logger = logging.getLogger("semstab")
@@ -29,7 +29,6 @@ CAMERAS = {
     "freiburg3": (535.4, 539.2, 320.1, 247.6),
 }
 """Calibrated intrinsics of the colour camera, to which depth is registered, by a part of the sequence's name."""
-USUAL = (525.0, 525.0, 319.5, 239.5)
 
 
 class TumOptions(FileOptions):
@@ -40,6 +39,7 @@ class TumOptions(FileOptions):
     intrinsics: opt.FourIntrinsics = None
     max_difference: opt.Positive = Field(0.02, description="seconds by which the time stamps of a frame may differ")
     poses: Literal["interpolate", "nearest"] = Field("interpolate", description="the pose at a depth image's time")
+    time_offset: opt.TimeOffset = 0.0
     trajectory: str = Field("groundtruth.txt", description="file of the poses: t tx ty tz qx qy qz qw")
 
 
@@ -47,7 +47,7 @@ class Tum(FileDataset[TumOptions]):
     """{name} is the colour image's name without suffix, 1305031102.175304; of the depth's where there is no rgb.txt.
 
     A depth image and a colour image form a frame where each is the other's nearest in time. Intrinsics not given are
-    those of the sequence's name (freiburg1, 2, 3), else the usual ones of a Kinect.
+    those of the sequence's name (freiburg1, 2, 3).
     """
 
     Options: type[BaseModel] = TumOptions
@@ -82,12 +82,12 @@ class Tum(FileDataset[TumOptions]):
         poses = at_times(
             times=numbers[:, 0],
             poses=from_quaternions(numbers[:, 1:4], numbers[:, 4:], trajectory),
-            wanted=times,
+            wanted=times + self.options.time_offset,
             max_gap=self.options.max_difference,
             method=self.options.poses,
         )
-        usual = next((numbers for key, numbers in CAMERAS.items() if key in folder.resolve().name), USUAL)
-        camera = camera_of(self.options.intrinsics, usual, IMAGE_SIZE)
+        _require_overlap(trajectory, numbers[:, 0], times + self.options.time_offset)
+        camera = self._camera(folder)
         return [
             FrameSource(
                 name=images[partners[k]].stem,
@@ -100,6 +100,16 @@ class Tum(FileDataset[TumOptions]):
             )
             for k in np.flatnonzero(paired)
         ]
+
+    def _camera(self, folder: Path) -> Camera:
+        """Return the stated intrinsics, else those of the sequence's name."""
+        known = next((numbers for key, numbers in CAMERAS.items() if key in folder.resolve().name), None)
+        if known is None and self.options.intrinsics is None:
+            raise DataError(
+                f"{folder}: the intrinsics are not known, as the folder's name has none of {', '.join(CAMERAS)}; set"
+                " intrinsics: [fx, fy, cx, cy] (--option 'intrinsics=[fx, fy, cx, cy]')"
+            )
+        return camera_of(self.options.intrinsics, known or CAMERAS["freiburg1"], IMAGE_SIZE)
 
     def _list(self, folder: Path) -> str:
         cast = self.options.surface is not None and not (folder / "depth.txt").is_file()
@@ -119,6 +129,23 @@ class Tum(FileDataset[TumOptions]):
         stamps = np.array(times, dtype=np.float64)
         _require_ascending(path, stamps)
         return stamps, paths
+
+
+UNITS = {1e3: "milliseconds", 1e6: "microseconds", 1e9: "nanoseconds"}
+
+
+def _require_overlap(path: Path, times: Float64, wanted: Float64) -> None:
+    """Raise DataError where the trajectory and the images have no time in common, with the reason that shows."""
+    if times[0] <= wanted[-1] and wanted[0] <= times[-1]:
+        return
+    for unit, name in UNITS.items():
+        for factor, where in ((1 / unit, path.name), (unit, "the lists of images")):
+            if abs(times[0] * factor - wanted[0]) < 0.1 * min(times[0] * factor, wanted[0]):
+                raise DataError(f"{path}: time stamps of {where} look like {name}; write seconds")
+    raise DataError(
+        f"{path}: poses are from {times[0]:.6f} to {times[-1]:.6f} s, images from {wanted[0]:.6f} to {wanted[-1]:.6f}"
+        f" s: they have no time in common; if the clocks differ, set time_offset (about {times[0] - wanted[0]:.6g})"
+    )
 
 
 def _require_ascending(path: Path, times: Float64) -> None:

@@ -449,3 +449,14 @@ def test_images_in_several_folders_have_names_with_folders(tmp_path):
     read = [scene.frame(k, "net") for k in range(2)]
     ds.assert_same_voxels(read, frames)
     assert read[1].files["labels"] == f"{tmp_path}/labels/net/cam1/1.v2.png"
+
+
+def test_an_image_of_another_size_than_the_model_says_is_named(tmp_path, caplog):
+    form = ds.FORMATS["colmap, text"]
+    ds.write_labelled(form, tmp_path)
+    ds.opened(form, tmp_path)
+    assert not caplog.records
+    cameras = tmp_path / "sparse/cameras.txt"
+    cameras.write_text(cameras.read_text().replace(f" {ds.W} {ds.H} ", f" {2 * ds.W} {2 * ds.H} "))
+    ds.opened(form, tmp_path)
+    assert f"0000.png has {2 * ds.W}x{2 * ds.H} pixels, but the file has {ds.W}x{ds.H}" in caplog.text

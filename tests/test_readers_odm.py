@@ -81,7 +81,13 @@ def put(path: Path, data: bytes) -> None:
 
 def write_mve(folder, frames) -> None:
     for k, frame in enumerate(frames):
-        put(folder / f"mve/views/view_{k:04d}.mve/depth-L0.mvei", mvei(along_rays(frame)))
+        write_view(folder, k, f"{k:04d}", frame)
+
+
+def write_view(folder, k: int, name: str, frame) -> None:
+    view = folder / f"mve/views/view_{k:04d}.mve"
+    put(view / "depth-L0.mvei", mvei(along_rays(frame)))
+    (view / "meta.ini").write_text(f"# MVE\n[camera]\nname = no view\n\n[view]\nid = {k}\nname = {name}\n")
 
 
 def write_openmvs(folder, frames, halves=False) -> None:
@@ -736,3 +742,31 @@ def seen(frame, mask: np.ndarray) -> np.ndarray:
     K, (v, u) = frame.intrinsics, np.nonzero(mask)
     rays = np.stack([(u - K.cx) / K.fx, (v - K.cy) / K.fy, np.ones(len(u))], axis=1)
     return (rays * frame.depth[mask][:, None].astype(float)) @ frame.T_wc[:3, :3].T + frame.T_wc[:3, 3]
+
+
+@pytest.mark.parametrize("suffix", ["", ".JPG", ".JPG.tif"])
+def test_mve_views_belong_to_the_images_that_they_name(tmp_path, suffix):
+    folder = write_project(tmp_path / "p", depth=None)
+    frames = {name: down.frame(k) for k, name in enumerate(NAMES)}
+    for k, name in enumerate(reversed(NAMES)):
+        write_view(folder, k, f"{name}{suffix}", frames[name])
+    scene = opened(folder)
+    for k in range(3):
+        np.testing.assert_allclose(scene.depth(k), frames[scene.frame_name(k)].depth, rtol=1e-5)
+
+
+def test_mve_views_of_other_images_are_refused(tmp_path):
+    folder = write_project(tmp_path / "p", depth=None)
+    write_view(folder, 0, "IMG_7.JPG", down.frame(0))
+    fails(
+        DataError,
+        r"the views are called IMG_7 in their meta.ini, which no shot of the",
+        opened,
+        folder,
+    )
+
+
+@pytest.mark.parametrize("camera", [PINHOLE | {"k1": 0.1}, PINHOLE | {"projection_type": "fisheye"}])
+def test_undistorted_images_whose_camera_distorts_are_refused(tmp_path, camera):
+    folder = write_project(tmp_path / "p", camera)
+    fails(DataError, r"undistorted/reconstruction.json: the camera of DJI_0\d+.JPG distorts", opened, folder)

@@ -153,9 +153,10 @@ def test_two_records_of_one_stamp_are_out_of_order(folder, name):
 
 
 def test_calibrations_go_by_the_sequences_name(tmp_path):
-    for name, fx in (("rgbd_dataset_freiburg2_desk", 520.908620), ("my_kinect", 525)):
-        folder = tmp_path / name
-        write_labels(folder, write_tum(folder, source(5000)), source(5000))
-        scene = opened(TUM, folder, intrinsics=None)
-        assert scene.intrinsics(0, (480, 640)).fx == fx
-        assert scene.intrinsics(0, (240, 320)).fx == fx / 2
+    for name in ("rgbd_dataset_freiburg2_desk", "my_kinect"):
+        write_labels(tmp_path / name, write_tum(tmp_path / name, source(5000)), source(5000))
+    scene = opened(TUM, tmp_path / "rgbd_dataset_freiburg2_desk", intrinsics=None)
+    assert scene.intrinsics(0, (480, 640)).fx == 520.908620
+    assert scene.intrinsics(0, (240, 320)).fx == 520.908620 / 2
+    with pytest.raises(DataError, match=r"my_kinect: the intrinsics are not known.*set intrinsics: \[fx, fy, cx, cy\]"):
+        opened(TUM, tmp_path / "my_kinect", intrinsics=None)

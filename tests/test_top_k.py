@@ -84,3 +84,9 @@ def test_a_run_tells_what_its_flag_left_out(tmp_path) -> None:
     assert f"top_k leaves out {lost.mean():.2%} of a pixel's scores on average, {lost.max():.2%} at most" in " ".join(
         told.split()
     )
+
+
+def test_label_maps_have_no_largest_scores(tmp_path) -> None:
+    scene = write_scene(tmp_path / "scene")
+    told = bench("--data", scene, "--model", "net", "--top-k", 1, "--check", "none", cwd=tmp_path, code=2).stderr
+    assert "top_k keeps the largest scores of a pixel, but net has label maps; leave it out" in " ".join(told.split())

@@ -86,6 +86,7 @@ class Reading:
         size: (width, height) of the depth images.
         ratios: Sizes that the intrinsics may be for, relative to what is said.
         file: The scene.yaml with further settings, where the dataset has one.
+        names: Names of all settings, those that are not set too.
     """
 
     said: Mapping[str, Any]
@@ -94,6 +95,12 @@ class Reading:
     ratios: tuple[Ratio, ...]
     file: str | None
     depth_scale: float | None
+    names: tuple[str, ...] = ()
+
+    @property
+    def known(self) -> frozenset[str]:
+        """Names of the settings that the dataset has, set or not."""
+        return frozenset(self.names)
 
     @property
     def convention(self) -> Convention:
@@ -177,6 +184,7 @@ def reading(
         ratios=tuple(_ratios(frame, color_shape)),
         file=None if scene.settings_file is None else str(scene.settings_file),
         depth_scale=scene.depth_scale or said.get("depth_scale"),
+        names=(*said,),
     )
 
 

@@ -127,6 +127,9 @@ def _label_table(checked: SceneCheck) -> Table:
 
 
 def _advice(checked: SceneCheck, *, verbose: bool) -> Iterator[str]:
+    for each in checked.label_findings if verbose else ():
+        if each.open is not None:
+            yield f"labels   {each.model}: {each.open}"
     if verbose and checked.motion is not None:
         (least, most), (from_, to) = checked.motion.shift, checked.motion.turn
         yield (

@@ -118,6 +118,7 @@ class Verdict:
         frames, pairs: Numbers of those that were looked at.
         undetermined: Parts of it that these frames cannot tell, because an alternative fits as well, and the reason
             where it is known.
+        remarks: Lines on what looks wrong but leaves the state.
         fits: The configured convention and the alternatives of interest, by name.
     """
 
@@ -130,6 +131,7 @@ class Verdict:
     pairs: int = 0
     undetermined: tuple[str, ...] = ()
     reason: str = ""
+    remarks: tuple[str, ...] = ()
     fits: tuple[tuple[str, Fit], ...] = ()
 
     def summary(self) -> dict[str, Any]:

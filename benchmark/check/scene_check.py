@@ -26,8 +26,10 @@ from semstab.check.coverage import (
     suggested_size,
 )
 from semstab.check.geometry import Verdict, assess, shifts_and_turns
+from semstab.check.labels import LabelFindings, check_labels
 from semstab.check.registration import assess_surface, match_images, notes
 from semstab.check.reprojection import Sample, View, clusters, label_source, pairs_within, reader
+from semstab.check.timing import with_lateness
 from semstab.config import Config
 from semstab.core.arrays import evenly
 from semstab.core.json_form import to_json
@@ -37,6 +39,7 @@ from semstab.data.labels import IGNORE_8BIT, IGNORE_16BIT, LabelSpace
 from semstab.data.results import VoxelAdvice
 from semstab.datasets import Scene, open_dataset
 from semstab.errors import DataError
+from semstab.predict.live import PredictedScene
 from semstab.task import frame_indices, selected
 
 # The classes that a label source predicts, their frequencies, and the ids that no class has.
@@ -139,6 +142,9 @@ QUICK_POINTS = 2400
 CONFIRMING_CLUSTERS = 3
 """The quick check takes so many points from one position, and from so many positions before it refuses data."""
 
+LABEL_RUNS, QUICK_LABEL_RUNS = 6, 2
+"""Numbers of runs of five frames in which label maps are compared with depth, colour and each other."""
+
 LABELLED_FRAMES = 8
 """Frames in which the labels of every model but the first are counted."""
 
@@ -189,6 +195,7 @@ class SceneCheck:
     fused_stride: int = 1
     persistence: tuple[Persistence, ...] = ()
     suggestion: Suggestion | None = None
+    label_findings: tuple[LabelFindings, ...] = ()
     notes: tuple[str, ...] = ()
     depth_from: str | None = None
     placed: str | None = None
@@ -200,7 +207,8 @@ class SceneCheck:
         geometry = [self.verdict.text] if self.verdict.state == "unsound" else []
         if self.depth.valid == 0:
             geometry.append("no pixel of the sampled frames has valid depth; check the files and depth_scale")
-        return tuple(geometry) + tuple(labels.problem for labels in self.labels if labels.problem is not None)
+        ids = [labels.problem for labels in self.labels if labels.problem is not None]
+        return (*geometry, *ids, *(line for each in self.label_findings for line in each.wrong))
 
     def to_dict(self) -> dict[str, Any]:
         """Return the JSON object."""
@@ -230,6 +238,7 @@ def check_scene(scene: Scene, config: Config) -> SceneCheck:
     )
     sample, how = inspection.sample(config.dataset.options), inspection.reading(config.dataset.options)
     verdict = inspection.verdict(config.dataset.options, thorough=True)
+    findings = tuple(label_findings(scene, indices, models, LABEL_RUNS)) if verdict.state != "unsound" else ()
     checked = SceneCheck(
         scene=scene.name,
         frames=len(scene),
@@ -242,7 +251,10 @@ def check_scene(scene: Scene, config: Config) -> SceneCheck:
         placed=scene.placed,
         sources=scene.sources,
         labels=tuple(_labels(scene, name, indices, config, inspection) for name in models),
+        label_findings=findings,
         notes=(
+            *verdict.remarks,
+            *(line for each in findings for line in each.remarks),
             *notes(scene, [inspection.views[at] for at in sorted(inspection.views)], how, inspection.tally.model),
             *begun,
         ),
@@ -296,6 +308,23 @@ def quick_sample(
         if verdict.state != "unsound":
             break
     return verdict, sample
+
+
+def label_findings(scene: Scene, indices: Sequence[int], models: Sequence[str], runs: int) -> Iterator[LabelFindings]:
+    """Yield what label maps show to be wrong with them, for each model that has files of its own."""
+    for model in models:
+        space = None
+        with contextlib.suppress(DataError):
+            space = scene.label_space(model)
+        yield check_labels(scene, indices, model, space, runs)
+
+
+def quick_labels(scene: Scene, indices: Sequence[int], models: Sequence[str]) -> list[str]:
+    """Return what a few frames show to be wrong with label files; nothing is predicted or simulated for it."""
+    if scene.folder is None or isinstance(scene, PredictedScene):
+        return []
+    found = label_findings(scene, indices, models, QUICK_LABEL_RUNS)
+    return [line for each in found for line in (*each.wrong, *each.remarks)]
 
 
 def require_sound(scene: Scene, indices: Sequence[int], options: Mapping[str, Any] | None = None) -> Verdict:
@@ -387,7 +416,8 @@ class Inspection:
         sample = self.sample(options)
         if self.scene.surface is not None:
             return assess_surface(match_images(self.scene, sample.views, sample.pairs), len(sample.views))
-        return assess(sample, self.reading(options), thorough=thorough)
+        how = self.reading(options)
+        return with_lateness(assess(sample, how, thorough=thorough), self.scene, sample, how)
 
     def depth(self) -> Depth:
         """Return the depth of all frames that were read."""

@@ -11,7 +11,7 @@ from collections import deque
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from semstab.check import Verdict, advise, quick_sample, refuse_unsound, with_voxel_size
+from semstab.check import Verdict, advise, quick_labels, quick_sample, refuse_unsound, with_voxel_size
 from semstab.config import Config
 from semstab.core.process import trim_malloc
 from semstab.data.records import Result
@@ -162,13 +162,22 @@ class _Execution:
         """Check the geometry and the voxel size of each scene of missing units; those report errors of reading."""
         tasks = {each.task.scene.name: each.task for each in reversed(missing) if not each.regions}
         verdicts: dict[str, Verdict] = {}
+        remarks: dict[str, list[str]] = {}
+        models: dict[str, list[str]] = {}
+        for each in missing:
+            if not each.regions:
+                models.setdefault(each.task.scene.name, []).append(each.task.model)
         for task in reversed(tasks.values()):
             with contextlib.suppress(DataError):
                 verdicts[task.scene.name], sample = quick_sample(task.scene, task.indices, config.dataset.options)
                 if (advice := advise(sample, config)) is not None:
                     self.units.advice[task.scene.name] = advice
+                found = quick_labels(task.scene, task.indices, models[task.scene.name])
+                remarks[task.scene.name] = [*verdicts[task.scene.name].remarks, *found]
         for scene, verdict in verdicts.items():
             refuse_unsound(scene, verdict)
+            for remark in dict.fromkeys(remarks.get(scene, ())):
+                logger.warning("%s: %s", scene, remark)
             self._observers.tell(
                 lambda observer, scene=scene, verdict=verdict: observer.geometry_checked(tasks[scene], verdict)  # type: ignore[misc]
             )

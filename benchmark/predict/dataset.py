@@ -8,10 +8,7 @@ import functools
 import hashlib
 import json
 import math
-import shutil
-import tempfile
 import threading
-import weakref
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, ClassVar
@@ -20,6 +17,7 @@ import numpy as np
 from pydantic import BaseModel, Field, field_validator
 
 from semstab.config import DatasetConfig, FrameSelection, Settings
+from semstab.core.files import ScratchFolder
 from semstab.core.types import Float64, UInt8
 from semstab.data.frames import Frame
 from semstab.data.labels import LabelSpace
@@ -118,9 +116,8 @@ class PredictedDataset(Dataset):
             return self._options.folder
         if self.run_folder is not None:
             return self.run_folder / PREDICTIONS
-        scratch = tempfile.mkdtemp(prefix="semstab-predictions-")
-        weakref.finalize(self, shutil.rmtree, scratch, ignore_errors=True)
-        return Path(scratch)
+        self._scratch = ScratchFolder()
+        return self._scratch.path
 
     def predictor(self, source: str) -> PredictorConfig:
         """Return the settings of a label source.

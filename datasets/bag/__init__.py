@@ -187,7 +187,8 @@ class Recorded:
     def _posed(self) -> Float64:
         """Return (n, 4, 4) poses of the frames, NaN where there is none."""
         bag, limit = self._content.bag, self._options.max_pose_gap
-        poses, where = self._content.poses.at(self._stamps.tolist(), self._seen.frame)
+        offset = round(self._options.time_offset * NANOSECONDS)
+        poses, where = self._content.poses.at((self._stamps + offset).tolist(), self._seen.frame)
         known = int(np.count_nonzero(np.isfinite(poses).all(axis=(1, 2))))
         if not known:
             raise DataError(

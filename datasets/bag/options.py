@@ -35,6 +35,7 @@ class BagOptions(FileOptions):
     stamps: Literal["header", "bag"] = Field("header", description="time of a message: its header's, or the bag's")
     max_difference: Positive = Field(0.02, description="seconds by which depth, colour and labels may differ")
     max_pose_gap: Positive = Field(0.5, description="most seconds between the two poses around a frame")
+    time_offset: opt.TimeOffset = 0.0
     rectified: bool | None = Field(None, description="whether images are rectified, if not as 'rect' in their topic")
     labels_on: Literal["original", "undistorted"] = Field(
         "original", description="images that label maps belong to: the bag's own, or undistorted ones"

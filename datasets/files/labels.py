@@ -30,6 +30,7 @@ SUFFIXES: Mapping[Kind, tuple[str, ...]] = {
     "scores": images.SCORE_SUFFIXES,
     "masks": images.MASK_SUFFIXES,
 }
+LOSSY_SUFFIXES = (".jpg", ".jpeg", ".JPG", ".JPEG")
 DEFAULTS: Mapping[Kind, str] = {"labels": "labels/{model}/{name}", "scores": "scores/{model}/{name}"}
 REGIONS = "regions/{model}/{name}"
 LABEL_SPACE_FILE = "label_space.yaml"
@@ -78,6 +79,13 @@ class LabelSource:
                 return file
         return None
 
+    def lossy(self, frames: Sequence[FrameSource]) -> Path | None:
+        """Return the JPEG of the first frame that has one in the place of a label map."""
+        bare = self.template.removesuffix(".png")
+        places = (self.base / bare.replace("{name}", frame.name) for frame in frames)
+        found = (self.folders.one_of(place, LOSSY_SUFFIXES) for place in places)
+        return next((path for path in found if path is not None), None)
+
     def missing(self, frame: FrameSource) -> list[str]:
         """Return nothing, or the path that the file of that frame would have."""
         if self.file(frame) is not None:
@@ -122,6 +130,10 @@ def find_sources(
                 raise ConfigError(f"{entry.folder}: two label sources are called '{name}'; rename one")
             if source.first is not None:
                 sources[name] = source
+            elif kind == "labels" and (lossy := source.lossy(frames)) is not None:
+                logger.warning(
+                    "%s: %s is a JPEG, which changes class ids; write label maps as PNG; left out", name, lossy
+                )
             elif frames:
                 logger.warning("%s: no file of any frame, such as %s; left out", name, source.missing(frames[0])[0])
     if not sources and (options.labels or options.scores or options.labels_root):

@@ -52,6 +52,9 @@ Linear = Annotated[
     Field(description="3x3 rows from the scene to crs, before offset is added; axes that are not those of crs"),
 ]
 Size = Annotated[tuple[PositiveInt, PositiveInt] | None, Field(description="[width, height] of the intrinsics' image")]
+TimeOffset = Annotated[
+    float, Field(ge=-1e9, le=1e9, description="seconds by which the time stamps of the poses are late")
+]
 GroundTruth = Annotated[str | None, Field(description="template of ground truth label maps, in the scene's folder")]
 VoidIds = Annotated[dict[str, tuple[Id, ...]], Field(description="ids that mean 'no label', by label source, or gt")]
 
@@ -90,6 +93,9 @@ class FileSettings(Settings):
     camera_axes: CameraAxes = "opencv"
     up_axis: UpAxis = None
     metres_per_unit: MetresPerUnit = 1.0
+    pose_shift: int | None = Field(
+        None, description="frames by which the poses are late: frame k has the pose of frame k + pose_shift"
+    )
     crs: str | None = Field(None, description="projected reference system in metres: EPSG:32615, PROJ string or WKT")
     offset: Offset = None
     linear: Linear = None

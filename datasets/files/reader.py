@@ -5,8 +5,11 @@ from __future__ import annotations
 import os
 from abc import abstractmethod
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Generic, TypeVar
+
+import numpy as np
 
 from semstab.config import nearest
 from semstab.core.types import UInt16
@@ -62,7 +65,7 @@ class FileDataset(Dataset, Generic[Options]):
             raise ConfigError(f"{self.options.root}: scene '{name}' is not there; {nearest(name, self.scenes)}")
         entry = self._entries[name]
         options = self.settled(entry.folder)
-        frames = tuple(self.frames(entry.folder))
+        frames = with_poses_of(tuple(self.frames(entry.folder)), options.pose_shift or 0)
         for frame in frames:
             inside(entry.folder, entry.folder, frame.name, str(frame.pose_file))  # files of predictions have its name
         if not frames:
@@ -148,6 +151,19 @@ class FileDataset(Dataset, Generic[Options]):
         Raises:
             DataError: If that fails, with the file.
         """
+
+
+def with_poses_of(frames: tuple[FrameSource, ...], shift: int) -> tuple[FrameSource, ...]:
+    """Return the frames, each with the pose of the frame `shift` further on; NaN where there is none."""
+    if shift == 0:
+        return frames
+    lost = np.full((4, 4), np.nan)
+    shifted = []
+    for k, frame in enumerate(frames):
+        there = 0 <= k + shift < len(frames)
+        other = frames[k + shift] if there else frame
+        shifted.append(replace(frame, pose=other.pose if there else lost, pose_file=other.pose_file))
+    return tuple(shifted)
 
 
 def find_scenes(root: Path, is_scene: Callable[[Path], bool], contents: str) -> list[SceneEntry]:

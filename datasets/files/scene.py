@@ -30,9 +30,9 @@ from semstab.errors import ConfigError, DataError
 
 PLACES = {
     "root", "labels_root", "incomplete", "taxonomy", "taxonomies", "classes", "class_table", "crs", "offset", "surface",
-    "casts", "images",
+    "casts", "images", "pose_shift", "time_offset",
 }  # fmt: skip
-"""Options that are paths and do not change the numbers; label spaces and tables count by their content."""
+"""Options that are paths and do not change the numbers; label spaces, tables and poses count by their content."""
 
 DEPTH_BYTES = 1 << 27
 """The most bytes of depth images that stay in memory."""

@@ -1,0 +1,467 @@
+"""A check of label maps against depth, colour and each other: do they belong to these frames, and are they ids?
+
+Each alternative reading of the files (another frame's map, mirrored, turned, of a part of the image) is compared with
+the given one by two numbers: the correlation of the labels' edges with those of depth and colour, frame by frame, and
+the agreement of labels that are reprojected from frame to frame, pair by pair.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from semstab.check.conventions import Convention
+from semstab.check.coverage import CONSISTENT
+from semstab.check.geometry import shifts_and_turns
+from semstab.check.registration import grey_levels
+from semstab.check.reprojection import Pair, Sample, View
+from semstab.core.arrays import evenly
+from semstab.core.types import Float64, Mask
+from semstab.data.labels import LabelSpace
+from semstab.datasets import Scene
+from semstab.errors import DataError
+from semstab.pixels.edges import depth_edges, image_edges, label_edges
+
+RUN = 5
+"""Frames in a row that are read together: labels may be those of a neighbour."""
+
+PIXELS = 2**17
+COLUMNS = 256
+"""Of a larger image every n-th pixel of each axis is used; edges are compared on a grid of at most so many columns."""
+
+POINTS = 1000
+"""Points of a frame that are reprojected into another."""
+
+CLEAR = 4.0
+"""Standard errors by which an alternative must be better, in the mean over frames or pairs; ..."""
+
+BETTER = 1.15
+LEAST_FIT = 0.08
+"""... the factor by which its edges must fit better, and the correlation that is a fit; ..."""
+
+FEWER = 0.85
+"""... or the part of the disagreement that remains; ..."""
+
+WON = 0.8
+"""... and the share of the frames or pairs in which it is better."""
+
+LEAST_FRAMES = 4
+LEAST_POINTS = 50
+
+TELLING = 0.9
+"""An alternative whose edges fit this part as well as the given ones cannot be told from them."""
+
+MOST_OPEN = 2
+"""Alternatives that are named where they cannot be told from the given maps; of more the reason is said."""
+
+MOVES = 0.01
+TURNS = 1.0
+"""The camera moves where it does by this share of the depth, or turns by these degrees, from frame to frame."""
+
+BAND_SHARE = 0.5
+BAND_PAIRS = 2
+BAND_BORDERS = 50
+"""The share of the borders of two classes at which the pixel between has an id between, which shows interpolation
+(real networks: up to 0.1, resized maps from 0.9); in so many pairs of classes, of those with so many border pixels."""
+
+ID_SHARE = 0.75
+"""The share of the ids between the first and the last that are used where ids are suspected to count from 1."""
+
+NOTHINGS = ("background", "clutter", "ignore", "none", "other", "unknown", "unlabeled", "unlabelled", "void")
+"""Words in the name of a first class that labels may well lack."""
+
+Ids = npt.NDArray[Any]
+Change = Callable[[Ids, int], Ids]
+
+
+@dataclass(frozen=True)
+class LabelFindings:
+    """The result for one model.
+
+    Attributes:
+        wrong: Lines on label maps that do not belong to the frames as they are, each with the mend.
+        remarks: Lines on ids that look wrong, but may be right.
+        open: Line on what these frames cannot tell; None where they tell it all.
+    """
+
+    model: str
+    wrong: tuple[str, ...] = ()
+    remarks: tuple[str, ...] = ()
+    open: str | None = None
+
+
+@dataclass(frozen=True)
+class Alternative:
+    """Another way to read label maps.
+
+    Attributes:
+        says: Completes 'labels of X ...'.
+        mend: The remedy.
+        step: Which frame's map is taken, relative to the frame.
+        change: What is done to the map (H, W), whose ignore id is given too.
+    """
+
+    says: str
+    mend: str
+    step: int = 0
+    change: Change = lambda labels, _: labels
+
+
+def alternatives(width: int, height: int) -> tuple[Alternative, ...]:
+    """Return the mistakes that are tried, for images of that size."""
+    found = [
+        Alternative("are one frame late", "give frame k the file of frame k + 1", step=1),
+        Alternative("are one frame early", "give frame k the file of frame k - 1", step=-1),
+        Alternative("are mirrored left to right", "mirror the files", change=lambda L, _: L[:, ::-1]),
+        Alternative("are upside down", "mirror the files", change=lambda L, _: L[::-1]),
+        Alternative("are turned by 180 degrees", "turn the files", change=lambda L, _: L[::-1, ::-1]),
+        Alternative("are transposed", "transpose the files", change=lambda L, _: _fill(L.T, L.shape)),
+        Alternative("are turned by 90 degrees", "turn the files", change=lambda L, _: _fill(np.rot90(L, 1), L.shape)),
+        Alternative("are turned by 270 degrees", "turn the files", change=lambda L, _: _fill(np.rot90(L, 3), L.shape)),
+        Alternative("are twice too large", "halve the files", change=lambda L, none: _scaled(L, 0.5, 0.5, none)),
+        Alternative("are half too small", "enlarge the files twice", change=lambda L, none: _scaled(L, 2, 2, none)),
+    ]
+    if max(width, height) > 1.1 * min(width, height):
+        x, y = (min(width, height) / side for side in (width, height))
+        crop = "are those of the central square of the image"
+        padded = "have the padding to a square still in them"
+        found += [
+            Alternative(crop, "label the whole image", change=lambda L, none: _scaled(L, x, y, none)),
+            Alternative(padded, "cut it off", change=lambda L, none: _scaled(L, 1 / y, 1 / x, none)),
+        ]
+    return tuple(found)
+
+
+def _fill(labels: Ids, shape: tuple[int, ...]) -> Ids:
+    """Return labels stretched to a shape (H, W), by the nearest."""
+    v, u = ((np.arange(n) + 0.5) * m / n for n, m in zip(shape, labels.shape, strict=True))
+    return np.asarray(labels[v.astype(np.int64)[:, None], u.astype(np.int64)])
+
+
+def _scaled(labels: Ids, x: float, y: float, ignore: int) -> Ids:
+    """Return labels (H, W) enlarged about the image's centre, ignored where nothing lies."""
+    H, W = labels.shape
+    v, u = (np.floor((np.arange(n) + 0.5 - n / 2) / s + n / 2).astype(np.int64) for n, s in ((H, y), (W, x)))
+    inside = ((v >= 0) & (v < H))[:, None] & ((u >= 0) & (u < W))
+    nearest = labels[v.clip(0, H - 1)[:, None], u.clip(0, W - 1)]
+    return np.asarray(np.where(inside, nearest, labels.dtype.type(ignore)))
+
+
+# --- the frames ------------------------------------------------------------------------------------------------------
+
+
+def runs_of(scene: Scene, indices: Sequence[int], model: str, count: int) -> list[list[int]]:
+    """Return `count` runs of frames in a row, evenly spaced; of selected frames where the ones between lack labels."""
+    count = max(1, min(count, len(indices) // RUN))
+    starts = [indices[position] for position in evenly(max(1, len(indices) - RUN + 1), count)]
+    wanted, runs = [[*range(start, start + RUN)] for start in starts], []
+    for run in wanted:
+        if all(i < len(scene) and scene.tracked(i) and not scene.missing(i, [model]) for i in run):
+            runs.append(run)
+    if runs:
+        return runs
+    return [[*indices[k : k + RUN]] for k in range(0, len(indices), RUN)][:count]
+
+
+@dataclass(frozen=True, eq=False)
+class Seen:
+    """A frame with labels, thinned, and the maps of edges that these should lie on: of depth, and of colour if any.
+
+    Attributes:
+        whole: All labels of the file (H, W), at the depth's pixels.
+    """
+
+    view: View
+    references: tuple[Float64, ...]
+    whole: Ids
+
+    @property
+    def labels(self) -> Ids:
+        """The labels (H, W)."""
+        assert self.view.labels is not None
+        return self.view.labels
+
+
+def read(scene: Scene, index: int, model: str) -> Seen:
+    """Read a frame with its labels and its colour; raises DataError."""
+    frame = scene.frame(index, model, color=False)
+    stride = max(1, math.ceil(math.sqrt(math.prod(frame.shape) / PIXELS)))
+    view = View.of(frame.every(stride), POINTS)
+    edges = [depth_edges(view.depth)]
+    try:
+        color = scene.color(index)
+        if color is not None:
+            grey = grey_levels(color)
+            if grey.shape != frame.shape:
+                grey = scene.predicted(index, labels=grey).labels  # type: ignore[assignment]
+            edges.append(image_edges(grey[::stride, ::stride]))
+    except DataError:  # no image of the depth's view
+        pass
+    return Seen(view, tuple(_smooth(each) for each in edges if each.any()), frame.predicted)
+
+
+def _smooth(edges: Mask) -> Float64:
+    """Return the share of edges in each cell of a grid, smoothed a little, without its mean, of length 1."""
+    import cv2
+
+    cell = max(1, math.ceil(edges.shape[1] / COLUMNS))
+    H, W = (side // cell for side in edges.shape)
+    grid = edges[: H * cell, : W * cell].reshape(H, cell, W, cell).mean(axis=(1, 3))
+    smooth = np.asarray(cv2.GaussianBlur(grid, (0, 0), 1.0), dtype=np.float64)
+    smooth -= smooth.mean()
+    normed: Float64 = smooth / max(float(np.linalg.norm(smooth)), 1e-12)
+    return normed
+
+
+# --- the comparison --------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Contrast:
+    """An alternative against the given maps, over frames or pairs of them, in the same ones.
+
+    Attributes:
+        given, other: Means of the measure.
+        z: Mean difference over its standard error.
+        won: Share in which the alternative is better.
+        count: Number of frames or pairs.
+    """
+
+    given: float
+    other: float
+    z: float
+    won: float
+    count: int
+
+    @classmethod
+    def of(cls, given: Sequence[float], other: Sequence[float]) -> Contrast:
+        """Compare two measures, one pair of numbers for each frame or pair; NaN does not count."""
+        both = np.array([given, other], dtype=np.float64).reshape(2, -1)
+        both = both[:, np.isfinite(both).all(axis=0)]
+        n = both.shape[1]
+        if n < 2:
+            return cls(math.nan, math.nan, 0.0, 0.0, n)
+        gain = both[1] - both[0]
+        error = max(float(gain.std(ddof=1)) / math.sqrt(n), 1e-9)
+        return cls(
+            float(both[0].mean()), float(both[1].mean()), float(gain.mean()) / error, float(np.mean(gain > 0)), n
+        )
+
+    @property
+    def is_clear(self) -> bool:
+        """Return whether the alternative is better beyond chance."""
+        return self.count >= LEAST_FRAMES and self.z > CLEAR and self.won >= WON
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """An alternative with what speaks for it: edges frame by frame, agreement pair by pair."""
+
+    alternative: Alternative
+    edges: Contrast
+    agreement: Contrast
+
+    @property
+    def is_found(self) -> bool:
+        """Return whether one measure is clearly better, and the other is not worse."""
+        edges, agreement = self.edges, self.agreement
+        by_edges = edges.is_clear and edges.other >= max(LEAST_FIT, BETTER * edges.given)
+        by_agreement = agreement.is_clear and 1 - agreement.other <= FEWER * (1 - agreement.given)
+        if by_edges:
+            return by_agreement or not agreement.other < agreement.given - 0.01
+        return by_agreement and not edges.other < edges.given
+
+    @property
+    def is_open(self) -> bool:
+        """Return whether edges fit about as well under the alternative, so that nothing is told."""
+        return not self.edges.other < TELLING * self.edges.given
+
+    def __str__(self) -> str:
+        text = (
+            f"their edges correlate {self.edges.other:.2f} with those of depth and colour, {self.edges.given:.2f} now"
+        )
+        if math.isfinite(self.agreement.other):
+            text += f"; {self.agreement.other:.0%} agree between frames, {self.agreement.given:.0%} now"
+        return f"{self.alternative.says} ({text}): {self.alternative.mend}"
+
+
+def compare(runs: Sequence[Sequence[Seen]]) -> list[Comparison]:
+    """Compare every alternative with the maps as they are."""
+    H, W = runs[0][0].labels.shape
+    return [_compared(each, runs) for each in alternatives(W, H)]
+
+
+def _compared(alternative: Alternative, runs: Sequence[Sequence[Seen]]) -> Comparison:
+    fits: list[tuple[float, float]] = []
+    agreements: list[tuple[float, float]] = []
+    for run in runs:
+        at = [k for k in range(len(run)) if 0 <= k + alternative.step < len(run)]
+        given = {k: run[k].labels for k in at}
+        other = {k: alternative.change(run[k + alternative.step].labels, run[k].view.ignore_id) for k in at}
+        if any(given[k].shape != other[k].shape for k in at):
+            continue
+        fits += [(_fit(run[k], given[k]), _fit(run[k], other[k])) for k in at]
+        agreements += _agreements({k: run[k].view for k in at}, given, other)
+    return Comparison(alternative, *(Contrast.of(*zip(*rows, strict=True)) if rows else Contrast.of((), ())
+                                     for rows in (fits, agreements)))  # fmt: skip
+
+
+def _fit(seen: Seen, labels: Ids) -> float:
+    """Return the correlation of the edges of labels with those of depth and of colour, their mean."""
+    edges = label_edges(labels, seen.view.ignore_id)
+    if not edges.any() or not seen.references:
+        return math.nan
+    own = _smooth(edges)
+    return float(np.mean([np.sum(own * reference) for reference in seen.references]))
+
+
+def _agreements(
+    views: Mapping[int, View], given: Mapping[int, Ids], other: Mapping[int, Ids]
+) -> list[tuple[float, float]]:
+    """Return for each pair of frames the share of common points whose labels agree, as given and otherwise."""
+    pairs: list[Pair] = [(a, b) for a, b in itertools.combinations(views, 2)]
+    sample, one = Sample(dict(views), pairs, Convention()), np.array([1.0])
+    rows = []
+    for a, b in pairs:
+        matches = sample.matched((a, b), Convention(), one)
+        same = matches.error[0] < CONSISTENT
+        if same.sum() < LEAST_POINTS:
+            continue
+        first, second = (views[a].v[same], views[a].u[same]), (matches.v[0][same], matches.u[0][same])
+        ignore = views[a].ignore_id
+        rows.append(tuple(_agreement(maps[a][first], maps[b][second], ignore) for maps in (given, other)))
+    return rows  # type: ignore[return-value]
+
+
+def _agreement(first: Ids, second: Ids, ignore: int) -> float:
+    told = (first != ignore) & (second != ignore)
+    return float(np.mean(first[told] == second[told])) if told.sum() >= LEAST_POINTS else math.nan
+
+
+# --- findings --------------------------------------------------------------------------------------------------------
+
+
+def check_labels(
+    scene: Scene, indices: Sequence[int], model: str, space: LabelSpace | None, runs: int
+) -> LabelFindings:
+    """Compare the label maps of a model with depth, colour and each other, in `runs` times five frames.
+
+    Frames that cannot be read are passed over.
+    """
+    read_runs = [[*_readable(scene, run, model)] for run in runs_of(scene, indices, model, runs)]
+    read_runs = [run for run in read_runs if len(run) > 1]
+    frames = [seen for run in read_runs for seen in run]
+    if len(frames) < 2 or any(seen.labels.shape != frames[0].labels.shape for seen in frames):
+        return LabelFindings(model)
+    texts = id_remarks(
+        [seen.labels for seen in frames], frames[0].view.ignore_id, space, [run[0].whole for run in read_runs]
+    )
+    remarks = tuple(f"labels of {model} {text}" for text in texts)
+    if (same := _identical(read_runs)) is not None:
+        return LabelFindings(model, (f"labels of {model} {same}",), remarks)
+    comparisons = compare(read_runs)
+    found = sorted((each for each in comparisons if each.is_found), key=lambda each: -each.edges.other)
+    wrong = tuple(f"labels of {model} {each}" for each in found[:1])
+    return LabelFindings(model, wrong, remarks, None if wrong else _open(comparisons))
+
+
+def _readable(scene: Scene, run: Sequence[int], model: str) -> Iterator[Seen]:
+    for index in run:
+        try:
+            yield read(scene, index, model)
+        except DataError:
+            return
+
+
+def _identical(runs: Sequence[Sequence[Seen]]) -> str | None:
+    """Return the finding where all maps are the same, of several classes, though the camera moves."""
+    frames = [seen for run in runs for seen in run]
+    first = frames[0].labels
+    if len(frames) < LEAST_FRAMES or len(np.unique(first)) < 2:
+        return None
+    if any(not np.array_equal(first, seen.labels) for seen in frames[1:]) or not any(map(_moves, runs)):
+        return None
+    return f"are the same map in all {len(frames)} frames that were read, though the camera moves: predict them again"
+
+
+def _moves(run: Sequence[Seen]) -> bool:
+    views = {k: seen.view for k, seen in enumerate(run)}
+    shifts, turns = shifts_and_turns(Sample(views, [(0, len(run) - 1)], Convention()))
+    return bool(shifts.max() > MOVES or turns.max() > TURNS)
+
+
+def _open(comparisons: Sequence[Comparison]) -> str | None:
+    """Return what the frames cannot tell, in one line."""
+    says = [each.alternative.says for each in comparisons if each.is_open]
+    if len(says) > MOST_OPEN:
+        return "their edges lie on those of depth and colour no better than mirrored, turned or of another frame"
+    return f"these frames cannot tell whether they {', or '.join(says)}" if says else None
+
+
+def id_remarks(maps: Sequence[Ids], ignore: int, space: LabelSpace | None, whole: Sequence[Ids]) -> Iterator[str]:
+    """Yield what ids of label maps (H, W) look wrong in, each with the mend; completes 'labels of X ...'.
+
+    `whole` are maps of which no pixel was left out.
+    """
+    used = sorted({int(i) for labels in maps for i in np.unique(labels)} - {ignore})
+    if len(used) == 1 and len(maps) >= LEAST_FRAMES:
+        name = f" ({space.classes[space.ids.index(used[0])]})" if space is not None and used[0] in space.ids else ""
+        yield f"have one class, id {used[0]}{name}, in all {len(maps)} frames that were read: are the files right?"
+    if space is not None and _from_one(used, space):
+        first, last = space.classes[0], space.classes[-1]
+        yield (
+            f"never have the first id, {space.ids[0]} ({first}), but the last, {space.ids[-1]} ({last}): if they count"
+            " from 1, subtract 1"
+        )
+    if _is_interpolated(whole, ignore):
+        yield "have thin bands of ids between those of the two sides at their borders: resize them by the nearest"
+
+
+def _from_one(used: Sequence[int], space: LabelSpace) -> bool:
+    ids = sorted(space.ids)
+    if (
+        len(ids) < 3
+        or ids[0] in used
+        or ids[-1] not in used
+        or any(word in space.classes[0].lower() for word in NOTHINGS)
+    ):
+        return False
+    return sum(i in used for i in ids[1:]) >= ID_SHARE * (len(ids) - 1)
+
+
+def _is_interpolated(maps: Sequence[Ids], ignore: int) -> bool:
+    """Return whether between two classes more than one id apart there mostly is an id between them."""
+    between: dict[tuple[int, int], list[int]] = {}
+    for labels in maps:
+        for triple in _triples(labels):
+            border = triple[0] != triple[2]
+            a, b, c = (ids[border].astype(np.int64) for ids in triple)
+            apart = (np.abs(a - c) >= 2) & (a != ignore) & (c != ignore) & (b != ignore)
+            low, high, middle = np.minimum(a, c)[apart], np.maximum(a, c)[apart], b[apart]
+            inside = (middle > low) & (middle < high)
+            for pair, count, hits in _counted(low, high, inside):
+                total = between.setdefault(pair, [0, 0])
+                total[0] += count
+                total[1] += hits
+    shares = [hits / count for count, hits in between.values() if count >= BAND_BORDERS]
+    return len(shares) >= BAND_PAIRS and float(np.median(shares)) >= BAND_SHARE
+
+
+def _triples(labels: Ids) -> Iterator[tuple[Ids, Ids, Ids]]:
+    """Yield the labels before, at and after each pixel, along rows and along columns."""
+    yield labels[:, :-2], labels[:, 1:-1], labels[:, 2:]
+    yield labels[:-2], labels[1:-1], labels[2:]
+
+
+def _counted(low: Ids, high: Ids, inside: Ids) -> Iterator[tuple[tuple[int, int], int, int]]:
+    """Yield for each pair of ids how many borders there are, and at how many an id between."""
+    keys, at = np.unique(low * 2**20 + high, return_inverse=True)
+    counts, hits = np.bincount(at, minlength=len(keys)), np.bincount(at, weights=inside, minlength=len(keys))
+    for key, count, hit in zip(keys.tolist(), counts.tolist(), hits.tolist(), strict=True):
+        yield (key >> 20, key & (2**20 - 1)), int(count), int(hit)

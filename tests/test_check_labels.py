@@ -1,0 +1,79 @@
+"""Label maps that do not belong to their frames, or are no ids: planted mistakes are named, whole scenes are silent."""
+
+from __future__ import annotations
+
+import doctor
+import numpy as np
+import pytest
+from command_line import bench
+from PIL import Image
+from posed_writer import write_posed
+
+from semstab.check.labels import alternatives, id_remarks
+from semstab.data.labels import LabelSpace
+
+NAMES = [f"{k:03d}" for k in range(doctor.FRAMES)]
+LABELS = [each for each in doctor.MISTAKES if each.name.startswith(("labels", "ids", "one class"))]
+
+
+def write(folder, frames):
+    return write_posed(folder, NAMES, {"net": frames}, scale=None, classes=list(doctor.SPACE.classes))
+
+
+@pytest.fixture(scope="module")
+def frames():
+    return doctor.scene(3)
+
+
+def words(result) -> str:
+    return " ".join((result.stdout + result.stderr).split())
+
+
+@pytest.mark.parametrize("mistake", LABELS, ids=lambda mistake: mistake.name)
+def test_check_names_what_is_wrong_with_labels(mistake, frames, tmp_path):
+    wrong = mistake.said.startswith("are ") or "same map" in mistake.said
+    folder = write(tmp_path / "room", mistake.plant(frames))
+    assert mistake.said in words(bench("check", "--data", folder, cwd=tmp_path, code=2 if wrong else 0))
+
+
+def test_a_run_says_the_same_and_goes_on(frames, tmp_path):
+    mirrored = next(each for each in LABELS if "mirrored" in each.name)
+    folder = write(tmp_path / "room", mirrored.plant(frames))
+    result = bench("run", "--data", folder, "--voxel-size", "0.2", "-b", "numpy", cwd=tmp_path)
+    assert "labels of net are mirrored left to right" in words(result)
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_a_scene_without_mistakes_is_silent(seed, tmp_path):
+    result = bench("check", "--data", write(tmp_path / "room", doctor.scene(seed)), cwd=tmp_path)
+    assert "labels of" not in words(result)
+
+
+def test_what_frames_cannot_tell_is_said(frames, tmp_path):
+    """Labels that have nothing to do with the scene fit no better as they are."""
+    rng = np.random.default_rng(0)
+    noise = doctor.relabelled(lambda L: rng.integers(0, 7, L.shape).astype(np.uint8))(frames)
+    result = bench("check", "-v", "--data", write(tmp_path / "room", noise), cwd=tmp_path)
+    assert "their edges lie on those of depth and colour no better than mirrored" in words(result)
+
+
+def test_jpegs_in_the_place_of_label_maps_are_named(frames, tmp_path):
+    folder = write(tmp_path / "room", frames)
+    for path in (folder / "labels/net").glob("*.png"):
+        Image.open(path).convert("L").save(path.with_suffix(".jpg"))
+        path.unlink()
+    result = bench("run", "--data", folder, cwd=tmp_path, code=2)
+    assert "labels/net/000.jpg is a JPEG, which changes class ids; write label maps as PNG" in words(result)
+
+
+def test_a_first_class_that_may_be_missing_is_no_remark():
+    maps = [np.arange(1, 4, dtype=np.uint8).repeat(4).reshape(3, 4)] * 4
+    road, void = (LabelSpace("s", (name, "a", "b", "c")) for name in ("road", "void"))
+    assert any("never have the first id" in line for line in id_remarks(maps, 255, road, maps))
+    assert not [*id_remarks(maps, 255, void, maps)]
+
+
+def test_every_alternative_has_the_shape_of_the_map():
+    labels = np.arange(6 * 8, dtype=np.uint8).reshape(6, 8)
+    for each in alternatives(8, 6):
+        assert each.change(labels, 255).shape == labels.shape
