@@ -39,7 +39,7 @@ from semstab.data.labels import IGNORE_8BIT, IGNORE_16BIT, LabelSpace
 from semstab.data.results import VoxelAdvice
 from semstab.datasets import Scene, open_dataset
 from semstab.errors import DataError
-from semstab.predict.live import PredictedScene
+from semstab.predict.dataset import PredictedScene
 from semstab.task import frame_indices, selected
 
 # The classes that a label source predicts, their frequencies, and the ids that no class has.
