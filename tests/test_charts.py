@@ -26,7 +26,8 @@ def test_intervals_stand_where_their_estimates_say() -> None:
         "a & <b>": [(0, "net", Estimate(NAN, NAN, NAN))],
     }
     svg = dot_chart(rows, "alpha", (0.0,))
-    first, second = (float(dot.get("cx")) for dot in drawn(svg, "dot"))
+    places = (re.match(r"translate\(([\d.]+) [\d.]+\)", dot.get("transform")) for dot in drawn(svg, "dot"))
+    first, second = (float(place[1]) for place in places)
     (bar,) = drawn(svg, "line")
     low, high = map(float, re.match(r"M([\d.]+) [\d.]+H([\d.]+)", bar.get("d")).groups())
     (guide,) = drawn(svg, "guide")

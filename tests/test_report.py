@@ -253,4 +253,4 @@ def test_the_notes_say_which_implementations_agree():
     assert "numba and open3d make the same maps as numpy." in sentences
     assert "mine and numpy disagree in 1 of 2 comparisons." in sentences
     drawn = dataclasses.replace(found, agreement=tuple(dataclasses.replace(row, one_in=16) for row in rows[:1]))
-    assert "numba makes the same maps as numpy (one voxel in 16 was compared)." in read(drawn)
+    assert "numba makes the same maps as numpy (1 in 16 voxels were compared)." in read(drawn)

@@ -21,7 +21,7 @@ from semstab.data.contrast import Against, RunComparison, SceneComparison
 from semstab.data.results import slug
 from semstab.data.statistics import Estimate
 from semstab.errors import ConfigError
-from semstab.report.charts import SERIES, dot_chart
+from semstab.report.charts import dot_chart, sample
 from semstab.report.figures.maps import Panel, draw_changes
 from semstab.report.figures.style import Figure
 from semstab.report.html import blocks, filled
@@ -185,7 +185,7 @@ def page(comparison: RunComparison, made: Sequence[Table], drawn: Sequence[Figur
         runs=comparison.runs,
         scenes=[scene.scene for scene in comparison.scenes],
         reading=[relations(text) for text in sentences(comparison)],
-        models=[(own.name, f"c{k % SERIES}") for k, own in enumerate(comparison.runs[1:])],
+        models=[(own.name, sample(k)) for k, own in enumerate(comparison.runs[1:])],
         topics=list(_topics(shown, drawn, charts(comparison), folder)),
     )
 

@@ -233,6 +233,7 @@ class UnitContent:
         files: Digests of the unit's other files, by their path in the folder.
         regions: Series of a source of regions, instead of a summary.
         advice: Advice on its voxel size, where that was assessed.
+        notes: Remarks of the check on its depth and labels, which look wrong but may be right.
         checked: Agreement with the reference on a sample of its voxels, where it was checked so.
     """
 
@@ -245,6 +246,7 @@ class UnitContent:
     regions: RegionFlicker | None = None
     checked: Agreement | None = None
     advice: VoxelAdvice | None = None
+    notes: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -269,6 +271,7 @@ class Result:
         regions: Flicker of the label sources that are regions without classes.
         compared: The same of each other backend and the base one, which need not agree.
         advice: Advice on the voxel size, scene by scene, for data of files.
+        notes: Remarks of the check, scene by scene: labels that are not registered to the depth, and the like.
         comparisons: The comparison of the models of each scene by `compare_models`, with `statistics`.
     """
 
@@ -284,6 +287,7 @@ class Result:
     comparisons: tuple[ModelComparison, ...] = ()
     compared: tuple[Agreement, ...] = ()
     advice: Mapping[str, VoxelAdvice] = field(default_factory=dict)
+    notes: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
 
     def __repr__(self) -> str:
         models, units = ", ".join(self.models), len(self.records)
@@ -323,7 +327,7 @@ class Result:
             return fitting[0]
         units = ", ".join(f"{record.unit.scene} of {record.unit.model}" for record in fitting[:4])
         raise ConfigError(
-            f"{self.name}: {len(fitting)} units fit" + (f" ({units}); choose with scene and model" if fitting else "")
+            f"{self.name}: {len(fitting)} units fit" + (f" ({units}); choose with --scene, --model" if fitting else "")
         )
 
     @property

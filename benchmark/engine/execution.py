@@ -12,6 +12,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from semstab.check import Verdict, advise, quick_labels, quick_sample, refuse_unsound, with_voxel_size
+from semstab.check.scene_notes import scene_notes
 from semstab.config import Config
 from semstab.core.process import trim_malloc
 from semstab.data.records import Result
@@ -141,7 +142,9 @@ class _Execution:
     def _keep(self, each: PlannedUnit, outcome: Outcome, *, in_tiles: bool = False) -> None:
         units, folder, content = self.units, self._folder, outcome.content
         if content is not None:
-            content = dataclasses.replace(content, advice=units.advice.get(each.unit.scene))
+            unit = each.unit
+            advice, notes = units.advice.get(unit.scene), units.notes.get((unit.scene, unit.model), ())
+            content = dataclasses.replace(content, advice=advice, notes=notes)
             with units.watch("keep"):
                 folder.save(dataclasses.replace(outcome, content=content))
                 folder.clear(each, content.files)
@@ -182,3 +185,10 @@ class _Execution:
                 lambda observer, scene=scene, verdict=verdict: observer.geometry_checked(tasks[scene], verdict)  # type: ignore[misc]
             )
         self.units.geometry = verdicts
+        for task in {
+            (each.task.scene.name, each.task.model): each.task for each in missing if not each.regions
+        }.values():
+            with contextlib.suppress(DataError):
+                self.units.notes[task.scene.name, task.model] = scene_notes(
+                    task.scene, task.indices, task.model, config
+                )

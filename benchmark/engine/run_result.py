@@ -32,12 +32,13 @@ from semstab.statistics.model_comparison import Region, Regions, compare_regions
 
 @dataclass
 class UnitResults:
-    """Contents of the units by identity, or their errors; geometry and advice by scene; causes by message."""
+    """Contents of the units by identity, or their errors; geometry, advice by scene, notes by model, causes."""
 
     contents: dict[str, UnitContent] = field(default_factory=dict)
     finished_before: int = 0
     geometry: dict[str, Verdict] = field(default_factory=dict)
     advice: dict[str, VoxelAdvice] = field(default_factory=dict)
+    notes: dict[tuple[str, str], tuple[str, ...]] = field(default_factory=dict)
     errors: dict[str, str] = field(default_factory=dict)
     causes: dict[str, BaseException] = field(default_factory=dict)
     watch: Stopwatch = field(default_factory=Stopwatch)
@@ -79,6 +80,7 @@ def result_of(plan: Plan, folder: Folder, units: UnitResults) -> Result:
         ),
         compared=compared,
         advice=units.advice,
+        notes=_notes_of(plan, contents),
     )
 
 
@@ -89,6 +91,15 @@ def advice_of(plan: Plan, contents: Mapping[str, UnitContent]) -> dict[str, Voxe
         for each in plan.units
         if each.variation.sweep == BASE and (content := contents.get(each.identity)) and content.advice is not None
     }
+
+
+def _notes_of(plan: Plan, contents: Mapping[str, UnitContent]) -> dict[str, tuple[str, ...]]:
+    """Return the remarks of the check on each scene, from when its base units were computed."""
+    notes: dict[str, list[str]] = {}
+    for each in plan.units:
+        if each.variation.sweep == BASE and (content := contents.get(each.identity)) and content.notes:
+            notes.setdefault(each.unit.scene, []).extend(content.notes)
+    return {scene: tuple(dict.fromkeys(own)) for scene, own in notes.items()}
 
 
 def _agreements(config: Config, records: Sequence[Record], tables: Tables, *, must: bool) -> Iterator[Agreement]:

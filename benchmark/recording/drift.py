@@ -18,7 +18,7 @@ from semstab.data.labels import GLOW, LabelSpace, between
 from semstab.data.measures import SBD_MAX, mean_drift
 from semstab.data.results import Changes
 from semstab.data.voxels import VoxelTable
-from semstab.recording.timeline import LINE_COLORS, Clock, path
+from semstab.recording.timeline import Clock, path
 
 # The pictures show levels of drift, in colours that no class has, and labels that contradict the map.
 
@@ -122,7 +122,11 @@ NUMBER = np.array([[0.04, 0.04], [0.04, 0.1]])
 
 MOVE = np.dtype([("voxel", np.int64), ("frame", np.int32), ("before", np.uint16), ("after", np.uint16), ("bits", "f4")])
 
-COLORS = (*LINE_COLORS, (255, 255, 255), (170, 255, 195), (220, 190, 255))
+COLORS = (
+    (230, 159, 0), (86, 180, 233), (0, 158, 115), (240, 228, 66), (204, 121, 167), (213, 94, 0), (0, 114, 178),
+    (255, 255, 255), (170, 255, 195), (220, 190, 255),
+)  # fmt: skip
+"""The colours of numbered places, on the viewer's dark ground."""
 
 
 class View(NamedTuple):

@@ -11,6 +11,7 @@ from typing import Any
 
 import rerun as rr
 
+from semstab.core.palette import model_color
 from semstab.data.digests import require_unchanged
 from semstab.data.measures import ENTROPY, VSS
 from semstab.data.results import RECURRENT, Unit
@@ -105,11 +106,6 @@ the CSV."""
 OF_THE_MODEL = ("flicker_percent", "compensated_flicker_percent", "decode_ms", "wait_ms")
 """The series that are the same for all backends; they are logged with the first one."""
 
-# The colours of Okabe and Ito without black are distinct for any colour vision, and on the viewer's dark background.
-LINE_COLORS = (
-    (230, 159, 0), (86, 180, 233), (0, 158, 115), (240, 228, 66), (204, 121, 167), (213, 94, 0), (0, 114, 178),
-)  # fmt: skip
-
 
 def entity(name: str, unit: Unit) -> str:
     """Return the entity of a series."""
@@ -167,10 +163,10 @@ def _damaged(file: Path, error: Exception) -> DataError:
 
 def log_styles(stream: rr.RecordingStream, plan: Plan) -> None:
     """Log names, colours and widths of all lines."""
-    units = list(dict.fromkeys((unit.model, unit.backend) for task in plan.tasks for unit in task.units))
+    models = list(dict.fromkeys(task.model for task in plan.tasks))
     for task in plan.tasks:
         for unit in task.units:
-            color = LINE_COLORS[units.index((unit.model, unit.backend)) % len(LINE_COLORS)]
+            color = model_color(models.index(unit.model))
             # The lines of backends that agree coincide; the viewer draws them by name, so each line is thinner.
             width = 2.0 + 2.5 * sum(backend > unit.backend for backend in task.backends)
             for name in columns(unit, task):

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import html
+import itertools
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
+from semstab.core.palette import MODEL_COLORS, dash, hexadecimal, marker, model_color
 from semstab.data.statistics import Estimate
 
 WIDTH, HEIGHT = 520, 230
@@ -18,9 +20,6 @@ ROW = 24
 
 POINTS = 400
 """The most points of a line; a longer line is drawn by the means of so many equal parts."""
-
-SERIES = 8
-"""The number of colours of the style sheet, c0 to c7."""
 
 
 @dataclass(frozen=True)
@@ -32,7 +31,6 @@ class Line:
     y: Sequence[float]
     ends: Sequence[tuple[float, float]] = ()
     color: int = 0
-    dashed: bool = False
 
 
 @dataclass(frozen=True)
@@ -84,18 +82,19 @@ def dot_chart(rows: Mapping[str, Sequence[tuple[int, str, Estimate]]], x_label: 
     """Return a chart of rows of dots with their intervals, (colour, name, estimate) each; lines at the guides."""
     values = [v for row in rows.values() for _, _, e in row for v in (e.value, e.low, e.high)]
     left = LEFT + 6 * min(16, max(map(len, rows)))
-    most = max(len(row) for row in rows.values())
-    step = ROW if most == 1 else 10 * most + 8
-    height = TOP + step * len(rows) + BOTTOM
+    ends = [0, *itertools.accumulate(max(ROW, 10 * len(row) + 8) for row in rows.values())]
+    middles = [(first + last) / 2 for first, last in itertools.pairwise(ends)]
+    height = TOP + ends[-1] + BOTTOM
     x = Scale.over([*values, *guides], left, WIDTH - RIGHT - 6)
-    y = Scale(0, len(rows), TOP, height - BOTTOM)
-    names = {k + 0.5: name if len(name) <= 22 else f"{name[:19]}..." for k, name in enumerate(rows)}
+    y = Scale(0, ends[-1], TOP, height - BOTTOM)
+    short = (name if len(name) <= 22 else f"{name[:19]}..." for name in rows)
+    names = dict(zip(middles, short, strict=True))
     parts = [*_frame(x, y, {tick: number(tick) for tick in x.ticks(7)}, names, x_label, "", left=left, height=height)]
     parts += [f'<path class="guide" d="M{x(g):.1f} {TOP}V{height - BOTTOM}"/>' for g in guides]
-    for k, row in enumerate(rows.values()):
+    for middle, row in zip(middles, rows.values(), strict=True):
         for j, (color, name, estimate) in enumerate(row):
             if math.isfinite(estimate.value):
-                at = y(k + 0.5) + 10 * (j - (len(row) - 1) / 2)
+                at = y(middle) + 10 * (j - (len(row) - 1) / 2)
                 parts += _dot(x, at, estimate, color, name)
     return _svg(parts, height, x_label)
 
@@ -107,7 +106,7 @@ def thinned(line: Line) -> Line:
     with np.errstate(invalid="ignore"):
         parts = [np.array_split(np.asarray(values, dtype=np.float64), POINTS) for values in (line.x, line.y)]
         x, y = ([float(np.nanmean(p)) if np.isfinite(p).any() else math.nan for p in own] for own in parts)
-    return Line(line.name, x, y, (), line.color, line.dashed)
+    return Line(line.name, x, y, (), line.color)
 
 
 def number(value: float) -> str:
@@ -116,27 +115,28 @@ def number(value: float) -> str:
 
 
 def _line(line: Line, x: Scale, y: Scale) -> Iterator[str]:
-    color = f"c{line.color % SERIES}"
+    color, pattern = _class(line.color), dash(line.color)
+    dashed = f' stroke-dasharray="{pattern}"' if pattern else ""
     points = list(zip(line.x, line.y, strict=True))
     pen, steps = "M", []
     for px, py in points:
         if math.isfinite(py):
             steps.append(f"{pen}{x(px):.1f} {y(py):.1f}")
         pen = "L" if math.isfinite(py) else "M"
-    yield f'<path class="line {color}{" dashed" if line.dashed else ""}" d="{"".join(steps)}"/>'
+    yield f'<path class="line {color}"{dashed} d="{"".join(steps)}"/>'
     for k, (px, py) in enumerate(points if len(points) <= 40 else ()):
         if math.isfinite(py):
             ends = line.ends[k] if line.ends else (math.nan, math.nan)
             if all(map(math.isfinite, ends)):
                 yield f'<path class="line {color}" d="M{x(px):.1f} {y(ends[0]):.1f}V{y(ends[1]):.1f}"/>'
-            yield _circle(x(px), y(py), color, f"{line.name}: {_with_ends(Estimate(py, *ends))}")
+            yield _mark(x(px), y(py), line.color, f"{line.name}: {_with_ends(Estimate(py, *ends))}")
 
 
 def _dot(x: Scale, at: float, estimate: Estimate, color: int, name: str) -> Iterator[str]:
-    shade = f"c{color % SERIES}"
+    shade = _class(color)
     if math.isfinite(estimate.low) and math.isfinite(estimate.high):
         yield f'<path class="line {shade}" d="M{x(estimate.low):.1f} {at:.1f}H{x(estimate.high):.1f}"/>'
-    yield _circle(x(estimate.value), at, shade, f"{name}: {_with_ends(estimate)}")
+    yield _mark(x(estimate.value), at, color, f"{name}: {_with_ends(estimate)}")
 
 
 def _with_ends(estimate: Estimate) -> str:
@@ -144,8 +144,41 @@ def _with_ends(estimate: Estimate) -> str:
     return f"{estimate.value:.3g}{ends}"
 
 
-def _circle(x: float, y: float, color: str, title: str) -> str:
-    return f'<circle class="dot {color}" cx="{x:.1f}" cy="{y:.1f}" r="3.4"><title>{html.escape(title)}</title></circle>'
+SHAPES = {
+    "circle": "M-3.4 0a3.4 3.4 0 1 0 6.8 0a3.4 3.4 0 1 0-6.8 0z",
+    "square": "M-3-3h6v6h-6z",
+    "diamond": "M0-4.3L4.3 0L0 4.3L-4.3 0z",
+    "triangle": "M0-4L4 3.2H-4z",
+    "cross": "M-3.8-1.3h2.5v-2.5h2.6v2.5h2.5v2.6h-2.5v2.5h-2.6v-2.5h-2.5z",
+}
+"""The outlines of markers about their middle."""
+
+
+def _mark(x: float, y: float, k: int, title: str) -> str:
+    """Return the marker of the k-th model."""
+    shape, text = SHAPES[marker(k)], html.escape(title)
+    return (
+        f'<path class="dot {_class(k)}" transform="translate({x:.1f} {y:.1f})" d="{shape}"><title>{text}</title></path>'
+    )
+
+
+def _class(k: int) -> str:
+    return f"c{k % len(MODEL_COLORS)}"
+
+
+def sample(k: int) -> str:
+    """Return the line and the marker of the k-th model, as a legend shows them."""
+    pattern = f' stroke-dasharray="{dash(k)}"' if dash(k) else ""
+    line = f'<path class="line {_class(k)}"{pattern} d="M0 6H30"/>'
+    return f'<svg class="chart sample" viewBox="0 0 30 12" width="30" height="12">{line}{_mark(15, 6, k, "")}</svg>'
+
+
+def colors_css() -> str:
+    """Return the rules of the style sheet for the models' colours."""
+    rows = ((_class(k), hexadecimal(model_color(k))) for k in range(len(MODEL_COLORS)))
+    return "\n".join(
+        f".chart .line.{c} {{ stroke: {shade}; }} .chart .dot.{c} {{ fill: {shade}; }}" for c, shade in rows
+    )
 
 
 def _frame(

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from semstab.core.types import UInt8
+from semstab.report.charts import colors_css
 from semstab.report.figures.style import COLUMN, DPI, Figure
 from semstab.report.tables.table import ARROWS, Table, relations, sections
 
@@ -35,7 +36,7 @@ def filled(template: str, **content: Any) -> str:
         loader=FileSystemLoader(here), autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
     )
     style, script = ((here / name).read_text(encoding="utf-8") for name in ("style.css", "page.js"))
-    page: str = environment.get_template(template).render(style=style, script=script, **content)
+    page: str = environment.get_template(template).render(style=f"{style}\n{colors_css()}", script=script, **content)
     return page
 
 

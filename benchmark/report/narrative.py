@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Mapping, Sequence
 
 from semstab.data.measures import VSS
@@ -11,7 +12,7 @@ from semstab.data.statistics import OutlyingFrames
 from semstab.datasets import GROUND_TRUTH
 from semstab.metrics import macro_mean
 from semstab.report.means import ENOUGH, by_model, pooled
-from semstab.report.tables.stability import comparable
+from semstab.report.tables.stability import comparable, one_in
 from semstab.statistics.frame_disagreement import LEAST_FRAMES, LEAST_PLACES
 from semstab.statistics.verdict import LIMITS
 
@@ -21,8 +22,17 @@ MOSTLY_ONCE = 0.5
 LEAST_RECALL = 0.25
 """The share of the edges of depth with a border of labels below which there is a warning of coarse labels."""
 
+TOO_LARGE = 25
+"""The multiple of the suggested voxel size from which on there is a warning."""
+
 ONE_CLASS = 0.9
 """The share of a class from which on it determines most of the numbers."""
+
+
+def noted(result: Result) -> Iterator[str]:
+    """Yield what `check` notes of the scenes: labels or images that are not registered to the depth, and the like."""
+    for scene, own in result.notes.items():
+        yield from (f"{scene}: {text}" if len(result.scenes) > 1 else text for text in own)
 
 
 def warnings(result: Result) -> Iterator[str]:
@@ -72,10 +82,10 @@ def warnings(result: Result) -> Iterator[str]:
     for name, own in covering.items():
         all_of_them = len(own) == len(runs)
         of = "" if all_of_them else f" of {', '.join(dict.fromkeys(model for model, _ in own))}"
-        least = min(share for _, share in own)
-        more = " or more" if len(own) > 1 and least < 0.995 else ""
+        least = math.floor(100 * min(share for _, share in own))
+        more = " or more" if len({share for _, share in own}) > 1 and least < 100 else ""
         yield (
-            f"'{name}' covers {least:.0%}{more} of the map{of}, and determines most of its numbers; read them by class,"
+            f"'{name}' covers {least}%{more} of the map{of}, and determines most of its numbers; read them by class,"
             f" or leave it out: --set exclude.classes=[{name}]"
         )
 
@@ -142,9 +152,14 @@ def _size(scene: str, advice: VoxelAdvice, result: Result) -> str:
             f"{where}at any voxel size, fewer than half of the points fall into the same voxel again when another frame"
             " sees them: semstab-bench check examines depth and poses"
         )
+    size = f"voxels of {advice.voxel_size:g} m"
+    if advice.voxel_size >= TOO_LARGE * advice.suggested:
+        return (
+            f"{where}{size} are {advice.voxel_size / advice.suggested:.0f} times as large as the data need, so that one"
+            f" holds several things: --voxel-size {advice.suggested:g}"
+        )
     if advice.chosen or advice.suggested <= advice.voxel_size:
         return ""
-    size = f"voxels of {advice.voxel_size:g} m"
     return f"{where}{size} are so small that noise splits locations: --voxel-size {advice.suggested:g}"
 
 
@@ -208,8 +223,8 @@ def _implementations(result: Result) -> Iterator[str]:
         for name in dict.fromkeys(row.backends[1] for row in result.agreement)
     }
     if same := [name for name, agrees in rows.items() if all(agrees)]:
-        drawn = max(row.one_in for row in result.agreement if row.backends[1] in same)
-        sample = f" (one voxel in {drawn} was compared)" if drawn > 1 else ""
+        drawn = one_in([row for row in result.agreement if row.backends[1] in same])
+        sample = f" ({drawn} voxels were compared)" if drawn else ""
         make = "makes" if len(same) == 1 else "make"
         yield f"{' and '.join(same)} {make} the same maps as {result.backend}{sample}."
     for name, agrees in rows.items():

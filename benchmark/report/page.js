@@ -57,6 +57,10 @@ const pixels = source => new Promise((resolve, reject) => {
 
 const colorOf = (unit, layer, k) => {
   const [a, b] = [unit.first, unit.second];
+  if (layer === "category" && unit.silent && a[k + 2]) {  // hatched, as agreement does not assess the map
+    const at = k / 4, [x, y] = [at % unit.size[0], Math.floor(at / unit.size[0])];
+    return (x + y) % 6 < 2 ? [120, 120, 120] : [225, 225, 225];
+  }
   if (layer === "category") return layers.colors[a[k + 2]];
   if (layer === "class") return unit.palette[a[k] + 256 * a[k + 1]] ?? [128, 128, 128];
   if (layer === "op") return shade(COOL, Math.log(b[k + 1]) / Math.log(MOST_OP));
@@ -84,7 +88,11 @@ const escaped = text => text.replace(/[&<>"]/g, c => `&#${c.charCodeAt(0)};`);
 const ramp = (colors, from, to) => `<span>${from} <i class="ramp" style="background:linear-gradient(to right,${
   colors.map(color => `rgb(${color})`)})"></i> ${to}</span>`;
 const key = (own, layer) => {
-  if (layer === "category") return NAMES.map((name, k) => swatch(layers.colors[k], name)).reverse().join("");
+  if (layer === "category") {
+    const silent = own.filter(unit => unit.silent), names = silent.length < own.length ? NAMES : NAMES.slice(0, 1);
+    return names.map((name, k) => swatch(layers.colors[k], name)).reverse().join("")
+      + silent.map(unit => `<span><i class="hatched"></i>${escaped(unit.silent)}</span>`).join("");
+  }
   if (layer === "op") return ramp(COOL, "seen once", `${MOST_OP} times or more`);
   if (layer === "vss") return ramp(RAMP, "frames agree", "half of the evidence disagrees") + swatch([190, 190, 190], "seen once");
   if (layer === "sbd") return ramp(RAMP, "0", `${layers.sbd} bits or more`) + swatch([190, 190, 190], "seen once");

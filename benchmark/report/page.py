@@ -18,14 +18,14 @@ from semstab.data.results import slug
 from semstab.data.statistics import CONFIDENCE, Estimate, MapStatistics
 from semstab.data.topdown import EMPTY
 from semstab.metrics import CATEGORIES, CATEGORY_COLORS, categories, macro_mean
-from semstab.report.charts import SERIES, Line, dot_chart, line_chart
+from semstab.report.charts import Line, dot_chart, line_chart, sample
 from semstab.report.figures.maps import Overview, Views
 from semstab.report.figures.topdown import FromAbove
 from semstab.report.filter_study import advice, filter_studies, of_interest
 from semstab.report.html import filled, jpeg, png, table_block
-from semstab.report.means import by_model, describe, levels, over_recurrent, pooled, swept
-from semstab.report.narrative import notes, outlying_line, warnings
-from semstab.report.ranking import answers, stated
+from semstab.report.means import ENOUGH, by_model, describe, levels, over_recurrent, pooled, swept
+from semstab.report.narrative import noted, notes, outlying_line, warnings
+from semstab.report.ranking import answers, short, stated
 from semstab.report.saved_run import read_series
 from semstab.report.tables import tables
 from semstab.report.tables.table import relations
@@ -72,6 +72,7 @@ def render(
         models=_legend(result.models),
         cards=[_card(name, records) for name, records in by_model(result.select()).items()],
         answers=[relations(text) for text in answers(result)],
+        noted=[relations(text) for text in noted(result)],
         advice=[sentence for each in filter_studies(everything) for sentence in advice(each)],
         warnings=[relations(text) for text in warnings(result)],
         notes=[relations(text) for text in notes(result)],
@@ -92,8 +93,8 @@ def _script(content: Any) -> str:
 
 
 def _legend(names: Sequence[str]) -> list[tuple[str, str]]:
-    """Return the names with the styles of their colours."""
-    return [(name, f"c{k % SERIES}") for k, name in enumerate(names)]
+    """Return the names with samples of their lines."""
+    return [(name, sample(k)) for k, name in enumerate(names)]
 
 
 # --- Cards ------------------------------------------------------------------------------------------------------------
@@ -132,20 +133,24 @@ def _numbers(
     def interval(estimate: Estimate | None, scale: float = 1.0) -> str:
         if estimate is None or math.isnan(estimate.low):
             return ""
-        digits = 2 if scale == 1.0 else 0
-        return f"{estimate.of} {scale * estimate.low:.{digits}f} to {scale * estimate.high:.{digits}f}"
+        if scale == 1.0:
+            return f"{estimate.of} {short(estimate.low)} to {short(estimate.high)}"
+        return f"{estimate.of} {scale * estimate.low:z.0f} to {scale * estimate.high:z.0f}"
 
     head = None if one is None else one.headline
     alphas = [stats.headline.alpha.value for stats in assessed]
-    yield "alpha", mean(alphas, "{:.2f}"), interval(None if head is None else head.alpha)
+    alpha = macro_mean(alphas)
+    yield "alpha", "" if math.isnan(alpha) else short(alpha), interval(None if head is None else head.alpha)
     psa = [stats.headline.psa.value for stats in assessed]
     yield "two frames agree", mean(psa, "{:.0f} %", 100), "of the locations"
     flicker = [record.image_space.compensated_flicker_percent for record in records]
     yield "flicker", mean(flicker, "{:.1f} %"), "of the pixels per frame, camera motion removed"
     together = pooled(records)
     yield "seen 3 times or more", f"{100 * together.recurrent.share:.0f} %", f"of {together.voxels:,} voxels"
-    yield "VSS", mean([together.recurrent[VSS]], "{:.3f}"), "OP ≥ 3"
-    yield "SBD", mean([together.recurrent[SBD]], "{:.4f}"), "bits, OP ≥ 3"
+    enough = together.recurrent.voxels >= ENOUGH
+    few = f"fewer than {ENOUGH:,} voxels with OP ≥ 3"
+    yield "VSS", short(together.recurrent[VSS], digits=3) if enough else "-", "OP ≥ 3" if enough else few
+    yield "SBD", short(together.recurrent[SBD], digits=4) if enough else "-", "bits, OP ≥ 3" if enough else few
     yield "mIoU", mean([miou(record) for record in records], "{:.1f} %", 100), "of voxels seen twice or more"
     wrong = [stats.headline.wrong_of_consistent.value for stats in assessed]
     yield "consistent but wrong", mean(wrong, "{:.1f} %", 100), "of the consistent locations"
@@ -208,6 +213,8 @@ def _map(record: Record, above: FromAbove, overview: Overview | None, most: int)
             break
         step += 1
     kinds = np.where(rows == EMPTY, len(CATEGORIES), category[rows]).astype(np.uint8)
+    silent = _silent(record)
+    shades = [NEUTRAL] * len(CATEGORIES) if silent else CATEGORY_COLORS
     palette = np.array([(k * 67 % 256, k * 131 % 256, k * 29 % 256) for k in range(table.K)], dtype=np.uint8)
     palette = palette if overview is None else overview.palette
     cell = step * above.cell
@@ -220,10 +227,24 @@ def _map(record: Record, above: FromAbove, overview: Overview | None, most: int)
         "names": names,
         "palette": palette.tolist(),
         "numbers": encoded,
-        "plain": png(kinds, np.array([*CATEGORY_COLORS, (255, 255, 255)], dtype=np.uint8)),
+        "silent": silent,
+        "plain": png(kinds, np.array([*shades, (255, 255, 255)], dtype=np.uint8)),
         "image": "" if overview is None or overview.color is None else jpeg(_reduced(overview.color, 960)),
         "frame": "" if overview is None else f"frame {overview.frame}",
     }
+
+
+NEUTRAL = (190, 190, 190)
+"""The colour of a map about whose stability its model says nothing."""
+
+
+def _silent(record: Record) -> str:
+    """Return why agreement does not assess a map: nearly all of it is one class; '' where it does."""
+    statistics = record.statistics
+    if statistics is None or statistics.cells is None or statistics.verdict.level != "uninformative":
+        return ""
+    share, name = statistics.cells.largest_share, statistics.cells.largest_class
+    return f"uninformative: {math.floor(100 * share)} % of the observations of {record.unit.model} are {name}"
 
 
 def _spread(rows: Any, values: UInt8) -> UInt8:

@@ -133,15 +133,15 @@ def answers(result: Result) -> Iterator[str]:
         yield f"not ranked, as nearly the whole map is one class: {', '.join(ranked.unranked)}"
 
 
-def short(value: float, sign: str = "") -> str:
+def short(value: float, sign: str = "", *, digits: int = 2) -> str:
     """Return a number from -1 to 1 without the 0 before its point: '.55', '-.19', '1.00'; '-' where it is undefined."""
-    return "-" if math.isnan(value) else re.sub(r"^([+-]?)0\.", r"\1.", f"{round(value, 2) + 0.0:{sign}.2f}")
+    return "-" if math.isnan(value) else re.sub(r"^([+-]?)0\.", r"\1.", f"{value:{sign}z.{digits}f}")
 
 
 def stated(verdict: StabilityVerdict) -> str:
-    """Return the probability of a level: 'p .51', 'p>.99', which no share of a map can be taken for; '' without one."""
+    """Return the probability of a level: '(p .51)', '(p > .99)', no share of a map; '' without one."""
     p = verdict.probability
-    return "" if math.isnan(p) else "p>.99" if p >= 0.995 else f"p {short(p)}"
+    return "" if math.isnan(p) else "(p > .99)" if p >= 0.995 else f"(p {short(p)})"
 
 
 def _is_uninformative(record: Record) -> bool:

@@ -22,10 +22,12 @@ from semstab.engine.observer import Observer
 from semstab.engine.units import Plan
 from semstab.metrics import CATEGORIES, macro_mean
 from semstab.report.filter_study import advice, filter_studies
-from semstab.report.narrative import outlying_line, warnings
+from semstab.report.means import ENOUGH
+from semstab.report.narrative import noted, outlying_line, warnings
 from semstab.report.ranking import answers, short, stated
 from semstab.report.tables import tables
 from semstab.report.tables.filters import row as filter_row
+from semstab.report.tables.stability import one_in
 from semstab.report.tables.table import to_terminal
 from semstab.statistics.verdict import LIMITS
 from semstab.task import Task
@@ -38,6 +40,14 @@ MAJORITY = 0.5
 RARE = 100
 """The least number of voxels of a class that is listed; a rarer class is not called unstable."""
 
+LEAST_SHARE = 0.005
+"""The least share of the map of a class that is listed: 1 % as it is printed."""
+
+CONFUSED = "confused with"
+CLASS_HEAD = ("classes that disagree most", "alpha", CONFUSED, "of map", "disagreement")
+CLASS_COLUMNS, LEAST_CLASS = 32, 28
+"""The columns of a line of classes beside its two names, and the least of the first name."""
+
 MOST_CLASSES = {1: 5, 2: 3}
 """The number of classes that are listed for each model, by the number of rows above; else 1."""
 
@@ -49,22 +59,24 @@ def print_summary(
     result: Result, console: Console, *, out: Path | None = None, seconds: float | None = None, verbose: bool = False
 ) -> None:
     """Print the answer, then the files to open; `verbose` adds every table of the run."""
-    for line in screen(result, out=out, seconds=seconds):
+    for line in screen(result, out=out, seconds=seconds, width=console.width):
         console.print(line, highlight=False, markup=False, soft_wrap=True)
     for table in tables(result) if verbose else ():
         console.print(f"\n{to_terminal(table)}", highlight=False, markup=False, soft_wrap=True)
 
 
-def screen(result: Result, *, out: Path | None = None, seconds: float | None = None) -> Iterator[str]:
-    """Yield the lines of a run or a study.
+def screen(
+    result: Result, *, out: Path | None = None, seconds: float | None = None, width: int = WIDTH
+) -> Iterator[str]:
+    """Yield the lines of a run or a study for a terminal of so many columns; sentences are wrapped at 80.
 
     They are verdicts, the classes that disagree most, warnings, the check, the time and the files to open.
     """
-    records = result.select()
+    records, width = result.select(), max(width, WIDTH)
     if len(records) == 1:
-        yield from _one(result, records[0])
+        yield from _one(result, records[0], width)
     else:
-        yield from _several(result, records)
+        yield from _several(result, records, width)
     for sweep in result.sweeps():
         yield f"  sweep over {sweep.replace('_', ' ')}: semstab-bench show {out or 'RUN'} sensitivity_{sweep}"
     for text in list(warnings(result))[:MOST_WARNINGS]:
@@ -76,35 +88,41 @@ def screen(result: Result, *, out: Path | None = None, seconds: float | None = N
 # --- One model on one scene -------------------------------------------------------------------------------------------
 
 
-def _one(result: Result, record: Record) -> Iterator[str]:
+def _one(result: Result, record: Record, width: int) -> Iterator[str]:
     run, statistics = record.summary, record.summary.statistics
-    yield _head(f"{run.unit.scene} / {run.unit.model}", result, [run])
-    yield ""
+    yield from _head(f"{run.unit.scene} / {run.unit.model}", result, [run], width)
     if statistics is not None:
         yield from _verdict(run)
     recurrent, shares = run.table.recurrent, run.table.categories
     if shares:
-        low, drifting, uncertain, stable = (_percent(shares[name]) for name in CATEGORIES)
+        low, drifting, uncertain, stable = percents([shares[name] for name in CATEGORIES])
         yield f"  map  {stable} stable  {uncertain} uncertain  {drifting} drifting  {low} seen less than 3 times"
     yield from _flicker(record)
-    yield from _classes([record])
+    yield from _classes([record], width)
     yield from _outlying([record])
-    means = "  ".join(f"{m.word} {recurrent[m]:.{m.digits[0]}f}{f' {m.unit}' if m.unit else ''}" for m in measures())
-    yield f"  paper (OP>=3)  {means}"
+    if recurrent.voxels >= ENOUGH:
+        means = (f"{m.word} {short(recurrent[m], digits=m.digits[0])} {m.unit}".rstrip() for m in measures())
+        yield f"  paper (OP>=3)  {'  '.join(means)}"
+    else:
+        yield f"  paper (OP>=3)  -, {recurrent.voxels:,} voxels are too few (at least {ENOUGH:,})"
     yield ""
 
 
-def _head(name: str, result: Result, runs: Sequence[UnitSummary]) -> str:
-    """Return the data that was fused: '40 frames, 7 classes, 0.2 m voxels', and whether depth and poses agree."""
+def _head(name: str, result: Result, runs: Sequence[UnitSummary], width: int) -> Iterator[str]:
+    """Yield the data that was fused: '40 frames, 7 classes, 0.2 m voxels', whether depth and poses agree, and notes."""
     first = runs[0]
     frames = sorted({run.frames for run in runs})
     counts = f"{frames[0]} to {frames[-1]}" if len(frames) > 1 else f"{frames[0]}"
     cells = [run.statistics.cells for run in runs if run.statistics is not None]
     views = min((own.views for own in cells if own is not None and own.views < own.frames), default=None)
     seen = "" if views is None else f" of {views} distinct views"
-    what = f"{counts} frames{seen}, {first.table.K} classes, {_metres(first.table.voxel_size)} voxels"
+    chosen = " (chosen)" if any(advice.chosen for advice in result.advice.values()) else ""
+    what = f"{counts} frames{seen}, {first.table.K} classes, {_metres(first.table.voxel_size)} voxels{chosen}"
     line = f"{name}    {what}    {_geometry(result)}".rstrip()
-    return line if len(line) <= WIDTH else f"{name}    {what}\n  {_geometry(result)}"
+    yield line if len(line) <= width else f"{name}    {what}\n  {_geometry(result)}".rstrip()
+    for text in noted(result):
+        yield from textwrap.wrap(f"note: {text}", WIDTH, initial_indent="  ", subsequent_indent="    ")
+    yield ""
 
 
 def _geometry(result: Result) -> str:
@@ -152,11 +170,25 @@ def _interval(estimate: Estimate, scale: float = 1.0) -> str:
         return ""
     if scale == 1.0:
         return f" ({estimate.of} {short(estimate.low)} to {short(estimate.high)})"
-    return f" ({scale * estimate.low:.0f} to {scale * estimate.high:.0f} %)"
+    return f" ({scale * estimate.low:z.0f} to {scale * estimate.high:z.0f} %)"
 
 
 def _percent(share: float) -> str:
     return "-" if math.isnan(share) else f"{100 * share:.0f} %"
+
+
+def percents(shares: Sequence[float]) -> list[str]:
+    """Return shares of one whole in percent, rounded so that they sum to what the shares do; '-' where undefined.
+
+    Those whose rounding down loses most are rounded up.
+    """
+    if any(map(math.isnan, shares)):
+        return [_percent(share) for share in shares]
+    whole = [math.floor(100 * share) for share in shares]
+    lost = sorted(range(len(shares)), key=lambda k: whole[k] - 100 * shares[k])
+    for k in lost[: round(100 * math.fsum(shares)) - sum(whole)]:
+        whole[k] += 1
+    return [f"{n} %" for n in whole]
 
 
 def _metres(size: float) -> str:
@@ -168,38 +200,57 @@ def _metres(size: float) -> str:
 
 COLUMNS = ("model", "verdict", f"alpha ({UNDEFINED.of})", "agree", "flicker", "VSS", "SBD", "mIoU")
 UNITS = ("", "", "", "%", "%", "OP>=3", "bits", "%")
-WIDTHS = (12, -15, -19, 6, 8, 6, 7, 5)
-"""The widths of the columns of several models; a negative width marks text, which is aligned left."""
+TEXTS = 3
+"""The number of columns of text, which are aligned left; numbers are aligned right."""
+
+LEAST_NAME = 9
+"""The least columns of a model's name, which is cut where the terminal has no room for all of it."""
 
 
-def _several(result: Result, records: Sequence[Record]) -> Iterator[str]:
+def _several(result: Result, records: Sequence[Record], width: int) -> Iterator[str]:
     """Yield which model is more stable where that is known, then a row for each scene and model."""
     listed = ", ".join(result.scenes[:3]) + (", ..." if len(result.scenes) > 3 else "")
-    yield _head(listed, result, [record.summary for record in records])
-    yield ""
+    yield from _head(listed, result, [record.summary for record in records], width)
     for text in (told := list(answers(result))):
         yield from textwrap.wrap(text, WIDTH, initial_indent="  ", subsequent_indent="    ")
     if told:
         yield ""
     known = any(not math.isnan(miou(record)) for record in records)
     columns = len(COLUMNS) if known else len(COLUMNS) - 1
-    yield _laid_out(COLUMNS[:columns])
-    yield _laid_out(UNITS[:columns])
-    for scene in result.scenes:
-        own = [record for record in records if record.unit.scene == scene]
-        if len(result.scenes) > 1 and own:
-            yield f"  {scene}"
-        yield from (_laid_out(_cells(record)[:columns]) for record in own)
-    yield from _classes(records)
+    heads, rows = [COLUMNS[:columns], UNITS[:columns]], [_cells(record)[:columns] for record in records]
+    lines = iter(laid_out([*heads, *rows], width))
+    yield next(lines)
+    yield next(lines)
+    scene = None
+    for record, line in zip(records, lines, strict=True):
+        if len(result.scenes) > 1 and record.unit.scene != scene:
+            yield f"  {(scene := record.unit.scene)}"
+        yield line
+    if any(record.summary.table.recurrent.voxels < ENOUGH for record in records):
+        yield f"  VSS, SBD -: fewer than {ENOUGH:,} voxels were seen 3 times or more"
+    yield from _classes(records, width)
     yield from _outlying(records)
     yield ""
 
 
-def _laid_out(cells: Sequence[str]) -> str:
-    first, *rest = cells
-    name = first if len(first) <= WIDTHS[0] else f"{first[:4]}...{first[7 - WIDTHS[0] :]}"  # names differ at the end
-    pairs = zip(rest, WIDTHS[1:], strict=False)
-    return f"  {name:<{WIDTHS[0]}}" + "".join(f" {c:<{-w - 1}}" if w < 0 else f"{c:>{w}}" for c, w in pairs)
+def laid_out(rows: Sequence[Sequence[str]], width: int) -> list[str]:
+    """Return rows of cells as lines, each column as wide as its cells; names of models are cut to fit the width."""
+    sizes = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    sizes[0] = min(sizes[0], max(LEAST_NAME, width - 2 - sum(sizes[1:]) - len(sizes[1:])))
+    lines = []
+    for name, *cells in rows:
+        sized = zip(cells, sizes[1:], strict=True)
+        aligned = (f"{c:<{n}}" if k < TEXTS else f"{c:>{n}}" for k, (c, n) in enumerate(sized, 1))
+        lines.append(" ".join(["", f" {_cut(name, sizes[0]):<{sizes[0]}}", *aligned]).rstrip())
+    return lines
+
+
+def _cut(name: str, size: int) -> str:
+    """Return a name without its middle where it is too long: names differ at their ends."""
+    if len(name) <= size:
+        return name
+    first = (size - 3) // 2
+    return f"{name[:first]}...{name[first + 3 - size :]}"
 
 
 def _cells(record: Record) -> list[str]:
@@ -210,10 +261,12 @@ def _cells(record: Record) -> list[str]:
         agree, own = 100 * statistics.headline.psa.value, statistics.headline.alpha
         ends = "" if math.isnan(own.low) else f" ({short(own.low)} to {short(own.high)})"
         alpha = f"{short(own.value)}{ends}"
-    vss, sbd = (run.table.recurrent[m] for m in measures()[:2])
+    recurrent = run.table.recurrent
+    means = [recurrent[m] if recurrent.voxels >= ENOUGH else math.nan for m in measures()[:2]]
+    vss, sbd = (short(mean, digits=m.digits[0]) for m, mean in zip(measures(), means, strict=False))
     flicker = record.image_space.compensated_flicker_percent
-    numbers = ((agree, 0), (flicker, 1), (vss, 3), (sbd, 4), (100 * miou(record), 1))
-    return [run.unit.model, level, alpha, *(_number(value, digits) for value, digits in numbers)]
+    agreeing, flickering, overlap = _number(agree, 0), _number(flicker, 1), _number(100 * miou(record), 1)
+    return [run.unit.model, level, alpha, agreeing, flickering, vss, sbd, overlap]
 
 
 def miou(record: Record) -> float:
@@ -223,34 +276,37 @@ def miou(record: Record) -> float:
 
 
 def _number(value: float, digits: int) -> str:
-    return "-" if math.isnan(value) else f"{value:.{digits}f}"
+    return "-" if math.isnan(value) else f"{value:z.{digits}f}"
 
 
 # --- Both -------------------------------------------------------------------------------------------------------------
 
 
-def _classes(records: Sequence[Record]) -> Iterator[str]:
-    """Yield the classes that disagree most, among those that cover enough of the map."""
+def _classes(records: Sequence[Record], width: int) -> Iterator[str]:
+    """Yield the classes with most of the disagreement, among those that cover enough of the map."""
     names = list(dict.fromkeys(record.unit.model for record in records))
     most, alone = MOST_CLASSES.get(len(records), 1), len(names) == 1
-    lines = []
+    rows: list[tuple[str, str, str, str, str]] = []
     for name in names:
         own = [record for record in records if record.unit.model == name]
         classes, shares = class_means(own), _class_shares(own)
         others = {k: v for record in own for k, v in record.summary.table.confused_with.items()}
-        common = [key for key, (voxels, _) in shares.items() if voxels >= RARE and key in classes]
+        common = [
+            key for key, (voxels, share) in shares.items() if voxels >= RARE and share >= LEAST_SHARE and key in classes
+        ]
         named = [key for key in common if shares[key][1] < MAJORITY] or common
         for key in sorted(named, key=lambda key: -classes[key][1])[:most]:
             label, (alpha, disagreement) = key if alone else f"{name}: {key}", classes[key]
-            lines.append(
-                f"    {label[:28]:<28}{short(alpha):>5}   {others.get(key, '')[:16]:<16}"
-                f"{100 * shares[key][1]:>6.0f} %{100 * disagreement:>12.0f} %"
-            )
-    if lines:
+            of_map, of_all = f"{100 * shares[key][1]:.0f} %", f"{100 * disagreement:.0f} %"
+            rows.append((f"  {label}", short(alpha), others.get(key, ""), of_map, of_all))
+    if rows:
         yield ""
-        columns = f"{'alpha':>5}   {'confused with':<16}{'of map':>8}{'disagreement':>14}"
-        yield f"  {'classes that disagree most':<30}{columns}"
-        yield from lines
+        room = width - CLASS_COLUMNS
+        first = max(LEAST_CLASS, min(room * 2 // 3, max(len(row[0]) for row in rows)))
+        second = max(len(CONFUSED), min(room - first, max(len(row[2]) for row in rows)))
+        for label, alpha_, other, of_map, of_all in (CLASS_HEAD, *rows):
+            line = f"  {_cut(label, first):<{first}}{alpha_:>5}   {_cut(other, second):<{second}}"
+            yield f"{line}{of_map:>8}{of_all:>14}"
 
 
 def class_means(records: Sequence[Record]) -> dict[str, tuple[float, float]]:
@@ -289,7 +345,7 @@ def _checks(result: Result) -> Iterator[str]:
     """Yield the agreement of the backends: one line for each pair."""
     for pair in dict.fromkeys(row.backends for row in result.agreement):
         rows = [row for row in result.agreement if row.backends == pair]
-        yield f"  {_check(pair, rows)}"
+        yield from textwrap.wrap(_check(pair, rows), WIDTH, initial_indent="  ", subsequent_indent="    ")
     for row in result.compared:
         relabelled = 100 * row.differences["label"].mean
         yield f"  {row.backends[1]} differs from {row.backends[0]} by design: {relabelled:.1f} % of the labels"
@@ -298,7 +354,10 @@ def _checks(result: Result) -> Iterator[str]:
 def _check(pair: tuple[str, str], rows: Sequence[Agreement]) -> str:
     checked, reference = pair
     voxels, bad = sum(row.voxels[-1] for row in rows), [row for row in rows if not row.agrees]
-    drawn = f" drawn at random, 1 in {rows[0].one_in}" if rows[0].one_in > 1 else ""
+    share = f", {one_in(rows)}" if one_in(rows) else ""
+    if not voxels and not bad:
+        return f"{checked} was not checked against {reference}: no voxel was drawn{share}"
+    drawn = f" drawn at random{share}" if share else ""
     if not bad:
         return f"checked {checked} against {reference} on {voxels:,} voxels{drawn}: equal"
     row = bad[0]

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from semstab.core.files import atomic_path
+from semstab.core.palette import hexadecimal, model_color
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -19,8 +20,8 @@ COLUMN, PAGE = 3.4, 7.0
 
 DPI = 300
 
-COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000", "#F0E442")
-"""The palette of Okabe and Ito, the darker colours first."""
+COLORS = ("#0072B2", "#D55E00")
+"""The ends of a scale between two sides, for any colour vision."""
 
 INK, FAINT = "#222222", "#999999"
 
@@ -113,8 +114,8 @@ def canvas(width: float, height: float) -> Canvas:
 
 
 def color(k: int) -> str:
-    """Return the k-th colour; they repeat after eight."""
-    return COLORS[k % len(COLORS)]
+    """Return the colour of the k-th model."""
+    return hexadecimal(model_color(k))
 
 
 def legend_columns(names: Sequence[str], width: float) -> int:

@@ -449,8 +449,8 @@ def agreement(result: Result) -> list[Table]:
     caption = (
         "Two backends fused the same frames. The table shows the largest difference of any voxel that both maps have."
     )
-    if one_in := {row.one_in for row in result.agreement} - {1}:
-        caption += f" With the numpy reference, one voxel in {max(one_in)} was compared, drawn at random."
+    if drawn := one_in(result.agreement):
+        caption += f" With the numpy reference, {drawn} voxels were compared, drawn at random."
     return [Table("agreement", "Agreement of the fusion implementations", caption, columns, groups, "backends")]
 
 
@@ -537,3 +537,9 @@ def voxel_sizes(result: Result) -> list[Table]:
         if groups
         else []
     )
+
+
+def one_in(rows: Sequence[Agreement]) -> str:
+    """Return which share of the voxels was compared: '1 in 64', '1 in 64 to 128'; '' where all were."""
+    drawn = sorted({row.one_in for row in rows})
+    return "" if drawn in ([], [1]) else f"1 in {' to '.join(map(str, dict.fromkeys((drawn[0], drawn[-1]))))}"

@@ -1,0 +1,32 @@
+"""The colours of models: the same in report, figures and viewer, for any colour vision, on light and dark ground."""
+
+from __future__ import annotations
+
+MODEL_COLORS = (
+    (0, 114, 178), (213, 94, 0), (0, 158, 115), (204, 121, 167), (176, 125, 0), (58, 150, 200),
+    (122, 92, 200), (176, 48, 96), (107, 142, 35), (0, 139, 139), (138, 109, 59), (127, 127, 127),
+)  # fmt: skip
+"""RGB of each model in order: those of Okabe and Ito that show on both grounds, then others of like lightness."""
+
+DASHES, MARKERS = ("", "6 3", "2 2.5"), ("circle", "square", "diamond", "triangle", "cross")
+"""Patterns of lines, and markers, by which models are told apart where colours are not."""
+
+
+def model_color(k: int) -> tuple[int, int, int]:
+    """Return the RGB of the k-th model."""
+    return MODEL_COLORS[k % len(MODEL_COLORS)]
+
+
+def hexadecimal(color: tuple[int, int, int]) -> str:
+    """Return RGB as '#0072b2'."""
+    return "#{:02x}{:02x}{:02x}".format(*color)
+
+
+def dash(k: int) -> str:
+    """Return the pattern of the k-th model's line, '' where it is solid: another one after every six colours."""
+    return DASHES[2 * k // len(MODEL_COLORS) % len(DASHES)]
+
+
+def marker(k: int) -> str:
+    """Return the marker of the k-th model."""
+    return MARKERS[k % len(MARKERS)]
