@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
+import sqlite3
 import struct
 from pathlib import Path
 
@@ -509,6 +511,15 @@ def test_a_truncated_bag_is_one_line(container, tmp_path, frames):
         with pytest.raises(DataError, match=rf"{path}.*: not a whole bag \(.*\); record it to its end, or '") as caught:
             frames_of(opened(path))
         assert "\n" not in str(caught.value)
+
+
+def test_a_topic_whose_name_is_no_text_is_damage(tmp_path, frames):
+    folder = bags.write_bag(tmp_path / "run", "sqlite3", lambda ros: bags.records(ros, frames))
+    (file,) = folder.glob("*.db3")
+    with contextlib.closing(sqlite3.connect(file)) as base, base:
+        base.execute("UPDATE topics SET name = x'0102' WHERE id = 1")
+    with pytest.raises(DataError, match=rf"{file}: damaged: a topic is called b.*; record the bag again"):
+        opened(file)
 
 
 def test_an_image_that_is_shorter_than_it_says_is_named(tmp_path, frames):

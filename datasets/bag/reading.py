@@ -104,6 +104,8 @@ class OpenBag:
             self._deserialize = store.deserialize_ros1 if first else store.deserialize_cdr
             self._connections: dict[str, list[Any]] = {}
             for connection in self._reader.connections:
+                if not isinstance(connection.topic, str):  # a database holds any type in any column
+                    raise DataError(f"{path}: damaged: a topic is called {connection.topic!r}; record the bag again")
                 self._connections.setdefault(connection.topic, []).append(connection)
             self.topics: Mapping[str, Topic] = {
                 name: Topic(name, same[0].msgtype.replace("/msg/", "/"), sum(int(each.msgcount) for each in same))

@@ -52,7 +52,7 @@ def of_kept(folder: Path) -> Iterator[Kind]:
     casts = Casts(folder / "casts", b"surface")
     casts.put(view, np.ones((12, 16), np.float32))
     yield Kind("cast depth", (next((folder / "casts").rglob("*.cast")),), lambda _: casts.get(view))
-    flight = predicted_scene.write(folder / "flight", frames=1)
+    flight = predicted_scene.write(folder / "predicted_on", frames=1)
     maps = folder / "predictions"
     produced(flight, maps)
     files = (maps / "labels/halves/000.png", maps / "scores/halves/000.npz", maps / "labels/halves/predictions.json")
@@ -69,7 +69,7 @@ def of_kept(folder: Path) -> Iterator[Kind]:
 
 def produced(flight: Path, maps: Path) -> Prediction:
     """The labels and scores of its first frame."""
-    scene = open_dataset("posed_folder", {"root": flight}).scene("flight")
+    scene = open_dataset("posed_folder", {"root": flight}).scene(flight.name)
     return Producer(scene, Halves(), maps, "halves", scores=True).read(0, scores=True)
 
 
