@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+
 import doctor
 import numpy as np
 import pytest
@@ -40,7 +42,10 @@ def test_a_run_says_the_same_and_goes_on(frames, tmp_path):
     mirrored = next(each for each in LABELS if "mirrored" in each.name)
     folder = write(tmp_path / "room", mirrored.plant(frames))
     result = bench("run", "--data", folder, "--voxel-size", "0.2", "-b", "numpy", cwd=tmp_path)
-    assert "labels of net are mirrored left to right" in words(result)
+    note, verdict = (words(result).index(text) for text in ("note: labels of net are mirrored left to right", "alpha"))
+    assert note < verdict
+    (kept,) = json.loads(next(tmp_path.glob("runs/*/summary.json")).read_text())["notes"].values()
+    assert any("mirrored" in text for text in kept)
 
 
 @pytest.mark.parametrize("seed", [0, 1])

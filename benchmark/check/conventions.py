@@ -98,11 +98,6 @@ class Reading:
     names: tuple[str, ...] = ()
 
     @property
-    def known(self) -> frozenset[str]:
-        """Names of the settings that the dataset has, set or not."""
-        return frozenset(self.names)
-
-    @property
     def convention(self) -> Convention:
         """The configured convention."""
         names = {"pose": "pose_convention", "axes": "camera_axes", "depth": "depth_kind"}

@@ -39,7 +39,6 @@ from semstab.data.labels import IGNORE_8BIT, IGNORE_16BIT, LabelSpace
 from semstab.data.results import VoxelAdvice
 from semstab.datasets import Scene, open_dataset
 from semstab.errors import DataError
-from semstab.predict.dataset import PredictedScene
 from semstab.task import frame_indices, selected
 
 # The classes that a label source predicts, their frequencies, and the ids that no class has.
@@ -142,8 +141,8 @@ QUICK_POINTS = 2400
 CONFIRMING_CLUSTERS = 3
 """The quick check takes so many points from one position, and from so many positions before it refuses data."""
 
-LABEL_RUNS, QUICK_LABEL_RUNS = 6, 2
-"""Numbers of runs of five frames in which label maps are compared with depth, colour and each other."""
+LABEL_RUNS = 6
+"""Number of runs of five frames in which label maps are compared with depth, colour and each other."""
 
 LABELLED_FRAMES = 8
 """Frames in which the labels of every model but the first are counted."""
@@ -317,14 +316,6 @@ def label_findings(scene: Scene, indices: Sequence[int], models: Sequence[str], 
         with contextlib.suppress(DataError):
             space = scene.label_space(model)
         yield check_labels(scene, indices, model, space, runs)
-
-
-def quick_labels(scene: Scene, indices: Sequence[int], models: Sequence[str]) -> list[str]:
-    """Return what a few frames show to be wrong with label files; nothing is predicted or simulated for it."""
-    if scene.folder is None or isinstance(scene, PredictedScene):
-        return []
-    found = label_findings(scene, indices, models, QUICK_LABEL_RUNS)
-    return [line for each in found for line in (*each.wrong, *each.remarks)]
 
 
 def require_sound(scene: Scene, indices: Sequence[int], options: Mapping[str, Any] | None = None) -> Verdict:

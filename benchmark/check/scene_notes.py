@@ -1,28 +1,35 @@
-"""The remarks of `check` on a scene, for a run of one of its models."""
+"""The notes of `check` on a scene, for a run of one of its models: fewer frames, the same words."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 
 from semstab.check.registration import REGISTERED_FRAMES, notes
-from semstab.check.scene_check import MADE, POINTS, Inspection
+from semstab.check.scene_check import POINTS, Inspection, label_findings
 from semstab.config import Config
 from semstab.datasets import Scene
 from semstab.predict.dataset import NAME as PREDICTED
+
+LABEL_RUNS = 2
+"""Number of runs of five frames in which label maps are compared with depth, colour and each other."""
 
 
 def scene_notes(scene: Scene, indices: Sequence[int], model: str, config: Config) -> tuple[str, ...]:
     """Return what looks wrong in depth and labels of a model, or its images, but may be right; in the words of `check`.
 
-    Labels that are predicted in memory are those of the images, which are compared with the depth before any is
-    predicted. A simulated scene has no remarks.
+    Labels that the run predicts are those of the images, which are compared with the depth before any is predicted. A
+    scene without files, simulated or in a program's memory, has no notes.
 
     Raises:
         DataError: If a frame cannot be read.
     """
-    if config.dataset.name == MADE:
+    if scene.folder is None:
         return ()
-    source = None if config.dataset.name == PREDICTED else model
-    inspection = Inspection(scene, indices, source, (), POINTS, fused=REGISTERED_FRAMES)
+    predicted = config.dataset.name == PREDICTED
+    inspection = Inspection(scene, indices, None if predicted else model, (), POINTS, fused=REGISTERED_FRAMES)
     views = [inspection.views[at] for at in sorted(inspection.views)]
-    return tuple(notes(scene, views, inspection.reading(config.dataset.options), model))
+    found = [] if predicted else label_findings(scene, indices, [model], LABEL_RUNS)
+    return (
+        *(line for each in found for line in (*each.wrong, *each.remarks)),
+        *notes(scene, views, inspection.reading(config.dataset.options), model),
+    )

@@ -75,14 +75,14 @@ class Lateness:
         """Return name and value of the setting that mends it; None where there is none."""
         if self.seconds is not None:
             return "time_offset", f"{how.said.get('time_offset', 0.0) + self.seconds:.4g}"
-        if self.frames == round(self.frames) and "pose_shift" in how.known:
+        if self.frames == round(self.frames) and "pose_shift" in how.names:
             return "pose_shift", f"{(how.said.get('pose_shift') or 0) + round(self.frames)}"
         return None
 
 
 def with_lateness(verdict: Verdict, scene: Scene, sample: Sample, how: Reading) -> Verdict:
     """Return the verdict, with an offset between poses and frames if one explains the error."""
-    if verdict.mend or (late := find_lateness(scene, sample, stamped="time_offset" in how.known)) is None:
+    if verdict.mend or (late := find_lateness(scene, sample, stamped="time_offset" in how.names)) is None:
         return verdict
     if not late.whole:
         return dataclasses.replace(verdict, remarks=(*verdict.remarks, late.text(how)))

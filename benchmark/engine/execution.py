@@ -11,7 +11,7 @@ from collections import deque
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from semstab.check import Verdict, advise, quick_labels, quick_sample, refuse_unsound, with_voxel_size
+from semstab.check import Verdict, advise, quick_sample, refuse_unsound, with_voxel_size
 from semstab.check.scene_notes import scene_notes
 from semstab.config import Config
 from semstab.core.process import trim_malloc
@@ -163,32 +163,22 @@ class _Execution:
 
     def _check_geometry(self, config: Config, missing: Sequence[PlannedUnit]) -> None:
         """Check the geometry and the voxel size of each scene of missing units; those report errors of reading."""
-        tasks = {each.task.scene.name: each.task for each in reversed(missing) if not each.regions}
+        fused = {(each.unit.scene, each.unit.model): each.task for each in reversed(missing) if not each.regions}
+        tasks = {scene: task for (scene, _), task in fused.items()}
         verdicts: dict[str, Verdict] = {}
-        remarks: dict[str, list[str]] = {}
-        models: dict[str, list[str]] = {}
-        for each in missing:
-            if not each.regions:
-                models.setdefault(each.task.scene.name, []).append(each.task.model)
         for task in reversed(tasks.values()):
             with contextlib.suppress(DataError):
                 verdicts[task.scene.name], sample = quick_sample(task.scene, task.indices, config.dataset.options)
                 if (advice := advise(sample, config)) is not None:
                     self.units.advice[task.scene.name] = advice
-                found = quick_labels(task.scene, task.indices, models[task.scene.name])
-                remarks[task.scene.name] = [*verdicts[task.scene.name].remarks, *found]
         for scene, verdict in verdicts.items():
             refuse_unsound(scene, verdict)
-            for remark in dict.fromkeys(remarks.get(scene, ())):
-                logger.warning("%s: %s", scene, remark)
             self._observers.tell(
                 lambda observer, scene=scene, verdict=verdict: observer.geometry_checked(tasks[scene], verdict)  # type: ignore[misc]
             )
         self.units.geometry = verdicts
-        for task in {
-            (each.task.scene.name, each.task.model): each.task for each in missing if not each.regions
-        }.values():
-            with contextlib.suppress(DataError):
-                self.units.notes[task.scene.name, task.model] = scene_notes(
-                    task.scene, task.indices, task.model, config
-                )
+        for (scene, model), task in fused.items():
+            if scene in verdicts:
+                with contextlib.suppress(DataError):
+                    found = scene_notes(task.scene, task.indices, model, config)
+                    self.units.notes[scene, model] = (*verdicts[scene].remarks, *found)
