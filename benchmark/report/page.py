@@ -264,7 +264,7 @@ def _timeline(records: Sequence[Record], colors: Mapping[str, int]) -> Iterator[
     series = {r.unit.model: read_series(r.series) for r in records if r.series is not None and r.series.exists()}
     for columns, title, unit in (
         (("compensated_flicker_percent",), "Flicker", "flicker, % of the pixels"),
-        (("lone_percent", "lone_null_percent"), "Frames that stand alone", "alone less its null, % of the places"),
+        (("lone_percent", "lone_null_percent"), "Frames that stand alone", "% of the places, less null"),
     ):
         lines = []
         for name, own in series.items():
