@@ -107,6 +107,24 @@ def test_files_beside_it_can_be_imported(file, tmp_path):
     np.testing.assert_array_equal(labels_of(create(f"{other}:Best")), WANTED)
 
 
+@pytest.mark.parametrize("lazy", [False, True], ids=["at the top", "while it predicts"])
+def test_two_repositories_may_call_their_modules_the_same(tmp_path, lazy):
+    """Each network gets what lies beside its own file, also where they take turns."""
+    line = "from net.layers import SIGN\nimport helpers_of_a_net as helpers\n"
+    body = "return ((SIGN + helpers.SIGN) * (image.mean(axis=2) - 128.0) > 0).astype(int)\n"
+    inside = line.replace("\n", "\n        ") if lazy else ""
+    for name, sign in (("first", 1), ("second", -1)):
+        (tmp_path / name / "net").mkdir(parents=True)
+        (tmp_path / name / "net/layers.py").write_text(f"SIGN = {sign}\n")
+        (tmp_path / name / "helpers_of_a_net.py").write_text(f"SIGN = {sign}\n")
+        text = f"class Net:\n    classes = ['dark', 'bright']\n    def predict(self, image):\n        {inside}{body}"
+        (tmp_path / name / "model.py").write_text(("" if lazy else line) + text)
+    first, second = (create(f"{tmp_path / name / 'model.py'}:Net") for name in ("first", "second"))
+    for _ in range(2):
+        np.testing.assert_array_equal(labels_of(first), WANTED)
+        np.testing.assert_array_equal(labels_of(second), IMAGE.mean(axis=2) < 128)
+
+
 def test_a_model_of_ones_own(tmp_path):
     text = """
 from semstab.models import Model, Prediction

@@ -100,7 +100,13 @@ def absolute(name: str) -> str:
 
 
 def guarded(text: str, do: Callable[[], T]) -> T:
-    """Run a user's code, and turn an error in it into one line with the position where it was raised."""
+    """Run a user's code, and turn an error in it into one line with the position where it was raised.
+
+    What a file imports is looked for beside it before it is looked for beside other files.
+    """
+    source = text.rpartition(":")[0]
+    if source.endswith(".py"):
+        _import_first_from(Path(source).expanduser().resolve().parent)
     try:
         with printing_aside():
             return do()
@@ -143,7 +149,6 @@ def _of_file(path: Path) -> ModuleType:
     assert spec is not None
     assert spec.loader is not None
     module = importlib.util.module_from_spec(spec)
-    _may_import_from(path.resolve().parent)
     sys.modules[name] = module
     try:
         spec.loader.exec_module(module)
@@ -157,3 +162,26 @@ def _may_import_from(folder: Path) -> None:
     """Append the folder to the search path, where nothing in it replaces an installed package."""
     if str(folder) not in sys.path:
         sys.path.append(str(folder))
+
+
+def _import_first_from(folder: Path) -> None:
+    """Search the folder before those of other users' files, and forget modules of theirs that it has by the same name.
+
+    Two networks from two repositories often have a `model.py` or a package `utils` each.
+    """
+    if _searched[:1] == [folder] or (folder not in _searched and str(folder) in sys.path):
+        return
+    others = [other for other in _searched if other != folder]
+    sys.path[:] = [name for name in sys.path if Path(name) not in _searched]
+    _searched[:] = [folder, *others]
+    sys.path.extend(map(str, _searched))
+    same = {path.stem for path in folder.iterdir()} & {path.stem for other in others for path in other.iterdir()}
+    for name in same & set(sys.modules):
+        module = sys.modules[name]
+        places = list(getattr(module, "__path__", [module.__file__ or ""]))
+        if any(Path(place).parent in others for place in places):
+            for part in [part for part in sys.modules if part.partition(".")[0] == name]:
+                del sys.modules[part]
+
+
+_searched: list[Path] = []  # folders of users' files that were appended to the search path, that of the last one first
