@@ -24,6 +24,7 @@ PACKAGES = {
     **{folder: f"semstab/{folder}" for folder in ("backends", "models", "datasets", "configs", "conformance")},
 }
 Done = subprocess.CompletedProcess[str]
+FEW = ("--scene", "scene0", "--frames", "::8", "--voxel-size", "0.4")
 BUILD = "import sys; from setuptools import build_meta; print(getattr(build_meta, sys.argv[1])(sys.argv[2]))"
 
 
@@ -102,7 +103,7 @@ def installed(built, tmp_path_factory: pytest.TempPathFactory) -> Path:
 def elsewhere(installed, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The folder in which the installed command has done its main job."""
     folder = tmp_path_factory.mktemp("elsewhere")
-    done = command(installed, folder, "--backend", "open3d", "--frames", "::4", "--out", "run")
+    done = command(installed, folder, "--backend", "open3d", *FEW, "--out", "run")
     assert done.returncode == 0, done.stderr
     return folder
 
@@ -128,9 +129,9 @@ def test_an_installed_wheel_does_its_main_job_in_any_folder(elsewhere, installed
     [
         (("export", "run", "--scene", "scene0", "--model", "sim-flicker", "--to", "map.laz"), "geo"),
         (("export", "run", "--scene", "scene0", "--model", "sim-flicker", "--to", "map.tif"), "geo"),
-        (("--predict", "segformer", "--out", "predicted"), "segformer"),
-        (("--predict", "model.pt", "--out", "predicted"), "torch"),
-        (("--predict", "model.onnx", "--out", "predicted"), "onnx"),
+        ((*FEW, "--predict", "segformer", "--out", "predicted"), "segformer"),
+        ((*FEW, "--predict", "model.pt", "--out", "predicted"), "torch"),
+        ((*FEW, "--predict", "model.onnx", "--out", "predicted"), "onnx"),
         (("--scheduler", "tcp://127.0.0.1:1", "--out", "far"), "cluster"),
         (("--backend", "torch", "--out", "accelerated"), "torch"),
     ],

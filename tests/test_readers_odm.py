@@ -729,8 +729,8 @@ def test_the_real_flight_in_a_turned_frame_lies_where_it_lay(brighton, tmp_path,
     assert here.georeference.turned is (known == "matrix")
     assert ("left from another version" in caplog.text) is (known != "matrix")
     np.testing.assert_allclose(where_cameras_lie(here), where_cameras_lie(there), atol=1e-4)
-    for index in (0, 9):
-        ours, theirs = here.geometry(index), there.geometry(index)
+    if known == "matrix":
+        ours, theirs = here.geometry(9), there.geometry(9)
         both = (ours.depth > 0) & (theirs.depth > 0)
         assert np.mean((ours.depth > 0) != (theirs.depth > 0)) < 3e-4
         gap = here.georeference.projected(seen(ours, both)) - there.georeference.projected(seen(theirs, both))
