@@ -274,7 +274,7 @@ def write_shots(folder: Path, shift: float = 0.0) -> None:
 
 def where_cameras_lie(scene) -> np.ndarray:
     """(n, 3) in the projection."""
-    return scene.georeference.projected(np.array([scene.geometry(k).T_wc[:3, 3] for k in range(len(scene))]))
+    return scene.georeference.projected(np.array([scene.T_wc(k)[:3, 3] for k in range(len(scene))]))
 
 
 @pytest.mark.parametrize("absolute", [True, False])
