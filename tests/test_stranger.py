@@ -20,10 +20,11 @@ from semstab.config import read_yaml
 from semstab.data.frames import Frame, Intrinsics
 from semstab.errors import DataError
 from semstab.metrics import split_last, summarise
+from semstab.predict.predictor import parse_predictor
 from semstab.report.narrative import notes
 from semstab.report.tables import tables
 from semstab.report.terminal import print_summary
-from semstab.settings import load_config, resolve
+from semstab.settings import load_config, predicted_config, resolve
 
 
 def printed(result, **options) -> str:
@@ -123,6 +124,14 @@ def test_without_a_voxel_size_own_data_gets_what_check_suggests(wide, tmp_path) 
     assert size == checked.suggestion.voxel_size == result.select()[0].summary.table.voxel_size
     assert read_yaml(tmp_path / "run" / "config.yaml")["voxel_size"] == size
     assert checked.persistence[1].voxel_size == size
+
+
+def test_a_model_on_the_built_in_city_has_the_voxels_of_the_citys_own_models() -> None:
+    city = {"name": "city", "options": {"width": 64, "height": 48, "frames": 8}}
+    given = {"dataset": city, "check": None, "scenes": ["scene0"]}
+    own = resolve(load_config(given))
+    predicted = resolve(predicted_config([parse_predictor("colour-clusters")], None, given))
+    assert semstab.run(predicted, report=False).select()[0].summary.table.voxel_size == own.voxel_size
 
 
 def test_a_given_voxel_size_is_told_where_it_lies(wide) -> None:

@@ -39,6 +39,7 @@ from semstab.data.labels import IGNORE_8BIT, IGNORE_16BIT, LabelSpace
 from semstab.data.results import VoxelAdvice
 from semstab.datasets import Scene, open_dataset
 from semstab.errors import DataError
+from semstab.predict.dataset import NAME as PREDICTED
 from semstab.task import frame_indices, selected
 
 # The classes that a label source predicts, their frequencies, and the ids that no class has.
@@ -493,7 +494,7 @@ def with_voxel_size(config: Config, scenes: Mapping[str, Scene]) -> tuple[Config
 
     The advice says scene by scene why that size was suggested.
     """
-    if config.sets_voxel_size or config.dataset.name == MADE:
+    if config.sets_voxel_size or _is_made(config):
         return config, {}
     some = [[*scenes.values()][k] for k in evenly(len(scenes), SCENES)]
     coverages = {scene.name: coverage for scene in some if (coverage := _coverage(config, scene)) is not None}
@@ -507,11 +508,17 @@ def with_voxel_size(config: Config, scenes: Mapping[str, Scene]) -> tuple[Config
 
 def advise(sample: Sample | None, config: Config) -> VoxelAdvice | None:
     """Return how the configured voxel size compares with the suggested one; None where the data do not tell."""
-    if sample is None or not sample.pairs or config.dataset.name == MADE:
+    if sample is None or not sample.pairs or _is_made(config):
         return None
     coverage = Coverage(sample)
     stays = coverage.stays(config.voxel_size)
     return None if math.isnan(stays) else VoxelAdvice(config.voxel_size, stays, suggested_size(coverage), chosen=False)
+
+
+def _is_made(config: Config) -> bool:
+    """Return whether the scenes are simulated, also where models predict on their images."""
+    dataset = config.dataset
+    return (dataset.options["dataset"]["name"] if dataset.name == PREDICTED else dataset.name) == MADE
 
 
 def _coverage(config: Config, scene: Scene) -> Coverage | None:
