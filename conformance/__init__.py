@@ -6,13 +6,10 @@ through the same door: `python -m semstab.conformance.fuse BACKEND CASE OUT`.
 
 from __future__ import annotations
 
-import atexit
 import functools
 import importlib.resources
 import shlex
-import shutil
 import subprocess
-import tempfile
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,6 +18,7 @@ from semstab.config import nearest
 from semstab.conformance.files import EXPECTED, differences, read_case, read_rows, read_table, write_case, write_rows
 from semstab.conformance.formulas import FORMULAS
 from semstab.conformance.random_cases import RANDOM, random_frames, seed_of, write_random
+from semstab.core.files import ScratchFolder
 from semstab.data.voxels import VoxelTable
 from semstab.errors import ConfigError, DataError, summarize_error
 
@@ -78,7 +76,7 @@ def expected_table(name: str) -> VoxelTable:
 
 @functools.cache
 def _written(name: str) -> Path:
-    folder = _temporary() / name.replace(":", "_")
+    folder = _scratch().path / name.replace(":", "_")
     seed = seed_of(name)
     if seed is None:
         FORMULAS[name].write(folder)
@@ -88,10 +86,8 @@ def _written(name: str) -> Path:
 
 
 @functools.cache
-def _temporary() -> Path:
-    folder = tempfile.mkdtemp(prefix="semstab-conformance-")
-    atexit.register(shutil.rmtree, folder, ignore_errors=True)
-    return Path(folder)
+def _scratch() -> ScratchFolder:
+    return ScratchFolder()
 
 
 def conform(command: str, only: Sequence[str] = (), tolerance: float = TOLERANCE, random: int = 0) -> Iterator[Verdict]:
@@ -113,8 +109,8 @@ def conform(command: str, only: Sequence[str] = (), tolerance: float = TOLERANCE
         raise ConfigError("name the program that fuses a case: semstab-bench conform 'PROGRAM OPTIONS'")
     for name in names:
         folder = case_folder(name)
-        with tempfile.TemporaryDirectory() as temporary:
-            out = Path(temporary) / "table.csv"
+        with ScratchFolder() as temporary:
+            out = temporary / "table.csv"
             problem = _ran(words, folder, out) or compared(folder, out, tolerance)
         yield Verdict(name, problem)
 

@@ -12,7 +12,6 @@ import io
 import json
 import math
 import os
-import tempfile
 import zipfile
 import zlib
 from collections.abc import Iterable, Mapping, Sequence
@@ -23,7 +22,7 @@ from typing import Any
 import numpy as np
 
 from semstab.config import nearest
-from semstab.core.files import atomic_path, parse_json, read_limited
+from semstab.core.files import ScratchFolder, atomic_path, parse_json, read_limited
 from semstab.core.json_form import from_json, to_json
 from semstab.data import earlier
 from semstab.data.contrast import FrameShare
@@ -325,8 +324,8 @@ def load_summary(path: str | Path) -> tuple[str, dict[str, Entry]]:
             f"{path}: it is neither a run's folder nor a small summary ({summarize_error(error)})"
         ) from error
     scenes = {}
-    with tempfile.TemporaryDirectory() as folder:
-        part = Path(folder) / "sums.parquet"
+    with ScratchFolder() as folder:
+        part = folder / "sums.parquet"
         for own, data in zip(content.scenes, files, strict=True):
             part.write_bytes(data)
             try:
@@ -345,10 +344,10 @@ def _numbers(own: EntryNumbers) -> dict[str, Any]:
 def _archive(content: str, sums: list[ClusterSums]) -> bytes:
     """Return the file, byte for byte the same for the same content."""
     data = io.BytesIO()
-    with zipfile.ZipFile(data, "w", zipfile.ZIP_DEFLATED) as archive, tempfile.TemporaryDirectory() as folder:
+    with zipfile.ZipFile(data, "w", zipfile.ZIP_DEFLATED) as archive, ScratchFolder() as folder:
         archive.writestr(zipfile.ZipInfo(CONTENT), content, zipfile.ZIP_DEFLATED)
         for i, own in enumerate(sums):
-            part = Path(folder) / "sums.parquet"
+            part = folder / "sums.parquet"
             own.save(part)
             archive.writestr(zipfile.ZipInfo(f"{i}.parquet"), part.read_bytes())
     return data.getvalue()

@@ -137,6 +137,8 @@ def only_writer(path: str | Path) -> Iterator[None]:
 class ScratchFolder:
     """A temporary folder that is removed with the last reference to it, with its process, or after a kill by the next.
 
+    In a `with` statement it is its path, and is removed at the end of the block.
+
     Attributes:
         path: The folder, empty.
     """
@@ -154,6 +156,12 @@ class ScratchFolder:
         self.path = own / "files"  # a run locks it
         self.path.mkdir()
         self.remove = weakref.finalize(self, _remove_scratch, own, handle)
+
+    def __enter__(self) -> Path:
+        return self.path
+
+    def __exit__(self, *_: object) -> None:
+        self.remove()
 
 
 def _remove_scratch(own: Path, handle: int) -> None:

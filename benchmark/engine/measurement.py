@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import tempfile
 from collections.abc import Callable, Mapping
 from functools import partial
 from pathlib import Path
@@ -14,7 +13,7 @@ import numpy.typing as npt
 
 from semstab.backends.numpy_reference import NumpySample, in_sample
 from semstab.config import Config
-from semstab.core.files import atomic_path, file_digest
+from semstab.core.files import ScratchFolder, atomic_path, file_digest
 from semstab.core.process import Stopwatch, trim_malloc
 from semstab.core.types import Float64
 from semstab.data.events import Events
@@ -310,9 +309,9 @@ def written(start: Start, savers: Savers) -> tuple[dict[str, str], dict[str, byt
             save(start.folder / name)
         return {name: file_digest(start.folder / name).hex() for name in savers}, {}
     digests, returned = {}, {}
-    with tempfile.TemporaryDirectory() as elsewhere:
+    with ScratchFolder() as elsewhere:
         for name, save in savers.items():
-            path = Path(elsewhere) / name
+            path = elsewhere / name
             save(path)
             digests[name], returned[name] = file_digest(path).hex(), path.read_bytes()
     return digests, returned
