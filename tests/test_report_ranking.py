@@ -9,8 +9,10 @@ from rich.console import Console
 
 import semstab
 from semstab.comparison.gate import gate, gate_config
+from semstab.predict.predictor import parse_predictors
 from semstab.report.ranking import answers, ranking
 from semstab.report.terminal import print_summary
+from semstab.settings import predicted_config, resolve
 
 ERRORS = {"place": 0.05, "view": 0.05, "cell": 2.0, "flicker": 0.03}
 
@@ -54,6 +56,27 @@ def test_every_pair_is_compared_and_corrected(result):
 def test_a_map_of_nearly_one_class_has_no_rank(result):
     assert ranking(result[0]).unranked == ("constant",)
     assert "not ranked, as nearly the whole map is one class: constant" in list(answers(result[0]))
+
+
+SIX = ["colour-clusters,clusters=6,name=six", "colour-clusters,clusters=6,seed=2,name=other"]
+
+
+@pytest.mark.parametrize(
+    ("models", "compared", "said"),
+    [
+        (SIX, ("six", "other"), "not compared, as the classes of the others differ: five"),
+        (SIX[:1], None, "not compared, as their classes differ: six, five"),
+    ],
+)
+def test_models_with_other_classes_are_named_and_the_rest_is_compared(models, compared, said, tmp_path):
+    city = {"name": "city", "options": {"frames": 24, "width": 160, "height": 90}}
+    given = {"dataset": city, "check": None, "scenes": ["scene0"], "frames": {"count": 12}, "statistics": True}
+    predictors = parse_predictors([*models, "colour-clusters,clusters=5,name=five"])
+    result = semstab.run(resolve(predicted_config(predictors, None, given)), out=tmp_path / "run", report=False)
+    *answer, last = answers(result)
+    assert last == said
+    assert [text.split()[0] in compared for text in answer] == ([True] if compared else [])
+    assert [each.models for each in result.comparisons] == ([compared] if compared else [])
 
 
 def test_the_answer_stands_above_the_table(result):

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from semstab.core.palette import MODEL_COLORS, dash, marker, model_color
+from semstab.metrics import CATEGORY_COLORS
 from semstab.report.ranking import short
 from semstab.report.tables.stability import one_in
 from semstab.report.terminal import laid_out, percents
@@ -53,3 +54,8 @@ def test_models_of_one_colour_differ_in_marker_or_dash() -> None:
     styles = {(model_color(k), dash(k), marker(k)) for k in range(count)}
     assert len(styles) == count
     assert len({model_color(k) for k in range(12)}) == 12
+
+
+def test_no_model_has_the_colour_of_a_stability_category() -> None:
+    models, categories = np.array(MODEL_COLORS, float), np.array(CATEGORY_COLORS, float)
+    assert np.linalg.norm(models[:, None] - categories, axis=2).min() > 50

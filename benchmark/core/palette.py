@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 MODEL_COLORS = (
-    (0, 114, 178), (213, 94, 0), (0, 158, 115), (204, 121, 167), (176, 125, 0), (58, 150, 200),
-    (122, 92, 200), (176, 48, 96), (107, 142, 35), (0, 139, 139), (138, 109, 59), (127, 127, 127),
+    (0, 158, 115), (122, 92, 200), (160, 125, 20), (204, 121, 167), (58, 150, 200), (176, 48, 96),
+    (107, 142, 35), (60, 130, 105), (138, 109, 59), (148, 103, 189), (199, 140, 120), (95, 115, 135),
 )  # fmt: skip
-"""RGB of each model in order: those of Okabe and Ito that show on both grounds, then others of like lightness."""
+"""RGB of each model in order, of like lightness, and none that a stability category has (`CATEGORY_COLORS`)."""
 
 DASHES, MARKERS = ("", "6 3", "2 2.5"), ("circle", "square", "diamond", "triangle", "cross")
 """Patterns of lines, and markers, by which models are told apart where colours are not."""

@@ -8,7 +8,7 @@ import importlib.resources
 import reprlib
 import unicodedata
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -381,6 +381,12 @@ def _taxonomy_text(name: str) -> tuple[str, str]:
         return read_limited(path, MAX_YAML_BYTES).decode("utf-8"), str(path)
     except (OSError, UnicodeDecodeError) as error:
         raise ConfigError(f"{path}: the taxonomy cannot be read ({error})") from error
+
+
+def sharing_classes(classes: Mapping[str, tuple[str, ...]]) -> tuple[str, ...]:
+    """Return the models that can be compared: those with the classes that most of them have, if two or more have."""
+    ((most, count),) = Counter(classes.values()).most_common(1) or [((), 0)]
+    return tuple(model for model, own in classes.items() if own == most) if count > 1 else ()
 
 
 def name_key(name: str) -> str:

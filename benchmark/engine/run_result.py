@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import importlib.metadata
 import itertools
 import platform
@@ -16,6 +15,7 @@ from semstab.check import Verdict
 from semstab.config import BACKENDS, BASE, Config
 from semstab.core.process import Stopwatch
 from semstab.data.events import Events
+from semstab.data.labels import sharing_classes
 from semstab.data.records import REGIONS, Failure, Record, Result, Tables, UnitContent
 from semstab.data.results import Agreement, VoxelAdvice
 from semstab.data.tiles import Tiles, side_by_side
@@ -140,26 +140,33 @@ def _comparisons(config: Config, records: Sequence[Record], tables: Tables) -> I
             files = {record.unit.model: record.observations_file for record in there}
             loaded = {name: CellObservations.load(file) for name, file in files.items() if file and file.exists()}
             regions, observations = _regions_of(there, config, tables), loaded if len(loaded) == len(there) else None
-            mixed = len({record.summary.reduced is None for record in there}) > 1
-            if (compared := _compared_maps(scene, regions, observations, mixed=mixed)) is not None:
+            of_labels = {record.unit.model: record.summary.reduced is None for record in there}
+            if (compared := _compared_maps(scene, regions, observations, of_labels)) is not None:
                 yield compared
 
 
 def _compared_maps(
-    scene: str, regions: Regions, observations: Mapping[str, CellObservations] | None, *, mixed: bool
+    scene: str, regions: Regions, observations: Mapping[str, CellObservations] | None, of_labels: Mapping[str, bool]
 ) -> ModelComparison | None:
-    """Return the comparison of a scene's maps; None where there are not two or more of them in one label space.
+    """Return the comparison of a scene's maps in the label space that most have; None without two such maps.
 
     The samples of all of them give matched observations.
     """
     first = next(iter(regions()))
-    classes = {table.classes for table in first.tables.values()}
-    if len(first.tables) < 2 or len(classes) > 1:
+    names = sharing_classes({name: table.classes for name, table in first.tables.items()})
+    if not names:
         return None
-    if first.truth is not None and first.truth.classes not in classes:
-        without = lambda: (dataclasses.replace(own, truth=None) for own in regions())  # noqa: E731
-        return _compared_maps(scene, without, observations, mixed=mixed)
-    return compare_regions(regions, observations=observations, mixed=mixed, scene=scene)
+    classes = first.tables[names[0]].classes
+
+    def comparable() -> Iterator[Region]:
+        for own in regions():
+            tables = {name: own.tables[name] for name in names}
+            logs = None if own.events is None else {name: own.events[name] for name in names}
+            truth = own.truth if own.truth is not None and own.truth.classes == classes else None
+            yield Region(tables, logs, truth, own.share)
+
+    mixed = len({of_labels[name] for name in names}) > 1
+    return compare_regions(comparable, observations=observations, mixed=mixed, scene=scene)
 
 
 def _regions_of(there: Sequence[Record], config: Config, tables: Tables) -> Regions:

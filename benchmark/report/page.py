@@ -386,8 +386,10 @@ def _title(result: Result) -> str:
 
 
 def _subtitle(result: Result) -> str:
-    units = {record.key for record in result.records}  # a sweep and the base share units
-    counts = [(len(result.scenes), "scene"), (len(result.models), "model"), (len(units), "unit")]
+    maps = {record.key for record in result.records}  # a sweep and the base share maps
+    counts = [(len(result.scenes), "scene"), (len(result.models), "model")]
+    if result.sweeps():
+        counts.append((len(maps), "map"))
     parts = [f"{n:,} {name}{'' if n == 1 else 's'}" for n, name in counts]
     if records := result.select():
         run = records[0].summary

@@ -10,6 +10,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+from semstab.data.labels import sharing_classes
 from semstab.data.records import Record, Result
 from semstab.data.statistics import StabilityVerdict
 from semstab.datasets import GROUND_TRUTH
@@ -51,11 +52,13 @@ class Ranking:
             be more stable, so that models without a shown difference can share it.
         differences: Of all pairs, each in the order of the models in the run.
         unranked: Models whose map is nearly one class, about which alpha tells nothing.
+        apart: Models with other classes than most, which cannot be compared with those.
     """
 
     ranks: tuple[tuple[int, tuple[str, ...]], ...]
     differences: tuple[Difference, ...]
     unranked: tuple[str, ...] = ()
+    apart: tuple[str, ...] = ()
 
 
 def ranking(result: Result) -> Ranking:
@@ -89,6 +92,8 @@ def _files(records: list[Record]) -> Files:
 def _ranking(scenes: tuple[Files, ...], names: tuple[str, ...]) -> Ranking:
     """Return the ranking of some models, which terminal and report ask for one after the other."""
     sums = [_common_sums(files) for files in scenes] if len(names) > 1 else []
+    apart = tuple(name for name in names if sums and name not in sums[0])
+    names = tuple(name for name in names if name not in apart)
     known = [own for own in sums if {*names} <= own.keys()]
     pairs = list(itertools.combinations(names, 2)) if known else []
     changes = [mean_of([difference(own[b], own[a], ALPHA.key) for own in known]) for a, b in pairs]
@@ -107,7 +112,7 @@ def _ranking(scenes: tuple[Files, ...], names: tuple[str, ...]) -> Ranking:
             better[each.other if each.value > 0 else each.model] += 1
     order = sorted(alpha, key=lambda name: (better[name], -alpha[name]))
     ranks = tuple((1 + n, tuple(own)) for n, own in itertools.groupby(order, key=better.__getitem__))
-    return Ranking(ranks, differences)
+    return Ranking(ranks, differences, apart=apart)
 
 
 def answers(result: Result) -> Iterator[str]:
@@ -131,6 +136,10 @@ def answers(result: Result) -> Iterator[str]:
         )
     if ranked.unranked:
         yield f"not ranked, as nearly the whole map is one class: {', '.join(ranked.unranked)}"
+    if ranked.apart and not ranked.ranks:
+        yield f"not compared, as their classes differ: {', '.join(ranked.apart)}"
+    elif ranked.apart:
+        yield f"not compared, as the classes of the others differ: {', '.join(ranked.apart)}"
 
 
 def short(value: float, sign: str = "", *, digits: int = 2) -> str:
@@ -149,7 +158,7 @@ def _is_uninformative(record: Record) -> bool:
 
 
 def _common_sums(files: Files) -> Mapping[str, ClusterSums]:
-    """Return the sums of the observations that all models of a scene made; none where their classes differ."""
-    observations = {name: CellObservations.load(file) for name, file, _ in files}
-    same = len({own.classes for own in observations.values()}) == 1
-    return compared_observations(observations).sums if same else {}
+    """Return the sums of the observations that all models of a scene with the same classes made."""
+    loaded = {name: CellObservations.load(file) for name, file, _ in files}
+    names = sharing_classes({name: own.classes for name, own in loaded.items()})
+    return compared_observations({name: loaded[name] for name in names}).sums if names else {}
