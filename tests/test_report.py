@@ -146,11 +146,11 @@ def pixels(source):
     return Image.open(io.BytesIO(base64.b64decode(source.partition(";base64,")[2])))
 
 
-def test_the_page_says_units_failures_and_where_the_numbers_come_from(walls, tmp_path_factory):
+def test_the_page_says_maps_failures_and_where_the_numbers_come_from(walls, tmp_path_factory):
     result, text = walls[0], plain(walls[2].text)
     _, folder = wall_study(tmp_path_factory.getbasetemp())
     units = json.loads((folder / "manifest.json").read_text())["units"]["units"]
-    assert f"{units // 2} units" in text  # those of one of the two models
+    assert f"{units // 2} maps" in text  # those of one of the two models
     for line in ("1 failed", 'out of memory <script>alert("x")</script>', "voxel size 0.001, repeat 0"):
         assert line in text
     assert result.manifest["python"] in text
