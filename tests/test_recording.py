@@ -43,6 +43,8 @@ from semstab.recording import (
 )
 from semstab.recording.layout import Legend, SceneBounds, direction, fit
 from semstab.recording.timeline import OF_THE_MODEL, Clock, log_file
+from semstab.report.ranking import answers
+from semstab.report.terminal import row_of
 from semstab.task import Task
 
 NANOSECONDS = 1_000_000_000
@@ -204,14 +206,43 @@ def test_the_blueprint_shows_every_series_and_every_model(run) -> None:
     pictures = {f"{model}: {what}" for model in "ab" for what in ("labels", *drift.PICTURES.values())}
     for views in read_blueprints(run / "recording.rrd"):
         names = {row["ViewBlueprint:display_name"][0] for row in views if "ViewBlueprint:display_name" in row}
-        assert names >= {*SERIES.values(), *maps, *pictures, "Classes", "Notes", "Depth", "Top contributing frames"}
+        others = {"Classes", "Notes", "Depth", "Top contributing frames", "Verdict"}
+        assert names >= {*SERIES.values(), *maps, *pictures, *others}
+
+
+def test_the_viewer_opens_on_the_stability_categories(run) -> None:
+    for rows in read_blueprints(run / "recording.rrd"):
+        named = {row["rerun.entity"]: row for row in rows if "ContainerBlueprint:display_name" in row}
+        (category,) = (
+            at for at, row in named.items() if row["ContainerBlueprint:display_name"] == [color_modes()["category"].tab]
+        )
+        opened = [row["ContainerBlueprint:active_tab"] for row in rows if row.get("ContainerBlueprint:active_tab")]
+        assert [category.removeprefix("/")] in [[at.removeprefix("/") for at in tab] for tab in opened]
+
+
+def test_the_verdict_is_that_of_the_terminal(run) -> None:
+    (*_, last) = (row["TextDocument:text"][0] for row in read(run / "recording.rrd")["/wall/verdict"])
+    result = semstab.load(run).result
+    rows = [row_of(record) for record in result.select()]
+    assert [line for line in last.splitlines() if line.startswith(("| a ", "| b "))] == [
+        f"| {' | '.join(row[:3])} |" for row in rows
+    ]
+    assert last.startswith("".join(f"{line}\n" for line in answers(result)))
+
+
+def test_numbered_voxels_are_in_the_tab_that_explains_them_alone(run) -> None:
+    for rows in read_blueprints(run / "recording.rrd"):
+        queries = [content for row in rows for content in row.get("ViewContents:query") or []]
+        for model in "ab":
+            assert sum(content.endswith(f"/flips_at/{model}") for content in queries) == 1
+            assert sum(content.endswith(f"/{model}/flips") for content in queries) == 1
 
 
 def test_every_map_is_seen_from_above(run) -> None:
     blueprints = read_blueprints(run / "recording.rrd")  # one when the run starts, one when a model is fused
     eyes = [row for rows in blueprints for row in rows if "EyeControls3D:look_target" in row]
     assert len(blueprints) == 3
-    assert len(eyes) == 2 * 2 * len(color_modes())
+    assert len(eyes) == 2 * 2 * (len(color_modes()) + 1)  # and the map beside the flips
     table = semstab.VoxelTable.load(run / "voxels" / "wall__a__numpy.parquet")
     for eye in eyes:
         assert eye["EyeControls3D:position"][0][1] < table.centers[:, 1].min()  # from above: up is -y

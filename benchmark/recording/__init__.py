@@ -16,6 +16,8 @@ Entities, all below the scene's name:
 - `camera/MODEL/flips`: Points2D: those voxels in the frame, where their numbers lie inside its image
 - `difference/MODEL/A and B/PART`: VoxelGridMap: voxels where two backends differ
 - `difference_report/MODEL/A and B`: TextDocument: the number of these voxels
+- `verdict`: TextDocument: the answer of the run, and the verdict of each model
+- `categories`: Points2D: the stability categories and their colours
 - `legend`, `all_classes`: Points2D: the classes and their colours, those with the most voxels first
 - `log`: TextLog: each unit's final numbers
 

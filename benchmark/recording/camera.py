@@ -20,7 +20,7 @@ from semstab.data.voxels import VoxelTable
 from semstab.errors import DataError
 from semstab.metrics import dominant
 from semstab.recording import drift
-from semstab.recording.layout import Legend, SceneBounds
+from semstab.recording.layout import Legend, SceneBounds, log_categories
 from semstab.recording.timeline import Background, path
 from semstab.task import Task
 
@@ -82,6 +82,7 @@ class SceneLog:
             axes = f"RIGHT_HAND_{'XYZ'[axis]}_{'UP' if up[axis] > 0 else 'DOWN'}"
             stream.log(path(self.name), getattr(rr.ViewCoordinates, axes), static=True)
         self.legend.log(stream, self.name)
+        log_categories(stream, self.name)
         for task in self._tasks:
             for name, context in {"labels": label_context(task.mapping.target), **drift.contexts()}.items():
                 stream.log(path(self.name, "camera", task.model, name), context, static=True)

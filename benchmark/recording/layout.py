@@ -17,9 +17,10 @@ import rerun.blueprint as rrb
 from semstab.backends import REGISTRY
 from semstab.core.types import Float64, UInt8
 from semstab.data.labels import Color, LabelSpace
-from semstab.data.results import Unit
+from semstab.data.results import RECURRENT, Unit
 from semstab.data.voxels import VoxelTable
 from semstab.engine.units import Plan
+from semstab.metrics import CATEGORIES, CATEGORY_COLORS
 from semstab.recording.drift import PICTURES
 from semstab.recording.target import Target
 from semstab.recording.timeline import SERIES, entity, path
@@ -158,28 +159,45 @@ class Legend:
         return LINE * (needed if lines is None else min(needed, lines))
 
     def log(self, stream: rr.RecordingStream, scene: str) -> None:
-        """Log dots in the classes' colours, and their names in white, as a label has its point's colour."""
-        k = np.arange(len(self._voxels))
-        at = np.stack([k % self._columns * WIDTH / self._columns + DOT / 2, (k // self._columns + 0.5) * LINE], axis=1)
-        for name, shown in ("legend", self.entries[: self.room]), ("all_classes", self.entries):
-            names, colors = zip(*shown, strict=True)
-            middle = DOT + LETTER / 2 * np.array([len(each) for each in names])
-            right_of = at[: len(shown)] + np.stack([middle, np.full(len(shown), LABEL)], axis=1)
-            dots = rr.Points2D(at[: len(shown)], colors=colors, radii=rr.Radius.ui_points(5.0))
-            words = rr.Points2D(right_of, colors=(255, 255, 255), labels=names, radii=0.0, show_labels=True)
-            stream.log(path(scene, name), dots, static=True)
-            stream.log(path(scene, name, "names"), words, static=True)
+        """Log the classes."""
+        log_names(stream, path(scene, "legend"), self.entries[: self.room], self._columns)
+        log_names(stream, path(scene, "all_classes"), self.entries, self._columns)
+
+
+def log_categories(stream: rr.RecordingStream, scene: str) -> None:
+    """Log the names of the stability categories, the stable one first."""
+    entries = list(zip(CATEGORIES, CATEGORY_COLORS, strict=True))[::-1]
+    log_names(stream, path(scene, "categories"), entries, len(entries))
+
+
+def log_names(stream: rr.RecordingStream, entity: str, entries: Sequence[tuple[str, Color]], columns: int) -> None:
+    """Log dots in the colours of names, in a grid, and the names in white, as a label has its point's colour."""
+    names, colors = zip(*entries, strict=True)
+    k = np.arange(len(entries))
+    at = np.stack([k % columns * WIDTH / columns + DOT / 2, (k // columns + 0.5) * LINE], axis=1)
+    middle = DOT + LETTER / 2 * np.array([len(each) for each in names])
+    right_of = at + np.stack([middle, np.full(len(entries), LABEL)], axis=1)
+    dots = rr.Points2D(at, colors=colors, radii=rr.Radius.ui_points(5.0))
+    words = rr.Points2D(right_of, colors=(255, 255, 255), labels=names, radii=0.0, show_labels=True)
+    stream.log(entity, dots, static=True)
+    stream.log(f"{entity}/names", words, static=True)
 
 
 # The views.
 
+VERDICT = "verdict"
+"""The entity of a scene that holds the answer of the run."""
+
 # The sizes are for a window of 1500 x 850 points, as on laptops; other windows have similar proportions.
 LEFT, TITLE = (808, 538), 27
 """The width and height of the left part, and the height of a view's title or of a row of tabs."""
-DIFFERENCE_ASPECT, COMPARED_ASPECT, CHANGE_ASPECT = 2.2, 1.6, 1.2
+DIFFERENCE_ASPECT, COMPARED_ASPECT, CHANGE_ASPECT, FLIPS_ASPECT = 2.2, 1.6, 1.2, 1.2
 
 SIDE_BY_SIDE = 4
 """The most maps and cameras that are shown at once; more have a tab each."""
+
+OPENED = "category"
+"""The colouring of the maps that the viewer opens on."""
 
 OVERVIEW = ("drift", "compensated_flicker_percent", "map_vss", "map_recurrent")
 COMPARED = ("drift", "map_vss", "map_entropy", "map_recurrent", "new_voxels", "fuse_ms")
@@ -220,7 +238,7 @@ def view_3d(
 
 
 def _scene(scene: str, tasks: list[Task], legend: Legend, bounds: SceneBounds | None) -> rrb.Container:
-    flips = [_flips(scene, task) for task in tasks]
+    flips = [_flips(scene, task, bounds) for task in tasks]
     comparisons = [
         _comparison(task, drawn(task), other, bounds)
         for task in tasks
@@ -235,10 +253,11 @@ def _overview(scene: str, tasks: list[Task], legend: Legend, bounds: SceneBounds
     tabs: list[rrb.Container | rrb.View] = [
         _maps(name, tasks, bounds, LEFT[1] - TITLE - below) for name in color_modes()
     ]
+    opened = [*color_modes()].index(OPENED)
     if len(legend.entries) > legend.room:
         tabs.append(_legend(scene, "all_classes", "All classes", legend.height()))
     classes = _legend(scene, "legend", "Classes", legend.height(LINES))
-    left = rrb.Vertical(rrb.Tabs(*tabs), classes, row_shares=[LEFT[1] - below, below])
+    left = rrb.Vertical(rrb.Tabs(*tabs, active_tab=opened), classes, row_shares=[LEFT[1] - below, below])
     depth = rrb.Spatial2DView(origin=path(scene, "depth"), name="Depth")
     right = rrb.Tabs(*(_cameras(scene, tasks, picture) for picture in PICTURES), depth)
     top = rrb.Horizontal(left, right, column_shares=[5, 4])
@@ -252,22 +271,31 @@ def _legend(scene: str, entity: str, name: str, height: float) -> rrb.Spatial2DV
 
 def _maps(name: str, tasks: list[Task], bounds: SceneBounds | None, height: float) -> rrb.Container:
     """Return the maps of all models, coloured by a measure."""
-    mode = color_modes()[name]
+    mode, scene = color_modes()[name], tasks[0].scene.name
+    height -= (LINE + TITLE) * (name == OPENED)
     apart = len(tasks) > SIDE_BY_SIDE
-    columns = 1 if apart else min(len(tasks), 2)
+    columns = 1 if apart else 2 if len(tasks) == SIDE_BY_SIDE else len(tasks)
     rows = 1 if apart else math.ceil(len(tasks) / columns)
     aspect = LEFT[0] / columns / ((height - TITLE * apart) / rows - TITLE)
     views = [_map(f"{task.model}: {mode.title}", task, drawn(task), bounds, aspect, name) for task in tasks]
-    return rrb.Tabs(*views, name=mode.tab) if apart else rrb.Grid(*views, grid_columns=columns, name=mode.tab)
+    if name != OPENED:
+        return rrb.Tabs(*views, name=mode.tab) if apart else rrb.Grid(*views, grid_columns=columns, name=mode.tab)
+    maps = rrb.Tabs(*views) if apart else rrb.Grid(*views, grid_columns=columns)
+    legend = _legend(scene, "categories", f"Category (low persistence: OP < {RECURRENT})", LINE)
+    return rrb.Vertical(maps, legend, row_shares=[height, LINE + TITLE], name=mode.tab)
 
 
 def _map(
-    title: str, task: Task, backend: str, bounds: SceneBounds | None, aspect: float, name: str = "class"
-) -> rrb.Spatial3DView:
-    """Return a backend's map; a view that is not coloured by class overrides the colours of each chunk."""
-    scene, model = task.scene.name, task.model
-    entity = path(scene, "map", model, backend)
-    around = [path(scene, "camera"), path(scene, "trajectory"), path(scene, "flips_at", model)]
+    title: str, task: Task, backend: str, bounds: SceneBounds | None, aspect: float, name: str = "class",
+    over: Sequence[str] = (),
+) -> rrb.Spatial3DView:  # fmt: skip
+    """Return a backend's map, with more of the model over it; a view that is not coloured by class overrides colours.
+
+    The overrides are those of each chunk.
+    """
+    scene = task.scene.name
+    entity = path(scene, "map", task.model, backend)
+    around = [path(scene, "camera"), path(scene, "trajectory"), *(path(scene, each, task.model) for each in over)]
     chunks = [] if name == "class" else [chunk(entity, number) for number in range(CHUNKS)]
     coloring = {"defaults": defaults(name), "overrides": dict.fromkeys(chunks, visualizer(name))}
     return view_3d(scene, [f"{entity}/**", *around], title, bounds, aspect, **coloring)
@@ -275,20 +303,20 @@ def _map(
 
 def _cameras(scene: str, tasks: list[Task], picture: str) -> rrb.Container:
     """Return the labels of each model next to a picture of the frame."""
-    rows = [rrb.Horizontal(*_camera(scene, task, picture), name=task.model) for task in tasks]
+    rows = [rrb.Horizontal(*_camera(scene, task, picture, []), name=task.model) for task in tasks]
     return (rrb.Vertical if len(rows) < SIDE_BY_SIDE else rrb.Tabs)(*rows, name=picture.capitalize())
 
 
-def _camera(scene: str, task: Task, picture: str) -> list[rrb.View]:
+def _camera(scene: str, task: Task, picture: str, over: list[str]) -> list[rrb.View]:
     origin, color = path(scene, "camera"), path(scene, "camera", "color")
-    labels, shown, flips = (path(scene, "camera", task.model, name) for name in ("labels", picture, "flips"))
+    labels, shown = (path(scene, "camera", task.model, name) for name in ("labels", picture))
     seen_through: Any = {labels: rr.SegmentationImage.from_fields(opacity=0.6).visualizer()}
     title = f"{task.model}: {PICTURES[picture]}"
     return [
         rrb.Spatial2DView(
             origin=origin, contents=[color, labels], overrides=seen_through, name=f"{task.model}: labels"
         ),
-        rrb.Spatial2DView(origin=origin, contents=[color, shown, flips], name=title),
+        rrb.Spatial2DView(origin=origin, contents=[color, shown, *over], name=title),
     ]
 
 
@@ -296,13 +324,15 @@ def _below(scene: str, tasks: list[Task]) -> rrb.Container:
     more = [name for name in SERIES if name not in OVERVIEW and not name.endswith("_ms")]
     times = [name for name in SERIES if name.endswith("_ms")]
     agreement = [rrb.TextDocumentView(origin=path(scene, "agreement", task.model), name=task.model) for task in tasks]
-    return rrb.Tabs(
+    series = rrb.Tabs(
         rrb.Horizontal(*(_plot(scene, name, tasks) for name in OVERVIEW), name="Time series"),
         rrb.Horizontal(*agreement, name="Agreement of frames"),
         rrb.Horizontal(*(_plot(scene, name, tasks) for name in more), name="More series"),
         rrb.Horizontal(*(_plot(scene, name, tasks) for name in times), name="Milliseconds"),
         rrb.TextLogView(origin=path(scene, "log"), name="Notes"),
     )
+    verdict = rrb.TextDocumentView(origin=path(scene, VERDICT), name="Verdict")
+    return rrb.Horizontal(verdict, series, column_shares=[2, 5])
 
 
 def _plot(scene: str, name: str, tasks: list[Task]) -> rrb.TimeSeriesView:
@@ -319,14 +349,16 @@ def _plot(scene: str, name: str, tasks: list[Task]) -> rrb.TimeSeriesView:
     )
 
 
-def _flips(scene: str, task: Task) -> rrb.Container:
-    """Return the voxels that drifted most and their top contributing frames, next to the camera."""
+def _flips(scene: str, task: Task, bounds: SceneBounds | None) -> rrb.Container:
+    """Return the voxels that drifted most, numbered in the map and in the camera, and their top contributing frames."""
     lanes = rrb.StateTimelineView(
         origin=path(scene, "flips", task.model), name="Dominant class of the voxels that drifted most"
     )
     frames = rrb.TextDocumentView(origin=path(scene, "flips_report", task.model), name="Top contributing frames")
-    pictures = rrb.Vertical(*_camera(scene, task, "drift"))
-    return rrb.Horizontal(rrb.Vertical(lanes, frames), pictures, column_shares=[5, 4], name=f"Flips: {task.model}")
+    pictures = rrb.Vertical(*_camera(scene, task, "drift", [path(scene, "camera", task.model, "flips")]))
+    where = _map(f"{task.model}: where they lie", task, drawn(task), bounds, FLIPS_ASPECT, over=["flips_at"])
+    left = rrb.Vertical(lanes, rrb.Horizontal(frames, where))
+    return rrb.Horizontal(left, pictures, column_shares=[5, 4], name=f"Flips: {task.model}")
 
 
 def _comparison(task: Task, first: str, second: str, bounds: SceneBounds | None) -> rrb.Container:

@@ -34,10 +34,17 @@ from semstab.errors import ConfigError, SemstabError, summarize_error
 from semstab.recording import timeline
 from semstab.recording.camera import COARSE_SIDE, SceneLog, over_camera, stride_of
 from semstab.recording.drift import DriftLog
-from semstab.recording.layout import blueprint, drawn
+from semstab.recording.layout import VERDICT, blueprint, drawn
 from semstab.recording.target import DEFAULT_URL, Target, is_whole
 from semstab.recording.timeline import Background, Clock, path
-from semstab.recording.voxel_maps import VoxelLogger, agreement_report, load_map, log_difference
+from semstab.recording.voxel_maps import (
+    PENDING,
+    VoxelLogger,
+    agreement_report,
+    load_map,
+    log_difference,
+    verdict_report,
+)
 from semstab.settings import load_config
 from semstab.task import Task, read
 
@@ -241,6 +248,9 @@ class Recording(Observer):
                 factor, table = load_map(record, group.origin)
                 self._log_unit(group, record.summary, table, factor)
             self._end_group()
+        for scene in self._scenes:
+            verdict = rr.TextDocument(verdict_report(result, scene), media_type=rr.MediaType.MARKDOWN)
+            stream.log(path(scene, VERDICT), verdict, static=True)
 
     def serve(self) -> None:
         """Wait for viewers until the user interrupts, where the recording is served; else return at once."""
@@ -282,6 +292,7 @@ class Recording(Observer):
             self._background = Background(self._stream, self._clock)
             for scene in self._scenes.values():
                 scene.log_static(self._stream)
+                self._stream.log(path(scene.name, VERDICT), rr.TextDocument(PENDING), static=True)
             timeline.log_styles(self._stream, self._plan)
             self._send_layout(self._stream)
         return self._stream, self._background

@@ -19,14 +19,15 @@ from rerun.blueprint.encodings import ComponentSourceKind, VisualizerComponentMa
 from semstab.core.types import Int64, UInt32
 from semstab.data.labels import LabelSpace
 from semstab.data.measures import Voxels, bits, measures, sbd
-from semstab.data.records import Record
-from semstab.data.results import RECURRENT
+from semstab.data.records import Record, Result
 from semstab.data.statistics import CONFIDENCE, LagBin, MapStatistics
 from semstab.data.voxels import VoxelTable
 from semstab.metrics import CATEGORY_COLORS, dominant, vss
 from semstab.metrics.agreement import shared_rows
 from semstab.metrics.summary import categorise
 from semstab.report.narrative import outlying_line
+from semstab.report.ranking import answers
+from semstab.report.terminal import COLUMNS, TEXTS, row_of
 
 
 @dataclass(frozen=True)
@@ -55,9 +56,8 @@ def color_modes() -> dict[str, ColorMode]:
         title = f"{measure.title} ({f'{ends} {measure.unit}'.strip()}{undefined})"
         colormap = colors.Viridis if measure.better == "higher" else colors.Plasma
         modes[measure.key] = ColorMode(measure.title, title, colormap, measure.range)
-    category = f"category (blue stable, orange uncertain, yellow drifting, grey OP < {RECURRENT})"
     modes["op"] = ColorMode("OP", "OP (1 to 10 and more)", colors.Viridis, (1.0, 10.0))
-    return modes | {"category": ColorMode("Category", category)}
+    return modes | {"category": ColorMode("Category", "category")}
 
 
 MAX_VOXELS = 2_000_000
@@ -267,6 +267,17 @@ AXES = {
     "baseline": "metres between the cameras",
     "range": "ratio of the ranges",
 }
+
+
+PENDING = "The verdict follows when all frames are fused."
+
+
+def verdict_report(result: Result, scene: str) -> str:
+    """Return the answer of a run, and the verdict of each model on a scene, in Markdown, as the terminal has them."""
+    rows = [row_of(record) for record in result.select(scene=scene)]
+    heads = (f"| {' | '.join(COLUMNS[:TEXTS])} |", f"|{'---|' * TEXTS}")
+    table = [f"| {' | '.join(row[:TEXTS])} |" for row in rows]
+    return "\n".join([*(f"{line}\n" for line in answers(result)), *heads, *table])
 
 
 def agreement_report(statistics: MapStatistics) -> str:

@@ -217,7 +217,7 @@ def _several(result: Result, records: Sequence[Record], width: int) -> Iterator[
         yield ""
     known = any(not math.isnan(miou(record)) for record in records)
     columns = len(COLUMNS) if known else len(COLUMNS) - 1
-    heads, rows = [COLUMNS[:columns], UNITS[:columns]], [_cells(record)[:columns] for record in records]
+    heads, rows = [COLUMNS[:columns], UNITS[:columns]], [row_of(record)[:columns] for record in records]
     lines = iter(laid_out([*heads, *rows], width))
     yield next(lines)
     yield next(lines)
@@ -253,7 +253,8 @@ def _cut(name: str, size: int) -> str:
     return f"{name[:first]}...{name[first + 3 - size :]}"
 
 
-def _cells(record: Record) -> list[str]:
+def row_of(record: Record) -> list[str]:
+    """Return a model's row under `COLUMNS`."""
     run, statistics = record.summary, record.summary.statistics
     level, alpha, agree = "-", "", math.nan
     if statistics is not None:
