@@ -181,7 +181,7 @@ def test_a_terminal_of_80_columns_and_markdown_hold_it(fault):
         assert word in text.getvalue()
     page = markdown(fault)
     assert page.startswith("## new against old\n")
-    assert "| Measure | old | The run |" in page
+    assert "| Measure | old | new |" in page
 
 
 def test_bad_input_is_one_line_and_the_command_writes_markdown(runs, tmp_path):

@@ -27,7 +27,7 @@ from semstab.data.records import ImageSpace, RegionFlicker, Result
 from semstab.metrics import entropy, op, sbd, vss
 from semstab.report.means import ENOUGH, Spread, complete_scenes, describe, levels, pooled, swept
 from semstab.report.tables import tables, write_tables
-from semstab.report.tables.table import Column, Group, Table, to_csv, to_json, to_latex, to_markdown
+from semstab.report.tables.table import Column, Group, Table, to_csv, to_json, to_latex, to_markdown, to_terminal
 from semstab.statistics import Estimate
 from semstab.testing import checks
 
@@ -324,3 +324,13 @@ def test_tables_are_written_in_four_formats(walls, tmp_path):
     content = json.loads((tmp_path / "tables" / "persistence.json").read_text())
     assert content["rows"][0]["persistence"] == "OP=1"
     assert content["rows"][0]["sbd"] is None
+
+
+def test_print_leaves_out_columns_without_a_value_and_files_keep_them():
+    columns = (Column("name", "Name"), Column("change", "Change"), Column("x", "X", 2), Column("y", "Y", 2))
+    table = Table("t", "T", "", columns, (Group("", (("a", "", math.nan, 1.0), ("", "", math.nan, math.nan))),), by="")
+    assert to_markdown(table).splitlines()[2] == "| Name | Y |"
+    assert to_csv(table).splitlines()[0] == "name,change,x,y"
+    for text in (to_terminal(table), to_latex(table)):
+        assert "Change" not in text
+        assert "Y" in text

@@ -104,7 +104,7 @@ def scope(row: Contrast) -> str:
 
 def _differences(comparison: RunComparison) -> Table:
     columns = (
-        Column("measure", "Measure"), Column("base", comparison.base, 4), Column("other", "The run", 4),
+        Column("measure", "Measure"), Column("base", comparison.base, 4), Column("other", _others(comparison), 4),
         Column("difference", "Difference", 4, signed=True), Column("p_holm", "p (Holm)", 4),
         Column("answers", "Answers for"), Column("change", "Change"),
     )  # fmt: skip
@@ -118,6 +118,11 @@ def _differences(comparison: RunComparison) -> Table:
         f" {ANSWERS}{macro}"
     )
     return Table("comparison", "Differences", caption, columns, groups, "scope")
+
+
+def _others(comparison: RunComparison) -> str:
+    """Return the heading of the numbers that are compared with the base's: the run's name where there is one run."""
+    return comparison.runs[1].name if len(comparison.runs) == 2 else "Other"
 
 
 def _rows(own: Against, shown: Sequence[Quantity]) -> tuple[Row, ...]:
@@ -192,9 +197,9 @@ def _area_row(area: Area) -> Row:
 
 
 def top_frames(frames: Sequence[FrameShare]) -> str:
-    """Return '13 (30%), 4 (26%)'."""
+    """Return '13 (30%), 4 (26%) and 7 more'."""
     listed = ", ".join(f"{own.name or own.frame} ({own.share:.0%})" for own in frames[:NAMED_FRAMES])
-    return listed + (", ..." if len(frames) > NAMED_FRAMES else "")
+    return listed + (f" and {len(frames) - NAMED_FRAMES} more" if len(frames) > NAMED_FRAMES else "")
 
 
 def _frames(comparison: RunComparison) -> Table:
@@ -215,7 +220,7 @@ def everything(comparison: RunComparison) -> Table:
     """Return all contrasts, one per row."""
     columns = (
         Column("run", "Run"), Column("class", "Class"), Column("measure", "Measure"), Column("base", "Base", 6),
-        Column("other", "The run", 6), Column("difference", "Difference", 6, signed=True),
+        Column("other", _others(comparison), 6), Column("difference", "Difference", 6, signed=True),
         Column("holds_for", "Holds for"), Column("p", "p", 6), Column("p_holm", "p (Holm)", 6),
         Column("change", "Change"), Column("undecided", "Undecided"),
     )  # fmt: skip
@@ -353,7 +358,7 @@ def _of_areas(areas: Sequence[Area]) -> str:
     x, y, z = first.centre
     frames = f"; the top contributing frames are {top_frames(first.frames)}" if first.frames else ""
     return (
-        f"{count} {lost} ({alike}); the largest is {first.voxels} voxels of"
+        f"{count} {lost} ({alike}); the largest is {first.voxels:,} voxels of"
         f" {first.of}{confused_with}, at ({x:.2f}, {y:.2f}, {z:.2f}) m{frames}"
     )
 

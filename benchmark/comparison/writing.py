@@ -60,7 +60,11 @@ def charts(comparison: RunComparison) -> dict[str, list[dict[str, str]]]:
                     dots.append((colors[own.other], own.other, row.difference))
     less = f"less {comparison.base}"
     return {
-        name: [{"title": title, "chart": dot_chart(rows, f"{title} {less}", (0.0,))} for title, rows in own.items()]
+        name: [
+            {"title": title, "chart": dot_chart(rows, f"{title} {less}", (0.0,))}
+            for title, rows in own.items()
+            if any(estimate.value for row in rows.values() for _, _, estimate in row)  # not where nothing differs
+        ]
         for name, own in (("comparison", panels), ("comparison_classes", by_class))
         if own
     }

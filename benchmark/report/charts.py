@@ -43,12 +43,16 @@ class Scale:
     last: float
 
     @classmethod
-    def over(cls, values: Sequence[float], first: float, last: float, *, zero: bool = False) -> Scale:
-        """Build the axis over the finite values, from 0 on where `zero` says so."""
+    def over(
+        cls, values: Sequence[float], first: float, last: float, *, zero: bool = False, margin: float = 0.0
+    ) -> Scale:
+        """Build the axis over the finite values, from 0 on where `zero` says so, and a share of it beyond both ends."""
         known = [value for value in values if math.isfinite(value)] or [0.0, 1.0]
         low, high = min(0.0, *known) if zero else min(known), max(known)
-        apart = high - low > 1e-9 * max(abs(low), abs(high), 1e-9)
-        return cls(low, high if apart else low + max(abs(low), 1e-3), first, last)
+        if not high - low > 1e-9 * max(abs(low), abs(high), 1e-9):
+            high = low + max(abs(low), 1e-3)
+        beyond = margin * (high - low)
+        return cls(low - beyond, high + beyond, first, last)
 
     def __call__(self, value: float) -> float:
         """Return the position of a value."""
@@ -85,7 +89,7 @@ def dot_chart(rows: Mapping[str, Sequence[tuple[int, str, Estimate]]], x_label: 
     ends = [0, *itertools.accumulate(max(ROW, 10 * len(row) + 8) for row in rows.values())]
     middles = [(first + last) / 2 for first, last in itertools.pairwise(ends)]
     height = TOP + ends[-1] + BOTTOM
-    x = Scale.over([*values, *guides], left, WIDTH - RIGHT - 6)
+    x = Scale.over([*values, *guides], left, WIDTH - RIGHT - 6, margin=0.03)
     y = Scale(0, ends[-1], TOP, height - BOTTOM)
     short = (name if len(name) <= 22 else f"{name[:19]}..." for name in rows)
     names = dict(zip(middles, short, strict=True))

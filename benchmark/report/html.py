@@ -55,6 +55,7 @@ def blocks(own: Sequence[Table], shown: Sequence[Figure], folder: Path) -> Itera
 
 def table_block(table: Table) -> dict[str, Any]:
     """Return a table as the page shows it."""
+    table = table.printed()
     headers = [f"{column.header} {ARROWS[column.better]}".strip() for column in table.columns]
     absent = [*dict.fromkeys(row[0] for _, rows in sections(table) for row in rows if row[-1] == ABSENT)]
     left_out = f" Absent: {', '.join(absent)}." if absent else ""

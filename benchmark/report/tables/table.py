@@ -111,6 +111,16 @@ class Table:
         groups = tuple(Group(g.name, tuple(map(cut, g.rows)), g.total and cut(g.total)) for g in self.groups)
         return dataclasses.replace(self, columns=tuple(self.columns[k] for k in at), groups=groups)
 
+    def printed(self) -> Table:
+        """Return the table without the columns that are empty in every row, as print shows it; files keep them."""
+        rows = [row for _, row in self.rows()]
+        empty = {
+            column.key
+            for k, column in enumerate(self.columns)
+            if k > 0 and rows and all(column.text(row[k]) in ("", UNDEFINED) for row in rows)
+        }
+        return self.only(*(column.key for column in self.columns if column.key not in empty)) if empty else self
+
     def rows(self) -> Iterator[tuple[str, Row]]:
         """Yield each row, totals too, with the name of its group."""
         for group in self.groups:
@@ -145,6 +155,7 @@ def to_csv(table: Table) -> str:
 
 def to_markdown(table: Table) -> str:
     """Return a GitHub table under its title, with the caption below."""
+    table = table.printed()
     headers = [_markdown(" ".join(filter(None, (c.over, c.header, ARROWS[c.better])))) for c in table.columns]
     rule = ["---" if column.digits is None else "---:" for column in table.columns]
     lines = [f"### {_markdown(table.title)}", "", _pipes(headers), _pipes(rule)]
@@ -157,6 +168,7 @@ def to_markdown(table: Table) -> str:
 
 def to_latex(table: Table) -> str:
     """Return a float with booktabs rules (it needs the package booktabs), in the layout of the paper's tables."""
+    table = table.printed()
     width = _width(table)
     fitting = [kind[1:] for kind in LATEX_WIDTHS if width <= kind[0]]
     environment, size = fitting[0] if fitting else ("table*", r"\footnotesize")
@@ -194,6 +206,7 @@ def to_terminal(table: Table, width: int = 0) -> str:
     from rich.markup import escape
     from rich.table import Table as Grid
 
+    table = table.printed()
     grid = Grid(title=escape(table.title), title_justify="left", box=SIMPLE_HEAD, pad_edge=False, collapse_padding=True)
     for column in table.columns:
         header = "\n".join(filter(None, (column.over, f"{column.header} {ARROWS[column.better]}".strip())))
