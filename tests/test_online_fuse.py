@@ -57,7 +57,11 @@ def test_a_generator_gives_what_a_run_gives(steady, city):
     for part in ("headline", "cells", "agreement"):
         assert to_json(getattr(own.statistics, part)) == to_json(getattr(other.statistics, part))
     assert own.statistics.verdict.level == other.statistics.verdict.level == steady.summary.verdict
-    assert steady.summary.alpha == other.statistics.headline.alpha.value
+    alpha = other.statistics.headline.alpha
+    assert steady.summary.alpha == alpha.value
+    assert (steady.summary.alpha_low, steady.summary.alpha_high, steady.summary.confidence) == (
+        alpha.low, alpha.high, 0.95,
+    )  # fmt: skip
     assert steady.summary.psa == other.statistics.agreement.psa.value
     assert steady.summary.flicker == own.image_space.compensated_flicker_percent > 0
     assert steady.summary.frames == len(city)
@@ -91,7 +95,13 @@ def test_results_are_compared_gated_and_exported_as_runs_are(steady, city, class
     comparison = semstab.compare([steady, other], tmp_path / "versus")
     assert [own.name for own in comparison.runs] == ["steady", "flicker"]
     assert (tmp_path / "versus/report.html").exists()
+    assert repr(comparison).startswith("<RunComparison with steady on frames>\n  flicker: alpha -")
+    again = semstab.fuse(frames_of(city, "sim-steady"), voxel_size=SIZE, classes=classes, model="steady")
+    assert [own.name for own in semstab.compare([steady, again]).runs] == ["steady", "steady (2)"]
     gate = semstab.GateConfig(rules=("alpha drop < 0.02",))
+    assert repr(semstab.gate(other, steady, gate)).splitlines()[0] == (
+        "<GateResult: fails; flicker against steady on frames>"
+    )
     assert [each.verdict for each in semstab.gate(other, steady, gate).judgements] == ["fails"]
     assert [each.verdict for each in semstab.gate(steady, steady, gate).judgements] == ["passes"]
     semstab.export(steady, tmp_path / "map.ply")

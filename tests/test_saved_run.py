@@ -6,6 +6,7 @@ import dataclasses
 import sys
 
 import numpy as np
+import pyarrow.parquet as pq
 import pytest
 import tiny_scene
 from posed_config import configure
@@ -34,6 +35,35 @@ def test_the_summary_has_a_row_a_unit_and_a_unit_series_and_events(run):
     assert list(run.series(model="b")["frame"]) == [0, 1, 2]
     assert len(run.events(model="b")) == run.table(model="b").op.sum()
     fails(ConfigError, "2 units fit", run.table)
+
+
+def test_the_summary_has_the_number_that_decides_with_its_interval_and_the_level(run):
+    assert run.summary.equals(run.result.summary)
+    for (_, row), own in zip(run.summary.iterrows(), run.result.select(), strict=True):
+        statistics = own.statistics
+        alpha = statistics.headline.alpha
+        assert row["verdict"] == statistics.verdict.level
+        np.testing.assert_equal(
+            [row[name] for name in ("probability", "alpha", "alpha_low", "alpha_high", "confidence")],
+            [statistics.verdict.probability, alpha.value, alpha.low, alpha.high, alpha.level],
+        )
+        assert row["compensated_flicker_percent"] == own.image_space.compensated_flicker_percent
+
+
+def test_a_run_at_a_prompt_is_a_few_lines(run):
+    first, *rest = repr(run).splitlines()
+    assert first.startswith(f"{run.folder}: <Result '")
+    verdicts = [own.statistics.verdict for own in run.result.select()]
+    assert [line.split(", alpha")[0] for line in rest] == [
+        f"  scene, {model}: {verdict}" for model, verdict in zip("ab", verdicts, strict=True)
+    ]
+
+
+def test_a_column_of_the_stored_file_has_its_name_and_values_in_a_data_frame(run):
+    file = run.result.record(model="a").voxels_file
+    frame, stored = run.table(model="a").to_pandas(), pq.read_table(file)
+    for name in set(stored.column_names) - {"evidence"}:  # which has a column a class in the frame
+        np.testing.assert_array_equal(frame[name], stored.column(name).to_pandas(), err_msg=name)
 
 
 def test_a_table_has_every_voxel_and_its_classes_by_name(run):

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from semstab.core.palette import MODEL_COLORS, dash, marker, model_color
+from semstab.data.statistics import short
 from semstab.metrics import CATEGORY_COLORS
-from semstab.report.ranking import short
 from semstab.report.tables.stability import one_in
 from semstab.report.terminal import laid_out, percents
 

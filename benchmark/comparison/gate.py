@@ -415,6 +415,11 @@ class GateResult:
     judgements: tuple[Judgement, ...]
     notes: tuple[str, ...] = ()
 
+    def __repr__(self) -> str:
+        against = f" against {self.against}" if self.against else ""
+        lines = [f"<GateResult: {self.outcome}; {self.new}{against} on {', '.join(self.scenes)}>"]
+        return "\n".join([*lines, *(f"  {each.verdict}: {each.rule.text}: {each.values}" for each in self.judgements)])
+
     def count(self, verdict: Verdict) -> int:
         """Return how many rules have this verdict."""
         return sum(each.verdict == verdict for each in self.judgements)
@@ -467,7 +472,7 @@ def gate(new: str | os.PathLike[str], against: str | os.PathLike[str] | None, co
             _require_values(rule, pairs)
             judgements.append(_assess(rule, pairs, config.level / len(rules), config.scope))
             notes += [*_counts(judgements[-1], pairs), *(runs.common[1] if runs.on_common(rule) else ())]
-    new_run, against_run = ("" if run is None else f"{run.model} ({run.source})" for run in (own, base))
+    new_run, against_run = ("" if run is None else str(run) for run in (own, base))
     return GateResult(
         new_run, against_run, scenes, config.level, config.undecided, tuple(judgements), tuple(dict.fromkeys(notes))
     )

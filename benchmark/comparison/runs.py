@@ -124,12 +124,17 @@ class RunHandle:
     Attributes:
         name: Distinct among the runs that are compared: its model, its folder, or both.
         source: The folder, or the file of a small summary.
+        in_memory: Whether a program holds it, so that its folder means nothing to anybody.
     """
 
     name: str
     source: Path
     model: str
     scenes: Mapping[str, Entry]
+    in_memory: bool = False
+
+    def __str__(self) -> str:
+        return self.model if self.in_memory else f"{self.model} ({self.source})"
 
 
 def open_runs(named: Sequence[str | os.PathLike[str]]) -> tuple[RunHandle, ...]:
@@ -139,10 +144,12 @@ def open_runs(named: Sequence[str | os.PathLike[str]]) -> tuple[RunHandle, ...]:
         ConfigError, DataError: As `open_run` does.
     """
     runs = [open_run(each) for each in named]
-    folders, models = [run.source.resolve().name for run in runs], [run.model for run in runs]
+    folders = ["" if run.in_memory else run.source.resolve().name for run in runs]
+    models = [run.model for run in runs]
     both = [f"{folder}:{model}" for folder, model in zip(folders, models, strict=True)]
-    names = [f"{run.source}:{run.model}" for run in runs]
-    names = next((short for short in (models, folders, both) if len({*short}) == len({*names})), names)
+    whole = [f"{run.source}:{run.model}" for run in runs]
+    names = next((own for own in (models, folders, both) if len({*own}) == len({*whole})), whole)
+    names = [run.model if run.in_memory else name for name, run in zip(names, runs, strict=True)]
     times = [names[: i + 1].count(name) for i, name in enumerate(names)]
     names = [name if nth == 1 else f"{name} ({nth})" for name, nth in zip(names, times, strict=True)]
     return tuple(replace(run, name=name) for run, name in zip(runs, names, strict=True))
@@ -174,7 +181,7 @@ def open_run(named: str | os.PathLike[str]) -> RunHandle:
         for record in result.select(model=model)
         for scene in [record.unit.scene]
     }  # fmt: skip
-    return RunHandle(model, path, model, scenes)
+    return RunHandle(model, path, model, scenes, in_memory=not isinstance(named, str | Path))
 
 
 def shared_scenes(runs: Sequence[RunHandle]) -> tuple[str, ...]:

@@ -307,3 +307,13 @@ class RunComparison:
     runs: tuple[Compared, ...]
     overall: tuple[Against, ...]
     scenes: tuple[SceneComparison, ...]
+
+    def __repr__(self) -> str:
+        scenes = ", ".join(scene.scene for scene in self.scenes)
+        lines = [f"<RunComparison with {self.base} on {scenes}>"]
+        for own in self.overall:
+            first = own.contrasts[0] if own.contrasts else None
+            changes = [f"{row.change} in {row.measure}" for row in own.contrasts if row.change]
+            known = "" if first is None else f": {first.measure} {first.difference.text('+')}, p {first.p_holm:.2g}"
+            lines.append(f"  {own.other}{known}; {', '.join(changes) or 'no difference is shown'}")
+        return "\n".join(lines)

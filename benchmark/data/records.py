@@ -16,7 +16,7 @@ from semstab.data.display import as_figure
 from semstab.data.georeference import Georeference
 from semstab.data.measures import measures
 from semstab.data.results import Agreement, Unit, UnitSummary, VoxelAdvice
-from semstab.data.statistics import MapStatistics
+from semstab.data.statistics import UNKNOWN, MapStatistics
 from semstab.data.voxels import VoxelTable
 from semstab.errors import ConfigError
 
@@ -37,8 +37,8 @@ SUMS_BEFORE = "influence"
 REGIONS = "region_maps"
 """The name, not of a sweep, for the label sources that hold regions without classes."""
 
-MAPS = 6
-"""Maps that a notebook shows of a result."""
+MAPS, LISTED = 6, 12
+"""The most maps that a notebook shows of a result, and the most units that its text lists."""
 
 
 @dataclass(frozen=True, order=True)
@@ -290,8 +290,18 @@ class Result:
     notes: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
 
     def __repr__(self) -> str:
-        models, units = ", ".join(self.models), len(self.records)
-        return f"<Result '{self.name}': {models} on {', '.join(self.scenes)}; {units} units, {self.backend}>"
+        units = f"{len(self.records)} unit{'' if len(self.records) == 1 else 's'}"
+        lines = [f"<{type(self).__name__} '{self.name}': {units}, fused by {self.backend}>"]
+        for run in self.runs[:LISTED]:
+            alpha = UNKNOWN if run.statistics is None else run.statistics.headline.alpha
+            verdict = "" if run.statistics is None else f": {run.statistics.verdict}, alpha {alpha.text()}"
+            lines.append(f"  {run.unit.scene}, {run.unit.model}{verdict}")
+        return "\n".join([*lines, *(["  ..."] if len(self.runs) > LISTED else [])])
+
+    @property
+    def summary(self) -> Any:
+        """The data frame of `to_pandas`, a row a unit; of one map that a program fused, its numbers."""
+        return self.to_pandas()
 
     def select(
         self, sweep: str = BASE, *, scene: str | None = None, model: str | None = None, value: float | None = None
@@ -356,7 +366,7 @@ class Result:
         return tuple(r.summary for group in groups for r in units if (r.unit.scene, r.unit.model) == group)
 
     def to_arrow(self) -> pa.Table:
-        """Return one row a unit: its names, the size of its map, the mean of every measure, of recurrent voxels too."""
+        """Return one row a unit: names, verdict, alpha with its interval, the map's size and means, flicker."""
         return voxels.to_arrow(self._columns())
 
     def to_pandas(self) -> pd.DataFrame:
@@ -368,7 +378,8 @@ class Result:
         return voxels.to_pandas(self._columns())
 
     def _columns(self) -> dict[str, Any]:
-        rows = [run.row() for run in self.runs]
+        flicker = {record.unit: record.image_space.compensated_flicker_percent for record in reversed(self.records)}
+        rows = [run.row() | {"compensated_flicker_percent": flicker[run.unit]} for run in self.runs]
         return {name: [row[name] for row in rows] for name in (rows[0] if rows else ())}
 
     def _repr_html_(self) -> str:

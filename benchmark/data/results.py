@@ -12,7 +12,7 @@ from semstab.core.json_form import INLINE
 from semstab.core.types import Float32, Int64, UInt16
 from semstab.data.frames import LeftOut
 from semstab.data.measures import Measure, MeasureMeans
-from semstab.data.statistics import MapStatistics
+from semstab.data.statistics import UNKNOWN, MapStatistics
 
 SCHEMA = 4
 """Version of summary.json."""
@@ -197,12 +197,21 @@ class UnitSummary:
     reduced: ReducedScores | None = None
 
     def row(self) -> dict[str, str | int | float]:
-        """Return a row: its names, the size of its map, the mean of every measure, also of recurrent voxels alone."""
+        """Return a row: its names, the verdict and the number that it rests on, the size of its map, means of measures.
+
+        Means are of all voxels, and of the recurrent ones. Without statistics the verdict is empty, and alpha NaN.
+        """
         table, unit = self.table, self.unit
+        alpha = UNKNOWN if self.statistics is None else self.statistics.headline.alpha
+        verdict = None if self.statistics is None else self.statistics.verdict
         return {
-            "scene": unit.scene, "model": unit.model, "backend": unit.backend, "taxonomy": self.taxonomy,
-            "K": table.K, "voxel_size": table.voxel_size, "frames": self.frames, "points": table.points,
-            "observations": table.observations, "voxels": table.voxels, "mean_op": table.mean_op,
+            "scene": unit.scene, "model": unit.model, "backend": unit.backend,
+            "verdict": "" if verdict is None else verdict.level,
+            "probability": math.nan if verdict is None else verdict.probability,
+            "alpha": alpha.value, "alpha_low": alpha.low, "alpha_high": alpha.high, "confidence": alpha.level,
+            "taxonomy": self.taxonomy, "K": table.K, "voxel_size": table.voxel_size, "frames": self.frames,
+            "points": table.points, "observations": table.observations, "voxels": table.voxels,
+            "mean_op": table.mean_op,
             **table.means.value, "recurrent_share": table.recurrent.share,
             **{f"recurrent_{key}": value for key, value in table.recurrent.means.value.items()},
             "flicker_percent": self.flicker_percent, "fuse_ms_per_frame": self.fuse_ms_per_frame,

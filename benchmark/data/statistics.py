@@ -6,6 +6,7 @@ Undefined numbers are NaN; a section that could not be computed is None.
 from __future__ import annotations
 
 import math
+import re
 from dataclasses import dataclass, field
 from typing import Literal
 
@@ -43,6 +44,16 @@ class Estimate:
     def of(self) -> str:
         """The interval's name in print, '95 % CI'."""
         return f"{100 * self.level:g} % CI"
+
+    def text(self, sign: str = "") -> str:
+        """Return '.68 (.52 to .78)'; '.68' without an interval."""
+        ends = "" if math.isnan(self.low) else f" ({short(self.low, sign)} to {short(self.high, sign)})"
+        return f"{short(self.value, sign)}{ends}"
+
+
+def short(value: float, sign: str = "", *, digits: int = 2) -> str:
+    """Return a number from -1 to 1 without the 0 before its point: '.55', '-.19', '1.00'; '-' where it is undefined."""
+    return "-" if math.isnan(value) else re.sub(r"^([+-]?)0\.", r"\1.", f"{value:{sign}z.{digits}f}")
 
 
 UNDEFINED = Estimate(math.nan, math.nan, math.nan)
@@ -96,6 +107,16 @@ class StabilityVerdict:
     level: Level
     probability: float
     line: str
+
+    @property
+    def stated(self) -> str:
+        """The probability in print: '(p .51)', '(p > .99)', no share of a map; '' where there is none."""
+        p = self.probability
+        return "" if math.isnan(p) else "(p > .99)" if p >= 0.995 else f"(p {short(p)})"
+
+    def __str__(self) -> str:
+        """Return 'stable (p .98)'."""
+        return f"{self.level} {self.stated}".rstrip()
 
 
 @dataclass(frozen=True)

@@ -213,7 +213,7 @@ class VoxelTable:
         return self if self.evidence.known is not None else replace(self, evidence=self.evidence.measured())
 
     def to_arrow(self) -> pa.Table:
-        """Return columns of every voxel: index, x, y, z in metres, op, class, every measure, evidence_CLASS."""
+        """Return columns of every voxel: those that `save` writes, x, y, z in metres, the class, evidence_CLASS."""
         return to_arrow(self._columns())
 
     def to_pandas(self) -> pd.DataFrame:
@@ -230,9 +230,9 @@ class VoxelTable:
         evidence = self.evidence[:]
         return {
             "ix": self.ix, "iy": self.iy, "iz": self.iz, "x": x, "y": y, "z": z, "op": self.op,
-            "class": named(dominant(self), names),
+            "label": dominant(self), "class": named(dominant(self), names),
             **{measure.key: measure.of(self) for measure in measures()},
-            "pixels": self.pixels, "first_frame": self.first_frame, "last_frame": self.last_frame,
+            **{name: getattr(self, name) for name in OF_VOXELS if name not in (*INDEX, "op", "evidence")},
             **{f"evidence_{name}": evidence[:, k] for k, name in enumerate(names)},
         }  # fmt: skip
 

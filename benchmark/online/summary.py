@@ -18,6 +18,8 @@ class Summary:
         frames: Frames that were fused.
         voxels: Voxels of the map.
         alpha: Agreement of two views at the same spot beyond chance, at most 1: the number that the verdict rests on.
+        alpha_low, alpha_high: Ends of its confidence interval.
+        confidence: Confidence of that interval, 0 to 1.
         vss3: The paper's VSS, of the voxels with OP >= 3.
         sbd: The paper's SBD in bits, of the voxels with OP >= 2.
         entropy: The paper's entropy, of all voxels.
@@ -33,6 +35,9 @@ class Summary:
     frames: int
     voxels: int
     alpha: float
+    alpha_low: float
+    alpha_high: float
+    confidence: float
     vss3: float
     sbd: float
     entropy: float
@@ -45,11 +50,14 @@ class Summary:
     @classmethod
     def of(cls, frames: int, table: TableSummary, statistics: MapStatistics, flicker: float) -> Summary:
         """Return the summary of a map's statistics."""
-        verdict = statistics.verdict
+        verdict, alpha = statistics.verdict, statistics.headline.alpha
         return cls(
             frames=frames,
             voxels=table.voxels,
-            alpha=statistics.headline.alpha.value,
+            alpha=alpha.value,
+            alpha_low=alpha.low,
+            alpha_high=alpha.high,
+            confidence=alpha.level,
             vss3=float(table.recurrent[VSS]),
             sbd=float(table[SBD]),
             entropy=float(table[ENTROPY]),

@@ -15,7 +15,7 @@ from semstab.core.types import Int64, UInt8
 from semstab.data.measures import SBD, VSS, dominant
 from semstab.data.records import OVERVIEW, Failure, Record, Result
 from semstab.data.results import slug
-from semstab.data.statistics import CONFIDENCE, Estimate, MapStatistics
+from semstab.data.statistics import CONFIDENCE, Estimate, MapStatistics, short
 from semstab.data.topdown import EMPTY
 from semstab.metrics import CATEGORIES, CATEGORY_COLORS, categories, macro_mean
 from semstab.report.charts import Line, dot_chart, line_chart, sample
@@ -25,7 +25,7 @@ from semstab.report.filter_study import advice, filter_studies, of_interest
 from semstab.report.html import filled, jpeg, png, table_block
 from semstab.report.means import ENOUGH, by_model, describe, levels, over_recurrent, pooled, swept
 from semstab.report.narrative import noted, notes, outlying_line, warnings
-from semstab.report.ranking import answers, short, stated
+from semstab.report.ranking import answers
 from semstab.report.saved_run import read_series
 from semstab.report.tables import tables
 from semstab.report.tables.table import relations
@@ -117,7 +117,7 @@ def _scene_verdict(record: Record) -> dict[str, str]:
     statistics = record.statistics
     if statistics is None:
         return {"scene": record.unit.scene, "level": "not assessed", "kind": "open", "probability": ""}
-    level, p = statistics.verdict.level, stated(statistics.verdict)
+    level, p = statistics.verdict.level, statistics.verdict.stated
     return {"scene": record.unit.scene, "level": level, "kind": KINDS.get(level, "bad"), "probability": p}
 
 

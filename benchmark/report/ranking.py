@@ -5,14 +5,13 @@ from __future__ import annotations
 import functools
 import itertools
 import math
-import re
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 from semstab.data.labels import sharing_classes
 from semstab.data.records import Record, Result
-from semstab.data.statistics import StabilityVerdict
+from semstab.data.statistics import Estimate
 from semstab.datasets import GROUND_TRUTH
 from semstab.metrics import macro_mean
 from semstab.report.filter_study import filter_studies
@@ -124,9 +123,9 @@ def answers(result: Result) -> Iterator[str]:
         relation = "does not differ significantly from"
         if one.shown:
             relation = "is more stable than" if one.value > 0 else "is less stable than"
-        change, ends = short(one.value, "+"), f"{short(one.low, '+')} to {short(one.high, '+')}"
+        change = Estimate(one.value, one.low, one.high).text("+")
         scenes = f", {one.scenes} of {len(result.scenes)} scenes" if one.scenes < len(result.scenes) else ""
-        yield f"{one.model} {relation} {one.other}: alpha {change} ({ends}){scenes}"
+        yield f"{one.model} {relation} {one.other}: alpha {change}{scenes}"
     elif known:
         ranks = "; ".join(f"{rank}. {', '.join(names)}" for rank, names in ranked.ranks)
         yield f"most stable first: {ranks}"
@@ -140,17 +139,6 @@ def answers(result: Result) -> Iterator[str]:
         yield f"not compared, as their classes differ: {', '.join(ranked.apart)}"
     elif ranked.apart:
         yield f"not compared, as the classes of the others differ: {', '.join(ranked.apart)}"
-
-
-def short(value: float, sign: str = "", *, digits: int = 2) -> str:
-    """Return a number from -1 to 1 without the 0 before its point: '.55', '-.19', '1.00'; '-' where it is undefined."""
-    return "-" if math.isnan(value) else re.sub(r"^([+-]?)0\.", r"\1.", f"{value:{sign}z.{digits}f}")
-
-
-def stated(verdict: StabilityVerdict) -> str:
-    """Return the probability of a level: '(p .51)', '(p > .99)', no share of a map; '' without one."""
-    p = verdict.probability
-    return "" if math.isnan(p) else "(p > .99)" if p >= 0.995 else f"(p {short(p)})"
 
 
 def _is_uninformative(record: Record) -> bool:

@@ -33,9 +33,12 @@ class Run:
     folder: Path
     result: Result
 
+    def __repr__(self) -> str:
+        return f"{self.folder}: {self.result!r}"
+
     @property
     def summary(self) -> pd.DataFrame:
-        """Return one row per unit: its names and the mean of every measure."""
+        """Return one row per unit: its names, its verdict, alpha with its interval, and the mean of every measure."""
         return self.result.to_pandas()
 
     def table(self, *, scene: str | None = None, model: str | None = None, backend: str | None = None) -> VoxelTable:

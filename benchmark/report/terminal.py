@@ -16,7 +16,7 @@ from semstab.config import BASE
 from semstab.data.measures import measures
 from semstab.data.records import Failure, Record, Result, UnitContent
 from semstab.data.results import Agreement, UnitSummary
-from semstab.data.statistics import UNDEFINED, Estimate
+from semstab.data.statistics import UNDEFINED, Estimate, short
 from semstab.engine.executors import InProcess
 from semstab.engine.observer import Observer
 from semstab.engine.units import Plan
@@ -24,7 +24,7 @@ from semstab.metrics import CATEGORIES, macro_mean
 from semstab.report.filter_study import advice, filter_studies
 from semstab.report.means import ENOUGH
 from semstab.report.narrative import noted, outlying_line, warnings
-from semstab.report.ranking import answers, short, stated
+from semstab.report.ranking import answers
 from semstab.report.tables import tables
 from semstab.report.tables.filters import row as filter_row
 from semstab.report.tables.stability import one_in
@@ -145,7 +145,7 @@ def _verdict(run: UnitSummary) -> Iterator[str]:
     if statistics.verdict.level == "no verdict":
         yield from textwrap.wrap(statistics.verdict.line, WIDTH, initial_indent="  ", subsequent_indent="    ")
         return
-    yield f"  {level} {stated(statistics.verdict)}".rstrip() + f"    alpha {short(alpha.value)}{_interval(alpha)}"
+    yield f"  {level} {statistics.verdict.stated}".rstrip() + f"    alpha {short(alpha.value)}{_interval(alpha)}"
     if statistics.verdict.level == "uninformative" and statistics.cells is not None:
         share, name = _percent(statistics.cells.largest_share), statistics.cells.largest_class
         yield f"  {share} of the observations are {name}: agreement does not assess such a map"
@@ -258,10 +258,8 @@ def row_of(record: Record) -> list[str]:
     run, statistics = record.summary, record.summary.statistics
     level, alpha, agree = "-", "", math.nan
     if statistics is not None:
-        level = f"{statistics.verdict.level} {stated(statistics.verdict)}".rstrip()
-        agree, own = 100 * statistics.headline.psa.value, statistics.headline.alpha
-        ends = "" if math.isnan(own.low) else f" ({short(own.low)} to {short(own.high)})"
-        alpha = f"{short(own.value)}{ends}"
+        level, alpha = str(statistics.verdict), statistics.headline.alpha.text()
+        agree = 100 * statistics.headline.psa.value
     recurrent = run.table.recurrent
     means = [recurrent[m] if recurrent.voxels >= ENOUGH else math.nan for m in measures()[:2]]
     vss, sbd = (short(mean, digits=m.digits[0]) for m, mean in zip(measures(), means, strict=False))
