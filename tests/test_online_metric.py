@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import math
 import pickle
 import subprocess
@@ -242,3 +243,15 @@ def test_lightning_logs_it(flights, tmp_path):
         (logged,) = trainer.validate(Module(), torch.utils.data.DataLoader(torch.arange(10)), verbose=False)
     expected = updated(TemporalStability(K, SIZE), frames).compute()
     assert logged == pytest.approx({f"val/{name}": value for name, value in expected.items()}, rel=1e-6)
+
+
+def test_help_shows_the_arguments_of_the_metric_and_its_own_documentation():
+    of_torch, own = semstab.TemporalStability, TemporalStability
+    for name in ("__init__", "update"):
+        shown, known = (dict(inspect.signature(getattr(each, name)).parameters) for each in (of_torch, own))
+        shown.pop("of_torchmetrics", None)
+        assert [(each.name, each.default) for each in shown.values()] == [
+            (each.name, each.default) for each in known.values()
+        ]
+    assert of_torch.__doc__ == own.__doc__
+    assert "T_wc: (4, 4)" in of_torch.update.__doc__

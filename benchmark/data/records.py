@@ -8,6 +8,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from semstab.config import BACKENDS, BASE, nearest
 from semstab.core.json_form import INLINE
 from semstab.data import voxels
@@ -380,7 +382,7 @@ class Result:
     def _columns(self) -> dict[str, Any]:
         flicker = {record.unit: record.image_space.compensated_flicker_percent for record in reversed(self.records)}
         rows = [run.row() | {"compensated_flicker_percent": flicker[run.unit]} for run in self.runs]
-        return {name: [row[name] for row in rows] for name in (rows[0] if rows else ())}
+        return {name: np.array([row[name] for row in rows]) for name in (rows[0] if rows else ())}
 
     def _repr_html_(self) -> str:
         """Return the summary table, the verdicts and maps from above, in a notebook."""

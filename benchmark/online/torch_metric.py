@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
+from semstab.data.labels import IGNORE_8BIT
 from semstab.errors import MissingDependencyError
 
 try:
@@ -17,28 +18,42 @@ except ImportError as missing:
     ) from missing
 
 from semstab.online import metric
-from semstab.online.metric import State
+from semstab.online.metric import MOST_VOXELS, State
 from semstab.online.summary import Summary
 
 
 class TemporalStability(Metric):
-    """A `torchmetrics.Metric` that takes the arguments of `semstab.online.metric.TemporalStability` and its own."""
+    """A `torchmetrics.Metric` of `semstab.online.metric.TemporalStability`, whose documentation it has."""
 
     higher_is_better = True
     is_differentiable = False
     full_state_update = False
 
-    def __init__(self, num_classes: int, voxel_size: float = 0.1, **options: Any) -> None:
-        own = ("ignore_index", "soft", "alpha", "max_voxels", "backend")
-        self._options = {name: options.pop(name) for name in own if name in options}
-        super().__init__(**options)
+    def __init__(
+        self,
+        num_classes: int,
+        voxel_size: float = 0.1,
+        *,
+        ignore_index: int | None = IGNORE_8BIT,
+        soft: bool = False,
+        alpha: bool = True,
+        max_voxels: int = MOST_VOXELS,
+        backend: str = "numba",
+        **of_torchmetrics: Any,
+    ) -> None:
+        super().__init__(**of_torchmetrics)
         self.num_classes, self.voxel_size = num_classes, voxel_size
+        self._options: dict[str, Any] = {
+            "ignore_index": ignore_index, "soft": soft, "alpha": alpha, "max_voxels": max_voxels, "backend": backend,
+        }  # fmt: skip
         self._own = self._new()
         self._all: metric.TemporalStability | None = None
 
-    def update(self, *args: Any, **kwargs: Any) -> None:
-        """Fuse one frame, or a batch of frames in the order of time; see `semstab.online.metric.TemporalStability`."""
-        self._own.update(*args, **kwargs)
+    def update(
+        self, predicted: Any, depth: Any, intrinsics: Any, T_wc: Any, sequence: str | int | Sequence[Any] = ""
+    ) -> None:
+        """Fuse one frame, or a batch of frames in the order of time."""
+        self._own.update(predicted, depth, intrinsics, T_wc, sequence)
 
     def compute(self) -> dict[str, torch.Tensor]:
         """Return the scalars of all frames of all processes, float64."""
@@ -92,3 +107,7 @@ class TemporalStability(Metric):
 
     def _new(self) -> metric.TemporalStability:
         return metric.TemporalStability(self.num_classes, self.voxel_size, **self._options)
+
+
+TemporalStability.__doc__ = metric.TemporalStability.__doc__
+TemporalStability.update.__doc__ = metric.TemporalStability.update.__doc__

@@ -82,7 +82,7 @@ def beside(words: Words, logs: tuple[Path, Path], seconds: float) -> str | None:
         (os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]), log.read_text())
         for child, log in zip(children, logs, strict=True)
     ]
-    refused = [said for code, said in ends if code == 2 and "another process works on it" in said]
+    refused = [said for code, said in ends if code == 2 and "another process" in said]
     if any(code for code, _ in ends) and (len(refused) != 1 or len(refused[0].splitlines()) != 1):
         return str(ends)
     return None
