@@ -1,4 +1,10 @@
-"""Fusion backends behind one protocol: `create("open3d", voxel_size=0.2, num_classes=7)`."""
+"""Fusion backends behind one protocol: `create("open3d", voxel_size=0.2, num_classes=7)`.
+
+Examples:
+    >>> backend = semstab.backends.create("numba", voxel_size=0.5, num_classes=3)
+    >>> backend.integrate(frames[0]).map_voxels == len(backend.table())
+    True
+"""
 
 from __future__ import annotations
 

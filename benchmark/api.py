@@ -44,6 +44,12 @@ def run(
 
     Raises:
         ConfigError, DataError: If the plan cannot be made, or a unit failed, once everything else has been written.
+
+    Examples:
+        >>> city = {"name": "city", "options": {"width": 160, "height": 90, "frames": 24}}
+        >>> result = semstab.run({"dataset": city, "scenes": ["scene0"], "voxel_size": 0.5}, out="again", report=False)
+        >>> result.models
+        ('sim-steady', 'sim-flicker')
     """
     with contextlib.ExitStack() as stack:
         if out is None:
@@ -70,6 +76,23 @@ def run_study(
     command: Sequence[str] = (),
     report: bool = True,
 ) -> Result:
-    """Run a study as `run` does: a unit that fails is among the result's failures, and the others finish."""
+    """Run a study as `run` does: a unit that fails is among the result's failures, and the others finish.
+
+    Args:
+        config: Settings, or a YAML file with them.
+        out: Folder of the results.
+        executor: Executor of the work; this process by default.
+        observers: Objects that are notified of each step.
+        command: The command line, for the manifest.
+        report: Whether tables, figures and report.html are written.
+
+    Returns:
+        The summaries of all units that finished, and the failures of the others.
+
+    Examples:
+        >>> study = {**config, "sweeps": {"voxel_size": [0.5, 1.0]}}
+        >>> len(semstab.run_study(study, "study", report=False).records)
+        6
+    """
     observing = [*observers, *([Reporting(out)] if report else [])]
     return execute(as_config(config), Path(out), executor, observing, command)[0]

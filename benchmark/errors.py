@@ -16,7 +16,15 @@ OUT_OF_MEMORY = (
 
 
 class SemstabError(Exception):
-    """An error that the caller can mend. The message, a line, names the fault, its source and the remedy."""
+    """An error that the caller can mend. The message, a line, names the fault, its source and the remedy.
+
+    Examples:
+        >>> try:
+        ...     semstab.load("nowhere")
+        ... except semstab.SemstabError as error:
+        ...     print(error)
+        nowhere/summary.json: cannot be read (No such file or directory)
+    """
 
     exit_code = 2
 
@@ -25,7 +33,15 @@ class SemstabError(Exception):
 
 
 class ConfigError(SemstabError, ValueError):
-    """A setting or an argument that cannot be used."""
+    """A setting or an argument that cannot be used.
+
+    Examples:
+        >>> try:
+        ...     semstab.load_config({"voxel_size": -1})
+        ... except semstab.ConfigError as error:
+        ...     print(error)
+        configuration: voxel_size: input should be greater than or equal to 0.000000001 (got -1)
+    """
 
 
 class OutgrownError(ConfigError):
@@ -33,11 +49,29 @@ class OutgrownError(ConfigError):
 
 
 class DataError(SemstabError, ValueError):
-    """Data that is missing, damaged, or that contradicts itself."""
+    """Data that is missing, damaged, or that contradicts itself.
+
+    Examples:
+        >>> try:
+        ...     semstab.fuse([])
+        ... except semstab.DataError as error:
+        ...     print(error)
+        there are no frames to fuse; give posed label maps: labels, depth, intrinsics, T_wc
+    """
 
 
 class MissingDependencyError(SemstabError, ImportError):
-    """An optional package that is not installed; the message holds the command that installs it."""
+    """An optional package that is not installed; the message holds the command that installs it.
+
+    Examples:
+        >>> try:
+        ...     table = semstab.load("run").summary
+        ... except semstab.MissingDependencyError as error:
+        ...     print(error)  # data frames need pandas; pip install 'semstab[pandas]', ...
+        ... else:
+        ...     print(len(table))
+        2
+    """
 
 
 def nearest(name: str, known: Sequence[str]) -> str:

@@ -21,10 +21,16 @@ def load_config(
 ) -> Config:
     """Return the configuration of a file, or of settings by name, over the defaults in configs/datasets/.
 
-    Overrides come last.
+    Args:
+        settings: A YAML file, or settings by name; the defaults where not given.
+        overrides: Settings that come last.
 
     Raises:
         ConfigError: If a setting cannot be used.
+
+    Examples:
+        >>> semstab.load_config({"voxel_size": 0.5}, {"voxel_size": 0.25}).voxel_size
+        0.25
     """
     base = settings if isinstance(settings, Mapping) else _of_file(settings)
     content = _over(base, overrides or {})
@@ -46,8 +52,16 @@ def load_study(study: str | Path, overrides: Mapping[str, Any] | None = None) ->
 
     Its name is the file's, and only backends that it names check it.
 
+    Args:
+        study: A YAML file, or the name of a study that ships.
+        overrides: Settings that come last.
+
     Raises:
         ConfigError: For an unknown study.
+
+    Examples:
+        >>> semstab.load_study("city").models
+        ['sim-steady', 'sim-flicker', 'sim-soft']
     """
     study = FORMER_STUDIES.get(str(study), study)
     path = _shipped("studies") / f"{study}.yaml" if str(study) in shipped_studies() else Path(study)

@@ -1,4 +1,11 @@
-"""Datasets behind one base class: a dataset has scenes, a scene yields frames with the labels of a model."""
+"""Datasets behind one base class: a dataset has scenes, a scene yields frames with the labels of a model.
+
+Examples:
+    >>> city = semstab.datasets.open_dataset("city", {"width": 160, "height": 90})
+    >>> scene = city.scene("scene0")
+    >>> scene.frame(0, "sim-steady").shape
+    (90, 160)
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,10 @@
-"""Segmentation models behind one protocol: `create("segformer", checkpoint="models/segformer-b0")`."""
+"""Segmentation models behind one protocol: `create("segformer", checkpoint="models/segformer-b0")`.
+
+Examples:
+    >>> model = semstab.models.create("colour-clusters", clusters=4)
+    >>> model.gives_scores
+    True
+"""
 
 from __future__ import annotations
 

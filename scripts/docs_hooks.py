@@ -1,4 +1,4 @@
-"""Pages of the documentation that are made from the code: the command line's options, and the public Python names."""
+"""Fit the pages of the documentation to the site: notebooks, tables, and links that lead out of it."""
 
 from __future__ import annotations
 
@@ -9,8 +9,6 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-import semstab
-
 PARENT = re.compile(r"\]\(\.\./[^)]*\)")
 """Links to files of the repository outside of docs/, which the site does not hold: their text alone is kept."""
 
@@ -20,15 +18,13 @@ TABLE = re.compile(r"^\[([^\]]*)\]\((tables/[^)]*\.csv)\)$", re.MULTILINE)
 
 
 def on_files(files: Any, config: Any, **_: Any) -> Any:
-    """Add the generated pages."""
+    """Add a page for each notebook."""
     from mkdocs.structure.files import File
 
     for notebook in [file for file in files if file.src_uri.endswith(".ipynb")]:
         files.remove(notebook)
         page = notebook.src_uri.removesuffix(".ipynb") + ".md"
         files.append(File.generated(config, page, content="\n\n".join(cells(notebook.content_string))))
-    for path, lines in (("reference/cli.md", command_line()), ("reference/api.md", python_names())):
-        files.append(File.generated(config, path, content="\n".join(lines)))
     return files
 
 
@@ -57,41 +53,5 @@ def cells(notebook: str) -> Iterator[str]:
                 yield "".join(shown.get("text/html", shown.get("text/markdown")))
 
 
-def command_line() -> Iterator[str]:
-    """A section a command: its synopsis, its arguments and options by panel."""
-    import typer
-
-    from semstab.cli import app
-
-    yield "# Command line\n\nMade from the commands themselves; `semstab-bench COMMAND --help` prints the same.\n"
-    commands: Any = typer.main.get_command(app)
-    for name, command in commands.commands.items():
-        if command.hidden:
-            continue
-        yield f"## semstab-bench {name}\n\n{(command.help or '').strip()}\n"
-        panels: dict[str, list[Any]] = {}
-        for parameter in command.params:
-            if not getattr(parameter, "hidden", False):
-                panels.setdefault(getattr(parameter, "rich_help_panel", None) or "Options", []).append(parameter)
-        for panel, own in panels.items():
-            yield f"**{panel}**\n\n| | |\n| --- | --- |"
-            yield from (f"| {_names(parameter)} | {_cell(parameter.help)} |" for parameter in own)
-            yield ""
-
-
-def _names(parameter: Any) -> str:
-    if parameter.param_type_name == "argument":
-        return f"`{parameter.metavar or parameter.name.upper()}`"
-    return ", ".join(f"`{option}`" for option in (*parameter.opts, *parameter.secondary_opts))
-
-
 def _cell(text: str | None) -> str:
     return " ".join((text or "").split()).replace("|", "\\|")
-
-
-def python_names() -> Iterator[str]:
-    """The public names of `semstab`, from their docstrings."""
-    yield "# Python\n\n`import semstab` is instant: what a name needs is imported when it is first used.\n"
-    for name in semstab.__all__:
-        home = semstab._HOMES.get(name)
-        yield f"::: semstab.{home}.{name}\n" if home else f"::: semstab.{name}\n    options: {{members: false}}\n"

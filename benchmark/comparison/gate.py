@@ -276,11 +276,17 @@ class GateConfig(BaseModel):
     """The content of gate.yaml.
 
     Attributes:
+        rules: Rules such as 'alpha drop < 0.02'; docs/gate.md has their form.
         level: Largest probability that a rule that holds fails, or that one that does not hold passes.
         undecided: The outcome of a gate with undecided rules: 'report' them, so that it neither passes nor fails;
             'pass', 'fail'.
         scope: The data for which rules are assessed: 'this scene' flown again, 'these frames', or 'other scenes' like
             these.
+
+    Examples:
+        >>> rules = semstab.GateConfig(rules=("alpha drop < 0.02", "flicker < 15"), undecided="fail")
+        >>> semstab.gate("run:sim-flicker", "run:sim-steady", rules).passed
+        False
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
@@ -452,7 +458,21 @@ class GateResult:
 def gate(new: str | os.PathLike[str], against: str | os.PathLike[str] | None, config: GateConfig) -> GateResult:
     """Assess a run, or 'FOLDER:MODEL', by rules; those on a drop or a rise need a baseline, a run or a small summary.
 
-    Raises ConfigError and DataError, each with the rule or the folder, and what to do.
+    Args:
+        new: Folder of a run, 'FOLDER:MODEL' where it has several models, or a result in memory.
+        against: The baseline: likewise, or a small summary; None where no rule needs one.
+        config: The rules.
+
+    Returns:
+        The outcome, and the verdict on each rule.
+
+    Raises:
+        ConfigError, DataError: For a rule or a folder that cannot be used, and what to do.
+
+    Examples:
+        >>> semstab.gate("run:sim-steady", None, semstab.GateConfig(rules=("alpha > 0.6",)))
+        <GateResult: passes; sim-steady (run) on scene0>
+          passes: alpha > 0.6: 0.94...
     """
     parsed = [parse(text) for text in config.rules]
     own = open_run(new)

@@ -129,6 +129,11 @@ def compare(
 
     Raises:
         ConfigError, DataError: For runs that cannot be opened, or have no scene or no classes in common, in one line.
+
+    Examples:
+        >>> semstab.compare(["run:sim-steady", "run:sim-flicker"])
+        <RunComparison with sim-steady on scene0>
+          sim-flicker: alpha -.21 ..., p ...; worse in alpha, psa, vss...
     """
     lock = None
     if out is not None:

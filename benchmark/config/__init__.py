@@ -115,12 +115,18 @@ class VerdictSettings(Settings):
 
 
 class Config(Settings):
-    """Settings that determine the numbers of a run or a study: scenes x models x backends x variations."""
+    """Settings that determine the numbers of a run or a study: scenes x models x backends x variations.
+
+    Examples:
+        >>> config = semstab.load_config({"dataset": {"name": "city"}, "voxel_size": 0.5})
+        >>> config.voxel_size, config.backends[0].name
+        (0.5, 'numba')
+    """
 
     earlier: ClassVar[Mapping[str, str]] = {"backbones": "models"}
     name: str = Field("run", min_length=1, description="the title of the report; a study's is its file's by default")
     description: str = Field("", description="one line")
-    dataset: DatasetConfig = DatasetConfig()
+    dataset: DatasetConfig = Field(DatasetConfig(), description="name and options of the dataset")
     scenes: list[str] | None = Field(None, description="scenes of the dataset; all of them where not given")
     models: list[str] | None = Field(None, description="label sources; all but the ground truth where not given")
     region_maps: list[str] = Field([], description="label sources whose ids mean nothing across frames (raw SAM)")
@@ -138,12 +144,12 @@ class Config(Settings):
     )
     pixel_stride: int = Field(1, ge=1, description="use every n-th pixel of each axis")
     top_k: int | None = Field(None, ge=1, description="fuse the so many largest scores of each pixel; null: all")
-    frames: FrameSelection = FrameSelection()
+    frames: FrameSelection = Field(FrameSelection(), description="frames that are fused; all by default")
     scene_frames: dict[str, FrameSelection] = Field({}, description="frames of single scenes, instead of `frames`")
-    exclude: Exclusion = Exclusion()
+    exclude: Exclusion = Field(Exclusion(), description="classes and pixels that are left out")
     perturbation: Perturbation | None = Field(None, description="noise in every unit; null for none")
     strata: list[int] = Field([1, 2, 5], min_length=1, description="upper OP edges of the persistence strata")
-    sweeps: Sweeps = Sweeps()
+    sweeps: Sweeps = Field(Sweeps(), description="settings of which a study tries several values")
     seed: int = Field(0, ge=0, description="of the noise; the n-th repeat of a sweep takes seed + n")
     events: bool = Field(False, description="also write the log of observations, where a backend keeps one")
     statistics: bool = Field(
@@ -152,7 +158,7 @@ class Config(Settings):
     frame_quality: bool = Field(False, description="also assess each frame's labels; the filters study does")
     critical_classes: list[str] = Field([], description="classes of the verdict; all frequent ones if none is named")
     scope: ScopeSetting = Field(THIS_SCENE, description="of intervals: 'these frames', 'this scene', 'other scenes'")
-    verdict: VerdictSettings = VerdictSettings()
+    verdict: VerdictSettings = Field(VerdictSettings(), description="thresholds of the levels")
 
     # These change no number, so they are not stored with a run.
     threads: int | None = Field(None, ge=1, exclude=True, description="threads that decode frames ahead")

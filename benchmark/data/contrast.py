@@ -313,7 +313,11 @@ class RunComparison:
         lines = [f"<RunComparison with {self.base} on {scenes}>"]
         for own in self.overall:
             first = own.contrasts[0] if own.contrasts else None
-            changes = [f"{row.change} in {row.measure}" for row in own.contrasts if row.change]
+            changes = [
+                f"{change} in {', '.join(named)}"
+                for change in ("worse", "better")
+                if (named := [row.measure for row in own.contrasts if row.change == change])
+            ]
             known = "" if first is None else f": {first.measure} {first.difference.text('+')}, p {first.p_holm:.2g}"
-            lines.append(f"  {own.other}{known}; {', '.join(changes) or 'no difference is shown'}")
+            lines.append(f"  {own.other}{known}; {'; '.join(changes) or 'no difference is shown'}")
         return "\n".join(lines)

@@ -34,6 +34,11 @@ class Events:
         pixels: (m,) int32 pixels behind it.
         voxel_size: r, metres.
         classes: The K class names, where they are known.
+
+    Examples:
+        >>> events = semstab.load("run").events(model="sim-steady")  # a run with --events
+        >>> int(events.frame.max()), events.evidence.shape[1] == len(events.classes)
+        (23, True)
     """
 
     ix: Int32

@@ -20,7 +20,16 @@ RIGID_TOLERANCE = 1e-3
 
 @dataclass(frozen=True)
 class Intrinsics:
-    """Pinhole intrinsics in pixels; integer (u, v) are pixel centres."""
+    """Pinhole intrinsics in pixels; integer (u, v) are pixel centres.
+
+    Attributes:
+        fx, fy: Focal lengths.
+        cx, cy: Principal point.
+
+    Examples:
+        >>> semstab.Intrinsics(fx=60.0, fy=60.0, cx=31.5, cy=23.5).matrix[0]
+        array([60. ,  0. , 31.5])
+    """
 
     fx: float
     fy: float
@@ -100,6 +109,13 @@ class Frame:
 
     Raises:
         DataError: If shapes disagree, the pose is not rigid or not finite, or a type is wrong.
+
+    Examples:
+        >>> depth, labels = np.full((48, 64), 5.0, np.float32), np.zeros((48, 64), np.uint8)
+        >>> camera = semstab.Intrinsics(fx=60.0, fy=60.0, cx=31.5, cy=23.5)
+        >>> frame = semstab.Frame(0, depth, camera, np.eye(4), labels=labels)
+        >>> frame.shape
+        (48, 64)
     """
 
     index: int

@@ -132,6 +132,11 @@ class LabelSpace:
 
     Raises:
         ConfigError: If these contradict each other.
+
+    Examples:
+        >>> space = semstab.LabelSpace("field", classes=("road", "tree"))
+        >>> space.ids
+        (0, 1)
     """
 
     name: str

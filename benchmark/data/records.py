@@ -265,11 +265,14 @@ class Result:
     """The result of a run or a study; tables, figures, report and terminal are made from it.
 
     Attributes:
+        name: The name of the run or study.
         backend: The base backend: that of every unit but those of the 'backends' variation.
         records: Records in the order of the plan.
+        failures: The units that failed, with the message of each.
         agreement: Agreement of each pair of backends that must agree, on each scene and model that both fused.
         up: (x, y, z) unit vector of the world's up axis by scene, where it is known or could be estimated.
         georeference: Georeference by scene, where that is known.
+        manifest: The content of manifest.json: versions, inputs, times.
         regions: Flicker of the label sources that are regions without classes.
         compared: The same of each other backend and the base one, which need not agree.
         advice: Advice on the voxel size, scene by scene, for data of files.

@@ -159,6 +159,14 @@ class VoxelTable:
 
     Raises:
         DataError: If columns disagree in length or rows are not sorted and distinct.
+
+    Examples:
+        >>> table = semstab.load("run").table(model="sim-steady")
+        >>> often = table.op >= 3
+        >>> bool(semstab.metrics.vss(table)[often].mean() > 0.9)
+        True
+        >>> list(table.to_pandas().columns[:9])
+        ['ix', 'iy', 'iz', 'x', 'y', 'z', 'op', 'label', 'class']
     """
 
     ix: Int32

@@ -1,4 +1,10 @@
-"""The engine of runs and studies: scenes x models x backends x variations, each unit is stored when it is finished."""
+"""The engine of runs and studies: scenes x models x backends x variations, each unit is stored when it is finished.
+
+Examples:
+    >>> result = semstab.run(config, out="jobs", executor=semstab.engine.LocalProcesses(2), report=False)
+    >>> len(result.records)
+    2
+"""
 
 from __future__ import annotations
 

@@ -291,8 +291,15 @@ def model_of(named: str | os.PathLike[str], model: str | None) -> tuple[Path, st
 def load_result(folder: str | Path) -> Result:
     """Return the result of a finished run or study from its folder.
 
+    Args:
+        folder: Its --out.
+
     Raises:
         DataError: If it is not there or damaged.
+
+    Examples:
+        >>> semstab.load_result("run").scenes
+        ('scene0',)
     """
     folder = Path(folder)
     path = folder / "summary.json"

@@ -117,6 +117,11 @@ def export(
 
     Raises:
         ConfigError, DataError, MissingDependencyError: If a file cannot be written; the message names it.
+
+    Examples:
+        >>> [file] = semstab.export("run:sim-steady", "map.ply", min_op=3)
+        >>> file.path.name
+        'map.ply'
     """
     run, model = model_of(run, model)
     files = [Path(file) for file in ([to] if isinstance(to, str | Path) else to)]

@@ -58,6 +58,11 @@ class Belief:
 
     Raises:
         ConfigError: For an unknown category, and values out of range.
+
+    Examples:
+        >>> belief = semstab.Belief(min_op=3, min_psa=0.8, categories=("stable",))
+        >>> semstab.relabel("run:sim-steady", "fused", belief=belief).frames
+        24
     """
 
     min_op: int = 1
@@ -310,6 +315,11 @@ def relabel(
     Raises:
         ConfigError, DataError: If the data has changed since it was fused, or its label maps cannot have the depth's
             pixels.
+
+    Examples:
+        >>> made = semstab.relabel("run:sim-flicker", "fused", name="calm")
+        >>> made.changed > 0
+        True
     """
     if name is not None and not names_a_folder(name):
         raise ConfigError(f"name {name!r}: {NO_FOLDER_NAME}")

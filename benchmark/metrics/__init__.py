@@ -1,4 +1,11 @@
-"""The paper's measures as pure functions of a voxel table, and measures in the image."""
+"""The paper's measures as pure functions of a voxel table, and measures in the image.
+
+Examples:
+    >>> table = semstab.load("run").table(model="sim-flicker")
+    >>> summary = semstab.metrics.summarise(table)
+    >>> summary.voxels == len(table)
+    True
+"""
 
 from semstab.data.measures import dominant, entropy, op, sbd, vss
 from semstab.metrics.agreement import compare

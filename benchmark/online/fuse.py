@@ -24,7 +24,15 @@ from semstab.settings import as_config
 
 @dataclasses.dataclass(frozen=True)
 class FusedResult(Result):
-    """A result whose files lie in a temporary folder until `save`; `compare`, `gate` and `export` take it as a run."""
+    """A result whose files lie in a temporary folder until `save`; `compare`, `gate` and `export` take it as a run.
+
+    Examples:
+        >>> result = semstab.fuse(frames, voxel_size=0.5, model="net")
+        >>> result.summary.frames, result.record().unit.model
+        (6, 'net')
+        >>> result.save("saved").name
+        'saved'
+    """
 
     _folder: Any = None
 
@@ -71,17 +79,30 @@ def fuse(
 ) -> FusedResult:
     """Fuse posed label maps, and return all numbers of a run: measures, strata, alpha, verdict, intervals.
 
-    - `frames`: `Frame`s, or mappings with labels (H, W) or scores (H, W, K), depth (H, W) in metres, intrinsics (3, 3),
-      T_wc (4, 4) or (3, 4) camera to world; color, mask, timestamp and truth (H, W) are optional. NumPy or
-      torch. A generator is read once; its frames wait on disk, in a temporary folder
-    - `voxel_size`: metres; by default the size that `check` suggests for the data
-    - `classes`: names, in the order of the labels
-    - `recording`: a file for the rerun viewer
-    - `settings`: further settings of `Config`: statistics=True, scope='these frames', events=True, ...
+    Args:
+        frames: `Frame`s, or mappings with labels (H, W) or scores (H, W, K), depth (H, W) in metres, intrinsics (3, 3),
+            T_wc (4, 4) or (3, 4) camera to world; color, mask, timestamp and truth (H, W) are optional. NumPy or
+            torch. A generator is read once; its frames wait on disk, in a temporary folder.
+        voxel_size: Edge of a voxel, metres; by default the size that `check` suggests for the data.
+        backend: Name of the backend that fuses.
+        classes: Names, in the order of the labels.
+        scene: Name of the scene.
+        model: Name of the model.
+        recording: A file for the rerun viewer.
+        observers: Objects that are notified of each step.
+        settings: Further settings of `Config`: statistics=True, scope='these frames', events=True, ...
+
+    Returns:
+        The result, whose `summary` has the numbers of the map.
 
     Raises:
         DataError: For a frame that cannot be fused, with its number.
         ConfigError: For a setting that is not valid.
+
+    Examples:
+        >>> result = semstab.fuse(frames, voxel_size=0.5)
+        >>> result.summary.frames, round(result.summary.op3_share, 1)
+        (6, 1.0)
     """
     sequence, token = Sequence(frames), uuid.uuid4().hex
     Frames.sequences[token] = sequence

@@ -152,18 +152,6 @@ class TemporalStability:
 
     It has the interface of torchmetrics, and is a `torchmetrics.Metric` if torchmetrics is installed.
 
-    >>> import numpy as np
-    >>> metric = TemporalStability(num_classes=3, voxel_size=0.1)
-    >>> K, pose = [[50, 0, 32], [0, 50, 24], [0, 0, 1]], np.eye(4)
-    >>> depth, labels = np.ones((48, 64), np.float32), np.zeros((48, 64), int)
-    >>> labels[:, 32:] = 1
-    >>> for wrong in (0, 0, 12):
-    ...     predicted = labels.copy()
-    ...     predicted[:, :wrong] = 2
-    ...     metric.update(predicted, depth, K, pose)
-    >>> {name: round(float(value), 2) for name, value in metric.compute().items() if name in ("vss@3", "op3_share")}
-    {'vss@3': 0.93, 'op3_share': 1.0}
-
     Attributes:
         num_classes: The number of classes, K.
         voxel_size: The edge of a voxel, metres.
@@ -172,6 +160,19 @@ class TemporalStability:
         alpha: True to sample the cells that give alpha and a verdict: half of the time of an update.
         max_voxels: The most voxels of a sequence; a larger map is sampled at random, so that its memory is bounded.
         backend: The backend that fuses.
+        of_torchmetrics: The arguments of `torchmetrics.Metric`, where it is installed.
+
+    Examples:
+        >>> metric = semstab.TemporalStability(num_classes=3, voxel_size=0.1)
+        >>> K, pose = [[50, 0, 32], [0, 50, 24], [0, 0, 1]], np.eye(4)
+        >>> depth, labels = np.ones((48, 64), np.float32), np.zeros((48, 64), int)
+        >>> labels[:, 32:] = 1
+        >>> for wrong in (0, 0, 12):
+        ...     predicted = labels.copy()
+        ...     predicted[:, :wrong] = 2
+        ...     metric.update(predicted, depth, K, pose)
+        >>> {name: round(float(value), 2) for name, value in metric.compute().items() if name in ("vss@3", "op3_share")}
+        {'vss@3': 0.93, 'op3_share': 1.0}
     """
 
     higher_is_better = True

@@ -74,8 +74,18 @@ class Run:
 def load(folder: str | Path) -> Run:
     """Return a finished run from its folder.
 
+    Args:
+        folder: The run's --out.
+
     Raises:
         DataError: If the run does not exist or is damaged.
+
+    Examples:
+        >>> run = semstab.load("run")
+        >>> run.summary[["model", "verdict"]]
+                 model verdict
+        0   sim-steady  stable
+        1  sim-flicker  usable
     """
     return Run(Path(folder), load_result(folder))
 

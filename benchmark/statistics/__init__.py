@@ -2,6 +2,11 @@
 
 Pure functions of a VoxelTable and its Events. `describe` returns all statistics of one map, `compare_models`
 compares several; docs/metrics.md derives each measure.
+
+Examples:
+    >>> table = semstab.load("run").table(model="sim-flicker")
+    >>> 0.6 < float(semstab.statistics.psa(table)[table.op >= 2].mean()) < 1.0
+    True
 """
 
 from semstab.data.contrast import ModelComparison

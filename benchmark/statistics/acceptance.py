@@ -68,9 +68,20 @@ class AcceptanceThresholds(BaseModel):
     """The labels of a map that may be acted on, as a YAML file stores them.
 
     Attributes:
+        schema: Version of the file.
         precision, confidence: Labels of a class that are acted on are right with at least this probability; a class'
             threshold promises too much with a probability of at most 1 - confidence.
+        voxel_size: Edge of the voxels that they hold for, metres.
+        calibrated_on: Runs that they come from.
         left: Share of the calibration's voxels whose label is acted on.
+        classes: The threshold of each class.
+
+    Examples:
+        >>> road = {"by": "op", "at_least": 3, "precision": 0.97}
+        >>> given = {"schema": 1, "precision": 0.95, "confidence": 0.95, "voxel_size": 0.5, "classes": {"road": road}}
+        >>> thresholds = semstab.AcceptanceThresholds(**given)
+        >>> thresholds.classes["road"].at_least
+        3.0
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)

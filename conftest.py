@@ -1,0 +1,52 @@
+"""The examples of docstrings: what they may use, and the folder in which they are run."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+from _pytest.doctest import DoctestItem
+
+CITY = {"name": "city", "options": {"width": 160, "height": 90, "frames": 24}}
+CONFIG = {"dataset": CITY, "scenes": ["scene0"], "voxel_size": 0.5}
+
+
+@pytest.fixture(scope="session")
+def example_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with a finished run `run` of two models."""
+    import semstab
+
+    folder = tmp_path_factory.mktemp("examples")
+    semstab.run({**CONFIG, "events": True}, out=folder / "run", report=False)
+    return folder
+
+
+@pytest.fixture(autouse=True)
+def _of_examples(request: pytest.FixtureRequest) -> None:
+    """Give an example `semstab`, `np`, six `frames` of a wall, a `config`, and the folder of the run if it names it."""
+    item = request.node
+    if not isinstance(item, DoctestItem):
+        return
+    import numpy as np
+
+    import semstab
+
+    source = "".join(example.source for example in item.dtest.examples)
+    names: dict[str, Any] = request.getfixturevalue("doctest_namespace")
+    names.update(np=np, semstab=semstab, config=CONFIG, frames=[wall(k) for k in range(6)])
+    if "semstab." in source:
+        request.getfixturevalue("monkeypatch").chdir(
+            request.getfixturevalue("example_folder" if "run" in source else "tmp_path")
+        )
+
+
+def wall(k: int) -> Any:
+    """A wall in front of a camera that stands still, and labels that move."""
+    import numpy as np
+
+    import semstab
+
+    labels = ((np.indices((48, 64)).sum(axis=0) // 16 + k // 3) % 3).astype(np.uint8)
+    camera = semstab.Intrinsics(60.0, 60.0, 31.5, 23.5)
+    return semstab.Frame(k, np.full((48, 64), 5.0, np.float32), camera, np.eye(4), labels=labels)
