@@ -25,6 +25,7 @@ def run(
     observers: Sequence[Observer] = (),
     command: Sequence[str] = (),
     report: bool = True,
+    overwrite: bool = False,
 ) -> Result:
     """Fuse, measure and compare what the configuration selects, without printing; it may be a dict or a YAML file.
 
@@ -38,6 +39,7 @@ def run(
         observers: Objects that are notified of each step.
         command: The command line, for the manifest.
         report: Whether tables, figures and report.html are written.
+        overwrite: Whether the results of another run in the folder may be replaced.
 
     Returns:
         The summaries of all units, with their voxels where `out` is given.
@@ -57,7 +59,8 @@ def run(
             stack.callback(scratch.remove)
         folder = scratch.path if out is None else Path(out)
         reporting = [Reporting(folder)] if report and out is not None else []
-        result, causes = execute(as_config(config), folder, executor, [*observers, *reporting], command)
+        watching = [*observers, *reporting]
+        result, causes = execute(as_config(config), folder, executor, watching, command, overwrite=overwrite)
     if result.failures:
         first = result.failures[0]
         raise causes.get(first.message) or DataError(first.message)
@@ -75,6 +78,7 @@ def run_study(
     observers: Sequence[Observer] = (),
     command: Sequence[str] = (),
     report: bool = True,
+    overwrite: bool = False,
 ) -> Result:
     """Run a study as `run` does: a unit that fails is among the result's failures, and the others finish.
 
@@ -85,6 +89,7 @@ def run_study(
         observers: Objects that are notified of each step.
         command: The command line, for the manifest.
         report: Whether tables, figures and report.html are written.
+        overwrite: Whether the results of another run in the folder may be replaced.
 
     Returns:
         The summaries of all units that finished, and the failures of the others.
@@ -95,4 +100,4 @@ def run_study(
         6
     """
     observing = [*observers, *([Reporting(out)] if report else [])]
-    return execute(as_config(config), Path(out), executor, observing, command)[0]
+    return execute(as_config(config), Path(out), executor, observing, command, overwrite=overwrite)[0]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import io
 import json
+import shutil
 
 import cv2
 import numpy as np
@@ -140,12 +141,36 @@ def test_running_the_resolved_configuration_again_gives_the_same_numbers(root, t
     assert (tmp_path / "one" / "config.yaml").read_text() == (tmp_path / "two" / "config.yaml").read_text()
 
 
-def test_a_folder_of_another_run_is_told_and_of_something_else_refused(root, tmp_path, caplog) -> None:
-    out = tmp_path / "run"
+def files_of(folder) -> dict:
+    return {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+def test_another_run_is_replaced_only_where_that_is_asked_for(root, tmp_path, caplog) -> None:
+    out, change = tmp_path / "run", "voxel_size: 0.25 there, 0.5 here"
     semstab.run(configure(root), out=out, report=False)
-    changed = semstab.run(configure(root, voxel_size=0.5), out=out, report=False)
-    assert "earlier results of other settings (voxel_size: 0.25 there, 0.5 here) are replaced" in caplog.text
+    before = files_of(out)
+    with pytest.raises(ConfigError, match=rf"holds another run \({change}\); choose another --out, or --overwrite"):
+        semstab.run(configure(root, voxel_size=0.5), out=out, report=False)
+    assert files_of(out) == before
+    changed = semstab.run(configure(root, voxel_size=0.5), out=out, report=False, overwrite=True)
+    assert f"earlier results of other settings ({change}) are replaced" in caplog.text
     assert changed.manifest["units"]["kept"] == 0
+
+
+def test_a_run_of_other_data_with_the_same_names_is_not_replaced(root, tmp_path) -> None:
+    out, moved, other = tmp_path / "run", tmp_path / "moved" / root.name, tmp_path / "other" / root.name
+    semstab.run(configure(root), out=out, report=False)
+    shutil.copytree(root, moved)
+    again = semstab.run(configure(moved), out=out, report=False)
+    assert again.manifest["units"]["computed"] == 0
+    shutil.copytree(root, other)
+    for file in other.rglob("labels/*/*.png"):
+        cv2.imwrite(str(file), np.zeros((6, 8), np.uint8))
+    with pytest.raises(ConfigError, match=r"holds another run \(dataset\.options\.root: "):
+        semstab.run(configure(other), out=out, report=False)
+
+
+def test_a_folder_of_something_else_is_refused(root, tmp_path) -> None:
     with pytest.raises(ConfigError, match="is not empty and holds no run"):
         semstab.run(configure(root), out=root, report=False)
     (tmp_path / "file").write_text("")

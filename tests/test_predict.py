@@ -756,11 +756,11 @@ def test_maps_are_read_again_whatever_is_fused_from_them(scene, tmp_path, monkey
     monkeypatch.setattr("semstab.predict.dataset.create", lambda name, **options: model)
     run(live_config(scene, PREDICTOR, frames={"stride": 2}), out=tmp_path / "run", report=False)
     assert len(model.seen) == 3
-    run(live_config(scene, PREDICTOR, voxel_size=0.5), out=tmp_path / "run", report=False)
+    run(live_config(scene, PREDICTOR, voxel_size=0.5), out=tmp_path / "run", report=False, overwrite=True)
     assert len(model.seen) == 6
     Image.fromarray(predicted_scene.image(5, seed=9)).save(scene / "color/005.png")
     (tmp_path / "run/predictions/flight/labels/colour-clusters/000.png").unlink()
-    run(live_config(scene, PREDICTOR, voxel_size=0.2), out=tmp_path / "run", report=False)
+    run(live_config(scene, PREDICTOR, voxel_size=0.2), out=tmp_path / "run", report=False, overwrite=True)
     assert len(model.seen) == 8
 
 

@@ -423,11 +423,12 @@ def test_what_does_not_fit_together_is_refused_before_anything_is_read(root, tmp
 
 def test_a_worker_that_does_not_see_the_folder_sends_the_voxels_back_and_a_job_fails_as_a_whole(root, tmp_path) -> None:
     config = resolve(configure(root, sweeps={}, backends=["numpy"], models=["a"]))
-    (cell,) = make_plan(config).units
+    plan = make_plan(config)
+    (cell,) = plan.units
     elsewhere = tmp_path / "elsewhere"
     (outcome,) = run_job((Work.of(cell, Start("start", elsewhere)),))
     assert not elsewhere.exists()
-    folder = Folder(tmp_path / "out", config)
+    folder = Folder(tmp_path / "out", plan)
     folder.save(outcome)
     folder.close()
     counting = Counting()

@@ -107,6 +107,7 @@ ScopeOption = Annotated[str | None, typer.Option(
     "--scope", metavar="these-frames|this-scene|other-scenes", show_default="this-scene",
     help="Population of intervals: these very frames, this scene flown again, or other scenes like it.",
     rich_help_panel=SETTINGS)]
+Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace the results of another run in --out.")]
 Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Print nothing but errors.")]
 # fmt: on
 

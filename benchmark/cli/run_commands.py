@@ -66,6 +66,7 @@ def run(
         "--statistics", help="Also measure drift and accuracy, and compare models; takes longer.")] = None,
     scope: opt.ScopeOption = None,
     out: Annotated[Path | None, typer.Option("--out", "-o", help="Run folder.", show_default="runs/TIME")] = None,
+    overwrite: opt.Overwrite = False,
     rerun: opt.Rerun = None,
     report: opt.Report = "on",
     jobs: opt.Jobs = 1,
@@ -102,13 +103,14 @@ def run(
     if device is not None:
         loaded = _on_device(loaded, device)
     out = out or Path("runs") / datetime.now().astimezone().strftime("%Y-%m-%d_%H-%M-%S")
-    execute(loaded, out, executor_of(jobs, scheduler), rerun, report, quiet=quiet, verbose=verbose)
+    execute(loaded, out, executor_of(jobs, scheduler), rerun, report, overwrite=overwrite, quiet=quiet, verbose=verbose)
 
 
 def study(
     file: Annotated[str, typer.Argument(
         metavar="FILE", help="Study file, or a shipped study: see `list`.", autocompletion=opt.studies)],
     out: Annotated[Path | None, typer.Option("--out", "-o", help="Study folder.", show_default="studies/NAME")] = None,
+    overwrite: opt.Overwrite = False,
     jobs: opt.Jobs = 1,
     scheduler: opt.Scheduler = None,
     only: Annotated[list[str] | None, typer.Option(
@@ -129,7 +131,7 @@ def study(
     config = load_study(file, chosen({"check_geometry": False if trust_geometry else None}, settings, options))
     config = config if only is None else config.only(only)
     out = out or Path("studies") / slug(config.name)
-    execute(config, out, executor_of(jobs, scheduler), rerun, report, quiet=quiet, verbose=verbose)
+    execute(config, out, executor_of(jobs, scheduler), rerun, report, overwrite=overwrite, quiet=quiet, verbose=verbose)
 
 
 def filters(
@@ -147,6 +149,7 @@ def filters(
     options: opt.DatasetOptions = None,
     trust_geometry: opt.TrustGeometry = False,
     out: Annotated[Path, typer.Option("--out", "-o", help="Study folder.")] = Path("studies/filters"),
+    overwrite: opt.Overwrite = False,
     report: opt.Report = "on",
     jobs: opt.Jobs = 1,
     quiet: opt.Quiet = False,
@@ -165,12 +168,13 @@ def filters(
     config, left_out = filter_study_config(models, model or [], filter_ or [], content)
     for line in left_out if not quiet else ():
         say(line)
-    execute(config, out, executor_of(jobs, None), "off", report, quiet=quiet)
+    execute(config, out, executor_of(jobs, None), "off", report, overwrite=overwrite, quiet=quiet)
 
 
 def execute(
-    config: Config, out: Path, executor: Executor, rerun: str | None, report: str, *, quiet: bool, verbose: bool = False
-) -> None:
+    config: Config, out: Path, executor: Executor, rerun: str | None, report: str, *, overwrite: bool, quiet: bool,
+    verbose: bool = False,
+) -> None:  # fmt: skip
     """Run a configuration, print the answer, and end with the exit code of its outcome."""
     began = time.monotonic()
     from rich.console import Console
@@ -190,7 +194,10 @@ def execute(
     observers: list[Observer] = [ProgressBar(Console(stderr=True, quiet=quiet)), *recording]
     gc.freeze()  # the garbage collector skips modules, which takes half a second of a short run otherwise
     try:
-        result = run_study(config, out, executor=executor, observers=observers, command=sys.argv, report=report == "on")
+        result = run_study(
+            config, out, executor=executor, observers=observers, command=sys.argv, report=report == "on",
+            overwrite=overwrite,
+        )  # fmt: skip
         for line in failure_lines(result):
             say(f"error: {line}")
         if result.select() and not quiet:

@@ -38,11 +38,14 @@ def execute(
     executor: Executor | None = None,
     observers: Sequence[Observer] = (),
     command: Sequence[str] = (),
+    *,
+    overwrite: bool = False,
 ) -> tuple[Result, Mapping[str, BaseException]]:
     """Compute the units that the folder `out` does not hold yet, and return the result of all.
 
     Each unit is stored when it is finished, under a key of its settings and its input: a killed run is resumed by the
-    same command, and a changed setting computes again only the units that it touches. `command` goes into the manifest.
+    same command, and a changed setting computes again only the units that it touches. `command` goes into the manifest;
+    results of another run, of which nothing would be kept, are replaced only with `overwrite`.
     A unit that fails is among the result's failures, and the others finish.
 
     Returns:
@@ -58,7 +61,7 @@ def execute(
     config, advice = with_voxel_size(config, scenes)
     plan = make_plan(config, scenes)
     require_file_names(out, (each.unit for each in plan.units))
-    folder = Folder(out, config)
+    folder = Folder(out, plan, overwrite=overwrite)
     try:
         execution = _Execution(plan, folder, executor, telling)
         with folder.started(config) as start, share_open_scenes(start.name, plan.scenes):

@@ -48,7 +48,7 @@ from semstab.data.records import (
 )
 from semstab.data.results import SCHEMA, Unit, slug
 from semstab.engine.messages import TILES, Outcome, Start
-from semstab.engine.units import PlannedUnit
+from semstab.engine.units import Plan, PlannedUnit
 from semstab.errors import ConfigError, DataError
 
 logger = logging.getLogger("semstab")
@@ -58,6 +58,11 @@ LAYOUT = "# semstab, folder layout 4"
 
 EARLIER_LAYOUT = "# semstab, folder layout 3"
 """The first line of version 0.3, whose results are read for one version."""
+
+OF_MAPS = (
+    "dataset", "taxonomy", "voxel_size", "pixel_stride", "top_k", "frames", "scene_frames", "exclude", "perturbation",
+)  # fmt: skip
+"""The settings that decide which observations fall into which voxels."""
 
 SETTINGS = "config.yaml"
 FAILURES = "failures.log"
@@ -108,18 +113,39 @@ class Folder:
     """OUT/ of a run or study, with what was computed with the same settings; one process owns it until `close`.
 
     Raises:
-        ConfigError: If another process does, or where it holds something else, or results of an earlier version.
+        ConfigError: If another process does, or where it holds something else, results of an earlier version, or of
+            another run of which this plan would keep nothing, unless `overwrite`.
     """
 
-    def __init__(self, path: str | Path, config: Config) -> None:
+    def __init__(self, path: str | Path, plan: Plan, *, overwrite: bool = False) -> None:
         self.path = Path(path).absolute()
-        earlier = _claimed(self.path)
+        earlier, config = _claimed(self.path), plan.config
+        self._files = {file.stem: file for file in (self.path / UNITS).glob("*.json")}
+        before, now = earlier or {}, yaml.safe_load(config.to_yaml())
+        other_map = _first_change({key: before[key] for key in OF_MAPS if key in before}, now)
+        if (
+            other_map
+            and self._files
+            and not overwrite
+            and not self._keeps_some(plan, before["dataset"] == now["dataset"])
+        ):
+            raise ConfigError(
+                f"{path}: holds another run ({other_map}); choose another --out, or --overwrite to replace it"
+            )
         self._lock = FolderLock(self.path)
         (self.path / UNITS).mkdir(exist_ok=True)
-        if earlier is not None and (change := _first_change(earlier, yaml.safe_load(config.to_yaml()))):
+        if change := _first_change(before, now):
             logger.warning("%s: earlier results of other settings (%s) are replaced", path, change)
         write_text(self.path / SETTINGS, f"{LAYOUT}\n{config.to_yaml()}")
-        self._files = {file.stem: file for file in (self.path / UNITS).glob("*.json")}
+
+    def _keeps_some(self, plan: Plan, same_dataset: bool) -> bool:
+        """Return whether the folder has a unit of a plan: of these settings and this dataset, or of this very input."""
+        units = plan.distinct().values()
+        if same_dataset:
+            return any(name.startswith(each.identity) for name in self._files for each in units)
+        with contextlib.suppress(DataError):
+            return any(unit_key(each.identity, each.task.digest) in self._files for each in units)
+        return False
 
     def close(self) -> None:
         """Let another process have it."""

@@ -45,7 +45,7 @@ def test_a_map_that_outgrows_the_memory_is_given_up_in_one_line(growing, tmp_pat
     semstab.run(small, out=tmp_path / "out", report=False)
     large = configure(growing, memory_gb=0.012, tile_size="off", **settings)
     with pytest.raises(ConfigError, match=r"wall, a, numba: after \d of 6 frames the map has .* million voxels"):
-        semstab.run(large, out=tmp_path / "out", report=False)
+        semstab.run(large, out=tmp_path / "out", report=False, overwrite=True)
     again = semstab.run(small, out=tmp_path / "out", report=False)
     assert again.manifest["units"]["kept"] == 1
     assert len(semstab.run(large.model_copy(update={"memory_gb": 2.0}), report=False).records) == 2
