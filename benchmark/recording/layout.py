@@ -22,7 +22,7 @@ from semstab.data.voxels import VoxelTable
 from semstab.engine.units import Plan
 from semstab.metrics import CATEGORIES, CATEGORY_COLORS
 from semstab.recording.drift import PICTURES
-from semstab.recording.target import Target
+from semstab.recording.target import Target, flush
 from semstab.recording.timeline import SERIES, entity, path
 from semstab.recording.voxel_maps import CHUNKS, DIFFERENCE, chunk, color_modes, defaults, packed, thinned, visualizer
 from semstab.task import Task
@@ -417,7 +417,7 @@ def record_changes(
     results = rrb.TextDocumentView(origin="/results", name="Results")
     shown = rrb.Horizontal(rrb.Tabs(*tabs) if len(tabs) > 1 else tabs[0], results, column_shares=[3, 1])
     stream.send_blueprint(rrb.Blueprint(shown, collapse_panels=True), make_default=True, make_active=True)
-    stream.flush()
+    flush(stream, file)
     stream.disconnect()
 
 

@@ -35,7 +35,7 @@ from semstab.recording import timeline
 from semstab.recording.camera import COARSE_SIDE, SceneLog, over_camera, stride_of
 from semstab.recording.drift import DriftLog
 from semstab.recording.layout import VERDICT, blueprint, drawn
-from semstab.recording.target import DEFAULT_URL, Target, is_whole
+from semstab.recording.target import DEFAULT_URL, Target, flush, is_whole
 from semstab.recording.timeline import Background, Clock, path
 from semstab.recording.voxel_maps import (
     PENDING,
@@ -276,14 +276,14 @@ class Recording(Observer):
             self._send_layout(stream)
         finally:
             try:
-                stream.flush()
+                flush(stream, self.target.file)
             except RuntimeError as error:
                 reason = "was the viewer closed?" if self.target.live else "is the disk full?"
                 raise ConfigError(
                     f"{self.target.file}: the recording is not complete ({summarize_error(error)}; {reason}); all"
                     " other files are complete, and the same command makes the recording again"
                 ) from error
-            finally:
+            else:
                 stream.disconnect()
 
     def _opened(self) -> tuple[rr.RecordingStream, Background]:

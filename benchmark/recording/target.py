@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import ctypes
 import os
 import re
 import shutil
@@ -29,9 +30,36 @@ FOOTER, FOOTER_BYTES = b"RRF2FOOT", 64
 ANSWER_SECONDS, SPAWN_SECONDS = 5.0, 30.0
 """The most seconds that a viewer may take to answer, and that a started viewer may take to listen."""
 
+STALLED_SECONDS = 10.0
+"""The seconds without a byte written after which a recording counts as one that cannot be written."""
+
 HTTP2_SETTINGS = b"\x04"
 HTTP2_PREFACE = b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n" + bytes(3) + HTTP2_SETTINGS + bytes(5)
 """A client's first bytes, an empty frame of settings included; a server answers with such a frame (RFC 9113)."""
+
+
+def flush(stream: rr.RecordingStream, file: Path) -> None:
+    """Wait until a recording is in its file, as long as the file grows: on a full disk rerun would wait for ever.
+
+    Raises:
+        RuntimeError: If it cannot be written.
+    """
+    size = _size(file)
+    while True:
+        try:
+            stream.flush(timeout_sec=STALLED_SECONDS)
+        except RuntimeError:
+            if (now := _size(file)) <= size:
+                rr.unregister_shutdown()  # at its end Python would wait for it, too, and where the stream is destroyed
+                ctypes.pythonapi.Py_IncRef(ctypes.py_object(stream))
+                raise
+            size = now
+        else:
+            return
+
+
+def _size(file: Path) -> int:
+    return file.stat().st_size if file.exists() else 0
 
 
 @dataclass(frozen=True)

@@ -33,6 +33,30 @@ def test_a_recording_that_finds_no_room_costs_no_result(tmp_path, monkeypatch) -
     assert len(json.loads((out / "summary.json").read_text())["runs"]) == 1
 
 
+FULL = """
+import resource, sys
+import semstab.recording.target as target
+from semstab.__main__ import main
+
+target.STALLED_SECONDS = 0.5
+resource.setrlimit(resource.RLIMIT_FSIZE, (250_000, resource.getrlimit(resource.RLIMIT_FSIZE)[1]))
+main()
+"""
+
+
+def test_a_full_disk_beneath_a_recording_ends_the_command(tmp_path) -> None:
+    """The thread of rerun that writes has ended: what waits for it would wait for ever, also at the program's end."""
+    words = ["--scene", "scene0", "--frames", "::20", "--voxel-size", "2", "--report", "off", "-q", "--out", "out"]
+    done = subprocess.run(
+        [sys.executable, "-c", FULL, *words], cwd=tmp_path, env=environment(80), capture_output=True, text=True,
+        timeout=100, check=False,
+    )  # fmt: skip
+    assert done.returncode == 2, done.stderr
+    (line,) = (line for line in done.stderr.splitlines() if line.startswith("error"))
+    assert line.startswith("error: out/recording.rrd: the recording is not complete")
+    assert len(json.loads((tmp_path / "out/summary.json").read_text())["runs"]) == 2
+
+
 def test_a_file_that_finds_no_room_is_named(tmp_path) -> None:
     """No file may grow beyond 64 kB, as on a disk that is full."""
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
