@@ -72,7 +72,8 @@ def tasks_of(scene: Scene, config: Config, others: Sequence[str] = ()) -> Iterat
     names = selected(config.models, scene.models, scene.by_name, "model", scene.name)
     if not names:
         searched = f"searched {', '.join(scene.label_paths)}; " if scene.label_paths else ""
-        raise DataError(f"{scene.name}: there are no label maps; {searched}add them, or choose with --scene")
+        instead = "add them, or predict them: --predict colour-clusters, or --predict FILE.py:NAME"
+        raise DataError(f"{scene.name}: there are no label maps; {searched}{instead}")
     frames = _chosen_frames(scene, config, [*dict.fromkeys((*names, *others))])
     indices = as_range(frames.indices)
     for model in names:

@@ -112,6 +112,13 @@ RECOGNISED = (
 """Formats that a folder is recognised as: the one whose scenes lie highest, of these the first."""
 
 
+POINTS = {
+    "LiDAR scans in SemanticKITTI's layout": "velodyne/*.bin",
+    "point clouds": "*.pcd",
+    "point clouds (LAS)": "*.la[sz]",
+}
+"""Data without depth images, by its name: a pattern of its files."""
+
 FILES = (".bag", ".mcap", ".db3")
 """Suffixes of files that are a scene each."""
 
@@ -141,6 +148,11 @@ def recognise(root: Path) -> tuple[str, str]:
             fits.append((deep, rank, name, f"{cls.contents}; {count}"))
     if fits:
         return min(fits)[2:]
+    for what, pattern in POINTS.items():
+        for depth in range(4):
+            if (found := next(root.glob("*/" * depth + pattern), None)) is not None:
+                where = found.parent.relative_to(root.parent)
+                raise DataError(f"{root}: holds {what} ({where}), and no depth images; scans are not read, give depth/")
     if not near:
         return RECOGNISED[-1], ""
     listed = " or ".join(text for _, text in sorted(near)[:3])

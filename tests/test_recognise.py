@@ -34,6 +34,18 @@ def test_what_is_nearly_a_format_says_what_it_lacks(tmp_path):
     assert recognise(tmp_path / "empty")[0] == "posed_folder"
 
 
+@pytest.mark.parametrize(
+    ("file", "said"),
+    [("sequences/00/velodyne/000000.bin", "LiDAR scans in SemanticKITTI's layout"), ("a.pcd", "point clouds")],
+)
+def test_scans_are_named_as_what_they_are(tmp_path, file, said):
+    (tmp_path / file).parent.mkdir(parents=True, exist_ok=True)
+    (tmp_path / file).touch()
+    (tmp_path / "poses.txt").touch()
+    with pytest.raises(DataError, match=rf"holds {said} \(.*\), and no depth images"):
+        recognise(tmp_path)
+
+
 def test_a_path_alone_is_checked_and_run(tmp_path):
     FORMATS["tum"].write(tmp_path / "rgbd", source(5000))
     result = bench("check", tmp_path / "rgbd", *CAMERA, cwd=tmp_path)

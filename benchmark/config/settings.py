@@ -109,7 +109,9 @@ def explain(error: ValidationError, model: type[BaseModel]) -> str:
     message = problem["msg"].removeprefix("Value error, ")
     if not name:  # of the settings as a whole
         return message
-    return f"{name}: {message[0].lower()}{message[1:]} (got {reprlib.repr(problem['input'])})"
+    given = problem["input"]
+    plain = all(isinstance(each, str | int | float) for each in (given if isinstance(given, list | tuple) else [given]))
+    return f"{name}: {message[0].lower()}{message[1:]}{f' (got {reprlib.repr(given)})' if plain else ''}"
 
 
 def _models_in(annotation: Any) -> Iterator[type[BaseModel]]:
