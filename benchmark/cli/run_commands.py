@@ -64,6 +64,9 @@ def run(
     rich_help_panel=opt.SETTINGS)] = None,
     statistics: Annotated[bool | None, typer.Option(
         "--statistics", help="Also measure drift and accuracy, and compare models; takes longer.")] = None,
+    video_measures: Annotated[str | None, typer.Option(
+        "--video-measures", metavar="depth|dis", show_default="none",
+        help="Also VC and TC as papers report them, by depth and pose, or by optical flow between images.")] = None,
     scope: opt.ScopeOption = None,
     out: Annotated[Path | None, typer.Option("--out", "-o", help="Run folder.", show_default="runs/TIME")] = None,
     overwrite: opt.Overwrite = False,
@@ -87,7 +90,7 @@ def run(
     named = {
         "backends": backend, "scenes": scene, "models": model, "taxonomy": taxonomy, "voxel_size": voxel_size,
         "pixel_stride": pixel_stride, "top_k": top_k, "check": check, "events": events, "statistics": statistics,
-        "scope": scope, "check_geometry": False if trust_geometry else None,
+        "video_measures": video_measures, "scope": scope, "check_geometry": False if trust_geometry else None,
         "tile_size": tile_size if tile_size is None or not tile_size.isdigit() else int(tile_size),
     }  # fmt: skip
     content = chosen(named, settings, options, dataset, data, frames, seed)

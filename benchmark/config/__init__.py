@@ -114,6 +114,10 @@ class VerdictSettings(Settings):
     class_locations: float = Field(100.0, ge=1, description="voxels that a class must dominate to be assessed")
 
 
+FlowName = Literal["depth", "dis"]
+"""The motion from a frame to the next one: by depth and pose, or OpenCV's dense inverse search on the images."""
+
+
 class Config(Settings):
     """Settings that determine the numbers of a run or a study: scenes x models x backends x variations.
 
@@ -156,6 +160,9 @@ class Config(Settings):
         False, description="also statistics of order, correctness and model comparison; fuses the ground truth too"
     )
     frame_quality: bool = Field(False, description="also assess each frame's labels; the filters study does")
+    video_measures: FlowName | None = Field(
+        None, description="also VC and TC as published, by flow: 'depth' and pose, or 'dis' (OpenCV, of the images)"
+    )
     critical_classes: list[str] = Field([], description="classes of the verdict; all frequent ones if none is named")
     scope: ScopeSetting = Field(THIS_SCENE, description="of intervals: 'these frames', 'this scene', 'other scenes'")
     verdict: VerdictSettings = Field(VerdictSettings(), description="thresholds of the levels")

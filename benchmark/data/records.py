@@ -88,6 +88,52 @@ class ImageSpace:
 
 
 @dataclass(frozen=True)
+class ClipMean:
+    """The mean of video consistency over clips, 0 to 1; NaN where there is no clip. Weigh by clips to pool videos."""
+
+    value: float = math.nan
+    clips: int = 0
+
+
+@dataclass(frozen=True)
+class WarpedOverlap:
+    """TC of one video in three published forms, 0 to 1, see `semstab.metrics.TemporalConsistency`; NaN where undefined.
+
+    Attributes:
+        sums: (4, K) pixels by class, from which 'vspw' and 'etc' of several videos follow.
+    """
+
+    vspw: float
+    etc: float
+    ssp: float
+    sums: tuple[tuple[int, ...], ...]
+
+
+@dataclass(frozen=True)
+class VideoMeasures:
+    """The published measures of time of one video, over all pixels of the sampled frames; see docs/metrics.md.
+
+    Attributes:
+        flow: 'depth' or 'dis', the motion by which TC warps.
+        vc8_published, vc16_published: VC as VC_perclip.py counts it: without the last clip, labels of all pixels.
+        vc8, vc16: VC over all clips, of the pixels that have a prediction and a true label in all frames of the clip.
+        self_vc8, self_vc16: The same of the pixels that have a prediction, without ground truth.
+        tc: TC of all pixels that the flow leads into the next image.
+        tc_seen: Without those that are hidden there.
+    """
+
+    flow: str
+    vc8_published: ClipMean
+    vc16_published: ClipMean
+    vc8: ClipMean
+    vc16: ClipMean
+    self_vc8: ClipMean
+    self_vc16: ClipMean
+    tc: WarpedOverlap
+    tc_seen: WarpedOverlap
+
+
+@dataclass(frozen=True)
 class FrameQuality:
     """The worth of single frames' labels, as filters left them; shares are 0 to 1, NaN where undefined.
 
@@ -128,6 +174,7 @@ class Record:
             `semstab.statistics` reports of the map.
         image_space: Image-space measures of the 'base' units; all NaN elsewhere.
         quality: Quality of the labels of single frames, where `frame_quality` asked for it.
+        video_measures: VC and TC as published, where `video_measures` asked for them.
         voxels_file: File of its voxel table, or the folder of its tiles, for the 'base' and 'backends' units; None
             elsewhere.
         truth_file: File of the ground truth's voxels of the same frames, where the statistics fused it.
@@ -138,6 +185,7 @@ class Record:
     summary: UnitSummary = field(metadata=INLINE)
     image_space: ImageSpace = ImageSpace()
     quality: FrameQuality | None = None
+    video_measures: VideoMeasures | None = None
     voxels_file: Path | None = None
     truth_file: Path | None = None
 
@@ -243,6 +291,7 @@ class UnitContent:
     summary: UnitSummary | None = None
     image_space: ImageSpace | None = None
     quality: FrameQuality | None = None
+    video_measures: VideoMeasures | None = None
     up: tuple[float, float, float] | None = None
     files: Mapping[str, str] = field(default_factory=dict)
     regions: RegionFlicker | None = None

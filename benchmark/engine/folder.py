@@ -211,6 +211,7 @@ class Folder:
             summary=content.summary,
             image_space=(content.image_space or ImageSpace()) if planned.image_space else ImageSpace(),
             quality=content.quality if planned.image_space else None,
+            video_measures=content.video_measures if planned.image_space else None,
             voxels_file=self.path / voxels if planned.stored else None,
             truth_file=self.path / truth if planned.image_space and has_truth else None,
         )

@@ -117,7 +117,8 @@ class Fusion:
         scene, wanting = self._scene, [stream for stream in self.streams if index in stream.frames]
         model = wanting[0].task.model
         try:
-            color = self._observers.want_color or any(stream.shown == index for stream in self.streams)
+            pictured = any(stream.shown == index for stream in self.streams)
+            color = self._observers.want_color or pictured or any(stream.wants_color for stream in wanting)
             frame = scene.frame(index, model, color=color)
             truth = _ground_truth(scene, index) if any(stream.truth_task is not None for stream in wanting) else None
             measures_quality = any(stream.quality is not None for stream in wanting)

@@ -26,7 +26,7 @@ from semstab.engine.messages import Work
 from semstab.engine.observer import Observers
 from semstab.engine.series import FrameRow, Series
 from semstab.engine.tiles import tiles_met
-from semstab.metrics import FrameQualityMeter, flicker_percent
+from semstab.metrics import FrameQualityMeter, VideoMeter, flicker_percent
 from semstab.metrics.image_space import ImageSpaceMeter
 from semstab.statistics import Sampler
 from semstab.statistics.observations import CellObservations
@@ -205,6 +205,9 @@ class Stream:
         self.image_space = ImageSpaceMeter() if base or series else None
         quality = base and maps[0].work.config.frame_quality
         self.quality = FrameQualityMeter(len(self.task.mapping.target)) if quality else None
+        flow = maps[0].work.config.video_measures if base else None
+        self.video = None if flow is None else VideoMeter(len(self.task.mapping.target), flow)
+        self.wants_color = flow == "dis"
         self.truth_task = truth_task(self.task) if base or maps[0].work.config.statistics else None
         self._poses = Rows(POSE)
         self._estimates_up = base and self.task.scene.up is None
@@ -227,7 +230,8 @@ class Stream:
             truth = prepare(self.truth_task, decoded.truth, self.pixel_stride)
         if decoded.index == self.shown:
             self.overview = _overview(self.task, decoded.frame)
-            frame = frame if self._observers.want_color else dataclasses.replace(frame, color=None)
+            wanted = self._observers.want_color or self.wants_color
+            frame = frame if wanted else dataclasses.replace(frame, color=None)
         return Prepared(fetched, frame, truth)
 
     def measure(self, now: Prepared, reports: Mapping[LiveMap, FrameReport]) -> dict[LiveMap, FrameRow]:
@@ -243,6 +247,9 @@ class Stream:
             with self._watch("frame quality"):
                 model = frame if decoded.model is None else prepare(self.task, decoded.model, self.pixel_stride)
                 self.quality.add(frame, model, now.truth)
+        if self.video is not None:
+            with self._watch("video measures"):
+                self.video.add(frame, now.truth)
         if self._estimates_up:
             self._poses.append(frame.T_wc[:3, 1:].ravel())
         self._previous = frame if self._sequential else None

@@ -77,6 +77,7 @@ def finish(live: LiveMap, stream: Stream, watch: Stopwatch) -> Outcome:
         sizes,
         _quality(stream),
         live.origin,
+        None if stream.video is None else stream.video.result(),
         series=live.rows.numbers,
         sums=sums,
         reduced=np.zeros(0) if fused is None else fused.reduced,
@@ -191,11 +192,13 @@ def unit_content(
 
 
 def in_image_space(content: UnitContent, task: Task, result: TileResult, points: VoxelTable | Float64) -> UnitContent:
-    """Return the content with stability in image coordinates, the quality of single frames and the scene's up axis."""
+    """Return the content with what is measured in image coordinates, and the scene's up axis."""
     assert content.summary is not None
     image_space = ImageSpaceMeter(result.image).result(content.summary.flicker_percent)
     up = up_axis(task.scene, points, result.poses)
-    return dataclasses.replace(content, image_space=image_space, up=up, quality=result.quality)
+    return dataclasses.replace(
+        content, image_space=image_space, up=up, quality=result.quality, video_measures=result.video_measures
+    )
 
 
 def reduced_sums(table: VoxelTable) -> Float64:

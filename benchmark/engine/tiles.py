@@ -16,7 +16,7 @@ from semstab.core.files import parse_json, read_arrays, write_arrays
 from semstab.core.json_form import from_json, to_json
 from semstab.core.types import Float64, Int32
 from semstab.data.frames import Frame
-from semstab.data.records import FrameQuality
+from semstab.data.records import FrameQuality, VideoMeasures
 from semstab.data.results import Agreement, SizeAlpha
 from semstab.engine.series import NUMBERS, Series
 from semstab.errors import DataError
@@ -81,6 +81,7 @@ class TileMeta:
     sizes: tuple[SizeAlpha, ...] = ()
     quality: FrameQuality | None = None
     origin: tuple[int, int, int] | None = None
+    video_measures: VideoMeasures | None = None
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

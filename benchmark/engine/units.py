@@ -178,6 +178,8 @@ def _base_units(config: Config, scenes: Mapping[str, Scene]) -> Iterator[Planned
             _check_classes(config.critical_classes, task)
             one = settings.model_copy(update={"models": [task.model]})
             sampled = _is_sampled(config, config.backends[0])
+            if config.video_measures == "dis" and scene.missing(task.indices[0], color=True):
+                raise ConfigError(f"{name}: there are no images for optical flow; use --video-measures depth")
             yield PlannedUnit(
                 Variation(BASE), one, task, identity(one, task), image_space=True, stored=True, sampled=sampled
             )
@@ -289,7 +291,9 @@ def identity(config: Config, task: Task) -> str:
         "frames": [*task.indices],
         "taxonomy": [mapping.target.name, mapping.target.classes, mapping.source.ids, mapping.rows],
     }
-    return _hash(config, content | ({"beside": filtering.model} if config.frame_quality else {}))
+    beside = {"beside": filtering.model} if config.frame_quality else {}
+    video = {} if config.video_measures is None else {"video_measures": config.video_measures}
+    return _hash(config, content | beside | video)
 
 
 def _hash(config: Config, content: Mapping[str, Any], without: Iterable[str] = ()) -> str:

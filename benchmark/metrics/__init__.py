@@ -33,6 +33,7 @@ from semstab.metrics.summary import (
     summarise,
 )
 from semstab.metrics.temporal_consistency import TemporalConsistency, flow_by_depth, image_flow, occluded, warp_labels
+from semstab.metrics.video_measures import VideoMeter
 
 __all__ = [
     "CATEGORIES",
@@ -44,6 +45,7 @@ __all__ = [
     "SelfConsistency",
     "TemporalConsistency",
     "VideoConsistency",
+    "VideoMeter",
     "categories",
     "category_shares",
     "changed_pixels",

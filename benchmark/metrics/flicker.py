@@ -143,6 +143,16 @@ class VideoConsistency:
         """The same without the last clip of each video, 0 to 1; NaN where there is none."""
         return self._clips.published
 
+    @property
+    def clips(self) -> int:
+        """The number of clips behind `value`."""
+        return self._clips.count
+
+    @property
+    def published_clips(self) -> int:
+        """The number of clips behind `published`."""
+        return self._clips.published_count
+
 
 class SelfConsistency:
     """VC_n without ground truth: the share of the pixels that are valid in all n frames whose prediction is constant.
@@ -167,6 +177,11 @@ class SelfConsistency:
     def value(self) -> float:
         """Mean over the clips in which a pixel counts, 0 to 1; NaN where there is none."""
         return self._clips.mean
+
+    @property
+    def clips(self) -> int:
+        """The number of clips behind `value`."""
+        return self._clips.count
 
 
 class _Run:
@@ -202,7 +217,7 @@ class _Clips:
 
     def __init__(self, n: int) -> None:
         self.n = n
-        self._sum, self._count = 0.0, 0
+        self._sum, self.count = 0.0, 0
         self._last = math.nan  # of the video so far
         self._lasts, self._videos = 0.0, 0  # of the videos before
 
@@ -215,7 +230,7 @@ class _Clips:
             return math.nan
         self._last = consistent / pixels
         self._sum += self._last
-        self._count += 1
+        self.count += 1
         return self._last
 
     def end(self) -> None:
@@ -227,12 +242,16 @@ class _Clips:
 
     @property
     def mean(self) -> float:
-        return self._sum / self._count if self._count else math.nan
+        return self._sum / self.count if self.count else math.nan
+
+    @property
+    def published_count(self) -> int:
+        return self.count - self._videos - (not math.isnan(self._last))
 
     @property
     def published(self) -> float:
         open_ = 0.0 if math.isnan(self._last) else self._last
-        count = self._count - self._videos - (not math.isnan(self._last))
+        count = self.published_count
         return (self._sum - self._lasts - open_) / count if count else math.nan
 
 

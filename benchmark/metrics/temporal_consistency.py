@@ -54,7 +54,7 @@ class TemporalConsistency:
         if num_classes < 1:
             raise ConfigError(f"num_classes = {num_classes}: TC needs at least 1")
         self.num_classes, self.form = num_classes, form
-        self._confusion = np.zeros((num_classes, num_classes + 1), dtype=np.int64)  # last: none of the classes
+        self._sums = np.zeros((SUMS, num_classes), dtype=np.int64)
         self._pairs: list[float] = []
         self._videos: list[float] = []
 
@@ -77,8 +77,9 @@ class TemporalConsistency:
         own, other = labels[known].astype(np.int64), warped[known].astype(np.int64)
         other = np.where((other >= 0) & (other < K), other, K)
         pair = np.bincount(own * (K + 1) + other, minlength=K * (K + 1)).reshape(K, K + 1)
-        self._confusion += pair
-        value = _mean_iou(pair[:, :K])
+        sums = np.stack([np.diag(pair), pair[:, :K].sum(axis=1), pair[:, :K].sum(axis=0), pair[:, K]])
+        self._sums += sums
+        value = _mean_iou(sums, sums[1] + sums[2] > 0)
         if not math.isnan(value):
             self._pairs.append(value)
         return value
@@ -92,24 +93,43 @@ class TemporalConsistency:
     @property
     def value(self) -> float:
         """TC of the videos so far, 0 to 1; NaN where no pixel counts."""
-        if self.form == "ssp":
+        return self.of(self.form)
+
+    def of(self, form: Form) -> float:
+        """Return TC of the same pairs in another form."""
+        if form == "ssp":
             videos = [*self._videos, *([float(np.mean(self._pairs))] if self._pairs else [])]
             return float(np.mean(videos)) if videos else math.nan
-        if self.form == "vspw":
-            return _mean_iou(self._confusion[:, :-1], own_alone=True)
-        if not self._confusion.any():
-            return math.nan
-        intersection = np.diag(self._confusion).astype(np.float64)
-        union = self._confusion.sum(axis=1) + self._confusion[:, :-1].sum(axis=0) - intersection
-        return float(np.mean(intersection / np.maximum(union, 1)))
+        return pooled_tc(self._sums, form)
+
+    @property
+    def sums(self) -> npt.NDArray[np.int64]:
+        """(4, K) pixels of each class, of which 'vspw' and 'etc' are made; those of several videos add up.
+
+        Of the own and the warped labels both, of the own ones, of the warped ones, and of the own ones where the warped
+        label is none, which the first three leave out.
+        """
+        return self._sums.copy()
 
 
-def _mean_iou(confusion: npt.NDArray[np.int64], *, own_alone: bool = False) -> float:
-    """Return the mean IoU over the classes of a pair, or those of its first map alone; NaN where there is none."""
-    intersection, own = np.diag(confusion), confusion.sum(axis=1)
-    union = own + confusion.sum(axis=0) - intersection
-    there = (own if own_alone else union) > 0
-    return float(np.mean(intersection[there] / union[there])) if there.any() else math.nan
+SUMS = 4
+"""Rows of `TemporalConsistency.sums`."""
+
+
+def pooled_tc(sums: npt.NDArray[np.int64], form: Literal["vspw", "etc"]) -> float:
+    """Return TC in a form that pools pixels, from `TemporalConsistency.sums`; NaN where no pixel counts."""
+    same, own, warped, lost = sums
+    if form == "vspw":
+        return _mean_iou(sums, own > 0)
+    if not sums.any():
+        return math.nan
+    return float(np.mean(same / np.maximum(own + lost + warped - same, 1)))
+
+
+def _mean_iou(sums: npt.NDArray[np.int64], there: Mask) -> float:
+    """Return the mean IoU over these classes; NaN where there is none."""
+    same, own, warped, _ = sums
+    return float(np.mean(same[there] / (own + warped - same)[there])) if there.any() else math.nan
 
 
 def warp_labels(labels: Labels, flow: npt.NDArray[np.floating[Any]], sampling: Sampling = "nearest") -> Labels:

@@ -79,6 +79,8 @@ def screen(
         yield from _several(result, records, width)
     for sweep in result.sweeps():
         yield f"  sweep over {sweep.replace('_', ' ')}: semstab-bench show {out or 'RUN'} sensitivity_{sweep}"
+    if any(record.video_measures is not None for record in records):
+        yield f"  VC and TC as published: semstab-bench show {out or 'RUN'} video_measures"
     for text in list(warnings(result))[:MOST_WARNINGS]:
         yield from textwrap.wrap(f"warning: {text}", WIDTH, initial_indent="  ", subsequent_indent="    ")
     yield from _checks(result)

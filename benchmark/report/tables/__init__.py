@@ -26,6 +26,7 @@ from semstab.report.tables.stability import (
 )
 from semstab.report.tables.statistics import class_agreement, drift, frames, temporal_agreement, uncertainty, verdicts
 from semstab.report.tables.table import TEXT_WRITERS, Cell, Column, Group, Table, to_csv, to_json, to_latex, to_markdown
+from semstab.report.tables.video_measures import video_measures
 
 __all__ = [
     "Cell",
@@ -42,9 +43,9 @@ __all__ = [
 ]
 
 BUILDERS = (
-    overview, verdicts, flicker, scenes, persistence, classes, temporal_agreement, correlogram, class_agreement, drift,
-    frames, uncertainty, ceiling, correctness, cross_model, comparison, sensitivity, voxel_sizes, reduced, fusion,
-    compared, agreement,
+    overview, verdicts, flicker, video_measures, scenes, persistence, classes, temporal_agreement, correlogram,
+    class_agreement, drift, frames, uncertainty, ceiling, correctness, cross_model, comparison, sensitivity,
+    voxel_sizes, reduced, fusion, compared, agreement,
 )  # fmt: skip
 """The functions that make tables, in the paper's order; without numbers for its tables a function returns none."""
 
