@@ -14,6 +14,7 @@ from posed_scene import fails
 from records import record, study, voxels
 
 import semstab
+from semstab.core.palette import KIND_COLORS
 from semstab.errors import ConfigError, DataError, MissingDependencyError
 from semstab.metrics import dominant, sbd, vss
 
@@ -82,7 +83,9 @@ def test_a_table_has_every_voxel_and_its_classes_by_name(run):
 def test_what_a_notebook_shows(run):
     shown = run._repr_html_()
     assert "<td>scene</td><td>a</td><td>numpy</td>" in shown
-    assert f"<td>{run.result.records[0].statistics.verdict.level}</td></tr>" in shown
+    statistics = run.result.records[0].statistics
+    assert f"{statistics.verdict}</td><td>{statistics.headline.alpha.text()}</td>" in shown
+    assert f'<td style="color: {KIND_COLORS["open"]}' in shown  # no verdict
     assert shown == run.result._repr_html_()
     table = run.table(model="a")
     assert f"{len(table)} voxels of 0.25 m, 3 classes" in table._repr_html_()

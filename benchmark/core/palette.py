@@ -12,6 +12,13 @@ DASHES, MARKERS = ("", "6 3", "2 2.5"), ("circle", "square", "diamond", "triangl
 """Patterns of lines, and markers, by which models are told apart where colours are not."""
 
 
+KINDS = {"stable": "good", "usable": "part", "undecided": "open", "uninformative": "open", "no verdict": "open"}
+"""The kinds of levels by which verdicts have their colour; all other levels are bad."""
+
+KIND_COLORS = {"good": "#1a8f68", "part": "#a17a10", "open": "#808085", "bad": "#c75a1a"}
+"""The colours of kinds where the ground is not known, as in a notebook; a report's own are darker, or lighter."""
+
+
 def model_color(k: int) -> tuple[int, int, int]:
     """Return the RGB of the k-th model."""
     return MODEL_COLORS[k % len(MODEL_COLORS)]

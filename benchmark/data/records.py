@@ -12,6 +12,7 @@ import numpy as np
 
 from semstab.config import BACKENDS, BASE, nearest
 from semstab.core.json_form import INLINE
+from semstab.core.palette import KIND_COLORS, KINDS
 from semstab.data import voxels
 from semstab.data.contrast import ModelComparison
 from semstab.data.display import as_figure
@@ -437,16 +438,30 @@ class Result:
         return {name: np.array([row[name] for row in rows]) for name in (rows[0] if rows else ())}
 
     def _repr_html_(self) -> str:
-        """Return the summary table, the verdicts and maps from above, in a notebook."""
+        """Return the verdicts with the numbers that they rest on, the means, and maps from above, in a notebook."""
         rows: list[list[voxels.Cell]] = []
+        colors = dict[str, str]()
         for run in self.runs:
             table, unit = run.table, run.unit
             means = (voxels.number(table[measure], measure.digits[0]) for measure in measures())
             seen = voxels.number(table.mean_op, 2), *means, voxels.number(100 * table.recurrent.share, 2)
-            verdict = "" if run.statistics is None else run.statistics.verdict.level
-            rows.append([unit.scene, unit.model, unit.backend, table.voxels, *seen, verdict])
+            verdict = alpha = ""
+            if run.statistics is not None:
+                verdict, alpha = str(run.statistics.verdict), run.statistics.headline.alpha.text()
+                colors[verdict] = KIND_COLORS[KINDS.get(run.statistics.verdict.level, "bad")]
+            rows.append([unit.scene, unit.model, unit.backend, verdict, alpha, table.voxels, *seen])
         titles = [measure.title for measure in measures()]
-        headers = ["scene", "model", "backend", "voxels", "mean OP", *titles, "OP>=3 %", "verdict"]
+        headers = [
+            "scene",
+            "model",
+            "backend",
+            "verdict",
+            f"alpha ({UNKNOWN.of})",
+            "voxels",
+            "mean OP",
+            *titles,
+            "OP>=3 %",
+        ]
         base = [record for record in self.select() if record.unit.backend == self.backend]
         there = [record for record in base if record.voxels_file is not None and record.voxels_file.is_file()][:MAPS]
         maps = [
@@ -454,7 +469,7 @@ class Result:
             for own in there
         ]
         legend = f"<div>{voxels.CAPTION}</div>" if maps else ""
-        return voxels.as_html(self.name, headers, rows) + "".join(maps) + legend
+        return voxels.as_html(self.name, headers, rows, colors) + "".join(maps) + legend
 
     @property
     def agrees(self) -> bool:

@@ -60,10 +60,18 @@ def named(rows: npt.NDArray[np.integer[Any]], names: Sequence[str]) -> pa.Dictio
     return pa.DictionaryArray.from_arrays(rows.astype(np.int32), list(names))
 
 
-def as_html(title: str, headers: Sequence[str], rows: Sequence[Sequence[Cell]]) -> str:
-    """Return a table with a caption; names are shown as they are."""
+def as_html(
+    title: str, headers: Sequence[str], rows: Sequence[Sequence[Cell]], colors: Mapping[str, str] | None = None
+) -> str:
+    """Return a table with a caption; names are shown as they are, and cells of these texts in their colours."""
+
+    def cell(value: Cell) -> str:
+        text, color = _text(value), (colors or {}).get(str(value))
+        style = f' style="color: {color}; font-weight: bold"' if color else ""
+        return f"<td{style}>{html.escape(text)}</td>"
+
     head = "".join(f"<th>{html.escape(header)}</th>" for header in headers)
-    body = "".join("<tr>" + "".join(f"<td>{html.escape(_text(cell))}</td>" for cell in row) + "</tr>" for row in rows)
+    body = "".join("<tr>" + "".join(map(cell, row)) + "</tr>" for row in rows)
     caption = f'<caption style="text-align: left; white-space: nowrap">{html.escape(title)}</caption>'
     return f"<table>{caption}<thead><tr>{head}</tr></thead><tbody>{body}</tbody></table>"
 

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from semstab.core.palette import KINDS
 from semstab.core.types import Int64, UInt8
 from semstab.data.measures import SBD, VSS, dominant
 from semstab.data.records import OVERVIEW, Failure, Record, Result
@@ -44,9 +45,6 @@ SBD_END = 0.25
 
 UNKNOWN = 255
 """The code of a value that is not defined; as a category, the code of a cell without a voxel."""
-
-KINDS = {"stable": "good", "usable": "part", "undecided": "open", "uninformative": "open", "no verdict": "open"}
-"""The styles of verdicts; all other verdicts have the style bad."""
 
 
 def render(
