@@ -5,17 +5,26 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+import numpy as np
+
 from semstab.check import with_voxel_size
 from semstab.config import Config, merge
+from semstab.core.arrays import evenly
+from semstab.data.measures import mean
 from semstab.datasets import Scene
+from semstab.errors import ConfigError
 from semstab.models import create
-from semstab.predict.filters import parse
+from semstab.pixels.warp import density
+from semstab.predict.filters import parse, too_sparse
 from semstab.predict.predictor import NAME as STORED
 from semstab.predict.predictor import PredictorConfig, StoredSequence
 from semstab.settings import dataset_defaults, load_config, load_study, predicted_config, resolve
-from semstab.task import open_scenes
+from semstab.task import frame_indices, open_scenes
 
 STUDY = "filters"
+
+DENSITY_FRAMES = 8
+"""Frames whose depth is looked at before filters are chosen."""
 
 
 def filter_study_config(
@@ -27,11 +36,11 @@ def filter_study_config(
     """Return the study `filters` with these models, and filters over the scenes' label sources, as dataset settings.
 
     Without models or sources all sources are taken; without filters those of the shipped study, with its map prior in
-    voxels of the run. Also returns a note on the filters that are
-    left out because a model gives no scores.
+    voxels of the run. Also returns notes on the filters that are left out: those that need scores where a model gives
+    none, and shipped ones that warp where depth is sparse.
 
     Raises:
-        ConfigError: For an unknown name.
+        ConfigError: For an unknown name, and a filter that warps where depth is sparse.
         DataError: For a scene that cannot be read.
     """
     content = merge(dataset_defaults(content), content)
@@ -43,7 +52,9 @@ def filter_study_config(
     config, _ = with_voxel_size(config, scenes)
     shipped = load_study(STUDY).dataset.options["try_filters"]
     grid = [_in_voxels(text, config.voxel_size) for text in filters or shipped]
-    able, left_out = _able(grid, predictors, scene)
+    grid, sparse = _warpable(grid, scene, frame_indices(scene, config), named=bool(filters))
+    able, without = _able(grid, predictors, scene)
+    left_out = [*sparse, *without]
     settings = {**content, "voxel_size": config.voxel_size, "frame_quality": True, "check": None, "name": STUDY}
     study = predicted_config(predictors, None, {**settings, "models": None})
     dataset_config = study.dataset.model_copy(update={"options": {**study.dataset.options, "try_filters": able}})
@@ -54,6 +65,24 @@ def _in_voxels(chain: str, size: float) -> str:
     """Return a chain with the numbers of its filters; the map prior has the run's voxel size by default."""
     texts = (f"map-prior:{size:g}" if text == "map-prior" else text for text in chain.split("+"))
     return "+".join(str(parse(text)) for text in texts)
+
+
+def _warpable(grid: Sequence[str], scene: Scene, frames: Sequence[int], *, named: bool) -> tuple[list[str], list[str]]:
+    """Return the filters that the scene's depth allows, and a note on the others, which is an error if they are named.
+
+    Raises:
+        ConfigError: If they are.
+    """
+    warping = [text for text in grid if any(parse(part).kind.warps for part in text.split("+"))]
+    if not warping:
+        return list(grid), []
+    found = [density(scene.depth(frames[at])) for at in evenly(len(frames), DENSITY_FRAMES)]
+    reason = too_sparse([parse(part) for text in warping for part in text.split("+")], mean(np.array(found)))
+    if reason is None:
+        return list(grid), []
+    if named:
+        raise ConfigError(f"{scene.name}: {reason}")
+    return [text for text in grid if text not in warping], [f"{scene.name}: left out, because {reason}"]
 
 
 def _able(grid: Sequence[str], predictors: Sequence[PredictorConfig], scene: Scene) -> tuple[list[str], list[str]]:

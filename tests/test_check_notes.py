@@ -102,6 +102,45 @@ def test_edges_that_have_nothing_to_do_with_each_other_are_not():
     assert find_offset([]) is None
 
 
+def test_an_optimum_on_the_bound_of_the_search_is_none():
+    """Of what is enlarged by more than the search tries, its first or last scale fits best."""
+    rng = np.random.default_rng(0)
+    depths = [np.kron(rng.uniform(1, 5, (6, 8)), np.ones((16, 20))).astype(np.float32) for _ in range(8)]
+
+    def found(scale):
+        return find_offset([(depth, depth_edges(zoomed(depth, scale))) for depth in depths])
+
+    assert found(1 / 0.9).scale == pytest.approx(0.9, abs=0.02)
+    assert found(1 / 0.84) is None
+    assert found(1 / 1.16) is None
+
+
+def test_sparse_depth_tells_nothing_of_registration():
+    """The edges of labels that are off, and dense depth, are enough; with depth in 30 % of the pixels they are not."""
+    rng = np.random.default_rng(0)
+    depths = [np.kron(rng.uniform(1, 5, (6, 8)), np.ones((16, 20))).astype(np.float32) for _ in range(8)]
+    edges = [depth_edges(zoomed(depth, 1.1)) for depth in depths]
+    sparse = [np.where(rng.random(depth.shape) < 0.3, depth, 0).astype(np.float32) for depth in depths]
+    assert find_offset(list(zip(depths, edges, strict=True))) is not None
+    assert find_offset(list(zip(sparse, edges, strict=True))) is None
+
+
+def test_it_is_said_where_few_pixels_have_depth(tmp_path):
+    def scans(z):
+        return np.where(np.random.default_rng(0).random(z.shape) < 0.04, np.round(z, 3), 0)
+
+    room = Room(walk(12), told_depth=scans)
+    sources = {name: [room.frame(i, name) for i in range(12)] for name in ("net", "gt")}
+    folder = write_posed(tmp_path / "room", [f"{i:03d}" for i in range(12)], sources, classes=list(CLASSES))
+    (note,) = notes(folder)
+    assert " % of the pixels have depth: labels of the others are in no map" in note
+    assert 3 < float(note.split()[0]) < 5
+    words = ["run", "--data", folder, "-m", "net", "--voxel-size", "0.1", "--out", tmp_path / "out", "--report", "off"]
+    words += ["--rerun", "off", "--check", "none"]
+    said = CliRunner().invoke(app, [str(word) for word in words]).stdout
+    assert "of the pixels have depth" in " ".join(said.split())
+
+
 @pytest.mark.parametrize("name", ["apc_shelf", "hololens", "brighton"])
 def test_real_data_are_registered_and_have_no_such_values(name):
     if not (DATA / name).is_dir():

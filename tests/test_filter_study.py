@@ -26,6 +26,8 @@ def result_of(filters="", flicker=0.2, worth=0.8, **more):
         "accuracy": worth,
         "miou": worth,
         "consistent_wrong": 0.05,
+        "changed": 0.2 if filters else 0.0,
+        "seen": 0.9,
     }
     return FilterResult(filters, flicker, **{**known, "lag": 0.0, "coverage": 1.0, "milliseconds": 2.0, **more})
 
@@ -83,6 +85,24 @@ def test_the_best_is_the_steadier_one_of_those_alike_and_alpha_alone_chooses_not
 def test_what_a_filter_must_not_cost(loss):
     found = study(dataclasses.replace(result_of("vote:9", flicker=0.05, worth=0.9), **loss))
     assert found.best is None
+
+
+def test_a_filter_that_changes_next_to_nothing_is_not_recommended():
+    found = study(result_of("ema:0.3", flicker=0.1, worth=0.9, changed=0.0003))
+    assert found.best is None
+    assert "These filters change fewer than 0.1 % of the labels: ema:0.3." in said(found)
+    found = study(result_of("ema:0.3", flicker=0.1, worth=0.9, changed=0.0012))
+    assert "flicker falls from 20.0 to 10.0 %, 0.12 % of the labels change" in said(found)
+    assert "fewer than" not in said(found)
+
+
+def test_nothing_is_recommended_where_flicker_is_known_of_next_to_nothing():
+    found = study(result_of("ema:0.3", flicker=0.1, worth=0.9))
+    assert found.best is not None
+    for seen in (0.003, NAN):
+        blind = dataclasses.replace(found, unfiltered=dataclasses.replace(found.unfiltered, seen=seen))
+        assert (blind.best, blind.best_whole) == (None, None)
+        assert said(blind).startswith("No filter over net is recommended: two frames in a row see the same surface at")
 
 
 @pytest.fixture(scope="module")
@@ -146,3 +166,53 @@ def test_bad_input_is_one_line(done, words, said):
     assert result.exit_code == 2
     assert said in result.output
     assert len(result.output.strip().splitlines()) == 1
+
+
+# --- sparse depth
+
+
+@pytest.fixture(scope="module")
+def sparse(tmp_path_factory):
+    """The same wall, with depth in one pixel of 25."""
+    folder = tmp_path_factory.mktemp("sparse")
+    scene = predicted_scene.write(folder / "flight", frames=6)
+    (scene / "scene.yaml").write_text("classes: [dark, bright]\n")
+    (scene / "labels" / "net").mkdir(parents=True)
+    rng = np.random.default_rng(0)
+    for k in range(6):
+        path = scene / f"depth/{k:03d}.png"
+        Image.fromarray(np.where(rng.random((48, 80)) < 0.04, np.array(Image.open(path)), 0).astype(np.uint16)).save(
+            path
+        )
+        truth = (np.arange(80) + 2 * k) // 9 % 2 + np.zeros((48, 1))
+        labels = np.where(rng.random(truth.shape) < 0.1, 1 - truth, truth).astype(np.uint8)
+        Image.fromarray(labels).save(scene / f"labels/net/{k:03d}.png")
+    return folder
+
+
+def command(folder, *words):
+    given = [*words, "--data", folder / "flight", "--model", "net", "--voxel-size", "0.1", "--no-geometry-check"]
+    return CliRunner().invoke(app, [str(word) for word in given])
+
+
+@pytest.mark.parametrize("words", [("filters",), ("run", "--rerun", "off", "--check", "none")], ids=["study", "run"])
+@pytest.mark.parametrize("chain", ["ema-warped:0.3", "vote-warped:3"])
+def test_filters_that_warp_are_refused(sparse, tmp_path, words, chain):
+    result = command(sparse, *words, "--filter", chain, "--out", tmp_path / "out", "--report", "off")
+    assert result.exit_code == 2
+    (line,) = [line for line in result.output.splitlines() if line.startswith("error")]
+    assert f"% of the neighbours of a pixel with depth have depth, 50 % are needed; {chain} would find few" in line
+
+
+def test_the_shipped_ones_that_warp_are_left_out_and_flicker_is_of_all_that_both_frames_see(sparse, tmp_path):
+    result = command(sparse, "filters", "--out", tmp_path / "out", "--report", "off")
+    assert result.exit_code == 0, result.output
+    assert "flight: left out, because depth is sparse" in result.output
+    (found,) = filter_studies(load_result(tmp_path / "out"))
+    names = [row.filters for row in found.filtered]
+    assert "ema:0.3" in names
+    assert not [name for name in names if "warped" in name]
+    record = load_result(tmp_path / "out").select()[0]
+    assert record.image_space.compensated_share < 0.06  # of the pixels with depth, where the frame before has it, too
+    assert record.quality.seen == pytest.approx(0.04 * 5 / 6, rel=0.1)  # 6 frames make 5 pairs
+    assert record.quality.flicker == pytest.approx(2 * 0.1 * 0.9, abs=0.04)

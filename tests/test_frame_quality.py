@@ -52,6 +52,35 @@ def test_what_is_stable_and_wrong_is_told_from_what_is_right():
     assert found.next_frame == 1
 
 
+def test_the_share_of_changed_labels_is_of_those_of_the_model():
+    maps = [wall(k) for k in range(4)]
+    none = np.arange(SHAPE[1]) < 20
+    filtered = [np.where(np.arange(SHAPE[1]) >= 70, (labels + 1) % 3, labels) for labels in maps]
+    model = [np.where(none, 255, labels) for labels in maps]
+    assert judged(filtered, model).changed == pytest.approx(10 / 60)
+    assert judged(model, maps).changed == pytest.approx(20 / 80)
+    assert judged(maps).changed == 0
+
+
+def test_flicker_is_of_all_that_both_frames_see_also_where_the_frame_before_has_no_depth():
+    """A point is hidden where the frame before has another depth; one without depth there hides nothing."""
+
+    def flight(depth_before):
+        judge = FrameQualityMeter(3)
+        for k, depth in enumerate((depth_before, np.full(SHAPE, 2.0))):
+            labels = np.zeros(SHAPE, np.uint8)
+            labels[:, 40:] = k
+            judge.add(*[dataclasses.replace(frame(0, labels), depth=depth.astype(np.float32))] * 2, None)
+        return judge.result("net", "", 0.0)
+
+    left = np.arange(SHAPE[1]) < 40
+    assert (flight(np.full(SHAPE, 2.0)).flicker, flight(np.full(SHAPE, 2.0)).seen) == (0.5, 0.5)
+    unknown = flight(np.where(left, 2.0, 0.0) + np.zeros(SHAPE))
+    assert (unknown.flicker, unknown.seen) == (0.5, 0.5)
+    hidden = flight(np.where(left, 2.0, 1.0) + np.zeros(SHAPE))
+    assert (hidden.flicker, hidden.seen) == (0, 0.25)
+
+
 def test_labels_that_stay_behind_are_not_foreseen():
     """A filter that repeats the first frame at its pixels is steady there, and wrong of the places."""
     maps = [wall(k) for k in range(5)]

@@ -133,6 +133,16 @@ def test_without_the_switch_there_is_no_such_table(tmp_path):
     assert "video_measures" not in [table.name for table in tables(load_result(tmp_path / "out"))]
 
 
+def test_a_map_in_tiles_has_the_same(run, tmp_path):
+    flow, out, _ = run
+    options = [word for key, value in CITY.items() for word in ("--option", f"{key}={value}")]
+    words = ("--model", "sim-flicker", "--scene", "scene0", "--frames", ":12", "--check", "none", *options)
+    bench("run", "--video-measures", flow, *words, "--tile-size", "64", "--out", "tiled", cwd=tmp_path)
+    (tiled,) = load_result(tmp_path / "tiled").select()
+    assert tiled.in_tiles
+    assert repr(tiled.video_measures) == repr(load_result(out).select(scene="scene0")[0].video_measures)
+
+
 def painted(frames):
     """A wall of two colours that the camera passes; labels are those of the wall."""
     for k in range(frames):

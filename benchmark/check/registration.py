@@ -14,9 +14,11 @@ from semstab.check.reprojection import Pair, View
 from semstab.core.arrays import evenly
 from semstab.core.types import Float32, Float64, Mask, UInt8
 from semstab.data.frames import Intrinsics
+from semstab.data.measures import mean
 from semstab.datasets import Scene
 from semstab.errors import DataError
 from semstab.pixels.edges import depth_edges, image_edges, label_edges
+from semstab.pixels.warp import LEAST_DENSITY, density
 
 WIDTH = 192
 """Edges are compared on a grid of about so many columns."""
@@ -64,10 +66,13 @@ class Offset:
 def find_offset(pairs: Sequence[Edges]) -> Offset | None:
     """Return how far edges (H, W) of labels or images are off those of depth (H, W), frame by frame.
 
-    The result is None where they fit.
+    The result is None where they fit, where the best fit lies on the bound of the search, and is no optimum, and where
+    depth is sparse (`semstab.pixels.warp.density`), whose edges are those of its gaps.
 
     Both halves of the frames have to agree, so that edges that have nothing to do with each other do not count.
     """
+    if not mean(np.array([density(depth) for depth, _ in pairs])) >= LEAST_DENSITY:
+        return None
     maps = [(_thinned(depth_edges(depth)), _thinned(edges)) for depth, edges in pairs]
     maps = [(a, b) for a, b in maps if a.any() and b.any() and a.shape == b.shape == maps[0][0].shape]
     if len(maps) < LEAST_FRAMES:
@@ -76,6 +81,8 @@ def find_offset(pairs: Sequence[Edges]) -> Offset | None:
     halves = [np.mean(fits[k::2], axis=0) for k in (0, 1)]
     whole = np.mean(fits, axis=0)
     best, here = _peak(whole), _identity(whole)
+    if any(at in (0, size - 1) for at, size in zip(best, whole.shape, strict=True)):
+        return None
     agree = all(_distance(_peak(half), best, maps[0][0].shape) < LEAST_OFFSET for half in halves)
     clear = all(half[best] > CLEARLY * half[here] for half in halves) and whole[best] >= LEAST_FIT
     clear = clear and np.mean([fit[best] > fit[here] for fit in fits]) >= MOST
@@ -340,6 +347,9 @@ def find_sentinel(depths: Iterable[Float32], scale: float) -> Sentinel | None:
 
 # Properties of a scene that look wrong, but may be right: values that mean 'no depth', labels off the edges of depth.
 
+FEW = 0.1
+"""The share of the pixels with depth below which it is said."""
+
 REGISTERED_FRAMES = 16
 """Frames in which the edges of labels are compared with those of depth."""
 
@@ -353,6 +363,11 @@ def notes(scene: Scene, views: Sequence[View], how: Reading, model: str) -> Iter
         listed = "[" + ", ".join(f"{value:.15g}" for value in values) + "]"
         yield f"{sentinel}; set {how.change('invalid_depth', listed)}"
     some = [views[k] for k in evenly(len(views), REGISTERED_FRAMES)]
+    if (share := mean(np.array([np.mean((v.depth > 0) & (v.depth < np.inf)) for v in some]))) < FEW:
+        yield (
+            f"{100 * share:.2g} % of the pixels have depth: labels of the others are in no map, and flicker is of those"
+            " that have it"
+        )
     if (offset := find_offset(list(_edges(scene, some)))) is not None:
         what = "the images" if some[0].labels is None else f"labels of {model}"
         mend = "register them to the depth"

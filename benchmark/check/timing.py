@@ -105,7 +105,7 @@ def find_lateness(scene: Scene, sample: Sample, *, stamped: bool) -> Lateness | 
     if len(moved.pairs) < LEAST_PAIRS:
         return None
     present = moved.errors(0.0)
-    if not (np.nanmedian(present) > MIN_GAIN):
+    if not _median(present) > MIN_GAIN:
         return None
     tried = {shift: moved.errors(shift) for shift in COARSE.tolist()}
     near = min(tried, key=lambda shift: _mean_log(tried[shift]))

@@ -140,6 +140,10 @@ class FrameQuality:
 
     Attributes:
         model, filters: The source of the labels, and the filters over it ('ema:0.6+threshold:0.5'; '' for nothing).
+        changed: Share of the pixels that the model labels to which the filters give another label, or none.
+        flicker: Share of the pixels that two frames in a row see whose label changes, camera motion removed: also where
+            the frame before has no depth, unlike `ImageSpace.compensated_flicker_percent`.
+        seen: The pixels behind flicker, for one that the model labels.
         coverage: Labelled pixels for one that the model labels.
         next_frame: Share of the pixels seen again by the next frame whose label the model then gives that surface
             point. No filter saw that frame: what it only repeats does not count for it.
@@ -153,6 +157,9 @@ class FrameQuality:
 
     model: str
     filters: str = ""
+    changed: float = math.nan
+    flicker: float = math.nan
+    seen: float = math.nan
     coverage: float = math.nan
     next_frame: float = math.nan
     accuracy: float = math.nan

@@ -36,7 +36,7 @@ from semstab.task import Task, applies, frame_indices, open_scenes, selected, ta
 
 logger = logging.getLogger("semstab")
 
-FORMAT = 9
+FORMAT = 10
 """Part of every key: raise it with any change of the numbers that a unit's settings and input lead to."""
 
 IN_KEYS = (

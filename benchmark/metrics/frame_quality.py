@@ -18,6 +18,9 @@ HORIZON = 8
 
 NONE = -1
 
+COUNTS = ("said", "changed", "seen", "flickering", "labelled", "sayable", "foreseen", "met", "stale", "compared")
+"""The pixels that are counted, over all frames."""
+
 
 class FrameQualityMeter:
     """The quality of frames in order, from the labels of a filter, of the model, and of the ground truth.
@@ -28,7 +31,7 @@ class FrameQualityMeter:
     def __init__(self, num_classes: int) -> None:
         self._K = num_classes
         self._confusion = np.zeros((num_classes, num_classes), dtype=np.int64)
-        self._counts = np.zeros(6)
+        self._counts = np.zeros(len(COUNTS))
         self._lag = Lag()
         self._before: tuple[Frame, Frame, Frame | None] | None = None
         self._accuracy: list[float] = []
@@ -42,25 +45,30 @@ class FrameQualityMeter:
             confusion = np.bincount(pairs, minlength=self._K**2).reshape(self._K, self._K)
             self._confusion += confusion
             self._accuracy.append(_share(np.trace(confusion), confusion.sum()))
+        said = model.predicted != model.ignore_id
         self._count(labelled=frame.valid, sayable=model.valid)
+        self._count(said=said, changed=said & (frame.predicted != model.predicted))
         if self._before is not None and self._before[0].shape == frame.shape:
             self._compare(*self._before, frame, model, truth)
         self._before = frame, model, truth
 
     def result(self, model: str, filters: str, milliseconds: float) -> FrameQuality:
         """Return the quality so far of filters over a model, which took so many milliseconds per frame."""
-        labelled, sayable, foreseen, met, stale, compared = self._counts
+        n = dict(zip(COUNTS, self._counts.tolist(), strict=True))
         right = np.diag(self._confusion)
         union = self._confusion.sum(axis=0) + self._confusion.sum(axis=1) - right
         there = union > 0
         return FrameQuality(
             model=model,
             filters=filters,
-            coverage=_share(labelled, sayable),
-            next_frame=_share(foreseen, met),
+            changed=_share(n["changed"], n["said"]),
+            flicker=_share(n["flickering"], n["seen"]),
+            seen=_share(n["seen"], n["said"]),
+            coverage=_share(n["labelled"], n["sayable"]),
+            next_frame=_share(n["foreseen"], n["met"]),
             accuracy=_share(right.sum(), self._confusion.sum()),
             miou=float(np.mean(right[there] / union[there])) if there.any() else math.nan,
-            consistent_wrong=_share(stale, compared),
+            consistent_wrong=_share(n["stale"], n["compared"]),
             lag=self._lag.mean,
             changes=self._lag.changes,
             milliseconds=milliseconds,
@@ -71,9 +79,11 @@ class FrameQualityMeter:
     def _compare(
         self, frame: Frame, model: Frame, truth: Frame | None, now: Frame, model_now: Frame, truth_now: Frame | None
     ) -> None:
-        seen = correspond(now, frame)
-        labelled = seen.bring(frame.valid, fill=False)
-        before = seen.bring(frame.predicted)
+        where = correspond(now, frame, depth_tolerance=math.inf)
+        labelled = _not_hidden(now, frame, where) & where.bring(frame.predicted != frame.ignore_id, fill=False)
+        before = where.bring(frame.predicted)
+        seen = labelled & now.valid
+        self._count(seen=seen, flickering=seen & (before != now.predicted))
         met = labelled & model_now.valid
         foreseen = met & (before == model_now.predicted)
         self._next_frame.append(_share(foreseen.sum(), met.sum()))
@@ -84,13 +94,21 @@ class FrameQualityMeter:
         self._count(
             stale=compared & (before == now.predicted) & (now.predicted != truth_now.predicted), compared=compared
         )
-        where = correspond(now, frame, depth_tolerance=math.inf)
         self._lag.add(where, now, model_now, truth, truth_now)
 
     def _count(self, **masks: Mask) -> None:
-        names = ("labelled", "sayable", "foreseen", "met", "stale", "compared")
         for name, mask in masks.items():
-            self._counts[names.index(name)] += np.count_nonzero(mask)
+            self._counts[COUNTS.index(name)] += np.count_nonzero(mask)
+
+
+def _not_hidden(now: Frame, before: Frame, where: Correspondence) -> Mask:
+    """Return the pixels (H, W) whose surface point the frame before sees: its depth there is the point's, or not known.
+
+    Where depth is sparse, its labels are known at places of which its depth is not.
+    """
+    known = where.bring((before.depth > 0) & (before.depth < np.inf), fill=False)
+    seen: Mask = where.visible & (correspond(now, before).visible | ~known)
+    return seen
 
 
 class Lag:

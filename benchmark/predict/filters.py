@@ -17,10 +17,10 @@ from semstab.core.registry import Entry, Registry
 from semstab.core.types import Float32, UInt16
 from semstab.data.frames import Frame
 from semstab.data.labels import LabelSpace, ignore_id
-from semstab.errors import ConfigError
+from semstab.errors import ConfigError, DataError
 from semstab.models import Image, Labels, Model, Prediction, narrowed
 from semstab.models.validation import Wrapped
-from semstab.pixels.warp import carry, warp
+from semstab.pixels.warp import LEAST_DENSITY, carry, density, warp
 
 Belief = Float32
 """(H, W, K) float32: the belief of each pixel, which sums to 1 over the classes, or to 0 where there is none."""
@@ -110,6 +110,7 @@ class Filter(ABC):
         wants_geometry: Whether it looks at depth and pose.
         wants_color: Whether it looks at the image.
         needs_scores: Whether labels alone will not do; else a label counts as certain.
+        warps: Whether it looks points up in the frames before pixel by pixel, which sparse depth does not allow.
     """
 
     parameter: ClassVar[Parameter]
@@ -117,6 +118,7 @@ class Filter(ABC):
     wants_geometry: ClassVar[bool] = False
     wants_color: ClassVar[bool] = False
     needs_scores: ClassVar[bool] = False
+    warps: ClassVar[bool] = False
 
     def __init__(self, value: float) -> None:
         self.value = value
@@ -152,6 +154,18 @@ def parse(text: str) -> FilterSpec:
     kind = cast("type[Filter]", REGISTRY.load(name))
     number = kind.parameter.read(value, f"filter '{text}'") if value else kind.parameter.usual
     return FilterSpec(name, number, kind)
+
+
+def too_sparse(filters: Sequence[FilterSpec], found: float) -> str | None:
+    """Return why filters that warp cannot be used with depth of that density; None where they can, or none warps."""
+    warped = [str(spec) for spec in filters if spec.kind.warps]
+    if not warped or not found < LEAST_DENSITY:
+        return None
+    return (
+        f"depth is sparse: {100 * found:.0f} % of the neighbours of a pixel with depth have depth,"
+        f" {100 * LEAST_DENSITY:.0f} % are needed; {', '.join(warped)} would find few points in the frame before: make"
+        " depth dense, or use ema or vote"
+    )
 
 
 def one_hot(rows: npt.NDArray[Any], K: int) -> Belief:
@@ -218,10 +232,15 @@ class Filtered(Wrapped):
     def _begin(self, shape: tuple[int, ...]) -> None:
         self._chain = [make() for make in self.filters]
         self._shape = shape
+        self._density = math.nan
 
     def _filtered(self, prediction: Prediction, image: Image, frame: Frame | None, scores: bool) -> Prediction:
         if image.shape != self._shape:
             self._begin(image.shape)
+        if frame is not None and math.isnan(self._density):  # of the first frame with depth
+            self._density = density(frame.depth)
+            if (reason := too_sparse(self.filters, self._density)) is not None:
+                raise DataError(f"{frame.where('depth')}: {reason}")
         started = time.thread_time()
         belief = belief_of(prediction, self.space)
         said = belief.any(axis=2, keepdims=True)
@@ -296,6 +315,7 @@ class EmaWarped(Filter):
     parameter = Ema.parameter
     sequential = True
     wants_geometry = True
+    warps = True
 
     def __init__(self, value: float) -> None:
         super().__init__(value)
@@ -402,6 +422,7 @@ class VoteWarped(Vote):
     """
 
     wants_geometry = True
+    warps = True
 
     def _seen_now(self, shown: Shown, nothing: int) -> Iterator[Rows]:
         (rows, _), *before = reversed(self._last)

@@ -16,11 +16,24 @@ MOST_LAG = 1.0
 LEAST_COVERAGE = 0.95
 """The least share of the model's labels that a recommended filter must leave."""
 
+LEAST_CHANGED = 0.001
+"""The least share of the model's labels that a recommended filter must change: else it does nothing."""
+
+LEAST_SEEN = 0.01
+"""The least share of the model's labelled pixels that two frames must see: else flicker is known of next to nothing."""
+
 ALIKE = 0.005
 """Shares that differ by no more count as equal."""
 
 ALIKE_WORTH = 0.002
 """Filters whose quality differs by no more count as equal: then the one with less flicker is better."""
+
+
+MEANS = (
+    "flicker", "next_frame", "accuracy", "miou", "consistent_wrong", "lag", "coverage", "milliseconds", "changed",
+    "seen",
+)  # fmt: skip
+"""The fields of a `FilterResult` that are means over scenes of those of `FrameQuality`."""
 
 
 @dataclass(frozen=True)
@@ -29,7 +42,9 @@ class FilterResult:
 
     Attributes:
         filters: The names of the filters; '' for the model itself.
-        flicker: The share of points seen in two frames in a row whose label changes: motion-compensated.
+        flicker: The share of points seen in two frames in a row whose label changes: motion-compensated; seen: such
+            points for one that the model labels.
+        changed: The share of the model's labels that it changes.
         plain: The same share at the same pixel, whatever it shows.
         alpha: The alpha on which verdicts rest.
         better: The number of frames whose accuracy, or next-frame consistency without truth, is above the model's, and
@@ -47,6 +62,8 @@ class FilterResult:
     lag: float
     coverage: float
     milliseconds: float
+    changed: float
+    seen: float
     better: tuple[int, int] = (0, 0)
 
     @property
@@ -96,11 +113,19 @@ class FilterStudy:
         return self._best_of([row for row in self.filtered if row.coverage >= 1 - ALIKE])
 
     def _best_of(self, rows: Sequence[FilterResult]) -> FilterResult | None:
-        able = [row for row in rows if row.flicker < self.unfiltered.flicker and self.harmless(row)]
+        if not self.unfiltered.seen >= LEAST_SEEN:
+            return None
+        acting = [row for row in rows if row not in self.idle]
+        able = [row for row in acting if row.flicker < self.unfiltered.flicker and self.harmless(row)]
         most = max(map(self.worth, able), default=math.nan)
         return min(
             (row for row in able if self.worth(row) >= most - ALIKE_WORTH), key=lambda row: row.flicker, default=None
         )
+
+    @property
+    def idle(self) -> list[FilterResult]:
+        """Return the filters that change next to no label."""
+        return [row for row in self.filtered if row.changed < LEAST_CHANGED]
 
     @property
     def misleading(self) -> list[FilterResult]:
@@ -154,13 +179,23 @@ def of_interest(result: Result) -> Result:
 def advice(study: FilterStudy) -> Iterator[str]:
     """Yield sentences: the filter to use and why, filters that only seem to help, and what is not known."""
     best, base = study.best, study.unfiltered
-    if best is None:
+    if not base.seen >= LEAST_SEEN:
+        yield (
+            f"No filter over {study.model} is recommended: two frames in a row see the same surface at"
+            f" {100 * max(0.0, base.seen):.2g} % of the labelled pixels, and flicker is measured on"
+            f" {100 * LEAST_SEEN:g} % or more."
+        )
+    elif best is None:
         least = "accuracy, IoU, coverage or time to follow" if study.has_truth else "next-frame consistency or coverage"
         yield f"Use none of these filters over {study.model}: none lowers its flicker without a loss of {least}."
     else:
         yield f"Use --filter {typed(best)} over {study.model}: {_why(study, best)}."
         if (whole := study.best_whole) is not None and whole != best:
             yield f"Use --filter {typed(whole)} to leave every label: {_why(study, whole)}."
+    if study.idle:
+        names = ", ".join(row.filters for row in study.idle[:4])
+        more = f" and {len(study.idle) - 4} more" if len(study.idle) > 4 else ""
+        yield f"These filters change fewer than {100 * LEAST_CHANGED:g} % of the labels: {names}{more}."
     if study.misleading:
         worst = study.misleading[0]
         names = ", ".join(row.filters for row in study.misleading[:4])
@@ -185,7 +220,10 @@ def typed(result: FilterResult) -> str:
 
 def _why(study: FilterStudy, best: FilterResult) -> str:
     base, (better, frames) = study.unfiltered, best.better
-    parts = [f"flicker falls from {100 * base.flicker:.1f} to {100 * best.flicker:.1f} %"]
+    parts = [
+        f"flicker falls from {100 * base.flicker:.1f} to {100 * best.flicker:.1f} %",
+        f"{100 * best.changed:.2g} % of the labels change",
+    ]
     if study.has_truth:
         parts.append(
             f"accuracy goes from {100 * base.accuracy:.1f} to {100 * best.accuracy:.1f} % (better in {better} of"
@@ -226,13 +264,9 @@ def _row(records: Sequence[Record], unfiltered: Sequence[Record]) -> FilterResul
 
     return FilterResult(
         filters=qualities[0].filters,
-        flicker=macro_mean([record.image_space.compensated_flicker_percent for record in records]) / 100,
         plain=macro_mean([record.image_space.flicker_percent for record in records]) / 100,
         alpha=macro_mean([row.alpha.value for row in headlines]),
-        **{
-            name: mean(name)
-            for name in ("next_frame", "accuracy", "miou", "consistent_wrong", "lag", "coverage", "milliseconds")
-        },
+        **{name: mean(name) for name in MEANS},
         better=_better(records, unfiltered),
     )
 

@@ -498,8 +498,8 @@ def print_answer(
 
 
 FILTER_HEADS = (
-    ("", "flick", "", "next", "accu-", "", "same,", "", "", "", ""),
-    ("filter", "%", "alpha", "%", "racy", "mIoU", "wrong", "lag", "cov.", "ms", ""),
+    ("", "chan-", "flick", "", "next", "accu-", "", "same,", "", "", "", ""),
+    ("filter", "ged %", "%", "alpha", "%", "racy", "mIoU", "wrong", "lag", "cov.", "ms", ""),
 )
 """The two lines above the rows of filters: 'next' is the next frame, 'same, wrong' consistent but wrong labels."""
 
@@ -516,9 +516,9 @@ def print_filter_study(result: Result, console: Console) -> None:
             for part in first:
                 console.print(f"    {part}", highlight=False, markup=False)
             name = f" +{last}" if first else last
-            digits = (1, 3, 1, 1, 1, 1, 1, 0, 0)
+            digits = (2, 1, 3, 1, 1, 1, 1, 1, 0, 0)
             cells = [_number(c, d) if isinstance(c, float) else str(c) for c, d in zip(row[1:-1], digits, strict=True)]
-            line = f"    {name:<19}{''.join(f'{cell:>6}' for cell in cells)}  {row[-1]}"
+            line = f"    {name:<17}{''.join(f'{cell:>6}' for cell in cells)}  {row[-1]}"
             console.print(line.rstrip(), highlight=False, markup=False, soft_wrap=True)
     text = (
         "Alpha rises with any memory: it recommends nothing here. 'worse': less flicker, at the pixel or"

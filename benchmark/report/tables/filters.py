@@ -8,6 +8,7 @@ from semstab.report.tables.table import Column, Group, Row, Table
 
 COLUMNS = (
     Column("filter", "Filter"),
+    Column("changed_percent", "Changed (%)", 2),
     Column("flicker_percent", "Flicker (%)", 2, "lower", over="Stability"),
     Column("alpha", "alpha", 3, over="Stability"),
     Column("next_frame_percent", "Next frame (%)", 2, "higher", over="Correctness"),
@@ -20,7 +21,8 @@ COLUMNS = (
     Column("advice", "Advice"),
 )
 CAPTION = (
-    "Flicker is the share of pixels seen in two frames in a row whose label changes, camera motion removed. Alpha is"
+    "Changed is the share of the model's labels to which the filter gives another class, or none. Flicker is the share"
+    " of pixels seen in two frames in a row whose label changes, camera motion removed. Alpha is"
     " the agreement of two views at the same spot. It rises with any memory of earlier frames, because frames that"
     " share a memory are not independent: a high alpha of a filter with memory is no evidence. Next frame is the share"
     " of pixels seen in the next frame that have the label that the unfiltered model gives them there; no filter has"
@@ -58,6 +60,7 @@ def row(study: FilterStudy, result: FilterResult) -> Row:
     """Return the cells of a filter."""
     return (
         result.filters or "none",
+        100 * result.changed,
         100 * result.flicker,
         result.alpha,
         100 * result.next_frame,
