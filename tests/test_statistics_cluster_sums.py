@@ -150,7 +150,13 @@ def test_an_older_file_is_read_without_its_cells(tmp_path, schema):
     assert np.isnan(value(back, "alpha"))
 
 
-@pytest.mark.parametrize("change", [{"schema": 9}, {"kind": "InfluenceSums"}, {"step": [1, 1]}, {"step": [1, 3, 1]}])
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"schema": 9}, {"kind": "InfluenceSums"}, {"step": [1, 1]}, {"step": [1, 3, 1]}, {"fused": [10**400, 8, 8]},
+        {"step": [2**40, 2**40, 2**40]},
+    ],
+)  # fmt: skip
 def test_a_file_of_another_kind_is_refused(tmp_path, change):
     whole, _ = stripes()
     whole.save(tmp_path / "sums.parquet")

@@ -160,7 +160,11 @@ def _class_rows(own: Against, shown: Sequence[Quantity]) -> tuple[Row, ...]:
         mine = {row.measure: row for row in own.by_class if row.of == name}
         cells = [mine[q.key].difference if q.key in mine else math.nan for q in shown]
         changed = {
-            change: ", ".join(words[row.measure].symbol for row in mine.values() if row.change == change)
+            change: ", ".join(
+                words[row.measure].symbol if row.measure in words else row.measure
+                for row in mine.values()
+                if row.change == change
+            )
             for change in ("worse", "better")
         }
         rows.append((name, changed["worse"], changed["better"], *cells))

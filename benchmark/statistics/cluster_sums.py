@@ -352,6 +352,8 @@ class ClusterSums:
                 raise DataError(f"{columns.shape[1]} columns of sums for {meta.K} classes")
             if np.any(np.abs(columns) > LARGEST**2):
                 raise DataError("a sum is larger than any map can have")
+            if not all(0 <= frames <= LARGEST for frames in (*meta.step, *meta.fused)):
+                raise DataError("a number of frames is one that no map can have")
             parts: list[ClusterSums] = []
             for number, (edge, step, voxel_size, fused) in enumerate(
                 zip(meta.edge, meta.step, meta.voxel_size, meta.fused, strict=True)

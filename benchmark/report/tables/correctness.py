@@ -174,7 +174,8 @@ def _difference_rows(comparison: ModelComparison) -> tuple[Row, ...]:
     words = {quantity.key: quantity.word for quantity in compared(truth=True)}
     rows = sorted(comparison.paired.differences, key=lambda row: row.measure != comparison.paired.primary)
     return tuple(
-        (row.a, row.b, words[row.measure], row.difference, row.p_holm, row.undecided or row.scope) for row in rows
+        (row.a, row.b, words.get(row.measure, row.measure), row.difference, row.p_holm, row.undecided or row.scope)
+        for row in rows
     )
 
 
