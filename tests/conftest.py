@@ -12,6 +12,7 @@ from semstab.report.figures import style
 
 pytest.register_assert_rewrite("semstab.testing")
 signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell lets what it starts in the background ignore Ctrl-C
+signal.signal(signal.SIGHUP, signal.SIG_DFL)  # and nohup the end of the terminal
 os.environ["SEMSTAB_CACHE"] = tempfile.mkdtemp(prefix="semstab-cache-")
 atexit.register(shutil.rmtree, os.environ["SEMSTAB_CACHE"], ignore_errors=True)
 style.DPI = 60  # of the 300 that an installed command writes (test_cli): half of a report's time

@@ -251,6 +251,6 @@ def test_a_run_says_what_it_was_shown(scene, live, tmp_path):
     assert said["dataset"]["options"]["frames"]["stride"] == 2
     said["frames"] = {**said["frames"], "stride": 3}
     again = Config.build({key: value for key, value in said.items() if key != "schema"})
-    (found,) = run(again, out=tmp_path / "run", report=False).runs
+    (found,) = run(again, out=tmp_path / "run", report=False, overwrite=True).runs
     assert found.unit.model == "average"
     assert json.loads((tmp_path / "run/summary.json").read_text())["runs"][0]["frames"] == 2

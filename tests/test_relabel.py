@@ -169,7 +169,7 @@ def test_what_cannot_be_relabelled_is_refused(fused, tmp_path):
     (tmp_path / "scene/intrinsic/intrinsic_color.txt").write_text("5 0 4 0\n0 5 3 0\n0 0 1 0\n0 0 0 1\n")
     options = {"root": str(tmp_path), "color_size": [8, 6], "classes": ["a", "b", "c"]}
     config = configure(tmp_path, dataset={"name": "scannet", "options": options}, check=None, check_geometry=False)
-    semstab.run(config, out=tmp_path / "run", report=False)
+    semstab.run(config, out=tmp_path / "run", report=False, overwrite=True)
     fails(
         DataError, "have the pixels of the image, not those of the depth; convert", relabel, tmp_path / "run", tmp_path
     )

@@ -151,7 +151,8 @@ def test_intrinsics_are_those_of_the_depth_files_that_a_surface_stands_for(fligh
 def test_a_run_is_kept_while_its_surface_is_the_same(flight, mesh, tmp_path) -> None:
     def units(surface):
         dataset = dataset_of(flight, surface=str(surface), casts=False)
-        return semstab.run(configure(flight, dataset=dataset), out=tmp_path / "run", report=False).manifest["units"]
+        result = semstab.run(configure(flight, dataset=dataset), out=tmp_path / "run", report=False, overwrite=True)
+        return result.manifest["units"]
 
     assert units(mesh)["computed"] == 1
     assert units(shutil.copy(mesh, tmp_path / "same.ply"))["computed"] == 0
