@@ -54,7 +54,7 @@ def device_of(name: str | None) -> torch.device:
     if name is None:
         return torch.device("cuda", torch.cuda.current_device()) if torch.cuda.is_available() else torch.device("cpu")
     try:
-        device = torch.device(name.lower())
+        device = torch.device(str(name).lower())
     except RuntimeError as error:
         raise ConfigError(f"device '{name}' is not one; use CPU:0 or CUDA:0") from error
     if device.type == "cpu":

@@ -23,7 +23,7 @@ class SemstabError(Exception):
         ...     semstab.load("nowhere")
         ... except semstab.SemstabError as error:
         ...     print(error)
-        nowhere/summary.json: cannot be read (No such file or directory)
+        nowhere: there is no such folder; give the folder of a finished run
     """
 
     exit_code = 2

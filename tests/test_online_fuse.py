@@ -95,6 +95,8 @@ def test_results_are_compared_gated_and_exported_as_runs_are(steady, city, class
     comparison = semstab.compare([steady, other], tmp_path / "versus")
     assert [own.name for own in comparison.runs] == ["steady", "flicker"]
     assert (tmp_path / "versus/report.html").exists()
+    assert repr(other).startswith("<FusedResult 'frames': 1 unit, fused by numba>\n  frames, flicker: ")
+    assert [own.source for own in comparison.runs] == [None, None]
     assert repr(comparison).startswith("<RunComparison with steady on frames>\n  flicker: alpha -")
     again = semstab.fuse(frames_of(city, "sim-steady"), voxel_size=SIZE, classes=classes, model="steady")
     assert [own.name for own in semstab.compare([steady, again]).runs] == ["steady", "steady (2)"]
@@ -106,6 +108,18 @@ def test_results_are_compared_gated_and_exported_as_runs_are(steady, city, class
     assert [each.verdict for each in semstab.gate(steady, steady, gate).judgements] == ["passes"]
     semstab.export(steady, tmp_path / "map.ply")
     assert (tmp_path / "map.ply").stat().st_size > 1000
+
+
+def test_a_rule_of_every_class_names_those_that_it_leaves_out(city, classes):
+    flown = semstab.fuse(frames_of(city, "sim-steady"), voxel_size=SIZE, classes=(*classes, "boat"), model="steady")
+    result = semstab.gate(flown, None, semstab.GateConfig(rules=("class *: alpha > -2",)))
+    assert "boat" not in [each.rule.class_name for each in result.judgements]
+    assert [
+        note
+        for note in result.notes
+        if note.startswith("class *: alpha > -2: left out, as seen nowhere twice in steady: ")
+    ]
+    assert any(note.endswith("boat") for note in result.notes)
 
 
 def test_nothing_is_written_unless_asked_and_then_all_of_it(city, classes, tmp_path, monkeypatch):

@@ -31,14 +31,14 @@ def calibrate_run(run: str | Path, *, precision: float = 0.95, confidence: float
         record = entry.with_voxels("a calibration")
         if record.truth_file is None:
             raise ConfigError(
-                f"{own.source}: ground truth of {scene} was not fused; run it with --statistics, on a scene that has it"
+                f"{own.where}: ground truth of {scene} was not fused; run it with --statistics, on a scene that has it"
             )
         maps.append(_with_truth(record, record.truth_file))
         sampled = min(sampled, share_of(record.summary.table.voxels))
     first = maps[0][0]
     for table, _ in maps[1:]:
         if (table.classes, table.voxel_size) != (first.classes, first.voxel_size):
-            raise DataError(f"{own.source}: its scenes differ in classes or voxel size; calibrate on one at a time")
+            raise DataError(f"{own.where}: its scenes differ in classes or voxel size; calibrate on one at a time")
     on = f"{own.model} on {', '.join(own.scenes)}"
     on += f", 1 in {round(1 / sampled)} of the locations of a large map" if sampled < 1 else ""
     return calibrate(maps, precision=precision, confidence=confidence, on=on)

@@ -486,7 +486,10 @@ def gate(new: str | os.PathLike[str], against: str | os.PathLike[str] | None, co
             _check(rule, own, base, scenes)
         if given.class_name == ALL:
             rules, absent = _with_a_value(rules, runs)
-            notes += [f"{given.text}: these classes were seen nowhere twice: {', '.join(absent)}"] if absent else []
+            notes += [
+                f"{given.text}: left out, as seen nowhere twice in {where}: {', '.join(names)}"
+                for where, names in absent.items()
+            ]
         for rule in rules:
             pairs = runs.pairs(rule)
             _require_values(rule, pairs)
@@ -528,7 +531,7 @@ def _check(rule: Rule, own: RunHandle, base: RunHandle | None, scenes: Sequence[
         if len({entry.sums.voxel_size for entry in entries}) > 1:
             sizes = [entry.sums.voxel_size for entry in entries]
             raise DataError(
-                f"{own.source}: its voxels have {sizes[0]:g} m, those of the baseline {sizes[1]:g} m; run it with"
+                f"{own.where}: its voxels have {sizes[0]:g} m, those of the baseline {sizes[1]:g} m; run it with"
                 f" --voxel-size {sizes[1]:g}"
             )
 
@@ -587,15 +590,20 @@ class _Runs:
         return [(self.own.scenes[scene], base.get(scene)) for scene in named]
 
 
-def _with_a_value(rules: Sequence[Rule], runs: _Runs) -> tuple[tuple[Rule, ...], list[str]]:
-    """Return the rules of classes for which some run has a value, and the names of the other classes."""
+def _with_a_value(rules: Sequence[Rule], runs: _Runs) -> tuple[tuple[Rule, ...], dict[str, list[str]]]:
+    """Return the rules of classes that have a value everywhere, and the other classes by the run that has none.
 
-    def has_value(rule: Rule) -> bool:
+    Where no class is left the rules stay, of which the first then says what it needs.
+    """
+    there, absent = list[Rule](), dict[str, list[str]]()
+    for rule in rules:
         entries = (entry for pair in runs.pairs(rule) for entry in pair if entry is not None)
-        return any(not math.isnan(_value(rule, entry)) for entry in entries)
-
-    there = tuple(filter(has_value, rules))
-    return there or tuple(rules), [str(rule.class_name) for rule in rules if rule not in there]
+        lacking = next((entry.where for entry in entries if math.isnan(_value(rule, entry))), None)
+        if lacking is None:
+            there.append(rule)
+        else:
+            absent.setdefault(lacking, []).append(str(rule.class_name))
+    return tuple(there or rules), absent if there else {}
 
 
 def _require_values(rule: Rule, pairs: Sequence[Pair]) -> None:

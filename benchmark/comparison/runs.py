@@ -60,12 +60,12 @@ class Entry(EntryNumbers):
     """A unit that is compared: a label source on a scene.
 
     Attributes:
-        where: The folder or the file that it comes from.
+        where: The folder or the file that it comes from, in print; the model of a run that a program holds.
         record: Its record in the folder; None for a small summary, which holds no voxels.
         small: Sums and flicker of a small summary.
     """
 
-    where: Path
+    where: str
     record: Record | None = None
     small: tuple[ClusterSums, Flicker] | None = None
 
@@ -123,18 +123,21 @@ class RunHandle:
 
     Attributes:
         name: Distinct among the runs that are compared: its model, its folder, or both.
-        source: The folder, or the file of a small summary.
-        in_memory: Whether a program holds it, so that its folder means nothing to anybody.
+        source: The folder, or the file of a small summary; None for a run that a program holds.
     """
 
     name: str
-    source: Path
+    source: Path | None
     model: str
     scenes: Mapping[str, Entry]
-    in_memory: bool = False
+
+    @property
+    def where(self) -> str:
+        """Its folder or file in print; the model of a run that a program holds."""
+        return str(self.source or self.model)
 
     def __str__(self) -> str:
-        return self.model if self.in_memory else f"{self.model} ({self.source})"
+        return self.model if self.source is None else f"{self.model} ({self.source})"
 
 
 def open_runs(named: Sequence[str | os.PathLike[str]]) -> tuple[RunHandle, ...]:
@@ -144,12 +147,12 @@ def open_runs(named: Sequence[str | os.PathLike[str]]) -> tuple[RunHandle, ...]:
         ConfigError, DataError: As `open_run` does.
     """
     runs = [open_run(each) for each in named]
-    folders = ["" if run.in_memory else run.source.resolve().name for run in runs]
+    folders = ["" if run.source is None else run.source.resolve().name for run in runs]
     models = [run.model for run in runs]
     both = [f"{folder}:{model}" for folder, model in zip(folders, models, strict=True)]
     whole = [f"{run.source}:{run.model}" for run in runs]
     names = next((own for own in (models, folders, both) if len({*own}) == len({*whole})), whole)
-    names = [run.model if run.in_memory else name for name, run in zip(names, runs, strict=True)]
+    names = [run.model if run.source is None else name for name, run in zip(names, runs, strict=True)]
     times = [names[: i + 1].count(name) for i, name in enumerate(names)]
     names = [name if nth == 1 else f"{name} ({nth})" for name, nth in zip(names, times, strict=True)]
     return tuple(replace(run, name=name) for run, name in zip(runs, names, strict=True))
@@ -170,18 +173,19 @@ def open_run(named: str | os.PathLike[str]) -> RunHandle:
         model, scenes = load_summary(path)
         _chosen(path, [model], wanted)
         return RunHandle(model, path, model, scenes)
-    result = load_result(path)
+    result, source = load_result(path), path if isinstance(named, str | Path) else None
     model = _chosen(path, result.models, wanted)
     seed = result.manifest.get("seed")
     scenes = {
         scene: Entry(
             summary=record.summary, image_space=record.image_space, georeference=result.georeference.get(scene),
-            up=result.up.get(scene), seed=seed if isinstance(seed, int) else None, where=path, record=record,
+            up=result.up.get(scene), seed=seed if isinstance(seed, int) else None, where=str(source or model),
+            record=record,
         )
         for record in result.select(model=model)
         for scene in [record.unit.scene]
     }  # fmt: skip
-    return RunHandle(model, path, model, scenes, in_memory=not isinstance(named, str | Path))
+    return RunHandle(model, source, model, scenes)
 
 
 def shared_scenes(runs: Sequence[RunHandle]) -> tuple[str, ...]:
@@ -196,7 +200,7 @@ def shared_scenes(runs: Sequence[RunHandle]) -> tuple[str, ...]:
         other = next((each for each in others if not first.scenes.keys() & each.scenes.keys()), others[-1])
         listed = [", ".join([*run.scenes][:3]) + (", ..." if len(run.scenes) > 3 else "") for run in (first, other)]
         raise DataError(
-            f"{first.source} and {other.source} have no scene in common ({listed[0] or 'none'}; {listed[1] or 'none'});"
+            f"{first.where} and {other.where} have no scene in common ({listed[0] or 'none'}; {listed[1] or 'none'});"
             " run both on the same scenes"
         )
     for scene in scenes:
@@ -340,7 +344,7 @@ def load_summary(path: str | Path) -> tuple[str, dict[str, Entry]]:
             except DataError as error:
                 raise DataError(f"{path}: the sums of {own.name} are damaged; write the summary again") from error
             flicker = dict(zip(own.frames, own.flicker, strict=True))
-            scenes[own.name] = Entry(**_numbers(own), where=path, small=(sums, flicker))
+            scenes[own.name] = Entry(**_numbers(own), where=str(path), small=(sums, flicker))
     return content.model, scenes
 
 

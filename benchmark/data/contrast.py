@@ -287,10 +287,10 @@ class SceneComparison:
 
 @dataclass(frozen=True)
 class Compared:
-    """A run as it was named, the file or folder it was read from, and its label source."""
+    """A run as it was named, the file or folder it was read from (None: a program held it), and its label source."""
 
     name: str
-    source: Path
+    source: Path | None
     model: str
 
 

@@ -330,6 +330,8 @@ def load_result(folder: str | Path) -> Result:
     """
     folder = Path(folder)
     path = folder / "summary.json"
+    if not os.path.lexists(folder):
+        raise DataError(f"{folder}: there is no such folder; give the folder of a finished run")
     if _is_earlier(folder, (LAYOUT, EARLIER_LAYOUT)):
         raise DataError(f"{folder}: holds results of an earlier version of semstab; run it again, into another folder")
     content = read_json(path)

@@ -22,7 +22,7 @@ from semstab.report import Reporting, write_report
 from semstab.settings import as_config
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True, repr=False)
 class FusedResult(Result):
     """A result whose files lie in a temporary folder until `save`; `compare`, `gate` and `export` take it as a run.
 

@@ -154,8 +154,8 @@ def frames(result: Result) -> list[Table]:
         SCENE,
         Column("frame", "Frame"),
         Column("places", "Places", 0),
-        Column("alone_percent", "alone (%)", 1, "lower", over="Of its places"),
-        Column("null_percent", "other frames there (%)", 1, over="Of its places"),
+        Column("lone_percent", "alone (%)", 1, "lower", over="Of its places"),
+        Column("lone_null_percent", "other frames there (%)", 1, over="Of its places"),
         Column("judged", "Judged", 0),
         Column("unjudged", "Not judged", 0),
     )
