@@ -197,7 +197,7 @@ def test_bad_choices_are_told_in_one_line(fused, message, options, monkeypatch):
 
 def test_other_bad_input(fused):
     fails(ConfigError, "format '.lax' is not known; did you mean '.la", written, fused, "map.lax")
-    fails(DataError, "summary.json: cannot be read", export, fused / "empty", fused / "map.ply")
+    fails(DataError, "empty: there is no such folder", export, fused / "empty", fused / "map.ply")
     lonely = dataclasses.replace(as_voxels(voxels_by_hand((1, 1, [1, 0, 0]))), up=None)
     fails(ConfigError, "set up_axis", seen_from_above, lonely)
 
