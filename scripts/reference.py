@@ -22,7 +22,7 @@ import semstab
 
 FOLDER = Path(__file__).parents[1] / "docs/reference"
 
-OBJECT = re.compile(r"<(?:function|object) .*?(?: at 0x[0-9a-f]+)?>|<factory>")
+OBJECT = re.compile(r"<(?:class|function|object) .*?(?: at 0x[0-9a-f]+)?>|<factory>")
 """A default that has no name."""
 
 
@@ -110,14 +110,22 @@ def _of(each: Any) -> str:
 
 
 def _module(name: str, module: Any) -> Iterator[str]:
-    """Yield what a module has: its functions and classes, each with the first line of its documentation."""
+    """Yield what a module has: functions and classes, each with its arguments and defaults, and its first line."""
     here = [each for each, own in vars(module).items() if getattr(own, "__module__", "") == module.__name__]
     own = getattr(module, "__all__", [each for each in here if not each.startswith("_")])
     yield "| | |\n| --- | --- |"
     for each in sorted(each for each in own if callable(getattr(module, each))):
         text = inspect.getdoc(getattr(module, each)) or ""
-        yield f"| `{name}.{each}` | {_cell(text.partition(chr(10) * 2)[0])} |"
+        yield f"| `{name}.{each}{_call(getattr(module, each))}` | {_cell(text.partition(chr(10) * 2)[0])} |"
     yield ""
+
+
+def _call(value: Any) -> str:
+    """Return '(table, digits=3)'; nothing for what is not called: protocols, base classes, exceptions."""
+    if inspect.isabstract(value) or getattr(value, "_is_protocol", False):
+        return ""
+    own = [f"{name}={default}" if default else name for name, default, _ in arguments(value)]
+    return f"({', '.join(own)})"
 
 
 def _rows(value: Any, parsed: list[Any]) -> Iterator[str]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import re
+import shutil
 import signal
 import subprocess
 import sys
@@ -91,7 +92,8 @@ def test_a_lost_pose_is_left_out_and_said_and_the_default_folder_is_new(wall, tm
 
 
 @pytest.mark.parametrize(("arguments", "message"), [
-    ("--data nowhere", "nowhere: there is no such folder"), ("--data empty", "empty"),
+    ("--data nowhere", "nowhere: there is no such folder"),
+    ("show nowhere", "nowhere: there is no such folder; give the folder of a finished run"), ("--data empty", "empty"),
     ("--config nowhere.yaml", "nowhere.yaml: cannot be read"),
     ("--config bad.yaml", "unknown setting 'voxel_sise'; did you mean 'voxel_size'?"),
     ("--data wall --voxel-size 0", "voxel_size: input should be greater than"),
@@ -117,6 +119,12 @@ def test_bad_input_is_one_line_and_exit_2(wall, tmp_path, arguments, message) ->
     dataset = "dataset: {name: posed_folder, options: {root: wall}}"
     (tmp_path / "tiny.yaml").write_text(f"name: tiny\n{dataset}\nsweeps: {{voxel_size: [0.5]}}\n")
     assert message in error_of(*arguments.split(), cwd=tmp_path)
+
+
+def test_a_scene_without_labels_points_to_what_predicts_them(wall, tmp_path) -> None:
+    shutil.rmtree(wall / "labels")
+    said = error_of("--data", wall, cwd=tmp_path)
+    assert said.endswith("add them, or predict them: --predict colour-clusters, or --predict FILE.py:NAME")
 
 
 def image(path: str, *shape_and_value: int, dtype: type = np.uint16):

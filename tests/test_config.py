@@ -116,3 +116,14 @@ def test_an_unknown_option_of_the_dataset_is_named() -> None:
     options = {"root": ".", "depthscale": 10}
     with pytest.raises(ConfigError, match="'depthscale'; did you mean 'depth_scale'"):
         resolve(load_config(overrides={"dataset": {"name": "posed_folder", "options": options}}))
+
+
+@pytest.mark.parametrize(("options", "message"), [
+    ({"name": "tum", "options": {"x": 1}}, "dataset 'tum', options: root: field required"),
+    ({"name": "posed_folder", "options": {"root": ".", "labels": {"a": 3}}}, "input should be a valid string"),
+    ({"name": "city", "options": {"frames": "abc"}}, "unable to parse string as an integer (got 'abc')"),
+])  # fmt: skip
+def test_an_error_prints_a_plain_value_and_no_options_as_python_has_them(options, message) -> None:
+    with pytest.raises(ConfigError) as caught:
+        resolve(load_config({"dataset": options}))
+    assert str(caught.value).endswith(message)

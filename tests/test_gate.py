@@ -6,6 +6,7 @@ import dataclasses
 import json
 import math
 import re
+import shutil
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -147,6 +148,19 @@ def test_a_rule_of_each_class_shares_the_level_and_voxel_sizes_must_be_the_same(
     fails(
         DataError, "run it with --voxel-size", gate, tmp_path / "large", f"{run}:a", gate_config(rules=["psa drop < 1"])
     )
+
+
+def test_a_rule_of_each_class_leaves_out_what_a_run_never_gives_and_says_so(run, tmp_path):
+    data = shutil.copytree(run.parent / "wall", tmp_path / "wall")
+    for path in (data / "labels/a").glob("*.png"):
+        labels = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+        cv2.imwrite(str(path), np.where(labels == 1, 0, labels))  # no door any more
+    semstab.run(configure(data, check=None, models=["a"]), out=tmp_path / "doorless", report=False)
+    for new, base in ((tmp_path / "doorless", f"{run}:a"), (f"{run}:a", tmp_path / "doorless")):
+        found = gate(new, base, gate_config(rules=["class *: alpha drop < 1.9"]))
+        assert [row.rule.class_name for row in found.judgements] == ["wall", "window"]
+        note = f"class *: alpha drop < 1.9: left out, as seen nowhere twice in {tmp_path / 'doorless'}: door"
+        assert note in found.notes
 
 
 def test_a_class_that_is_nowhere_has_no_value_and_ends_are_one_sided():

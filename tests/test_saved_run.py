@@ -60,6 +60,29 @@ def test_a_run_at_a_prompt_is_a_few_lines(run):
     ]
 
 
+def test_the_parts_of_a_run_at_a_prompt_are_one_line_each(run):
+    own = run.result.record(model="a")
+    verdict = str(own.statistics)
+    stated = verdict.removeprefix("<MapStatistics 'a': ").removesuffix(">")
+    assert stated.startswith(f"{own.statistics.verdict}, alpha ")
+    assert repr(own) == f"<Record scene, a: {stated}; numpy>"
+    assert repr(own.summary).startswith(f"<UnitSummary scene, a: {stated}; ")
+    assert repr(run.table(model="a")) == f"<VoxelTable: {own.summary.table.voxels:,} voxels of 0.25 m, 3 classes>"
+    assert repr(run.events(model="a")).startswith("<Events: ")
+
+
+def test_a_comparison_and_a_gate_at_a_prompt_are_a_few_lines(run):
+    a, b = f"{run.folder}:a", f"{run.folder}:b"
+    compared = semstab.compare([a, b])
+    (line,) = repr(compared).splitlines()[1:]
+    assert line.startswith("  b: ")
+    assert repr(compared.scenes[0]).splitlines()[1:] == [f"  {compared.scenes[0].against[0].stated}"]
+    assert repr(compared.overall[0]) == f"<Against {line.strip()}>"
+    judged = semstab.gate(b, a, semstab.GateConfig(rules=("psa drop < 1",)))
+    assert repr(judged).splitlines()[1:] == [f"  {judged.judgements[0].stated}"]
+    assert repr(judged.judgements[0]) == f"<Judgement {judged.judgements[0].stated}>"
+
+
 def test_a_column_of_the_stored_file_has_its_name_and_values_in_a_data_frame(run):
     file = run.result.record(model="a").voxels_file
     frame, stored = run.table(model="a").to_pandas(), pq.read_table(file)

@@ -458,6 +458,11 @@ def test_options_that_cannot_be_used_are_refused(options, message):
         new_map(**options)
 
 
+def test_a_device_that_is_no_name_is_one_line():
+    with pytest.raises(ConfigError, match="device '1' is not one; use CPU:0 or CUDA:0"):
+        backends.create("torch", voxel_size=0.2, num_classes=2, device=1)
+
+
 def test_the_default_device_is_the_accelerator_where_there_is_one():
     backend = backends.create("torch", voxel_size=0.2, num_classes=2)
     assert backend.device.type == ("cuda" if HAS_CUDA else "cpu")

@@ -341,6 +341,14 @@ class Judgement:
     new: float
     base: float
 
+    def __repr__(self) -> str:
+        return f"<Judgement {self.stated}>"
+
+    @property
+    def stated(self) -> str:
+        """The verdict, the rule and its numbers: 'passes: alpha > .6: 0.933 [0.920, 0.944]'."""
+        return f"{self.verdict}: {self.rule.text}: {self.values}"
+
     @property
     def about(self) -> str:
         """The scope of the interval: what varies."""
@@ -424,7 +432,7 @@ class GateResult:
     def __repr__(self) -> str:
         against = f" against {self.against}" if self.against else ""
         lines = [f"<GateResult: {self.outcome}; {self.new}{against} on {', '.join(self.scenes)}>"]
-        return "\n".join([*lines, *(f"  {each.verdict}: {each.rule.text}: {each.values}" for each in self.judgements)])
+        return "\n".join([*lines, *(f"  {each.stated}" for each in self.judgements)])
 
     def count(self, verdict: Verdict) -> int:
         """Return how many rules have this verdict."""

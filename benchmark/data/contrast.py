@@ -264,6 +264,17 @@ class Against:
     top_frames: tuple[FrameShare, ...] = ()
     columns: Path | None = None
 
+    def __repr__(self) -> str:
+        return f"<Against {self.stated}>"
+
+    @property
+    def stated(self) -> str:
+        """The first difference, and the measures in which a difference is shown."""
+        first = self.contrasts[0] if self.contrasts else None
+        changes = [f"{row.change} in {row.measure}" for row in self.contrasts if row.change]
+        known = "" if first is None else f": {first.measure} {first.difference.text('+')}, p {first.p_holm:.2g}"
+        return f"{self.other}{known}; {', '.join(changes) or 'no difference is shown'}"
+
 
 @dataclass(frozen=True)
 class SceneComparison:
@@ -283,6 +294,10 @@ class SceneComparison:
     coverage: tuple[MapCoverage, ...]
     observations: ComparedObservations | None
     against: tuple[Against, ...]
+
+    def __repr__(self) -> str:
+        lines = [f"<SceneComparison of {self.scene}: {self.voxels:,} voxels that all saw twice, {self.frames} frames>"]
+        return "\n".join([*lines, *(f"  {own.stated}" for own in self.against)])
 
 
 @dataclass(frozen=True)
@@ -311,13 +326,5 @@ class RunComparison:
     def __repr__(self) -> str:
         scenes = ", ".join(scene.scene for scene in self.scenes)
         lines = [f"<RunComparison with {self.base} on {scenes}>"]
-        for own in self.overall:
-            first = own.contrasts[0] if own.contrasts else None
-            changes = [
-                f"{change} in {', '.join(named)}"
-                for change in ("worse", "better")
-                if (named := [row.measure for row in own.contrasts if row.change == change])
-            ]
-            known = "" if first is None else f": {first.measure} {first.difference.text('+')}, p {first.p_holm:.2g}"
-            lines.append(f"  {own.other}{known}; {'; '.join(changes) or 'no difference is shown'}")
+        lines += [f"  {own.stated}" for own in self.overall]
         return "\n".join(lines)

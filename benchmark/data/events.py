@@ -58,6 +58,9 @@ class Events:
         if not np.array_equal(np.append(self.voxel[:1], further), np.arange(len(self.ix))):
             raise DataError("events: rows must be grouped by voxel, each voxel with one row or more")
 
+    def __repr__(self) -> str:
+        return f"<Events: {len(self):,} observations of {len(self.ix):,} voxels of {self.voxel_size:g} m>"
+
     def __len__(self) -> int:
         return len(self.voxel)
 

@@ -197,6 +197,11 @@ class Record:
     voxels_file: Path | None = None
     truth_file: Path | None = None
 
+    def __repr__(self) -> str:
+        sweep, value = self.variation.sweep, self.variation.value
+        varied = "" if sweep == BASE else f", {sweep}" if value is None else f", {sweep} {value:g}"
+        return f"<Record {self.summary.stated}; {self.unit.backend}{varied}>"
+
     @property
     def statistics(self) -> MapStatistics | None:
         """Return the statistics of the map."""
@@ -354,10 +359,7 @@ class Result:
     def __repr__(self) -> str:
         units = f"{len(self.records)} unit{'' if len(self.records) == 1 else 's'}"
         lines = [f"<{type(self).__name__} '{self.name}': {units}, fused by {self.backend}>"]
-        for run in self.runs[:LISTED]:
-            alpha = UNKNOWN if run.statistics is None else run.statistics.headline.alpha
-            verdict = "" if run.statistics is None else f": {run.statistics.verdict}, alpha {alpha.text()}"
-            lines.append(f"  {run.unit.scene}, {run.unit.model}{verdict}")
+        lines += [f"  {run.stated}" for run in self.runs[:LISTED]]
         return "\n".join([*lines, *(["  ..."] if len(self.runs) > LISTED else [])])
 
     @property

@@ -196,6 +196,15 @@ class UnitSummary:
     sizes: tuple[SizeAlpha, ...] = ()
     reduced: ReducedScores | None = None
 
+    def __repr__(self) -> str:
+        return f"<UnitSummary {self.stated}; {self.table.voxels:,} voxels of {self.table.voxel_size:g} m>"
+
+    @property
+    def stated(self) -> str:
+        """Its scene and model, the verdict and alpha: 'scene0, m: stable (p .98), alpha .93 (.92 to .95)'."""
+        known = "" if self.statistics is None else f": {self.statistics.stated}"
+        return f"{self.unit.scene}, {self.unit.model}{known}"
+
     def row(self) -> dict[str, str | int | float]:
         """Return a row: its names, the verdict and the number that it rests on, the size of its map, means of measures.
 

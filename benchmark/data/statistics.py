@@ -494,6 +494,14 @@ class MapStatistics:
     strata: tuple[StratumStatistics, ...]
     outlying_frames: OutlyingFrames | None = None
 
+    def __repr__(self) -> str:
+        return f"<MapStatistics '{self.name}': {self.stated}>"
+
+    @property
+    def stated(self) -> str:
+        """The verdict and the number that it rests on: 'stable (p .98), alpha .93 (.92 to .95)'."""
+        return f"{self.verdict}, alpha {self.headline.alpha.text()}"
+
     @property
     def order_known(self) -> bool:
         """Return whether a random order of the observations was drawn for a quarter of the locations.

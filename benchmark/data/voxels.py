@@ -201,6 +201,9 @@ class VoxelTable:
         if not ascends.all():
             raise DataError("voxel table: rows must be distinct and sorted by ix, iy, iz")
 
+    def __repr__(self) -> str:
+        return f"<VoxelTable: {len(self):,} voxels of {self.voxel_size:g} m, {self.K} classes>"
+
     def __len__(self) -> int:
         return len(self.ix)
 

@@ -170,6 +170,7 @@ class Recording(Observer):
         self._unfinished: set[Unit] = set()  # of the group
         self._logged: set[Unit] = set()
         self._sent = 0
+        self._others = "all other files are complete, and the same command makes the recording again"
 
     def run_started(self, plan: Plan, finished: Mapping[str, UnitContent]) -> None:
         """Store the plan, which gives layout, names and colours."""
@@ -215,6 +216,11 @@ class Recording(Observer):
         Where no frame was fused here, an earlier recording that is whole stays.
         """
         self._end_group()
+        if result.failures:
+            self._others = (
+                f"{len(result.failures)} of {len(result.failures) + len(result.records)} units failed, the first with"
+                f" {result.failures[0].message}; the same command computes them again"
+            )
         if self._stream is None and is_whole(self.target.file):
             return
         self.log_finished(result)
@@ -280,8 +286,8 @@ class Recording(Observer):
             except RuntimeError as error:
                 reason = "was the viewer closed?" if self.target.live else "is the disk full?"
                 raise ConfigError(
-                    f"{self.target.file}: the recording is not complete ({summarize_error(error)}; {reason}); all"
-                    " other files are complete, and the same command makes the recording again"
+                    f"{self.target.file}: the recording is not complete ({summarize_error(error)}; {reason});"
+                    f" {self._others}"
                 ) from error
             else:
                 stream.disconnect()

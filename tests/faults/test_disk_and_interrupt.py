@@ -33,6 +33,25 @@ def test_a_recording_that_finds_no_room_costs_no_result(tmp_path, monkeypatch) -
     assert len(json.loads((out / "summary.json").read_text())["runs"]) == 1
 
 
+def test_a_recording_without_room_beside_units_without_room_says_which_are_missing(tmp_path, monkeypatch) -> None:
+    """Not that all other files are complete."""
+
+    def full(*_: object, **__: object) -> None:
+        raise RuntimeError("File-writer thread shut down prematurely")
+
+    def no_room(*_: object) -> None:
+        raise OSError(28, "No space left on device", "overview.npz")
+
+    monkeypatch.setattr("rerun.RecordingStream.flush", full)
+    monkeypatch.setattr("semstab.engine.measurement.save_overview", no_room)
+    config, out = configure(tiny_scene.write(tmp_path / "wall"), check=None), tmp_path / "out"
+    said = r"1 of 1 units failed, the first with .*No space left on device.*; the same command computes them again"
+    with pytest.raises(ConfigError, match=said) as caught:
+        semstab.run({**config.model_dump(), "models": ["a"]}, out=out, observers=[Recording(out / "r.rrd")])
+    assert "all other files" not in str(caught.value)
+    assert not list((out / "units").iterdir())
+
+
 FULL = """
 import resource, sys
 import semstab.recording.target as target
