@@ -271,9 +271,13 @@ class Against:
     def stated(self) -> str:
         """The first difference, and the measures in which a difference is shown."""
         first = self.contrasts[0] if self.contrasts else None
-        changes = [f"{row.change} in {row.measure}" for row in self.contrasts if row.change]
+        changes = [
+            f"{change} in {', '.join(named)}"
+            for change in ("worse", "better")
+            if (named := [row.measure for row in self.contrasts if row.change == change])
+        ]
         known = "" if first is None else f": {first.measure} {first.difference.text('+')}, p {first.p_holm:.2g}"
-        return f"{self.other}{known}; {', '.join(changes) or 'no difference is shown'}"
+        return f"{self.other}{known}; {'; '.join(changes) or 'no difference is shown'}"
 
 
 @dataclass(frozen=True)
