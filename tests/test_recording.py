@@ -65,7 +65,7 @@ def run(tmp_path_factory):
 
 
 def read(path: Path) -> dict[str, list[dict[str, Any]]]:
-    """Rows by entity path, in the order of the file."""
+    """Rows by entity path, in the order in which they were logged; a file may hold its chunks in another."""
     return _read(path, path.stat().st_mtime_ns)
 
 
@@ -76,7 +76,7 @@ def _read(path: Path, _: int) -> dict[str, list[dict[str, Any]]]:
     rows: dict[str, list[dict[str, Any]]] = {}
     for chunk in reader.stream(store=store):
         rows.setdefault(chunk.entity_path, []).extend(rows_of(chunk))
-    return rows
+    return {path: sorted(of_path, key=lambda row: row["rerun.controls.RowId"]) for path, of_path in rows.items()}
 
 
 @functools.lru_cache(maxsize=2)
