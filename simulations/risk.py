@@ -1,0 +1,225 @@
+"""Does disagreement tell which labels are wrong, and how many, without ground truth?
+
+    python simulations/risk.py made [--scenes 3] [--seed 0]
+    python simulations/risk.py city [--frames 20] [--width 288]
+    python simulations/risk.py runs RUN ...
+
+Places are the voxels of a map that were seen three times or more and have a true class; the label of one is its
+dominant class. `made` takes flights of `pictures.py`, with errors of eight kinds at four rates, `city` the simulated
+models on scenes of the city, `runs` the maps of runs with ground truth (`semstab-bench --statistics`).
+
+How well disagreement, 1 - PSA, tells wrong places from right ones is the area under the ROC curve (AUROC): the
+probability that it is larger at a wrong place than at a right one. The probability that a label is wrong, given the
+disagreement, OP and class of its place, is then counted on other flights of the same model, and on other models, and
+held against the map: at all places, and at those where frames disagree (PSA < 0.8). No truth is needed for one bound:
+of the frames that see a place, no more can be right than give it its most frequent label. Prints a table in Markdown.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+import tempfile
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from alpha import RATES
+from pictures import KINDS, K, Views, frames, predicted, scene
+from scipy.stats import mannwhitneyu
+
+import semstab
+from semstab import backends
+from semstab.comparison.runs import open_run
+from semstab.data.measures import dominant
+from semstab.data.voxels import VoxelTable
+from semstab.statistics.agreement import CONSISTENT, psa
+from semstab.statistics.correctness import join_truth
+
+VOXEL = 0.5
+"""Metres along the edge of a voxel of the made flights."""
+
+STEPS = (1e-9, 0.1, 0.2, 0.35, 0.5)
+"""Disagreement: none, and up to each; then more."""
+
+SEEN = (5, 10, 20)
+"""OP: below each, and from the last one on."""
+
+SIMULATED = ("sim-steady", "sim-flicker", "sim-soft", "trick-two-class", "trick-blur-81", "trick-coarse-16")
+"""Models of the city: their errors last, are drawn anew, or come from the way they label."""
+
+WEIGHT = 20
+"""Places of a class that count as much as all classes together."""
+
+HEAD = (
+    "model", "wrong, %", "AUROC, mean (least to most)", "frames disagree at, %", "wrong there, %",
+    "as on its other flights", "as with other models", "wrong in all, as with other models",
+    "of the frames' labels wrong, %", "at least, %",
+)  # fmt: skip
+
+
+@dataclass(frozen=True, eq=False)
+class Places:
+    """The places of one map, (n,) each.
+
+    Attributes:
+        model, flight: Of whom, and where.
+        disagreement: 1 - PSA.
+        op: Frames that saw it.
+        label: Its dominant class.
+        wrong: Whether that is not the true one.
+        agreeing: Frames that give it its dominant class.
+        right: Frames that give it the true one.
+    """
+
+    model: str
+    flight: str
+    disagreement: np.ndarray
+    op: np.ndarray
+    label: np.ndarray
+    wrong: np.ndarray
+    agreeing: np.ndarray
+    right: np.ndarray
+
+    @classmethod
+    def of(cls, model: str, flight: str, table: VoxelTable, truth: VoxelTable) -> Places:
+        """Return the places of a map with the map of its ground truth."""
+        label = join_truth(table, truth).label
+        some = np.flatnonzero((label >= 0) & (table.op >= 3))
+        evidence = table.evidence[:][some]
+        said, true = dominant(table)[some], label[some]
+        row = np.arange(len(some))
+        return cls(
+            model, flight, 1 - np.nan_to_num(psa(table))[some], table.op[some], said, said != true,
+            evidence[row, said], evidence[row, true],
+        )  # fmt: skip
+
+    @property
+    def disagree(self) -> np.ndarray:
+        """(n,) true where frames disagree: the place is not consistent."""
+        return self.disagreement > 1 - CONSISTENT
+
+    @property
+    def auroc(self) -> float:
+        """How well disagreement tells wrong places; NaN where all are right, or wrong."""
+        wrong, right = self.disagreement[self.wrong], self.disagreement[~self.wrong]
+        if not (len(wrong) and len(right)):
+            return math.nan
+        return float(mannwhitneyu(wrong, right).statistic / (len(wrong) * len(right)))
+
+
+def cells_of(places: Places) -> np.ndarray:
+    """Return the number (n,) of the cell of disagreement and OP that each place is in."""
+    return np.searchsorted(STEPS, places.disagreement) * (len(SEEN) + 1) + np.searchsorted(SEEN, places.op, "right")
+
+
+def expected(places: Places, others: Sequence[Places], *, by_class: bool) -> np.ndarray:
+    """Return P(wrong | disagreement, OP, class) of each place (n,), counted on other maps; NaN without any."""
+    if not others:
+        return np.full(len(places.wrong), math.nan)
+    cells = (len(STEPS) + 1) * (len(SEEN) + 1)
+    classes = 1 + max(int(own.label.max(initial=0)) for own in [places, *others])
+    cell = np.concatenate([cells_of(own) for own in others])
+    label = np.concatenate([own.label for own in others])
+    wrong = np.concatenate([own.wrong for own in others]).astype(float)
+    count, bad = np.bincount(cell, minlength=cells), np.bincount(cell, wrong, cells)
+    of_cell = (bad + wrong.mean()) / (count + 1)
+    if not by_class:
+        return of_cell[cells_of(places)]
+    both = cell * classes + label
+    count, bad = np.bincount(both, minlength=cells * classes), np.bincount(both, wrong, cells * classes)
+    of_both = (bad + WEIGHT * of_cell.repeat(classes)) / (count + WEIGHT)
+    return of_both[cells_of(places) * classes + places.label]
+
+
+def made(scenes: int, seed: int) -> Iterator[Places]:
+    """Yield the maps of the made flights: a model is a kind of errors and a rate of them."""
+    for kind in KINDS[1:]:
+        for rate in np.linspace(*RATES[kind], 4):
+            for trial in range(scenes):
+                views = scene(np.random.default_rng([seed, trial]))
+                labels = predicted(views, kind, rate, trial, 0)
+                yield Places.of(f"{kind}, {rate:.2f}", f"{trial}", fused(views, labels), fused(views, views.labels))
+
+
+def fused(views: Views, labels: np.ndarray) -> VoxelTable:
+    """Return the map of labels (F, H, W)."""
+    backend = backends.create("numba", voxel_size=VOXEL, num_classes=K)
+    for frame in frames(views, labels):
+        backend.integrate(frame)
+    return backend.table()
+
+
+def city(count: int, width: int) -> Iterator[Places]:
+    """Yield the maps of the simulated models on the scenes of the city."""
+    options = {"frames": count, "width": width, "height": round(width * 9 / 16)}
+    settings = {
+        "dataset": {"name": "city", "options": options}, "scenes": ["scene0", "scene1"], "models": list(SIMULATED),
+        "statistics": True, "check": None,
+    }  # fmt: skip
+    with tempfile.TemporaryDirectory() as folder:
+        semstab.run(semstab.load_config(overrides=settings), out=folder, report=False)
+        for model in semstab.load_result(folder).models:
+            yield from of_run(f"{folder}:{model}")
+
+
+def of_run(run: str) -> Iterator[Places]:
+    """Yield the maps of a run."""
+    own = open_run(run)
+    for name, entry in own.scenes.items():
+        record = entry.with_voxels("this")
+        yield Places.of(own.model, name, record.table(), VoxelTable.load(record.truth_file))
+
+
+def rows(maps: Sequence[Places], family: Callable[[str], str], *, by_class: bool) -> Iterator[list[str]]:
+    """Yield the cells of each model; `family` has in common what may not be learnt from."""
+    for model in dict.fromkeys(own.model for own in maps):
+        flights = [own for own in maps if own.model == model]
+        others = [own for own in maps if family(own.model) != family(model)]
+        area = [own.auroc for own in flights]
+        seen = [own for own in area if not math.isnan(own)]
+        same = [expected(own, [each for each in flights if each is not own], by_class=by_class) for own in flights]
+        other = [expected(own, others, by_class=by_class) for own in flights]
+        disagree = [own.disagree for own in flights]
+        observations = sum(own.op.sum() for own in flights)
+        yield [
+            model, percent(own.wrong for own in flights),
+            f"{np.mean(seen):.2f} ({min(seen):.2f} to {max(seen):.2f})" if seen else "-", percent(disagree),
+            percent(own.wrong[own.disagree] for own in flights),
+            percent(chance[where] for chance, where in zip(same, disagree, strict=True)),
+            percent(chance[where] for chance, where in zip(other, disagree, strict=True)), percent(other),
+            f"{100 * (1 - sum(own.right.sum() for own in flights) / observations):.1f}",
+            f"{100 * (1 - sum(own.agreeing.sum() for own in flights) / observations):.1f}",
+        ]  # fmt: skip
+
+
+def percent(parts: Iterable[np.ndarray]) -> str:
+    """Return the mean of some values or masks, in percent."""
+    values = np.concatenate([np.asarray(part, float) for part in parts])
+    return f"{100 * values.mean():.1f}" if len(values) and not np.isnan(values).any() else "-"
+
+
+def main() -> None:
+    """Print the table."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("study", choices=["made", "city", "runs"])
+    parser.add_argument("run", nargs="*", metavar="RUN[:MODEL]")
+    parser.add_argument("--scenes", type=int, default=3)
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--frames", type=int, default=20)
+    parser.add_argument("--width", type=int, default=288)
+    arguments = parser.parse_args()
+    if arguments.study == "made":
+        maps = list(made(arguments.scenes, arguments.seed))
+    elif arguments.study == "city":
+        maps = list(city(arguments.frames, arguments.width))
+    else:
+        maps = [own for run in arguments.run for own in of_run(run)]
+    print("|", " | ".join(HEAD), "|")
+    print("|", " | ".join("---" for _ in HEAD), "|")
+    for cells in rows(maps, lambda model: model.split(",")[0], by_class=arguments.study != "runs"):
+        print("|", " | ".join(cells), "|", flush=True)
+
+
+if __name__ == "__main__":
+    main()
