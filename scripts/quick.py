@@ -4,7 +4,7 @@
     python scripts/quick.py HEAD~3      # since another commit
 
 A test file is near a changed file where it changed itself, where it has its name (test_readers_odm.py that of odm.py),
-or where it imports the changed module, its package or a neighbour in it. `make test` runs all.
+or by how few imports it leads to the changed module. `make test` runs all.
 """
 
 from __future__ import annotations
@@ -24,6 +24,9 @@ CORE = (
     "test_pipeline", "test_cli", "test_backends",
 )  # fmt: skip
 """Equations, settings, what a fresh machine has, a run, the command line, backends: in this order."""
+
+FAR = 5
+"""Imports between a test and a module from which on it is not near."""
 
 FOLDERS = {"benchmark": "semstab"} | {
     name: f"semstab.{name}" for name in ("backends", "models", "datasets", "configs", "conformance")
@@ -48,36 +51,49 @@ def module_of(file: Path) -> str | None:
 
 
 def imported(file: Path) -> Iterator[str]:
-    """Yield the modules that a file imports, and the names that it takes from them."""
+    """Yield the modules that a file imports, names that it takes from them, and modules that it names in strings."""
     for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
         if isinstance(node, ast.Import):
             yield from (alias.name for alias in node.names)
         elif isinstance(node, ast.ImportFrom) and node.module:
             yield node.module
             yield from (f"{node.module}.{alias.name}" for alias in node.names)
+        elif isinstance(node, ast.Constant) and isinstance(node.value, str) and node.value.startswith("semstab."):
+            yield node.value.partition(":")[0]  # of a registry: imported when it is asked for
 
 
-def distance(names: Iterable[str], module: str) -> int:
-    """Return 0 where the module itself is among the names, 1 where its package is, 2 for a neighbour, else 9."""
-    package = module.rpartition(".")[0]
-    known = set(names)
-    if module in known:
-        return 0
-    if package == "semstab":
-        return 9
-    return 1 if package in known else 2 if any(name.startswith(f"{package}.") for name in known) else 9
+def importers() -> dict[str, set[str]]:
+    """Return by whom each module is imported: modules of the product, helpers of the tests, tests by their path."""
+    files = {module: file for name in FOLDERS for file in (ROOT / name).rglob("*.py")
+             if (module := module_of(file.relative_to(ROOT))) is not None}  # fmt: skip
+    for file in (ROOT / "tests").rglob("*.py"):
+        files[str(file.relative_to(ROOT)) if file.stem.startswith("test_") else file.stem] = file
+    by: dict[str, set[str]] = {module: set() for module in files}
+    for module, file in files.items():
+        for name in by.keys() & set(imported(file)):
+            by[name].add(module)
+    return by
+
+
+def distances(modules: Iterable[str]) -> dict[str, int]:
+    """Return how many imports lie between some modules and whatever imports them, itself or by way of others."""
+    by, far, met = importers(), dict.fromkeys(modules, 0), list(modules)
+    for module in met:  # grows
+        for name in sorted(by.get(module, set()) - far.keys()):
+            far[name] = far[module] + 1
+            met.append(name)
+    return far
 
 
 def selected(files: set[Path]) -> list[Path]:
     """Return the test files to run, the nearest first, then the core."""
-    tests = {path.relative_to(ROOT): set(imported(path)) for path in sorted((ROOT / "tests").rglob("test_*.py"))}
-    modules = [module for file in files if (module := module_of(file)) is not None]
-    near = {test: min((distance(names, module) for module in modules), default=9) for test, names in tests.items()}
+    tests = sorted(path.relative_to(ROOT) for path in (ROOT / "tests").rglob("test_*.py"))
     named = {file.stem for file in files if module_of(file) is not None}
-    near |= {test: -1 for test in tests if test in files or named & set(test.stem.split("_"))}
-    core = [ROOT / "tests" / f"{name}.py" for name in CORE]
-    order = sorted((test for test, far in near.items() if far < 9), key=near.__getitem__)
-    return list(dict.fromkeys([*order, *(path.relative_to(ROOT) for path in core)]))
+    far = distances([module for file in files if (module := module_of(file)) is not None])
+    far |= {str(test): 0 for test in tests if test in files or named & set(test.stem.split("_"))}
+    near = sorted((test for test in tests if far.get(str(test), FAR) < FAR), key=lambda test: far[str(test)])
+    core = [(ROOT / "tests" / f"{name}.py").relative_to(ROOT) for name in CORE]
+    return list(dict.fromkeys([*near, *core]))
 
 
 def main() -> int:
