@@ -3,7 +3,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from semstab.data.labels import LabelSpace, shipped_taxonomies
+from semstab.data.labels import LabelSpace, moving, shipped_taxonomies
 from semstab.errors import ConfigError, DataError
 from semstab.testing import checks
 
@@ -224,3 +224,15 @@ def test_a_label_space_that_contradicts_itself_is_refused(fields, message):
     with pytest.raises(ConfigError, match=message) as error:
         LabelSpace(**{"name": "mine", "classes": ("a", "b")} | fields)
     assert str(error.value).startswith("taxonomy mine: ")
+
+
+def test_classes_that_move_are_known_by_their_last_word() -> None:
+    names = (
+        "road", "Moving_Car", "static car", "human", "car, auto, automobile", "bus stop", "train track",
+        "parked vehicles", "vehicles", "people", "Traffic light", "buses", "carpet", "animals (wild)",
+        "bus;coach", "van/truck",
+    )  # fmt: skip
+    assert [names[k] for k in moving(names)] == [
+        "Moving_Car", "human", "car, auto, automobile", "vehicles", "people", "animals (wild)", "bus;coach",
+        "van/truck",
+    ]  # fmt: skip

@@ -5,6 +5,7 @@ from __future__ import annotations
 import difflib
 import functools
 import importlib.resources
+import re
 import reprlib
 import unicodedata
 from collections import Counter
@@ -392,6 +393,27 @@ def sharing_classes(classes: Mapping[str, tuple[str, ...]]) -> tuple[str, ...]:
     """Return the models that can be compared: those with the classes that most of them have, if two or more have."""
     ((most, count),) = Counter(classes.values()).most_common(1) or [((), 0)]
     return tuple(model for model, own in classes.items() if own == most) if count > 1 else ()
+
+
+MOVING = frozenset({
+    "aeroplane", "aircraft", "airplane", "animal", "bicycle", "bicyclist", "bike", "bird", "boat", "bus", "car",
+    "caravan", "cat", "cow", "cyclist", "deer", "dog", "drone", "elephant", "helicopter", "horse", "human", "minibike",
+    "motorbike", "motorcycle", "motorcyclist", "pedestrian", "people", "person", "rider", "scooter", "sheep", "ship",
+    "tractor", "trailer", "train", "tram", "truck", "van", "vehicle",
+})  # fmt: skip
+"""Last words of the names of classes that move."""
+
+
+def moving(classes: Sequence[str]) -> tuple[int, ...]:
+    """Return the numbers of the classes that move, by their names; what is said to be static or parked does not."""
+    return tuple(k for k, name in enumerate(classes) if _moves(name.lower()))
+
+
+def _moves(name: str) -> bool:
+    parts = [words for part in re.split("[,;/()]", name) if (words := re.findall("[a-z]+", part))]
+    last = {words[-1] for words in parts}
+    still = any(word in ("static", "parked") for words in parts for word in words)
+    return not still and not MOVING.isdisjoint(last | {word.removesuffix("s") for word in last})
 
 
 def name_key(name: str) -> str:

@@ -185,6 +185,21 @@ class ClassAlpha:
 
 
 @dataclass(frozen=True)
+class MovingClasses:
+    """Disagreement where the map has classes that move, as vehicles and persons do.
+
+    Attributes:
+        classes: Their names.
+        disagreement: Share of all disagreement that is at locations with one of these as dominant class.
+        alpha: Of all other locations.
+    """
+
+    classes: tuple[str, ...]
+    disagreement: float
+    alpha: float
+
+
+@dataclass(frozen=True)
 class CellAgreement:
     """The observations that alpha rests on: labels of sampled cells, about as wide as a pixel's footprint.
 
@@ -198,6 +213,7 @@ class CellAgreement:
         largest_class: The class with most observations, and `largest_share` its share of them.
         labelled: Share of the locations with depth that have a label in at least half of their observations.
         classes: Alpha of each class.
+        moving: The classes that move, where much of the disagreement is theirs; else None.
     """
 
     cell_size: float
@@ -210,6 +226,7 @@ class CellAgreement:
     largest_share: float
     labelled: float
     classes: tuple[ClassAlpha, ...]
+    moving: MovingClasses | None = None
 
     @property
     def effective_classes(self) -> float:

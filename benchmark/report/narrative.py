@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import math
+import shlex
 from collections.abc import Iterator, Mapping, Sequence
+
+import yaml
 
 from semstab.data.measures import VSS
 from semstab.data.records import Record, Result
 from semstab.data.results import UnitSummary, VoxelAdvice
-from semstab.data.statistics import OutlyingFrames
+from semstab.data.statistics import OutlyingFrames, short
 from semstab.datasets import GROUND_TRUTH
 from semstab.metrics import macro_mean
 from semstab.report.means import ENOUGH, by_model, pooled
@@ -24,6 +27,9 @@ LEAST_RECALL = 0.25
 
 TOO_LARGE = 25
 """The multiple of the suggested voxel size from which on there is a warning."""
+
+MOSTLY_MOVING = 0.5
+"""The share of the disagreement at locations of classes that move from which on there is a warning."""
 
 ONE_CLASS = 0.9
 """The share of a class from which on it determines most of the numbers."""
@@ -74,7 +80,7 @@ def warnings(result: Result) -> Iterator[str]:
     if mixed(runs):
         yield "VSS, entropy and voxel alpha do not compare labels with soft scores: semstab-bench show RUN reduced"
     for record in result.select():
-        yield from (f"{_name(record.summary, result)}: {text}" for text in _suspicions(record))
+        yield from (f"{_name(record.summary, result)}: {text}" for text in (*_suspicions(record), *_traffic(record)))
     covering: dict[str, list[tuple[str, float]]] = {}
     for run in filter(_one_class, runs):
         largest = max(run.table.classes, key=lambda row: row.voxels)
@@ -86,8 +92,14 @@ def warnings(result: Result) -> Iterator[str]:
         more = " or more" if len({share for _, share in own}) > 1 and least < 100 else ""
         yield (
             f"'{name}' covers {least}%{more} of the map{of}, and determines most of its numbers; read them by class,"
-            f" or leave it out: --set exclude.classes=[{name}]"
+            f" or leave it out: {_excluding(name)}"
         )
+
+
+def _excluding(*classes: str) -> str:
+    """Return the option that leaves out classes, as a shell takes it."""
+    listed = yaml.safe_dump(list(classes), default_flow_style=True, width=math.inf).strip()
+    return f"--set {shlex.quote(f'exclude.classes={listed}')}"
 
 
 MOST_FRAMES = 12
@@ -134,6 +146,18 @@ def _suspicions(record: Record) -> Iterator[str]:
             f"only {recall:.0%} of the edges of depth have a border of labels near them: the labels may be coarse,"
             " blurred, or of few objects"
         )
+
+
+def _traffic(record: Record) -> Iterator[str]:
+    """Yield that most disagreement is of what moves, where frames would agree much better without it."""
+    cells = None if record.statistics is None else record.statistics.cells
+    if cells is None or (moving := cells.moving) is None or moving.disagreement < MOSTLY_MOVING:
+        return
+    yield (
+        f"{moving.disagreement:.0%} of the disagreement is where the map has classes that move"
+        f" ({', '.join(moving.classes)}); without these locations alpha is {short(moving.alpha)}:"
+        f" {_excluding(*moving.classes)}"
+    )
 
 
 def _seen_once(run: UnitSummary) -> int:

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from semstab.core.types import THIS_SCENE, Float64, Scope
+from semstab.data import labels
 from semstab.data.events import Events
 from semstab.data.information import by_group
 from semstab.data.measures import SBD, dominant
@@ -26,6 +27,7 @@ from semstab.data.statistics import (
     HeadlineStatistics,
     Interval,
     MapStatistics,
+    MovingClasses,
     Repeated,
     StratumStatistics,
     Trend,
@@ -33,9 +35,9 @@ from semstab.data.statistics import (
 from semstab.data.voxels import VoxelTable
 from semstab.metrics.agreement import shared_rows
 from semstab.metrics.summary import STRATA, groups_of
-from semstab.statistics.accumulate import Cubes, CubeSums, cluster_sums_of
+from semstab.statistics.accumulate import Cubes, CubeSums, cluster_sums_of, sums_of_cells
 from semstab.statistics.agreement import class_agreement_of, class_sums, consistency_posterior, shares_of
-from semstab.statistics.cluster_sums import MOST_CLASSES, ClusterSums, chance_of
+from semstab.statistics.cluster_sums import MOST_CLASSES, ClusterSums, chance_of, value
 from semstab.statistics.correctness import (
     ACCURACY,
     MIOU,
@@ -285,6 +287,7 @@ def cell_agreement(
     alphas = confidence_intervals(spec_of(sums, "alpha", k, own) for k in range(table.K) if table.K <= MOST_CLASSES)
     n, largest = float(fine["observations"].sum()), int(evidence.argmax())
     disagreement = _disagreement(evidence / n if n else evidence, np.array([alpha.value for alpha in alphas]))
+    moving = [k for k in labels.moving(names) if k < len(disagreement) and disagreement[k] >= LITTLE]
     return CellAgreement(
         cell_size=cells.coarsening * cells.cell_size,
         cells=round(float(fine["voxels"].sum())),
@@ -306,7 +309,26 @@ def cell_agreement(
             )
             for k, (name, alpha) in enumerate(zip(names, alphas, strict=False))
         ),
+        moving=moving_classes(cells, sums, moving) if disagreement[moving].sum() >= MUCH else None,
     )
+
+
+LITTLE, MUCH = 0.01, 0.1
+"""The shares of the disagreement from which on a class that moves, and all of them together, are looked into."""
+
+
+def moving_classes(cells: CellObservations, sums: ClusterSums, moving: Sequence[int]) -> MovingClasses:
+    """Return what locations of these classes have of the disagreement, and alpha without them; `sums` are of all."""
+
+    def disagreeing(own: ClusterSums, alpha: float) -> float:
+        fine = own.fine
+        assert fine is not None
+        return float(fine["observations"].sum()) * (1 - alpha) * (1 - chance_of(fine))
+
+    rest = sums_of_cells(cells.without(moving))
+    whole, alpha = (min(value(own, "alpha"), 1.0) for own in (sums, rest))  # extrapolated to cells without a size
+    share = 1 - disagreeing(rest, alpha) / disagreeing(sums, whole)
+    return MovingClasses(tuple(sums.classes[k] for k in moving), min(max(share, 0.0), 1.0), alpha)
 
 
 def _disagreement(shares: Float64, alpha: Float64) -> Float64:
