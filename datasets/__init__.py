@@ -152,7 +152,10 @@ def recognise(root: Path) -> tuple[str, str]:
         for depth in range(4):
             if (found := next(root.glob("*/" * depth + pattern), None)) is not None:
                 where = found.parent.relative_to(root.parent)
-                raise DataError(f"{root}: holds {what} ({where}), and no depth images; scans are not read, give depth/")
+                raise DataError(
+                    f"{root}: holds {what} ({where}), and no depth images; scans are not read: where a camera was"
+                    " beside, make depth images of them (docs/tutorials/lidar-camera.md)"
+                )
     if not near:
         return RECOGNISED[-1], ""
     listed = " or ".join(text for _, text in sorted(near)[:3])

@@ -37,6 +37,7 @@ def save_backend(folder: Path) -> None:
 @pytest.mark.parametrize(("name", "prepare", "left"), [
     ("own-backend", save_backend, ["mine/report.html", "both/report.html"]),
     ("own-sequence", make_nothing, ["runs/first/report.html", "runs/first/tables/classes.csv"]),
+    ("lidar-camera", make_nothing, ["run/report.html"]),
     ("two-models", make_nothing, ["both/report.html", "versus/report.html", "versus/comparison.json"]),
     ("drone-flight", make_project, ["map/report.html", "map.ply", "map.tif"]),
 ])  # fmt: skip
