@@ -85,7 +85,9 @@ def resolved(config: DatasetConfig) -> DatasetConfig:
     Raises:
         ConfigError: For a dataset or an option that cannot be used.
     """
-    options = validated(options_model(config.name), config.options, f"dataset '{config.name}', options: ")
+    model = options_model(config.name)
+    title = getattr(model, "title", f"dataset '{config.name}', options")
+    options = validated(model, config.options, f"{title}: ")
     paths = {key: value.absolute() for key, value in options if isinstance(value, Path)}
     return config.model_copy(update={"options": options.model_copy(update=paths).model_dump(mode="json")})
 

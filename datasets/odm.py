@@ -306,7 +306,7 @@ class Odm(FileDataset[OdmOptions]):
         images = images if self.options.images is None else [self.options.images]
         frames = []
         for shot, name in zip(shots, names, strict=True):
-            color = find_image(images, shot.name, contents, where)
+            color = find_image(images, shot.name, contents, where) or inside(images[0], images[0], shot.name, where)
             frames.append(
                 FrameSource(
                     name=name, depth=depth[shot.name], pose=shot.T_cw, pose_file=project.poses, camera=shot.camera,

@@ -673,6 +673,12 @@ def test_label_maps_of_another_view_are_named(tmp_path, lens) -> None:
     fails(DataError, "DJI_0001.JPG.png: labels are 16x16 but .* 24x16, another view", opened(folder).frame, 0, "net")
 
 
+def test_an_image_that_is_not_there_is_named_by_where_it_would_be(tmp_path) -> None:
+    folder = write_project(tmp_path / "field")
+    shutil.rmtree(folder / "opensfm/undistorted/images")
+    assert opened(folder).missing(0, color=True) == [f"{folder}/opensfm/undistorted/images/DJI_0001.JPG"]
+
+
 def test_original_labels_need_the_cameras_of_the_photographs(tmp_path) -> None:
     folder = write_project(tmp_path / "field")
     match = "opensfm/reconstruction.json: does not give the distortion of the photograph DJI_0002, which labels_on"
