@@ -7,10 +7,13 @@ import runpy
 import shlex
 import shutil
 from pathlib import Path
+from typing import Any
 
 import pytest
 from command_line import bench
 from test_readers_odm import write_georeference, write_project
+
+from semstab.testing import BackendConformance
 
 DOCS = Path(__file__).parents[1] / "docs"
 TUTORIALS = DOCS / "tutorials"
@@ -56,6 +59,15 @@ def test_every_block_of_a_tutorial_works_as_it_stands(name, prepare, left, tmp_p
             assert bench(*words, cwd=tmp_path, report=True, columns=80).stdout
     for file in left:
         assert (tmp_path / file).stat().st_size > 0
+
+
+class TestOwnBackend(BackendConformance):
+    """The backend of the tutorial passes the suite that the tutorial gives it to."""
+
+    def create(self, voxel_size, num_classes):
+        names: dict[str, Any] = {}
+        exec(compile(python_blocks("tutorials/own-backend.md")[0], "own-backend.md", "exec"), names)
+        return names["Mine"](voxel_size, num_classes)
 
 
 def python_blocks(page: str) -> list[str]:
