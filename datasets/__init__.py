@@ -134,6 +134,8 @@ def recognise(root: Path) -> tuple[str, str]:
     """
     if root.is_file() and root.suffix.lower() not in FILES:
         raise DataError(f"{root}: a file, but no bag ({', '.join(FILES)}); give the folder of a scene, or above scenes")
+    if (root / "summary.json").is_file() and (root / "units").is_dir():
+        raise DataError(f"{root}: a finished run, no scene; semstab-bench show {root} says what it found")
     near, fits = list[tuple[float, str]](), list[tuple[int, int, str, str]]()
     for rank, name in enumerate(RECOGNISED):
         cls: Any = REGISTRY.load(name)

@@ -46,6 +46,21 @@ def test_scans_are_named_as_what_they_are(tmp_path, file, said):
         recognise(tmp_path)
 
 
+def test_a_word_that_is_neither_command_nor_path_gets_the_nearest_of_both(tmp_path):
+    (tmp_path / "shelf").mkdir()
+    neither = "is no command, and there is no such file or folder; "
+    assert error_of("shelff", cwd=tmp_path).endswith(f"'shelff' {neither}did you mean 'shelf'?")
+    assert error_of("shwo", cwd=tmp_path).endswith(f"'shwo' {neither}did you mean 'show'?")
+    assert f"'elsewhere' {neither}commands: run, study," in error_of("elsewhere", cwd=tmp_path)
+
+
+def test_a_finished_run_is_named_as_what_it_is(tmp_path):
+    (tmp_path / "run/units").mkdir(parents=True)
+    (tmp_path / "run/summary.json").touch()
+    with pytest.raises(DataError, match=r"run: a finished run, no scene; semstab-bench show"):
+        recognise(tmp_path / "run")
+
+
 def test_a_path_alone_is_checked_and_run(tmp_path):
     FORMATS["tum"].write(tmp_path / "rgbd", source(5000))
     result = bench("check", tmp_path / "rgbd", *CAMERA, cwd=tmp_path)

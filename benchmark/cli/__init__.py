@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import difflib
 import io
 import logging
 import os
@@ -21,7 +22,7 @@ from semstab.cli.options import say
 from semstab.cli.result_commands import calibrate, compare, conform, export, gate, list_, relabel
 from semstab.cli.run_commands import check, convert, filters, predict, run, show, study, view
 from semstab.core.process import configure_process
-from semstab.errors import OUT_OF_MEMORY, SemstabError, summarize_error
+from semstab.errors import OUT_OF_MEMORY, ConfigError, SemstabError, summarize_error
 
 # Ctrl-C may interrupt any code: an import, a callback from compiled code.
 
@@ -138,6 +139,15 @@ class Group(TyperGroup):
         if args[0] in OF_PATHS and len(args) > 1 and not args[1].startswith("-"):
             args = [args[0], "--data", *args[1:]]
         return super().parse_args(ctx, _of_today(args))
+
+    def resolve_command(self, ctx: Any, args: list[str]) -> Any:
+        """Return the command that the first word names; it may also have been meant as a path."""
+        word = args[0]
+        if word not in self.commands and not word.startswith("-") and not ctx.resilient_parsing:
+            near = difflib.get_close_matches(word, [*self.commands, *os.listdir()], n=1)
+            hint = f"did you mean '{near[0]}'?" if near else f"commands: {', '.join(self.commands)}"
+            raise ConfigError(f"'{word}' is no command, and there is no such file or folder; {hint}")
+        return super().resolve_command(ctx, args)
 
     def format_help(self, ctx: Any, formatter: Any) -> None:
         """Write the group's own help, with the options of `run` in it."""
