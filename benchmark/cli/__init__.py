@@ -144,7 +144,8 @@ class Group(TyperGroup):
         """Return the command that the first word names; it may also have been meant as a path."""
         word = args[0]
         if word not in self.commands and not word.startswith("-") and not ctx.resilient_parsing:
-            near = difflib.get_close_matches(word, [*self.commands, *os.listdir()], n=1)
+            here = [path.name for path in Path().iterdir()]
+            near = difflib.get_close_matches(word, [*self.commands, *here], n=1)
             hint = f"did you mean '{near[0]}'?" if near else f"commands: {', '.join(self.commands)}"
             raise ConfigError(f"'{word}' is no command, and there is no such file or folder; {hint}")
         return super().resolve_command(ctx, args)
