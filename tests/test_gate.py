@@ -150,17 +150,40 @@ def test_a_rule_of_each_class_shares_the_level_and_voxel_sizes_must_be_the_same(
     )
 
 
-def test_a_rule_of_each_class_leaves_out_what_a_run_never_gives_and_says_so(run, tmp_path):
+@pytest.fixture
+def doorless(run, tmp_path):
     data = shutil.copytree(run.parent / "wall", tmp_path / "wall")
     for path in (data / "labels/a").glob("*.png"):
         labels = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
         cv2.imwrite(str(path), np.where(labels == 1, 0, labels))  # no door any more
     semstab.run(configure(data, check=None, models=["a"]), out=tmp_path / "doorless", report=False)
-    for new, base in ((tmp_path / "doorless", f"{run}:a"), (f"{run}:a", tmp_path / "doorless")):
-        found = gate(new, base, gate_config(rules=["class *: alpha drop < 1.9"]))
+    return tmp_path / "doorless"
+
+
+def test_a_rule_of_each_class_leaves_out_what_neither_or_the_baseline_never_gives_and_says_so(run, doorless):
+    for new, base, rule in (
+        (f"{run}:a", doorless, "class *: alpha drop < 1.9"),
+        (doorless, None, "class *: alpha > -1"),
+        (doorless, doorless, "class *: alpha drop < 1.9"),
+    ):
+        found = gate(new, base, gate_config(rules=[rule]))
         assert [row.rule.class_name for row in found.judgements] == ["wall", "window"]
-        note = f"class *: alpha drop < 1.9: left out, as seen nowhere twice in {tmp_path / 'doorless'}: door"
-        assert note in found.notes
+        assert f"{rule}: left out, as seen nowhere twice in {doorless}: door" in found.notes
+
+
+def test_a_class_that_the_run_has_lost_does_not_pass(run, doorless):
+    found = gate(doorless, f"{run}:a", gate_config(rules=["class *: alpha drop < 1.9"]))
+    wall, door, window = found.judgements
+    assert (wall.verdict, window.verdict) == ("passes", "passes")
+    assert (door.rule.class_name, door.verdict) == ("door", "undecided")
+    assert door.reason == judging.LOST
+    assert math.isnan(door.new)
+    (alone,) = gate(f"{run}:a", None, gate_config(rules=["class door: alpha > 0"])).judgements
+    assert door.base == pytest.approx(alone.new, abs=0.05)
+    assert found.outcome == "undecided"
+    assert not [note for note in found.notes if "left out, as seen" in note]
+    assert any("undecided: the baseline has this class" in line for line in gate_report.lines(found, 200))
+    assert door.frames_needed(0.05) is None
 
 
 def test_a_class_that_is_nowhere_has_no_value_and_ends_are_one_sided():

@@ -358,3 +358,11 @@ def test_each_image_is_read_once(root, tmp_path, monkeypatch) -> None:
     semstab.run(config, out=tmp_path / "run", observers=[watching], report=False)
     assert "kept a" in watching.seen
     assert len([name for name in read if name.endswith(".png")]) == 2 * tiny_scene.FRAMES
+
+
+def test_a_backend_that_is_its_own_check_is_said_to_check_nothing(root, caplog):
+    semstab.run(configure(root, backends=["numpy"], check="numpy", models=["a"]), report=False)
+    assert "check: numpy is the backend that fuses, so it checks nothing" in caplog.text
+    caplog.clear()
+    semstab.run(configure(root, backends=["numpy"], models=["a"], check=None), report=False)
+    assert "check" not in caplog.text

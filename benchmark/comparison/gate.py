@@ -33,7 +33,7 @@ from semstab.config import nearest, read_yaml, validated
 from semstab.config.settings import ScopeSetting
 from semstab.core.types import OTHER_SCENES, THESE_FRAMES, THIS_SCENE, Scope
 from semstab.data.measures import ENTROPY, Quantity
-from semstab.data.statistics import Interval
+from semstab.data.statistics import UNKNOWN, Interval
 from semstab.errors import ConfigError, DataError
 from semstab.statistics.agreement import ALPHA, PSA, VOXEL_ALPHA
 from semstab.statistics.cluster_sums import (
@@ -500,6 +500,11 @@ def gate(new: str | os.PathLike[str], against: str | os.PathLike[str] | None, co
             ]
         for rule in rules:
             pairs = runs.pairs(rule)
+            if given.class_name == ALL and _is_lost(rule, pairs):
+                base_value = float(np.nanmean([_value(rule, old) for _, old in pairs if old is not None]))
+                lost = dataclasses.replace(UNKNOWN, undecided=LOST)
+                judgements.append(Judgement(rule, "undecided", lost, math.nan, base_value))
+                continue
             _require_values(rule, pairs)
             judgements.append(_assess(rule, pairs, config.level / len(rules), config.scope))
             notes += [*_counts(judgements[-1], pairs), *(runs.common[1] if runs.on_common(rule) else ())]
@@ -601,17 +606,29 @@ class _Runs:
 def _with_a_value(rules: Sequence[Rule], runs: _Runs) -> tuple[tuple[Rule, ...], dict[str, list[str]]]:
     """Return the rules of classes that have a value everywhere, and the other classes by the run that has none.
 
-    Where no class is left the rules stay, of which the first then says what it needs.
+    A class that only the baseline has stays: the run has lost it, and no drop of a measure shows that. Where no class
+    is left the rules stay, of which the first then says what it needs.
     """
     there, absent = list[Rule](), dict[str, list[str]]()
     for rule in rules:
-        entries = (entry for pair in runs.pairs(rule) for entry in pair if entry is not None)
+        pairs = runs.pairs(rule)
+        entries = (entry for pair in pairs for entry in pair if entry is not None)
         lacking = next((entry.where for entry in entries if math.isnan(_value(rule, entry))), None)
-        if lacking is None:
+        if lacking is None or _is_lost(rule, pairs):
             there.append(rule)
         else:
             absent.setdefault(lacking, []).append(str(rule.class_name))
     return tuple(there or rules), absent if there else {}
+
+
+LOST = "the baseline has this class, and the run gives it to no location that was seen twice"
+
+
+def _is_lost(rule: Rule, pairs: Sequence[Pair]) -> bool:
+    """Return whether a class has a value in the baseline of a scene, and none in the run."""
+    return any(
+        old is not None and math.isnan(_value(rule, new)) and not math.isnan(_value(rule, old)) for new, old in pairs
+    )
 
 
 def _require_values(rule: Rule, pairs: Sequence[Pair]) -> None:
@@ -658,7 +675,8 @@ def _interval_of(rule: Rule, new: Entry, base: Entry | None, level: float, scope
     if scope == OTHER_SCENES:
         raise ConfigError(f"rule '{rule.text}': flicker is known only by frame; assess it with --scope this-scene")
     if base is None:
-        return mean_over_frames(np.array([*new.flicker]), np.array([*new.flicker.values()]), 1 - 2 * level)
+        mean = mean_over_frames(np.array([*new.flicker]), np.array([*new.flicker.values()]), 1 - 2 * level)
+        return dataclasses.replace(mean, low=max(mean.low, 0.0), high=min(mean.high, 100.0))
     result = flicker_difference(new.flicker, base.flicker, level=1 - 2 * level)
     return result if rule.change == "rise" else negative(result)
 

@@ -144,6 +144,8 @@ def make_plan(config: Config, scenes: Mapping[str, Scene] | None = None) -> Plan
     _check_names(config.scene_frames, [*scenes], "scene_frames")
     base = tuple(_base_units(config, scenes))
     units = (*base, *_varied_units(config, base, scenes))
+    if [config.check] == [backend.name for backend in config.backends]:
+        logger.warning("check: %s is the backend that fuses, so it checks nothing; name another, or null", config.check)
     if config.exclude.predicted_classes:
         logger.warning(
             "exclude.predicted_classes also leaves out pixels predicted so by mistake, which then are no error;"
