@@ -116,8 +116,13 @@ def _of_text(node: ast.AST) -> bool:
 
 
 def _nodes(node: ast.AST) -> Iterator[ast.AST]:
-    """Yield what a program computes with: no types, and no texts, in which Python 3.11 does not know the places."""
+    """Yield what a program computes with: no types, and no texts, in which Python 3.11 does not know the places.
+
+    Where right code is called, what zip and data classes are told of errors and of comparison changes nothing.
+    """
     if isinstance(node, ast.JoinedStr) or (isinstance(node, ast.If) and ast.unparse(node.test) == "TYPE_CHECKING"):
+        return
+    if isinstance(node, ast.keyword) and node.arg in ("strict", "frozen", "eq"):
         return
     yield node
     for name, value in ast.iter_fields(node):

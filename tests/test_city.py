@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import runpy
 import tracemalloc
 from functools import cache
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from pydantic import ValidationError
 
+from semstab.core.files import read_json
 from semstab.data.frames import Frame
 from semstab.datasets import GROUND_TRUTH, open_dataset
 from semstab.datasets.city import City, CityScene, SimulatedModel
@@ -370,3 +373,30 @@ def test_known_settings_give_known_results() -> None:
         "0xe220a8397b1dcdaf",
         "0x910a2dec89025cc1",
     ]
+
+
+GOLDEN = runpy.run_path(str(Path(__file__).parent / "golden/regenerate.py"))
+
+
+def test_the_city_is_what_its_version_stands_for() -> None:
+    """Raise GENERATOR_VERSION with a change of the city; `python tests/golden/regenerate.py` then writes the file."""
+    found, known = GOLDEN["golden_city"](), read_json(Path(__file__).parent / "golden/city.json")
+    assert found.keys() == known.keys()
+    assert found["version"] == known["version"]
+    for scene in found.keys() - {"version"}:
+        labels = [own[scene].pop("labels") for own in (found, known)]
+        for model, counts in labels[0].items():  # a ray at an edge may hit either side
+            assert np.abs(np.array(counts) - labels[1][model]).max() <= 3
+        approximately(found[scene], known[scene], scene)
+
+
+def approximately(found: Any, known: Any, where: str) -> None:
+    """Every number is the same to six digits; depth and colour of images to three."""
+    if isinstance(known, dict):
+        assert found.keys() == known.keys(), where
+    if isinstance(known, dict | list):
+        for key in known if isinstance(known, dict) else range(len(known)):
+            approximately(found[key], known[key], f"{where}, {key}")
+        return
+    image = where.endswith("depth") or where.split(", ")[1] == "color"
+    assert found == pytest.approx(known, rel=1e-3 if image else 1e-6, abs=1e-9), where

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import logging
 import os
 import re
 import shutil
@@ -197,3 +198,24 @@ def test_ctrl_c_is_exit_130_and_the_same_command_goes_on(tmp_path) -> None:
     assert "Traceback" not in stderr
     again = bench(*arguments, cwd=tmp_path)
     assert "finished earlier: 1 of 2 units" in again.stderr
+
+
+def test_a_warning_of_check_and_run_is_said_once(monkeypatch, capsys):
+    from semstab import cli
+
+    warned = logging.getLogger("semstab")
+    filters = list(warned.filters)
+
+    def warn_twice():
+        for name in ("one", "one", "another"):
+            warned.warning("%s frame has no pose", name)
+
+    monkeypatch.setattr(cli, "app", warn_twice)
+    printed = logging.StreamHandler(sys.stdout)
+    warned.addHandler(printed)
+    try:
+        cli.main()
+    finally:
+        warned.removeHandler(printed)
+        warned.filters[:] = filters
+    assert capsys.readouterr().out.splitlines() == ["one frame has no pose", "another frame has no pose"]

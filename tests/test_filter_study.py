@@ -216,3 +216,10 @@ def test_the_shipped_ones_that_warp_are_left_out_and_flicker_is_of_all_that_both
     assert record.image_space.compensated_share < 0.06  # of the pixels with depth, where the frame before has it, too
     assert record.quality.seen == pytest.approx(0.04 * 5 / 6, rel=0.1)  # 6 frames make 5 pairs
     assert record.quality.flicker == pytest.approx(2 * 0.1 * 0.9, abs=0.04)
+
+
+@pytest.mark.parametrize(("count", "named"), [(4, "ema:0.1, ema:0.2, ema:0.3, ema:0.4."), (6, "ema:0.4 and 2 more.")])
+def test_filters_that_change_nothing_are_named_up_to_four(count, named):
+    found = study(*(result_of(f"ema:0.{k + 1}", changed=0.0) for k in range(count)))
+    (line,) = (line for line in advice(found) if line.startswith("These filters change fewer than"))
+    assert line.endswith(named)

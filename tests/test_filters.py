@@ -297,3 +297,17 @@ def test_regions_have_no_classes_to_filter():
     model.label_space = None
     with pytest.raises(ConfigError, match="'fixed' finds regions without classes"):
         Filtered(model, [parse("ema")], "fixed")
+
+
+def test_each_filter_looks_at_what_it_needs():
+    looks = ("sequential", "wants_geometry", "wants_color", "needs_scores", "warps")
+    found = {name: {look for look in looks if getattr(REGISTRY.load(name), look)} for name in REGISTRY.entries()}
+    assert found == {
+        "ema": {"sequential"},
+        "ema-warped": {"sequential", "wants_geometry", "warps"},
+        "vote": {"sequential"},
+        "vote-warped": {"sequential", "wants_geometry", "warps"},
+        "guided": {"wants_color"},
+        "threshold": {"needs_scores"},
+        "map-prior": {"sequential", "wants_geometry"},
+    }

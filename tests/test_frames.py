@@ -6,6 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from semstab.data.frames import Frame, Intrinsics
+from semstab.datasets.geometry.cameras import Camera
 from semstab.errors import DataError
 from semstab.testing import checks
 
@@ -218,3 +219,9 @@ sizes = st.tuples(st.integers(1, 4000), st.integers(1, 4000))
 def test_resizing_there_and_back(size, to):
     back = CAMERA.resized(size, to).resized(to, size)
     assert np.allclose(back.matrix, CAMERA.matrix, rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize("numbers", [(0, 50, 10, 10), (50, 1e12, 10, 10), (50, 1e-4, 10, 10)])
+def test_a_camera_that_there_is_not_is_refused_with_the_file_that_states_it(numbers) -> None:
+    with pytest.raises(DataError, match=r"^cameras\.txt: intrinsics: f[xy] = "):
+        Camera.stated(numbers, None, "cameras.txt")

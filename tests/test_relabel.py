@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import re
 import shutil
 
 import cv2
 import numpy as np
 import pytest
 import tiny_scene
-from command_line import bench
+from command_line import bench, error_of
 from dataset_writers import write_labels, write_scannet
 from posed_config import configure, dataset_of
 from posed_scene import fails
@@ -148,6 +149,9 @@ def test_a_run_reads_what_was_relabelled(fused, tmp_path):
     assert again.record().summary.table.means.value["vss"] == 1.0
     other = "holds predictions with other settings .min_op: 1 there, 2 here."
     fails(ConfigError, other, relabel, fused / "run", tmp_path, belief=Belief(min_op=2))
+    changed = ("relabel", fused / "run", "--out", tmp_path, "--min-op", 2)
+    assert re.search(other, error_of(*changed, cwd=tmp_path))
+    assert "a-fused: 4 frames" in bench(*changed, "--overwrite", cwd=tmp_path).stdout
 
 
 def test_what_cannot_be_relabelled_is_refused(fused, tmp_path):

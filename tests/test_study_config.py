@@ -76,6 +76,8 @@ def test_every_setting_is_in_the_key_of_a_unit_or_has_a_reason_not_to_be() -> No
         ({"sweeps": {"voxel_size": [0]}}, r"sweeps\.voxel_size\.values\.0: input should be greater than"),
         ({"sweeps": {"voxel_size": []}}, r"sweeps\.voxel_size\.values: list should have at least 1 item"),
         ({"sweeps": {"depth_noise": [-0.1]}}, r"sweeps\.depth_noise\.values\.0: input should be greater than or equal"),
+        ({"sweeps": {"frame_count": [0]}}, r"sweeps\.frame_count\.values\.0: input should be greater than"),
+        ({"sweeps": {"pixel_stride": [0]}}, r"sweeps\.pixel_stride\.values\.0: input should be greater than"),
         ({"sweeps": {"frame_count": [2.5]}}, r"sweeps\.frame_count\.values\.0: input should be a valid integer"),
         ({"sweeps": {"pixel_stride": {"values": [2], "repeats": 3}}}, "unknown setting 'sweeps.pixel_stride.repeats'"),
         ({"sweeps": {"voxel_size": [1, 0.5, 1.0]}}, "name each value once"),

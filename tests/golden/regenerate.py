@@ -57,6 +57,45 @@ def golden(backend="numpy"):
     }
 
 
+def golden_city():
+    """The built-in city, which its version in `datasets/city` stands for: what stands still, traffic, and labels."""
+    from semstab.datasets import open_dataset
+    from semstab.datasets.city import GENERATOR_VERSION
+
+    dataset = open_dataset("city", {"width": 96, "height": 54, "frames": 5})
+    content = {"version": GENERATOR_VERSION}
+    for name in dataset.scenes:
+        scene = dataset.scene(name)
+        frame = scene.frame(2, "gt")
+        labels = {model: scene.frame(2, model).labels for model in ("gt", "sim-steady", "sim-flicker")}
+        content[name] = {
+            "still": surface_content(scene.world.still),
+            "traffic": surface_content(scene.world.traffic.at(3.0, frame.T_wc[:3, 3])),
+            "pose": frame.T_wc.tolist(),
+            "depth": float(frame.depth.mean()),
+            "color": frame.color.mean(axis=(0, 1)).tolist(),
+            "labels": {model: np.bincount(own.ravel(), minlength=8).tolist() for model, own in labels.items()},
+        }
+    return content
+
+
+def surface_content(surface):
+    """Of each class the triangles, their area, centre and mean colour, each weighted by area."""
+    a, b, c = (surface.vertices[surface.faces[:, k]] for k in range(3))
+    area = np.linalg.norm(np.cross(b - a, c - a), axis=1) / 2
+    content = {}
+    for k in np.unique(surface.classes).tolist():
+        own = surface.classes == k
+        weight = area[own, None] / area[own].sum()
+        content[str(k)] = {
+            "triangles": int(own.sum()),
+            "area": float(area[own].sum()),
+            "centre": (weight * (a + b + c)[own] / 3).sum(axis=0).tolist(),
+            "color": (weight * surface.colors[own]).sum(axis=0).tolist(),
+        }
+    return content
+
+
 def write_table_files():
     """The tables of the study of two walls, tables.{csv,md,tex}."""
     sys.path.insert(0, str(FILE.parents[1]))
@@ -70,4 +109,5 @@ def write_table_files():
 
 if __name__ == "__main__":
     write_json(FILE, golden())
+    write_json(FILE.with_name("city.json"), golden_city())
     write_table_files()
