@@ -62,6 +62,14 @@ REGISTRY = Registry(
         ),
         "colmap": Entry("semstab.datasets.colmap:Colmap", "COLMAP models, text or binary, with depth maps"),
         "odm": Entry("semstab.datasets.odm:Odm", "projects of OpenDroneMap and OpenSfM, depth from their mesh or DSM"),
+        "metashape": Entry(
+            "semstab.datasets.metashape:Metashape", "cameras of Agisoft Metashape (XML), depth from its mesh or DEM"
+        ),
+        "pix4d": Entry("semstab.datasets.pix4d:Pix4d", "cameras of Pix4Dmapper (params), depth from its mesh or DSM"),
+        "realitycapture": Entry(
+            "semstab.datasets.realitycapture:RealityCapture",
+            "cameras of RealityCapture and RealityScan (CSV), depth from their mesh",
+        ),
         "bag": Entry(
             "semstab.datasets.bag:Bag",
             "ROS 1 and ROS 2 bags with colour, depth, camera info and poses",
@@ -108,8 +116,8 @@ def open_dataset(name: str, options: dict[str, Any] | BaseModel, run_folder: Pat
 
 
 RECOGNISED = (
-    "odm", "hololens", "tum", "seven_scenes", "replica", "scannet", "tartanair", "transforms_json", "colmap",
-    "bag", "posed_folder",
+    "odm", "metashape", "pix4d", "realitycapture", "hololens", "tum", "seven_scenes", "replica", "scannet", "tartanair",
+    "transforms_json", "colmap", "bag", "posed_folder",
 )  # fmt: skip
 """Formats that a folder is recognised as: the one whose scenes lie highest, of these the first."""
 

@@ -6,7 +6,7 @@ Sources: opendronemap.org (docs, Outputs); opensfm.org; the folders of real proj
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -22,9 +22,10 @@ from semstab.datasets.files.options import FileOptions, Folders, FrameSource, Te
 from semstab.datasets.files.reader import FileDataset
 from semstab.datasets.files.scene import FileScene
 from semstab.datasets.formats.disk import natural, records, subfolders
-from semstab.datasets.formats.images import COLOR_SUFFIXES, DEPTH_SUFFIXES
+from semstab.datasets.formats.images import DEPTH_SUFFIXES
 from semstab.datasets.geometry.lenses import Lens
-from semstab.datasets.opensfm import Shot, read_reconstruction
+from semstab.datasets.opensfm import read_reconstruction
+from semstab.datasets.photographs import Shot, bare_name, find_image, frame_names, written_names
 from semstab.datasets.placing import Placement, Positions, placement_of
 from semstab.errors import DataError
 
@@ -65,45 +66,6 @@ def find_project(folder: Path) -> Project | None:
         for poses in (opensfm / UNDISTORTED, opensfm / DISTORTED):
             if poses.is_file():
                 return Project(folder, opensfm, poses)
-    return None
-
-
-# --- names and images -----------------------------------------------------------------------------------------------
-
-
-PHOTO_SUFFIXES = (".JPG", ".jpg", ".JPEG", ".jpeg", ".png", ".PNG", ".tif", ".TIF", ".tiff", ".TIFF")
-ADDED_SUFFIXES = ("", ".tif", ".jpg", ".png")
-"""The suffixes that ODM appends to the name of an undistorted image."""
-
-
-def bare_name(shot: str) -> str:
-    """Return a shot's name without the suffixes of images: DJI_0018 of DJI_0018.JPG.tif."""
-    while Path(shot).suffix and Path(shot).suffix in PHOTO_SUFFIXES:
-        shot = shot[: -len(Path(shot).suffix)]
-    return shot
-
-
-def written_names(shot: str) -> tuple[str, ...]:
-    """Return the names that files of a shot may have: its own, and without and with any suffixes."""
-    bare = bare_name(shot)
-    names = (f"{bare}{suffix}{added}" for suffix in PHOTO_SUFFIXES for added in ADDED_SUFFIXES)
-    return tuple(dict.fromkeys((shot, *(f"{shot}{added}" for added in ADDED_SUFFIXES), bare, *names)))
-
-
-def frame_names(shots: Iterable[str]) -> list[str]:
-    """Return the frames' names: the shots' without suffixes, or as they are where these would not differ."""
-    names = list(shots)
-    bare = [bare_name(name) for name in names]
-    return bare if len(set(bare)) == len(names) else names
-
-
-def find_image(folders: Iterable[Path], shot: str, contents: Folders, where: str) -> Path | None:
-    """Return the image of a shot in the first folder that has one; `where` is the file that names the shot."""
-    for folder in folders:
-        for written in written_names(shot):
-            path = inside(folder, folder, written, where)
-            if path.suffix.lower() in COLOR_SUFFIXES and contents.has(path):
-                return path
     return None
 
 
@@ -276,7 +238,7 @@ class Odm(FileDataset[OdmOptions]):
     def _placement(self, folder: Path) -> Placement | None:
         if folder not in self._placements:
             project = self._project(folder)
-            shots = {bare_name(shot.name): shot.T_cw for shot in self._shots(project.poses)}
+            shots = {bare_name(shot.name): shot.pose for shot in self._shots(project.poses)}
             names = {bare_name(shot.name): shot.name for shot in self._shots(project.poses)}
             photographs, contents = [folder / "images", project.opensfm / "images"], Folders()
             if self.options.images is not None:
@@ -309,7 +271,7 @@ class Odm(FileDataset[OdmOptions]):
             color = find_image(images, shot.name, contents, where) or inside(images[0], images[0], shot.name, where)
             frames.append(
                 FrameSource(
-                    name=name, depth=depth[shot.name], pose=shot.T_cw, pose_file=project.poses, camera=shot.camera,
+                    name=name, depth=depth[shot.name], pose=shot.pose, pose_file=project.poses, camera=shot.camera,
                     color=color, color_lens=shot.lens, label_lens=lenses.get(name),
                     photograph=find_image(photographs, shot.name, contents, where) if project.undistorted else color,
                     aliases=written_names(shot.name),

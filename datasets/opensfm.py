@@ -6,15 +6,15 @@ Source: opensfm.org, Reconstruction Format and Geometric Models; OpenDroneMap ha
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from semstab.datasets.formats.disk import number, pixels, read_content
-from semstab.datasets.geometry.cameras import Camera, Poses
+from semstab.datasets.geometry.cameras import Camera
 from semstab.datasets.geometry.lenses import Lens
+from semstab.datasets.photographs import Shot
 from semstab.errors import DataError
 
 MAX_BYTES = 2**32
@@ -31,22 +31,10 @@ COEFFICIENTS: Mapping[str, tuple[str, tuple[str, ...]]] = {
 """The model of the lens by projection type, and which key each of the lens's coefficients has, if any."""
 
 
-@dataclass(frozen=True, eq=False)
-class Shot:
-    """One photograph: its name, its pose (4, 4) world-to-camera, its camera without distortion, and its lens.
-
-    Attributes:
-        lens: None where nothing distorts.
-    """
-
-    name: str
-    T_cw: Poses
-    camera: Camera
-    lens: Lens | None
-
-
 def read_reconstruction(path: Path, wanted: int | None = None) -> list[Shot]:
     """Return the shots of the only reconstruction of a file, or of the one with that number, in its order.
+
+    Poses are from the world to the camera.
 
     Raises:
         DataError: For a damaged file, several reconstructions where none is wanted, or an unknown camera model.

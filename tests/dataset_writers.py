@@ -298,6 +298,119 @@ def write_odm(folder: Path, frames: Sequence[Frame]) -> list[str]:
     return names
 
 
+def write_photographs(folder: Path, frames: Sequence[Frame]) -> list[str]:
+    """The images and depth files of photographs, in images/ and depth/."""
+    names = [f"DJI_{k:04d}" for k in range(len(frames))]
+    for name, frame in zip(names, frames, strict=True):
+        save(folder / f"depth/{name}.npy", frame.depth)
+        save(folder / f"images/{name}.png", frame.color)
+    return names
+
+
+def write_metashape(folder: Path, frames: Sequence[Frame]) -> list[str]:
+    """A local chunk of Metashape whose component is turned, moved and scaled."""
+    names = write_photographs(folder, frames)
+    write_metashape_xml(
+        folder / "cameras.xml",
+        {f"{name}.png": frame.T_wc for name, frame in zip(names, frames, strict=True)},
+        four(frames[0]),
+        (W, H),
+    )
+    return names
+
+
+def write_metashape_xml(
+    path: Path,
+    poses: dict[str, np.ndarray],
+    camera: Sequence[float],
+    size: tuple[int, int],
+    *,
+    reference: str = "LOCAL_CS[]",
+    scale: float = 2.5,
+    **more: float,
+) -> None:
+    """Poses camera to world, fx, fy, cx, cy with the first pixel at 0, and coefficients by Metashape's names."""
+    turn, move = Rotation.from_euler("xyz", [20, -30, 40], degrees=True).as_matrix(), np.array([5.0, -7.0, 3.0])
+    fx, fy, cx, cy = camera
+    values = {"f": fy, "cx": cx - (size[0] - 1) / 2, "cy": cy - (size[1] - 1) / 2, "b1": fx - fy} | more
+    cameras = []
+    for k, (name, T) in enumerate(poses.items()):
+        own = np.eye(4)
+        own[:3, :3], own[:3, 3] = turn.T @ T[:3, :3], turn.T @ (T[:3, 3] - move) / scale
+        head = f'<camera id="{k}" sensor_id="0" component_id="0" label="{name}">'
+        cameras.append(f"{head}<transform>{numbers(own)}</transform></camera>")
+    wrong = "<calibration class='initial'><f>1</f></calibration>"
+    adjusted = "".join(f"<{key}>{value!r}</{key}>" for key, value in values.items())
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(f"""<?xml version="1.0" encoding="UTF-8"?>
+<document version="2.0.0"><chunk label="Chunk 1" enabled="true">
+<sensors><sensor id="0" label="FC6310" type="frame"><resolution width="{size[0]}" height="{size[1]}"/>{wrong}
+<calibration type="frame" class="adjusted"><resolution width="{size[0]}" height="{size[1]}"/>{adjusted}</calibration>
+</sensor></sensors>
+<components><component id="0"><transform><rotation>{numbers(turn)}</rotation><translation>{numbers(move)}</translation>
+<scale>{scale!r}</scale></transform></component></components>
+<cameras><group id="0" label="all">{"".join(cameras[::2])}</group>{"".join(cameras[1::2])}
+<camera id="99" sensor_id="0" label="lost"/></cameras>
+<reference>{reference}</reference></chunk></document>
+""")
+
+
+def write_pix4d(folder: Path, frames: Sequence[Frame]) -> list[str]:
+    """The folder params of a project of Pix4D, without a projection."""
+    names = write_photographs(folder, frames)
+    poses = {f"{name}.png": frame.T_wc for name, frame in zip(names, frames, strict=True)}
+    write_pix4d_parameters(folder / "1_initial/params", poses, four(frames[0]), (W, H))
+    return names
+
+
+def write_pix4d_parameters(
+    folder: Path,
+    poses: dict[str, np.ndarray],
+    camera: Sequence[float],
+    size: tuple[int, int],
+    radial=(0.0, 0.0, 0.0),
+    tangential=(0.0, 0.0),
+) -> None:
+    fx, fy, cx, cy = camera
+    lines = [
+        "fileName imageWidth imageHeight", "camera matrix K [3x3]", "radial distortion [3x1]",
+        "tangential distortion [2x1]", "camera position t [3x1]", "camera rotation R [3x3]",
+        "camera model m = K [R|-Rt] X", "",
+    ]  # fmt: skip
+    for name, T in poses.items():
+        lines += [f"{name} {size[0]} {size[1]}", numbers([fx, 0, cx + 0.5]), numbers([0, fy, cy + 0.5]), "0 0 1"]
+        lines += [numbers(radial), numbers(tangential), numbers(T[:3, 3]), *matrix_text(T[:3, :3].T)]
+    write_lines(folder / "flight_calibrated_camera_parameters.txt", lines)
+
+
+def write_realitycapture(folder: Path, frames: Sequence[Frame]) -> list[str]:
+    """The CSV of RealityCapture."""
+    names = write_photographs(folder, frames)
+    write_realitycapture_csv(
+        folder / "registration.csv",
+        {f"{n}.png": f.T_wc for n, f in zip(names, frames, strict=True)},
+        four(frames[0]),
+        (W, H),
+    )
+    return names
+
+
+def write_realitycapture_csv(
+    path: Path, poses: dict[str, np.ndarray], camera: Sequence[float], size: tuple[int, int], k1: float = 0.0
+) -> None:
+    """Angles of a camera that looks down with the top of its image to the north where they are 0."""
+    fx, fy, cx, cy = camera
+    assert fx == fy
+    unit = 36 / max(size)
+    lines = ["#name,x,y,alt,heading,pitch,roll,f,px,py,k1,k2,k3,k4,t1,t2"]
+    for name, T in poses.items():
+        yaw, pitch, roll = Rotation.from_matrix(with_axes(T, "opengl")[:3, :3]).as_euler("ZXY", degrees=True)
+        offset = [(cx - (size[0] - 1) / 2) * unit, (cy - (size[1] - 1) / 2) * unit]
+        values = [*T[:3, 3], -yaw, pitch, roll, fx * unit, *offset, k1, 0, 0, 0, 0, 0]
+        lines.append(",".join([name, *(repr(float(value)) for value in values)]))
+    write_lines(path, lines)
+
+
 def shot(frame: Frame, camera: str) -> dict[str, object]:
     T_cw = np.linalg.inv(frame.T_wc)
     rotation = Rotation.from_matrix(T_cw[:3, :3]).as_rotvec().tolist()
@@ -353,6 +466,9 @@ FORMATS = {
     "colmap, text": Format("colmap", write_colmap, None),
     "colmap, binary": Format("colmap", functools.partial(write_colmap, binary=True, model="sparse/0"), None),
     "odm": Format("odm", write_odm, None),
+    "metashape": Format("metashape", write_metashape, None),
+    "pix4d": Format("pix4d", write_pix4d, None),
+    "realitycapture": Format("realitycapture", write_realitycapture, None, {"image_size": (W, H)}),
     "bag, sqlite3": Format("bag", write_rosbag2, 1000),
     "bag, MCAP": Format("bag", functools.partial(write_rosbag2, container="MCAP"), 1000),
     "tartanair": Format("tartanair", write_tartanair, None, {"intrinsics": camera_option}),
