@@ -43,7 +43,11 @@ DSM = "odm_dem/dsm.tif"
 VIEWS = "mve/views"
 DMAPS = "undistorted/openmvs/depthmaps"
 
-Kind = Literal["mesh", "dsm", "mve", "openmvs", "files"]
+NPZ_MAPS = "undistorted/depthmaps"
+NPZ_SUFFIXES = (".clean.npz", ".raw.npz")
+"""Of OpenSfM's own depth maps those that were checked against their neighbours first."""
+
+Kind = Literal["mesh", "dsm", "mve", "openmvs", "opensfm", "files"]
 
 
 @dataclass(frozen=True)
@@ -77,6 +81,7 @@ LOCATIONS: dict[Kind, str] = {
     "dsm": DSM,
     "mve": "mve/views/view_NNNN.mve/depth-L0.mvei",
     "openmvs": "opensfm/undistorted/openmvs/depthmaps/*.dmap",
+    "opensfm": "opensfm/undistorted/depthmaps/NAME.clean.npz, NAME.raw.npz",
     "files": "depth/NAME.png",
 }
 """Sources of depth and their paths; the first of them that a project has is taken."""
@@ -90,6 +95,10 @@ def find_depth(project: Project, kind: Kind, template: str) -> Path | None:
         return next(iter(sorted(project.folder.glob("mve/views/*/depth-L0.mvei"))), None)
     if kind == "openmvs":
         return next(iter(sorted((project.opensfm / DMAPS).glob("*.dmap"))), None)
+    if kind == "opensfm":
+        maps = project.opensfm / NPZ_MAPS
+        there = project.undistorted and any(True for suffix in NPZ_SUFFIXES for _ in maps.glob(f"*{suffix}"))
+        return maps if there else None
     path = project.folder / DSM if kind == "dsm" else (project.folder / template).parent
     there = path.is_file() if kind == "dsm" else "{" not in str(path) and path.is_dir()
     return path if there else None
@@ -107,6 +116,13 @@ def depth_files(project: Project, kind: Kind | None, names: Mapping[str, str], t
             maps[bare_name(Path(image.replace("\\", "/")).name)] = path
         return {shot: maps.get(name, folder / f"{name}.dmap") for shot, name in names.items()}
     folders = Folders()
+    if kind == "opensfm":
+        maps_of = project.opensfm / NPZ_MAPS
+        found = {
+            shot: [maps_of / f"{name}{suffix}" for suffix in NPZ_SUFFIXES for name in written_names(shot)]
+            for shot in names
+        }
+        return {shot: next(filter(folders.has, paths), paths[0]) for shot, paths in found.items()}
     wanted = {shot: project.folder / template.filled(name=name) for shot, name in names.items()}
     return {shot: folders.one_of(path, DEPTH_SUFFIXES) or path for shot, path in wanted.items()}
 

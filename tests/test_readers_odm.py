@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import os
 import re
@@ -97,6 +98,16 @@ def write_openmvs(folder, frames, halves=False) -> None:
         put(folder / f"opensfm/undistorted/openmvs/depthmaps/depth{k:04d}.dmap", dmap(frame.depth, image, halves))
 
 
+def write_opensfm(folder, frames, kind="clean") -> None:
+    """Half as large as the images, with the plane of each pixel and a score beside the depth."""
+    K, shape = down.K.resized((down.W, down.H), (down.W // 2, down.H // 2)), (down.H // 2, down.W // 2)
+    for k, name in enumerate(NAMES):
+        path = folder / f"opensfm/undistorted/depthmaps/{name}.JPG.tif.{kind}.npz"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        depth = down.plane_depth(frames[k].T_wc, K, shape).astype(np.float32)
+        np.savez(path, depth=depth, plane=np.zeros((*shape, 3), np.float32), score=np.ones(shape, np.float32))
+
+
 def write_files(folder, frames) -> None:
     for name, frame in zip(NAMES, frames, strict=True):
         save(folder / f"depth/{name}.npy", frame.depth)
@@ -107,6 +118,7 @@ DEPTHS = {
     "dsm": lambda folder, frames: down.write_raster(folder / "odm_dem/dsm.tif"),
     "mve": write_mve,
     "openmvs": write_openmvs,
+    "opensfm": write_opensfm,
     "files": write_files,
 }
 
@@ -137,7 +149,25 @@ def test_depth_of_every_source_which_is_said(tmp_path, kind) -> None:
     assert scene.depth_from.startswith(f"{kind}, ")
     assert scene.settings["depth_from"] == kind
     for at, k in enumerate((2, 0, 1)):
-        np.testing.assert_allclose(scene.depth(at), down.plane_depth(down.pose(k)), atol=2e-5)
+        frame = scene.geometry(at)
+        assert frame.shape == ((down.H // 2, down.W // 2) if kind == "opensfm" else (down.H, down.W))
+        expected = down.plane_depth(down.pose(k), frame.intrinsics, frame.shape)
+        np.testing.assert_allclose(frame.depth, expected, atol=2e-5)
+        assert frame.intrinsics.fx == pytest.approx(down.K.fx * frame.shape[1] / down.W)
+
+
+def test_a_map_of_opensfm_that_was_checked_goes_before_a_raw_one(tmp_path) -> None:
+    folder = write_project(tmp_path / "field", depth=None)
+    frames = [down.frame(k) for k in range(3)]
+    write_opensfm(folder, [dataclasses.replace(frame, T_wc=down.pose(9)) for frame in frames], "raw")
+    wrong = opened(folder).geometry(0)
+    write_opensfm(folder, frames)
+    right = opened(folder).geometry(0)
+    expected = down.plane_depth(down.pose(2), right.intrinsics, right.shape)
+    np.testing.assert_allclose(right.depth, expected, atol=2e-5)
+    assert np.abs(wrong.depth - expected).max() > 0.1
+    (folder / f"opensfm/undistorted/depthmaps/{NAMES[2]}.JPG.tif.clean.npz").unlink()
+    np.testing.assert_array_equal(opened(folder).geometry(0).depth, wrong.depth)
 
 
 def test_the_first_source_is_taken_or_the_one_that_is_asked_for(tmp_path) -> None:
