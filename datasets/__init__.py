@@ -76,6 +76,10 @@ REGISTRY = Registry(
             "pip install 'semstab[bags]'",
             ("rosbags",),
         ),
+        "stray_scanner": Entry("semstab.datasets.stray_scanner:StrayScanner", "recordings of the app Stray Scanner"),
+        "polycam": Entry("semstab.datasets.polycam:Polycam", "raw data of the app Polycam: keyframes/"),
+        "record3d": Entry("semstab.datasets.record3d:Record3D", "EXR and JPG sequences of the app Record3D"),
+        "arkitscenes": Entry("semstab.datasets.arkitscenes:ArkitScenes", "ARKitScenes, raw data"),
         "tartanair": Entry("semstab.datasets.tartanair:TartanAir", "TartanAir: simulated flights, NED poses"),
         "hololens": Entry("semstab.datasets.hololens:HoloLens", "DeepVideoMVS and HoloLens: poses.txt and K.txt"),
     },
@@ -117,7 +121,7 @@ def open_dataset(name: str, options: dict[str, Any] | BaseModel, run_folder: Pat
 
 RECOGNISED = (
     "odm", "metashape", "pix4d", "realitycapture", "hololens", "tum", "seven_scenes", "replica", "scannet", "tartanair",
-    "transforms_json", "colmap", "bag", "posed_folder",
+    "stray_scanner", "polycam", "record3d", "arkitscenes", "transforms_json", "colmap", "bag", "posed_folder",
 )  # fmt: skip
 """Formats that a folder is recognised as: the one whose scenes lie highest, of these the first."""
 

@@ -411,6 +411,74 @@ def write_realitycapture_csv(
     write_lines(path, lines)
 
 
+def write_stray_scanner(folder: Path, frames: Sequence[Frame], *, own_intrinsics: bool = True) -> list[str]:
+    """With intrinsics of each frame, or with those of the file alone; the images of the video in rgb/."""
+    names = [f"{k:06d}" for k in range(len(frames))]
+    lines = ["timestamp, frame, x, y, z, qx, qy, qz, qw" + ", fx, fy, cx, cy" * own_intrinsics]
+    for k, (name, frame) in enumerate(zip(names, frames, strict=True)):
+        save(folder / f"depth/{name}.png", stored(frame, 1000))
+        save(folder / f"confidence/{name}.png", np.full(frame.depth.shape, 1 + k % 2, np.uint8))
+        save(folder / f"rgb/{name}.png", frame.color)
+        values = [*frame.T_wc[:3, 3], *quaternion(frame.T_wc[:3, :3]), *(four(frame) if own_intrinsics else ())]
+        lines.append(", ".join([repr(k / 60), name, *(repr(float(value)) for value in values)]))
+    write_lines(folder / "odometry.csv", lines)
+    matrix = frames[0].intrinsics.matrix * (
+        np.ones((3, 3)) if not own_intrinsics else [[2, 1, 2], [1, 2, 2], [1, 1, 1]]
+    )
+    write_lines(folder / "camera_matrix.csv", [", ".join(map(repr, map(float, row))) for row in matrix])
+    return names
+
+
+def write_polycam(folder: Path, frames: Sequence[Frame], *, corrected: bool = True) -> list[str]:
+    """OpenGL axes, principal point from the corner."""
+    names, kind = [f"{9380 + 77 * k}" for k in range(len(frames))], "corrected_" * corrected
+    for name, frame in zip(names, frames, strict=True):
+        T, (fx, fy, cx, cy) = with_axes(frame.T_wc, "opengl"), four(frame)
+        content = {f"t_{i}{j}": T[i, j] for i in range(3) for j in range(4)} | {"blur_score": 92.1, "timestamp": name}
+        content |= {"fx": fx, "fy": fy, "cx": cx + 0.5, "cy": cy + 0.5, "width": W, "height": H}
+        save(folder / f"keyframes/depth/{name}.png", stored(frame, 1000))
+        save(folder / f"keyframes/confidence/{name}.png", np.full(frame.depth.shape, 255, np.uint8))
+        save(folder / f"keyframes/{kind}images/{name}.jpg", frame.color)
+        cameras = folder / f"keyframes/{kind}cameras"
+        cameras.mkdir(parents=True, exist_ok=True)
+        (cameras / f"{name}.json").write_text(json.dumps(content))
+    return names
+
+
+def write_record3d(folder: Path, frames: Sequence[Frame], *, own_intrinsics: bool = False) -> list[str]:
+    """OpenGL axes, K column by column; depth in metres."""
+    names = [str(k) for k in range(len(frames))]
+    poses = [with_axes(frame.T_wc, "opengl") for frame in frames]
+    for name, frame in zip(names, frames, strict=True):
+        save(folder / f"depth/{name}.npy", frame.depth)  # converted, as not every OpenCV reads the app's EXR
+        save(folder / f"rgb/{name}.jpg", frame.color)
+    K = np.add(frames[0].intrinsics.matrix, [[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])
+    content = {
+        "K": (K * (2 if own_intrinsics else 1)).T.ravel().tolist(), "w": W, "h": H, "dw": W, "dh": H, "fps": 60,
+        "poses": [[*quaternion(T[:3, :3]).tolist(), *T[:3, 3].tolist()] for T in poses],
+    }  # fmt: skip
+    if own_intrinsics:
+        content["perFrameIntrinsicCoeffs"] = [[K[0, 0], K[1, 1], K[0, 2], K[1, 2]]] * len(frames)
+    (folder / "metadata.json").write_text(json.dumps(content))
+    return names
+
+
+def write_arkitscenes(folder: Path, frames: Sequence[Frame]) -> list[str]:
+    """A pose of the world to the camera before and after each image, of the image's; intrinsics of each."""
+    names = [f"41069021_{305.377 + 0.5 * k:.3f}" for k in range(len(frames))]
+    trajectory = []
+    for k, (name, frame) in enumerate(zip(names, frames, strict=True)):
+        save(folder / f"lowres_depth/{name}.png", stored(frame, 1000))
+        save(folder / f"confidence/{name}.png", np.full(frame.depth.shape, 2, np.uint8))
+        save(folder / f"lowres_wide/{name}.png", frame.color)
+        write_lines(folder / f"lowres_wide_intrinsics/{name}.pincam", [f"{W} {H} {numbers(four(frame))}"])
+        T_cw = np.linalg.inv(frame.T_wc)
+        pose = numbers([*Rotation.from_matrix(T_cw[:3, :3]).as_rotvec(), *T_cw[:3, 3]])
+        trajectory += [f"{305.377 + 0.5 * k + apart:.4f} {pose}" for apart in (-0.05, 0.05)]
+    write_lines(folder / "lowres_wide.traj", trajectory)
+    return names
+
+
 def shot(frame: Frame, camera: str) -> dict[str, object]:
     T_cw = np.linalg.inv(frame.T_wc)
     rotation = Rotation.from_matrix(T_cw[:3, :3]).as_rotvec().tolist()
@@ -469,6 +537,10 @@ FORMATS = {
     "metashape": Format("metashape", write_metashape, None),
     "pix4d": Format("pix4d", write_pix4d, None),
     "realitycapture": Format("realitycapture", write_realitycapture, None, {"image_size": (W, H)}),
+    "stray_scanner": Format("stray_scanner", write_stray_scanner, 1000, {"image_size": (W, H)}),
+    "polycam": Format("polycam", write_polycam, 1000),
+    "record3d": Format("record3d", write_record3d, None),
+    "arkitscenes": Format("arkitscenes", write_arkitscenes, 1000),
     "bag, sqlite3": Format("bag", write_rosbag2, 1000),
     "bag, MCAP": Format("bag", functools.partial(write_rosbag2, container="MCAP"), 1000),
     "tartanair": Format("tartanair", write_tartanair, None, {"intrinsics": camera_option}),

@@ -467,6 +467,18 @@ def test_label_files_may_have_six_digits_or_whole_nanoseconds(alias, tmp_path, f
 # --- what is missing or damaged
 
 
+def test_camera_info_without_a_message_is_no_camera(tmp_path, frames):
+    ds.write_rosbag2(tmp_path / "seq", frames)
+    (file,) = (tmp_path / "seq").glob("*.db3")
+    with contextlib.closing(sqlite3.connect(file)) as base:
+        base.execute("DELETE FROM messages WHERE topic_id IN (SELECT id FROM topics WHERE name LIKE '%camera_info')")
+        base.commit()
+    said = r"seq: no message of the camera info of /camera/aligned_depth_to_color/image_raw can be read; set intrinsics"
+    with pytest.raises(DataError, match=said):
+        opened(tmp_path / "seq")
+    assert opened(tmp_path / "seq", intrinsics=[50, 50, 20, 15]).geometry(0).intrinsics.fx == 50
+
+
 @pytest.mark.parametrize(
     ("lost", "said"),
     [

@@ -231,8 +231,12 @@ class Recorded:
         cameras = self._content.cameras.get(topic)
         if cameras is not None and cameras.cameras and (self._options.intrinsics is None or topic != self._seen.topic):
             return cameras.at(stamp)
-        if self._options.intrinsics is None:  # a colour image without CameraInfo is taken to be as depth sees it
-            return self._camera(self._seen.topic, stamp)
+        if self._options.intrinsics is None and topic != self._seen.topic:
+            return self._camera(self._seen.topic, stamp)  # colour without CameraInfo is taken to be as depth sees it
+        if self._options.intrinsics is None:
+            raise DataError(
+                f"{self._content.bag.path}: no message of the camera info of {topic} can be read; set intrinsics"
+            )
         return Camera(Intrinsics(*self._options.intrinsics)), None
 
 

@@ -55,6 +55,9 @@ Size = Annotated[tuple[PositiveInt, PositiveInt] | None, Field(description="[wid
 TimeOffset = Annotated[
     float, Field(ge=-1e9, le=1e9, description="seconds by which the time stamps of the poses are late")
 ]
+LeastConfidence = Annotated[
+    int, Field(ge=0, le=255, description="depth of pixels with less confidence, as stored, is left out; 0 keeps all")
+]
 GroundTruth = Annotated[str | None, Field(description="template of ground truth label maps, in the scene's folder")]
 VoidIds = Annotated[dict[str, tuple[Id, ...]], Field(description="ids that mean 'no label', by label source, or gt")]
 
@@ -264,6 +267,7 @@ class FrameSource:
         color: The file that it has, or would have; None where that is not known.
         depth_scale: Units in a metre, where the dataset's own files say so.
         timestamp: Seconds.
+        confidence: Image of how sure each pixel's depth is; pixels below `least_confidence` have none.
     """
 
     name: str
@@ -280,3 +284,5 @@ class FrameSource:
     color: Path | None = None
     depth_scale: float | None = None
     timestamp: float | None = None
+    confidence: Path | None = None
+    least_confidence: int = 0

@@ -22,7 +22,7 @@ from semstab.datasets.files.options import FileOptions, Folders, FrameSource
 from semstab.datasets.files.surfaces import Surface, View
 from semstab.datasets.formats import disk
 from semstab.datasets.formats.disk import read_pose
-from semstab.datasets.formats.images import Read, read_color, read_mask
+from semstab.datasets.formats.images import Read, read_color, read_confidence, read_mask
 from semstab.datasets.geometry.cameras import UP_AXES, Camera, Poses, to_camera_to_world
 from semstab.datasets.geometry.lenses import Labels, Pixels, Scores, at_image, fit, fitted, undistorted
 from semstab.datasets.scene import Scene
@@ -37,7 +37,7 @@ PLACES = {
 DEPTH_BYTES = 1 << 27
 """The most bytes of depth images that stay in memory."""
 
-DEPTH, LABELS, MASK = "depth", "labels of ", "mask"
+DEPTH, CONFIDENCE, LABELS, MASK = "depth", "confidence", "labels of ", "mask"
 """Kinds of a frame's files."""
 
 
@@ -120,6 +120,7 @@ class FileScene(Scene):
         """Return the paths of the missing files of the frame: depth, pose, the labels of these sources, colour."""
         frame = self._frame(index)
         files = [self.surface or frame.depth, *([frame.pose_file] if frame.pose is None else [])]
+        files += [frame.confidence] if frame.confidence is not None and self.surface is None else []
         lost = [str(path) for path in files if not self._folders.has(path)]
         lost += [path for name in sources for path in self._maps.source(name).missing(frame)]
         if color and self._color_file(frame) is None:
@@ -213,8 +214,9 @@ class FileScene(Scene):
 
     def _read_depth(self, index: int) -> Float32:
         if self._surface is None:
-            read = self._reader(index, DEPTH)
-            return stored_depth(self._frame(index), self.options, read, lambda shape: self.intrinsics(index, shape))
+            source, read = self._frame(index), self._reader(index, DEPTH)
+            depth = stored_depth(source, self.options, read, lambda shape: self.intrinsics(index, shape))
+            return depth if source.confidence is None else self._confident(index, depth, source.confidence)
         depth = self._surface.depth(self._view(index))
         if not self._surface_seen and not depth.any():
             self._surface.require_seen(self._view(k) for k in range(len(self)) if self.tracked(k))
@@ -222,6 +224,14 @@ class FileScene(Scene):
         if self.options.max_depth is not None:
             depth[depth >= self.options.max_depth] = 0
         return depth
+
+    def _confident(self, index: int, depth: Float32, file: Path) -> Float32:
+        """Return depth without that of pixels whose confidence is too low."""
+        confidence = read_confidence(file, self._reader(index, CONFIDENCE))
+        if confidence.shape != depth.shape:
+            (h, w), (H, W) = confidence.shape, depth.shape
+            raise DataError(f"{file}: confidence is {w}x{h} but depth is {W}x{H}; export them again")
+        return np.where(confidence >= self._frame(index).least_confidence, depth, np.float32(0))
 
     def color(self, index: int) -> UInt8 | None:
         """Return the colour (H, W, 3) uint8 RGB, None where the frame has none; needs no labels. Raises DataError."""
@@ -300,7 +310,8 @@ class FileScene(Scene):
         source = self._frame(index)
         depth = source.depth if self._surface is None else None
         labels, mask = self._maps.file(source, model), self._maps.mask_file(source)
-        files = {DEPTH: depth, LABELS + model: labels, MASK: mask}
+        confidence = None if depth is None else source.confidence
+        files = {DEPTH: depth, CONFIDENCE: confidence, LABELS + model: labels, MASK: mask}
         return {(index, what): path for what, path in files.items() if path is not None}
 
     def _view(self, index: int) -> View:

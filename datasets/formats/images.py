@@ -129,6 +129,18 @@ def read_scores(
     return np.ascontiguousarray(scores.transpose(1, 2, 0) if layout == "KHW" else scores)
 
 
+def read_confidence(path: Path, read: Read = read_bytes) -> UInt8 | UInt16:
+    """Return (H, W) how sure depth is, as stored.
+
+    Raises:
+        DataError: If it is no one-channel PNG, or damaged.
+    """
+    with _whole_png(path, read(path)) as png:
+        if png.kind != "grey":
+            raise DataError(f"{path}: a {png.bits}-bit {png.kind} PNG is no image of confidence; export it again")
+        return png.samples()
+
+
 def read_mask(path: Path, read: Read = read_bytes) -> Mask:
     """Return mask (H, W) bool, True where the image is 0: black is left out, as COLMAP and nerfstudio have it.
 
