@@ -232,12 +232,19 @@ def camera_json(frame: Frame) -> dict[str, float]:
 
 
 def write_tartanair(folder: Path, frames: Sequence[Frame], side: str = "left") -> list[str]:
-    """NED axes; depth in metres as .npy; pixels far away are sky."""
+    """NED axes; pixels far away are sky. Depth in metres, .npy, or of V2 packed into the four channels of a PNG."""
     names = [f"{k:06d}" for k in range(len(frames))]
+    suffix = "png" if "cam" in side else "npy"
     lines = []
     for name, frame in zip(names, frames, strict=True):
-        save(folder / f"depth_{side}/{name}_{side}_depth.npy", np.where(frame.depth > 0, frame.depth, np.float32(1e4)))
-        save(folder / f"seg_{side}/{name}_{side}_seg.npy", frame.labels)
+        depth = np.where(frame.depth > 0, frame.depth, np.float32(1e4)).astype("<f4")
+        stored = folder / f"depth_{side}/{name}_{side}_depth.{suffix}"
+        if suffix == "npy":
+            save(stored, depth)
+        else:
+            stored.parent.mkdir(parents=True, exist_ok=True)
+            assert cv2.imwrite(str(stored), depth[..., None].view(np.uint8))
+        save(folder / f"seg_{side}/{name}_{side}_seg.{suffix}", frame.labels)
         save(folder / f"image_{side}/{name}_{side}.png", frame.color)
         T = with_axes(frame.T_wc, "ned")
         lines.append(numbers([*T[:3, 3], *quaternion(T[:3, :3])]))
@@ -544,6 +551,9 @@ FORMATS = {
     "bag, sqlite3": Format("bag", write_rosbag2, 1000),
     "bag, MCAP": Format("bag", functools.partial(write_rosbag2, container="MCAP"), 1000),
     "tartanair": Format("tartanair", write_tartanair, None, {"intrinsics": camera_option}),
+    "tartanair, V2": Format(
+        "tartanair", functools.partial(write_tartanair, side="lcam_front"), None, {"intrinsics": camera_option}
+    ),
 }
 
 

@@ -407,3 +407,18 @@ HEADERS = r"\{'descr': '[<>|=]?[a-zA-Z]\d{0,2}', 'fortran_order': (True|False), 
 def test_npy_with_any_header_is_an_array_or_a_data_error(tmp_path, header, body):
     text = header.encode("utf-8", errors="surrogatepass")
     survives(written(tmp_path / "file.npy", b"\x93NUMPY\x01\0" + struct.pack("<H", len(text)) + text + body))
+
+
+@pytest.mark.parametrize("alpha", [0, 1, 40, 200, 255])
+def test_a_picture_with_an_alpha_channel_is_no_packed_depth(tmp_path, alpha) -> None:
+    picture = np.random.default_rng(0).integers(0, 256, (6, 8, 4), np.uint8)
+    picture[..., 3] = alpha
+    assert cv2.imwrite(str(tmp_path / "d.png"), picture)
+    refused(read_depth, tmp_path / "d.png", match="expected 16-bit grey, got 8-bit RGBA")
+
+
+def test_packed_depth_is_float_metres(tmp_path) -> None:
+    depth = np.array([[0.0, 0.25, 3.5], [1e4, 80.125, 6.0]], "<f4")
+    assert cv2.imwrite(str(tmp_path / "d.png"), depth[..., None].view(np.uint8))
+    np.testing.assert_array_equal(read_depth(tmp_path / "d.png"), depth)
+    np.testing.assert_array_equal(read_depth(tmp_path / "d.png", 2.0), depth / 2)

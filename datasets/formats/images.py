@@ -61,12 +61,14 @@ def read_depth(path: Path, scale: float | None = None, read: Read = read_bytes) 
     suffix = path.suffix.lower()
     if suffix == ".png":
         with _whole_png(path, data) as png:
-            if png.kind != "grey" or png.bits != 16:
+            packed = _unpacked(png.samples()) if (png.kind, png.bits) == ("RGBA", 8) else None
+            if packed is None and (png.kind != "grey" or png.bits != 16):
                 raise DataError(
                     f"{path}: expected 16-bit grey, got {png.bits}-bit {png.kind} (a picture of the depth?);"
                     " export the depth values"
                 )
-            depth, scale = png.samples(), scale or MILLIMETRES
+            depth = png.samples() if packed is None else packed
+            scale = scale or (MILLIMETRES if packed is None else 1.0)
     elif suffix in (".tiff", ".tif"):
         depth = _decode_tiff(path, data)
     elif suffix == ".exr":
@@ -80,6 +82,17 @@ def read_depth(path: Path, scale: float | None = None, read: Read = read_bytes) 
     with np.errstate(all="ignore"):  # beyond float32 becomes inf: invalid, as it should
         metres: Float32 = np.divide(depth, scale or 1, dtype=np.float32, casting="same_kind")
     return metres
+
+
+NEAREST = 1e-4
+"""Metres: bytes of a picture that are read as floats are below, or no numbers."""
+
+
+def _unpacked(samples: npt.NDArray[Any]) -> Float32 | None:
+    """Return float32 depth that TartanAir V2 packs into the channels blue, green, red, alpha; None for a picture."""
+    depth: Float32 = np.ascontiguousarray(samples[..., [2, 1, 0, 3]]).view("<f4")[..., 0]
+    known = depth[depth != 0]  # an opaque picture is all NaN or negative, a transparent one tiny
+    return depth if len(known) and bool(((known >= NEAREST) & np.isfinite(known)).all()) else None
 
 
 def read_labels(path: Path, space: LabelSpace | None = None, read: Read = read_bytes) -> Labels:
