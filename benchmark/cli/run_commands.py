@@ -401,19 +401,28 @@ FORMER_TABLES = {"glance": "overview", "remedies": "filters"}
 
 
 def show(
-    run: Annotated[Path, typer.Argument(metavar="RUN", help="Folder of a finished run.")],
+    run: Annotated[Path, typer.Argument(metavar="RUN", help="Folder of a finished run, or of several.")],
     what: Annotated[list[str] | None, typer.Argument(
-        metavar="[TABLE]...", help="Tables to print, by the beginning of their names.")] = None,
+        metavar="[RUN|TABLE]...", help="Further runs, for one table of all; or tables, by the beginning of their names."
+    )] = None,
+    out: Annotated[Path | None, typer.Option(help="Write the table of several runs and a figure here.")] = None,
     figures: Annotated[FigureFormat | None, typer.Option(help="Draw the figures for a paper into RUN/figures.")] = None,
 ) -> None:  # fmt: skip
-    """Print the answer of a finished run, or its tables, without computing."""
+    """Print the answer of a finished run, or its tables, without computing; of several runs one table of all."""
     from rich.console import Console
 
     from semstab.engine.folder import load_result
     from semstab.report.tables import tables
+    from semstab.report.tables.runs import is_run
     from semstab.report.tables.table import to_terminal
     from semstab.report.terminal import print_answer
 
+    further = [Path(word) for word in what or () if Path(word).is_dir()]
+    if further or (run.is_dir() and not is_run(run)):
+        _show_several(run, further, [word for word in what or () if Path(word) not in further], out, figures)
+        return
+    if out is not None:
+        raise ConfigError("--out is for the table of several runs; the tables of one are in its folder")
     result = load_result(run)
     there = {table.name: table for table in tables(result)}
     if figures is not None:
@@ -429,6 +438,25 @@ def show(
         if not matching:
             raise ConfigError(f"{run}: no table '{name}'; the tables are {', '.join(there)}")
         print_lines(f"{to_terminal(table)}\n" for table in matching)
+
+
+def _show_several(
+    run: Path, further: list[Path], names: list[str], out: Path | None, figures: FigureFormat | None
+) -> None:
+    """Print one table of several runs, and write it with its figure where that is wanted."""
+    from semstab.report.figures.runs import runs_figure
+    from semstab.report.tables import save_tables
+    from semstab.report.tables.runs import found_runs, runs_table
+    from semstab.report.tables.table import to_terminal
+
+    if names:
+        raise ConfigError(f"'{names[0]}' is neither a table of several runs nor a folder; name one run for its tables")
+    results = found_runs([run, *further])
+    table = runs_table(results)
+    print_lines([to_terminal(table)])
+    if out is not None:
+        written = save_tables([table], out)
+        print_lines(map(str, [*written, *runs_figure(results).save(out, svg=figures is FigureFormat.svg)]))
 
 
 def view(run: Annotated[Path, typer.Argument(metavar="RUN", help="Run folder, or an .rrd file.")]) -> None:

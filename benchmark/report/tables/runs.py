@@ -1,0 +1,83 @@
+"""Many runs at a glance: one row for each model and scene of each run."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from pathlib import Path
+
+from semstab.data.measures import SBD, VSS
+from semstab.data.records import Record, Result
+from semstab.data.statistics import CONFIDENCE
+from semstab.engine.folder import load_result
+from semstab.errors import ConfigError
+from semstab.report.means import ENOUGH
+from semstab.report.tables.statistics import SCENE
+from semstab.report.tables.table import Column, Group, Row, Table
+from semstab.statistics.agreement import ALPHA
+from semstab.statistics.correctness import MIOU
+
+COLUMNS = (
+    SCENE, Column("model", "Model"), Column("verdict", "Verdict"), Column("probability_percent", "Probability (%)", 0),
+    Column.of(ALPHA), Column("agree_percent", "Agree (%)", 1, "higher"),
+    Column("flicker_percent", "Flicker (%)", 1, "lower"),
+    Column("vss3", "VSS, OP>=3", 3, "higher"), Column("sbd3", "SBD, OP>=3", 4, "lower"), Column.of(MIOU),
+    Column("voxel_size", "Voxel (m)", 3), Column("frames", "Frames", 0),
+)  # fmt: skip
+
+
+def found_runs(words: list[Path]) -> dict[str, Result]:
+    """Return the finished runs that folders are, or hold, by the shortest names that tell them apart.
+
+    Raises:
+        ConfigError: If a folder is no run and holds none, or a run is named twice.
+        DataError: As `load_result` does.
+    """
+    folders: list[Path] = []
+    for word in words:
+        own = (
+            [word] if is_run(word) else sorted(path for path in word.glob("*") if is_run(path)) if word.is_dir() else []
+        )
+        if not own:
+            raise ConfigError(f"{word}: there is no finished run here; give folders of --out, or the folder above them")
+        folders += own
+    resolved = [folder.resolve() for folder in folders]
+    if repeated := next(
+        (folder for folder, path in zip(folders, resolved, strict=True) if resolved.count(path) > 1), None
+    ):
+        raise ConfigError(f"{repeated}: is named twice")
+    depth = 1
+    while len({path.parts[-depth:] for path in resolved}) < len(resolved):
+        depth += 1
+    return {"/".join(path.parts[-depth:]): load_result(folder) for path, folder in zip(resolved, folders, strict=True)}
+
+
+def is_run(folder: Path) -> bool:
+    """Return whether a folder is that of a finished run."""
+    return (folder / "summary.json").is_file() and (folder / "units").is_dir()
+
+
+def runs_table(results: Mapping[str, Result]) -> Table:
+    """Return one row for each model and scene of each run, at its own settings."""
+    caption = (
+        "Each row is a model on a scene at the settings of its run; runs differ in what else varies, and only `compare`"
+        f" says whether two differ. VSS and SBD are means over voxels with OP >= 3, where there are {ENOUGH:,} or more."
+        f" Brackets hold the interval of alpha at {CONFIDENCE:.0%}, that of the verdict."
+    )
+    groups = tuple(Group(name, tuple(map(_row, result.select()))) for name, result in results.items())
+    return Table("runs", "Runs", caption, COLUMNS, groups, "run")
+
+
+def _row(record: Record) -> Row:
+    run, statistics, unknown = record.summary, record.statistics, math.nan
+    recurrent = run.table.recurrent
+    means = [recurrent[measure] if recurrent.voxels >= ENOUGH else unknown for measure in (VSS, SBD)]
+    verdict = None if statistics is None else statistics.verdict
+    headline = None if statistics is None else statistics.headline
+    correct = None if statistics is None else statistics.correctness
+    return (
+        run.unit.scene, run.unit.model, "" if verdict is None else verdict.level,
+        unknown if verdict is None else 100 * verdict.probability, unknown if headline is None else headline.alpha,
+        unknown if headline is None else 100 * headline.psa.value, record.image_space.compensated_flicker_percent,
+        *means, unknown if correct is None else correct.miou, run.table.voxel_size, run.frames,
+    )  # fmt: skip
