@@ -38,7 +38,7 @@ def commands() -> Iterator[str]:
     """Yield a section a command: its synopsis, its arguments and options by panel."""
     import typer
 
-    from semstab.cli import app
+    from semstab.cli import EXAMPLES, app
 
     yield "# Command line\n\nMade from the commands themselves; `semstab-bench COMMAND --help` prints the same.\n"
     known: Any = typer.main.get_command(app)
@@ -46,6 +46,7 @@ def commands() -> Iterator[str]:
     yield " · ".join(f"[{name}](#semstab-bench-{name})" for name in shown) + "\n"
     for name, command in shown.items():
         yield f"## semstab-bench {name}\n\n{inspect.cleandoc(command.help or '')}\n"
+        yield "".join(f"    semstab-bench {line}\n" for line in EXAMPLES[name])
         panels: dict[str, list[Any]] = {}
         for parameter in command.params:
             if not getattr(parameter, "hidden", False):
