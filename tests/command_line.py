@@ -18,7 +18,7 @@ COMMAND = str(Path(sys.executable).with_name("semstab-bench"))
 
 
 def environment(columns: int, **more: str) -> dict[str, str]:
-    return {**os.environ, "COLUMNS": str(columns), "NO_COLOR": "1", **more}
+    return {**os.environ, "COLUMNS": str(columns), "NO_COLOR": "1", "SEMSTAB_CONFIG": "", **more}
 
 
 def command(words: Sequence[object], report: bool = False, recording: bool = False) -> list[str]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import operator
+import os
 from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Annotated, Any
@@ -57,9 +58,30 @@ scenes, label_sources = _beginning(lambda ctx: [*_opened(ctx).scenes, "all"]), _
 SETTINGS, LABELS, CHECKS, MACHINE = "Settings", "Labels", "Checks", "Machine"
 """The panels of the help below that of the options which most people need."""
 
+
+def own_defaults() -> Path | None:
+    """Return the file of settings that a user wants everywhere; None where there is none.
+
+    It is SEMSTAB_CONFIG, where that is set, else semstab/config.yaml in the user's folder of configurations.
+    """
+    named = os.environ.get("SEMSTAB_CONFIG")
+    if named is not None:
+        return Path(named) if named else None
+    path = Path(os.environ.get("XDG_CONFIG_HOME") or Path.home() / ".config") / "semstab/config.yaml"
+    return path if path.is_file() else None
+
+
+def _or_own_defaults(ctx: typer.Context, value: Path | None) -> Path | None:
+    if value is not None or ctx.resilient_parsing or (path := own_defaults()) is None:
+        return value
+    if not ctx.params.get("quiet"):
+        say(f"settings of {path}")
+    return path
+
+
 # fmt: off
 ConfigFile = Annotated[Path | None, typer.Option("--config", "-c", help="YAML file with settings.",
-    rich_help_panel=SETTINGS)]
+    show_default="yours, see `list`", callback=_or_own_defaults, rich_help_panel=SETTINGS)]
 DataFolder = Annotated[Path | None, typer.Option(help="Folder of scenes, or one scene, or a bag; the format is found.")]
 DatasetOptions = Annotated[list[str] | None, typer.Option(
     "--option", metavar="KEY=VALUE", help="Option of the dataset, short for --set dataset.options.KEY=VALUE.",

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from semstab.cli.options import Quiet, ScopeOption, Verbose, print_lines, say
+from semstab.cli.options import Quiet, ScopeOption, Verbose, own_defaults, print_lines, say
 
 
 def compare(
@@ -243,12 +243,17 @@ def relabel(
 def list_(
     check: Annotated[bool, typer.Option("--check", help="Also load each one, which takes seconds.")] = False,
 ) -> None:
-    """List backends, datasets, models, filters, taxonomies and studies, each with 'ready' or the missing package."""
+    """List backends, datasets, models, filters, taxonomies and studies, each with 'ready' or the missing package.
+
+    Below stand the settings of your own: ~/.config/semstab/config.yaml.
+    """
+    import yaml
     from rich.console import Console
     from rich.markup import escape
     from rich.table import Table
 
     from semstab import backends, datasets, models
+    from semstab.config import read_yaml
     from semstab.data.labels import LabelSpace, shipped_taxonomies
     from semstab.errors import MissingDependencyError
     from semstab.predict import filters
@@ -272,4 +277,11 @@ def list_(
         table.add_row("taxonomy", name, "[green]ready", f"K = {len(space)}: {', '.join(space.classes)}")
     for name in shipped_studies():
         table.add_row("study", name, "[green]ready", load_study(name).description)
-    Console().print(table)
+    console = Console()
+    console.print(table)
+    if (own := own_defaults()) is None:
+        console.print("no settings of your own: ~/.config/semstab/config.yaml, or SEMSTAB_CONFIG", markup=False)
+    else:
+        console.print(f"settings of your own, where no --config is given: {own}", markup=False)
+        content = yaml.safe_dump(read_yaml(own), sort_keys=False, allow_unicode=True)
+        print_lines(f"  {line}" for line in content.splitlines())
