@@ -67,7 +67,7 @@ class ArkitScenes(FileDataset[ArkitScenesOptions]):
         times = np.array([_seconds(name, folder) for name in names])
         poses = between_times(rows[:, 0], T, times + self.options.time_offset, self.options.max_pose_gap)
         for name, time, pose in zip(names, times.tolist(), poses, strict=True):
-            ((width, height, fx, fy, cx, cy),) = _one_row(cameras[name])
+            width, height, fx, fy, cx, cy = _pinhole(cameras[name])
             confidence = folder / f"confidence/{name}.png"
             yield FrameSource(
                 name=name, depth=there[name], pose=pose, pose_file=path, timestamp=time,
@@ -78,11 +78,12 @@ class ArkitScenes(FileDataset[ArkitScenesOptions]):
             )  # fmt: skip
 
 
-def _one_row(path: Path) -> list[list[float]]:
+def _pinhole(path: Path) -> list[float]:
+    """Return width, height, fx, fy, cx, cy of a .pincam file."""
     rows = read_table(path, 6, "width height fx fy cx cy")
-    if len(rows) != 1 or not (rows[0, :2] >= 1).all() or not (rows[0, :2] < 2**20).all():
+    if len(rows) != 1 or not ((rows[0, :2] >= 1) & (rows[0, :2] < 2**20)).all():
         raise DataError(f"{path}: expected one line of width height fx fy cx cy; download it again")
-    return [rows[0].tolist()]
+    return [float(value) for value in rows[0]]
 
 
 def _seconds(name: str, folder: Path) -> float:

@@ -16,7 +16,7 @@ import numpy as np
 from pydantic import Field
 
 from semstab.core.types import Float64
-from semstab.data.georeference import Georeference, wkt
+from semstab.data.georeference import INSTALL, Georeference, wkt
 from semstab.datasets.files import options as opt
 from semstab.datasets.files.options import FileOptions, Folders, FrameSource, Template, inside
 from semstab.datasets.files.reader import FileDataset
@@ -25,7 +25,7 @@ from semstab.datasets.formats.disk import natural
 from semstab.datasets.formats.images import COLOR_SUFFIXES, DEPTH_SUFFIXES
 from semstab.datasets.geometry.cameras import Camera, Poses
 from semstab.datasets.geometry.lenses import Lens
-from semstab.errors import DataError, summarize_error
+from semstab.errors import DataError, MissingDependencyError, summarize_error
 
 PHOTO_SUFFIXES = (".JPG", ".jpg", ".JPEG", ".jpeg", ".png", ".PNG", ".tif", ".TIF", ".tiff", ".TIFF")
 ADDED_SUFFIXES = ("", ".tif", ".jpg", ".png")
@@ -226,9 +226,13 @@ def from_geocentric(poses: Float64, crs: str, wanted: str | None, where: str) ->
         DataError: For a reference system that is not known, or cameras that are nowhere in it.
         ConfigError, MissingDependencyError: As `wkt` does.
     """
-    from pyproj import CRS, Transformer
-    from pyproj.exceptions import CRSError, ProjError
-
+    try:
+        from pyproj import CRS, Transformer
+        from pyproj.exceptions import CRSError, ProjError
+    except ImportError as error:
+        raise MissingDependencyError(
+            f"{where}: its coordinates are geocentric, which needs pyproj; {INSTALL}"
+        ) from error
     try:
         stated = CRS.from_user_input(crs)
     except (CRSError, RecursionError) as error:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import sys
 from pathlib import Path
 
 import dataset_writers as ds
@@ -16,7 +17,7 @@ from semstab.backends import create
 from semstab.data.frames import Intrinsics
 from semstab.datasets import open_dataset
 from semstab.datasets.geometry.lenses import undistorted
-from semstab.errors import DataError
+from semstab.errors import DataError, MissingDependencyError
 
 pyproj = pytest.importorskip("pyproj")
 
@@ -183,6 +184,15 @@ def test_a_mesh_of_realitycapture_lies_where_its_cameras_are(tmp_path, mesh) -> 
         np.testing.assert_allclose(frame.T_wc[:3, :3], down.pose(k)[:3, :3], atol=1e-12)
         expected = down.plane_depth(down.pose(k), Intrinsics(*CAMERA), SIZE[::-1])
         assert np.median(np.abs(frame.depth - expected)) < 0.02  # of the mesh's 32-bit vertices, 5000 km away
+
+
+def test_geocentric_cameras_without_pyproj_say_what_to_install(tmp_path, monkeypatch) -> None:
+    poses = {name: geocentric(T) for name, T in POSES.items()}
+    ds.write_metashape_xml(
+        tmp_path / "cameras.xml", poses, CAMERA, SIZE, reference=pyproj.CRS(4326).to_wkt(), scale=1.0
+    )
+    monkeypatch.setitem(sys.modules, "pyproj", None)
+    fails(MissingDependencyError, r"needs pyproj; pip install 'semstab\[geo\]'", open_frames, "metashape", tmp_path)
 
 
 # --- What is refused --------------------------------------------------------------------------------------------------
