@@ -460,7 +460,7 @@ def test_a_change_of_alpha_is_what_a_comparison_says_of_the_same_runs(run, quiet
     text, *_ = gate(new, base, gate_config(rules=rules[:1])).notes
     assert re.fullmatch(r"wall: the run gives no label to 1\d\.\d% of the pixels .* agree as by chance", text)
     said = " ".join(cli("compare", base, new).output.split())
-    assert f"alpha {found.base:.3f} and {found.other:.3f}" in said
+    assert f"alpha {found.other:.3f} against {found.base:.3f}" in said
     assert (
         f"{found.base:.3f} to {found.other:.3f}, drop" in cli("gate", new, "--against", base, "--rule", rules[0]).output
     )

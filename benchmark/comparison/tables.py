@@ -315,7 +315,7 @@ def _stability(comparison: RunComparison, own: Against) -> str:
     if row is None:
         return f"Alpha of {own.other} or {comparison.base} is not known: run it with more overlap between frames."
     where = f" over {len(comparison.scenes)} scenes" if len(comparison.scenes) > 1 else ""
-    numbers = f"{ALPHA.word} {row.base:.3f} and {row.other:.3f}{where}"
+    numbers = f"{ALPHA.word} {row.other:.3f} against {row.base:.3f}{where}"
     if row.difference.value == row.difference.low == row.difference.high == 0:
         return f"{own.other} is as stable as {comparison.base}: {numbers}, the same everywhere."
     interval = f"{row.difference.value:+z.3f} ({row.difference.low:+z.3f} to {row.difference.high:+z.3f})"
