@@ -17,6 +17,7 @@ from pydantic import BaseModel
 
 from semstab.config import DatasetConfig, validated
 from semstab.core.registry import Entry, Registry
+from semstab.data.records import is_run
 from semstab.datasets.scene import GROUND_TRUTH, Dataset, Filtering, Scene
 from semstab.errors import DataError
 
@@ -146,7 +147,7 @@ def recognise(root: Path) -> tuple[str, str]:
     """
     if root.is_file() and root.suffix.lower() not in FILES:
         raise DataError(f"{root}: a file, but no bag ({', '.join(FILES)}); give the folder of a scene, or above scenes")
-    if (root / "summary.json").is_file() and (root / "units").is_dir():
+    if is_run(root):
         raise DataError(f"{root}: a finished run, no scene; semstab-bench show {root} says what it found")
     near, fits = list[tuple[float, str]](), list[tuple[int, int, str, str]]()
     for rank, name in enumerate(RECOGNISED):

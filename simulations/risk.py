@@ -217,8 +217,14 @@ def main() -> None:
         maps = [own for run in arguments.run for own in of_run(run)]
     print("|", " | ".join(HEAD), "|")
     print("|", " | ".join("---" for _ in HEAD), "|")
-    for cells in rows(maps, lambda model: model.split(",")[0], by_class=arguments.study != "runs"):
+    told = list(rows(maps, lambda model: model.split(",")[0], by_class=arguments.study != "runs"))
+    for cells in told:
         print("|", " | ".join(cells), "|", flush=True)
+    for column in ("as on its other flights", "as with other models"):
+        pairs = [(cells[HEAD.index("wrong there, %")], cells[HEAD.index(column)]) for cells in told]
+        off = [abs(float(own) - float(other)) for own, other in pairs if other != "-"]
+        if off:
+            print(f"\n{column}: off by {np.median(off):.1f} points in the median, {max(off):.1f} at most")
 
 
 if __name__ == "__main__":

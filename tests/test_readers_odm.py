@@ -209,6 +209,7 @@ def test_a_project_of_opensfm_alone_and_a_mesh_beside_it(tmp_path) -> None:
         labels="{model}/{name}",
     )
     assert scene.depth_from.startswith("rays cast at")
+    assert scene.settings["depth_kind"] == "planar"
     np.testing.assert_allclose(scene.frame(1, "net").depth, down.plane_depth(down.pose(0)), atol=2e-5)
 
 

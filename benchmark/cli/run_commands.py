@@ -411,9 +411,9 @@ def show(
     """Print the answer of a finished run, or its tables, without computing; of several runs one table of all."""
     from rich.console import Console
 
+    from semstab.data.records import is_run
     from semstab.engine.folder import load_result
     from semstab.report.tables import tables
-    from semstab.report.tables.runs import is_run
     from semstab.report.tables.table import to_terminal
     from semstab.report.terminal import print_answer
 

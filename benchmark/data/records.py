@@ -322,6 +322,11 @@ class Failure:
     message: str
 
 
+def is_run(folder: Path) -> bool:
+    """Return whether a folder is that of a finished run or study."""
+    return (folder / "summary.json").is_file() and (folder / "units").is_dir()
+
+
 @dataclass(frozen=True, repr=False)
 class Result:
     """The result of a run or a study; tables, figures, report and terminal are made from it.

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from semstab.data.measures import SBD, VSS
-from semstab.data.records import Record, Result
+from semstab.data.records import Record, Result, is_run
 from semstab.data.statistics import CONFIDENCE
 from semstab.engine.folder import load_result
 from semstab.errors import ConfigError
@@ -50,11 +50,6 @@ def found_runs(words: list[Path]) -> dict[str, Result]:
     while len({path.parts[-depth:] for path in resolved}) < len(resolved):
         depth += 1
     return {"/".join(path.parts[-depth:]): load_result(folder) for path, folder in zip(resolved, folders, strict=True)}
-
-
-def is_run(folder: Path) -> bool:
-    """Return whether a folder is that of a finished run."""
-    return (folder / "summary.json").is_file() and (folder / "units").is_dir()
 
 
 def runs_table(results: Mapping[str, Result]) -> Table:
