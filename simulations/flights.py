@@ -10,6 +10,7 @@ from scipy.stats import norm
 from semstab.data.events import Events
 from semstab.data.voxels import VoxelTable
 from semstab.statistics.accumulate import cluster_sums_of
+from semstab.statistics.agreement import consistency_posterior
 from semstab.statistics.cluster_sums import FUNCTIONALS, ClusterSums, columns_of, parts_of
 from semstab.statistics.observations import CellObservations, Views, keys_of
 
@@ -188,8 +189,9 @@ def sums_of(
 ) -> ClusterSums:
     """Return the sums of a flight, with the truth, and with the cells that alpha is of; see `sample_of`."""
     log = log_of(labels, over, flight)
-    some = (labels >= 0).any(axis=1)
-    return cluster_sums_of(table_of(log), log, over.truth[some], cells=sample_of(labels, over, flight, rng))
+    table, truth = table_of(log), over.truth[(labels >= 0).any(axis=1)]
+    observed = sample_of(labels, over, flight, rng)
+    return cluster_sums_of(table, log, truth, cells=observed, consistent=consistency_posterior(table))
 
 
 def sample_of(

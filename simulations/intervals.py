@@ -3,11 +3,12 @@
     python simulations/intervals.py these-frames [--trials 300] [--seed 0]
     python simulations/intervals.py this-scene [--trials 300] [--seed 0]
     python simulations/intervals.py other-scenes [--trials 300] [--seed 0]
+    python simulations/intervals.py locations [--trials 300] [--seed 0]
     python simulations/intervals.py differences [--trials 300] [--seed 0]
     python simulations/intervals.py correlogram [--trials 300] [--seed 0]
 
 Prints a table in Markdown. The target of an interval is the number that very many flights have together: over the same
-scene for 'this scene', over all scenes for the others.
+scene for 'this scene' and numbers by location, over all scenes for the others.
 """
 
 from __future__ import annotations
@@ -61,9 +62,18 @@ HEAD = ["condition", "of", "target", "sd", "half width", "half width / 1.96 sd",
 
 
 def trials(
-    flight: Flight, count: int, seed: int, scope: Scope, keys: Sequence[str] = KEYS, name: str = ""
+    flight: Flight,
+    count: int,
+    seed: int,
+    scope: Scope,
+    keys: Sequence[str] = KEYS,
+    name: str = "",
+    interval: Scope | None = None,
 ) -> list[Row]:
-    """Simulate scene after scene: 'this scene' has a target of its own in each, the others one of all."""
+    """Simulate scene after scene: 'this scene' has a target of its own in each, the others one of all.
+
+    The interval's scope is the same, unless it is given.
+    """
     flights = FLIGHTS if scope == THIS_SCENE else 1
     intervals: dict[str, list[Interval]] = {key: [] for key in keys}
     values: dict[str, list[list[float]]] = {key: [] for key in keys}
@@ -74,7 +84,7 @@ def trials(
         flown = [sums_of(fly(flight, over, rng), over, flight, rng) for _ in range(flights)]
         for key in keys:
             columns = np.array([totals_of(sums, key) for sums in flown])
-            intervals[key].append(estimate(flown[0], key, scope=scope))
+            intervals[key].append(estimate(flown[0], key, scope=interval or scope))
             values[key].append([*number_of(columns, key)])
             totals[key].append(columns.sum(axis=0))
     rows = []
@@ -156,6 +166,20 @@ def _of_frames(
     yield from trials(flight, count, seed, scope, (key,), name)
 
 
+BY_LOCATION = ("wrong_of_consistent", "entropy")
+
+
+def locations(count: int, seed: int) -> Iterator[Row]:
+    """Numbers whose frames do not show how they vary: by locations, as they are printed, and by frames.
+
+    The target of both is what many flights over the same scene have together.
+    """
+    for quality in QUALITIES:
+        flight, name = Flight(45, 2.0, 1.0, 40, 5, quality, K=5), f"40 frames, {quality}, strips, five classes"
+        for scope, by in ((THESE_FRAMES, "by location"), (THIS_SCENE, "by frame")):
+            yield from trials(flight, count, seed, THIS_SCENE, BY_LOCATION, f"{name}, {by}", interval=scope)
+
+
 # --- Differences ------------------------------------------------------------------------------------------------------
 
 
@@ -215,6 +239,7 @@ STUDIES = {
     "these-frames": these_frames,
     "this-scene": this_scene,
     "other-scenes": other_scenes,
+    "locations": locations,
     "differences": differences,
     "correlogram": correlograms,
 }

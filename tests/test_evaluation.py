@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import json
+import re
 from pathlib import Path
 
 import numpy as np
@@ -93,18 +95,25 @@ def test_the_verdict_on_each_model_is_printed(ran) -> None:
     assert len(screen.splitlines()) <= 24
 
 
-def test_classes_of_too_few_voxels_are_not_listed(tmp_path, monkeypatch) -> None:
-    root = tiny_scene.write(tmp_path / "wall", ("a",))
-    result = semstab.run(configure(root), out=tmp_path / "run", report=False)
-    voxels = {row.name: row.voxels for row in result.record().summary.table.classes}
-    least = min(voxels, key=voxels.__getitem__)
-    assert max(voxels.values()) < terminal.RARE
-    assert "classes that disagree most" not in "\n".join(terminal.screen(result))
-    for bound, listed in ((voxels[least], True), (voxels[least] + 1, False)):
-        monkeypatch.setattr(terminal, "RARE", bound)
-        shown = "\n".join(terminal.screen(result)).partition("classes that disagree most")[2]
-        assert (f"\n    {least} " in shown) == listed
-        assert len(shown.splitlines()) > 2
+def listed_classes(result) -> tuple[list[str], str]:
+    """Return the classes that the screen lists, in order, and the lines after them."""
+    after = "\n".join(terminal.screen(result)).partition("classes that disagree most")[2].splitlines()[1:]
+    rows = list(itertools.takewhile(lambda line: line.endswith(" %"), after))
+    return [re.split(r"  +", row.strip())[0] for row in rows], "\n".join(after[len(rows) :])
+
+
+def test_the_classes_with_most_of_the_disagreement_are_listed(tmp_path, monkeypatch) -> None:
+    root = tiny_scene.write(tmp_path / "wall", ("a", "b"))
+    one = semstab.run(configure(root, models=["a"]), out=tmp_path / "one", report=False)
+    classes = one.record().statistics.cells.classes
+    largest = sorted((row for row in classes if row.disagreement >= 0.01), key=lambda row: -row.disagreement)
+    assert listed_classes(one)[0] == [row.name for row in largest]
+    covering = max(one.record().summary.table.classes, key=lambda row: row.share)
+    monkeypatch.setattr(terminal, "MAJORITY", covering.share)
+    assert covering.name in listed_classes(one)[0]
+    both, after = listed_classes(semstab.run(configure(root), out=tmp_path / "both", report=False))
+    assert f"a: {covering.name}" not in both
+    assert after.startswith(f"    {covering.name}: half of the map or more, not listed\n")
 
 
 def test_without_asking_there_is_what_the_map_alone_tells(tmp_path) -> None:

@@ -210,6 +210,6 @@ def test_what_describes_says_what_its_interval_answers():
     logs = {name: log_of(rng.integers(0, 2, size=(256, 30)), K=2, index=grid(16)) for name in "ab"}
     result = paired({name: log.table() for name, log in logs.items()}, logs=logs)
     answers = {row.measure: row.scope for row in result.differences}
-    assert answers["psa"] == answers["voxel_alpha"] == answers["entropy"] == THIS_SCENE
-    assert answers["sbd"] == answers["vss"] == THESE_FRAMES
+    assert answers["psa"] == answers["voxel_alpha"] == THIS_SCENE
+    assert answers["sbd"] == answers["vss"] == answers["entropy"] == THESE_FRAMES
     assert all(row.difference.low < 0 < row.difference.high for row in result.differences)

@@ -11,8 +11,7 @@ from sklearn.metrics import accuracy_score, jaccard_score
 
 from semstab.data.information import normalise
 from semstab.errors import DataError
-from semstab.statistics import consistent_wrong, correctness, join_truth, quadrants, reliability
-from semstab.statistics.accumulate import Cubes
+from semstab.statistics import consistent_wrong, correctness, describe, join_truth, reliability
 from semstab.statistics.agreement import consistency_posterior
 from semstab.statistics.correctness import Predictions, by_stratum
 
@@ -96,8 +95,8 @@ def test_quadrants_by_hand():
     labels[:4] = np.arange(40) >= np.array([40, 0, 26, 26])[:, None]
     labels[4, :2], labels[5] = 2, 2
     table = log_of(labels).table()
-    truth = join_truth(table, log_of([[0], [0], [0], [1], [0]]).table())
-    found = quadrants(table, truth, Cubes.of(table, where=table.op > 0))
+    true = log_of([[0], [0], [0], [1], [0]]).table()
+    truth, found = join_truth(table, true), describe(table, truth=true).correctness.quadrants
     assert found.voxels == 4
     shares = (found.consistent_right, found.consistent_wrong, found.inconsistent_right, found.inconsistent_wrong)
     assert [share.value for share in shares] == pytest.approx([0.25, 0.25, 0.25, 0.25], abs=0.01)
@@ -107,7 +106,7 @@ def test_quadrants_by_hand():
     truth = join_truth(table, log_of([[1], [1]]).table())
     assert consistent_wrong(table, truth).tolist() == [True, False]
     table = log_of([[0, 0]]).table()
-    found = quadrants(table, join_truth(table, table), Cubes.of(table, where=table.op > 0))
+    found = describe(table, truth=table).correctness.quadrants
     assert found.voxels == 0
     assert math.isnan(found.consistent_wrong.value)
     assert math.isnan(correctness(np.zeros((0, 3)), np.zeros(0, dtype=int)).accuracy)
@@ -142,7 +141,7 @@ def test_a_model_that_errs_the_same_way_in_every_view_is_stable_and_wrong():
     flicker = rng.random((side**2, F)) < 0.1
     labels = np.where(flicker, rng.integers(0, 3, size=flicker.shape), (true + place) % 3)
     table = log_of(labels, index=grid(side)).table()
-    truth = join_truth(table, log_of(true, index=grid(side)).table())
-    found = quadrants(table, truth, Cubes.of(table, where=table.op > 0))
+    true = log_of(true, index=grid(side)).table()
+    truth, found = join_truth(table, true), describe(table, truth=true).correctness.quadrants
     assert found.wrong_of_consistent.low <= place.mean() <= found.wrong_of_consistent.high
     assert consistent_wrong(table, truth)[~place[:, 0]].mean() < 0.01

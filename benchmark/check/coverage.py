@@ -38,6 +38,9 @@ PIXELS_ACROSS = 2
 SHARED = 0.6
 """The suggested frame stride leaves this share of a frame's points in view of the next one."""
 
+FRAMES_LEFT = 20
+"""The least number of frames that it leaves, where there are so many: intervals need them to tell how frames differ."""
+
 BINS = ((1, 1), (2, 2), (3, 8), (9, 27))
 """Distances between frames that are reported together."""
 
@@ -98,7 +101,7 @@ class Suggestion:
     voxel_size_reason: str
     pixel_stride: int | None
     pixel_stride_reason: str
-    frame_stride: int | None
+    frame_stride: int
     frame_stride_reason: str
 
 
@@ -243,23 +246,23 @@ def suggested_size(coverage: Coverage) -> float | None:
     return next((size for size in SIZES if coverage.stays(size) >= STAYS), None)
 
 
-def suggest(coverage: Coverage, overlaps: Sequence[Overlap], stride: int) -> Suggestion:
-    """Return voxel size, pixel stride and frame stride that suit the data; `stride` is the selected frames' own."""
+def suggest(coverage: Coverage, overlaps: Sequence[Overlap], frames: int, stride: int) -> Suggestion:
+    """Return voxel size, pixel stride and frame stride that suit so many frames, whose own stride is `stride`."""
     voxel_size = suggested_size(coverage)
     views = coverage.sample.views.values()
     far = float(np.percentile(np.concatenate([view.depth[view.v, view.u] for view in views]), 95))
     footprint = far / min(view.camera.fx for view in views)
     pixels = None if voxel_size is None else max(1, int(voxel_size / (PIXELS_ACROSS * footprint)))
-    frames = max((row.apart[0] for row in overlaps if row.in_view >= SHARED), default=1)
-    near = overlaps[0].in_view if overlaps else math.nan
-    shared = {row.apart[0]: row.in_view for row in overlaps}.get(frames, near)
+    shared = {row.apart[0]: row.in_view for row in overlaps}
+    times = max((n for n in shared if shared[n] >= SHARED and frames >= FRAMES_LEFT * n), default=1)
+    stays = math.nan if voxel_size is None else coverage.stays(voxel_size)
     return Suggestion(
         voxel_size=voxel_size,
-        voxel_size_reason=f"{STAYS:.0%} of the points stay in such a voxel when another frame sees them",
+        voxel_size_reason=f"{stays:.0%} of the points stay in such a voxel when another frame sees them",
         pixel_stride=pixels,
         pixel_stride_reason=f"{PIXELS_ACROSS} pixels or more along a voxel's edge at {far:.3g} m",
-        frame_stride=stride * frames,
-        frame_stride_reason=f"successive frames then share {shared:.0%} of their view",
+        frame_stride=stride * times,
+        frame_stride_reason=f"successive frames share {shared.get(times, math.nan):.0%} of their view",
     )
 
 

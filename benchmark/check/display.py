@@ -154,7 +154,8 @@ def _advice(checked: SceneCheck, *, verbose: bool) -> Iterator[str]:
         yield f"voxels   --voxel-size {suggestion.voxel_size:g}: {suggestion.voxel_size_reason}"
         if verbose:
             yield f"pixels   --pixel-stride {suggestion.pixel_stride}: {suggestion.pixel_stride_reason}"
-    yield f"frames   --frames ::{suggestion.frame_stride}: {suggestion.frame_stride_reason}"
+    stride = suggestion.frame_stride
+    yield f"frames   {f'--frames ::{stride}' if stride > 1 else 'all'}: {suggestion.frame_stride_reason}"
 
 
 def _conclusion(checked: SceneCheck) -> str:

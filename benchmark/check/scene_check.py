@@ -426,7 +426,7 @@ def _with_coverage(checked: SceneCheck, inspection: Inspection, sample: Sample, 
     noise = coverage.noise() if overlaps and any(row.covisible > 0 for row in overlaps) else None
     views = [inspection.views[position] for position in inspection.fused]
     stride = fused_stride(checked.size, config.pixel_stride)
-    suggestion = None if noise is None else suggest(coverage, overlaps, config.frames.stride)
+    suggestion = None if noise is None else suggest(coverage, overlaps, checked.selected, config.frames.stride)
     size = config.voxel_size
     if not config.sets_voxel_size and suggestion is not None and suggestion.voxel_size is not None:
         size = suggestion.voxel_size

@@ -110,9 +110,9 @@ class StabilityVerdict:
 
     @property
     def stated(self) -> str:
-        """The probability in print: '(p .51)', '(p > .99)', no share of a map; '' where there is none."""
+        """The probability in print: '(p .71)', '(p > .99)', no share of a map; '' where no level has enough."""
         p = self.probability
-        return "" if math.isnan(p) else "(p > .99)" if p >= 0.995 else f"(p {short(p)})"
+        return "" if math.isnan(p) or self.level == "undecided" else "(p > .99)" if p >= 0.995 else f"(p {short(p)})"
 
     def __str__(self) -> str:
         """Return 'stable (p .98)'."""

@@ -304,14 +304,21 @@ def _indexed(index: Int64, palette: UInt8) -> str:
     return png(index.astype(np.uint8), palette) if len(palette) <= 256 else png(palette[index])
 
 
+DISAGREES = 0.02
+"""The share of the disagreement from which on a class is drawn that has too few locations for the verdict."""
+
+
 def _classes(records: Sequence[Record], colors: Mapping[str, int]) -> str:
-    """Return a chart of the classes that count for the verdict, with their alphas."""
+    """Return a chart of the classes that count for the verdict or disagree, with their alphas."""
     rows: dict[str, list[tuple[int, str, Estimate]]] = {}
+    shown: dict[str, bool] = {}
     for record in records:
         statistics, name = record.statistics, record.unit.model
         for own in () if statistics is None or statistics.cells is None else statistics.cells.classes:
-            if own.counts_for_verdict and not math.isnan(own.alpha.value):
+            if not math.isnan(own.alpha.value):
                 rows.setdefault(own.name, []).append((colors[name], name, own.alpha))
+                shown[own.name] = shown.get(own.name, False) or own.counts_for_verdict or own.disagreement >= DISAGREES
+    rows = {name: own for name, own in rows.items() if shown[name]}
     if not rows:
         return ""
     ordered = dict(sorted(rows.items(), key=lambda item: min(e.value for _, _, e in item[1])))

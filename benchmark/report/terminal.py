@@ -13,6 +13,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from semstab.check import Verdict
 from semstab.config import BASE
+from semstab.core.types import THESE_FRAMES
 from semstab.data.measures import measures
 from semstab.data.records import Failure, Record, Result, UnitContent
 from semstab.data.results import Agreement, UnitSummary
@@ -29,24 +30,22 @@ from semstab.report.tables import tables
 from semstab.report.tables.filters import row as filter_row
 from semstab.report.tables.stability import one_in
 from semstab.report.tables.table import to_terminal
-from semstab.statistics.verdict import LIMITS
+from semstab.statistics.intervals import LEAST_FRAMES
+from semstab.statistics.verdict import DANGEROUS, LIMITS
 from semstab.task import Task
 
 WIDTH = 80
 
 MAJORITY = 0.5
-"""A class with this share of the map or more is listed only if no other is: others disagree with it most."""
-
-RARE = 100
-"""The least number of voxels of a class that is listed; a rarer class is not called unstable."""
-
-LEAST_SHARE = 0.005
-"""The least share of the map of a class that is listed: 1 % as it is printed."""
+"""A class with this share of the map or more is not listed beside others of several models: all disagree with it."""
 
 CONFUSED = "confused with"
 CLASS_HEAD = ("classes that disagree most", "alpha", CONFUSED, "of map", "disagreement")
 CLASS_COLUMNS, LEAST_CLASS = 32, 28
 """The columns of a line of classes beside its two names, and the least of the first name."""
+
+CONTRIBUTES = 0.01
+"""The least share of the disagreement of a class that is listed."""
 
 MOST_CLASSES = {1: 5, 2: 3}
 """The number of classes that are listed for each model, by the number of rows above; else 1."""
@@ -120,8 +119,9 @@ def _head(name: str, result: Result, runs: Sequence[UnitSummary], width: int) ->
     seen = "" if views is None else f" of {views} distinct views"
     chosen = " (chosen)" if any(advice.chosen for advice in result.advice.values()) else ""
     what = f"{counts} frames{seen}, {first.table.K} classes, {_metres(first.table.voxel_size)} voxels{chosen}"
-    line = f"{name}    {what}    {_geometry(result)}".rstrip()
-    yield line if len(line) <= width else f"{name}    {what}\n  {_geometry(result)}".rstrip()
+    beside = "    ".join(filter(None, (_geometry(result), _scope(runs))))
+    line = f"{name}    {what}    {beside}".rstrip()
+    yield line if len(line) <= width else f"{name}    {what}\n  {beside}".rstrip()
     for text in noted(result):
         yield from textwrap.wrap(f"note: {text}", WIDTH, initial_indent="  ", subsequent_indent="    ")
     yield ""
@@ -139,6 +139,14 @@ def _geometry(result: Result) -> str:
     return "geometry unclear: semstab-bench check"
 
 
+def _scope(runs: Sequence[UnitSummary]) -> str:
+    """Return that intervals and verdicts are for the frames of a run alone, where these are too few for more."""
+    alphas = [run.statistics.headline.alpha for run in runs if run.statistics is not None]
+    few = [alpha for alpha in alphas if alpha.scope == THESE_FRAMES and alpha.frames]
+    of = "" if len(few) == len(alphas) else f" in {len(few)} of {len(alphas)} rows"
+    return f"intervals for these frames alone{of}: fewer than {LEAST_FRAMES} views" if few else ""
+
+
 def _verdict(run: UnitSummary) -> Iterator[str]:
     """Yield the level, the number that it rests on, and the meaning of that number."""
     statistics = run.statistics
@@ -148,16 +156,24 @@ def _verdict(run: UnitSummary) -> Iterator[str]:
         yield from textwrap.wrap(statistics.verdict.line, WIDTH, initial_indent="  ", subsequent_indent="    ")
         return
     yield f"  {level} {statistics.verdict.stated}".rstrip() + f"    alpha {short(alpha.value)}{_interval(alpha)}"
-    if statistics.verdict.level == "uninformative" and statistics.cells is not None:
+    wrong = statistics.headline.wrong_of_consistent
+    told = f"{_percent(wrong.value)}{_interval(wrong, 100)} of the consistent locations are wrong"
+    if statistics.verdict.level == "misleading":
+        yield from textwrap.wrap(
+            f"{told}, more than {_percent(DANGEROUS)}: do not take agreement for truth",
+            WIDTH,
+            initial_indent="  ",
+            subsequent_indent="  ",
+        )
+    elif statistics.verdict.level == "uninformative" and statistics.cells is not None:
         share, name = _percent(statistics.cells.largest_share), statistics.cells.largest_class
         yield f"  {share} of the observations are {name}: agreement does not assess such a map"
     else:
         yield f"  act on labels from alpha {short(LIMITS.stable)} on, with care from {short(LIMITS.usable)}"
     psa = statistics.headline.psa.value
     yield f"  two frames see the same class at {_percent(psa)} of the locations"
-    wrong = statistics.headline.wrong_of_consistent
-    if not math.isnan(wrong.value):
-        yield f"  {_percent(wrong.value)}{_interval(wrong, 100)} of the consistent locations are wrong"
+    if not math.isnan(wrong.value) and statistics.verdict.level != "misleading":
+        yield f"  {told}"
     yield ""
 
 
@@ -284,21 +300,26 @@ def _number(value: float, digits: int) -> str:
 
 
 def _classes(records: Sequence[Record], width: int) -> Iterator[str]:
-    """Yield the classes with most of the disagreement, among those that cover enough of the map."""
+    """Yield the classes with most of the disagreement, and which class is not listed."""
     names = list(dict.fromkeys(record.unit.model for record in records))
     most, alone = MOST_CLASSES.get(len(records), 1), len(names) == 1
     rows: list[tuple[str, str, str, str, str]] = []
+    left_out: dict[str, None] = {}
     for name in names:
         own = [record for record in records if record.unit.model == name]
         classes, shares = class_means(own), _class_shares(own)
         others = {k: v for record in own for k, v in record.summary.table.confused_with.items()}
-        common = [
-            key for key, (voxels, share) in shares.items() if voxels >= RARE and share >= LEAST_SHARE and key in classes
-        ]
-        named = [key for key in common if shares[key][1] < MAJORITY] or common
-        for key in sorted(named, key=lambda key: -classes[key][1])[:most]:
+        listed = sorted(
+            (key for key, (_, disagreement) in classes.items() if disagreement >= CONTRIBUTES),
+            key=lambda key: -classes[key][1],
+        )
+        small = [key for key in listed if shares.get(key, 0.0) < MAJORITY]
+        if not alone and small:
+            left_out |= dict.fromkeys(key for key in listed if key not in small)
+            listed = small
+        for key in listed[:most]:
             label, (alpha, disagreement) = key if alone else f"{name}: {key}", classes[key]
-            of_map, of_all = f"{100 * shares[key][1]:.0f} %", f"{100 * disagreement:.0f} %"
+            of_map, of_all = f"{100 * shares.get(key, 0.0):.0f} %", f"{100 * disagreement:.0f} %"
             rows.append((f"  {label}", short(alpha), others.get(key, ""), of_map, of_all))
     if rows:
         yield ""
@@ -308,6 +329,8 @@ def _classes(records: Sequence[Record], width: int) -> Iterator[str]:
         for label, alpha_, other, of_map, of_all in (CLASS_HEAD, *rows):
             line = f"  {_cut(label, first):<{first}}{alpha_:>5}   {_cut(other, second):<{second}}"
             yield f"{line}{of_map:>8}{of_all:>14}"
+    if left_out:
+        yield f"    {', '.join(left_out)}: half of the map or more, not listed"
 
 
 def class_means(records: Sequence[Record]) -> dict[str, tuple[float, float]]:
@@ -333,13 +356,13 @@ def _outlying(records: Sequence[Record]) -> Iterator[str]:
         )
 
 
-def _class_shares(records: Sequence[Record]) -> dict[str, tuple[int, float]]:
-    """Return the number of voxels of each class, and their share of the map."""
+def _class_shares(records: Sequence[Record]) -> dict[str, float]:
+    """Return the share of the map that each class dominates."""
     voxels: dict[str, int] = {}
     for row in (row for record in records for row in record.summary.table.classes):
         voxels[row.name] = voxels.get(row.name, 0) + row.voxels
     total = sum(record.summary.table.voxels for record in records)
-    return {name: (n, n / max(1, total)) for name, n in voxels.items()}
+    return {name: n / max(1, total) for name, n in voxels.items()}
 
 
 def _checks(result: Result) -> Iterator[str]:

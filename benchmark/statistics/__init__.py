@@ -12,7 +12,7 @@ Examples:
 from semstab.data.contrast import ModelComparison
 from semstab.data.statistics import Estimate, Reliability
 from semstab.statistics.agreement import class_agreement, decompose, disagreement, fleiss_kappa, krippendorff_alpha, psa
-from semstab.statistics.correctness import consistent_wrong, correctness, join_truth, quadrants, reliability
+from semstab.statistics.correctness import consistent_wrong, correctness, join_truth, reliability
 from semstab.statistics.correlogram import correlogram
 from semstab.statistics.drift import expected_sbd, flips, trends
 from semstab.statistics.geometry import ceiling, losses, rendered
@@ -53,7 +53,6 @@ __all__ = [
     "losses",
     "paired",
     "psa",
-    "quadrants",
     "reliability",
     "rendered",
     "standardised",

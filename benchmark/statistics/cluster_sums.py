@@ -453,6 +453,8 @@ class Functional:
         parts: The parts that its sums come from, each with its weight: a map, or sampled cells.
         pairs: The first sum is of pairwise agreement; at a location that two frames saw, neither frame has it for
             itself alone.
+        by_location: What a location adds is no frame's more than another's, so that frames do not show how much the
+            number varies between flights: its intervals are for these frames (docs/validity.md).
     """
 
     names: tuple[str, ...]
@@ -462,6 +464,7 @@ class Functional:
     scale: Scale = "share"
     pairs: bool = False
     parts: tuple[tuple[Part, float], ...] = (("map", 1.0),)
+    by_location: bool = False
 
 
 CELLS: tuple[tuple[Part, float], ...] = (("fine", 2.0), ("coarse", -1.0))
@@ -485,10 +488,10 @@ FUNCTIONALS: Mapping[str, Functional] = {
     "alpha": Functional(ALPHA_SUMS, alpha_of, -1.0, 1.0, "agreement", pairs=True, parts=CELLS),
     "voxel_alpha": Functional(ALPHA_SUMS, alpha_of, -1.0, 1.0, "agreement", pairs=True),
     "vss": Functional(("vss", "recurrent"), ratio_of),
-    "entropy": Functional(("entropy", "voxels"), ratio_of),
+    "entropy": Functional(("entropy", "voxels"), ratio_of, by_location=True),
     "accuracy": Functional(("right", "known"), ratio_of),
     "observation_accuracy": Functional(("observed_right", "observed"), ratio_of),
-    "wrong_of_consistent": Functional(("consistent_wrong", "consistent"), ratio_of),
+    "wrong_of_consistent": Functional(("consistent_wrong", "consistent"), ratio_of, by_location=True),
     "sbd_excess": Functional(("sbd_excess", "sbd_known"), ratio_of, -1.0, 1.0, "plain"),
     "miou": Functional(("known", "known", "class_right", "class_known", "class_predicted"), miou_of, scale="plain"),
     "ece": Functional(("calibrated", "calibrated", "gap"), ece_of, scale="plain"),
@@ -516,8 +519,9 @@ def chance_of(cells: ClusterSums) -> float:
 
 
 def of_space_alone(key: str, k: int | None = None) -> bool:
-    """Return whether a number does not depend on frames, so that its intervals are for these frames."""
-    return set(functional(key, k).names) <= set(WITHOUT_FRAMES)
+    """Return whether frames do not show how much a number varies, so that its intervals are for these frames."""
+    number = functional(key, k)
+    return number.by_location or set(number.names) <= set(WITHOUT_FRAMES)
 
 
 def functional(key: str, k: int | None = None) -> Functional:

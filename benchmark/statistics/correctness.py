@@ -13,7 +13,7 @@ from semstab.core.types import Float64, Int32, Int64, Mask
 from semstab.data.evidence import Evidence
 from semstab.data.measures import Quantity, dominant
 from semstab.data.results import RECURRENT
-from semstab.data.statistics import UNKNOWN, Correctness, Quadrants, Reliability
+from semstab.data.statistics import UNKNOWN, Correctness, Interval, Quadrants, Reliability
 from semstab.data.voxels import VoxelTable
 from semstab.metrics import strata
 from semstab.metrics.agreement import require_same_grid, same_voxels, shared_rows
@@ -170,34 +170,28 @@ def by_stratum(predictions: Predictions, op: Int32, known: Mask, edges: Sequence
     return tuple(correctness_of(own, name) for own, name in zip([sums.sum(axis=0), *sums], names, strict=True))
 
 
-def quadrants(table: VoxelTable, truth: Truth, cubes: Cubes, *, consistent: float = CONSISTENT) -> Quadrants:
-    """Count voxels by stability and correctness, never those with OP < 3: two frames agree by chance too easily.
-
-    A voxel counts as consistent by the probability that it is (`consistency_posterior`), so that the shares do not
-    depend on how often locations were seen. `cubes` are those of all of the table's voxels.
-    """
-    return quadrants_of(quadrant_sums(table, truth, consistency_posterior(table, consistent=consistent), cubes.edge))
-
-
 QUADRANTS = ("consistent_right", "consistent_wrong", "inconsistent_right", "inconsistent_wrong")
 
 
-def quadrant_sums(table: VoxelTable, truth: Truth, consistent: Float64, edge: float) -> CubeSums:
-    """Return the sums for `quadrants_of` over cubes of that edge, by the stability posterior (n,)."""
+def quadrants(table: VoxelTable, truth: Truth, consistent: Float64, edge: float, wrong: Interval) -> Quadrants:
+    """Count voxels by stability and correctness, never those with OP < 3: two frames agree by chance too easily.
+
+    Args:
+        table: The map.
+        truth: The true classes of its voxels.
+        consistent: (n,) how probable it is that each is consistent (`consistency_posterior`), by which it counts:
+            the shares do not depend on how often locations were seen.
+        edge: Edge of the cubes that intervals rest on, in metres.
+        wrong: The share of the consistent voxels that are wrong, with the interval of the headline.
+    """
     counted, likely, right = _masks(table, truth, consistent)
+    if not counted.any():
+        return Quadrants(0, *[UNKNOWN] * 5)
     cubes = Cubes.of(table, edge, where=counted)
     parts = (likely * right, likely * ~right, (1 - likely) * right, (1 - likely) * ~right)
-    sums = cubes.means(dict(zip(QUADRANTS, parts, strict=True)))
-    wrong, every = sums["consistent_wrong"][:, 0], sums["consistent_right"][:, 0] + sums["consistent_wrong"][:, 0]
-    return CubeSums(cubes.cell, edge, sums | {"wrong_of_consistent": np.stack([wrong, every], axis=1)})
-
-
-def quadrants_of(sums: CubeSums) -> Quadrants:
-    """Return the shares, from `quadrant_sums`."""
-    voxels = int(sums["consistent_right"][1])
-    if not voxels:
-        return Quadrants(0, *[UNKNOWN] * 5)
-    return Quadrants(voxels, *(sums.estimate(name, ratio_of) for name in (*QUADRANTS, "wrong_of_consistent")))
+    sums = CubeSums(cubes.cell, edge, cubes.means(dict(zip(QUADRANTS, parts, strict=True))))
+    shares = {name: sums.estimate(name, ratio_of) for name in QUADRANTS}
+    return Quadrants(int(counted.sum()), **shares, wrong_of_consistent=wrong)
 
 
 def consistent_wrong(table: VoxelTable, truth: Truth, *, consistent: float = CONSISTENT) -> Mask:

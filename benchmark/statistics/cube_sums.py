@@ -15,7 +15,7 @@ from semstab.data.measures import sbd, vss
 from semstab.data.statistics import Flipping, Interval
 from semstab.data.voxels import VoxelTable
 from semstab.statistics.accumulate import Cubes, CubeSums, Mean
-from semstab.statistics.agreement import alpha_of, decompose, disagreement, kappa_of, psa
+from semstab.statistics.agreement import decompose, disagreement, kappa_of, psa
 from semstab.statistics.drift import flips, trends
 from semstab.statistics.intervals import EstimateSpec
 from semstab.statistics.sample import MapSample
@@ -43,13 +43,13 @@ def row_columns(table: VoxelTable, null: Float64) -> Columns:
 
 SIGNED = (-1.0, 1.0)
 MEANS: Mapping[str, Mean] = {
-    **{name: Mean(name) for name in ("psa", "vss", "within", "between", "sbd", "null")},
-    **{name: Mean(name) for name in ("entropy", "entropy_within", "entropy_between")},
-    "excess": Mean("excess", bounds=SIGNED),
+    **{name: Mean(name) for name in ("vss", "within", "between", "sbd", "null", "entropy_within", "entropy_between")},
     "kappa": Mean("kappa", kappa_of, SIGNED, "agreement"),
-    "voxel_alpha": Mean("voxel_alpha", alpha_of, SIGNED, "agreement"),
 }
-"""Means over the voxels with OP >= 2 where values are defined, and agreement beyond chance."""
+"""Means over the voxels with OP >= 2 where values are defined, and kappa."""
+
+OF_CLUSTERS = {"psa": "psa", "voxel_alpha": "voxel_alpha", "entropy": "entropy", "excess": "sbd_excess"}
+"""Numbers of the same voxels that verdicts, gates and comparisons print, too, with their names in `FUNCTIONALS`."""
 
 OF_FLIPS: Mapping[str, Mean] = {
     **{name: Mean(name) for name in ("flip_rate", "flip_null")},
@@ -66,31 +66,25 @@ OF_CHANGES: Mapping[str, Mean] = {
 
 def location_sums(table: VoxelTable, columns: Columns, cubes: Cubes) -> CubeSums:
     """Return the sums over cubes of the voxels with OP >= 2 that give `MEANS`."""
-    T, agreement = table.op.astype(np.float64), columns["psa"]
+    T = table.op.astype(np.float64)
     sums = cubes.means(
         {
-            "psa": agreement,
+            "psa": columns["psa"],
             "vss": vss(table),
             "sbd": columns["sbd_excess"] + columns["sbd_null"],
             "null": columns["sbd_null"],
-            "excess": columns["sbd_excess"],
-            "entropy": columns["entropy_within"] + columns["entropy_between"],
             "entropy_within": columns["entropy_within"],
             "entropy_between": columns["entropy_between"],
             "observations": T,
-            "agreeing": T * agreement,
-            "own": table.self_sum,
             **{name: T * columns[f"disagreement_{name}"] for name in ("within", "between")},
         }
     )
-    observations, agreeing, own = (sums.pop(name)[:, :1] for name in ("observations", "agreeing", "own"))
-    weight = table.evidence.weight
+    observations = sums.pop("observations")[:, :1]
     each = np.repeat(T, np.diff(table.evidence.starts))
-    by_observation, by_voxel = cubes.sums_by_class(table.evidence, weight, weight / each)
+    (by_voxel,) = cubes.sums_by_class(table.evidence, table.evidence.weight / each)
     further = {
         **{name: [sums[name][:, :1], observations] for name in ("within", "between")},
-        "kappa": [sums["psa"], by_voxel],  # as of `kappa_columns`, and of `alpha_columns`
-        "voxel_alpha": [agreeing, observations, own, by_observation],
+        "kappa": [sums["psa"], by_voxel],  # as of `kappa_columns`
     }
     return CubeSums(cubes.cell, cubes.edge, sums | {name: np.hstack(parts) for name, parts in further.items()})
 

@@ -23,6 +23,7 @@ from semstab.statistics.cluster_sums import (
     columns_of,
     frames_of,
     functional,
+    of_space_alone,
     parts_of,
     value,
 )
@@ -208,8 +209,9 @@ def spec_of_observations(
 
 
 def scope_of(sums: ClusterSums, wanted: Scope = THIS_SCENE, key: str = "alpha", k: int | None = None) -> Scope:
-    """Return the scope of a number's interval: the wanted one if there are enough frames for it, else these frames."""
-    return wanted if frames_of(sums, key, k) >= LEAST_FRAMES else THESE_FRAMES
+    """Return the scope of a number's interval: the wanted one if enough frames show it, else these frames."""
+    shown = frames_of(sums, key, k) >= LEAST_FRAMES and not of_space_alone(key, k)
+    return wanted if shown else THESE_FRAMES
 
 
 def headline_specs(sums: ClusterSums, wanted: Scope = THIS_SCENE) -> Iterator[EstimateSpec]:

@@ -39,7 +39,6 @@ from semstab.statistics.accumulate import Cubes, CubeSums, cluster_sums_of, sums
 from semstab.statistics.agreement import class_agreement_of, class_sums, consistency_posterior, shares_of
 from semstab.statistics.cluster_sums import MOST_CLASSES, ClusterSums, chance_of, value
 from semstab.statistics.correctness import (
-    ACCURACY,
     MIOU,
     Predictions,
     Truth,
@@ -47,8 +46,7 @@ from semstab.statistics.correctness import (
     correctness_of,
     join_truth,
     prediction_sums,
-    quadrant_sums,
-    quadrants_of,
+    quadrants,
     reliability_of,
     wrong_where_consistent,
 )
@@ -56,6 +54,7 @@ from semstab.statistics.correlogram import correlogram
 from semstab.statistics.cube_sums import (
     MEANS,
     OF_CHANGES,
+    OF_CLUSTERS,
     OF_FLIPS,
     Columns,
     FlippingSums,
@@ -67,7 +66,14 @@ from semstab.statistics.cube_sums import (
 from semstab.statistics.drift import expected_sbd
 from semstab.statistics.frame_disagreement import LoneDisagreement, lone_disagreement, outlying_frames
 from semstab.statistics.geometry import losses
-from semstab.statistics.intervals import confidence_intervals, headline_specs, probability_above, scope_of, spec_of
+from semstab.statistics.intervals import (
+    confidence_intervals,
+    estimate,
+    headline_specs,
+    probability_above,
+    scope_of,
+    spec_of,
+)
 from semstab.statistics.observations import CellObservations
 from semstab.statistics.sample import MapSample
 from semstab.statistics.verdict import LIMITS, Limits, verdict
@@ -217,7 +223,9 @@ def analyse(
         drawn["true_label"] = truth.label
     (inconsistent,) = confidence_intervals(flipping.specs())
     of_flips = [] if log is None else confidence_intervals(log.sums.specs(OF_FLIPS))
-    means = dict(zip(MEANS, confidence_intervals(of_locations.specs(MEANS)), strict=True))
+    means = dict(zip(MEANS, confidence_intervals(of_locations.specs(MEANS)), strict=True)) | {
+        name: estimate(influence, key, scope=scope_of(influence, scope, key)) for name, key in OF_CLUSTERS.items()
+    }
     whole = sample.summary.summary(table.voxel_size, table.classes, edges)
     headline, count = HeadlineStatistics(*confidence_intervals(headline_specs(influence, scope))), len(cubes.cell)
     agreeing = None if cells is None else cell_agreement(cells, influence, table, scope, critical, limits)
@@ -254,7 +262,7 @@ def analyse(
         drift=_drift(repeats, means, of_locations, log, of_flips),
         uncertainty=EntropyParts(means["entropy"], means["entropy_within"], means["entropy_between"]),
         geometry=None if limit is None else losses(table, limit),
-        correctness=None if truth is None else _correctness(table, truth, consistent, influence, edges, scope),
+        correctness=None if truth is None else _correctness(table, truth, consistent, influence, edges, headline),
         strata=_strata(whole, table, columns, edges),
         outlying_frames=outlying,
     )
@@ -370,21 +378,24 @@ def _drift(
 
 
 def _correctness(
-    table: VoxelTable, truth: Truth, consistent: Float64, sums: ClusterSums, edges: Sequence[int], scope: Scope
+    table: VoxelTable,
+    truth: Truth,
+    consistent: Float64,
+    sums: ClusterSums,
+    edges: Sequence[int],
+    headline: HeadlineStatistics,
 ) -> CorrectnessStatistics:
     predictions = Predictions.of(table.evidence, truth.label)
     repeated = prediction_sums(predictions, truth.known & (table.op >= 2))
-    accuracy, miou = confidence_intervals(
-        spec_of(sums, key, scope=scope_of(sums, scope, key)) for key in (ACCURACY.key, MIOU.key)
-    )
+    miou = estimate(sums, MIOU.key, scope=scope_of(sums, headline.accuracy.scope, MIOU.key))
     if math.isnan(miou.value):  # there are no sums of so many classes
         miou = dataclasses.replace(miou, value=correctness_of(repeated).miou)
     return CorrectnessStatistics(
-        accuracy=accuracy,
+        accuracy=headline.accuracy,
         miou=miou,
         strata=by_stratum(predictions, table.op, truth.known, edges),
         reliability=reliability_of(repeated),
-        quadrants=quadrants_of(quadrant_sums(table, truth, consistent, sums.edge)),
+        quadrants=quadrants(table, truth, consistent, sums.edge, headline.wrong_of_consistent),
     )
 
 

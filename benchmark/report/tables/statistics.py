@@ -31,8 +31,8 @@ from semstab.statistics.verdict import ADVICE, DANGEROUS, DECIDED, LEAST_CLASSES
 SCENE = Column("scene", "Scene")
 REPEATED = Column("repeated_voxels", "Voxels", 0)
 INTERVALS = (
-    f"Brackets hold intervals at {CONFIDENCE:.0%} for these frames; those of verdicts are for this scene flown again"
-    f" if there are {LEAST_FRAMES} frames."
+    f"Brackets hold intervals at {CONFIDENCE:.0%}: of alpha, PSA and accuracy for this scene flown again if there are"
+    f" {LEAST_FRAMES} frames, of other numbers for these frames."
 )
 SEEN_TWICE = "The table shows the voxels seen twice or more."
 
