@@ -22,7 +22,7 @@ from semstab.comparison.pairing import pair
 from semstab.comparison.runs import open_runs
 from semstab.comparison.tables import print_comparison, sentences
 from semstab.comparison.writing import load_comparison, markdown
-from semstab.data.contrast import Against, Contrast, RunComparison
+from semstab.data.contrast import Against, Contrast, RunComparison, SceneComparison
 from semstab.data.frames import Frame, Intrinsics
 from semstab.data.georeference import Georeference
 from semstab.data.statistics import Interval
@@ -184,6 +184,38 @@ def test_a_terminal_of_80_columns_and_markdown_hold_it(fault):
     assert "| Measure | old | new |" in page
 
 
+def renamed(scene: SceneComparison, overall: tuple[Against, ...]) -> SceneComparison:
+    """Return a scene with the contrasts and names of what stands over all scenes."""
+    own = (
+        dataclasses.replace(a, other=o.other, contrasts=o.contrasts)
+        for a, o in zip(scene.against, overall, strict=True)
+    )
+    return dataclasses.replace(scene, against=tuple(own))
+
+
+def test_long_names_of_runs_stand_in_the_title_and_what_is_written_is_not_offered(fault):
+    first, other = "espnetv2_voc scale=2.0", "espnetv2_voc scale=1.0"
+    runs = tuple(dataclasses.replace(run, name=name) for run, name in zip(fault.runs, (first, other), strict=True))
+    overall = tuple(dataclasses.replace(own, other=other) for own in fault.overall)
+    (scene,) = fault.scenes
+    named = dataclasses.replace(fault, base=first, runs=runs, overall=overall, scenes=(renamed(scene, overall),))
+    text = StringIO()
+    print_comparison(named, Console(file=text, width=80), out=Path("versus"))
+    lines = text.getvalue().splitlines()
+    assert max(map(len, lines)) <= 80
+    assert f"Differences (base: {first}, other: {other})" in lines
+    assert sum(line.startswith(" Alpha  ") for line in lines) == 1
+    assert lines[-1] == "  more     -v: classes and areas"
+
+
+def test_scenes_without_an_interval_do_not_count_beside_those_that_have_one():
+    few = dataclasses.replace(contrast(0.5, 0.1), difference=Interval(0.5, math.nan, math.nan))
+    (mean,) = over_scenes([[contrast(0.1, 0.1)], [few]])
+    assert (mean.base, mean.other, mean.difference.value) == pytest.approx((0.5, 0.6, 0.1))
+    (alone,) = over_scenes([[few], [few]])
+    assert alone.difference.value == pytest.approx(0.5)
+
+
 def test_bad_input_is_one_line_and_the_command_writes_markdown(runs, tmp_path):
     done = bench("compare", runs / "old", runs / "old", "--markdown", cwd=tmp_path, columns=80)
     assert done.stdout.startswith("## net (2) against net\n")
@@ -224,8 +256,13 @@ def test_coverage_is_a_count_and_neither_better_nor_worse(runs, change, said):
         )
 
     rows = tuple(map(covering, against.contrasts))
-    other = dataclasses.replace(comparison, overall=(dataclasses.replace(against, contrasts=rows),))
+    overall = (dataclasses.replace(against, contrasts=rows),)
+    other = dataclasses.replace(comparison, overall=overall, scenes=(renamed(comparison.scenes[0], overall),))
     text = " ".join(sentences(other))
     assert said in text
     assert "in coverage" not in text
+    shown = StringIO()
+    print_comparison(other, Console(file=shown, width=80))
+    (line,) = (line for line in shown.getvalue().splitlines() if line.startswith(" Coverage "))
+    assert line.split()[-1] == ("fewer" if change < 0 else "more")
     assert bool(said) == ("covers" in text)

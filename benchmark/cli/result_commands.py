@@ -37,7 +37,7 @@ def compare(
         print_lines([as_markdown(comparison)], quiet=quiet)
         return
     if not quiet:
-        print_comparison(comparison, Console(), verbose=verbose)
+        print_comparison(comparison, Console(), verbose=verbose, out=out)
     if out is not None:
         print_lines([f"folder: {out}; report: {out / 'report.html'}"], quiet=quiet)
 

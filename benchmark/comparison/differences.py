@@ -51,6 +51,7 @@ from semstab.statistics.intervals import (
     unpaired,
 )
 from semstab.statistics.paired_differences import LEAST_VOXELS, holm
+from semstab.statistics.verdict import ADVICE
 
 OF_ANY_SIZE = OF_LIKELIEST = (ALPHA, ACCURACY, MIOU, RECALL, PRECISION, IOU)
 """Measures that hardly depend on the size of voxels, and need no more than the likeliest classes of scores."""
@@ -81,12 +82,13 @@ def by_class(common: Common, base: Entry, number: int) -> tuple[Contrast, ...]:
 
 
 def over_scenes(result: Sequence[Sequence[Contrast]]) -> tuple[Contrast, ...]:
-    """Return the macro mean of each measure (and class) over the scenes that have it."""
+    """Return the macro mean of each measure (and class) over scenes that have an interval of it, or else a value."""
     groups: dict[tuple[str, str], list[Contrast]] = {}
     for row in (row for rows in result for row in rows):
         groups.setdefault((row.measure, row.of), []).append(row)
     means = []
-    for (measure, of), rows in groups.items():
+    for (measure, of), every in groups.items():
+        rows = [row for row in every if not math.isnan(row.difference.low)] or every
         base, other = macro_mean([row.base for row in rows]), macro_mean([row.other for row in rows])
         means.append(Contrast(measure, of, base, other, mean_of([row.difference for row in rows]), math.nan, ""))
     return tuple(means)
@@ -316,15 +318,26 @@ def _scene(scene: str, runs: Sequence[RunHandle], scope: Scope) -> tuple[SceneCo
                 columns=Path(COLUMNS) / f"{slug(scene, names[0], names[n])}.parquet",
             )
         against.append(result)
-    return _scene_comparison(scene, common, tuple(against)), changes
+    judged = [note for name, entry in zip(names, entries, strict=True) for note in _judged(name, entry)]
+    return _scene_comparison(scene, common, tuple(judged), tuple(against)), changes
 
 
-def _scene_comparison(scene: str, common: Common, against: tuple[Against, ...]) -> SceneComparison:
+def _judged(name: str, entry: Entry) -> Iterator[str]:
+    """Yield that a run's agreement says nothing of its labels, as its verdict has it."""
+    statistics = entry.summary.statistics
+    if statistics is None or statistics.verdict.level not in ("uninformative", "misleading"):
+        return
+    yield f"{name} is {statistics.verdict.level}: {ADVICE[statistics.verdict.level]}"
+
+
+def _scene_comparison(
+    scene: str, common: Common, judged: tuple[str, ...], against: tuple[Against, ...]
+) -> SceneComparison:
     frames = min((sums.frame_count for sums in common.sums), default=0)
     voxels = len(common.tables[0]) if common.tables else 0
     voxels = int((common.tables[0].op >= 2).sum()) if voxels else 0
     return SceneComparison(
-        scene, common.basis, common.notes, voxels, frames, common.coverage, common.observations, against
+        scene, common.basis, (*judged, *common.notes), voxels, frames, common.coverage, common.observations, against
     )
 
 

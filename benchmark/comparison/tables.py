@@ -6,6 +6,7 @@ import dataclasses
 import math
 import textwrap
 from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
 
 from rich.console import Console
 
@@ -109,7 +110,7 @@ def _differences(comparison: RunComparison) -> Table:
         Column("answers", "Answers for"), Column("change", "Change"),
     )  # fmt: skip
     groups = tuple(Group(heading(comparison, scope, own), _rows(own, HEADLINES)) for scope, own in scopes(comparison))
-    macro = " Over all scenes each scene counts once." if len(comparison.scenes) > 1 else ""
+    macro = " Over all scenes each scene with an interval counts once." if len(comparison.scenes) > 1 else ""
     caption = (
         "Alpha is of the observations that all runs made, and other measures are of the voxels that all saw twice or"
         " more; coverage is of each run's whole map, and flicker is of its images. Coverage is the number of voxels"
@@ -128,10 +129,18 @@ def _others(comparison: RunComparison) -> str:
 def _rows(own: Against, shown: Sequence[Quantity]) -> tuple[Row, ...]:
     keys = {quantity.key: quantity for quantity in shown}
     return tuple(
-        (_titled(keys[row.measure]), row.base, row.other, row.difference, row.p_holm, scope(row), row.change)
+        (_titled(keys[row.measure]), row.base, row.other, row.difference, row.p_holm, scope(row), _change(row))
         for row in own.contrasts
         if row.measure in keys
     )
+
+
+def _change(row: Contrast) -> str:
+    """Return 'better' or 'worse'; of coverage, which no model is judged by, 'more' or 'fewer'."""
+    return COUNTED.get(row.change, "") if row.measure == COVERAGE.key else row.change
+
+
+COUNTED = {"better": "more", "worse": "fewer"}
 
 
 def _titled(quantity: Quantity) -> str:
@@ -319,7 +328,7 @@ def _stability(comparison: RunComparison, own: Against) -> str:
     if row.difference.value == row.difference.low == row.difference.high == 0:
         return f"{own.other} is as stable as {comparison.base}: {numbers}, the same everywhere."
     interval = f"{row.difference.value:+z.3f} ({row.difference.low:+z.3f} to {row.difference.high:+z.3f})"
-    p = "" if math.isnan(row.p_holm) else f", p {row.p_holm:.2g}"
+    p = "" if math.isnan(row.p_holm) else f", p {row.p_holm:.2g} (Holm)"
     text = {"better": "is more stable than", "worse": "is less stable than"}
     if row.change:
         return (
@@ -370,23 +379,48 @@ def _of_areas(areas: Sequence[Area]) -> str:
 # --- In a terminal of 80 columns --------------------------------------------------------------------------------------
 
 SHOWN = {
-    "comparison": ("measure", "base", "other", "difference", "change"),
+    "comparison": ("measure", "base", "other", "difference", "p_holm", "change"),
     "comparison_classes": ("class", "worse", "better", ALPHA.key),
     "comparison_areas": ("class", "confused_with", "voxels", "loss", "x", "y", "z"),
 }
 """The columns of each table that fit; files have all of them."""
 
+LONGEST_NAME = 8
+"""The longest names of runs over the columns of their numbers."""
 
-def print_comparison(comparison: RunComparison, console: Console, *, verbose: bool = False) -> None:
-    """Print the answer in sentences, the differences and the notes; verbose: also classes and areas."""
+
+def print_comparison(
+    comparison: RunComparison, console: Console, *, verbose: bool = False, out: Path | None = None
+) -> None:
+    """Print the answer in sentences, the differences and the notes; verbose: also classes and areas.
+
+    `out` is the folder that they were written to.
+    """
     for sentence in answers(comparison):
         console.print(sentence, highlight=False, markup=False)
     for table in tables(comparison):
         if table.name == "comparison" or (verbose and table.name in SHOWN):
-            text = to_terminal(dataclasses.replace(table.only(*SHOWN[table.name]), caption=""), WIDTH)
+            fitting = _fitting(table.only(*SHOWN[table.name]), comparison)
+            text = to_terminal(dataclasses.replace(fitting, caption=""), WIDTH)
             console.print(f"\n{text}", highlight=False, markup=False, soft_wrap=True)
     for sentence in notes(comparison):
         wrapped = textwrap.wrap(f"  {sentence}", console.width, subsequent_indent="    ")
         console.print("\n".join(wrapped), highlight=False, markup=False)
-    if not verbose:
-        console.print("  more     -v: classes and areas; --out DIR: report.html, tables, maps", highlight=False)
+    more = [*([] if verbose else ["-v: classes and areas"]), *([] if out else ["--out DIR: report.html, tables, maps"])]
+    if more:
+        console.print(f"  more     {'; '.join(more)}", highlight=False)
+
+
+def _fitting(table: Table, comparison: RunComparison) -> Table:
+    """Return a table whose groups are scenes, where there is one other run, and whose title has names that are long."""
+    if len(comparison.runs) == 2:
+        pair = heading(comparison, "", comparison.overall[0])
+        groups = (dataclasses.replace(own, name=own.name.removesuffix(pair)) for own in table.groups)
+        table = dataclasses.replace(table, groups=tuple(groups))
+    heads = {column.key: column.header for column in table.columns if column.key in ("base", "other")}
+    if max(map(len, heads.values()), default=0) <= LONGEST_NAME:
+        return table
+    short = {"base": "Base", "other": "Other"}
+    columns = (dataclasses.replace(each, header=short.get(each.key, each.header)) for each in table.columns)
+    other = f", other: {heads['other']}" if heads["other"] != short["other"] else ""
+    return dataclasses.replace(table, title=f"{table.title} (base: {comparison.base}{other})", columns=tuple(columns))
