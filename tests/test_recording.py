@@ -37,6 +37,7 @@ from semstab.recording import (
     color_modes,
     drift,
     lacks_pictures,
+    observer,
     record_finished,
     timeline,
     voxel_maps,
@@ -177,6 +178,20 @@ def test_the_final_voxels_are_those_of_the_run(run, model) -> None:
     np.testing.assert_array_equal(voxels["op"], table.op)
     expected = voxel_maps.packed(metrics.CATEGORY_COLORS)[metrics.categories(table)]
     np.testing.assert_array_equal(voxels["category"], expected)
+
+
+def test_a_map_about_which_its_frames_say_nothing_has_no_categories(tmp_path, monkeypatch) -> None:
+    told = "uninformative: 98 % of the observations of b are wall"
+    monkeypatch.setattr(observer, "not_assessed", lambda run: told if run.unit.model == "b" else "")
+    file, root = tmp_path / "run.rrd", tiny_scene.write(tmp_path / "data" / "wall")
+    semstab.run(config_of(root), out=tmp_path / "run", observers=[Recording(file)], report=False)
+    shown = {model: {*grid(read(file), f"/wall/map/{model}/numpy")["category"]} for model in "ab"}
+    assert shown["b"] == {*voxel_maps.packed([metrics.NOT_ASSESSED]).tolist()}
+    assert shown["a"] <= {*voxel_maps.packed(metrics.CATEGORY_COLORS).tolist()}
+    titles = [row.get("ViewBlueprint:display_name") for rows in read_blueprints(file) for row in rows]
+    assert ["b: not assessed (uninformative)"] in titles
+    assert ["a: not assessed (uninformative)"] not in titles
+    assert any(told in note for note in notes(read(file)))
 
 
 def test_voxels_have_the_colours_of_the_legend(run) -> None:
@@ -463,7 +478,7 @@ def test_what_goes_wrong_beside_the_loop_is_said_and_the_file_is_closed(tmp_path
     path = tmp_path / "broken.rrd"
     watching, table = record(path, [frame(i, 0, (0.01, 0.01, 2.01)) for i in range(2)], finish=False)
 
-    def fail(*_: object) -> str:
+    def fail(*_: object, **__: object) -> str:
         raise RuntimeError("no room")
 
     monkeypatch.setattr(voxel_maps.VoxelLogger, "finish", fail)

@@ -23,6 +23,7 @@ from semstab.metrics.frame_quality import FrameQualityMeter
 from semstab.metrics.summary import (
     CATEGORIES,
     CATEGORY_COLORS,
+    NOT_ASSESSED,
     CategoryThresholds,
     categories,
     category_shares,
@@ -38,6 +39,7 @@ from semstab.metrics.video_measures import VideoMeter
 __all__ = [
     "CATEGORIES",
     "CATEGORY_COLORS",
+    "NOT_ASSESSED",
     "CategoryThresholds",
     "CompensatedFlicker",
     "FrameQualityMeter",

@@ -32,6 +32,9 @@ CATEGORIES = ("low persistence", "drifting", "uncertain", "stable")
 CATEGORY_COLORS = ((153, 153, 153), (240, 228, 66), (213, 94, 0), (0, 114, 178))
 """RGB by id: grey, and yellow, vermillion and blue of the colour-blind safe palette by Okabe and Ito (2008)."""
 
+NOT_ASSESSED = (190, 190, 190)
+"""RGB of all categories of a map about whose stability its frames say nothing."""
+
 MOST_CONFUSED = 1024
 """Most classes of a taxonomy whose confusions are summed up."""
 

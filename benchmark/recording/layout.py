@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence, Set
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -204,10 +204,18 @@ COMPARED = ("drift", "map_vss", "map_entropy", "map_recurrent", "new_voxels", "f
 """The series of two backends that are shown in one plot."""
 
 
-def blueprint(plan: Plan, legends: Mapping[str, Legend], bounds: Mapping[str, SceneBounds | None]) -> rrb.Blueprint:
-    """Return the layout of a plan, with the legends and bounds of its scenes so far."""
+def blueprint(
+    plan: Plan,
+    legends: Mapping[str, Legend],
+    bounds: Mapping[str, SceneBounds | None],
+    not_assessed: Set[tuple[str, str]] = frozenset(),
+) -> rrb.Blueprint:
+    """Return the layout of a plan, with the legends and bounds of its scenes so far.
+
+    `not_assessed` has scenes and models whose maps' categories say nothing.
+    """
     by_scene = itertools.groupby(plan.tasks, key=lambda task: task.scene.name)
-    scenes = [_scene(scene, list(tasks), legends[scene], bounds[scene]) for scene, tasks in by_scene]
+    scenes = [_scene(scene, list(tasks), legends[scene], bounds[scene], not_assessed) for scene, tasks in by_scene]
     return rrb.Blueprint(
         rrb.Tabs(*scenes) if len(scenes) > 1 else scenes[0],
         rrb.BlueprintPanel(state="collapsed"),
@@ -237,7 +245,13 @@ def view_3d(
     )  # fmt: skip
 
 
-def _scene(scene: str, tasks: list[Task], legend: Legend, bounds: SceneBounds | None) -> rrb.Container:
+def _scene(
+    scene: str,
+    tasks: list[Task],
+    legend: Legend,
+    bounds: SceneBounds | None,
+    not_assessed: Set[tuple[str, str]],
+) -> rrb.Container:
     flips = [_flips(scene, task, bounds) for task in tasks]
     comparisons = [
         _comparison(task, drawn(task), other, bounds)
@@ -245,13 +259,19 @@ def _scene(scene: str, tasks: list[Task], legend: Legend, bounds: SceneBounds | 
         for other in task.backends
         if other != drawn(task)
     ]
-    return rrb.Tabs(_overview(scene, tasks, legend, bounds), *flips, *comparisons, name=scene)
+    return rrb.Tabs(_overview(scene, tasks, legend, bounds, not_assessed), *flips, *comparisons, name=scene)
 
 
-def _overview(scene: str, tasks: list[Task], legend: Legend, bounds: SceneBounds | None) -> rrb.Container:
+def _overview(
+    scene: str,
+    tasks: list[Task],
+    legend: Legend,
+    bounds: SceneBounds | None,
+    not_assessed: Set[tuple[str, str]],
+) -> rrb.Container:
     below = legend.height(LINES) + TITLE
     tabs: list[rrb.Container | rrb.View] = [
-        _maps(name, tasks, bounds, LEFT[1] - TITLE - below) for name in color_modes()
+        _maps(name, tasks, bounds, LEFT[1] - TITLE - below, not_assessed) for name in color_modes()
     ]
     opened = [*color_modes()].index(OPENED)
     if len(legend.entries) > legend.room:
@@ -269,15 +289,26 @@ def _legend(scene: str, entity: str, name: str, height: float) -> rrb.Spatial2DV
     return rrb.Spatial2DView(origin=path(scene, entity), name=name, visual_bounds=bounds)
 
 
-def _maps(name: str, tasks: list[Task], bounds: SceneBounds | None, height: float) -> rrb.Container:
+def _maps(
+    name: str,
+    tasks: list[Task],
+    bounds: SceneBounds | None,
+    height: float,
+    not_assessed: Set[tuple[str, str]],
+) -> rrb.Container:
     """Return the maps of all models, coloured by a measure."""
+
+    def title(task: Task) -> str:
+        silent = name == OPENED and (scene, task.model) in not_assessed
+        return f"{task.model}: {'not assessed (uninformative)' if silent else mode.title}"
+
     mode, scene = color_modes()[name], tasks[0].scene.name
     height -= (LINE + TITLE) * (name == OPENED)
     apart = len(tasks) > SIDE_BY_SIDE
     columns = 1 if apart else 2 if len(tasks) == SIDE_BY_SIDE else len(tasks)
     rows = 1 if apart else math.ceil(len(tasks) / columns)
     aspect = LEFT[0] / columns / ((height - TITLE * apart) / rows - TITLE)
-    views = [_map(f"{task.model}: {mode.title}", task, drawn(task), bounds, aspect, name) for task in tasks]
+    views = [_map(title(task), task, drawn(task), bounds, aspect, name) for task in tasks]
     if name != OPENED:
         return rrb.Tabs(*views, name=mode.tab) if apart else rrb.Grid(*views, grid_columns=columns, name=mode.tab)
     maps = rrb.Tabs(*views) if apart else rrb.Grid(*views, grid_columns=columns)

@@ -45,6 +45,7 @@ from semstab.recording.voxel_maps import (
     log_difference,
     verdict_report,
 )
+from semstab.report.narrative import not_assessed
 from semstab.settings import load_config
 from semstab.task import Task, read
 
@@ -109,7 +110,9 @@ class GroupLog:
             for other in self._tables if unit.backend == first else [unit.backend]:
                 if other != first:
                     self._log_difference(stream, first, other, tolerance)
-        note = self._map(unit.backend).finish(stream, table, factor)
+        silent = not_assessed(summary)
+        note = self._map(unit.backend).finish(stream, table, factor, assessed=not silent)
+        note += f"; {silent}" if silent else ""
         means = (f"{m.symbol} {summary.table[m]:.{m.digits[0]}f} {m.unit}".rstrip() for m in measures())
         text = (
             f"{unit.model}, {unit.backend}: {summary.table.voxels:,} voxels, mean OP {summary.table.mean_op:.2f},"
@@ -169,6 +172,7 @@ class Recording(Observer):
         self._group: GroupLog | None = None  # the model on a scene that is being fused
         self._unfinished: set[Unit] = set()  # of the group
         self._logged: set[Unit] = set()
+        self._not_assessed: set[tuple[str, str]] = set()  # scenes and models
         self._sent = 0
         self._others = "all other files are complete, and the same command makes the recording again"
 
@@ -334,6 +338,8 @@ class Recording(Observer):
     def _log_unit(self, group: GroupLog, summary: UnitSummary, table: VoxelTable, factor: int = 1) -> None:
         stream, background = self._opened()
         self._logged.add(summary.unit)
+        if not_assessed(summary):
+            self._not_assessed.add((summary.unit.scene, summary.unit.model))
         tolerance = self._plan.config.tolerance
 
         def job() -> None:
@@ -356,7 +362,8 @@ class Recording(Observer):
     def _send_layout(self, stream: rr.RecordingStream) -> None:
         """Send the layout; a viewer that follows the run keeps the first one."""
         legends = {name: scene.legend for name, scene in self._scenes.items()}
-        layout = blueprint(self._plan, legends, {name: scene.bounds for name, scene in self._scenes.items()})
+        bounds = {name: scene.bounds for name, scene in self._scenes.items()}
+        layout = blueprint(self._plan, legends, bounds, self._not_assessed)
         stream.send_blueprint(layout, make_default=True, make_active=self._sent == 0 or not self.target.live)
         self._sent += 1
 

@@ -22,7 +22,7 @@ from semstab.data.measures import Voxels, bits, measures, sbd
 from semstab.data.records import Record, Result
 from semstab.data.statistics import CONFIDENCE, LagBin, MapStatistics
 from semstab.data.voxels import VoxelTable
-from semstab.metrics import CATEGORY_COLORS, dominant, vss
+from semstab.metrics import CATEGORY_COLORS, NOT_ASSESSED, dominant, vss
 from semstab.metrics.agreement import shared_rows
 from semstab.metrics.summary import categorise
 from semstab.report.narrative import outlying_line
@@ -90,7 +90,7 @@ def packed(colors: npt.ArrayLike) -> UInt32:
     return rgba
 
 
-def components(index: Int64, size: float, classes: LabelSpace, voxels: Voxels) -> list[Any]:
+def components(index: Int64, size: float, classes: LabelSpace, voxels: Voxels, *, assessed: bool = True) -> list[Any]:
     """Return a grid that shows the dominant class, with the measures that it can show instead; see `visualizer`.
 
     Args:
@@ -98,8 +98,10 @@ def components(index: Int64, size: float, classes: LabelSpace, voxels: Voxels) -
         size: Edge of a voxel, metres.
         classes: The label space, with its colours.
         voxels: Evidence that is measured, so that each measure is computed in one pass.
+        assessed: False for a map about whose stability its frames say nothing: its categories have no colours.
     """
-    category = packed(CATEGORY_COLORS)[categorise(voxels.op, sbd(voxels), bits(voxels))]
+    colors = CATEGORY_COLORS if assessed else [NOT_ASSESSED] * len(CATEGORY_COLORS)
+    category = packed(colors)[categorise(voxels.op, sbd(voxels), bits(voxels))]
     values: dict[str, npt.NDArray[Any]] = {measure.key: measure.of(voxels) for measure in measures()}
     return [
         rr.VoxelGridMap.from_fields(
@@ -187,26 +189,37 @@ class VoxelLogger:
         self._drawn = len(chunks)
         return [functools.partial(self._log, stream, c, grown, part, 1) for c, part in enumerate(chunks)]
 
-    def _log(self, stream: rr.RecordingStream, c: int, table: VoxelTable, rows: Int64, factor: int) -> None:
+    def _log(
+        self,
+        stream: rr.RecordingStream,
+        c: int,
+        table: VoxelTable,
+        rows: Int64,
+        factor: int,
+        *,
+        assessed: bool = True,
+    ) -> None:
         """Log rows of a table as a chunk, whose voxels stand for blocks with an edge of `factor` voxels."""
         at = np.s_[rows[0] : rows[-1] + 1] if factor == 1 else rows  # a map that is not thinned is not copied
         voxels = Voxels(table.op[at], table.evidence.take(at).measured(), table.drift_sum[at])
         index = (table.index[at] - self._origin) // factor
-        stream.log(chunk(self._entity, c), *components(index, table.voxel_size * factor, self._classes, voxels))
+        size = table.voxel_size * factor
+        stream.log(chunk(self._entity, c), *components(index, size, self._classes, voxels, assessed=assessed))
 
-    def finish(self, stream: rr.RecordingStream, table: VoxelTable, factor: int = 1) -> str:
+    def finish(self, stream: rr.RecordingStream, table: VoxelTable, factor: int = 1, *, assessed: bool = True) -> str:
         """Log the final map instead of the growing one; return a note on thinning where it is too large.
 
         Args:
             stream: The recording.
             table: The final map.
             factor: Edge of the blocks of a table that is thinned already.
+            assessed: See `components`.
         """
         index = table.index - self._origin
         factor, rows = thinned(index) if factor == 1 else (factor, np.arange(len(index)))
         for c, part in enumerate(np.split(rows, self._edges[1:-1])):
             if len(part):
-                self._log(stream, c, table, part, factor)
+                self._log(stream, c, table, part, factor, assessed=assessed)
             elif c < self._drawn:
                 stream.log(chunk(self._entity, c), rr.Clear(recursive=False))
         thin = f"; drawn: one voxel of each block of {factor}x{factor}x{factor}, as large as the block"

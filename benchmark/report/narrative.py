@@ -122,6 +122,15 @@ def outlying_line(outlying: OutlyingFrames, of: str = "", *, most: int = MOST_FR
     return f"{head}: {len(names)} of {outlying.judged}{left}, {' '.join(names[:most])}{more}"
 
 
+def not_assessed(run: UnitSummary) -> str:
+    """Return why agreement does not assess a map: nearly all of it is one class; '' where it does."""
+    statistics = run.statistics
+    if statistics is None or statistics.cells is None or statistics.verdict.level != "uninformative":
+        return ""
+    share, name = statistics.cells.largest_share, statistics.cells.largest_class
+    return f"uninformative: {math.floor(100 * share)} % of the observations of {run.unit.model} are {name}"
+
+
 def _is_untested(record: Record) -> bool:
     """Return whether a map has the verdict stable, but was not compared with the ground truth."""
     statistics = record.statistics
@@ -206,7 +215,7 @@ def notes(result: Result) -> Iterator[str]:
 
 
 def _ranking(result: Result) -> Iterator[str]:
-    """Yield whether the order of the models changes if only recurrent voxels count."""
+    """Yield that the order of the models by VSS changes if only recurrent voxels count."""
     records = comparable(result)
     means = {name: pooled(rows) for name, rows in by_model(records).items()}
     if mixed([record.summary for record in result.select()]):
@@ -216,10 +225,10 @@ def _ranking(result: Result) -> Iterator[str]:
     every = _order({name: voxels.every[VSS] for name, voxels in means.items()})
     recurrent = _order({name: voxels.recurrent[VSS] for name, voxels in means.items()})
     taxonomy = records[0].summary.taxonomy
-    if every == recurrent:
-        yield f"In one taxonomy ({taxonomy}) the order by VSS is {every}, both over all voxels and for OP>=3."
-    else:
-        yield f"In one taxonomy ({taxonomy}) the order by VSS is {every} over all voxels, but {recurrent} for OP>=3."
+    if every != recurrent:
+        yield (
+            f"VSS of all voxels misleads: in one taxonomy ({taxonomy}) its order is {every}, and {recurrent} for OP>=3."
+        )
 
 
 def _order(values: Mapping[str, float]) -> str:

@@ -18,14 +18,14 @@ from semstab.data.records import OVERVIEW, Failure, Record, Result
 from semstab.data.results import slug
 from semstab.data.statistics import CONFIDENCE, Estimate, MapStatistics, short
 from semstab.data.topdown import EMPTY
-from semstab.metrics import CATEGORIES, CATEGORY_COLORS, categories, macro_mean
+from semstab.metrics import CATEGORIES, CATEGORY_COLORS, NOT_ASSESSED, categories, macro_mean
 from semstab.report.charts import Line, dot_chart, line_chart, sample
 from semstab.report.figures.maps import Overview, Views
 from semstab.report.figures.topdown import FromAbove
 from semstab.report.filter_study import advice, filter_studies, of_interest
 from semstab.report.html import filled, jpeg, png, table_block
 from semstab.report.means import ENOUGH, by_model, describe, levels, over_recurrent, pooled, swept
-from semstab.report.narrative import noted, notes, outlying_line, warnings
+from semstab.report.narrative import not_assessed, noted, notes, outlying_line, warnings
 from semstab.report.ranking import answers
 from semstab.report.saved_run import read_series
 from semstab.report.tables import tables
@@ -211,16 +211,19 @@ def _map(record: Record, above: FromAbove, overview: Overview | None, most: int)
             break
         step += 1
     kinds = np.where(rows == EMPTY, len(CATEGORIES), category[rows]).astype(np.uint8)
-    silent = _silent(record)
-    shades = [NEUTRAL] * len(CATEGORIES) if silent else CATEGORY_COLORS
+    silent = not_assessed(record.summary)
+    shades = [NOT_ASSESSED] * len(CATEGORIES) if silent else CATEGORY_COLORS
     palette = np.array([(k * 67 % 256, k * 131 % 256, k * 29 % 256) for k in range(table.K)], dtype=np.uint8)
     palette = palette if overview is None else overview.palette
     cell = step * above.cell
+    size = rows.shape[1] * cell, rows.shape[0] * cell
+    cut = any(all_of_it > 1.02 * own + 2 * cell for all_of_it, own in zip(above.whole, size, strict=True))
+    of = f" of {above.whole[0]:.3g} m by {above.whole[1]:.3g} m (without outlying voxels)" if cut else ""
     return {
         "model": record.unit.model,
         "scene": record.unit.scene,
         "size": [rows.shape[1], rows.shape[0]],
-        "text": f"{rows.shape[1] * cell:.3g} m by {rows.shape[0] * cell:.3g} m, seen {above.view}",
+        "text": f"{size[0]:.3g} m by {size[1]:.3g} m{of}, seen {above.view}",
         "cell": cell,
         "names": names,
         "palette": palette.tolist(),
@@ -230,19 +233,6 @@ def _map(record: Record, above: FromAbove, overview: Overview | None, most: int)
         "image": "" if overview is None or overview.color is None else jpeg(_reduced(overview.color, 960)),
         "frame": "" if overview is None else f"frame {overview.frame}",
     }
-
-
-NEUTRAL = (190, 190, 190)
-"""The colour of a map about whose stability its model says nothing."""
-
-
-def _silent(record: Record) -> str:
-    """Return why agreement does not assess a map: nearly all of it is one class; '' where it does."""
-    statistics = record.statistics
-    if statistics is None or statistics.cells is None or statistics.verdict.level != "uninformative":
-        return ""
-    share, name = statistics.cells.largest_share, statistics.cells.largest_class
-    return f"uninformative: {math.floor(100 * share)} % of the observations of {record.unit.model} are {name}"
 
 
 def _spread(rows: Any, values: UInt8) -> UInt8:
@@ -398,7 +388,8 @@ def _subtitle(result: Result) -> str:
     parts = [f"{n:,} {name}{'' if n == 1 else 's'}" for n, name in counts]
     if records := result.select():
         run = records[0].summary
-        parts += [f"{run.frames} frames", f"{run.table.K} classes", f"voxels of {run.table.voxel_size:g} m"]
+        classes = " and ".join(map(str, sorted({record.summary.table.K for record in records})))
+        parts += [f"{run.frames} frames", f"{classes} classes", f"voxels of {run.table.voxel_size:g} m"]
     return " · ".join([*parts, f"fused by {result.backend}"])
 
 

@@ -118,7 +118,8 @@ def _head(name: str, result: Result, runs: Sequence[UnitSummary], width: int) ->
     views = min((own.views for own in cells if own is not None and own.views < own.frames), default=None)
     seen = "" if views is None else f" of {views} distinct views"
     chosen = " (chosen)" if any(advice.chosen for advice in result.advice.values()) else ""
-    what = f"{counts} frames{seen}, {first.table.K} classes, {_metres(first.table.voxel_size)} voxels{chosen}"
+    classes = " and ".join(map(str, sorted({run.table.K for run in runs})))
+    what = f"{counts} frames{seen}, {classes} classes, {_metres(first.table.voxel_size)} voxels{chosen}"
     beside = "    ".join(filter(None, (_geometry(result), _scope(runs))))
     line = f"{name}    {what}    {beside}".rstrip()
     yield line if len(line) <= width else f"{name}    {what}\n  {beside}".rstrip()

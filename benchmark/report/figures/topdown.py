@@ -98,6 +98,7 @@ class FromAbove:
         rows: (H, W) the row of each cell's voxel in `table`, EMPTY where there is none.
         cell: The edge of a cell in metres.
         view: The name of the view.
+        whole: Width and height of all voxels that the view has, metres: the outermost ones are not in the picture.
     """
 
     table: VoxelTable
@@ -105,14 +106,17 @@ class FromAbove:
     rows: Int64
     cell: float
     view: str = "from above"
+    whole: tuple[float, float] = (0.0, 0.0)
 
     @classmethod
     def of(cls, table: VoxelTable, up: npt.ArrayLike) -> FromAbove:
         """Return the voxels of a map that are seen; see `best_view` and `top_down`."""
         selected, axis, view = best_view(table, up)
-        rows, cell = top_down(rows_of(table, selected).centers, table.voxel_size, axis)
+        centers = rows_of(table, selected).centers
+        rows, cell = top_down(centers, table.voxel_size, axis)
+        width, height = (float(np.ptp(centers @ along)) + table.voxel_size for along in level_axes(axis)[:2])
         rows = np.where(rows == EMPTY, EMPTY, np.flatnonzero(selected)[rows])
         shown = np.zeros(len(table), dtype=np.bool_)
         shown[rows[rows != EMPTY]] = True
         renumbered: npt.NDArray[Any] = np.where(rows == EMPTY, EMPTY, (np.cumsum(shown) - 1)[rows])
-        return cls(rows_of(table, shown), shown, renumbered, cell, view)
+        return cls(rows_of(table, shown), shown, renumbered, cell, view, (width, height))
