@@ -15,6 +15,7 @@ from semstab.datasets.files.reader import FileDataset
 from semstab.datasets.formats.disk import files_by_stem, natural, read_intrinsics
 from semstab.datasets.formats.images import COLOR_SUFFIXES, DEPTH_SUFFIXES
 from semstab.datasets.geometry.cameras import Camera
+from semstab.errors import DataError
 
 SETTINGS_FILE = "scene.yaml"
 MASKS = "mask/{name}"
@@ -47,12 +48,15 @@ class PosedFolder(FileDataset[PosedOptions]):
         """Yield a frame for each name of a depth image or a pose.
 
         Raises:
-            DataError: For two files of one frame.
+            DataError: For two files of one frame, or without intrinsics.txt.
         """
         depth = files_by_stem(folder / "depth", DEPTH_SUFFIXES)
         poses = files_by_stem(folder / "pose", (".txt",))
         colors = files_by_stem(folder / "color", COLOR_SUFFIXES)
-        camera = Camera(read_intrinsics(folder / "intrinsics.txt"))
+        matrix = folder / "intrinsics.txt"
+        if not matrix.exists():
+            raise DataError(f"{matrix}: is missing; write the camera matrix there, fx 0 cx 0 fy cy 0 0 1")
+        camera = Camera(read_intrinsics(matrix))
         suffix = next((os.path.splitext(file)[1] for file in depth.values()), DEPTH_SUFFIXES[0])  # noqa: PTH122
         for name in sorted({*depth, *poses}, key=natural):
             yield FrameSource(

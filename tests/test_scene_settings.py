@@ -98,7 +98,7 @@ def test_unknown_classes_matter_only_when_asked_for(folder):
     scene = opened(folder)
     assert scene.up is None
     assert scene.frame(0, "net").labels is not None
-    fails(DataError, r"scene\.yaml: the classes of 'net' are not known; set classes", scene.label_space, "net")
+    fails(DataError, r"the classes of 'net' are not known; write scene\.yaml with classes", scene.label_space, "net")
 
 
 def test_labels_by_colour_go_through_the_taxonomy(folder):

@@ -29,9 +29,11 @@ def print_check(checked: SceneCheck, console: Console, *, verbose: bool = False)
         console.print("\n".join(lines), style=style, highlight=False, markup=False, soft_wrap=True)
 
     say(_heading(checked), 4, "bold")
-    state = "unsound" if checked.problems else checked.verdict.state
+    state = "unsound" if checked.problems_of_geometry else checked.verdict.state
     console.print()
     say(f"  {state.upper()}  {_conclusion(checked)}", 4, STATES[state])
+    for text in checked.problems_of_labels:
+        say(f"  LABELS  {text}", 4, STATES["unsound"])
     if checked.placed is not None:
         say(f"  place    {checked.placed}", 11)
     for source in checked.sources:
@@ -159,8 +161,8 @@ def _advice(checked: SceneCheck, *, verbose: bool) -> Iterator[str]:
 
 
 def _conclusion(checked: SceneCheck) -> str:
-    if checked.problems:
-        return "; ".join(checked.problems)
+    if checked.problems_of_geometry:
+        return "; ".join(checked.problems_of_geometry)
     verdict = checked.verdict
     if not verdict.undetermined:
         return verdict.text

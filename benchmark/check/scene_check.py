@@ -204,11 +204,21 @@ class SceneCheck:
     @property
     def problems(self) -> tuple[str, ...]:
         """Return what makes the scene unsound, one line each."""
+        return self.problems_of_geometry + self.problems_of_labels
+
+    @property
+    def problems_of_geometry(self) -> tuple[str, ...]:
+        """Return those of depth and poses."""
         geometry = [self.verdict.text] if self.verdict.state == "unsound" else []
         if self.depth.valid == 0:
             geometry.append("no pixel of the sampled frames has valid depth; check the files and depth_scale")
+        return tuple(geometry)
+
+    @property
+    def problems_of_labels(self) -> tuple[str, ...]:
+        """Return those of label maps."""
         ids = [labels.problem for labels in self.labels if labels.problem is not None]
-        return (*geometry, *ids, *(line for each in self.label_findings for line in each.wrong))
+        return (*ids, *(line for each in self.label_findings for line in each.wrong))
 
     def to_dict(self) -> dict[str, Any]:
         """Return the JSON object."""

@@ -97,7 +97,10 @@ def run(
     if check in ("none", "off"):
         content["check"] = None
     if classes is not None and not predict:
-        raise ConfigError("--classes names the classes of a model; choose the model with --predict")
+        raise ConfigError(
+            "--classes names the classes of a model that --predict chooses; those of label maps stand in scene.yaml"
+            " (classes: [name, ...]), or in --option 'classes=[name, ...]'"
+        )
     if predict:
         given = {} if classes is None else {"classes": classes}
         loaded = predicted_config(parse_predictors(predict, given, filters or []), config, content)

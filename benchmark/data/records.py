@@ -406,7 +406,7 @@ class Result:
             return fitting[0]
         units = ", ".join(f"{record.unit.scene} of {record.unit.model}" for record in fitting[:4])
         raise ConfigError(
-            f"{self.name}: {len(fitting)} units fit" + (f" ({units}); choose with --scene, --model" if fitting else "")
+            f"{len(fitting)} units fit" + (f" ({units}); choose with --scene, --model" if fitting else "")
         )
 
     @property

@@ -164,7 +164,7 @@ def _written(chosen: Chosen, file: Path, settings: Settings) -> Exported:
     voxels, some = WRITERS[file.suffix.lower()](chosen, file, settings), chosen.first
     where = "coordinates of the scene, which has no georeference"
     where = where if some.georeference is None else crs_name(some.georeference)
-    return Exported(file, f"{voxels:,} voxels, {where}", tuple(_notes(some, file.suffix.lower(), settings)))
+    return Exported(file, f"{voxels:,} voxels, {where}", tuple(_notes(some, file, settings)))
 
 
 def _tasks_written(file: TaskFile, kind: str, task: Task) -> Exported:
@@ -180,7 +180,7 @@ def _classified(chosen: Chosen, cloud: Path, file: Path, radius: float | None, s
     if chosen.whole and share < FEW_MET:
         logger.warning("%s: %s", cloud, _few_met(tally, some))
     content = f"{tally.points:,} points, {share:.1%} of them classified"
-    return Exported(file, content, tuple(_notes(some, file.suffix.lower(), settings)))
+    return Exported(file, content, tuple(_notes(some, file, settings)))
 
 
 def _few_met(tally: joining.Tally, some: Voxels) -> str:
@@ -196,7 +196,10 @@ def _few_met(tally: joining.Tally, some: Voxels) -> str:
     )
 
 
-def _notes(voxels: Voxels, kind: str, settings: Settings) -> Iterator[str]:
+def _notes(voxels: Voxels, file: Path, settings: Settings) -> Iterator[str]:
+    kind = file.suffix.lower()
+    if kind == ".tif":
+        yield f"the classes, with their colours, are in {file.with_suffix(f'.class{file.suffix}').name}"
     if kind in (".las", ".laz") and (names := clouds.without_code(voxels, settings.asprs)):
         listed = ", ".join(names[:3]) + (", ..." if len(names) > 3 else "")
         yield f"without ASPRS code (--asprs): {listed}; their classification is 1, their number is in dimension 'class'"

@@ -81,7 +81,8 @@ def screen(
     if any(record.video_measures is not None for record in records):
         yield f"  VC and TC as published: semstab-bench show {out or 'RUN'} video_measures"
     for text in list(warnings(result))[:MOST_WARNINGS]:
-        yield from textwrap.wrap(f"warning: {text}", WIDTH, initial_indent="  ", subsequent_indent="    ")
+        named = text.replace("show RUN", f"show {out or 'RUN'}")
+        yield from textwrap.wrap(f"warning: {named}", WIDTH, initial_indent="  ", subsequent_indent="    ")
     yield from _checks(result)
     yield from _where(result, out, seconds)
 

@@ -287,9 +287,11 @@ class LabelMaps:
         if space is None:
             assert source.first is not None
             folder = source.first[1].parent
+            settings = "set" if where.exists() else f"write {where.name} with"
             raise DataError(
-                f"{where}: the classes of '{model}' are not known; set classes: [name, ...] in id order, taxonomy:"
-                f" NAME, or taxonomies: {{{model}: NAME}}, or put a {LABEL_SPACE_FILE} into {folder}"
+                f"{where if where.exists() else where.parent}: the classes of '{model}' are not known; {settings}"
+                f" classes: [name, ...] in id order, taxonomy: NAME, or taxonomies: {{{model}: NAME}}, or put a"
+                f" {LABEL_SPACE_FILE} into {folder}"
             )
         return space
 
