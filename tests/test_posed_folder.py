@@ -324,7 +324,7 @@ def test_intrinsics_that_are_none_are_refused(folder, text, match):
 
 def test_missing_intrinsics_are_named(folder):
     (folder / "intrinsics.txt").unlink()
-    fails(DataError, r"intrinsics\.txt: cannot be read", opened, folder)
+    fails(DataError, r"intrinsics\.txt: is missing; write the camera matrix", opened, folder)
 
 
 NUMBERISH = st.text(alphabet="0123456789.eE+-_, \n\tnaif", max_size=120)
