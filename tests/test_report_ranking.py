@@ -5,6 +5,8 @@ from __future__ import annotations
 import io
 
 import pytest
+import tiny_scene
+from posed_config import configure
 from rich.console import Console
 
 import semstab
@@ -126,3 +128,15 @@ def test_a_gate_on_alpha_of_nearly_one_class_is_undecided(result):
     )
     assert [each.verdict for each in decided.judgements] == ["undecided", "undecided"]
     assert "nearly the whole map is one class" in decided.judgements[0].reason
+
+
+@pytest.mark.parametrize("frames", [3, 12])
+def test_a_run_and_compare_say_the_same_of_the_same_pair(tmp_path, frames):
+    root = tiny_scene.write(tmp_path / "wall", ("a", "b"), frames=frames)
+    result = semstab.run(configure(root), out=tmp_path / "run", report=False)
+    (one,) = ranking(result).differences
+    comparison = semstab.compare([f"{tmp_path}/run:a", f"{tmp_path}/run:b"])
+    (row,) = (row for row in comparison.overall[0].contrasts if row.measure == "alpha")
+    found, expected = (one.value, one.low, one.high), row.difference
+    assert found == pytest.approx((expected.value, expected.low, expected.high), nan_ok=True)
+    assert (one.scope, one.undecided) == (expected.scope, expected.undecided)

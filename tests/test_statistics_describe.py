@@ -235,7 +235,10 @@ def test_few_locations_have_no_verdict():
     assert judged(0.9, 0.95, cells=99).level == judged(0.9, 0.95, cubes=15).level == "no verdict"
     assert judged(0.9, 0.95, cells=0).level == "no verdict"
     assert "more overlap between frames" in judged(0.9, 0.95, cells=99).line
-    assert judged(0.9, 0.95, voxels=1, cells=100, cubes=16).level == "stable"
+    assert judged(0.9, 0.95, voxels=100, cells=100, cubes=16).level == "stable"
+    few = judged(0.9, 0.95, voxels=99, cells=100, cubes=16)
+    assert few.level == "no verdict"
+    assert "too few locations to act on; use smaller voxels" in few.line
 
 
 def test_a_camera_that_stood_still_has_no_verdict_and_a_single_frame_needs_more_overlap():
@@ -267,8 +270,9 @@ def test_probabilities_of_the_levels_sum_to_one_and_the_line_says_what_to_do_and
         assert min(levels.values()) >= 0
     assert level_probabilities(replace(between(0.7, 0.9), value=LIMITS.stable))["stable"] == pytest.approx(0.5)
     assert judged(0.5, 0.6).line == (
-        "net: unstable (100%), do not act on its labels: alpha 0.55 (0.50 to 0.60), two frames agree at 55% of the"
-        " locations; 5000 locations seen twice or more, 50% of the map; for this scene flown again, from 60 frames"
+        "net: unstable (100%), do not act on its labels: alpha 0.55 (0.50 to 0.60), two views see the same class at"
+        " 73% of the spots; 5000 locations seen twice or more, 50% of the map; for this scene flown again, from 60"
+        " frames"
     )
 
 

@@ -262,8 +262,13 @@ def suggest(coverage: Coverage, overlaps: Sequence[Overlap], frames: int, stride
         pixel_stride=pixels,
         pixel_stride_reason=f"{PIXELS_ACROSS} pixels or more along a voxel's edge at {far:.3g} m",
         frame_stride=stride * times,
-        frame_stride_reason=f"successive frames share {shared.get(times, math.nan):.0%} of their view",
+        frame_stride_reason=_shared(shared.get(times, math.nan)),
     )
+
+
+def _shared(share: float) -> str:
+    few = f", less than {SHARED:.0%}: more frames help" if share < SHARED else ""
+    return f"successive frames share {share:.0%} of their view{few}"
 
 
 def _mean(values: npt.NDArray[Any]) -> float:

@@ -122,6 +122,20 @@ def _is_path(word: str) -> bool:
     return os.sep in word or bool(Path(word).suffix) or Path(word).exists()
 
 
+UsageError: Any = next(each for each in typer.BadParameter.__mro__ if each.__name__ == "UsageError")
+"""The error of a command line that the options do not allow: typer exports only its subclass."""
+
+
+def _usage(error: Any) -> str:
+    """Return what is wrong with a command line, with the option that may have been meant."""
+    option = getattr(error, "option_name", None)
+    if option is None:
+        text: str = error.format_message()
+        return text.rstrip(".")
+    near = difflib.get_close_matches(option, error.possibilities or (), n=1)
+    return f"no such option: {option}" + (f"; did you mean {near[0]}?" if near else "")
+
+
 class Group(TyperGroup):
     """Runs `run` where no command is named, shows its options in the help, and reports every error in one line."""
 
@@ -167,6 +181,10 @@ class Group(TyperGroup):
         except SemstabError as error:
             say(f"error: {error}")
             raise typer.Exit(error.exit_code) from error
+        except UsageError as error:
+            command = " ".join(filter(None, ("semstab-bench", ctx.invoked_subcommand)))
+            say(f"error: {_usage(error)}; see {command} --help")
+            raise typer.Exit(2) from error
         except KeyboardInterrupt as error:
             say(_interrupted(ctx.invoked_subcommand))
             number = next((each for each in error.args if isinstance(each, int)), signal.SIGINT)

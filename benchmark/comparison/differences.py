@@ -51,7 +51,6 @@ from semstab.statistics.intervals import (
     unpaired,
 )
 from semstab.statistics.paired_differences import LEAST_VOXELS, holm
-from semstab.statistics.verdict import ADVICE
 
 OF_ANY_SIZE = OF_LIKELIEST = (ALPHA, ACCURACY, MIOU, RECALL, PRECISION, IOU)
 """Measures that hardly depend on the size of voxels, and need no more than the likeliest classes of scores."""
@@ -288,7 +287,15 @@ def find(
     result = RunComparison(
         schema=SCHEMA,
         base=handles[0].name,
-        runs=tuple(Compared(each.name, each.source, each.model) for each in handles),
+        runs=tuple(
+            Compared(
+                each.name,
+                each.source,
+                each.model,
+                uninformative=all(each.scenes[row.scene].judged.startswith("uninformative") for row in scenes),
+            )
+            for each in handles
+        ),
         overall=_over_all(scenes),
         scenes=tuple(scenes),
     )
@@ -318,16 +325,8 @@ def _scene(scene: str, runs: Sequence[RunHandle], scope: Scope) -> tuple[SceneCo
                 columns=Path(COLUMNS) / f"{slug(scene, names[0], names[n])}.parquet",
             )
         against.append(result)
-    judged = [note for name, entry in zip(names, entries, strict=True) for note in _judged(name, entry)]
+    judged = [f"{name} is {text}" for name, entry in zip(names, entries, strict=True) if (text := entry.judged)]
     return _scene_comparison(scene, common, tuple(judged), tuple(against)), changes
-
-
-def _judged(name: str, entry: Entry) -> Iterator[str]:
-    """Yield that a run's agreement says nothing of its labels, as its verdict has it."""
-    statistics = entry.summary.statistics
-    if statistics is None or statistics.verdict.level not in ("uninformative", "misleading"):
-        return
-    yield f"{name} is {statistics.verdict.level}: {ADVICE[statistics.verdict.level]}"
 
 
 def _scene_comparison(

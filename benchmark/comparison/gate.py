@@ -386,7 +386,8 @@ class Judgement:
         if self.verdict == "fails":
             bounded = self.rule.bounds_a_loss and self.interval.low <= self.rule.limit
             return "a loss is shown, but not that it is within the limit" if bounded else "the contrary is shown"
-        return self.interval.undecided or "neither is shown; more frames may decide"
+        more = "locations" if self.interval.scope == THESE_FRAMES else "frames"
+        return self.interval.undecided or f"neither is shown; more {more} may decide"
 
     def digits(self, value: float) -> str:
         """Return a number of the rule's measure."""
@@ -508,6 +509,7 @@ def gate(new: str | os.PathLike[str], against: str | os.PathLike[str] | None, co
             _require_values(rule, pairs)
             judgements.append(_assess(rule, pairs, config.level / len(rules), config.scope))
             notes += [*_counts(judgements[-1], pairs), *(runs.common[1] if runs.on_common(rule) else ())]
+    notes += _without_frames(judgements, config.scope)
     new_run, against_run = ("" if run is None else str(run) for run in (own, base))
     return GateResult(
         new_run, against_run, scenes, config.level, config.undecided, tuple(judgements), tuple(dict.fromkeys(notes))
@@ -515,10 +517,31 @@ def gate(new: str | os.PathLike[str], against: str | os.PathLike[str] | None, co
 
 
 def _notes(own: RunHandle, base: RunHandle | None, scenes: Sequence[str]) -> list[str]:
+    judged = [
+        f"{scene}: {run.name} is {why}"
+        for scene in scenes
+        for run in (own, base)
+        if run is not None and (why := run.scenes[scene].judged)
+    ]
     left = [scene for scene in own.scenes if scene not in scenes]
     missing = [scene for scene in (base.scenes if base else ()) if scene not in scenes]
     text = [f"only the run has these scenes, which are left out: {', '.join(left)}"] if left else []
-    return text + ([f"only the baseline has these scenes, which are left out: {', '.join(missing)}"] if missing else [])
+    text += [f"only the baseline has these scenes, which are left out: {', '.join(missing)}"] if missing else []
+    return judged + text
+
+
+def _without_frames(judgements: Sequence[Judgement], wanted: Scope) -> list[str]:
+    """Return which rules are judged for these frames, because the run does not tell frames apart in its map."""
+    names = [
+        each.rule.text
+        for each in judgements
+        if each.interval.scope == THESE_FRAMES != wanted
+        and not each.counted
+        and each.rule.measure.quantity not in (FLICKER, COVERAGE)
+        and not of_space_alone(each.rule.measure.quantity.key)
+    ]
+    why = "as the run kept no sums of its map by frame or has few; --statistics, or more frames"
+    return [f"judged for these frames, {why}: {', '.join(names)}"] if names else []
 
 
 # --- Checks before any rule is assessed -------------------------------------------------------------------------------

@@ -77,8 +77,12 @@ def lines(result: GateResult, width: int = 80) -> Iterator[str]:
     for each in result.judgements:
         yield from _wrapped(f"  {each.verdict.upper():<9}  {each.rule.text:<{longest}}  {each.values}", width, 13)
     yield ""
-    for why in dict.fromkeys(f"{each.verdict}: {each.reason} ({each.about})" for each in result.judgements):
-        yield from _wrapped(f"  {why}", width, 4)
+    reasons: dict[str, list[str]] = {}
+    for each in result.judgements:
+        reasons.setdefault(f"{each.verdict}: {each.reason} ({each.about})", []).append(each.rule.text)
+    for why, rules in reasons.items():
+        named = f": {', '.join(rules)}" if len(reasons) > 1 else ""
+        yield from _wrapped(f"  {why}{named}", width, 4)
     if result.count("undecided"):
         yield "  more     --plan: how many frames each rule needs; --out gate.md"
 

@@ -34,6 +34,7 @@ from semstab.datasets import GROUND_TRUTH
 from semstab.engine.folder import load_result, run_and_model
 from semstab.errors import ConfigError, DataError, summarize_error
 from semstab.statistics.cluster_sums import ClusterSums
+from semstab.statistics.verdict import ADVICE
 
 Flicker = Mapping[int, float]
 """Percent of the pixels whose label differs from that of the frame before, camera motion removed, by frame index."""
@@ -102,6 +103,14 @@ class Entry(EntryNumbers):
         with self.record.series.open(encoding="utf-8", newline="") as lines:
             names = {row["frame"]: row.get("name") or "" for row in csv.DictReader(lines)}
         return tuple(replace(each, name=names.get(str(each.frame), "")) for each in frames)
+
+    @property
+    def judged(self) -> str:
+        """Why its agreement does not assess its labels, as its verdict has it; '' where it does."""
+        statistics = self.summary.statistics
+        if statistics is None or statistics.verdict.level not in ("uninformative", "misleading"):
+            return ""
+        return f"{statistics.verdict.level}: {ADVICE[statistics.verdict.level]}"
 
     @property
     def classes(self) -> tuple[str, ...]:

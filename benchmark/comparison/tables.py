@@ -308,9 +308,10 @@ def _of_run(comparison: RunComparison, own: Against) -> Iterator[str]:
         name: [row for row in own.by_class if row.of == name] for name in dict.fromkeys(r.of for r in own.by_class)
     }
     notes = {name: _changes(rows, by_key(BY_CLASS)) for name, rows in classes.items()}
-    if listed := [f"{name} {text}" for name, text in notes.items() if text]:
-        more = f"; and {len(listed) - MOST_CLASSES} more classes" if len(listed) > MOST_CLASSES else ""
-        yield f"{own.other} by class: {'. '.join(listed[:MOST_CLASSES])}{more}."
+    if listed := [f"{name} ({text})" for name, text in notes.items() if text]:
+        left = len(listed) - MOST_CLASSES
+        more = f" and {left} more {'class' if left == 1 else 'classes'}" if len(listed) > MOST_CLASSES else ""
+        yield f"{own.other} by class: {', '.join(listed[:MOST_CLASSES])}{more}."
     for scene in comparison.scenes:
         mine = next(each for each in scene.against if each.other == own.other)
         for what in ("agreement", "truth"):
@@ -330,6 +331,10 @@ def _stability(comparison: RunComparison, own: Against) -> str:
     interval = f"{row.difference.value:+z.3f} ({row.difference.low:+z.3f} to {row.difference.high:+z.3f})"
     p = "" if math.isnan(row.p_holm) else f", p {row.p_holm:.2g} (Holm)"
     text = {"better": "is more stable than", "worse": "is less stable than"}
+    pair = own.other, comparison.base
+    if silent := [run.name for run in comparison.runs if run.uninformative and run.name in pair]:
+        which = f"{' and '.join(silent)} {'is' if len(silent) == 1 else 'are'} nearly one class all over"
+        return f"{own.other} and {comparison.base} are not ranked, as {which}: {numbers}, {interval}{p}."
     if row.change:
         return (
             f"{own.other} {text[row.change]} {comparison.base}: {numbers}, {interval}{p}, for {row.difference.scope}."

@@ -306,11 +306,16 @@ class SceneComparison:
 
 @dataclass(frozen=True)
 class Compared:
-    """A run as it was named, the file or folder it was read from (None: a program held it), and its label source."""
+    """A run as it was named, the file or folder it was read from (None: a program held it), and its label source.
+
+    Attributes:
+        uninformative: Nearly the whole map is one class in every scene: its alpha ranks nothing.
+    """
 
     name: str
     source: Path | None
     model: str
+    uninformative: bool = False
 
 
 @dataclass(frozen=True)

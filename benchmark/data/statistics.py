@@ -233,6 +233,10 @@ class CellAgreement:
         """1 / chance: as many classes of equal size have this chance (Hill 1973, Ecology 54, of order 2)."""
         return 1 / self.chance if self.chance > 0 else math.nan
 
+    def agreeing(self, alpha: float) -> float:
+        """Return the share of the spots at which two views see the same class, as an alpha of these cells has it."""
+        return 1 - (1 - alpha) * (1 - self.chance)
+
     @property
     def critical_classes(self) -> tuple[ClassAlpha, ...]:
         """The classes that count for the verdict, those most probably unstable first."""
@@ -518,6 +522,11 @@ class MapStatistics:
     def stated(self) -> str:
         """The verdict and the number that it rests on: 'stable (p .98), alpha .93 (.92 to .95)'."""
         return f"{self.verdict}, alpha {self.headline.alpha.text()}"
+
+    @property
+    def agreeing(self) -> float:
+        """The share of the spots at which two views see the same class; NaN without sampled cells."""
+        return math.nan if self.cells is None else self.cells.agreeing(self.headline.alpha.value)
 
     @property
     def order_known(self) -> bool:

@@ -79,7 +79,7 @@ def _cell(text: str) -> str:
     if text == "--":
         return "\N{EN DASH}"
     is_number = text[-1:].isdigit() or re.fullmatch(r"[-+]?[\d.,]+ \([-+\d., ]+\)", text)
-    return relations(re.sub(r"(^|(?<=\()|(?<=, )|(?<=e))-(?=\d)", "\N{MINUS SIGN}", text) if is_number else text)
+    return relations(re.sub(r"(^|(?<=\()|(?<=, )|(?<=\de))-(?=\d)", "\N{MINUS SIGN}", text) if is_number else text)
 
 
 def figure_block(figure: Figure, folder: Path) -> dict[str, Any]:

@@ -88,8 +88,8 @@ def warnings(result: Result) -> Iterator[str]:
     for name, own in covering.items():
         all_of_them = len(own) == len(runs)
         of = "" if all_of_them else f" of {', '.join(dict.fromkeys(model for model, _ in own))}"
-        least = math.floor(100 * min(share for _, share in own))
-        more = " or more" if len({share for _, share in own}) > 1 and least < 100 else ""
+        more = " or more" if len({f"{share:.0%}" for _, share in own}) > 1 else ""
+        least = round(100 * min(share for _, share in own))
         yield (
             f"'{name}' covers {least}%{more} of the map{of}, and determines most of its numbers; read them by class,"
             f" or leave it out: {_excluding(name)}"

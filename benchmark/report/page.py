@@ -139,8 +139,7 @@ def _numbers(
     alphas = [stats.headline.alpha.value for stats in assessed]
     alpha = macro_mean(alphas)
     yield "alpha", "" if math.isnan(alpha) else short(alpha), interval(None if head is None else head.alpha)
-    psa = [stats.headline.psa.value for stats in assessed]
-    yield "two frames agree", mean(psa, "{:.0f} %", 100), "of the locations"
+    yield "two views agree", mean([stats.agreeing for stats in assessed], "{:.0f} %", 100), "of the spots"
     flicker = [record.image_space.compensated_flicker_percent for record in records]
     yield "flicker", mean(flicker, "{:.1f} %"), "of the pixels per frame, camera motion removed"
     together = pooled(records)

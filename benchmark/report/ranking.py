@@ -9,16 +9,17 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+from semstab.core.types import THESE_FRAMES, THIS_SCENE, Scope
 from semstab.data.labels import sharing_classes
 from semstab.data.records import Record, Result
-from semstab.data.statistics import Estimate
+from semstab.data.statistics import Estimate, Interval
 from semstab.datasets import GROUND_TRUTH
 from semstab.metrics import macro_mean
 from semstab.report.filter_study import filter_studies
 from semstab.report.means import by_model
 from semstab.statistics.agreement import ALPHA
 from semstab.statistics.cluster_sums import ClusterSums, value
-from semstab.statistics.intervals import difference, mean_of
+from semstab.statistics.intervals import difference, mean_of, scope_of
 from semstab.statistics.observations import CellObservations
 from semstab.statistics.paired_differences import compared_observations, holm
 
@@ -29,6 +30,8 @@ class Difference:
 
     Attributes:
         p_holm: p-value, corrected for all pairs of models.
+        scope: What varies in the interval.
+        undecided: Why nothing may be claimed; '' where something may.
         shown: Whether the difference is shown: Holm's p-value is below 0.05, and the interval excludes 0.
     """
 
@@ -39,6 +42,8 @@ class Difference:
     high: float
     scenes: int
     p_holm: float
+    scope: Scope
+    undecided: str
     shown: bool
 
 
@@ -95,11 +100,11 @@ def _ranking(scenes: tuple[Files, ...], names: tuple[str, ...]) -> Ranking:
     names = tuple(name for name in names if name not in apart)
     known = [own for own in sums if {*names} <= own.keys()]
     pairs = list(itertools.combinations(names, 2)) if known else []
-    changes = [mean_of([difference(own[b], own[a], ALPHA.key) for own in known]) for a, b in pairs]
+    changes = [mean_of([_difference(own[b], own[a]) for own in known]) for a, b in pairs]
     p_values = holm([change.p_value for change in changes])
     differences = tuple(
         Difference(
-            b, a, change.value, change.low, change.high, len(known), p,
+            b, a, change.value, change.low, change.high, len(known), p, change.scope, change.undecided,
             shown=change.decided and p < 1 - change.level and not change.low <= 0 <= change.high,
         )
         for (a, b), change, p in zip(pairs, changes, p_values, strict=True)
@@ -114,6 +119,12 @@ def _ranking(scenes: tuple[Files, ...], names: tuple[str, ...]) -> Ranking:
     return Ranking(ranks, differences, apart=apart)
 
 
+def _difference(own: ClusterSums, other: ClusterSums) -> Interval:
+    """Return alpha of a model less that of another on common observations, for another flight if frames allow that."""
+    scopes = {scope_of(sums) for sums in (own, other)}
+    return difference(own, other, ALPHA.key, scope=THESE_FRAMES if THESE_FRAMES in scopes else THIS_SCENE)
+
+
 def answers(result: Result) -> Iterator[str]:
     """Yield the answer: the difference of two models, or the ranks of more."""
     ranked = ranking(result)
@@ -121,11 +132,14 @@ def answers(result: Result) -> Iterator[str]:
     if len(ranked.differences) == 1 and known:
         (one,) = known
         relation = "does not differ significantly from"
-        if one.shown:
+        if one.undecided:
+            relation = "is not compared with"
+        elif one.shown:
             relation = "is more stable than" if one.value > 0 else "is less stable than"
         change = Estimate(one.value, one.low, one.high).text("+")
         scenes = f", {one.scenes} of {len(result.scenes)} scenes" if one.scenes < len(result.scenes) else ""
-        yield f"{one.model} {relation} {one.other}: alpha {change}{scenes}"
+        why = f"; {one.undecided}" if one.undecided else ""
+        yield f"{one.model} {relation} {one.other}: alpha {change}{scenes}{why}"
     elif known:
         ranks = "; ".join(f"{rank}. {', '.join(names)}" for rank, names in ranked.ranks)
         yield f"most stable first: {ranks}"

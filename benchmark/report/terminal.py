@@ -31,7 +31,7 @@ from semstab.report.tables.filters import row as filter_row
 from semstab.report.tables.stability import one_in
 from semstab.report.tables.table import to_terminal
 from semstab.statistics.intervals import LEAST_FRAMES
-from semstab.statistics.verdict import DANGEROUS, LIMITS
+from semstab.statistics.verdict import DANGEROUS, DECIDED, LIMITS, level_probabilities
 from semstab.task import Task
 
 WIDTH = 80
@@ -51,7 +51,13 @@ MOST_CLASSES = {1: 5, 2: 3}
 """The number of classes that are listed for each model, by the number of rows above; else 1."""
 
 MOST_WARNINGS = 3
-STAGE_NAMES = {"read": "reading", "reference": "check", "voxel sizes": "other voxel sizes", "write": "writing"}
+STAGE_NAMES = {
+    "read": "reading",
+    "check": "data check",
+    "reference": "check of the backend",
+    "voxel sizes": "other voxel sizes",
+    "write": "writing",
+}
 
 
 def print_summary(
@@ -172,8 +178,10 @@ def _verdict(run: UnitSummary) -> Iterator[str]:
         yield f"  {share} of the observations are {name}: agreement does not assess such a map"
     else:
         yield f"  act on labels from alpha {short(LIMITS.stable)} on, with care from {short(LIMITS.usable)}"
-    psa = statistics.headline.psa.value
-    yield f"  two frames see the same class at {_percent(psa)} of the locations"
+    if statistics.verdict.level == "undecided":
+        levels = ", ".join(f"{name} {short(p)}" for name, p in level_probabilities(alpha).items())
+        yield f"  no level has p {short(DECIDED)} ({levels}): more frames decide it"
+    yield f"  two views see the same class at {_percent(statistics.agreeing)} of the spots"
     if not math.isnan(wrong.value) and statistics.verdict.level != "misleading":
         yield f"  {told}"
     yield ""
@@ -279,7 +287,7 @@ def row_of(record: Record) -> list[str]:
     level, alpha, agree = "-", "", math.nan
     if statistics is not None:
         level, alpha = str(statistics.verdict), statistics.headline.alpha.text()
-        agree = 100 * statistics.headline.psa.value
+        agree = 100 * statistics.agreeing
     recurrent = run.table.recurrent
     means = [recurrent[m] if recurrent.voxels >= ENOUGH else math.nan for m in measures()[:2]]
     vss, sbd = (short(mean, digits=m.digits[0]) for m, mean in zip(measures(), means, strict=False))
@@ -312,7 +320,7 @@ def _classes(records: Sequence[Record], width: int) -> Iterator[str]:
         classes, shares = class_means(own), _class_shares(own)
         others = {k: v for record in own for k, v in record.summary.table.confused_with.items()}
         listed = sorted(
-            (key for key, (_, disagreement) in classes.items() if disagreement >= CONTRIBUTES),
+            (key for key, (_, disagreement) in classes.items() if disagreement >= CONTRIBUTES and key in shares),
             key=lambda key: -classes[key][1],
         )
         small = [key for key in listed if shares.get(key, 0.0) < MAJORITY]

@@ -66,7 +66,6 @@ OF_CHANGES: Mapping[str, Mean] = {
 
 def location_sums(table: VoxelTable, columns: Columns, cubes: Cubes) -> CubeSums:
     """Return the sums over cubes of the voxels with OP >= 2 that give `MEANS`."""
-    T = table.op.astype(np.float64)
     sums = cubes.means(
         {
             "psa": columns["psa"],
@@ -75,18 +74,13 @@ def location_sums(table: VoxelTable, columns: Columns, cubes: Cubes) -> CubeSums
             "null": columns["sbd_null"],
             "entropy_within": columns["entropy_within"],
             "entropy_between": columns["entropy_between"],
-            "observations": T,
-            **{name: T * columns[f"disagreement_{name}"] for name in ("within", "between")},
+            **{name: columns[f"disagreement_{name}"] for name in ("within", "between")},
         }
     )
-    observations = sums.pop("observations")[:, :1]
-    each = np.repeat(T, np.diff(table.evidence.starts))
+    each = np.repeat(table.op.astype(np.float64), np.diff(table.evidence.starts))
     (by_voxel,) = cubes.sums_by_class(table.evidence, table.evidence.weight / each)
-    further = {
-        **{name: [sums[name][:, :1], observations] for name in ("within", "between")},
-        "kappa": [sums["psa"], by_voxel],  # as of `kappa_columns`
-    }
-    return CubeSums(cubes.cell, cubes.edge, sums | {name: np.hstack(parts) for name, parts in further.items()})
+    kappa = np.hstack([sums["psa"], by_voxel])  # as of `kappa_columns`
+    return CubeSums(cubes.cell, cubes.edge, sums | {"kappa": kappa})
 
 
 # --- Locations that flip

@@ -44,8 +44,8 @@ DANGEROUS = 0.05
 """Largest share of the consistent locations that may be wrong."""
 
 LEAST_CELLS, LEAST_CUBES = 100, 16
-"""Cells that two views saw or more, and cubes of space that hold them, below which there is no verdict. Both are the
-same whatever the voxels of the map."""
+"""Cells that two views saw or more, and cubes of space that hold them, below which there is no verdict: both are the
+same whatever the voxels of the map, of which as many have to be seen twice."""
 
 ADVICE: dict[Level, str] = {
     "stable": "its labels agree from frame to frame; act on them",
@@ -62,6 +62,7 @@ ACTED_ON, LEAST_FLIPS = ("stable", "usable"), 0.001
 """Levels at which labels are acted on, and the least share of locations that flip that is reported."""
 
 NO_CELLS = "no cells were sampled; give the observations of a `Sampler`"
+TOO_FEW_VOXELS = "its map has too few locations to act on; use smaller voxels, or frames that overlap more"
 STILL = "the camera stood still: all frames show one view"
 
 
@@ -95,7 +96,7 @@ def verdict(
         limits: Limits of the levels.
     """
     support = f"{voxels} locations seen twice or more, {share:.0%} of the map"
-    if reason := _missing(cells):
+    if reason := _missing(cells, voxels):
         return StabilityVerdict("no verdict", math.nan, f"{model}: no verdict, {reason}; {support}")
     assert cells is not None
     probabilities = level_probabilities(headline.alpha, limits)
@@ -103,8 +104,9 @@ def verdict(
     silent = cells.labelled < limits.labelled
     if silent and level == "stable":
         level, probability = "usable", probabilities["usable"] + probability
-    psa, wrong = headline.psa, headline.wrong_of_consistent
-    parts = [_alpha(headline.alpha, cells), f"two frames agree at {psa.value:.0%} of the locations"]
+    wrong = headline.wrong_of_consistent
+    same = cells.agreeing(headline.alpha.value)
+    parts = [_alpha(headline.alpha, cells), f"two views see the same class at {same:.0%} of the spots"]
     if level == "uninformative":
         parts.insert(0, f"{cells.largest_share:.0%} of the observations are {cells.largest_class}")
     if not math.isnan(wrong.low):
@@ -113,19 +115,21 @@ def verdict(
         parts.append(f"{1 - cells.labelled:.0%} of the locations have no label in most frames")
     if flips is not None and level in ACTED_ON:
         parts += _flips(flips)
-    how_sure = "" if math.isnan(probability) else f" ({probability:.0%})"
+    how_sure = "" if math.isnan(probability) or level == "undecided" else f" ({probability:.0%})"
     reasons = ", ".join(parts)
     line = f"{model}: {level}{how_sure}, {ADVICE[level]}: {reasons}; {support}; {_for(headline.alpha)}"
     return StabilityVerdict(level, probability, line)
 
 
-def _missing(cells: CellAgreement | None) -> str:
+def _missing(cells: CellAgreement | None, voxels: int) -> str:
     """Return why there is no verdict; empty where there is one."""
     if cells is None:
         return NO_CELLS
     if cells.views < 2 <= cells.frames:
         return STILL
-    return "" if cells.cells >= LEAST_CELLS and cells.cubes >= LEAST_CUBES else ADVICE["no verdict"]
+    if cells.cells < LEAST_CELLS or cells.cubes < LEAST_CUBES:
+        return ADVICE["no verdict"]
+    return TOO_FEW_VOXELS if voxels < LEAST_CELLS else ""
 
 
 def _level(
@@ -165,6 +169,6 @@ def _flips(flips: Flipping) -> list[str]:
         return []
     share, part = flips.share, f", {flips.part:.0%} of them between {flips.a} and {flips.b}" if flips.a else ""
     return [
-        f"{share.value:.1%} of the locations of this map flip ({share.low:.1%} to {share.high:.1%}{part}): do not act"
-        " on them"
+        f"{share.value:.1%} of the locations of this map flip ({share.low:.1%} to {share.high:.1%}{part}): act on the"
+        " others only"
     ]

@@ -19,7 +19,7 @@ from semstab.statistics.correctness import MIOU
 
 COLUMNS = (
     SCENE, Column("model", "Model"), Column("verdict", "Verdict"), Column("probability_percent", "Probability (%)", 0),
-    Column.of(ALPHA), Column("agree_percent", "Agree (%)", 1, "higher"),
+    Column.of(ALPHA), Column("scope", "For"), Column("agree_percent", "Agree (%)", 1, "higher"),
     Column("flicker_percent", "Flicker (%)", 1, "lower"),
     Column("vss3", "VSS, OP>=3", 3, "higher"), Column("sbd3", "SBD, OP>=3", 4, "lower"), Column.of(MIOU),
     Column("voxel_size", "Voxel (m)", 3), Column("frames", "Frames", 0),
@@ -57,7 +57,8 @@ def runs_table(results: Mapping[str, Result]) -> Table:
     caption = (
         "Each row is a model on a scene at the settings of its run; runs differ in what else varies, and only `compare`"
         f" says whether two differ. VSS and SBD are means over voxels with OP >= 3, where there are {ENOUGH:,} or more."
-        f" Brackets hold the interval of alpha at {CONFIDENCE:.0%}, that of the verdict."
+        f" Brackets hold the interval of alpha at {CONFIDENCE:.0%}, that of the verdict; those for these frames alone, of"
+        " runs with few frames, say nothing of another flight, and look surer than they are."
     )
     groups = tuple(Group(name, tuple(map(_row, result.select()))) for name, result in results.items())
     return Table("runs", "Runs", caption, COLUMNS, groups, "run")
@@ -73,6 +74,7 @@ def _row(record: Record) -> Row:
     return (
         run.unit.scene, run.unit.model, "" if verdict is None else verdict.level,
         unknown if verdict is None else 100 * verdict.probability, unknown if headline is None else headline.alpha,
-        unknown if headline is None else 100 * headline.psa.value, record.image_space.compensated_flicker_percent,
+        "" if headline is None else headline.alpha.scope,
+        unknown if statistics is None else 100 * statistics.agreeing, record.image_space.compensated_flicker_percent,
         *means, unknown if correct is None else correct.miou, run.table.voxel_size, run.frames,
     )  # fmt: skip

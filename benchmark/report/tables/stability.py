@@ -255,7 +255,7 @@ def _agreement_table(result: Result, sweep: Sweep) -> Table | None:
         Column("value", sweep.header),
         Column("mean_op", "Mean OP", 2),
         Column("vss", "VSS, all voxels", VSS.digits[1], VSS.better),
-        *(Column.of(quantity, compared=True) for quantity in (SBD, PSA, ALPHA)),
+        *(Column.of(quantity, compared=True) for quantity in (PSA, ALPHA)),
         Column("sbd_excess", "SBD excess", 4, signed=True),
     )
     by_model = {name: levels(result, sweep.name, name) for name in result.models}
@@ -267,8 +267,9 @@ def _agreement_table(result: Result, sweep: Sweep) -> Table | None:
         "VSS is pooled over the voxels of all scenes. The other numbers are of the voxels seen twice or more, and are"
         " macro means of the scenes. PSA is the share of pairs of frames that agree about a voxel. Alpha is the"
         " agreement of two views at the same spot beyond chance. SBD excess is SBD less that of the same observations"
-        " in random order (bits). These three do not depend on how often a voxel was seen, but the set of voxels seen"
-        " twice changes along the sweep. ± is the standard deviation over the repeats."
+        " in random order (bits), over the voxels where that is known. These three do not depend on how often a voxel"
+        " was seen, but the set of voxels seen twice changes along the sweep. ± is the standard deviation over the"
+        " repeats."
     )
     title = f"Agreement against {sweep.title}"
     return Table(f"sensitivity_agreement_{sweep.name}", title, caption, columns, groups)
@@ -280,7 +281,6 @@ def _agreement_row(sweep: Sweep, level: Level) -> Row:
         sweep.text(level.value),
         level.mean(lambda p: p.mean_op),
         spread(over_all(VSS)),
-        spread(lambda p: p.drift.value),
         spread(lambda p: p.psa.value),
         spread(lambda p: p.alpha.value),
         spread(lambda p: p.excess_drift),
