@@ -42,7 +42,7 @@ def save_backend(folder: Path) -> None:
     ("own-sequence", make_nothing, ["runs/first/report.html", "runs/first/tables/classes.csv"]),
     ("lidar-camera", make_nothing, ["run/report.html"]),
     ("two-models", make_nothing, ["both/report.html", "versus/report.html", "versus/comparison.json"]),
-    ("drone-flight", make_project, ["map/report.html", "map.ply", "map.tif"]),
+    ("drone-flight", make_project, ["map/report.html", "map.ply", "map.tif", "map.class.tif", "map.laz"]),
 ])  # fmt: skip
 def test_every_block_of_a_tutorial_works_as_it_stands(name, prepare, left, tmp_path, monkeypatch) -> None:
     monkeypatch.chdir(tmp_path)

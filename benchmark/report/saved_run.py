@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 import numpy.typing as npt
 
 from semstab.core.arrays import values_of
@@ -40,6 +41,23 @@ class Run:
     def summary(self) -> pd.DataFrame:
         """Return one row per unit: its names, its verdict, alpha with its interval, and the mean of every measure."""
         return self.result.to_pandas()
+
+    @property
+    def classes(self) -> pd.DataFrame:
+        """Return one row per unit and class: alpha with its interval, and the class's share of the disagreement."""
+        rows: list[dict[str, Any]] = []
+        for unit in (each for each in self.result.runs if each.statistics is not None):
+            cells = None if unit.statistics is None else unit.statistics.cells
+            rows += [
+                {
+                    "scene": unit.unit.scene, "model": unit.unit.model, "backend": unit.unit.backend, "class": own.name,
+                    "locations": own.locations, "counts_for_verdict": own.counts_for_verdict,
+                    "alpha": own.alpha.value, "alpha_low": own.alpha.low, "alpha_high": own.alpha.high,
+                    "unstable": own.unstable, "disagreement": own.disagreement,
+                }
+                for own in (() if cells is None else cells.classes)
+            ]  # fmt: skip
+        return voxels.to_pandas({name: np.array([row[name] for row in rows]) for name in (rows[0] if rows else ())})
 
     def table(self, *, scene: str | None = None, model: str | None = None, backend: str | None = None) -> VoxelTable:
         """Return the voxels of a unit."""
@@ -77,6 +95,12 @@ def load(folder: str | Path) -> Run:
     Args:
         folder: The run's --out.
 
+    Returns:
+        Data frames `summary` (a row a unit; its `flicker_percent` counts the camera's motion, the screen's flicker is
+        `compensated_flicker_percent`) and `classes` (a row a class: alpha with its interval, share of the
+        disagreement). For a unit, which scene, model and backend name as far as that is needed, `table()`, its voxels;
+        `series()`, a row a frame; `events()`, the log of a run with --events. `result`: all numbers, typed.
+
     Raises:
         DataError: If the run does not exist or is damaged.
 
@@ -86,6 +110,10 @@ def load(folder: str | Path) -> Run:
                  model verdict
         0   sim-steady  stable
         1  sim-flicker  usable
+        >>> run.classes[["model", "class", "alpha", "alpha_low", "alpha_high"]].head(2).round(2)
+                model     class  alpha  alpha_low  alpha_high
+        0  sim-steady  building   0.94       0.93        0.96
+        1  sim-steady      road   0.96       0.95        0.97
     """
     return Run(Path(folder), load_result(folder))
 

@@ -57,8 +57,8 @@ def runs_table(results: Mapping[str, Result]) -> Table:
     caption = (
         "Each row is a model on a scene at the settings of its run; runs differ in what else varies, and only `compare`"
         f" says whether two differ. VSS and SBD are means over voxels with OP >= 3, where there are {ENOUGH:,} or more."
-        f" Brackets hold the interval of alpha at {CONFIDENCE:.0%}, that of the verdict; those for these frames alone, of"
-        " runs with few frames, say nothing of another flight, and look surer than they are."
+        f" Brackets hold the interval of alpha at {CONFIDENCE:.0%}, that of the verdict; one for these frames alone"
+        " says nothing of another flight, and looks surer than it is."
     )
     groups = tuple(Group(name, tuple(map(_row, result.select()))) for name, result in results.items())
     return Table("runs", "Runs", caption, COLUMNS, groups, "run")
