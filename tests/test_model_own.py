@@ -125,6 +125,24 @@ def test_two_repositories_may_call_their_modules_the_same(tmp_path, lazy):
         np.testing.assert_array_equal(labels_of(second), IMAGE.mean(axis=2) < 128)
 
 
+def test_what_lies_beside_a_file_comes_before_what_lies_in_the_folder_that_a_program_works_in(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "shapes.py").write_text(
+        "SIGN = -1\nclass Net:\n    def predict(self, image):\n        return image[..., 0]\n"
+    )
+    create("shapes:Net", classes=["a", "b"])
+    (tmp_path / "repository/shapes").mkdir(parents=True)
+    (tmp_path / "repository/shapes/__init__.py").touch()
+    (tmp_path / "repository/shapes/layers.py").write_text("SIGN = 1\n")
+    text = (
+        "from shapes.layers import SIGN\nclass Net:\n    classes = ['dark', 'bright']\n    def predict(self, image):\n"
+    )
+    (tmp_path / "repository/model.py").write_text(
+        f"{text}        return (SIGN * (image.mean(axis=2) - 128.0) > 0).astype(int)\n"
+    )
+    np.testing.assert_array_equal(labels_of(create(f"{tmp_path}/repository/model.py:Net")), WANTED)
+
+
 def test_a_model_of_ones_own(tmp_path):
     text = """
 from semstab.models import Model, Prediction

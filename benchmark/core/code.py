@@ -162,26 +162,29 @@ def _may_import_from(folder: Path) -> None:
     """Append the folder to the search path, where nothing in it replaces an installed package."""
     if str(folder) not in sys.path:
         sys.path.append(str(folder))
+        _allowed.append(folder)
 
 
 def _import_first_from(folder: Path) -> None:
-    """Search the folder before those of other users' files, and forget modules of theirs that it has by the same name.
+    """Search the folder instead of those of other files, and forget modules of theirs that it has by the same name.
 
-    Two networks from two repositories often have a `model.py` or a package `utils` each.
+    Two networks from two repositories often have a `model.py` or a package `utils` each; a package without __init__.py
+    would be found after a module of that name anywhere else.
     """
-    if _searched[:1] == [folder] or (folder not in _searched and str(folder) in sys.path):
+    if _searched[:1] == [folder] or (folder not in (*_searched, *_allowed) and str(folder) in sys.path):
         return
-    others = [other for other in _searched if other != folder]
-    sys.path[:] = [name for name in sys.path if Path(name) not in _searched]
-    _searched[:] = [folder, *others]
-    sys.path.extend(map(str, _searched))
-    same = {path.stem for path in folder.iterdir()} & {path.stem for other in others for path in other.iterdir()}
-    for name in same & set(sys.modules):
+    others = [other for other in (*_searched, *_allowed) if other != folder]
+    named = {path.stem for other in others if other.is_dir() for path in other.iterdir()}
+    for name in {path.stem for path in folder.iterdir()} & named & set(sys.modules):
         module = sys.modules[name]
         places = list(getattr(module, "__path__", [module.__file__ or ""]))
         if any(Path(place).parent in others for place in places):
             for part in [part for part in sys.modules if part.partition(".")[0] == name]:
                 del sys.modules[part]
+    sys.path[:] = [name for name in sys.path if Path(name) not in (*_searched, *_allowed)]
+    _searched[:] = [folder, *(other for other in _searched if other != folder)]
+    sys.path.extend(dict.fromkeys(map(str, (folder, *_allowed))))
 
 
-_searched: list[Path] = []  # folders of users' files that were appended to the search path, that of the last one first
+_searched: list[Path] = []  # folders of users' files, that of the last one first, which alone is on the search path
+_allowed: list[Path] = []  # folders that a program works in, which were appended for modules that are named
