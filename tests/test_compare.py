@@ -143,6 +143,7 @@ def test_runs_of_other_voxel_sizes_and_frames_of_reference_are_hardly_compared(r
     assert scene.basis == "cubes"
     assert set(rows(scene.against[0])) == {"alpha", "compensated_flicker_percent", "accuracy", "miou"}
     assert not scene.against[0].areas
+    assert (scene.against[0].compared, scene.against[0].worse, scene.against[0].better) == (0, 0, 0)
     assert "voxels of 0.125 m and 0.25 m" in scene.notes[0]
     entries = [each.scenes["wall"] for each in open_runs([runs / "old", f"{runs}/new:net"])]
     here = Georeference("PROJCRS", (0.0, 0.0, 0.0))

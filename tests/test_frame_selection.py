@@ -32,6 +32,7 @@ from semstab.errors import ConfigError, DataError
         ({"spacing": "even", "count": 1}, [0]),
         ({"spacing": "even", "count": 50, "start": 17}, [17, 18, 19]),
         ({"spacing": "even", "count": 2, "start": 20}, []),
+        ({"count": 3, "stride": 2, "start": 5}, [5, 7, 9]),
         ({"list": [0, 7, 19]}, [0, 7, 19]),
     ],
 )

@@ -433,6 +433,18 @@ def test_a_lens_that_is_not_known_and_a_camera_that_is_not_calibrated_are_refuse
         opened(write(tmp_path, frames, odd("plumb_bob", np.zeros(9)), name="b"))
 
 
+def test_images_that_were_not_taken_are_said(tmp_path, frames):
+    def twice(ros, topic, time, message):
+        yield topic, time, message
+        if topic == COLOR:
+            yield "/rear/image_raw", time, message
+
+    scene = opened(write(tmp_path, frames, twice), color=COLOR, depth=DEPTH)
+    assert [text for text in scene.sources if text.startswith("others")] == [
+        "others   /rear/image_raw (set depth, color)"
+    ]
+
+
 # --- labels
 
 

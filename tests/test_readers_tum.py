@@ -115,6 +115,17 @@ def test_without_colour_images_labels_go_by_the_depth_images_name(tmp_path):
     assert (len(scene), scene.frame(0, "net").color) == (4, None)
 
 
+@pytest.mark.parametrize(("unit", "name"), [(1e3, "milliseconds"), (1e6, "microseconds"), (1e9, "nanoseconds")])
+@pytest.mark.parametrize("file", ["groundtruth.txt", "depth.txt"])
+def test_stamps_in_other_units_are_told(unit, name, file, folder):
+    (folder / "rgb.txt").unlink()
+    lines = [line.split(maxsplit=1) for line in (folder / file).read_text().splitlines() if line[0] != "#"]
+    write_lines(folder / file, [f"{float(stamp) * unit:.0f} {rest}" for stamp, rest in lines])
+    where = "groundtruth.txt" if file == "groundtruth.txt" else "the lists of images"
+    with pytest.raises(DataError, match=f"time stamps of {where} look like {name}; write seconds"):
+        opened(TUM, folder).T_wc(0)
+
+
 def test_poses_are_taken_between_stamps_or_the_nearest(folder):
     """Of a trajectory that only knows 0.01 s before and 0.01 s after each depth image."""
     start = 1305031102.0

@@ -18,7 +18,7 @@ from semstab.errors import DataError
 from semstab.metrics.agreement import rows_of
 from semstab.statistics.accumulate import cluster_sums_of, sums_of_cells
 from semstab.statistics.agreement import class_agreement, consistency_posterior, krippendorff_alpha, psa
-from semstab.statistics.cluster_sums import ClusterSums, aligned, value
+from semstab.statistics.cluster_sums import MOST_CLASSES, ClusterSums, aligned, value
 from semstab.statistics.correctness import correctness
 from semstab.statistics.drift import expected_sbd
 from semstab.statistics.intervals import coverage, difference, difference_over_frames, mean_over_frames, same_flight
@@ -35,6 +35,18 @@ def flight(side=12, F=9, K=3, soft_evidence=False, seed=0):
     some = seen.any(axis=1)
     log = log_of_evidence(evidence[some], seen[some], index=index[some])
     return log.table(), log, truth[some]
+
+
+@pytest.mark.parametrize(("K", "there"), [(MOST_CLASSES, True), (MOST_CLASSES + 1, False)])
+def test_sums_by_class_are_there_up_to_so_many_classes(K, there):
+    table, log, truth = flight(K=K)
+    again = (table.op >= 2) & (truth == 1)
+    expected = (dominant(table) == truth)[again].mean() if there else np.nan
+    for given in (log, None):
+        sums = cluster_sums_of(table, given, truth)
+        found = value(sums, "accuracy", 1) if there else value(sums, "miou")
+        assert found == pytest.approx(expected, nan_ok=True)
+        assert value(sums, "accuracy") == pytest.approx((dominant(table) == truth)[table.op >= 2].mean())
 
 
 @pytest.mark.parametrize("soft_evidence", [False, True])

@@ -124,6 +124,15 @@ def test_the_same_seed_gives_the_same_description():
     assert to_json(a.agreement) == to_json(other.agreement)
 
 
+def test_the_order_is_known_where_a_quarter_of_the_locations_tell_of_it():
+    found = describe(model(0.2, 0).table())
+    of = [
+        replace(found, drift=replace(found.drift, voxels=n), repeated=replace(found.repeated, voxels=100))
+        for n in (24, 25)
+    ]
+    assert [each.order_known for each in of] == [False, True]
+
+
 def values(section):
     return [value.value for value in vars(section).values() if isinstance(value, Interval)]
 
