@@ -67,6 +67,7 @@ class Scene(ABC):
         sources: Where its parts come from, in words, a line each, where that was found and could be another.
         on_photographs: Whether `image` is a distorted photograph, which `color` shows undistorted.
         skips_incomplete: Whether selected frames without a file are left out; else they are an error.
+        images_elsewhere: Whether option images may name another folder of images, and does not.
     """
 
     name: str
@@ -86,6 +87,7 @@ class Scene(ABC):
     sources: tuple[str, ...] = ()
     on_photographs: bool = False
     skips_incomplete: bool = False
+    images_elsewhere: bool = False
 
     @abstractmethod
     def __len__(self) -> int:
@@ -319,7 +321,8 @@ def _tell_missing(scene: Scene, paths: list[str], complete: int, selected: int, 
     where = str(scene.folder or scene.name)
     if not scene.skips_incomplete:
         skip = "set incomplete: skip (--option incomplete=skip) to leave such frames out"
-        raise DataError(f"{where}: {listed(paths, where)}; add them, or {skip}")
+        there = ", name their folder (--option images=FOLDER)" if scene.images_elsewhere else ""
+        raise DataError(f"{where}: {listed(paths, where)}; add them{there}, or {skip}")
     if not complete:
         raise DataError(
             f"{where}: no selected frame has {', '.join(needs[:-1])} and {needs[-1]} ({listed(paths, where)})"

@@ -115,6 +115,7 @@ class OwnModel(Model):
         return {**about, "classes": list(self.label_space.classes)}
 
     def _predict(self, image: Image, frame: Sequence[Any], scores: bool) -> Prediction:
+        image = image if image.flags.writeable else image.copy()  # torch warns of arrays that cannot be written to
         output = guarded(self._code.text, lambda: _array(self._call(image, *frame)))
         shape, K = image.shape[:2], len(self.label_space or ())
         if output.shape == shape and output.dtype.kind in "iu":

@@ -38,7 +38,7 @@ def save_backend(folder: Path) -> None:
 
 
 @pytest.mark.parametrize(("name", "prepare", "left"), [
-    ("own-backend", save_backend, ["mine/report.html", "both/report.html"]),
+    ("own-backend", save_backend, ["mine/report.html", "side-by-side/report.html"]),
     ("own-sequence", make_nothing, ["runs/first/report.html", "runs/first/tables/classes.csv"]),
     ("lidar-camera", make_nothing, ["run/report.html"]),
     ("two-models", make_nothing, ["both/report.html", "versus/report.html", "versus/comparison.json"]),

@@ -32,6 +32,8 @@ def print_check(checked: SceneCheck, console: Console, *, verbose: bool = False)
     state = "unsound" if checked.problems_of_geometry else checked.verdict.state
     console.print()
     say(f"  {state.upper()}  {_conclusion(checked)}", 4, STATES[state])
+    if not checked.labels:
+        say("  labels   none: predict them (--predict), or put the label maps of a model into its folder", 11)
     for text in checked.problems_of_labels:
         say(f"  LABELS  {text}", 4, STATES["unsound"])
     if checked.placed is not None:
@@ -89,7 +91,8 @@ def _convention_table(checked: SceneCheck) -> Table:
 
 
 def _overlap_table(checked: SceneCheck) -> Table:
-    numbers = ("pairs", "in view\n%", "co-visible\n%", "error\n%", "labels agree\n%")
+    of = f" of {checked.labels[0].model}" if len(checked.labels) > 1 else ""
+    numbers = ("pairs", "in view\n%", "co-visible\n%", "error\n%", f"labels{of}\nagree %")
     table = _table(("frames apart",), numbers)
     for row in checked.overlaps:
         low, high = row.apart

@@ -197,7 +197,7 @@ class PredictedScene(Scene):
         self.sources = inner.sources
         self.folder = inner.folder
         self.settings_file = inner.settings_file
-        self.skips_incomplete = inner.skips_incomplete
+        self.skips_incomplete, self.images_elsewhere = inner.skips_incomplete, inner.images_elsewhere
         self._inner = inner
         self._dataset = dataset
         self._producers: dict[str, Producer] = {}

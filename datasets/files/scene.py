@@ -76,6 +76,7 @@ class FileScene(Scene):
         self.folder = entry.folder
         self.options = options
         self.skips_incomplete = options.incomplete == "skip"
+        self.images_elsewhere = getattr(options, "images", "") is None
         self.up = np.array(UP_AXES[options.up_axis], dtype=np.float64) if options.up_axis else None
         self._frames = frames
         self._folders = folders or Folders()
