@@ -304,7 +304,9 @@ def select_frames(
     complete = [index for index in chosen if index not in missing]
     if len(complete) < len(chosen):
         needs = ("depth", "pose", *(("labels",) if sources else ()), *(("colour",) if color else ()))
-        _tell_missing(scene, [path for paths in missing.values() for path in paths], len(complete), len(chosen), needs)
+        paths = [path for paths in missing.values() for path in paths]
+        images = color and any(len(paths) > len(scene.missing(index, sources)) for index, paths in missing.items())
+        _tell_missing(scene, paths, len(complete), len(chosen), needs, images=images)
     lost = {index for index in complete if not scene.tracked(index)}
     if lost:
         more = ", ..." if len(lost) > MAX_LISTED else ""
@@ -317,11 +319,13 @@ def select_frames(
     )
 
 
-def _tell_missing(scene: Scene, paths: list[str], complete: int, selected: int, needs: Sequence[str]) -> None:
+def _tell_missing(
+    scene: Scene, paths: list[str], complete: int, selected: int, needs: Sequence[str], *, images: bool
+) -> None:
     where = str(scene.folder or scene.name)
     if not scene.skips_incomplete:
         skip = "set incomplete: skip (--option incomplete=skip) to leave such frames out"
-        there = ", name their folder (--option images=FOLDER)" if scene.images_elsewhere else ""
+        there = ", name their folder (--option images=FOLDER)" if images and scene.images_elsewhere else ""
         raise DataError(f"{where}: {listed(paths, where)}; add them{there}, or {skip}")
     if not complete:
         raise DataError(

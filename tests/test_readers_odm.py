@@ -20,8 +20,10 @@ from PIL import Image
 from posed_scene import fails
 from scipy.spatial.transform import Rotation
 
+from semstab.config import FrameSelection
 from semstab.data.georeference import Georeference, wkt
 from semstab.datasets import open_dataset
+from semstab.datasets.scene import select_frames
 from semstab.errors import ConfigError, DataError
 
 pytest.importorskip("pyproj")
@@ -708,6 +710,8 @@ def test_an_image_that_is_not_there_is_named_by_where_it_would_be(tmp_path) -> N
     folder = write_project(tmp_path / "field")
     shutil.rmtree(folder / "opensfm/undistorted/images")
     assert opened(folder).missing(0, color=True) == [f"{folder}/opensfm/undistorted/images/DJI_0001.JPG"]
+    with pytest.raises(DataError, match=r"3 missing: .*add them, name their folder \(--option images=FOLDER\), or set"):
+        select_frames(opened(folder), FrameSelection(), color=True)
 
 
 def test_original_labels_need_the_cameras_of_the_photographs(tmp_path) -> None:
