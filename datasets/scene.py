@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import hashlib
 import logging
 import math
 import os
@@ -110,6 +111,18 @@ class Scene(ABC):
     @abstractmethod
     def digest(self, indices: list[int], model: str) -> str:
         """Return a hash of the content behind those frames: the same digest means the same numbers."""
+
+    def fingerprints(self, index: int) -> Mapping[str, str]:
+        """Return a short hash of the frame's depth, and of its pose and camera, by the name of what holds it.
+
+        They are equal where the geometry is; labels and images do not count.
+        """
+        frame = self.geometry(index)
+        name = self.frame_name(index)
+        return {
+            f"depth of {name}": fingerprint(frame.depth.tobytes()),
+            f"pose of {name}": view_fingerprint(frame.T_wc, frame.intrinsics, frame.shape),
+        }
 
     @property
     def by_name(self) -> tuple[str, ...]:
@@ -224,6 +237,17 @@ class Scene(ABC):
             DataError: If image and depth do not show the same view.
         """
         return at_image(self.geometry(index), shape, f"{self.name}, {self.image_name(index)}")
+
+
+def fingerprint(content: bytes) -> str:
+    """Return a short hash, of 8 hexadecimal digits."""
+    return hashlib.blake2b(content, digest_size=4).hexdigest()
+
+
+def view_fingerprint(T_wc: Float64, intrinsics: Intrinsics, shape: tuple[int, ...]) -> str:
+    """Return a short hash of a pose and a camera, to a micrometre and a millionth of a pixel."""
+    numbers = [*np.ravel(T_wc).tolist(), *dataclasses.astuple(intrinsics), *shape]
+    return fingerprint(" ".join(f"{round(number, 6) + 0.0:.6f}" for number in numbers).encode())
 
 
 class Dataset(ABC):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shlex
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -28,8 +29,14 @@ STUDY = {"dataset": {"name": "posed_folder", "options": {"root": "flight"}}, "sw
 FAILS = {"gate new --rule 'alpha > 0.6' --out gate.md": 5}
 """Gates that so few frames leave undecided."""
 
-SLOW = ("conform './fuse'", "list --check")
-"""All cases, and all models loaded: test_conformance_data and test_cli run these."""
+SLOW = ("conform './fuse'", "list --check", "benchmark city@1 --predict net.py:Net")
+"""All cases, all models loaded, five flights: other tests run these, or their like."""
+
+RESULTS = Path(__file__).parents[1] / "results"
+BENCHMARK = {
+    "description": "a wall", "get": "write it", "license": "none", "citation": "nobody", "voxel_size": 0.2,
+    "dataset": {"name": "posed_folder"}, "scenes": ["flight"],
+}  # fmt: skip
 
 
 @pytest.fixture(scope="module")
@@ -42,6 +49,8 @@ def folder(tmp_path_factory):
         write_image(folder / f"flight/color/{k:04d}.png", image)
     (folder / "net.py").write_text(NET)
     (folder / "mine.yaml").write_text(yaml.safe_dump(STUDY))
+    (folder / "mine@1.yaml").write_text(yaml.safe_dump(BENCHMARK))
+    (folder / "results").symlink_to(RESULTS)
     (folder / "fuse").write_text(f'#!/bin/sh\nexec {sys.executable} -m semstab.conformance.fuse numba "$@"\n')
     (folder / "fuse").chmod(0o755)
     for name in ("old", "new"):

@@ -61,7 +61,7 @@ def test_units_have_the_base_settings_as_a_run_of_their_own() -> None:
 def test_every_setting_is_in_the_key_of_a_unit_or_has_a_reason_not_to_be() -> None:
     """A new one must be thought of."""
     selects = {"dataset", "scenes", "models", "region_maps", "backends", "taxonomy", "frames", "scene_frames"}
-    plans = {"name", "description", "check", "tolerance", "shared_taxonomy", "sweeps", "seed", "events"}
+    plans = {"name", "description", "benchmark", "check", "tolerance", "shared_taxonomy", "sweeps", "seed", "events"}
     plans |= {"frame_quality", "video_measures"}  # with the label source that it compares with, and with the flow
     elsewhere = {"check_geometry", "threads", "memory_gb", "tile_size"}
     assert set(Config.model_fields) == selects | plans | elsewhere | set(IN_KEYS)

@@ -10,7 +10,7 @@ import os
 import signal
 import sys
 import threading
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -19,8 +19,8 @@ from typer.core import TyperCommand, TyperGroup
 
 from semstab import __version__
 from semstab.cli.options import say
-from semstab.cli.result_commands import calibrate, compare, conform, export, gate, list_, relabel
-from semstab.cli.run_commands import check, convert, filters, predict, run, show, study, view
+from semstab.cli.result_commands import calibrate, compare, conform, export, gate, leaderboard, list_, relabel
+from semstab.cli.run_commands import benchmark, check, convert, filters, predict, run, show, study, view
 from semstab.core.process import configure_process
 from semstab.errors import OUT_OF_MEMORY, ConfigError, SemstabError, summarize_error
 
@@ -64,7 +64,7 @@ def interruptible() -> Iterator[None]:
 ENDINGS = signal.SIGINT, signal.SIGTERM, signal.SIGHUP
 """Signals that end a command in one line."""
 
-RESUMED = ("run", "study", "filters", "predict", "convert")
+RESUMED = ("run", "study", "benchmark", "filters", "predict", "convert")
 """The commands that go on where they were."""
 
 
@@ -227,37 +227,36 @@ def root(
     """Take the options that stand before the command."""
 
 
-EXAMPLES: Mapping[str, tuple[str, str]] = {
-    "run": ("run --data flight --out now", "run --data flight --model net --frames ::2 --out thinned"),
-    "study": ("study mine.yaml --out sweep", "study mine.yaml --only voxel_size --jobs 2"),
-    "predict": (
+COMMANDS: Mapping[Callable[..., None], tuple[str, str]] = {
+    run: ("run --data flight --out now", "run --data flight --model net --frames ::2 --out thinned"),
+    study: ("study mine.yaml --out sweep", "study mine.yaml --only voxel_size --jobs 2"),
+    benchmark: ("benchmark city@1 --predict net.py:Net", "benchmark mine@1.yaml --data flight --submit net.semstab"),
+    predict: (
         "predict --model colour-clusters --data flight", "predict --model net.py:Net --data flight --name mine",
     ),
-    "check": ("check --data flight", "check --data flight --json flight.json"),
-    "convert": ("convert --data flight --out same", "convert --data flight --out small --depth-error 0.002"),
-    "compare": ("compare old new", "compare old new --out versus"),
-    "filters": (
+    check: ("check --data flight", "check --data flight --json flight.json"),
+    convert: ("convert --data flight --out same", "convert --data flight --out small --depth-error 0.002"),
+    compare: ("compare old new", "compare old new --out versus"),
+    filters: (
         "filters --data flight --model net --out steadier", "filters --data flight --model net --filter ema:0.6",
     ),
-    "gate": ("gate new --against old --rule 'alpha drop < 0.02'", "gate new --rule 'alpha > 0.6' --out gate.md"),
-    "calibrate": ("calibrate judged --out thresholds.yaml", "calibrate judged --precision 0.9 --out thresholds.yaml"),
-    "export": ("export new --to map.ply", "export new --to voxels.csv --min-op 3"),
-    "relabel": ("relabel new --out fused", "relabel new --out steady --category stable"),
-    "conform": ("conform './fuse'", "conform './fuse' --only pinhole"),
-    "show": ("show new", "show old new --out glance"),
-    "view": ("view new", "view new/recording.rrd"),
-    "list": ("list", "list --check"),
+    gate: ("gate new --against old --rule 'alpha drop < 0.02'", "gate new --rule 'alpha > 0.6' --out gate.md"),
+    leaderboard: ("leaderboard results", "leaderboard results --out site"),
+    calibrate: ("calibrate judged --out thresholds.yaml", "calibrate judged --precision 0.9 --out thresholds.yaml"),
+    export: ("export new --to map.ply", "export new --to voxels.csv --min-op 3"),
+    relabel: ("relabel new --out fused", "relabel new --out steady --category stable"),
+    conform: ("conform './fuse'", "conform './fuse' --only pinhole"),
+    show: ("show new", "show old new --out glance"),
+    view: ("view new", "view new/recording.rrd"),
+    list_: ("list", "list --check"),
 }  # fmt: skip
-"""Two command lines for each command, of a scene `flight` and of finished runs, which end its help."""
+"""The commands, with two command lines of each, of a scene `flight` and of finished runs, which end its help."""
 
+EXAMPLES = {command.__name__.rstrip("_"): lines for command, lines in COMMANDS.items()}
 
-for command, name in (
-    (run, "run"), (study, "study"), (predict, "predict"), (check, "check"), (convert, "convert"), (compare, "compare"),
-    (filters, "filters"), (gate, "gate"), (calibrate, "calibrate"), (export, "export"), (relabel, "relabel"),
-    (conform, "conform"), (show, "show"), (view, "view"), (list_, "list"),
-):  # fmt: skip
-    lines = [f"semstab-bench {line}" for line in EXAMPLES[name]]
-    app.command(name, cls=Command, epilog="\n\n".join(["Examples:", *lines]))(command)
+for command, examples in COMMANDS.items():
+    lines = [f"semstab-bench {line}" for line in examples]
+    app.command(command.__name__.rstrip("_"), cls=Command, epilog="\n\n".join(["Examples:", *lines]))(command)
 
 
 class _Once(logging.Filter):

@@ -1,4 +1,4 @@
-"""Define the commands over finished runs: compare, gate, calibrate, export, relabel; conform and list."""
+"""Define the commands over finished runs: compare, gate, leaderboard, calibrate, export, relabel; conform and list."""
 
 from __future__ import annotations
 
@@ -100,6 +100,26 @@ def gate(
     if save_baseline is not None:
         save_summary(open_run(new), save_baseline)
         print_lines([f"{save_baseline}: a baseline of {save_baseline.stat().st_size:,} bytes"], quiet=quiet)
+
+
+def leaderboard(
+    folder: Annotated[Path, typer.Argument(metavar="FOLDER", help="Folder with results, files of --submit.")],
+    out: Annotated[Path | None, typer.Option(
+        "--out", "-o", help="Folder for index.html, and JSON, CSV and Markdown of each benchmark.")] = None,
+    definition: Annotated[list[Path] | None, typer.Option(
+        "--benchmark", metavar="FILE", help="Definition of a benchmark that does not ship; repeatable.")] = None,
+    quiet: Quiet = False,
+) -> None:  # fmt: skip
+    """Check results of benchmarks that were handed in, and rank them with intervals."""
+    from semstab.leaderboard.board import boards, lines, write_site
+    from semstab.leaderboard.definition import load_benchmark
+
+    own = {each.id: each for each in map(load_benchmark, definition or ())}
+    made = boards(folder, own)
+    print_lines(lines(made), quiet=quiet)
+    if out is not None:
+        write_site(made, out)
+        print_lines([f"  page  {out / 'index.html'}"], quiet=quiet)
 
 
 def calibrate(
@@ -243,7 +263,7 @@ def relabel(
 def list_(
     check: Annotated[bool, typer.Option("--check", help="Also load each one, which takes seconds.")] = False,
 ) -> None:
-    """List backends, datasets, models, filters, taxonomies and studies, each with 'ready' or the missing package.
+    """List backends, datasets, models, filters, taxonomies, studies and benchmarks, with 'ready' or what is missing.
 
     Below stand the settings of your own: ~/.config/semstab/config.yaml.
     """
@@ -256,6 +276,7 @@ def list_(
     from semstab.config import read_yaml
     from semstab.data.labels import LabelSpace, shipped_taxonomies
     from semstab.errors import MissingDependencyError
+    from semstab.leaderboard.definition import load_benchmark, shipped_benchmarks
     from semstab.predict import filters
     from semstab.settings import load_study, shipped_studies
 
@@ -277,6 +298,9 @@ def list_(
         table.add_row("taxonomy", name, "[green]ready", f"K = {len(space)}: {', '.join(space.classes)}")
     for name in shipped_studies():
         table.add_row("study", name, "[green]ready", load_study(name).description)
+    for name in shipped_benchmarks():
+        definition = load_benchmark(name)
+        table.add_row("benchmark", name, "[green]ready", definition.description)
     console = Console()
     console.print(table)
     if (own := own_defaults()) is None:

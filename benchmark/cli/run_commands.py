@@ -1,4 +1,4 @@
-"""Define the commands that compute: run, study, filters, check, predict, convert; and show and view of results."""
+"""Define the commands that compute: run, study, benchmark, filters, check, predict, convert; and show and view."""
 
 from __future__ import annotations
 
@@ -138,6 +138,64 @@ def study(
     config = config if only is None else config.only(only)
     out = out or Path("studies") / slug(config.name)
     execute(config, out, executor_of(jobs, scheduler), rerun, report, overwrite=overwrite, quiet=quiet, verbose=verbose)
+
+
+def benchmark(
+    name: Annotated[str, typer.Argument(
+        metavar="NAME[@VERSION]", help="Benchmark of `list`, or its YAML file.", autocompletion=opt.benchmarks)],
+    data: Annotated[Path | None, typer.Option(help="Folder of its data.", show_default="built in")] = None,
+    labels: Annotated[Path | None, typer.Option(
+        help="Folder of label maps, SCENE/MODEL/NAME.png below it.", show_default="the data's own")] = None,
+    predict: opt.Predicted = None,
+    classes: opt.Classes = None,
+    filters: opt.Filters = None,
+    taxonomy: Annotated[str | None, typer.Option(
+        metavar="FILE", help="The benchmark's classes, with your names for them as members.",
+        show_default="the benchmark's", rich_help_panel=opt.LABELS)] = None,
+    model: opt.Models = None,
+    out: Annotated[Path | None, typer.Option(
+        "--out", "-o", help="Run folder.", show_default="runs/NAME@VERSION")] = None,
+    submit: Annotated[Path | None, typer.Option(
+        metavar="FILE|FOLDER", help="Write the result as a file to hand in; a folder gets one a model.")] = None,
+    card: Annotated[Path | None, typer.Option(
+        metavar="FILE", help="YAML about the model: name, by, url, license, parameters, trained_on, notes.")] = None,
+    overwrite: opt.Overwrite = False,
+    rerun: opt.Rerun = "off",
+    report: opt.Report = "on",
+    jobs: opt.Jobs = 1,
+    scheduler: opt.Scheduler = None,
+    quiet: opt.Quiet = False,
+    verbose: opt.Verbose = False,
+) -> None:  # fmt: skip
+    """Run a benchmark: fixed data, frames and settings, so that its numbers can be compared with everybody's."""
+    from semstab.engine.folder import require_output
+    from semstab.leaderboard.definition import load_benchmark
+    from semstab.leaderboard.submission import ModelCard, submissions
+    from semstab.predict.predictor import parse_predictors
+
+    definition = load_benchmark(name)
+    if "@" not in name or definition.superseded_by is not None:
+        newer = f"; {definition.superseded_by} has replaced it" if definition.superseded_by else ""
+        say(f"benchmark {definition.id}{newer}")
+    if classes is not None and not predict:
+        raise ConfigError("--classes names the classes of a model that --predict chooses")
+    if card is not None and submit is None:
+        raise ConfigError("--card describes a result to hand in; name its file with --submit")
+    about = None if card is None else ModelCard.load(card)
+    if submit is not None and submit.suffix:
+        require_output(submit, [card])
+    predictors = parse_predictors(predict or [], {} if classes is None else {"classes": classes}, filters or [])
+    if filters and not predict:
+        raise ConfigError("--filter stands over a model that --predict chooses")
+    config = definition.configured(data, labels, predictors, None if model == ["all"] else model, taxonomy)
+    if definition.digests is None:
+        say(f"{definition.id}: nobody had the data when it was defined, so that your copy is not compared")
+    definition.require_data(data)
+    out = out or Path("runs") / definition.id
+    execute(config, out, executor_of(jobs, scheduler), rerun, report, overwrite=overwrite, quiet=quiet, verbose=verbose)
+    if submit is not None:
+        for path, handle in submissions(out, submit, about):
+            print_lines([f"{path}: {handle.model} on {definition.id}, {path.stat().st_size:,} bytes"], quiet=quiet)
 
 
 def filters(

@@ -133,12 +133,14 @@ class RunHandle:
     Attributes:
         name: Distinct among the runs that are compared: its model, its folder, or both.
         source: The folder, or the file of a small summary; None for a run that a program holds.
+        about: What a small summary that was handed in says of its benchmark and its model.
     """
 
     name: str
     source: Path | None
     model: str
     scenes: Mapping[str, Entry]
+    about: Mapping[str, Any] = field(default_factory=dict)
 
     @property
     def where(self) -> str:
@@ -179,9 +181,9 @@ def open_run(named: str | os.PathLike[str]) -> RunHandle:
     if not path.exists():
         raise ConfigError(f"{path}: there is no such folder; give the folder of a run, or FOLDER:MODEL")
     if path.is_file():
-        model, scenes = load_summary(path)
-        _chosen(path, [model], wanted)
-        return RunHandle(model, path, model, scenes)
+        small = load_summary(path)
+        _chosen(path, [small.model], wanted)
+        return small
     result, source = load_result(path), path if isinstance(named, str | Path) else None
     model = _chosen(path, result.models, wanted)
     seed = result.manifest.get("seed")
@@ -294,12 +296,14 @@ class _Scene(EntryNumbers):
 class _Content:
     model: str
     scenes: tuple[_Scene, ...] = field(default=())
+    about: dict[str, Any] = field(default_factory=dict)
 
 
-def save_summary(run: RunHandle, path: str | Path, most: int = 1_000_000) -> None:
+def save_summary(run: RunHandle, path: str | Path, most: int = 1_000_000, *, single: bool = False) -> None:
     """Write all data of a later comparison except voxels into one file.
 
-    Its cubes of space and groups of frames are as fine as `most` bytes allow.
+    Its cubes of space and groups of frames are as fine as `most` bytes allow; sums are rounded to single precision on
+    request, which halves the file.
 
     Raises:
         DataError: If even the coarsest sums need more.
@@ -308,9 +312,9 @@ def save_summary(run: RunHandle, path: str | Path, most: int = 1_000_000) -> Non
         _Scene(**_numbers(own), name=name, frames=(*own.flicker,), flicker=(*own.flicker.values(),))
         for name, own in run.scenes.items()
     )
-    content = json.dumps({"kind": KIND, "schema": SCHEMA, **to_json(_Content(run.model, scenes))})
+    content = json.dumps({"kind": KIND, "schema": SCHEMA, **to_json(_Content(run.model, scenes, {**run.about}))})
     sums = [own.sums for own in run.scenes.values()]
-    while len(data := _archive(content, sums)) > most:
+    while len(data := _archive(content, sums, single=single)) > most:
         coarser = [_coarser(own) for own in sums]
         if all(np.array_equal(a.cell, b.cell) and a.step == b.step for a, b in zip(coarser, sums, strict=True)):
             raise DataError(f"{path}: a summary of {len(sums)} scenes takes {len(data)} bytes; use fewer scenes")
@@ -319,8 +323,8 @@ def save_summary(run: RunHandle, path: str | Path, most: int = 1_000_000) -> Non
         temporary.write_bytes(data)
 
 
-def load_summary(path: str | Path) -> tuple[str, dict[str, Entry]]:
-    """Return the model and the scenes that `save_summary` wrote.
+def load_summary(path: str | Path) -> RunHandle:
+    """Return what `save_summary` wrote.
 
     Raises:
         DataError: For any other file.
@@ -354,21 +358,21 @@ def load_summary(path: str | Path) -> tuple[str, dict[str, Entry]]:
                 raise DataError(f"{path}: the sums of {own.name} are damaged; write the summary again") from error
             flicker = dict(zip(own.frames, own.flicker, strict=True))
             scenes[own.name] = Entry(**_numbers(own), where=str(path), small=(sums, flicker))
-    return content.model, scenes
+    return RunHandle(content.model, path, content.model, scenes, content.about)
 
 
 def _numbers(own: EntryNumbers) -> dict[str, Any]:
     return {field.name: getattr(own, field.name) for field in dataclasses.fields(EntryNumbers)}
 
 
-def _archive(content: str, sums: list[ClusterSums]) -> bytes:
+def _archive(content: str, sums: list[ClusterSums], *, single: bool) -> bytes:
     """Return the file, byte for byte the same for the same content."""
     data = io.BytesIO()
     with zipfile.ZipFile(data, "w", zipfile.ZIP_DEFLATED) as archive, ScratchFolder() as folder:
         archive.writestr(zipfile.ZipInfo(CONTENT), content, zipfile.ZIP_DEFLATED)
         for i, own in enumerate(sums):
             part = folder / "sums.parquet"
-            own.save(part)
+            own.save(part, single=single)
             archive.writestr(zipfile.ZipInfo(f"{i}.parquet"), part.read_bytes())
     return data.getvalue()
 

@@ -29,8 +29,8 @@ from semstab.core.types import THIS_SCENE
 from semstab.errors import ConfigError, nearest
 
 __all__ = [
-    "BackendConfig", "Config", "DatasetConfig", "Deviation", "Exclusion", "FrameSelection", "Noise", "Part",
-    "Perturbation", "Settings", "Sweeps", "as_range", "explain", "merge", "nearest", "read_yaml", "validated",
+    "BackendConfig", "Config", "DatasetConfig", "Deviation", "Exclusion", "FrameSelection", "NamedBenchmark", "Noise",
+    "Part", "Perturbation", "Settings", "Sweeps", "as_range", "explain", "merge", "nearest", "read_yaml", "validated",
 ]  # fmt: skip
 
 BASE, SHARED, BACKENDS = "base", "shared_taxonomy", "backends"
@@ -118,6 +118,17 @@ FlowName = Literal["depth", "dis"]
 """The motion from a frame to the next one: by depth and pose, or OpenCV's dense inverse search on the images."""
 
 
+class NamedBenchmark(Settings):
+    """The benchmark that a run is of, as `semstab-bench benchmark` sets it."""
+
+    id: str = Field(description="NAME@VERSION")
+    digest: str = Field(description="hash of the definition")
+    file: str | None = Field(None, description="the definition, where it does not ship")
+
+    def __str__(self) -> str:
+        return f"{self.id} ({self.digest})"
+
+
 class Config(Settings):
     """Settings that determine the numbers of a run or a study: scenes x models x backends x variations.
 
@@ -166,6 +177,7 @@ class Config(Settings):
     critical_classes: list[str] = Field([], description="classes of the verdict; all frequent ones if none is named")
     scope: ScopeSetting = Field(THIS_SCENE, description="of intervals: 'these frames', 'this scene', 'other scenes'")
     verdict: VerdictSettings = Field(VerdictSettings(), description="thresholds of the levels")
+    benchmark: NamedBenchmark | None = Field(None, description="the benchmark that these settings are of; null: none")
 
     # These change no number, so they are not stored with a run.
     threads: int | None = Field(None, ge=1, exclude=True, description="threads that decode frames ahead")

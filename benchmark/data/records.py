@@ -345,6 +345,7 @@ class Result:
         advice: Advice on the voxel size, scene by scene, for data of files.
         notes: Remarks of the check, scene by scene: labels that are not registered to the depth, and the like.
         comparisons: The comparison of the models of each scene by `compare_models`, with `statistics`.
+        benchmark: The benchmark that it is a run of, 'NAME@VERSION (hash of the definition)'; '' for none.
     """
 
     name: str
@@ -360,6 +361,7 @@ class Result:
     compared: tuple[Agreement, ...] = ()
     advice: Mapping[str, VoxelAdvice] = field(default_factory=dict)
     notes: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+    benchmark: str = ""
 
     def __repr__(self) -> str:
         units = f"{len(self.records)} unit{'' if len(self.records) == 1 else 's'}"
@@ -448,7 +450,8 @@ class Result:
 
     def _columns(self) -> dict[str, Any]:
         flicker = {record.unit: record.image_space.compensated_flicker_percent for record in reversed(self.records)}
-        rows = [run.row() | {"compensated_flicker_percent": flicker[run.unit]} for run in self.runs]
+        named: dict[str, str | int | float] = {"benchmark": self.benchmark} if self.benchmark else {}
+        rows = [run.row() | {"compensated_flicker_percent": flicker[run.unit]} | named for run in self.runs]
         return {name: np.array([row[name] for row in rows]) for name in (rows[0] if rows else ())}
 
     def _repr_html_(self) -> str:

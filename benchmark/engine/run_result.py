@@ -81,6 +81,7 @@ def result_of(plan: Plan, folder: Folder, units: UnitResults) -> Result:
         compared=compared,
         advice=units.advice,
         notes=_notes_of(plan, contents),
+        benchmark="" if config.benchmark is None else str(config.benchmark),
     )
 
 

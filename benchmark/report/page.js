@@ -28,6 +28,16 @@ for (const table of document.querySelectorAll("table.sortable")) {
   });
 }
 
+// Filters: rows of the table below whose text does not hold the words are hidden.
+for (const filter of document.querySelectorAll("input.filter")) {
+  const rows = document.getElementById(filter.getAttribute("aria-controls")).querySelectorAll("tbody tr");
+  filter.closest(".controls").hidden = false;
+  filter.addEventListener("input", () => {
+    const words = filter.value.toLowerCase().split(/\s+/);
+    for (const row of rows) row.hidden = !words.every(word => row.textContent.toLowerCase().includes(word));
+  });
+}
+
 // Maps: two images of numbers a model, (class low, class high, category) and (VSS, OP, SBD), painted by layer.
 const parsed = id => JSON.parse(document.getElementById(id)?.textContent ?? "null");
 const layers = parsed("layers"), units = parsed("maps") ?? [];

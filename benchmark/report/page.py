@@ -372,7 +372,9 @@ def _sweeps(result: Result) -> Iterator[dict[str, str]]:
 
 
 def _title(result: Result) -> str:
-    """Return the name of a study; of a run, which has none, its scenes."""
+    """Return the name of a study, or of a benchmark; of a run, which has none, its scenes."""
+    if result.benchmark:
+        return f"Benchmark {result.benchmark.partition(' ')[0]}"
     if result.sweeps():
         return result.name
     scenes = result.scenes
@@ -389,7 +391,8 @@ def _subtitle(result: Result) -> str:
         run = records[0].summary
         classes = " and ".join(map(str, sorted({record.summary.table.K for record in records})))
         parts += [f"{run.frames} frames", f"{classes} classes", f"voxels of {run.table.voxel_size:g} m"]
-    return " · ".join([*parts, f"fused by {result.backend}"])
+    definition = [f"definition {result.benchmark.partition('(')[2].rstrip(')')}"] if result.benchmark else []
+    return " · ".join([*parts, f"fused by {result.backend}", *definition])
 
 
 def _failure(failure: Failure) -> dict[str, str]:

@@ -5,9 +5,10 @@ from __future__ import annotations
 import functools
 import itertools
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import TypeVar
 
 from semstab.core.types import THESE_FRAMES, THIS_SCENE, Scope
 from semstab.data.labels import sharing_classes
@@ -22,6 +23,8 @@ from semstab.statistics.cluster_sums import ClusterSums, value
 from semstab.statistics.intervals import difference, mean_of, scope_of
 from semstab.statistics.observations import CellObservations
 from semstab.statistics.paired_differences import compared_observations, holm
+
+Value = TypeVar("Value")
 
 
 @dataclass(frozen=True)
@@ -99,24 +102,46 @@ def _ranking(scenes: tuple[Files, ...], names: tuple[str, ...]) -> Ranking:
     apart = tuple(name for name in names if sums and name not in sums[0])
     names = tuple(name for name in names if name not in apart)
     known = [own for own in sums if {*names} <= own.keys()]
-    pairs = list(itertools.combinations(names, 2)) if known else []
-    changes = [mean_of([_difference(own[b], own[a]) for own in known]) for a, b in pairs]
+    return replace(ranked(known, names), apart=apart)
+
+
+def ranked(
+    scenes: Sequence[Mapping[str, ClusterSums]], names: Sequence[str], places: Sequence[str] | None = None
+) -> Ranking:
+    """Return the ranking of models by their sums in each scene; each place counts once, however often it was flown."""
+    places = [str(k) for k in range(len(scenes))] if places is None else places
+    pairs = list(itertools.combinations(names, 2)) if scenes else []
+    changes = [over_places([_difference(own[b], own[a]) for own in scenes], places) for a, b in pairs]
     p_values = holm([change.p_value for change in changes])
     differences = tuple(
         Difference(
-            b, a, change.value, change.low, change.high, len(known), p, change.scope, change.undecided,
+            b, a, change.value, change.low, change.high, len(scenes), p, change.scope, change.undecided,
             shown=change.decided and p < 1 - change.level and not change.low <= 0 <= change.high,
         )
         for (a, b), change, p in zip(pairs, changes, p_values, strict=True)
     )  # fmt: skip
-    alpha = {name: macro_mean([value(own[name], ALPHA.key) for own in known]) for name in names} if known else {}
+    alpha = {name: _mean_alpha(name, scenes, places) for name in names} if scenes else {}
     better = dict.fromkeys(alpha, 0)
     for each in differences:
         if each.shown:
             better[each.other if each.value > 0 else each.model] += 1
     order = sorted(alpha, key=lambda name: (better[name], -alpha[name]))
     ranks = tuple((1 + n, tuple(own)) for n, own in itertools.groupby(order, key=better.__getitem__))
-    return Ranking(ranks, differences, apart=apart)
+    return Ranking(ranks, differences)
+
+
+def over_places(values: Sequence[Interval], places: Sequence[str]) -> Interval:
+    """Return the mean over places of the mean over the scenes of each place, with its interval."""
+    return mean_of([mean_of(own) for own in _by_place(values, places)])
+
+
+def _by_place(values: Sequence[Value], places: Sequence[str]) -> list[list[Value]]:
+    return [[own for own, of in zip(values, places, strict=True) if of == place] for place in dict.fromkeys(places)]
+
+
+def _mean_alpha(name: str, scenes: Sequence[Mapping[str, ClusterSums]], places: Sequence[str]) -> float:
+    alpha = [value(own[name], ALPHA.key) for own in scenes]
+    return macro_mean([macro_mean(own) for own in _by_place(alpha, places)])
 
 
 def _difference(own: ClusterSums, other: ClusterSums) -> Interval:

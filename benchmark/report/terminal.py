@@ -89,6 +89,8 @@ def screen(
     for text in list(warnings(result))[:MOST_WARNINGS]:
         named = text.replace("show RUN", f"show {out or 'RUN'}")
         yield from textwrap.wrap(f"warning: {named}", WIDTH, initial_indent="  ", subsequent_indent="    ")
+    if result.benchmark:
+        yield f"  benchmark {result.benchmark}"
     yield from _checks(result)
     yield from _where(result, out, seconds)
 

@@ -304,8 +304,8 @@ class ClusterSums:
         columns = self.columns[:, : width(self.K, truth=False)]
         return dataclasses.replace(self, columns=columns, truth=False)
 
-    def save(self, path: str | Path) -> None:
-        """Write Parquet, atomically."""
+    def save(self, path: str | Path, *, single: bool = False) -> None:
+        """Write Parquet, atomically; in single precision, which takes half the bytes and keeps seven digits."""
         import pyarrow as pa
         import pyarrow.parquet as pq
 
@@ -322,11 +322,14 @@ class ClusterSums:
             for name, own in layout(self.K, truth=self.truth).items()
             for k in range(own.stop - own.start)
         ]
-        arrays = [np.repeat(np.arange(len(parts)), lengths), *cell.T, frame, *columns.T]
+        stored = columns.astype(np.float32) if single else columns
+        arrays = [np.repeat(np.arange(len(parts)), lengths), *cell.T, frame, *stored.T]
         content = pa.table({name: arrow.column(array) for name, array in zip([*KEYS, *names], arrays, strict=True)})
         text = json.dumps({"schema": SCHEMA, "kind": "ClusterSums", **about})
         with atomic_path(path) as temporary:
-            pq.write_table(content.replace_schema_metadata({"semstab": text}), temporary, compression="zstd")
+            packed: dict[str, Any] = {"use_dictionary": False, "use_byte_stream_split": names} if single else {}
+            content = content.replace_schema_metadata({"semstab": text})
+            pq.write_table(content, temporary, compression="zstd", compression_level=19 if single else None, **packed)
 
     @classmethod
     def load(cls, path: str | Path) -> ClusterSums:

@@ -265,11 +265,15 @@ def probability_above(interval: Interval, threshold: float, scale: Scale) -> flo
 # --- Ends -------------------------------------------------------------------------------------------------------------
 
 
+ROUNDED = 1e-6
+"""Distance from 0 or 1 within which a share is that: sums may be stored in single precision."""
+
+
 def _share_ends(p: float, spread: Spread, units: int, level: float) -> tuple[float, float]:
     """Return the ends for a mean of numbers from 0 to 1, by its effective sample size (Korn and Graubard 1998)."""
     from scipy import special
 
-    p = min(max(p, 0.0), 1.0)
+    p = float(np.rint(p)) if abs(p - np.rint(p)) < ROUNDED else min(max(p, 0.0), 1.0)
     observations: float = units
     if spread.variance > TINY and 0 < p < 1:
         quantile = special.stdtrit([max(units - 1, 1), spread.degrees], (1 + level) / 2)

@@ -10,6 +10,7 @@ from __future__ import annotations
 import hashlib
 import json
 import threading
+from collections.abc import Mapping
 from functools import cached_property
 
 import numpy as np
@@ -24,7 +25,7 @@ from semstab.datasets.city.mesh import uavid8
 from semstab.datasets.city.options import FLIGHTS, CityOptions, SimulatedModel
 from semstab.datasets.city.simulation import Caster, Rendered, Simulation, View, render
 from semstab.datasets.city.world import World, build_world
-from semstab.datasets.scene import GROUND_TRUTH, Dataset, Scene
+from semstab.datasets.scene import GROUND_TRUTH, Dataset, Scene, fingerprint
 from semstab.errors import ConfigError, DataError
 
 __all__ = ["GENERATOR_VERSION", "City", "CityOptions", "CityScene", "SimulatedModel"]
@@ -146,6 +147,12 @@ class CityScene(Scene):
             "simulated": None if simulated is None else simulated.model_dump(mode="json"),
         }
         return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
+
+    def fingerprints(self, index: int) -> Mapping[str, str]:
+        """Return a short hash of all settings that the frame's geometry depends on; nothing is rendered."""
+        drawn = self._options.model_dump(mode="json", exclude={"models", "cache_megabytes"})
+        content = json.dumps([GENERATOR_VERSION, drawn, self.name, index], sort_keys=True)
+        return {f"frame {index}": fingerprint(content.encode())}
 
     @cached_property
     def world(self) -> World:

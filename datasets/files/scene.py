@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import os
 from collections.abc import Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
@@ -25,7 +26,7 @@ from semstab.datasets.formats.disk import read_pose
 from semstab.datasets.formats.images import Read, read_color, read_confidence, read_mask
 from semstab.datasets.geometry.cameras import UP_AXES, Camera, Poses, to_camera_to_world
 from semstab.datasets.geometry.lenses import Labels, Pixels, Scores, at_image, fit, fitted, undistorted
-from semstab.datasets.scene import Scene
+from semstab.datasets.scene import Scene, fingerprint, view_fingerprint
 from semstab.errors import ConfigError, DataError
 
 PLACES = {
@@ -305,6 +306,29 @@ class FileScene(Scene):
             for key in own:
                 digest.update(self._digests[key])
         return digest.hexdigest()
+
+    def fingerprints(self, index: int) -> Mapping[str, str]:
+        """Return a short hash of the file of depth and how it is read, and of the pose and camera, by their files."""
+        source, options = self._frame(index), self.options
+        if self._surface is None:
+            name, content = source.depth, self._folders.digest(source.depth)
+            if source.confidence is not None:
+                content += self._folders.digest(source.confidence)
+            least = source.least_confidence
+            content += repr((self.depth_scale, options.depth_kind, options.invalid_depth, least)).encode()
+        else:
+            name, content = self._surface.path, self._surface.digest
+        content += repr(options.max_depth).encode()
+        view = self._view(index)
+        pose = source.pose_file if source.pose is None else f"pose of {source.name}"
+        return {
+            self._named(name): fingerprint(content),
+            self._named(pose): view_fingerprint(view.T_wc, view.intrinsics, view.shape),
+        }
+
+    def _named(self, path: Path | str | None) -> str:
+        """Return a path as it is called in the scene's folder."""
+        return str(path).removeprefix(f"{self.folder}{os.sep}")
 
     def _images(self, index: int, model: str) -> dict[tuple[int, str], Path]:
         """Return the files that a frame is made of, but for its pose: depth where it is stored, labels, a mask."""

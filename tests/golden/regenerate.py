@@ -1,6 +1,7 @@
 """Writes the golden files: `python tests/golden/regenerate.py`. Look at the diff before you commit."""
 
 import dataclasses
+import json
 import sys
 import tempfile
 from pathlib import Path
@@ -96,6 +97,15 @@ def surface_content(surface):
     return content
 
 
+def write_benchmark_digests():
+    """The digest of each benchmark that ships, benchmarks.json: new versions are added, published ones stay."""
+    from semstab.leaderboard.definition import load_benchmark, shipped_benchmarks
+
+    path = FILE.with_name("benchmarks.json")
+    known = json.loads(path.read_text()) if path.exists() else {}
+    write_json(path, {name: load_benchmark(name).digest for name in shipped_benchmarks()} | known)
+
+
 def write_table_files():
     """The tables of the study of two walls, tables.{csv,md,tex}."""
     sys.path.insert(0, str(FILE.parents[1]))
@@ -110,4 +120,5 @@ def write_table_files():
 if __name__ == "__main__":
     write_json(FILE, golden())
     write_json(FILE.with_name("city.json"), golden_city())
+    write_benchmark_digests()
     write_table_files()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -53,7 +54,10 @@ BUILDERS = (
 def tables(result: Result) -> list[Table]:
     """Return every table that the study has records for, in the paper's order."""
     shown = of_interest(result)
-    return [*filter_tables(result), *(table for build in BUILDERS for table in build(shown))]
+    made = [*filter_tables(result), *(table for build in BUILDERS for table in build(shown))]
+    if not result.benchmark:
+        return made
+    return [dataclasses.replace(table, caption=f"{table.caption} Benchmark {result.benchmark}.") for table in made]
 
 
 def write_tables(result: Result, folder: str | Path) -> list[Path]:

@@ -1,0 +1,244 @@
+"""Benchmarks with a name and a version: data, settings, and hashes of the geometry that their numbers rest on."""
+
+from __future__ import annotations
+
+import hashlib
+import importlib.resources
+import json
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any, Literal
+
+from pydantic import Field
+
+from semstab.config import (
+    Config,
+    DatasetConfig,
+    Exclusion,
+    FrameSelection,
+    Settings,
+    merge,
+    nearest,
+    read_yaml,
+    validated,
+)
+from semstab.core.prefetch import prefetch
+from semstab.data.labels import LabelSpace
+from semstab.datasets import Scene, open_dataset
+from semstab.errors import ConfigError, DataError
+from semstab.predict.predictor import PredictorConfig
+from semstab.settings import load_config, predicted_config
+from semstab.task import frame_indices
+
+Number = Literal["alpha", "flicker", "accuracy", "miou", "wrong_of_consistent"]
+"""The numbers of a headline; see `semstab.leaderboard.board.COLUMNS`."""
+
+WITHOUT_NUMBERS = {"description", "get", "license", "citation", "superseded_by"}
+"""What may change in a version: words, no number follows from them."""
+
+
+IN_A_RUN = (
+    "scenes", "frames", "scene_frames", "taxonomy", "voxel_size", "pixel_stride", "exclude", "critical_classes",
+    "statistics",
+)  # fmt: skip
+"""The settings of a run that a definition fixes, beside its dataset."""
+
+
+class Benchmark(Settings):
+    """A definition: with the same labels everybody gets the same numbers from it.
+
+    Its file is NAME@VERSION.yaml. What numbers follow from is frozen once a version is published.
+
+    Examples:
+        >>> city = load_benchmark("city")
+        >>> city.id, city.scenes
+        ('city@1', ('scene0', 'scene1', 'scene2', 'scene3', 'scene4'))
+    """
+
+    file: str | None = Field(None, exclude=True, description="the file, of a definition that does not ship")
+    id: str = Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_-]*@[1-9][0-9]{0,3}$", description="NAME@VERSION, as its file")
+    description: str = Field(min_length=1, description="one line")
+    get: str = Field("", description="how the data is obtained, one line; nothing where it is built in")
+    license: str = Field(min_length=1, description="licence of the data")
+    citation: str = Field(min_length=1, description="whom users of the data cite")
+    superseded_by: str | None = Field(None, description="the version to use instead of this one")
+    dataset: DatasetConfig = Field(description="dataset and its options, without paths")
+    scenes: tuple[str, ...] = Field(min_length=1, description="the scenes, each counts once")
+    flights: dict[str, tuple[str, ...]] = Field({}, description="scenes that are the same place flown again, by place")
+    frames: FrameSelection = Field(FrameSelection(), description="frames that are fused")
+    scene_frames: dict[str, FrameSelection] = Field({}, description="frames of single scenes, instead of `frames`")
+    taxonomy: str | None = Field(None, description="label space to fuse in; that of the labels where not given")
+    voxel_size: float = Field(ge=1e-3, le=1e3, description="edge, metres")
+    voxel_sizes: tuple[float, ...] = Field((), description="further edges, metres, at which the maps are fused as well")
+    pixel_stride: int = Field(1, ge=1, description="use every n-th pixel of each axis")
+    exclude: Exclusion = Field(Exclusion(), description="classes and pixels that are left out")
+    critical_classes: tuple[str, ...] = Field((), description="classes of the verdict")
+    statistics: bool = Field(False, description="also accuracy, where there is ground truth")
+    measures: tuple[Number, ...] = Field(("alpha",), min_length=1, description="of the headline; the first one ranks")
+    digests: dict[str, str] | None = Field(
+        None, description="short hashes of each frame's depth and pose, by scene; null where nobody had the data yet"
+    )
+
+    @property
+    def name(self) -> str:
+        """Its name without the version."""
+        return self.id.partition("@")[0]
+
+    @property
+    def version(self) -> int:
+        """Its version."""
+        return int(self.id.partition("@")[2])
+
+    @property
+    def digest(self) -> str:
+        """Return a hash of all that its numbers follow from, the classes of its taxonomy and the data among it."""
+        content = self.model_dump(mode="json", exclude=WITHOUT_NUMBERS, exclude_defaults=True)
+        if self.taxonomy is not None:
+            content["classes"] = LabelSpace.load(self.taxonomy).classes
+        text = json.dumps(content, sort_keys=True)
+        return hashlib.blake2b(text.encode(), digest_size=8).hexdigest()
+
+    def places(self) -> tuple[str, ...]:
+        """Return the place of each scene: scenes that are one place flown again count as one together."""
+        of = {scene: place for place, own in self.flights.items() for scene in own}
+        return tuple(of.get(scene, scene) for scene in self.scenes)
+
+    def configured(
+        self,
+        data: Path | None = None,
+        labels: Path | None = None,
+        predictors: Sequence[PredictorConfig] = (),
+        models: Sequence[str] | None = None,
+        taxonomy: str | None = None,
+    ) -> Config:
+        """Return the settings of a run of it.
+
+        Args:
+            data: Folder of its data; none where that is built in.
+            labels: Folder of label maps, SCENE/MODEL/NAME below it; the data's own where not given.
+            predictors: Models that predict, instead of label maps.
+            models: Names of label sources; all where not given.
+            taxonomy: The classes of its taxonomy, with the names that the labels have for them among the members.
+
+        Raises:
+            ConfigError: For a folder that is missing, or not wanted, or a taxonomy of other classes.
+        """
+        content: dict[str, Any] = self.model_dump(mode="json", include={*IN_A_RUN})
+        content |= {"name": self.id, "description": self.description, "dataset": self._dataset(data, labels)}
+        content["benchmark"] = {"id": self.id, "digest": self.digest, "file": self.file}
+        if taxonomy is not None:
+            own, given = self._classes, LabelSpace.load(taxonomy).classes
+            if own != given:
+                raise ConfigError(f"{taxonomy}: its classes are not those of {self.id}: {', '.join(own) or 'any'}")
+            content["taxonomy"] = taxonomy
+        if self.voxel_sizes:
+            content["sweeps"] = {"voxel_size": [*self.voxel_sizes]}
+        if models is not None:
+            content["models"] = [*models]
+        if labels is not None and predictors:
+            raise ConfigError("--labels and --predict: label maps are read or predicted; leave one out")
+        return predicted_config(predictors, None, content) if predictors else load_config(content)
+
+    def changed(self, config: Config) -> list[str]:
+        """Return the settings of a run that are not those of the definition."""
+        own, given = (each.model_dump(mode="json", include={*IN_A_RUN}) for each in (self, config))
+        if config.taxonomy is not None and LabelSpace.load(config.taxonomy).classes == self._classes:
+            own["taxonomy"] = config.taxonomy
+        return [name for name, value in given.items() if value != own[name]]
+
+    @property
+    def _classes(self) -> tuple[str, ...]:
+        return () if self.taxonomy is None else LabelSpace.load(self.taxonomy).classes
+
+    def _dataset(self, data: Path | None, labels: Path | None = None) -> dict[str, Any]:
+        """Return the dataset with the paths of this machine."""
+        built_in = not self.get
+        if data is None and not built_in:
+            raise ConfigError(f"{self.id}: name the folder of its data with --data; {self.get}")
+        if built_in and (data is not None or labels is not None):
+            raise ConfigError(f"{self.id}: its data is built in; leave out --data and --labels, and choose --predict")
+        paths = {"root": data, "labels_root": labels}
+        options = {name: str(path.absolute()) for name, path in paths.items() if path is not None}
+        return merge(self.dataset.model_dump(mode="json"), {"options": options})
+
+    def open_scenes(self, data: Path | None = None) -> dict[str, Scene]:
+        """Open its scenes; no image is read.
+
+        Raises:
+            ConfigError, DataError: If a scene is not there.
+        """
+        content = self._dataset(data)
+        dataset = open_dataset(content["name"], content["options"])
+        for scene in self.scenes:
+            if scene not in dataset.scenes:
+                raise DataError(f"{data}: {self.id} has a scene '{scene}'; {nearest(scene, dataset.scenes)}")
+        return {scene: dataset.scene(scene) for scene in self.scenes}
+
+    def require_data(self, data: Path | None = None) -> None:
+        """Compare the depth, the poses and the frames of the data with those of the definition; labels do not count.
+
+        Raises:
+            ConfigError, DataError: With the first file that differs.
+        """
+        if self.digests is None:
+            return
+        for name, scene in self.open_scenes(data).items():
+            known, indices = self.digests.get(name, "").split(), self.selected(scene)
+            for (index, found), expected in zip(self._found(scene, indices), known, strict=False):
+                for (what, hashed), stated in zip(found.items(), expected.split("-"), strict=True):
+                    if hashed != stated:
+                        raise DataError(f"{name}: {what} differs from that of {self.id} (frame {index}); {self._again}")
+            if len(indices) != len(known):
+                raise DataError(
+                    f"{name}: {len(indices)} frames are selected, but {self.id} has {len(known)}; {self._again}"
+                )
+
+    @property
+    def _again(self) -> str:
+        return f"it is another copy of the data: {self.get}" if self.get else "this semstab draws another city"
+
+    def selected(self, scene: Scene) -> list[int]:
+        """Return the indices of its frames of a scene."""
+        return frame_indices(scene, Config(frames=self.scene_frames.get(scene.name, self.frames)))
+
+    def digests_of(self, data: Path | None = None) -> dict[str, str]:
+        """Return the hashes of the data as a definition states them."""
+        return {
+            name: " ".join("-".join(found.values()) for _, found in self._found(scene, self.selected(scene)))
+            for name, scene in self.open_scenes(data).items()
+        }
+
+    @staticmethod
+    def _found(scene: Scene, indices: Sequence[int]) -> Iterator[tuple[int, Mapping[str, str]]]:
+        """Yield frames of a scene with their hashes, in order."""
+        for index, fetched in zip(indices, prefetch(scene.fingerprints, indices), strict=True):
+            yield index, fetched.item
+
+
+def load_benchmark(named: str | Path) -> Benchmark:
+    """Return a benchmark that ships with semstab, NAME@VERSION or NAME for the last version, or that of a YAML file.
+
+    Raises:
+        ConfigError: For an unknown one.
+    """
+    text = str(named)
+    if text.endswith((".yaml", ".yml")):
+        path = Path(text)
+        return validated(Benchmark, read_yaml(path) | {"id": path.stem, "file": str(path.absolute())}, f"{path}: ")
+    known = shipped_benchmarks()
+    if text not in known and (versions := [each for each in known if each.partition("@")[0] == text]):
+        text = versions[-1]
+    if text not in known:
+        raise ConfigError(f"'{named}' is neither a benchmark that ships nor a .yaml file; {nearest(text, known)}")
+    path = _folder() / f"{text}.yaml"
+    return validated(Benchmark, read_yaml(path) | {"id": text}, f"{path.name}: ")
+
+
+def shipped_benchmarks() -> tuple[str, ...]:
+    """Return the benchmarks that ship with semstab, NAME@VERSION, the versions of a name in order."""
+    names = [path.stem for path in _folder().glob("*.yaml")]
+    return tuple(sorted(names, key=lambda name: (name.partition("@")[0], int(name.partition("@")[2]))))
+
+
+def _folder() -> Path:
+    return Path(str(importlib.resources.files("semstab.configs") / "benchmarks"))

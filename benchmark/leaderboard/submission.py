@@ -1,0 +1,232 @@
+"""Results that are handed in: a run of a benchmark as one small file, with sums from which all numbers follow."""
+
+from __future__ import annotations
+
+import dataclasses
+import importlib.metadata
+import math
+import os
+import platform
+import sys
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from pydantic import Field
+
+from semstab.comparison.runs import Entry, RunHandle, open_run, save_summary
+from semstab.config import Config, Settings, read_yaml, validated
+from semstab.core.json_form import from_json, to_json
+from semstab.data.records import Result
+from semstab.data.results import slug
+from semstab.datasets import GROUND_TRUTH
+from semstab.engine.folder import load_result
+from semstab.errors import ConfigError, DataError
+from semstab.leaderboard.definition import Benchmark, load_benchmark
+from semstab.predict.dataset import NAME as PREDICTED
+from semstab.statistics.cluster_sums import value
+
+SUFFIX = ".semstab"
+"""Suffix of the files."""
+
+LARGEST = 600_000
+"""Bytes of a file at most: sums are made coarser until they fit, which changes no number, and intervals a little."""
+
+ALIKE = 1e-6
+"""Largest difference between a number that a file states and the one that follows from its sums."""
+
+PACKAGES = ("numpy", "numba", "open3d", "torch", "transformers", "tflite-runtime", "ai-edge-litert")
+"""Packages whose versions are told, where they are installed."""
+
+
+class ModelCard(Settings):
+    """What whoever hands a result in says of the model."""
+
+    name: str = Field("", description="its name in the table; that of the label source where not given")
+    by: str = Field("", description="who made it")
+    url: str = Field("", pattern=r"^(https?://\S+)?$", description="where it is found")
+    license: str = Field("", description="licence of the weights")
+    parameters: float | None = Field(None, gt=0, description="number of its parameters, millions")
+    trained_on: str = Field("", description="training data")
+    notes: str = Field("", max_length=500, description="anything else, in a few words")
+
+    @classmethod
+    def load(cls, path: Path) -> ModelCard:
+        """Read a YAML file. Raises ConfigError in one line."""
+        return validated(cls, read_yaml(path), f"{path}: ")
+
+
+@dataclass(frozen=True)
+class Submission:
+    """What stands beside the sums of a result that was handed in.
+
+    Attributes:
+        benchmark: NAME@VERSION; digest that of its definition.
+        made: Day, year first.
+        semstab, python, platform, processor, cores, packages: What it was computed with.
+        predicted: Whether the model predicted in this very run, so that milliseconds are its own.
+        milliseconds: Of the model for a frame, on that machine; NaN where label maps were read.
+    """
+
+    benchmark: str
+    digest: str
+    card: Mapping[str, Any]
+    made: str
+    semstab: str
+    python: str
+    platform: str
+    processor: str
+    cores: int
+    packages: Mapping[str, str] = field(default_factory=dict)
+    predicted: bool = False
+    milliseconds: float = math.nan
+
+
+def submissions(run: Path, path: Path, card: ModelCard | None = None) -> Iterator[tuple[Path, RunHandle]]:
+    """Write the result of each model of a finished run of a benchmark into a file; yield the file and what it holds.
+
+    Args:
+        run: Folder of the run.
+        path: File of the only model; or a folder, which gets a file for each model.
+        card: What is said of the only model.
+
+    Raises:
+        ConfigError: If the run is not of a benchmark, its settings are others, or there are several models for a file.
+        DataError: If the run is damaged.
+    """
+    result, config = load_result(run), Config.build(read_yaml(run / "config.yaml"), str(run / "config.yaml"))
+    benchmark = _benchmark_of(run, config)
+    models = [name for name in result.models if name != GROUND_TRUTH]
+    if len(models) > 1 and (path.suffix or card is not None):
+        what = path if path.suffix else "--card"
+        raise ConfigError(f"{what}: the run has several models ({', '.join(models)}); choose one with --model")
+    for model in models:
+        handle = open_run(f"{run}:{model}")
+        require_whole(benchmark, handle)
+        about = _about(benchmark, result, config, handle, card or ModelCard())
+        handle = dataclasses.replace(handle, about=to_json(about))
+        file = path if path.suffix else path / f"{benchmark.id}__{slug(model)}{SUFFIX}"
+        file.parent.mkdir(parents=True, exist_ok=True)
+        save_summary(handle, file, LARGEST, single=True)
+        yield file, handle
+
+
+def load_submission(
+    path: Path, definitions: Mapping[str, Benchmark] | None = None
+) -> tuple[Benchmark, Submission, RunHandle]:
+    """Return the benchmark, what is said of the model, and the numbers of a file, checked.
+
+    Args:
+        path: The file.
+        definitions: Benchmarks that do not ship with semstab, by NAME@VERSION.
+
+    Raises:
+        ConfigError, DataError: If it is no result of a benchmark that is known, or its numbers contradict its sums.
+    """
+    if path.is_dir():
+        raise DataError(f"{path}: it is a folder; results are files that --submit wrote")
+    handle = open_run(path)
+    if not handle.about:
+        raise DataError(f"{path}: it is a small summary, but of no benchmark; write it with benchmark ... --submit")
+    about = from_json(Submission, handle.about, path)
+    try:
+        benchmark = (definitions or {}).get(about.benchmark) or load_benchmark(about.benchmark)
+        validated(ModelCard, dict(about.card), "card: ")
+    except ConfigError as error:
+        raise DataError(f"{path}: {error}") from error
+    if about.digest != benchmark.digest:
+        raise DataError(
+            f"{path}: it is of another definition of {benchmark.id} ({about.digest}; this semstab has"
+            f" {benchmark.digest}); run the benchmark again"
+        )
+    require_whole(benchmark, handle)
+    for scene, entry in handle.scenes.items():
+        _require_consistent(path, scene, entry)
+    return benchmark, about, handle
+
+
+def require_whole(benchmark: Benchmark, handle: RunHandle) -> None:
+    """Raise DataError where scenes, frames or voxels are not those of the definition."""
+    for scene in benchmark.scenes:
+        if (entry := handle.scenes.get(scene)) is None:
+            raise DataError(f"{handle.where}: {scene} of {benchmark.id} is missing; run all of its scenes")
+        summary, known = entry.summary, (benchmark.digests or {}).get(scene)
+        if known is not None and summary.frames != len(known.split()):
+            raise DataError(
+                f"{handle.where}: {scene} has {summary.frames} frames, but {len(known.split())} in {benchmark.id};"
+                " run it again"
+            )
+        if not math.isclose(summary.table.voxel_size, benchmark.voxel_size):
+            raise DataError(f"{handle.where}: its voxels are not those of {benchmark.id}; run it again")
+        if summary.statistics is None:
+            raise DataError(f"{handle.where}: {scene} has no statistics; run it again")
+    if more := [scene for scene in handle.scenes if scene not in benchmark.scenes]:
+        raise DataError(f"{handle.where}: {more[0]} is no scene of {benchmark.id}; run it again")
+
+
+def _benchmark_of(run: Path, config: Config) -> Benchmark:
+    if config.benchmark is None:
+        raise ConfigError(f"{run}: it is a run of no benchmark; start it with semstab-bench benchmark NAME")
+    benchmark = load_benchmark(config.benchmark.file or config.benchmark.id)
+    if benchmark.digest != config.benchmark.digest:
+        raise ConfigError(f"{run}: {benchmark.id} has changed since; run it again")
+    changed = benchmark.changed(config)
+    if changed:
+        raise ConfigError(f"{run}: {changed[0]} is not that of {benchmark.id}; run it again")
+    return benchmark
+
+
+def _about(benchmark: Benchmark, result: Result, config: Config, handle: RunHandle, card: ModelCard) -> Submission:
+    network = [entry.summary.stages_ms.get("network", math.nan) for entry in handle.scenes.values()]
+    predicted = config.dataset.name == PREDICTED and not np.isnan(network).all()
+    known = {name: version for name in PACKAGES if (version := _version(name))}
+    return Submission(
+        benchmark.id,
+        benchmark.digest,
+        card.model_dump(mode="json", exclude_defaults=True),
+        datetime.now(UTC).date().isoformat(),
+        str(result.manifest.get("semstab")),
+        platform.python_version(),
+        f"{platform.system()} {platform.machine()}",
+        _processor(),
+        os.cpu_count() or 1,
+        known,
+        predicted,
+        float(np.nanmean(network)) if predicted else math.nan,
+    )
+
+
+def _require_consistent(path: Path, scene: str, entry: Entry) -> None:
+    """Raise DataError where a stated number does not follow from the sums."""
+    statistics, sums = entry.summary.statistics, entry.sums
+    assert statistics is not None
+    stated = {"alpha": statistics.headline.alpha.value, "psa": statistics.headline.psa.value}
+    if sums.truth:
+        stated |= {
+            "accuracy": statistics.headline.accuracy.value,
+            "wrong_of_consistent": statistics.headline.wrong_of_consistent.value,
+        }
+    for key, number in stated.items():
+        follows = value(sums, key)
+        if not math.isnan(follows) and not abs(number - follows) <= ALIKE:
+            raise DataError(f"{path}: {scene}: {key} is stated as {number:.6g}, but its sums give {follows:.6g}")
+
+
+def _version(package: str) -> str | None:
+    try:
+        return importlib.metadata.version(package)
+    except importlib.metadata.PackageNotFoundError:
+        return None
+
+
+def _processor() -> str:
+    """Return the name of the processor, as far as the system tells it."""
+    if sys.platform == "linux":
+        for line in Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines():
+            key, _, name = line.partition(":")
+            if key.strip() == "model name":
+                return name.strip()
+    return platform.processor() or platform.machine()
