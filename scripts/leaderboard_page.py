@@ -16,8 +16,8 @@ PAGE = ROOT / "docs/leaderboard.md"
 
 HEAD = """# Leaderboard
 
-Results of the [benchmarks](benchmarks.md) that can be run here. `semstab-bench leaderboard results --out site` makes the
-page to sort and filter; `python scripts/leaderboard_page.py` writes these tables.
+Results of the [benchmarks](benchmarks.md) that can be run here. `semstab-bench leaderboard results --out site` makes
+the page to sort and filter; `python scripts/leaderboard_page.py` writes these tables.
 
 - `city@1`: simulated models of known quality, tricks that buy stability without knowledge (a map painted in the world,
   two classes, one class), and clusters of colour named by eye. A model may be stable and wrong: read alpha beside

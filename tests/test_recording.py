@@ -43,7 +43,7 @@ from semstab.recording import (
     voxel_maps,
 )
 from semstab.recording.layout import Legend, SceneBounds, direction, fit
-from semstab.recording.timeline import OF_THE_MODEL, Clock, log_file
+from semstab.recording.timeline import Clock, log_file
 from semstab.report.ranking import answers
 from semstab.report.terminal import row_of
 from semstab.task import Task
@@ -148,7 +148,7 @@ def test_every_series_is_a_column_of_the_frame_csv(run, model) -> None:
     for row in frames:
         row["updated_voxels"] = str(int(row["voxels"]) - int(row["new_voxels"]))
     for column in SERIES:
-        backend = "" if column in OF_THE_MODEL else "/numpy"
+        backend = "" if SERIES[column].of_model else "/numpy"
         defined = {int(row["frame"]): float(row[column]) for row in frames if row[column]}
         assert series(rows, f"/wall/series/{column}/{model}{backend}") == defined
         in_all_but = {"drift": 1, "flicker_percent": 1, "compensated_flicker_percent": 1}
@@ -222,7 +222,7 @@ def test_the_blueprint_shows_every_series_and_every_model(run) -> None:
     for views in read_blueprints(run / "recording.rrd"):
         names = {row["ViewBlueprint:display_name"][0] for row in views if "ViewBlueprint:display_name" in row}
         others = {"Classes", "Notes", "Depth", "Top contributing frames", "Verdict"}
-        assert names >= {*SERIES.values(), *maps, *pictures, *others}
+        assert names >= {*(own.plot for own in SERIES.values()), *maps, *pictures, *others}
 
 
 def test_the_viewer_opens_on_the_stability_categories(run) -> None:

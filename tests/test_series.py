@@ -13,7 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from semstab.data.results import FrameReport
-from semstab.engine.series import FRAME_COLUMNS, OF_FRAMES, FrameRow, Series
+from semstab.engine.series import COLUMNS, OF_FRAMES, FrameRow, Series
 
 counts, numbers = st.integers(0, 2**53), st.floats()
 reports = st.builds(
@@ -34,7 +34,7 @@ def test_rows_come_out_as_they_went_in(given_rows) -> None:
     with tempfile.TemporaryDirectory() as folder:
         series.save_csv(Path(folder) / "series.csv")
         header, *lines = csv.reader((Path(folder) / "series.csv").read_text().splitlines())
-    assert header == [*FRAME_COLUMNS, *OF_FRAMES, "name"]
+    assert header == [*(column.key for column in COLUMNS), *OF_FRAMES, "name"]
     written = [[*row.cells().values(), *[None] * len(OF_FRAMES), row.report.frame] for row in given_rows]
     assert lines == [["" if cell is None else str(cell) for cell in cells] for cells in written]
 

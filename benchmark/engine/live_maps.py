@@ -254,10 +254,22 @@ class Stream:
             self._poses.append(frame.T_wc[:3, 1:].ravel())
         self._previous = frame if self._sequential else None
         cut = frame.scores_left_out
-        left_out = (frame.left_out_pixels, *((math.nan, math.nan) if cut is None else (cut.mean, cut.most)))
-        seconds = now.fetched.seconds, decoded.network, now.fetched.waited, lap.seconds, math.nan
-        numbers = frame.timestamp, flicker, compensated, *seconds, *left_out
-        return {live: FrameRow(report, *numbers) for live, report in reports.items()}
+        return {
+            live: FrameRow(
+                report,
+                timestamp=frame.timestamp,
+                flicker_percent=flicker,
+                compensated_flicker_percent=compensated,
+                decode_seconds=now.fetched.seconds,
+                network_seconds=decoded.network,
+                wait_seconds=now.fetched.waited,
+                flicker_seconds=lap.seconds,
+                left_out=frame.left_out_pixels,
+                scores_left_out=math.nan if cut is None else cut.mean,
+                most_scores_left_out=math.nan if cut is None else cut.most,
+            )
+            for live, report in reports.items()
+        }
 
     def notify(self, now: Prepared, rows: Mapping[LiveMap, FrameRow]) -> None:
         """Show the frame to observers, and append each row to the series of its map."""

@@ -16,15 +16,48 @@ import numpy.typing as npt
 from semstab.core.arrays import Rows
 from semstab.core.files import atomic_path
 from semstab.core.types import Float64
-from semstab.data.results import STAGES, FrameReport
+from semstab.data.measures import ENTROPY, VSS
+from semstab.data.results import RECURRENT, STAGES, FrameReport
 
-FRAME_COLUMNS = (
-    "frame", "timestamp", "points", "voxels", "new_voxels", "drift", "flicker_percent",
-    "compensated_flicker_percent", "map_voxels", "map_vss",
-    "map_entropy", "map_recurrent", "fuse_ms",
-    "decode_ms", "wait_ms", "association_ms", "update_ms", "left_out",
-)  # fmt: skip
-"""The first columns of OUT/frames/*.csv; drift in bits; an undefined number is an empty field."""
+
+@dataclasses.dataclass(frozen=True)
+class FrameColumn:
+    """A column of OUT/frames/*.csv, and a time series of the recording.
+
+    Attributes:
+        key: A field of the report or the row, 'drift', or NAME_ms for NAME_seconds.
+        plot: Title of its plot in the recording, with the unit; '' for a column that is not drawn.
+        of_model: Whether it is the same for all backends.
+    """
+
+    key: str
+    plot: str = ""
+    of_model: bool = False
+
+
+COLUMNS = (
+    FrameColumn("frame"),
+    FrameColumn("timestamp"),
+    FrameColumn("points"),
+    FrameColumn("voxels"),
+    FrameColumn("new_voxels", "New voxels"),
+    FrameColumn("drift", "Mean drift of updates (bits)"),
+    FrameColumn("flicker_percent", "Pixel flicker (%)", of_model=True),
+    FrameColumn("compensated_flicker_percent", "Flicker (%)", of_model=True),
+    FrameColumn("map_voxels"),
+    FrameColumn("map_vss", f"{VSS.word} so far, any OP (0 to {VSS.largest:g})"),
+    FrameColumn("map_entropy", f"{ENTROPY.word} so far, any OP (0 to {ENTROPY.largest:g})"),
+    FrameColumn("map_recurrent", f"Share OP >= {RECURRENT} so far (0 to 1)"),
+    FrameColumn("fuse_ms", "Fusion (ms)"),
+    FrameColumn("decode_ms", "Decoding, in a worker (ms)", of_model=True),
+    FrameColumn("wait_ms", "Waiting for a frame (ms)", of_model=True),
+    FrameColumn("association_ms", "Fusion: association (ms)"),
+    FrameColumn("update_ms", "Fusion: update (ms)"),
+    FrameColumn("left_out"),
+)
+"""The first columns of the file, in order; drift in bits; an undefined number is an empty field."""
+
+_KEYS = tuple(column.key for column in COLUMNS)
 
 OF_FRAMES = ("lone_percent", "lone_null_percent", "outlying")
 """The next ones, which follow from all frames (`semstab.statistics.frame_disagreement`); the last one is the name."""
@@ -54,14 +87,21 @@ class FrameRow:
 
     def stage_ms(self) -> dict[str, float]:
         """Return the milliseconds of each of `STAGES`; NaN where it is not known."""
-        seconds = vars(self.report) | vars(self)
-        return {stage: 1e3 * seconds[f"{stage}_seconds"] for stage in STAGES}
+        return {stage: self[f"{stage}_ms"] for stage in STAGES}
+
+    def __getitem__(self, key: str) -> Any:
+        """Return the value of a column."""
+        if key == "drift":
+            return self.report.drift
+        if key.endswith("_ms"):
+            stage = key.removesuffix("_ms")
+            return 1e3 * (self.report.seconds if stage == "fuse" else self[f"{stage}_seconds"])
+        return getattr(self if hasattr(self, key) else self.report, key)
 
     def cells(self) -> dict[str, Any]:
-        """Return the row by column name, an undefined number as None."""
-        row = vars(self.report) | vars(self) | {"drift": self.report.drift, "fuse_ms": self.report.seconds * 1e3}
-        row |= {f"{stage}_ms": value for stage, value in self.stage_ms().items()}
-        return {name: None if row[name] is None or row[name] != row[name] else row[name] for name in FRAME_COLUMNS}
+        """Return the row by column, an undefined number as None."""
+        row = {column.key: self[column.key] for column in COLUMNS}
+        return {key: None if value is None or math.isnan(value) else value for key, value in row.items()}
 
 
 REPORT, ROW = ([field.name for field in dataclasses.fields(cls)] for cls in (FrameReport, FrameRow))
@@ -105,9 +145,9 @@ class Series:
         names: Callable[[int], str] = str,
         of_frames: Mapping[int, Mapping[str, float]] = MappingProxyType({}),
     ) -> None:
-        """Write FRAME_COLUMNS, OF_FRAMES by index and the frames' names as text, with a header, atomically."""
+        """Write COLUMNS, OF_FRAMES by index and the frames' names as text, with a header, atomically."""
         with atomic_path(path) as temporary, temporary.open("w", encoding="utf-8", newline="") as file:
-            writer = csv.DictWriter(file, (*FRAME_COLUMNS, *OF_FRAMES, "name"), lineterminator="\n")
+            writer = csv.DictWriter(file, (*_KEYS, *OF_FRAMES, "name"), lineterminator="\n")
             writer.writeheader()
             for row in self:
                 index = row.report.frame

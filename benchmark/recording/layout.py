@@ -376,7 +376,10 @@ def _plot(scene: str, name: str, tasks: list[Task]) -> rrb.TimeSeriesView:
     ]
     legend = rrb.PlotLegend(rrb.Corner2D.LeftTop, visible=name in ("map_recurrent", "fuse_ms"))
     return rrb.TimeSeriesView(
-        origin=path(scene, "series", name), contents=list(dict.fromkeys(lines)), name=SERIES[name], plot_legend=legend
+        origin=path(scene, "series", name),
+        contents=list(dict.fromkeys(lines)),
+        name=SERIES[name].plot,
+        plot_legend=legend,
     )
 
 
@@ -411,7 +414,7 @@ def _comparison(task: Task, first: str, second: str, bounds: SceneBounds | None)
         rrb.TimeSeriesView(
             origin=path(scene, "series", name),
             contents=[entity(name, Unit(scene, model, backend)) for backend in (first, second)],
-            name=SERIES[name],
+            name=SERIES[name].plot,
         )
         for name in COMPARED
     ]

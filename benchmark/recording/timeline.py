@@ -13,8 +13,8 @@ import rerun as rr
 
 from semstab.core.palette import model_color
 from semstab.data.digests import require_unchanged
-from semstab.data.measures import ENTROPY, VSS
-from semstab.data.results import RECURRENT, Unit
+from semstab.data.results import Unit
+from semstab.engine.series import COLUMNS, FrameColumn
 from semstab.engine.units import Plan
 from semstab.errors import DataError, summarize_error
 from semstab.task import Task
@@ -85,37 +85,22 @@ class Background:
 
 # Time series are columns of RUN/frames/*.csv, and one that follows from two of them.
 
-SERIES = {
-    "drift": "Mean drift of updates (bits)",
-    "flicker_percent": "Pixel flicker (%)",
-    "compensated_flicker_percent": "Flicker (%)",
-    "map_vss": f"{VSS.word} so far, any OP (0 to {VSS.largest:g})",
-    "map_entropy": f"{ENTROPY.word} so far, any OP (0 to {ENTROPY.largest:g})",
-    "map_recurrent": f"Share OP >= {RECURRENT} so far (0 to 1)",
-    "new_voxels": "New voxels",
-    "updated_voxels": "Updated voxels",
-    "fuse_ms": "Fusion (ms)",
-    "association_ms": "Fusion: association (ms)",
-    "update_ms": "Fusion: update (ms)",
-    "decode_ms": "Decoding, in a worker (ms)",
-    "wait_ms": "Waiting for a frame (ms)",
-}
-"""The time series by name, and the titles of their plots. All but updated_voxels (voxels - new_voxels) are columns of
-the CSV."""
+UPDATED = FrameColumn("updated_voxels", "Updated voxels")
+"""voxels - new_voxels."""
 
-OF_THE_MODEL = ("flicker_percent", "compensated_flicker_percent", "decode_ms", "wait_ms")
-"""The series that are the same for all backends; they are logged with the first one."""
+SERIES = {column.key: column for column in (*COLUMNS, UPDATED) if column.plot}
+"""The time series by name."""
 
 
 def entity(name: str, unit: Unit) -> str:
     """Return the entity of a series."""
-    backend = () if name in OF_THE_MODEL else (unit.backend,)
+    backend = () if SERIES[name].of_model else (unit.backend,)
     return path(unit.scene, "series", name, unit.model, *backend)
 
 
 def columns(unit: Unit, task: Task) -> list[str]:
     """Return the names of the unit's series."""
-    return [name for name in SERIES if name not in OF_THE_MODEL or unit.backend == task.backends[0]]
+    return [name for name, own in SERIES.items() if not own.of_model or unit.backend == task.backends[0]]
 
 
 def log_row(stream: rr.RecordingStream, unit: Unit, task: Task, cells: Mapping[str, Any]) -> None:
@@ -170,6 +155,6 @@ def log_styles(stream: rr.RecordingStream, plan: Plan) -> None:
             # The lines of backends that agree coincide; the viewer draws them by name, so each line is thinner.
             width = 2.0 + 2.5 * sum(backend > unit.backend for backend in task.backends)
             for name in columns(unit, task):
-                label = unit.model if name in OF_THE_MODEL else f"{unit.model}, {unit.backend}"
+                label = unit.model if SERIES[name].of_model else f"{unit.model}, {unit.backend}"
                 line = rr.SeriesLines(colors=color, names=label, widths=width)
                 stream.log(entity(name, unit), line, static=True)
