@@ -307,6 +307,20 @@ def test_models_are_ranked_and_those_that_cannot_be_told_apart_share_ranks(home,
         assert row.numbers["alpha"].low < row.numbers["alpha"].value < row.numbers["alpha"].high
 
 
+def test_a_model_that_alpha_does_not_assess_is_shown_without_a_rank(home, results) -> None:
+    def judged(content, levels):
+        for scene, level in zip(content["scenes"], levels, strict=True):
+            scene["summary"]["statistics"]["verdict"]["level"] = level
+
+    rewritten(results["good"], lambda c: judged(c, ["misleading", "misleading"]))
+    rewritten(results["bad"], lambda c: judged(c, ["uninformative", "usable"]))
+    (board,) = boards(results["good"].parent, definitions(home))
+    assert [(row.name, row.ranks, row.verdict) for row in board.rows] == [
+        ("same", "1", board.rows[0].verdict), ("bad", "2", "uninformative 1, usable 1"), ("good", "-", "misleading"),
+    ]  # fmt: skip
+    assert board.reasons == ["not ranked, as consistent labels are often wrong: good"]
+
+
 def test_flights_over_one_place_count_once_together(home, results, tmp_path) -> None:
     """Three scenes, two of them one place: the mean over places, not over scenes."""
     data, again = tmp_path / "data", "one-again"

@@ -30,9 +30,9 @@ from semstab.data.labels import LabelSpace
 from semstab.data.measures import measures
 from semstab.data.records import REGIONS, Variation
 from semstab.data.results import Unit
-from semstab.datasets import Scene
+from semstab.datasets import GROUND_TRUTH, Scene
 from semstab.errors import ConfigError
-from semstab.task import Task, applies, frame_indices, open_scenes, selected, tasks_of
+from semstab.task import Task, applies, frame_indices, open_scenes, selected, tasks_of, truth_task
 
 logger = logging.getLogger("semstab")
 
@@ -179,6 +179,12 @@ def _base_units(config: Config, scenes: Mapping[str, Scene]) -> Iterator[Planned
         for task in tasks_of(scene, settings):
             _check_classes(config.critical_classes, task)
             one = settings.model_copy(update={"models": [task.model]})
+            if config.statistics and scene.ground_truth and task.model != GROUND_TRUTH and truth_task(task) is None:
+                space, target = scene.label_space(GROUND_TRUTH), task.mapping.target
+                logger.warning(
+                    "%s: labels are not compared with the ground truth, as %s has classes that %s has not;"
+                    " list them under its ignored, or among members", name, space.name, target.name,
+                )  # fmt: skip
             sampled = _is_sampled(config, config.backends[0])
             if config.video_measures == "dis" and scene.missing(task.indices[0], color=True):
                 raise ConfigError(f"{name}: there are no images for optical flow; use --video-measures depth")
@@ -293,9 +299,11 @@ def identity(config: Config, task: Task) -> str:
         "frames": [*task.indices],
         "taxonomy": [mapping.target.name, mapping.target.classes, mapping.source.ids, mapping.rows],
     }
+    truth = truth_task(task) if config.statistics else None
+    compared = {} if truth is None else {"truth": truth.mapping.rows}
     beside = {"beside": filtering.model} if config.frame_quality else {}
     video = {} if config.video_measures is None else {"video_measures": config.video_measures}
-    return _hash(config, content | beside | video)
+    return _hash(config, content | compared | beside | video)
 
 
 def _hash(config: Config, content: Mapping[str, Any], without: Iterable[str] = ()) -> str:

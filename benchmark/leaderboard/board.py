@@ -37,8 +37,8 @@ class BoardRow:
     """A result in the table.
 
     Attributes:
-        rank: 1 plus the number of models that are shown to be more stable; last is the worst rank that is possible: no
-            model below it is shown to be less stable.
+        rank: 1 plus the number of models that are shown to be more stable; None for a model that is not ranked.
+        last: The worst rank that is possible: the models below it are shown to be less stable.
         numbers: Of the headline, over all places, with their intervals.
         scenes: Alpha in each scene, with the verdict's level.
         classes: Alpha of each class, the mean over scenes that assess it.
@@ -47,7 +47,7 @@ class BoardRow:
     file: str
     name: str
     about: Submission
-    rank: int
+    rank: int | None
     last: int
     numbers: Mapping[str, Interval]
     scenes: Mapping[str, tuple[Interval, str]]
@@ -55,29 +55,35 @@ class BoardRow:
 
     @property
     def ranks(self) -> str:
-        """The ranks that are possible, in print: '1', '2 to 4'."""
+        """The ranks that are possible, in print: '1', '2 to 4', '-' without one."""
+        if self.rank is None:
+            return "-"
         return str(self.rank) if self.rank == self.last else f"{self.rank} to {self.last}"
+
+    @property
+    def verdict(self) -> str:
+        """The levels of its verdicts, in print: 'stable', 'stable 3, usable 2'."""
+        levels = [level for _, level in self.scenes.values()]
+        counts = {level: levels.count(level) for level in sorted({*levels}, key=lambda level: -levels.count(level))}
+        return ", ".join(level if len(counts) == 1 else f"{level} {n}" for level, n in counts.items())
 
 
 @dataclass(frozen=True, eq=False)
 class Board:
-    """A benchmark with its results, the most stable first.
+    """A benchmark with its results, the most stable first, then those that are not ranked.
 
     Attributes:
-        apart: Results whose label space is another one, which cannot be ranked with the others.
-        uninformative: Results whose maps are nearly one class in every scene, about which alpha tells nothing.
+        unranked: Why models are not ranked, and which.
     """
 
     benchmark: Benchmark
     rows: tuple[BoardRow, ...]
-    apart: tuple[str, ...] = ()
-    uninformative: tuple[str, ...] = ()
+    unranked: Mapping[str, tuple[str, ...]]
 
     @property
-    def unranked(self) -> list[str]:
-        """Sentences about results that are not ranked."""
-        reasons = ("their classes are others", self.apart), ("nearly the whole map is one class", self.uninformative)
-        return [f"not ranked, as {reason}: {', '.join(names)}" for reason, names in reasons if names]
+    def reasons(self) -> list[str]:
+        """Sentences about models that are not ranked."""
+        return [f"not ranked, as {reason}: {', '.join(names)}" for reason, names in self.unranked.items()]
 
 
 Result = tuple[str, Submission, RunHandle]
@@ -117,44 +123,57 @@ def board_of(benchmark: Benchmark, results: Sequence[Result]) -> Board:
     if twice := next((name for name in names if names.count(name) > 1), None):
         first, second = (file for (file, _, _), name in zip(results, names, strict=True) if name == twice)
         raise DataError(f"{first} and {second}: both are called '{twice}'; name one otherwise in its card")
-    own = dict(zip(names, results, strict=True))
-    classes = {name: handle.scenes[benchmark.scenes[0]].classes for name, (_, _, handle) in own.items()}
-    most = max(classes.values(), key=[*classes.values()].count)
-    one_class = [name for name in names if _is_uninformative(own[name][2])]
-    compared = [name for name in names if classes[name] == most and name not in one_class]
-    places = benchmark.places()
+    own, places = dict(zip(names, results, strict=True)), benchmark.places()
+    unranked = _unranked(own, benchmark)
+    compared = [name for name in names if not any(name in left for left in unranked.values())]
     sums = [{name: own[name][2].scenes[scene].sums for name in compared} for scene in benchmark.scenes]
     ranking = ranked(sums, compared, places)
-    rank = {name: number for number, group in ranking.ranks for name in group} or dict.fromkeys(compared, 1)
+    rank: dict[str, int | None] = {name: number for number, group in ranking.ranks for name in group}
     worse = dict.fromkeys(compared, 0)
     for each in ranking.differences:
         if each.shown:
             worse[each.model if each.value > 0 else each.other] += 1
-    rows = [_row(benchmark, name, own[name], rank[name], len(compared) - worse[name], places) for name in compared]
-    rows.sort(key=lambda row: (row.rank, -row.numbers["alpha"].value))
-    apart = tuple(name for name in names if name not in compared and name not in one_class)
-    return Board(benchmark, tuple(rows), apart, tuple(one_class))
+    last = {name: len(compared) - number for name, number in worse.items()}
+    rows = [_row(benchmark, name, result, rank.get(name), last.get(name, 0)) for name, result in own.items()]
+    rows.sort(key=lambda row: (math.inf if row.rank is None else row.rank, -row.numbers["alpha"].value))
+    return Board(benchmark, tuple(rows), unranked)
 
 
-def _is_uninformative(handle: RunHandle) -> bool:
+NOT_RANKED = {"uninformative": "nearly the whole map is one class", "misleading": "consistent labels are often wrong"}
+"""Levels of verdicts in all scenes at which alpha assesses no labels, and why."""
+
+OTHER_CLASSES = "their classes are others"
+
+
+def _unranked(own: Mapping[str, Result], benchmark: Benchmark) -> dict[str, tuple[str, ...]]:
+    """Return the models that alpha cannot rank, by the reason."""
+    classes = {name: handle.scenes[benchmark.scenes[0]].classes for name, (_, _, handle) in own.items()}
+    most = max(classes.values(), key=[*classes.values()].count)
+    reasons = {OTHER_CLASSES: tuple(name for name in own if classes[name] != most)}
+    for level, reason in NOT_RANKED.items():
+        left = [name for name, (_, _, handle) in own.items() if {*_levels(handle)} == {level}]
+        reasons[reason] = tuple(name for name in left if classes[name] == most)
+    return {reason: names for reason, names in reasons.items() if names}
+
+
+def _levels(handle: RunHandle) -> list[str]:
     statistics = [entry.summary.statistics for entry in handle.scenes.values()]
-    return all(own is not None and own.verdict.level == "uninformative" for own in statistics)
+    return ["" if own is None else own.verdict.level for own in statistics]
 
 
 def _name(about: Submission, handle: RunHandle) -> str:
     return str(about.card.get("name") or handle.model)
 
 
-def _row(benchmark: Benchmark, name: str, result: Result, rank: int, last: int, places: Sequence[str]) -> BoardRow:
+def _row(benchmark: Benchmark, name: str, result: Result, rank: int | None, last: int) -> BoardRow:
     file, about, handle = result
-    entries = [handle.scenes[scene] for scene in benchmark.scenes]
+    entries, places = [handle.scenes[scene] for scene in benchmark.scenes], benchmark.places()
+    shown = dict.fromkeys(("alpha", *benchmark.measures))
     numbers: dict[str, Interval] = {
-        key: _over_places([_number(entry, key) for entry in entries], places) for key in benchmark.measures
+        key: _over_places([_number(entry, key) for entry in entries], places) for key in shown
     }
-    numbers.setdefault("alpha", _over_places([_number(entry, "alpha") for entry in entries], places))
-    alphas = {scene: _number(entry, "alpha") for scene, entry in zip(benchmark.scenes, entries, strict=True)}
-    levels = [entry.summary.statistics.verdict.level if entry.summary.statistics else "" for entry in entries]
-    scenes = {scene: (alpha, level) for (scene, alpha), level in zip(alphas.items(), levels, strict=True)}
+    alphas = [_number(entry, "alpha") for entry in entries]
+    scenes = dict(zip(benchmark.scenes, zip(alphas, _levels(handle), strict=True), strict=True))
     return BoardRow(file, name, about, rank, last, numbers, scenes, _classes(entries))
 
 
@@ -193,27 +212,28 @@ def headline(board: Board) -> Table:
     shown = [key for key in NUMBERS if key in board.benchmark.measures]
     columns = (
         Column("rank", "rank"), Column("model", "model"), *(NUMBERS[key] for key in shown),
-        Column("milliseconds", "ms a frame", 1, "lower"), Column("parameters", "parameters, M", 1),
-        Column("by", "by"), Column("made", "day"), Column("semstab", "semstab"),
+        Column("verdict", "verdict"), Column("milliseconds", "ms a frame", 1, "lower"),
+        Column("parameters", "parameters, M", 1), Column("by", "by"), Column("made", "day"), Column("semstab", "semstab"),
     )  # fmt: skip
     rows: Rows = tuple(
         (
-            row.ranks, row.name, *(row.numbers[key] for key in shown), row.about.milliseconds,
+            row.ranks, row.name, *(row.numbers[key] for key in shown), row.verdict, row.about.milliseconds,
             float(row.about.card.get("parameters") or math.nan), str(row.about.card.get("by", "")), row.about.made,
             row.about.semstab,
         )
         for row in board.rows
     )  # fmt: skip
     benchmark = board.benchmark
-    what = "places" if benchmark.flights else "scenes"
+    count = len({*benchmark.places()})
+    what = f"{count} {'place' if benchmark.flights else 'scene'}{'' if count == 1 else 's'}"
     caption = (
-        f"{benchmark.id} (definition {benchmark.digest}): {benchmark.description}. Means over"
-        f" {len({*benchmark.places()})} {what}, with intervals at 95 %. A rank is 1 plus the number of models that are"
-        " shown to be more stable in alpha (paired by frames and cubes, Holm); 'to' names the last rank that is"
-        " possible: models that share ranks are not told apart. Milliseconds are of the model on the machine that it"
-        " was run on, and unknown where label maps were read."
+        f"{benchmark.description[0].upper()}{benchmark.description[1:]}; definition {benchmark.digest}. Means over"
+        f" {what}, with intervals at 95 %. A rank is 1 plus the number of models that are shown to be more stable in"
+        " alpha (paired by frames and cubes, Holm); 'to' names the last rank that is possible: models that share ranks"
+        " are not told apart. Milliseconds are of the model on the machine that it was run on, and unknown where label"
+        " maps were read."
     )
-    caption += "".join(f" {text[0].upper()}{text[1:]}." for text in board.unranked)
+    caption += "".join(f" {text[0].upper()}{text[1:]}." for text in board.reasons)
     return Table(f"leaderboard-{benchmark.id}", benchmark.id, caption, columns, (Group("", rows),))
 
 
@@ -287,8 +307,8 @@ def _section(board: Board) -> dict[str, Any]:
 
 
 def _charts(board: Board) -> Iterator[dict[str, str]]:
-    """Yield stability against accuracy, and against cost, where two models have both."""
-    rows = board.rows
+    """Yield stability against accuracy, cost and size, where two models have both."""
+    rows = [row for row in board.rows if row.verdict != "uninformative"]
     accuracy = [(row.name, row.numbers.get("accuracy", UNKNOWN).value, row.numbers["alpha"]) for row in rows]
     cost = [(row.name, row.about.milliseconds, row.numbers["alpha"]) for row in rows]
     size = [(row.name, float(row.about.card.get("parameters") or math.nan), row.numbers["alpha"]) for row in rows]
@@ -328,7 +348,8 @@ def _card(row: BoardRow) -> Iterator[tuple[str, str]]:
 def lines(made: Sequence[Board]) -> Iterator[str]:
     """Yield what a terminal shows: the rank, the model and alpha of each result."""
     for board in made:
-        yield f"{board.benchmark.id} ({board.benchmark.digest}), {len(board.rows)} results"
+        count = len(board.rows)
+        yield f"{board.benchmark.id} ({board.benchmark.digest}), {count} result{'' if count == 1 else 's'}"
         for row in board.rows:
             yield f"  {row.ranks:>8}  {row.name:<28} alpha {row.numbers['alpha'].text()}"
-        yield from (f"  {text}" for text in board.unranked)
+        yield from (f"  {text}" for text in board.reasons)

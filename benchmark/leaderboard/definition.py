@@ -127,9 +127,12 @@ class Benchmark(Settings):
         content |= {"name": self.id, "description": self.description, "dataset": self._dataset(data, labels)}
         content["benchmark"] = {"id": self.id, "digest": self.digest, "file": self.file}
         if taxonomy is not None:
-            own, given = self._classes, LabelSpace.load(taxonomy).classes
-            if own != given:
+            own, given = self._classes, LabelSpace.load(taxonomy)
+            if own != given.classes:
                 raise ConfigError(f"{taxonomy}: its classes are not those of {self.id}: {', '.join(own) or 'any'}")
+            ignored = LabelSpace.load(self.taxonomy).ignored if self.taxonomy is not None else ()
+            if lost := [name for name in ignored if name not in given.ignored]:
+                raise ConfigError(f"{taxonomy}: {self.id} ignores {', '.join(lost)}; add them to 'ignored'")
             content["taxonomy"] = taxonomy
         if self.voxel_sizes:
             content["sweeps"] = {"voxel_size": [*self.voxel_sizes]}

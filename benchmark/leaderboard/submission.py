@@ -161,8 +161,9 @@ def require_whole(benchmark: Benchmark, handle: RunHandle) -> None:
             )
         if not math.isclose(summary.table.voxel_size, benchmark.voxel_size):
             raise DataError(f"{handle.where}: its voxels are not those of {benchmark.id}; run it again")
-        if summary.statistics is None:
-            raise DataError(f"{handle.where}: {scene} has no statistics; run it again")
+        if summary.statistics is None or (benchmark.statistics and not entry.sums.truth):
+            lacking = "statistics" if summary.statistics is None else "ground truth"
+            raise DataError(f"{handle.where}: {scene} has no {lacking}; run it again")
     if more := [scene for scene in handle.scenes if scene not in benchmark.scenes]:
         raise DataError(f"{handle.where}: {more[0]} is no scene of {benchmark.id}; run it again")
 

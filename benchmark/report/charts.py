@@ -103,8 +103,8 @@ def dot_chart(rows: Mapping[str, Sequence[tuple[int, str, Estimate]]], x_label: 
     return _svg(parts, height, x_label)
 
 
-LABEL = 12
-"""The least height between the names of two points."""
+POINTS_HEIGHT, LABEL = 320, 13
+"""Height of a chart of points, and the least height between the names of two of them."""
 
 
 def point_chart(points: Sequence[tuple[str, float, Estimate]], x_label: str, y_label: str) -> str:
@@ -112,9 +112,10 @@ def point_chart(points: Sequence[tuple[str, float, Estimate]], x_label: str, y_l
     known = [each for each in points if math.isfinite(each[1]) and math.isfinite(each[2].value)]
     ys = [v for _, _, y in known for v in (y.value, y.low, y.high)]
     x = Scale.over([own for _, own, _ in known], LEFT + 14, WIDTH - RIGHT - 14, margin=0.06)
-    y = Scale.over(ys, HEIGHT - BOTTOM - 6, TOP + 6, margin=0.04)
+    y = Scale.over(ys, POINTS_HEIGHT - BOTTOM - 6, TOP + 6, margin=0.04)
     x_ticks, y_ticks = ({tick: number(tick) for tick in axis.ticks(6)} for axis in (x, y))
-    parts, taken = [*_frame(x, y, x_ticks, y_ticks, x_label, y_label)], list[tuple[float, float]]()
+    parts = [*_frame(x, y, x_ticks, y_ticks, x_label, y_label, height=POINTS_HEIGHT)]
+    taken = list[tuple[float, float]]()
     for k, (name, own, estimate) in enumerate(sorted(known, key=lambda each: -each[2].value)):
         at, height = x(own), y(estimate.value)
         if math.isfinite(estimate.low) and math.isfinite(estimate.high):
@@ -122,12 +123,14 @@ def point_chart(points: Sequence[tuple[str, float, Estimate]], x_label: str, y_l
         parts.append(_mark(at, height, k, f"{name}: {_with_ends(estimate)}"))
         left = at > (LEFT + WIDTH) / 2
         side = at - 7 if left else at + 7
-        while any(abs(height - other) < LABEL and abs(at - near) < WIDTH / 3 for near, other in taken):
-            height += LABEL / 2
+        near = [other for beside, other in taken if abs(at - beside) < WIDTH / 2]
+        steps = (height + sign * k * LABEL / 2 for k in range(len(known) * 4) for sign in (1, -1))
+        height = next(own for own in steps if all(abs(own - other) >= LABEL for other in near))
         taken.append((at, height))
         anchor = "end" if left else "start"
-        parts.append(f'<text x="{side:.1f}" y="{height + 4:.1f}" text-anchor="{anchor}">{html.escape(name)}</text>')
-    return _svg(parts, HEIGHT, f"{y_label} by {x_label}")
+        place = f'x="{side:.1f}" y="{height + 4:.1f}" text-anchor="{anchor}"'
+        parts.append(f'<text class="dot {_class(k)}" {place}>{html.escape(name)}</text>')
+    return _svg(parts, POINTS_HEIGHT, f"{y_label} by {x_label}")
 
 
 def thinned(line: Line) -> Line:
