@@ -64,7 +64,9 @@ class BoardRow:
     def verdict(self) -> str:
         """The levels of its verdicts, in print: 'stable', 'stable 3, usable 2'."""
         levels = [level for _, level in self.scenes.values()]
-        counts = {level: levels.count(level) for level in sorted({*levels}, key=lambda level: -levels.count(level))}
+        counts = {
+            level: levels.count(level) for level in sorted(dict.fromkeys(levels), key=lambda own: -levels.count(own))
+        }
         return ", ".join(level if len(counts) == 1 else f"{level} {n}" for level, n in counts.items())
 
 
@@ -213,7 +215,8 @@ def headline(board: Board) -> Table:
     columns = (
         Column("rank", "rank"), Column("model", "model"), *(NUMBERS[key] for key in shown),
         Column("verdict", "verdict"), Column("milliseconds", "ms a frame", 1, "lower"),
-        Column("parameters", "parameters, M", 1), Column("by", "by"), Column("made", "day"), Column("semstab", "semstab"),
+        Column("parameters", "parameters, M", 1), Column("by", "by"), Column("made", "day"),
+        Column("semstab", "semstab"),
     )  # fmt: skip
     rows: Rows = tuple(
         (
