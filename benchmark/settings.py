@@ -43,7 +43,7 @@ def as_config(settings: Config | Mapping[str, Any] | str | Path) -> Config:
     return settings if isinstance(settings, Config) else load_config(settings)
 
 
-FORMER_STUDIES = {"remedies": "filters"}
+FORMER_STUDIES = {"remedies": "filters", "city": "paper"}
 """Names of shipped studies in 0.3, and now: the old ones work for one version."""
 
 
@@ -60,7 +60,7 @@ def load_study(study: str | Path, overrides: Mapping[str, Any] | None = None) ->
         ConfigError: For an unknown study.
 
     Examples:
-        >>> semstab.load_study("city").models
+        >>> semstab.load_study("paper").models
         ['sim-steady', 'sim-flicker', 'sim-soft']
     """
     study = FORMER_STUDIES.get(str(study), study)

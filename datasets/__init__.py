@@ -71,6 +71,9 @@ REGISTRY = Registry(
             "semstab.datasets.realitycapture:RealityCapture",
             "cameras of RealityCapture and RealityScan (CSV), depth from their mesh",
         ),
+        "uavscenes": Entry(
+            "semstab.datasets.uavscenes:UavScenes", "UAVScenes: flights over four places, depth from their maps"
+        ),
         "bag": Entry(
             "semstab.datasets.bag:Bag",
             "ROS 1 and ROS 2 bags with colour, depth, camera info and poses",
@@ -121,8 +124,9 @@ def open_dataset(name: str, options: dict[str, Any] | BaseModel, run_folder: Pat
 
 
 RECOGNISED = (
-    "odm", "metashape", "pix4d", "realitycapture", "hololens", "tum", "seven_scenes", "replica", "scannet", "tartanair",
-    "stray_scanner", "polycam", "record3d", "arkitscenes", "transforms_json", "colmap", "bag", "posed_folder",
+    "odm", "metashape", "pix4d", "realitycapture", "uavscenes", "hololens", "tum", "seven_scenes", "replica", "scannet",
+    "tartanair", "stray_scanner", "polycam", "record3d", "arkitscenes", "transforms_json", "colmap", "bag",
+    "posed_folder",
 )  # fmt: skip
 """Formats that a folder is recognised as: the one whose scenes lie highest, of these the first."""
 

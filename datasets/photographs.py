@@ -170,7 +170,7 @@ class Photographs(FileDataset[Options], Generic[Options]):
         """Return a frame for each shot, in natural order of names. Raises what `reconstruction` raises."""
         reconstruction, contents = self._reconstruction(folder), Folders()
         where, frames = str(reconstruction.file), []
-        images = [folder / "images" if self.options.images is None else self.options.images, folder]
+        images = self.image_folders(folder)
         names = frame_names(shot.name for shot in reconstruction.shots)
         if repeated := next((name for name in names if names.count(name) > 1), None):
             raise DataError(f"{where}: two photographs are called {repeated[:80]!r}; rename one")
@@ -186,6 +186,10 @@ class Photographs(FileDataset[Options], Generic[Options]):
                 )
             )  # fmt: skip
         return sorted(frames, key=lambda frame: natural(frame.name))
+
+    def image_folders(self, folder: Path) -> Sequence[Path]:
+        """Return the folders in which the images of a scene are sought."""
+        return [folder / "images" if self.options.images is None else self.options.images, folder]
 
     def _reconstruction(self, folder: Path) -> Reconstruction:
         if folder not in self._read:

@@ -418,6 +418,27 @@ def write_realitycapture_csv(
     write_lines(path, lines)
 
 
+def write_uavscenes(folder: Path, frames: Sequence[Frame]) -> list[str]:
+    """A flight of UAVScenes, with depth images: the poses of ten times as many frames as have a photograph."""
+    names = [f"{1658137057 + k // 2}.{k % 2}41204937" for k in range(len(frames))]
+    cameras = []
+    for name, frame in zip(names, frames, strict=True):
+        save(folder / f"interval5_CAM/{name}.jpg", frame.color)
+        save(folder / f"depth/{name}.npy", frame.depth)
+        cameras += [uavscenes_camera(f"{name}.jpg", frame), uavscenes_camera(f"{name}5.jpg", frame)]
+    (folder / "sampleinfos_interpolated.json").write_text(json.dumps(cameras))
+    return names
+
+
+def uavscenes_camera(name: str, frame: Frame, lens=(0.0, 0.0, 0.0, 0.0, 0.0)) -> dict[str, object]:
+    """A camera of sampleinfos_interpolated.json; the lens is k1, k2, p1, p2, k3."""
+    named = dict(zip(("K1", "K2", "P1", "P2", "K3"), lens, strict=True))
+    return {
+        "OriginalImageName": name, "T4x4": frame.T_wc.tolist(), "P3x3": frame.intrinsics.matrix.tolist(),
+        "Width": frame.shape[1], "Height": frame.shape[0], **named,
+    }  # fmt: skip
+
+
 def write_stray_scanner(folder: Path, frames: Sequence[Frame], *, own_intrinsics: bool = True) -> list[str]:
     """With intrinsics of each frame, or with those of the file alone; the images of the video in rgb/."""
     names = [f"{k:06d}" for k in range(len(frames))]
@@ -544,6 +565,7 @@ FORMATS = {
     "metashape": Format("metashape", write_metashape, None),
     "pix4d": Format("pix4d", write_pix4d, None),
     "realitycapture": Format("realitycapture", write_realitycapture, None, {"image_size": (W, H)}),
+    "uavscenes": Format("uavscenes", write_uavscenes, None),
     "stray_scanner": Format("stray_scanner", write_stray_scanner, 1000, {"image_size": (W, H)}),
     "polycam": Format("polycam", write_polycam, 1000),
     "record3d": Format("record3d", write_record3d, None),

@@ -35,7 +35,7 @@ def test_the_name_is_the_file_s_and_the_dataset_s_defaults_lie_below(tmp_path) -
 
 
 def test_a_resolved_study_is_read_back(tmp_path) -> None:
-    study = resolve(load_study("city"))
+    study = resolve(load_study("paper"))
     (tmp_path / "study.yaml").write_text(study.to_yaml())
     assert load_study(tmp_path / "study.yaml") == study
     assert study.dataset.options["seed"] == 0  # defaults are filled in
@@ -50,7 +50,7 @@ def test_a_run_is_a_study_without_sweeps(tmp_path) -> None:
 
 def test_units_have_the_base_settings_as_a_run_of_their_own() -> None:
     settings = {"strata": [1, 3], "seed": 4, "perturbation": {"depth_noise": 0.01}, "models": ["sim-soft"]}
-    plan = make_plan(resolve(load_study("city", {**settings, "scene_frames": {"scene0": {"stop": 3}}})).only([]))
+    plan = make_plan(resolve(load_study("paper", {**settings, "scene_frames": {"scene0": {"stop": 3}}})).only([]))
     base, other, *_ = (each.config for each in plan.units)
     assert (base.strata, base.scenes, base.check, base.models) == ([1, 3], ["scene0"], None, ["sim-soft"])
     assert (base.frames.stop, other.frames.stop) == (3, None)
@@ -97,9 +97,9 @@ def test_bad_settings_are_one_line_that_names_the_setting(tmp_path, content, mes
 
 
 def test_the_shipped_studies_fit_together() -> None:
-    assert shipped_studies() == ("city", "filters", "ladder", "uavid3d")
+    assert shipped_studies() == ("filters", "ladder", "paper", "uavid3d")
     assert all(load_study(name).description for name in shipped_studies())
-    grid = make_plan(resolve(load_study("city")))
+    grid = make_plan(resolve(load_study("paper")))
     assert {cell.variation.sweep for cell in grid.units} == {
         "base", "shared_taxonomy", "backends", "voxel_size", "depth_noise", "translation_noise", "rotation_noise",
         "translation_drift", "rotation_drift", "frame_count", "pixel_stride",
@@ -115,7 +115,7 @@ def test_the_shipped_studies_fit_together() -> None:
 
 
 def test_a_part_of_a_study(tmp_path) -> None:
-    study = load_study("city")
+    study = load_study("paper")
     part = study.only(["depth_noise"])
     assert [name for name, _ in part.sweeps.given()] == ["depth_noise"]
     assert (part.shared_taxonomy, [backend.name for backend in part.backends]) == (None, ["numba"])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -64,10 +65,8 @@ class BoardRow:
     def verdict(self) -> str:
         """The levels of its verdicts, in print: 'stable', 'stable 3, usable 2'."""
         levels = [level for _, level in self.scenes.values()]
-        counts = {
-            level: levels.count(level) for level in sorted(dict.fromkeys(levels), key=lambda own: -levels.count(own))
-        }
-        return ", ".join(level if len(counts) == 1 else f"{level} {n}" for level, n in counts.items())
+        counts = Counter(levels).most_common()
+        return ", ".join(level if len(counts) == 1 else f"{level} {n}" for level, n in counts)
 
 
 @dataclass(frozen=True, eq=False)

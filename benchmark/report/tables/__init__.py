@@ -11,6 +11,7 @@ from semstab.data.records import Result
 from semstab.report.filter_study import of_interest
 from semstab.report.tables.correctness import ceiling, comparison, correctness, correlogram
 from semstab.report.tables.filters import filter_tables
+from semstab.report.tables.paper import paper
 from semstab.report.tables.stability import (
     agreement,
     classes,
@@ -44,7 +45,7 @@ __all__ = [
 ]
 
 BUILDERS = (
-    overview, verdicts, flicker, video_measures, scenes, persistence, classes, temporal_agreement, correlogram,
+    overview, paper, verdicts, flicker, video_measures, scenes, persistence, classes, temporal_agreement, correlogram,
     class_agreement, drift, frames, uncertainty, ceiling, correctness, cross_model, comparison, sensitivity,
     voxel_sizes, reduced, fusion, compared, agreement,
 )  # fmt: skip

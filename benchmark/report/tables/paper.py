@@ -1,0 +1,233 @@
+"""Make the tables that hold a study against the paper: its findings, and its numbers beside those of the study."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+
+from semstab.config import SHARED
+from semstab.data.measures import ENTROPY, SBD, VSS
+from semstab.data.records import Record, Result
+from semstab.data.results import Means
+from semstab.metrics import macro_mean
+from semstab.report.means import Level, Pooled, by_model, levels, over_all, over_recurrent, pooled
+from semstab.report.tables.table import Column, Group, Row, Table
+
+STUDIES = ("paper", "uavid3d")
+"""The studies of the paper's protocol: on the built-in city, and on the paper's own data."""
+
+OPEN, CLOSED = "SegEarth-OV", "SegFormer"
+"""The two models of the paper that are compared; its other tables are of the first one."""
+
+STANDS_FOR = {"sim-flicker": OPEN, "sim-steady": CLOSED, "segearth-ov": OPEN, "segformer": CLOSED}
+"""The model of a study that stands for one of the paper's."""
+
+NEARLY = 0.25
+"""A change is little where it is less than so much of the one that it is held against."""
+
+Numbers = tuple[float, float, float, float]
+"""Percent of the voxels, VSS, SBD in bits, normalised entropy."""
+
+STRATA: Mapping[str, Numbers] = {
+    "OP=1": (57.89, 1.0, math.nan, 0.0), "OP=2": (20.32, 0.873, 0.0790, 0.1602),
+    "3<=OP<=5": (18.02, 0.869, 0.0454, 0.2285), "OP>5": (3.77, 0.870, 0.0216, 0.2530),
+}  # fmt: skip
+"""Paper, Observation Persistence."""
+
+CLASSES: Mapping[str, Numbers] = {
+    "building": (286_565 / 7059.02, 0.939, 0.0626, 0.0464), "road": (207_895 / 7059.02, 0.915, 0.0913, 0.0685),
+    "tree": (97_988 / 7059.02, 0.929, 0.0851, 0.0612), "low vegetation": (102_703 / 7059.02, 0.961, 0.0393, 0.0375),
+    "moving car": (10_564 / 7059.02, 0.960, 0.0498, 0.0403),
+}  # fmt: skip
+"""Paper, Class-wise Stability; of its 705,902 voxels."""
+
+ALL: Numbers = (100.0, 0.957, 0.0845, 0.0336)
+"""Paper, Multi-Scene Voxel-Level Stability: the means over scenes."""
+
+SHARED_TAXONOMY: Mapping[str, tuple[Numbers, Numbers]] = {
+    OPEN: ((100.0, 0.9657, 0.0661, math.nan), (21.79, 0.8692, 0.0413, math.nan)),
+    CLOSED: ((100.0, 0.9848, 0.0380, math.nan), (15.29, 0.9410, 0.0186, math.nan)),
+}
+"""Paper, Cross-Backbone Temporal Stability: of all voxels, and of those with OP >= 3."""
+
+FLICKER = {"SAM + heuristic": 29.47, "Raw SAM proposals": 21.64, CLOSED: 25.39, OPEN: 15.73}
+"""Paper, Frame-wise Semantic Flicker: mean flicker in percent."""
+
+
+def paper(result: Result) -> list[Table]:
+    """Return what the paper finds and whether it holds here, and its numbers beside those of the study."""
+    models = {STANDS_FOR[name]: name for name in result.models if name in STANDS_FOR}
+    if result.name not in STUDIES or OPEN not in models:
+        return []
+    named = " and ".join(
+        f"{own} stands for {theirs}" for theirs, own in models.items() if own.lower() != theirs.lower()
+    )
+    said = f" {named[0].upper()}{named[1:]}; absolute numbers are not comparable, the findings are." if named else ""
+    return [_findings(result, models, said), _numbers(result, models, said)]
+
+
+@dataclass(frozen=True)
+class Finding:
+    """What the paper finds, by numbers of the paper and of the study in the same order.
+
+    Attributes:
+        digits: Decimals in print.
+        holds: Whether the study's numbers show it, too; None where it has none of them.
+    """
+
+    text: str
+    theirs: Sequence[float]
+    ours: Sequence[float]
+    digits: int
+    holds: bool | None
+
+    def row(self) -> Row:
+        """Return its row of the table."""
+        theirs, ours = (" → ".join(f"{value:.{self.digits}f}" for value in own) for own in (self.theirs, self.ours))
+        held = "--" if self.holds is None else "yes" if self.holds else "no"
+        return self.text, theirs, "--" if self.holds is None else ours, held
+
+
+def falls(values: Sequence[float]) -> bool:
+    """Return whether each value is below the one before it."""
+    return all(a > b for a, b in itertools.pairwise(values))
+
+
+def _finding(text: str, theirs: Sequence[float], ours: Sequence[float], digits: int) -> Finding:
+    """Return a finding that numbers fall, or rise, as those of the paper do."""
+    known = len(ours) == len(theirs) and not any(map(math.isnan, ours))
+    shown = falls(ours) if falls(theirs) else falls([-value for value in ours])
+    return Finding(text, theirs, ours, digits, shown if known else None)
+
+
+def _changes_little(text: str, theirs: Sequence[float], ours: Sequence[float], held: float, digits: int) -> Finding:
+    """Return a finding that numbers hardly change, beside a change that `held` is."""
+    if len(ours) != len(theirs) or any(map(math.isnan, (*ours, held))):
+        return Finding(text, theirs, ours, digits, None)
+    return Finding(text, theirs, ours, digits, abs(ours[-1] - ours[0]) < NEARLY * abs(held))
+
+
+def _findings(result: Result, models: Mapping[str, str], said: str) -> Table:
+    columns = (Column("finding", "Finding"), Column("paper", "Paper"), Column("here", "Here"), Column("holds", "Holds"))
+    groups = (
+        Group("Observation persistence", tuple(each.row() for each in _persistence(result, models[OPEN]))),
+        Group("Two models in one taxonomy", tuple(each.row() for each in _order(result, models))),
+        Group("World-space association", tuple(each.row() for each in _association(result, models[OPEN]))),
+    )
+    caption = (
+        "The findings of the paper (arXiv:2608.28665) in its numbers, and in those of this study. 'Little' holds where"
+        f" the change is less than {NEARLY:.0%} of that of all voxels above it."
+    )
+    return Table("paper", "Findings of the paper", caption + said, columns, groups)
+
+
+def _persistence(result: Result, model: str) -> Iterator[Finding]:
+    strata = {row.name: row for row in pooled(result.select(model=model)).strata}
+    recurrent = pooled(result.select(model=model)).recurrent
+    once = strata["OP=1"][VSS] if "OP=1" in strata else math.nan
+    theirs = [STRATA["OP=1"][1], STRATA["3<=OP<=5"][1]]
+    yield _finding("VSS: seen once → OP>=3", theirs, [once, recurrent[VSS]], 3)
+    seen = [name for name in STRATA if name != "OP=1"]
+    ours = [strata[name][SBD] for name in seen if name in strata]
+    yield _finding("SBD falls with OP: 2 → 3 to 5 → more", [STRATA[name][2] for name in seen], ours, 4)
+
+
+def _order(result: Result, models: Mapping[str, str]) -> Iterator[Finding]:
+    records = result.select(SHARED) or result.select()
+    own = {theirs: pooled([r for r in records if r.unit.model == name]) for theirs, name in models.items()}
+    compared: Sequence[tuple[str, int, int, Callable[[Pooled], float]]] = (
+        ("VSS of all voxels", 0, 1, over_all(VSS)),
+        ("VSS of voxels with OP>=3", 1, 1, over_recurrent(VSS)),
+        ("SBD of voxels with OP>=3", 1, 2, over_recurrent(SBD)),
+        ("share of voxels with OP>=3, %", 1, 0, _share),
+    )
+    for text, row, column, take in compared:
+        theirs = [SHARED_TAXONOMY[name][row][column] for name in (OPEN, CLOSED)]
+        ours = [take(own[name]) for name in (OPEN, CLOSED) if name in own]
+        yield _finding(f"{text}: {OPEN} → {CLOSED}", theirs, ours, 2 if column == 0 else 4)
+
+
+def _association(result: Result, model: str) -> Iterator[Finding]:
+    sweeps = {name: levels(result, name, model) for name in ("voxel_size", "depth_noise", "frame_count")}
+    voxels, frames = _ends(sweeps["voxel_size"]), _ends(sweeps["frame_count"])
+    noise = _ends([level for level in sweeps["depth_noise"] if level.value <= 0.003])
+    yield _finding("Voxels of 0.1 → 0.4 m: share with OP>=3, %", (3.90, 42.61), _each(voxels, _share), 2)
+    yield _finding("and VSS of all voxels", (0.9824, 0.9274), _each(voxels, over_all(VSS)), 4)
+    yield _finding("Depth noise of 0 → 0.3 %: share with OP>=3, %", (22.12, 9.81), _each(noise, _share), 2)
+    yield _finding("and VSS of all voxels", (0.9569, 0.9777), _each(noise, over_all(VSS)), 4)
+    yield _finding("20 → 80 frames: share with OP>=3, %", (1.61, 18.99), _each(frames, _share), 2)
+    aggregate = _each(frames, over_all(VSS))
+    yield _finding("and VSS of all voxels", (0.9805, 0.9400), aggregate, 4)
+    held = aggregate[-1] - aggregate[0] if aggregate else math.nan
+    recurrent = _each(frames, over_recurrent(VSS))
+    yield _changes_little("and little VSS of those with OP>=3", (0.8544, 0.8446), recurrent, held, 4)
+
+
+def _ends(own: Sequence[Level]) -> Sequence[Level]:
+    return (own[0], own[-1]) if len(own) > 1 else ()
+
+
+def _each(own: Sequence[Level], take: Callable[[Pooled], float]) -> list[float]:
+    return [level.mean(take) for level in own]
+
+
+def _share(each: Pooled) -> float:
+    return 100 * each.recurrent.share
+
+
+# --- Numbers side by side ---------------------------------------------------------------------------------------------
+
+
+def _numbers(result: Result, models: Mapping[str, str], said: str) -> Table:
+    measured = (
+        Column("percent", "Voxels (%)", 2), Column("vss", "VSS", 4), Column("sbd", "SBD", 4),
+        Column("entropy", "Entropy", 4),
+    )  # fmt: skip
+    columns = (
+        Column("what", ""),
+        *(Column(f"paper_{c.key}", c.header, c.digits, over="Paper") for c in measured),
+        *(Column(f"here_{c.key}", c.header, c.digits, over="Here") for c in measured),
+    )
+    own = result.select(model=models[OPEN])
+    together = pooled(own)
+    strata, classes = {row.name: row for row in together.strata}, {row.name: row for row in together.classes}
+    everywhere: Row = ("all voxels", *ALL, *_macro(own))
+    groups = [
+        Group("All scenes, means over scenes", (everywhere,)),
+        Group("By observation persistence", tuple(_beside(STRATA, strata))),
+        Group("By class", tuple(_beside(CLASSES, classes))),
+    ]
+    records = result.select(SHARED) or result.select()
+    for theirs, name in models.items():
+        both = pooled([record for record in records if record.unit.model == name])
+        every, recurrent = SHARED_TAXONOMY[theirs]
+        rows: tuple[Row, ...] = (("all voxels", *every, *_of(both.every)), ("OP>=3", *recurrent, *_of(both.recurrent)))
+        groups.append(Group(f"{theirs} in the shared taxonomy", rows))
+    flicker = {
+        STANDS_FOR.get(name, name): macro_mean([record.image_space.flicker_percent for record in rows])
+        for name, rows in by_model(result.select()).items()
+    }
+    caption = (
+        "The numbers of the paper (arXiv:2608.28665, SegEarth-OV unless said) beside those of this study, whose tables"
+        " have all of its own. Mean flicker in percent, paper:"
+        f" {', '.join(f'{name} {value:.2f}' for name, value in FLICKER.items())}; here:"
+        f" {', '.join(f'{name} {value:.2f}' for name, value in flicker.items())}."
+    )
+    return Table("paper_numbers", "Numbers of the paper", caption + said, columns, tuple(groups))
+
+
+def _beside(theirs: Mapping[str, Numbers], ours: Mapping[str, Means]) -> Iterator[Row]:
+    for name, numbers in theirs.items():
+        yield name, *numbers, *(_of(ours[name]) if name in ours else (math.nan,) * 4)
+
+
+def _of(means: Means) -> Numbers:
+    return 100 * means.share, means[VSS], means[SBD], means[ENTROPY]
+
+
+def _macro(records: Sequence[Record]) -> Numbers:
+    tables = [record.summary.table for record in records]
+    vss, sbd, entropy = (macro_mean([table[measure] for table in tables]) for measure in (VSS, SBD, ENTROPY))
+    return 100.0, vss, sbd, entropy
