@@ -112,24 +112,22 @@ def _named(entry: SceneEntry) -> SceneEntry:
 def _map_of(folder: Path) -> Path | None:
     """Return the mesh of the place that a flight is over, None where it is not there."""
     flight = FLIGHT.fullmatch(folder.name)
-    for above in [] if flight is None else [*folder.absolute().parents][:ABOVE]:
-        for inner in (MAPS, f"{MAPS}/{MAPS}"):
-            mesh = above / inner / flight["place"] / "Mesh.ply"
-            if mesh.is_file():
-                return mesh
-    return None
+    found = [] if flight is None else _above(folder, MAPS, f"{flight['place']}/Mesh.ply")
+    return next((path for path in found if path.is_file()), None)
 
 
 def _truth_of(folder: Path) -> Path | None:
     """Return the folder of a flight's label maps, None where they are not there."""
     flight = FLIGHT.fullmatch(folder.name)
-    for above in [] if flight is None else [*folder.absolute().parents][:ABOVE]:
-        outer = f"interval{flight['step']}_CAM_label"
-        for inner in (outer, f"{outer}/{outer}"):
-            truth = above / inner / folder.name / f"{outer}_id"
-            if truth.is_dir():
-                return truth
-    return None
+    archive = "" if flight is None else f"interval{flight['step']}_CAM_label"
+    found = _above(folder, archive, f"{folder.name}/{archive}_id") if archive else []
+    return next((path for path in found if path.is_dir()), None)
+
+
+def _above(folder: Path, archive: str, inner: str) -> list[Path]:
+    """Return where a part of an archive may lie above a flight: an archive holds a folder of its own name, or not."""
+    above = [*folder.absolute().parents][:ABOVE]
+    return [parent / outer / inner for parent in above for outer in (archive, f"{archive}/{archive}")]
 
 
 def _seconds(name: str) -> float | None:
