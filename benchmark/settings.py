@@ -67,7 +67,7 @@ def load_study(study: str | Path, overrides: Mapping[str, Any] | None = None) ->
     path = _shipped("studies") / f"{study}.yaml" if str(study) in shipped_studies() else Path(study)
     if path.suffix not in (".yaml", ".yml"):
         raise ConfigError(
-            f"study '{study}' is not known; {nearest(str(study), shipped_studies())}, or name a .yaml file"
+            f"'{study}' is neither a study that ships nor a .yaml file; {nearest(str(study), shipped_studies())}"
         )
     content = _over(read_yaml(path), overrides or {})
     own = {"name": path.stem, "check": None}

@@ -107,7 +107,7 @@ def test_a_lost_pose_is_left_out_and_said_and_the_default_folder_is_new(wall, tm
     ("--data wall --jobs 2 --rerun spawn", "a viewer follows a run in one process; leave out --jobs and"),
     ("--data wall --jobs 2 --scheduler tcp://x:1", "--jobs and --scheduler: the scheduler's workers do the work"),
     ("view wall", "there is no finished run here"),
-    ("study citi", "study 'citi' is not known; did you mean 'city'?, or name a .yaml file"),
+    ("study papr", "'papr' is neither a study that ships nor a .yaml file; did you mean 'paper'?"),
     ("study nowhere.yaml", "nowhere.yaml: cannot be read"),
     ("study tiny.yaml --only voxelsize", "study tiny: no part 'voxelsize'; did you mean 'voxel_size'?"),
     ("study tiny.yaml --set sweeps.voxels=[1]", "unknown setting 'sweeps.voxels'; did you mean 'voxel_size'?"),
