@@ -239,6 +239,18 @@ ENTROPY = Measure(
 )  # fmt: skip
 MARGIN = Measure(key="margin", title="Margin", short="M", better="higher", of=margin, range=(0.0, 1.0), panel=False)
 
+RESERVED = frozenset((
+    "K", "backend", "categories", "classes", "confused_with", "entropy_between", "entropy_within",
+    "flicker_percent", "frames", "frames_empty", "frames_left_out", "fuse_ms_per_frame", "image_space", "key",
+    "left_out", "mean_op", "means", "model", "name", "observations", "points", "psa", "quality", "recurrent",
+    "reduced", "sbd_excess", "sbd_null", "scene", "scores_left_out", "share", "sizes", "stages_ms",
+    "statistics", "strata", "summary", "table", "taxonomy", "truth_file", "unit", "variation", "video_measures",
+    "voxel_size", "voxels", "voxels_file", "well_seen", "op", "evidence", "label", "alpha", "voxel_alpha",
+    "accuracy", "observation_accuracy", "precision", "iou", "miou", "ece", "wrong_of_consistent", "coverage",
+    "compensated_flicker_percent",
+))  # fmt: skip
+"""Keys that no measure may have: fields beside its mean in JSON, other differences of maps, other compared numbers."""
+
 _REGISTER = {measure.key: measure for measure in (VSS, SBD, ENTROPY, MARGIN)}
 
 
@@ -251,10 +263,12 @@ def register(measure: Measure) -> None:
     """Add a measure to every summary from now on.
 
     Raises:
-        ConfigError: If its key is taken.
+        ConfigError: If its key is taken, or is the name of another number or field.
     """
     if measure.key in _REGISTER:
         raise ConfigError(f"there is a measure '{measure.key}' already; choose another key")
+    if measure.key in RESERVED or measure.key.endswith("_voxels"):
+        raise ConfigError(f"'{measure.key}' is the name of another number or field; choose another key")
     _REGISTER[measure.key] = measure
 
 
@@ -314,10 +328,6 @@ class MeasureMeans:
 
     @classmethod
     def of_json_content(cls, content: Any) -> MeasureMeans:
-        """Return the entries of all measures."""
-        rare = {measure.key: f"{measure.key}_voxels" for measure in measures() if measure.lowest_op > 1}
-        for key in (*(measure.key for measure in measures()), *rare.values()):
-            if key not in content:
-                raise ValueError(f"{key} is missing")
-        counts = {key: content[entry] for key, entry in rare.items()}
-        return cls({measure.key: number(content[measure.key]) for measure in measures()}, counts)
+        """Return the entries of all measures; those of one that was declared later are NaN, over 0 voxels."""
+        rare = {m.key: content.get(f"{m.key}_voxels", 0) for m in measures() if m.lowest_op > 1}
+        return cls({measure.key: number(content.get(measure.key)) for measure in measures()}, rare)
