@@ -18,10 +18,17 @@ from semstab.errors import DataError
 from semstab.metrics.agreement import rows_of
 from semstab.statistics.accumulate import cluster_sums_of, sums_of_cells
 from semstab.statistics.agreement import class_agreement, consistency_posterior, krippendorff_alpha, psa
-from semstab.statistics.cluster_sums import MOST_CLASSES, ClusterSums, aligned, value
+from semstab.statistics.cluster_sums import EARLIER_NAMES, FUNCTIONALS, MOST_CLASSES, ClusterSums, aligned, value
 from semstab.statistics.correctness import correctness
 from semstab.statistics.drift import expected_sbd
-from semstab.statistics.intervals import coverage, difference, difference_over_frames, mean_over_frames, same_flight
+from semstab.statistics.intervals import (
+    coverage,
+    difference,
+    difference_over_frames,
+    estimate,
+    mean_over_frames,
+    same_flight,
+)
 
 
 def flight(side=12, F=9, K=3, soft_evidence=False, seed=0):
@@ -140,6 +147,41 @@ def test_a_file_holds_a_map_and_its_fine_and_coarse_cells(tmp_path):
             assert getattr(part, name) == getattr(own, name)
     assert (back.voxel_size, back.fine.voxel_size, back.coarse.voxel_size) == (0.3, 0.125, 0.25)
     assert value(back, "alpha") == value(whole, "alpha")
+
+
+def test_a_file_is_read_by_the_names_of_its_columns(tmp_path):
+    table, log, truth = flight()
+    whole = cluster_sums_of(table, log, truth)
+    whole.save(tmp_path / "sums.parquet")
+    content = pq.read_table(tmp_path / "sums.parquet")
+    further = content.select(content.column_names[::-1]).append_column("further", content.column("psa"))
+    pq.write_table(further, tmp_path / "swapped.parquet")
+    np.testing.assert_array_equal(ClusterSums.load(tmp_path / "swapped.parquet").columns, whole.columns)
+    pq.write_table(content.drop_columns(["entropy"]), tmp_path / "without.parquet")
+    without = ClusterSums.load(tmp_path / "without.parquet")
+    expected = {key: np.nan if key == "entropy" else value(whole, key) for key in FUNCTIONALS}
+    assert {key: value(without, key) for key in FUNCTIONALS} == pytest.approx(expected, nan_ok=True, rel=0)
+    assert np.isnan([getattr(estimate(without, "entropy"), end) for end in ("value", "low", "high")]).all()
+    assert np.isnan(difference(without, whole, "entropy").value)
+    assert difference(without, whole, "psa").value == 0
+    about = json.loads(content.schema.metadata[b"semstab"]) | {"K": 1000, "classes": []}
+    pq.write_table(content.replace_schema_metadata({"semstab": json.dumps(about)}), tmp_path / "sums.parquet")
+    with pytest.raises(DataError, match="columns of sums for 1000 classes"):
+        ClusterSums.load(tmp_path / "sums.parquet")
+
+
+def test_an_older_file_has_its_sums_by_their_names_of_then(tmp_path):
+    table, log, truth = flight()
+    whole = cluster_sums_of(table, log, truth)
+    whole.save(tmp_path / "sums.parquet")
+    content = pq.read_table(tmp_path / "sums.parquet")
+    about = json.loads(content.schema.metadata[b"semstab"])
+    about |= {name: about[name][0] for name in ("edge", "step", "voxel_size", "fused")}
+    about |= {"schema": 3, "kind": "InfluenceSums"}
+    then = {name: old for old, name in EARLIER_NAMES.items()}
+    content = content.rename_columns([then.get(name, name) for name in content.column_names])
+    pq.write_table(content.replace_schema_metadata({"semstab": json.dumps(about)}), tmp_path / "old.parquet")
+    np.testing.assert_array_equal(ClusterSums.load(tmp_path / "old.parquet").columns, whole.columns)
 
 
 @pytest.mark.parametrize("schema", [2, 3])

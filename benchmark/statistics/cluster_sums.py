@@ -99,6 +99,15 @@ def width(K: int, *, truth: bool) -> int:
     return max(int(part.stop) for part in layout(K, truth=truth).values())
 
 
+def column_names(K: int, *, truth: bool) -> list[str]:
+    """Return the names of the columns in a file."""
+    return [
+        f"{name}_{k}" if own.stop - own.start > 1 else name
+        for name, own in layout(K, truth=truth).items()
+        for k in range(own.stop - own.start)
+    ]
+
+
 # --- Numbers of right and wrong ---------------------------------------------------------------------------------------
 
 
@@ -317,11 +326,7 @@ class ClusterSums:
         columns = np.zeros((sum(lengths), self.columns.shape[1]))
         for part, rows in zip(parts, np.split(np.arange(len(columns)), np.cumsum(lengths)[:-1]), strict=True):
             columns[rows, : part.columns.shape[1]] = part.columns
-        names = [
-            f"{name}_{k}" if own.stop - own.start > 1 else name
-            for name, own in layout(self.K, truth=self.truth).items()
-            for k in range(own.stop - own.start)
-        ]
+        names = column_names(self.K, truth=self.truth)
         arrays = [np.repeat(np.arange(len(parts)), lengths), *cell.T, frame, *columns.T]
         content = pa.table({name: arrow.column(array) for name, array in zip([*KEYS, *names], arrays, strict=True)})
         text = json.dumps({"schema": SCHEMA, "kind": "ClusterSums", **about})
@@ -330,7 +335,7 @@ class ClusterSums:
 
     @classmethod
     def load(cls, path: str | Path) -> ClusterSums:
-        """Read a file that `save` wrote.
+        """Read a file that `save` wrote; sums that it lacks are NaN, and those of other names are left out.
 
         Raises:
             DataError: If the file is missing, damaged or of another kind.
@@ -347,9 +352,14 @@ class ClusterSums:
                 about |= {name: [about.get(name, 0)] for name in ("edge", "step", "voxel_size", "fused")}
             meta = from_json(SumsMeta, about, path)
             part, *keys = (_key(arrow.values_of(content.column(name)), name) for name in KEYS)
-            columns = np.stack([*map(arrow.values_of, content.columns[len(KEYS) :])], axis=1)
-            if columns.shape[1] != width(meta.K, truth=meta.truth):
-                raise DataError(f"{columns.shape[1]} columns of sums for {meta.K} classes")
+            names = [EARLIER_NAMES.get(name, name) for name in content.column_names] if old else content.column_names
+            if len(names) < meta.K:
+                raise DataError(f"{len(names) - len(KEYS)} columns of sums for {meta.K} classes")
+            stored = dict(zip(names, content.columns, strict=True))
+            columns = np.full((len(content), width(meta.K, truth=meta.truth)), np.nan)
+            for k, name in enumerate(column_names(meta.K, truth=meta.truth)):
+                if name in stored:
+                    columns[:, k] = arrow.values_of(stored[name])
             if np.any(np.abs(columns) > LARGEST**2):
                 raise DataError("a sum is larger than any map can have")
             if not all(0 <= frames <= LARGEST for frames in (*meta.step, *meta.fused)):
@@ -359,13 +369,22 @@ class ClusterSums:
                 zip(meta.edge, meta.step, meta.voxel_size, meta.fused, strict=True)
             ):
                 own, truth = part == number, meta.truth and not number
-                sums = columns[own, : width(meta.K, truth=truth)].astype(np.float64)
+                sums = columns[own, : width(meta.K, truth=truth)]
                 cell, frame = np.stack([key[own] for key in keys[:3]], axis=1), keys[3][own]
                 where = cell.astype(np.int32), frame.astype(np.int32), sums, edge, step
                 parts.append(cls(*where, voxel_size, meta.K, meta.classes, truth, fused))
         whole, *cells = parts
         return dataclasses.replace(whole, fine=cells[0], coarse=cells[1]) if cells else whole
 
+
+EARLIER_NAMES = {
+    "looks": "observed",
+    "looks_right": "observed_right",
+    "stable": "consistent",
+    "stable_wrong": "consistent_wrong",
+    "judged": "calibrated",
+}
+"""Names of sums in files without cells, and their names today."""
 
 KEYS = ("part", "ix", "iy", "iz", "frame")
 """The columns of the file before the sums; part 0 is the map, 1 the fine cells, 2 the coarse ones."""
