@@ -26,6 +26,7 @@ from semstab.cli import app
 from semstab.comparison import differences, gate_report
 from semstab.comparison import gate as judging
 from semstab.comparison.gate import GateResult, Judgement, gate, gate_config, parse
+from semstab.comparison.runs import open_run, save_summary
 from semstab.data.measures import Measure, margin, registered, sbd
 from semstab.data.statistics import Interval
 from semstab.errors import ConfigError, DataError
@@ -246,6 +247,25 @@ def test_the_command_says_what_came_of_each_rule(run, tmp_path):
     content = json.loads(out[2].read_text())
     assert (content["gate"], content["exit_code"], content["undecided"]) == ("fails", 4, "report")
     assert [row["verdict"] for row in content["rules"]] == ["passes", "passes", "fails"]
+
+
+@pytest.mark.parametrize("share", [0.0, 0.2, 0.3])
+def test_sbd_excess_is_judged_only_where_it_is_known_at_a_quarter_of_the_locations(run, tmp_path, share):
+    """Of soft scores without a log it is known at a few locations, which are no random sample."""
+    own = open_run(f"{run}:a")
+    entry = own.scenes["wall"]
+    columns = entry.sums.columns.copy()
+    columns[:, [entry.sums.layout[name].start for name in ("sbd_excess", "sbd_known")]] *= share
+    few = dataclasses.replace(entry, small=(dataclasses.replace(entry.sums, columns=columns), entry.flicker))
+    save_summary(dataclasses.replace(own, scenes={"wall": few}), file := tmp_path / "few.semstab")
+    rules = gate_config(rules=["sbd excess < 0.5"])
+    if share > 0.25:
+        assert gate(file, None, rules).passed
+        return
+    total = round(entry.sums["voxels"].sum())
+    reason = f", which is known at {share * total:,.0f} of {total:,} locations, fewer than 25%" if share else ""
+    line = f"has no sbd excess of wall{reason}; run it with --statistics, which keeps the order of observations"
+    fails(ConfigError, re.escape(line), gate, file, None, rules)
 
 
 def second_largest(rows):

@@ -33,7 +33,7 @@ from semstab.config import nearest, read_yaml, validated
 from semstab.config.settings import ScopeSetting
 from semstab.core.types import OTHER_SCENES, THESE_FRAMES, THIS_SCENE, Scope
 from semstab.data.measures import ENTROPY, Measure, Quantity
-from semstab.data.statistics import UNKNOWN, Interval
+from semstab.data.statistics import ORDER_KNOWN, UNKNOWN, Interval
 from semstab.errors import ConfigError, DataError
 from semstab.statistics.agreement import ALPHA, PSA, VOXEL_ALPHA
 from semstab.statistics.cluster_sums import (
@@ -565,9 +565,9 @@ def _check(rule: Rule, own: RunHandle, base: RunHandle | None, scenes: Sequence[
             )
         for entry in entries:
             if not _has(rule, entry):
-                name = rule.measure.name
+                name, few = rule.measure.name, _few_known(rule, entry)
                 raise ConfigError(
-                    f"rule '{rule.text}': {entry.where} has no {name} of {scene}; {rule.measure.if_missing}"
+                    f"rule '{rule.text}': {entry.where} has no {name} of {scene}{few}; {rule.measure.if_missing}"
                 )
         if len({entry.sums.voxel_size for entry in entries}) > 1:
             sizes = [entry.sums.voxel_size for entry in entries]
@@ -584,8 +584,24 @@ def _has(rule: Rule, entry: Entry) -> bool:
     if rule.measure.quantity is COVERAGE:
         return True
     key, k = rule.measure.quantity.key, _k(rule, entry)
-    parts = parts_of(entry.sums, functional(key, k))
-    return bool(parts) and (rule.measure.quantity is not SBD_EXCESS or bool(columns_of(entry.sums, key)[:, 1].any()))
+    if not parts_of(entry.sums, functional(key, k)):
+        return False
+    if rule.measure.quantity is not SBD_EXCESS:
+        return True
+    known, locations = _order_known(entry.sums)
+    return known > 0 and known >= ORDER_KNOWN * locations
+
+
+def _order_known(sums: ClusterSums) -> tuple[float, int]:
+    """Return at how many locations SBD in random order is known, and of how many."""
+    return float(columns_of(sums, SBD_EXCESS.key)[:, 1].sum()), round(float(sums["voxels"].sum()))
+
+
+def _few_known(rule: Rule, entry: Entry) -> str:
+    """Return at how few locations SBD in random order is known, which are no random sample; empty for other rules."""
+    known, locations = _order_known(entry.sums) if rule.measure.quantity is SBD_EXCESS else (0.0, 0)
+    few = f", which is known at {known:,.0f} of {locations:,} locations, fewer than {ORDER_KNOWN:.0%}"
+    return few if known > 0 else ""
 
 
 Pair = tuple[Entry, Entry | None]
