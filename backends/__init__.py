@@ -116,7 +116,7 @@ def create(
     make: Any = partial(cls, voxel_size=voxel_size, num_classes=num_classes, **options)
     if within is None:
         return cast(FusionBackend, make())
-    if not restrictable(name):
+    if not is_pointwise(name):
         raise ConfigError(f"backend '{name}' does not associate pixel by pixel; it cannot be restricted to a part")
     if "within" in inspect.signature(cls).parameters:
         return cast(FusionBackend, make(within=within))
@@ -130,8 +130,12 @@ def changes_of(backend: FusionBackend) -> Changes | None:
     return backend.changes() if hasattr(backend, "changes") else None
 
 
-def restrictable(name: str) -> bool:
-    """Return whether maps of the backend of that name can be restricted to an extent."""
+def is_pointwise(name: str) -> bool:
+    """Return whether the backend of that name associates pixel by pixel, as the reference does.
+
+    Only then its maps can be restricted to an extent. Whether they must agree with the others may be configured, too:
+    see `semstab.engine.units.must_agree`.
+    """
     return bool(getattr(REGISTRY.load(name), "pointwise", True))
 
 
