@@ -69,7 +69,8 @@ class FusionBackend(Protocol):
         x_c = ((u - cx) / fx) * d        y_c = ((v - cy) / fy) * d        z_c = d
         x_w = ((R00 * x_c + R01 * y_c) + R02 * z_c) + t0     and so on
 
-    A voxel takes one evidence vector a frame: the mean over the frame's pixels in it.
+    A voxel takes one evidence vector a frame: the mean over the frame's pixels in it, a distribution over the classes.
+    So the rows of evidence in the table sum to OP; a run with other rows fails.
 
     A backend that associates pixels and voxels in another way says `pointwise = False`: it is compared with the
     others, but they need not agree.
