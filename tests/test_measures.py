@@ -26,13 +26,14 @@ from semstab.engine import load_result
 from semstab.errors import ConfigError
 from semstab.recording import Recording, color_modes
 from semstab.recording.voxel_maps import defaults
+from semstab.report import page
 from semstab.report.figures.distributions import draw_ecdf, draw_persistence, draw_sweep, histograms, informative
 from semstab.report.figures.maps import draw_stability
 from semstab.report.figures.topdown import FromAbove
 from semstab.report.means import describe, levels
 from semstab.report.tables import tables
 from semstab.report.tables.table import to_csv
-from semstab.report.terminal import print_summary
+from semstab.report.terminal import columns, print_answer, print_summary, row_of
 from semstab.statistics.cluster_sums import BY_CLASS, FUNCTIONALS
 
 
@@ -44,7 +45,7 @@ def second_largest(table):
 
 RIVAL = Measure(
     key="rival", title="Rival", short="R2", unit="parts", better="lower", digits=(2, 5), of=second_largest,
-    range=(0.0, 0.4), lowest_op=3, largest=0.5,
+    range=(0.0, 0.4), lowest_op=3, largest=0.5, chart=True, headline=True,
 )  # fmt: skip
 
 
@@ -100,6 +101,23 @@ def test_the_terminal_shows_it(run) -> None:
     text = io.StringIO()
     print_summary(result, Console(file=text, width=120), verbose=True)
     assert text.getvalue().count("Rival") >= 3  # scenes, persistence, classes
+
+
+def test_the_report_draws_it_by_op_and_cards_and_rows_of_models_have_it(run, study) -> None:
+    result, _ = run
+    record = result.select()[0]
+    assert [head for head, _ in columns()[5:-1]] == ["VSS", "SBD", "Rival"]
+    assert ("Rival", "parts") in columns()
+    assert len(row_of(record)) == len(columns())
+    titles = [chart["title"] for chart in page._by_op(result)]
+    assert titles == [f"{title} by observation persistence" for title in ("VSS", "SBD", "Rival")]
+    numbers = {name: note for name, _, note in page._numbers([record], [record.statistics], record.statistics)}
+    few = "fewer than 1,000 voxels with OP ≥ 3"
+    assert [numbers[name] for name in ("VSS", "SBD", "Rival")] == [few] * 3
+    text = io.StringIO()
+    print_answer(study[0], Console(file=text, width=120))
+    assert "VSS, SBD, Rival -: fewer than 1,000 voxels were seen 3 times or more" in text.getvalue()
+    assert [chart["title"] for chart in page._sweeps(study[0])] == ["alpha by voxel size", "VSS, OP ≥ 3 by voxel size"]
 
 
 def test_tables_and_the_comparison_have_it(study) -> None:

@@ -147,6 +147,8 @@ class Measure(Quantity):
         lowest_op: Lowest OP at which it is defined.
         range: Range of its colours, in which maps differ; values beyond look like the ends.
         panel: Whether it has a panel in the figure of a map: not where another one shows the same areas.
+        chart: Whether the report draws it against OP.
+        headline: Whether the terminal's row of a model and the report's card of it have it, of the recurrent voxels.
     """
 
     of: Callable[[Beliefs], Float64]
@@ -154,6 +156,8 @@ class Measure(Quantity):
     lowest_op: int = 1
     largest: float = 1.0
     panel: bool = True
+    chart: bool = False
+    headline: bool = False
 
     def __post_init__(self) -> None:
         if not hasattr(self.of, "whole"):
@@ -228,10 +232,13 @@ SBD_MAX = 1.5 - 0.75 * math.log2(3)
 
 _SECTION = "Voxel-Level Stability Metrics"
 
-VSS = Measure(key="vss", title="VSS", better="higher", of=vss, range=(0.5, 1.0), panel=False, section=_SECTION)
+VSS = Measure(
+    key="vss", title="VSS", better="higher", of=vss, range=(0.5, 1.0), panel=False, chart=True, headline=True,
+    section=_SECTION,
+)  # fmt: skip
 SBD = Measure(
     key="sbd", title="SBD", unit="bits", better="lower", digits=(4, 4), of=sbd, range=(0.0, SBD_MAX), largest=SBD_MAX,
-    lowest_op=2, section=_SECTION,
+    lowest_op=2, chart=True, headline=True, section=_SECTION,
 )  # fmt: skip
 ENTROPY = Measure(
     key="entropy", title="Entropy", short="H", better="lower", digits=(4, 4), of=entropy, range=(0.0, 0.5),
@@ -257,6 +264,11 @@ _REGISTER = {measure.key: measure for measure in (VSS, SBD, ENTROPY, MARGIN)}
 def measures() -> tuple[Measure, ...]:
     """Return the measures of every summary, in the order of the paper's tables."""
     return tuple(_REGISTER.values())
+
+
+def headlines() -> tuple[Measure, ...]:
+    """Return the measures that the terminal and the cards of the report show of each model."""
+    return tuple(measure for measure in measures() if measure.headline)
 
 
 def register(measure: Measure) -> None:
