@@ -69,7 +69,8 @@ class FusionBackend(Protocol):
         x_c = ((u - cx) / fx) * d        y_c = ((v - cy) / fy) * d        z_c = d
         x_w = ((R00 * x_c + R01 * y_c) + R02 * z_c) + t0     and so on
 
-    A voxel takes one evidence vector a frame: the mean over the frame's pixels in it.
+    A voxel takes one evidence vector a frame: the mean over the frame's pixels in it, a distribution over the classes.
+    So the rows of evidence in the table sum to OP; a run with other rows fails.
 
     A backend that associates pixels and voxels in another way says `pointwise = False`: it is compared with the
     others, but they need not agree.
@@ -116,7 +117,7 @@ def create(
     make: Any = partial(cls, voxel_size=voxel_size, num_classes=num_classes, **options)
     if within is None:
         return cast(FusionBackend, make())
-    if not restrictable(name):
+    if not is_pointwise(name):
         raise ConfigError(f"backend '{name}' does not associate pixel by pixel; it cannot be restricted to a part")
     if "within" in inspect.signature(cls).parameters:
         return cast(FusionBackend, make(within=within))
@@ -130,8 +131,12 @@ def changes_of(backend: FusionBackend) -> Changes | None:
     return backend.changes() if hasattr(backend, "changes") else None
 
 
-def restrictable(name: str) -> bool:
-    """Return whether maps of the backend of that name can be restricted to an extent."""
+def is_pointwise(name: str) -> bool:
+    """Return whether the backend of that name associates pixel by pixel, as the reference does.
+
+    Only then its maps can be restricted to an extent. Whether they must agree with the others may be configured, too:
+    see `semstab.engine.units.must_agree`.
+    """
     return bool(getattr(REGISTRY.load(name), "pointwise", True))
 
 

@@ -29,6 +29,7 @@ class Task:
         indices: Indices of the frames, ascending; a range where they are evenly spaced.
         top_k: Number of the largest scores of a pixel that are fused; all where not given.
         left_out: Number of selected frames without a file or a pose.
+        apart: Backends whose maps need not agree with those of the others, where a plan puts backends together.
     """
 
     scene: Scene
@@ -40,6 +41,7 @@ class Task:
     exclude: Exclusion = dataclasses.field(default_factory=Exclusion)
     top_k: int | None = None
     left_out: int = 0
+    apart: tuple[str, ...] = ()
 
     @property
     def units(self) -> list[Unit]:

@@ -26,6 +26,8 @@ from semstab.cli import app
 from semstab.comparison import differences, gate_report
 from semstab.comparison import gate as judging
 from semstab.comparison.gate import GateResult, Judgement, gate, gate_config, parse
+from semstab.comparison.runs import open_run, save_summary
+from semstab.data.measures import Measure, margin, registered, sbd
 from semstab.data.statistics import Interval
 from semstab.errors import ConfigError, DataError
 from semstab.statistics.accumulate import cluster_sums_of
@@ -245,6 +247,49 @@ def test_the_command_says_what_came_of_each_rule(run, tmp_path):
     content = json.loads(out[2].read_text())
     assert (content["gate"], content["exit_code"], content["undecided"]) == ("fails", 4, "report")
     assert [row["verdict"] for row in content["rules"]] == ["passes", "passes", "fails"]
+
+
+@pytest.mark.parametrize("share", [0.0, 0.2, 0.3])
+def test_sbd_excess_is_judged_only_where_it_is_known_at_a_quarter_of_the_locations(run, tmp_path, share):
+    """Of soft scores without a log it is known at a few locations, which are no random sample."""
+    own = open_run(f"{run}:a")
+    entry = own.scenes["wall"]
+    columns = entry.sums.columns.copy()
+    columns[:, [entry.sums.layout[name].start for name in ("sbd_excess", "sbd_known")]] *= share
+    few = dataclasses.replace(entry, small=(dataclasses.replace(entry.sums, columns=columns), entry.flicker))
+    save_summary(dataclasses.replace(own, scenes={"wall": few}), file := tmp_path / "few.semstab")
+    rules = gate_config(rules=["sbd excess < 0.5"])
+    if share > 0.25:
+        assert gate(file, None, rules).passed
+        return
+    total = round(entry.sums["voxels"].sum())
+    reason = f", which is known at {share * total:,.0f} of {total:,} locations, fewer than 25%" if share else ""
+    line = f"has no sbd excess of wall{reason}; run it with --statistics, which keeps the order of observations"
+    fails(ConfigError, re.escape(line), gate, file, None, rules)
+
+
+def second_largest(rows):
+    return np.sort(rows.evidence / rows.evidence.sum(axis=1, keepdims=True), axis=1)[:, -2]
+
+
+def test_rules_on_measures_of_the_register(run, tmp_path):
+    """SBD and margin of any run, and a measure that is declared here; a run that was made before has none of it."""
+    found = gate(f"{run}:a", f"{run}:b", gate_config(rules=["sbd < 0.3", "Margin > 0.01", "margin drop < 0.5"]))
+    assert [each.verdict for each in found.judgements] == ["passes"] * 3
+    for each in found.judgements:
+        assert each.interval.low < each.interval.value < each.interval.high
+        assert each.about == "these frames"
+    table = semstab.load(run).table(model="a")
+    means = [of(table)[table.op >= 2].mean() for of in (sbd, margin)]
+    assert [each.new for each in found.judgements[:2]] == pytest.approx(means)
+    with registered(Measure(key="rival_1", title="Rival", better="lower", of=second_largest, range=(0.0, 1.0))):
+        assert parse("Rival < 0.1").measure is not None
+        line = f"rule 'rival-1 < 0.1': {run} has no rival 1 of wall; run it again"
+        fails(ConfigError, re.escape(line), gate, f"{run}:a", None, gate_config(rules=["rival-1 < 0.1"]))
+        semstab.run(configure(run.parent / "wall", check=None), out=tmp_path / "run", report=False)
+        (own,) = gate(f"{tmp_path / 'run'}:a", None, gate_config(rules=["rival-1 < 0.5"])).judgements
+        assert (own.verdict, 0 < own.new < 0.5) == ("passes", True)
+    fails(ConfigError, "no measure 'rival 1'", parse, "rival 1 < 0.1")
 
 
 @pytest.mark.parametrize(("arguments", "line"), [

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import csv
+import dataclasses
 import io
 import json
+from typing import get_type_hints
 
 import numpy as np
 import pyarrow.parquet as pq
@@ -16,19 +18,23 @@ from rich.console import Console
 
 import semstab
 from semstab.api import run_study
-from semstab.data.measures import VSS, Measure, measures, register, registered
+from semstab.comparison.tables import quantities
+from semstab.data import records, results, statistics
+from semstab.data.measures import RESERVED, VSS, Measure, MeasureMeans, measures, register, registered
 from semstab.data.voxels import VoxelTable
 from semstab.engine import load_result
 from semstab.errors import ConfigError
 from semstab.recording import Recording, color_modes
 from semstab.recording.voxel_maps import defaults
+from semstab.report import page
 from semstab.report.figures.distributions import draw_ecdf, draw_persistence, draw_sweep, histograms, informative
 from semstab.report.figures.maps import draw_stability
 from semstab.report.figures.topdown import FromAbove
 from semstab.report.means import describe, levels
 from semstab.report.tables import tables
 from semstab.report.tables.table import to_csv
-from semstab.report.terminal import print_summary
+from semstab.report.terminal import columns, print_answer, print_summary, row_of
+from semstab.statistics.cluster_sums import BY_CLASS, FUNCTIONALS
 
 
 def second_largest(table):
@@ -39,7 +45,7 @@ def second_largest(table):
 
 RIVAL = Measure(
     key="rival", title="Rival", short="R2", unit="parts", better="lower", digits=(2, 5), of=second_largest,
-    range=(0.0, 0.4), lowest_op=3, largest=0.5,
+    range=(0.0, 0.4), lowest_op=3, largest=0.5, chart=True, headline=True,
 )  # fmt: skip
 
 
@@ -95,6 +101,23 @@ def test_the_terminal_shows_it(run) -> None:
     text = io.StringIO()
     print_summary(result, Console(file=text, width=120), verbose=True)
     assert text.getvalue().count("Rival") >= 3  # scenes, persistence, classes
+
+
+def test_the_report_draws_it_by_op_and_cards_and_rows_of_models_have_it(run, study) -> None:
+    result, _ = run
+    record = result.select()[0]
+    assert [head for head, _ in columns()[5:-1]] == ["VSS", "SBD", "Rival"]
+    assert ("Rival", "parts") in columns()
+    assert len(row_of(record)) == len(columns())
+    titles = [chart["title"] for chart in page._by_op(result)]
+    assert titles == [f"{title} by observation persistence" for title in ("VSS", "SBD", "Rival")]
+    numbers = {name: note for name, _, note in page._numbers([record], [record.statistics], record.statistics)}
+    few = "fewer than 1,000 voxels with OP ≥ 3"
+    assert [numbers[name] for name in ("VSS", "SBD", "Rival")] == [few] * 3
+    text = io.StringIO()
+    print_answer(study[0], Console(file=text, width=120))
+    assert "VSS, SBD, Rival -: fewer than 1,000 voxels were seen 3 times or more" in text.getvalue()
+    assert [chart["title"] for chart in page._sweeps(study[0])] == ["alpha by voxel size", "VSS, OP ≥ 3 by voxel size"]
 
 
 def test_tables_and_the_comparison_have_it(study) -> None:
@@ -156,3 +179,49 @@ def test_it_is_gone_when_the_block_ends() -> None:
         with pytest.raises(ConfigError, match="there is a measure 'other' already"):
             register(other)
     assert measures() == before
+
+
+LATER = Measure(key="later", title="Later", better="lower", of=second_largest, range=(0.0, 1.0), lowest_op=2)
+
+
+def test_one_that_was_declared_later_is_undefined_in_earlier_results(run, study) -> None:
+    with registered(LATER):
+        earlier = load_result(run[1])
+        table = earlier.select()[0].summary.table
+        assert np.isnan(table[LATER])
+        assert np.isnan(table.recurrent[LATER])
+        assert (table.recurrent.defined(LATER), table[RIVAL]) == (0, run[0].select()[0].summary.table[RIVAL])
+        assert np.isnan(earlier.agreement[0].difference("later").max)
+        shown = {made.name: to_csv(made) for made in (*tables(earlier), *tables(load_result(study[1])))}
+        (row, *_) = csv.DictReader(io.StringIO(shown["agreement"]))
+        assert (row["max_later"], row["verdict"]) == ("", "agree")
+        print_summary(earlier, Console(file=(text := io.StringIO()), width=120), verbose=True)
+        assert "voxels" in text.getvalue()
+
+
+@pytest.mark.parametrize("key", ["share", "psa", "K", "voxels", "op", "alpha", "vss_voxels"])
+def test_a_key_that_names_another_number_is_refused(key) -> None:
+    other = Measure(key=key, title="Other", better="higher", of=VSS.of, range=(0.0, 1.0))
+    with pytest.raises(ConfigError, match=f"'{key}' is the name of another number or field; choose another key"):
+        register(other)
+
+
+def test_reserved_keys_are_those_beside_a_measure_and_other_compared_numbers() -> None:
+    def inline(cls):
+        hints = get_type_hints(cls)
+        return [hints[own.name] for own in dataclasses.fields(cls) if "inline" in own.metadata]
+
+    def has_means(cls):
+        return cls is MeasureMeans or any(map(has_means, inline(cls)))
+
+    def fields(cls):
+        own = set() if cls is MeasureMeans else {own.name for own in dataclasses.fields(cls)}
+        return own.union(*map(fields, inline(cls)))
+
+    kinds = {
+        kind for module in (records, results, statistics) for kind in vars(module).values() if isinstance(kind, type)
+    }
+    beside = [kind for kind in kinds - {MeasureMeans} if dataclasses.is_dataclass(kind) and has_means(kind)]
+    compared = {quantity.key for quantity in quantities()} | {*FUNCTIONALS, *BY_CLASS}
+    own = {measure.key for measure in measures()}
+    assert set().union(*map(fields, beside), compared, {"op", "evidence", "label"}) - own == RESERVED - own

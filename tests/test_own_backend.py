@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import pytest
@@ -14,10 +15,20 @@ from semstab.errors import ConfigError
 from semstab.settings import load_config
 
 ALIKE = """
+from dataclasses import replace
+
+import numpy as np
 from semstab.backends.numpy_reference import NumpyReference
 
 class Mine(NumpyReference):
     pass
+"""
+
+TWICE = """
+    def table(self):
+        table = super().table()
+        weight = [1.0] * 7 + [2.0] * (len(table) - 7)
+        return replace(table, evidence=table.evidence[:] * np.array(weight)[:, None])
 """
 
 
@@ -58,6 +69,16 @@ def test_a_changed_file_computes_its_units_again(folder) -> None:
     (folder / "fusion.py").write_text(wrong, encoding="utf-8")
     said = run(folder, "--backend", "fusion.py:Mine", "--check", "numpy", code=3)
     assert "the backends disagree" in said.stderr
+
+
+def test_evidence_that_does_not_sum_to_op_is_one_line(folder) -> None:
+    (folder / "fusion.py").write_text(ALIKE.replace("pass", TWICE), encoding="utf-8")
+    said = run(folder, "--backend", "fusion.py:Mine", code=2).stderr
+    assert re.search(
+        r"wall, a: backend 'Mine': the evidence of voxel \(-?\d+, -?\d+, -?\d+\) sums to (\d+), and its OP is \d+; add"
+        r" one distribution over the classes for each frame that sees a voxel",
+        said,
+    )
 
 
 @pytest.mark.parametrize(("text", "line"), [

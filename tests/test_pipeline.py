@@ -222,11 +222,11 @@ def test_disagreement_is_reported_after_everything_is_written(root, tmp_path, mo
 
     table = NumpyReference.table
 
-    def half(self):
+    def other(self):
         whole = table(self)
-        return dataclasses.replace(whole, evidence=whole.evidence / 2)
+        return dataclasses.replace(whole, evidence=np.roll(whole.evidence, 1, axis=1))
 
-    monkeypatch.setattr(NumpyReference, "table", half)
+    monkeypatch.setattr(NumpyReference, "table", other)
     result = semstab.run(configure(root, models=["a"], backends=["open3d"]), out=tmp_path / "run", report=False)
     assert not result.agrees
     assert result.agreement[0].differences["evidence"].max > 0.1
@@ -239,7 +239,6 @@ PLANTED = {
     "first_frame": lambda table: table.first_frame + 1,
     "last_frame": lambda table: table.first_frame,
     "pixels": lambda table: np.minimum(table.pixels, 1),
-    "op": lambda table: np.minimum(table.op, 2),
     "drift_sum": lambda table: np.where(table.drift_sum < 0.1, 0, table.drift_sum),
 }
 """A wrong column, from a right table."""
@@ -273,6 +272,16 @@ def test_a_wrong_column_is_named_with_its_voxel(root, tmp_path, monkeypatch, col
     print_answer(result, Console(file=printed, width=80))
     words = " ".join(printed.getvalue().split())
     assert f"numba and numpy DISAGREE in 1 of 1 maps: wall, a: {row.first}" in words
+
+
+def test_a_map_whose_evidence_does_not_sum_to_op_is_no_result(root, tmp_path, monkeypatch) -> None:
+    from semstab.backends.numba_hash import NumbaHash
+
+    table = NumbaHash.table
+    monkeypatch.setattr(NumbaHash, "table", lambda self: dataclasses.replace(right := table(self), op=right.op + 1))
+    line = r"wall, a: backend 'numba': the evidence of voxel \(.*\) sums to \d+, and its OP is \d+; add one"
+    with pytest.raises(DataError, match=line):
+        semstab.run(configure(root, models=["a"], backends=["numba"], check=None), out=tmp_path / "run", report=False)
 
 
 @pytest.mark.parametrize(("settings", "message"), [

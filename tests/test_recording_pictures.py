@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import io
 import re
 import signal
@@ -25,11 +26,12 @@ from semstab import backends, metrics
 from semstab.data.frames import Frame, Intrinsics
 from semstab.data.labels import LabelSpace
 from semstab.data.measures import SBD_MAX
+from semstab.data.results import Unit
 from semstab.engine.units import make_plan
 from semstab.errors import DataError
-from semstab.recording import Recording, camera, color_modes, drift, lacks_pictures, record_finished, voxel_maps
+from semstab.recording import Recording, camera, color_modes, drift, lacks_pictures, layout, record_finished, voxel_maps
 from semstab.recording.drift import DriftLog, View
-from semstab.recording.timeline import Clock
+from semstab.recording.timeline import Clock, entity
 from semstab.settings import load_config
 from semstab.task import read as read_frame
 
@@ -55,6 +57,28 @@ def compared(tmp_path_factory):
     out = folder / "run"
     semstab.run(config, out=out, observers=[Recording(out / "recording.rrd")], report=False)
     return config, out
+
+
+@pytest.mark.parametrize(("given", "shown", "lines"), [
+    (["numba", "numpy"], "numba", ["numba"]),
+    (["numba", {"name": "numpy", "check": False}], "numba", ["numba", "numpy"]),
+    ([{"name": "numba", "check": False}, "numpy"], "numpy", ["numba", "numpy"]),
+    (["open3d-projective", "numba"], "numba", ["open3d-projective", "numba"]),
+    ([{"name": "open3d-projective", "check": True}, "numba"], "open3d-projective", ["open3d-projective"]),
+])  # fmt: skip
+def test_backends_that_need_not_agree_have_lines_of_their_own(tmp_path, given, shown, lines) -> None:
+    config = config_of(tiny_scene.write(tmp_path / "wall", models=("a",)))
+    given_backends = load_config(overrides={"backends": given}).backends
+    plan = make_plan(config.model_copy(update={"backends": given_backends, "check": None}))
+    (task,) = plan.tasks
+    assert layout.drawn(task) == shown
+    views = layout._plot("wall", "map_vss", [task])
+    assert views.contents == [entity("map_vss", Unit("wall", "a", backend)) for backend in lines]
+    watching = Recording(tmp_path / "recording.rrd")
+    watching.run_started(plan, {})
+    fused = {Unit("wall", "a", name): backends.create(name, voxel_size=0.25, num_classes=3) for name in task.backends}
+    watching.group_started(dataclasses.replace(task, apart=()), config, fused)
+    assert watching._fused is fused[Unit("wall", "a", shown)]
 
 
 def frames_of(config: Any) -> list[Frame]:

@@ -13,15 +13,23 @@ from striped_floor import K, fused, sampled
 from striped_floor import flight as over_stripes
 
 from semstab.core.json_form import to_json
-from semstab.data.measures import dominant, entropy, sbd, vss
+from semstab.data.measures import Measure, dominant, entropy, margin, registered, sbd, vss
 from semstab.errors import DataError
 from semstab.metrics.agreement import rows_of
 from semstab.statistics.accumulate import cluster_sums_of, sums_of_cells
 from semstab.statistics.agreement import class_agreement, consistency_posterior, krippendorff_alpha, psa
-from semstab.statistics.cluster_sums import MOST_CLASSES, ClusterSums, aligned, value
+from semstab.statistics.cluster_sums import EARLIER_NAMES, FUNCTIONALS, MOST_CLASSES, ClusterSums, aligned, value
 from semstab.statistics.correctness import correctness
 from semstab.statistics.drift import expected_sbd
-from semstab.statistics.intervals import coverage, difference, difference_over_frames, mean_over_frames, same_flight
+from semstab.statistics.intervals import (
+    coverage,
+    difference,
+    difference_over_frames,
+    estimate,
+    mean_over_frames,
+    same_flight,
+    scope_of,
+)
 
 
 def flight(side=12, F=9, K=3, soft_evidence=False, seed=0):
@@ -142,6 +150,41 @@ def test_a_file_holds_a_map_and_its_fine_and_coarse_cells(tmp_path):
     assert value(back, "alpha") == value(whole, "alpha")
 
 
+def test_a_file_is_read_by_the_names_of_its_columns(tmp_path):
+    table, log, truth = flight()
+    whole = cluster_sums_of(table, log, truth)
+    whole.save(tmp_path / "sums.parquet")
+    content = pq.read_table(tmp_path / "sums.parquet")
+    further = content.select(content.column_names[::-1]).append_column("further", content.column("psa"))
+    pq.write_table(further, tmp_path / "swapped.parquet")
+    np.testing.assert_array_equal(ClusterSums.load(tmp_path / "swapped.parquet").columns, whole.columns)
+    pq.write_table(content.drop_columns(["entropy"]), tmp_path / "without.parquet")
+    without = ClusterSums.load(tmp_path / "without.parquet")
+    expected = {key: np.nan if key == "entropy" else value(whole, key) for key in FUNCTIONALS}
+    assert {key: value(without, key) for key in FUNCTIONALS} == pytest.approx(expected, nan_ok=True, rel=0)
+    assert np.isnan([getattr(estimate(without, "entropy"), end) for end in ("value", "low", "high")]).all()
+    assert np.isnan(difference(without, whole, "entropy").value)
+    assert difference(without, whole, "psa").value == 0
+    about = json.loads(content.schema.metadata[b"semstab"]) | {"K": 1000, "classes": []}
+    pq.write_table(content.replace_schema_metadata({"semstab": json.dumps(about)}), tmp_path / "sums.parquet")
+    with pytest.raises(DataError, match="columns of sums for 1000 classes"):
+        ClusterSums.load(tmp_path / "sums.parquet")
+
+
+def test_an_older_file_has_its_sums_by_their_names_of_then(tmp_path):
+    table, log, truth = flight()
+    whole = cluster_sums_of(table, log, truth)
+    whole.save(tmp_path / "sums.parquet")
+    content = pq.read_table(tmp_path / "sums.parquet")
+    about = json.loads(content.schema.metadata[b"semstab"])
+    about |= {name: about[name][0] for name in ("edge", "step", "voxel_size", "fused")}
+    about |= {"schema": 3, "kind": "InfluenceSums"}
+    then = {name: old for old, name in EARLIER_NAMES.items()}
+    content = content.rename_columns([then.get(name, name) for name in content.column_names])
+    pq.write_table(content.replace_schema_metadata({"semstab": json.dumps(about)}), tmp_path / "old.parquet")
+    np.testing.assert_array_equal(ClusterSums.load(tmp_path / "old.parquet").columns, whole.columns)
+
+
 @pytest.mark.parametrize("schema", [2, 3])
 def test_an_older_file_is_read_without_its_cells(tmp_path, schema):
     """Parts 1 and 2 of schema 3 were of another sample; schema 2 had no frames that were fused."""
@@ -201,7 +244,8 @@ def test_a_share_is_the_frames_own_quality():
     labels[:25, 2] = 1
     table = (log := log_of(labels, index=grid(8)[:50])).table()
     sums = cluster_sums_of(table, log)
-    share = np.bincount(sums.frame, weights=sums["agreeing"][:, 0]) / 50
+    of_frames = sums.frame >= 0
+    share = np.bincount(sums.frame[of_frames], weights=sums["agreeing"][of_frames, 0]) / 50
     assert share.sum() == pytest.approx((table.op * psa(table)).mean())
     lost = share - share[0]
     assert lost[[0, 1, 3, 4]] == pytest.approx(0)
@@ -246,3 +290,43 @@ def test_a_map_of_which_nothing_was_seen_twice_has_no_numbers_and_a_large_one_fe
     sums = cluster_sums_of(log.table(), log)
     assert (sums.cells, sums.edge) == (256, 0.5)
     assert (sums.frames, sums.step) == (38, 4)
+
+
+def test_measures_of_the_register_have_sums_of_their_own(tmp_path):
+    """A measure that is declared here has a mean over the voxels, and an interval, from a file of sums."""
+    table, log, truth = flight(side=24)
+    often = Measure(
+        key="often",
+        title="Often",
+        better="higher",
+        range=(0.0, 1.0),
+        of=lambda rows: np.where(rows.op > 2, 0.5, np.nan),
+    )
+    before = cluster_sums_of(table, log, truth)
+    with registered(often):
+        for given in (log, None):
+            whole = cluster_sums_of(table, given, truth, sbd_excess=np.zeros(len(table)))
+            whole.save(tmp_path / "sums.parquet")
+            for sums in (whole, ClusterSums.load(tmp_path / "sums.parquet"), whole.without_truth()):
+                found = {key: value(sums, key) for key in ("sbd", "margin", "often")}
+                again = table.op >= 2
+                expected = {"sbd": sbd(table)[again].mean(), "margin": margin(table)[again].mean(), "often": 0.5}
+                assert found == pytest.approx(expected)
+                interval = estimate(sums, "margin", scope=scope_of(sums, key="margin"))
+                assert interval.low < expected["margin"] < interval.high
+                assert interval.scope == "these frames"
+            assert value(whole, "ece") == pytest.approx(value(before, "ece"))
+        assert np.isnan(value(before, "often"))
+    again = ClusterSums.load(tmp_path / "sums.parquet")
+    assert again.measured == ("sbd", "margin")
+    assert value(again, "accuracy") == pytest.approx(value(before, "accuracy"))
+    assert value(whole, "margin") == value(again, "margin")
+    content = pq.read_table(tmp_path / "sums.parquet")
+    old = content.drop_columns([name for name in content.column_names if name.endswith(("_sum", "_count"))])
+    pq.write_table(old, tmp_path / "old.parquet")
+    old = ClusterSums.load(tmp_path / "old.parquet")
+    assert np.isnan(value(old, "sbd"))
+    assert {key: value(old, key) for key in FUNCTIONALS} == pytest.approx(
+        {key: value(again, key) for key in FUNCTIONALS}, rel=0, nan_ok=True
+    )
+    assert difference(old, again, "psa").value == 0

@@ -32,8 +32,8 @@ from semstab.comparison.tables import (
 from semstab.config import nearest, read_yaml, validated
 from semstab.config.settings import ScopeSetting
 from semstab.core.types import OTHER_SCENES, THESE_FRAMES, THIS_SCENE, Scope
-from semstab.data.measures import ENTROPY, Quantity
-from semstab.data.statistics import UNKNOWN, Interval
+from semstab.data.measures import ENTROPY, Measure, Quantity
+from semstab.data.statistics import ORDER_KNOWN, UNKNOWN, Interval
 from semstab.errors import ConfigError, DataError
 from semstab.statistics.agreement import ALPHA, PSA, VOXEL_ALPHA
 from semstab.statistics.cluster_sums import (
@@ -43,6 +43,7 @@ from semstab.statistics.cluster_sums import (
     functional,
     of_space_alone,
     parts_of,
+    summed,
     value,
 )
 from semstab.statistics.correctness import ACCURACY, ECE, MIOU
@@ -105,20 +106,23 @@ MEASURES = (
     GateMeasure(PRECISION, "precision", of_all=False, of_class=True, if_missing=TRUTH),
     GateMeasure(IOU, "iou", of_all=False, of_class=True, if_missing=TRUTH),
 )
-"""Measures in the order of lists."""
+"""Measures in the order of lists, before those of the register."""
+
+
+def gate_measures() -> tuple[GateMeasure, ...]:
+    """Return all measures in the order of lists."""
+    return (*MEASURES, *(GateMeasure(each, _plain(each.key), if_missing="run it again") for each in summed()))
+
 
 NOTHING = "no location that it needs was seen twice"
 SCORES = "one run has labels and the other scores, which spread their evidence; run both as labels"
 
-OF_EVIDENCE = (PSA, VOXEL_ALPHA, RECURRENT_VSS, ENTROPY, SBD_EXCESS, ECE)
-"""Measures that depend on the output of a model: labels or scores."""
+OF_EVIDENCE = (PSA, VOXEL_ALPHA, RECURRENT_VSS, SBD_EXCESS, ECE)
+"""Measures that depend on the output of a model, labels or scores, as do those of the register."""
 
 
 def _plain(name: str) -> str:
     return re.sub(r"[\s_-]+", " ", name.strip()).lower()
-
-
-NAMED = {_plain(name): each for each in MEASURES for name in (each.name, each.quantity.title, *each.also)}
 
 
 def measure_named(name: str, where: str) -> GateMeasure:
@@ -127,10 +131,11 @@ def measure_named(name: str, where: str) -> GateMeasure:
     Raises:
         ConfigError: If there is no such measure; the message starts with `where`.
     """
-    result = NAMED.get(_plain(name))
-    if result is None:
-        raise ConfigError(f"{where}: no measure '{name}'; {nearest(_plain(name), [each.name for each in MEASURES])}")
-    return result
+    known = gate_measures()
+    named = {_plain(own): each for each in reversed(known) for own in (each.name, each.quantity.title, *each.also)}
+    if _plain(name) not in named:
+        raise ConfigError(f"{where}: no measure '{name}'; {nearest(_plain(name), [each.name for each in known])}")
+    return named[_plain(name)]
 
 
 # The rules of a gate, as text: 'alpha drop < 0.02', 'class human: recall > 0.6'.
@@ -560,9 +565,9 @@ def _check(rule: Rule, own: RunHandle, base: RunHandle | None, scenes: Sequence[
             )
         for entry in entries:
             if not _has(rule, entry):
-                name = rule.measure.name
+                name, few = rule.measure.name, _few_known(rule, entry)
                 raise ConfigError(
-                    f"rule '{rule.text}': {entry.where} has no {name} of {scene}; {rule.measure.if_missing}"
+                    f"rule '{rule.text}': {entry.where} has no {name} of {scene}{few}; {rule.measure.if_missing}"
                 )
         if len({entry.sums.voxel_size for entry in entries}) > 1:
             sizes = [entry.sums.voxel_size for entry in entries]
@@ -579,8 +584,24 @@ def _has(rule: Rule, entry: Entry) -> bool:
     if rule.measure.quantity is COVERAGE:
         return True
     key, k = rule.measure.quantity.key, _k(rule, entry)
-    parts = parts_of(entry.sums, functional(key, k))
-    return bool(parts) and (rule.measure.quantity is not SBD_EXCESS or bool(columns_of(entry.sums, key)[:, 1].any()))
+    if not parts_of(entry.sums, functional(key, k)):
+        return False
+    if rule.measure.quantity is not SBD_EXCESS:
+        return True
+    known, locations = _order_known(entry.sums)
+    return known > 0 and known >= ORDER_KNOWN * locations
+
+
+def _order_known(sums: ClusterSums) -> tuple[float, int]:
+    """Return at how many locations SBD in random order is known, and of how many."""
+    return float(columns_of(sums, SBD_EXCESS.key)[:, 1].sum()), round(float(sums["voxels"].sum()))
+
+
+def _few_known(rule: Rule, entry: Entry) -> str:
+    """Return at how few locations SBD in random order is known, which are no random sample; empty for other rules."""
+    known, locations = _order_known(entry.sums) if rule.measure.quantity is SBD_EXCESS else (0.0, 0)
+    few = f", which is known at {known:,.0f} of {locations:,} locations, fewer than {ORDER_KNOWN:.0%}"
+    return few if known > 0 else ""
 
 
 Pair = tuple[Entry, Entry | None]
@@ -666,7 +687,7 @@ def _require_values(rule: Rule, pairs: Sequence[Pair]) -> None:
                     f"rule '{rule.text}': {entry.where} has no {named}: {NOTHING}; {rule.measure.if_missing}"
                 )
         mixed = old is not None and (new.summary.reduced is None) != (old.summary.reduced is None)
-        if mixed and rule.measure.quantity in OF_EVIDENCE:
+        if mixed and (rule.measure.quantity in OF_EVIDENCE or isinstance(rule.measure.quantity, Measure)):
             raise ConfigError(f"rule '{rule.text}': {SCORES}")
 
 

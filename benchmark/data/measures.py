@@ -147,6 +147,8 @@ class Measure(Quantity):
         lowest_op: Lowest OP at which it is defined.
         range: Range of its colours, in which maps differ; values beyond look like the ends.
         panel: Whether it has a panel in the figure of a map: not where another one shows the same areas.
+        chart: Whether the report draws it against OP.
+        headline: Whether the terminal's row of a model and the report's card of it have it, of the recurrent voxels.
     """
 
     of: Callable[[Beliefs], Float64]
@@ -154,6 +156,8 @@ class Measure(Quantity):
     lowest_op: int = 1
     largest: float = 1.0
     panel: bool = True
+    chart: bool = False
+    headline: bool = False
 
     def __post_init__(self) -> None:
         if not hasattr(self.of, "whole"):
@@ -228,16 +232,31 @@ SBD_MAX = 1.5 - 0.75 * math.log2(3)
 
 _SECTION = "Voxel-Level Stability Metrics"
 
-VSS = Measure(key="vss", title="VSS", better="higher", of=vss, range=(0.5, 1.0), panel=False, section=_SECTION)
+VSS = Measure(
+    key="vss", title="VSS", better="higher", of=vss, range=(0.5, 1.0), panel=False, chart=True, headline=True,
+    section=_SECTION,
+)  # fmt: skip
 SBD = Measure(
     key="sbd", title="SBD", unit="bits", better="lower", digits=(4, 4), of=sbd, range=(0.0, SBD_MAX), largest=SBD_MAX,
-    lowest_op=2, section=_SECTION,
+    lowest_op=2, chart=True, headline=True, section=_SECTION,
 )  # fmt: skip
 ENTROPY = Measure(
     key="entropy", title="Entropy", short="H", better="lower", digits=(4, 4), of=entropy, range=(0.0, 0.5),
     section=_SECTION,
 )  # fmt: skip
 MARGIN = Measure(key="margin", title="Margin", short="M", better="higher", of=margin, range=(0.0, 1.0), panel=False)
+
+RESERVED = frozenset((
+    "K", "backend", "categories", "classes", "confused_with", "entropy_between", "entropy_within",
+    "flicker_percent", "frames", "frames_empty", "frames_left_out", "fuse_ms_per_frame", "image_space", "key",
+    "left_out", "mean_op", "means", "model", "name", "observations", "points", "psa", "quality", "recurrent",
+    "reduced", "sbd_excess", "sbd_null", "scene", "scores_left_out", "share", "sizes", "stages_ms",
+    "statistics", "strata", "summary", "table", "taxonomy", "truth_file", "unit", "variation", "video_measures",
+    "voxel_size", "voxels", "voxels_file", "well_seen", "op", "evidence", "label", "alpha", "voxel_alpha",
+    "accuracy", "observation_accuracy", "precision", "iou", "miou", "ece", "wrong_of_consistent", "coverage",
+    "compensated_flicker_percent",
+))  # fmt: skip
+"""Keys that no measure may have: fields beside its mean in JSON, other differences of maps, other compared numbers."""
 
 _REGISTER = {measure.key: measure for measure in (VSS, SBD, ENTROPY, MARGIN)}
 
@@ -247,14 +266,21 @@ def measures() -> tuple[Measure, ...]:
     return tuple(_REGISTER.values())
 
 
+def headlines() -> tuple[Measure, ...]:
+    """Return the measures that the terminal and the cards of the report show of each model."""
+    return tuple(measure for measure in measures() if measure.headline)
+
+
 def register(measure: Measure) -> None:
     """Add a measure to every summary from now on.
 
     Raises:
-        ConfigError: If its key is taken.
+        ConfigError: If its key is taken, or is the name of another number or field.
     """
     if measure.key in _REGISTER:
         raise ConfigError(f"there is a measure '{measure.key}' already; choose another key")
+    if measure.key in RESERVED or measure.key.endswith("_voxels"):
+        raise ConfigError(f"'{measure.key}' is the name of another number or field; choose another key")
     _REGISTER[measure.key] = measure
 
 
@@ -314,10 +340,6 @@ class MeasureMeans:
 
     @classmethod
     def of_json_content(cls, content: Any) -> MeasureMeans:
-        """Return the entries of all measures."""
-        rare = {measure.key: f"{measure.key}_voxels" for measure in measures() if measure.lowest_op > 1}
-        for key in (*(measure.key for measure in measures()), *rare.values()):
-            if key not in content:
-                raise ValueError(f"{key} is missing")
-        counts = {key: content[entry] for key, entry in rare.items()}
-        return cls({measure.key: number(content[measure.key]) for measure in measures()}, counts)
+        """Return the entries of all measures; those of one that was declared later are NaN, over 0 voxels."""
+        rare = {m.key: content.get(f"{m.key}_voxels", 0) for m in measures() if m.lowest_op > 1}
+        return cls({measure.key: number(content.get(measure.key)) for measure in measures()}, rare)

@@ -323,3 +323,7 @@ class Agreement:
     agrees: bool
     one_in: int = 1
     first: Mismatch | None = None
+
+    def difference(self, key: str) -> Deviation:
+        """Return the differences of a quantity, NaN of a measure that was declared later."""
+        return self.differences.get(key, Deviation(math.nan, math.nan))

@@ -486,6 +486,10 @@ class OutlyingFrames:
     frames: tuple[FrameDisagreement, ...] = ()
 
 
+ORDER_KNOWN = 0.25
+"""Share of the locations seen twice from which on SBD less that in random order is reported."""
+
+
 # --- One map ----------------------------------------------------------------------------------------------------------
 
 
@@ -534,7 +538,7 @@ class MapStatistics:
 
         For soft scores without a log that is so for a few of them only, which are no random sample.
         """
-        return 4 * self.drift.voxels >= self.repeated.voxels
+        return self.drift.voxels >= ORDER_KNOWN * self.repeated.voxels
 
     @property
     def sections(self) -> int:

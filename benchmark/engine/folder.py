@@ -31,7 +31,6 @@ from semstab.core.files import (
 from semstab.core.json_form import from_json, to_json
 from semstab.data import earlier
 from semstab.data.digests import DIGESTS, write_digests
-from semstab.data.measures import measures
 from semstab.data.records import (
     EVENTS,
     FRAMES,
@@ -355,9 +354,8 @@ def _contradiction(result: Result) -> str | None:
         table = record.summary.table
         if not table.strata or (table.voxels and not table.classes):
             return f"{record.unit} has no {'classes' if table.strata else 'strata'}"
-    quantities = {"op", "evidence", *(measure.key for measure in measures())}
     for row in result.agreement:
-        if lost := quantities - row.differences.keys():
+        if lost := {"op", "evidence"} - row.differences.keys():
             return f"the agreement on {row.scene} has no {min(lost)}"
     files = (file for record in result.records for file in (record.voxels_file, record.truth_file) if file is not None)
     outside = (file for file in files if file.is_absolute() or ".." in file.parts)

@@ -22,7 +22,7 @@ from semstab.data.frames import LeftOut
 from semstab.data.measures import dominant, mean, measures, vss
 from semstab.data.parquet import Tile
 from semstab.data.records import EVENTS, FRAMES, OBSERVATIONS, OVERVIEW, SUMS, TRUTH, VOXELS, FrameQuality, UnitContent
-from semstab.data.results import RECURRENT, STAGES, Agreement, ReducedScores, UnitSummary, slug
+from semstab.data.results import RECURRENT, STAGES, Agreement, ReducedScores, Unit, UnitSummary, slug
 from semstab.data.voxels import VoxelTable
 from semstab.datasets import Scene
 from semstab.engine.live_maps import LiveMap, Stream
@@ -113,6 +113,7 @@ def _fused_map(live: LiveMap, watch: Stopwatch) -> FusedMap:
     config, classes = live.work.config, live.task.mapping.target.classes
     with watch("table"):
         table = dataclasses.replace(live.backend.table(), classes=classes)
+        _check_evidence(table, live.unit)
         events = live.backend.events() if config.statistics or config.events else None
         truth = None if live.truth is None else dataclasses.replace(live.truth.table(), classes=classes)
         reduced = np.zeros(0) if live.hard is None else reduced_sums(_left(live, live.hard.table())[0])
@@ -122,6 +123,28 @@ def _fused_map(live: LiveMap, watch: Stopwatch) -> FusedMap:
         trim_malloc(least=SMALL)
     events = None if events is None else dataclasses.replace(events, classes=classes)
     return FusedMap(*_left(live, table, events), truth, reduced, checked)
+
+
+OF_OP = 1e-6
+"""Largest difference of a voxel's summed evidence from its OP, divided by OP."""
+
+
+def _check_evidence(table: VoxelTable, unit: Unit) -> None:
+    """Raise DataError where a backend's evidence of a voxel does not sum to its OP."""
+    starts, _, weight = table.evidence.entries
+    for some in stretches(len(table)):
+        first, op = starts[some], table.op[some]
+        total, filled = np.zeros(len(op)), starts[some.start + 1 : some.stop + 1] > first
+        total[filled] = np.add.reduceat(weight[: starts[some.stop]], first[filled]) if filled.any() else 0.0
+        wrong = np.flatnonzero(~(np.abs(total - op) <= OF_OP * op))
+        if len(wrong):
+            row = some.start + wrong[0]
+            voxel = ", ".join(str(axis[row]) for axis in (table.ix, table.iy, table.iz))
+            raise DataError(
+                f"{unit.scene}, {unit.model}: backend '{unit.backend}': the evidence of voxel ({voxel}) sums to"
+                f" {total[wrong[0]]:g}, and its OP is {op[wrong[0]]}; add one distribution over the classes for each"
+                " frame that sees a voxel (semstab.testing.BackendConformance finds where it goes wrong)"
+            )
 
 
 def _left(live: LiveMap, table: VoxelTable, events: Events | None = None) -> tuple[VoxelTable, Events | None]:

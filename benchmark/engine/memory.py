@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from semstab.backends import expected_bytes, restrictable
+from semstab.backends import expected_bytes, is_pointwise
 from semstab.backends.numpy_reference import ONE_IN
 from semstab.config import Config
 from semstab.core.arrays import evenly
@@ -127,7 +127,7 @@ def _plan_sizes(config: Config, group: Sequence[PlannedUnit], width: int, sizing
     why = None
     if config.tile_size == "off":
         why = "tile_size: off forbids to fuse it in tiles"
-    elif other := [each.unit.backend for each in group if not restrictable(each.unit.backend)]:
+    elif other := [each.unit.backend for each in group if not is_pointwise(each.unit.backend)]:
         why = f"backend '{other[0]}' cannot be restricted to tiles"
     if isinstance(config.tile_size, int):
         if why is not None:

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
-from semstab.backends import REGISTRY, create, keeps_log
+from semstab.backends import create, is_pointwise, keeps_log
 from semstab.config import (
     BACKENDS,
     BASE,
@@ -121,8 +121,9 @@ class Plan:
         for each in self.units:
             if each.variation.sweep in (BASE, BACKENDS):
                 backends.setdefault((each.unit.scene, each.unit.model), []).append(each.unit.backend)
+        apart = tuple(backend.name for backend in self.config.fused_by() if not must_agree(backend))
         return tuple(
-            dataclasses.replace(each.task, backends=tuple(backends[each.unit.scene, each.unit.model]))
+            dataclasses.replace(each.task, backends=tuple(backends[each.unit.scene, each.unit.model]), apart=apart)
             for each in self.units
             if each.variation.sweep == BASE
         )
@@ -200,8 +201,7 @@ def _is_sampled(config: Config, backend: BackendConfig) -> bool:
 
 def must_agree(backend: BackendConfig) -> bool:
     """Return whether it must agree with the others: as it is configured, or else if it associates pixel by pixel."""
-    pointwise: bool = getattr(REGISTRY.load(backend.name), "pointwise", True)
-    return pointwise if backend.check is None else backend.check
+    return is_pointwise(backend.name) if backend.check is None else backend.check
 
 
 def _check_classes(critical: Sequence[str], task: Task) -> None:

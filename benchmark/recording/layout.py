@@ -14,7 +14,6 @@ import numpy.typing as npt
 import rerun as rr
 import rerun.blueprint as rrb
 
-from semstab.backends import REGISTRY
 from semstab.core.types import Float64, UInt8
 from semstab.data.labels import Color, LabelSpace
 from semstab.data.results import RECURRENT, Unit
@@ -225,14 +224,9 @@ def blueprint(
 
 
 def drawn(task: Task) -> str:
-    """Return the backend whose map is drawn while it grows: the first that fuses like the reference."""
-    alike = [name for name in task.backends if is_pointwise(name)]
+    """Return the backend whose map is drawn while it grows: the first that must agree with the others."""
+    alike = [name for name in task.backends if name not in task.apart]
     return (alike or list(task.backends))[0]
-
-
-def is_pointwise(backend: str) -> bool:
-    """Return whether a backend fuses like the reference."""
-    return bool(getattr(REGISTRY.load(backend), "pointwise", True))
 
 
 def view_3d(
@@ -367,12 +361,12 @@ def _below(scene: str, tasks: list[Task]) -> rrb.Container:
 
 
 def _plot(scene: str, name: str, tasks: list[Task]) -> rrb.TimeSeriesView:
-    """Return a series of all models; backends that fuse alike share one line, except for their times."""
+    """Return a series of all models; backends that must agree share one line, except for their times."""
     lines = [
         entity(name, Unit(scene, task.model, backend))
         for task in tasks
         for backend in task.backends
-        if name.endswith("_ms") or backend == drawn(task) or not is_pointwise(backend)
+        if name.endswith("_ms") or backend == drawn(task) or backend in task.apart
     ]
     legend = rrb.PlotLegend(rrb.Corner2D.LeftTop, visible=name in ("map_recurrent", "fuse_ms"))
     return rrb.TimeSeriesView(

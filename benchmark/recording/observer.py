@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import logging
 import threading
 from collections.abc import Callable, Mapping
@@ -186,11 +187,11 @@ class Recording(Observer):
         """Follow the map that is drawn."""
         self._end_group()
         self._unfinished = {*backends}
-        self._fused = next((each for unit, each in backends.items() if unit.backend == drawn(task)), None)
+        self._fused = next((each for unit, each in backends.items() if unit.backend == self._drawn(task)), None)
 
     def frame_fused(self, task: Task, frame: Frame, rows: Mapping[Unit, FrameRow]) -> None:
         """Log a row of each time series, the camera, and the map."""
-        voxels = next((row.report.map_voxels for unit, row in rows.items() if unit.backend == drawn(task)), 0)
+        voxels = next((row.report.map_voxels for unit, row in rows.items() if unit.backend == self._drawn(task)), 0)
         self._log_frame(task, frame, rows, voxels)
 
     def _log_frame(self, task: Task, frame: Frame, rows: Mapping[Unit, FrameRow], voxels: int) -> None:
@@ -314,9 +315,17 @@ class Recording(Observer):
         if position is None:
             position = task.scene.T_wc(task.indices[0])[:3, 3]
         origin = scene.begin(stream, position, voxel_size)
-        own = next(each for each in self._plan.tasks if (each.scene.name, each.model) == (scene.name, task.model))
-        self._group = GroupLog(own, voxel_size, origin, self._fused)
+        self._group = GroupLog(self._planned(task), voxel_size, origin, self._fused)
         return self._group
+
+    def _planned(self, task: Task) -> Task:
+        """Return the model on the scene with all backends of the plan."""
+        named = task.scene.name, task.model
+        return next(each for each in self._plan.tasks if (each.scene.name, each.model) == named)
+
+    def _drawn(self, task: Task) -> str:
+        """Return the backend that is drawn among those that are fused now."""
+        return drawn(dataclasses.replace(self._planned(task), backends=task.backends))
 
     def _replay_frames(self, task: Task, summary: UnitSummary) -> None:
         """Read and fuse the frames of a task again; where the map would not fit into memory, drift is left out."""

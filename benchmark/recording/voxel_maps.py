@@ -27,7 +27,7 @@ from semstab.metrics.agreement import shared_rows
 from semstab.metrics.summary import categorise
 from semstab.report.narrative import outlying_line
 from semstab.report.ranking import answers
-from semstab.report.terminal import COLUMNS, TEXTS, row_of
+from semstab.report.terminal import TEXTS, columns, row_of
 
 
 @dataclass(frozen=True)
@@ -288,7 +288,7 @@ PENDING = "The verdict follows when all frames are fused."
 def verdict_report(result: Result, scene: str) -> str:
     """Return the answer of a run, and the verdict of each model on a scene, in Markdown, as the terminal has them."""
     rows = [row_of(record) for record in result.select(scene=scene)]
-    heads = (f"| {' | '.join(COLUMNS[:TEXTS])} |", f"|{'---|' * TEXTS}")
+    heads = (f"| {' | '.join(head for head, _ in columns()[:TEXTS])} |", f"|{'---|' * TEXTS}")
     table = [f"| {' | '.join(row[:TEXTS])} |" for row in rows]
     return "\n".join([*(f"{line}\n" for line in answers(result)), *heads, *table])
 

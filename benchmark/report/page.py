@@ -13,7 +13,7 @@ import numpy as np
 
 from semstab.core.palette import KINDS
 from semstab.core.types import Int64, UInt8
-from semstab.data.measures import SBD, VSS, dominant
+from semstab.data.measures import SBD, VSS, dominant, headlines, measures
 from semstab.data.records import OVERVIEW, Failure, Record, Result
 from semstab.data.results import slug
 from semstab.data.statistics import CONFIDENCE, Estimate, MapStatistics, short
@@ -146,8 +146,10 @@ def _numbers(
     yield "seen 3 times or more", f"{100 * together.recurrent.share:.0f} %", f"of {together.voxels:,} voxels"
     enough = together.recurrent.voxels >= ENOUGH
     few = f"fewer than {ENOUGH:,} voxels with OP ≥ 3"
-    yield "VSS", short(together.recurrent[VSS], digits=3) if enough else "-", "OP ≥ 3" if enough else few
-    yield "SBD", short(together.recurrent[SBD], digits=4) if enough else "-", "bits, OP ≥ 3" if enough else few
+    for measure in headlines():
+        value = short(together.recurrent[measure], digits=measure.digits[0]) if enough else "-"
+        note = f"{measure.unit}, OP ≥ 3" if measure.unit else "OP ≥ 3"
+        yield measure.title, value, note if enough else few
     yield "mIoU", mean([miou(record) for record in records], "{:.1f} %", 100), "of voxels seen twice or more"
     wrong = [stats.headline.wrong_of_consistent.value for stats in assessed]
     yield "consistent but wrong", mean(wrong, "{:.1f} %", 100), "of the consistent locations"
@@ -342,7 +344,7 @@ def _distance(records: Sequence[Record], colors: Mapping[str, int]) -> Iterator[
 def _by_op(result: Result) -> Iterator[dict[str, str]]:
     """Yield the measures by observation persistence."""
     together = {name: pooled(records) for name, records in by_model(result.select()).items()}
-    for measure in (VSS, SBD):
+    for measure in (measure for measure in measures() if measure.chart):
         lines, names = [], list[str]()
         for k, (model, own) in enumerate(together.items()):
             strata = [*own.strata[:-1], *(own.well_seen or own.strata[-1:])]
@@ -352,13 +354,15 @@ def _by_op(result: Result) -> Iterator[dict[str, str]]:
             lines.append(Line(model, [*range(len(strata))], [row[measure] for row in strata], color=k))
         unit = f"{measure.title}, {measure.unit}" if measure.unit else measure.title
         if lines:
-            chart = line_chart(lines, "OP, frames that saw the voxel", unit, names=names, zero=measure is SBD)
+            chart = line_chart(lines, "OP, frames that saw the voxel", unit, names=names, zero=measure.range[0] == 0)
             yield {"title": f"{measure.title} by observation persistence", "chart": chart}
 
 
 def _sweeps(result: Result) -> Iterator[dict[str, str]]:
+    """Yield alpha and the first headline measure by the settings of each sweep."""
+    first = [(f"{measure.title}, OP ≥ 3", over_recurrent(measure)) for measure in headlines()[:1]]
     for sweep in swept(result):
-        for title, take in (("alpha", lambda p: p.alpha.value), ("VSS, OP ≥ 3", over_recurrent(VSS))):
+        for title, take in (("alpha", lambda p: p.alpha.value), *first):
             lines = []
             for k, model in enumerate(result.models):
                 if own := levels(result, sweep.name, model):

@@ -14,7 +14,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from semstab.check import Verdict
 from semstab.config import BASE
 from semstab.core.types import THESE_FRAMES
-from semstab.data.measures import measures
+from semstab.data.measures import headlines, measures
 from semstab.data.records import Failure, Record, Result, UnitContent
 from semstab.data.results import Agreement, UnitSummary
 from semstab.data.statistics import UNDEFINED, Estimate, short
@@ -228,8 +228,13 @@ def _metres(size: float) -> str:
 # --- Several ----------------------------------------------------------------------------------------------------------
 
 
-COLUMNS = ("model", "verdict", f"alpha ({UNDEFINED.of})", "agree", "flicker", "VSS", "SBD", "mIoU")
-UNITS = ("", "", "", "%", "%", "OP>=3", "bits", "%")
+def columns() -> list[tuple[str, str]]:
+    """Return the head and the unit of each number in a model's row, see `row_of`."""
+    shown = [(measure.title, measure.unit or "OP>=3") for measure in headlines()]
+    texts = [("model", ""), ("verdict", ""), (f"alpha ({UNDEFINED.of})", "")]
+    return [*texts, ("agree", "%"), ("flicker", "%"), *shown, ("mIoU", "%")]
+
+
 TEXTS = 3
 """The number of columns of text, which are aligned left; numbers are aligned right."""
 
@@ -246,8 +251,8 @@ def _several(result: Result, records: Sequence[Record], width: int) -> Iterator[
     if told:
         yield ""
     known = any(not math.isnan(miou(record)) for record in records)
-    columns = len(COLUMNS) if known else len(COLUMNS) - 1
-    heads, rows = [COLUMNS[:columns], UNITS[:columns]], [row_of(record)[:columns] for record in records]
+    shown = columns() if known else columns()[:-1]
+    heads, rows = [*zip(*shown, strict=True)], [row_of(record)[: len(shown)] for record in records]
     lines = iter(laid_out([*heads, *rows], width))
     yield next(lines)
     yield next(lines)
@@ -257,7 +262,8 @@ def _several(result: Result, records: Sequence[Record], width: int) -> Iterator[
             yield f"  {(scene := record.unit.scene)}"
         yield line
     if any(record.summary.table.recurrent.voxels < ENOUGH for record in records):
-        yield f"  VSS, SBD -: fewer than {ENOUGH:,} voxels were seen 3 times or more"
+        titles = ", ".join(measure.title for measure in headlines())
+        yield f"  {titles} -: fewer than {ENOUGH:,} voxels were seen 3 times or more"
     yield from _classes(records, width)
     yield from _outlying(records)
     yield ""
@@ -284,18 +290,18 @@ def _cut(name: str, size: int) -> str:
 
 
 def row_of(record: Record) -> list[str]:
-    """Return a model's row under `COLUMNS`."""
+    """Return a model's row under `columns`."""
     run, statistics = record.summary, record.summary.statistics
     level, alpha, agree = "-", "", math.nan
     if statistics is not None:
         level, alpha = str(statistics.verdict), statistics.headline.alpha.text()
         agree = 100 * statistics.agreeing
     recurrent = run.table.recurrent
-    means = [recurrent[m] if recurrent.voxels >= ENOUGH else math.nan for m in measures()[:2]]
-    vss, sbd = (short(mean, digits=m.digits[0]) for m, mean in zip(measures(), means, strict=False))
+    means = {m: recurrent[m] if recurrent.voxels >= ENOUGH else math.nan for m in headlines()}
+    shown = [short(value, digits=m.digits[0]) for m, value in means.items()]
     flicker = record.image_space.compensated_flicker_percent
     agreeing, flickering, overlap = _number(agree, 0), _number(flicker, 1), _number(100 * miou(record), 1)
-    return [run.unit.model, level, alpha, agreeing, flickering, vss, sbd, overlap]
+    return [run.unit.model, level, alpha, agreeing, flickering, *shown, overlap]
 
 
 def miou(record: Record) -> float:

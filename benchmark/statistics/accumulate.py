@@ -33,6 +33,8 @@ from semstab.statistics.cluster_sums import (
     distinct_rows,
     layout,
     most_groups,
+    of_measure,
+    summed,
     width,
 )
 from semstab.statistics.intervals import EstimateSpec, confidence_intervals, spec_of_cubes
@@ -298,8 +300,17 @@ def _sums_of_log(
 def _with_frameless_sums(
     sums: ClusterSums, table: VoxelTable, cubes: Cubes, true_label: Int64 | None, sbd_excess: Float64 | None
 ) -> ClusterSums:
-    """Return the sums with rows that belong to no frame: SBD less that in random order, and calibration of beliefs."""
-    columns, own = np.zeros((cubes.count, sums.columns.shape[1])), layout(sums.K, truth=sums.truth)
+    """Return the sums with rows that belong to no frame.
+
+    These are of the measures, of SBD less that in random order, and of calibration of beliefs.
+    """
+    values = {measure.key: measure.of(table) for measure in summed()}
+    measured = tuple(values)
+    own = layout(sums.K, truth=sums.truth, measured=measured)
+    columns = np.zeros((cubes.count, width(sums.K, truth=sums.truth, measured=measured)))
+    for key, both in cubes.means(values).items():
+        for name, column in zip(of_measure(key), both.T, strict=True):
+            columns[:, own[name].start] = column
     if sbd_excess is not None:
         for name, values in zip(DRIFT, cubes.means({"": sbd_excess})[""].T, strict=True):
             columns[:, own[name].start] = values
@@ -311,12 +322,15 @@ def _with_frameless_sums(
         columns[:, own["gap"]] = gap.reshape(-1, BINS)
         columns[:, own["calibrated"]] = known.reshape(-1, BINS).sum(axis=1, keepdims=True)
     some = columns.any(axis=1)
+    of_frames = np.zeros((len(sums.columns), columns.shape[1]))
+    of_frames[:, : sums.columns.shape[1]] = sums.columns
     return replace(
         sums,
         classes=table.classes,
+        measured=measured,
         cell=np.concatenate([sums.cell, cubes.cell[some]]),
         frame=np.concatenate([sums.frame, np.full(some.sum(), -1, np.int32)]),
-        columns=np.concatenate([sums.columns, columns[some]]),
+        columns=np.concatenate([of_frames, columns[some]]),
     )
 
 

@@ -23,6 +23,7 @@ from semstab.core.files import atomic_path, parse_json
 from semstab.core.json_form import from_json
 from semstab.core.types import Float64, Int32, Int64, Mask
 from semstab.data import parquet
+from semstab.data.measures import Measure, measures
 from semstab.errors import DataError
 from semstab.statistics.agreement import ONE_HOT, alpha_of, ratio_of
 
@@ -42,12 +43,20 @@ DRIFT = ("sbd_excess", "sbd_known")
 WITH_TRUTH = ("known", "right", "observed", "observed_right", "consistent", "consistent_wrong")
 BY_TRUE_CLASS = ("class_known", "class_right", "class_predicted")
 WITHOUT_FRAMES = (*DRIFT, "calibrated", "gap")
-"""Sums that belong to no frame: they stand in rows whose frame is -1."""
+"""Sums that belong to no frame: they stand in rows whose frame is -1, as those of the register of measures."""
+
+
+def of_measure(key: str) -> tuple[str, str]:
+    """Return the names of the sums of a measure of the register: its total, and over how many voxels."""
+    return f"{key}_sum", f"{key}_count"
 
 
 @functools.lru_cache(maxsize=16)
-def layout(K: int, *, truth: bool) -> Mapping[str, slice]:
-    """Return the columns of the sums for each name; those by class have K columns, `gap` one for each bin."""
+def layout(K: int, *, truth: bool, measured: tuple[str, ...] = ()) -> Mapping[str, slice]:
+    """Return the columns of the sums for each name; those by class have K columns, `gap` one for each bin.
+
+    Those of the measures with these keys come last.
+    """
     by_class = K <= MOST_CLASSES
     widths = [(name, 1) for name in PLAIN] + [("evidence", K)]
     widths += [(name, K) for name in BY_CLASS_ALONE] if by_class else []
@@ -56,6 +65,7 @@ def layout(K: int, *, truth: bool) -> Mapping[str, slice]:
         widths += [(name, 1) for name in WITH_TRUTH]
         widths += [(name, K) for name in BY_TRUE_CLASS] if by_class else []
         widths += [("calibrated", 1), ("gap", BINS)]
+    widths += [(name, 1) for key in measured for name in of_measure(key)]
     ends = np.cumsum([width for _, width in widths])
     slices = {name: slice(int(end) - width, int(end)) for (name, width), end in zip(widths, ends, strict=True)}
     return MappingProxyType(slices)
@@ -94,9 +104,18 @@ class FirstColumns(NamedTuple):
         return cls(*(columns[name].start if name in columns else -1 for name in cls._fields))
 
 
-def width(K: int, *, truth: bool) -> int:
+def width(K: int, *, truth: bool, measured: tuple[str, ...] = ()) -> int:
     """Return how many columns there are."""
-    return max(int(part.stop) for part in layout(K, truth=truth).values())
+    return max(int(part.stop) for part in layout(K, truth=truth, measured=measured).values())
+
+
+def column_names(K: int, *, truth: bool, measured: tuple[str, ...] = ()) -> list[str]:
+    """Return the names of the columns in a file."""
+    return [
+        f"{name}_{k}" if own.stop - own.start > 1 else name
+        for name, own in layout(K, truth=truth, measured=measured).items()
+        for k in range(own.stop - own.start)
+    ]
 
 
 # --- Numbers of right and wrong ---------------------------------------------------------------------------------------
@@ -225,6 +244,7 @@ class ClusterSums:
         step: Frames of a group, a power of 2; 0 where they are unknown.
         fused: Number of frames that they come from.
         truth: True if sums of ground truth are included.
+        measured: Keys of the measures of the register that have sums over the voxels.
         fine, coarse: The same of sampled cells, which are units instead of voxels and views instead of frames, and of
             cells twice as wide, where there are `CellObservations`.
     """
@@ -239,12 +259,18 @@ class ClusterSums:
     classes: tuple[str, ...] = ()
     truth: bool = False
     fused: int = 0
+    measured: tuple[str, ...] = ()
     fine: ClusterSums | None = None
     coarse: ClusterSums | None = None
 
     def __getitem__(self, name: str) -> Float64:
         """Return sums (m, 1), or (m, K) by class, of that name."""
-        return self.columns[:, layout(self.K, truth=self.truth)[name]]
+        return self.columns[:, self.layout[name]]
+
+    @property
+    def layout(self) -> Mapping[str, slice]:
+        """The columns for each name."""
+        return layout(self.K, truth=self.truth, measured=self.measured)
 
     def of(self, names: tuple[str, ...]) -> Float64:
         """Return sums (m, C) of several names side by side."""
@@ -301,8 +327,8 @@ class ClusterSums:
 
     def without_truth(self) -> ClusterSums:
         """Return the sums without those of ground truth."""
-        columns = self.columns[:, : width(self.K, truth=False)]
-        return dataclasses.replace(self, columns=columns, truth=False)
+        names = layout(self.K, truth=False, measured=self.measured)
+        return dataclasses.replace(self, columns=self.of(tuple(names)), truth=False)
 
     def save(self, path: str | Path, *, single: bool = False) -> None:
         """Write Parquet, atomically; in single precision, which takes half the bytes and keeps seven digits."""
@@ -317,11 +343,7 @@ class ClusterSums:
         columns = np.zeros((sum(lengths), self.columns.shape[1]))
         for part, rows in zip(parts, np.split(np.arange(len(columns)), np.cumsum(lengths)[:-1]), strict=True):
             columns[rows, : part.columns.shape[1]] = part.columns
-        names = [
-            f"{name}_{k}" if own.stop - own.start > 1 else name
-            for name, own in layout(self.K, truth=self.truth).items()
-            for k in range(own.stop - own.start)
-        ]
+        names = column_names(self.K, truth=self.truth, measured=self.measured)
         stored = columns.astype(np.float32) if single else columns
         arrays = [np.repeat(np.arange(len(parts)), lengths), *cell.T, frame, *stored.T]
         content = pa.table({name: arrow.column(array) for name, array in zip([*KEYS, *names], arrays, strict=True)})
@@ -333,7 +355,7 @@ class ClusterSums:
 
     @classmethod
     def load(cls, path: str | Path) -> ClusterSums:
-        """Read a file that `save` wrote.
+        """Read a file that `save` wrote; sums that it lacks are NaN, and those of other names are left out.
 
         Raises:
             DataError: If the file is missing, damaged or of another kind.
@@ -350,9 +372,15 @@ class ClusterSums:
                 about |= {name: [about.get(name, 0)] for name in ("edge", "step", "voxel_size", "fused")}
             meta = from_json(SumsMeta, about, path)
             part, *keys = (_key(arrow.values_of(content.column(name)), name) for name in KEYS)
-            columns = np.stack([*map(arrow.values_of, content.columns[len(KEYS) :])], axis=1)
-            if columns.shape[1] != width(meta.K, truth=meta.truth):
-                raise DataError(f"{columns.shape[1]} columns of sums for {meta.K} classes")
+            names = [EARLIER_NAMES.get(name, name) for name in content.column_names] if old else content.column_names
+            if len(names) < meta.K:
+                raise DataError(f"{len(names) - len(KEYS)} columns of sums for {meta.K} classes")
+            stored = dict(zip(names, content.columns, strict=True))
+            measured = tuple(own.key for own in summed() if stored.keys() >= {*of_measure(own.key)})
+            columns = np.full((len(content), width(meta.K, truth=meta.truth, measured=measured)), np.nan)
+            for k, name in enumerate(column_names(meta.K, truth=meta.truth, measured=measured)):
+                if name in stored:
+                    columns[:, k] = arrow.values_of(stored[name])
             if np.any(np.abs(columns) > LARGEST**2):
                 raise DataError("a sum is larger than any map can have")
             if not all(0 <= frames <= LARGEST for frames in (*meta.step, *meta.fused)):
@@ -361,14 +389,23 @@ class ClusterSums:
             for number, (edge, step, voxel_size, fused) in enumerate(
                 zip(meta.edge, meta.step, meta.voxel_size, meta.fused, strict=True)
             ):
-                own, truth = part == number, meta.truth and not number
-                sums = columns[own, : width(meta.K, truth=truth)].astype(np.float64)
+                own, truth, measures_of = part == number, meta.truth and not number, () if number else measured
+                sums = columns[own, : width(meta.K, truth=truth, measured=measures_of)]
                 cell, frame = np.stack([key[own] for key in keys[:3]], axis=1), keys[3][own]
                 where = cell.astype(np.int32), frame.astype(np.int32), sums, edge, step
-                parts.append(cls(*where, voxel_size, meta.K, meta.classes, truth, fused))
+                parts.append(cls(*where, voxel_size, meta.K, meta.classes, truth, fused, measures_of))
         whole, *cells = parts
         return dataclasses.replace(whole, fine=cells[0], coarse=cells[1]) if cells else whole
 
+
+EARLIER_NAMES = {
+    "looks": "observed",
+    "looks_right": "observed_right",
+    "stable": "consistent",
+    "stable_wrong": "consistent_wrong",
+    "judged": "calibrated",
+}
+"""Names of sums in files without cells, and their names today."""
 
 KEYS = ("part", "ix", "iy", "iz", "frame")
 """The columns of the file before the sums; part 0 is the map, 1 the fine cells, 2 the coarse ones."""
@@ -515,6 +552,17 @@ BY_CLASS: Mapping[str, Functional] = {
 predicted (precision), and intersection over union."""
 
 
+def summed() -> tuple[Measure, ...]:
+    """Return the measures of the register that have sums over the voxels; others have their own over observations."""
+    return tuple(measure for measure in measures() if measure.key not in FUNCTIONALS)
+
+
+def mean_over_voxels(measure: Measure) -> Functional:
+    """Return the mean of a measure of the register over the voxels with OP >= 2 where it is defined."""
+    scale: Scale = "share" if measure.largest == 1 else "plain"
+    return Functional(of_measure(measure.key), ratio_of, 0.0, measure.largest, scale, by_location=True)
+
+
 def chance_of(cells: ClusterSums) -> float:
     """Return the probability that two observations from anywhere, of different views, agree; NaN for fewer than two."""
     evidence, n = cells["evidence"].sum(axis=0), float(cells["observations"].sum())
@@ -529,14 +577,16 @@ def of_space_alone(key: str, k: int | None = None) -> bool:
 
 def functional(key: str, k: int | None = None) -> Functional:
     """Return the number that a key stands for: of all classes, or of class k."""
-    return FUNCTIONALS[key] if k is None else BY_CLASS[key]
+    if k is not None:
+        return BY_CLASS[key]
+    return FUNCTIONALS[key] if key in FUNCTIONALS else mean_over_voxels({own.key: own for own in summed()}[key])
 
 
 def parts_of(sums: ClusterSums, number: Functional) -> tuple[tuple[ClusterSums, float], ...]:
     """Return the sums that a number is of, each with its weight; none where they are missing."""
     of = {"map": sums, "fine": sums.fine, "coarse": sums.coarse}
     there = [(part, weight) for name, weight in number.parts if (part := of[name]) is not None]
-    known = all(set(number.names) <= set(layout(part.K, truth=part.truth)) for part, _ in there)
+    known = all(set(number.names) <= set(part.layout) for part, _ in there)
     return tuple(there) if known and len(there) == len(number.parts) else ()
 
 

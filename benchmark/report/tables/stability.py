@@ -427,7 +427,7 @@ def compared(result: Result) -> list[Table]:
 
 def _compared_row(row: Agreement, names: Iterable[str]) -> Row:
     shares = (100 * only / max(1, n) for only, n in zip(row.only_in, row.voxels, strict=True))
-    means = (row.differences[name].mean for name in names)
+    means = (row.difference(name).mean for name in names)
     return row.scene, row.model, *shares, 100 * row.differences["label"].mean, *means
 
 
@@ -455,7 +455,7 @@ def agreement(result: Result) -> list[Table]:
 
 
 def _backend_agreement_row(row: Agreement, names: Iterable[str]) -> Row:
-    largest = (row.differences[name].max for name in names)
+    largest = (row.difference(name).max for name in names)
     return row.scene, row.model, sum(row.only_in), *largest, "agree" if row.agrees else "disagree"
 
 
