@@ -13,6 +13,7 @@ import semstab
 from semstab.core.json_form import from_json, to_json
 from semstab.data.statistics import MapStatistics
 from semstab.report.narrative import warnings
+from semstab.statistics import map_statistics
 
 ROAD, GRASS, CAR, PERSON = range(4)
 
@@ -64,6 +65,12 @@ def test_nothing_is_said_where_most_disagreement_is_elsewhere() -> None:
     result = fused(("car", "grass", "road", "kerb"))
     cells = result.record().statistics.cells
     assert cells.moving is None or cells.moving.disagreement < 0.1
+
+
+def test_nothing_is_said_where_alpha_leaves_no_disagreement(monkeypatch) -> None:
+    """Alpha of cells without a size may come out as 1 where there are few, though their labels differ."""
+    monkeypatch.setattr(map_statistics, "value", lambda sums, key: 1.2)
+    assert fused().record().statistics.cells.moving is None
 
 
 def test_it_is_kept_with_the_result() -> None:

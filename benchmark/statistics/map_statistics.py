@@ -325,8 +325,11 @@ LITTLE, MUCH = 0.01, 0.1
 """The shares of the disagreement from which on a class that moves, and all of them together, are looked into."""
 
 
-def moving_classes(cells: CellObservations, sums: ClusterSums, moving: Sequence[int]) -> MovingClasses:
-    """Return what locations of these classes have of the disagreement, and alpha without them; `sums` are of all."""
+def moving_classes(cells: CellObservations, sums: ClusterSums, moving: Sequence[int]) -> MovingClasses | None:
+    """Return what locations of these classes have of the disagreement, and alpha without them; `sums` are of all.
+
+    None where so few cells leave no disagreement to share.
+    """
 
     def disagreeing(own: ClusterSums, alpha: float) -> float:
         fine = own.fine
@@ -335,7 +338,9 @@ def moving_classes(cells: CellObservations, sums: ClusterSums, moving: Sequence[
 
     rest = sums_of_cells(cells.without(moving))
     whole, alpha = (min(value(own, "alpha"), 1.0) for own in (sums, rest))  # extrapolated to cells without a size
-    share = 1 - disagreeing(rest, alpha) / disagreeing(sums, whole)
+    if not (everywhere := disagreeing(sums, whole)) > 0:
+        return None
+    share = 1 - disagreeing(rest, alpha) / everywhere
     return MovingClasses(tuple(sums.classes[k] for k in moving), min(max(share, 0.0), 1.0), alpha)
 
 

@@ -24,7 +24,7 @@ OPEN, CLOSED = "SegEarth-OV", "SegFormer"
 STANDS_FOR = {"sim-flicker": OPEN, "sim-steady": CLOSED, "segearth-ov": OPEN, "segformer": CLOSED}
 """The model of a study that stands for one of the paper's."""
 
-NEARLY = 0.25
+NEARLY = 1 / 3
 """A change is little where it is less than so much of the one that it is held against."""
 
 Numbers = tuple[float, float, float, float]
@@ -64,7 +64,7 @@ def paper(result: Result) -> list[Table]:
     named = " and ".join(
         f"{own} stands for {theirs}" for theirs, own in models.items() if own.lower() != theirs.lower()
     )
-    said = f" {named[0].upper()}{named[1:]}; absolute numbers are not comparable, the findings are." if named else ""
+    said = f" Here {named}; absolute numbers are not comparable, the findings are." if named else ""
     return [_findings(result, models, said), _numbers(result, models, said)]
 
 
@@ -118,9 +118,9 @@ def _findings(result: Result, models: Mapping[str, str], said: str) -> Table:
     )
     caption = (
         "The findings of the paper (arXiv:2608.28665) in its numbers, and in those of this study. 'Little' holds where"
-        f" the change is less than {NEARLY:.0%} of that of all voxels above it."
+        " the change is less than a third of that of all voxels above it."
     )
-    return Table("paper", "Findings of the paper", caption + said, columns, groups)
+    return Table("findings", "Findings of the paper", caption + said, columns, groups)
 
 
 def _persistence(result: Result, model: str) -> Iterator[Finding]:
@@ -206,7 +206,7 @@ def _numbers(result: Result, models: Mapping[str, str], said: str) -> Table:
         rows: tuple[Row, ...] = (("all voxels", *every, *_of(both.every)), ("OP>=3", *recurrent, *_of(both.recurrent)))
         groups.append(Group(f"{theirs} in the shared taxonomy", rows))
     flicker = {
-        STANDS_FOR.get(name, name): macro_mean([record.image_space.flicker_percent for record in rows])
+        name: macro_mean([record.image_space.flicker_percent for record in rows])
         for name, rows in by_model(result.select()).items()
     }
     caption = (
@@ -215,7 +215,7 @@ def _numbers(result: Result, models: Mapping[str, str], said: str) -> Table:
         f" {', '.join(f'{name} {value:.2f}' for name, value in FLICKER.items())}; here:"
         f" {', '.join(f'{name} {value:.2f}' for name, value in flicker.items())}."
     )
-    return Table("paper_numbers", "Numbers of the paper", caption + said, columns, tuple(groups))
+    return Table("published", "Numbers of the paper", caption + said, columns, tuple(groups))
 
 
 def _beside(theirs: Mapping[str, Numbers], ours: Mapping[str, Means]) -> Iterator[Row]:
