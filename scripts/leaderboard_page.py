@@ -22,6 +22,7 @@ the page to sort and filter; `python scripts/leaderboard_page.py` writes these t
 - `city@1`: simulated models of known quality, tricks that buy stability without knowledge (a map painted in the world,
   two classes, one class), and clusters of colour named by eye. A model may be stable and wrong: read alpha beside
   accuracy.
+- `apc_shelf@1`: the labels and the scores that were published with the data.
 - `livingroom@1`: ten networks of two families, trained on PASCAL VOC ([how](real-networks.md)).
 
 ```bash
@@ -29,6 +30,7 @@ semstab-bench benchmark city@1 -m sim-steady -m sim-flicker -m sim-soft -m trick
   -m trick-world-locked -m trick-constant --submit results
 semstab-bench benchmark city@1 --predict colour-clusters \\
   --taxonomy results/colour_clusters_uavid7.yaml --submit results
+semstab-bench benchmark apc_shelf@1 --data DATA/apc_shelf --submit results
 semstab-bench benchmark livingroom@1 --data DATA/livingroom \\
   --predict EdgeNets/nets.py:espnetv2_voc,scale=0.5,name=espnetv2-0.5 ... --submit results
 ```
