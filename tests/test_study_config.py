@@ -7,7 +7,7 @@ import tiny_study
 import yaml
 
 from semstab.config import Config
-from semstab.engine.units import IN_KEYS, make_plan
+from semstab.engine.units import NOT_IN_KEYS, make_plan
 from semstab.errors import ConfigError
 from semstab.settings import load_config, load_study, resolve, shipped_studies
 
@@ -58,13 +58,28 @@ def test_units_have_the_base_settings_as_a_run_of_their_own() -> None:
     assert base.perturbation.seed == 4
 
 
-def test_every_setting_is_in_the_key_of_a_unit_or_has_a_reason_not_to_be() -> None:
-    """A new one must be thought of."""
-    selects = {"dataset", "scenes", "models", "region_maps", "backends", "taxonomy", "frames", "scene_frames"}
-    plans = {"name", "description", "benchmark", "check", "tolerance", "shared_taxonomy", "sweeps", "seed", "events"}
-    plans |= {"frame_quality", "video_measures"}  # with the label source that it compares with, and with the flow
-    elsewhere = {"check_geometry", "threads", "memory_gb", "tile_size"}
-    assert set(Config.model_fields) == selects | plans | elsewhere | set(IN_KEYS)
+CHANGED = {
+    "voxel_size": 0.5, "pixel_stride": 2, "top_k": 2, "exclude": {"classes": ["road"]}, "statistics": True,
+    "perturbation": {"depth_noise": 0.1}, "strata": [1, 2], "frame_quality": True, "video_measures": "depth",
+    "critical_classes": ["road"], "scope": "other scenes", "verdict": {"stable": 0.9},
+}  # fmt: skip
+"""Another value of each setting that numbers follow from."""
+
+
+def test_every_setting_is_in_the_key_of_a_unit_or_named_as_none_that_is() -> None:
+    """A new setting is in the key by itself; the test asks for another value of it, or for a line in NOT_IN_KEYS."""
+    elsewhere = {"check_geometry", "threads", "memory_gb", "tile_size"}  # not stored with a run
+    assert set(Config.model_fields) == NOT_IN_KEYS | elsewhere | set(CHANGED)
+    city = {"name": "city", "options": {"width": 64, "height": 36, "frames": 4}}
+    base = {"dataset": city, "scenes": ["scene0"], "models": ["sim-soft"], "taxonomy": "uavid8", "check": None}
+
+    def key(**changes: object) -> str:
+        (unit,) = make_plan(resolve(load_config(base | changes))).units
+        return unit.identity
+
+    keys = {name: key(**{name: value}) for name, value in CHANGED.items()}
+    assert len({key(), *keys.values()}) == 1 + len(CHANGED)
+    assert key(name="another", tolerance=1e-3, seed=3, events=True) == key()
 
 
 @pytest.mark.parametrize(

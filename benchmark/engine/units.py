@@ -30,21 +30,26 @@ from semstab.data.labels import LabelSpace
 from semstab.data.measures import measures
 from semstab.data.records import REGIONS, Variation
 from semstab.data.results import Unit
+from semstab.data.statistics import CONFIDENCE
 from semstab.datasets import GROUND_TRUTH, Scene
 from semstab.errors import ConfigError
 from semstab.task import Task, applies, frame_indices, open_scenes, selected, tasks_of, truth_task
 
 logger = logging.getLogger("semstab")
 
-FORMAT = 10
-"""Part of every key: raise it with any change of the numbers that a unit's settings and input lead to."""
+FORMAT = 11
+"""Part of every key: raise it with any change of the numbers that a unit's settings and input lead to, and with a
+setting's default."""
 
-IN_KEYS = (
-    "voxel_size", "pixel_stride", "top_k", "exclude", "perturbation", "strata", "statistics", "critical_classes",
-    "scope", "verdict",
-)  # fmt: skip
-"""Settings that a unit's numbers depend on as they stand; of the others, what they select is in its key: the digest of
-the input, frames, classes, the backend."""
+NOT_IN_KEYS = {
+    "dataset", "scenes", "models", "region_maps", "backends", "taxonomy", "frames", "scene_frames",
+    "name", "description", "benchmark", "check", "tolerance", "shared_taxonomy", "sweeps", "seed", "events",
+}  # fmt: skip
+"""Settings that no number of a unit follows from. What the first ones select is in its key: the digest of the input,
+frames, classes, the backend. A setting that is not named here is part of the key, where it is not the default."""
+
+OF_REGIONS = {"pixel_stride", "exclude", "perturbation"}
+"""The settings that the flicker of regions without classes follows from."""
 
 NOISES = tuple(name for name in Perturbation.model_fields if name != "seed")
 
@@ -218,8 +223,8 @@ def _planned_regions(config: Config, scenes: Mapping[str, Scene]) -> Iterator[Pl
             settings = _base_settings(config, name, [model])
             frames = frame_indices(scene, settings, [model])
             task = Task(scene, model, frames, space.mapping_to(space), ("none",))
-            fused_only = {"voxel_size", "strata", "statistics", "critical_classes", "scope", "verdict"}
-            key = _hash(settings, {"regions": [name, model], "frames": frames}, fused_only)
+            content = settings.model_dump(mode="json", include=OF_REGIONS, exclude_defaults=True)
+            key = _hash(content, {"regions": [name, model], "frames": frames})
             yield PlannedUnit(Variation(REGIONS), settings, task, key, image_space=False, stored=False)
 
 
@@ -302,14 +307,13 @@ def identity(config: Config, task: Task) -> str:
     truth = truth_task(task) if config.statistics else None
     compared = {} if truth is None else {"truth": truth.mapping.rows}
     beside = {"beside": filtering.model} if config.frame_quality else {}
-    video = {} if config.video_measures is None else {"video_measures": config.video_measures}
-    return _hash(config, content | compared | beside | video)
+    settings = config.model_dump(mode="json", exclude=NOT_IN_KEYS, exclude_defaults=True)
+    return _hash(settings, content | compared | beside)
 
 
-def _hash(config: Config, content: Mapping[str, Any], without: Iterable[str] = ()) -> str:
-    settings = config.model_dump(mode="json", include={*IN_KEYS} - {*without})
+def _hash(settings: Mapping[str, Any], content: Mapping[str, Any]) -> str:
     measured = [measure.key for measure in measures()]
-    text = json.dumps([FORMAT, measured, settings, content], sort_keys=True)
+    text = json.dumps([FORMAT, CONFIDENCE, measured, settings, content], sort_keys=True)
     return hashlib.blake2b(text.encode(), digest_size=8).hexdigest()
 
 
