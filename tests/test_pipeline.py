@@ -157,6 +157,37 @@ def test_another_run_is_replaced_only_where_that_is_asked_for(root, tmp_path, ca
     assert changed.manifest["units"]["kept"] == 0
 
 
+def test_another_option_of_a_model_is_another_run(root, tmp_path) -> None:
+    """Two runs whose only difference lies deep in the options of the dataset."""
+
+    def settings(seed):
+        models = [{"model": "colour-clusters", "options": {"clusters": 2, "seed": seed}}]
+        dataset = {"name": "predicted", "options": {"dataset": configure(root).dataset.model_dump(), "models": models}}
+        return load_config({"dataset": dataset, "voxel_size": 0.25, "check": None})
+
+    for name in ("depth", "color"):
+        (root / name).mkdir(exist_ok=True)
+    images = [np.full((6, 8, 3), 40 * k, np.uint8) for k in range(3)]
+    for k, image in enumerate(images):
+        image[:, ::2] = 255 - 30 * k
+        cv2.imwrite(str(root / f"color/{k:04d}.png"), image)
+    out = tmp_path / "run"
+    semstab.run(settings(0), out=out, report=False)
+    with pytest.raises(ConfigError, match=r"dataset\.options\.models\.0\.options\.seed: 0 there, 1 here"):
+        semstab.run(settings(1), out=out, report=False)
+
+
+def test_outputs_of_earlier_results_do_not_stay_beside_new_ones(root, tmp_path) -> None:
+    out = tmp_path / "run"
+    semstab.run(configure(root), out=out)
+    (out / "recording.rrd").write_bytes(b"of the first run")
+    outputs = [out / name for name in ("report.html", "recording.rrd", "tables", "figures")]
+    semstab.run(configure(root), out=out, report=False)
+    assert all(path.exists() for path in outputs[:3])  # nothing was computed: they are of these results
+    semstab.run(configure(root, voxel_size=0.5), out=out, report=False, overwrite=True)
+    assert not any(path.exists() for path in outputs)
+
+
 def test_a_run_of_other_data_with_the_same_names_is_not_replaced(root, tmp_path) -> None:
     out, moved, other = tmp_path / "run", tmp_path / "moved" / root.name, tmp_path / "other" / root.name
     semstab.run(configure(root), out=out, report=False)

@@ -94,10 +94,21 @@ def over_scenes(result: Sequence[Sequence[Contrast]]) -> tuple[Contrast, ...]:
 
 
 def corrected(lists: Sequence[Sequence[Contrast]]) -> list[tuple[Contrast, ...]]:
-    """Return lists with p-values corrected for all contrasts in them together, and the change that each shows."""
-    p_values = iter(holm([row.difference.p_value for rows in lists for row in rows]))
+    """Return lists with corrected p-values, and the change that each shows.
+
+    Alpha over all classes is what is tested: it is corrected for the runs alone, all that describes for all of it.
+    """
+    rows = [row for own in lists for row in own]
+    p_values = np.array([row.difference.p_value for row in rows])
+    for family in (np.array([_is_tested(row) is tested for row in rows], bool) for tested in (True, False)):
+        p_values[family] = holm(p_values[family].tolist())
+    of_rows = iter(p_values.tolist())
     better = {quantity.key: quantity.sign for quantity in (*quantities(), *BY_CLASS)}
-    return [tuple(_with_change(row, next(p_values), better[row.measure]) for row in rows) for rows in lists]
+    return [tuple(_with_change(row, next(of_rows), better[row.measure]) for row in own) for own in lists]
+
+
+def _is_tested(row: Contrast) -> bool:
+    return row.measure == ALPHA.key and not row.of
 
 
 def _with_change(row: Contrast, p_holm: float, sign: float) -> Contrast:

@@ -69,7 +69,8 @@ IN_CLASSES = (ALPHA, PSA, RECALL, IOU)
 ANSWERS = (
     f"Brackets hold intervals at {CONFIDENCE:.0%}, for this scene flown again where there are {LEAST_FRAMES} frames or"
     " more, else for these frames, that is, for other locations in the same frames. p (Holm) is the p-value of no"
-    " difference, corrected for all comparisons of the scene, or of all scenes together."
+    " difference: of alpha corrected for the runs that are compared, of what describes for all of it in the scene, or"
+    " over all scenes."
 )
 
 

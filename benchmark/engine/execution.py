@@ -98,8 +98,10 @@ class _Execution:
             there = ((key, folder.finished(each)) for key, each in plan.distinct().items())
             units.contents = {key: content for key, content in there if content is not None}
         units.finished_before, finished = len(units.contents), dict(units.contents)
-        observers.tell(lambda observer: observer.run_started(plan, finished))
         self._missing = {each.identity: each for each in plan.distinct().values() if each.identity not in finished}
+        if self._missing:
+            folder.remove_outputs()
+        observers.tell(lambda observer: observer.run_started(plan, finished))
         self._queue, self._tiled, self.ended = deque[Job](), dict[str, TiledUnit](), list[Outcome]()
         if plan.config.check_geometry:
             with units.watch("check"):

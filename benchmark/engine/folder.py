@@ -146,6 +146,13 @@ class Folder:
             return any(unit_key(each.identity, each.task.digest) in self._files for each in units)
         return False
 
+    def remove_outputs(self) -> None:
+        """Remove report, tables, figures and recording of earlier results, which are about to change."""
+        for name in ("report.html", "recording.rrd"):
+            (self.path / name).unlink(missing_ok=True)
+        for name in ("tables", "figures"):
+            shutil.rmtree(self.path / name, ignore_errors=True)
+
     def close(self) -> None:
         """Let another process have it."""
         self._lock.release()
@@ -395,12 +402,17 @@ def _is_earlier(folder: Path, layouts: Collection[str] = (LAYOUT,)) -> bool:
 
 
 def _first_change(old: Mapping[str, Any], new: Mapping[str, Any], prefix: str = "") -> str | None:
-    left_out = {"name", "description", "scenes", "models", "backends", "sweeps"}
+    """Return the first setting that differs, with both values; not what a run may add: scenes, models, ..."""
+    left_out = set() if prefix else {"name", "description", "scenes", "models", "backends", "sweeps"}
     for key in (key for key in old if key in new and key not in left_out):
-        there, here = old[key], new[key]
+        there, here, name = old[key], new[key], f"{prefix}{key}"
+        if isinstance(there, list) and isinstance(here, list):
+            there, here = ({str(k): item for k, item in enumerate(each)} for each in (there, here))
+            if len(there) != len(here):
+                return f"{name}: {len(there)} there, {len(here)} here"
         if isinstance(there, dict) and isinstance(here, dict):
-            if change := _first_change(there, here, f"{prefix}{key}."):
+            if change := _first_change(there, here, f"{name}."):
                 return change
         elif there != here:
-            return f"{prefix}{key}: {there} there, {here} here"
+            return f"{name}: {there} there, {here} here"
     return None
