@@ -235,7 +235,8 @@ def test_the_order_of_the_models_may_change_where_voxels_recur_and_the_shared_ta
 def test_the_scene_that_seems_most_stable_may_be_the_one_seen_least():
     scenes = [record(voxels((10, 4, SPLIT)), scene="looked at"), record(voxels((10, 1, SURE)), scene="passed by")]
     expected = (
-        "m is most stable in passed by (VSS 1.000), which is also the scene seen least often: 1.00 frames per voxel."
+        "The mean VSS of all voxels of m is highest in passed by (1.000 at any OP), which is the scene seen least"
+        " often, 1.00 frames per voxel: voxels seen once look stable for that reason."
     )
     assert expected in read(study(*scenes))
     assert expected not in read(study(record(voxels((10, 4, SURE)), scene="looked at"), scenes[1]))

@@ -14,6 +14,7 @@ from rich.table import Table
 
 from semstab.check.coverage import FUSED_FRAMES
 from semstab.check.scene_check import SceneCheck
+from semstab.data.labels import IGNORE_16BIT
 
 STATES = {"sound": "green", "unsound": "bold red", "unclear": "yellow"}
 NOTHING = "-"
@@ -125,7 +126,8 @@ def _label_table(checked: SceneCheck) -> Table:
     unknown = sorted({i for labels in checked.labels for i in labels.unknown})
     for i in unknown[:MOST_UNKNOWN]:
         shares = (_percent(labels.unknown.get(i, 0.0), 2) for labels in checked.labels)
-        table.add_row(f"id {i}: no class", *shares, style="red")
+        name = f"id {i}" if i < IGNORE_16BIT else f"score {i - IGNORE_16BIT}"
+        table.add_row(f"{name}: no class", *shares, style="red")
     if len(unknown) > MOST_UNKNOWN:
         table.add_row(f"{len(unknown) - MOST_UNKNOWN} more such ids", style="red")
     return table

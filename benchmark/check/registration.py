@@ -210,7 +210,7 @@ def assess_surface(match: ImageMatch | None, frames: int) -> Verdict:
         return Verdict(
             "unclear",
             "depth is cast at a surface and so agrees between frames whatever the poses are; without images of"
-            " overlapping frames nothing tells whether they fit",
+            " overlapping frames nothing tells whether they fit; option images names their folder",
             frames=frames,
         )
     if match.best >= MATCHING and match.best - match.now > CLEARLY_BETTER:

@@ -101,7 +101,7 @@ Predicted = Annotated[list[str] | None, typer.Option(
     "--predict", metavar="NAME[,KEY=VALUE...]",
     help="Model that makes the labels in memory: a name of `list`, FILE.py:NAME; repeatable.")]
 Classes = Annotated[str | None, typer.Option(
-    metavar="A,B,C|FILE", help="Names of the model's classes by id, if it does not contain them.",
+    metavar="A,B,C|FILE", help="Names of the classes of a --predict model by id, if it does not contain them.",
     rich_help_panel=LABELS)]
 Filters = Annotated[list[str] | None, typer.Option(
     "--filter", metavar="NAME:NUMBER", autocompletion=filters,

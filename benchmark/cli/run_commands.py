@@ -5,6 +5,7 @@ from __future__ import annotations
 import gc
 import os
 import re
+import shlex
 import sys
 import textwrap
 import time
@@ -538,5 +539,8 @@ def view(run: Annotated[Path, typer.Argument(metavar="RUN", help="Run folder, or
     stderr = None if display else subprocess.DEVNULL  # where it says in several lines that there is none
     code = subprocess.run([*viewer_command(), str(recording)], check=False, stderr=stderr).returncode
     if code and not display:
-        raise ConfigError(f"{recording}: there is no display for the viewer; copy the file to a machine with one")
+        raise ConfigError(
+            f"{recording}: there is no display for the viewer; copy the file to a machine with one, or show it in a"
+            f" browser: rerun --serve-web {shlex.quote(str(recording))}"
+        )
     raise typer.Exit(code)

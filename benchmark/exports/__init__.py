@@ -28,6 +28,9 @@ __all__ = ["SUFFIXES", "Exported", "export"]
 
 logger = logging.getLogger("semstab")
 
+MOST_NAMED = 40
+"""The most classes that a note names."""
+
 FEW_MET = 0.5
 """The share of a cloud's points with a voxel below which cloud and map may lie in different areas."""
 
@@ -201,5 +204,5 @@ def _notes(voxels: Voxels, file: Path, settings: Settings) -> Iterator[str]:
     if kind == ".tif":
         yield f"the classes, with their colours, are in {file.with_suffix(f'.class{file.suffix}').name}"
     if kind in (".las", ".laz") and (names := clouds.without_code(voxels, settings.asprs)):
-        listed = ", ".join(names[:3]) + (", ..." if len(names) > 3 else "")
+        listed = ", ".join(names[:MOST_NAMED]) + (", ..." if len(names) > MOST_NAMED else "")
         yield f"without ASPRS code (--asprs): {listed}; their classification is 1, their number is in dimension 'class'"

@@ -261,8 +261,11 @@ class TemporalStability:
         if depth.ndim == 2:
             predicted, depth, T_wc = predicted[None], depth[None], T_wc[None]
         B = len(depth)
-        if depth.ndim != 3 or len(predicted) != B:
-            raise DataError(f"predicted {predicted.shape} and depth {depth.shape} are not a batch of one size")
+        if depth.ndim != 3 or len(predicted) != B or predicted.shape[-2:] != depth.shape[-2:]:
+            raise DataError(
+                f"predicted {predicted.shape} and depth {depth.shape} do not belong together; give labels or logits and"
+                " depth of one frame, (H, W) or (K, H, W) and (H, W), or of a batch, with B before them"
+            )
         if not isinstance(intrinsics, Intrinsics | list | tuple):
             intrinsics = as_array(intrinsics)
         own = [*intrinsics] if np.ndim(intrinsics) == 3 or _are_cameras(intrinsics) else [intrinsics] * B

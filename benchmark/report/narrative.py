@@ -128,7 +128,14 @@ def not_assessed(run: UnitSummary) -> str:
     if statistics is None or statistics.cells is None or statistics.verdict.level != "uninformative":
         return ""
     share, name = statistics.cells.largest_share, statistics.cells.largest_class
-    return f"uninformative: {math.floor(100 * share)} % of the observations of {run.unit.model} are {name}"
+    return f"uninformative: {nearly_all(share)} of the observations of {run.unit.model} are {name}"
+
+
+def nearly_all(share: float) -> str:
+    """Return a share in percent, rounded; one that is not all of it is never 100: '99 %', 'more than 99.9 %'."""
+    if share < 0.995:
+        return f"{100 * share:.0f} %"
+    return "all" if share >= 1 else f"more than {math.floor(1000 * share) / 10:g} %"
 
 
 def _is_untested(record: Record) -> bool:
@@ -236,7 +243,7 @@ def _order(values: Mapping[str, float]) -> str:
 
 
 def _least_seen(records: Sequence[Record]) -> Iterator[str]:
-    """Yield the paradox between scenes: the scene that seems most stable may be the one seen least."""
+    """Yield the paradox between scenes: the scene with the highest mean VSS may be the one seen least."""
     for model, rows in by_model(records).items():
         tables = {row.unit.scene: row.summary.table for row in rows if row.summary.table.voxels}
         if len(tables) < 2:
@@ -244,8 +251,9 @@ def _least_seen(records: Sequence[Record]) -> Iterator[str]:
         steadiest = max(tables, key=lambda name: tables[name][VSS])
         if steadiest == min(tables, key=lambda name: tables[name].mean_op):
             yield (
-                f"{model} is most stable in {steadiest} (VSS {tables[steadiest][VSS]:.3f}), which is also the scene"
-                f" seen least often: {tables[steadiest].mean_op:.2f} frames per voxel."
+                f"The mean VSS of all voxels of {model} is highest in {steadiest} ({tables[steadiest][VSS]:.3f} at any"
+                f" OP), which is the scene seen least often, {tables[steadiest].mean_op:.2f} frames per voxel: voxels"
+                " seen once look stable for that reason."
             )
 
 

@@ -24,7 +24,7 @@ from semstab.engine.units import Plan
 from semstab.metrics import CATEGORIES, macro_mean
 from semstab.report.filter_study import advice, filter_studies
 from semstab.report.means import ENOUGH
-from semstab.report.narrative import noted, outlying_line, warnings
+from semstab.report.narrative import nearly_all, noted, outlying_line, warnings
 from semstab.report.ranking import answers
 from semstab.report.tables import tables
 from semstab.report.tables.filters import row as filter_row
@@ -176,7 +176,7 @@ def _verdict(run: UnitSummary) -> Iterator[str]:
             subsequent_indent="  ",
         )
     elif statistics.verdict.level == "uninformative" and statistics.cells is not None:
-        share, name = _percent(statistics.cells.largest_share), statistics.cells.largest_class
+        share, name = nearly_all(statistics.cells.largest_share), statistics.cells.largest_class
         yield f"  {share} of the observations are {name}: agreement does not assess such a map"
     else:
         yield f"  act on labels from alpha {short(LIMITS.stable)} on, with care from {short(LIMITS.usable)}"
