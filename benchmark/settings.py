@@ -79,6 +79,13 @@ def shipped_studies() -> tuple[str, ...]:
     return tuple(sorted(path.stem for path in _shipped("studies").glob("*.yaml")))
 
 
+def shipped_benchmarks() -> dict[str, Path]:
+    """Return the definitions of the benchmarks that ship, by NAME@VERSION, the versions of a name in order."""
+    files = {path.stem: path for path in _shipped("benchmarks").glob("*.yaml")}
+    order = sorted(files, key=lambda name: (name.partition("@")[0], int(name.partition("@")[2])))
+    return {name: files[name] for name in order}
+
+
 def dataset_defaults(content: Mapping[str, Any]) -> dict[str, Any]:
     """Return the settings that ship for the dataset which the content names, or for the built-in one."""
     dataset = content.get("dataset")

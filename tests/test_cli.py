@@ -160,7 +160,7 @@ def test_damaged_data_is_one_line_that_names_the_file(wall, tmp_path, damage, me
 
 
 def test_disagreement_is_exit_3_after_everything_is_written(wall, tmp_path) -> None:
-    """A plug-in's backend that counts every observation twice is found out by the reference."""
+    """A plug-in's backend whose belief drifts twice as far is found out by the reference."""
     plugin = tmp_path / "plugin"
     (plugin / "twice-1.0.dist-info").mkdir(parents=True)
     (plugin / "twice.py").write_text(
@@ -169,7 +169,7 @@ def test_disagreement_is_exit_3_after_everything_is_written(wall, tmp_path) -> N
         "class Twice(NumpyReference):\n"
         "    def table(self):\n"
         "        table = super().table()\n"
-        "        return dataclasses.replace(table, op=table.op * 2)\n"
+        "        return dataclasses.replace(table, drift_sum=table.drift_sum * 2)\n"
     )
     (plugin / "twice-1.0.dist-info/METADATA").write_text("Metadata-Version: 2.1\nName: twice\nVersion: 1.0\n")
     (plugin / "twice-1.0.dist-info/entry_points.txt").write_text("[semstab.backends]\ntwice = twice:Twice\n")
@@ -178,7 +178,7 @@ def test_disagreement_is_exit_3_after_everything_is_written(wall, tmp_path) -> N
     result = bench(*words, cwd=tmp_path, code=3, process=True, PYTHONPATH=paths)
     assert "DISAGREE" in result.stdout
     assert re.search(
-        r"error: the backends disagree \(wall, \w+: op of the voxel \(.*\) is \d+, expected", result.stderr
+        r"error: the backends disagree \(wall, \w+: drift_sum of the voxel \(.*\) is [\d.]+, expected", result.stderr
     )
     assert json.loads((tmp_path / "run" / "summary.json").read_text())["agreement"][0]["agrees"] is False
 

@@ -24,8 +24,9 @@ from semstab.comparison.runs import open_run, save_summary
 from semstab.datasets import city
 from semstab.errors import ConfigError, DataError
 from semstab.leaderboard.board import boards
-from semstab.leaderboard.definition import load_benchmark, shipped_benchmarks
+from semstab.leaderboard.definition import load_benchmark
 from semstab.leaderboard.submission import load_submission, submissions
+from semstab.settings import shipped_benchmarks
 from semstab.statistics.cluster_sums import value
 from semstab.statistics.intervals import estimate, scope_of
 

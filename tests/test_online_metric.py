@@ -158,7 +158,7 @@ def test_a_large_map_is_sampled_and_stays_bounded(flights):
 @pytest.mark.parametrize(("change", "message"), [
     ({"predicted": np.zeros((54, 96))}, "frame 0: labels are float64"),
     ({"predicted": np.zeros((5, 54, 96), np.float32)}, r"frame 0: logits of shape \(5, 54, 96\); give \(8, H, W\)"),
-    ({"depth": np.ones((2, 54, 96), np.float32)}, "are not a batch of one size"),
+    ({"depth": np.ones((2, 54, 96), np.float32)}, "do not belong together"),
     ({"T_wc": np.diag([1, 1, -1, 1.0])}, "frame 0, pose: the rotation mirrors"),
     ({"sequence": ["a", "b"]}, "sequence: 2 names for 1 frames"),
 ])  # fmt: skip

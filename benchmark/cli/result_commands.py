@@ -276,9 +276,8 @@ def list_(
     from semstab.config import read_yaml
     from semstab.data.labels import LabelSpace, shipped_taxonomies
     from semstab.errors import MissingDependencyError
-    from semstab.leaderboard.definition import load_benchmark, shipped_benchmarks
     from semstab.predict import filters
-    from semstab.settings import load_study, shipped_studies
+    from semstab.settings import load_study, shipped_benchmarks, shipped_studies
 
     table = Table(show_edge=False)
     for name in ("kind", "name", "", "description"):
@@ -298,9 +297,8 @@ def list_(
         table.add_row("taxonomy", name, "[green]ready", f"K = {len(space)}: {', '.join(space.classes)}")
     for name in shipped_studies():
         table.add_row("study", name, "[green]ready", load_study(name).description)
-    for name in shipped_benchmarks():
-        definition = load_benchmark(name)
-        table.add_row("benchmark", name, "[green]ready", definition.description)
+    for name, file in shipped_benchmarks().items():
+        table.add_row("benchmark", name, "[green]ready", read_yaml(file)["description"])
     console = Console()
     console.print(table)
     if (own := own_defaults()) is None:

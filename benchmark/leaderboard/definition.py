@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import importlib.resources
 import json
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
@@ -27,7 +26,7 @@ from semstab.data.labels import LabelSpace
 from semstab.datasets import Scene, open_dataset
 from semstab.errors import ConfigError, DataError
 from semstab.predict.predictor import PredictorConfig
-from semstab.settings import load_config, predicted_config
+from semstab.settings import load_config, predicted_config, shipped_benchmarks
 from semstab.task import frame_indices
 
 Number = Literal["alpha", "flicker", "accuracy", "miou", "wrong_of_consistent"]
@@ -232,16 +231,5 @@ def load_benchmark(named: str | Path) -> Benchmark:
     if text not in known and (versions := [each for each in known if each.partition("@")[0] == text]):
         text = versions[-1]
     if text not in known:
-        raise ConfigError(f"'{named}' is neither a benchmark that ships nor a .yaml file; {nearest(text, known)}")
-    path = _folder() / f"{text}.yaml"
-    return validated(Benchmark, read_yaml(path) | {"id": text}, f"{path.name}: ")
-
-
-def shipped_benchmarks() -> tuple[str, ...]:
-    """Return the benchmarks that ship with semstab, NAME@VERSION, the versions of a name in order."""
-    names = [path.stem for path in _folder().glob("*.yaml")]
-    return tuple(sorted(names, key=lambda name: (name.partition("@")[0], int(name.partition("@")[2]))))
-
-
-def _folder() -> Path:
-    return Path(str(importlib.resources.files("semstab.configs") / "benchmarks"))
+        raise ConfigError(f"'{named}' is neither a benchmark that ships nor a .yaml file; {nearest(text, [*known])}")
+    return validated(Benchmark, read_yaml(known[text]) | {"id": text}, f"{text}.yaml: ")

@@ -22,7 +22,7 @@ from semstab.core import arrays as arrow
 from semstab.core.files import atomic_path, parse_json
 from semstab.core.json_form import from_json
 from semstab.core.types import Float64, Int32, Int64, Mask
-from semstab.data import parquet
+from semstab.data import earlier, parquet
 from semstab.data.measures import Measure, measures
 from semstab.errors import DataError
 from semstab.statistics.agreement import ONE_HOT, alpha_of, ratio_of
@@ -372,7 +372,7 @@ class ClusterSums:
                 about |= {name: [about.get(name, 0)] for name in ("edge", "step", "voxel_size", "fused")}
             meta = from_json(SumsMeta, about, path)
             part, *keys = (_key(arrow.values_of(content.column(name)), name) for name in KEYS)
-            names = [EARLIER_NAMES.get(name, name) for name in content.column_names] if old else content.column_names
+            names = [earlier.SUMS.get(name, name) for name in content.column_names] if old else content.column_names
             if len(names) < meta.K:
                 raise DataError(f"{len(names) - len(KEYS)} columns of sums for {meta.K} classes")
             stored = dict(zip(names, content.columns, strict=True))
@@ -397,15 +397,6 @@ class ClusterSums:
         whole, *cells = parts
         return dataclasses.replace(whole, fine=cells[0], coarse=cells[1]) if cells else whole
 
-
-EARLIER_NAMES = {
-    "looks": "observed",
-    "looks_right": "observed_right",
-    "stable": "consistent",
-    "stable_wrong": "consistent_wrong",
-    "judged": "calibrated",
-}
-"""Names of sums in files without cells, and their names today."""
 
 KEYS = ("part", "ix", "iy", "iz", "frame")
 """The columns of the file before the sums; part 0 is the map, 1 the fine cells, 2 the coarse ones."""
