@@ -24,7 +24,7 @@ from semstab.metrics import categories, vss
 from semstab.report import write_report
 from semstab.report.figures.topdown import EMPTY, FromAbove
 from semstab.report.means import ENOUGH
-from semstab.report.narrative import notes
+from semstab.report.narrative import notes, warnings
 from semstab.report.page import UNKNOWN
 from semstab.report.tables import tables
 
@@ -256,3 +256,10 @@ def test_the_notes_say_which_implementations_agree():
     assert "mine and numpy disagree in 1 of 2 comparisons." in sentences
     drawn = dataclasses.replace(found, agreement=tuple(dataclasses.replace(row, one_in=16) for row in rows[:1]))
     assert "numba makes the same maps as numpy (1 in 16 voxels were compared)." in read(drawn)
+
+
+@pytest.mark.parametrize(("other", "advice"), [(70, "leave it out: --set"), (5, "take another model")])
+def test_a_class_that_leaves_nothing_else_is_not_to_be_left_out(other, advice) -> None:
+    found = study(record(voxels((1000 - other, 4, SURE), (other, 4, [0, 1, 0]))))
+    (line,) = (text for text in warnings(found) if "covers" in text)
+    assert advice in line

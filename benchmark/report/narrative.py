@@ -81,6 +81,10 @@ def warnings(result: Result) -> Iterator[str]:
         yield "VSS, entropy and voxel alpha do not compare labels with soft scores: semstab-bench show RUN reduced"
     for record in result.select():
         yield from (f"{_name(record.summary, result)}: {text}" for text in (*_suspicions(record), *_traffic(record)))
+    yield from _one_class_covers(runs)
+
+
+def _one_class_covers(runs: Sequence[UnitSummary]) -> Iterator[str]:
     covering: dict[str, list[tuple[str, float]]] = {}
     for run in filter(_one_class, runs):
         largest = max(run.table.classes, key=lambda row: row.voxels)
@@ -89,11 +93,16 @@ def warnings(result: Result) -> Iterator[str]:
         all_of_them = len(own) == len(runs)
         of = "" if all_of_them else f" of {', '.join(dict.fromkeys(model for model, _ in own))}"
         more = " or more" if len({f"{share:.0%}" for _, share in own}) > 1 else ""
-        least = round(100 * min(share for _, share in own))
-        yield (
-            f"'{name}' covers {least}%{more} of the map{of}, and determines most of its numbers; read them by class,"
-            f" or leave it out: {_excluding(name)}"
-        )
+        least = min(share for _, share in own)
+        covers = f"'{name}' covers {round(100 * least)}%{more} of the map{of}, and determines most of its numbers"
+        if least >= NOTHING_ELSE:
+            yield f"{covers}; what is left without it is too little to assess: take another model, or another scene"
+        else:
+            yield f"{covers}; read them by class, or leave it out: {_excluding(name)}"
+
+
+NOTHING_ELSE = 0.99
+"""The share of a map from which on a class leaves nothing else to assess."""
 
 
 def _excluding(*classes: str) -> str:
