@@ -114,6 +114,13 @@ def create(
     if unknown := sorted(set(options) - set(known)):
         listed = f"it takes {', '.join(known)}" if known else "it takes none"
         raise ConfigError(f"backend '{name}' has no option '{unknown[0]}'; {listed}")
+    try:
+        inspect.signature(cls).bind(voxel_size=voxel_size, num_classes=num_classes, **options)
+    except TypeError as error:
+        raise ConfigError(
+            f"backend '{name}' cannot be made with voxel_size and num_classes ({error}): __init__(self, *, voxel_size,"
+            " num_classes)"
+        ) from error
     make: Any = partial(cls, voxel_size=voxel_size, num_classes=num_classes, **options)
     if within is None:
         return cast(FusionBackend, make())

@@ -126,8 +126,14 @@ class Tally:
             return (
                 f"labels of {self.model}: id {listed} ({sum(unknown.values()):.2%} of the pixels) is outside the"
                 f" taxonomy {space.name} (ids {min(space.ids)} to {max(space.ids)})"
-            )
+            ) + _counted_from_one(space, self._ids)
         return None if labelled else f"labels of {self.model}: no pixel has a label"
+
+
+def _counted_from_one(space: LabelSpace, ids: Counter[int]) -> str:
+    """Return what explains ids outside of a taxonomy, where they may count from 1 instead of 0."""
+    told = min(space.ids) == 0 and space.ids[0] not in ids and max(ids) == max(space.ids) + 1
+    return "; the ids may count from 1: write them from 0, or name what 0 means as the first class" if told else ""
 
 
 SCHEMA = 2

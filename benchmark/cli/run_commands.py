@@ -477,7 +477,7 @@ def show(
     from semstab.engine.folder import load_result
     from semstab.report.tables import tables
     from semstab.report.tables.table import to_terminal
-    from semstab.report.terminal import print_answer
+    from semstab.report.terminal import failure_lines, print_answer
 
     further = [Path(word) for word in what or () if Path(word).is_dir()]
     if further or (run.is_dir() and not is_run(run)):
@@ -486,6 +486,10 @@ def show(
     if out is not None:
         raise ConfigError("--out is for the table of several runs; the tables of one are in its folder")
     result = load_result(run)
+    for line in failure_lines(result):
+        say(f"failed: {line}")
+    if not result.select():
+        raise DataError(f"{run}: no unit finished; {run / 'failures.log'} has more where it exists; run it again")
     there = {table.name: table for table in tables(result)}
     if figures is not None:
         from semstab.report.figures import write_figures

@@ -142,6 +142,8 @@ class Values(Part, Generic[V]):
     @model_validator(mode="before")
     @classmethod
     def _a_list_is_values(cls, content: Any) -> Any:
+        if not isinstance(content, list | dict | Values):
+            raise ValueError("write a list of values, for example [0.1, 0.2]")
         return {"values": content} if isinstance(content, list) else content
 
     @field_validator("values")

@@ -231,6 +231,8 @@ class Folder:
         digests = {name: digest for content in contents for name, digest in content.files.items()}
         if lost := next((name for name in digests if not (self.path / name).exists()), None):
             raise DataError(f"{self.path / lost}: was written, and is gone; run the same command again")
+        if gone := sorted(_models_in(self.path) - {record.unit.model for record in result.records}):
+            logger.warning("%s: %s no longer in the summary; name them, too, to have them back", self.path, _are(gone))
         records = _with_files(result.records, lambda file: file.relative_to(self.path))
         content = to_json(dataclasses.replace(result, records=records, manifest={}))
         runs = content.pop("records")
@@ -291,6 +293,19 @@ class Folder:
         if planned.stored and planned.config.events and keeps_log(planned.unit.backend):
             wanted += _in_tiles(unit, content, EVENTS) or [f"{EVENTS}/{unit.slug}.parquet"]
         return wanted + ([f"{OVERVIEW}/{slug(unit.scene, unit.model)}.npz"] if planned.image_space else [])
+
+
+def _models_in(folder: Path) -> set[str]:
+    """Return the models of the summary that lies in a folder; none where it cannot be read."""
+    try:
+        content = read_json(folder / "summary.json")
+        return {str(run["model"]) for run in content["runs"]}
+    except (DataError, KeyError, TypeError):
+        return set()
+
+
+def _are(names: Sequence[str]) -> str:
+    return f"{', '.join(names)} {'is' if len(names) == 1 else 'are'}"
 
 
 def _in_tiles(unit: Unit, content: UnitContent, of: str = VOXELS) -> list[str]:

@@ -26,6 +26,7 @@ from semstab.engine.messages import Work
 from semstab.engine.observer import Observers
 from semstab.engine.series import FrameRow, Series
 from semstab.engine.tiles import tiles_met
+from semstab.errors import ConfigError
 from semstab.metrics import FrameQualityMeter, VideoMeter, flicker_percent
 from semstab.metrics.image_space import ImageSpaceMeter
 from semstab.statistics import Sampler
@@ -104,6 +105,11 @@ class LiveMap:
             new_map(config, K).integrate(frame.every(WARM_UP_STRIDE))
         with watch(f"fuse {self.unit.backend}"):
             report = self.backend.integrate(frame)
+        if not isinstance(report, FrameReport):
+            raise ConfigError(
+                f"backend '{self.unit.backend}': integrate returned a {type(report).__name__}; it returns a"
+                " semstab.data.results.FrameReport (docs/tutorials/own-backend.md)"
+            )
         if self.reference is not None:
             with watch("reference"):
                 self.reference.integrate(frame)

@@ -182,7 +182,11 @@ def failed(works: Iterable[Work], error: str | Exception) -> list[Outcome]:
 def _one_line(error: Exception) -> str:
     if isinstance(error, SemstabError):
         return str(error)
-    return OUT_OF_MEMORY if isinstance(error, MemoryError) else f"{type(error).__name__}: {summarize_error(error)}"
+    if isinstance(error, MemoryError):
+        return OUT_OF_MEMORY
+    frames = traceback.extract_tb(error.__traceback__)
+    where = f" ({Path(frames[-1].filename).name}, line {frames[-1].lineno})" if frames else ""
+    return f"{type(error).__name__}: {summarize_error(error)}{where}"
 
 
 def jobs_of(works: Iterable[Work], width: int) -> list[Job]:

@@ -56,9 +56,10 @@ def tables(result: Result) -> list[Table]:
     """Return every table that the study has records for, in the paper's order."""
     shown = of_interest(result)
     made = [*filter_tables(result), *(table for build in BUILDERS for table in build(shown))]
-    if not result.benchmark:
-        return made
-    return [dataclasses.replace(table, caption=f"{table.caption} Benchmark {result.benchmark}.") for table in made]
+    words = f" Benchmark {result.benchmark}." if result.benchmark else ""
+    if n := len(result.failures):
+        words += f" Without {n} unit{'' if n == 1 else 's'} that failed."
+    return [dataclasses.replace(table, caption=table.caption + words) for table in made] if words else made
 
 
 def write_tables(result: Result, folder: str | Path) -> list[Path]:

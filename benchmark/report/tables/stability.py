@@ -404,6 +404,7 @@ def compared(result: Result) -> list[Table]:
     """Return the differences of maps by backends that associate pixels and voxels in another way than the base one."""
     if not result.compared:
         return []
+    differ = any(row.first for row in result.agreement)
     titles = {"op": "OP", **{measure.key: measure.title for measure in measures() if not measure.lowest_op > 1}}
     columns = (
         Column("scene", "Scene"),
@@ -442,9 +443,13 @@ def agreement(result: Result) -> list[Table]:
         Column("only_in_one", "Voxels in one only", 0),
         *(Column(f"max_{name}", header, 0, scientific=True, over=LARGEST) for name, header in titles.items()),
         Column("verdict", "Verdict"),
+        *([Column("first", "First difference")] if differ else []),
     )
     pairs = dict.fromkeys(row.backends for row in result.agreement)
-    rows = [(row.backends, _backend_agreement_row(row, titles)) for row in result.agreement]
+    rows = [
+        (row.backends, (*_backend_agreement_row(row, titles), *([str(row.first or "")] if differ else [])))
+        for row in result.agreement
+    ]
     groups = tuple(Group(" and ".join(pair), tuple(row for of, row in rows if of == pair)) for pair in pairs)
     caption = (
         "Two backends fused the same frames. The table shows the largest difference of any voxel that both maps have."
