@@ -404,7 +404,6 @@ def compared(result: Result) -> list[Table]:
     """Return the differences of maps by backends that associate pixels and voxels in another way than the base one."""
     if not result.compared:
         return []
-    differ = any(row.first for row in result.agreement)
     titles = {"op": "OP", **{measure.key: measure.title for measure in measures() if not measure.lowest_op > 1}}
     columns = (
         Column("scene", "Scene"),
@@ -436,6 +435,7 @@ def agreement(result: Result) -> list[Table]:
     """Return the agreement of each backend's map with the base one's, voxel by voxel."""
     if not result.agreement:
         return []
+    differ = any(row.first for row in result.agreement)
     titles = {"op": "OP", **{measure.key: measure.title for measure in measures()}, "evidence": "Evidence"}
     columns = (
         Column("scene", "Scene"),
