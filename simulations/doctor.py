@@ -1,4 +1,4 @@
-"""How often does `check` find a planted mistake in labels or time, and how often one that is not there?
+"""How often does `check` find a planted mistake in labels, time or intrinsics, and how often one that is not there?
 
     python simulations/doctor.py [--scenes 20] [--seed 0] [--only TEXT]
 
@@ -136,6 +136,12 @@ def poses_of(by: int) -> Callable[[Frames], Frames]:
     return lambda frames: [replace(f, T_wc=frames[k].T_wc) for f, k in zip(frames, later(frames, by), strict=True)]
 
 
+def camera(factor: float = 1.0, right: float = 0.0) -> Callable[[Frames], Frames]:
+    """Return a mistake that states other intrinsics: focal lengths times a factor, cx so many pixels to the right."""
+    K = Intrinsics(CAMERA.fx * factor, CAMERA.fy * factor, CAMERA.cx + right, CAMERA.cy)
+    return lambda frames: [replace(f, intrinsics=K) for f in frames]
+
+
 def resized(labels: np.ndarray) -> np.ndarray:
     small = cv2.resize(labels, (W // 2, H // 2), interpolation=cv2.INTER_NEAREST)
     return cv2.resize(small, (W, H), interpolation=cv2.INTER_LINEAR)
@@ -165,6 +171,10 @@ MISTAKES = (
     Mistake("labels resized with interpolation", relabelled(resized), "thin bands of ids"),
     Mistake("poses of the next frame", poses_of(1), "poses are one frame early"),
     Mistake("poses of the frame before", poses_of(-1), "poses are one frame late"),
+    Mistake("focal length 20 % too small", camera(0.8), "focal length is"),
+    Mistake("focal length 10 % too small", camera(0.9), "focal length is"),
+    Mistake("focal length 10 % too large", camera(1.1), "focal length is"),
+    Mistake("cx 10 % of the width too large", camera(right=W / 10), "cx is"),
     Mistake("none", lambda frames: frames, "nothing"),
 )  # fmt: skip
 

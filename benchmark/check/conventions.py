@@ -25,6 +25,9 @@ KNOWN_SCALES = (256.0, 1000.0, 4000.0, 5000.0, 6553.5, *(10.0**k for k in range(
 SNAP = 0.1
 """A depth scale that was measured may be a known one that is this close to it."""
 
+USUAL = 0.001
+"""A depth scale that is this close to a known one is that."""
+
 OPTION = "dataset.options."
 """The beginning of the path of a dataset's option."""
 
@@ -111,6 +114,10 @@ class Reading:
         now = 1.0 if self.depth_scale is None else self.depth_scale
         near = min(KNOWN_SCALES, key=lambda known: abs(known * factor / now - 1))
         return now / (near if abs(near * factor / now - 1) <= SNAP else float(f"{now / factor:.3g}"))
+
+    def is_usual(self, scale: float) -> bool:
+        """Return whether datasets use this depth scale, or half of them would round to it: 1000, 5000, 6553.5, ..."""
+        return any(abs(known / scale - 1) < USUAL for known in KNOWN_SCALES)
 
     def size_after(self, ratio: Ratio) -> list[int]:
         """Return [width, height] of the image of the intrinsics where it is `ratio` times the configured one."""

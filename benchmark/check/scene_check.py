@@ -26,6 +26,7 @@ from semstab.check.coverage import (
     suggested_size,
 )
 from semstab.check.geometry import Verdict, assess, shifts_and_turns
+from semstab.check.intrinsics import with_intrinsics
 from semstab.check.labels import LabelFindings, check_labels
 from semstab.check.registration import assess_surface, match_images, notes
 from semstab.check.reprojection import Sample, View, clusters, label_source, pairs_within, reader
@@ -425,7 +426,9 @@ class Inspection:
         if self.scene.surface is not None:
             return assess_surface(match_images(self.scene, sample.views, sample.pairs), len(sample.views))
         how = self.reading(options)
-        return with_lateness(assess(sample, how, thorough=thorough), self.scene, sample, how)
+        verdict = assess(sample, how, thorough=thorough)
+        timed = with_lateness(verdict, self.scene, sample, how)
+        return with_intrinsics(verdict, sample, how) if timed == verdict else timed
 
     def depth(self) -> Depth:
         """Return the depth of all frames that were read."""

@@ -27,6 +27,13 @@ FINE = np.arange(-9, 10) / 10
 CLEAR = 4.0
 """Standard errors by which the logarithm of the error must fall, in the mean over pairs of frames."""
 
+HALF, STRIKING = 0.5, 0.25
+"""A shift that not all pairs of frames show is remarked where the error falls to the first part, and a fault where it
+falls to the second one."""
+
+DIFFER, LEAST_MOVING = 0.3, 8
+"""Change of an error, as a logarithm, from which on a pair tells two shifts apart, and the least such pairs."""
+
 WHOLE = 0.75
 """A shift of so many frames is a fault of the files, which makes a scene unsound; a smaller one is remarked."""
 
@@ -40,12 +47,14 @@ class Lateness:
         seconds: The same in seconds, None where the frames have no time stamps that poses are looked up by.
         error: Median relative depth error under it.
         present: The same without it.
+        sure: Whether enough pairs of frames show it; else it is remarked.
     """
 
     frames: float
     seconds: float | None
     error: float
     present: float
+    sure: bool = True
 
     @property
     def whole(self) -> bool:
@@ -84,7 +93,7 @@ def with_lateness(verdict: Verdict, scene: Scene, sample: Sample, how: Reading) 
     """Return the verdict, with an offset between poses and frames if one explains the error."""
     if verdict.mend or (late := find_lateness(scene, sample, stamped="time_offset" in how.names)) is None:
         return verdict
-    if not late.whole:
+    if not (late.whole and late.sure):
         return dataclasses.replace(verdict, remarks=(*verdict.remarks, late.text(how)))
     setting = late.setting(how)
     mend = () if setting is None else (f"{setting[0]}: {setting[1]}",)
@@ -105,36 +114,56 @@ def find_lateness(scene: Scene, sample: Sample, *, stamped: bool) -> Lateness | 
     if len(moved.pairs) < LEAST_PAIRS:
         return None
     present = moved.errors(0.0)
-    if not _median(present) > MIN_GAIN:
+    if not middle(present) > MIN_GAIN:
         return None
     tried = {shift: moved.errors(shift) for shift in COARSE.tolist()}
-    near = min(tried, key=lambda shift: _mean_log(tried[shift]))
+    near = min(tried, key=lambda shift: mean_log(tried[shift]))
     tried |= {near + part: moved.errors(near + part) for part in FINE.tolist() if abs(near + part) <= REACH}
-    best = min(tried, key=lambda shift: _mean_log(tried[shift]))
-    if not stamped and _median(tried[float(round(best))]) <= SIMPLER * _median(tried[best]):
+    best = min(tried, key=lambda shift: mean_log(tried[shift]))
+    if not stamped and middle(tried[float(round(best))]) <= SIMPLER * middle(tried[best]):
         best = float(round(best))
-    error, before = _median(tried[best]), _median(present)
-    if abs(best) < 0.1 or not _clearly_lower(tried[best], present) or error > GOOD:
+    error, before = middle(tried[best]), middle(present)
+    won = _won(tried[best], present)
+    sure = clearly_lower(tried[best], present) or (won and error <= STRIKING * before)
+    if abs(best) < 0.1 or not (sure or (won and error <= HALF * before)) or error > GOOD:
         return None
-    return Lateness(round(best, 1), round(best, 1) * _period(scene) if stamped else None, error, before)
+    return Lateness(round(best, 1), round(best, 1) * _period(scene) if stamped else None, error, before, sure)
 
 
-def _clearly_lower(errors: Float64, present: Float64) -> bool:
+def _won(errors: Float64, present: Float64) -> bool:
+    """Return whether errors (pairs,) are lower than the present ones in most pairs in which they differ at all.
+
+    They do not where the camera stands still.
+    """
+    told = np.isfinite(errors) & np.isfinite(present)
+    told[told] = np.abs(np.log(np.maximum(errors[told], 1e-9) / np.maximum(present[told], 1e-9))) > DIFFER
+    return bool(told.sum() >= LEAST_MOVING and np.mean(errors[told] < present[told]) >= WON_PAIRS)
+
+
+def median_by_pair(sample: Sample) -> Float64:
+    """Return (pairs,) median relative error of depth as configured; NaN where few points are seen again."""
+    errors = sample.errors(sample.configured, np.array([1.0]))
+    return np.array([median_of_seen(e)[0] if np.isfinite(e).sum() >= PAIR_POINTS else math.nan for e in errors])
+
+
+def clearly_lower(errors: Float64, present: Float64) -> bool:
     """Return whether errors (pairs,) are lower than the present ones: in the mean, by its standard error, in most."""
     told = np.isfinite(errors) & np.isfinite(present)
-    if told.sum() < LEAST_PAIRS or _median(errors) > min(BETTER * _median(present), _median(present) - MIN_GAIN):
+    if told.sum() < LEAST_PAIRS or middle(errors) > min(BETTER * middle(present), middle(present) - MIN_GAIN):
         return False
     gains = np.log(np.maximum(present[told], 1e-9)) - np.log(np.maximum(errors[told], 1e-9))
     standard_error = gains.std(ddof=1) / math.sqrt(len(gains))
     return bool(gains.mean() > CLEAR * standard_error and np.mean(gains > 0) >= WON_PAIRS)
 
 
-def _mean_log(errors: Float64) -> float:
+def mean_log(errors: Float64) -> float:
+    """Return the mean logarithm of errors (pairs,) that are known; inf where none is."""
     told = errors[np.isfinite(errors)]
     return float(np.log(np.maximum(told, 1e-9)).mean()) if len(told) else math.inf
 
 
-def _median(errors: Float64) -> float:
+def middle(errors: Float64) -> float:
+    """Return the median of errors (pairs,) that are known; inf where none is."""
     return float(np.nanmedian(errors)) if np.isfinite(errors).any() else math.inf
 
 
@@ -167,8 +196,7 @@ class PoseShift:
             for position, view in self._sample.views.items()
             if position in used
         }
-        errors = Sample(views, self.pairs, self._sample.configured).errors(self._sample.configured, np.array([1.0]))
-        return np.array([median_of_seen(e)[0] if np.isfinite(e).sum() >= PAIR_POINTS else math.nan for e in errors])
+        return median_by_pair(Sample(views, self.pairs, self._sample.configured))
 
     def _between(self, at: float) -> Float64:
         from scipy.spatial.transform import Rotation, Slerp
