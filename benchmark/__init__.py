@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from semstab.data.events import Events
     from semstab.data.frames import Frame, Intrinsics
     from semstab.data.labels import LabelSpace
+    from semstab.data.records import Result
     from semstab.data.voxels import VoxelTable
     from semstab.engine.folder import load_result
     from semstab.errors import ConfigError, DataError, MissingDependencyError, SemstabError
@@ -39,6 +40,7 @@ __all__ = [
     "Intrinsics",
     "LabelSpace",
     "MissingDependencyError",
+    "Result",
     "SemstabError",
     "TemporalStability",
     "VoxelTable",
@@ -65,7 +67,7 @@ _HOMES = {
     "AcceptanceThresholds": "statistics.acceptance", "Belief": "exports.relabel", "Config": "config",
     "ConfigError": "errors", "DataError": "errors", "Events": "data.events", "Frame": "data.frames",
     "GateConfig": "comparison.gate", "Intrinsics": "data.frames", "LabelSpace": "data.labels",
-    "MissingDependencyError": "errors", "SemstabError": "errors", "VoxelTable": "data.voxels",
+    "MissingDependencyError": "errors", "Result": "data.records", "SemstabError": "errors", "VoxelTable": "data.voxels",
     "FusedResult": "online", "TemporalStability": "online", "compare": "comparison.writing", "fuse": "online",
     "export": "exports", "gate": "comparison.gate", "load": "report.saved_run",
     "load_config": "settings", "load_result": "engine.folder", "load_study": "settings", "relabel": "exports.relabel",

@@ -174,8 +174,8 @@ def recognise(root: Path) -> tuple[str, str]:
             if (found := next(root.glob("*/" * depth + pattern), None)) is not None:
                 where = found.parent.relative_to(root.parent)
                 raise DataError(
-                    f"{root}: holds {what} ({where}), and no depth images; scans are not read: where a camera was"
-                    " beside, make depth images of them (docs/tutorials/lidar-camera.md)"
+                    f"{root}: holds {what} ({where}), and no depth images; scans are not read, nor are labels of their"
+                    " points: where a camera was beside, make depth images of them (docs/tutorials/lidar-camera.md)"
                 )
     if not near:
         return RECOGNISED[-1], ""

@@ -127,3 +127,8 @@ def test_an_error_prints_a_plain_value_and_no_options_as_python_has_them(options
     with pytest.raises(ConfigError) as caught:
         resolve(load_config({"dataset": options}))
     assert str(caught.value).endswith(message)
+
+
+def test_a_folder_in_place_of_a_datasets_name_says_what_to_write() -> None:
+    with pytest.raises(ConfigError, match=r"write \{name: posed_folder, options: \{root: /data/flight\}\}"):
+        load_config(overrides={"dataset": "/data/flight"})

@@ -49,6 +49,15 @@ class DatasetConfig(Settings):
     name: str = Field("city", description="a name from `semstab-bench list`")
     options: dict[str, Any] = Field(default_factory=dict, description="options of that dataset")
 
+    @field_validator("name")
+    @classmethod
+    def _is_no_folder(cls, name: str) -> str:
+        if "/" in name and ":" not in name:
+            raise ValueError(
+                f"must name a dataset, not a folder; write {{name: posed_folder, options: {{root: {name}}}}}"
+            )
+        return name
+
 
 class BackendConfig(Part):
     """The settings that name a fusion backend: its options, where it fuses, whether it must agree with the others."""

@@ -346,6 +346,11 @@ class Result:
         notes: Remarks of the check, scene by scene: labels that are not registered to the depth, and the like.
         comparisons: The comparison of the models of each scene by `compare_models`, with `statistics`.
         benchmark: The benchmark that it is a run of, 'NAME@VERSION (hash of the definition)'; '' for none.
+
+    Examples:
+        >>> result = semstab.load_result("run")
+        >>> result.record(model="sim-steady").unit.scene
+        'scene0'
     """
 
     name: str
@@ -408,7 +413,7 @@ class Result:
             return fitting[0]
         units = ", ".join(f"{record.unit.scene} of {record.unit.model}" for record in fitting[:4])
         raise ConfigError(
-            f"{len(fitting)} units fit" + (f" ({units}); choose with --scene, --model" if fitting else "")
+            f"{len(fitting)} units fit" + (f" ({units}); name the scene, or the model" if fitting else "")
         )
 
     @property

@@ -44,7 +44,10 @@ class Run:
 
     @property
     def classes(self) -> pd.DataFrame:
-        """Return one row per unit and class: alpha with its interval, and the class's share of the disagreement."""
+        """One row per unit and class: alpha with its interval, and the class's share of the disagreement.
+
+        `unstable` is the probability that alpha of the class is below the level 'usable'.
+        """
         rows: list[dict[str, Any]] = []
         for unit in (each for each in self.result.runs if each.statistics is not None):
             cells = None if unit.statistics is None else unit.statistics.cells
@@ -59,11 +62,11 @@ class Run:
             ]  # fmt: skip
         return voxels.to_pandas({name: np.array([row[name] for row in rows]) for name in (rows[0] if rows else ())})
 
-    def table(self, *, scene: str | None = None, model: str | None = None, backend: str | None = None) -> VoxelTable:
-        """Return the voxels of a unit."""
+    def table(self, model: str | None = None, *, scene: str | None = None, backend: str | None = None) -> VoxelTable:
+        """Return the voxels of a unit, as arrays; `.to_pandas()` of it is a data frame."""
         return self.result.record(scene=scene, model=model, backend=backend).table()
 
-    def series(self, *, scene: str | None = None, model: str | None = None, backend: str | None = None) -> pd.DataFrame:
+    def series(self, model: str | None = None, *, scene: str | None = None, backend: str | None = None) -> pd.DataFrame:
         """Return the time series of a unit: one row per frame.
 
         Raises:
@@ -74,7 +77,7 @@ class Run:
             raise DataError(f"{self.folder}: the run stored no series of this unit; run it again")
         return voxels.to_pandas(_columns(file))
 
-    def events(self, *, scene: str | None = None, model: str | None = None, backend: str | None = None) -> Events:
+    def events(self, model: str | None = None, *, scene: str | None = None, backend: str | None = None) -> Events:
         """Return the log of a unit's observations.
 
         Raises:

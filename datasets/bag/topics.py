@@ -101,7 +101,10 @@ def choose(bag: OpenBag, options: BagOptions) -> Chosen:
         )
     if lacks:
         held = f"{', '.join(lacks[:-1])} and no {lacks[-1]}" if len(lacks) > 1 else lacks[0]
-        raise DataError(f"{bag.path}: holds no {held}; its topics: {bag.listed()}")
+        raise DataError(
+            f"{bag.path}: holds no {held}; record these, too, or use images in folders with the bag's poses"
+            f" (docs/datasets.md, TUM RGB-D); its topics: {bag.listed()}"
+        )
     others = [each.topic for each in depths + colors if each not in (depth, color)]
     return Chosen(depth, color, labels, depth_info, color_info, tuple(others))
 
