@@ -12,6 +12,7 @@ import zipfile
 from pathlib import Path
 
 import numpy as np
+import pyarrow.parquet as pq
 import pytest
 import tiny_scene
 import yaml
@@ -189,7 +190,7 @@ def test_what_cannot_be_run_is_one_line(home, words, line) -> None:
 # --- Runs and results -------------------------------------------------------------------------------------------------
 
 
-def test_name_version_and_definition_stand_with_every_number(home) -> None:
+def test_name_version_and_definition_stand_with_every_number(home, tmp_path) -> None:
     own = load_benchmark(home / "walls@1.yaml")
     stated = f"walls@1 ({own.digest})"
     result = semstab.load_result(home / "run")
@@ -199,6 +200,11 @@ def test_name_version_and_definition_stand_with_every_number(home) -> None:
     assert stated in bench("show", "run", cwd=home).stdout
     for file in (home / "run/tables").glob("*.md"):
         assert f"Benchmark {stated}." in file.read_text(), file.name
+    for file in (home / "run/tables").glob("*.csv"):
+        assert {row["benchmark"] for row in csv.DictReader(io.StringIO(file.read_text()))} <= {stated}, file.name
+    semstab.export(home / "run:bad", [tmp_path / "bad.ply", tmp_path / "bad.parquet"], scene="one")
+    assert f"comment benchmark {stated}\n".encode() in (tmp_path / "bad.ply").read_bytes()[:2000]
+    assert stated in pq.read_schema(tmp_path / "bad.parquet").metadata[b"semstab"].decode()
     page = (home / "run/report.html").read_text()
     assert "Benchmark walls@1" in page
     assert f"definition {own.digest}" in page

@@ -188,6 +188,21 @@ def test_what_a_killed_program_left_is_removed_by_the_next(when, tmp_path, monke
     assert [path.name for path in tmp_path.iterdir()] == ["semstab-scratch-linked"]
 
 
+def test_a_scratch_folder_that_another_process_removes_at_once_is_made_again(tmp_path, monkeypatch):
+    made, make = [], tempfile.mkdtemp
+
+    def removed_once(**options):
+        made.append(make(dir=tmp_path, **options))
+        if len(made) == 1:
+            Path(made[0]).rmdir()
+        return made[-1]
+
+    monkeypatch.setattr(tempfile, "mkdtemp", removed_once)
+    with ScratchFolder() as folder:
+        assert folder == Path(made[1]) / "files"
+        assert folder.is_dir()
+
+
 def test_what_cannot_be_fused_is_one_line(city, classes):
     (good, *_) = frames_of(city, "sim-steady")
     for wrong, message in (

@@ -147,7 +147,10 @@ class ScratchFolder:
         _remove_abandoned_scratch(Path(tempfile.gettempdir()))
         while True:
             own = Path(tempfile.mkdtemp(prefix=SCRATCH))
-            handle = os.open(own, os.O_RDONLY)
+            try:
+                handle = os.open(own, os.O_RDONLY)
+            except FileNotFoundError:  # another process took it for one that is abandoned
+                continue
             with suppress(OSError):  # a file system without locks
                 fcntl.flock(handle, fcntl.LOCK_SH)
             if own.exists():  # else it was removed before it was locked

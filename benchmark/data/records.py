@@ -413,7 +413,8 @@ class Result:
             return fitting[0]
         units = ", ".join(f"{record.unit.scene} of {record.unit.model}" for record in fitting[:4])
         raise ConfigError(
-            f"{len(fitting)} units fit" + (f" ({units}); name the scene, or the model" if fitting else "")
+            f"{len(fitting)} units fit"
+            + (f" ({units}); choose with --scene, --model (in Python: scene=, model=)" if fitting else "")
         )
 
     @property

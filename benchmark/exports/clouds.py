@@ -132,6 +132,8 @@ def legend(voxels: Voxels) -> Iterable[str]:
     """Yield the lines that explain a file: the voxel size, the coordinates, the classes, the columns."""
     where = "coordinates of the scene" if voxels.georeference is None else crs_name(voxels.georeference)
     yield f"semstab: voxels of {voxels.table.voxel_size:g} m, {where}"
+    if voxels.benchmark:
+        yield f"benchmark {voxels.benchmark}"
     yield from (f"class {k} {name}" for k, name in enumerate(("unclassified", *voxels.classes)))
     yield from (f"{name}: {column.about} {column.unit}".rstrip() for name, column in voxels.columns.items())
 
@@ -247,7 +249,11 @@ def declare(header: laspy.LasHeader, voxels: Voxels, **more: tuple[npt.DTypeLike
     for name, (kind, about) in dimensions.items():
         if name not in header.point_format.dimension_names:
             header.add_extra_dims([laspy.ExtraBytesParams(name=name, type=np.dtype(kind), description=about[:31])])
-    legend = {"taxonomy": voxels.taxonomy, "classes": ["unclassified", *voxels.classes]}
+    legend = {
+        "taxonomy": voxels.taxonomy,
+        "classes": ["unclassified", *voxels.classes],
+        "benchmark": voxels.benchmark,
+    }
     header.vlrs.append(laspy.VLR("semstab", 1, "classes of dimension class", json.dumps(legend).encode()))
     if voxels.georeference is not None and header.parse_crs() is None and header.point_format.id >= FIRST_OF_1_4:
         from pyproj import CRS

@@ -91,6 +91,9 @@ def write_raster(chosen: Chosen, path: Path, cell: int = 1) -> int:
             file.raster.set_band_unit(number, unit)
             file.raster.update_tags(number, about=about)
         file.raster.update_tags(1, **legend)
+        if some.benchmark:
+            file.raster.update_tags(benchmark=some.benchmark)
+            classes.raster.update_tags(benchmark=some.benchmark)
         classes.raster.write_colormap(1, palette)
         classes.raster.set_band_description(1, "class")
         classes.raster.update_tags(1, **legend)
@@ -330,6 +333,7 @@ def write_mesh(chosen: Chosen, path: Path) -> int:
         "coordinates": "the scene" if some.georeference is None else crs_name(some.georeference),
         "voxel_size": some.table.voxel_size,
         "classes": list(some.classes),
+        "benchmark": some.benchmark,
     }
     scene: Any = trimesh.Scene(metadata=extras)
     voxels, size, to_gltf = 0, 0, some.table.voxel_size * (_to_gltf(some.up) @ some.linear).T

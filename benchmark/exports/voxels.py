@@ -63,6 +63,7 @@ class Voxels:
         taxonomy: The taxonomy of the classes.
         up: (3,) the scene's up axis, None where it is not known.
         georeference: Georeference of the scene, None where it has none.
+        benchmark: The benchmark that the run is of, '' for none.
     """
 
     table: VoxelTable
@@ -72,6 +73,7 @@ class Voxels:
     taxonomy: str
     up: tuple[float, float, float] | None
     georeference: Georeference | None
+    benchmark: str = ""
 
     @property
     def points(self) -> Float64:
@@ -206,6 +208,7 @@ class Chosen:
             record.summary.taxonomy,
             self._result.up.get(scene) if georeference is None else (0.0, 0.0, 1.0),
             georeference,
+            self._result.benchmark,
         )
 
 
@@ -336,6 +339,7 @@ def _written(parts: Iterable[Voxels], path: Path, opened: Callable[[Path, pa.Sch
                 "crs": None if part.georeference is None else part.georeference.crs,
                 "taxonomy": part.taxonomy,
                 "classes": list(part.classes),
+                "benchmark": part.benchmark,
                 "units": {name: column.unit for name, column in part.columns.items() if column.unit},
             }
             table = arrow(part).replace_schema_metadata({"semstab": json.dumps(about)})

@@ -59,7 +59,7 @@ def tables(result: Result) -> list[Table]:
     words = f" Benchmark {result.benchmark}." if result.benchmark else ""
     if n := len(result.failures):
         words += f" Without {n} unit{'' if n == 1 else 's'} that failed."
-    return [dataclasses.replace(table, caption=table.caption + words) for table in made] if words else made
+    return [dataclasses.replace(table, caption=table.caption + words, benchmark=result.benchmark) for table in made]
 
 
 def write_tables(result: Result, folder: str | Path) -> list[Path]:

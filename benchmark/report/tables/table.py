@@ -92,6 +92,7 @@ class Table:
         name: The name of its files.
         caption: A description of the numbers, and of the data over which means run.
         by: The kind of the groups ('model'), the leading column of CSV and JSON; '' for one group without a name.
+        benchmark: The benchmark whose numbers these are, the last column of CSV; '' for none.
     """
 
     name: str
@@ -100,6 +101,7 @@ class Table:
     columns: tuple[Column, ...]
     groups: tuple[Group, ...]
     by: str = "model"
+    benchmark: str = ""
 
     def only(self, *keys: str) -> Table:
         """Return the table with these columns alone."""
@@ -146,10 +148,11 @@ def to_csv(table: Table) -> str:
     writer = csv.writer(text, lineterminator="\n")
     parts = [_csv_parts([row[k] for _, row in table.rows()]) for k in range(len(table.columns))]
     keys = [[f"{column.key}{part}" for part in own] for column, own in zip(table.columns, parts, strict=True)]
-    writer.writerow([*_leading(table, table.by), *itertools.chain(*keys)])
+    last = [csv_text(table.benchmark)] if table.benchmark else []
+    writer.writerow([*_leading(table, table.by), *itertools.chain(*keys), *(["benchmark"] if last else [])])
     for group, row in table.rows():
         cells = (_csv_cells(column, cell, own) for column, cell, own in zip(table.columns, row, parts, strict=True))
-        writer.writerow([*_leading(table, group), *itertools.chain(*cells)])
+        writer.writerow([*_leading(table, group), *itertools.chain(*cells), *last])
     return text.getvalue()
 
 
