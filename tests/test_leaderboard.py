@@ -24,7 +24,7 @@ import semstab
 from semstab.comparison.runs import open_run, save_summary
 from semstab.datasets import city
 from semstab.errors import ConfigError, DataError
-from semstab.leaderboard.board import boards
+from semstab.leaderboard.board import board_of, boards
 from semstab.leaderboard.definition import load_benchmark
 from semstab.leaderboard.submission import load_submission, submissions
 from semstab.settings import shipped_benchmarks
@@ -236,13 +236,21 @@ def test_a_result_can_be_compared_as_a_run(home, results) -> None:
     assert one.change == other.change == "worse"
 
 
+def statistics_of(content, scene):
+    return content["scenes"][scene]["summary"]["statistics"]
+
+
 def stated(content, scene):
-    return content["scenes"][scene]["summary"]["statistics"]["headline"]
+    return statistics_of(content, scene)["headline"]
 
 
 @pytest.mark.parametrize(("change", "line"), [
     (lambda c: stated(c, 0)["alpha"].update(value=0.99), "alpha is stated as 0.99"),
     (lambda c: stated(c, 1)["accuracy"].update(value=0.5), "accuracy is stated as 0.5"),
+    (lambda c: statistics_of(c, 0)["cells"]["classes"][1]["alpha"].update(value=0.99), "is stated as 0.99"),
+    (lambda c: statistics_of(c, 0)["cells"].update(chance=0.99), "chance is stated as 0.99"),
+    (lambda c: stated(c, 0)["alpha"].update(value=None), "alpha is stated as nan"),
+    (lambda c: statistics_of(c, 1)["verdict"].update(level="misleading"), "the level is stated as 'misleading'"),
     (lambda c: c["about"].update(digest="0123456789abcdef"), "of another definition of walls@1 (0123456789abcdef"),
     (lambda c: c["about"].update(benchmark="walls@2"), "'walls@2' is neither a benchmark"),
     (lambda c: c["scenes"][0].update(name="three"), "one of walls@1 is missing"),
@@ -315,13 +323,12 @@ def test_models_are_ranked_and_those_that_cannot_be_told_apart_share_ranks(home,
 
 
 def test_a_model_that_alpha_does_not_assess_is_shown_without_a_rank(home, results) -> None:
-    def judged(content, levels):
-        for scene, level in zip(content["scenes"], levels, strict=True):
-            scene["summary"]["statistics"]["verdict"]["level"] = level
-
-    rewritten(results["good"], lambda c: judged(c, ["misleading", "misleading"]))
-    rewritten(results["bad"], lambda c: judged(c, ["uninformative", "usable"]))
-    (board,) = boards(results["good"].parent, definitions(home))
+    levels = {"good": ("misleading", "misleading"), "bad": ("uninformative", "usable")}
+    loaded = {name: load_submission(file, definitions(home)) for name, file in results.items()}
+    for name, own in levels.items():
+        for entry, level in zip(loaded[name][2].scenes.values(), own, strict=True):
+            object.__setattr__(entry.summary.statistics.verdict, "level", level)
+    board = board_of(loaded["good"][0], [(name, about, handle) for name, (_, about, handle) in loaded.items()])
     assert [(row.name, row.ranks, row.verdict) for row in board.rows] == [
         ("same", "1", board.rows[0].verdict), ("bad", "2", "uninformative 1, usable 1"), ("good", "-", "misleading"),
     ]  # fmt: skip

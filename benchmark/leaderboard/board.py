@@ -236,7 +236,8 @@ def headline(board: Board) -> Table:
         " maps were read."
     )
     caption += "".join(f" {text[0].upper()}{text[1:]}." for text in board.reasons)
-    return Table(f"leaderboard-{benchmark.id}", benchmark.id, caption, columns, (Group("", rows),))
+    named = f"{benchmark.id} ({benchmark.digest})"
+    return Table(f"leaderboard-{benchmark.id}", benchmark.id, caption, columns, (Group("", rows),), benchmark=named)
 
 
 def by_scene(board: Board) -> Table:

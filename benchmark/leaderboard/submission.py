@@ -22,20 +22,24 @@ from semstab.config import Config, Settings, read_yaml, validated
 from semstab.core.json_form import from_json, to_json
 from semstab.data.records import Result
 from semstab.data.results import slug
+from semstab.data.statistics import HeadlineStatistics, Interval
 from semstab.datasets import GROUND_TRUTH
 from semstab.engine.folder import load_result
 from semstab.errors import ConfigError, DataError
 from semstab.leaderboard.definition import Benchmark, load_benchmark
 from semstab.predict.dataset import NAME as PREDICTED
-from semstab.statistics.cluster_sums import value
+from semstab.statistics.cluster_sums import chance_of, value
+from semstab.statistics.verdict import verdict
 
 SUFFIX = ".semstab"
 """Suffix of the files."""
 
 LARGEST = 600_000
-"""Bytes of a file at most: sums are made coarser until they fit, which changes no number, and intervals a little."""
+"""Bytes of a file at most: sums are made coarser until they fit, which changes no number, but the ends of intervals.
 
-ALIKE = 1e-6
+Most move by less than .01; where frames agree everywhere, few cubes leave a much lower end."""
+
+ALIKE = 1e-5
 """Largest difference between a number that a file states and the one that follows from its sums."""
 
 PACKAGES = ("numpy", "numba", "open3d", "torch", "transformers", "tflite-runtime", "ai-edge-litert")
@@ -144,7 +148,7 @@ def load_submission(
         )
     require_whole(benchmark, handle)
     for scene, entry in handle.scenes.items():
-        _require_consistent(path, scene, entry)
+        _require_consistent(path, handle.model, scene, entry)
     return benchmark, about, handle
 
 
@@ -200,20 +204,31 @@ def _about(benchmark: Benchmark, result: Result, config: Config, handle: RunHand
     )
 
 
-def _require_consistent(path: Path, scene: str, entry: Entry) -> None:
-    """Raise DataError where a stated number does not follow from the sums."""
+def _require_consistent(path: Path, model: str, scene: str, entry: Entry) -> None:
+    """Raise DataError where a stated number does not follow from the sums, or the level not from the numbers."""
     statistics, sums = entry.summary.statistics, entry.sums
     assert statistics is not None
-    stated = {"alpha": statistics.headline.alpha.value, "psa": statistics.headline.psa.value}
-    if sums.truth:
-        stated |= {
-            "accuracy": statistics.headline.accuracy.value,
-            "wrong_of_consistent": statistics.headline.wrong_of_consistent.value,
-        }
-    for key, number in stated.items():
-        follows = value(sums, key)
-        if not math.isnan(follows) and not abs(number - follows) <= ALIKE:
+    own, cells, repeated = statistics.headline, statistics.cells, statistics.repeated
+    stated: dict[str, tuple[float, float]] = {
+        key: (interval.value, value(sums, key))
+        for key, interval in (("alpha", own.alpha), ("psa", own.psa), *(_of_truth(own) if sums.truth else ()))
+        if not interval.undecided
+    }
+    if cells is not None and sums.fine is not None:
+        stated["chance"] = cells.chance, chance_of(sums.fine)
+        for row in cells.classes:
+            stated[f"alpha of {row.name}"] = row.alpha.value, value(sums, "alpha", entry.classes.index(row.name))
+    for key, (number, follows) in stated.items():
+        if not math.isclose(number, follows, abs_tol=ALIKE) and not (math.isnan(number) and math.isnan(follows)):
             raise DataError(f"{path}: {scene}: {key} is stated as {number:.6g}, but its sums give {follows:.6g}")
+    follow = verdict(model, headline=own, cells=cells, voxels=repeated.voxels, share=repeated.share)
+    if statistics.verdict.level != follow.level:
+        level = statistics.verdict.level
+        raise DataError(f"{path}: {scene}: the level is stated as '{level}', but its numbers give '{follow.level}'")
+
+
+def _of_truth(own: HeadlineStatistics) -> tuple[tuple[str, Interval], ...]:
+    return ("accuracy", own.accuracy), ("wrong_of_consistent", own.wrong_of_consistent)
 
 
 def _version(package: str) -> str | None:
