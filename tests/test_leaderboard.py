@@ -378,6 +378,9 @@ def test_the_page_and_the_files_say_what_the_terminal_says(home, results) -> Non
     said = bench("leaderboard", "results", "--benchmark", home / "walls@1.yaml", "--out", "site", cwd=root).stdout
     rows = list(csv.DictReader((root / "site/walls@1.csv").read_text().splitlines()))
     assert [row["rank"] for row in rows] == ["1 to 2", "1 to 2", "3"]
+    header = (root / "site/walls@1.csv").read_text().splitlines()[0].split(",")
+    assert header[:2] == ["rank", "model"]
+    assert len({*header}) == len(header)
     content = json.loads((root / "site/walls@1.json").read_text())
     assert content["digest"] == load_benchmark(home / "walls@1.yaml").digest
     page = (root / "site/index.html").read_text()

@@ -237,7 +237,7 @@ def headline(board: Board) -> Table:
     )
     caption += "".join(f" {text[0].upper()}{text[1:]}." for text in board.reasons)
     named = f"{benchmark.id} ({benchmark.digest})"
-    return Table(f"leaderboard-{benchmark.id}", benchmark.id, caption, columns, (Group("", rows),), benchmark=named)
+    return Table(f"leaderboard-{benchmark.id}", benchmark.id, caption, columns, (Group("", rows),), "", named)
 
 
 def by_scene(board: Board) -> Table:
@@ -246,7 +246,9 @@ def by_scene(board: Board) -> Table:
     columns = (Column("model", "model"), *(Column(scene, scene, 3, "higher") for scene in scenes))
     rows: Rows = tuple((row.name, *(row.scenes[scene][0] for scene in scenes)) for row in board.rows)
     caption = "Alpha in each scene, with intervals at 95 %."
-    return Table(f"scenes-{board.benchmark.id}", f"{board.benchmark.id} by scene", caption, columns, (Group("", rows),))
+    return Table(
+        f"scenes-{board.benchmark.id}", f"{board.benchmark.id} by scene", caption, columns, (Group("", rows),), ""
+    )
 
 
 def by_class(board: Board) -> Table:
@@ -256,7 +258,7 @@ def by_class(board: Board) -> Table:
     rows: Rows = tuple((row.name, *(row.classes.get(name, math.nan) for name in names)) for row in board.rows)
     caption = "Alpha of a class against all others, the mean over scenes in which it counts for the verdict."
     return Table(
-        f"classes-{board.benchmark.id}", f"{board.benchmark.id} by class", caption, columns, (Group("", rows),)
+        f"classes-{board.benchmark.id}", f"{board.benchmark.id} by class", caption, columns, (Group("", rows),), ""
     )
 
 
