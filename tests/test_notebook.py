@@ -33,11 +33,17 @@ def executed(folder: Path):
 
 def shown(notebook) -> list[str]:
     """What the cells show, without pictures."""
-    outputs = [output for cell in notebook.cells for output in cell.get("outputs", ())]
-    texts = [
-        output.get("text") or output["data"].get("text/html", output["data"].get("text/markdown")) for output in outputs
-    ]
-    return [PICTURE.sub("", text).strip() for text in texts]
+    texts = []
+    for cell in notebook.cells:
+        outputs = cell.get("outputs", ())
+        # A cell's printed text arrives in pieces, as many as the pipe makes of it.
+        texts.append("".join(output["text"] for output in outputs if output.output_type == "stream"))
+        texts += [
+            output["data"].get("text/html", output["data"].get("text/markdown"))
+            for output in outputs
+            if output.output_type != "stream"
+        ]
+    return [PICTURE.sub("", text).strip() for text in texts if text]
 
 
 @pytest.mark.filterwarnings("ignore::DeprecationWarning:zmq", "ignore::RuntimeWarning:zmq")
