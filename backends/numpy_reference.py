@@ -155,10 +155,9 @@ class NumpySample(NumpyReference):
         return table.rows(in_sample(table.index.T, self.one_in))
 
     def _observe(self, frame: Frame) -> Observations:
-        from semstab.backends.shared.pixel_keys import drawn_pixels
+        from semstab.backends.shared.pixel_keys import drawn_of
 
-        K, pose = frame.intrinsics, np.ascontiguousarray(frame.T_wc)
-        near = drawn_pixels(frame.depth, frame.valid, (K.fx, K.fy, K.cx, K.cy), pose, self.voxel_size, ODD, self.one_in)
+        near = drawn_of(frame, self.voxel_size, ODD, self.one_in)
         seen = observe(frame, self.voxel_size, self.num_classes, near)
         held = in_sample(seen.index.T, self.one_in)
         held = held if self.within is None else held & self.within.holds(seen.index.T)

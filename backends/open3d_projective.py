@@ -24,7 +24,7 @@ from semstab.backends.shared.observations import Observed
 from semstab.core.types import Int64
 from semstab.data.frames import Frame
 from semstab.data.labels import IGNORE_8BIT
-from semstab.errors import ConfigError
+from semstab.errors import ConfigError, DataError
 
 MARGIN = 1.25
 """Voxels beyond the band in which blocks are visited, from the centres of the voxels that hold a pixel's point: half a
@@ -79,6 +79,11 @@ class Projector(Aggregator):
         Raises:
             DataError: For a label outside the classes, or a point more than 2^20 voxels from the origin.
         """
+        if frame.is_scan:
+            raise DataError(
+                f"{frame.where('points')}: backend 'open3d-projective' looks voxels up in an image, and a scan is"
+                " none; fuse scans with numba, open3d, torch or numpy"
+            )
         check_depth(frame)
         check_frame(frame, self.num_classes)
         blocks = self._touched(frame)

@@ -312,7 +312,8 @@ class TorchMap(FusionBackend):
         """Fuse one frame, copied to the device."""
         started = time.perf_counter()
         check_depth(frame)
-        view = DepthView(on_device(frame.depth, self.device), frame)
+        points = None if frame.points is None else on_device(frame.points, self.device)
+        view = DepthView(on_device(frame.depth, self.device), frame, points)
         if frame.labels is not None:
             seen: Labels | Scores = Labels(on_device(frame.labels, self.device).reshape(-1), frame.ignore_id)
         else:

@@ -99,15 +99,24 @@ def _keys(view: DepthView, grid: MapGrid, terms: list[torch.Tensor], rows: slice
     d = torch.where(ok, depth, 0).to(grid.dtype)
     if grid.dtype == torch.float64:  # by a number, not a tensor, torch divides on a CUDA device as by the reciprocal
         ray_x, ray_y, T, r, origin = terms
-        x, y = ray_x * d, ray_y[rows] * d
-        q = torch.floor((((T[:, 0] * x + T[:, 1] * y) + T[:, 2] * d) + T[:, 3]) / r) - origin
-    else:
+        x, y, z = (ray_x * d, ray_y[rows] * d, d) if view.points is None else _coordinates(view.points[rows], ok, grid)
+        q = torch.floor((((T[:, 0] * x + T[:, 1] * y) + T[:, 2] * z) + T[:, 3]) / r) - origin
+    elif view.points is None:
         a, b, start, origin = terms
         q = torch.floor(d * (a + b[:, rows]) + start) + origin
+    else:
+        R, start, origin = terms
+        x, y, z = _coordinates(view.points[rows], ok, grid)
+        q = torch.floor(((R[:, 0] * x + R[:, 1] * y) + R[:, 2] * z) + start) + origin
     near = ((q >= -HALF) & (q < HALF)).all(dim=0)
     i, j, k = torch.where(near, q, 0).to(torch.int64) + HALF
     key = torch.where(near, (i << 42) | (j << 21) | k, LOST)
     return torch.where(ok, key, NONE).reshape(-1)
+
+
+def _coordinates(points: torch.Tensor, ok: torch.Tensor, grid: MapGrid) -> tuple[torch.Tensor, ...]:
+    """Return x, y and z (H, W) of points (H, W, 3); 0 where they do not count."""
+    return torch.where(ok[..., None], points, 0).to(grid.dtype).unbind(dim=-1)
 
 
 def camera_terms(view: DepthView, grid: MapGrid) -> list[torch.Tensor]:
@@ -122,14 +131,17 @@ def camera_terms_single(view: DepthView, grid: MapGrid) -> list[torch.Tensor]:
     """Return a (3, 1, W), b (3, H, 1), start and offset (3, 1, 1), float32: x_w / r = d (a + b) + start.
 
     Units are voxels, with the whole voxels of the camera's position left to the integers: so float32 holds no more
-    than the distance from the camera, and decides alike in UTM-sized coordinates.
+    than the distance from the camera, and decides alike in UTM-sized coordinates. Of a scan they are R (3, 3, 1, 1),
+    start and offset: x_w / r = R p + start.
     """
     ray_x, ray_y = view.rays
     R, t = view.camera.T_wc[:3, :3] / grid.voxel_size, view.camera.T_wc[:3, 3] / grid.voxel_size
     camera = np.floor(t)
+    start, offset = (t - camera)[:, None, None], (camera - grid.origin)[:, None, None]
+    if view.points is not None:
+        return _uploaded([R[:, :, None, None], start, offset], grid.dtype, view.depth.device)
     a = (R[:, :1] * ray_x)[:, None, :]
     b = (R[:, 1:2] * ray_y + R[:, 2:])[:, :, None]
-    start, offset = (t - camera)[:, None, None], (camera - grid.origin)[:, None, None]
     return _uploaded([a, b, start, offset], grid.dtype, view.depth.device)
 
 

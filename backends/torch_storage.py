@@ -262,15 +262,17 @@ class TensorPrediction:
 
 @dataclass(frozen=True, eq=False)
 class DepthView:
-    """A depth image on the device, with its camera.
+    """A depth image on the device, with its camera; or a scan.
 
     Attributes:
-        depth: (H, W) float32, contiguous, metres along the optical axis.
+        depth: (H, W) float32, contiguous, metres along the optical axis; of a scan from the sensor.
         camera: A frame of one empty pixel, or the whole frame: index, intrinsics, pose, and the names of files.
+        points: (H, W, 3) float32 of a scan, in the sensor's coordinates.
     """
 
     depth: torch.Tensor
     camera: Frame
+    points: torch.Tensor | None = None
 
     @classmethod
     def of(
@@ -297,7 +299,9 @@ class DepthView:
 
     @cached_property
     def rays(self) -> tuple[Float64, Float64]:
-        """(u - cx) / fx of each column and (v - cy) / fy of each row."""
+        """(u - cx) / fx of each column and (v - cy) / fy of each row; none of a scan."""
+        if self.points is not None:
+            return np.zeros(0), np.zeros(0)
         v, u = (np.arange(size, dtype=np.float64) for size in self.depth.shape)
         K = self.camera.intrinsics
         return (u - K.cx) / K.fx, (v - K.cy) / K.fy

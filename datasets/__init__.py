@@ -85,6 +85,9 @@ REGISTRY = Registry(
         "record3d": Entry("semstab.datasets.record3d:Record3D", "EXR and JPG sequences of the app Record3D"),
         "arkitscenes": Entry("semstab.datasets.arkitscenes:ArkitScenes", "ARKitScenes, raw data"),
         "tartanair": Entry("semstab.datasets.tartanair:TartanAir", "TartanAir: simulated flights, NED poses"),
+        "semantickitti": Entry(
+            "semstab.datasets.semantickitti:SemanticKitti", "SemanticKITTI: LiDAR scans, a class a point"
+        ),
         "hololens": Entry("semstab.datasets.hololens:HoloLens", "DeepVideoMVS and HoloLens: poses.txt and K.txt"),
     },
 )
@@ -125,8 +128,8 @@ def open_dataset(name: str, options: dict[str, Any] | BaseModel, run_folder: Pat
 
 RECOGNISED = (
     "odm", "metashape", "pix4d", "realitycapture", "uavscenes", "hololens", "tum", "seven_scenes", "replica", "scannet",
-    "tartanair", "stray_scanner", "polycam", "record3d", "arkitscenes", "transforms_json", "colmap", "bag",
-    "posed_folder",
+    "semantickitti", "tartanair", "stray_scanner", "polycam", "record3d", "arkitscenes", "transforms_json", "colmap",
+    "bag", "posed_folder",
 )  # fmt: skip
 """Formats that a folder is recognised as: the one whose scenes lie highest, of these the first."""
 

@@ -69,6 +69,7 @@ class Scene(ABC):
         on_photographs: Whether `image` is a distorted photograph, which `color` shows undistorted.
         skips_incomplete: Whether selected frames without a file are left out; else they are an error.
         images_elsewhere: Whether option images may name another folder of images, and does not.
+        of_scans: Whether its frames are scans of points, not images.
     """
 
     name: str
@@ -89,6 +90,7 @@ class Scene(ABC):
     on_photographs: bool = False
     skips_incomplete: bool = False
     images_elsewhere: bool = False
+    of_scans: bool = False
 
     @abstractmethod
     def __len__(self) -> int:

@@ -410,6 +410,7 @@ class Scene:
     name = "floor 1"
     models = ("net/x",)
     ground_truth = False
+    of_scans = False
     up = np.array([0.0, 0.1, 0.99])
 
 

@@ -1,9 +1,9 @@
-"""Observations, one a voxel, from the pixels of a frame: labels by tiles of the image, scores likewise."""
+"""Observations, one a voxel, from the pixels or points of a frame: labels by tiles of the image, scores likewise."""
 
 from __future__ import annotations
 
 import dataclasses
-from typing import Any
+from typing import Any, NamedTuple
 
 import numba as nb
 import numpy as np
@@ -15,9 +15,9 @@ from semstab.backends.shared.observations import Observed, ObservedScores, WorkS
 from semstab.backends.shared.pixel_keys import columns_of, frame_terms
 from semstab.backends.shared.score_loops import LANES
 from semstab.backends.shared.tile_loops import NEAR, REACH
-from semstab.core.types import Float64, Int32, Int64, UInt8
+from semstab.core.types import Float32, Float64, Int32, Int64, UInt8
 from semstab.data.frames import Frame
-from semstab.data.labels import fixed
+from semstab.data.labels import fixed, flat
 from semstab.data.voxels import Extent
 
 FIRST_VOXELS = 1 << 12
@@ -25,6 +25,20 @@ FIRST_VOXELS = 1 << 12
 
 SAMPLE = 1 << 10
 """Voxels, about, that tell whether a frame's voxels have evidence of most classes."""
+
+
+class Words(NamedTuple):
+    """The entries of bands of a frame, see `tile_loops.find_words`; each band has `room` for them."""
+
+    word: Int64
+    count: Int32
+    partition: UInt8
+    room: int
+    entries: Int64
+    lost: Int64
+    spread: Int64
+    low: Int64
+    high: Int64
 
 
 class Aggregator:
@@ -77,37 +91,67 @@ class Aggregator:
     def _labels(self, frame: Frame, origin: Int64) -> Observed | None:
         """Return the observations of labels, None where the frame reaches too far or a label is no class."""
         assert frame.labels is not None
-        space, (H, W) = self._space, frame.shape
         corner = np.floor(frame.T_wc[:3, 3] / self.voxel_size).astype(np.int64) - origin + (HALF - NEAR)
         if corner.min() < 0 or corner.max() > 2 * (HALF - NEAR):
             return None
-        ray_x, ray_y = _rays(frame)
+        seen = self._words_of_points(frame, origin, corner) if frame.is_scan else self._words(frame, origin, corner)
+        word, count, partition, room, entries, lost, spread, low, high = seen
+        if lost.any() or high[:, 3].max() >= self.num_classes:
+            return None
+        extent = low[:, :3].min(axis=0), high.max(axis=0)
+        return self._merged_labels(word, count, partition, room, entries, spread, *extent, corner)
+
+    def _words(self, frame: Frame, origin: Int64, corner: Int64) -> Words:
+        """Return the entries of an image, by bands of rows."""
+        assert frame.labels is not None
+        space, (H, W) = self._space, frame.shape
+        ray_x, ray_y = frame.rays
         rays = space.room("rays", 3, W, dtype=np.float64)
         rays[:], margin = frame_terms(ray_x, frame.T_wc, self.voxel_size, REACH)
         down = (frame.T_wc[:3, 1] * ray_y[:, None] + frame.T_wc[:3, 2]) / self.voxel_size
         half, face = tile_loops.face_terms(margin)
         begin = frame.T_wc[:3, 3] / self.voxel_size - origin + (REACH + half + HALF - corner)
-        rows, columns, table = tile_loops.ROWS, tile_loops.COLUMNS, 1 << tile_loops.TABLE_BITS
-        bands, threads = -(-H // rows), nb.get_num_threads()
-        tables = space.room("table", threads, table)
-        tables[:] = -1
-        room = rows * W + (columns + 1) * rows + 2 * table  # memory that is not written to is not taken
-        word, count = space.room("word", bands * room), space.room("count", bands * room, dtype=np.int32)
-        partition = space.room("partition", bands * room, dtype=np.uint8)
-        entries, lost = np.zeros(bands, dtype=np.int64), np.zeros(bands, dtype=np.int64)
-        spread = np.zeros((bands, PARTITIONS), dtype=np.int64)
-        low, high = np.zeros((bands, 4), dtype=np.int64), np.full((bands, 4), -1)
+        work, found = self._room_for_words(-(-H // tile_loops.ROWS), tile_loops.ROWS, W)
         tile_loops.find_words(
             fixed(frame.depth), fixed(frame.labels), ray_x, ray_y, fixed(frame.T_wc), self.voxel_size, origin,
-            corner, columns_of(self.within, origin), rays, down, begin, face, frame.ignore_id, room,
-            space.room("stretches", threads, 4, columns + 2 * tile_loops.LANES), tables,
-            space.room("table_count", threads, table, dtype=np.int32),
-            word, count, partition, entries, lost, spread, low, high,
+            corner, columns_of(self.within, origin), rays, down, begin, face, frame.ignore_id, found.room, *work,
+            found.word, found.count, found.partition, found.entries, found.lost, found.spread, found.low, found.high,
         )  # fmt: skip
-        if lost.any() or high[:, 3].max() >= self.num_classes:
-            return None
-        extent = low[:, :3].min(axis=0), high.max(axis=0)
-        return self._merged_labels(word, count, partition, room, entries, spread, *extent, corner)
+        return found
+
+    def _words_of_points(self, frame: Frame, origin: Int64, corner: Int64) -> Words:
+        """Return the entries of a scan, by bands of points."""
+        assert frame.labels is not None
+        assert frame.points is not None
+        points = fixed(frame.points).reshape(-1, 3)
+        work, found = self._room_for_words(-(-len(points) // tile_loops.POINTS), 1, tile_loops.POINTS)
+        tile_loops.find_words_of_points(
+            points, flat(frame.depth), flat(frame.labels), fixed(frame.T_wc), self.voxel_size, origin, corner,
+            columns_of(self.within, origin), frame.ignore_id, found.room, *work,
+            found.word, found.count, found.partition, found.entries, found.lost, found.spread, found.low, found.high,
+        )  # fmt: skip
+        return found
+
+    def _room_for_words(self, bands: int, rows: int, width: int) -> tuple[tuple[Any, Any, Any], Words]:
+        """Return work space for the threads, and room for the entries of bands of so many rows."""
+        space, threads = self._space, nb.get_num_threads()
+        columns, table = tile_loops.COLUMNS, 1 << tile_loops.TABLE_BITS
+        tables = space.room("table", threads, table)
+        tables[:] = -1
+        room = rows * width + (columns + 1) * rows + 2 * table  # memory that is not written to is not taken
+        stretches = space.room("stretches", threads, 4, columns + 2 * tile_loops.LANES)
+        found = Words(
+            space.room("word", bands * room),
+            space.room("count", bands * room, dtype=np.int32),
+            space.room("partition", bands * room, dtype=np.uint8),
+            room,
+            entries=np.zeros(bands, dtype=np.int64),
+            lost=np.zeros(bands, dtype=np.int64),
+            spread=np.zeros((bands, PARTITIONS), dtype=np.int64),
+            low=np.zeros((bands, 4), dtype=np.int64),
+            high=np.full((bands, 4), -1),
+        )
+        return (stretches, tables, space.room("table_count", threads, table, dtype=np.int32)), found
 
     def _merged_labels(
         self, word: Int64, count: Int32, partition: UInt8, room: int, entries: Int64, spread: Int64,
@@ -182,9 +226,10 @@ class Aggregator:
 
         Voxels outside the extent are left out at the end: all voxels of the frame decide how sums are rounded.
         """
-        space, (H, W), K = self._space, frame.shape, self.num_classes
-        ray_x, ray_y = _rays(frame)
+        space, K = self._space, self.num_classes
         rows, columns, table = score_loops.ROWS, score_loops.COLUMNS, 1 << score_loops.TABLE_BITS
+        depth, points, (ray_x, ray_y) = _by_rows(frame, columns)
+        H, W = depth.shape
         bands, threads = -(-H // rows), nb.get_num_threads()
         stride = -(-K // LANES) * LANES
         scores = _flat(frame.scores)
@@ -197,7 +242,7 @@ class Aggregator:
             entries, lost = np.zeros(bands, dtype=np.int64), np.zeros(bands, dtype=np.int64)
             spread = np.zeros((bands, PARTITIONS), dtype=np.int64)
             score_loops.sum_scores(
-                fixed(frame.depth), np.zeros(W, dtype=np.uint8), scores, ending, K, ray_x, ray_y,
+                depth, points, np.zeros(W, dtype=np.uint8), scores, ending, K, ray_x, ray_y,
                 fixed(frame.T_wc), self.voxel_size, origin, room,
                 space.room("keys", threads, rows, W), space.room("table", threads, table),
                 space.room("table_row", threads, table, dtype=np.int32),
@@ -236,11 +281,19 @@ class Aggregator:
         return ObservedScores(keys, pixels, row, sums, bounds, K)
 
 
-def _rays(frame: Frame) -> tuple[Float64, Float64]:
-    """Return (u - cx) / fx of each column and (v - cy) / fy of each row."""
-    (H, W), camera = frame.shape, frame.intrinsics
-    u, v = np.arange(W, dtype=np.float64), np.arange(H, dtype=np.float64)
-    return (u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy
+def _by_rows(frame: Frame, columns: int) -> tuple[Float32, Float32, tuple[Float64, Float64]]:
+    """Return depth (H, W), points (H, W, 3) and the rays of an image, which has no points.
+
+    The points of a scan come as rows of so many columns, the last one filled up by points without depth.
+    """
+    if frame.points is None:
+        return fixed(frame.depth), fixed(np.zeros((0, 0, 3), np.float32)), frame.rays
+    H = -(-frame.depth.size // columns)
+    depth, points = np.zeros(H * columns, np.float32), np.zeros((H * columns, 3), np.float32)
+    depth[: frame.depth.size] = frame.depth.reshape(-1)
+    points[: frame.depth.size] = frame.points.reshape(-1, 3)
+    rows = fixed(depth.reshape(H, columns)), fixed(points.reshape(H, columns, 3))
+    return *rows, (np.zeros(columns), np.zeros(H))
 
 
 def _offsets(spread: Int64) -> tuple[Int64, Int64]:

@@ -1,4 +1,4 @@
-"""Voxels from the pixels of a frame: back-projection, voxel index, and one evidence vector a voxel.
+"""Voxels from the pixels or points of a frame: back-projection, voxel index, and one evidence vector a voxel.
 
 Paper, Semantic Evidence and World-Space Association, and Persistent Voxel Evidence.
 """
@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -79,11 +79,18 @@ def check_frame(frame: Frame, num_classes: int) -> None:
 def check_depth(frame: Frame) -> None:
     """Raise DataError where the frame's depth is finite nowhere, or cannot be metres."""
     depth = frame.depth
-    step = max(1, int(np.sqrt(depth.size / CHECKED)))
+    step = max(1, depth.size // CHECKED if len(depth) == 1 else int(np.sqrt(depth.size / CHECKED)))
     some = depth[::step, ::step]
     if depth.size >= CHECKED and not np.isfinite(some).any() and not np.isfinite(depth).any():
         raise DataError(f"{frame.where('depth')}: depth is finite nowhere (NaN or inf); leave this frame out")
-    if _whole_millimetres(some[np.isfinite(some) & (some > 0)]):
+    if frame.points is not None:
+        some = np.abs(frame.points[::step, ::step])
+        if _whole_millimetres(some[np.isfinite(some) & (some > 0)]):
+            raise DataError(
+                f"{frame.where('points')}: points look like millimetres, whole numbers up to"
+                f" {np.max(some, initial=0, where=np.isfinite(some)):.0f}; divide them by 1000"
+            )
+    elif _whole_millimetres(some[np.isfinite(some) & (some > 0)]):
         raise DataError(
             f"{frame.where('depth')}: depth looks like millimetres, whole numbers up to {np.nanmax(some):.0f};"
             " divide it by 1000, or set depth_scale"
@@ -116,7 +123,7 @@ def observe(frame: Frame, voxel_size: float, num_classes: int, pixels: Mask | No
 def back_project(frame: Frame, pixels: Mask | None = None) -> Float64:
     """Return world coordinates (3, n), metres, of the frame's valid pixels, or of some of them (H, W), in row order.
 
-    x_w = T_wc d ((u - cx) / fx, (v - cy) / fy, 1).
+    x_w = T_wc d ((u - cx) / fx, (v - cy) / fy, 1), of a scan T_wc p.
 
     The order of operations is the protocol's, so that every backend decides alike at a voxel's face.
     """
@@ -133,15 +140,22 @@ def pixels_held(frame: Frame, pixels: Mask, voxel_size: float, holds: Callable[[
 
 def _points(frame: Frame, pixels: Mask) -> Iterator[Float64]:
     """Yield world coordinates (3, n) of some pixels, of a few rows at a time: a large frame would take much memory."""
+    if frame.points is not None:
+        yield in_world(frame.points[pixels].T.astype(np.float64), frame.T_wc)
+        return
     H, W = frame.shape
-    K, R, t = frame.intrinsics, frame.T_wc[:3, :3], frame.T_wc[:3, 3]
-    across, down = (np.arange(W) - K.cx) / K.fx, (np.arange(H) - K.cy) / K.fy
+    across, down = frame.rays
     step = max(1, FEW // W)
     for rows in (slice(first, first + step) for first in range(0, H, step)):
         row, column = np.nonzero(pixels[rows])
         z = frame.depth[rows][row, column].astype(np.float64)
-        x, y = across[column] * z, down[rows][row] * z
-        yield np.stack([((R[i, 0] * x + R[i, 1] * y) + R[i, 2] * z) + t[i] for i in range(3)])
+        yield in_world((across[column] * z, down[rows][row] * z, z), frame.T_wc)
+
+
+def in_world(points: Sequence[Float64] | Float64, T_wc: Float64) -> Float64:
+    """Return world coordinates (3, n) of points in the sensor's (3, n): ((R0 x + R1 y) + R2 z) + t, in this order."""
+    (x, y, z), R, t = points, T_wc[:3, :3], T_wc[:3, 3]
+    return np.stack([((R[i, 0] * x + R[i, 1] * y) + R[i, 2] * z) + t[i] for i in range(3)])
 
 
 def voxel_index(points: Float64, voxel_size: float, frame: Frame) -> Int64:

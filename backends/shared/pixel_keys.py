@@ -1,4 +1,4 @@
-"""Compiled loops from the pixels of a row to packed voxel keys."""
+"""Compiled loops from the pixels of a row, or the points of a scan, to packed voxel keys."""
 
 from __future__ import annotations
 
@@ -12,7 +12,8 @@ from numba.extending import intrinsic
 
 from semstab.backends.shared.keys import HALF
 from semstab.core.compiled import serial
-from semstab.core.types import Float64
+from semstab.core.types import Float64, Int64, Mask
+from semstab.data.frames import Frame
 
 Floats = npt.NDArray[np.floating]
 
@@ -37,7 +38,6 @@ def exact_keys_of_row(depth, labels, ray_x, ray_y, T, size, ox, oy, oz, ignore, 
     r00, r01, r02, t0 = T[0, 0], T[0, 1], T[0, 2], T[0, 3]
     r10, r11, r12, t1 = T[1, 0], T[1, 1], T[1, 2], T[1, 3]
     r20, r21, r22, t2 = T[2, 0], T[2, 1], T[2, 2], T[2, 3]
-    low, high = -float(HALF), float(HALF - 1)
     lost = 0
     for u in range(depth.shape[0]):
         d = np.float64(depth[u])
@@ -48,22 +48,86 @@ def exact_keys_of_row(depth, labels, ray_x, ray_y, T, size, ox, oy, oz, ignore, 
         a = np.floor(in_voxels(r00, r01, r02, t0, x, y, d, size)) - ox
         b = np.floor(in_voxels(r10, r11, r12, t1, x, y, d, size)) - oy
         c = np.floor(in_voxels(r20, r21, r22, t2, x, y, d, size)) - oz
-        near = (a >= low) & (a <= high) & (b >= low) & (b <= high) & (c >= low) & (c <= high)
-        lost |= 1 if ok & (not near) else 0
-        good = ok & near
-        i = np.int64(np.int32(a if good else 0.0)) + HALF
-        j = np.int64(np.int32(b if good else 0.0)) + HALF
-        k = np.int64(np.int32(c if good else 0.0)) + HALF
-        out[u] = ((i << 42) | (j << 21) | k) if good else -1
+        key = packed_near(a, b, c)
+        lost |= 1 if ok & (key < 0) else 0
+        out[u] = key if ok else -1
     return lost
 
 
 @serial
-def drawn_pixels(depth, wanted, camera, T, size, odd, one_in):
-    """Return the wanted pixels (H, W) that may fall into a voxel of the sample: all that do, and those close to a face.
+def exact_keys_of_points(points, depth, labels, T, size, ox, oy, oz, ignore, out):
+    """Return packed keys of points (n, 3) of a scan, as `exact_keys_of_row` of pixels; where depth is 0 there is none.
+
+    Returns 1 where one is out of reach, else 0.
+    """
+    r00, r01, r02, t0 = T[0, 0], T[0, 1], T[0, 2], T[0, 3]
+    r10, r11, r12, t1 = T[1, 0], T[1, 1], T[1, 2], T[1, 3]
+    r20, r21, r22, t2 = T[2, 0], T[2, 1], T[2, 2], T[2, 3]
+    lost = 0
+    for u in range(depth.shape[0]):
+        ok = (depth[u] > 0.0) & (depth[u] < np.inf) & (labels[u] != ignore)
+        x = np.float64(points[u, 0]) if ok else 0.0
+        y = np.float64(points[u, 1]) if ok else 0.0
+        z = np.float64(points[u, 2]) if ok else 0.0
+        a = np.floor(in_voxels(r00, r01, r02, t0, x, y, z, size)) - ox
+        b = np.floor(in_voxels(r10, r11, r12, t1, x, y, z, size)) - oy
+        c = np.floor(in_voxels(r20, r21, r22, t2, x, y, z, size)) - oz
+        key = packed_near(a, b, c)
+        lost |= 1 if ok & (key < 0) else 0
+        out[u] = key if ok else -1
+    return lost
+
+
+@serial
+def packed_near(a, b, c):
+    """Return the packed key of a voxel, whole numbers from the origin; -1 where it is out of reach."""
+    low, high = -float(HALF), float(HALF - 1)
+    near = (a >= low) & (a <= high) & (b >= low) & (b <= high) & (c >= low) & (c <= high)
+    i = np.int64(np.int32(a if near else 0.0)) + HALF
+    j = np.int64(np.int32(b if near else 0.0)) + HALF
+    k = np.int64(np.int32(c if near else 0.0)) + HALF
+    return ((i << 42) | (j << 21) | k) if near else np.int64(-1)
+
+
+def drawn_of(frame: Frame, size: float, odd: Int64, one_in: int) -> Mask:
+    """Return the valid pixels (H, W) that may fall into a voxel of the sample: all that do, and those close to a face.
 
     A filter for the numpy reference, which decides on the pixels that are left by itself.
     """
+    pose = np.ascontiguousarray(frame.T_wc)
+    if frame.points is not None:
+        drawn: Mask = drawn_points(frame.points, frame.valid, pose, size, odd, one_in)
+    else:
+        K = frame.intrinsics
+        drawn = drawn_pixels(frame.depth, frame.valid, (K.fx, K.fy, K.cx, K.cy), pose, size, odd, one_in)
+    return drawn
+
+
+@serial
+def drawn_points(points, wanted, T, size, odd, one_in):
+    """Return the wanted points (H, W), of (H, W, 3), that may fall into a voxel of the sample, see `drawn_of`."""
+    out = np.zeros(wanted.shape, dtype=np.bool_)
+    for v in range(wanted.shape[0]):
+        for u in range(wanted.shape[1]):
+            x, y, z = np.float64(points[v, u, 0]), np.float64(points[v, u, 1]), np.float64(points[v, u, 2])
+            out[v, u] = wanted[v, u] and _may_be_drawn(x, y, z, T, size, odd, one_in)
+    return out
+
+
+@serial
+def _may_be_drawn(x, y, z, T, size, odd, one_in):
+    mixed, near = np.int64(0), False
+    for axis in range(3):
+        q = in_voxels(T[axis, 0], T[axis, 1], T[axis, 2], T[axis, 3], x, y, z, size)
+        low = np.floor(q)
+        near |= not (1e-6 < q - low < 1 - 1e-6 and abs(q) < FACE)
+        mixed += np.int64(low) * odd[axis] if abs(q) < FACE else 0
+    return near or ((mixed >> 40) & (one_in - 1)) == 0
+
+
+@serial
+def drawn_pixels(depth, wanted, camera, T, size, odd, one_in):
+    """Return the wanted pixels (H, W) that may fall into a voxel of the sample, see `drawn_of`."""
     fx, fy, cx, cy = camera
     out = np.zeros(depth.shape, dtype=np.bool_)
     for v in range(depth.shape[0]):
@@ -72,13 +136,7 @@ def drawn_pixels(depth, wanted, camera, T, size, odd, one_in):
             if not wanted[v, u]:
                 continue
             d = np.float64(depth[v, u])
-            x, y, mixed, near = (u - cx) / fx * d, ray_y * d, np.int64(0), False
-            for axis in range(3):
-                q = in_voxels(T[axis, 0], T[axis, 1], T[axis, 2], T[axis, 3], x, y, d, size)
-                low = np.floor(q)
-                near |= not (1e-6 < q - low < 1 - 1e-6 and abs(q) < FACE)
-                mixed += np.int64(low) * odd[axis] if abs(q) < FACE else 0
-            out[v, u] = near or ((mixed >> 40) & (one_in - 1)) == 0
+            out[v, u] = _may_be_drawn((u - cx) / fx * d, ray_y * d, d, T, size, odd, one_in)
     return out
 
 

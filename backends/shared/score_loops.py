@@ -12,7 +12,7 @@ from numba.core import cgutils, types
 from numba.extending import intrinsic
 
 from semstab.backends.shared.keys import PARTITIONS, mix, partition_of
-from semstab.backends.shared.pixel_keys import exact_keys_of_row
+from semstab.backends.shared.pixel_keys import exact_keys_of_points, exact_keys_of_row
 from semstab.backends.shared.tile_loops import runs_of_eight
 from semstab.core.compiled import parallel, serial
 
@@ -190,13 +190,14 @@ SHIFT = np.uint64(64 - TABLE_BITS)
 
 @parallel
 def sum_scores(
-    depth, labels, scores, ending, K, ray_x, ray_y, T, size, origin, room, row_keys,
+    depth, points, labels, scores, ending, K, ray_x, ray_y, T, size, origin, room, row_keys,
     tables, table_rows, stretches, scales, key, count, sums, entries, lost, spread,
 ):  # fmt: skip
     """Sum the scores of each voxel's pixels, each scaled to sum 1, band by band; some voxels come twice.
 
     If a band has more than `room` of them, its number in `entries` is -1, and its rest is left undone.
 
+    - `points`: (H, W, 3) of a scan, for which rays do not count; (0, 0, 3) of an image
     - `labels`: (W,) 0 wherever there is depth: scores have no ignore id
     - `scores`: (H * W * K,), see `vectors`
     - `ending`: the last scores of at least a tile's row, and room for as many: where reading goes beyond the image
@@ -213,7 +214,11 @@ def sum_scores(
         keys, table = row_keys[thread], tables[thread]
         first, last = band * ROWS, min(H, (band + 1) * ROWS)
         for v in range(first, last):
-            lost[band] |= exact_keys_of_row(depth[v], labels, ray_x, ray_y[v], T, size, ox, oy, oz, 1, keys[v - first])
+            own = keys[v - first]
+            if points.shape[0]:
+                lost[band] |= exact_keys_of_points(points[v], depth[v], labels, T, size, ox, oy, oz, 1, own)
+            else:
+                lost[band] |= exact_keys_of_row(depth[v], labels, ray_x, ray_y[v], T, size, ox, oy, oz, 1, own)
         table[:] = -1
         own_key, own_count = key[band * room : (band + 1) * room], count[band * room : (band + 1) * room]
         own_sums = sums[band * room * stride : (band + 1) * room * stride]

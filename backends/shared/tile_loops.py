@@ -1,4 +1,4 @@
-"""Compiled loops from the labels of a frame to its observations, by tiles of the image.
+"""Compiled loops from the labels of a frame to its observations, by tiles of the image, or stretches of a scan.
 
 A pixel is one word: its voxel, counted from 2^15 below the camera's along each axis, and its label, 16 bits each; -1
 where it does not count. Pixels become runs of equal words along rows, runs of a tile entries in a small table that
@@ -18,7 +18,7 @@ from numba.core import cgutils, types
 from numba.extending import intrinsic
 
 from semstab.backends.shared.keys import HALF, PARTITIONS, partition_of
-from semstab.backends.shared.pixel_keys import bits_of, exact_keys_of_row, touch
+from semstab.backends.shared.pixel_keys import bits_of, exact_keys_of_points, exact_keys_of_row, touch
 from semstab.core.compiled import compiled, parallel, serial
 
 # Runs of equal words, eight at a time, for compiled loops; no branch guesses where a run ends.
@@ -94,6 +94,9 @@ FROM = 0x40F0 << 48
 ROWS, COLUMNS = 32, 128
 """Pixels of a tile."""
 
+POINTS = 1 << 14
+"""Points of a band of a scan."""
+
 TABLE_BITS = 11
 DIGIT_BITS = 10
 
@@ -146,10 +149,18 @@ def _words_of_stretch(
     ):
         ox, oy, oz = float(origin[0]), float(origin[1]), float(origin[2])
         lost = exact_keys_of_row(depth, labels, ray_x, ray_y, T, size, ox, oy, oz, ignore, keys)
-        for u in range(depth.shape[0]):
-            i, j, k = _from_corner(keys[u], corner)
-            lost |= (keys[u] >= 0) & (((i | j | k) >> 16) != 0)
-            out[u] = ((i << 48) | (j << 32) | (k << 16) | np.int64(labels[u])) if keys[u] >= 0 else -1
+        lost |= _words_of_keys(keys, labels, corner, out)
+    return lost
+
+
+@serial
+def _words_of_keys(keys, labels, corner, out):
+    """Write the words of packed keys and labels; return whether one is out of the reach of words."""
+    lost = 0
+    for u in range(labels.shape[0]):
+        i, j, k = _from_corner(keys[u], corner)
+        lost |= (keys[u] >= 0) & (((i | j | k) >> 16) != 0)
+        out[u] = ((i << 48) | (j << 32) | (k << 16) | np.int64(labels[u])) if keys[u] >= 0 else -1
     return lost
 
 
@@ -242,6 +253,40 @@ def find_words(
                 if columns.shape[0]:
                     _keep_columns(own, columns, corner)
                 n = _enter_runs(own, run_word, run_end, table, table_count, own_word, own_count, n)
+        n = _flush(table, table_count, own_word, own_count, n)
+        entries[band] = _describe(
+            own_word, own_count, n, corner, partition[band * room : (band + 1) * room], spread[band], low[band],
+            high[band],
+        )  # fmt: skip
+
+
+@parallel
+def find_words_of_points(
+    points, depth, labels, T, size, origin, corner, columns, ignore, room, stretches, tables, table_counts, word, count,
+    partition, entries, lost, spread, low, high,
+):  # fmt: skip
+    """Find the entries of bands of `POINTS` points of a scan (N, 3), as `find_words` finds those of a band of rows."""
+    ox, oy, oz = float(origin[0]), float(origin[1]), float(origin[2])
+    for band in nb.prange(entries.shape[0]):
+        thread = nb.get_thread_id()
+        table, table_count = tables[thread], table_counts[thread]
+        words, keys = stretches[thread, 0], stretches[thread, 1]
+        run_word, run_end = stretches[thread, 2], stretches[thread, 3]
+        own_word = word[band * room : (band + 1) * room]
+        own_count = count[band * room : (band + 1) * room]
+        n = np.int64(0)
+        end = min(depth.shape[0], (band + 1) * POINTS)
+        for first in range(band * POINTS, end, COLUMNS):
+            to = min(first + COLUMNS, end)
+            own = words[: -(-(to - first) // LANES) * LANES + 1]
+            own[to - first :] = -1
+            lost[band] |= exact_keys_of_points(
+                points[first:to], depth[first:to], labels[first:to], T, size, ox, oy, oz, ignore, keys
+            )
+            lost[band] |= _words_of_keys(keys, labels[first:to], corner, own)
+            if columns.shape[0]:
+                _keep_columns(own, columns, corner)
+            n = _enter_runs(own, run_word, run_end, table, table_count, own_word, own_count, n)
         n = _flush(table, table_count, own_word, own_count, n)
         entries[band] = _describe(
             own_word, own_count, n, corner, partition[band * room : (band + 1) * room], spread[band], low[band],

@@ -13,7 +13,7 @@ import numpy.typing as npt
 
 from semstab.backends import create
 from semstab.check.reprojection import Pair, Sample, View
-from semstab.core.types import Float64, Int64, Mask
+from semstab.core.types import Float64, Int32, Int64, Mask
 from semstab.data.frames import Frame
 from semstab.data.labels import IGNORE_8BIT
 
@@ -224,10 +224,14 @@ def persistence(views: Sequence[View], coverage: Coverage, voxel_size: float, pi
     backend = create("numba", voxel_size=voxel_size, num_classes=2)
     for view in views:
         backend.integrate(_without_labels(view, pixel_stride))
-    op = backend.table().op
+    return distribution(backend.table().op, voxel_size, coverage.stays(voxel_size))
+
+
+def distribution(op: Int32, voxel_size: float, stays: float) -> Persistence:
+    """Return the distribution of OP (n,) over voxels of that size, in which that share of the points stays."""
     edges = [0, 1, 2, 5, np.inf]
     shares = tuple(_mean((low < op) & (op <= high)) for low, high in itertools.pairwise(edges))
-    return Persistence(voxel_size, len(op), _mean(op), shares, coverage.stays(voxel_size))
+    return Persistence(voxel_size, len(op), _mean(op), shares, stays)
 
 
 def fused_stride(size: tuple[int, int], pixel_stride: int) -> int:

@@ -60,6 +60,9 @@ def print_check(checked: SceneCheck, console: Console, *, verbose: bool = False)
 
 def _heading(checked: SceneCheck) -> str:
     depth, (width, height) = checked.depth, checked.size
+    if checked.of_scans:
+        text = f"{checked.scene}    {checked.selected} of {checked.frames} scans of {width:,} points"
+        return f"{text}, {depth.p5:.2g} to {depth.p95:.2g} m" if depth.valid else text
     text = f"{checked.scene}    {checked.selected} of {checked.frames} frames {width}x{height}"
     text += f", depth in {depth.valid:.0%} of the pixels"
     if depth.valid:
@@ -74,6 +77,8 @@ def _tables(checked: SceneCheck) -> dict[str, tuple[str, Table]]:
         tables["overlap"] = "overlap of frames, by their distance in the sequence", _overlap_table(checked)
     if verdict.fits:
         title = f"depth of {verdict.frames} frames reprojected into each other, {verdict.pairs} pairs"
+        if checked.of_scans:
+            title = f"points of {verdict.frames} scans, and the nearest ones of the others, {verdict.pairs} pairs"
         tables["conventions"] = title, _convention_table(checked)
     if checked.persistence:
         every = f", every {_ordinal(checked.fused_stride)} pixel of each axis" if checked.fused_stride > 1 else ""
@@ -149,7 +154,13 @@ def _advice(checked: SceneCheck, *, verbose: bool) -> Iterator[str]:
             f"OP       is that of {checked.fused_frames} frames (at most {FUSED_FRAMES} are fused here); all"
             f" {checked.selected} see a voxel about {times:.2g} times as often"
         )
-    if checked.noise is not None:
+    if checked.noise is not None and checked.of_scans:
+        between, within, apart = map(_metres, (checked.noise.between, checked.noise.within, checked.noise.footprint))
+        yield (
+            f"points   lie {between} from the nearest of another scan, {within} from that of their own; rays are"
+            f" {apart} apart"
+        )
+    elif checked.noise is not None:
         yield (
             f"depth    errs by {_metres(checked.noise.between)} between frames, by {_metres(checked.noise.within)}"
             f" within one; a pixel covers {_metres(checked.noise.footprint)}"
@@ -159,7 +170,7 @@ def _advice(checked: SceneCheck, *, verbose: bool) -> Iterator[str]:
         return
     if suggestion.voxel_size is not None:
         yield f"voxels   --voxel-size {suggestion.voxel_size:g}: {suggestion.voxel_size_reason}"
-        if verbose:
+        if verbose and not checked.of_scans:
             yield f"pixels   --pixel-stride {suggestion.pixel_stride}: {suggestion.pixel_stride_reason}"
     stride = suggestion.frame_stride
     yield f"frames   {f'--frames ::{stride}' if stride > 1 else 'all'}: {suggestion.frame_stride_reason}"

@@ -30,6 +30,7 @@ from semstab.check.intrinsics import with_intrinsics
 from semstab.check.labels import LabelFindings, check_labels
 from semstab.check.registration import assess_surface, match_images, notes
 from semstab.check.reprojection import Sample, View, clusters, label_source, pairs_within, reader
+from semstab.check.scans import ScanCoverage, ScanSample, assess_scans, quick_sample_of_scans
 from semstab.check.timing import with_lateness
 from semstab.config import Config
 from semstab.core.arrays import evenly
@@ -140,10 +141,11 @@ def _counted_from_one(space: LabelSpace, ids: Counter[int]) -> str:
 SCHEMA = 2
 """Version of the file that --json writes."""
 
-CLUSTERS = 4
+CLUSTERS, SCAN_CLUSTERS = 4, 2
 POINTS = 8000
 LEAST_POINTS_A_VIEW, MOST_POINTS_A_VIEW = 50, 500
-"""The number of points that are reprojected, from neighbouring frames at so many positions of the sequence."""
+"""The number of points that are reprojected, from neighbouring frames at so many positions of the sequence; and the
+number of positions of a sequence of scans."""
 
 QUICK_POINTS = 2400
 CONFIRMING_CLUSTERS = 3
@@ -209,6 +211,11 @@ class SceneCheck:
     sources: tuple[str, ...] = ()
 
     @property
+    def of_scans(self) -> bool:
+        """Return whether it is a scene of scans: their size is (points, 1)."""
+        return self.size[1] == 1
+
+    @property
     def problems(self) -> tuple[str, ...]:
         """Return what makes the scene unsound, one line each."""
         return self.problems_of_geometry + self.problems_of_labels
@@ -250,6 +257,8 @@ def check_scene(scene: Scene, config: Config) -> SceneCheck:
     models, begun = _whole(scene, config)
     indices = frame_indices(scene, config, models)
     first = models[0] if models else label_source(scene)
+    if scene.of_scans:
+        return _check_scans(scene, config, models, begun, indices, first)
     inspection = Inspection(
         scene, indices, first, clusters(len(indices), CLUSTERS), POINTS, fused=FUSED_FRAMES, with_color=True
     )
@@ -267,7 +276,7 @@ def check_scene(scene: Scene, config: Config) -> SceneCheck:
         depth_from=scene.depth_from,
         placed=scene.placed,
         sources=scene.sources,
-        labels=tuple(_labels(scene, name, indices, config, inspection) for name in models),
+        labels=tuple(_labels(scene, name, indices, config, inspection.tally) for name in models),
         label_findings=findings,
         notes=(
             *verdict.remarks,
@@ -277,6 +286,48 @@ def check_scene(scene: Scene, config: Config) -> SceneCheck:
         ),
     )
     return checked if verdict.state == "unsound" else _with_coverage(checked, inspection, sample, config)
+
+
+def _check_scans(
+    scene: Scene, config: Config, models: Sequence[str], begun: Sequence[str], indices: Sequence[int], first: str | None
+) -> SceneCheck:
+    """Check a scene of scans: their poses, what they share, voxels, and the ids of their labels."""
+    sample = ScanSample(scene, indices, first, clusters(len(indices), SCAN_CLUSTERS), fused=FUSED_FRAMES)
+    verdict, coverage = assess_scans(sample), ScanCoverage(sample)
+    scans = [*sample.scans.values()]
+    ranges = [scan.depth[(scan.depth > 0) & (scan.depth < np.inf)] for scan in scans]
+    p5, p50, p95 = np.percentile(np.concatenate(ranges), (5, 50, 95)) if sum(map(len, ranges)) else (np.nan,) * 3
+    valid = float(np.mean([len(own) / scan.depth.size for own, scan in zip(ranges, scans, strict=True)]))
+    tally = Tally(first or "")
+    for scan in scans if first is not None else ():
+        tally.add(scan)
+    checked = SceneCheck(
+        scene=scene.name,
+        frames=len(scene),
+        selected=len(indices),
+        size=(int(np.median([scan.depth.size for scan in scans])), 1),
+        depth=Depth(valid, float(p5), float(p50), float(p95)),
+        motion=None,
+        verdict=verdict,
+        sources=scene.sources,
+        labels=tuple(_labels(scene, name, indices, config, tally) for name in models),
+        notes=(*verdict.remarks, *begun),
+    )
+    if verdict.state == "unsound" or not sample.pairs:
+        return checked
+    overlaps = coverage.overlaps()
+    suggestion = coverage.suggestion(overlaps, len(indices), config.frames.stride)
+    size = config.voxel_size
+    if not config.sets_voxel_size and suggestion.voxel_size is not None:
+        size = suggestion.voxel_size
+    return dataclasses.replace(
+        checked,
+        overlaps=tuple(overlaps),
+        noise=coverage.noise(),
+        fused_frames=len(sample.fused),
+        persistence=tuple(coverage.persistence(size * factor) for factor in VOXEL_FACTORS),
+        suggestion=suggestion,
+    )
 
 
 def _whole(scene: Scene, config: Config) -> tuple[list[str], list[str]]:
@@ -314,6 +365,8 @@ def quick_sample(
 ) -> tuple[Verdict, Sample | None]:
     """Return the verdict of `quick_check`, and the frames that it looked at; None where there are not two."""
     verdict, sample = Verdict("unclear", "it takes two frames to tell whether depth and poses agree"), None
+    if scene.of_scans:
+        return assess_scans(quick_sample_of_scans(scene, indices)), None
     for count in (1, CONFIRMING_CLUSTERS):
         inspection = Inspection(
             scene, indices, None, clusters(len(indices), count), count * QUICK_POINTS, passing_over=True
@@ -482,9 +535,8 @@ def _motion(sample: Sample) -> Motion | None:
     return Motion((float(shifts.min()), float(shifts.max())), (float(turns.min()), float(turns.max())))
 
 
-def _labels(scene: Scene, model: str, indices: Sequence[int], config: Config, inspection: Inspection) -> Histogram:
+def _labels(scene: Scene, model: str, indices: Sequence[int], config: Config, tally: Tally) -> Histogram:
     """Return the labels of a model: of the frames that were read already, or of a few read for it."""
-    tally = inspection.tally
     if model != tally.model:
         tally = Tally(model)
         chosen = [indices[position] for position in evenly(len(indices), LABELLED_FRAMES)]

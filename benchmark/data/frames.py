@@ -1,8 +1,9 @@
-"""One posed image with depth and labels: what every dataset yields and every backend integrates."""
+"""One posed image with depth, or scan of points, and labels: what datasets yield and backends integrate."""
 
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -85,18 +86,31 @@ class LeftOut:
     most: float
 
 
-IMAGES = ("depth", "labels", "scores", "color", "mask", "left_out", "unlabelled")
+IMAGES = ("depth", "points", "labels", "scores", "color", "mask", "left_out", "unlabelled")
+
+OF_VECTORS = ("points", "scores", "color")
+"""The images that have a vector in each pixel."""
+
+NOT_GIVEN: Any = None
+
+SOME_POINTS = 1 << 13
+"""Points of a scan, about, that tell how far apart its rays are."""
 
 
 @dataclass(frozen=True, eq=False)
 class Frame:
     """One observation of the scene, validated where it is made; its arrays are read-only views.
 
+    It is an image with depth and intrinsics, or a scan of points. A scan of N points is one row: H = 1, W = N, and its
+    arrays may be given without that row, as (N, 3), (N,) and (N, K).
+
     Attributes:
         index: Number in the sequence.
-        depth: (H, W) float32, metres along the optical axis (planar z); 0, negative, NaN and inf are invalid.
-        intrinsics: Intrinsics of the depth image; or its 3x3 camera matrix.
-        T_wc: (4, 4) or (3, 4) float64 camera-to-world, metres; camera axes x right, y down, z forward (OpenCV).
+        depth: (H, W) float32, metres along the optical axis (planar z); 0, negative, NaN and inf are invalid. Of a
+            scan it is each point's distance from the sensor, computed where it is not given.
+        intrinsics: Intrinsics of the depth image; or its 3x3 camera matrix. A scan has none.
+        T_wc: (4, 4) or (3, 4) float64 camera-to-world (sensor-to-world), metres; camera axes x right, y down,
+            z forward (OpenCV), a sensor's those of its points.
         labels: (H, W) uint8 or uint16 class ids, ignore id 255 or 65535; other integers become the smaller one.
         scores: (H, W, K) float, instead of labels, non-negative; normalised per pixel where they are used.
         color: (H, W, 3) uint8 RGB, optional.
@@ -106,6 +120,8 @@ class Frame:
         scores_left_out: Part of the scores that was left out, where only the largest are used.
         timestamp: Seconds, optional.
         files: File that each field came from ('depth', 'pose', 'labels', ...); error messages name it.
+        points: (H, W, 3) or (N, 3) float32 sensor coordinates, metres, instead of depth and intrinsics; those that are
+            not finite, or at the sensor itself, are invalid.
 
     Raises:
         DataError: If shapes disagree, the pose is not rigid or not finite, or a type is wrong.
@@ -116,12 +132,16 @@ class Frame:
         >>> frame = semstab.Frame(0, depth, camera, np.eye(4), labels=labels)
         >>> frame.shape
         (48, 64)
+        >>> points = np.random.default_rng(0).uniform(1, 20, (1000, 3)).astype(np.float32)
+        >>> scan = semstab.Frame(0, points=points, labels=np.zeros(1000, np.uint8), T_wc=np.eye(4))
+        >>> scan.shape
+        (1, 1000)
     """
 
     index: int
-    depth: Float32
-    intrinsics: Intrinsics
-    T_wc: Float64
+    depth: Float32 = NOT_GIVEN
+    intrinsics: Intrinsics = NOT_GIVEN
+    T_wc: Float64 = NOT_GIVEN
     labels: UInt8 | UInt16 | None = None
     scores: npt.NDArray[np.floating[Any]] | None = None
     color: UInt8 | None = None
@@ -131,10 +151,14 @@ class Frame:
     scores_left_out: LeftOut | None = None
     timestamp: float | None = None
     files: Mapping[str, str] = field(default_factory=dict)
+    points: Float32 | None = None
 
     def __post_init__(self) -> None:
+        if self.points is not None:
+            self._set_scan(np.asarray(self.points))
         self._set("depth", self._checked_depth())
-        object.__setattr__(self, "intrinsics", _intrinsics(self.intrinsics, self.where("intrinsics")))
+        if self.points is None:
+            object.__setattr__(self, "intrinsics", _intrinsics(self.intrinsics, self.where("intrinsics")))
         self._set("T_wc", self._checked_pose())
         if (self.labels is None) == (self.scores is None):
             raise DataError(f"{self.where('labels')}: give labels or scores, one of the two")
@@ -147,6 +171,35 @@ class Frame:
         for name in ("mask", "left_out", "unlabelled"):
             if (marked := getattr(self, name)) is not None:
                 self._set(name, self._checked_mask(name, np.asarray(marked)))
+
+    @property
+    def is_scan(self) -> bool:
+        """Whether it is a scan of points, and not an image."""
+        return self.points is not None
+
+    @cached_property
+    def rays(self) -> tuple[Float64, Float64]:
+        """(u - cx) / fx of each column (W,), (v - cy) / fy of each row (H,); of a scan, which has none, 0."""
+        H, W = self.shape
+        if self.is_scan:
+            return np.zeros(W), np.zeros(H)
+        K = self.intrinsics
+        u, v = np.arange(W, dtype=np.float64), np.arange(H, dtype=np.float64)
+        return (u - K.cx) / K.fx, (v - K.cy) / K.fy
+
+    @cached_property
+    def ray_angle(self) -> float:
+        """Radians between neighbouring rays: of pixels in the middle of an image; of a scan on average."""
+        if self.points is None:
+            return 1.0 / math.sqrt(self.intrinsics.fx * self.intrinsics.fy)
+        there = np.flatnonzero((self.depth > 0) & (self.depth < np.inf))
+        if not len(there):
+            return math.nan
+        x, y, z = self.points.reshape(-1, 3)[there[:: max(1, len(there) // SOME_POINTS)]].T.astype(np.float64)
+        degree = np.degrees([np.arctan2(y, x), np.arcsin(np.clip(z / np.sqrt(x * x + y * y + z * z), -1, 1))])
+        cells = np.unique(np.floor(degree / 2).astype(np.int64), axis=1)  # those of 2 degrees that have points
+        solid = np.cos(np.radians(2 * cells[1] + 1)).sum() * math.radians(2) ** 2
+        return math.sqrt(solid / len(there))
 
     @cached_property
     def valid(self) -> Mask:
@@ -203,12 +256,25 @@ class Frame:
         return {name: image for name, image in images.items() if image is not None}
 
     def every(self, stride: int) -> Frame:
-        """Return the frame with every stride-th pixel of each axis, from pixel (0, 0), with its intrinsics."""
+        """Return the frame with every stride-th pixel of each axis, from pixel (0, 0), with its intrinsics.
+
+        Of a scan it is every stride-th point.
+        """
         if stride == 1:
             return self
         pick = (slice(None, None, stride), slice(None, None, stride))
         images: dict[str, Any] = {name: image[pick] for name, image in self._images.items()}
+        if self.points is not None:
+            return dataclasses.replace(self, **images)
         return dataclasses.replace(self, intrinsics=self.intrinsics.every(stride), **images)
+
+    def within(self, side: int) -> Frame:
+        """Return the frame by the least stride that leaves at most `side` pixels along each axis.
+
+        A scan keeps at most as many points as a square image of that side has pixels.
+        """
+        H, W = self.shape
+        return self.every(max(1, -(-H * W // side**2) if self.is_scan else -(-max(H, W) // side)))
 
     def where(self, what: str) -> str:
         """Return the name of a field in an error message: its file where it has one, else the frame and the field."""
@@ -219,7 +285,30 @@ class Frame:
         value.setflags(write=False)
         object.__setattr__(self, name, value)
 
+    def _set_scan(self, points: npt.NDArray[Any]) -> None:
+        """Set the points, and what belongs to them, as images of one row where they have none."""
+        where = self.where("points")
+        if self.intrinsics is not None:
+            raise DataError(f"{where}: give depth and intrinsics, or points; a scan has no intrinsics")
+        if points.ndim not in (2, 3) or points.shape[-1] != 3 or points.size == 0:
+            raise DataError(f"{where}: points must be (N, 3), got shape {points.shape}")
+        if not np.issubdtype(points.dtype, np.floating):
+            raise DataError(f"{where}: points are {points.dtype}; convert them to metres (float32)")
+        points = np.ascontiguousarray(points[None] if points.ndim == 2 else points, dtype=np.float32)
+        if len(points) == 1:
+            for name in IMAGES:
+                if (given := getattr(self, name)) is not None and np.ndim(given) == 1 + (name in OF_VECTORS):
+                    object.__setattr__(self, name, np.asarray(given)[None])
+        if self.depth is None:
+            x, y, z = np.moveaxis(points.astype(np.float64), -1, 0)
+            object.__setattr__(self, "depth", np.sqrt(x * x + y * y + z * z).astype(np.float32))
+        self._set("points", points)
+        if self.depth.shape != points.shape[:2]:
+            raise DataError(f"{where}: {points.shape[0] * points.shape[1]} points, but depth of {self.depth.shape}")
+
     def _checked_depth(self) -> Float32:
+        if self.depth is None:
+            raise DataError(f"{self.where('depth')}: give depth and intrinsics, or points")
         depth = np.asarray(self.depth)
         if depth.ndim != 2 or depth.size == 0:
             raise DataError(f"{self.where('depth')}: depth must be (H, W), got shape {depth.shape}")
@@ -231,6 +320,8 @@ class Frame:
 
     def _checked_pose(self) -> Float64:
         where = self.where("pose")
+        if self.T_wc is None:
+            raise DataError(f"{where}: there is no pose; give T_wc, camera-to-world")
         T = np.array(self.T_wc, dtype=np.float64)
         if T.shape == (3, 4):
             T = np.vstack([T, [0.0, 0.0, 0.0, 1.0]])
@@ -293,6 +384,9 @@ class Frame:
 
     def _same_size(self, name: str, shape: tuple[int, ...]) -> None:
         H, W = self.shape
+        if shape != (H, W) and self.is_scan:
+            number, points = math.prod(shape), f"{H * W} points" if H == 1 else f"{W}x{H} points"
+            raise DataError(f"{self.where(name)}: {number} {name} but {points}; give one for each point")
         if shape != (H, W):
             size = "x".join(str(n) for n in shape[::-1])
             raise DataError(f"{self.where(name)}: {name} are {size} but depth is {W}x{H}; bring them to one size")

@@ -29,6 +29,7 @@ from semstab.engine.tiles import tiles_met
 from semstab.errors import ConfigError
 from semstab.metrics import FrameQualityMeter, VideoMeter, flicker_percent
 from semstab.metrics.image_space import ImageSpaceMeter
+from semstab.pixels.scans import pictured
 from semstab.statistics import Sampler
 from semstab.statistics.observations import CellObservations
 from semstab.statistics.voxel_sizes import SizeSample
@@ -208,7 +209,8 @@ class Stream:
         self._previous: Frame | None = None
         base = any(live.work.image_space and live.work.measures_images for live in maps)
         series = any(live.work.stored and live.work.measures_images for live in maps)  # theirs hold flicker
-        self.image_space = ImageSpaceMeter() if base or series else None
+        voxel_size = maps[0].work.config.voxel_size
+        self.image_space = ImageSpaceMeter(voxel_size=voxel_size) if base or series else None
         quality = base and maps[0].work.config.frame_quality
         self.quality = FrameQualityMeter(len(self.task.mapping.target)) if quality else None
         flow = maps[0].work.config.video_measures if base else None
@@ -244,7 +246,12 @@ class Stream:
         """Return flicker and stability in image coordinates with the reports of the maps: a row of each series."""
         frame, decoded, flicker, compensated = now.frame, now.fetched.item, math.nan, math.nan
         with self._watch("flicker") as lap:
-            if self._sequential and self._previous is not None and self._previous.shape == frame.shape:
+            if (
+                self._sequential
+                and self._previous is not None
+                and self._previous.shape == frame.shape
+                and not frame.is_scan
+            ):
                 flicker = flicker_percent(self._previous, frame)
         if self.image_space is not None:
             with self._watch("image space"):
@@ -257,7 +264,8 @@ class Stream:
             with self._watch("video measures"):
                 self.video.add(frame, now.truth)
         if self._estimates_up:
-            self._poses.append(frame.T_wc[:3, 1:].ravel())
+            x, y, z, centre = frame.T_wc[:3].T
+            self._poses.append(np.stack([-z, x, centre] if frame.is_scan else [y, z, centre], axis=1).ravel())
         self._previous = frame if self._sequential else None
         cut = frame.scores_left_out
         return {
@@ -314,7 +322,10 @@ def _as_set(frames: Iterable[int]) -> range | frozenset[int]:
 
 
 def _overview(task: Task, decoded: Frame) -> dict[str, Any]:
-    frame = prepare(task, decoded, -(-decoded.shape[1] // OVERVIEW_WIDTH))
     palette = np.array(task.mapping.target.colors, dtype=np.uint8)
+    if decoded.is_scan:
+        frame = prepare(task, decoded)
+        return {"frame": frame.index, "labels": pictured(frame, frame.predicted, frame.ignore_id), "palette": palette}
+    frame = prepare(task, decoded, -(-decoded.shape[1] // OVERVIEW_WIDTH))
     arrays: dict[str, Any] = {"frame": frame.index, "labels": frame.predicted, "palette": palette}
     return arrays if frame.color is None else arrays | {"color": frame.color}

@@ -34,6 +34,8 @@ MARGIN = 1.0
 def tiles_met(frame: Frame, voxel_size: float, size: int) -> Int32:
     """Return (n, 2) the tiles of that edge in voxels that the frustum between the least and the largest depth meets.
 
+    Of a scan it is the box around its points, along the sensor's axes.
+
     A tile is left out where a line separates it from the corners of the frustum, seen from above. None is left out that
     a pixel falls into.
 
@@ -43,11 +45,15 @@ def tiles_met(frame: Frame, voxel_size: float, size: int) -> Int32:
     depth = frame.depth[(frame.depth > 0) & np.isfinite(frame.depth)]
     if not depth.size:
         return np.zeros((0, 2), np.int32)
-    (H, W), camera = frame.shape, frame.intrinsics
-    u, v, d = np.meshgrid([0, W - 1], [0, H - 1], [depth.min(), depth.max()])
-    x, y = (u - camera.cx) / camera.fx * d, (v - camera.cy) / camera.fy * d
-    rays = np.stack([x, y, d], axis=-1, dtype=np.float64).reshape(-1, 3)
-    corners = ((rays @ frame.T_wc[:3, :3].T + frame.T_wc[:3, 3]) / voxel_size)[:, :2]
+    if frame.points is None:
+        across, down = (axis[[0, -1]] for axis in frame.rays)
+        x, y, d = np.meshgrid(across, down, [depth.min(), depth.max()])
+        x, y = x * d, y * d
+    else:  # the box around its points
+        points = frame.points[(frame.depth > 0) & np.isfinite(frame.depth)]
+        x, y, d = np.meshgrid(*zip(points.min(axis=0), points.max(axis=0), strict=True))
+    box = np.stack([x, y, d], axis=-1, dtype=np.float64).reshape(-1, 3)
+    corners = ((box @ frame.T_wc[:3, :3].T + frame.T_wc[:3, 3]) / voxel_size)[:, :2]
     low = np.floor((corners.min(axis=0) - MARGIN) / size)
     high = np.floor((corners.max(axis=0) + MARGIN) / size)
     if (count := float(np.prod(high - low + 1))) > MOST_TILES:

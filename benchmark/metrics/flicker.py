@@ -14,6 +14,7 @@ from semstab.data.frames import Frame
 from semstab.data.information import entropy_bits
 from semstab.data.labels import flat
 from semstab.errors import ConfigError, DataError
+from semstab.pixels.scans import dominant_before
 from semstab.pixels.warp import DEPTH_TOLERANCE, correspond
 
 
@@ -51,7 +52,7 @@ class CompensatedFlicker:
 
 
 def compensated_flicker(
-    previous: Frame, current: Frame, *, depth_tolerance: float = DEPTH_TOLERANCE
+    previous: Frame, current: Frame, *, depth_tolerance: float = DEPTH_TOLERANCE, voxel_size: float = math.nan
 ) -> CompensatedFlicker:
     """Return flicker after the previous frame's labels are warped into the current one: camera motion is not counted.
 
@@ -59,9 +60,14 @@ def compensated_flicker(
     `semstab.pixels.warp.correspond`), and the pixel that saw it was valid too. Soft scores count by their largest
     class; the frames may differ in size. Equals `flicker_percent` where camera and depth stay as they are.
 
+    Scans meet by voxels of that size, in metres: a point is compared with the label that most points of the previous
+    scan have in its voxel (see `semstab.pixels.scans.dominant_before`).
+
     Raises:
         ConfigError: If depth_tolerance is not above 0 and below 1.
     """
+    if current.is_scan or previous.is_scan:
+        return _between_scans(previous, current, voxel_size)
     from semstab.data.kernels import count_changed_at
 
     seen = correspond(current, previous, depth_tolerance=depth_tolerance).pixel
@@ -70,6 +76,17 @@ def compensated_flicker(
     return CompensatedFlicker(
         100.0 * changed / covisible if covisible else math.nan,
         covisible / valid if (valid := int(np.count_nonzero(current.valid))) else math.nan,
+    )
+
+
+def _between_scans(previous: Frame, current: Frame, voxel_size: float) -> CompensatedFlicker:
+    valid = int(np.count_nonzero(current.valid))
+    before = dominant_before(previous, current, voxel_size)
+    met = before >= 0
+    covisible = int(np.count_nonzero(met))
+    changed = int(np.count_nonzero(before[met] != current.predicted[current.valid][met]))
+    return CompensatedFlicker(
+        100.0 * changed / covisible if covisible else math.nan, covisible / valid if valid else math.nan
     )
 
 

@@ -44,22 +44,29 @@ def edge_recall(frame: Frame) -> float:
 
 
 class ImageSpaceMeter:
-    """The image-space measures of a unit's frames, taken in order; only the last one stays in memory."""
+    """The image-space measures of a unit's frames, taken in order; only the last one stays in memory.
 
-    def __init__(self, rows: npt.ArrayLike = ()) -> None:
+    Scans have none but compensated flicker, by voxels of a size in metres.
+    """
+
+    def __init__(self, rows: npt.ArrayLike = (), *, voxel_size: float = math.nan) -> None:
         self.rows = Rows(len(COLUMNS), rows)
+        self._voxel_size = voxel_size
         self._previous: Frame | None = None
         self._by_truth = [VideoConsistency(n) for n in CLIPS]
         self._by_itself = [SelfConsistency(n) for n in CLIPS]
 
     def add(self, frame: Frame, truth: Frame | None) -> float:
         """Add the next frame, and its truth in the same label space if there is any; return compensated flicker."""
-        step = -(-max(frame.shape) // SIDE)
-        sample, true = frame.every(step), None if truth is None else truth.every(step)
+        sample, true = frame.within(SIDE), None if truth is None else truth.within(SIDE)
         flicker, share = math.nan, math.nan
         if self._previous is not None:  # each pixel of the sample is looked up in the whole frame before
-            pair = compensated_flicker(self._previous, sample)
+            pair = compensated_flicker(self._previous, sample, voxel_size=self._voxel_size)
             flicker, share = pair.flicker_percent, pair.share
+        self._previous = frame
+        if frame.is_scan:
+            self.rows.append((flicker, share, *[math.nan] * (len(COLUMNS) - 2)))
+            return flicker
         by_itself = [each.add(sample.predicted, sample.valid) for each in self._by_itself]
         by_truth = [
             each.skip() if true is None else each.add(sample.predicted, sample.valid & true.valid, true.predicted)
@@ -67,7 +74,6 @@ class ImageSpaceMeter:
         ]
         recall = math.nan if len(self.rows) % EDGES_EVERY else edge_recall(sample)
         self.rows.append((flicker, share, *by_truth, *by_itself, recall))
-        self._previous = frame
         return flicker
 
     def result(self, flicker_percent: float) -> ImageSpace:

@@ -13,7 +13,7 @@ import numpy.typing as npt
 
 from semstab.backends import FusionBackend, create
 from semstab.backends.numpy_reference import ODD, in_sample
-from semstab.backends.shared.pixel_keys import drawn_pixels
+from semstab.backends.shared.pixel_keys import drawn_of
 from semstab.core.types import Float64, Int64
 from semstab.data.evidence import Evidence
 from semstab.data.frames import Frame, Intrinsics
@@ -116,7 +116,8 @@ class _Map:
         if self._sampler is not None:
             self._sampler.add(frame)
         if self._previous is not None:
-            step = compensated_flicker(self._previous, frame.every(-(-max(frame.shape) // SIDE))).flicker_percent
+            sample = frame.within(SIDE)
+            step = compensated_flicker(self._previous, sample, voxel_size=self._voxel_size).flicker_percent
             if not math.isnan(step):
                 self._flicker, self._pairs = self._flicker + step, self._pairs + 1
         self._previous = frame
@@ -132,9 +133,7 @@ class _Map:
         """Return the frame without depth where it shows voxels that are left out."""
         if self._one_in == 1:
             return frame
-        K, size = frame.intrinsics, self._voxel_size
-        pose, camera = np.ascontiguousarray(frame.T_wc), (K.fx, K.fy, K.cx, K.cy)
-        near = drawn_pixels(frame.depth, frame.valid, camera, pose, size, ODD, self._one_in)
+        near = drawn_of(frame, self._voxel_size, ODD, self._one_in)
         return dataclasses.replace(frame, depth=np.where(near, frame.depth, np.float32(0)))
 
     def state(self) -> State:

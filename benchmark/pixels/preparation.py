@@ -52,7 +52,8 @@ def perturb(frame: Frame, noise: Perturbation, scene: str) -> Frame:
     Every number depends on the seed, the scene's name, the frame's index and the pixel only: all models and backends
     see the same disturbed geometry, in whatever order frames are read and whichever are sampled.
 
-    - depth: d (1 + depth_noise n), with n drawn for each pixel; a depth that falls to 0 or below is invalid
+    - depth: d (1 + depth_noise n), with n drawn for each pixel; a depth that falls to 0 or below is invalid; of a
+      scan it is the distance from the sensor, along the point's ray
     - position: t + translation_noise n + translation_drift w, world axes
     - rotation: R exp(rotation_drift w) exp(rotation_noise n), rotation vectors in camera axes, about the camera
 
@@ -65,7 +66,11 @@ def perturb(frame: Frame, noise: Perturbation, scene: str) -> Frame:
     T = frame.T_wc.copy()
     T[:3, 3] += noise.translation_noise * n[:3] + noise.translation_drift * w[:3]
     T[:3, :3] = T[:3, :3] @ _rotation(noise.rotation_drift * w[3:]) @ _rotation(noise.rotation_noise * n[3:])
-    return dataclasses.replace(frame, depth=_noisy_depth(frame, noise, scene), T_wc=T)
+    depth = _noisy_depth(frame, noise, scene)
+    if frame.points is None or not noise.depth_noise:
+        return dataclasses.replace(frame, depth=depth, T_wc=T)
+    factor = np.divide(depth, frame.depth, out=np.ones_like(depth), where=frame.depth > 0)
+    return dataclasses.replace(frame, depth=depth, points=frame.points * factor[..., None], T_wc=T)
 
 
 def _noisy_depth(frame: Frame, noise: Perturbation, scene: str) -> Float32:

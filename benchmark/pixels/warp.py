@@ -75,12 +75,10 @@ def correspond(frame: Frame, other: Frame, *, depth_tolerance: float = DEPTH_TOL
 
     if not 0 < depth_tolerance < 1 and depth_tolerance != math.inf:
         raise ConfigError(f"depth_tolerance = {depth_tolerance:g}: use a share of the distance, above 0 and below 1")
-    H, W = frame.shape
-    K, camera = frame.intrinsics, other.intrinsics
-    rays = ((np.arange(W) - K.cx) / K.fx, (np.arange(H) - K.cy) / K.fy)
-    pixel = np.empty((H, W), dtype=np.int32)
+    camera = other.intrinsics
+    pixel = np.empty(frame.shape, dtype=np.int32)
     look_up(
-        fixed(frame.depth), rays, by_rows(motion(frame, other)), fixed(other.depth),
+        fixed(frame.depth), frame.rays, by_rows(motion(frame, other)), fixed(other.depth),
         (camera.fx, camera.fy, camera.cx, camera.cy), depth_tolerance, pixel,
     )  # fmt: skip
     return Correspondence(pixel)
@@ -122,11 +120,10 @@ def carry(belief: Float32, source: Frame, target: Frame, *, depth_tolerance: flo
     from semstab.pixels.kernels import blend
 
     H, W = target.shape
-    K, camera = target.intrinsics, source.intrinsics
-    rays = ((np.arange(W) - K.cx) / K.fx, (np.arange(H) - K.cy) / K.fy)
+    camera = source.intrinsics
     carried = np.zeros((H, W, belief.shape[2]), dtype=np.float32)
     blend(
-        fixed(target.depth), rays, by_rows(motion(target, source)), fixed(source.depth),
+        fixed(target.depth), target.rays, by_rows(motion(target, source)), fixed(source.depth),
         (camera.fx, camera.fy, camera.cx, camera.cy), depth_tolerance, np.ascontiguousarray(belief), carried,
     )  # fmt: skip
     return carried

@@ -54,11 +54,10 @@ class MapPrior(Filter):
         """Return (H, W) the row of each pixel's voxel in the evidence, -1 without depth or out of reach."""
         if not len(self._row_of_voxel):
             self._origin = np.floor(frame.T_wc[:3, 3] / self.value)
-        (H, W), K, T = frame.shape, frame.intrinsics, frame.T_wc.copy()
+        T = frame.T_wc.copy()
         T[:3, 3] -= self._origin * self.value  # small numbers in UTM coordinates too
-        row = np.empty((H, W), dtype=np.int32)
-        rays = (np.arange(W) - K.cx) / K.fx, (np.arange(H) - K.cy) / K.fy
-        find_rows(frame.depth, rays, T, self.value, self._row_of_voxel, row)
+        row = np.empty(frame.shape, dtype=np.int32)
+        find_rows(frame.depth, frame.rays, T, self.value, self._row_of_voxel, row)
         return row
 
 

@@ -7,6 +7,8 @@ Entities, all below the scene's name:
 - `camera/MODEL/contradictions`: SegmentationImage: labels that are not the dominant class of the map before the frame
 - `camera/MODEL/drift`: SegmentationImage: drift that the frame caused at each pixel's voxel. A Transform3D spreads each
   picture over the camera's image
+- `camera/MODEL/labels/points`, `.../contradictions/points`, `.../drift/points`: Points3D, instead of these pictures, of
+  a scan; it has no Pinhole
 - `depth`, `trajectory`: DepthImage; LineStrips3D
 - `map/MODEL/BACKEND/CHUNK`: VoxelGridMap, coloured by class; components category:colors, op:values and KEY:values of
   each measure, which the views map to its own

@@ -116,7 +116,8 @@ class SceneLog:
         pose[:3, 3] -= self._translation
         if self._intrinsics != (frame.intrinsics, frame.shape):
             self._intrinsics = frame.intrinsics, frame.shape
-            stream.log(path(self.name, "camera"), _pinhole(frame))
+            if not frame.is_scan:
+                stream.log(path(self.name, "camera"), _pinhole(frame))
         stream.log(path(self.name, "camera"), rr.Transform3D(translation=pose[:3, 3], mat3x3=pose[:3, :3]))
         n = len(self._poses)
         if (
@@ -127,6 +128,8 @@ class SceneLog:
         background.submit(frame.index, frame.timestamp, functools.partial(self._log_images, stream, frame))
 
     def _log_images(self, stream: rr.RecordingStream, frame: Frame) -> None:
+        if frame.is_scan:
+            return
         stride = stride_of(frame.shape, COARSE_SIDE)
         depth = frame.depth[::stride, ::stride]
         depth = np.where(depth <= np.finfo(np.float16).max, depth, 0).astype(np.float16)  # to 0.05 %

@@ -83,6 +83,10 @@ class FrameChanges:
     def pictures(self, stride: int) -> dict[str, UInt8]:
         """Return each of PICTURES, of every stride-th pixel (H', W'); the stride is a power of 2."""
         frame = self.frame.every(stride)  # rays divided by a power of 2 stay exact: each pixel falls into its voxel
+        return self.values(frame)
+
+    def values(self, frame: Frame) -> dict[str, UInt8]:
+        """Return each of PICTURES for the pixels or points (H, W) of the frame, or of every n-th."""
         key = packed(self.changes.index)
         order = np.argsort(key)
         pixels = packed(voxel_index(back_project(frame), self.voxel_size, frame).T)
@@ -92,10 +96,27 @@ class FrameChanges:
             "contradictions": np.where(contradicts, CONTRADICTS, AGREES),
             "drift": levels_of(self.changes.drift)[voxel],
         }
-        pictures = {name: np.full(frame.shape, NO_VOXEL, np.uint8) for name in PICTURES}
-        for name, picture in pictures.items():
-            picture[frame.valid] = shown[name]
-        return pictures
+        values = {name: np.full(frame.shape, NO_VOXEL, np.uint8) for name in PICTURES}
+        for name, of_name in values.items():
+            of_name[frame.valid] = shown[name]
+        return values
+
+
+POINT_RADIUS = 1.5
+"""Radius of a scan's point in the viewer, in its units of the screen."""
+
+
+def log_points(stream: rr.RecordingStream, entity: str, frame: Frame, drift: FrameChanges | None) -> None:
+    """Log a scan's valid points in the sensor's axes, by class, and by the drift that it caused in their voxels."""
+    assert frame.points is not None
+    values: dict[str, npt.NDArray[Any]] = {"labels": frame.predicted}
+    if drift is not None:
+        values |= drift.values(frame)
+    for name, of_name in values.items():
+        points = rr.Points3D(
+            frame.points[frame.valid], class_ids=of_name[frame.valid], radii=rr.Radius.ui_points(POINT_RADIUS)
+        )
+        stream.log(f"{entity}/{name}/points", points)
 
 
 def packed(index: npt.NDArray[np.integer[Any]]) -> Int64:
@@ -130,16 +151,17 @@ COLORS = (
 
 
 class View(NamedTuple):
-    """A frame without its images: its time, the camera that projects into it, and its label file."""
+    """A frame without its images: its time, the camera that projects into it, if it is an image, and its label file."""
 
     timestamp: float | None
-    intrinsics: Intrinsics
+    intrinsics: Intrinsics | None
     T_wc: Float64
     shape: tuple[int, int]
     file: str = ""
 
     def project(self, points: Float64) -> tuple[Float64, Mask]:
         """Return the pixels (n, 2) of points (n, 3) in the viewer's image, and a mask of those with a number inside."""
+        assert self.intrinsics is not None
         x, y, z = self.intrinsics.matrix @ ((points - self.T_wc[:3, 3]) @ self.T_wc[:3, :3]).T
         pixels = np.stack([x, y], axis=1) / np.where(z > 0, z, 1.0)[:, None] + 0.5  # its pixel centres are at halves
         size = np.array(self.shape[::-1], dtype=np.float64)
@@ -237,6 +259,8 @@ class DriftLog:
         )
         stream.log(path(scene, "flips_at", model), points, static=True)
         for index, view in self._views.items():  # the view of an image would also draw 3D points outside of it
+            if view.intrinsics is None:
+                continue
             pixels, inside = view.project(centers)
             clock.set(stream, index, view.timestamp)
             numbers = rr.Points2D(

@@ -335,6 +335,12 @@ def _cameras(scene: str, tasks: list[Task], picture: str) -> rrb.Container:
 def _camera(scene: str, task: Task, picture: str, over: list[str]) -> list[rrb.View]:
     origin, color = path(scene, "camera"), path(scene, "camera", "color")
     labels, shown = (path(scene, "camera", task.model, name) for name in ("labels", picture))
+    if task.scene.of_scans:
+        titles = {labels: f"{task.model}: labels of the scan", shown: f"{task.model}: {PICTURES[picture]}"}
+        return [
+            rrb.Spatial3DView(origin=origin, contents=[f"{entity}/points"], background=BACKGROUND, name=title)
+            for entity, title in titles.items()
+        ]
     seen_through: Any = {labels: rr.SegmentationImage.from_fields(opacity=0.6).visualizer()}
     title = f"{task.model}: {PICTURES[picture]}"
     return [

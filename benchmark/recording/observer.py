@@ -34,7 +34,7 @@ from semstab.engine.units import Plan, PlannedUnit, make_plan
 from semstab.errors import ConfigError, SemstabError, summarize_error
 from semstab.recording import timeline
 from semstab.recording.camera import COARSE_SIDE, SceneLog, over_camera, stride_of
-from semstab.recording.drift import DriftLog
+from semstab.recording.drift import DriftLog, FrameChanges, log_points
 from semstab.recording.layout import VERDICT, blueprint, drawn
 from semstab.recording.target import DEFAULT_URL, Target, flush, is_whole
 from semstab.recording.timeline import Background, Clock, path
@@ -83,19 +83,26 @@ class GroupLog:
                 drift = self._drift.follow(frame, changes)
 
         def job() -> None:
-            stride, coarse = stride_of(frame.shape), stride_of(frame.shape, COARSE_SIDE)
-            pictures: dict[str, tuple[npt.NDArray[Any], int]] = {
-                "labels": (np.ascontiguousarray(frame.predicted[::stride, ::stride]), stride)
-            }
-            if drift is not None:
-                pictures |= {name: (picture, coarse) for name, picture in drift.pictures(coarse).items()}
-            for name, (picture, every) in pictures.items():
-                image = rr.SegmentationImage(picture, draw_order=-10)
-                stream.log(path(self._scene, "camera", self.task.model, name), image, over_camera(every))
+            if frame.is_scan:
+                log_points(stream, path(self._scene, "camera", self.task.model), frame, drift)
+            else:
+                self._log_pictures(stream, frame, drift)
             for log_chunk in jobs:
                 log_chunk()
 
         background.submit(frame.index, frame.timestamp, job)
+
+    def _log_pictures(self, stream: rr.RecordingStream, frame: Frame, drift: FrameChanges | None) -> None:
+        """Log labels, contradictions and drift over the image."""
+        stride, coarse = stride_of(frame.shape), stride_of(frame.shape, COARSE_SIDE)
+        pictures: dict[str, tuple[npt.NDArray[Any], int]] = {
+            "labels": (np.ascontiguousarray(frame.predicted[::stride, ::stride]), stride)
+        }
+        if drift is not None:
+            pictures |= {name: (picture, coarse) for name, picture in drift.pictures(coarse).items()}
+        for name, (picture, every) in pictures.items():
+            image = rr.SegmentationImage(picture, draw_order=-10)
+            stream.log(path(self._scene, "camera", self.task.model, name), image, over_camera(every))
 
     def log_unit(
         self, stream: rr.RecordingStream, summary: UnitSummary, table: VoxelTable, tolerance: float, factor: int = 1
@@ -409,6 +416,7 @@ class _ClosedScene:
     name: str
     models: tuple[str, ...]
     up: Float64 | None
+    of_scans: bool = False
 
     def T_wc(self, index: int) -> Float64:
         """Return the world's origin: poses are not in the folder."""

@@ -25,7 +25,7 @@ BUDGET = 1 << 19
 """Most entries (cell, view, class)."""
 
 SIDE = 640
-"""Most pixels on a side: every n-th pixel of each axis of a larger frame is taken."""
+"""Most pixels on a side: every n-th pixel of each axis of a larger frame is taken, or every n-th point of a scan."""
 
 FEW = 4
 """The median depth is that of every FEW-th pixel of each axis."""
@@ -88,7 +88,7 @@ class Sampler:
     def add(self, frame: Frame) -> None:
         """Add the labels of a frame's pixels with depth in sampled cells."""
         self._frames += 1
-        frame = frame.every(math.ceil(max(frame.shape) / SIDE))
+        frame = frame.within(SIDE)
         there = frame.valid if frame.unlabelled is None else frame.valid | frame.unlabelled
         if not there.any():
             return
@@ -105,7 +105,7 @@ class Sampler:
             return None
         if self._anchor is not None and self._anchor.sees_alike(frame):
             return self._anchor.view
-        focal = math.sqrt(frame.intrinsics.fx * frame.intrinsics.fy)
+        focal = 1.0 / frame.ray_angle
         self._anchor = self._seen[digest] = Anchor(len(self._views), frame.T_wc.copy(), focal, depth)
         centre, when = frame.T_wc[:3, 3], math.nan if frame.timestamp is None else frame.timestamp
         self._views.append([frame.index, *centre.tolist(), when, depth / focal])
@@ -120,12 +120,13 @@ class Sampler:
         """Return cells, labels, pixels and hashes of the frame's entries."""
         from semstab.statistics.loops.observations import draw, grouped
 
-        (H, W), camera, T_wc = frame.shape, frame.intrinsics, fixed(frame.T_wc)
-        ray_x, ray_y = (np.arange(W) - camera.cx) / camera.fx, (np.arange(H) - camera.cy) / camera.fy
+        H, W = frame.shape
+        ray_x, ray_y = frame.rays
+        points = np.zeros((0, 0, 3), np.float32) if frame.points is None else frame.points
         cell, drawn, label = np.empty(H * W, np.int64), np.empty(H * W, np.uint32), np.empty(H * W, np.uint16)
         n = draw(
-            fixed(frame.depth), fixed(there), labels, ray_x, ray_y, T_wc, CELLS * self._cell_size, self._share,
-            self._origin, REACH, cell, drawn, label,
+            fixed(frame.depth), fixed(points), fixed(there), labels, ray_x, ray_y, fixed(frame.T_wc),
+            CELLS * self._cell_size, self._share, self._origin, REACH, cell, drawn, label,
         )  # fmt: skip
         near = slice(n) if cell[:n].min(initial=0) >= 0 else np.flatnonzero(cell[:n] >= 0)
         cell, drawn, label = cell[near], drawn[near], label[near]

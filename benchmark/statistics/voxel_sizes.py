@@ -33,10 +33,11 @@ class SizeSample:
     def add(self, frame: Frame) -> None:
         """Keep some pixels of the frame, if it is one of them."""
         if frame.index in self._indices:
-            some = frame.every(max(1, round(math.sqrt(math.prod(frame.shape) / SIZE_PIXELS))))
+            times = math.prod(frame.shape) / SIZE_PIXELS
+            some = frame.every(max(1, round(times if frame.is_scan else math.sqrt(times))))
             images = {
                 name: image.copy()
-                for name in ("depth", "labels", "scores")
+                for name in ("depth", "points", "labels", "scores")
                 if (image := getattr(some, name)) is not None
             }
             self._frames.append(dataclasses.replace(some, color=None, mask=None, left_out=None, **images))

@@ -7,7 +7,7 @@ import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal
+from typing import Literal, Protocol
 
 import numpy as np
 
@@ -23,12 +23,13 @@ from semstab.errors import ConfigError, DataError
 
 logger = logging.getLogger("semstab")
 
-Kind = Literal["labels", "scores", "masks"]
+Kind = Literal["labels", "scores", "masks", "points"]
 KINDS: tuple[Kind, ...] = ("labels", "scores")
 SUFFIXES: Mapping[Kind, tuple[str, ...]] = {
     "labels": images.LABEL_SUFFIXES,
     "scores": images.SCORE_SUFFIXES,
     "masks": images.MASK_SUFFIXES,
+    "points": (".label", ".bin", ".npy"),
 }
 LOSSY_SUFFIXES = (".jpg", ".jpeg", ".JPG", ".JPEG")
 DEFAULTS: Mapping[Kind, str] = {"labels": "labels/{model}/{name}", "scores": "scores/{model}/{name}"}
@@ -49,6 +50,18 @@ class SceneEntry:
     below_root: str
 
 
+class Named(Protocol):
+    """A frame or a scan, by the names that its files have."""
+
+    @property
+    def name(self) -> str:
+        """Return its name in path templates."""
+
+    @property
+    def aliases(self) -> tuple[str, ...]:
+        """Return other names that its files may have."""
+
+
 @dataclass(frozen=True)
 class LabelSource:
     """One label source of a scene, with the path of each frame's file.
@@ -65,13 +78,13 @@ class LabelSource:
     first: tuple[str, Path] | None = None
 
     @classmethod
-    def of(cls, kind: Kind, base: Path, template: str, frames: Sequence[FrameSource], folders: Folders) -> LabelSource:
+    def of(cls, kind: Kind, base: Path, template: str, frames: Sequence[Named], folders: Folders) -> LabelSource:
         """Return one source, with the first frame that has a file."""
         source = cls(kind, base, template, folders)
         there = ((frame.name, file) for frame in frames if (file := source.file(frame)) is not None)
         return replace(source, first=next(there, None))
 
-    def file(self, frame: FrameSource) -> Path | None:
+    def file(self, frame: Named) -> Path | None:
         """Return the file of a frame, under its own name or another that it has."""
         for name in (frame.name, *frame.aliases):
             path = inside(self.base, self.base, self.template.replace("{name}", name), str(self.base))
@@ -86,7 +99,7 @@ class LabelSource:
         found = (self.folders.one_of(place, LOSSY_SUFFIXES) for place in places)
         return next((path for path in found if path is not None), None)
 
-    def missing(self, frame: FrameSource) -> list[str]:
+    def missing(self, frame: Named) -> list[str]:
         """Return nothing, or the path that the file of that frame would have."""
         if self.file(frame) is not None:
             return []

@@ -37,23 +37,32 @@ def hash_row(at_x, at_y, at_z, hashed):
 
 
 @serial
-def draw(depth, valid, labels, ray_x, ray_y, T, size, share, origin, reach, cell, drawn, label):
-    """Write key of the cell, hash and label of the pixels that show a sampled block; return the number of pixels."""
+def draw(depth, points, valid, labels, ray_x, ray_y, T, size, share, origin, reach, cell, drawn, label):
+    """Write key of the cell, hash and label of the pixels that show a sampled block; return the number of pixels.
+
+    - `points`: (H, W, 3) of a scan, for which rays do not count; (0, 0, 3) of an image
+    """
     n = held = 0
     H, W = depth.shape
     at, hashed, last = np.empty((3, W), np.int32), np.empty(W, np.uint32), np.uint32(share - 1)
     selected = np.empty(W, np.int32)
     x, y, z = np.empty(HELD + W), np.empty(HELD + W), np.empty(HELD + W)
     for v in range(H):
-        locate_row(depth[v], ray_x, ray_y[v], T, size, at[0], at[1], at[2])
+        if points.shape[0]:
+            locate_points(points[v], T, size, at[0], at[1], at[2])
+        else:
+            locate_row(depth[v], ray_x, ray_y[v], T, size, at[0], at[1], at[2])
         hash_row(at[0], at[1], at[2], hashed)
         end = 0
         for u in range(W):  # without a branch: it could not be predicted where depth is noisy
             selected[end] = u
             end += hashed[u] <= last
         for u in selected[:end]:
-            d = np.float64(depth[v, u])
-            x[held], y[held], z[held] = ray_x[u] * d, ray_y[v] * d, d
+            if points.shape[0]:
+                x[held], y[held], z[held] = points[v, u, 0], points[v, u, 1], points[v, u, 2]
+            else:
+                d = np.float64(depth[v, u])
+                x[held], y[held], z[held] = ray_x[u] * d, ray_y[v] * d, d
             drawn[n], label[n] = hashed[u], labels[v, u]
             n += valid[v, u]
             held += valid[v, u]
@@ -72,6 +81,19 @@ def locate_row(depth, ray_x, ray_y, T, size, at_x, at_y, at_z):
     for u in range(len(depth)):
         z = np.float64(depth[u])
         x, y = ray_x[u] * z, ray_y * z
+        at_x[u] = np.int32(np.floor(in_voxels(x0, x1, x2, x3, x, y, z, size)))
+        at_y[u] = np.int32(np.floor(in_voxels(y0, y1, y2, y3, x, y, z, size)))
+        at_z[u] = np.int32(np.floor(in_voxels(z0, z1, z2, z3, x, y, z, size)))
+
+
+@serial
+def locate_points(points, T, size, at_x, at_y, at_z):
+    """Find the block of each point (n, 3) of a scan, any of invalid ones, as `locate_row` finds those of pixels."""
+    x0, x1, x2, x3 = T[0, 0], T[0, 1], T[0, 2], T[0, 3]
+    y0, y1, y2, y3 = T[1, 0], T[1, 1], T[1, 2], T[1, 3]
+    z0, z1, z2, z3 = T[2, 0], T[2, 1], T[2, 2], T[2, 3]
+    for u in range(len(points)):
+        x, y, z = np.float64(points[u, 0]), np.float64(points[u, 1]), np.float64(points[u, 2])
         at_x[u] = np.int32(np.floor(in_voxels(x0, x1, x2, x3, x, y, z, size)))
         at_y[u] = np.int32(np.floor(in_voxels(y0, y1, y2, y3, x, y, z, size)))
         at_z[u] = np.int32(np.floor(in_voxels(z0, z1, z2, z3, x, y, z, size)))

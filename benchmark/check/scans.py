@@ -1,0 +1,400 @@
+"""The check of a scene of scans: whether they lie on each other by their poses, and how else they would.
+
+A point of one scan is carried by the poses into the axes of another, where its nearest point is sought; the distance,
+divided by the point's range, is its error. Each other reading of the poses is assessed in the same way.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from semstab.backends import create
+from semstab.check.conventions import Convention
+from semstab.check.coverage import (
+    BINS,
+    CONSISTENT,
+    FRAMES_LEFT,
+    SHARED,
+    SIZES,
+    STAYS,
+    Noise,
+    Overlap,
+    Persistence,
+    Suggestion,
+    distribution,
+)
+from semstab.check.geometry import Fit, Verdict
+from semstab.check.reprojection import clusters, motion, pairs_within, reader
+from semstab.core.arrays import evenly
+from semstab.core.prefetch import prefetch
+from semstab.core.types import Float64, Int64, Mask
+from semstab.data.frames import Frame
+from semstab.datasets import Scene
+from semstab.errors import DataError
+
+QUERIES = 2000
+"""Points of a scan that are sought in another one."""
+
+TO_CAMERA = np.array([[0.0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0], [0, 0, 0, 1]])
+"""From the axes of a LiDAR (x forward, y left, z up) to those of a camera beside it (x right, y down, z forward)."""
+
+BETTER = 0.67
+"""Another reading of the poses is right where its error is at most this part of the configured one, ..."""
+
+WON = 0.8
+"""... and lower in this share of the pairs of scans."""
+
+ALIKE = 1.1
+"""Readings whose errors differ by no more cannot be told apart."""
+
+HOPELESS = 0.05
+"""The error from which on scans do not lie on each other, though no reading explains it."""
+
+
+@dataclass(frozen=True)
+class PoseReading:
+    """A way to read the poses of scans.
+
+    Attributes:
+        name: Its name, in words.
+        of: From a pose (4, 4) as it is read now to the pose as it would be.
+        mends: The options that mend it, by the option's name and value now; '' for those of any reader.
+        otherwise: What to do where the reader has no such option.
+    """
+
+    name: str
+    of: Callable[[Float64], Float64]
+    mends: Mapping[tuple[str, str], str]
+    otherwise: str
+
+
+def _inverse(T: Float64) -> Float64:
+    return np.asarray(np.linalg.inv(T), dtype=np.float64)
+
+
+def _camera_to_lidar(T: Float64) -> Float64:
+    pose: Float64 = np.linalg.inv(TO_CAMERA) @ T @ TO_CAMERA
+    return pose
+
+
+def _lidar_to_camera(T: Float64) -> Float64:
+    return TO_CAMERA @ T @ np.linalg.inv(TO_CAMERA)
+
+
+def _first_number_last(T: Float64) -> Float64:
+    """Return the pose of the quaternion w x y z that was read as x y z w."""
+    from scipy.spatial.transform import Rotation
+
+    turned = T.copy()
+    w, x, y, z = Rotation.from_matrix(T[:3, :3]).as_quat()
+    turned[:3, :3] = Rotation.from_quat([x, y, z, w]).as_matrix()
+    return turned
+
+
+def _last_number_first(T: Float64) -> Float64:
+    """Return the pose of the quaternion x y z w that was read as w x y z."""
+    from scipy.spatial.transform import Rotation
+
+    turned = T.copy()
+    x, y, z, w = Rotation.from_matrix(T[:3, :3]).as_quat()
+    turned[:3, :3] = Rotation.from_quat([w, x, y, z]).as_matrix()
+    return turned
+
+
+def _scaled(factor: float) -> Callable[[Float64], Float64]:
+    def of(T: Float64) -> Float64:
+        scaled = T.copy()
+        scaled[:3, 3] *= factor
+        return scaled
+
+    return of
+
+
+def _turned(factor: float) -> Callable[[Float64], Float64]:
+    """Return how poses would be whose angles are so many times those that were read."""
+
+    def of(T: Float64) -> Float64:
+        from scipy.spatial.transform import Rotation
+
+        turned = T.copy()
+        turned[:3, :3] = Rotation.from_rotvec(factor * Rotation.from_matrix(T[:3, :3]).as_rotvec()).as_matrix()
+        return turned
+
+    return of
+
+
+READINGS = (
+    PoseReading(
+        "inverse poses",
+        _inverse,
+        {
+            ("pose_convention", "camera_to_world"): "pose_convention: world_to_camera",
+            ("pose_convention", "world_to_camera"): "pose_convention: camera_to_world",
+        },
+        "invert the poses: they map the world to the sensor",
+    ),
+    PoseReading(
+        "poses of a camera, not of the LiDAR",
+        _camera_to_lidar,
+        {("pose_frame", "lidar"): "pose_frame: camera"},
+        "the calibration from the LiDAR to the camera is forgotten: apply it",
+    ),
+    PoseReading(
+        "poses of the LiDAR, to which a camera's calibration was applied",
+        _lidar_to_camera,
+        {("pose_frame", "camera"): "pose_frame: lidar"},
+        "leave the calibration away",
+    ),
+    PoseReading("quaternions w x y z", _first_number_last, {}, "write quaternions as x y z w"),
+    PoseReading("quaternions x y z w", _last_number_first, {}, "write quaternions as w x y z"),
+    PoseReading("poses in millimetres", _scaled(0.001), {}, "divide the positions of the poses by 1000"),
+    PoseReading("poses in kilometres", _scaled(1000.0), {}, "multiply the positions of the poses by 1000"),
+    PoseReading("angles in degrees, read as radians", _turned(math.pi / 180), {}, "convert the angles to radians"),
+    PoseReading("angles in radians, read as degrees", _turned(180 / math.pi), {}, "convert the angles to degrees"),
+)
+"""Other readings of poses than the configured one."""
+
+
+@dataclass(frozen=True, eq=False)
+class Met:
+    """The points of a scan that were sought in another one.
+
+    Attributes:
+        distance: (n,) metres to the nearest point there.
+        range: (n,) of each point from its own sensor.
+        nearest: (n,) its row there.
+    """
+
+    distance: Float64
+    range: Float64
+    nearest: Int64
+
+    @property
+    def error(self) -> Float64:
+        """(n,) the distance as a share of the range."""
+        return self.distance / self.range
+
+
+class ScanSample:
+    """Scans of a scene at some positions of the sequence, and points of each sought in the others.
+
+    Args:
+        scene: The scene.
+        indices: The selected scans.
+        source: Label source to read them with; None needs no labels.
+        groups: Positions in `indices` of scans that are compared with each other.
+        fused: Number of scans, evenly spaced, that are read for fusion too.
+        passing_over: Leave out scans that cannot be read, instead of raising what reading them raises.
+    """
+
+    def __init__(
+        self,
+        scene: Scene,
+        indices: Sequence[int],
+        source: str | None,
+        groups: Sequence[Sequence[int]],
+        *,
+        fused: int = 0,
+        passing_over: bool = False,
+    ) -> None:
+        self.scene, self.fused = scene, evenly(len(indices), fused)
+        compared = {position for group in groups for position in group}
+        self.scans: dict[int, Frame] = {}
+        read = reader(scene, source)
+
+        def attempt(index: int) -> Frame | None:
+            try:
+                return read(index)
+            except DataError:
+                if not passing_over:
+                    raise
+                return None
+
+        positions = sorted(compared | set(self.fused))
+        for position, fetched in zip(positions, prefetch(attempt, [indices[p] for p in positions]), strict=True):
+            if fetched.item is not None:
+                self.scans[position] = fetched.item
+        self.pairs = [pair for pair in pairs_within(groups) if pair[0] < pair[1] and {*pair} <= self.scans.keys()]
+        self._trees: dict[int, Any] = {}
+
+    def met(self, pair: tuple[int, int], of: Callable[[Float64], Float64] | None = None) -> Met:
+        """Seek points of the pair's first scan in its second one, under the configured reading or another."""
+        a, b = self.scans[pair[0]], self.scans[pair[1]]
+        poses = [scan.T_wc if of is None else of(scan.T_wc) for scan in (a, b)]
+        R, t = motion(*poses)
+        rows = self._queries(pair[0])
+        points = _points(a)[rows]
+        distance, nearest = self._tree(pair[1]).query(points @ R.T + t)
+        return Met(distance, np.linalg.norm(points, axis=1), nearest)
+
+    @cached_property
+    def spacing(self) -> float:
+        """Median distance of a point from the nearest of its own scan, metres."""
+        own = []
+        for position in {pair[0] for pair in self.pairs}:
+            distance, _ = self._tree(position).query(_points(self.scans[position])[self._queries(position)], k=2)
+            own.append(distance[:, 1])
+        return float(np.median(np.concatenate(own))) if own else math.nan
+
+    def agree(self, pair: tuple[int, int], met: Met) -> Mask:
+        """Return whether labels agree, of the points met that have one in both scans."""
+        a, b = self.scans[pair[0]], self.scans[pair[1]]
+        first = a.predicted.reshape(-1)[_rows(a)][self._queries(pair[0])]
+        second = b.predicted.reshape(-1)[_rows(b)][met.nearest]
+        known = (met.error <= CONSISTENT) & (first != a.ignore_id) & (second != b.ignore_id)
+        agree: Mask = (first == second)[known]
+        return agree
+
+    def stays(self, voxel_size: float) -> float:
+        """Return the share of the points met that lie in the same voxel as the nearest of the other scan."""
+        same = []
+        for pair in self.pairs:
+            met = self.met(pair)
+            first, second = (
+                _in_world(self.scans[p], rows)
+                for p, rows in ((pair[0], self._queries(pair[0])), (pair[1], met.nearest))
+            )
+            near = met.error <= CONSISTENT
+            same.append(np.all(np.floor(first / voxel_size) == np.floor(second / voxel_size), axis=1)[near])
+        return float(np.concatenate(same).mean()) if same and sum(map(len, same)) else math.nan
+
+    def _queries(self, position: int) -> Int64:
+        return np.array(evenly(len(_rows(self.scans[position])), QUERIES))
+
+    def _tree(self, position: int) -> Any:
+        from scipy.spatial import cKDTree
+
+        if position not in self._trees:
+            self._trees[position] = cKDTree(_points(self.scans[position]))
+        return self._trees[position]
+
+
+def _rows(scan: Frame) -> Int64:
+    return np.flatnonzero((scan.depth > 0) & (scan.depth < np.inf))
+
+
+def _points(scan: Frame) -> Float64:
+    """Return the points (n, 3) of a scan with a range, in its sensor's axes."""
+    assert scan.points is not None
+    points: Float64 = scan.points.reshape(-1, 3)[_rows(scan)].astype(np.float64)
+    return points
+
+
+def _in_world(scan: Frame, rows: Int64) -> Float64:
+    return _points(scan)[rows] @ scan.T_wc[:3, :3].T + scan.T_wc[:3, 3]
+
+
+def quick_sample_of_scans(scene: Scene, indices: Sequence[int]) -> ScanSample:
+    """Return a few scans of a scene, those that can be read."""
+    return ScanSample(scene, indices, None, clusters(len(indices), 1), passing_over=True)
+
+
+def assess_scans(sample: ScanSample) -> Verdict:
+    """Return whether scans lie on each other, and the reading of the poses under which they would."""
+    pairs = sample.pairs
+    if not pairs or not all(len(_rows(scan)) for scan in sample.scans.values()):
+        return Verdict("unclear", "it takes two scans with points to tell whether poses are right")
+    errors = {"as configured": _errors(sample, None)} | {each.name: _errors(sample, each.of) for each in READINGS}
+    fits = {name: _fit(own) for name, own in errors.items()}
+    configured, now = fits["as configured"], np.array([np.median(own) for own in errors["as configured"]])
+    wins = {name: float(np.mean([np.median(own) for own in errors[name]] < now)) for name in errors}
+    best = min(READINGS, key=lambda each: fits[each.name].error)
+    better = fits[best.name].error <= BETTER * configured.error and wins[best.name] >= WON
+    shown = sorted(fits.items(), key=lambda item: (item[0] != "as configured", item[1].error))[:5]
+    about: dict[str, Any] = {
+        "error": configured.error, "share": configured.share, "frames": len({p for pair in pairs for p in pair}),
+        "pairs": len(pairs), "fits": tuple(shown),
+    }  # fmt: skip
+    if better:
+        settings = sample.scene.settings
+        mend = next((text for (key, now_), text in best.mends.items() if settings.get(key) == now_), None)
+        advice = f"set {mend} (--option {mend.replace(': ', '=')})" if mend else best.otherwise
+        text = (
+            f"scans do not lie on each other: the nearest point of another scan is {configured.error:.1%} of the range"
+            f" away, and {fits[best.name].error:.2%} with {best.name}; {advice}"
+        )
+        return Verdict("unsound", text, () if mend is None else (mend,), **about)
+    if configured.error > HOPELESS:
+        text = (
+            f"scans do not lie on each other: the nearest point of another scan is {configured.error:.1%} of the range"
+            " away, with every reading of the poses; check the order of poses and scans"
+        )
+        return Verdict("unsound", text, **about)
+    open_ = tuple(each.name for each in READINGS if fits[each.name].error <= ALIKE * configured.error)
+    text = f"scans lie on each other: the nearest point of another scan is {configured.error:.2%} of the range away"
+    reason = "the sensor hardly moves" if open_ else ""
+    return Verdict("sound", text, undetermined=open_, reason=reason, **about)
+
+
+def _errors(sample: ScanSample, of: Callable[[Float64], Float64] | None) -> list[Float64]:
+    return [sample.met(pair, of).error for pair in sample.pairs]
+
+
+def _fit(errors: Sequence[Float64]) -> Fit:
+    every = np.concatenate(errors)
+    return Fit(Convention(), float(np.median(every)), float(np.mean(every <= CONSISTENT)), len(every))
+
+
+# What a check reports beside the verdict.
+
+
+@dataclass(frozen=True, eq=False)
+class ScanCoverage:
+    """What scans share, how far their points lie apart, and the voxels that this carries."""
+
+    sample: ScanSample
+
+    @cached_property
+    def _met(self) -> dict[tuple[int, int], Met]:
+        return {pair: self.sample.met(pair) for pair in self.sample.pairs}
+
+    def overlaps(self) -> list[Overlap]:
+        """Return one row a distance between scans."""
+        rows = []
+        for low, high in BINS:
+            pairs = [pair for pair in self._met if low <= pair[1] - pair[0] <= high]
+            if pairs:
+                error = np.concatenate([self._met[pair].error for pair in pairs])
+                agree = np.concatenate([self.sample.agree(pair, self._met[pair]) for pair in pairs])
+                share = float(np.mean(error <= CONSISTENT))
+                agreement = float(agree.mean()) if len(agree) else math.nan
+                rows.append(Overlap((low, high), len(pairs), share, share, float(np.median(error)), agreement))
+        return rows
+
+    def noise(self) -> Noise:
+        """Return the distance of points from the nearest of another scan and of their own, and between rays."""
+        between = np.concatenate([met.distance for met in self._met.values()])
+        ranges = np.concatenate([met.range for met in self._met.values()])
+        angle = float(np.median([scan.ray_angle for scan in self.sample.scans.values()]))
+        return Noise(float(np.median(between)), self.sample.spacing, angle * float(np.median(ranges)))
+
+    def suggestion(self, overlaps: Sequence[Overlap], scans: int, stride: int) -> Suggestion:
+        """Return voxel size and stride that suit so many scans, whose own stride is `stride`."""
+        size = next((size for size in SIZES if self.sample.stays(size) >= STAYS), None)
+        stays = math.nan if size is None else self.sample.stays(size)
+        shared = {row.apart[0]: row.covisible for row in overlaps}
+        times = max((n for n in shared if shared[n] >= SHARED and scans >= FRAMES_LEFT * n), default=1)
+        share = shared.get(times, math.nan)
+        return Suggestion(
+            voxel_size=size,
+            voxel_size_reason=f"{stays:.0%} of the points have the nearest one of another scan in the same voxel",
+            pixel_stride=1,
+            pixel_stride_reason="all points",
+            frame_stride=stride * times,
+            frame_stride_reason=f"{share:.0%} of a scan's points lie on the surfaces of the next one",
+        )
+
+    def persistence(self, voxel_size: float) -> Persistence:
+        """Fuse the scans that were read for it, and count how often each voxel is seen."""
+        backend = create("numba", voxel_size=voxel_size, num_classes=2)
+        for position in self.sample.fused:
+            scan = self.sample.scans[position]
+            backend.integrate(dataclasses.replace(scan, labels=np.zeros(scan.shape, np.uint8), scores=None))
+        return distribution(backend.table().op, voxel_size, self.sample.stays(voxel_size))

@@ -1,0 +1,366 @@
+"""Scenes of posed LiDAR scans in files, a file of points and one of labels a scan; readers of such formats share it."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import logging
+import math
+from abc import abstractmethod
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any, Generic, Literal, TypeVar
+
+import numpy as np
+import numpy.typing as npt
+from pydantic import Field
+
+from semstab.config import Settings, nearest
+from semstab.core.types import Float32, Float64, Mask, UInt16
+from semstab.data.frames import Frame, Intrinsics
+from semstab.data.labels import IGNORE_16BIT, LabelSpace
+from semstab.datasets.files import options as opt
+from semstab.datasets.files.labels import LabelSource, SceneEntry
+from semstab.datasets.files.options import Folders, Template, matching_folders
+from semstab.datasets.files.reader import find_scenes
+from semstab.datasets.geometry.cameras import UP_AXES
+from semstab.datasets.scene import GROUND_TRUTH, Dataset, Scene, fingerprint, listed
+from semstab.errors import ConfigError, DataError
+
+logger = logging.getLogger("semstab")
+
+PLACES = {"root", "labels_root", "incomplete", "taxonomy", "taxonomies", "classes"}
+"""Options that do not change the numbers; label spaces count by their content."""
+
+NO_ID = IGNORE_16BIT - 1
+"""The mark in a table of ids for one that is not in it."""
+
+
+class ScanOptions(Settings):
+    """Options that every dataset of scans has."""
+
+    root: Path = Field(description="a scene's folder, or the folder above scenes")
+    incomplete: Literal["error", "skip"] = Field("error", description="a selected scan without points, pose or labels")
+    labels: str | None = Field(None, description="template of predictions, with {model} and {name}")
+    labels_root: Path | None = Field(None, description="folder of predictions, if not the scene's own")
+    taxonomy: opt.Taxonomy = None
+    classes: tuple[str, ...] | None = Field(None, description="class names in id order, instead of a taxonomy")
+    taxonomies: dict[str, str] = Field({}, description="taxonomies of single label sources; gt is the ground truth")
+    void_ids: opt.VoidIds = Field({})
+    min_range: opt.Positive | None = Field(None, description="metres up to which points are left out: the own vehicle")
+    max_range: opt.Positive | None = Field(None, description="metres from which on points are left out")
+    up_axis: opt.UpAxis = None
+
+
+@dataclass(frozen=True, eq=False)
+class ScanSource:
+    """The files and numbers that one scan comes from.
+
+    Attributes:
+        name: Name of the scan in path templates.
+        points: The file.
+        pose: (4, 4) sensor-to-world, metres; NaN where there is none.
+        pose_file: The file that holds it.
+        timestamp: Seconds.
+        aliases: Other names that its label files may have.
+    """
+
+    name: str
+    points: Path
+    pose: Float64
+    pose_file: Path
+    timestamp: float | None = None
+    aliases: tuple[str, ...] = ()
+
+
+Options = TypeVar("Options", bound=ScanOptions)
+
+
+class ScanDataset(Dataset, Generic[Options]):
+    """Scenes of scans below a root. A reader recognises a scene's folder, lists its scans, and reads points and ids.
+
+    Attributes:
+        contents: The files of a scene's folder, for error messages.
+        labels: Templates of predictions, of which the first that finds some counts.
+        truth: Template of ground truth, or None.
+        taxonomy: The classes of the labels, where options name no others.
+
+    Raises:
+        DataError: If there is no scene.
+    """
+
+    contents: str
+    labels: tuple[str, ...] = ("predictions/{model}/{name}",)
+    truth: str | None = None
+    taxonomy: str | None = None
+
+    def __init__(self, options: Options) -> None:
+        self.options = options
+        self._entries = {entry.name: entry for entry in find_scenes(options.root, self.is_scene, self.contents)}
+
+    @property
+    def scenes(self) -> tuple[str, ...]:
+        """Return the names of the scenes, in natural order: their paths below root, with - between folders."""
+        return tuple(self._entries)
+
+    @property
+    def folders(self) -> list[Path]:
+        """The folders of its scenes."""
+        return [entry.folder for entry in self._entries.values()]
+
+    def scene(self, name: str) -> ScanScene:
+        """Open one.
+
+        Raises:
+            ConfigError: For a name that is not there.
+            DataError: For one without scans, or damaged poses.
+        """
+        if name not in self._entries:
+            raise ConfigError(f"{self.options.root}: scene '{name}' is not there; {nearest(name, self.scenes)}")
+        entry = self._entries[name]
+        scans = list(self.scans(entry.folder))
+        if not scans:
+            raise DataError(f"{entry.folder}: holds no scan; expected {self.contents}")
+        return ScanScene(self, entry, scans)
+
+    @abstractmethod
+    def is_scene(self, folder: Path) -> bool:
+        """Return whether a folder is a scene of this format."""
+
+    @abstractmethod
+    def scans(self, folder: Path) -> Iterable[ScanSource]:
+        """Return the scans of a scene's folder, in order, of different names; raises DataError with the file."""
+
+    @abstractmethod
+    def points(self, path: Path, data: bytes) -> Float32:
+        """Return points (N, 3), sensor coordinates in metres, of a file's content; raises DataError with the file."""
+
+    @abstractmethod
+    def ids(self, path: Path, data: bytes) -> npt.NDArray[np.integer[Any]]:
+        """Return stored ids (N,) of a file's content; raises DataError with the file."""
+
+    def class_ids(self) -> UInt16 | None:
+        """Return a table (65536,) from stored ids to those of the taxonomy, where they differ; NO_ID is none."""
+        return None
+
+    def moving(self, ids: npt.NDArray[np.integer[Any]]) -> Mask | None:
+        """Return the points (N,) that move by their true ids, where the format says so."""
+        return None
+
+
+class ScanScene(Scene):
+    """One sequence of scans, each file required when it is read; opening it reads no scan.
+
+    Args:
+        dataset: Its reader.
+        entry: Its name and its folder.
+        scans: Its scans.
+
+    Raises:
+        ConfigError: For options that cannot be used.
+        DataError: For two scans of one name.
+    """
+
+    folder: Path
+    of_scans = True
+
+    def __init__(self, dataset: ScanDataset[Any], entry: SceneEntry, scans: Sequence[ScanSource]) -> None:
+        if len({scan.name for scan in scans}) < len(scans):
+            raise DataError(f"{entry.folder}: two scans have one name; scans need names of their own")
+        self.name, self.folder, self.options = entry.name, entry.folder, dataset.options
+        self.skips_incomplete = self.options.incomplete == "skip"
+        self.up = np.array(UP_AXES[self.options.up_axis], np.float64) if self.options.up_axis else None
+        self._dataset, self._scans, self._files = dataset, scans, Folders()
+        base = self.options.labels_root or entry.folder
+        self._truth = None
+        if dataset.truth is not None:
+            truth = LabelSource.of("points", entry.folder, dataset.truth, scans, self._files)
+            self._truth = None if truth.first is None else truth
+        templates = dataset.labels if self.options.labels is None else (self.options.labels,)
+        shown = {"scene": entry.below_root, "model": "MODEL", "name": scans[0].name}
+        known = [Template("labels", text, ("scene", "model", "name"), ("model", "name")) for text in templates]
+        self.label_paths = tuple(str(base / template.filled(**shown)) for template in known)
+        self._sources = dict[str, LabelSource]()
+        for template in known:
+            found = {
+                model: LabelSource.of("points", base, filled, scans, self._files)
+                for model, filled in matching_folders(base, template, "model", scene=entry.below_root).items()
+            }
+            self._sources |= {model: source for model, source in found.items() if source.first is not None}
+            if self._sources:
+                break
+        self.models, self.ground_truth = tuple(self._sources), self._truth is not None
+
+    def __len__(self) -> int:
+        """Return the number of scans of the sequence, those without a file or a pose among them."""
+        return len(self._scans)
+
+    @cached_property
+    def timestamps(self) -> Float64 | None:
+        """Return (len,) seconds on the dataset's own clock; None where it has none."""
+        times = [scan.timestamp for scan in self._scans]
+        return None if None in times else np.array(times, dtype=np.float64)
+
+    def tracked(self, index: int) -> bool:
+        """Return whether the scan has a pose."""
+        return bool(np.isfinite(self._scan(index).pose).all())
+
+    def missing(self, index: int, sources: Sequence[str] = (), *, color: bool = False) -> list[str]:
+        """Return the missing files of the scan, among labels of these sources."""
+        scan = self._scan(index)
+        lost = [] if self._files.has(scan.points) else [str(scan.points)]
+        for name in sources:
+            lost += self._source(name).missing(scan)
+        return lost
+
+    def frame_name(self, index: int) -> str:
+        """Return the name of the scan's files."""
+        return self._scan(index).name
+
+    def image_name(self, index: int) -> str:
+        """Return the name of the scan's files."""
+        return self._scan(index).name
+
+    @property
+    def settings(self) -> Mapping[str, Any]:
+        """The conventions by which its files are read, by name of option."""
+        settings: Mapping[str, Any] = self.options.model_dump()
+        return settings
+
+    def label_space(self, model: str) -> LabelSpace:
+        """Return the classes of that label source.
+
+        Raises:
+            DataError: If they are not known.
+            ConfigError: If there is no such source, or it has none.
+        """
+        self._source(model)
+        options = self.options
+        name = options.taxonomies.get(model, options.taxonomy or self._dataset.taxonomy)
+        if options.classes is not None and model not in options.taxonomies:
+            return LabelSpace(name="classes of the scene", classes=options.classes)
+        if name is None:
+            raise DataError(
+                f"{self.folder}: the classes of '{model}' are not known; set classes: [name, ...] in id order, or"
+                " taxonomy: NAME (--option taxonomy=FILE.yaml)"
+            )
+        return LabelSpace.load(name)
+
+    def frame(self, index: int, model: str, *, color: bool = True) -> Frame:
+        """Return scan 0 <= index < len with that source's labels.
+
+        Raises:
+            DataError: If that fails; the message names the file.
+            ConfigError: If there is no such scan or model.
+        """
+        scan, source = self._scan(index), self._source(model)
+        file = source.file(scan)
+        if file is None:
+            raise DataError(
+                f"{self.folder}: {listed(source.missing(scan), str(self.folder))}; choose scans that have it, or add it"
+            )
+        stored, moving = self._dataset.ids(file, self._files.read(file)), self._moving(scan)
+        return self._framed(index, self._labels(model, stored, file), {"labels": str(file)}, moving)
+
+    def geometry(self, index: int, *, color: bool = False) -> Frame:
+        """Return the scan but for its labels: all points are of class 0."""
+        return self._framed(index, None, {})
+
+    def intrinsics(self, index: int, shape: tuple[int, ...]) -> Intrinsics:
+        """Raise DataError: a scan has none."""
+        raise DataError(f"{self.folder}: scans have no intrinsics")
+
+    def T_wc(self, index: int) -> Float64:
+        """Return pose (4, 4) sensor-to-world in metres; reads no points."""
+        return self._scan(index).pose
+
+    def digest(self, indices: Sequence[int], model: str) -> str:
+        """Return a hash of the settings, the classes, and the points, poses and labels of those scans."""
+        settings = self.options.model_dump(mode="json", exclude=PLACES)
+        space, source = self.label_space(model), self._source(model)
+        digest = hashlib.blake2b(digest_size=16)
+        digest.update(json.dumps([settings, space.to_dict()]).encode())
+        if (table := self._dataset.class_ids()) is not None:
+            digest.update(table.tobytes())
+        for index in indices:
+            scan = self._scan(index)
+            digest.update(scan.name.encode() + b"\0" + scan.pose.tobytes() + self._files.digest(scan.points))
+            for each in (source, self._truth):
+                file = None if each is None else each.file(scan)
+                digest.update(b"" if file is None else self._files.digest(file))
+        return digest.hexdigest()
+
+    def fingerprints(self, index: int) -> Mapping[str, str]:
+        """Return a short hash of the file of points, and of the pose."""
+        scan = self._scan(index)
+        pose = " ".join(f"{round(value, 6) + 0.0:.6f}" for value in scan.pose.ravel().tolist())
+        return {
+            str(scan.points.relative_to(self.folder)): fingerprint(self._files.digest(scan.points)),
+            f"pose of {scan.name}": fingerprint(pose.encode()),
+        }
+
+    def _labels(self, model: str, stored: npt.NDArray[Any], file: Path) -> UInt16:
+        """Return stored ids as ids of the source's taxonomy."""
+        if stored.size and (stored.min() < 0 or stored.max() > IGNORE_16BIT):
+            raise DataError(f"{file}: ids go from {stored.min()} to {stored.max()}; they must be 0 to 65535")
+        labels: UInt16 = stored.astype(np.uint16)
+        if void := self.options.void_ids.get(model):
+            labels = np.where(np.isin(labels, void), np.uint16(IGNORE_16BIT), labels)
+        table = None if model in self.options.taxonomies else self._dataset.class_ids()
+        if table is None:
+            return labels
+        ids: UInt16 = table[labels]
+        if (unknown := ids == NO_ID).any():
+            raise DataError(f"{file}: the id {labels[unknown][0]} is no class of the format; is it another format?")
+        return ids
+
+    def _moving(self, scan: ScanSource) -> Mask | None:
+        """Return the points that move, by the ground truth, where it says so."""
+        file = None if self._truth is None else self._truth.file(scan)
+        return None if file is None else self._dataset.moving(self._dataset.ids(file, self._files.read(file)))
+
+    def _framed(
+        self, index: int, labels: npt.NDArray[Any] | None, files: Mapping[str, str], moving: Mask | None = None
+    ) -> Frame:
+        scan = self._scan(index)
+        points = self._dataset.points(scan.points, self._files.read(scan.points))
+        near, far = self.options.min_range or 0.0, self.options.max_range or math.inf
+        depth = np.sqrt((points.astype(np.float64) ** 2).sum(axis=1)).astype(np.float32)
+        if near > 0 or far < math.inf:
+            depth = np.where((depth > near) & (depth < far), depth, np.float32(0))
+        if labels is None:
+            labels = np.zeros(len(points), np.uint8)
+        known = {"points": str(scan.points), "depth": str(scan.points), "pose": str(scan.pose_file)}
+        return Frame(
+            index=int(index), points=points, depth=depth, T_wc=scan.pose, labels=labels, mask=moving,
+            timestamp=scan.timestamp, files=known | dict(files),
+        )  # fmt: skip
+
+    def _source(self, model: str) -> LabelSource:
+        """Return the files of a label source; raises ConfigError if there is none of that name."""
+        known = self._sources | ({} if self._truth is None else {GROUND_TRUTH: self._truth})
+        if model not in known:
+            hint = nearest(model, [*known]) if known else f"put its files into {self.label_paths[0]}"
+            raise ConfigError(f"{self.folder}: model '{model}' is not there; {hint}")
+        return known[model]
+
+    def _scan(self, index: int) -> ScanSource:
+        if not 0 <= index < len(self):
+            raise ConfigError(f"{self.folder}: there is no scan {index}; it has {len(self)}, counted from 0")
+        return self._scans[index]
+
+
+def floats_of(path: Path, data: bytes, columns: int) -> Float32:
+    """Return the rows (N, columns) of float32 that a file holds, little-endian.
+
+    Raises:
+        DataError: If its size is no multiple of a row's, with the file.
+    """
+    if len(data) % (4 * columns) or not data:
+        raise DataError(
+            f"{path}: {len(data)} bytes are no rows of {columns} float32 (x, y, z, ...); is it cut off, or another"
+            " format?"
+        )
+    return np.frombuffer(data, "<f4").reshape(-1, columns)
