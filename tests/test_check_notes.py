@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import os
 from pathlib import Path
 
@@ -14,8 +15,10 @@ from posed_writer import write_posed
 from room_scene import CLASSES, Room, walk, write
 from typer.testing import CliRunner
 
+import semstab
 from semstab.check import check
-from semstab.check.registration import find_offset, find_sentinel, grey_levels
+from semstab.check.no_depth import find_sentinel
+from semstab.check.registration import find_offset, grey_levels
 from semstab.cli import app
 from semstab.datasets import open_dataset
 from semstab.pixels.edges import depth_edges, image_edges
@@ -37,16 +40,39 @@ def with_gaps(z, value=65.535):
     return z
 
 
-def test_65535_in_16_bits_is_pointed_out(tmp_path):
-    room = Room(walk(6), told_depth=with_gaps)
-    sources = {name: [room.frame(i, name) for i in range(6)] for name in ("net", "gt")}
-    folder = write_posed(tmp_path / "room", [f"{i:03d}" for i in range(6)], sources, classes=list(CLASSES))
-    (note,) = notes(folder)
-    assert "2.9% of the pixels with depth have the value 65535 (65.54 m), and nothing lies between it and " in note
-    assert note.endswith(f"it means 'no depth'; set invalid_depth: [65535] (set it in {folder}/scene.yaml)")
-    assert notes(folder, invalid_depth=[65535]) == ()
-    result = CliRunner().invoke(app, ["check", "--data", str(folder)], env={"COLUMNS": "80", "NO_COLOR": "1"})
-    assert "note: 2.9% of the pixels with depth have the value 65535" in result.stdout
+@pytest.fixture(scope="module")
+def gaps(tmp_path_factory):
+    """Folders by what 'no depth' is stored as: 65535 in millimetres, a far plane in millimetres, and 0 for both."""
+    folders = {}
+    for name, value in (("65535", 65.535), ("40000", 40.0), ("0", 0.0)):
+        room = Room(walk(6), told_depth=functools.partial(with_gaps, value=value))
+        sources = {name: [room.frame(i, name) for i in range(6)] for name in ("net", "gt")}
+        folder = tmp_path_factory.mktemp(f"gaps{name}") / "room"
+        folders[name] = write_posed(folder, [f"{i:03d}" for i in range(6)], sources, classes=list(CLASSES))
+    return folders
+
+
+@pytest.mark.parametrize("value", ["65535", "40000"])
+def test_a_value_that_means_no_depth_is_left_out_and_said(gaps, value):
+    (note,) = notes(gaps[value])
+    assert f"2.9% of the pixels with depth have the value {value} " in note
+    assert note.endswith(f"it means 'no depth'; it is left out (invalid_depth: [{value}])")
+    assert notes(gaps[value], invalid_depth=[float(value)]) == ()
+    result = CliRunner().invoke(app, ["check", "--data", str(gaps[value])], env={"COLUMNS": "80", "NO_COLOR": "1"})
+    assert f"note: 2.9% of the pixels with depth have the value {value}" in result.stdout
+
+
+@pytest.mark.parametrize("value", ["65535", "40000"])
+def test_a_run_leaves_it_out_as_check_does_and_says_so(gaps, value, tmp_path):
+    def run(name, **settings):
+        config = configure(gaps[name], models=["net"], check=None, **settings)
+        result = semstab.run(config, out=tmp_path / f"{name}{len(settings)}", report=False)
+        return result.runs[0].table.voxels, [note for of_scene in result.notes.values() for note in of_scene]
+
+    (left_out, said), (without, silent), (trusting, _) = run(value), run("0"), run(value, check_geometry=False)
+    assert left_out == without < trusting
+    assert [note.endswith(f"it is left out (invalid_depth: [{value}])") for note in said] == [True]
+    assert silent == []
 
 
 def test_far_walls_and_noise_are_depth(tmp_path):

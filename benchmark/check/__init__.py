@@ -1,6 +1,7 @@
 """A check that a dataset makes sense: poses, depth, units, intrinsics, labels, and what voxels it can carry."""
 
 from semstab.check.geometry import Verdict
+from semstab.check.no_depth import with_invalid_depth
 from semstab.check.scene_check import (
     SCHEMA,
     SceneCheck,
@@ -25,5 +26,6 @@ __all__ = [
     "quick_sample",
     "refuse_unsound",
     "require_sound",
+    "with_invalid_depth",
     "with_voxel_size",
 ]

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from semstab.check.conventions import OPTION, Reading
+from semstab.check.conventions import OPTION
 from semstab.check.geometry import Verdict
 from semstab.check.reprojection import Pair, View
 from semstab.core.arrays import evenly
@@ -296,56 +296,7 @@ def _correlation(a: Float32, b: Float32) -> float:
     return float(np.corrcoef(a, b)[0, 1])
 
 
-# Stored values that mean 'no depth', where they are taken for metres: 65535 of 16 bits is 65 m away.
-
-FULL = 65535.0
-"""The largest number of 16 bits: hardly ever a distance."""
-
-LEAST_SHARE = 1e-3
-"""The least share of the pixels with depth that have one and the same value, the largest of all."""
-
-GAP = 2.0
-"""A value marks pixels where it is so many times the largest depth below it."""
-
-
-@dataclass(frozen=True)
-class Sentinel:
-    """A value that stands alone at the far end of the depths.
-
-    Attributes:
-        value: The value as it is stored.
-        metres: The depth that it is read as.
-        share: Share of the pixels with depth.
-        next: The largest depth below it, metres.
-    """
-
-    value: float
-    metres: float
-    share: float
-    next: float
-
-    def __str__(self) -> str:
-        return (
-            f"{self.share:.1%} of the pixels with depth have the value {self.value:.15g} ({self.metres:.4g} m), and"
-            f" nothing lies between it and {self.next:.4g} m: it means 'no depth'"
-        )
-
-
-def find_sentinel(depths: Iterable[Float32], scale: float) -> Sentinel | None:
-    """Return the value that many `depths` (metres, `scale` stored units each) have at the far end, none near it."""
-    valid = [depth[(depth > 0) & (depth < np.inf)] for depth in depths]
-    pixels = sum(values.size for values in valid)
-    largest = max((values.max() for values in valid if values.size), default=np.float32(0))
-    below = max((rest.max() for values in valid if (rest := values[values < largest]).size), default=np.float32(0))
-    share = sum(np.count_nonzero(values == largest) for values in valid) / max(1, pixels)
-    value = float(f"{float(largest) * scale:.6g}")
-    stands_alone = largest >= GAP * below or value == FULL
-    if below == 0 or share < LEAST_SHARE or not stands_alone:
-        return None
-    return Sentinel(value, float(largest), share, float(below))
-
-
-# Properties of a scene that look wrong, but may be right: values that mean 'no depth', labels off the edges of depth.
+# Properties of a scene that look wrong, but may be right: little depth, labels off the edges of depth.
 
 FEW = 0.1
 """The share of the pixels with depth below which it is said."""
@@ -354,14 +305,8 @@ REGISTERED_FRAMES = 16
 """Frames in which the edges of labels are compared with those of depth."""
 
 
-def notes(scene: Scene, views: Sequence[View], how: Reading, model: str) -> Iterator[str]:
+def notes(scene: Scene, views: Sequence[View], model: str) -> Iterator[str]:
     """Yield one line each; the views have the labels of `model`, or none."""
-    if how.convention.depth == "planar" and (
-        sentinel := find_sentinel((view.depth for view in views), how.depth_scale or 1)
-    ):
-        values = [*how.said.get("invalid_depth", ()), sentinel.value]
-        listed = "[" + ", ".join(f"{value:.15g}" for value in values) + "]"
-        yield f"{sentinel}; set {how.change('invalid_depth', listed)}"
     some = [views[k] for k in evenly(len(views), REGISTERED_FRAMES)]
     if (share := mean(np.array([np.mean((v.depth > 0) & (v.depth < np.inf)) for v in some]))) < FEW:
         yield (

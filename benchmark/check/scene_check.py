@@ -28,6 +28,7 @@ from semstab.check.coverage import (
 from semstab.check.geometry import Verdict, assess, shifts_and_turns
 from semstab.check.intrinsics import with_intrinsics
 from semstab.check.labels import LabelFindings, check_labels
+from semstab.check.no_depth import with_invalid_depth
 from semstab.check.registration import assess_surface, match_images, notes
 from semstab.check.reprojection import Sample, View, clusters, label_source, pairs_within, reader
 from semstab.check.scans import ScanCoverage, ScanSample, assess_scans, quick_sample_of_scans
@@ -249,11 +250,18 @@ def check(config: Config) -> Iterator[SceneCheck]:
     """
     dataset = open_dataset(config.dataset.name, config.dataset.options)
     for name in selected(config.scenes, dataset.scenes, (), "scene", config.dataset.name):
-        yield check_scene(dataset.scene(name), config)
+        scene = dataset.scene(name)
+        changed, gaps = with_invalid_depth(config, {name: scene})
+        if gaps:
+            scene = open_dataset(changed.dataset.name, changed.dataset.options).scene(name)
+        yield check_scene(scene, changed, [*gaps.values()])
 
 
-def check_scene(scene: Scene, config: Config) -> SceneCheck:
-    """Check one scene under the configuration's selection of frames, models, taxonomy, voxel size and stride."""
+def check_scene(scene: Scene, config: Config, told: Sequence[str] = ()) -> SceneCheck:
+    """Check one scene under the configuration's selection of frames, models, taxonomy, voxel size and stride.
+
+    `told` are notes on how it was opened.
+    """
     models, begun = _whole(scene, config)
     indices = frame_indices(scene, config, models)
     first = models[0] if models else label_source(scene)
@@ -279,9 +287,10 @@ def check_scene(scene: Scene, config: Config) -> SceneCheck:
         labels=tuple(_labels(scene, name, indices, config, inspection.tally) for name in models),
         label_findings=findings,
         notes=(
+            *told,
             *verdict.remarks,
             *(line for each in findings for line in each.remarks),
-            *notes(scene, [inspection.views[at] for at in sorted(inspection.views)], how, inspection.tally.model),
+            *notes(scene, [inspection.views[at] for at in sorted(inspection.views)], inspection.tally.model),
             *begun,
         ),
     )

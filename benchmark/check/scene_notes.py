@@ -31,5 +31,5 @@ def scene_notes(scene: Scene, indices: Sequence[int], model: str, config: Config
     found = [] if predicted else label_findings(scene, indices, [model], LABEL_RUNS)
     return (
         *(line for each in found for line in (*each.wrong, *each.remarks)),
-        *notes(scene, views, inspection.reading(config.dataset.options), model),
+        *notes(scene, views, model),
     )

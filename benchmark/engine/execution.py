@@ -11,7 +11,7 @@ from collections import deque
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from semstab.check import Verdict, advise, quick_sample, refuse_unsound, with_voxel_size
+from semstab.check import Verdict, advise, quick_sample, refuse_unsound, with_invalid_depth, with_voxel_size
 from semstab.check.scene_notes import scene_notes
 from semstab.config import Config
 from semstab.core.process import trim_malloc
@@ -58,12 +58,15 @@ def execute(
     started, telling, executor = time.perf_counter(), Observers(observers), executor or InProcess()
     config = resolve(config)
     scenes = open_scenes(config, out.absolute())
+    config, gaps = with_invalid_depth(config, scenes) if config.check_geometry else (config, {})
+    if gaps:
+        scenes = open_scenes(config, out.absolute())
     config, advice = with_voxel_size(config, scenes)
     plan = make_plan(config, scenes)
     require_file_names(out, (each.unit for each in plan.units))
     folder = Folder(out, plan, overwrite=overwrite)
     try:
-        execution = _Execution(plan, folder, executor, telling)
+        execution = _Execution(plan, folder, executor, telling, gaps)
         with folder.started(config) as start, share_open_scenes(start.name, plan.scenes):
             execution.begin(start)
             with contextlib.closing(executor.run(execution.next_job, telling)) as outcomes:
@@ -91,8 +94,11 @@ class _Execution:
         ended: Outcomes of tiled units that an earlier start computed and did not store.
     """
 
-    def __init__(self, plan: Plan, folder: Folder, executor: Executor, observers: Observers) -> None:
+    def __init__(
+        self, plan: Plan, folder: Folder, executor: Executor, observers: Observers, gaps: Mapping[str, str]
+    ) -> None:
         self._plan, self._folder, self._executor, self._observers = plan, folder, executor, observers
+        self._gaps = gaps
         self.units = units = UnitResults()
         with units.watch("digest"):
             there = ((key, folder.finished(each)) for key, each in plan.distinct().items())
@@ -186,4 +192,5 @@ class _Execution:
             if scene in verdicts:
                 with contextlib.suppress(DataError):
                     found = scene_notes(task.scene, task.indices, model, config)
-                    self.units.notes[scene, model] = (*verdicts[scene].remarks, *found)
+                    left_out = [self._gaps[scene]] if scene in self._gaps else []
+                    self.units.notes[scene, model] = (*left_out, *verdicts[scene].remarks, *found)
