@@ -70,6 +70,7 @@ class Scene(ABC):
         skips_incomplete: Whether selected frames without a file are left out; else they are an error.
         images_elsewhere: Whether option images may name another folder of images, and does not.
         of_scans: Whether its frames are scans of points, not images.
+        made: Whether it is simulated, so that each frame has the pose that it was rendered from.
     """
 
     name: str
@@ -91,6 +92,7 @@ class Scene(ABC):
     skips_incomplete: bool = False
     images_elsewhere: bool = False
     of_scans: bool = False
+    made: bool = False
 
     @abstractmethod
     def __len__(self) -> int:

@@ -18,7 +18,8 @@ import cv2
 import numpy as np
 
 from semstab.check.labels import check_labels
-from semstab.check.scene_check import quick_check
+from semstab.check.reprojection import clusters
+from semstab.check.scene_check import CLUSTERS, POINTS, Inspection
 from semstab.data.frames import Frame, Intrinsics
 from semstab.data.labels import LabelSpace
 from semstab.datasets import Scene
@@ -136,6 +137,23 @@ def poses_of(by: int) -> Callable[[Frames], Frames]:
     return lambda frames: [replace(f, T_wc=frames[k].T_wc) for f, k in zip(frames, later(frames, by), strict=True)]
 
 
+def jump(frames: Frames) -> Frames:
+    """Return the frames with the poses of the second half moved by 0.3 m, to the side and forward."""
+    half = len(frames) // 2
+    return [replace(f, T_wc=moved(f.T_wc, (0.2, 0.0, 0.2))) if f.index >= half else f for f in frames]
+
+
+def moved(T: np.ndarray, by: Sequence[float]) -> np.ndarray:
+    out = T.copy()
+    out[:3, 3] += by
+    return out
+
+
+def one(change: Callable[[Frame], Frame]) -> Callable[[Frames], Frames]:
+    """Return a mistake in one frame, the 12th."""
+    return lambda frames: [change(f) if f.index == 11 else f for f in frames]
+
+
 def camera(factor: float = 1.0, right: float = 0.0) -> Callable[[Frames], Frames]:
     """Return a mistake that states other intrinsics: focal lengths times a factor, cx so many pixels to the right."""
     K = Intrinsics(CAMERA.fx * factor, CAMERA.fy * factor, CAMERA.cx + right, CAMERA.cy)
@@ -175,6 +193,13 @@ MISTAKES = (
     Mistake("focal length 10 % too small", camera(0.9), "focal length is"),
     Mistake("focal length 10 % too large", camera(1.1), "focal length is"),
     Mistake("cx 10 % of the width too large", camera(right=W / 10), "cx is"),
+    Mistake("poses jump by 0.3 m in the middle", jump, f"poses jump at frame {FRAMES // 2}:"),
+    Mistake("depth of one frame times 5", one(lambda f: replace(f, depth=f.depth * np.float32(5))),
+            "frame 11 does not fit"),
+    Mistake("pose of one frame off by 0.4 m", one(lambda f: replace(f, T_wc=moved(f.T_wc, (0.3, 0.0, 0.3)))),
+            "frame 11 does not fit"),
+    Mistake("labels of one frame upside down", one(lambda f: replace(f, labels=f.labels[::-1].copy())),
+            "the map of frame 11 "),
     Mistake("none", lambda frames: frames, "nothing"),
 )  # fmt: skip
 
@@ -182,7 +207,8 @@ MISTAKES = (
 def said(frames: Frames) -> Iterator[str]:
     """Yield the findings, as `check` says them."""
     made, indices = Made(frames), range(len(frames))
-    verdict = quick_check(made, indices)
+    inspection = Inspection(made, indices, "net", clusters(len(frames), CLUSTERS), POINTS)
+    verdict = inspection.verdict({}, thorough=True)
     yield from verdict.remarks
     if verdict.state == "unsound":
         yield verdict.text

@@ -16,7 +16,7 @@ from semstab.check.coverage import FUSED_FRAMES
 from semstab.check.scene_check import SceneCheck
 from semstab.data.labels import IGNORE_16BIT
 
-STATES = {"sound": "green", "unsound": "bold red", "unclear": "yellow"}
+STATES = {"sound": "green", "imprecise": "yellow", "unsound": "bold red", "unclear": "yellow"}
 NOTHING = "-"
 MOST_UNKNOWN = 4
 MOST_COLUMNS = 100
@@ -45,7 +45,7 @@ def print_check(checked: SceneCheck, console: Console, *, verbose: bool = False)
         say(f"  note: {note}", 4, "yellow")
     tables = _tables(checked)
     wrong_labels = any(labels.problem for labels in checked.labels)
-    wanted = "labels" if wrong_labels else "overlap" if state == "sound" else "conventions"
+    wanted = "labels" if wrong_labels else "overlap" if state in ("sound", "imprecise") else "conventions"
     for name in tables if verbose else [name for name in (wanted,) if name in tables]:
         title, table = tables[name]
         if verbose:

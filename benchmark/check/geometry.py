@@ -76,7 +76,7 @@ HARDLY_DEEP = 1.05
 """Limits below which a reason says what frames cannot tell: motion as a share of depth, degrees, and the ratio of
 the 90th to the 10th percentile of depth."""
 
-State = Literal["sound", "unsound", "unclear"]
+State = Literal["sound", "imprecise", "unsound", "unclear"]
 
 
 @dataclass(frozen=True)
@@ -111,7 +111,8 @@ class Verdict:
     """The outcome of a check of the geometry.
 
     Attributes:
-        state: Sound; unsound; or unclear, where the frames do not tell.
+        state: Sound; imprecise, where depth agrees far worse than its noise explains; unsound; or unclear, where the
+            frames do not tell.
         text: The reason, in one line.
         mend: Lines of configuration that would mend it, where they are known.
         error, share: Those of the configured convention, see `Fit`.

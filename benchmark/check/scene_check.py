@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from semstab.check.continuity import Neighbours, with_continuity
 from semstab.check.conventions import Reading, reading
 from semstab.check.coverage import (
     FUSED_FRAMES,
@@ -29,6 +30,7 @@ from semstab.check.geometry import Verdict, assess, shifts_and_turns
 from semstab.check.intrinsics import with_intrinsics
 from semstab.check.labels import LabelFindings, check_labels
 from semstab.check.no_depth import with_invalid_depth
+from semstab.check.precision import with_precision
 from semstab.check.registration import assess_surface, match_images, notes
 from semstab.check.reprojection import Sample, View, clusters, label_source, pairs_within, reader
 from semstab.check.scans import ScanCoverage, ScanSample, assess_scans, quick_sample_of_scans
@@ -149,8 +151,7 @@ LEAST_POINTS_A_VIEW, MOST_POINTS_A_VIEW = 50, 500
 number of positions of a sequence of scans."""
 
 QUICK_POINTS = 2400
-CONFIRMING_CLUSTERS = 3
-"""The quick check takes so many points from one position, and from so many positions before it refuses data."""
+"""The quick check takes so many points from one position, and looks as thoroughly as the check before it refuses."""
 
 LABEL_RUNS = 6
 """Number of runs of five frames in which label maps are compared with depth, colour and each other."""
@@ -376,15 +377,13 @@ def quick_sample(
     verdict, sample = Verdict("unclear", "it takes two frames to tell whether depth and poses agree"), None
     if scene.of_scans:
         return assess_scans(quick_sample_of_scans(scene, indices)), None
-    for count in (1, CONFIRMING_CLUSTERS):
-        inspection = Inspection(
-            scene, indices, None, clusters(len(indices), count), count * QUICK_POINTS, passing_over=True
-        )
+    for count, points, thorough in ((1, QUICK_POINTS, False), (CLUSTERS, POINTS, True)):
+        inspection = Inspection(scene, indices, None, clusters(len(indices), count), points, passing_over=True)
         if len(inspection.views) < 2:
             continue
         sample = inspection.sample(options or {})
-        verdict = inspection.verdict(options or {}, thorough=False)
-        if verdict.state != "unsound":
+        verdict = inspection.verdict(options or {}, thorough=thorough)
+        if verdict.state in ("sound", "imprecise"):
             break
     return verdict, sample
 
@@ -441,7 +440,7 @@ class Inspection:
         passing_over: bool = False,
         with_color: bool = False,
     ) -> None:
-        self.scene = scene
+        self.scene, self.indices, self.source = scene, indices, source
         self.tally = Tally(source or "")
         self.views: dict[int, View] = {}
         self.fused = evenly(len(indices), fused)
@@ -490,7 +489,12 @@ class Inspection:
         how = self.reading(options)
         verdict = assess(sample, how, thorough=thorough)
         timed = with_lateness(verdict, self.scene, sample, how)
-        return with_intrinsics(verdict, sample, how) if timed == verdict else timed
+        verdict = with_intrinsics(verdict, sample, how) if timed == verdict else timed
+        verdict = with_precision(verdict, sample)
+        if self.scene.made and not thorough:
+            return verdict  # rendering its frames takes longer than fusing them
+        neighbours = Neighbours(self.scene, self.indices, self.source, how.convention, self.views)
+        return with_continuity(verdict, neighbours, neighbours.spread(how.size, thorough=thorough))
 
     def depth(self) -> Depth:
         """Return the depth of all frames that were read."""
@@ -508,6 +512,9 @@ def _with_coverage(checked: SceneCheck, inspection: Inspection, sample: Sample, 
     views = [inspection.views[position] for position in inspection.fused]
     stride = fused_stride(checked.size, config.pixel_stride)
     suggestion = None if noise is None else suggest(coverage, overlaps, checked.selected, config.frames.stride)
+    if suggestion is not None and checked.verdict.state == "imprecise":
+        reason = f"{suggestion.voxel_size_reason}, which are that large because depth and poses are imprecise"
+        suggestion = dataclasses.replace(suggestion, voxel_size_reason=reason)
     size = config.voxel_size
     if not config.sets_voxel_size and suggestion is not None and suggestion.voxel_size is not None:
         size = suggestion.voxel_size

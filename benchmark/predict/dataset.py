@@ -197,6 +197,7 @@ class PredictedScene(Scene):
         self.sources = inner.sources
         self.folder = inner.folder
         self.settings_file = inner.settings_file
+        self.made = inner.made
         self.skips_incomplete, self.images_elsewhere = inner.skips_incomplete, inner.images_elsewhere
         self._inner = inner
         self._dataset = dataset

@@ -477,8 +477,8 @@ class ProgressBar(Observer):
             self.bar.start()
 
     def geometry_checked(self, task: Task, verdict: Verdict) -> None:
-        """Store an unclear result until the run is finished."""
-        if verdict.state == "unclear":
+        """Store an unclear or imprecise result until the run is finished."""
+        if verdict.state in ("unclear", "imprecise"):
             self.notes.append(f"{task.scene.name}: {verdict.text}")
 
     def advanced(self, frames: int, what: str) -> None:

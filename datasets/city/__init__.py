@@ -65,6 +65,7 @@ class CityScene(Scene):
     """One flight over one town; see `semstab.datasets.Scene`."""
 
     ground_truth = True
+    made = True
 
     def __init__(self, name: str, options: CityOptions) -> None:
         self.name = name

@@ -1,0 +1,85 @@
+"""Whether depth agrees between frames as well as the noise of the camera lets expect, at each distance of frames."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import numpy as np
+
+from semstab.check.coverage import BINS, plane_residuals
+from semstab.check.geometry import GOOD, LEAST_PAIRS, MIN_POINTS, MIN_SHARE, Verdict
+from semstab.check.reprojection import Pair, Sample, View, median_of_seen
+
+MEASURED = 1e-4
+"""Noise of one frame, relative, from which on its depth is measured; below, it is rendered or of a surface."""
+
+SENSOR, SURFACE = 0.005, 0.0015
+"""Errors that depth of either kind has at least, from the place of a pixel and from what a sensor always gets wrong."""
+
+IMPRECISE = 3.0
+"""Depth is imprecise where its error is so many times the one to expect."""
+
+GROWS = 10.0
+"""Poses drift where the error of distant frames is so many times that of the nearest ones, and no longer a good fit."""
+
+
+def with_precision(verdict: Verdict, sample: Sample) -> Verdict:
+    """Return the verdict; one that is sound becomes imprecise where depth agrees far worse than its noise explains."""
+    if verdict.state != "sound" or not math.isfinite(verdict.error):
+        return verdict
+    text = _drift(sample) or _coarse(verdict, sample)
+    return verdict if text is None else dataclasses.replace(verdict, state="imprecise", text=text)
+
+
+def _coarse(verdict: Verdict, sample: Sample) -> str | None:
+    expected, kind = expected_error(sample)
+    if verdict.error <= IMPRECISE * expected:
+        return None
+    return (
+        f"depth reprojects with {verdict.error:.2%} median error, {verdict.share:.0%} co-visible; {kind} has about"
+        f" {expected:.2%}: poses, intrinsics or the scale of depth are imprecise"
+    )
+
+
+def expected_error(sample: Sample) -> tuple[float, str]:
+    """Return the relative error that depth has with exact poses, and the kind of depth, in words."""
+    noise = float(np.nanmedian([_noise(view) for view in sample.views.values()]))
+    least, kind = (SENSOR, "depth as noisy as this") if noise >= MEASURED else (SURFACE, "depth as smooth as this")
+    return max(least, math.sqrt(2) * noise), kind
+
+
+def _noise(view: View) -> float:
+    residuals = plane_residuals(view)
+    return float(np.median(residuals) / np.median(view.depth[view.v, view.u])) if len(residuals) else math.nan
+
+
+def _drift(sample: Sample) -> str | None:
+    """Return the line on poses that fit nearby frames and not distant ones."""
+    near: tuple[tuple[int, int], float] | None = None
+    for low, high in BINS:
+        pairs = [(a, b) for a, b in sample.pairs if low <= abs(a - b) <= high]
+        error = _error(sample, pairs)
+        if near is not None and error > max(GOOD, GROWS * near[1]):
+            return (
+                f"poses drift: depth reprojects with {near[1]:.2%} error in frames {_apart(near[0])} apart, but with"
+                f" {error:.1%} in those {low} to {high} apart"
+            )
+        if near is None and math.isfinite(error):
+            near = (low, high), error
+    return None
+
+
+def _apart(distances: tuple[int, int]) -> str:
+    low, high = distances
+    return str(low) if low == high else f"{low} to {high}"
+
+
+def _error(sample: Sample, pairs: list[Pair]) -> float:
+    """Return the median error over pairs; NaN where they see too little of each other."""
+    if len(pairs) < LEAST_PAIRS:
+        return math.nan
+    chosen = dataclasses.replace(sample, pairs=pairs)
+    errors = np.concatenate([error[0] for error in chosen.errors(sample.configured, np.array([1.0]))])
+    seen = np.isfinite(errors)
+    return float(median_of_seen(errors)) if seen.sum() >= MIN_POINTS and seen.mean() >= MIN_SHARE else math.nan

@@ -1,0 +1,68 @@
+"""Poses that jump and single frames that do not fit: found, named, and refused or noted; real sequences are silent."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import doctor
+import numpy as np
+import pytest
+
+from semstab.check import quick_check
+from semstab.datasets import open_dataset
+
+DATA = Path(os.environ.get("SEMSTAB_DATA", Path(__file__).parents[1] / "../shared/data"))
+PLANTED = {mistake.name: mistake for mistake in doctor.MISTAKES}
+
+
+def lines(mistake: str, seed: int = 0) -> list[str]:
+    return [*doctor.said(PLANTED[mistake].plant(doctor.scene(seed)))]
+
+
+@pytest.mark.parametrize(
+    "mistake",
+    ["poses jump by 0.3 m in the middle", "depth of one frame times 5", "pose of one frame off by 0.4 m"],
+)
+def test_it_is_named_with_its_frame_and_nothing_else_is_said(mistake) -> None:
+    (line,) = lines(mistake)
+    assert PLANTED[mistake].said in line
+
+
+def test_depth_in_another_unit_is_told_from_a_wrong_pose() -> None:
+    assert "is 5 times too long" in lines("depth of one frame times 5")[0]
+    assert "its pose or its depth" in lines("pose of one frame off by 0.4 m")[0]
+
+
+def test_the_map_of_one_frame_is_named() -> None:
+    assert any(
+        PLANTED["labels of one frame upside down"].said in line for line in lines("labels of one frame upside down")
+    )
+
+
+def test_poses_that_jump_are_refused_with_the_parts_to_fuse() -> None:
+    made = doctor.Made(doctor.jump(doctor.scene(0)))
+    verdict = quick_check(made, range(len(made)))
+    assert verdict.state == "unsound"
+    assert "--frames :15 and --frames 15:" in verdict.text
+
+
+@pytest.mark.skipif(not DATA.is_dir(), reason="the real sequences are not here")
+@pytest.mark.parametrize("name", ["livingroom", "apc_shelf", "hololens", "brighton"])
+def test_real_sequences_are_sound_and_have_no_misfits(name) -> None:
+    dataset = open_dataset("posed_folder", {"root": DATA / name})
+    scene = dataset.scene(dataset.scenes[0])
+    verdict = quick_check(scene, range(len(scene)))
+    assert (verdict.state, verdict.remarks) == ("sound", ())
+
+
+@pytest.mark.skipif(not DATA.is_dir(), reason="the real sequences are not here")
+def test_a_jump_in_a_real_sequence_is_named(monkeypatch) -> None:
+    dataset = open_dataset("posed_folder", {"root": DATA / "livingroom"})
+    scene = dataset.scene(dataset.scenes[0])
+    right = type(scene).T_wc
+    monkeypatch.setattr(
+        type(scene), "T_wc", lambda self, k: doctor.moved(right(self, k), np.r_[0.3, 0, 0] * (k >= 106))
+    )
+    verdict = quick_check(scene, range(len(scene)))
+    assert (verdict.state, verdict.text.split(":")[0]) == ("unsound", f"poses jump at frame {scene.frame_name(106)}")
