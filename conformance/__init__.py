@@ -23,9 +23,9 @@ from semstab.data.voxels import VoxelTable
 from semstab.errors import ConfigError, DataError, summarize_error
 
 __all__ = [
-    "AT_FACES", "EXPECTED", "LONG", "SECONDS", "TOLERANCE", "Verdict", "case_folder", "case_names", "compared",
-    "conform", "differences", "expected_table", "random_frames", "read_case", "read_rows", "read_table", "write_case",
-    "write_rows",
+    "AT_FACES", "EXPECTED", "LONG", "OF_SCANS", "SECONDS", "TOLERANCE", "Verdict", "case_folder", "case_names",
+    "compared", "conform", "differences", "expected_table", "random_frames", "read_case", "read_rows",
+    "read_table", "write_case", "write_rows",
 ]  # fmt: skip
 
 TOLERANCE = 1e-9
@@ -39,8 +39,13 @@ LONG = ("frames_65536",)
 
 AT_FACES = (
     "faces", "decimal_faces", "negative", "ranges", "near", "rays", "quotients", "utm", "utm_faces", "utm_origins",
+    "scan_faces", "scan_utm",
 )  # fmt: skip
 """Cases whose points lie at faces or far away: arithmetic other than float64 may put them into other voxels."""
+
+
+OF_SCANS = ("scan", "scan_scores", "scan_faces", "scan_utm", "scans_and_images")
+"""Cases that have scans: a program for depth images alone cannot read them."""
 
 
 @dataclass(frozen=True)
@@ -90,15 +95,18 @@ def _scratch() -> ScratchFolder:
     return ScratchFolder()
 
 
-def conform(command: str, only: Sequence[str] = (), tolerance: float = TOLERANCE, random: int = 0) -> Iterator[Verdict]:
+def conform(
+    command: str, only: Sequence[str] = (), tolerance: float = TOLERANCE, random: int = 0, *, scans: bool = True
+) -> Iterator[Verdict]:
     """Run `command CASE OUT` for each case, or for some, and compare what it wrote to OUT with what is expected.
 
-    So many random cases, with seeds from 0, follow.
+    So many random cases, with seeds from 0, follow. Without `scans` the cases that have some are left out.
 
     Raises:
         ConfigError: For a case that there is not, or a command that cannot be read or started.
     """
-    names = [*(only or case_names()), *(f"{RANDOM}{seed}" for seed in range(random))]
+    known = [name for name in case_names() if scans or name not in OF_SCANS]
+    names = [*(only or known), *(f"{RANDOM}{seed}" for seed in range(random))]
     for name in only:
         case_folder(name)
     try:

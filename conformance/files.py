@@ -21,8 +21,8 @@ from semstab.data.voxels import VoxelTable
 from semstab.errors import DataError
 
 CASE, EXPECTED = "case.txt", "expected.csv"
-FIRST_LINE, WITH_ROUNDS = "semstab conformance 1", "semstab conformance 2"
-"""The first line of a case, and of one whose frames are fused several times."""
+FIRST_LINE, WITH_ROUNDS, WITH_SCANS = "semstab conformance 1", "semstab conformance 2", "semstab conformance 3"
+"""The first line of a case, of one whose frames are fused several times, and of one that has scans."""
 
 KINDS: Mapping[str, tuple[str, str]] = {
     "labels8": ("labels", "<u1"), "labels16": ("labels", "<u2"), "scores16": ("scores", "<f2"),
@@ -46,23 +46,38 @@ Rows = dict[Voxel, dict[str, float]]
 def read_case(folder: Path) -> tuple[float, int, list[Frame]]:
     """Return voxel size (metres), number of classes, and frames in the order in which they are fused."""
     first, *lines = (folder / CASE).read_text(encoding="utf-8").splitlines()
-    if first not in (FIRST_LINE, WITH_ROUNDS):
+    if first not in (FIRST_LINE, WITH_ROUNDS, WITH_SCANS):
         raise DataError(f"{folder / CASE}: begins with '{first}', not with '{FIRST_LINE}'")
     count = 3 if first == WITH_ROUNDS else 2
     settings = dict(line.split() for line in lines[:count])
     classes, rounds = int(settings["num_classes"]), int(settings.get("rounds", 1))
-    frames = [_read_frame(folder, classes, *line.split()[1:]) for line in lines[count:]]
+    frames = [
+        _read_frame(folder, classes, *words) if kind == "frame" else _read_scan(folder, classes, *words)
+        for kind, *words in map(str.split, lines[count:])
+    ]
     every = [dataclasses.replace(f, index=f.index + n * len(frames)) for n in range(1, rounds) for f in frames]
     return float(settings["voxel_size"]), classes, frames + every
+
+
+def _read_scan(folder: Path, classes: int, index: str, count: str, *words: str) -> Frame:
+    *pose, kind = words
+    points = np.fromfile(folder / f"{index}.points", "<f4").reshape(int(count), 3)
+    T_wc = np.reshape([float(number) for number in pose], (3, 4))
+    return Frame(int(index), points=points, T_wc=T_wc, **_evidence(folder, index, kind, classes, (int(count),)))
+
+
+def _evidence(folder: Path, index: str, kind: str, classes: int, shape: tuple[int, ...]) -> dict[str, Any]:
+    """Return the labels or scores of a frame."""
+    suffix, dtype = KINDS[kind]
+    values = np.fromfile(folder / f"{index}.{suffix}", dtype)
+    return {suffix: values.reshape(shape if suffix == "labels" else (*shape, classes))}
 
 
 def _read_frame(folder: Path, classes: int, index: str, width: str, height: str, *words: str) -> Frame:
     *numbers, kind = words
     fx, fy, cx, cy, *pose = map(float, numbers)
     H, W = int(height), int(width)
-    suffix, dtype = KINDS[kind]
-    values = np.fromfile(folder / f"{index}.{suffix}", dtype)
-    given: dict[str, Any] = {suffix: values.reshape((H, W) if suffix == "labels" else (H, W, classes))}
+    given = _evidence(folder, index, kind, classes, (H, W))
     depth = np.fromfile(folder / f"{index}.depth", "<f4").reshape(H, W)
     T_wc = np.vstack([np.reshape(pose, (3, 4)), [0, 0, 0, 1]])
     return Frame(int(index), depth, Intrinsics(fx, fy, cx, cy), T_wc, **given)
@@ -74,15 +89,22 @@ def write_case(folder: Path, voxel_size: float, classes: int, frames: Sequence[F
     lines = [FIRST_LINE, f"voxel_size {voxel_size!r}", f"num_classes {classes}"]
     if rounds > 1:
         lines = [WITH_ROUNDS, *lines[1:], f"rounds {rounds}"]
+    elif any(frame.is_scan for frame in frames):
+        lines[0] = WITH_SCANS
     for frame in frames:
         values = frame.labels if frame.scores is None else frame.scores
         assert values is not None
         (kind,) = (kind for kind, (_, dtype) in KINDS.items() if np.dtype(dtype) == values.dtype)
-        K, (H, W) = frame.intrinsics, frame.shape
-        numbers = [K.fx, K.fy, K.cx, K.cy, *frame.T_wc[:3].ravel().tolist()]
-        lines.append(" ".join(["frame", str(frame.index), str(W), str(H), *map(repr, numbers), kind]))
+        (H, W), pose = frame.shape, frame.T_wc[:3].ravel().tolist()
+        if frame.points is not None:
+            lines.append(" ".join(["scan", str(frame.index), str(H * W), *map(repr, pose), kind]))
+            frame.points.astype("<f4").tofile(folder / f"{frame.index}.points")
+        else:
+            K = frame.intrinsics
+            numbers = [K.fx, K.fy, K.cx, K.cy, *pose]
+            lines.append(" ".join(["frame", str(frame.index), str(W), str(H), *map(repr, numbers), kind]))
+            frame.depth.astype("<f4").tofile(folder / f"{frame.index}.depth")
         values.astype(KINDS[kind][1]).tofile(folder / f"{frame.index}.{KINDS[kind][0]}")
-        frame.depth.astype("<f4").tofile(folder / f"{frame.index}.depth")
     write_text(folder / CASE, "\n".join([*lines, ""]))
 
 

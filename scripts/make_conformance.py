@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -188,7 +189,40 @@ def cases() -> Mapping[str, Case]:
         "random": (0.5, 4, _walk(6, 4, np.array([0.03, -0.04, 0.05]))),
         "random_scores": (0.5, 4, _walk(4, 4, np.array([0.03, -0.04, 0.05]), soft=np.float32)),
         **many_cases(),
+        **scan_cases(),
     }
+
+
+def scan_cases() -> Mapping[str, Case]:
+    """Return the cases of scans."""
+    images = _walk(2, 3, np.zeros(3))
+    return {
+        "scan": (0.5, 3, [_scan(t, 3) for t in range(4)]),
+        "scan_scores": (0.5, 3, [_scan(t, 3, soft=np.float16 if t % 2 else np.float32) for t in range(4)]),
+        "scan_faces": (0.2, 3, [_scan_at_faces(t, np.array([0.2 * t, 0.0, -0.4])) for t in range(3)]),
+        "scan_utm": (0.2, 3, [_scan_at_faces(t, np.array([448262.2, 5411932.6, 301.0 + t])) for t in range(3)]),
+        "scans_and_images": (0.5, 3, [images[0], _scan(1, 3), dataclasses.replace(images[1], index=2), _scan(3, 3)]),
+    }
+
+
+def _scan(t: int, K: int, soft: type[Any] | None = None) -> Frame:
+    """A sensor that wanders and turns among scattered points, of which some are none: not finite, or at the sensor."""
+    rng = np.random.default_rng(50 + t)
+    points = rng.normal(0, 1.5, (60, 3)).astype(np.float32)
+    points[:6] = [[0, 0, 0], [np.nan, 1, 1], [1, np.inf, 1], [1, 1, -np.inf], [0, 0, 1.5], [0.5, 0, 0]]
+    labels = rng.choice([*range(K), 65535 if t % 2 else 255], size=60).astype(np.uint16 if t % 2 else np.uint8)
+    given: dict[str, Any] = {"labels": labels}
+    if soft is not None:
+        given = {"scores": rng.random((60, K)).astype(soft)}
+    return Frame(t, points=points, T_wc=_pose(rng.normal(0, 0.3, 3), rng.normal(0, 0.4, 3)), **given)
+
+
+def _scan_at_faces(t: int, at: Float64) -> Frame:
+    """Points on faces of voxels of 0.2 m, or next to them: 0.6 / 0.2 is what float64 says."""
+    points = np.array([(0.2 * n, -0.2 * (n % 7), 0.2 * (n % 5) + 0.1) for n in range(1, 31)], np.float32)
+    T_wc = np.eye(4)
+    T_wc[:3, 3] = at
+    return Frame(t, points=points, T_wc=T_wc, labels=(np.arange(30) * (t + 1) % 3).astype(np.uint8))
 
 
 def _pinhole() -> Frame:

@@ -91,7 +91,10 @@ class Oracle:
 
     def world_point(self, frame, u, v, d):
         K, T = frame.intrinsics, frame.T_wc.tolist()
-        x_c = [(u - K.cx) / K.fx * d, (v - K.cy) / K.fy * d, d]
+        if frame.points is not None:
+            x_c = frame.points[v, u].tolist()
+        else:
+            x_c = [(u - K.cx) / K.fx * d, (v - K.cy) / K.fy * d, d]
         return [T[i][0] * x_c[0] + T[i][1] * x_c[1] + T[i][2] * x_c[2] + T[i][3] for i in range(3)]
 
     def voxel(self, frame, x_w):

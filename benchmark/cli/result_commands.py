@@ -156,6 +156,7 @@ def conform(
             min=0, metavar="N", help="Also N random cases, random:0 and so on; 4 by default, none with --only."
         ),
     ] = None,
+    scans: Annotated[bool, typer.Option("--scans/--no-scans", help="The cases that have scans of points, too.")] = True,
     quiet: Quiet = False,
 ) -> None:
     """Test an external fusion program with the conformance data. Exit code 3 if its tables differ."""
@@ -163,7 +164,7 @@ def conform(
 
     wrong = 0
     more = random if random is not None else 0 if only else RANDOM_CASES
-    for verdict in conform(command, only or (), tolerance, more):
+    for verdict in conform(command, only or (), tolerance, more, scans=scans):
         wrong += bool(verdict.problem)
         if verdict.problem:
             say(f"{verdict.case}: {verdict.problem}")

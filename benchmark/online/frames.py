@@ -21,7 +21,7 @@ from semstab.data.labels import LabelSpace
 from semstab.datasets.scene import GROUND_TRUTH, Dataset, Scene
 from semstab.errors import DataError
 
-FIELDS = "labels", "scores", "depth", "intrinsics", "T_wc", "color", "mask", "timestamp", "truth"
+FIELDS = "labels", "scores", "depth", "intrinsics", "T_wc", "color", "mask", "timestamp", "truth", "points"
 """The fields of a posed label map that is given as a mapping; see `Frame`. truth (H, W) has the true labels."""
 
 
@@ -44,20 +44,21 @@ def as_frame(given: Frame | Mapping[str, Any], index: int) -> tuple[Frame, Frame
     for name in fields:
         if name not in FIELDS:
             raise DataError(f"frame {index}: no field '{name}'; the fields are {', '.join(FIELDS)}")
-    for name in ("depth", "intrinsics", "T_wc"):
+    for name in ("T_wc",) if "points" in fields else ("depth", "intrinsics", "T_wc"):
         if name not in fields:
             raise DataError(
-                f"frame {index}: '{name}' is missing; a posed label map has labels, depth, intrinsics, T_wc"
+                f"frame {index}: '{name}' is missing; a posed label map has labels, depth, intrinsics, T_wc, and a scan"
+                " labels, points, T_wc"
             )
     for name in fields.keys() - {"intrinsics", "timestamp"}:
         fields[name] = None if fields[name] is None else as_array(fields[name])
-    if hasattr(fields["intrinsics"], "detach"):
+    if hasattr(fields.get("intrinsics"), "detach"):
         fields["intrinsics"] = as_array(fields["intrinsics"])
     truth = fields.pop("truth", None)
     frame = Frame(index, **fields)
     if truth is None:
         return frame, None
-    return frame, Frame(index, frame.depth, frame.intrinsics, frame.T_wc, labels=truth, timestamp=frame.timestamp)
+    return frame, dataclasses.replace(frame, labels=truth, scores=None, color=None, mask=None)
 
 
 class Sequence:
@@ -66,22 +67,25 @@ class Sequence:
     Attributes:
         classes: The number of classes by the largest label, or by the scores.
         timestamps: (n,) seconds, where all frames have one and they ascend.
+        of_scans: Whether one of them is a scan.
     """
 
     def __init__(self, frames: Iterable[Frame | Mapping[str, Any]]) -> None:
         self._folder = ScratchFolder()
-        self.count = self.classes = 0
+        self.count, self.classes, self.of_scans = 0, 0, False
         self.has_truth, times, digest = True, list[float | None](), hashlib.blake2b(digest_size=16)
         for given in frames:
             frame, truth = as_frame(given, self.count)
             with self._file(self.count).open("wb") as file:
                 pickle.dump((frame, truth), file, protocol=5)
-            for image in (frame.depth, frame.labels, frame.scores, frame.T_wc, None if truth is None else truth.labels):
+            true = None if truth is None else truth.labels
+            for image in (frame.depth, frame.points, frame.labels, frame.scores, frame.T_wc, true):
                 digest.update(b"" if image is None else np.ascontiguousarray(image).data)
             digest.update(repr((frame.intrinsics, frame.timestamp)).encode())
             self.classes = max(self.classes, _classes(frame), 0 if truth is None else _classes(truth))
             self.has_truth = self.has_truth and truth is not None
             times.append(frame.timestamp)
+            self.of_scans = self.of_scans or frame.is_scan
             self.count += 1
         if not self.count:
             raise DataError("there are no frames to fuse; give posed label maps: labels, depth, intrinsics, T_wc")
@@ -150,6 +154,7 @@ class FramesScene(Scene):
     def __init__(self, sequence: Sequence, options: FramesOptions) -> None:
         self._sequence = sequence
         self.name, self.models, self.ground_truth = options.scene, (options.model,), sequence.has_truth
+        self.of_scans = sequence.of_scans
         classes = options.classes or tuple(f"class {k}" for k in range(max(2, sequence.classes)))
         if len(classes) < sequence.classes:
             raise DataError(f"{self.name}: there are labels up to {sequence.classes - 1}, but {len(classes)} classes")

@@ -22,7 +22,7 @@ except ImportError as missing:
         f"semstab.testing cannot be used ({missing}); pip install 'semstab[testing]'"
     ) from missing
 
-for _part in ("builders", "cases", "contract", "properties"):
+for _part in ("builders", "cases", "contract", "properties", "scans"):
     pytest.register_assert_rewrite(f"semstab.testing.{_part}")  # a failure shows the values that were compared
 
 from semstab.testing.builders import (  # noqa: E402
@@ -41,6 +41,7 @@ from semstab.testing.builders import (  # noqa: E402
 from semstab.testing.cases import CaseTests  # noqa: E402
 from semstab.testing.contract import ContractTests  # noqa: E402
 from semstab.testing.properties import EvidenceTests, GeometryTests, PropertyTests  # noqa: E402
+from semstab.testing.scans import ScanTests  # noqa: E402
 
 __all__ = [
     "EXACT",
@@ -58,7 +59,7 @@ __all__ = [
 ]
 
 
-class BackendConformance(EvidenceTests, GeometryTests, ContractTests, PropertyTests, CaseTests):
+class BackendConformance(EvidenceTests, GeometryTests, ContractTests, PropertyTests, ScanTests, CaseTests):
     """The contract of every fusion backend. A subclass defines `create`; the rest is inherited.
 
     Attributes:
@@ -68,4 +69,5 @@ class BackendConformance(EvidenceTests, GeometryTests, ContractTests, PropertyTe
         reach: Voxels that a map holds to either side of its first camera, 2^31 unless the backend reaches less far;
             points beyond are refused.
         long_cases: Whether the cases of very many frames (65,538) are run too.
+        scans: Whether the backend fuses scans of points too; False where it takes images alone.
     """

@@ -152,6 +152,7 @@ class BackendTests:
     voxel_share: float = 0.0
     reach: int = 2**31
     long_cases: bool = False
+    scans: bool = True
 
     def create(self, voxel_size: float, num_classes: int) -> FusionBackend:
         """Return a new, empty map."""

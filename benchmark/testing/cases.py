@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from semstab.conformance import AT_FACES, LONG, case_folder, case_names, expected_table, read_case
+from semstab.conformance import AT_FACES, LONG, OF_SCANS, case_folder, case_names, expected_table, read_case
 from semstab.data.voxels import VoxelTable
 from semstab.testing.builders import BackendTests, assert_same_map, share_that_differs
 
@@ -17,6 +17,8 @@ class CaseTests(BackendTests):
         """The map of the case's frames is the case's table, in every column."""
         if case in LONG and not self.long_cases:
             pytest.skip(f"{case} has very many frames; long_cases = True runs it")
+        if case in OF_SCANS and not self.scans:
+            pytest.skip("scans = False: this backend fuses images alone")
         if self.voxel_share and case in AT_FACES:
             pytest.skip("this backend may decide otherwise at a face")
         table, expected = self.fuse_case(case), expected_table(case)
