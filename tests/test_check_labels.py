@@ -15,7 +15,8 @@ from semstab.check.labels import alternatives, id_remarks
 from semstab.data.labels import LabelSpace
 
 NAMES = [f"{k:03d}" for k in range(doctor.FRAMES)]
-LABELS = [each for each in doctor.MISTAKES if each.name.startswith(("labels", "ids", "one class"))]
+OF_ALL = [each for each in doctor.MISTAKES if "of one frame" not in each.name]  # found in 7 of 10 scenes: docs/check.md
+LABELS = [each for each in OF_ALL if each.name.startswith(("labels", "ids", "one class"))]
 
 
 def write(folder, frames):

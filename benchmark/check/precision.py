@@ -17,6 +17,10 @@ MEASURED = 1e-4
 SENSOR, SURFACE = 0.005, 0.0015
 """Errors that depth of either kind has at least, from the place of a pixel and from what a sensor always gets wrong."""
 
+BESIDE = 0.1
+"""Footprints of a pixel by which the depth of the nearest pixel differs from the point's own: a point lies up to half a
+pixel beside its middle, and most surfaces slant little."""
+
 IMPRECISE = 3.0
 """Depth is imprecise where its error is so many times the one to expect."""
 
@@ -46,7 +50,8 @@ def expected_error(sample: Sample) -> tuple[float, str]:
     """Return the relative error that depth has with exact poses, and the kind of depth, in words."""
     noise = float(np.nanmedian([_noise(view) for view in sample.views.values()]))
     least, kind = (SENSOR, "depth as noisy as this") if noise >= MEASURED else (SURFACE, "depth as smooth as this")
-    return max(least, math.sqrt(2) * noise), kind
+    focal = float(np.median([view.camera.fx / view.stride for view in sample.views.values()]))
+    return max(least, math.sqrt(2) * noise, BESIDE / focal), kind
 
 
 def _noise(view: View) -> float:
