@@ -6,7 +6,7 @@ import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 import numpy.typing as npt
@@ -245,7 +245,14 @@ def _without_labels(view: View, pixel_stride: int) -> Frame:
     return Frame(view.index, view.depth, view.camera.every(view.stride), view.T_wc, labels=labels).every(step)
 
 
-def suggested_size(coverage: Coverage) -> float | None:
+class Stays(Protocol):
+    """What tells which share of the points stays in its voxel."""
+
+    def stays(self, voxel_size: float) -> float:
+        """Return that share for a voxel size in metres; NaN where no point is seen again."""
+
+
+def suggested_size(coverage: Stays) -> float | None:
     """Return the smallest voxel size in which points fall again, metres; None where frames do not see the same."""
     return next((size for size in SIZES if coverage.stays(size) >= STAYS), None)
 

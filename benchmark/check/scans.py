@@ -22,13 +22,12 @@ from semstab.check.coverage import (
     CONSISTENT,
     FRAMES_LEFT,
     SHARED,
-    SIZES,
-    STAYS,
     Noise,
     Overlap,
     Persistence,
     Suggestion,
     distribution,
+    suggested_size,
 )
 from semstab.check.geometry import Fit, Verdict
 from semstab.check.reprojection import clusters, motion, pairs_within, reader
@@ -377,7 +376,7 @@ class ScanCoverage:
 
     def suggestion(self, overlaps: Sequence[Overlap], scans: int, stride: int) -> Suggestion:
         """Return voxel size and stride that suit so many scans, whose own stride is `stride`."""
-        size = next((size for size in SIZES if self.sample.stays(size) >= STAYS), None)
+        size = suggested_size(self.sample)
         stays = math.nan if size is None else self.sample.stays(size)
         shared = {row.apart[0]: row.covisible for row in overlaps}
         times = max((n for n in shared if shared[n] >= SHARED and scans >= FRAMES_LEFT * n), default=1)

@@ -20,6 +20,7 @@ from semstab.check.coverage import (
     Noise,
     Overlap,
     Persistence,
+    Stays,
     Suggestion,
     fused_stride,
     persistence,
@@ -389,8 +390,8 @@ def quick_sample(
 
 
 def label_findings(scene: Scene, indices: Sequence[int], models: Sequence[str], runs: int) -> Iterator[LabelFindings]:
-    """Yield what label maps show to be wrong with them, for each model that has files of its own."""
-    for model in models:
+    """Yield what label maps show to be wrong with them, for each model that has files of its own; nothing of scans."""
+    for model in () if scene.of_scans else models:
         space = None
         with contextlib.suppress(DataError):
             space = scene.label_space(model)
@@ -608,11 +609,13 @@ def _is_made(config: Config) -> bool:
     return (dataset.options["dataset"]["name"] if dataset.name == PREDICTED else dataset.name) == MADE
 
 
-def _coverage(config: Config, scene: Scene) -> Coverage | None:
+def _coverage(config: Config, scene: Scene) -> Stays | None:
     """Return what a scene's frames share; None where they cannot be read."""
     models = selected(config.models, scene.models, scene.by_name, "model", scene.name)
     with contextlib.suppress(DataError):
         indices = frame_indices(scene, config, models)
+        if scene.of_scans:
+            return scans if (scans := quick_sample_of_scans(scene, indices)).pairs else None
         inspection = Inspection(scene, indices, None, clusters(len(indices), CLUSTERS), POINTS, passing_over=True)
         return Coverage(inspection.sample(config.dataset.options)) if len(inspection.views) > 1 else None
     return None

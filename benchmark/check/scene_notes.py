@@ -18,12 +18,12 @@ def scene_notes(scene: Scene, indices: Sequence[int], model: str, config: Config
     """Return what looks wrong in depth and labels of a model, or its images, but may be right; in the words of `check`.
 
     Labels that the run predicts are those of the images, which are compared with the depth before any is predicted. A
-    scene without files, simulated or in a program's memory, has no notes.
+    scene without files, simulated or in a program's memory, has no notes, nor has one of scans.
 
     Raises:
         DataError: If a frame cannot be read.
     """
-    if scene.folder is None:
+    if scene.folder is None or scene.of_scans:
         return ()
     predicted = config.dataset.name == PREDICTED
     inspection = Inspection(scene, indices, None if predicted else model, (), POINTS, fused=REGISTERED_FRAMES)

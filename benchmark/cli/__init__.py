@@ -129,7 +129,7 @@ UsageError: Any = next(each for each in typer.BadParameter.__mro__ if each.__nam
 def _usage(error: Any) -> str:
     """Return what is wrong with a command line, with the option that may have been meant."""
     option = getattr(error, "option_name", None)
-    if option is None:
+    if option is None or not hasattr(error, "possibilities"):  # for example an option without its argument
         text: str = error.format_message()
         return text.rstrip(".")
     near = difflib.get_close_matches(option, error.possibilities or (), n=1)

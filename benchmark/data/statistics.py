@@ -200,6 +200,62 @@ class MovingClasses:
 
 
 @dataclass(frozen=True)
+class RangeStratum:
+    """Observations from some range.
+
+    Attributes:
+        low, high: Ends of the range in metres; the high one is not part of it.
+        share: Share of all sampled observations.
+        cells: Cells that two views saw from there.
+        alpha: Alpha of these observations.
+    """
+
+    low: float
+    high: float
+    share: float
+    cells: int
+    alpha: Interval
+
+
+@dataclass(frozen=True)
+class RangeAgreement:
+    """Agreement by the distance from which spots were seen.
+
+    Attributes:
+        strata: By range, the nearest first.
+        usable: The level above which labels can be used.
+        reliable: Metres up to which alpha stays above it, 0 where it never does.
+        low, high: The least and the largest that this may be, by the intervals of the strata.
+    """
+
+    strata: tuple[RangeStratum, ...]
+    usable: float
+    reliable: float
+    low: float
+    high: float
+
+    @property
+    def farthest(self) -> float:
+        """Return the end of the last stratum, metres."""
+        return self.strata[-1].high
+
+    @property
+    def limited(self) -> bool:
+        """Return whether labels may be unreliable somewhere in the range that was seen."""
+        return self.low < self.farthest
+
+    @property
+    def text(self) -> str:
+        """Return the one number for people: 'reliable up to 30 m (20 to 50 m)'."""
+        if not self.reliable:
+            return f"reliable at no range (alpha {self.strata[0].alpha.text()} up to {self.strata[0].high:g} m)"
+        most = "all" if self.high == self.farthest else f"{self.high:g} m"
+        if self.reliable == self.farthest:
+            return f"reliable at all ranges, up to {self.reliable:g} m (at least up to {self.low:g} m)"
+        return f"reliable up to {self.reliable:g} m ({self.low:g} m to {most})"
+
+
+@dataclass(frozen=True)
 class CellAgreement:
     """The observations that alpha rests on: labels of sampled cells, about as wide as a pixel's footprint.
 
@@ -518,6 +574,7 @@ class MapStatistics:
     correctness: CorrectnessStatistics | None
     strata: tuple[StratumStatistics, ...]
     outlying_frames: OutlyingFrames | None = None
+    ranges: RangeAgreement | None = None
 
     def __repr__(self) -> str:
         return f"<MapStatistics '{self.name}': {self.stated}>"

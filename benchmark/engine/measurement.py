@@ -315,12 +315,12 @@ def save_overview(arrays: Mapping[str, Any], path: Path) -> None:
 
 
 def pictures_of_outlying(task: Task, config: Config, analysis: Analysis | None) -> dict[str, npt.NDArray[Any]]:
-    """Return pictures of the first frames that stand out, which are read once more, as arrays by name.
+    """Return pictures of the first frames that stand out, which are read once more, as arrays by name; none of scans.
 
     A frame is held against those of the run before and after it, the first and the last one against the two nearest.
     """
     outlying, pictures = None if analysis is None else analysis.summary.outlying_frames, list[LonePicture]()
-    for each in () if outlying is None else outlying.frames[:PICTURED]:
+    for each in () if outlying is None or task.scene.of_scans else outlying.frames[:PICTURED]:
         at = task.indices.index(each.frame)
         start = min(max(at - 1, 0), len(task.indices) - 3)
         others = [read(task, task.indices[k], config.pixel_stride) for k in range(start, start + 3) if k != at]

@@ -298,6 +298,9 @@ def relabel(
 ) -> Relabelled:
     """Write the fused class of every pixel of every frame of a unit to OUT/labels/NAME.
 
+    Of scans it is a .label file of each in OUT/predictions/NAME: an id a point, where it has none 0, or 65535 where 0
+    is a class.
+
     Args:
         run: Folder of the run, or FOLDER:MODEL.
         out: Folder that gets labels/NAME.
@@ -330,8 +333,10 @@ def relabel(
     chosen, name = belief or Belief(), name or f"{record.unit.model}-fused"
     settings = {"unit": record.key, "backend": record.unit.backend, **chosen.settings()}
     space = task.mapping.target
+    scans = task.scene.of_scans
+    path = Path(out) / ("predictions" if scans else "labels") / name
     folder = PredictionFolder(
-        Path(out) / "labels" / name, "labels", settings, {"name": name}, space, overwrite=overwrite
+        path, "points" if scans else "labels", settings, {"name": name}, space, overwrite=overwrite
     )
     if record.voxels_file is None:
         raise DataError(f"{run}: the run stored no voxels of {record.unit.slug}; run it again")
@@ -350,7 +355,13 @@ def relabel(
         for done, fetched in enumerate(prefetch(read_and_fuse, task.indices), start=1):
             frame, rows, known = fetched.item
             maps = labels_of(rows, space.ids)
-            if done == 1 and not np.array_equal(task.scene.predicted(frame.index, labels=maps).predicted, maps):
+            if scans and 0 not in space.ids:  # formats of scans have 0 where a point has no class
+                maps = np.where(rows < 0, maps.dtype.type(0), maps)
+            if (
+                done == 1
+                and not scans
+                and not np.array_equal(task.scene.predicted(frame.index, labels=maps).predicted, maps)
+            ):
                 raise DataError(
                     f"{task.scene.name}: its label maps have the pixels of the image, not those of the depth;"
                     " convert it (semstab-bench convert), and run and relabel the posed folder"

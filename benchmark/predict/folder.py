@@ -17,9 +17,8 @@ from semstab.core.files import FolderLock, atomic_path, content_key, read_json, 
 from semstab.core.json_form import from_json
 from semstab.core.types import Float32
 from semstab.data.labels import LabelSpace
-from semstab.datasets.files.labels import LABEL_SPACE_FILE
+from semstab.datasets.files.labels import LABEL_SPACE_FILE, SUFFIXES
 from semstab.datasets.files.options import inside
-from semstab.datasets.formats.images import LABEL_SUFFIXES, SCORE_SUFFIXES
 from semstab.datasets.geometry.lenses import fitted
 from semstab.datasets.scene import GROUND_TRUTH
 from semstab.errors import ConfigError, DataError
@@ -31,7 +30,10 @@ MANIFEST_FILE = "predictions.json"
 SAVE_SECONDS = 5.0
 """Seconds of work that a killed process may lose at most."""
 
-Kind = Literal["labels", "scores", "regions"]
+Kind = Literal["labels", "scores", "regions", "points"]
+WRITTEN: Mapping[Kind, str] = {"labels": ".png", "scores": ".npz", "regions": ".png", "points": ".label"}
+"""The suffix of the files that are written."""
+
 ScoreType = Literal["float16", "float32"]
 
 
@@ -65,7 +67,7 @@ class PredictionFolder:
 
     Attributes:
         path: The folder.
-        kind: Kind of maps: PNG ids, .npz scores (K, H, W), PNG region ids.
+        kind: Kind of maps: PNG ids, .npz scores (K, H, W), PNG region ids, .label ids of the points of a scan.
         settings: All that the maps depend on in addition to the image, for JSON.
         about: The rest of the manifest.
         space: The classes; None for regions.
@@ -92,7 +94,7 @@ class PredictionFolder:
     ) -> None:
         self.path = path
         self.kind = kind
-        self._suffix = ".npz" if kind == "scores" else ".png"
+        self._suffix = WRITTEN[kind]
         self._score_type = None if score_type is None else np.dtype(score_type)
         self._compressed = top_k is not None  # most of it is 0
         said = dict(settings) | ({"score_type": score_type} if kind == "scores" else {})
@@ -128,9 +130,13 @@ class PredictionFolder:
         return inside(self.path, self.path, f"{name}{self._suffix}", f"image {name[:80]!r}")
 
     def write(self, name: str, image: str, values: npt.NDArray[Any], seconds: float) -> None:
-        """Store a frame's map of ids (H, W)."""
+        """Store a frame's map of ids (H, W); of a scan they are little-endian uint32, one after the other."""
         self._claimed()
-        write_image(self.file(name), values)
+        if self.kind == "points":
+            with atomic_path(self.file(name)) as temporary:
+                temporary.write_bytes(values.astype("<u4").tobytes())
+        else:
+            write_image(self.file(name), values)
         self._done(name, image, seconds)
 
     def write_scores(self, name: str, image: str, maps: Iterable[npt.NDArray[Any]], seconds: float) -> None:
@@ -186,7 +192,7 @@ class PredictionFolder:
         """Return the frames that an earlier start finished."""
         manifest = self.path / MANIFEST_FILE
         if not manifest.is_file():
-            suffixes = SCORE_SUFFIXES if self.kind == "scores" else LABEL_SUFFIXES
+            suffixes = SUFFIXES["labels" if self.kind == "regions" else self.kind]
             if any(file.suffix.lower() in suffixes for file in _files(self.path)):
                 raise ConfigError(f"{self.path}: holds maps that were not predicted here; choose another --name")
             return {}

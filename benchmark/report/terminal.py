@@ -186,13 +186,15 @@ def _verdict(run: UnitSummary) -> Iterator[str]:
     yield f"  two views see the same class at {_percent(statistics.agreeing)} of the spots"
     if not math.isnan(wrong.value) and statistics.verdict.level != "misleading":
         yield f"  {told}"
+    if statistics.ranges is not None and statistics.ranges.limited:
+        yield f"  {statistics.ranges.text}"
     yield ""
 
 
 def _flicker(record: Record) -> Iterator[str]:
     compensated = record.image_space.compensated_flicker_percent
     if not math.isnan(compensated):
-        yield f"  flicker  {compensated:.1f} % of the pixels change class per frame (camera motion removed)"
+        yield f"  flicker  {compensated:.1f} % of the pixels change class per frame (motion removed)"
 
 
 def _interval(estimate: Estimate, scale: float = 1.0) -> str:

@@ -75,6 +75,7 @@ from semstab.statistics.intervals import (
     spec_of,
 )
 from semstab.statistics.observations import CellObservations
+from semstab.statistics.ranges import range_agreement
 from semstab.statistics.sample import MapSample
 from semstab.statistics.verdict import LIMITS, Limits, verdict
 
@@ -265,6 +266,7 @@ def analyse(
         correctness=None if truth is None else _correctness(table, truth, consistent, influence, edges, headline),
         strata=_strata(whole, table, columns, edges),
         outlying_frames=outlying,
+        ranges=None if cells is None else range_agreement(cells, scope, limits),
     )
     return Analysis(summary, whole, influence, sample, shares, drawn, lone)
 

@@ -26,7 +26,15 @@ from semstab.report.tables.stability import (
     sensitivity,
     voxel_sizes,
 )
-from semstab.report.tables.statistics import class_agreement, drift, frames, temporal_agreement, uncertainty, verdicts
+from semstab.report.tables.statistics import (
+    class_agreement,
+    drift,
+    frames,
+    ranges,
+    temporal_agreement,
+    uncertainty,
+    verdicts,
+)
 from semstab.report.tables.table import TEXT_WRITERS, Cell, Column, Group, Table, to_csv, to_json, to_latex, to_markdown
 from semstab.report.tables.video_measures import video_measures
 
@@ -46,7 +54,7 @@ __all__ = [
 
 BUILDERS = (
     overview, paper, verdicts, flicker, video_measures, scenes, persistence, classes, temporal_agreement, correlogram,
-    class_agreement, drift, frames, uncertainty, ceiling, correctness, cross_model, comparison, sensitivity,
+    class_agreement, ranges, drift, frames, uncertainty, ceiling, correctness, cross_model, comparison, sensitivity,
     voxel_sizes, reduced, fusion, compared, agreement,
 )  # fmt: skip
 """The functions that make tables, in the paper's order; without numbers for its tables a function returns none."""

@@ -17,6 +17,7 @@ from semstab.data.statistics import (
     Estimate,
     MapStatistics,
     OutlyingFrames,
+    RangeStratum,
 )
 from semstab.metrics import macro_mean
 from semstab.report.means import by_model
@@ -106,6 +107,40 @@ def class_agreement(result: Result) -> list[Table]:
     return [
         Table("class_agreement", title, caption, (Column("class", "Class"), *(columns[k] for k in known)), retained)
     ]
+
+
+def ranges(result: Result) -> list[Table]:
+    """Return alpha by the distance from which spots were seen, scene by scene."""
+    groups = []
+    for name, rows in assessed_records(result).items():
+        several = len(rows) > 1
+        own = [
+            (
+                f"{record.unit.scene}: {_from_to(row)}" if several else _from_to(row),
+                100 * row.share,
+                row.cells,
+                row.alpha,
+            )
+            for record, stats in rows
+            if stats.ranges is not None
+            for row in stats.ranges.strata
+        ]
+        groups += [Group(name, tuple(own))] if own else []
+    if not groups:
+        return []
+    columns = (
+        Column("range", "Range (m)"), Column("observations_percent", "Observations (%)", 1),
+        Column("cells", "Cells seen twice", 0), Column.of(ALPHA),
+    )  # fmt: skip
+    caption = (
+        "The range of an observation is the distance from which a spot was seen; two of one spot count together where"
+        f" both were made in the same range. Labels can be used where alpha is above {LIMITS.usable:.3f}. {INTERVALS}"
+    )
+    return [Table("ranges", "Agreement by range", caption, columns, tuple(groups))]
+
+
+def _from_to(stratum: RangeStratum) -> str:
+    return f"{stratum.low:g} to {stratum.high:g}"
 
 
 def drift(result: Result) -> list[Table]:

@@ -1,0 +1,80 @@
+"""Agreement by the distance from which spots were seen, and the range up to which labels can be relied on."""
+
+from __future__ import annotations
+
+import itertools
+import math
+
+import numpy as np
+
+from semstab.core.types import THIS_SCENE, Float64, Scope
+from semstab.data.statistics import RangeAgreement, RangeStratum
+from semstab.statistics.accumulate import sums_of_cells
+from semstab.statistics.intervals import estimate, scope_of
+from semstab.statistics.observations import CellObservations
+from semstab.statistics.verdict import LIMITS, Limits
+
+EDGES: Float64 = np.array([m * 10.0**e for e in range(-1, 4) for m in (1, 1.5, 2, 3, 5, 7)])
+"""Ranges, in metres, at which strata end."""
+
+LEAST_ENTRIES, LEAST_SHARE = 2000, 0.02
+"""The least entries of a stratum, and their share in all; a smaller one is joined with the next."""
+
+
+def range_agreement(
+    cells: CellObservations, scope: Scope = THIS_SCENE, limits: Limits = LIMITS
+) -> RangeAgreement | None:
+    """Return alpha by range, from sampled cells; None where all were seen from about one distance.
+
+    The range of an observation is the distance of the cell from its view's centre. A stratum has the observations that
+    were made in it: two of one cell count together where both fall into it.
+    """
+    if not len(cells):
+        return None
+    at = (cells.cell + 0.5) * cells.cell_size
+    distance = np.linalg.norm(at - cells.views.centre[cells.view], axis=1)
+    edges = _edges(distance)
+    if len(edges) < 3:
+        return None
+    strata = []
+    for low, high in itertools.pairwise(edges):
+        own = cells.only((distance >= low) & (distance < high))
+        sums = sums_of_cells(own)
+        fine = sums.fine
+        assert fine is not None
+        alpha = estimate(sums, "alpha", scope=scope_of(sums, scope))
+        strata.append(RangeStratum(low, high, len(own) / len(cells), round(float(fine["voxels"].sum())), alpha))
+    return RangeAgreement(tuple(strata), limits.usable, *_reliable(strata, limits.usable))
+
+
+def _edges(distance: Float64) -> list[float]:
+    """Return ends of strata that each have enough entries, the first one 0; the last one is the farthest entry's."""
+    least = max(LEAST_ENTRIES, LEAST_SHARE * len(distance))
+    chosen, below = [0.0], 0
+    for edge in EDGES.tolist():
+        here = int(np.count_nonzero(distance < edge))
+        if here - below >= least and len(distance) - here >= least:
+            chosen.append(edge)
+            below = here
+    beyond = EDGES[distance.max() < EDGES]
+    return [*chosen, float(beyond[0]) if len(beyond) else math.inf]
+
+
+def _reliable(strata: list[RangeStratum], usable: float) -> tuple[float, float, float]:
+    """Return the range up to which alpha stays above a level, and the least and the largest that it may be.
+
+    Strata count from the nearest on, up to the first one below.
+    """
+
+    def up_to(values: list[float]) -> float:
+        reached = 0.0
+        for stratum, value in zip(strata, values, strict=True):
+            if math.isnan(value):
+                continue  # no spot was seen twice from there
+            if value < usable:
+                break
+            reached = stratum.high
+        return reached
+
+    alphas = [stratum.alpha for stratum in strata]
+    return up_to([a.value for a in alphas]), up_to([a.low for a in alphas]), up_to([a.high for a in alphas])
