@@ -236,8 +236,8 @@ class RangeAgreement:
 
     @property
     def farthest(self) -> float:
-        """Return the end of the last stratum, metres."""
-        return self.strata[-1].high
+        """Return the end of the last stratum in which two views saw a spot, metres."""
+        return max((row.high for row in self.strata if not math.isnan(row.alpha.value)), default=0.0)
 
     @property
     def limited(self) -> bool:
@@ -249,10 +249,9 @@ class RangeAgreement:
         """Return the one number for people: 'reliable up to 30 m (20 to 50 m)'."""
         if not self.reliable:
             return f"reliable at no range (alpha {self.strata[0].alpha.text()} up to {self.strata[0].high:g} m)"
-        most = "all" if self.high == self.farthest else f"{self.high:g} m"
-        if self.reliable == self.farthest:
-            return f"reliable at all ranges, up to {self.reliable:g} m (at least up to {self.low:g} m)"
-        return f"reliable up to {self.reliable:g} m ({self.low:g} m to {most})"
+        ends = "" if self.low == self.high else f" ({self.low:g} to {self.high:g} m)"
+        far = ", the farthest seen" if self.reliable == self.farthest else ""
+        return f"reliable up to {self.reliable:g} m{ends}{far}"
 
 
 @dataclass(frozen=True)

@@ -14,6 +14,9 @@ from semstab.data.frames import Frame
 WIDTH = 1280
 """Pixels around the horizon of a picture of a scan."""
 
+REACH = 1 << 14
+"""Voxels to either side of the sensor within which scans are compared."""
+
 ROWS = 64
 """Rows of such a picture, from the highest ray to the lowest: those of a common scanner."""
 
@@ -38,13 +41,13 @@ def dominant_before(previous: Frame, current: Frame, voxel_size: float) -> Int32
 
 
 def _voxels(frame: Frame, origin: Float64, voxel_size: float) -> Int64:
-    """Return a key (n,) of each valid point's voxel within 2^15 of the origin, another -1."""
+    """Return a key (n,) of 45 bits of each valid point's voxel within REACH of the origin, another -1."""
     assert frame.points is not None
     R, t = frame.T_wc[:3, :3], frame.T_wc[:3, 3]
-    index = np.floor((frame.points[frame.valid].astype(np.float64) @ R.T + t) / voxel_size) - origin + 2**15
-    near = np.logical_and.reduce([(axis >= 0) & (axis < 2**16) for axis in index.T])
+    index = np.floor((frame.points[frame.valid].astype(np.float64) @ R.T + t) / voxel_size) - origin + REACH
+    near = np.logical_and.reduce([(axis >= 0) & (axis < 2 * REACH) for axis in index.T])
     i, j, k = np.where(near[:, None], index, 0).astype(np.int64).T
-    return np.where(near, i << 32 | j << 16 | k, -1)
+    return np.where(near, i << 30 | j << 15 | k, -1)
 
 
 def pictured(frame: Frame, values: npt.NDArray[Any], fill: float) -> npt.NDArray[Any]:

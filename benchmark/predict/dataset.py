@@ -24,7 +24,7 @@ from semstab.data.labels import LabelSpace
 from semstab.datasets import GROUND_TRUTH, Dataset, Filtering, Scene, open_dataset, resolved
 from semstab.datasets.geometry.lenses import Labels, Scores
 from semstab.datasets.scene import select_frames
-from semstab.errors import ConfigError
+from semstab.errors import ConfigError, DataError
 from semstab.models import Model, create
 from semstab.predict.filters import Filtered, parse
 from semstab.predict.images import ImageSequence, first_images
@@ -186,6 +186,11 @@ class PredictedScene(Scene):
     """
 
     def __init__(self, inner: Scene, dataset: PredictedDataset) -> None:
+        if inner.of_scans:
+            raise DataError(
+                f"{inner.name}: holds scans, and models predict on images; write the labels of a model's points into"
+                " predictions/MODEL (docs/tutorials/scans.md)"
+            )
         self.name = inner.name
         self.models = tuple(dataset.predictors)
         self.ground_truth = inner.ground_truth

@@ -268,6 +268,11 @@ def _several(result: Result, records: Sequence[Record], width: int) -> Iterator[
         yield f"  {titles} -: fewer than {ENOUGH:,} voxels were seen 3 times or more"
     yield from _classes(records, width)
     yield from _outlying(records)
+    for record in records:
+        ranges = None if record.summary.statistics is None else record.summary.statistics.ranges
+        if ranges is not None and ranges.limited:
+            scene = f" in {record.unit.scene}" if len(result.scenes) > 1 else ""
+            yield f"  {record.unit.model}{scene}: {ranges.text}"
     yield ""
 
 

@@ -221,7 +221,7 @@ def cluster_sums_of(
 
 
 def with_cells(whole: ClusterSums, cells: CellObservations, edge: float | None = None) -> ClusterSums:
-    """Return the sums with those of sampled cells: fine cells, and coarse cells twice as wide.
+    """Return the sums with those of sampled cells: fine cells, and coarse cells twice as wide, of scans the same ones.
 
     Args:
         whole: Sums of the map.
@@ -230,7 +230,7 @@ def with_cells(whole: ClusterSums, cells: CellObservations, edge: float | None =
             default, whatever the voxels of the map.
     """
     parts = []
-    for times in (2, 1):  # cubes that hold whole coarse cells hold whole fine ones
+    for times in (1, 1) if cells.sparse else (2, 1):  # cubes that hold whole coarse cells hold whole fine ones
         log = cells.observations(times * cells.coarsening)
         cubes = Cubes.of_log(log, edge)
         edge = cubes.edge

@@ -157,6 +157,8 @@ class CellObservations:
         share: Sampled share of the blocks, times 2^32.
         classes: Names of the classes.
         frames: Number of frames, of which some may share a view.
+        sparse: Whether views are scans: their points lie apart, so that fine and coarse cells that two of them meet lie
+            at other ranges, and alpha is that of fine cells, without extrapolation.
     """
 
     key: Int64
@@ -171,6 +173,7 @@ class CellObservations:
     share: int = 1 << 32
     classes: tuple[str, ...] = ()
     frames: int = 0
+    sparse: bool = False
 
     def __len__(self) -> int:
         return len(self.key)
@@ -290,7 +293,7 @@ class CellObservations:
 
         columns = dict(zip("xyz", self.cell.astype(np.int32).T, strict=True))
         columns |= {name: getattr(self, name) for name in COLUMNS[1:]}
-        about = {name: getattr(self, name) for name in ("cell_size", "K", "share", "classes", "frames")}
+        about = {name: getattr(self, name) for name in ("cell_size", "K", "share", "classes", "frames", "sparse")}
         content = pa.table({name: arrays.column(values) for name, values in columns.items()})
         text = json.dumps({"schema": SCHEMA, "kind": "CellObservations", **about, "views": self.views.rows().tolist()})
         with atomic_path(path) as temporary, pq.ParquetWriter(temporary, content.schema, compression="zstd") as file:

@@ -77,7 +77,7 @@ class Sampler:
         self._origin: Int64 = np.zeros(3, np.int64)
         self._columns: tuple[npt.NDArray[Any], ...] = tuple(np.empty(budget, dtype) for dtype in TYPES)
         self._views = Rows(VIEW)
-        self._frames = 0
+        self._frames, self._sparse = 0, False
         self._anchor: Anchor | None = None
         self._seen: dict[bytes, Anchor] = {}
         self._clear()
@@ -88,6 +88,7 @@ class Sampler:
     def add(self, frame: Frame) -> None:
         """Add the labels of a frame's pixels with depth in sampled cells."""
         self._frames += 1
+        self._sparse = self._sparse or frame.is_scan
         frame = frame.within(SIDE)
         there = frame.valid if frame.unlabelled is None else frame.valid | frame.unlabelled
         if not there.any():
@@ -155,4 +156,4 @@ class Sampler:
         key, view, label, weight, drawn = (column[: self._entries].copy() for column in self._columns)
         size = self._cell_size if len(self._views) else 1.0
         own = (key, view, label, weight, drawn, (x, y, z), Views.of(self._views.table().copy()), size, self.K)
-        return CellObservations(*own, self._share, classes, self._frames)
+        return CellObservations(*own, self._share, classes, self._frames, self._sparse)
