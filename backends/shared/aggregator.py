@@ -109,8 +109,7 @@ class Aggregator:
         rays = space.room("rays", 3, W, dtype=np.float64)
         rays[:], margin = frame_terms(ray_x, frame.T_wc, self.voxel_size, REACH)
         down = (frame.T_wc[:3, 1] * ray_y[:, None] + frame.T_wc[:3, 2]) / self.voxel_size
-        half, face = tile_loops.face_terms(margin)
-        begin = frame.T_wc[:3, 3] / self.voxel_size - origin + (REACH + half + HALF - corner)
+        begin, face = self._begin(frame, origin, corner, margin)
         work, found = self._room_for_words(-(-H // tile_loops.ROWS), tile_loops.ROWS, W)
         tile_loops.find_words(
             fixed(frame.depth), fixed(frame.labels), ray_x, ray_y, fixed(frame.T_wc), self.voxel_size, origin,
@@ -124,13 +123,21 @@ class Aggregator:
         assert frame.labels is not None
         assert frame.points is not None
         points = fixed(frame.points).reshape(-1, 3)
+        _, margin = frame_terms(np.zeros(0), frame.T_wc, self.voxel_size, REACH)
+        begin, face = self._begin(frame, origin, corner, margin)
         work, found = self._room_for_words(-(-len(points) // tile_loops.POINTS), 1, tile_loops.POINTS)
         tile_loops.find_words_of_points(
             points, flat(frame.depth), flat(frame.labels), fixed(frame.T_wc), self.voxel_size, origin, corner,
-            columns_of(self.within, origin), frame.ignore_id, found.room, *work,
-            found.word, found.count, found.partition, found.entries, found.lost, found.spread, found.low, found.high,
+            columns_of(self.within, origin), fixed(frame.T_wc[:3, :3] / self.voxel_size), begin, face, frame.ignore_id,
+            found.room, *work, found.word, found.count, found.partition, found.entries, found.lost, found.spread,
+            found.low, found.high,
         )  # fmt: skip
         return found
+
+    def _begin(self, frame: Frame, origin: Int64, corner: Int64, margin: float) -> tuple[Float64, int]:
+        """Return the sensor in voxels, as fused words count from -2^16, and the bits of a face; see `face_terms`."""
+        half, face = tile_loops.face_terms(margin)
+        return frame.T_wc[:3, 3] / self.voxel_size - origin + (REACH + half + HALF - corner), face
 
     def _room_for_words(self, bands: int, rows: int, width: int) -> tuple[tuple[Any, Any, Any], Words]:
         """Return work space for the threads, and room for the entries of bands of so many rows."""

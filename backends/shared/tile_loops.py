@@ -126,6 +126,27 @@ def _words_fused(depth, labels, ignore, ray_a, ray_b, ray_c, a0, b0, c0, ta, tb,
     return doubt | ((outside >> 52) != 0)
 
 
+@compiled(fastmath={"contract"})
+def _words_of_points_fused(points, depth, labels, ignore, M, ta, tb, tc, face, out):
+    """Return the words of points of a scan, and any doubt, as `_words_fused` of pixels; M (3, 3) is R / r."""
+    a0, a1, a2, b0, b1, b2 = M[0, 0], M[0, 1], M[0, 2], M[1, 0], M[1, 1], M[1, 2]
+    c0, c1, c2 = M[2, 0], M[2, 1], M[2, 2]
+    doubt = outside = 0
+    for u in range(depth.shape[0]):
+        ok = (depth[u] > np.float32(0)) & (depth[u] < np.float32(np.inf)) & (labels[u] != ignore)
+        x = np.float64(points[u, 0]) if ok else 0.0
+        y = np.float64(points[u, 1]) if ok else 0.0
+        z = np.float64(points[u, 2]) if ok else 0.0
+        a: Any = bits_of(x * a0 + (y * a1 + (z * a2 + ta)))
+        b: Any = bits_of(x * b0 + (y * b1 + (z * b2 + tb)))
+        c: Any = bits_of(x * c0 + (y * c1 + (z * c2 + tc)))
+        doubt |= ok & (((a & face) == 0) | ((b & face) == 0) | ((c & face) == 0))
+        outside |= (a ^ FROM) | (b ^ FROM) | (c ^ FROM)
+        i, j, k = (a << 12) & (-1 << 48), (b >> 4) & (0xFFFF << 32), (c >> 20) & (0xFFFF << 16)
+        out[u] = (i | j | k | np.int64(labels[u])) if ok else -1
+    return doubt | ((outside >> 52) != 0)
+
+
 def face_terms(margin: float) -> tuple[float, int]:
     """Return half a voxel's face's width, within which a pixel is in doubt, and which bits of a fraction are 0 there.
 
@@ -262,8 +283,8 @@ def find_words(
 
 @parallel
 def find_words_of_points(
-    points, depth, labels, T, size, origin, corner, columns, ignore, room, stretches, tables, table_counts, word, count,
-    partition, entries, lost, spread, low, high,
+    points, depth, labels, T, size, origin, corner, columns, M, begin, face, ignore, room, stretches, tables,
+    table_counts, word, count, partition, entries, lost, spread, low, high,
 ):  # fmt: skip
     """Find the entries of bands of `POINTS` points of a scan (N, 3), as `find_words` finds those of a band of rows."""
     ox, oy, oz = float(origin[0]), float(origin[1]), float(origin[2])
@@ -280,10 +301,10 @@ def find_words_of_points(
             to = min(first + COLUMNS, end)
             own = words[: -(-(to - first) // LANES) * LANES + 1]
             own[to - first :] = -1
-            lost[band] |= exact_keys_of_points(
-                points[first:to], depth[first:to], labels[first:to], T, size, ox, oy, oz, ignore, keys
-            )
-            lost[band] |= _words_of_keys(keys, labels[first:to], corner, own)
+            some, seen, named = points[first:to], depth[first:to], labels[first:to]
+            if _words_of_points_fused(some, seen, named, ignore, M, begin[0], begin[1], begin[2], face, own):
+                lost[band] |= exact_keys_of_points(some, seen, named, T, size, ox, oy, oz, ignore, keys)
+                lost[band] |= _words_of_keys(keys, named, corner, own)
             if columns.shape[0]:
                 _keep_columns(own, columns, corner)
             n = _enter_runs(own, run_word, run_end, table, table_count, own_word, own_count, n)
