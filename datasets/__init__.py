@@ -135,11 +135,11 @@ RECOGNISED = (
 
 
 POINTS = {
-    "LiDAR scans in SemanticKITTI's layout": "velodyne/*.bin",
+    "LiDAR scans in KITTI's layout": "velodyne/*.bin",
     "point clouds": "*.pcd",
     "point clouds (LAS)": "*.la[sz]",
 }
-"""Data without depth images, by its name: a pattern of its files."""
+"""Points in a layout that no reader has, by its name: a pattern of its files."""
 
 FILES = (".bag", ".mcap", ".db3")
 """Suffixes of files that are a scene each."""
@@ -172,15 +172,17 @@ def recognise(root: Path) -> tuple[str, str]:
             fits.append((deep, rank, name, f"{cls.contents}; {count}"))
     if fits:
         return min(fits)[2:]
+    listed = " or ".join(text for _, text in sorted(near)[:3])
     for what, pattern in POINTS.items():
         for depth in range(4):
             if (found := next(root.glob("*/" * depth + pattern), None)) is not None:
                 where = found.parent.relative_to(root.parent)
                 raise DataError(
-                    f"{root}: holds {what} ({where}), and no depth images; scans are not read, nor are labels of their"
-                    " points: where a camera was beside, make depth images of them (docs/tutorials/lidar-camera.md)"
+                    f"{root}: holds {what} ({where}), in no layout of scans that is read"
+                    f"{f', the nearest is {listed}' if near else ''}; lay them out as one, with poses"
+                    " (docs/datasets.md#scans), or, where a camera was beside, make depth images of them"
+                    " (docs/tutorials/lidar-camera.md)"
                 )
     if not near:
         return RECOGNISED[-1], ""
-    listed = " or ".join(text for _, text in sorted(near)[:3])
     raise DataError(f"{root}: no format is recognised; the nearest are {listed}; name it with --dataset NAME")

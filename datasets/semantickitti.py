@@ -18,8 +18,10 @@ from semstab.config import read_yaml
 from semstab.core.types import Float32, Float64, Mask, UInt16
 from semstab.data.labels import IGNORE_16BIT
 from semstab.datasets.files import options as opt
-from semstab.datasets.files.scans import NO_ID, ScanDataset, ScanOptions, ScanSource, floats_of
+from semstab.datasets.files.labels import SceneEntry
+from semstab.datasets.files.scans import NO_ID, ScanDataset, ScanOptions, ScanSource, as_poses, floats_of, rigid_inverse
 from semstab.datasets.formats.disk import files_named, read_table, records, to_number
+from semstab.datasets.formats.images import Read
 from semstab.errors import ConfigError, DataError
 
 LEARNING_MAP = {
@@ -75,22 +77,20 @@ class SemanticKitti(ScanDataset[SemanticKittiOptions]):
         """Return whether scans are there, and their poses."""
         return (folder / "velodyne").is_dir() and (folder / self.options.poses).is_file()
 
-    def scans(self, folder: Path) -> Iterator[ScanSource]:
+    def scans(self, entry: SceneEntry) -> Iterator[ScanSource]:
         """Yield a scan for each file of points.
 
         Raises:
             DataError: If there are fewer poses, or the calibration is not there.
         """
+        folder = entry.folder
         files = files_named(folder / "velodyne", "", ".bin")
         path = folder / self.options.poses
         rows = read_table(path, 12, "r11 r12 r13 t1 ... of each scan").reshape(-1, 3, 4)
-        last = np.tile([0.0, 0.0, 0.0, 1.0], (len(rows), 1, 1))
-        poses: Any = np.concatenate([rows, last], axis=1)
-        if self.options.pose_convention == "world_to_camera":
-            poses = np.linalg.inv(poses)
+        poses = as_poses(rows, self.options.pose_convention, path)
         if self.options.pose_frame == "camera":
             Tr = _calibration(folder / "calib.txt")
-            poses = np.linalg.inv(Tr) @ poses @ Tr  # in the world of the first LiDAR, z up
+            poses = rigid_inverse(Tr, str(folder / "calib.txt")) @ poses @ Tr  # in the world of the first LiDAR, z up
         times = folder / "times.txt"
         stamps = read_table(times, 1, "seconds").ravel() if times.is_file() else None
         for k, (name, points) in enumerate(files.items()):
@@ -100,17 +100,11 @@ class SemanticKitti(ScanDataset[SemanticKittiOptions]):
             stamp = None if stamps is None or row >= len(stamps) else float(stamps[row])
             yield ScanSource(name, points, poses[row], path, stamp)
 
-    def points(self, path: Path, data: bytes) -> Float32:
+    def points(self, path: Path, read: Read) -> Float32:
         """Return the points of x, y, z and remission."""
-        return floats_of(path, data, 4)[:, :3]
+        return floats_of(path, read(path), 4)[:, :3]
 
-    def ids(self, path: Path, data: bytes) -> npt.NDArray[np.integer[Any]]:
-        """Return the lower 16 bits of each point: its class; the upper ones are an instance."""
-        if len(data) % 4:
-            raise DataError(f"{path}: {len(data)} bytes are no uint32; is it cut off, or another format?")
-        return np.frombuffer(data, "<u4") & 0xFFFF
-
-    def class_ids(self) -> UInt16 | None:
+    def class_ids(self, model: str) -> UInt16 | None:
         """Return the learning map as a table."""
         return self._table
 

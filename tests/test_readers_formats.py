@@ -21,7 +21,8 @@ from semstab.config import Config, FrameSelection
 from semstab.core.files import parse_yaml
 from semstab.data.labels import shipped_taxonomies
 from semstab.datasets import REGISTRY, open_dataset, options_model
-from semstab.datasets.files.options import Folders
+from semstab.datasets.files.options import FileOptions, Folders
+from semstab.datasets.files.scans import ScanOptions
 from semstab.datasets.scene import select_frames
 from semstab.errors import DataError
 
@@ -273,8 +274,22 @@ def test_the_options_in_tables_are_those_of_every_reader():
         re.findall(r"`(\w+)`", "".join(line.split("|")[1] for line in table.splitlines() if line.startswith("|")))
     )
     assert len(named) > 8
-    for name in SECTIONS:
-        assert named <= set(options_model(name).model_fields), name
+    models = {name: options_model(name) for name in SECTIONS}
+    of_images = {name: model for name, model in models.items() if issubclass(model, FileOptions)}
+    assert len(of_images) > 15
+    for name, model in of_images.items():
+        assert named <= set(model.model_fields), name
+
+
+def test_the_options_of_scans_are_those_of_every_reader_of_them():
+    table = TEXT.split("## Scans")[1].split("\n## ")[0]
+    named = re.findall(r"^\| `(\w+)`(?:, `(\w+)`)*", table, re.M)
+    assert len(named) > 5
+    models = {name: options_model(name) for name in SECTIONS}
+    of_scans = {name: model for name, model in models.items() if issubclass(model, ScanOptions)}
+    assert set(of_scans) >= {"semantickitti"}
+    for name, model in of_scans.items():
+        assert {word for words in named for word in words if word} <= set(model.model_fields), name
 
 
 def test_the_frames_that_are_shown_are_settings():

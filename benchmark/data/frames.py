@@ -386,7 +386,8 @@ class Frame:
         H, W = self.shape
         if shape != (H, W) and self.is_scan:
             number, points = math.prod(shape), f"{H * W} points" if H == 1 else f"{W}x{H} points"
-            raise DataError(f"{self.where(name)}: {number} {name} but {points}; give one for each point")
+            what = name if name.endswith("s") else f"values of the {name}"
+            raise DataError(f"{self.where(name)}: {number} {what} but {points}; give one for each point")
         if shape != (H, W):
             size = "x".join(str(n) for n in shape[::-1])
             raise DataError(f"{self.where(name)}: {name} are {size} but depth is {W}x{H}; bring them to one size")

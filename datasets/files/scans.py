@@ -25,7 +25,9 @@ from semstab.datasets.files import options as opt
 from semstab.datasets.files.labels import LabelSource, SceneEntry
 from semstab.datasets.files.options import Folders, Template, matching_folders
 from semstab.datasets.files.reader import find_scenes
-from semstab.datasets.geometry.cameras import UP_AXES
+from semstab.datasets.formats.disk import decode_array
+from semstab.datasets.formats.images import Read
+from semstab.datasets.geometry.cameras import LARGEST_COORDINATE, UP_AXES, to_camera_to_world
 from semstab.datasets.scene import GROUND_TRUTH, Dataset, Scene, fingerprint, listed
 from semstab.errors import ConfigError, DataError
 
@@ -36,6 +38,9 @@ PLACES = {"root", "labels_root", "incomplete", "taxonomy", "taxonomies", "classe
 
 NO_ID = IGNORE_16BIT - 1
 """The mark in a table of ids for one that is not in it."""
+
+CALIBRATED = 0.01
+"""How far the rotation of a calibration may be from orthonormal: it has few digits in some files."""
 
 
 class ScanOptions(Settings):
@@ -86,6 +91,7 @@ class ScanDataset(Dataset, Generic[Options]):
         labels: Templates of predictions, of which the first that finds some counts.
         truth: Template of ground truth, or None.
         taxonomy: The classes of the labels, where options name no others.
+        in_world: Whether points are in the world already; a pose is then only where the sensor was.
 
     Raises:
         DataError: If there is no scene.
@@ -95,10 +101,11 @@ class ScanDataset(Dataset, Generic[Options]):
     labels: tuple[str, ...] = ("predictions/{model}/{name}",)
     truth: str | None = None
     taxonomy: str | None = None
+    in_world = False
 
     def __init__(self, options: Options) -> None:
         self.options = options
-        self._entries = {entry.name: entry for entry in find_scenes(options.root, self.is_scene, self.contents)}
+        self._entries = {entry.name: entry for entry in self.find_scenes(options.root)}
 
     @property
     def scenes(self) -> tuple[str, ...]:
@@ -120,29 +127,33 @@ class ScanDataset(Dataset, Generic[Options]):
         if name not in self._entries:
             raise ConfigError(f"{self.options.root}: scene '{name}' is not there; {nearest(name, self.scenes)}")
         entry = self._entries[name]
-        scans = list(self.scans(entry.folder))
+        scans = list(self.scans(entry))
         if not scans:
             raise DataError(f"{entry.folder}: holds no scan; expected {self.contents}")
         return ScanScene(self, entry, scans)
+
+    def find_scenes(self, root: Path) -> Iterable[SceneEntry]:
+        """Return the scenes below the root, in natural order; raises what `find_scenes` raises."""
+        return find_scenes(root, self.is_scene, self.contents)
 
     @abstractmethod
     def is_scene(self, folder: Path) -> bool:
         """Return whether a folder is a scene of this format."""
 
     @abstractmethod
-    def scans(self, folder: Path) -> Iterable[ScanSource]:
-        """Return the scans of a scene's folder, in order, of different names; raises DataError with the file."""
+    def scans(self, entry: SceneEntry) -> Iterable[ScanSource]:
+        """Return the scans of a scene, in order, of different names; raises DataError with the file."""
 
     @abstractmethod
-    def points(self, path: Path, data: bytes) -> Float32:
-        """Return points (N, 3), sensor coordinates in metres, of a file's content; raises DataError with the file."""
+    def points(self, path: Path, read: Read) -> npt.NDArray[np.floating[Any]]:
+        """Return points (N, 3) in metres of a file, whose bytes `read` gives; raises DataError with the file."""
 
-    @abstractmethod
-    def ids(self, path: Path, data: bytes) -> npt.NDArray[np.integer[Any]]:
-        """Return stored ids (N,) of a file's content; raises DataError with the file."""
+    def ids(self, path: Path, read: Read) -> npt.NDArray[np.integer[Any]]:
+        """Return stored ids (N,) of a file, whose bytes `read` gives; raises DataError with the file."""
+        return ids_of(path, read(path))
 
-    def class_ids(self) -> UInt16 | None:
-        """Return a table (65536,) from stored ids to those of the taxonomy, where they differ; NO_ID is none."""
+    def class_ids(self, model: str) -> UInt16 | None:
+        """Return a table (65536,) from ids of that source's files to its taxonomy's, where they differ; NO_ID: none."""
         return None
 
     def moving(self, ids: npt.NDArray[np.integer[Any]]) -> Mask | None:
@@ -261,8 +272,11 @@ class ScanScene(Scene):
             raise DataError(
                 f"{self.folder}: {listed(source.missing(scan), str(self.folder))}; choose scans that have it, or add it"
             )
-        stored, moving = self._dataset.ids(file, self._files.read(file)), self._moving(scan)
-        return self._framed(index, self._labels(model, stored, file), {"labels": str(file)}, moving)
+        stored = self._dataset.ids(file, self._files.read)
+        truth = None if self._truth is None else self._truth.file(scan)
+        moving = None if truth is None else self._dataset.moving(self._dataset.ids(truth, self._files.read))
+        files = {"labels": str(file), "mask": str(truth)}
+        return self._framed(index, self._labels(model, stored, file), files, moving)
 
     def geometry(self, index: int, *, color: bool = False) -> Frame:
         """Return the scan but for its labels: all points are of class 0."""
@@ -282,7 +296,7 @@ class ScanScene(Scene):
         space, source = self.label_space(model), self._source(model)
         digest = hashlib.blake2b(digest_size=16)
         digest.update(json.dumps([settings, space.to_dict()]).encode())
-        if (table := self._dataset.class_ids()) is not None:
+        if (table := self._dataset.class_ids(model)) is not None:
             digest.update(table.tobytes())
         for index in indices:
             scan = self._scan(index)
@@ -308,7 +322,7 @@ class ScanScene(Scene):
         labels: UInt16 = stored.astype(np.uint16)
         if void := self.options.void_ids.get(model):
             labels = np.where(np.isin(labels, void), np.uint16(IGNORE_16BIT), labels)
-        table = None if model in self.options.taxonomies else self._dataset.class_ids()
+        table = None if model in self.options.taxonomies else self._dataset.class_ids(model)
         if table is None:
             return labels
         ids: UInt16 = table[labels]
@@ -316,16 +330,14 @@ class ScanScene(Scene):
             raise DataError(f"{file}: the id {labels[unknown][0]} is no class of the format; is it another format?")
         return ids
 
-    def _moving(self, scan: ScanSource) -> Mask | None:
-        """Return the points that move, by the ground truth, where it says so."""
-        file = None if self._truth is None else self._truth.file(scan)
-        return None if file is None else self._dataset.moving(self._dataset.ids(file, self._files.read(file)))
-
     def _framed(
         self, index: int, labels: npt.NDArray[Any] | None, files: Mapping[str, str], moving: Mask | None = None
     ) -> Frame:
         scan = self._scan(index)
-        points = self._dataset.points(scan.points, self._files.read(scan.points))
+        points = self._dataset.points(scan.points, self._files.read)
+        if self._dataset.in_world:
+            points = (points - scan.pose[:3, 3]) @ scan.pose[:3, :3]
+        points = points.astype(np.float32, copy=False)
         near, far = self.options.min_range or 0.0, self.options.max_range or math.inf
         depth = np.sqrt((points.astype(np.float64) ** 2).sum(axis=1)).astype(np.float32)
         if near > 0 or far < math.inf:
@@ -342,7 +354,7 @@ class ScanScene(Scene):
         """Return the files of a label source; raises ConfigError if there is none of that name."""
         known = self._sources | ({} if self._truth is None else {GROUND_TRUTH: self._truth})
         if model not in known:
-            hint = nearest(model, [*known]) if known else f"put its files into {self.label_paths[0]}"
+            hint = nearest(model, [*known]) if self._sources else f"put its files into {self.label_paths[0]}"
             raise ConfigError(f"{self.folder}: model '{model}' is not there; {hint}")
         return known[model]
 
@@ -350,6 +362,32 @@ class ScanScene(Scene):
         if not 0 <= index < len(self):
             raise ConfigError(f"{self.folder}: there is no scan {index}; it has {len(self)}, counted from 0")
         return self._scans[index]
+
+
+def as_poses(T: Float64, convention: str, path: Path) -> Float64:
+    """Return poses (n, 4, 4) of a file as sensor-to-world, of rows (n, 3, 4) or (n, 4, 4); NaN stays.
+
+    Raises:
+        DataError: For one that cannot be inverted, or is too far away, with the file and its number from 1.
+    """
+    if T.shape[1:] == (3, 4):
+        T = np.concatenate([T, np.tile([0.0, 0.0, 0.0, 1.0], (len(T), 1, 1))], axis=1)
+    each = [to_camera_to_world(pose, convention, "opencv", f"{path}: pose {k}") for k, pose in enumerate(T, start=1)]
+    return np.stack(each)
+
+
+def rigid_inverse(T: Float64, where: str) -> Float64:
+    """Return the inverse of a calibration (4, 4).
+
+    Raises:
+        DataError: If it is not rigid, with `where` (the file).
+    """
+    R = T[:3, :3]
+    if not (np.isfinite(T).all() and np.abs(T).max() < LARGEST_COORDINATE):
+        raise DataError(f"{where}: the matrix holds a number that is not finite, or too large; is the file damaged?")
+    if np.abs(R.T @ R - np.eye(3)).max() > CALIBRATED or np.linalg.det(R) < 0:
+        raise DataError(f"{where}: the rotation is not orthonormal; is the matrix transposed, or the file damaged?")
+    return np.linalg.inv(T).astype(np.float64, copy=False)
 
 
 def floats_of(path: Path, data: bytes, columns: int) -> Float32:
@@ -364,3 +402,21 @@ def floats_of(path: Path, data: bytes, columns: int) -> Float32:
             " format?"
         )
     return np.frombuffer(data, "<f4").reshape(-1, columns)
+
+
+def ids_of(path: Path, data: bytes) -> npt.NDArray[np.integer[Any]]:
+    """Return ids (N,): of .label the lower 16 bits of each uint32 (the upper ones are an instance); of .npy integers.
+
+    Raises:
+        DataError: If the file is another one.
+    """
+    if path.suffix == ".npy":
+        ids = decode_array(path, data, "labels")
+        if not np.issubdtype(ids.dtype, np.integer):
+            raise DataError(f"{path}: holds {ids.dtype}, not integers; write the class of each point, not its scores")
+        return ids.reshape(-1)
+    if path.suffix != ".label":
+        raise DataError(f"{path}: is neither .label (uint32) nor .npy; write one of these")
+    if len(data) % 4:
+        raise DataError(f"{path}: {len(data)} bytes are no uint32; is it cut off, or another format?")
+    return np.frombuffer(data, "<u4") & 0xFFFF

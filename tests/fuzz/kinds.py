@@ -13,6 +13,7 @@ import cv2
 import image_files as images
 import looking_down as down
 import numpy as np
+import scan_writers
 import test_readers_odm as odm
 import tiny_scene
 import yaml
@@ -182,6 +183,10 @@ def of_datasets(folder: Path) -> Iterator[Kind]:
         write_labels(root / "seq", form.write(root / "seq", frames), frames)
         (root / "seq/labels/net/label_space.yaml").write_text(yaml.safe_dump({"classes": CLASSES}))
         yield Kind(name, described(root), functools.partial(read_scene, form=form, root=root))
+    for name, of_scans in scan_writers.SCANS.items():
+        root = folder / f"scans {name}"
+        scan_writers.write_predicted(of_scans, root)
+        yield Kind(f"scans {name}", every_file(root), lambda _, f=of_scans, r=root: read_scans(f, r))
     project = odm.write_project(folder / "project", depth="mve")
     odm.write_georeference(project)
     options = {"root": project, "classes": odm.CLASSES, "casts": False}
@@ -197,6 +202,16 @@ def stored(frame: Frame, scale: float | None) -> Frame:
 def described(root: Path) -> tuple[Path, ...]:
     suffixes = (".txt", ".json", ".yaml", ".bin", ".db3", ".mcap", ".xml", ".csv", ".pincam", ".traj")
     return tuple(sorted(p for p in root.rglob("*") if p.suffix in suffixes and "depth_maps" not in p.parts))
+
+
+def every_file(root: Path) -> tuple[Path, ...]:
+    return tuple(sorted(path for path in root.rglob("*") if path.is_file()))
+
+
+def read_scans(form: scan_writers.ScanFormat, root: Path) -> None:
+    scene = scan_writers.opened(form, root)
+    for index in range(len(scene)):
+        scene.frame(index, "net")
 
 
 def read_scene(_: Path, form: Format, root: Path) -> None:

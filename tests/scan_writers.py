@@ -1,0 +1,140 @@
+"""Small files in the true format of every dataset of scans, from scans of a room by a sensor that moves and turns."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+from dataset_writers import numbers, write_lines
+from scipy.spatial.transform import Rotation
+
+from semstab.datasets import open_dataset
+
+COUNT, POINTS = 4, 400
+SIDE = np.array([8.0, 6.0, 3.0])
+"""The room, metres; its floor is z = 0."""
+
+
+@dataclass(frozen=True, eq=False)
+class Scan:
+    """Points (N, 3) float32 in the sensor's coordinates, the wall of each (N,), 0 to 5, and the sensor's pose."""
+
+    points: np.ndarray
+    walls: np.ndarray
+    T: np.ndarray
+
+
+def rigid(angles: Sequence[float], t: Sequence[float]) -> np.ndarray:
+    """A pose from angles about x, y, z in degrees, and a translation."""
+    T = np.eye(4)
+    T[:3, :3] = Rotation.from_euler("xyz", angles, degrees=True).as_matrix()
+    T[:3, 3] = t
+    return T
+
+
+def room(k: int, count: int) -> Scan:
+    """Scan k of the six walls of a room, whose points are on them in the world."""
+    rng = np.random.default_rng((5, k))
+    T = rigid((2 * k, -3, 25 * k), (2 + k, 3 + 0.2 * k, 1.5))
+    walls = rng.integers(0, 6, count)
+    world = rng.uniform(0, SIDE, (count, 3))
+    world[np.arange(count), walls // 2] = np.where(walls % 2, SIDE[walls // 2], 0.0)
+    return Scan(((world - T[:3, 3]) @ T[:3, :3]).astype(np.float32), walls.astype(np.uint16), T)
+
+
+@functools.cache
+def scans() -> tuple[Scan, ...]:
+    """The scans that are written."""
+    return tuple(room(k, POINTS) for k in range(COUNT))
+
+
+def save_bytes(path: Path, data: bytes) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_bytes(data)
+
+
+# --- SemanticKITTI
+
+TR = rigid((-90, 90, 0), (0.1, -0.2, -0.3))
+"""From the LiDAR to camera 0: its axes are others."""
+
+KITTI_IDS = np.array([40, 48, 50, 70, 10, 252], np.uint32)
+"""The stored id of each wall; the last one is a moving car."""
+
+
+def write_semantickitti(folder: Path, wanted: Sequence[Scan]) -> list[str]:
+    """Points with remission, true labels with an instance in the upper half, and poses of camera 0."""
+    names = [f"{k:06d}" for k in range(len(wanted))]
+    for name, scan in zip(names, wanted, strict=True):
+        rows = np.column_stack([scan.points, np.full(len(scan.points), 0.5, np.float32)])
+        save_bytes(folder / f"velodyne/{name}.bin", rows.astype("<f4").tobytes())
+        save_bytes(folder / f"labels/{name}.label", (KITTI_IDS[scan.walls] | 7 << 16).astype("<u4").tobytes())
+    poses = [TR @ scan.T @ np.linalg.inv(TR) for scan in wanted]
+    write_lines(folder / "poses.txt", [numbers(T[:3]) for T in poses])
+    write_lines(folder / "calib.txt", [f"P0: {numbers(np.eye(4)[:3])}", f"Tr: {numbers(TR[:3])}"])
+    write_lines(folder / "times.txt", [numbers(0.1 * k) for k in range(len(wanted))])
+    return names
+
+
+def predict_semantickitti(folder: Path, name: str, walls: np.ndarray, model: str = "net") -> None:
+    save_bytes(folder / f"predictions/{model}/{name}.label", KITTI_IDS[walls].astype("<u4").tobytes())
+
+
+# --- all of them
+
+
+@dataclass(frozen=True)
+class ScanFormat:
+    """A dataset: writers of its scans and of predictions, the class that each wall is read as, and needed options.
+
+    Attributes:
+        dataset: Its name.
+        write: Writes scans into a folder, and returns their names.
+        predict: Writes the walls of a scan as predictions into the same folder.
+        classes: The class of each wall, in words.
+        points: The file of a scan's points, a template.
+        predicted: The file of its predictions.
+        moves: The wall that moves, by the format's truth.
+        options: Options that it needs.
+    """
+
+    dataset: str
+    write: Callable[[Path, Sequence[Scan]], list[str]]
+    predict: Callable[[Path, str, np.ndarray], None]
+    classes: tuple[str, ...]
+    points: str
+    predicted: str
+    moves: int | None = None
+    truth: bool = True
+    options: dict[str, object] = field(default_factory=dict)
+
+
+SCANS = {
+    "semantickitti": ScanFormat(
+        "semantickitti", write_semantickitti, predict_semantickitti,
+        ("road", "sidewalk", "building", "vegetation", "car", "car"), "velodyne/{}.bin", "predictions/net/{}.label",
+        moves=5,
+    ),
+}  # fmt: skip
+
+
+def write_predicted(form: ScanFormat, folder: Path) -> list[str]:
+    """Write all scans with predictions that are right but for every tenth point, which is of the first wall."""
+    names = form.write(folder, scans())
+    for name, scan in zip(names, scans(), strict=True):
+        form.predict(folder, name, predicted(scan))
+    return names
+
+
+def predicted(scan: Scan) -> np.ndarray:
+    """The walls that the model predicts."""
+    return np.where(np.arange(len(scan.walls)) % 10, scan.walls, 0).astype(scan.walls.dtype)
+
+
+def opened(form: ScanFormat, root: Path, **options):
+    """The first scene of a dataset that was written, with the options that its format needs."""
+    dataset = open_dataset(form.dataset, {"root": root} | form.options | options)
+    return dataset.scene(dataset.scenes[0])

@@ -1,0 +1,314 @@
+"""Readers of scans: every format gives the points, poses and classes it was written from, or one line that says why."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+import scan_writers as sw
+import yaml
+from dataset_writers import numbers, write_lines
+from posed_scene import fails
+from scan_writers import SCANS
+
+from semstab.backends import create
+from semstab.check import check_scene
+from semstab.data.frames import Frame
+from semstab.datasets import open_dataset, recognise
+from semstab.errors import ConfigError, DataError
+from semstab.settings import load_config, resolve
+
+
+@pytest.fixture(params=SCANS)
+def form(request):
+    return SCANS[request.param]
+
+
+@pytest.fixture
+def folder(form, tmp_path):
+    """The root of a dataset with one scene."""
+    sw.write_predicted(form, tmp_path / "data")
+    return tmp_path / "data"
+
+
+def names_of_labels(scene, frame, model):
+    """The class of each point in words, None where it has none."""
+    space = scene.label_space(model)
+    names = dict(zip(space.ids, space.classes, strict=True))
+    return [names.get(int(label)) for label in frame.labels[0]]
+
+
+def same_pose_up_to_the_world(found, expected):
+    """Poses agree but for one transform of the whole world."""
+    move = found[0] @ np.linalg.inv(expected[0])
+    np.testing.assert_allclose(found, [move @ T for T in expected], rtol=0, atol=1e-6)
+
+
+# --- all formats
+
+
+def test_points_land_where_the_written_pose_says(form, folder):
+    scene = sw.opened(form, folder)
+    frames = [scene.frame(k, "net") for k in range(len(scene))]
+    assert (len(scene), scene.models, scene.of_scans) == (sw.COUNT, ("net",), True)
+    for frame, scan in zip(frames, sw.scans(), strict=True):
+        np.testing.assert_allclose(frame.points[0], scan.points, rtol=0, atol=1e-3)
+    same_pose_up_to_the_world([f.T_wc for f in frames], [s.T for s in sw.scans()])
+    walls = np.concatenate([s.points @ s.T[:3, :3].T + s.T[:3, 3] for s in sw.scans()])
+    move = frames[0].T_wc @ np.linalg.inv(sw.scans()[0].T)
+    found = np.concatenate([f.points[0] @ f.T_wc[:3, :3].T + f.T_wc[:3, 3] for f in frames])
+    np.testing.assert_allclose(found, walls @ move[:3, :3].T + move[:3, 3], rtol=0, atol=2e-3)
+
+
+def test_labels_are_the_classes_that_were_predicted(form, folder):
+    scene = sw.opened(form, folder)
+    for k, scan in enumerate(sw.scans()):
+        found = names_of_labels(scene, scene.frame(k, "net"), "net")
+        assert found == [form.classes[wall] for wall in sw.predicted(scan)]
+
+
+def test_the_truth_is_read_where_the_format_has_one(form, folder):
+    scene = sw.opened(form, folder)
+    assert scene.ground_truth == form.truth
+    if form.truth:
+        found = names_of_labels(scene, scene.frame(1, "gt"), "gt")
+        assert found == [form.classes[wall] for wall in sw.scans()[1].walls]
+    else:
+        fails(ConfigError, "model 'gt' is not there", scene.frame, 1, "gt")
+
+
+def test_points_that_move_by_the_truth_are_masked(form, folder):
+    frame = sw.opened(form, folder).frame(1, "net")
+    if form.moves is None:
+        assert frame.mask is None
+    else:
+        np.testing.assert_array_equal(frame.mask[0], sw.scans()[1].walls == form.moves)
+
+
+def test_the_range_limits_what_is_valid_and_keeps_the_points(form, folder):
+    scene = sw.opened(form, folder, min_range=2.0, max_range=4.0)
+    frame, all_ = scene.frame(0, "net"), sw.opened(form, folder).frame(0, "net")
+    distance = np.linalg.norm(sw.scans()[0].points, axis=1)
+    inside = (distance > 2) & (distance < 4)
+    assert 20 < inside.sum() < sw.POINTS - 20
+    np.testing.assert_array_equal(frame.depth[0] > 0, inside)
+    assert (all_.depth > 0).all()
+    assert frame.shape == all_.shape == (1, sw.POINTS)
+
+
+def test_it_is_recognised_as_itself(form, folder):
+    assert recognise(folder)[0] == form.dataset
+    assert recognise(folder.parent)[0] == form.dataset
+
+
+def test_it_is_fused_by_its_poses(form, folder):
+    """The walls are planes: with right poses they fill as many voxels as the room's surface has."""
+    scene = sw.opened(form, folder)
+    backend = create("numpy", voxel_size=0.5, num_classes=256)
+    for k in range(len(scene)):
+        frame = scene.geometry(k)
+        backend.integrate(dataclasses.replace(frame, T_wc=np.linalg.inv(shift(scene)) @ frame.T_wc))
+    expected = create("numpy", voxel_size=0.5, num_classes=256)
+    for k, scan in enumerate(sw.scans()):
+        labels = np.zeros(len(scan.points), np.uint8)
+        expected.integrate(Frame(k, points=scan.points, labels=labels, T_wc=scan.T))
+    assert len(expected.table()) > 300
+    assert abs(len(backend.table()) - len(expected.table())) < 60  # points on the planes between voxels may fall anew
+
+
+def shift(scene):
+    """The transform from the world of the written poses to that of the scene."""
+    return scene.T_wc(0) @ np.linalg.inv(sw.scans()[0].T)
+
+
+def test_the_digest_changes_with_points_labels_and_options(form, folder):
+    def digest(**options):
+        return sw.opened(form, folder, **options).digest([0, 1], "net")
+
+    first, name = digest(), sw.opened(form, folder).frame_name(1)
+    assert digest() == first != digest(max_range=30.0)
+    found = {first}
+    for template in (form.points, form.predicted):
+        path = folder / template.format(name)
+        path.write_bytes(path.read_bytes()[:-1] + b"\x01")
+        found.add(digest())
+    assert len(found) == 3
+
+
+def test_labels_of_another_scan_are_refused_with_the_file(form, folder):
+    scene = sw.opened(form, folder)
+    form.predict(folder, scene.frame_name(2), sw.predicted(sw.scans()[2])[:-3])
+    fails(DataError, f"{sw.POINTS - 3} labels but {sw.POINTS} points; give one for each point", scene.frame, 2, "net")
+    scene.frame(1, "net")
+
+
+def test_a_file_that_is_missing_is_named(form, folder):
+    name = sw.opened(form, folder).frame_name(2)
+    (folder / form.predicted.format(name)).unlink()
+    scene = sw.opened(form, folder)
+    (lost,) = scene.missing(2, ["net"])
+    assert name in lost
+    assert lost.startswith(str(folder))
+    fails(DataError, "choose scans that have it, or add it", scene.frame, 2, "net")
+    assert scene.missing(1, ["net"]) == []
+
+
+def test_a_damaged_file_of_points_is_named(form, folder):
+    path = folder / form.points.format(sw.opened(form, folder).frame_name(1))
+    path.write_bytes(path.read_bytes()[:-2])
+    fails(DataError, path.name, sw.opened(form, folder).frame, 1, "net")
+    path.write_bytes(b"")
+    fails(DataError, "the file is empty", sw.opened(form, folder).frame, 1, "net")
+
+
+def test_there_is_no_such_scan_nor_model(form, folder):
+    scene = sw.opened(form, folder)
+    fails(ConfigError, f"there is no scan {sw.COUNT}; it has {sw.COUNT}, counted from 0", scene.frame, sw.COUNT, "net")
+    fails(ConfigError, "model 'nett' is not there; did you mean 'net'", scene.frame, 0, "nett")
+
+
+def test_check_finds_that_the_scans_lie_on_each_other(form, folder):
+    dense(form, folder)
+    options = form.options | {"root": str(folder)}
+    content = {"dataset": {"name": form.dataset, "options": options}, "models": ["net"], "voxel_size": 0.5}
+    checked = check_scene(sw.opened(form, folder), resolve(load_config(None, content | {"taxonomy": None})))
+    assert checked.verdict.state == "sound"
+
+
+def dense(form, folder):
+    """Scans with as many points as the check needs, over the ones that are there."""
+    many = [sw.room(k, 6000) for k in range(sw.COUNT)]
+    for name, scan in zip(form.write(folder, many), many, strict=True):
+        form.predict(folder, name, scan.walls)
+
+
+# --- SemanticKITTI
+
+
+@pytest.fixture
+def kitti(tmp_path):
+    sw.write_predicted(SCANS["semantickitti"], tmp_path / "sequences/00")
+    return tmp_path / "sequences/00"
+
+
+def read(folder, **options):
+    return sw.opened(SCANS["semantickitti"], folder, **options)
+
+
+def test_kitti_poses_are_of_the_lidar_in_the_first_lidars_world(kitti):
+    scene = read(kitti)
+    np.testing.assert_allclose([scene.T_wc(k) for k in range(4)], [s.T for s in sw.scans()], rtol=0, atol=1e-9)
+    np.testing.assert_allclose(scene.timestamps, [0, 0.1, 0.2, 0.3])
+    assert (scene.name, scene.up.tolist()) == ("00", [0, 0, 1])
+    assert open_dataset("semantickitti", {"root": kitti.parents[1]}).scenes == ("sequences-00",)
+
+
+def test_kitti_poses_may_be_of_the_lidar_or_inverse(kitti):
+    write_lines(kitti / "poses.txt", [numbers(np.linalg.inv(scan.T)[:3]) for scan in sw.scans()])
+    (kitti / "calib.txt").unlink()
+    scene = read(kitti, pose_frame="lidar", pose_convention="world_to_camera")
+    np.testing.assert_allclose([scene.T_wc(k) for k in range(4)], [s.T for s in sw.scans()], rtol=0, atol=1e-9)
+    fails(DataError, "calib.txt: is missing; it holds Tr.*pose_frame=lidar", read, kitti)
+
+
+@pytest.mark.parametrize(
+    ("line", "said"),
+    [
+        ("P0: 1 2 3", "calib.txt: has no line Tr"),
+        ("Tr: 1 2 3", "calib.txt, line 1: Tr has 3 numbers, not 12"),
+        ("Tr: 1 0 0 0 0 1 0 0 0 0 one 0", "calib.txt: line 1: 'one' is not a number"),
+        ("Tr: 0 0 0 0 0 0 0 0 0 0 0 0", "calib.txt: the rotation is not orthonormal"),
+        ("Tr: 1 0 0 0 0 1 0 0 0 0 1 nan", "calib.txt: the matrix holds a number that is not finite"),
+    ],
+)
+def test_kitti_calibration_that_is_none_is_refused(kitti, line, said):
+    (kitti / "calib.txt").write_text(line + "\n")
+    fails(DataError, said, read, kitti)
+
+
+def test_kitti_poses_that_are_fewer_or_damaged_are_refused(kitti):
+    lines = (kitti / "poses.txt").read_text().splitlines()
+    write_lines(kitti / "poses.txt", lines[:3])
+    fails(DataError, "poses.txt: has 3 poses, and scan 000003 is number 3; add its pose", read, kitti)
+    write_lines(kitti / "poses.txt", [*lines[:3], "1 2 3"])
+    fails(DataError, "poses.txt: line 4 has 3 values; expected 12", read, kitti)
+    write_lines(kitti / "poses.txt", [*lines[:3], " ".join(["1e30"] * 12)])
+    fails(DataError, r"poses.txt: pose 4: the pose holds 1e\+30", read, kitti)
+    write_lines(kitti / "poses.txt", [*lines[:3], " ".join(["nan"] * 12)])
+    assert [read(kitti).tracked(k) for k in range(4)] == [True, True, True, False]
+
+
+def test_kitti_scans_of_a_part_of_a_sequence_have_the_poses_of_their_numbers(kitti):
+    for folder, suffix in (("velodyne", "bin"), ("labels", "label"), ("predictions/net", "label")):
+        (kitti / folder / f"000000.{suffix}").unlink()
+    scene = read(kitti)
+    assert [scene.frame_name(k) for k in range(3)] == ["000001", "000002", "000003"]
+    np.testing.assert_allclose(scene.T_wc(0), sw.scans()[1].T, rtol=0, atol=1e-9)
+    np.testing.assert_allclose(scene.timestamps, [0.1, 0.2, 0.3])
+
+
+def test_kitti_ids_are_joined_as_the_benchmark_does_and_others_refused(kitti):
+    stored = np.zeros(sw.POINTS, "<u4")
+    stored[:8] = 13, 60, 254, 0, 99, 52, 1, 30
+    (kitti / "predictions/net/000000.label").write_bytes(stored.tobytes())
+    frame = read(kitti).frame(0, "net")
+    assert frame.labels[0, :8].tolist() == [20, 40, 30, 65535, 65535, 65535, 65535, 30]
+    stored[3] = 123
+    (kitti / "predictions/net/000000.label").write_bytes(stored.tobytes())
+    fails(DataError, "000000.label: the id 123 is no class of the format", read(kitti).frame, 0, "net")
+    (kitti / "predictions/net/000000.label").write_bytes(stored.tobytes()[:-1])
+    fails(DataError, f"000000.label: {4 * sw.POINTS - 1} bytes are no uint32", read(kitti).frame, 0, "net")
+
+
+def test_kitti_moving_points_may_be_kept(kitti):
+    assert read(kitti, moving="keep").frame(1, "net").mask is None
+    short = (kitti / "labels/000001.label").read_bytes()[:-4]
+    (kitti / "labels/000001.label").write_bytes(short)
+    fails(
+        DataError,
+        f"000001.label: {sw.POINTS - 1} values of the mask but {sw.POINTS} points",
+        read(kitti).frame,
+        1,
+        "net",
+    )
+    for file in (kitti / "labels").iterdir():
+        file.unlink()
+    scene = read(kitti)
+    assert not scene.ground_truth
+    assert scene.frame(1, "net").mask is None
+
+
+def test_kitti_a_learning_map_of_ones_own(kitti, tmp_path):
+    table = tmp_path / "map.yaml"
+    ids = {int(n): k % 2 for k, n in enumerate(sw.KITTI_IDS)}
+    table.write_text(yaml.safe_dump({"learning_map": ids}))
+    classes = ("flat", "other")
+    scene = read(kitti, learning_map=table, classes=classes)
+    found = names_of_labels(scene, scene.frame(0, "net"), "net")
+    assert found == [classes[wall % 2] for wall in sw.predicted(sw.scans()[0])]
+    fails(ConfigError, "map.yaml: name the classes of its ids", read, kitti, learning_map=table)
+    table.write_text(yaml.safe_dump({"learning_map": {10: 70000}}))
+    fails(ConfigError, "learning_map: 70000 is no id", read, kitti, learning_map=table, classes=classes)
+    table.write_text(yaml.safe_dump({"learning_map": {10: "car"}}))
+    fails(ConfigError, "has no learning_map of ids", read, kitti, learning_map=table, classes=classes)
+
+
+def test_kitti_predictions_elsewhere_and_ids_that_are_void(kitti, tmp_path):
+    (tmp_path / "out/net/predictions").parent.mkdir(parents=True)
+    (kitti / "predictions/net").rename(tmp_path / "out/net/predictions")
+    scene = read(kitti, labels_root=tmp_path / "out", void_ids={"net": [40]})
+    assert scene.models == ("net",)
+    labels = scene.frame(0, "net").labels[0]
+    np.testing.assert_array_equal(labels == 65535, sw.predicted(sw.scans()[0]) == 0)
+    fails(ConfigError, r"put its files into .*predictions/MODEL/000000\.label", read(kitti).frame, 0, "net")
+
+
+def test_kitti_is_missing_what_makes_a_scene(kitti):
+    (kitti / "poses.txt").unlink()
+    fails(DataError, r"no scene here.*velodyne/ and poses\.txt", read, kitti)
+    fails(DataError, r"the nearest is semantickitti \(without poses\.txt\)", recognise, kitti)
+    (kitti / "poses.txt").write_text(numbers(np.eye(4)[:3]))
+    for file in (kitti / "velodyne").iterdir():
+        file.unlink()
+    fails(DataError, "holds no scan; expected velodyne/ and poses.txt", read, kitti)
