@@ -88,6 +88,8 @@ REGISTRY = Registry(
         "semantickitti": Entry(
             "semstab.datasets.semantickitti:SemanticKitti", "SemanticKITTI: LiDAR scans, a class a point"
         ),
+        "nuscenes": Entry("semstab.datasets.nuscenes:NuScenes", "nuScenes lidarseg: LiDAR key frames, a class a point"),
+        "kitti360": Entry("semstab.datasets.kitti360:Kitti360", "KITTI-360: velodyne scans of its raw data"),
         "hololens": Entry("semstab.datasets.hololens:HoloLens", "DeepVideoMVS and HoloLens: poses.txt and K.txt"),
     },
 )
@@ -128,8 +130,8 @@ def open_dataset(name: str, options: dict[str, Any] | BaseModel, run_folder: Pat
 
 RECOGNISED = (
     "odm", "metashape", "pix4d", "realitycapture", "uavscenes", "hololens", "tum", "seven_scenes", "replica", "scannet",
-    "semantickitti", "tartanair", "stray_scanner", "polycam", "record3d", "arkitscenes", "transforms_json", "colmap",
-    "bag", "posed_folder",
+    "semantickitti", "nuscenes", "kitti360", "tartanair", "stray_scanner", "polycam", "record3d", "arkitscenes",
+    "transforms_json", "colmap", "bag", "posed_folder",
 )  # fmt: skip
 """Formats that a folder is recognised as: the one whose scenes lie highest, of these the first."""
 

@@ -20,7 +20,7 @@ from semstab.data.labels import IGNORE_16BIT
 from semstab.datasets.files import options as opt
 from semstab.datasets.files.labels import SceneEntry
 from semstab.datasets.files.scans import NO_ID, ScanDataset, ScanOptions, ScanSource, as_poses, floats_of, rigid_inverse
-from semstab.datasets.formats.disk import files_named, read_table, records, to_number
+from semstab.datasets.formats.disk import files_named, read_matrices, read_table
 from semstab.datasets.formats.images import Read
 from semstab.errors import ConfigError, DataError
 
@@ -138,11 +138,10 @@ def _calibration(path: Path) -> Float64:
             f"{path}: is missing; it holds Tr, from the LiDAR to the camera whose poses are given; where they are the"
             " LiDAR's own, set pose_frame: lidar (--option pose_frame=lidar)"
         )
-    for line, text in records(path):
-        key, _, values = text.partition(":")
-        if key.strip() in ("Tr", "Tr_velo_to_cam"):
-            numbers = [to_number(word, path, line) for word in values.split()]
-            if len(numbers) != 12:
-                raise DataError(f"{path}, line {line}: Tr has {len(numbers)} numbers, not 12")
-            return np.vstack([np.reshape(numbers, (3, 4)), [0, 0, 0, 1]])
-    raise DataError(f"{path}: has no line Tr; copy that of the sequence's calib.txt, or set pose_frame: lidar")
+    matrices = read_matrices(path)
+    for key in ("Tr", "Tr_velo_to_cam"):
+        if key in matrices:
+            return matrices[key]
+    raise DataError(
+        f"{path}: has no line Tr of 12 numbers; copy that of the sequence's calib.txt, or set pose_frame: lidar"
+    )

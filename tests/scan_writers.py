@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import json
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -83,6 +84,98 @@ def predict_semantickitti(folder: Path, name: str, walls: np.ndarray, model: str
     save_bytes(folder / f"predictions/{model}/{name}.label", KITTI_IDS[walls].astype("<u4").tobytes())
 
 
+# --- nuScenes
+
+MOUNTED = rigid((1, 2, -90), (0.9, 0, 1.8))
+"""The pose of the LiDAR on the vehicle."""
+
+CATEGORIES = (
+    "noise",
+    "flat.other",
+    "flat.sidewalk",
+    "static.manmade",
+    "vehicle.car",
+    "vehicle.ego",
+    "vehicle.bus.rigid",
+)
+WALLS = np.array([1, 2, 3, 4, 6, 5], np.uint8)
+"""The category of each wall; the last one is the vehicle itself, which the challenge ignores."""
+
+COARSE = np.array([12, 13, 15, 4, 3, 0], np.uint8)
+"""The same as the challenge's classes."""
+
+
+def quaternion_first(T: np.ndarray) -> dict[str, list[float]]:
+    x, y, z, w = Rotation.from_matrix(T[:3, :3]).as_quat().tolist()
+    return {"translation": T[:3, 3].tolist(), "rotation": [w, x, y, z]}
+
+
+def write_nuscenes(folder: Path, wanted: Sequence[Scan], scene: str = "scene-0061") -> list[str]:
+    """Tables of one scene, with a camera and a sweep between key frames; categories have an order of their own."""
+    names = [f"{k:032x}" for k in range(len(wanted), 0, -1)]
+    tables: dict[str, list[dict[str, object]]] = {
+        "scene": [{"token": "s", "name": scene, "first_sample_token": "s0"}],
+        "sensor": [{"token": "lidar", "channel": "LIDAR_TOP"}, {"token": "cam", "channel": "CAM_FRONT"}],
+        "calibrated_sensor": [
+            {"token": "c-cam", "sensor_token": "cam"} | quaternion_first(np.eye(4)),
+            {"token": "c-lidar", "sensor_token": "lidar"} | quaternion_first(MOUNTED),
+        ],
+        "category": [{"token": f"k{k}", "name": name, "index": k} for k, name in enumerate(CATEGORIES)],
+        "sample": [{"token": f"s{k}", "scene_token": "s"} for k in range(len(wanted))],
+        "sample_data": [], "ego_pose": [], "lidarseg": [],
+    }  # fmt: skip
+    for k, (name, scan) in enumerate(zip(names, wanted, strict=True)):
+        rows = np.column_stack([scan.points, np.full((len(scan.points), 2), 9, np.float32)])
+        file, labels = f"samples/LIDAR_TOP/{k}.pcd.bin", f"lidarseg/v1.0-mini/{name}_lidarseg.bin"
+        save_bytes(folder / file, rows.astype("<f4").tobytes())
+        save_bytes(folder / labels, WALLS[scan.walls].tobytes())
+        tables["ego_pose"].append({"token": f"e{k}"} | quaternion_first(scan.T @ np.linalg.inv(MOUNTED)))
+        tables["lidarseg"].append({"token": name, "sample_data_token": name, "filename": labels})
+        shared = {"sample_token": f"s{k}", "ego_pose_token": f"e{k}", "timestamp": 1_532_402_927_000_000 + 500_000 * k}
+        key = {"filename": file, "calibrated_sensor_token": "c-lidar", "is_key_frame": True}
+        tables["sample_data"] += [
+            shared | key | {"token": name},
+            shared | key | {"token": f"sweep{k}", "is_key_frame": False},
+            shared | key | {"token": f"cam{k}", "calibrated_sensor_token": "c-cam"},
+        ]
+    tables["sample_data"].reverse()
+    for table, content in tables.items():
+        save_bytes(folder / f"v1.0-mini/{table}.json", json.dumps(content).encode())
+    return names
+
+
+def predict_nuscenes(folder: Path, name: str, walls: np.ndarray) -> None:
+    save_bytes(folder / f"predictions/net/{name}_lidarseg.bin", COARSE[walls].tobytes())
+
+
+# --- KITTI-360
+
+DRIVE = "2013_05_28_drive_0000_sync"
+IMU_FROM_CAMERA = rigid((90, 0, 90), (1.6, 0.1, -0.6))
+LIDAR_FROM_CAMERA = rigid((-88, 3, -91), (0.3, -0.1, -0.7))
+
+
+def write_kitti360(folder: Path, wanted: Sequence[Scan]) -> list[str]:
+    """Raw scans from frame 7 on, and poses of the IMU, also of other frames."""
+    names = [f"{7 + k:010d}" for k in range(len(wanted))]
+    lidar_in_imu, lines = IMU_FROM_CAMERA @ np.linalg.inv(LIDAR_FROM_CAMERA), [f"1 {numbers(np.eye(4)[:3])}"]
+    for k, (name, scan) in enumerate(zip(names, wanted, strict=True)):
+        rows = np.column_stack([scan.points, np.full(len(scan.points), 0.5, np.float32)])
+        save_bytes(folder / f"data_3d_raw/{DRIVE}/velodyne_points/data/{name}.bin", rows.astype("<f4").tobytes())
+        lines.append(f"{7 + k} {numbers((scan.T @ np.linalg.inv(lidar_in_imu))[:3])}")
+    write_lines(folder / f"data_poses/{DRIVE}/poses.txt", lines)
+    cameras = [f"image_0{k}: {numbers((IMU_FROM_CAMERA @ rigid((0, 0, k), (k, 0, 0)))[:3])}" for k in range(4)]
+    write_lines(folder / "calibration/calib_cam_to_pose.txt", cameras)
+    write_lines(folder / "calibration/calib_cam_to_velo.txt", [numbers(LIDAR_FROM_CAMERA[:3])])
+    return names
+
+
+def predict_kitti360(folder: Path, name: str, walls: np.ndarray) -> None:
+    path = folder / f"data_3d_raw/{DRIVE}/predictions/net/{name}.npy"
+    path.parent.mkdir(parents=True, exist_ok=True)
+    np.save(path, walls.astype(np.uint8))
+
+
 # --- all of them
 
 
@@ -95,16 +188,17 @@ class ScanFormat:
         write: Writes scans into a folder, and returns their names.
         predict: Writes the walls of a scan as predictions into the same folder.
         classes: The class of each wall, in words.
-        points: The file of a scan's points, a template.
-        predicted: The file of its predictions.
+        points: The file of the second scan's points, a template.
+        predicted: The file of a scan's predictions.
         moves: The wall that moves, by the format's truth.
+        truth: Whether it has ground truth of each point.
         options: Options that it needs.
     """
 
     dataset: str
     write: Callable[[Path, Sequence[Scan]], list[str]]
     predict: Callable[[Path, str, np.ndarray], None]
-    classes: tuple[str, ...]
+    classes: tuple[str | None, ...]
     points: str
     predicted: str
     moves: int | None = None
@@ -117,6 +211,16 @@ SCANS = {
         "semantickitti", write_semantickitti, predict_semantickitti,
         ("road", "sidewalk", "building", "vegetation", "car", "car"), "velodyne/{}.bin", "predictions/net/{}.label",
         moves=5,
+    ),
+    "nuscenes": ScanFormat(
+        "nuscenes", write_nuscenes, predict_nuscenes,
+        ("other_flat", "sidewalk", "manmade", "car", "bus", None), "samples/LIDAR_TOP/1.pcd.bin",
+        "predictions/net/{}_lidarseg.bin",
+    ),
+    "kitti360": ScanFormat(
+        "kitti360", write_kitti360, predict_kitti360, tuple("abcdef"),
+        f"data_3d_raw/{DRIVE}/velodyne_points/data/{{}}.bin", f"data_3d_raw/{DRIVE}/predictions/net/{{}}.npy",
+        truth=False, options={"classes": tuple("abcdef")},
     ),
 }  # fmt: skip
 

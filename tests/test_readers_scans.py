@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
+import json
+import shutil
 
 import numpy as np
 import pytest
@@ -216,7 +218,7 @@ def test_kitti_poses_may_be_of_the_lidar_or_inverse(kitti):
     ("line", "said"),
     [
         ("P0: 1 2 3", "calib.txt: has no line Tr"),
-        ("Tr: 1 2 3", "calib.txt, line 1: Tr has 3 numbers, not 12"),
+        ("Tr: 1 2 3", "calib.txt: has no line Tr of 12 numbers"),
         ("Tr: 1 0 0 0 0 1 0 0 0 0 one 0", "calib.txt: line 1: 'one' is not a number"),
         ("Tr: 0 0 0 0 0 0 0 0 0 0 0 0", "calib.txt: the rotation is not orthonormal"),
         ("Tr: 1 0 0 0 0 1 0 0 0 0 1 nan", "calib.txt: the matrix holds a number that is not finite"),
@@ -312,3 +314,153 @@ def test_kitti_is_missing_what_makes_a_scene(kitti):
     for file in (kitti / "velodyne").iterdir():
         file.unlink()
     fails(DataError, "holds no scan; expected velodyne/ and poses.txt", read, kitti)
+
+
+# --- nuScenes
+
+
+@pytest.fixture
+def nuscenes(tmp_path):
+    sw.write_predicted(SCANS["nuscenes"], tmp_path / "nuscenes")
+    return tmp_path / "nuscenes"
+
+
+def read_nuscenes(folder, **options):
+    return sw.opened(SCANS["nuscenes"], folder, **options)
+
+
+def change_table(folder, table, change):
+    path = folder / f"v1.0-mini/{table}.json"
+    rows = json.loads(path.read_text())
+    change(rows)
+    path.write_text(json.dumps(rows))
+
+
+def test_nuscenes_poses_are_of_the_lidar_in_the_world(nuscenes):
+    scene = read_nuscenes(nuscenes)
+    np.testing.assert_allclose([scene.T_wc(k) for k in range(4)], [s.T for s in sw.scans()], rtol=0, atol=1e-9)
+    np.testing.assert_allclose(scene.timestamps - scene.timestamps[0], [0, 0.5, 1, 1.5])
+    assert (scene.name, scene.up.tolist(), len(scene.frame_name(0))) == ("scene-0061", [0, 0, 1], 32)
+
+
+def test_nuscenes_true_ids_are_those_of_its_categories_and_predicted_ones_the_challenges(nuscenes):
+    name = read_nuscenes(nuscenes).frame_name(0)
+    labels = nuscenes / f"predictions/net/{name}_lidarseg.bin"
+    labels.write_bytes(bytes([5, 255, 0, 16] * (sw.POINTS // 4)))
+    assert read_nuscenes(nuscenes).frame(0, "net").labels[0, :4].tolist() == [5, 65535, 65535, 16]
+    labels.write_bytes(bytes([17]) * sw.POINTS)
+    fails(DataError, r"_lidarseg.bin: the id 17 is no class of the format", read_nuscenes(nuscenes).frame, 0, "net")
+    change_table(nuscenes, "category", lambda rows: rows[1].update(name="static.vegetation"))
+    scene = read_nuscenes(nuscenes)
+    found = names_of_labels(scene, scene.frame(0, "gt"), "gt")
+    assert [found[k] for k in np.flatnonzero(sw.scans()[0].walls == 0)[:3]] == ["vegetation"] * 3
+    change_table(nuscenes, "category", lambda rows: rows.pop(2))
+    fails(DataError, "the id 2 is no class of the format", read_nuscenes(nuscenes).frame, 0, "gt")
+    change_table(nuscenes, "category", lambda rows: rows[1].pop("index"))
+    fails(DataError, "static.vegetation: 'index' is missing", read_nuscenes(nuscenes).frame, 0, "gt")
+
+
+def test_nuscenes_results_as_they_are_handed_in(nuscenes, tmp_path):
+    (tmp_path / "results/net/lidarseg").mkdir(parents=True)
+    (nuscenes / "predictions/net").rename(tmp_path / "results/net/lidarseg/val")
+    options = {"labels_root": tmp_path / "results", "labels": "{model}/lidarseg/val/{name}_lidarseg.bin"}
+    scene = read_nuscenes(nuscenes, **options)
+    found = names_of_labels(scene, scene.frame(3, "net"), "net")
+    assert found == [SCANS["nuscenes"].classes[wall] for wall in sw.predicted(sw.scans()[3])]
+
+
+def test_nuscenes_has_a_scene_for_each_of_its_own(nuscenes):
+    change_table(nuscenes, "scene", lambda rows: rows.append({"token": "t", "name": "scene-0007"}))
+    change_table(nuscenes, "sample", lambda rows: rows[3].update(scene_token="t"))
+    dataset = open_dataset("nuscenes", {"root": nuscenes})
+    assert dataset.scenes == ("scene-0007", "scene-0061")
+    assert [len(dataset.scene(name)) for name in dataset.scenes] == [1, 3]
+    np.testing.assert_allclose(dataset.scene("scene-0007").T_wc(0), sw.scans()[3].T, rtol=0, atol=1e-9)
+    change_table(nuscenes, "sample", lambda rows: rows[3].update(scene_token="s"))
+    fails(DataError, "holds no scan", open_dataset("nuscenes", {"root": nuscenes}).scene, "scene-0007")
+    assert open_dataset("nuscenes", {"root": nuscenes.parent}).scenes == ("nuscenes-scene-0007", "nuscenes-scene-0061")
+
+
+def test_nuscenes_of_two_versions_asks_for_one(nuscenes):
+    shutil.copytree(nuscenes / "v1.0-mini", nuscenes / "v1.0-trainval")
+    fails(ConfigError, "v1.0-mini and v1.0-trainval; choose one.*version=v1.0-mini", read_nuscenes, nuscenes)
+    assert read_nuscenes(nuscenes, version="v1.0-mini").ground_truth
+    assert not read_nuscenes(nuscenes, version="v1.0-trainval").ground_truth
+
+
+@pytest.mark.parametrize(
+    ("table", "change", "said"),
+    [
+        ("sample", lambda rows: rows.pop(), "sample.json: sample s3 is missing, which .* in sample_data.json names"),
+        ("ego_pose", lambda rows: rows.pop(), "ego_pose.json: pose e3 is missing"),
+        (
+            "ego_pose",
+            lambda rows: rows[1].update(rotation=[1, 0, 0]),
+            "'rotation' of e1 is .* 4 numbers",
+        ),
+        (
+            "ego_pose",
+            lambda rows: rows[1].update(rotation=[2, 0, 0, 0]),
+            "quaternion of pose 2 has length 2, not 1",
+        ),
+        ("ego_pose", lambda rows: rows[1].update(translation=[0, "x", 0]), "'translation' of e1: .*expected a number"),
+        ("sample_data", lambda rows: [row.pop("filename") for row in rows], "'filename' of a row is None"),
+        ("sample_data", lambda rows: [row.update(filename="../x") for row in rows], "the path '../x' leaves"),
+        ("sample_data", lambda rows: [row.pop("timestamp") for row in rows], "'timestamp' is missing"),
+        ("scene", lambda rows: rows.append(dict(rows[0])), "two scenes are called 'scene-0061'"),
+        ("scene", lambda rows: rows.append(7), "scene.json: expected a list of objects"),
+    ],
+)
+def test_nuscenes_tables_that_do_not_fit_are_named(nuscenes, table, change, said):
+    change_table(nuscenes, table, change)
+    fails(DataError, said, read_nuscenes, nuscenes)
+
+
+def test_nuscenes_lidars_by_their_channel(nuscenes):
+    said = "there is no channel 'LIDAR_BACK', only CAM_FRONT, LIDAR_TOP"
+    fails(ConfigError, said, read_nuscenes, nuscenes, channel="LIDAR_BACK")
+
+
+# --- KITTI-360
+
+
+@pytest.fixture
+def kitti360(tmp_path):
+    sw.write_predicted(SCANS["kitti360"], tmp_path / "KITTI-360")
+    return tmp_path / "KITTI-360"
+
+
+def read_kitti360(folder, **options):
+    return sw.opened(SCANS["kitti360"], folder, **options)
+
+
+def test_kitti360_poses_are_of_the_lidar_by_the_number_of_the_frame(kitti360):
+    scene = read_kitti360(kitti360)
+    np.testing.assert_allclose([scene.T_wc(k) for k in range(4)], [s.T for s in sw.scans()], rtol=0, atol=1e-9)
+    assert scene.name == f"data_3d_raw-{sw.DRIVE}"
+    path = kitti360 / f"data_poses/{sw.DRIVE}/poses.txt"
+    lines = path.read_text().splitlines()
+    write_lines(path, [*lines[:2], *lines[3:]])
+    scene = read_kitti360(kitti360)
+    assert [scene.tracked(k) for k in range(4)] == [True, False, True, True]
+    np.testing.assert_allclose(scene.T_wc(2), sw.scans()[2].T, rtol=0, atol=1e-9)
+
+
+def test_kitti360_without_a_part_says_which(kitti360):
+    (kitti360 / "calibration/calib_cam_to_velo.txt").unlink()
+    fails(DataError, "calib_cam_to_velo.txt: cannot be read", read_kitti360, kitti360)
+    (kitti360 / "calibration/calib_cam_to_pose.txt").write_text("image_01: 1 2 3\n")
+    fails(DataError, "calib_cam_to_pose.txt: has no line image_00", read_kitti360, kitti360)
+    (kitti360 / f"data_poses/{sw.DRIVE}/poses.txt").unlink()
+    fails(DataError, "poses.txt: cannot be read", read_kitti360, kitti360)
+
+
+def test_kitti360_ids_are_integers_of_the_users_classes(kitti360):
+    path = kitti360 / f"data_3d_raw/{sw.DRIVE}/predictions/net/0000000007.npy"
+    np.save(path, np.zeros((sw.POINTS, 6), np.float32))
+    fails(DataError, "0000000007.npy: holds float32, not integers", read_kitti360(kitti360).frame, 0, "net")
+    np.save(path, np.full(sw.POINTS, 70000))
+    fails(DataError, "ids go from 70000 to 70000; they must be 0 to 65535", read_kitti360(kitti360).frame, 0, "net")
+    fails(DataError, "the classes of 'net' are not known", read_kitti360(kitti360, classes=None).label_space, "net")
+    (kitti360 / f"data_3d_raw/{sw.DRIVE}/velodyne_points/data/copy.bin").write_bytes(b"0" * 16)
+    fails(DataError, "copy.bin: the name is no number of a frame", read_kitti360, kitti360)

@@ -373,7 +373,7 @@ def as_poses(T: Float64, convention: str, path: Path) -> Float64:
     if T.shape[1:] == (3, 4):
         T = np.concatenate([T, np.tile([0.0, 0.0, 0.0, 1.0], (len(T), 1, 1))], axis=1)
     each = [to_camera_to_world(pose, convention, "opencv", f"{path}: pose {k}") for k, pose in enumerate(T, start=1)]
-    return np.stack(each)
+    return np.array(each, np.float64).reshape(-1, 4, 4)
 
 
 def rigid_inverse(T: Float64, where: str) -> Float64:

@@ -311,6 +311,25 @@ def read_table(path: Path, columns: int, what: str) -> Float64:
     return np.frombuffer(values, dtype=np.float64).reshape(-1, columns)
 
 
+def read_matrices(path: Path) -> dict[str, Float64]:
+    """Return the matrices (4, 4) of a file of KITTI by name: lines 'NAME: r11 r12 r13 t1 ...', others left out.
+
+    Raises:
+        DataError: For a word that is no number, with the line.
+    """
+    found = {}
+    for line, text in records(path):
+        key, _, values = text.partition(":")
+        if len(words := values.split()) == 12:
+            found[key.strip()] = matrix_of([to_number(word, path, line) for word in words])
+    return found
+
+
+def matrix_of(rows: npt.ArrayLike) -> Float64:
+    """Return (4, 4) from the 12 numbers of its upper rows."""
+    return np.vstack([np.reshape(np.asarray(rows, np.float64), (3, 4)), [0.0, 0.0, 0.0, 1.0]])
+
+
 def to_number(word: str, path: Path, line: int) -> float:
     """Return one number.
 

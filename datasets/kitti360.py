@@ -1,0 +1,76 @@
+"""KITTI-360: velodyne scans of its raw data, with the poses of its IMU and calibration.
+
+Source: Liao et al., KITTI-360, PAMI 2022; github.com/autonomousvision/kitti360Scripts: devkits/accumuLaser (poses and
+calibration), devkits/convertOxtsPose (axes), devkits/commons/loadCalibration.py.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+from pydantic import BaseModel
+
+from semstab.core.types import Float32, Float64
+from semstab.datasets.files import options as opt
+from semstab.datasets.files.labels import SceneEntry
+from semstab.datasets.files.scans import ScanDataset, ScanOptions, ScanSource, as_poses, floats_of, rigid_inverse
+from semstab.datasets.formats.disk import files_named, matrix_of, read_matrices, read_table
+from semstab.datasets.formats.images import Read
+from semstab.errors import DataError
+
+CAMERA = "image_00"
+"""The camera that the LiDAR is calibrated with."""
+
+
+class Kitti360Options(ScanOptions):
+    """Options with the defaults of the format."""
+
+    up_axis: opt.UpAxis = "z"
+
+
+class Kitti360(ScanDataset[Kitti360Options]):
+    """{name} is the scan's number: 0000000250. Scans without a pose, as where the vehicle stands, are left out.
+
+    The classes of predictions are not known by the format, whose ground truth is of fused clouds.
+    """
+
+    Options: type[BaseModel] = Kitti360Options
+    contents = "velodyne_points/data/ below data_3d_raw/, and data_poses/ and calibration/ beside that"
+
+    def is_scene(self, folder: Path) -> bool:
+        """Return whether scans are there."""
+        return (folder / "velodyne_points/data").is_dir()
+
+    def scans(self, entry: SceneEntry) -> Iterator[ScanSource]:
+        """Yield a scan for each file of points, with NaN for its pose where there is none.
+
+        Raises:
+            DataError: If poses or calibration are missing or damaged.
+        """
+        folder = entry.folder.absolute()
+        root, path = folder.parents[1], folder.parents[1] / "data_poses" / folder.name / "poses.txt"
+        rows = read_table(path, 13, "frame r11 r12 r13 t1 ...")
+        poses = as_poses(rows[:, 1:].reshape(-1, 3, 4), "camera_to_world", path) @ _lidar_in_imu(root / "calibration")
+        by_frame = dict(zip(rows[:, 0].tolist(), poses, strict=True))
+        lost = np.full((4, 4), np.nan)
+        for name, points in files_named(folder / "velodyne_points/data", "", ".bin").items():
+            if not name.isdecimal():
+                raise DataError(f"{points}: the name is no number of a frame; rename or remove the file")
+            yield ScanSource(name, points, by_frame.get(int(name), lost), path)
+
+    def points(self, path: Path, read: Read) -> Float32:
+        """Return the points of x, y, z and reflectance."""
+        return floats_of(path, read(path), 4)[:, :3]
+
+
+def _lidar_in_imu(folder: Path) -> Float64:
+    """Return the pose (4, 4) of the LiDAR in the IMU: of camera 0 in the IMU, after that of the LiDAR in camera 0."""
+    to_imu, to_lidar = folder / "calib_cam_to_pose.txt", folder / "calib_cam_to_velo.txt"
+    cameras = read_matrices(to_imu)
+    if CAMERA not in cameras:
+        raise DataError(f"{to_imu}: has no line {CAMERA}; get KITTI-360's calibration anew")
+    rigid_inverse(cameras[CAMERA], str(to_imu))
+    camera_in_lidar = matrix_of(read_table(to_lidar, 12, "r11 r12 r13 t1 ...")[0])
+    return cameras[CAMERA] @ rigid_inverse(camera_in_lidar, str(to_lidar))
