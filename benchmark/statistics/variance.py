@@ -126,7 +126,7 @@ def variances(
     n = len(effect)
     if n < 2 or not effect.var() > 0:
         return NOTHING
-    contrasts = np.linalg.svd(np.eye(n) - 1 / n)[0][:, : n - 1]
+    contrasts = _contrasts(n)
     error = contrasts.T @ noise @ contrasts + 1e-9 * effect.var() * np.eye(n - 1)
     whiten = np.linalg.inv(np.linalg.cholesky(error)) @ contrasts.T
     seen, largest = whiten @ effect, (n - 1) / special.chdtri(n - 1, 1 - UNLIKELY)
@@ -283,7 +283,7 @@ class Effects:
     def locations(self) -> Variances:
         """The variances over new locations."""
         grid = self.grid
-        of = _neighbours(grid.cubes.astype(np.float64), MOST_LOCATIONS)
+        of = _neighbours(grid.cubes, MOST_LOCATIONS)
         weight: Float64 = np.bincount(of, weights=grid.all).astype(np.float64)
         effect = np.bincount(of, weights=grid.block)
         at = np.stack([np.bincount(of, weights=grid.all * axis) / weight for axis in grid.cubes.T], axis=1)
@@ -299,6 +299,14 @@ class Effects:
         )
 
 
+@functools.lru_cache(maxsize=64)
+def _contrasts(n: int) -> Float64:
+    """Return (n, n - 1) orthonormal contrasts of n effects."""
+    contrasts: Float64 = np.linalg.svd(np.eye(n) - 1 / n)[0][:, : n - 1]
+    contrasts.setflags(write=False)
+    return contrasts
+
+
 def _of_frames(effect: Float64, weight: Float64, noise: Float64, at: Float64) -> Variances:
     """Return the variances over new frames; `at` (F,) is when they were taken, ascending."""
     step = float(np.median(np.diff(at)))  # effects last for so many frames that were fused
@@ -306,19 +314,28 @@ def _of_frames(effect: Float64, weight: Float64, noise: Float64, at: Float64) ->
     return variances(effect, weight, noise, np.abs(np.subtract.outer(at, at)), ranges)
 
 
-def _neighbours(points: Float64, most: int) -> Int64:
-    """Return the group (G,) of points (G, 3), in at most `most` groups of neighbours: halves of halves."""
+def _neighbours(cubes: Int64, most: int) -> Int64:
+    """Return the group (G,) of cubes (G, 3), in at most `most` groups of neighbours: halves of halves."""
+    return _halved(np.ascontiguousarray(cubes, np.int64).tobytes(), most)
+
+
+@functools.lru_cache(maxsize=16)
+def _halved(cubes: bytes, most: int) -> Int64:
+    """Return the groups of cubes: the numbers of a map lie in the same ones."""
+    points = np.frombuffer(cubes, np.int64).reshape(-1, 3).astype(np.float64)
     groups = [np.arange(len(points))]
     while 2 * len(groups) <= most and len(groups) < len(points):
         halves = []
         for group in groups:
             along = int(np.ptp(points[group], axis=0).argmax())
             order = group[np.argsort(points[group, along], kind="stable")]
-            halves += [half for half in np.array_split(order, 2) if len(half)]
+            middle = (len(order) + 1) // 2
+            halves += [half for half in (order[:middle], order[middle:]) if len(half)]
         groups = halves
     of = np.empty(len(points), np.int64)
     for number, group in enumerate(groups):
         of[group] = number
+    of.setflags(write=False)
     return of
 
 
