@@ -122,7 +122,7 @@ def decoded(monkeypatch) -> list[tuple[int, str]]:
 
 
 def test_frames_are_decoded_once_for_all_units_of_a_model(root, tmp_path, decoded) -> None:
-    run_study(configure(root, check_geometry=False), tmp_path / "out", report=False)  # the check reads some for itself
+    run_study(configure(root), tmp_path / "out", report=False)
     predicted = [pair for pair in decoded if pair[1] != "gt"]
     # a's ten frames for the sweep of frame_count, b's five
     assert sorted(predicted) == sorted([(i, "a") for i in range(10)] + [(i, "b") for i in (0, 2, 4, 7, 9)])
