@@ -105,7 +105,7 @@ def folder(street, tmp_path_factory):
 def run(folder, tmp_path_factory):
     """A run of a clean model, one that flips labels in each third scan, and one that is worse the farther it looks."""
     where = tmp_path_factory.mktemp("run")
-    result = bench("run", "--data", folder, "--voxel-size", "0.5", "--out", "out", cwd=where)
+    result = bench("run", "--data", folder, "--voxel-size", "0.5", "--out", "out", cwd=where, report=True)
     return where / "out", result.stdout
 
 
@@ -171,6 +171,12 @@ def test_strata_by_range_tell_a_model_that_is_worse_far_away(run):
     assert alphas[0] > 0.9
     assert alphas[-1] < 0.6
     assert sum(row.share for row in far.strata) == pytest.approx(1)
+
+
+def test_the_report_says_up_to_which_range(run):
+    page = (run[0] / "report.html").read_text(encoding="utf-8")
+    assert "<dt>reliable</dt>" in page
+    assert "Agreement by range" in page
 
 
 def test_truth_is_stable_and_corrupted_scans_are_found(run, tmp_path):

@@ -84,7 +84,8 @@ class SceneLog:
         self.legend.log(stream, self.name)
         log_categories(stream, self.name)
         for task in self._tasks:
-            for name, context in {"labels": label_context(task.mapping.target), **drift.contexts()}.items():
+            nothing = drift.AMONG_POINTS if task.scene.of_scans else drift.OVER_COLOUR
+            for name, context in {"labels": label_context(task.mapping.target), **drift.contexts(nothing)}.items():
                 stream.log(path(self.name, "camera", task.model, name), context, static=True)
 
     def begin(self, stream: rr.RecordingStream, position: Float64, voxel_size: float) -> Int64:

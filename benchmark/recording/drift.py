@@ -45,21 +45,25 @@ def levels_of(drift: Float32) -> UInt8:
     return level.astype(np.uint8)
 
 
-def contexts() -> dict[str, rr.AnnotationContext]:
-    """Return names and colours of each picture; pixels without a finding are dark over the colour image."""
+OVER_COLOUR, AMONG_POINTS = (0, 0, 0, 150), (150, 150, 155, 255)
+"""What has no finding: pixels darken the colour image that they lie on, points are grey."""
+
+
+def contexts(nothing: tuple[int, int, int, int] = OVER_COLOUR) -> dict[str, rr.AnnotationContext]:
+    """Return names and colours of each picture; pixels or points without a finding have the colour of `nothing`."""
     names = [f"{low:.4f} to {high:.4f} bits" for low, high in itertools.pairwise(LEVEL_EDGES)]
     names[-1] = f"{LEVEL_EDGES[-2]:.4f} bits and more"
     none, glow = (NO_VOXEL, "no voxel", (0, 0, 0, 200)), between(GLOW, LEVELS).astype(int).tolist()
     infos = {
         "contradictions": [
             none,
-            (AGREES, "as the map", (0, 0, 0, 150)),
+            (AGREES, "as the map", nothing),
             (CONTRADICTS, "contradicts the map", (255, 120, 0, 255)),
         ],
         "drift": [
             none,
             (FIRST_SEEN, "first seen", (40, 60, 110, 170)),
-            (NO_DRIFT, "no drift", (0, 0, 0, 150)),
+            (NO_DRIFT, "no drift", nothing),
             *((NO_DRIFT + 1 + k, name, (*glow[k], 255)) for k, name in enumerate(names)),
         ],
     }

@@ -272,8 +272,10 @@ def _overview(
         tabs.append(_legend(scene, "all_classes", "All classes", legend.height()))
     classes = _legend(scene, "legend", "Classes", legend.height(LINES))
     left = rrb.Vertical(rrb.Tabs(*tabs, active_tab=opened), classes, row_shares=[LEFT[1] - below, below])
-    depth = rrb.Spatial2DView(origin=path(scene, "depth"), name="Depth")
-    right = rrb.Tabs(*(_cameras(scene, tasks, picture) for picture in PICTURES), depth)
+    pictures: list[rrb.Container | rrb.View] = [_cameras(scene, tasks, picture) for picture in PICTURES]
+    if not tasks[0].scene.of_scans:
+        pictures.append(rrb.Spatial2DView(origin=path(scene, "depth"), name="Depth"))
+    right = rrb.Tabs(*pictures)
     top = rrb.Horizontal(left, right, column_shares=[5, 4])
     return rrb.Vertical(top, _below(scene, tasks), row_shares=[5, 2], name="Overview")
 

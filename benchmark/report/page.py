@@ -140,8 +140,10 @@ def _numbers(
     alpha = macro_mean(alphas)
     yield "alpha", "" if math.isnan(alpha) else short(alpha), interval(None if head is None else head.alpha)
     yield "two views agree", mean([stats.agreeing for stats in assessed], "{:.0f} %", 100), "of the spots"
+    if one is not None and one.ranges is not None and one.ranges.limited:
+        yield "reliable", f"up to {one.ranges.reliable:g} m", one.ranges.text.partition(" m")[2].strip(" ,")
     flicker = [record.image_space.compensated_flicker_percent for record in records]
-    yield "flicker", mean(flicker, "{:.1f} %"), "of the pixels per frame, camera motion removed"
+    yield "flicker", mean(flicker, "{:.1f} %"), "of the pixels per frame, motion removed"
     together = pooled(records)
     yield "seen 3 times or more", f"{100 * together.recurrent.share:.0f} %", f"of {together.voxels:,} voxels"
     enough = together.recurrent.voxels >= ENOUGH
