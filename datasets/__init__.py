@@ -90,6 +90,10 @@ REGISTRY = Registry(
         ),
         "nuscenes": Entry("semstab.datasets.nuscenes:NuScenes", "nuScenes lidarseg: LiDAR key frames, a class a point"),
         "kitti360": Entry("semstab.datasets.kitti360:Kitti360", "KITTI-360: velodyne scans of its raw data"),
+        "points_folder": Entry(
+            "semstab.datasets.points_folder:PointsFolder",
+            "folders points/ (LAS, LAZ, PLY, NPY), pose/ and labels/MODEL/, one file a scan",
+        ),
         "hololens": Entry("semstab.datasets.hololens:HoloLens", "DeepVideoMVS and HoloLens: poses.txt and K.txt"),
     },
 )
@@ -131,7 +135,7 @@ def open_dataset(name: str, options: dict[str, Any] | BaseModel, run_folder: Pat
 RECOGNISED = (
     "odm", "metashape", "pix4d", "realitycapture", "uavscenes", "hololens", "tum", "seven_scenes", "replica", "scannet",
     "semantickitti", "nuscenes", "kitti360", "tartanair", "stray_scanner", "polycam", "record3d", "arkitscenes",
-    "transforms_json", "colmap", "bag", "posed_folder",
+    "transforms_json", "colmap", "bag", "posed_folder", "points_folder",
 )  # fmt: skip
 """Formats that a folder is recognised as: the one whose scenes lie highest, of these the first."""
 
@@ -186,5 +190,5 @@ def recognise(root: Path) -> tuple[str, str]:
                     " (docs/tutorials/lidar-camera.md)"
                 )
     if not near:
-        return RECOGNISED[-1], ""
+        return "posed_folder", ""
     raise DataError(f"{root}: no format is recognised; the nearest are {listed}; name it with --dataset NAME")

@@ -176,6 +176,49 @@ def predict_kitti360(folder: Path, name: str, walls: np.ndarray) -> None:
     np.save(path, walls.astype(np.uint8))
 
 
+# --- points_folder
+
+EAST = rigid((0, 0, 0), (400_000, 5_000_000, 30))
+"""The origin of the room on Earth, for clouds that are in the world."""
+
+
+def write_points(folder: Path, wanted: Sequence[Scan], suffix: str = ".npy", *, in_world: bool = False) -> list[str]:
+    names = [f"scan {k}" for k in range(8, 8 + len(wanted))]
+    for name, scan in zip(names, wanted, strict=True):
+        T = EAST @ scan.T if in_world else scan.T
+        points = scan.points @ T[:3, :3].T + T[:3, 3] if in_world else scan.points
+        write_cloud(folder / f"points/{name}{suffix}", points, scan.walls)
+        write_lines(folder / f"pose/{name}.txt", [numbers(row) for row in T])
+    return names
+
+
+def write_cloud(path: Path, points: np.ndarray, walls: np.ndarray) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    if path.suffix == ".npy":
+        np.save(path, points)
+    elif path.suffix == ".ply":
+        head = f"ply\nformat binary_little_endian 1.0\nelement vertex {len(points)}\n"
+        head += "property uchar extra\n" + "".join(f"property float {axis}\n" for axis in "xyz") + "end_header\n"
+        rows = np.zeros(len(points), [("extra", "u1"), *((axis, "<f4") for axis in "xyz")])
+        for axis, values in zip("xyz", points.T, strict=True):
+            rows[axis] = values
+        path.write_bytes(head.encode() + rows.tobytes())
+    else:
+        import laspy
+
+        las = laspy.LasData(laspy.LasHeader(point_format=6, version="1.4"))
+        las.header.scales, las.header.offsets = [0.0001] * 3, points.mean(axis=0).round()
+        las.x, las.y, las.z = points.T
+        las.classification = walls
+        las.write(path)
+
+
+def predict_points(folder: Path, name: str, walls: np.ndarray) -> None:
+    path = folder / f"labels/net/{name}.npy"
+    path.parent.mkdir(parents=True, exist_ok=True)
+    np.save(path, walls.astype(np.uint8))
+
+
 # --- all of them
 
 
@@ -206,6 +249,15 @@ class ScanFormat:
     options: dict[str, object] = field(default_factory=dict)
 
 
+def of_points(suffix: str, *, in_world: bool = False) -> ScanFormat:
+    options: dict[str, object] = {"classes": tuple("abcdef")} | ({"coordinates": "world"} if in_world else {})
+    write = functools.partial(write_points, suffix=suffix, in_world=in_world)
+    return ScanFormat(
+        "points_folder", write, predict_points, tuple("abcdef"), f"points/{{}}{suffix}", "labels/net/{}.npy",
+        truth=suffix in (".las", ".laz"), options=options,
+    )  # fmt: skip
+
+
 SCANS = {
     "semantickitti": ScanFormat(
         "semantickitti", write_semantickitti, predict_semantickitti,
@@ -222,6 +274,10 @@ SCANS = {
         f"data_3d_raw/{DRIVE}/velodyne_points/data/{{}}.bin", f"data_3d_raw/{DRIVE}/predictions/net/{{}}.npy",
         truth=False, options={"classes": tuple("abcdef")},
     ),
+    "points_folder, NPY": of_points(".npy"),
+    "points_folder, PLY": of_points(".ply"),
+    "points_folder, LAS": of_points(".las"),
+    "points_folder, LAZ in the world": of_points(".laz", in_world=True),
 }  # fmt: skip
 
 

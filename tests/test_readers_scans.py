@@ -161,7 +161,8 @@ def test_a_damaged_file_of_points_is_named(form, folder):
     path.write_bytes(path.read_bytes()[:-2])
     fails(DataError, path.name, sw.opened(form, folder).frame, 1, "net")
     path.write_bytes(b"")
-    fails(DataError, "the file is empty", sw.opened(form, folder).frame, 1, "net")
+    said = f"{path.name}: (the file is empty|.*it is no LAS file)"
+    fails(DataError, said, sw.opened(form, folder).frame, 1, "net")
 
 
 def test_there_is_no_such_scan_nor_model(form, folder):
@@ -464,3 +465,70 @@ def test_kitti360_ids_are_integers_of_the_users_classes(kitti360):
     fails(DataError, "the classes of 'net' are not known", read_kitti360(kitti360, classes=None).label_space, "net")
     (kitti360 / f"data_3d_raw/{sw.DRIVE}/velodyne_points/data/copy.bin").write_bytes(b"0" * 16)
     fails(DataError, "copy.bin: the name is no number of a frame", read_kitti360, kitti360)
+
+
+# --- points_folder
+
+
+def read_points(folder, **options):
+    return sw.opened(SCANS["points_folder, NPY"], folder, **options)
+
+
+@pytest.fixture
+def clouds(tmp_path):
+    sw.write_predicted(SCANS["points_folder, NPY"], tmp_path / "clouds")
+    return tmp_path / "clouds"
+
+
+def test_clouds_without_a_pose_are_not_tracked_and_poses_may_be_inverse(clouds):
+    for k, scan in enumerate(sw.scans()):
+        write_lines(clouds / f"pose/scan {8 + k}.txt", [numbers(row) for row in np.linalg.inv(scan.T)])
+    (clouds / "pose/scan 10.txt").unlink()
+    scene = read_points(clouds, pose_convention="world_to_camera")
+    assert [scene.frame_name(k) for k in range(4)] == ["scan 8", "scan 9", "scan 10", "scan 11"]
+    assert [scene.tracked(k) for k in range(4)] == [True, True, False, True]
+    np.testing.assert_allclose(scene.T_wc(3), sw.scans()[3].T, rtol=0, atol=1e-9)
+    fails(DataError, "scan 10.txt: the pose is not finite", scene.frame, 2, "net")
+
+
+def test_clouds_with_all_poses_in_one_file(clouds):
+    shutil.rmtree(clouds / "pose")
+    write_lines(clouds / "poses.txt", [numbers(scan.T[:3]) for scan in sw.scans()])
+    scene = read_points(clouds)
+    np.testing.assert_allclose([scene.T_wc(k) for k in range(4)], [s.T for s in sw.scans()], rtol=0, atol=1e-12)
+    write_lines(clouds / "poses.txt", [numbers(scan.T[:3]) for scan in sw.scans()[:3]])
+    fails(DataError, "poses.txt: has 3 poses, but there are 4 clouds", read_points, clouds)
+
+
+def test_clouds_in_the_world_keep_their_millimetres_far_from_its_origin(tmp_path):
+    form = SCANS["points_folder, LAZ in the world"]
+    sw.write_predicted(form, tmp_path)
+    frame = sw.opened(form, tmp_path).frame(2, "net")
+    assert frame.T_wc[1, 3] > 4_999_000
+    np.testing.assert_allclose(frame.points[0], sw.scans()[2].points, rtol=0, atol=2e-4)
+    np.testing.assert_allclose(frame.depth[0], np.linalg.norm(sw.scans()[2].points, axis=1), rtol=0, atol=2e-4)
+
+
+def test_clouds_beside_depth_images_are_recognised_as_those(clouds):
+    (clouds / "depth").mkdir()
+    assert recognise(clouds)[0] == "posed_folder"
+    assert len(read_points(clouds)) == sw.COUNT
+
+
+def test_clouds_labels_gt_are_the_truth(clouds):
+    (clouds / "labels/net").rename(clouds / "labels/gt")
+    scene = read_points(clouds)
+    assert (scene.models, scene.ground_truth) == ((), True)
+    found = names_of_labels(scene, scene.frame(0, "gt"), "gt")
+    assert found == ["abcdef"[wall] for wall in sw.predicted(sw.scans()[0])]
+
+
+def test_clouds_that_hold_something_else_are_named(clouds):
+    path = clouds / "points/scan 8.npy"
+    for array in (np.zeros((sw.POINTS, 2)), np.zeros((sw.POINTS, 3), np.int32), np.zeros(sw.POINTS)):
+        np.save(path, array)
+        fails(DataError, r"scan 8.npy: holds .*; write float \(N, 3\), metres", read_points(clouds).frame, 0, "net")
+    shutil.copy(path, clouds / "points/scan 8.ply")
+    fails(DataError, "is the same frame; delete one of the two", read_points, clouds)
+    path.unlink()
+    fails(DataError, "scan 8.ply: not a PLY file", read_points(clouds).frame, 0, "net")

@@ -20,6 +20,7 @@ from semstab.core.types import Float64, Int64
 from semstab.data.tiles import AT_HAND, TileIndex
 from semstab.data.voxels import VoxelTable
 from semstab.datasets.files.surfaces import open_las, points_at_once
+from semstab.datasets.formats.ply import Header
 from semstab.errors import ConfigError, DataError
 from semstab.exports import clouds
 from semstab.exports.voxels import Chosen, Voxels
@@ -303,7 +304,7 @@ def _require_same_crs(voxels: Voxels, header: laspy.LasHeader, cloud: Path) -> N
 
 def _classify_ply(voxels: Voxels, cloud: Path, out: Path, find: Finder) -> None:
     with cloud.open("rb") as source, out.open("wb") as target:
-        header = clouds.Header.read(source, cloud)
+        header = Header.read(source, cloud)
         own = {name: header.dtype[name].newbyteorder("<") for name in header.dtype.names or ()}
         kinds = {
             "class": voxels.classified.dtype,
@@ -311,7 +312,7 @@ def _classify_ply(voxels: Voxels, cloud: Path, out: Path, find: Finder) -> None:
         }
         dtype = np.dtype([*(own | kinds).items()])
         comments = dict.fromkeys((*header.comments, *clouds.legend(voxels)))
-        target.write(clouds.Header(dtype, header.count, 0, tuple(comments)).text())
+        target.write(Header(dtype, header.count, 0, tuple(comments)).text())
         for points in _ply_chunks(source, header, cloud):
             assigned = find(np.stack([points[axis].astype(np.float64) for axis in "xyz"], axis=1))
             chunk = np.empty(len(points), dtype)
@@ -323,7 +324,7 @@ def _classify_ply(voxels: Voxels, cloud: Path, out: Path, find: Finder) -> None:
             target.write(chunk.tobytes())
 
 
-def _ply_chunks(source: Any, header: clouds.Header, cloud: Path) -> Iterator[npt.NDArray[np.void]]:
+def _ply_chunks(source: Any, header: Header, cloud: Path) -> Iterator[npt.NDArray[np.void]]:
     for first in range(0, header.count, CHUNK):
         wanted = min(CHUNK, header.count - first)
         points = np.fromfile(source, header.dtype, wanted)

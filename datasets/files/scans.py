@@ -202,6 +202,7 @@ class ScanScene(Scene):
             self._sources |= {model: source for model, source in found.items() if source.first is not None}
             if self._sources:
                 break
+        self._truth = self._sources.pop(GROUND_TRUTH, self._truth)
         self.models, self.ground_truth = tuple(self._sources), self._truth is not None
 
     def __len__(self) -> int:
@@ -335,11 +336,12 @@ class ScanScene(Scene):
     ) -> Frame:
         scan = self._scan(index)
         points = self._dataset.points(scan.points, self._files.read)
-        if self._dataset.in_world:
-            points = (points - scan.pose[:3, 3]) @ scan.pose[:3, :3]
-        points = points.astype(np.float32, copy=False)
         near, far = self.options.min_range or 0.0, self.options.max_range or math.inf
-        depth = np.sqrt((points.astype(np.float64) ** 2).sum(axis=1)).astype(np.float32)
+        with np.errstate(over="ignore", invalid="ignore"):  # numbers beyond float32 are no valid points
+            if self._dataset.in_world:
+                points = (points - scan.pose[:3, 3]) @ scan.pose[:3, :3]
+            points = points.astype(np.float32, copy=False)
+            depth = np.sqrt((points.astype(np.float64) ** 2).sum(axis=1)).astype(np.float32)
         if near > 0 or far < math.inf:
             depth = np.where((depth > near) & (depth < far), depth, np.float32(0))
         if labels is None:

@@ -21,9 +21,9 @@ from semstab.data.voxels import VoxelTable
 from semstab.datasets import open_dataset
 from semstab.datasets.files.surfaces import Surface, open_las
 from semstab.datasets.formats.disk import natural
+from semstab.datasets.formats.ply import Header
 from semstab.engine.tiles import TileResult
 from semstab.errors import ConfigError, DataError, summarize_error
-from semstab.exports.clouds import Header
 from semstab.models.names import class_names
 from semstab.models.segearth_ov import read_prompts
 from semstab.report.figures.maps import Overview

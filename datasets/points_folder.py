@@ -1,0 +1,109 @@
+"""Posed clouds in plain folders: points/NAME.las (.laz, .ply, .npy), pose/NAME.txt or poses.txt, labels/MODEL/."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import numpy.typing as npt
+from pydantic import BaseModel, Field
+
+from semstab.core.types import Float64
+from semstab.datasets.files.labels import SceneEntry
+from semstab.datasets.files.scans import ScanDataset, ScanOptions, ScanSource, as_poses, ids_of
+from semstab.datasets.files.surfaces import open_las
+from semstab.datasets.formats.disk import decode_array, files_by_stem, natural, read_pose, read_table
+from semstab.datasets.formats.images import Read
+from semstab.datasets.formats.ply import Header
+from semstab.errors import DataError
+
+LAS = (".las", ".laz")
+SUFFIXES = (*LAS, ".ply", ".npy")
+
+
+class PointsOptions(ScanOptions):
+    """Options with the defaults of the format."""
+
+    coordinates: Literal["sensor", "world"] = Field(
+        "sensor", description="what points are in; those in the world need the pose only for where the sensor was"
+    )
+    pose_convention: Literal["camera_to_world", "world_to_camera"] = Field(
+        "camera_to_world", description="map of the poses: from the sensor to the world, or back"
+    )
+
+
+class PointsFolder(ScanDataset[PointsOptions]):
+    """{name} is the name that a scan's files share. The classification of LAS files is the ground truth."""
+
+    Options: type[BaseModel] = PointsOptions
+    contents = "points/ and pose/ or poses.txt"
+    labels = ("labels/{model}/{name}",)
+
+    def __init__(self, options: PointsOptions) -> None:
+        super().__init__(options)
+        self.in_world = options.coordinates == "world"
+
+    def is_scene(self, folder: Path) -> bool:
+        """Return whether points are there, and poses."""
+        return (folder / "points").is_dir() and ((folder / "pose").is_dir() or (folder / "poses.txt").is_file())
+
+    def scans(self, entry: SceneEntry) -> Iterator[ScanSource]:
+        """Yield a scan for each cloud, with NaN for its pose where pose/ has none.
+
+        Raises:
+            DataError: If poses.txt has another number of rows, or a file is damaged.
+        """
+        folder = entry.folder
+        files = files_by_stem(folder / "points", SUFFIXES)
+        names = sorted(files, key=natural)
+        self.truth = next((f"points/{{name}}{suffix}" for suffix in LAS if _ends(files, suffix)), None)
+        poses = self._poses(folder, names)
+        for name, (pose, path) in zip(names, poses, strict=True):
+            yield ScanSource(name, folder / "points" / files[name], pose, path)
+
+    def points(self, path: Path, read: Read) -> npt.NDArray[np.floating[Any]]:
+        """Return x, y, z of a cloud."""
+        if path.suffix.lower() in LAS:
+            with open_las(path) as reader:
+                return np.asarray(reader.read().xyz, np.float64)
+        if path.suffix.lower() == ".ply":
+            return _of_ply(path, read(path))
+        rows = decode_array(path, read(path), "points")
+        if rows.ndim != 2 or rows.shape[1] < 3 or not np.issubdtype(rows.dtype, np.floating):
+            raise DataError(f"{path}: holds {rows.dtype} of shape {rows.shape}; write float (N, 3), metres")
+        return rows[:, :3]
+
+    def ids(self, path: Path, read: Read) -> npt.NDArray[np.integer[Any]]:
+        """Return the classification of a LAS file, or the ids of another one."""
+        if path.suffix.lower() not in LAS:
+            return ids_of(path, read(path))
+        with open_las(path) as reader:
+            return np.asarray(reader.read().classification, np.uint8)
+
+    def _poses(self, folder: Path, names: list[str]) -> list[tuple[Float64, Path]]:
+        convention, path = self.options.pose_convention, folder / "poses.txt"
+        if not path.is_file():
+            stored, lost = files_by_stem(folder / "pose", (".txt",)), np.full((4, 4), np.nan)
+            paths = {name: folder / "pose" / stored.get(name, f"{name}.txt") for name in names}
+            given = {name: read_pose(path) if name in stored else lost for name, path in paths.items()}
+            return [(as_poses(given[name][None], convention, paths[name])[0], paths[name]) for name in names]
+        rows = read_table(path, 12, "r11 r12 r13 t1 ... of each scan").reshape(-1, 3, 4)
+        if len(rows) != len(names):
+            raise DataError(f"{path}: has {len(rows)} poses, but there are {len(names)} clouds; they must be as many")
+        return [(pose, path) for pose in as_poses(rows, convention, path)]
+
+
+def _ends(files: dict[str, str], suffix: str) -> bool:
+    return any(file.lower().endswith(suffix) for file in files.values())
+
+
+def _of_ply(path: Path, data: bytes) -> Float64:
+    """Return the points of a binary PLY file."""
+    header = Header.read(io.BytesIO(data), path)
+    if len(data) < header.size + header.count * header.dtype.itemsize:
+        raise DataError(f"{path}: ends before its {header.count:,} points; it is cut short")
+    rows = np.frombuffer(data, header.dtype, header.count, header.size)
+    return np.column_stack([rows[axis].astype(np.float64) for axis in "xyz"])
