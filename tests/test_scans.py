@@ -143,6 +143,29 @@ def test_a_mistake_of_the_poses_is_named_with_the_option_that_mends_it(name, fol
     assert mend in checked.verdict.text
 
 
+@pytest.mark.parametrize("coordinates", ["sensor", "world"])
+def test_points_in_the_world_are_told_from_those_in_the_axes_of_the_sensor(street, coordinates, tmp_path):
+    """At UTM coordinates too, where each error is a tiny share of the distance from the origin."""
+    offset = np.array([448262.0, 5411932.0, 300.0])
+    for folder in ("points", "pose", "labels/net"):
+        (tmp_path / folder).mkdir(parents=True)
+    for k, (points, ids, pose) in enumerate(zip(street.scans, street.ids, street.poses, strict=True)):
+        moved = pose.copy()
+        moved[:3, 3] += offset
+        world = points @ moved[:3, :3].T.astype(np.float64) + moved[:3, 3]
+        np.save(tmp_path / f"points/{k:03d}.npy", world if coordinates == "world" else points)
+        np.savetxt(tmp_path / f"pose/{k:03d}.txt", moved)
+        np.save(tmp_path / f"labels/net/{k:03d}.npy", np.searchsorted(IDS, ids).astype(np.uint8))
+    for told in ("sensor", "world"):
+        options = {"root": str(tmp_path), "coordinates": told, "classes": ["car", "road", "building", "tree"]}
+        (checked,) = check(load_config({"dataset": {"name": "points_folder", "options": options}}))
+        if told == coordinates:
+            assert checked.verdict.state == "sound"
+        else:
+            assert checked.verdict.state == "unsound"
+            assert f"set coordinates: {coordinates}" in checked.verdict.text
+
+
 def test_a_run_refuses_poses_that_check_calls_unsound(folder, tmp_path):
     words = "run", "--data", folder, "--dataset", "semantickitti", "--option", "pose_frame=lidar"
     result = bench(*words, cwd=tmp_path, code=2)

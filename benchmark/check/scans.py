@@ -1,7 +1,8 @@
 """The check of a scene of scans: whether they lie on each other by their poses, and how else they would.
 
 A point of one scan is carried by the poses into the axes of another, where its nearest point is sought; the distance,
-divided by the point's range, is its error. Each other reading of the poses is assessed in the same way.
+divided by the point's distance from the middle of its scan, is its error. Each other reading of the poses is assessed
+in the same way.
 """
 
 from __future__ import annotations
@@ -52,6 +53,12 @@ WON = 0.8
 
 ALIKE = 1.1
 """Readings whose errors differ by no more cannot be told apart."""
+
+LEAST_RANGE = 0.1
+"""Metres; a point in the very middle of its scan has no range."""
+
+FAR = 20_000.0
+"""Metres beyond which no scanner sees half of its points."""
 
 HOPELESS = 0.05
 """The error from which on scans do not lie on each other, though no reading explains it."""
@@ -151,6 +158,18 @@ READINGS = (
         {("pose_frame", "camera"): "pose_frame: lidar"},
         "leave the calibration away",
     ),
+    PoseReading(
+        "points that are in the world already",
+        lambda T: np.eye(len(T)),
+        {("coordinates", "sensor"): "coordinates: world"},
+        "carry the points into the axes of the sensor",
+    ),
+    PoseReading(
+        "points that are in the sensor's axes already",
+        lambda T: T @ T,
+        {("coordinates", "world"): "coordinates: sensor"},
+        "carry the points into the axes of the sensor once",
+    ),
     PoseReading("quaternions w x y z", _first_number_last, {}, "write quaternions as x y z w"),
     PoseReading("quaternions x y z w", _last_number_first, {}, "write quaternions as w x y z"),
     PoseReading("poses in millimetres", _scaled(0.001), {}, "divide the positions of the poses by 1000"),
@@ -167,7 +186,7 @@ class Met:
 
     Attributes:
         distance: (n,) metres to the nearest point there.
-        range: (n,) of each point from its own sensor.
+        range: (n,) of each point from the middle of its scan, near which the sensor is, if points are in its axes.
         nearest: (n,) its row there.
     """
 
@@ -178,7 +197,7 @@ class Met:
     @property
     def error(self) -> Float64:
         """(n,) the distance as a share of the range."""
-        return self.distance / self.range
+        return self.distance / np.maximum(self.range, LEAST_RANGE)
 
 
 class ScanSample:
@@ -231,7 +250,7 @@ class ScanSample:
         rows = self._queries(pair[0])
         points = _points(a)[rows]
         distance, nearest = self._tree(pair[1]).query(points @ R.T + t)
-        return Met(distance, np.linalg.norm(points, axis=1), nearest)
+        return Met(distance, np.linalg.norm(points - np.median(points, axis=0), axis=1), nearest)
 
     @cached_property
     def spacing(self) -> float:
@@ -300,6 +319,12 @@ def assess_scans(sample: ScanSample) -> Verdict:
     pairs = sample.pairs
     if not pairs or not all(len(_rows(scan)) for scan in sample.scans.values()):
         return Verdict("unclear", "it takes two scans with points to tell whether poses are right")
+    if (away := float(np.median([np.median(scan.depth.ravel()[_rows(scan)]) for scan in sample.scans.values()]))) > FAR:
+        other = {"sensor": "world", "world": "sensor"}.get(sample.scene.settings.get("coordinates", ""))
+        mend = None if other is None else f"coordinates: {other}"
+        advice = "carry them into its axes" if mend is None else f"set {mend} (--option coordinates={other})"
+        text = f"points lie {away / 1000:,.0f} km from their sensor, as in the axes of the world; {advice}"
+        return Verdict("unsound", text, () if mend is None else (mend,))
     errors = {"as configured": _errors(sample, None)} | {each.name: _errors(sample, each.of) for each in READINGS}
     fits = {name: _fit(own) for name, own in errors.items()}
     configured, now = fits["as configured"], np.array([np.median(own) for own in errors["as configured"]])
@@ -390,10 +415,16 @@ class ScanCoverage:
             frame_stride_reason=f"{share:.0%} of a scan's points lie on the surfaces of the next one",
         )
 
-    def persistence(self, voxel_size: float) -> Persistence:
-        """Fuse the scans that were read for it, and count how often each voxel is seen."""
+    def persistence(self, voxel_size: float) -> Persistence | None:
+        """Fuse the scans that were read for it, and count how often each voxel is seen.
+
+        None where points lie so far out that voxels of that size cannot be counted.
+        """
         backend = create("numba", voxel_size=voxel_size, num_classes=2)
         for position in self.sample.fused:
             scan = self.sample.scans[position]
-            backend.integrate(dataclasses.replace(scan, labels=np.zeros(scan.shape, np.uint8), scores=None))
+            try:
+                backend.integrate(dataclasses.replace(scan, labels=np.zeros(scan.shape, np.uint8), scores=None))
+            except DataError:
+                return None
         return distribution(backend.table().op, voxel_size, self.sample.stays(voxel_size))

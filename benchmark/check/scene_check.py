@@ -336,7 +336,7 @@ def _check_scans(
         overlaps=tuple(overlaps),
         noise=coverage.noise(),
         fused_frames=len(sample.fused),
-        persistence=tuple(coverage.persistence(size * factor) for factor in VOXEL_FACTORS),
+        persistence=tuple(filter(None, (coverage.persistence(size * factor) for factor in VOXEL_FACTORS))),
         suggestion=suggestion,
     )
 
