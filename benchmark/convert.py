@@ -315,6 +315,8 @@ def convert(
 
 def convert_scene(scene: Scene, config: Config, path: Path, depth_error: float, progress: Reporter) -> Converted:
     """Write one scene; see `convert`."""
+    if scene.of_scans:
+        raise DataError(f"{scene.name}: holds scans, and a posed folder holds images; scans are read as they are")
     known = (*scene.models, *scene.by_name)
     models = selected(config.models, known, (), "model", scene.name)
     indices = frame_indices(scene, config, models)

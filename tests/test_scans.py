@@ -263,4 +263,10 @@ def test_a_scan_cannot_be_looked_up_in_an_image(street):
 
 def test_no_model_predicts_on_scans(folder, tmp_path):
     result = bench("run", "--data", folder, "--predict", "colour-clusters", cwd=tmp_path, code=2)
-    assert "00: holds scans, and models predict on images; write the labels" in result.stderr
+    assert "00: holds scans, and models and filters work on images; write the labels" in result.stderr
+
+
+def test_scans_are_not_converted_to_images(folder, tmp_path):
+    result = bench("convert", "--data", folder, "--out", tmp_path / "images", cwd=tmp_path, code=2)
+    assert "00: holds scans, and a posed folder holds images" in result.stderr
+    assert not (tmp_path / "images").exists()

@@ -188,8 +188,8 @@ class PredictedScene(Scene):
     def __init__(self, inner: Scene, dataset: PredictedDataset) -> None:
         if inner.of_scans:
             raise DataError(
-                f"{inner.name}: holds scans, and models predict on images; write the labels of a model's points into"
-                " predictions/MODEL (docs/tutorials/scans.md)"
+                f"{inner.name}: holds scans, and models and filters work on images; write the labels of a model's"
+                " points into predictions/MODEL (docs/tutorials/scans.md)"
             )
         self.name = inner.name
         self.models = tuple(dataset.predictors)
