@@ -1,0 +1,56 @@
+"""Alpha by range of labels that are worse the farther away.
+
+    python simulations/ranges.py SEQUENCES [--voxel-size 0.2]
+
+SEQUENCES is a folder in SemanticKITTI's layout with ground truth. Labels are the true ones; of the points at range r a
+share of (r - 10 m) / 40 m, at most 80 %, is drawn anew from nine classes. Printed are alpha of fine cells, alpha
+extrapolated to cells without a size, as it is for images, and the strata.
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+
+import numpy as np
+
+from semstab.backends import create
+from semstab.datasets import open_dataset
+from semstab.statistics import Sampler, describe
+
+DRAWN = (0, 8, 10, 12, 13, 14, 15, 16, 17)
+"""car, road, sidewalk, building, fence, vegetation, trunk, terrain and pole, among the 19 classes."""
+
+
+def main() -> None:
+    """Print the table."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("sequences")
+    parser.add_argument("--voxel-size", type=float, default=0.2)
+    arguments = parser.parse_args()
+    dataset = open_dataset("semantickitti", {"root": arguments.sequences})
+    scene, rng = dataset.scene(dataset.scenes[0]), np.random.default_rng(0)
+    mapping = scene.label_space("gt").mapping_to(scene.label_space("gt"))
+    K = len(mapping.target)
+    backend, sampler = create("numba", voxel_size=arguments.voxel_size, num_classes=K, history=True), Sampler(K)
+    for index in range(len(scene)):
+        frame = scene.frame(index, "gt")
+        labels = mapping.labels(frame.predicted, scene.frame_name(index))
+        wrong = rng.random(frame.shape) < np.clip((frame.depth - 10) / 40, 0, 0.8)
+        drawn = rng.choice(DRAWN, frame.shape).astype(labels.dtype)
+        made = dataclasses.replace(frame, labels=np.where(wrong & (labels < K), drawn, labels), mask=None)
+        backend.integrate(made)
+        sampler.add(made)
+    cells, table = sampler.sample(), backend.table()
+    found = describe(table, backend.events(), cells=cells)
+    images = describe(table, backend.events(), cells=dataclasses.replace(cells, sparse=False))
+    print(f"alpha {found.headline.alpha.text()}, extrapolated {images.headline.alpha.text()}")
+    assert found.ranges is not None
+    print(found.ranges.text)
+    print("| range m | observations % | alpha |\n|---|---:|---:|")
+    for row in found.ranges.strata:
+        print(f"| {row.low:g} to {row.high:g} | {100 * row.share:.1f} | {row.alpha.text()} |")
+
+
+if __name__ == "__main__":
+    main()
