@@ -80,6 +80,12 @@ REGISTRY = Registry(
             "pip install 'semstab[bags]'",
             ("rosbags",),
         ),
+        "bag_scans": Entry(
+            "semstab.datasets.bag.scans:BagScans",
+            "ROS 1 and ROS 2 bags with clouds (PointCloud2) and poses: LiDAR scans",
+            "pip install 'semstab[bags]'",
+            ("rosbags",),
+        ),
         "stray_scanner": Entry("semstab.datasets.stray_scanner:StrayScanner", "recordings of the app Stray Scanner"),
         "polycam": Entry("semstab.datasets.polycam:Polycam", "raw data of the app Polycam: keyframes/"),
         "record3d": Entry("semstab.datasets.record3d:Record3D", "EXR and JPG sequences of the app Record3D"),
@@ -135,7 +141,7 @@ def open_dataset(name: str, options: dict[str, Any] | BaseModel, run_folder: Pat
 RECOGNISED = (
     "odm", "metashape", "pix4d", "realitycapture", "uavscenes", "hololens", "tum", "seven_scenes", "replica", "scannet",
     "semantickitti", "nuscenes", "kitti360", "tartanair", "stray_scanner", "polycam", "record3d", "arkitscenes",
-    "transforms_json", "colmap", "bag", "posed_folder", "points_folder",
+    "transforms_json", "colmap", "bag_scans", "bag", "posed_folder", "points_folder",
 )  # fmt: skip
 """Formats that a folder is recognised as: the one whose scenes lie highest, of these the first."""
 

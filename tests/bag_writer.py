@@ -5,7 +5,7 @@ from __future__ import annotations
 import shutil
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import cv2
 import numpy as np
@@ -13,14 +13,20 @@ from scipy.spatial.transform import Rotation
 
 from semstab.data.frames import Frame
 
+if TYPE_CHECKING:
+    from scan_writers import Scan
+
 START, STEP = 1305031102_000000000, 100_000_000
 LATER = 4_000_000
 """Nanoseconds from a depth image to its colour image."""
 
 OPTICAL, LINK, BASE, ODOM, MAP = "camera_color_optical_frame", "camera_link", "base_link", "odom", "map"
+LIDAR, CLOUDS = "os_sensor", "/ouster/points"
+DATATYPES = {"i1": 1, "u1": 2, "i2": 3, "u2": 4, "i4": 5, "u4": 6, "f4": 7, "f8": 8}
 DEPTH, COLOR = "/camera/aligned_depth_to_color/image_raw", "/camera/color/image_raw"
 DEPTH_INFO, COLOR_INFO = "/camera/aligned_depth_to_color/camera_info", "/camera/color/camera_info"
 LINK_IN_BASE = np.array([[1, 0, 0, 0.1], [0, 1, 0, 0], [0, 0, 1, 0.3], [0, 0, 0, 1.0]])
+LIDAR_IN_BASE = np.array([[0, -1, 0, 0.2], [1, 0, 0, 0], [0, 0, 1, 0.9], [0, 0, 0, 1.0]])
 OPTICAL_IN_LINK = np.array([[0, 0, 1, 0], [-1, 0, 0, 0.015], [0, -1, 0, 0], [0, 0, 0, 1.0]])
 ODOM_IN_MAP = np.eye(4)
 ODOM_IN_MAP[:3, :3] = Rotation.from_euler("z", 30, degrees=True).as_matrix()
@@ -78,6 +84,30 @@ class Ros:
             **{name if self.first else name.lower(): value for name, value in named.items()},
         )  # fmt: skip
 
+    def cloud(
+        self,
+        ns: int,
+        columns: dict[str, np.ndarray],
+        frame: str = LIDAR,
+        height: int = 1,
+        big: bool = False,
+        pad: int = 0,
+    ) -> Any:
+        """Fields by name, in this order, each after a byte that is in no field; rows are `pad` bytes longer."""
+        order, (count, *_) = ">" if big else "<", next(iter(columns.values())).shape
+        kinds = [(name, values.dtype.newbyteorder(order)) for name, values in columns.items()]
+        layout = np.dtype([each for k, kind in enumerate(kinds) for each in ((f"gap{k}", "u1"), kind)])
+        points = np.zeros(count, layout)
+        for name, values in columns.items():
+            points[name] = values
+        rows = np.pad(points.view(np.uint8).reshape(height, -1), ((0, 0), (0, pad)))
+        field = self.types["sensor_msgs/msg/PointField"]
+        return self.types["sensor_msgs/msg/PointCloud2"](
+            header=self.header(ns, frame), height=height, width=count // height, is_bigendian=big,
+            fields=[field(name, layout.fields[name][1], DATATYPES[kind.str[1:]], 1) for name, kind in kinds],
+            point_step=layout.itemsize, row_step=rows.shape[1], data=rows.ravel(), is_dense=False,
+        )  # fmt: skip
+
     def pose(self, T: np.ndarray) -> Any:
         x, y, z, w = Rotation.from_matrix(T[:3, :3]).as_quat()
         point, turn = self.types["geometry_msgs/msg/Point"], self.types["geometry_msgs/msg/Quaternion"]
@@ -122,6 +152,35 @@ def records(ros: Ros, frames: Sequence[Frame]) -> Iterable[Entry]:
         yield COLOR, t + 3, ros.image(t + LATER, frame.color, "rgb8")
         for name in (DEPTH_INFO, COLOR_INFO):
             yield name, t, ros.info(t, frame)
+
+
+def cloud_records(
+    ros: Ros, scans: Sequence[Scan], *, tf: bool = True, dtype: Any = np.float32, **layout
+) -> Iterable[Entry]:
+    """What a robot with a LiDAR records: poses by /tf, or Odometry of base_link; the wall of each point as `label`."""
+    start = START - STEP // 2
+    yield "/tf_static", start, ros.transforms((start, BASE, LIDAR, LIDAR_IN_BASE))
+    for k, scan in enumerate(scans):
+        t = START + k * STEP
+        base = scan.T @ np.linalg.inv(LIDAR_IN_BASE)
+        for at in (t, t + STEP // 2):
+            if tf:
+                in_odom = np.linalg.inv(ODOM_IN_MAP) @ base
+                yield "/tf", at, ros.transforms((at, MAP, ODOM, ODOM_IN_MAP), (at, ODOM, BASE, in_odom))
+            else:
+                yield "/odometry", at, ros.odometry(at, base, BASE)
+        yield CLOUDS, t + 1, ros.cloud(t, columns_of(scan, dtype), **layout)
+
+
+def columns_of(scan: Scan, dtype: Any = np.float32) -> dict[str, np.ndarray]:
+    """The fields of a cloud: some that nothing reads, among them."""
+    axes = dict(zip("xyz", scan.points.T.astype(dtype), strict=True))
+    return {"intensity": np.ones(len(scan.points), np.float32), **axes, "label": scan.walls, "t": scan.walls}
+
+
+def clouds_of(count: int) -> list[str]:
+    """The names of the scans that `cloud_records` makes."""
+    return [str(START + k * STEP) for k in range(count)]
 
 
 def names_of(count: int) -> list[str]:

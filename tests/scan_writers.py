@@ -8,6 +8,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
+import bag_writer as bags
 import numpy as np
 from dataset_writers import numbers, write_lines
 from scipy.spatial.transform import Rotation
@@ -219,6 +220,15 @@ def predict_points(folder: Path, name: str, walls: np.ndarray) -> None:
     np.save(path, walls.astype(np.uint8))
 
 
+# --- bags
+
+
+def write_cloud_bag(folder: Path, wanted: Sequence[Scan]) -> list[str]:
+    """A rosbag2, whose clouds have the true classes in them."""
+    bags.write_bag(folder, "MCAP", lambda ros: bags.cloud_records(ros, wanted))
+    return bags.clouds_of(len(wanted))
+
+
 # --- all of them
 
 
@@ -231,7 +241,7 @@ class ScanFormat:
         write: Writes scans into a folder, and returns their names.
         predict: Writes the walls of a scan as predictions into the same folder.
         classes: The class of each wall, in words.
-        points: The file of the second scan's points, a template.
+        points: The file of the second scan's points, a template; '' where one file holds all scans.
         predicted: The file of a scan's predictions.
         moves: The wall that moves, by the format's truth.
         truth: Whether it has ground truth of each point.
@@ -278,6 +288,10 @@ SCANS = {
     "points_folder, PLY": of_points(".ply"),
     "points_folder, LAS": of_points(".las"),
     "points_folder, LAZ in the world": of_points(".laz", in_world=True),
+    "bag_scans": ScanFormat(
+        "bag_scans", write_cloud_bag, predict_points, tuple("abcdef"), "", "labels/net/{}.npy",
+        options={"classes": tuple("abcdef"), "label_source": "gt"},
+    ),
 }  # fmt: skip
 
 

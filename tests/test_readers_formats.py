@@ -232,7 +232,7 @@ def test_a_name_that_is_listed_in_a_folder_is_found_and_no_other(tmp_path):
 TEXT = (Path(__file__).parents[1] / "docs/datasets.md").read_text()
 SECTIONS = {match[1]: match[2] for match in re.finditer(r"^## [^\n]*\(`(\w+)`\)\n(.*?)(?=^## |\Z)", TEXT, re.M | re.S)}
 READERS = {
-    name for name, entry in REGISTRY.builtin.items() if re.fullmatch(r"semstab\.datasets\.\w+:\w+", entry.target)
+    name for name, entry in REGISTRY.builtin.items() if re.fullmatch(r"semstab\.datasets\.[\w.]+:\w+", entry.target)
 }
 
 

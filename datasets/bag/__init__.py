@@ -6,7 +6,7 @@ Sources: docs.ros.org (sensor_msgs, tf2_msgs, nav_msgs, geometry_msgs); REP 103,
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -14,16 +14,16 @@ from pydantic import BaseModel
 
 from semstab.core.types import Float64
 from semstab.data.frames import Intrinsics
-from semstab.datasets.bag.index import Content, Int64, Stream, read_once
+from semstab.datasets.bag.finding import CONTENTS, find_bags
+from semstab.datasets.bag.index import Content, Int64, read_once
 from semstab.datasets.bag.messages import Folder, Messages
 from semstab.datasets.bag.options import BagOptions
-from semstab.datasets.bag.reading import NANOSECONDS, SUFFIXES, OpenBag, is_bag, seconds
+from semstab.datasets.bag.reading import NANOSECONDS, OpenBag, is_bag, seconds
 from semstab.datasets.files.labels import SceneEntry
 from semstab.datasets.files.options import FileOptions, FrameSource
-from semstab.datasets.files.reader import DEEPEST, FileDataset
+from semstab.datasets.files.reader import FileDataset
 from semstab.datasets.files.scene import FileScene
 from semstab.datasets.files.surfaces import Surface
-from semstab.datasets.formats.disk import files_named, natural, subfolders
 from semstab.datasets.formats.images import MILLIMETRES
 from semstab.datasets.geometry.cameras import Camera, mutual_nearest
 from semstab.datasets.geometry.lenses import Lens
@@ -40,7 +40,7 @@ class Bag(FileDataset[BagOptions]):
     """
 
     Options: type[BaseModel] = BagOptions
-    contents = f"a ROS bag ({', '.join(SUFFIXES)}, or a folder of a rosbag2)"
+    contents = CONTENTS
 
     def __init__(self, options: BagOptions) -> None:
         self._bags: dict[Path, Path] = {}
@@ -53,20 +53,9 @@ class Bag(FileDataset[BagOptions]):
         Raises:
             DataError: If there is none, or two would have one name.
         """
-        if not root.exists():
-            raise DataError(f"{root}: there is no such bag or folder; set root to a bag, or to the folder above bags")
-        paths = [root] if is_bag(root) else sorted(_bags_below(root, DEEPEST), key=lambda path: natural(str(path)))
-        if not paths:
-            raise DataError(f"{root}: no bag here, nor {DEEPEST} folders deep; expected {self.contents}")
-        entries = []
-        for path in paths:
-            folder = path if path.is_dir() else path.with_suffix("")
-            if folder in self._bags:
-                raise DataError(f"{path}: {self._bags[folder].name} would be a scene of the same name; rename one")
-            self._bags[folder] = path
-            parts = (folder.resolve().name or "scene",) if path == root else folder.relative_to(root).parts
-            entries.append(SceneEntry("-".join(parts), folder, "/".join(parts)))
-        return entries
+        found = find_bags(root)
+        self._bags = {entry.folder: path for entry, path in found}
+        return [entry for entry, _ in found]
 
     @property
     def folders(self) -> list[Path]:
@@ -96,16 +85,6 @@ class Bag(FileDataset[BagOptions]):
         scene = FileScene(entry, frames, options, self.class_ids(), surface, recorded.messages, labels)
         scene.sources = tuple(recorded.sources)
         return scene
-
-
-def _bags_below(folder: Path, levels: int) -> Iterator[Path]:
-    """Yield the bags in a folder and, up to so many levels, in the folders below it."""
-    if not folder.is_dir():
-        return
-    for suffix in SUFFIXES:
-        yield from (path for path in files_named(folder, "", suffix).values() if is_bag(path))
-    for name in subfolders(folder) if levels else ():
-        yield from [folder / name] if is_bag(folder / name) else _bags_below(folder / name, levels - 1)
 
 
 class Recorded:
@@ -139,20 +118,22 @@ class Recorded:
         self._stamps = streams[seen.topic].stamps[at]
         self._names = [seconds(int(stamp)) for stamp in named.stamps[to]]
         self._poses = self._posed()
-        folders = []
+        bag, folders = content.bag, []
         if chosen.depth is not None:
-            folders.append(Folder(chosen.depth, False, [streams[chosen.depth.topic].place(k) for k in at]))
+            places = [streams[chosen.depth.topic].place(k) for k in at]
+            folders.append(Folder.of_images(bag, chosen.depth, places, color=False))
         if chosen.color is not None:
-            folders.append(Folder(chosen.color, True, [named.place(k) for k in to]))
+            folders.append(Folder.of_images(bag, chosen.color, [named.place(k) for k in to], color=True))
         for source, images in chosen.labels.items():
             stream = streams[images.topic]
             near = stream.near(named.stamps[to], options.max_difference)
-            folders.append(Folder(images, False, [None if k is None else stream.place(k) for k in near]))
+            found = [None if k is None else stream.place(k) for k in near]
+            folders.append(Folder.of_images(bag, images, found, color=False))
             count = len(near) - near.count(None)
             self.sources.append(f"labels   {source}: {images}, of {count} of {len(at)} frames")
-        self.messages = Messages(content.bag, folders, self._names)
+        self.messages = Messages(bag, folders, self._names)
         self.label_folders = {source: self.messages.folder(images) for source, images in chosen.labels.items()}
-        self.sources += [text for topic, stream in streams.items() for text in _order(topic, stream)]
+        self.sources += [text for topic, stream in streams.items() for text in stream.notes(topic)]
         if chosen.others:
             self.sources.append(f"others   {', '.join(chosen.others)} (set depth, color)")
 
@@ -186,16 +167,9 @@ class Recorded:
 
     def _posed(self) -> Float64:
         """Return (n, 4, 4) poses of the frames, NaN where there is none."""
-        bag, limit = self._content.bag, self._options.max_pose_gap
-        offset = round(self._options.time_offset * NANOSECONDS)
-        poses, where = self._content.poses.at((self._stamps + offset).tolist(), self._seen.frame)
-        known = int(np.count_nonzero(np.isfinite(poses).all(axis=(1, 2))))
-        if not known:
-            raise DataError(
-                f"{bag.path}: no frame lies between two poses of {where} that are at most {limit:g} s apart; set"
-                " max_pose_gap, or stamps: bag"
-            )
-        self.sources.append(f"poses    {where}; around {known} of {len(poses)} frames, at most {limit:g} s apart")
+        frame = self._options.camera_frame or self._seen.frame
+        poses, said = self._content.poses.around(self._stamps.tolist(), frame, "frame")
+        self.sources.append(said)
         return poses
 
     def frames(self) -> list[FrameSource]:
@@ -238,10 +212,3 @@ class Recorded:
                 f"{self._content.bag.path}: no message of the camera info of {topic} can be read; set intrinsics"
             )
         return Camera(Intrinsics(*self._options.intrinsics)), None
-
-
-def _order(topic: str, stream: Stream) -> Iterator[str]:
-    if stream.unsorted:
-        yield f"order    {topic}: {stream.unsorted} messages come after a later stamp; sorted"
-    if stream.repeated:
-        yield f"order    {topic}: {stream.repeated} messages have the stamp of another one; left out"

@@ -97,14 +97,14 @@ def content(message: Any, kind: Kind, where: str, *, color: bool) -> bytes:
         if message.encoding != kind.encoding:
             raise DataError(f"{where}: is {message.encoding}, but the first image of the topic is {kind.encoding}")
         samples = samples_of(message, where)
-        return _npy(_rgb(samples, kind.encoding, where) if color else samples)
+        return npy(_rgb(samples, kind.encoding, where) if color else samples)
     data: bytes = message.data.tobytes()
     if kind.transport == "compressed":
         return data
     if len(data) <= DEPTH_HEADER.size:
         raise DataError(f"{where}: the compressed depth image is truncated; {AGAIN}")
     image = data[DEPTH_HEADER.size :]
-    return image if kind.suffix == ".png" else _npy(_from_inverse(image, data, where))
+    return image if kind.suffix == ".png" else npy(_from_inverse(image, data, where))
 
 
 def samples_of(message: Any, where: str) -> npt.NDArray[Any]:
@@ -154,7 +154,8 @@ def _from_inverse(image: bytes, data: bytes, where: str) -> Float32:
     return depth.astype(np.float32)
 
 
-def _npy(array: npt.NDArray[Any]) -> bytes:
+def npy(array: npt.NDArray[Any]) -> bytes:
+    """Return an array as the content of an .npy file."""
     buffer = io.BytesIO()
     np.save(buffer, array)
     return buffer.getvalue()

@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 from array import array
+from collections.abc import Iterator
 from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -11,7 +14,7 @@ import numpy.typing as npt
 from semstab.core.types import Float64
 from semstab.datasets.bag.cameras import camera_of, is_rectified
 from semstab.datasets.bag.options import BagOptions
-from semstab.datasets.bag.poses import CameraPoses
+from semstab.datasets.bag.poses import SensorPoses
 from semstab.datasets.bag.reading import NANOSECONDS, OpenBag, Place, stamp_of
 from semstab.datasets.bag.topics import Chosen, Images, choose
 from semstab.datasets.geometry.cameras import Camera, nearest
@@ -62,6 +65,38 @@ class Stream:
         close = np.abs(own[at] - wanted) <= max_difference
         return [int(k) if there else None for k, there in zip(at, close, strict=True)]
 
+    def notes(self, topic: str) -> Iterator[str]:
+        """Yield a line for each thing that is not in order."""
+        if self.unsorted:
+            yield f"order    {topic}: {self.unsorted} messages come after a later stamp; sorted"
+        if self.repeated:
+            yield f"order    {topic}: {self.repeated} messages have the stamp of another one; left out"
+
+
+class Arrivals:
+    """Stamps and places of the messages of a topic, as they come.
+
+    Args:
+        topic: The topic.
+        stamps: Whose time a message has: its header's, or the bag's.
+    """
+
+    def __init__(self, topic: str, stamps: Literal["header", "bag"]) -> None:
+        self._topic, self._by_bag = topic, stamps == "bag"
+        self._stamps, self._times, self._ranks = array("q"), array("q"), array("q")
+
+    def add(self, place: Place, message: Any) -> None:
+        """Add a message."""
+        self._stamps.append(place.time if self._by_bag else stamp_of(message))
+        self._times.append(place.time)
+        self._ranks.append(place.rank)
+
+    def stream(self, path: Path) -> Stream:
+        """Return them in order; raises DataError, with the path of the bag, if no header has a stamp."""
+        if not self._by_bag and len(self._stamps) > 1 and not any(self._stamps):
+            raise DataError(f"{path}: all stamps in the headers of {self._topic} are 0; set stamps: bag")
+        return Stream(self._stamps, self._times, self._ranks)
+
 
 @dataclass
 class Cameras:
@@ -88,7 +123,7 @@ class Content:
     bag: OpenBag
     chosen: Chosen
     streams: dict[str, Stream]
-    poses: CameraPoses
+    poses: SensorPoses
     cameras: dict[str, Cameras]
 
 
@@ -98,27 +133,22 @@ def read_once(bag: OpenBag, options: BagOptions) -> Content:
     Raises:
         DataError: If the bag lacks a part or is damaged.
     """
-    chosen, poses = choose(bag, options), CameraPoses(bag, options)
+    chosen, poses = choose(bag, options), SensorPoses(bag, options)
     pictures = {each.topic: each for each in (chosen.depth, chosen.color, *chosen.labels.values()) if each is not None}
-    stamps, times, ranks = ({topic: array("q") for topic in pictures} for _ in range(3))
+    arrivals = {topic: Arrivals(topic, options.stamps) for topic in pictures}
     infos = [(chosen.depth_info, chosen.depth or chosen.color), (chosen.color_info, chosen.color)]
     cameras = {images.topic: Cameras() for _, images in infos if images is not None}
     topics = {*pictures, *poses.topics, *(info for info, _ in infos if info is not None)}
     for topic, place, message in bag.messages(sorted(topics)):
         if topic in pictures:
-            stamps[topic].append(place.time if options.stamps == "bag" else stamp_of(message))
-            times[topic].append(place.time)
-            ranks[topic].append(place.rank)
+            arrivals[topic].add(place, message)
         elif topic in poses.topics:
             poses.add(topic, place.time, message)
         for info, images in infos:
             if topic == info and images is not None:
                 stamp = place.time if options.stamps == "bag" else stamp_of(message)
                 cameras[images.topic].add(stamp, _camera(bag, options, topic, message, images))
-    for topic in pictures:
-        if options.stamps == "header" and len(stamps[topic]) > 1 and not any(stamps[topic]):
-            raise DataError(f"{bag.path}: all stamps in the headers of {topic} are 0; set stamps: bag")
-    streams = {topic: Stream(stamps[topic], times[topic], ranks[topic]) for topic in pictures}
+    streams = {topic: each.stream(bag.path) for topic, each in arrivals.items()}
     return Content(bag, chosen, streams, poses, cameras)
 
 

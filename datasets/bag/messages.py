@@ -1,11 +1,12 @@
-"""Image messages of a bag as files that are read from it whenever they are wanted."""
+"""Messages of a bag as files that are read from it whenever they are wanted."""
 
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from semstab.datasets.bag.images import content
 from semstab.datasets.bag.reading import OpenBag, Place
@@ -13,14 +14,41 @@ from semstab.datasets.bag.topics import Images
 from semstab.datasets.files.options import Folders
 from semstab.datasets.formats.disk import digest
 
+Content = Callable[[Any, str], bytes]
+"""The content of the file that a message is, whose name is given for errors."""
+
 
 @dataclass(frozen=True)
 class Folder:
-    """A topic as a folder: its images, whether they are colour, and the place of each frame's message, if any."""
+    """A topic as a folder of files.
 
-    images: Images
-    color: bool
+    Attributes:
+        path: The folder.
+        topic: The topic.
+        suffix: Suffix of the files.
+        content: Returns a file's content.
+        places: The place of each frame's message, if any.
+    """
+
+    path: Path
+    topic: str
+    suffix: str
+    content: Content
     places: Sequence[Place | None]
+
+    @classmethod
+    def of_images(cls, bag: OpenBag, images: Images, places: Sequence[Place | None], *, color: bool) -> Folder:
+        """Return the folder of the images of a topic, those of `color` as RGB."""
+
+        def read(message: Any, where: str) -> bytes:
+            return content(message, images.kind, where, color=color)
+
+        return cls(topic_path(bag, images.topic), images.topic, images.kind.suffix, read, places)
+
+
+def topic_path(bag: OpenBag, topic: str) -> Path:
+    """Return the folder that a topic of a bag is."""
+    return Path(f"{bag.path}:{topic}")
 
 
 class Messages(Folders):
@@ -35,12 +63,12 @@ class Messages(Folders):
     def __init__(self, bag: OpenBag, folders: Sequence[Folder], frames: Sequence[str]) -> None:
         super().__init__()
         self._bag = bag
-        self._topics = {str(self.folder(each.images)): each for each in folders}
+        self._topics = {str(each.path): each for each in folders}
         self._index: Mapping[str, int] = {name: k for k, name in enumerate(frames)}
 
     def folder(self, images: Images) -> Path:
         """Return the folder of the images of a topic."""
-        return Path(f"{self._bag.path}:{images.topic}")
+        return topic_path(self._bag, images.topic)
 
     def file(self, images: Images, frame: str) -> Path:
         """Return the file of a frame's image."""
@@ -60,9 +88,8 @@ class Messages(Folders):
         """
         if (found := self._found(path)) is None:
             return super().read(path)
-        topic, place = found
-        message = self._bag.message(topic.images.topic, place)
-        return content(message, topic.images.kind, str(path), color=topic.color)
+        folder, place = found
+        return folder.content(self._bag.message(folder.topic, place), str(path))
 
     def digest(self, path: Path) -> bytes:
         """Return a hash of the same."""
@@ -74,6 +101,6 @@ class Messages(Folders):
         if topic is None:
             return None
         frame, suffix = os.path.splitext(name)  # noqa: PTH122
-        at = self._index.get(frame) if suffix == topic.images.kind.suffix else None
+        at = self._index.get(frame) if suffix == topic.suffix else None
         place = None if at is None else topic.places[at]
         return None if place is None else (topic, place)

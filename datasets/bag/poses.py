@@ -1,4 +1,4 @@
-"""Poses of a bag's camera: from /tf and /tf_static, from a topic of poses, or from a file."""
+"""Poses of a bag's camera or LiDAR: from /tf and /tf_static, from a topic of poses, or from a file."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from semstab.datasets.bag.options import BagOptions
+from semstab.datasets.bag.options import PoseOptions
 from semstab.datasets.bag.reading import NANOSECONDS, OpenBag, stamp_of
 from semstab.datasets.formats.disk import read_table
 from semstab.datasets.geometry.cameras import Poses, from_quaternions
@@ -41,8 +41,14 @@ def numbers_of(pose: Any) -> tuple[float, ...]:
     return at.x, at.y, at.z, turn.x, turn.y, turn.z, turn.w
 
 
-class CameraPoses:
-    """What a bag says about where its camera is: add the messages of `topics`, then ask.
+class SensorPoses:
+    """What a bag says about where its sensor is: add the messages of `topics`, then ask.
+
+    Args:
+        bag: The bag.
+        options: Which poses are meant.
+        sensor: What it is called in messages; SENSOR_frame is the option of its frame.
+        seen: What its messages are: images, clouds.
 
     Attributes:
         topics: The topics that are needed.
@@ -51,8 +57,9 @@ class CameraPoses:
         DataError: If an option names what is not there.
     """
 
-    def __init__(self, bag: OpenBag, options: BagOptions) -> None:
+    def __init__(self, bag: OpenBag, options: PoseOptions, sensor: str = "camera", seen: str = "images") -> None:
         self._path = bag.path
+        self._sensor, self._seen = sensor, seen
         self._options = options
         self._transforms = Transforms()
         self._tf = bag.of_types(*TF_TYPE)
@@ -82,53 +89,69 @@ class CameraPoses:
     def _stamp(self, message: Any, time: int) -> int:
         return time if self._options.stamps == "bag" else stamp_of(message)
 
-    def at(self, stamps: Sequence[int], camera: str) -> tuple[Poses, str]:
-        """Return poses (n, 4, 4) of the camera at stamps, NaN where they are not known, and where they come from.
-
-        `camera` is the frame of the images.
+    def around(self, stamps: Sequence[int], sensor: str, what: str) -> tuple[Poses, str]:
+        """Return what `at` does, for stamps by the sensor's clock, and a line that says how many of `what` have a pose.
 
         Raises:
-            DataError: If nothing tells where the camera is.
+            DataError: What `at` raises, or if none has one.
+        """
+        offset, limit = round(self._options.time_offset * NANOSECONDS), self._options.max_pose_gap
+        poses, where = self.at([stamp + offset for stamp in stamps], sensor)
+        known = int(np.count_nonzero(np.isfinite(poses).all(axis=(1, 2))))
+        if not known:
+            raise DataError(
+                f"{self._path}: no {what} lies between two poses of {where} that are at most {limit:g} s apart; set"
+                " max_pose_gap, or stamps: bag"
+            )
+        return poses, f"poses    {where}; around {known} of {len(poses)} {what}s, at most {limit:g} s apart"
+
+    def at(self, stamps: Sequence[int], sensor: str) -> tuple[Poses, str]:
+        """Return poses (n, 4, 4) of the sensor at stamps, NaN where they are not known, and where they come from.
+
+        `sensor` is the frame of its messages.
+
+        Raises:
+            DataError: If nothing tells where it is.
         """
         options = self._options
-        camera = bare(options.camera_frame or camera)
+        sensor = bare(sensor)
         if options.trajectory is not None:
             numbers = read_table(options.trajectory, 8, "timestamp tx ty tz qx qy qz qw")
             series = Trajectory()
             for time, *pose in numbers.tolist():
                 series.add(round(time * NANOSECONDS), pose)
             poses = series.at(_snapped(stamps, series.stamps), options.max_pose_gap, options.trajectory)
-            return self._from_body(poses, options.pose_frame or "", camera, stamps, str(options.trajectory))
-        chain, why = self._chain(camera)
+            return self._from_body(poses, options.pose_frame or "", sensor, stamps, str(options.trajectory))
+        chain, why = self._chain(sensor)
         if chain and (options.pose == TF or (options.pose is None)):
             poses = self._transforms.at(chain, stamps, options.max_pose_gap, self._path)
             poses = poses @ self._extrinsics()
             by = f" by {', '.join(reversed(chain[1:-1]))}" if chain[1:-1] else ""
             return poses, f"{' and '.join(self._tf)}: {chain[0]} in {chain[-1]}{by}"
         if self._topic is None:
-            raise DataError(f"{self._path}: no pose of the camera: {why}")
+            raise DataError(f"{self._path}: no pose of the {self._sensor}: {why}")
         poses = self._own.at(stamps, options.max_pose_gap, Path(f"{self._path}, {self._topic}"))
         body = options.pose_frame or self._of
         where = f"{self._topic}{f' in {self._frame}' if self._frame else ''}"
-        return self._from_body(poses, bare(body), camera, stamps, where)
+        return self._from_body(poses, bare(body), sensor, stamps, where)
 
-    def _from_body(self, poses: Poses, body: str, camera: str, stamps: Sequence[int], where: str) -> tuple[Poses, str]:
-        """Return poses of the camera from those of a body that it is mounted on; '' is the camera itself."""
+    def _from_body(self, poses: Poses, body: str, sensor: str, stamps: Sequence[int], where: str) -> tuple[Poses, str]:
+        """Return poses of the sensor from those of a body that it is mounted on; '' is the sensor itself."""
         options = self._options
         if options.extrinsics is not None:
             return poses @ self._extrinsics(), f"{where}, and extrinsics"
-        if body in ("", camera):
-            return poses, f"{where}, of the camera"
-        chain = self._transforms.upwards(camera)
+        if body in ("", sensor):
+            return poses, f"{where}, of the {self._sensor}"
+        chain = self._transforms.upwards(sensor)
         if body not in chain:
             raise DataError(
                 f"{self._path}: the poses of {where} are of the frame '{body}', from which no transform leads to the"
-                f" camera's frame '{camera}'; set extrinsics: [x, y, z, qx, qy, qz, qw], or pose_frame: {camera} if"
-                " they are the camera's"
+                f" {self._sensor}'s frame '{sensor}'; set extrinsics: [x, y, z, qx, qy, qz, qw], or pose_frame:"
+                f" {sensor} if they are the {self._sensor}'s"
             )
         chain = chain[: chain.index(body) + 1]
         mounted = self._transforms.at(chain, stamps, options.max_pose_gap, self._path)
-        return poses @ mounted, f"{where}, of {body}; {camera} in it from {' and '.join(self._tf)}"
+        return poses @ mounted, f"{where}, of {body}; {sensor} in it from {' and '.join(self._tf)}"
 
     def _extrinsics(self) -> Poses:
         if self._options.extrinsics is None:
@@ -137,24 +160,25 @@ class CameraPoses:
         T: Poses = from_quaternions(numbers[:, :3], numbers[:, 3:], Path("option extrinsics"))[0]
         return T
 
-    def _chain(self, camera: str) -> tuple[list[str], str]:
-        """Return the frames from the camera up to the world, or none and the reason."""
-        chain, world = self._transforms.upwards(camera), self._options.world_frame
+    def _chain(self, sensor: str) -> tuple[list[str], str]:
+        """Return the frames from the sensor up to the world, or none and the reason."""
+        chain, world = self._transforms.upwards(sensor), self._options.world_frame
         if not self._tf:
             return [], "there is no /tf; set trajectory: FILE, or pose: TOPIC"
         if len(chain) == 1:
             known = ", ".join(self._transforms.frames()[:8])
-            return [], f"'{camera}', the frame of its images, is not in /tf (camera_frame: one of {known})"
+            frame = f"{self._sensor}_frame"
+            return [], f"'{sensor}', the frame of its {self._seen}, is not in /tf ({frame}: one of {known})"
         if world is not None:
             if bare(world) not in chain:
                 raise DataError(
-                    f"{self._path}: option world_frame: '{world}' is not above '{camera}' in /tf, which hangs from"
+                    f"{self._path}: option world_frame: '{world}' is not above '{sensor}' in /tf, which hangs from"
                     f" {', '.join(chain[1:])}"
                 )
             return chain[: chain.index(bare(world)) + 1], ""
         moving = [frame for k, frame in enumerate(chain) if self._transforms.moves(chain[: k + 1])]
         if not moving:
-            return [], f"no transform moves between '{camera}' and '{chain[-1]}', from which it hangs"
+            return [], f"no transform moves between '{sensor}' and '{chain[-1]}', from which it hangs"
         named = (f for word in WORLDS for f in moving if word in f.rpartition("/")[2].lower())
         found = next(named, moving[-1])
         return chain[: chain.index(found) + 1], ""

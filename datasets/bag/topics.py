@@ -71,7 +71,7 @@ def choose(bag: OpenBag, options: BagOptions) -> Chosen:
         DataError: If parts are missing that a scene needs, with the topics that there are, or a named topic is none.
     """
     for name, (topic, types) in _named(options).items():
-        _require(bag, name, topic, types)
+        require(bag, name, topic, types)
     images = dict(_images(bag, options))
     labels = _labels(images, options)
     left = [each for each in images.values() if each not in labels.values() and not LABELS.search(each.topic.lower())]
@@ -109,6 +109,12 @@ def choose(bag: OpenBag, options: BagOptions) -> Chosen:
     return Chosen(depth, color, labels, depth_info, color_info, tuple(others))
 
 
+def has_depth(bag: OpenBag) -> bool:
+    """Return whether a bag has a topic that is taken for depth; raises DataError for a damaged one."""
+    images = dict(_images(bag, BagOptions(root=bag.path)))
+    return any(is_depth(each) and not LABELS.search(each.topic.lower()) for each in images.values())
+
+
 def is_depth(images: Images) -> bool:
     """Return whether images may be depth, by encoding and name."""
     if images.kind.transport == "compressedDepth" or images.kind.encoding == "32FC1":
@@ -136,7 +142,8 @@ def _named(options: BagOptions) -> dict[str, tuple[str, tuple[str, ...]]]:
     return {name: (topic, types) for name, (topic, types) in (named | labels).items() if topic is not None}
 
 
-def _require(bag: OpenBag, option: str, name: str, types: tuple[str, ...]) -> None:
+def require(bag: OpenBag, option: str, name: str, types: tuple[str, ...]) -> None:
+    """Raise DataError if the topic that an option names is not there, of none of the types, or empty."""
     topic = bag.topics.get(name)
     if topic is None:
         raise DataError(f"{bag.path}: option {option}: there is no topic '{name}'; {nearest(name, [*bag.topics])}")

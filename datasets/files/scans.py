@@ -6,6 +6,7 @@ import hashlib
 import json
 import logging
 import math
+import os
 from abc import abstractmethod
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -130,6 +131,10 @@ class ScanDataset(Dataset, Generic[Options]):
         scans = list(self.scans(entry))
         if not scans:
             raise DataError(f"{entry.folder}: holds no scan; expected {self.contents}")
+        return self.opened(entry, scans)
+
+    def opened(self, entry: SceneEntry, scans: Sequence[ScanSource]) -> ScanScene:
+        """Return the scene of these scans."""
         return ScanScene(self, entry, scans)
 
     def find_scenes(self, root: Path) -> Iterable[SceneEntry]:
@@ -168,6 +173,8 @@ class ScanScene(Scene):
         dataset: Its reader.
         entry: Its name and its folder.
         scans: Its scans.
+        files: The files that it reads.
+        own: Folders of labels, {name} a file, by the label source that they are, besides those that templates find.
 
     Raises:
         ConfigError: For options that cannot be used.
@@ -177,13 +184,20 @@ class ScanScene(Scene):
     folder: Path
     of_scans = True
 
-    def __init__(self, dataset: ScanDataset[Any], entry: SceneEntry, scans: Sequence[ScanSource]) -> None:
+    def __init__(
+        self,
+        dataset: ScanDataset[Any],
+        entry: SceneEntry,
+        scans: Sequence[ScanSource],
+        files: Folders | None = None,
+        own: Mapping[str, Path] | None = None,
+    ) -> None:
         if len({scan.name for scan in scans}) < len(scans):
             raise DataError(f"{entry.folder}: two scans have one name; scans need names of their own")
         self.name, self.folder, self.options = entry.name, entry.folder, dataset.options
         self.skips_incomplete = self.options.incomplete == "skip"
         self.up = np.array(UP_AXES[self.options.up_axis], np.float64) if self.options.up_axis else None
-        self._dataset, self._scans, self._files = dataset, scans, Folders()
+        self._dataset, self._scans, self._files = dataset, scans, files or Folders()
         base = self.options.labels_root or entry.folder
         self._truth = None
         if dataset.truth is not None:
@@ -202,6 +216,10 @@ class ScanScene(Scene):
             self._sources |= {model: source for model, source in found.items() if source.first is not None}
             if self._sources:
                 break
+        for name, labels in (own or {}).items():
+            if name in self._sources:
+                raise ConfigError(f"{entry.folder}: two label sources are called '{name}'; rename one")
+            self._sources[name] = LabelSource.of("points", labels, "{name}", scans, self._files)
         self._truth = self._sources.pop(GROUND_TRUTH, self._truth)
         self.models, self.ground_truth = tuple(self._sources), self._truth is not None
 
@@ -312,7 +330,7 @@ class ScanScene(Scene):
         scan = self._scan(index)
         pose = " ".join(f"{round(value, 6) + 0.0:.6f}" for value in scan.pose.ravel().tolist())
         return {
-            str(scan.points.relative_to(self.folder)): fingerprint(self._files.digest(scan.points)),
+            os.path.relpath(scan.points, self.folder): fingerprint(self._files.digest(scan.points)),
             f"pose of {scan.name}": fingerprint(pose.encode()),
         }
 
