@@ -11,8 +11,9 @@ import pytest
 import scan_writers as sw
 from bag_writer import BASE, CLOUDS, LIDAR, MAP, START, STEP
 from command_line import bench
-from dataset_writers import assert_same_voxels, source
+from dataset_writers import assert_same_voxels, numbers, source, write_lines
 from posed_scene import fails
+from scipy.spatial.transform import Rotation
 
 from semstab.datasets import open_dataset, recognise
 from semstab.errors import ConfigError, DataError
@@ -207,17 +208,48 @@ def test_frames_that_are_not_in_tf_are_named(tmp_path, scans):
         opened, path, sensor_frame="lidar",
     )  # fmt: skip
     fails(DataError, "option world_frame: 'earth' is not above", opened, path, world_frame="earth")
-    same(
-        opened(
-            write(tmp_path, scans, with_clouds(lambda r, s, m: unframed(r, s, m, scans)), name="b"), sensor_frame=LIDAR
-        ),
-        scans,
-    )
+
+    def unframed(_ros, _stamp, message):
+        message.header.frame_id = "none"
+        return message
+
+    path = write(tmp_path, scans, with_clouds(unframed), name="unframed")
+    fails(DataError, "'none', the frame of its clouds, is not in /tf", opened, path)
+    same(opened(path, sensor_frame=LIDAR), scans)
 
 
-def unframed(ros, stamp, message, scans):
-    message.header.frame_id = "none"
-    return message
+def test_poses_of_a_file_and_the_clock_of_the_bag(tmp_path, scans):
+    def unstamped(ros, topic, t, message):
+        if topic == CLOUDS:
+            message.header.stamp = ros.stamp(0)
+            yield topic, t - 1, message
+
+    path = write(tmp_path, scans, unstamped)
+    turns = Rotation.from_matrix([scan.T[:3, :3] for scan in scans]).as_quat()
+    times = [f"{1305031102 + k / 10:.6f}" for k in range(4)]
+    rows = [f"{time} {numbers(scan.T[:3, 3])} {numbers(q)}" for time, scan, q in zip(times, scans, turns, strict=True)]
+    write_lines(tmp_path / "poses.txt", rows)
+    given = {"trajectory": tmp_path / "poses.txt"}
+    fails(DataError, f"all stamps in the headers of {CLOUDS} are 0; set stamps: bag", opened, path, **given)
+    same(opened(path, stamps="bag", **given), scans)
+    fails(DataError, "holds no poses; record these, too", opened, path, stamps="bag")
+
+
+def test_of_two_topics_the_one_with_classes_is_read_or_the_one_that_is_named(tmp_path, scans):
+    def twice(ros, topic, t, message):
+        yield topic, t, message
+        if topic == CLOUDS:
+            columns = bags.columns_of(scans[(t - START) // STEP])
+            del columns["label"]
+            for late in (0, STEP // 4):
+                yield "/a/raw", t + late, ros.cloud(t - 1 + late, columns)
+
+    path = write(tmp_path, scans, twice)
+    scene = opened(path)
+    assert (len(scene), scene.sources[-1]) == (4, "others   /a/raw (set points)")
+    same(scene, scans)
+    other = opened(path, points="/a/raw")
+    assert (len(other), other.models, other.sources[-1]) == (8, (), f"others   {CLOUDS} (set points)")
 
 
 # --- what is missing or damaged
