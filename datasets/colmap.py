@@ -20,7 +20,7 @@ from semstab.core.files import open_file
 from semstab.datasets.files import options as opt
 from semstab.datasets.files.options import FileOptions, Folders, FrameSource, Template, inside
 from semstab.datasets.files.reader import FileDataset
-from semstab.datasets.formats.disk import AGAIN, natural, to_number
+from semstab.datasets.formats.disk import AGAIN, natural, numbered_lines, to_number
 from semstab.datasets.formats.images import DEPTH_SUFFIXES, color_size
 from semstab.datasets.geometry.cameras import Camera, Poses, from_quaternions
 from semstab.errors import DataError
@@ -184,7 +184,7 @@ def _pinhole(camera: Stated, where: str) -> Camera:
 
 
 def _cameras_txt(file: BinaryIO, path: Path) -> Iterator[tuple[int, Stated]]:
-    for line, text in _lines(file):
+    for line, text in numbered_lines(file):
         words = text.split()
         if not words or text.startswith("#"):
             continue
@@ -209,7 +209,7 @@ def _cameras_bin(file: BinaryIO, path: Path) -> Iterator[tuple[int, Stated]]:
 
 def _images_txt(file: BinaryIO, path: Path) -> Iterator[Registered]:
     """Yield the images, two lines each, of which the second, with its points, may be empty."""
-    lines = _lines(file)
+    lines = numbered_lines(file)
     for line, text in lines:
         words = text.split(maxsplit=9)
         if not words or text.startswith("#"):
@@ -239,12 +239,6 @@ def _images_bin(file: BinaryIO, path: Path) -> Iterator[Registered]:
             raise DataError(f"{path}: truncated in the points of image {name[:80]!r}; {AGAIN}")
         file.seek(24 * points, os.SEEK_CUR)
         yield numbers, camera_id, name
-
-
-def _lines(file: BinaryIO) -> Iterator[tuple[int, str]]:
-    """Yield the number and stripped text of every line: points can take gigabytes, so no file is read whole."""
-    for number, line in enumerate(file, start=1):
-        yield number, line.decode("utf-8", errors="replace").strip()
 
 
 def _unpack(file: BinaryIO, layout: str, path: Path) -> tuple[Any, ...]:

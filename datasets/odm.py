@@ -15,6 +15,7 @@ from pydantic import BaseModel, Field
 
 from semstab.core.files import open_file
 from semstab.data.georeference import Georeference
+from semstab.datasets.exported_cameras import bundle_distorts, read_bundle, read_nvm
 from semstab.datasets.files import options as opt
 from semstab.datasets.files.depth import HEADER_BYTES, dmap_header
 from semstab.datasets.files.labels import SceneEntry
@@ -22,7 +23,7 @@ from semstab.datasets.files.options import FileOptions, Folders, FrameSource, Te
 from semstab.datasets.files.reader import FileDataset
 from semstab.datasets.files.scene import FileScene
 from semstab.datasets.formats.disk import natural, records, subfolders
-from semstab.datasets.formats.images import DEPTH_SUFFIXES
+from semstab.datasets.formats.images import DEPTH_SUFFIXES, color_size
 from semstab.datasets.geometry.lenses import Lens
 from semstab.datasets.opensfm import read_reconstruction
 from semstab.datasets.photographs import Shot, bare_name, find_image, frame_names, written_names
@@ -33,6 +34,9 @@ from semstab.errors import DataError
 
 UNDISTORTED = "undistorted/reconstruction.json"
 DISTORTED = "reconstruction.json"
+NVM = ("undistorted/reconstruction.nvm", "reconstruction.nvm")
+BUNDLES = ("bundler/bundle*.out", "bundle*.out")
+"""What OpenSfM exports, where a project has no reconstruction.json any more."""
 
 MESHES = (
     "odm_meshing/odm_mesh.ply", "odm_meshing/odm_25dmesh.ply", "odm_texturing*/odm_textured_model_geo.obj",
@@ -52,25 +56,50 @@ Kind = Literal["mesh", "dsm", "mve", "openmvs", "opensfm", "files"]
 
 @dataclass(frozen=True)
 class Project:
-    """The parts of a project: its folder, the folder of OpenSfM in it, and the file of its poses."""
+    """The parts of a project: its folder, the folder of OpenSfM in it, and the file of its poses.
+
+    Attributes:
+        undistorted: Whether the poses are of undistorted images.
+    """
 
     folder: Path
     opensfm: Path
     poses: Path
-
-    @property
-    def undistorted(self) -> bool:
-        """Return whether the poses are of undistorted images."""
-        return self.poses == self.opensfm / UNDISTORTED
+    undistorted: bool
 
 
-def find_project(folder: Path) -> Project | None:
-    """Return the project in a folder, of OpenDroneMap or of OpenSfM; None where there is no reconstruction."""
+def find_project(folder: Path, wanted: int | None = None) -> Project | None:
+    """Return the project in a folder, of OpenDroneMap or of OpenSfM; None where there is no reconstruction.
+
+    Of several bundles that is taken whose number is `wanted`, else the first.
+    """
     for opensfm in (folder / "opensfm", folder):
-        for poses in (opensfm / UNDISTORTED, opensfm / DISTORTED):
-            if poses.is_file():
-                return Project(folder, opensfm, poses)
+        for name in (UNDISTORTED, DISTORTED, *NVM):
+            if (opensfm / name).is_file():
+                return Project(folder, opensfm, opensfm / name, name != DISTORTED)
+        if bundles := find_bundles(opensfm):
+            poses = bundles[min(wanted or 0, len(bundles) - 1)]
+            return Project(folder, opensfm, poses, _of_undistorted(poses, opensfm))
     return None
+
+
+def find_bundles(opensfm: Path) -> list[Path]:
+    """Return the bundles of a folder of OpenSfM, one a reconstruction, in their order."""
+    found = (sorted(opensfm.glob(pattern)) for pattern in BUNDLES)
+    return next((paths for paths in found if paths), [])
+
+
+def _of_undistorted(bundle: Path, opensfm: Path) -> bool:
+    """Return whether a bundle is of undistorted images: it may be of either, and says so by what distorts alone."""
+    try:
+        return (opensfm / "undistorted").is_dir() and not bundle_distorts(bundle)
+    except DataError:  # raised where the poses are read
+        return False
+
+
+def photographs_of(project: Project) -> list[Path]:
+    """Return the folders in which the photographs of a project are sought."""
+    return [project.folder / "images", project.opensfm / "images"]
 
 
 # --- depth ----------------------------------------------------------------------------------------------------------
@@ -186,7 +215,10 @@ class Odm(FileDataset[OdmOptions]):
     """
 
     Options: type[BaseModel] = OdmOptions
-    contents = f"opensfm/{UNDISTORTED} or opensfm/{DISTORTED}, which is there once a project is reconstructed"
+    contents = (
+        f"opensfm/{UNDISTORTED} or opensfm/{DISTORTED}, which is there once a project is reconstructed, or its export"
+        " reconstruction.nvm or bundle_r000.out"
+    )
 
     def __init__(self, options: OdmOptions) -> None:
         self._depth = Template("depth", options.depth, ("name",), ("name",))
@@ -254,9 +286,9 @@ class Odm(FileDataset[OdmOptions]):
     def _placement(self, folder: Path) -> Placement | None:
         if folder not in self._placements:
             project = self._project(folder)
-            shots = {bare_name(shot.name): shot.pose for shot in self._shots(project.poses)}
-            names = {bare_name(shot.name): shot.name for shot in self._shots(project.poses)}
-            photographs, contents = [folder / "images", project.opensfm / "images"], Folders()
+            shots = {bare_name(shot.name): shot.pose for shot in self._shots_of(project)}
+            names = {bare_name(shot.name): shot.name for shot in self._shots_of(project)}
+            photographs, contents = photographs_of(project), Folders()
             if self.options.images is not None:
                 photographs.append(self.options.images)
 
@@ -267,9 +299,14 @@ class Odm(FileDataset[OdmOptions]):
         return self._placements[folder]
 
     def frames(self, folder: Path) -> list[FrameSource]:
-        """Return a frame for each shot, in natural order of names. Raises what `read_reconstruction` raises."""
+        """Return a frame for each shot, in natural order of names.
+
+        Raises:
+            DataError: For a damaged file of poses, several reconstructions where none is wanted, or no image where its
+                size is needed.
+        """
         project = self._project(folder)
-        shots, contents, where = self._shots(project.poses), Folders(), str(project.poses)
+        shots, contents, where = self._shots_of(project), Folders(), str(project.poses)
         if project.undistorted and (shot := next((shot for shot in shots if shot.lens is not None), None)) is not None:
             raise DataError(
                 f"{where}: the camera of {shot.name[:80]} distorts, but these should be undistorted images; run ODM"
@@ -279,9 +316,7 @@ class Odm(FileDataset[OdmOptions]):
         by_shot = {shot.name: name for shot, name in zip(shots, names, strict=True)}
         depth = depth_files(project, self.settled(folder).depth_from, by_shot, self._depth)
         lenses = self._label_lenses(project, dict(zip(names, shots, strict=True)))
-        photographs = [project.folder / "images", project.opensfm / "images"]
-        images = [project.opensfm / "undistorted/images"] if project.undistorted else photographs
-        images = images if self.options.images is None else [self.options.images]
+        photographs, images = photographs_of(project), self._images(project)
         frames = []
         for shot, name in zip(shots, names, strict=True):
             color = find_image(images, shot.name, contents, where) or inside(images[0], images[0], shot.name, where)
@@ -301,7 +336,7 @@ class Odm(FileDataset[OdmOptions]):
             return {}
         if project.undistorted:
             path = project.opensfm / DISTORTED
-            originals = self._shots(path) if path.is_file() else []
+            originals = self._reconstruction(path) if path.is_file() else []
             there = dict(zip(frame_names(shot.name for shot in originals), originals, strict=True))
             if lost := next((name for name in shots if name not in there), None):
                 raise DataError(
@@ -310,12 +345,51 @@ class Odm(FileDataset[OdmOptions]):
             shots = there
         return {name: shot.lens for name, shot in shots.items()}
 
-    def _shots(self, path: Path) -> list[Shot]:
+    def _images(self, project: Project) -> list[Path]:
+        """Return the folders in which the posed images of a project are sought."""
+        if self.options.images is not None:
+            return [self.options.images]
+        undistorted = [project.opensfm / "undistorted/images", project.opensfm / "undistorted"]
+        return undistorted if project.undistorted else photographs_of(project)
+
+    def _shots_of(self, project: Project) -> list[Shot]:
+        if project.poses.suffix == ".json":
+            return self._reconstruction(project.poses)
+        if project.poses not in self._read:
+            self._read[project.poses] = self._exported(project)
+        return self._read[project.poses]
+
+    def _reconstruction(self, path: Path) -> list[Shot]:
         if path not in self._read:
             self._read[path] = read_reconstruction(path, self.options.reconstruction)
         return self._read[path]
 
+    def _exported(self, project: Project) -> list[Shot]:
+        """Read a project's reconstruction.nvm or bundle, and the sizes of its images."""
+        path, wanted, images, contents = project.poses, self.options.reconstruction, self._images(project), Folders()
+        bundles = find_bundles(project.opensfm) if path.suffix == ".out" else []
+        if len(bundles) > 1 and wanted is None:
+            raise DataError(
+                f"{path}: one of {len(bundles)} reconstructions, which share no coordinates; choose one with"
+                " reconstruction: NUMBER"
+            )
+        if (wanted or 0) >= max(len(bundles), 1):
+            raise DataError(
+                f"{path}: there is no reconstruction {wanted}; it has {max(len(bundles), 1)}, counted from 0"
+            )
+
+        def size_of(name: str) -> tuple[int, int]:
+            image = find_image(images, name, contents, str(path))
+            if image is None:
+                raise DataError(
+                    f"{path}: the image {name[:80]!r}, whose size the file does not say, is not in {images[0]}; set"
+                    " images: FOLDER"
+                )
+            return color_size(image)
+
+        return (read_bundle if bundles else read_nvm)(path, size_of)
+
     def _project(self, folder: Path) -> Project:
-        project = find_project(folder)
+        project = find_project(folder, self.options.reconstruction)
         assert project is not None
         return project

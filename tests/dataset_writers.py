@@ -305,6 +305,45 @@ def write_odm(folder: Path, frames: Sequence[Frame]) -> list[str]:
     return names
 
 
+def write_exported(folder: Path, frames: Sequence[Frame], kind: str) -> list[str]:
+    """The same with the export of OpenSfM in place of its reconstruction: 'nvm' or 'bundle'."""
+    names = write_odm(folder, frames)
+    (folder / "opensfm/undistorted/reconstruction.json").unlink()
+    poses = {f"{name}.JPG.tif": np.linalg.inv(frame.T_wc) for name, frame in zip(names, frames, strict=True)}
+    write = {"nvm": write_nvm, "bundle": write_bundle}[kind]
+    write(folder / "opensfm", poses, frames[0].intrinsics.fx)
+    return names
+
+
+def write_nvm(opensfm: Path, poses: dict[str, np.ndarray], focal: float) -> Path:
+    """What export_visualsfm writes of world-to-camera poses, with one point."""
+    lines = ["NVM_V3", "", len(poses)]
+    for name, T in poses.items():
+        x, y, z, w = quaternion(T[:3, :3])
+        lines.append(f"images/{name} {numbers([focal, w, x, y, z, *(-T[:3, :3].T @ T[:3, 3])])} 0 0")
+    return write_lines(
+        opensfm / "undistorted/reconstruction.nvm", [*lines, "", 1, "1.5 2.5 3.5 9 8 7 2 0 3 1 1 1 4 2 2"]
+    )
+
+
+def write_bundle(
+    opensfm: Path,
+    poses: dict[str, np.ndarray],
+    focal: float,
+    radial=(0.0, 0.0),
+    number: int = 0,
+    lost: str = "lost.JPG",
+) -> Path:
+    """What export_bundler writes, with an image that was not reconstructed, and one point."""
+    lines = ["# Bundle file v0.3", f"{len(poses) + 1} 1"]
+    for T in poses.values():
+        flipped = np.diag([1.0, -1.0, -1.0]) @ T[:3]
+        lines += [numbers([focal, *radial]), *matrix_text(flipped[:, :3]), numbers(flipped[:, 3])]
+    lines += ["0 0 0"] * 5 + ["1.5 2.5 3.5", "9 8 7", "1 0 3 4.5 -5.5"]
+    write_lines(opensfm / f"bundler/list_r{number:03d}.out", [*poses, lost])
+    return write_lines(opensfm / f"bundler/bundle_r{number:03d}.out", lines)
+
+
 def write_photographs(folder: Path, frames: Sequence[Frame]) -> list[str]:
     """The images and depth files of photographs, in images/ and depth/."""
     names = [f"DJI_{k:04d}" for k in range(len(frames))]
@@ -535,12 +574,16 @@ Writer = Callable[[Path, Sequence[Frame]], list[str]]
 
 @dataclasses.dataclass(frozen=True)
 class Format:
-    """A dataset: its name, its writer, the depth scale that it stores (None: floats), and options that it needs."""
+    """A dataset: its name, its writer, the depth scale that it stores (None: floats), and options that it needs.
+
+    `sizes_in_images`: the size of an image stands in no other file.
+    """
 
     dataset: str
     write: Writer
     scale: float | None
     options: dict[str, object] = dataclasses.field(default_factory=dict)
+    sizes_in_images: bool = False
 
 
 def camera_option() -> list[float]:
@@ -562,6 +605,8 @@ FORMATS = {
     "colmap, text": Format("colmap", write_colmap, None),
     "colmap, binary": Format("colmap", functools.partial(write_colmap, binary=True, model="sparse/0"), None),
     "odm": Format("odm", write_odm, None),
+    "odm, NVM": Format("odm", functools.partial(write_exported, kind="nvm"), None, sizes_in_images=True),
+    "odm, Bundler": Format("odm", functools.partial(write_exported, kind="bundle"), None, sizes_in_images=True),
     "metashape": Format("metashape", write_metashape, None),
     "pix4d": Format("pix4d", write_pix4d, None),
     "realitycapture": Format("realitycapture", write_realitycapture, None, {"image_size": (W, H)}),

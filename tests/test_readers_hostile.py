@@ -35,7 +35,7 @@ def written(request, tmp_path):
 
 def text_files(folder: Path) -> list[Path]:
     """What a reader parses beside images: text, JSON, COLMAP's binary files."""
-    suffixes = (".txt", ".json", ".bin")
+    suffixes = (".txt", ".json", ".bin", ".nvm", ".out")
     return sorted(path for path in folder.rglob("*") if path.suffix in suffixes and "depth_maps" not in path.parts)
 
 

@@ -12,7 +12,7 @@ import zipfile
 from array import array
 from collections.abc import Container, Iterator, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 import numpy.typing as npt
@@ -292,6 +292,12 @@ def records(path: Path) -> Iterator[tuple[int, str]]:
         text = line.strip()
         if text and not text.startswith("#"):
             yield number, text
+
+
+def numbered_lines(file: BinaryIO) -> Iterator[tuple[int, str]]:
+    """Yield the number, from 1, and stripped text of every line, each read when it is wanted: files may be large."""
+    for number, line in enumerate(file, start=1):
+        yield number, line.decode("utf-8", errors="replace").strip()
 
 
 def read_table(path: Path, columns: int, what: str) -> Float64:
