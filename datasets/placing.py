@@ -209,7 +209,7 @@ def _matrix_of(rows: Any, path: Path) -> Float64:
     """
     try:
         T = np.array([[float(value) for value in row] for row in rows])
-    except (TypeError, ValueError) as error:
+    except (TypeError, ValueError, OverflowError) as error:
         raise DataError(f"{path}: expected four rows of four numbers; write it again, or delete it") from error
     if T.shape != (4, 4) or not np.isfinite(T).all() or T[3].tolist() != [0, 0, 0, 1]:
         raise DataError(f"{path}: expected four rows of four numbers, 0 0 0 1 the last; write it again, or delete it")

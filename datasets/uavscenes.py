@@ -160,7 +160,7 @@ def _shot(camera: Any, where: str) -> Shot:
 def _matrix(camera: Mapping[str, Any], key: str, size: int, where: str) -> Any:
     try:
         matrix = np.array(camera.get(key), dtype=np.float64)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         matrix = np.zeros(0)
     if matrix.shape != (size, size) or not np.isfinite(matrix).all():
         raise DataError(f"{where}: {key} is no {size}x{size} matrix; download the file again")

@@ -100,6 +100,7 @@ def test_without_the_map_a_surface_is_asked_for(tmp_path) -> None:
 
 @pytest.mark.parametrize(("change", "line"), [
     (lambda c: c[0].pop("T4x4"), "camera 0: T4x4 is no 4x4 matrix"),
+    (lambda c: c[0]["T4x4"][0].__setitem__(0, 10**400), "camera 0: T4x4 is no 4x4 matrix"),
     (lambda c: c[1].update(P3x3=[[1, 2], [3, 4]]), "camera 1: P3x3 is no 3x3 matrix"),
     (lambda c: c[0]["P3x3"][0].__setitem__(1, 4.0), "camera 0: P3x3 is no matrix of a camera without skew"),
     (lambda c: c[0].update(K1="x"), "camera 0: K1 is no number"),
