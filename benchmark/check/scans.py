@@ -1,8 +1,7 @@
 """The check of a scene of scans: whether they lie on each other by their poses, and how else they would.
 
 A point of one scan is carried by the poses into the axes of another, where its nearest point is sought; the distance,
-divided by the point's distance from the middle of its scan, is its error. Each other reading of the poses is assessed
-in the same way.
+divided by the point's range, is its error. Each other reading of the poses is assessed in the same way.
 """
 
 from __future__ import annotations
@@ -54,8 +53,11 @@ WON = 0.8
 ALIKE = 1.1
 """Readings whose errors differ by no more cannot be told apart."""
 
+APART = 4.0
+"""They lie so many times as far from each other as the points of one scan do, at least: sparse scans err more."""
+
 LEAST_RANGE = 0.1
-"""Metres; a point in the very middle of its scan has no range."""
+"""Metres; a point may be at the sensor itself."""
 
 FAR = 20_000.0
 """Metres beyond which no scanner sees half of its points."""
@@ -186,7 +188,7 @@ class Met:
 
     Attributes:
         distance: (n,) metres to the nearest point there.
-        range: (n,) of each point from the middle of its scan, near which the sensor is, if points are in its axes.
+        range: (n,) of each point from its own sensor.
         nearest: (n,) its row there.
     """
 
@@ -250,7 +252,7 @@ class ScanSample:
         rows = self._queries(pair[0])
         points = _points(a)[rows]
         distance, nearest = self._tree(pair[1]).query(points @ R.T + t)
-        return Met(distance, np.linalg.norm(points - np.median(points, axis=0), axis=1), nearest)
+        return Met(distance, np.linalg.norm(points, axis=1), nearest)
 
     @cached_property
     def spacing(self) -> float:
@@ -345,7 +347,8 @@ def assess_scans(sample: ScanSample) -> Verdict:
             f" away, and {fits[best.name].error:.2%} with {best.name}; {advice}"
         )
         return Verdict("unsound", text, () if mend is None else (mend,), **about)
-    if configured.error > HOPELESS:
+    between = float(np.median(np.concatenate([sample.met(pair).distance for pair in pairs])))
+    if configured.error > HOPELESS and between > APART * sample.spacing:
         text = (
             f"scans do not lie on each other: the nearest point of another scan is {configured.error:.1%} of the range"
             " away, with every reading of the poses; check the order of poses and scans"
