@@ -67,22 +67,26 @@ KITTI_IDS = np.array([40, 48, 50, 70, 10, 252], np.uint32)
 """The stored id of each wall; the last one is a moving car."""
 
 
-def write_semantickitti(folder: Path, wanted: Sequence[Scan]) -> list[str]:
+def write_semantickitti(
+    folder: Path, wanted: Sequence[Scan], ids: np.ndarray = KITTI_IDS, to_camera: np.ndarray = TR
+) -> list[str]:
     """Points with remission, true labels with an instance in the upper half, and poses of camera 0."""
     names = [f"{k:06d}" for k in range(len(wanted))]
     for name, scan in zip(names, wanted, strict=True):
         rows = np.column_stack([scan.points, np.full(len(scan.points), 0.5, np.float32)])
         save_bytes(folder / f"velodyne/{name}.bin", rows.astype("<f4").tobytes())
-        save_bytes(folder / f"labels/{name}.label", (KITTI_IDS[scan.walls] | 7 << 16).astype("<u4").tobytes())
-    poses = [TR @ scan.T @ np.linalg.inv(TR) for scan in wanted]
+        save_bytes(folder / f"labels/{name}.label", (ids[scan.walls] | 7 << 16).astype("<u4").tobytes())
+    poses = [to_camera @ scan.T @ np.linalg.inv(to_camera) for scan in wanted]
     write_lines(folder / "poses.txt", [numbers(T[:3]) for T in poses])
-    write_lines(folder / "calib.txt", [f"P0: {numbers(np.eye(4)[:3])}", f"Tr: {numbers(TR[:3])}"])
+    write_lines(folder / "calib.txt", [f"P0: {numbers(np.eye(4)[:3])}", f"Tr: {numbers(to_camera[:3])}"])
     write_lines(folder / "times.txt", [numbers(0.1 * k) for k in range(len(wanted))])
     return names
 
 
-def predict_semantickitti(folder: Path, name: str, walls: np.ndarray, model: str = "net") -> None:
-    save_bytes(folder / f"predictions/{model}/{name}.label", KITTI_IDS[walls].astype("<u4").tobytes())
+def predict_semantickitti(
+    folder: Path, name: str, walls: np.ndarray, model: str = "net", ids: np.ndarray = KITTI_IDS
+) -> None:
+    save_bytes(folder / f"predictions/{model}/{name}.label", ids[walls].astype("<u4").tobytes())
 
 
 # --- nuScenes

@@ -21,8 +21,8 @@ from typer.testing import CliRunner
 import semstab
 from semstab.check import check, check_scene, quick_check
 from semstab.check.coverage import SIZES, plane_residuals
+from semstab.check.histogram import Tally
 from semstab.check.reprojection import View
-from semstab.check.scene_check import Tally
 from semstab.cli import app
 from semstab.data.frames import Frame
 from semstab.data.labels import LabelSpace

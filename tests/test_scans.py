@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 from command_line import bench
-from scan_writer import IDS, Street, write_semantickitti
+from street import IDS, Street, write_street
 
 import semstab
 from semstab.check import check
@@ -97,7 +97,7 @@ def street():
 @pytest.fixture(scope="module")
 def folder(street, tmp_path_factory):
     root = tmp_path_factory.mktemp("street")
-    write_semantickitti(root / "00", street)
+    write_street(root / "00", street)
     return root
 
 
@@ -149,7 +149,7 @@ def test_points_in_the_world_are_told_from_those_in_the_axes_of_the_sensor(stree
     offset = np.array([448262.0, 5411932.0, 300.0])
     for folder in ("points", "pose", "labels/net"):
         (tmp_path / folder).mkdir(parents=True)
-    for k, (points, ids, pose) in enumerate(zip(street.scans, street.ids, street.poses, strict=True)):
+    for k, (points, ids, pose) in enumerate(street):
         moved = pose.copy()
         moved[:3, 3] += offset
         world = points @ moved[:3, :3].T.astype(np.float64) + moved[:3, 3]
@@ -164,6 +164,15 @@ def test_points_in_the_world_are_told_from_those_in_the_axes_of_the_sensor(stree
         else:
             assert checked.verdict.state == "unsound"
             assert f"set coordinates: {coordinates}" in checked.verdict.text
+
+
+def test_scans_without_points_are_passed_over(street, tmp_path):
+    """Two of ten hold a point at the sensor alone: the others tell that the poses are right."""
+    lost = Street([own[:1] * 0 if k in (0, 4) else own for k, own in enumerate(street.scans)],
+                  [own[:1] if k in (0, 4) else own for k, own in enumerate(street.ids)], street.poses)  # fmt: skip
+    write_street(tmp_path / "00", lost)
+    (checked,) = check(load_config({"dataset": {"name": "semantickitti", "options": {"root": str(tmp_path)}}}))
+    assert checked.verdict.state == "sound"
 
 
 def test_a_run_refuses_poses_that_check_calls_unsound(folder, tmp_path):
@@ -223,7 +232,7 @@ def test_relabelled_scans_are_label_files_that_are_read_again(run, folder, tmp_p
 
 def test_moving_points_are_left_out_of_all_models_by_default(street, tmp_path):
     moving = street.with_ids(lambda ids, k: np.where(ids == 10, 252, ids))
-    write_semantickitti(tmp_path / "00", moving)
+    write_street(tmp_path / "00", moving)
     kept, left = (
         open_dataset("semantickitti", {"root": tmp_path, "moving": how}).scene("00").frame(0, "clean")
         for how in ("keep", "leave_out")
@@ -235,7 +244,7 @@ def test_moving_points_are_left_out_of_all_models_by_default(street, tmp_path):
 def test_scans_of_a_program_are_fused_as_images_are(street):
     frames = [
         {"points": points, "labels": np.searchsorted(IDS, ids).astype(np.uint8), "T_wc": pose}
-        for points, ids, pose in zip(street.scans, street.ids, street.poses, strict=True)
+        for points, ids, pose in street
     ]
     result = semstab.fuse(frames, voxel_size=0.5)
     assert result.summary.alpha > 0.9

@@ -274,10 +274,9 @@ def find_words(
                 if columns.shape[0]:
                     _keep_columns(own, columns, corner)
                 n = _enter_runs(own, run_word, run_end, table, table_count, own_word, own_count, n)
-        n = _flush(table, table_count, own_word, own_count, n)
-        entries[band] = _describe(
-            own_word, own_count, n, corner, partition[band * room : (band + 1) * room], spread[band], low[band],
-            high[band],
+        entries[band] = _finish(
+            table, table_count, own_word, own_count, n, corner, partition[band * room : (band + 1) * room],
+            spread[band], low[band], high[band],
         )  # fmt: skip
 
 
@@ -308,11 +307,17 @@ def find_words_of_points(
             if columns.shape[0]:
                 _keep_columns(own, columns, corner)
             n = _enter_runs(own, run_word, run_end, table, table_count, own_word, own_count, n)
-        n = _flush(table, table_count, own_word, own_count, n)
-        entries[band] = _describe(
-            own_word, own_count, n, corner, partition[band * room : (band + 1) * room], spread[band], low[band],
-            high[band],
+        entries[band] = _finish(
+            table, table_count, own_word, own_count, n, corner, partition[band * room : (band + 1) * room],
+            spread[band], low[band], high[band],
         )  # fmt: skip
+
+
+@serial
+def _finish(table, table_count, word, count, n, corner, partition, spread, low, high):
+    """Empty the table into a band's entries, of which there are n; return how many are left, see `_describe`."""
+    n = _flush(table, table_count, word, count, n)
+    return _describe(word, count, n, corner, partition, spread, low, high)
 
 
 @serial

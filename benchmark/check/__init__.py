@@ -5,15 +5,14 @@ from semstab.check.no_depth import with_invalid_depth
 from semstab.check.scene_check import (
     SCHEMA,
     SceneCheck,
-    advise,
     check,
     check_scene,
     quick_check,
     quick_sample,
     refuse_unsound,
     require_sound,
-    with_voxel_size,
 )
+from semstab.check.voxel_size import advise, with_voxel_size
 
 __all__ = [
     "SCHEMA",

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, cast
 
@@ -11,10 +11,12 @@ import numpy as np
 import numpy.typing as npt
 
 from semstab.check.conventions import Convention
+from semstab.core.prefetch import prefetch
 from semstab.core.types import Float32, Float64, Int64, Mask
 from semstab.data.frames import Frame, Intrinsics
 from semstab.datasets import GROUND_TRUTH, Scene
 from semstab.datasets.geometry.cameras import CAMERA_AXES, ray_lengths
+from semstab.errors import DataError
 
 # The frames and pixels that a check holds in memory: their number is bounded at any length and image size.
 
@@ -112,6 +114,28 @@ def reader(scene: Scene, model: str | None, *, color: bool = False) -> Callable[
     if model is None:
         return lambda index: scene.geometry(index, color=color)
     return lambda index: scene.frame(index, model, color=color)
+
+
+def frames_at(
+    positions: Iterable[int], indices: Sequence[int], read: Callable[[int], Frame], *, passing_over: bool = False
+) -> Iterator[tuple[int, Frame]]:
+    """Yield frames of a sequence with their positions in `indices`, ascending, read ahead by threads.
+
+    Those that cannot be read raise what `read` does, or are passed over.
+    """
+
+    def attempt(index: int) -> Frame | None:
+        try:
+            return read(index)
+        except DataError:
+            if not passing_over:
+                raise
+            return None
+
+    ordered = sorted(positions)
+    for position, fetched in zip(ordered, prefetch(attempt, [indices[p] for p in ordered]), strict=True):
+        if fetched.item is not None:
+            yield position, fetched.item
 
 
 @dataclass(frozen=True, eq=False)

@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 
 from semstab.backends import create
+from semstab.backends.shared.association import in_world
 from semstab.check.conventions import Convention
 from semstab.check.coverage import (
     BINS,
@@ -30,10 +31,9 @@ from semstab.check.coverage import (
     suggested_size,
 )
 from semstab.check.geometry import Fit, Verdict
-from semstab.check.reprojection import clusters, motion, pairs_within, reader
+from semstab.check.reprojection import Pair, clusters, frames_at, motion, pairs_within, reader
 from semstab.core.arrays import evenly
-from semstab.core.prefetch import prefetch
-from semstab.core.types import Float64, Int64, Mask
+from semstab.core.types import Float32, Float64, Int64, Mask
 from semstab.data.frames import Frame
 from semstab.datasets import Scene
 from semstab.errors import DataError
@@ -75,12 +75,21 @@ class PoseReading:
         of: From a pose (4, 4) as it is read now to the pose as it would be.
         mends: The options that mend it, by the option's name and value now; '' for those of any reader.
         otherwise: What to do where the reader has no such option.
+        applies: Whether it may be the right one for scans at these poses, by the middles (n, 3) of their points and the
+            positions (n, 3) of their sensors; any poses that are wrong look better where nothing moves.
     """
 
     name: str
     of: Callable[[Float64], Float64]
     mends: Mapping[tuple[str, str], str]
     otherwise: str
+    applies: Callable[[Float64, Float64], bool] = lambda middle, sensor: True
+
+
+def _nearer_to_their_sensors(middle: Float64, sensor: Float64) -> bool:
+    """Return whether points lie around the positions of their sensors, and not around the origin."""
+    from_sensor, from_origin = (np.linalg.norm(middle - at, axis=1) for at in (sensor, np.zeros(3)))
+    return bool(np.median(from_sensor) < np.median(from_origin))
 
 
 def _inverse(T: Float64) -> Float64:
@@ -165,6 +174,7 @@ READINGS = (
         lambda T: np.eye(len(T)),
         {("coordinates", "sensor"): "coordinates: world"},
         "carry the points into the axes of the sensor",
+        _nearer_to_their_sensors,
     ),
     PoseReading(
         "points that are in the sensor's axes already",
@@ -226,89 +236,102 @@ class ScanSample:
     ) -> None:
         self.scene, self.fused = scene, evenly(len(indices), fused)
         compared = {position for group in groups for position in group}
-        self.scans: dict[int, Frame] = {}
-        read = reader(scene, source)
+        positions = compared | set(self.fused)
+        read = frames_at(positions, indices, reader(scene, source), passing_over=passing_over)
+        self.scans: dict[int, Frame] = dict(read)
+        clouds = {position: _Cloud(self.scans[position]) for position in compared & self.scans.keys()}
+        self._clouds = {position: cloud for position, cloud in clouds.items() if len(cloud.rows)}
+        self.pairs = [pair for pair in pairs_within(groups) if pair[0] < pair[1] and {*pair} <= self._clouds.keys()]
 
-        def attempt(index: int) -> Frame | None:
-            try:
-                return read(index)
-            except DataError:
-                if not passing_over:
-                    raise
-                return None
+    @cached_property
+    def met(self) -> dict[Pair, Met]:
+        """Points of each pair's first scan in its second one, under the configured reading."""
+        return {pair: self.met_under(pair, lambda T: T) for pair in self.pairs}
 
-        positions = sorted(compared | set(self.fused))
-        for position, fetched in zip(positions, prefetch(attempt, [indices[p] for p in positions]), strict=True):
-            if fetched.item is not None:
-                self.scans[position] = fetched.item
-        self.pairs = [pair for pair in pairs_within(groups) if pair[0] < pair[1] and {*pair} <= self.scans.keys()]
-        self._trees: dict[int, Any] = {}
-
-    def met(self, pair: tuple[int, int], of: Callable[[Float64], Float64] | None = None) -> Met:
-        """Seek points of the pair's first scan in its second one, under the configured reading or another."""
-        a, b = self.scans[pair[0]], self.scans[pair[1]]
-        poses = [scan.T_wc if of is None else of(scan.T_wc) for scan in (a, b)]
-        R, t = motion(*poses)
-        rows = self._queries(pair[0])
-        points = _points(a)[rows]
-        distance, nearest = self._tree(pair[1]).query(points @ R.T + t)
+    def met_under(self, pair: Pair, of: Callable[[Float64], Float64]) -> Met:
+        """Seek points of the pair's first scan in its second one, under another reading of the poses."""
+        R, t = motion(*(of(self.scans[position].T_wc) for position in pair))
+        points = self._clouds[pair[0]].sought
+        distance, nearest = self._clouds[pair[1]].tree.query(points @ R.T + t)
         return Met(distance, np.linalg.norm(points, axis=1), nearest)
+
+    @property
+    def ranges(self) -> list[Float32]:
+        """Return for each scan the ranges (n,) of its points that have one, metres."""
+        return [scan.depth[(scan.depth > 0) & (scan.depth < np.inf)] for scan in self.scans.values()]
+
+    @property
+    def places(self) -> tuple[Float64, Float64]:
+        """Return the middles (n, 3) of the points of scans that are compared, and the positions (n, 3) of the poses."""
+        middle = [np.median(cloud.points, axis=0) for cloud in self._clouds.values()]
+        return np.array(middle), np.array([self.scans[position].T_wc[:3, 3] for position in self._clouds])
+
+    @property
+    def between(self) -> float:
+        """Median distance of a point from the nearest of another scan, metres."""
+        return float(np.median(np.concatenate([met.distance for met in self.met.values()])))
 
     @cached_property
     def spacing(self) -> float:
         """Median distance of a point from the nearest of its own scan, metres."""
-        own = []
-        for position in {pair[0] for pair in self.pairs}:
-            distance, _ = self._tree(position).query(_points(self.scans[position])[self._queries(position)], k=2)
-            own.append(distance[:, 1])
+        clouds = [self._clouds[position] for position in {pair[0] for pair in self.pairs}]
+        own = [cloud.tree.query(cloud.sought, k=2)[0][:, 1] for cloud in clouds]
         return float(np.median(np.concatenate(own))) if own else math.nan
 
-    def agree(self, pair: tuple[int, int], met: Met) -> Mask:
+    def agree(self, pair: Pair) -> Mask:
         """Return whether labels agree, of the points met that have one in both scans."""
         a, b = self.scans[pair[0]], self.scans[pair[1]]
-        first = a.predicted.reshape(-1)[_rows(a)][self._queries(pair[0])]
-        second = b.predicted.reshape(-1)[_rows(b)][met.nearest]
+        here, there, met = self._clouds[pair[0]], self._clouds[pair[1]], self.met[pair]
+        first = a.predicted.reshape(-1)[here.rows][here.chosen]
+        second = b.predicted.reshape(-1)[there.rows][met.nearest]
         known = (met.error <= CONSISTENT) & (first != a.ignore_id) & (second != b.ignore_id)
         agree: Mask = (first == second)[known]
         return agree
 
     def stays(self, voxel_size: float) -> float:
         """Return the share of the points met that lie in the same voxel as the nearest of the other scan."""
-        same = []
-        for pair in self.pairs:
-            met = self.met(pair)
-            first, second = (
-                _in_world(self.scans[p], rows)
-                for p, rows in ((pair[0], self._queries(pair[0])), (pair[1], met.nearest))
-            )
+        first, second = self._in_world
+        same = np.all(np.floor(first / voxel_size) == np.floor(second / voxel_size), axis=1)
+        return float(same.mean()) if len(same) else math.nan
+
+    @cached_property
+    def _in_world(self) -> tuple[Float64, Float64]:
+        """Return (n, 3) the points met of all pairs, and the nearest ones of the other scans, in the world."""
+        first, second = [np.zeros((0, 3))], [np.zeros((0, 3))]
+        for pair, met in self.met.items():
+            (here, T), (there, T_other) = ((self._clouds[p], self.scans[p].T_wc) for p in pair)
             near = met.error <= CONSISTENT
-            same.append(np.all(np.floor(first / voxel_size) == np.floor(second / voxel_size), axis=1)[near])
-        return float(np.concatenate(same).mean()) if same and sum(map(len, same)) else math.nan
+            first.append(in_world(here.sought[near].T, T).T)
+            second.append(in_world(there.points[met.nearest[near]].T, T_other).T)
+        return np.concatenate(first), np.concatenate(second)
 
-    def _queries(self, position: int) -> Int64:
-        return np.array(evenly(len(_rows(self.scans[position])), QUERIES))
 
-    def _tree(self, position: int) -> Any:
+class _Cloud:
+    """The points of a scan that have a range, and those of them that are sought in others.
+
+    Attributes:
+        rows: (n,) rows of these points among all.
+        points: (n, 3) in the sensor's axes.
+        chosen: (m,) those that are sought, of the n.
+    """
+
+    def __init__(self, scan: Frame) -> None:
+        assert scan.points is not None
+        self.rows = np.flatnonzero((scan.depth > 0) & (scan.depth < np.inf))
+        self.points: Float64 = scan.points.reshape(-1, 3)[self.rows].astype(np.float64)
+        self.chosen = np.array(evenly(len(self.rows), QUERIES), dtype=np.int64)
+
+    @property
+    def sought(self) -> Float64:
+        """(m, 3) the points that are sought."""
+        return self.points[self.chosen]
+
+    @cached_property
+    def tree(self) -> Any:
+        """Return a search tree of the points."""
         from scipy.spatial import cKDTree
 
-        if position not in self._trees:
-            self._trees[position] = cKDTree(_points(self.scans[position]))
-        return self._trees[position]
-
-
-def _rows(scan: Frame) -> Int64:
-    return np.flatnonzero((scan.depth > 0) & (scan.depth < np.inf))
-
-
-def _points(scan: Frame) -> Float64:
-    """Return the points (n, 3) of a scan with a range, in its sensor's axes."""
-    assert scan.points is not None
-    points: Float64 = scan.points.reshape(-1, 3)[_rows(scan)].astype(np.float64)
-    return points
-
-
-def _in_world(scan: Frame, rows: Int64) -> Float64:
-    return _points(scan)[rows] @ scan.T_wc[:3, :3].T + scan.T_wc[:3, 3]
+        return cKDTree(self.points)
 
 
 def quick_sample_of_scans(scene: Scene, indices: Sequence[int]) -> ScanSample:
@@ -318,20 +341,22 @@ def quick_sample_of_scans(scene: Scene, indices: Sequence[int]) -> ScanSample:
 
 def assess_scans(sample: ScanSample) -> Verdict:
     """Return whether scans lie on each other, and the reading of the poses under which they would."""
-    pairs = sample.pairs
-    if not pairs or not all(len(_rows(scan)) for scan in sample.scans.values()):
+    pairs, ranges = sample.pairs, sample.ranges
+    if not pairs:
         return Verdict("unclear", "it takes two scans with points to tell whether poses are right")
-    if (away := float(np.median([np.median(scan.depth.ravel()[_rows(scan)]) for scan in sample.scans.values()]))) > FAR:
+    if (away := float(np.median(np.concatenate(ranges)))) > FAR:
         other = {"sensor": "world", "world": "sensor"}.get(sample.scene.settings.get("coordinates", ""))
         mend = None if other is None else f"coordinates: {other}"
         advice = "carry them into its axes" if mend is None else f"set {mend} (--option coordinates={other})"
         text = f"points lie {away / 1000:,.0f} km from their sensor, as in the axes of the world; {advice}"
         return Verdict("unsound", text, () if mend is None else (mend,))
-    errors = {"as configured": _errors(sample, None)} | {each.name: _errors(sample, each.of) for each in READINGS}
+    errors = {"as configured": [met.error for met in sample.met.values()]}
+    others = [each for each in READINGS if each.applies(*sample.places)]
+    errors |= {each.name: [sample.met_under(pair, each.of).error for pair in pairs] for each in others}
     fits = {name: _fit(own) for name, own in errors.items()}
     configured, now = fits["as configured"], np.array([np.median(own) for own in errors["as configured"]])
     wins = {name: float(np.mean([np.median(own) for own in errors[name]] < now)) for name in errors}
-    best = min(READINGS, key=lambda each: fits[each.name].error)
+    best = min(others, key=lambda each: fits[each.name].error)
     better = fits[best.name].error <= BETTER * configured.error and wins[best.name] >= WON
     shown = sorted(fits.items(), key=lambda item: (item[0] != "as configured", item[1].error))[:5]
     about: dict[str, Any] = {
@@ -347,21 +372,16 @@ def assess_scans(sample: ScanSample) -> Verdict:
             f" away, and {fits[best.name].error:.2%} with {best.name}; {advice}"
         )
         return Verdict("unsound", text, () if mend is None else (mend,), **about)
-    between = float(np.median(np.concatenate([sample.met(pair).distance for pair in pairs])))
-    if configured.error > HOPELESS and between > APART * sample.spacing:
+    if configured.error > HOPELESS and sample.between > APART * sample.spacing:
         text = (
             f"scans do not lie on each other: the nearest point of another scan is {configured.error:.1%} of the range"
             " away, with every reading of the poses; check the order of poses and scans"
         )
         return Verdict("unsound", text, **about)
-    open_ = tuple(each.name for each in READINGS if fits[each.name].error <= ALIKE * configured.error)
+    open_ = tuple(each.name for each in others if fits[each.name].error <= ALIKE * configured.error)
     text = f"scans lie on each other: the nearest point of another scan is {configured.error:.2%} of the range away"
     reason = "the sensor hardly moves" if open_ else ""
     return Verdict("sound", text, undetermined=open_, reason=reason, **about)
-
-
-def _errors(sample: ScanSample, of: Callable[[Float64], Float64] | None) -> list[Float64]:
-    return [sample.met(pair, of).error for pair in sample.pairs]
 
 
 def _fit(errors: Sequence[Float64]) -> Fit:
@@ -378,18 +398,14 @@ class ScanCoverage:
 
     sample: ScanSample
 
-    @cached_property
-    def _met(self) -> dict[tuple[int, int], Met]:
-        return {pair: self.sample.met(pair) for pair in self.sample.pairs}
-
     def overlaps(self) -> list[Overlap]:
         """Return one row a distance between scans."""
         rows = []
         for low, high in BINS:
-            pairs = [pair for pair in self._met if low <= pair[1] - pair[0] <= high]
+            pairs = [pair for pair in self.sample.pairs if low <= pair[1] - pair[0] <= high]
             if pairs:
-                error = np.concatenate([self._met[pair].error for pair in pairs])
-                agree = np.concatenate([self.sample.agree(pair, self._met[pair]) for pair in pairs])
+                error = np.concatenate([self.sample.met[pair].error for pair in pairs])
+                agree = np.concatenate([self.sample.agree(pair) for pair in pairs])
                 share = float(np.mean(error <= CONSISTENT))
                 agreement = float(agree.mean()) if len(agree) else math.nan
                 rows.append(Overlap((low, high), len(pairs), share, share, float(np.median(error)), agreement))
@@ -397,10 +413,9 @@ class ScanCoverage:
 
     def noise(self) -> Noise:
         """Return the distance of points from the nearest of another scan and of their own, and between rays."""
-        between = np.concatenate([met.distance for met in self._met.values()])
-        ranges = np.concatenate([met.range for met in self._met.values()])
+        ranges = np.concatenate([met.range for met in self.sample.met.values()])
         angle = float(np.median([scan.ray_angle for scan in self.sample.scans.values()]))
-        return Noise(float(np.median(between)), self.sample.spacing, angle * float(np.median(ranges)))
+        return Noise(self.sample.between, self.sample.spacing, angle * float(np.median(ranges)))
 
     def suggestion(self, overlaps: Sequence[Overlap], scans: int, stride: int) -> Suggestion:
         """Return voxel size and stride that suit so many scans, whose own stride is `stride`."""

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-import math
-from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -20,20 +18,19 @@ from semstab.check.coverage import (
     Noise,
     Overlap,
     Persistence,
-    Stays,
     Suggestion,
     fused_stride,
     persistence,
     suggest,
-    suggested_size,
 )
 from semstab.check.geometry import Verdict, assess, shifts_and_turns
+from semstab.check.histogram import Histogram, Tally
 from semstab.check.intrinsics import with_intrinsics
 from semstab.check.labels import LabelFindings, check_labels
 from semstab.check.no_depth import with_invalid_depth
 from semstab.check.precision import with_precision
 from semstab.check.registration import assess_surface, match_images, notes
-from semstab.check.reprojection import Sample, View, clusters, label_source, pairs_within, reader
+from semstab.check.reprojection import Sample, View, clusters, frames_at, label_source, pairs_within, reader
 from semstab.check.scans import ScanCoverage, ScanSample, assess_scans, quick_sample_of_scans
 from semstab.check.timing import with_lateness
 from semstab.config import Config
@@ -41,106 +38,10 @@ from semstab.core.arrays import evenly
 from semstab.core.json_form import to_json
 from semstab.core.prefetch import prefetch
 from semstab.data.frames import Frame
-from semstab.data.labels import IGNORE_8BIT, IGNORE_16BIT, LabelSpace
-from semstab.data.results import VoxelAdvice
+from semstab.data.labels import LabelSpace
 from semstab.datasets import Scene, open_dataset
 from semstab.errors import DataError
-from semstab.predict.dataset import NAME as PREDICTED
 from semstab.task import frame_indices, selected
-
-# The classes that a label source predicts, their frequencies, and the ids that no class has.
-
-MOST_IDS = 5
-
-
-@dataclass(frozen=True)
-class Histogram:
-    """The labels of a model in some frames.
-
-    Attributes:
-        space: Its taxonomy's name, or None where none is known.
-        pixels: Number of pixels that were counted.
-        classes: Share of them by class, in the taxonomy's order; by id where no taxonomy is known.
-        ignored: Share with the ignore id, or without usable scores.
-        unknown: Share by id that no class has.
-        problem: The fault, or None.
-    """
-
-    model: str
-    space: str | None
-    pixels: int
-    classes: Mapping[str, float]
-    ignored: float
-    unknown: Mapping[int, float]
-    problem: str | None
-
-
-class Tally:
-    """The labels of a model, counted frame by frame."""
-
-    def __init__(self, model: str) -> None:
-        self.model = model
-        self._ids: Counter[int] = Counter()
-        self._ignored = 0
-        self._widths: set[int] = set()
-
-    def add(self, frame: Frame) -> None:
-        """Count a frame's labels, or the classes of its largest scores."""
-        counts = np.bincount(frame.predicted.ravel())
-        by_class = {int(i): int(counts[i]) for i in np.flatnonzero(counts)}
-        self._ignored += by_class.pop(frame.ignore_id, 0)
-        self._ids.update(by_class)
-        if frame.scores is not None:
-            self._widths.add(frame.scores.shape[2])
-
-    def histogram(self, space: LabelSpace | None, missing: str | None = None) -> Histogram:
-        """Return the shares, with their fault if there is one; `missing` says why there is no taxonomy."""
-        ids = self._named(space)
-        total = max(1, self._ignored + ids.total())
-        if space is None:
-            classes, unknown = {str(i): n / total for i, n in sorted(ids.items())}, {}
-        else:
-            classes = {name: ids[i] / total for name, i in zip(space.classes, space.ids, strict=True)}
-            unknown = {i: n / total for i, n in sorted(ids.items()) if i not in space.ids}
-        return Histogram(
-            model=self.model,
-            space=None if space is None else space.name,
-            pixels=self._ignored + ids.total(),
-            classes=classes,
-            ignored=self._ignored / total,
-            unknown=unknown,
-            problem=missing or self._problem(space, unknown, ids.total()),
-        )
-
-    def _named(self, space: LabelSpace | None) -> Counter[int]:
-        """Return the counts by the taxonomy's ids: scores count in its order, and 255 of 16 bits may mean 'ignore'."""
-        if space is None:
-            return self._ids
-        if self._widths:
-            rows = dict(enumerate(space.ids))
-            return Counter({rows.get(row, IGNORE_16BIT + row): n for row, n in self._ids.items()})
-        if max(space.ids) < IGNORE_8BIT and IGNORE_8BIT in self._ids:
-            self._ignored += self._ids.pop(IGNORE_8BIT)
-        return self._ids
-
-    def _problem(self, space: LabelSpace | None, unknown: Mapping[int, float], labelled: int) -> str | None:
-        if space is not None and self._widths - {len(space)}:
-            widths = ", ".join(map(str, sorted(self._widths)))
-            return f"scores of {self.model} hold {widths} classes, but {space.name} has {len(space)}"
-        if space is not None and unknown:
-            listed = ", ".join(map(str, list(unknown)[:MOST_IDS])) + (", ..." if len(unknown) > MOST_IDS else "")
-            return (
-                f"labels of {self.model}: id {listed} ({sum(unknown.values()):.2%} of the pixels) is outside the"
-                f" taxonomy {space.name} (ids {min(space.ids)} to {max(space.ids)})"
-            ) + _counted_from_one(space, self._ids)
-        return None if labelled else f"labels of {self.model}: no pixel has a label"
-
-
-def _counted_from_one(space: LabelSpace, ids: Counter[int]) -> str:
-    """Return what explains ids outside of a taxonomy, where they may count from 1 instead of 0."""
-    told = min(space.ids) == 0 and space.ids[0] not in ids and max(ids) == max(space.ids) + 1
-    return "; the ids may count from 1: write them from 0, or name what 0 means as the first class" if told else ""
-
 
 SCHEMA = 2
 """Version of the file that --json writes."""
@@ -305,8 +206,7 @@ def _check_scans(
     """Check a scene of scans: their poses, what they share, voxels, and the ids of their labels."""
     sample = ScanSample(scene, indices, first, clusters(len(indices), SCAN_CLUSTERS), fused=FUSED_FRAMES)
     verdict, coverage = assess_scans(sample), ScanCoverage(sample)
-    scans = [*sample.scans.values()]
-    ranges = [scan.depth[(scan.depth > 0) & (scan.depth < np.inf)] for scan in scans]
+    scans, ranges = [*sample.scans.values()], sample.ranges
     p5, p50, p95 = np.percentile(np.concatenate(ranges), (5, 50, 95)) if sum(map(len, ranges)) else (np.nan,) * 3
     valid = float(np.mean([len(own) / scan.depth.size for own, scan in zip(ranges, scans, strict=True)]))
     tally = Tally(first or "")
@@ -455,21 +355,12 @@ class Inspection:
         self._read(indices, reader(scene, source), passing_over)
 
     def _read(self, indices: Sequence[int], read: Callable[[int], Frame], passing_over: bool) -> None:
-        def attempt(index: int) -> Frame | None:
-            try:
-                return read(index)
-            except DataError:
-                if not passing_over:
-                    raise
-                return None
-
-        positions = sorted(self._compared | set(self.fused))
-        for position, fetched in zip(positions, prefetch(attempt, [indices[p] for p in positions]), strict=True):
-            if (frame := fetched.item) is not None:
-                self._first = self._first or frame
-                if self._labelled:
-                    self.tally.add(frame)
-                self.views[position] = View.of(frame, self._points, labelled=self._labelled)
+        positions = self._compared | set(self.fused)
+        for position, frame in frames_at(positions, indices, read, passing_over=passing_over):
+            self._first = self._first or frame
+            if self._labelled:
+                self.tally.add(frame)
+            self.views[position] = View.of(frame, self._points, labelled=self._labelled)
 
     def reading(self, options: Mapping[str, Any]) -> Reading:
         """Return how the scene is configured."""
@@ -566,56 +457,3 @@ def _labels(scene: Scene, model: str, indices: Sequence[int], config: Config, ta
     if config.taxonomy is not None:
         space.mapping_to(LabelSpace.load(config.taxonomy))
     return tally.histogram(space)
-
-
-# The voxel size that suits the data, and how a given one compares with it.
-
-SCENES = 3
-"""The most scenes that are looked at; the largest size suits all of them."""
-
-MADE = "city"
-"""The simulated dataset, for which no voxel size is suggested."""
-
-
-def with_voxel_size(config: Config, scenes: Mapping[str, Scene]) -> tuple[Config, dict[str, VoxelAdvice]]:
-    """Return the configuration, with the voxel size that `check` suggests for files if none is set, and the advice.
-
-    The advice says scene by scene why that size was suggested.
-    """
-    if config.sets_voxel_size or _is_made(config):
-        return config, {}
-    some = [[*scenes.values()][k] for k in evenly(len(scenes), SCENES)]
-    coverages = {scene.name: coverage for scene in some if (coverage := _coverage(config, scene)) is not None}
-    sizes = [size for coverage in coverages.values() if (size := suggested_size(coverage)) is not None]
-    if not sizes:
-        return config, {}
-    size = max(sizes)
-    advice = {name: VoxelAdvice(size, coverage.stays(size), size, chosen=True) for name, coverage in coverages.items()}
-    return config.model_copy(update={"voxel_size": size}), advice
-
-
-def advise(sample: Sample | None, config: Config) -> VoxelAdvice | None:
-    """Return how the configured voxel size compares with the suggested one; None where the data do not tell."""
-    if sample is None or not sample.pairs or _is_made(config):
-        return None
-    coverage = Coverage(sample)
-    stays = coverage.stays(config.voxel_size)
-    return None if math.isnan(stays) else VoxelAdvice(config.voxel_size, stays, suggested_size(coverage), chosen=False)
-
-
-def _is_made(config: Config) -> bool:
-    """Return whether the scenes are simulated, also where models predict on their images."""
-    dataset = config.dataset
-    return (dataset.options["dataset"]["name"] if dataset.name == PREDICTED else dataset.name) == MADE
-
-
-def _coverage(config: Config, scene: Scene) -> Stays | None:
-    """Return what a scene's frames share; None where they cannot be read."""
-    models = selected(config.models, scene.models, scene.by_name, "model", scene.name)
-    with contextlib.suppress(DataError):
-        indices = frame_indices(scene, config, models)
-        if scene.of_scans:
-            return scans if (scans := quick_sample_of_scans(scene, indices)).pairs else None
-        inspection = Inspection(scene, indices, None, clusters(len(indices), CLUSTERS), POINTS, passing_over=True)
-        return Coverage(inspection.sample(config.dataset.options)) if len(inspection.views) > 1 else None
-    return None

@@ -14,11 +14,11 @@ from pydantic import BaseModel
 
 from semstab.core.types import Float64
 from semstab.data.frames import Intrinsics
-from semstab.datasets.bag.finding import CONTENTS, find_bags
+from semstab.datasets.bag.finding import OfBags
 from semstab.datasets.bag.index import Content, Int64, read_once
 from semstab.datasets.bag.messages import Folder, Messages
 from semstab.datasets.bag.options import BagOptions
-from semstab.datasets.bag.reading import NANOSECONDS, OpenBag, is_bag, seconds
+from semstab.datasets.bag.reading import NANOSECONDS, OpenBag, seconds
 from semstab.datasets.files.labels import SceneEntry
 from semstab.datasets.files.options import FileOptions, FrameSource
 from semstab.datasets.files.reader import FileDataset
@@ -32,7 +32,7 @@ from semstab.errors import DataError
 logger = logging.getLogger("semstab")
 
 
-class Bag(FileDataset[BagOptions]):
+class Bag(OfBags, FileDataset[BagOptions]):
     """{name} is the stamp of the colour image, 1305031102.175304000; of the depth image where there is no colour.
 
     Label maps may be named by it with six digits, too, or as whole nanoseconds. They are in the folder that is called
@@ -40,31 +40,15 @@ class Bag(FileDataset[BagOptions]):
     """
 
     Options: type[BaseModel] = BagOptions
-    contents = CONTENTS
 
     def __init__(self, options: BagOptions) -> None:
-        self._bags: dict[Path, Path] = {}
         self._opened: dict[Path, Recorded] = {}
         super().__init__(options)
-
-    def find_scenes(self, root: Path) -> list[SceneEntry]:
-        """Return the bag that the root is, else the bags below it in natural order.
-
-        Raises:
-            DataError: If there is none, or two would have one name.
-        """
-        found = find_bags(root)
-        self._bags = {entry.folder: path for entry, path in found}
-        return [entry for entry, _ in found]
 
     @property
     def folders(self) -> list[Path]:
         """The bags."""
-        return list(self._bags.values())
-
-    def is_scene(self, folder: Path) -> bool:
-        """Return whether a path is a bag."""
-        return is_bag(folder)
+        return list(self.bags.values())
 
     def frames(self, folder: Path) -> list[FrameSource]:
         """Return a frame for each depth image with a colour image; NaN is its pose where no two poses are around it.
@@ -72,7 +56,7 @@ class Bag(FileDataset[BagOptions]):
         Raises:
             DataError: If the bag lacks a part, is damaged, or nothing fits together in time.
         """
-        bag = OpenBag(self._bags[folder])
+        bag = OpenBag(self.bags[folder])
         self._opened[folder] = recorded = Recorded(read_once(bag, self.options), self.options)
         return recorded.frames()
 

@@ -15,6 +15,31 @@ CONTENTS = f"a ROS bag ({', '.join(SUFFIXES)}, or a folder of a rosbag2)"
 """What a scene is, for error messages."""
 
 
+class OfBags:
+    """The part of a dataset that finds its scenes, which are bags.
+
+    Attributes:
+        bags: The bag of each scene, by the scene's folder.
+    """
+
+    contents = CONTENTS
+    bags: dict[Path, Path]
+
+    def find_scenes(self, root: Path) -> list[SceneEntry]:
+        """Return the bag that the root is, else the bags below it in natural order.
+
+        Raises:
+            DataError: If there is none, or two would have one name.
+        """
+        found = find_bags(root)
+        self.bags = {entry.folder: path for entry, path in found}
+        return [entry for entry, _ in found]
+
+    def is_scene(self, folder: Path) -> bool:
+        """Return whether a path is a bag."""
+        return is_bag(folder)
+
+
 def find_bags(root: Path) -> list[tuple[SceneEntry, Path]]:
     """Return the bag that the root is, else the bags below it in natural order, each with the scene that it is.
 

@@ -15,13 +15,13 @@ import numpy.typing as npt
 from pydantic import BaseModel, Field
 
 from semstab.datasets.bag.clouds import CLOUD, classes_of, field_of, label_field_of, points_of, size_of
-from semstab.datasets.bag.finding import CONTENTS, find_bags
+from semstab.datasets.bag.finding import OfBags
 from semstab.datasets.bag.images import npy
 from semstab.datasets.bag.index import Arrivals, Stream
 from semstab.datasets.bag.messages import Folder, Messages, topic_path
 from semstab.datasets.bag.options import PoseOptions
 from semstab.datasets.bag.poses import POSES, TF, TF_TYPE, SensorPoses
-from semstab.datasets.bag.reading import NANOSECONDS, OpenBag, is_bag, seconds
+from semstab.datasets.bag.reading import NANOSECONDS, OpenBag, seconds
 from semstab.datasets.bag.topics import has_depth, require
 from semstab.datasets.files import options as opt
 from semstab.datasets.files.labels import SceneEntry
@@ -47,7 +47,7 @@ class BagScanOptions(PoseOptions, ScanOptions):
     up_axis: opt.UpAxis = "z"
 
 
-class BagScans(ScanDataset[BagScanOptions]):
+class BagScans(OfBags, ScanDataset[BagScanOptions]):
     """{name} is the stamp of the cloud in whole nanoseconds, 1305031102175304000.
 
     Predictions may be named by it in seconds, too, with nine digits or six. They are in the folder that is called as
@@ -55,23 +55,11 @@ class BagScans(ScanDataset[BagScanOptions]):
     """
 
     Options: type[BaseModel] = BagScanOptions
-    contents = CONTENTS
     labels = ("labels/{model}/{name}",)
 
     def __init__(self, options: BagScanOptions) -> None:
-        self._bags: dict[Path, Path] = {}
         self._opened: dict[Path, RecordedScans] = {}
         super().__init__(options)
-
-    def find_scenes(self, root: Path) -> list[SceneEntry]:
-        """Return the bag that the root is, else the bags below it in natural order.
-
-        Raises:
-            DataError: If there is none, or two would have one name.
-        """
-        found = find_bags(root)
-        self._bags = {entry.folder: path for entry, path in found}
-        return [entry for entry, _ in found]
 
     @property
     def folders(self) -> list[Path]:
@@ -80,14 +68,10 @@ class BagScans(ScanDataset[BagScanOptions]):
         Raises:
             DataError: If the first one with depth or clouds has depth, so that `bag` reads it, or none has clouds.
         """
-        bags = list(self._bags.values())
+        bags = list(self.bags.values())
         if not next((found for path in bags if (found := _holds_clouds(path)) is not None), False):
             raise DataError(f"{self.options.root}: no bag with clouds, and without depth")
         return bags
-
-    def is_scene(self, folder: Path) -> bool:
-        """Return whether a path is a bag."""
-        return is_bag(folder)
 
     def scans(self, entry: SceneEntry) -> list[ScanSource]:
         """Return a scan for each cloud with points; NaN is its pose where no two poses are around it.
@@ -95,7 +79,7 @@ class BagScans(ScanDataset[BagScanOptions]):
         Raises:
             DataError: If the bag lacks a part, or is damaged.
         """
-        bag = OpenBag(self._bags[entry.folder])
+        bag = OpenBag(self.bags[entry.folder])
         self._opened[entry.folder] = recorded = RecordedScans(bag, self.options)
         return recorded.scans
 

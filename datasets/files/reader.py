@@ -7,7 +7,7 @@ from abc import abstractmethod
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Generic, TypeVar
+from typing import Generic, Protocol, TypeVar
 
 import numpy as np
 
@@ -30,23 +30,30 @@ DEEPEST = 3
 Options = TypeVar("Options", bound=FileOptions)
 
 
-class FileDataset(Dataset, Generic[Options]):
-    """Scenes of files below a root. A reader recognises a scene's folder, and lists its frames.
+class WithRoot(Protocol):
+    """Options that name a root."""
+
+    @property
+    def root(self) -> Path:
+        """Return a scene, or what holds scenes."""
+
+
+AnyOptions = TypeVar("AnyOptions", bound=WithRoot)
+
+
+class ScenesBelow(Dataset, Generic[AnyOptions]):
+    """Scenes below a root, each in a folder that a reader recognises.
 
     Attributes:
         contents: The files of a scene's folder, for error messages.
-        labels_like_depth: Whether label maps that are made for it have the depth's pixels, not those of the images.
-        settings_file: Name of a file in a scene's folder with further settings, which `settled` reads.
 
     Raises:
         DataError: If there is no scene.
     """
 
     contents: str
-    labels_like_depth = False
-    settings_file: str | None = None
 
-    def __init__(self, options: Options) -> None:
+    def __init__(self, options: AnyOptions) -> None:
         self.options = options
         self._entries = {entry.name: entry for entry in self.find_scenes(options.root)}
 
@@ -55,15 +62,47 @@ class FileDataset(Dataset, Generic[Options]):
         """Return the names of the scenes, in natural order: their paths below root, with - between folders."""
         return tuple(self._entries)
 
+    @property
+    def folders(self) -> list[Path]:
+        """The folders of its scenes."""
+        return [entry.folder for entry in self._entries.values()]
+
+    def entry(self, name: str) -> SceneEntry:
+        """Return the scene of that name; raises ConfigError if it is not there."""
+        if name not in self._entries:
+            raise ConfigError(f"{self.options.root}: scene '{name}' is not there; {nearest(name, self.scenes)}")
+        return self._entries[name]
+
+    def find_scenes(self, root: Path) -> Iterable[SceneEntry]:
+        """Return the scenes below the root, in natural order; raises what `find_scenes` raises."""
+        return find_scenes(root, self.is_scene, self.contents)
+
+    @abstractmethod
+    def is_scene(self, folder: Path) -> bool:
+        """Return whether a folder is a scene of this format."""
+
+
+class FileDataset(ScenesBelow[Options]):
+    """Scenes of files below a root. A reader recognises a scene's folder, and lists its frames.
+
+    Attributes:
+        labels_like_depth: Whether label maps that are made for it have the depth's pixels, not those of the images.
+        settings_file: Name of a file in a scene's folder with further settings, which `settled` reads.
+
+    Raises:
+        DataError: If there is no scene.
+    """
+
+    labels_like_depth = False
+    settings_file: str | None = None
+
     def scene(self, name: str) -> FileScene:
         """Open one.
 
         Raises:
             ConfigError: For a name that is not there, and what `FileScene` raises.
         """
-        if name not in self._entries:
-            raise ConfigError(f"{self.options.root}: scene '{name}' is not there; {nearest(name, self.scenes)}")
-        entry = self._entries[name]
+        entry = self.entry(name)
         options = self.settled(entry.folder)
         frames = with_poses_of(tuple(self.frames(entry.folder)), options.pose_shift or 0)
         for frame in frames:
@@ -93,15 +132,6 @@ class FileDataset(Dataset, Generic[Options]):
     ) -> FileScene:
         """Return the scene of these frames."""
         return FileScene(entry, frames, options, self.class_ids(), surface)
-
-    def find_scenes(self, root: Path) -> Iterable[SceneEntry]:
-        """Return the scenes below the root, in natural order; raises what `find_scenes` raises."""
-        return find_scenes(root, self.is_scene, self.contents)
-
-    @property
-    def folders(self) -> list[Path]:
-        """The folders of its scenes."""
-        return [entry.folder for entry in self._entries.values()]
 
     def settled(self, folder: Path) -> FileOptions:
         """Return the options with which a scene's folder is read."""
@@ -139,10 +169,6 @@ class FileDataset(Dataset, Generic[Options]):
     def class_ids(self) -> Mapping[str, UInt16]:
         """Return by label source a table (65536,) from its files' ids to those of its taxonomy, where they differ."""
         return {}
-
-    @abstractmethod
-    def is_scene(self, folder: Path) -> bool:
-        """Return whether a folder is a scene of this format."""
 
     @abstractmethod
     def frames(self, folder: Path) -> Iterable[FrameSource]:

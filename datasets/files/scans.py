@@ -12,7 +12,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Generic, Literal, TypeVar
+from typing import Any, Literal, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -25,11 +25,11 @@ from semstab.data.labels import IGNORE_16BIT, LabelSpace
 from semstab.datasets.files import options as opt
 from semstab.datasets.files.labels import LabelSource, SceneEntry
 from semstab.datasets.files.options import Folders, Template, matching_folders
-from semstab.datasets.files.reader import find_scenes
+from semstab.datasets.files.reader import ScenesBelow
 from semstab.datasets.formats.disk import decode_array
 from semstab.datasets.formats.images import Read
 from semstab.datasets.geometry.cameras import LARGEST_COORDINATE, UP_AXES, to_camera_to_world
-from semstab.datasets.scene import GROUND_TRUTH, Dataset, Scene, fingerprint, listed
+from semstab.datasets.scene import GROUND_TRUTH, Scene, fingerprint, listed
 from semstab.errors import ConfigError, DataError
 
 logger = logging.getLogger("semstab")
@@ -84,11 +84,10 @@ class ScanSource:
 Options = TypeVar("Options", bound=ScanOptions)
 
 
-class ScanDataset(Dataset, Generic[Options]):
+class ScanDataset(ScenesBelow[Options]):
     """Scenes of scans below a root. A reader recognises a scene's folder, lists its scans, and reads points and ids.
 
     Attributes:
-        contents: The files of a scene's folder, for error messages.
         labels: Templates of predictions, of which the first that finds some counts.
         truth: Template of ground truth, or None.
         taxonomy: The classes of the labels, where options name no others.
@@ -98,25 +97,10 @@ class ScanDataset(Dataset, Generic[Options]):
         DataError: If there is no scene.
     """
 
-    contents: str
     labels: tuple[str, ...] = ("predictions/{model}/{name}",)
     truth: str | None = None
     taxonomy: str | None = None
     in_world = False
-
-    def __init__(self, options: Options) -> None:
-        self.options = options
-        self._entries = {entry.name: entry for entry in self.find_scenes(options.root)}
-
-    @property
-    def scenes(self) -> tuple[str, ...]:
-        """Return the names of the scenes, in natural order: their paths below root, with - between folders."""
-        return tuple(self._entries)
-
-    @property
-    def folders(self) -> list[Path]:
-        """The folders of its scenes."""
-        return [entry.folder for entry in self._entries.values()]
 
     def scene(self, name: str) -> ScanScene:
         """Open one.
@@ -125,9 +109,7 @@ class ScanDataset(Dataset, Generic[Options]):
             ConfigError: For a name that is not there.
             DataError: For one without scans, or damaged poses.
         """
-        if name not in self._entries:
-            raise ConfigError(f"{self.options.root}: scene '{name}' is not there; {nearest(name, self.scenes)}")
-        entry = self._entries[name]
+        entry = self.entry(name)
         scans = list(self.scans(entry))
         if not scans:
             raise DataError(f"{entry.folder}: holds no scan; expected {self.contents}")
@@ -136,14 +118,6 @@ class ScanDataset(Dataset, Generic[Options]):
     def opened(self, entry: SceneEntry, scans: Sequence[ScanSource]) -> ScanScene:
         """Return the scene of these scans."""
         return ScanScene(self, entry, scans)
-
-    def find_scenes(self, root: Path) -> Iterable[SceneEntry]:
-        """Return the scenes below the root, in natural order; raises what `find_scenes` raises."""
-        return find_scenes(root, self.is_scene, self.contents)
-
-    @abstractmethod
-    def is_scene(self, folder: Path) -> bool:
-        """Return whether a folder is a scene of this format."""
 
     @abstractmethod
     def scans(self, entry: SceneEntry) -> Iterable[ScanSource]:

@@ -1,25 +1,19 @@
-"""A drive through a street of boxes, seen by a LiDAR, and its files in SemanticKITTI's layout."""
+"""A drive through a street of boxes, seen by a LiDAR, in SemanticKITTI's layout, with predictions of three models."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scan_writers import Scan, predict_semantickitti, rigid, write_semantickitti
 
 IDS = np.array([10, 40, 50, 70])
 """Stored ids: car, road, building, vegetation."""
 
 SCANS, ROWS, COLUMNS = 10, 24, 360
-CALIBRATION = np.array([[0.01, -1.0, 0.0, -0.01], [0.0, 0.0, -1.0, -0.06], [1.0, 0.01, 0.0, -0.33]])
-"""Tr: from the LiDAR to the camera, close to a turn of the axes; its rotation is made orthonormal below."""
 
-
-def calibration():
-    """Tr (4, 4)."""
-    u, _, v = np.linalg.svd(CALIBRATION[:, :3])
-    Tr = np.eye(4)
-    Tr[:3, :3], Tr[:3, 3] = u @ v, CALIBRATION[:, 3]
-    return Tr
+TO_CAMERA = rigid((90.5, -89.6, 0.3), (-0.01, -0.06, -0.33))
+"""Tr, nearly as KITTI's: a camera that looks where the LiDAR's x points."""
 
 
 @dataclass(frozen=True)
@@ -59,6 +53,14 @@ class Street:
             poses.append(pose)
         return cls(scans, ids, poses)
 
+    def __iter__(self):
+        return zip(self.scans, self.ids, self.poses, strict=True)
+
+    @property
+    def known(self):
+        """The stored ids that there are, ascending, those of IDS among them."""
+        return np.unique(np.concatenate([IDS, *self.ids]))
+
     def with_ids(self, change):
         """The same with other ids: `change` takes those of a scan and its number."""
         return replace(self, ids=[change(own, k) for k, own in enumerate(self.ids)])
@@ -77,34 +79,14 @@ def _cast(origin, rays, boxes):
     return distance, label
 
 
-def write_semantickitti(folder, street):
-    """Write velodyne/, labels/, poses.txt, calib.txt, times.txt, and predictions of three models."""
-    rng, Tr = np.random.default_rng(1), calibration()
-    models = {
-        "labels": lambda ids, points, k: ids,
-        "predictions/clean": lambda ids, points, k: ids,
-        "predictions/flips": lambda ids, points, k: _flipped(ids, 0.25 if k % 3 == 1 else 0.0, rng),
-        "predictions/far": lambda ids, points, k: _flipped(
-            ids, np.clip((np.linalg.norm(points, axis=1) - 8) / 12, 0, 0.8), rng
-        ),
-    }
-    (folder / "velodyne").mkdir(parents=True)
-    for k, (points, ids) in enumerate(zip(street.scans, street.ids, strict=True)):
-        rows = np.column_stack([points, np.zeros(len(points), np.float32)]).astype("<f4")
-        rows.tofile(folder / f"velodyne/{k:06d}.bin")
-        for name, change in models.items():
-            (folder / name).mkdir(parents=True, exist_ok=True)
-            stored = change(ids, points, k).astype("<u4") | (7 << 16)  # the upper half is an instance
-            stored.tofile(folder / name / f"{k:06d}.label")
-    poses = [(Tr @ pose @ np.linalg.inv(Tr))[:3].ravel() for pose in street.poses]
-    np.savetxt(folder / "poses.txt", poses, fmt="%.9e")
-    numbers = " ".join(f"{number:.12e}" for number in Tr[:3].ravel())
-    (folder / "calib.txt").write_text(f"P0: {' '.join(['0'] * 12)}\nTr: {numbers}\n")
-    np.savetxt(folder / "times.txt", 0.1 * np.arange(len(poses)))
-
-
-def _flipped(ids, share, rng):
-    return np.where(rng.random(len(ids)) < share, rng.choice(IDS, len(ids)), ids)
-
-
-__all__ = ["IDS", "Street", "calibration", "write_semantickitti"]
+def write_street(folder, street):
+    """Write it with its true labels, and predictions of three models: right, flipped in each third scan, worse far."""
+    rng = np.random.default_rng(1)
+    classes = [Scan(points, np.searchsorted(street.known, ids), T) for points, ids, T in street]
+    names = write_semantickitti(folder, classes, street.known, TO_CAMERA)
+    for k, (name, scan) in enumerate(zip(names, classes, strict=True)):
+        far = np.clip((np.linalg.norm(scan.points, axis=1) - 8) / 12, 0, 0.8)
+        for model, share in (("clean", 0.0), ("flips", 0.25 if k % 3 == 1 else 0.0), ("far", far)):
+            wrong = rng.random(len(scan.walls)) < share
+            predicted = np.where(wrong, rng.integers(0, len(IDS), len(scan.walls)), scan.walls)
+            predict_semantickitti(folder, name, predicted, model, street.known)
